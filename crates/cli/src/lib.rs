@@ -1,0 +1,1 @@
+//! The program: detectors trained in simulation, measured on the road.

@@ -1,0 +1,2 @@
+//! The program `lidarshift`.
+fn main() {}

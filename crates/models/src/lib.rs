@@ -1,0 +1,1 @@
+//! PointPillars in burn, faithful to the published network to the last tensor.

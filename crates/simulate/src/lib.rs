@@ -1,0 +1,1 @@
+//! Synthetic LiDAR data sets by seeded ray casting.

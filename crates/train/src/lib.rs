@@ -1,0 +1,1 @@
+//! One run: optimiser, schedule, checkpoints, resume.

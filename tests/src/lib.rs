@@ -1,0 +1,1 @@
+//! Paths of the data that the tests of several crates share.
