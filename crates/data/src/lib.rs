@@ -4,8 +4,10 @@
 
 mod error;
 mod frame;
+pub mod kitti_text;
 mod stream;
 
 pub use error::DataError;
 pub use frame::{Cloud, Detection, Frame, Object};
+pub use kitti_text::{DONT_CARE, KittiLine, KittiText, LabelFrame, parse_kitti_text, read_kitti_text, to_kitti_text};
 pub use stream::{Stream, stream};
