@@ -1,2 +1,95 @@
-//! The program `lidarshift`.
-fn main() {}
+//! `cargo xtask WORD ...`: the program `lidarshift`, built in release and run with the same words; and the chores of who works on it.
+
+mod bench;
+mod ci;
+mod program;
+mod tidy;
+
+use anyhow::{Result, bail};
+use clap::{Parser, Subcommand};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::{Command, ExitCode};
+
+/// Chores of the workspace; every other word (train, eval, simulate, detect, doctor, parity, ...) goes to the program
+/// `lidarshift`, built in release with the backend that `--device` asks for.
+#[derive(Parser)]
+#[command(
+    name = "cargo xtask",
+    bin_name = "cargo xtask",
+    arg_required_else_help = true,
+    disable_help_subcommand = true,
+    after_help = "Any other word goes to the program: `cargo xtask train --help`, `cargo xtask help` for all of them."
+)]
+struct Xtask {
+    #[command(subcommand)]
+    word: Word,
+}
+
+#[derive(Subcommand)]
+enum Word {
+    /// All that has to pass: format, house rules, clippy, tests, a smoke run. The README's test command.
+    Ci,
+    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths.
+    Tidy,
+    /// Write configs/schema.json and docs/configuration.md from the Rust types.
+    Schema,
+    /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion.
+    Bench {
+        /// A benchmark (`crates/*/benches/NAME.rs`) or the folder of a crate; all when left out.
+        name: Option<String>,
+        /// For Criterion, as `--quick` or a filter.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        criterion: Vec<String>,
+    },
+    /// Face every reader of files with mutated inputs: `fuzz --inputs 1000000`.
+    Fuzz {
+        /// For the program's `fuzz`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        args: Vec<OsString>,
+    },
+    /// A word of the program.
+    #[command(external_subcommand)]
+    Program(Vec<OsString>),
+}
+
+fn main() -> ExitCode {
+    let outcome = match Xtask::parse().word {
+        Word::Ci => ci::ci(&root()),
+        Word::Tidy => tidy(),
+        Word::Schema => program::run(&root(), &["schema".into()]),
+        Word::Bench { name, criterion } => bench::bench(&root(), name.as_deref(), &criterion),
+        Word::Fuzz { args } => program::hand_over(&root(), &[vec!["fuzz".into()], args].concat()),
+        Word::Program(args) => program::hand_over(&root(), &args),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn tidy() -> Result<()> {
+    let complaints = tidy::complaints(&root())?;
+    for complaint in &complaints {
+        eprintln!("{complaint}");
+    }
+    match complaints.len() {
+        0 => Ok(()),
+        n => bail!("tidy: {n} complaints"),
+    }
+}
+
+/// The folder of the workspace.
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the workspace").into()
+}
+
+/// The cargo that runs us, in the folder of the workspace.
+fn cargo(root: &Path) -> Command {
+    let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    command.current_dir(root);
+    command
+}

@@ -1,0 +1,287 @@
+//! `cargo xtask tidy`: the house rules that a machine can check. ARCHITECTURE.md gives the reason of each.
+
+use anyhow::{Context, Result};
+use fs_err as fs;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// Who may know whom: a crate's folder, and the folders that it may depend on directly. What those may know, it may know too.
+const ARROWS: &[(&str, &[&str])] = &[
+    ("geometry", &[]),
+    ("kernels", &[]),
+    ("data", &["geometry"]),
+    ("simulate", &["data"]),
+    ("models", &["data", "kernels"]),
+    ("eval", &["data"]),
+    ("train", &["kernels", "models", "eval"]),
+    ("diagnose", &["simulate", "data", "eval"]),
+    ("report", &["eval", "diagnose"]),
+    ("cli", &["simulate", "train", "report"]),
+    ("tests", &["cli"]),
+    ("xtask", &[]),
+];
+
+/// The crates that may know tensors.
+const KNOWS_BURN: &[&str] = &["models", "train", "cli", "tests"];
+
+/// File names that say nothing.
+const EMPTY_NAMES: &[&str] = &["utils", "util", "common", "base", "helper", "helpers", "manager"];
+
+/// Lines of a source file before its tests.
+const MAX_LINES: usize = 400;
+
+/// Macros that stand for work not done.
+const UNDONE: &[&str] = &[concat!("to", "do!("), concat!("unimple", "mented!(")];
+
+/// Beginnings of paths that exist on one machine only.
+const MACHINE_PATHS: &[&str] =
+    &[concat!("/ho", "me/"), concat!("/ro", "ot/"), concat!("/wo", "rk/"), concat!("/Us", "ers/"), concat!("C:", "\\")];
+
+/// What the manifest of one member of the workspace says.
+pub struct Manifest {
+    /// The last part of its folder: `geometry`, `xtask`.
+    pub folder: String,
+    /// The package's name, as cargo wants it.
+    pub package: String,
+    path: PathBuf,
+    toml: toml::Table,
+}
+
+impl Manifest {
+    fn read(path: PathBuf) -> Result<Self> {
+        let toml: toml::Table = fs::read_to_string(&path)?.parse().with_context(|| path.display().to_string())?;
+        let package = toml.get("package").and_then(|p| p.get("name")).and_then(|n| n.as_str());
+        let package = package.with_context(|| format!("{}: no package.name", path.display()))?.to_owned();
+        let folder = path.parent().and_then(|p| p.file_name()).context("a manifest lies in a folder")?;
+        Ok(Manifest { folder: folder.to_string_lossy().into(), package, path, toml })
+    }
+
+    /// Names of all dependencies, those for tests and builds included.
+    fn dependencies(&self) -> BTreeSet<&str> {
+        ["dependencies", "dev-dependencies", "build-dependencies"]
+            .into_iter()
+            .filter_map(|kind| self.toml.get(kind)?.as_table())
+            .flat_map(|table| table.keys().map(String::as_str))
+            .collect()
+    }
+
+    /// Names of its `[[bench]]` entries.
+    pub fn benches(&self) -> Vec<String> {
+        let entries = self.toml.get("bench").and_then(|b| b.as_array()).into_iter().flatten();
+        entries.filter_map(|b| Some(b.get("name")?.as_str()?.to_owned())).collect()
+    }
+
+    fn takes_workspace_lints(&self) -> bool {
+        self.toml.get("lints").and_then(|l| l.get("workspace")).and_then(|w| w.as_bool()) == Some(true)
+    }
+}
+
+/// The manifests of all members, by path.
+pub fn manifests(root: &Path) -> Result<Vec<Manifest>> {
+    let mut paths = vec![root.join("tests/Cargo.toml"), root.join("xtask/Cargo.toml")];
+    for entry in fs::read_dir(root.join("crates"))? {
+        paths.push(entry?.path().join("Cargo.toml"));
+    }
+    paths.retain(|p| p.is_file());
+    paths.sort();
+    paths.into_iter().map(Manifest::read).collect()
+}
+
+/// Everything that breaks a rule of the house, one sentence each, in the order of paths.
+pub fn complaints(root: &Path) -> Result<Vec<String>> {
+    let mut found = Vec::new();
+    for manifest in manifests(root)? {
+        let path = shown(root, &manifest.path);
+        found.extend(manifest_complaints(&manifest).into_iter().map(|c| format!("{path}: {c}")));
+    }
+    for file in texts(root)? {
+        let path = shown(root, &file);
+        let text = fs::read_to_string(&file)?;
+        found.extend(text_complaints(&path, &text).into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));
+    }
+    Ok(found)
+}
+
+fn shown(root: &Path, path: &Path) -> String {
+    path.strip_prefix(root).unwrap_or(path).display().to_string()
+}
+
+fn manifest_complaints(manifest: &Manifest) -> Vec<String> {
+    let mut found = Vec::new();
+    if !manifest.takes_workspace_lints() {
+        found.push("the lints of the workspace are missing: add `[lints] workspace = true`".into());
+    }
+    let known: BTreeSet<&str> = ARROWS.iter().map(|(folder, _)| *folder).collect();
+    let Some(allowed) = may_know(&manifest.folder) else {
+        found.push(format!(
+            "{} has no place in the picture: add it to ARROWS in xtask and to ARCHITECTURE.md",
+            manifest.folder
+        ));
+        return found;
+    };
+    for dependency in manifest.dependencies() {
+        let folder = if dependency == "lidarshift" { "cli" } else { dependency };
+        if known.contains(folder) && !allowed.contains(folder) {
+            found.push(format!("{} may not know {folder}; it may know: {}", manifest.folder, list(&allowed)));
+        }
+        if dependency == "burn" && !KNOWS_BURN.contains(&manifest.folder.as_str()) {
+            found.push(format!("{} may not know burn", manifest.folder));
+        }
+    }
+    found
+}
+
+fn list(names: &BTreeSet<&str>) -> String {
+    if names.is_empty() { "none".into() } else { names.iter().copied().collect::<Vec<_>>().join(", ") }
+}
+
+/// All crates that `folder` may depend on; `None` when it is not in the picture.
+fn may_know(folder: &str) -> Option<BTreeSet<&'static str>> {
+    let arrows: BTreeMap<_, _> = ARROWS.iter().copied().collect();
+    let mut open = arrows.get(folder)?.to_vec();
+    let mut known = BTreeSet::new();
+    while let Some(next) = open.pop() {
+        if known.insert(next) {
+            open.extend(arrows[next]);
+        }
+    }
+    Some(known)
+}
+
+/// Line (from 1) and complaint.
+fn text_complaints(path: &str, text: &str) -> Vec<(usize, String)> {
+    let mut found = Vec::new();
+    for (i, line) in text.lines().enumerate() {
+        if let Some(prefix) = MACHINE_PATHS.iter().find(|p| names_path(line, p)) {
+            found.push((i + 1, format!("a path of one machine ({prefix}...): make it relative")));
+        }
+    }
+    if !path.ends_with(".rs") {
+        return found;
+    }
+    for (i, line) in text.lines().enumerate() {
+        if let Some(name) = UNDONE.iter().find(|u| line.contains(**u)) {
+            found.push((i + 1, format!("{name}...): finish it or return an error")));
+        }
+    }
+    let stem = Path::new(path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+    if EMPTY_NAMES.contains(&stem.as_str()) {
+        found.push((1, format!("`{stem}` says nothing: name the idea that the file is about")));
+    }
+    let lines = lines_before_tests(text);
+    if lines > MAX_LINES && !is_test(path) {
+        found.push((
+            MAX_LINES + 1,
+            format!("{lines} lines before the tests, more than {MAX_LINES}: a file is one idea"),
+        ));
+    }
+    found
+}
+
+/// Whether `line` holds `prefix` as the beginning of a path, not as the middle of one.
+fn names_path(line: &str, prefix: &str) -> bool {
+    line.match_indices(prefix).any(|(at, _)| {
+        let before = line[..at].chars().next_back();
+        !before.is_some_and(|c| c.is_alphanumeric() || "._-~/:".contains(c))
+    })
+}
+
+/// Files that hold tests alone.
+fn is_test(path: &str) -> bool {
+    path.starts_with("tests/") || path.contains("/tests/") || path.ends_with("/tests.rs")
+}
+
+/// Lines up to `#[cfg(test)] mod ...`.
+fn lines_before_tests(text: &str) -> usize {
+    let lines: Vec<&str> = text.lines().collect();
+    let tests = lines.windows(2).position(|w| w[0] == "#[cfg(test)]" && w[1].starts_with("mod "));
+    tests.unwrap_or(lines.len())
+}
+
+/// Everything a person wrote in the repository, by path: sources, manifests, scripts, documents; not what a run made.
+fn texts(root: &Path) -> Result<Vec<PathBuf>> {
+    let (mut open, mut files) = (vec![root.to_owned()], Vec::new());
+    while let Some(folder) = open.pop() {
+        for entry in fs::read_dir(&folder)? {
+            let entry = entry?;
+            let (path, name) = (entry.path(), entry.file_name().to_string_lossy().into_owned());
+            if entry.file_type()?.is_dir() {
+                let made = folder == root && matches!(name.as_str(), "target" | "runs" | "bench")
+                    || folder == root.join("datasets")
+                    || name.starts_with('.') && !matches!(name.as_str(), ".cargo" | ".ci");
+                if !made {
+                    open.push(path);
+                }
+            } else if [".rs", ".toml", ".md", ".sh"].iter().any(|end| name.ends_with(end)) || folder.ends_with(".ci") {
+                files.push(path);
+            }
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_repository_is_tidy() {
+        let found = complaints(&crate::root()).unwrap();
+        assert!(found.is_empty(), "\n{}\n", found.join("\n"));
+    }
+
+    fn manifest(folder: &str, rest: &str) -> Manifest {
+        let toml = format!("[package]\nname = \"lidarshift-{folder}\"\n{rest}").parse().unwrap();
+        Manifest { folder: folder.into(), package: String::new(), path: PathBuf::new(), toml }
+    }
+
+    #[test]
+    fn arrows_run_one_way() {
+        let lints = "[lints]\nworkspace = true\n";
+        for (folder, dependency, allowed) in [
+            ("data", "geometry", true),
+            ("geometry", "data", false),
+            ("eval", "models", false),
+            ("models", "eval", false),
+            ("eval", "burn", false),
+            ("models", "burn", true),
+            ("train", "geometry", true),
+            ("kernels", "geometry", false),
+            ("report", "simulate", true),
+            ("report", "train", false),
+            ("cli", "geometry", true),
+            ("tests", "lidarshift", true),
+            ("train", "lidarshift", false),
+            ("xtask", "geometry", false),
+            ("geometry", "serde", true),
+            ("unheard-of", "serde", false),
+        ] {
+            for kind in ["dependencies", "dev-dependencies"] {
+                let text = format!("{lints}[{kind}]\n{dependency}.workspace = true\n");
+                let found = manifest_complaints(&manifest(folder, &text));
+                assert_eq!(found.is_empty(), allowed, "{folder} -> {dependency}: {found:?}");
+            }
+        }
+        assert_eq!(manifest_complaints(&manifest("data", "")).len(), 1);
+    }
+
+    #[test]
+    fn each_text_rule_bites() {
+        let long = "x\n".repeat(MAX_LINES + 1);
+        let [h, undone] = [MACHINE_PATHS[0], UNDONE[0]];
+        for (path, text, complaints) in [
+            ("crates/a/src/lib.rs", "fn f() {}\n".to_owned(), 0),
+            ("crates/a/src/utils.rs", "fn f() {}\n".to_owned(), 1),
+            ("crates/a/src/lib.rs", format!("fn f() {{ {undone}) }}\n"), 1),
+            ("README.md", format!("see {h}me/data\n"), 1),
+            ("README.md", format!("see https://example.org{h}page\n"), 0),
+            ("crates/a/src/lib.rs", long.clone(), 1),
+            ("crates/a/tests/all.rs", long.clone(), 0),
+            ("crates/a/src/lib.rs", format!("#[cfg(test)]\nmod tests {{\n{long}}}\n"), 0),
+        ] {
+            let found = text_complaints(path, &text);
+            assert_eq!(found.len(), complaints, "{path}: {found:?}");
+        }
+    }
+}
