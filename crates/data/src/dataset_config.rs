@@ -1,0 +1,201 @@
+//! What a data set's TOML may say, and what holds where it says nothing.
+
+use crate::{DataError, LabelFrame, PointColumns};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Where the files lie below the root.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Layout {
+    /// `velodyne/*.bin`, `label_2/*.txt` and, where there is a camera, `calib/*.txt`.
+    #[default]
+    Kitti,
+    /// `data/pcl/*.pcd` and `data/label/*.txt`, without calibration.
+    S2rDad,
+}
+
+impl Layout {
+    /// The folder of the clouds, relative to the root.
+    pub fn cloud_folder(self) -> &'static str {
+        match self {
+            Layout::Kitti => "velodyne",
+            Layout::S2rDad => "data/pcl",
+        }
+    }
+
+    /// The folder of the labels, relative to the root.
+    pub fn label_folder(self) -> &'static str {
+        match self {
+            Layout::Kitti => "label_2",
+            Layout::S2rDad => "data/label",
+        }
+    }
+
+    /// The usual ending of a cloud first, then the other one.
+    pub(crate) fn endings(self) -> [&'static str; 2] {
+        match self {
+            Layout::Kitti => ["bin", "pcd"],
+            Layout::S2rDad => ["pcd", "bin"],
+        }
+    }
+}
+
+/// A data set: files, frame of the labels, classes, splits.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct DatasetConfig {
+    /// A name for tables and messages. Default: the name of the folder.
+    #[serde(default)]
+    pub name: String,
+    /// Folder of the data, relative to this file.
+    #[serde(default = "here")]
+    pub root: PathBuf,
+    /// Where the files lie below the root.
+    #[serde(default)]
+    pub layout: Layout,
+    /// Columns of a `.bin`. A `.pcd` says so itself; `xyz` here then drops its intensity.
+    #[serde(default)]
+    pub points: PointColumns,
+    /// Frame of the labels. Default: `camera` where the KITTI layout has a folder `calib`, else `lidar`.
+    #[serde(default = "lidar")]
+    pub label_frame: LabelFrame,
+    /// Classes to learn and to evaluate. Default: those found in the labels (of KITTI itself: Car, Pedestrian, Cyclist).
+    #[serde(default)]
+    pub classes: Vec<String>,
+    /// Name and file of each split, relative to the root. Default: those of train, val and test for which `ImageSets/NAME.txt` exists.
+    #[serde(default)]
+    pub splits: BTreeMap<String, PathBuf>,
+    /// Keep only the points that the camera sees (needs `calib`). The reference does so with KITTI in training and in test.
+    #[serde(default)]
+    pub fov_crop: bool,
+    /// Width and height of the camera's image, px.
+    #[serde(default = "kitti_image_size")]
+    pub image_size: [u32; 2],
+}
+
+fn here() -> PathBuf {
+    ".".into()
+}
+
+fn lidar() -> LabelFrame {
+    LabelFrame::Lidar
+}
+
+fn kitti_image_size() -> [u32; 2] {
+    [1242, 375]
+}
+
+impl Default for DatasetConfig {
+    fn default() -> Self {
+        DatasetConfig {
+            name: String::new(),
+            root: here(),
+            layout: Layout::default(),
+            points: PointColumns::default(),
+            label_frame: lidar(),
+            classes: Vec::new(),
+            splits: BTreeMap::new(),
+            fov_crop: false,
+            image_size: kitti_image_size(),
+        }
+    }
+}
+
+impl DatasetConfig {
+    /// Reads a data set's TOML; `root` is then relative to the working folder and every default is filled in but the classes.
+    pub fn read(path: &Path) -> Result<Self, DataError> {
+        let bytes = fs_err::read(path)?;
+        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not text"))?;
+        let mut config: DatasetConfig = toml::from_str(text).map_err(|e| {
+            let line = 1 + e.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count());
+            DataError::line(path, line, e.message())
+        })?;
+        config.root = path.parent().unwrap_or(Path::new("")).join(&config.root);
+        let written: toml::Table = toml::from_str(text).expect("it was read above");
+        config.fill_in(!written.contains_key("label_frame"));
+        config.check(path)?;
+        Ok(config)
+    }
+
+    /// What a folder without a TOML is: KITTI (itself or in `training/` below it), or S2R-DAD.
+    pub fn of_folder(folder: &Path) -> Result<Self, DataError> {
+        let holds = |layout: Layout, root: &Path| root.join(layout.cloud_folder()).is_dir();
+        let with = |layout, root: &Path| DatasetConfig { layout, root: root.into(), ..DatasetConfig::default() };
+        let training = folder.join("training");
+        let mut config = if holds(Layout::Kitti, folder) {
+            with(Layout::Kitti, folder)
+        } else if holds(Layout::Kitti, &training) {
+            let mut config = with(Layout::Kitti, &training);
+            config.name = folder_name(folder);
+            // Above `training/` lie the lists of the whole benchmark, whose `test.txt` speaks of the frames of `testing/`.
+            for name in ["train", "val"] {
+                let list = PathBuf::from(format!("../ImageSets/{name}.txt"));
+                if training.join(&list).is_file() {
+                    config.splits.insert(name.into(), list);
+                }
+            }
+            config
+        } else if holds(Layout::S2rDad, folder) {
+            with(Layout::S2rDad, folder)
+        } else if folder.is_dir() {
+            return Err(DataError::file(
+                folder,
+                "is no data set: it has neither dataset.toml nor velodyne/ (KITTI), training/velodyne/ or data/pcl/ (S2R-DAD)",
+            ));
+        } else {
+            return Err(DataError::file(folder, "does not exist; a data set is a folder or its TOML"));
+        };
+        config.fill_in(true);
+        Ok(config)
+    }
+
+    fn fill_in(&mut self, label_frame_unsaid: bool) {
+        if self.name.is_empty() {
+            self.name = folder_name(&self.root);
+        }
+        if label_frame_unsaid && self.layout == Layout::Kitti && self.root.join("calib").is_dir() {
+            self.label_frame = LabelFrame::Camera;
+        }
+        if self.splits.is_empty() {
+            for name in ["train", "val", "test"] {
+                let list = PathBuf::from(format!("ImageSets/{name}.txt"));
+                if self.root.join(&list).is_file() {
+                    self.splits.insert(name.into(), list);
+                }
+            }
+        }
+    }
+
+    fn check(&self, path: &Path) -> Result<(), DataError> {
+        let wrong = |message: String| Err(DataError::file(path, message));
+        if self.image_size.contains(&0) {
+            return wrong(format!("image_size {:?} px has no pixel", self.image_size));
+        }
+        if self.layout == Layout::S2rDad && self.label_frame == LabelFrame::Camera {
+            return wrong(
+                "label_frame = \"camera\" needs a calibration, which the layout s2r_dad does not have".into(),
+            );
+        }
+        if self.layout == Layout::S2rDad && self.fov_crop {
+            return wrong("fov_crop needs a calibration, which the layout s2r_dad does not have".into());
+        }
+        for (i, class) in self.classes.iter().enumerate() {
+            if class.is_empty()
+                || class.contains(char::is_whitespace)
+                || class == "DontCare"
+                || self.classes[..i].contains(class)
+            {
+                return wrong(format!("classes: {class:?} is empty, has a space, is there twice or is DontCare"));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn folder_name(folder: &Path) -> String {
+    let name = |p: &Path| p.file_name().map(|n| n.to_string_lossy().into_owned());
+    name(folder).or_else(|| name(&folder.canonicalize().ok()?)).unwrap_or_else(|| "data set".into())
+}

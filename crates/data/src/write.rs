@@ -1,0 +1,111 @@
+//! Files appear whole or not at all: temporary file in the same folder, sync, rename.
+
+use crate::dataset_config::{DatasetConfig, Layout};
+use crate::kitti_text::to_kitti_text;
+use crate::{Cloud, DataError, Frame, KittiLine, PcdEncoding, encode_pcd};
+use std::io::Write as _;
+use std::path::Path;
+
+/// Writes `bytes` to `path`, making its folder where needed. A reader sees the old file or the new one, never a part of it.
+pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
+    let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    fs_err::create_dir_all(folder)?;
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".writing-");
+    #[cfg(unix)]
+    let permissions = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
+    #[cfg(unix)]
+    builder.permissions(permissions); // the umask still applies; the default of temporary files is 0600
+    let mut file = builder.tempfile_in(folder).map_err(failed)?;
+    file.write_all(bytes).map_err(failed)?;
+    file.as_file().sync_all().map_err(failed)?;
+    file.persist(path).map_err(|e| failed(e.error))?;
+    Ok(())
+}
+
+/// KITTI's `.bin`: the cloud's values as little-endian f32, point after point.
+pub fn write_bin(path: &Path, cloud: &Cloud) -> Result<(), DataError> {
+    let bytes: Vec<u8> = cloud.values.iter().flat_map(|v| v.to_le_bytes()).collect();
+    write_atomic(path, &bytes)
+}
+
+/// PCD v0.7 with the fields x, y, z and, for four channels, intensity.
+pub fn write_pcd(path: &Path, cloud: &Cloud, encoding: PcdEncoding) -> Result<(), DataError> {
+    write_atomic(path, &encode_pcd(cloud, encoding))
+}
+
+/// Label lines of a frame in the label frame "lidar": KITTI's columns, location = box centre, rotation = yaw counter-clockwise from +x.
+pub fn label_lines(frame: &Frame) -> Vec<KittiLine> {
+    let line = |object: &crate::Object| {
+        let mut line = KittiLine::from_box(&object.class, &object.bbox, None);
+        line.truncation = object.truncation.unwrap_or(line.truncation);
+        line.occlusion = object.occlusion.map_or(line.occlusion, f64::from);
+        line.image_box = object.image_box.unwrap_or(line.image_box);
+        line
+    };
+    frame.objects.iter().map(line).collect()
+}
+
+/// KITTI text, one line each.
+pub fn write_kitti_text(path: &Path, lines: &[KittiLine]) -> Result<(), DataError> {
+    write_atomic(path, to_kitti_text(lines).as_bytes())
+}
+
+/// One frame in the KITTI layout: `velodyne/ID.bin` and `label_2/ID.txt`, labels in the label frame "lidar".
+pub fn write_kitti_frame(root: &Path, frame: &Frame) -> Result<(), DataError> {
+    write_bin(&root.join(format!("velodyne/{}.bin", frame.id)), &frame.cloud)?;
+    write_kitti_text(&root.join(format!("label_2/{}.txt", frame.id)), &label_lines(frame))
+}
+
+/// One frame in the S2R-DAD layout: `data/pcl/ID.pcd` and `data/label/ID.txt`, labels in the label frame "lidar".
+pub fn write_s2r_dad_frame(root: &Path, frame: &Frame, encoding: PcdEncoding) -> Result<(), DataError> {
+    write_pcd(&root.join(format!("data/pcl/{}.pcd", frame.id)), &frame.cloud, encoding)?;
+    write_kitti_text(&root.join(format!("data/label/{}.txt", frame.id)), &label_lines(frame))
+}
+
+/// One frame in either layout; PCD in its binary form.
+pub fn write_frame(root: &Path, layout: Layout, frame: &Frame) -> Result<(), DataError> {
+    match layout {
+        Layout::Kitti => write_kitti_frame(root, frame),
+        Layout::S2rDad => write_s2r_dad_frame(root, frame, PcdEncoding::Binary),
+    }
+}
+
+/// A data set's TOML; the file name that [`crate::Dataset::open`] looks for in a folder is `dataset.toml`.
+pub fn write_dataset_toml(path: &Path, config: &DatasetConfig) -> Result<(), DataError> {
+    let text = toml::to_string_pretty(config).map_err(|e| DataError::file(path, e.to_string()))?;
+    write_atomic(path, text.as_bytes())
+}
+
+/// A split: frame ids, one a line.
+pub fn write_split<S: AsRef<str>>(path: &Path, ids: &[S]) -> Result<(), DataError> {
+    let text: String = ids.iter().flat_map(|id| [id.as_ref(), "\n"]).collect();
+    write_atomic(path, text.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn writes_whole_files_and_leaves_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a/b/split.txt");
+        write_split(&path, &["000001", "000002"]).unwrap();
+        write_split(&path, &["000003"]).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "000003\n");
+        assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_written_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("plain"), b"").unwrap();
+        let error = write_atomic(&folder.path().join("plain/x.txt"), b"").unwrap_err();
+        assert!(error.to_string().contains("plain"), "{error}");
+    }
+}
