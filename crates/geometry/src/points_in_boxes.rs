@@ -1,0 +1,172 @@
+//! Which points lie in which boxes.
+
+use crate::Box3;
+
+/// Cells along each side of the grid.
+const CELLS: usize = 64;
+
+/// For each box the indices of the points inside, ascending. `points` holds `channels` values each, x, y, z first.
+///
+/// Inside is OpenPCDet's rule, in the box's own frame: |z| <= dz/2, |x| < dx/2 + margin, |y| < dy/2 + margin. Its margin is 1e-5 m
+/// on the GPU and 1e-2 m on the CPU; 0 is the box itself. A point that is not finite is in no box, and nothing is in a box that has
+/// no extent.
+///
+/// # Shapes
+/// `points`: `[N * channels]`; out: one list a box.
+pub fn points_in_boxes(points: &[f32], channels: usize, boxes: &[Box3], margin_m: f64) -> Vec<Vec<u32>> {
+    assert!(channels >= 3 && points.len() % channels == 0, "points of {channels} values do not fill {}", points.len());
+    let mut inside = vec![Vec::new(); boxes.len()];
+    let tests: Vec<InsideTest> =
+        boxes.iter().enumerate().filter_map(|(i, b)| InsideTest::new(i, b, margin_m)).collect();
+    let Some(grid) = BoxGrid::new(&tests) else { return inside };
+    for (i, p) in points.chunks_exact(channels).enumerate() {
+        let p = [f64::from(p[0]), f64::from(p[1]), f64::from(p[2])];
+        for &k in grid.boxes_near(p[0], p[1]) {
+            let test = &tests[k as usize];
+            if test.holds(p) {
+                inside[test.index].push(i as u32);
+            }
+        }
+    }
+    inside
+}
+
+/// A box, ready to test points.
+struct InsideTest {
+    index: usize,
+    center: [f64; 3],
+    half: [f64; 3],
+    sin: f64,
+    cos: f64,
+    /// Lowest and highest x and y that can be inside, rounded outwards.
+    low: [f64; 2],
+    high: [f64; 2],
+}
+
+impl InsideTest {
+    fn new(index: usize, b: &Box3, margin_m: f64) -> Option<Self> {
+        if !b.size.iter().all(|&s| s > 0.0) || !b.to_array().iter().all(|v| v.is_finite()) {
+            return None;
+        }
+        let (sin, cos) = b.yaw_rad.sin_cos();
+        let half = [b.size[0] / 2.0 + margin_m, b.size[1] / 2.0 + margin_m, b.size[2] / 2.0];
+        let reach = [half[0] * cos.abs() + half[1] * sin.abs(), half[0] * sin.abs() + half[1] * cos.abs()];
+        let mut test = InsideTest { index, center: b.center, half, sin, cos, low: [0.0; 2], high: [0.0; 2] };
+        for axis in [0, 1] {
+            let outwards = reach[axis] + 1e-9 * (1.0 + reach[axis] + b.center[axis].abs());
+            test.low[axis] = b.center[axis] - outwards;
+            test.high[axis] = b.center[axis] + outwards;
+        }
+        Some(test)
+    }
+
+    fn holds(&self, p: [f64; 3]) -> bool {
+        let (x, y) = (p[0] - self.center[0], p[1] - self.center[1]);
+        (p[2] - self.center[2]).abs() <= self.half[2]
+            && (x * self.cos + y * self.sin).abs() < self.half[0]
+            && (y * self.cos - x * self.sin).abs() < self.half[1]
+    }
+}
+
+/// The boxes over each cell of a grid that covers all of them.
+struct BoxGrid {
+    low: [f64; 2],
+    high: [f64; 2],
+    cells_per_m: [f64; 2],
+    /// Cell c has `boxes[starts[c]..starts[c + 1]]`.
+    starts: Vec<u32>,
+    boxes: Vec<u32>,
+}
+
+impl BoxGrid {
+    fn new(tests: &[InsideTest]) -> Option<Self> {
+        let first = tests.first()?;
+        let mut grid =
+            BoxGrid { low: first.low, high: first.high, cells_per_m: [0.0; 2], starts: Vec::new(), boxes: Vec::new() };
+        for axis in [0, 1] {
+            grid.low[axis] = tests.iter().map(|t| t.low[axis]).fold(f64::INFINITY, f64::min);
+            grid.high[axis] = tests.iter().map(|t| t.high[axis]).fold(f64::NEG_INFINITY, f64::max);
+            grid.cells_per_m[axis] = CELLS as f64 / (grid.high[axis] - grid.low[axis]);
+        }
+        let mut in_cell = vec![Vec::new(); CELLS * CELLS];
+        for (k, test) in tests.iter().enumerate() {
+            let [x0, y0] = [0, 1].map(|axis| grid.index(axis, test.low[axis]));
+            let [x1, y1] = [0, 1].map(|axis| grid.index(axis, test.high[axis]));
+            for x in x0..=x1 {
+                in_cell[x * CELLS + y0..=x * CELLS + y1].iter_mut().for_each(|cell| cell.push(k as u32));
+            }
+        }
+        grid.starts.push(0);
+        for cell in in_cell {
+            grid.boxes.extend(cell);
+            grid.starts.push(grid.boxes.len() as u32);
+        }
+        Some(grid)
+    }
+
+    /// Never falls when `v` grows, so that a point between the bounds of a box is in a cell between theirs.
+    fn index(&self, axis: usize, v: f64) -> usize {
+        (((v - self.low[axis]) * self.cells_per_m[axis]) as usize).min(CELLS - 1)
+    }
+
+    fn boxes_near(&self, x: f64, y: f64) -> &[u32] {
+        let within = x >= self.low[0] && x <= self.high[0] && y >= self.low[1] && y <= self.high[1];
+        if !within {
+            return &[]; // NaN comes here, too
+        }
+        let cell = self.index(0, x) * CELLS + self.index(1, y);
+        &self.boxes[self.starts[cell] as usize..self.starts[cell + 1] as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn borders_and_bad_points() {
+        let b = Box3::from_array([1.0, 2.0, 3.0, 4.0, 2.0, 2.0, 0.0]);
+        let points = [
+            [1.0, 2.0, 4.0],      // on the top: inside
+            [3.0, 2.0, 3.0],      // on the front: outside without a margin
+            [1.0, 2.999, 3.0],    // inside
+            [f32::NAN, 2.0, 3.0], // nowhere
+            [1.0, f32::INFINITY, 3.0],
+        ]
+        .concat();
+        assert_eq!(points_in_boxes(&points, 3, &[b], 0.0), [vec![0, 2]]);
+        assert_eq!(points_in_boxes(&points, 3, &[b], 1e-5), [vec![0, 1, 2]]);
+        let flat = Box3 { size: [0.0; 3], ..b };
+        let nan = Box3 { center: [f64::NAN; 3], ..b };
+        assert_eq!(points_in_boxes(&points, 3, &[flat, b, nan], 0.0), [vec![], vec![0, 2], vec![]]);
+        assert_eq!(points_in_boxes(&[], 4, &[b], 0.0), [Vec::<u32>::new()]);
+        assert!(points_in_boxes(&points, 3, &[], 0.0).is_empty());
+    }
+
+    proptest! {
+        #[test]
+        fn equals_testing_every_point(
+            boxes in prop::collection::vec((-50.0..50.0f64, -50.0..50.0f64, 0.0..20.0f64, 0.0..20.0f64, -7.0..7.0f64), 0..12),
+            points in prop::collection::vec((-60.0..60.0f32, -60.0..60.0f32, -2.0..2.0f32), 0..400),
+        ) {
+            let boxes: Vec<Box3> =
+                boxes.iter().map(|v| Box3::from_array([v.0, v.1, 0.0, v.2, v.3, 2.0, v.4])).collect();
+            let flat: Vec<f32> = points.iter().flat_map(|p| [p.0, p.1, p.2, 0.5]).collect();
+            let got = points_in_boxes(&flat, 4, &boxes, 0.01);
+            for (b, got) in boxes.iter().zip(got) {
+                let want: Vec<u32> = (0..points.len() as u32)
+                    .filter(|&i| {
+                        let p = points[i as usize];
+                        let q = b.to_local([f64::from(p.0), f64::from(p.1), f64::from(p.2)]);
+                        b.size.iter().all(|&s| s > 0.0)
+                            && q[0].abs() < b.size[0] / 2.0 + 0.01
+                            && q[1].abs() < b.size[1] / 2.0 + 0.01
+                            && q[2].abs() <= b.size[2] / 2.0
+                    })
+                    .collect();
+                prop_assert_eq!(got, want);
+            }
+        }
+    }
+}
