@@ -1,1 +1,16 @@
 //! Synthetic LiDAR data sets by seeded ray casting.
+//!
+//! A road with cars, walls, poles and things that are no cars, seen by one spinning LiDAR. Everything is in the LiDAR frame: origin at the
+//! sensor, x forward, y left, z up, m; yaw counter-clockwise from +x, rad. A frame is a pure function of (configuration, split, index).
+
+pub mod cars;
+mod config;
+mod dataset;
+pub mod raycast;
+pub mod road;
+mod roadside;
+pub mod scene;
+pub mod sensor;
+
+pub use config::{FrameCounts, RoadConfig, SimulateError};
+pub use dataset::{MANIFEST_SCHEMA, Manifest, SplitCounts, make_road_dataset, make_road_frame};
