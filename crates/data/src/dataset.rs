@@ -228,3 +228,196 @@ fn check_frame_id(id: &str) -> Result<(), String> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Layout;
+    use crate::write::{write_dataset_toml, write_frame, write_split};
+    use geometry::Box3;
+
+    fn frame(id: &str, channels: usize) -> Frame {
+        let object = Object {
+            class: "Car".into(),
+            bbox: Box3::from_array([10.5, -2.25, -0.9, 4.1, 1.7, 1.5, 0.3]),
+            truncation: Some(0.0),
+            occlusion: Some(0),
+            image_box: None,
+        };
+        let values = (0..channels * 5).map(|i| i as f32 * 0.5).collect();
+        Frame { id: id.into(), cloud: Cloud { values, channels }, objects: vec![object] }
+    }
+
+    /// A folder with two frames and a TOML.
+    fn made_up(layout: Layout, channels: usize) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for id in ["000000", "000001"] {
+            write_frame(folder.path(), layout, &frame(id, channels)).unwrap();
+        }
+        write_split(&folder.path().join("ImageSets/train.txt"), &["000001", "000000"]).unwrap();
+        let points = if channels == 4 { PointColumns::Xyzi } else { PointColumns::Xyz };
+        let config = DatasetConfig { name: "made up".into(), layout, points, ..DatasetConfig::default() };
+        write_dataset_toml(&folder.path().join("dataset.toml"), &config).unwrap();
+        folder
+    }
+
+    fn with_toml(folder: &Path, text: &str) -> Result<Dataset, String> {
+        std::fs::write(folder.join("dataset.toml"), text).unwrap();
+        Dataset::open(folder).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn both_layouts_read_what_they_wrote() {
+        for layout in [Layout::Kitti, Layout::S2rDad] {
+            for channels in [3, 4] {
+                let folder = made_up(layout, channels);
+                let dataset = Dataset::open(folder.path()).unwrap();
+                assert_eq!(dataset, Dataset::open(&folder.path().join("dataset.toml")).unwrap());
+                assert_eq!(dataset.config.points.channels(), channels);
+                assert_eq!(dataset.config.classes, ["Car"]);
+                assert_eq!(dataset.ids("train").unwrap(), ["000001", "000000"]);
+                assert_eq!(dataset.all_ids().unwrap(), ["000000", "000001"]);
+                assert_eq!(dataset.load("000001").unwrap(), frame("000001", channels));
+            }
+        }
+    }
+
+    #[test]
+    fn folders_without_a_toml_are_known_by_their_layout() {
+        let folder = made_up(Layout::Kitti, 4);
+        std::fs::remove_file(folder.path().join("dataset.toml")).unwrap();
+        let dataset = Dataset::open(folder.path()).unwrap();
+        assert_eq!((dataset.config.label_frame, dataset.config.splits.len()), (LabelFrame::Lidar, 1));
+        std::fs::create_dir(folder.path().join("calib")).unwrap();
+        let dataset = Dataset::open(folder.path()).unwrap();
+        assert_eq!(dataset.config.label_frame, LabelFrame::Camera);
+        let error = dataset.load("000000").unwrap_err().to_string();
+        assert!(error.contains("calib/000000.txt"), "{error}");
+
+        let above = tempfile::tempdir().unwrap();
+        std::fs::rename(folder.path(), above.path().join("training")).unwrap();
+        write_split(&above.path().join("ImageSets/val.txt"), &["000000"]).unwrap();
+        assert_eq!(Dataset::open(above.path()).unwrap().ids("val").unwrap(), ["000000"]);
+    }
+
+    #[test]
+    fn a_bad_toml_is_refused_by_line() {
+        let folder = made_up(Layout::Kitti, 4);
+        let cases = [
+            ("name = \"a\"\nroat = \".\"\n", "dataset.toml:2: unknown field `roat`"),
+            ("name = \"a\"\nclasses = \"Car\"\n", "dataset.toml:2: invalid type"),
+            ("label_frame = \"world\"\n", "dataset.toml:1: unknown variant `world`"),
+            ("a = = 1", "dataset.toml:1: "),
+            ("root = \"elsewhere\"", "elsewhere/velodyne: does not exist"),
+            ("classes = [\"Car\", \"Car\"]", "there twice"),
+            ("layout = \"s2r_dad\"\nlabel_frame = \"camera\"", "needs a calibration"),
+            ("image_size = [0, 375]", "no pixel"),
+        ];
+        for (text, want) in cases {
+            let error = with_toml(folder.path(), text).unwrap_err();
+            assert!(error.contains(want), "{error}, not {want}");
+        }
+    }
+
+    #[test]
+    fn bad_splits_are_refused_by_line() {
+        let folder = made_up(Layout::Kitti, 4);
+        let dataset = Dataset::open(folder.path()).unwrap();
+        let cases = [
+            ("", "train.txt: the split \"train\" has no frame"),
+            ("\n  \n", "has no frame"),
+            ("000000\n../000001\n", "train.txt:2: frame id \"../000001\""),
+            ("a\\b\n", "path separator"),
+            ("000000\n\n000009\n", "train.txt:3: frame 000009 has no cloud"),
+        ];
+        for (text, want) in cases {
+            std::fs::write(folder.path().join("ImageSets/train.txt"), text).unwrap();
+            let error = dataset.ids("train").unwrap_err().to_string();
+            assert!(error.contains(want), "{error}, not {want}");
+        }
+        let error = dataset.ids("val").unwrap_err().to_string();
+        assert!(error.contains("no split \"val\" (it has: train)"), "{error}");
+        assert!(dataset.load("../000000").unwrap_err().to_string().contains("path separator"));
+    }
+
+    #[test]
+    fn the_camera_crop_keeps_what_it_sees() {
+        let folder = made_up(Layout::Kitti, 3);
+        let cloud = Cloud { values: vec![10.0, 0.0, 0.0, -10.0, 0.0, 0.0, 10.0, 30.0, 0.0], channels: 3 };
+        crate::write::write_bin(&folder.path().join("velodyne/000000.bin"), &cloud).unwrap();
+        std::fs::create_dir(folder.path().join("calib")).unwrap();
+        std::fs::write(folder.path().join("calib/000000.txt"), crate::calibration::tests::MADE_UP).unwrap();
+        let text = "points = \"xyz\"\nlabel_frame = \"lidar\"\nfov_crop = true\n";
+        let dataset = with_toml(folder.path(), text).unwrap();
+        assert_eq!(dataset.load("000000").unwrap().cloud.values, [10.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn detections_are_written_in_the_frame_of_the_labels() {
+        let folder = made_up(Layout::Kitti, 4);
+        std::fs::create_dir(folder.path().join("calib")).unwrap();
+        std::fs::write(folder.path().join("calib/000000.txt"), crate::calibration::tests::MADE_UP).unwrap();
+        let detection = Detection { class: "Car".into(), bbox: frame("", 3).objects[0].bbox, score: 0.75 };
+        for label_frame in ["lidar", "camera"] {
+            let dataset = with_toml(folder.path(), &format!("label_frame = \"{label_frame}\"")).unwrap();
+            let line = dataset.detection_line("000000", &detection).unwrap();
+            assert_eq!((line.score, line.truncation), (Some(0.75), -1.0));
+            let back = dataset.objects("000000", &[line]).unwrap()[0].bbox.to_array();
+            assert!(back.iter().zip(detection.bbox.to_array()).all(|(a, b)| (a - b).abs() < 1e-9), "{label_frame}");
+        }
+    }
+
+    #[test]
+    fn real_scans_load() {
+        let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/kitti"));
+        if !root.exists() {
+            return eprintln!("skipped: {} is not there", root.display());
+        }
+        let dataset = Dataset::open(root).unwrap();
+        assert_eq!(dataset.config.classes, ["Car", "Pedestrian", "Cyclist"]);
+        let ids = dataset.all_ids().unwrap();
+        assert_eq!(ids.len(), 8);
+        for id in ids {
+            let frame = dataset.load(&id).unwrap();
+            assert!(frame.cloud.len() > 100_000 && !frame.objects.is_empty());
+            let calibration = dataset.calibration(&id).unwrap();
+            let lines = dataset.labels(&id).unwrap();
+            for (line, object) in lines.iter().filter(|l| l.has_box()).zip(&frame.objects) {
+                let back = calibration.camera_from_lidar_box(&line.class, &object.bbox, None, [1242, 375]);
+                assert!((0..3).all(|i| (line.location[i] - back.location[i]).abs() < 1e-9));
+                assert!((line.alpha - back.alpha).abs() < 0.05 || line.truncation > 0.0, "{line:?} {back:?}");
+                let off = (0..4).map(|i| (line.image_box[i] - back.image_box[i]).abs()).fold(0.0, f64::max);
+                assert!(off < 25.0 || line.truncation > 0.0, "{line:?} {back:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_camera_crop_is_the_reference_s() {
+        let shared = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared"));
+        let golden = shared.join("golden/pointpillars_kitti/eval.safetensors");
+        if !golden.exists() {
+            return eprintln!("skipped: {} is not there", golden.display());
+        }
+        let bytes = std::fs::read(golden).unwrap();
+        let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+        let bits = |p: &[f32]| [0, 1, 2, 3].map(|i| p[i].to_bits());
+        let values: Vec<f32> = tensors
+            .tensor("in.points")
+            .unwrap()
+            .data()
+            .chunks(4)
+            .map(|b| f32::from_le_bytes(b.try_into().unwrap()))
+            .collect();
+        let mut want: Vec<_> = values.chunks(4).map(bits).collect();
+        let mut dataset = Dataset::open(&shared.join("data/kitti")).unwrap();
+        dataset.config.fov_crop = true;
+        let cloud = dataset.load("000007").unwrap().cloud;
+        let inside = |p: &&[f32]| (0.0..=69.12).contains(&p[0]) && (-39.68..=39.68).contains(&p[1]);
+        let mut got: Vec<_> = cloud.points().filter(inside).map(bits).collect();
+        want.sort();
+        got.sort();
+        assert_eq!(got.len(), want.len());
+        assert!(got == want);
+    }
+}

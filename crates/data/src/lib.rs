@@ -2,26 +2,32 @@
 //!
 //! Everything here is in the LiDAR frame: x forward, y left, z up; yaw counter-clockwise from +x; the centre of a box is its geometric centre.
 
+pub mod augment;
 mod calibration;
 mod cloud_file;
 mod dataset;
 mod dataset_config;
 mod error;
 mod frame;
+mod gt_database;
 pub mod kitti_text;
 mod pcd;
 mod pcd_header;
+mod prefetch;
 mod stream;
 pub mod write;
 
+pub use augment::{AugmentConfig, augment};
 pub use calibration::Calibration;
 pub use cloud_file::{FARTHEST_M, PointColumns, parse_bin, read_cloud};
 pub use dataset::Dataset;
 pub use dataset_config::{DatasetConfig, Layout};
 pub use error::DataError;
 pub use frame::{Cloud, Detection, Frame, Object};
+pub use gt_database::{GtDatabase, GtSample};
 pub use kitti_text::{DONT_CARE, KittiLine, KittiText, LabelFrame, parse_kitti_text, read_kitti_text, to_kitti_text};
 pub use pcd::{encode_pcd, parse_pcd};
 pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
+pub use prefetch::{Prefetch, prefetch};
 pub use stream::{Stream, stream};
 pub use write::write_atomic;
