@@ -1,0 +1,92 @@
+//! Convolutions with what follows them.
+
+use super::{BatchNorm, Init, Mode};
+use burn::module::{Module, Param};
+use burn::tensor::Tensor;
+use burn::tensor::activation::relu;
+use burn::tensor::module::{conv_transpose2d, conv2d};
+use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
+
+/// 3x3 convolution with padding 1 and no bias, batch normalisation, ReLU.
+#[derive(Module, Debug)]
+pub struct ConvBnRelu {
+    /// `[C_out, C_in, 3, 3]`.
+    pub weight: Param<Tensor<4>>,
+    /// After the convolution.
+    pub norm: BatchNorm,
+    stride: usize,
+}
+
+impl ConvBnRelu {
+    /// A layer of the given channels and stride; `name` keys its initial weights.
+    pub fn new(name: &str, channels: [usize; 2], stride: usize, norm: BatchNorm, init: &Init<'_>) -> Self {
+        let [input, output] = channels;
+        ConvBnRelu { weight: init.uniform(name, [output, input, 3, 3], input * 9), norm, stride }
+    }
+
+    /// # Shapes
+    /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H / stride, W / stride]`.
+    pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
+        let options = ConvOptions::new([self.stride; 2], [1, 1], [1, 1], 1);
+        norm_relu(&self.norm, conv2d(x, self.weight.val(), None, options), mode)
+    }
+}
+
+/// Transposed convolution with kernel = stride and no bias, batch normalisation, ReLU.
+#[derive(Module, Debug)]
+pub struct DeconvBnRelu {
+    /// `[C_in, C_out, stride, stride]`.
+    pub weight: Param<Tensor<4>>,
+    /// After the convolution.
+    pub norm: BatchNorm,
+    stride: usize,
+}
+
+impl DeconvBnRelu {
+    /// A layer of the given channels and stride; `name` keys its initial weights.
+    pub fn new(name: &str, channels: [usize; 2], stride: usize, norm: BatchNorm, init: &Init<'_>) -> Self {
+        let [input, output] = channels;
+        let fan = output * stride * stride;
+        DeconvBnRelu { weight: init.uniform(name, [input, output, stride, stride], fan), norm, stride }
+    }
+
+    /// # Shapes
+    /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H * stride, W * stride]`.
+    pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
+        let options = ConvTransposeOptions::new([self.stride; 2], [0, 0], [0, 0], [1, 1], 1);
+        norm_relu(&self.norm, conv_transpose2d(x, self.weight.val(), None, options), mode)
+    }
+}
+
+fn norm_relu(norm: &BatchNorm, x: Tensor<4>, mode: Mode) -> Tensor<4> {
+    relu(match mode {
+        Mode::Train => norm.forward_train(x),
+        Mode::Eval => norm.forward_eval(x),
+    })
+}
+
+/// 1x1 convolution with bias.
+#[derive(Module, Debug)]
+pub struct PointwiseConv {
+    /// `[C_out, C_in, 1, 1]`.
+    pub weight: Param<Tensor<4>>,
+    /// `[C_out]`.
+    pub bias: Param<Tensor<1>>,
+}
+
+impl PointwiseConv {
+    /// PyTorch's default weights; biases as given, or PyTorch's default.
+    pub fn new(name: &str, channels: [usize; 2], init: &Init<'_>) -> Self {
+        let [input, output] = channels;
+        PointwiseConv {
+            weight: init.uniform(&format!("{name}.weight"), [output, input, 1, 1], input),
+            bias: init.uniform(&format!("{name}.bias"), [output], input),
+        }
+    }
+
+    /// # Shapes
+    /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H, W]`.
+    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        conv2d(x, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1, 1], [0, 0], [1, 1], 1))
+    }
+}

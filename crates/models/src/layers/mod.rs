@@ -1,0 +1,20 @@
+//! Layers that the networks are built of.
+
+mod batch_norm;
+mod conv;
+mod host;
+mod init;
+
+pub use batch_norm::{BatchNorm, Moments};
+pub use conv::{ConvBnRelu, DeconvBnRelu, PointwiseConv};
+pub use host::host;
+pub use init::Init;
+
+/// Whether a pass learns (batch statistics, running ones updated) or only looks (running statistics).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Batch statistics; the running ones are updated.
+    Train,
+    /// Running statistics.
+    Eval,
+}

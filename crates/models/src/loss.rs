@@ -1,0 +1,49 @@
+//! Losses of the detectors, as OpenPCDet computes them.
+
+use burn::tensor::activation::{log_softmax, sigmoid};
+use burn::tensor::{Int, Tensor};
+
+/// Sigmoid focal loss with alpha 0.25 and gamma 2, one value an entry.
+///
+/// # Shapes
+/// `logits`, `target` (0 or 1) and the result: `[N, C]`.
+pub fn sigmoid_focal(logits: Tensor<2>, target: Tensor<2>) -> Tensor<2> {
+    let p = sigmoid(logits.clone());
+    let alpha = target.clone() * -0.5 + 0.75; // 0.25 where the target is 1, 0.75 where it is 0
+    let miss = target.clone() + p.clone() - target.clone() * p * 2.0; // t (1 - p) + (1 - t) p
+    let cross_entropy = logits.clone().clamp_min(0.0) - logits.clone() * target + (-logits.abs()).exp().log1p();
+    alpha * miss.clone() * miss * cross_entropy
+}
+
+/// Smooth L1 of a difference: quadratic below `beta`, linear above.
+///
+/// # Shapes
+/// Any, kept.
+pub fn smooth_l1<const D: usize>(difference: Tensor<D>, beta: f64) -> Tensor<D> {
+    let n = difference.abs();
+    let small = n.clone().powi_scalar(2) * (0.5 / beta);
+    let large = n.clone() - 0.5 * beta;
+    let is_small = n.lower_elem(beta);
+    large.mask_where(is_small, small)
+}
+
+/// Residuals with the seventh replaced on both sides so that their difference is the sine of the difference of headings:
+/// `sin p cos t` and `cos p sin t`.
+///
+/// # Shapes
+/// `pred`, `target` and both results: `[N, 7]`.
+pub fn add_sin_difference(pred: Tensor<2>, target: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
+    let (heading, truth) = (pred.clone().narrow(1, 6, 1), target.clone().narrow(1, 6, 1)); // [N, 1]
+    let ours = heading.clone().sin() * truth.clone().cos();
+    let theirs = heading.cos() * truth.sin();
+    (Tensor::cat(vec![pred.narrow(1, 0, 6), ours], 1), Tensor::cat(vec![target.narrow(1, 0, 6), theirs], 1))
+}
+
+/// Cross entropy of each row.
+///
+/// # Shapes
+/// `logits`: `[N, K]`; `target`: `[N]`; result `[N]`.
+pub fn cross_entropy(logits: Tensor<2>, target: Tensor<1, Int>) -> Tensor<1> {
+    let [n, _] = logits.dims();
+    -log_softmax(logits, 1).gather(1, target.reshape([n, 1])).reshape([n])
+}

@@ -1,0 +1,74 @@
+//! The 2D backbone and neck (OpenPCDet: `BaseBEVBackbone`).
+
+use crate::config::BackboneConfig;
+use crate::layers::{BatchNorm, ConvBnRelu, DeconvBnRelu, Init, Mode};
+use burn::module::Module;
+use burn::tensor::Tensor;
+
+/// Blocks of 3x3 convolutions, the first of each with a stride, and a transposed convolution behind each block.
+#[derive(Module, Debug)]
+pub struct BaseBevBackbone {
+    /// The blocks, finest first.
+    pub blocks: Vec<Block>,
+    /// One for each block.
+    pub deblocks: Vec<DeconvBnRelu>,
+}
+
+/// Convolutions at one resolution.
+#[derive(Module, Debug)]
+pub struct Block {
+    /// The first has the stride.
+    pub convs: Vec<ConvBnRelu>,
+}
+
+/// What the backbone computes on its way.
+#[derive(Clone, Debug)]
+pub struct BackboneStages {
+    /// Behind each block.
+    pub blocks: Vec<Tensor<4>>,
+    /// Behind each transposed convolution, all of one size.
+    pub deblocks: Vec<Tensor<4>>,
+    /// The latter side by side.
+    pub spatial_features_2d: Tensor<4>,
+}
+
+impl BaseBevBackbone {
+    /// For a canvas with `inputs` channels.
+    pub fn new(inputs: usize, config: &BackboneConfig, init: &Init<'_>) -> Self {
+        let norm = |channels| BatchNorm::new(channels, 0.01, 1e-3, init);
+        let mut from = inputs;
+        let mut blocks = Vec::new();
+        let mut deblocks = Vec::new();
+        for i in 0..config.layers.len() {
+            let filters = config.filters[i];
+            let conv = |j: usize, from, stride| {
+                let name = format!("backbone_2d.blocks.{i}.{}.weight", 1 + 3 * j);
+                ConvBnRelu::new(&name, [from, filters], stride, norm(filters), init)
+            };
+            let mut convs = vec![conv(0, from, config.strides[i])];
+            convs.extend((1..=config.layers[i]).map(|j| conv(j, filters, 1)));
+            blocks.push(Block { convs });
+            let (stride, up) = (config.upsample_strides[i], config.upsample_filters[i]);
+            let name = format!("backbone_2d.deblocks.{i}.0.weight");
+            deblocks.push(DeconvBnRelu::new(&name, [filters, up], stride, norm(up), init));
+            from = filters;
+        }
+        BaseBevBackbone { blocks, deblocks }
+    }
+
+    /// # Shapes
+    /// `x`: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s = first stride over
+    /// its upsampling stride.
+    pub fn forward(&self, mut x: Tensor<4>, mode: Mode) -> BackboneStages {
+        let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
+        for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
+            for conv in &block.convs {
+                x = conv.forward(x, mode);
+            }
+            blocks.push(x.clone());
+            deblocks.push(deblock.forward(x.clone(), mode));
+        }
+        let spatial_features_2d = Tensor::cat(deblocks.clone(), 1);
+        BackboneStages { blocks, deblocks, spatial_features_2d }
+    }
+}

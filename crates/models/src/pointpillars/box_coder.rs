@@ -1,0 +1,115 @@
+//! Boxes as corrections of anchors, and headings as a correction and a direction bin (OpenPCDet: `ResidualCoder`).
+//!
+//! All in f32, in the reference's order of operations. Boxes are `[x, y, z, dx, dy, dz, yaw]`, m and rad.
+
+use std::f32::consts::TAU;
+
+/// Sizes below this are taken as this, m.
+const SMALLEST_SIZE_M: f32 = 1e-5;
+
+/// Direction bins that targets are made for.
+pub const DIRECTION_BINS: usize = 2;
+
+/// `value` moved by whole periods into `[-offset * period, (1 - offset) * period)`, up to rounding.
+pub fn limit_period(value: f32, offset: f32, period: f32) -> f32 {
+    value - (value / period + offset).floor() * period
+}
+
+/// What has to be predicted at `anchor` to get `bbox`: centre offsets over the anchor's base diagonal and height, logarithms
+/// of the size ratios, difference of the headings.
+pub fn encode(bbox: [f32; 7], anchor: [f32; 7]) -> [f32; 7] {
+    let [x, y, z, dx, dy, dz, yaw] = with_least_size(bbox);
+    let [xa, ya, za, dxa, dya, dza, yaw_a] = with_least_size(anchor);
+    let diagonal = (dxa * dxa + dya * dya).sqrt();
+    [
+        (x - xa) / diagonal,
+        (y - ya) / diagonal,
+        (z - za) / dza,
+        (dx / dxa).ln(),
+        (dy / dya).ln(),
+        (dz / dza).ln(),
+        yaw - yaw_a,
+    ]
+}
+
+/// The box that a prediction at `anchor` means; the inverse of [`encode`].
+pub fn decode(residual: [f32; 7], anchor: [f32; 7]) -> [f32; 7] {
+    let [xt, yt, zt, dxt, dyt, dzt, yaw_t] = residual;
+    let [xa, ya, za, dxa, dya, dza, yaw_a] = anchor;
+    let diagonal = (dxa * dxa + dya * dya).sqrt();
+    [
+        xt * diagonal + xa,
+        yt * diagonal + ya,
+        zt * dza + za,
+        dxt.exp() * dxa,
+        dyt.exp() * dya,
+        dzt.exp() * dza,
+        yaw_t + yaw_a,
+    ]
+}
+
+/// The direction bin of a heading: bins of equal width, the first begins at `offset_rad`.
+pub fn direction_target(yaw_rad: f32, offset_rad: f32, bins: usize) -> usize {
+    let turned = limit_period(yaw_rad - offset_rad, 0.0, TAU);
+    let bin = (turned / (TAU / bins as f32)).floor();
+    (bin.max(0.0) as usize).min(bins - 1)
+}
+
+/// The heading in a direction bin: `yaw_rad` up to whole bins says where in it, `bin` says which.
+pub fn direction_decode(yaw_rad: f32, bin: usize, offset_rad: f32, limit_offset: f32, bins: usize) -> f32 {
+    let period = TAU / bins as f32;
+    limit_period(yaw_rad - offset_rad, limit_offset, period) + offset_rad + period * bin as f32
+}
+
+fn with_least_size(mut bbox: [f32; 7]) -> [f32; 7] {
+    bbox[3..6].iter_mut().for_each(|size| *size = size.max(SMALLEST_SIZE_M));
+    bbox
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const OFFSET: f32 = 0.78539;
+
+    proptest! {
+        #[test]
+        fn decode_inverts_encode(
+            center in prop::array::uniform3(-50.0f32..50.0),
+            size in prop::array::uniform3(0.3f32..6.0),
+            yaw in -3.1f32..3.1,
+            anchor_center in prop::array::uniform3(-50.0f32..50.0),
+        ) {
+            let bbox = [center[0], center[1], center[2], size[0], size[1], size[2], yaw];
+            let anchor = [anchor_center[0], anchor_center[1], anchor_center[2], 3.9, 1.6, 1.56, 1.57];
+            let back = decode(encode(bbox, anchor), anchor);
+            prop_assert!((0..7).all(|i| (back[i] - bbox[i]).abs() < 1e-4), "{:?} {:?}", back, bbox);
+        }
+
+        /// Up to whole turns, heading = f(heading up to half a turn, bin).
+        #[test]
+        fn a_heading_survives_its_bin(yaw in -3.1f32..3.1, half_turns in -2i32..3) {
+            let bin = direction_target(yaw, OFFSET, DIRECTION_BINS);
+            let folded = yaw + half_turns as f32 * std::f32::consts::PI;
+            let back = direction_decode(folded, bin, OFFSET, 0.0, DIRECTION_BINS);
+            let difference = limit_period(back - yaw, 0.5, TAU).abs();
+            // At a border of the bins rounding may choose the other half turn.
+            let border = limit_period(yaw - OFFSET, 0.5, std::f32::consts::PI).abs();
+            prop_assert!(difference < 1e-4 || border < 1e-4, "{} {}", back, yaw);
+        }
+    }
+
+    #[test]
+    fn bins_of_the_reference() {
+        let bins: Vec<usize> =
+            [0.0, 0.8, 3.0, 3.93, -3.0, -1.0].iter().map(|&y| direction_target(y, OFFSET, 2)).collect();
+        assert_eq!(bins, [1, 0, 0, 1, 0, 1]);
+    }
+
+    #[test]
+    fn no_size_is_zero() {
+        let anchor = [0.0, 0.0, 0.0, 3.9, 1.6, 1.56, 0.0];
+        assert!(encode([0.0; 7], anchor).iter().all(|v| v.is_finite()));
+    }
+}

@@ -1,0 +1,63 @@
+//! The anchor head (OpenPCDet: `AnchorHeadSingle`).
+
+use crate::layers::{Init, PointwiseConv};
+use burn::module::Module;
+use burn::tensor::Tensor;
+
+/// Three 1x1 convolutions: classes, boxes, direction bins.
+#[derive(Module, Debug)]
+pub struct AnchorHead {
+    /// Anchors a cell times classes.
+    pub conv_cls: PointwiseConv,
+    /// Anchors a cell times 7.
+    pub conv_box: PointwiseConv,
+    /// Anchors a cell times bins.
+    pub conv_dir_cls: PointwiseConv,
+}
+
+/// What the head says of every anchor, in the anchors' order `[y, x, class, rotation]`.
+#[derive(Clone, Debug)]
+pub struct Predictions {
+    /// Logits, `[B, A, classes]`.
+    pub cls: Tensor<3>,
+    /// Residuals, `[B, A, 7]`.
+    pub boxes: Tensor<3>,
+    /// Logits of the direction bins, `[B, A, bins]`.
+    pub dir: Tensor<3>,
+    /// Height and width of the feature map.
+    pub map: [usize; 2],
+}
+
+impl AnchorHead {
+    /// `anchors`: anchors a cell.
+    pub fn new(inputs: usize, anchors: usize, classes: usize, bins: usize, init: &Init<'_>) -> Self {
+        let mut conv_cls = PointwiseConv::new("dense_head.conv_cls", [inputs, anchors * classes], init);
+        // Every anchor starts as background with probability 0.99.
+        conv_cls.bias = init.constant([anchors * classes], -(99f32.ln()));
+        let mut conv_box = PointwiseConv::new("dense_head.conv_box", [inputs, anchors * 7], init);
+        conv_box.weight = init.normal("dense_head.conv_box.weight", [anchors * 7, inputs, 1, 1], 0.001);
+        AnchorHead {
+            conv_cls,
+            conv_box,
+            conv_dir_cls: PointwiseConv::new("dense_head.conv_dir_cls", [inputs, anchors * bins], init),
+        }
+    }
+
+    /// # Shapes
+    /// `x`: `[B, C, H, W]`.
+    pub fn forward(&self, x: Tensor<4>) -> Predictions {
+        let [_, _, h, w] = x.dims();
+        let anchors = self.conv_box.bias.dims()[0] / 7;
+        let per_anchor = |conv: &PointwiseConv| {
+            let y = conv.forward(x.clone()).permute([0, 2, 3, 1]); // [B, H, W, anchors * k]
+            let [b, h, w, k] = y.dims();
+            y.reshape([b, h * w * anchors, k / anchors]) // [B, A, k]
+        };
+        Predictions {
+            cls: per_anchor(&self.conv_cls),
+            boxes: per_anchor(&self.conv_box),
+            dir: per_anchor(&self.conv_dir_cls),
+            map: [h, w],
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! The three losses of PointPillars (OpenPCDet: `AnchorHeadTemplate.get_loss`).
+
+use super::Sample;
+use super::head::Predictions;
+use crate::Losses;
+use crate::config::LossConfig;
+use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal, smooth_l1};
+use burn::tensor::{Int, Tensor, TensorData};
+
+/// Weighted losses of a batch: classes over all anchors that count, boxes and directions over the positive ones, each
+/// frame's divided by its number of positives, the sum divided by the number of frames.
+///
+/// # Panics
+/// When a sample was prepared without targets.
+pub fn losses(predictions: &Predictions, batch: &[Sample], weights: &LossConfig) -> Losses {
+    let device = predictions.cls.device();
+    let [b, anchors, classes] = predictions.cls.dims();
+    let mut one_hot = vec![0f32; b * anchors * classes];
+    let mut class_weight = vec![0f32; b * anchors];
+    let (mut positive, mut share, mut residuals, mut bins) = (vec![], vec![], vec![], vec![]);
+    for (frame, sample) in batch.iter().enumerate() {
+        let targets = sample.targets.as_ref().expect("a training sample has targets");
+        let norm = 1.0 / (targets.positive.len().max(1) * b) as f32;
+        for (a, &label) in targets.labels.iter().enumerate() {
+            let row = frame * anchors + a;
+            if label >= 0 {
+                class_weight[row] = norm;
+            }
+            if label > 0 {
+                one_hot[row * classes + label as usize - 1] = 1.0;
+            }
+        }
+        for (k, &(anchor, _)) in targets.positive.iter().enumerate() {
+            positive.push((frame * anchors + anchor) as i32);
+            share.push(norm);
+            residuals.extend(targets.reg[k]);
+            bins.push(targets.dir[k] as i32);
+        }
+    }
+    let tensor = |values, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
+    let rows = b * anchors;
+    let focal = sigmoid_focal(predictions.cls.clone().reshape([rows, classes]), tensor(one_hot, [rows, classes]));
+    let cls = (focal * tensor(class_weight, [rows, 1])).sum() * weights.class_weight;
+    let n = positive.len();
+    let (boxes, dir) = if n == 0 {
+        (Tensor::zeros([1], &device), Tensor::zeros([1], &device))
+    } else {
+        let int = |values| Tensor::<1, Int>::from_data(TensorData::new(values, [n]), &device);
+        let index = int(positive);
+        let share = tensor(share, [n, 1]);
+        let pred = predictions.boxes.clone().reshape([rows, 7]).select(0, index.clone()); // [n, 7]
+        let code = tensor(weights.code_weights.to_vec(), [1, 7]);
+        let (pred, target) = add_sin_difference(pred, tensor(residuals, [n, 7]));
+        let difference = (pred - target) * code; // [n, 7]
+        let boxes = (smooth_l1(difference, 1.0 / 9.0) * share.clone()).sum() * weights.box_weight;
+        let bins_a_box = predictions.dir.dims()[2];
+        let logits = predictions.dir.clone().reshape([rows, bins_a_box]).select(0, index); // [n, bins]
+        let dir = (cross_entropy(logits, int(bins)) * share.reshape([n])).sum() * weights.direction_weight;
+        (boxes, dir)
+    };
+    Losses { total: cls.clone() + boxes.clone() + dir.clone(), parts: vec![("cls", cls), ("box", boxes), ("dir", dir)] }
+}

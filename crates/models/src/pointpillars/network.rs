@@ -1,0 +1,73 @@
+//! PointPillars from decorated points to predictions (Lang et al. 2019; OpenPCDet: `PointPillar`).
+
+use super::Sample;
+use super::backbone::{BackboneStages, BaseBevBackbone};
+use super::head::{AnchorHead, Predictions};
+use super::scatter::scatter;
+use super::vfe::{PillarRows, PillarVfe};
+use crate::config::{DetectorConfig, PointPillarsConfig};
+use crate::layers::{Init, Mode};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+
+/// The network. Field names are OpenPCDet's.
+#[derive(Module, Debug)]
+pub struct PointPillars {
+    /// Pillar feature net.
+    pub vfe: PillarVfe,
+    /// 2D backbone and neck.
+    pub backbone_2d: BaseBevBackbone,
+    /// Head.
+    pub dense_head: AnchorHead,
+    nx: usize,
+    ny: usize,
+}
+
+/// Every stage of a pass, for who compares or looks.
+#[derive(Clone, Debug)]
+pub struct Stages {
+    /// `[P, C]`.
+    pub pillar_features: Tensor<2>,
+    /// `[B, C, H, W]`.
+    pub spatial_features: Tensor<4>,
+    /// Blocks, neck, and both together.
+    pub backbone: BackboneStages,
+    /// Of every anchor.
+    pub predictions: Predictions,
+}
+
+impl PointPillars {
+    /// With fresh weights from `seed`.
+    pub fn new(config: &DetectorConfig, net: &PointPillarsConfig, seed: u64, device: &Device) -> Self {
+        let init = Init { seed, device };
+        let neck = net.backbone.upsample_filters.iter().sum();
+        let anchors = net.anchors.iter().map(|a| a.rotations_rad.len()).sum();
+        let [nx, ny, _] = config.grid_size();
+        PointPillars {
+            vfe: PillarVfe::new(config.channels + 6, net.vfe_filters, net.pillars.max_points, &init),
+            backbone_2d: BaseBevBackbone::new(net.vfe_filters, &net.backbone, &init),
+            dense_head: AnchorHead::new(neck, anchors, config.classes.len(), net.head.dir_bins, &init),
+            nx,
+            ny,
+        }
+    }
+
+    /// All stages of a batch.
+    pub fn forward(&self, batch: &[Sample], mode: Mode) -> Stages {
+        let device = self.vfe.weight.val().device();
+        let inputs = self.vfe.weight.dims()[1];
+        let features: Vec<f32> = batch.iter().flat_map(|s| s.features.iter().copied()).collect();
+        let rows = features.len() / inputs;
+        let num_points = batch.iter().flat_map(|s| s.pillars.num_points.iter().copied()).collect();
+        let features = Tensor::<2>::from_data(TensorData::new(features, [rows, inputs]), &device); // [N, F]
+        let pillar_features = self.vfe.forward(PillarRows { features, num_points }, mode);
+        let cells = batch.iter().enumerate().flat_map(|(b, sample)| {
+            let cell = move |&[_, y, x]: &[u32; 3]| ((b * self.ny + y as usize) * self.nx + x as usize) as i32;
+            sample.pillars.coords_zyx.iter().map(cell)
+        });
+        let spatial_features = scatter(pillar_features.clone(), cells.collect(), [batch.len(), self.ny, self.nx]);
+        let backbone = self.backbone_2d.forward(spatial_features.clone(), mode);
+        let predictions = self.dense_head.forward(backbone.spatial_features_2d.clone());
+        Stages { pillar_features, spatial_features, backbone, predictions }
+    }
+}

@@ -1,0 +1,121 @@
+//! Pillar feature net (OpenPCDet: `PillarVFE`): what the points of a pillar become on the canvas.
+
+use crate::layers::{BatchNorm, Init, Mode, Moments};
+use burn::module::{Module, Param};
+use burn::tensor::activation::relu;
+use burn::tensor::{Int, Tensor, TensorData};
+
+/// Linear without bias, batch normalisation, ReLU, maximum over the pillar.
+///
+/// The reference pads every pillar with zero rows up to `max_points` *before* the linear layer, and these rows count in
+/// the statistics and take part in the maximum. Here only the points themselves are computed: a zero row stays zero
+/// behind the linear layer, so its share in mean and variance is known, and one row stands for all of them in the maximum.
+#[derive(Module, Debug)]
+pub struct PillarVfe {
+    /// `[C, F]`, F = 10 with intensity, 9 without.
+    pub weight: Param<Tensor<2>>,
+    /// After the linear layer.
+    pub norm: BatchNorm,
+    max_points: usize,
+}
+
+/// The points of all pillars of a batch, pillar after pillar.
+#[derive(Clone, Debug)]
+pub struct PillarRows {
+    /// Decorated points, `[N, F]`.
+    pub features: Tensor<2>,
+    /// Points in each pillar; their sum is N.
+    pub num_points: Vec<u32>,
+}
+
+impl PillarVfe {
+    /// For `inputs` values a point and `filters` values a pillar.
+    pub fn new(inputs: usize, filters: usize, max_points: usize, init: &Init<'_>) -> Self {
+        PillarVfe {
+            weight: init.uniform("vfe.pfn_layers.0.linear.weight", [filters, inputs], inputs),
+            norm: BatchNorm::new(filters, 0.01, 1e-3, init),
+            max_points,
+        }
+    }
+
+    /// # Shapes
+    /// `rows.features`: `[N, F]`; result `[P, C]`.
+    pub fn forward(&self, rows: PillarRows, mode: Mode) -> Tensor<2> {
+        let device = rows.features.device();
+        let [n, _] = rows.features.dims();
+        let pillars = rows.num_points.len();
+        let x = rows.features.matmul(self.weight.val().transpose()); // [N, C]
+        let [_, c] = x.dims();
+        let moments = match mode {
+            Mode::Train => {
+                let moments = padded_moments(x.clone(), pillars * self.max_points);
+                self.norm.update(moments.clone());
+                moments
+            }
+            Mode::Eval => self.norm.running(),
+        };
+        let x = Tensor::cat(vec![x, Tensor::zeros([1, c], &device)], 0); // [N + 1, C]; the last row is the padding
+        let x = relu(self.norm.normalise_rows(x, &moments)); // [N + 1, C]
+        let (slots, index) = slot_index(&rows.num_points, self.max_points, n);
+        let index = Tensor::<1, Int>::from_data(TensorData::new(index, [pillars * slots]), &device);
+        x.select(0, index).reshape([pillars, slots, c]).max_dim(1).reshape([pillars, c]) // [P, S, C] -> [P, C]
+    }
+}
+
+/// Mean and variance over `count` rows, of which those not in `x` are zero.
+fn padded_moments(x: Tensor<2>, count: usize) -> Moments {
+    let [n, c] = x.dims();
+    let rows = count as f64;
+    let mean = x.clone().sum_dim(0) / rows; // [1, C]
+    let deviation = (x - mean.clone()).powi_scalar(2).sum_dim(0); // [1, C]
+    let variance = (deviation + mean.clone().powi_scalar(2) * (count - n) as f64) / rows;
+    Moments { mean: mean.reshape([c]), variance: variance.reshape([c]), count }
+}
+
+/// For each pillar the rows of its points, filled up with the padding row `padding`. Slots: as many as the fullest pillar
+/// needs, and one for the padding where it is not full.
+fn slot_index(num_points: &[u32], max_points: usize, padding: usize) -> (usize, Vec<i32>) {
+    let fullest = num_points.iter().max().copied().unwrap_or(0) as usize;
+    let slots = (fullest + 1).min(max_points);
+    let mut index = Vec::with_capacity(num_points.len() * slots);
+    let mut row = 0;
+    for &count in num_points {
+        index.extend((0..slots).map(|s| if s < count as usize { row + s as i32 } else { padding as i32 }));
+        row += count as i32;
+    }
+    (slots, index)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use burn::tensor::Device;
+
+    #[test]
+    fn equals_the_padded_form() {
+        let device = Device::flex();
+        let vfe = PillarVfe::new(3, 5, 4, &Init { seed: 3, device: &device });
+        let (num_points, max_points) = (vec![2u32, 4, 1], 4);
+        let values: Vec<f32> = (0..21).map(|i| ((i * 37 % 23) as f32 - 9.0) / 5.0).collect();
+        let features = Tensor::<2>::from_data(TensorData::new(values.clone(), [7, 3]), &device);
+        let got = vfe.forward(PillarRows { features, num_points: num_points.clone() }, Mode::Train);
+
+        let mut padded = vec![0.0f32; 3 * max_points * 3];
+        let mut from = 0;
+        for (p, &count) in num_points.iter().enumerate() {
+            let count = count as usize * 3;
+            padded[p * max_points * 3..][..count].copy_from_slice(&values[from..from + count]);
+            from += count;
+        }
+        let fresh = PillarVfe::new(3, 5, 4, &Init { seed: 3, device: &device });
+        let x =
+            Tensor::<2>::from_data(TensorData::new(padded, [12, 3]), &device).matmul(fresh.weight.val().transpose());
+        let want = relu(fresh.norm.forward_train(x)).reshape([3, 4, 5]).max_dim(1).reshape([3, 5]);
+        let difference: f32 = (got - want).abs().max().into_scalar();
+        assert!(difference < 1e-5, "{difference}");
+        let statistics = |v: &PillarVfe| crate::layers::host(v.norm.running_var.value()).unwrap();
+        for (a, b) in statistics(&vfe).iter().zip(statistics(&fresh)) {
+            assert!((a - b).abs() < 1e-6, "{a} {b}");
+        }
+    }
+}
