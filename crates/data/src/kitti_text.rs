@@ -158,7 +158,8 @@ impl KittiLine {
     }
 
     fn check_box(&self, kind: KittiText) -> Result<(), String> {
-        if !self.has_box() && (kind == KittiText::Detections || self.is_dont_care()) {
+        let dont_care = self.class.eq_ignore_ascii_case(DONT_CARE);
+        if !self.has_box() && (kind == KittiText::Detections || dont_care) {
             return Ok(());
         }
         for (i, size) in self.size_hwl.iter().enumerate() {
@@ -166,7 +167,7 @@ impl KittiLine {
             if *size < 0.0 {
                 return Err(format!("{name} (value {}) is {size}; a size cannot be negative", 9 + i));
             }
-            if *size == 0.0 && kind == KittiText::Labels && !self.is_dont_care() {
+            if *size == 0.0 && kind == KittiText::Labels && !dont_care {
                 return Err(format!("{name} (value {}) is 0; a labelled object has a size", 9 + i));
             }
         }

@@ -1,0 +1,218 @@
+//! KITTI's assignment of detections to ground truths in one frame, step by step as OpenPCDet's `kitti_object_eval_python/eval.py`.
+
+use crate::overlaps::{FrameOverlaps, Pair, range_m};
+use crate::{Difficulty, EvalFrame, EvalOptions, Metric};
+use data::KittiLine;
+use serde::{Deserialize, Serialize};
+use std::ops::{AddAssign, Sub};
+
+/// Hits, false alarms and misses.
+#[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize)]
+pub struct Counts {
+    /// Hits.
+    pub tp: i64,
+    /// False alarms.
+    pub fp: i64,
+    /// Misses. A ground truth that an ignored detection takes is neither hit nor miss.
+    pub fn_: i64,
+    /// Sum over the hits of (1 + cos of the error of alpha) / 2.
+    pub similarity: f64,
+}
+
+impl Sub for Counts {
+    type Output = Counts;
+
+    fn sub(self, o: Counts) -> Counts {
+        Counts {
+            tp: self.tp - o.tp,
+            fp: self.fp - o.fp,
+            fn_: self.fn_ - o.fn_,
+            similarity: self.similarity - o.similarity,
+        }
+    }
+}
+
+impl AddAssign for Counts {
+    fn add_assign(&mut self, o: Counts) {
+        self.tp += o.tp;
+        self.fp += o.fp;
+        self.fn_ += o.fn_;
+        self.similarity += o.similarity;
+    }
+}
+
+/// What a label or detection is to the evaluation of one class and difficulty.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Role {
+    /// Counts (KITTI's 0).
+    Counted,
+    /// Takes a partner, but counts neither way (KITTI's 1).
+    Ignored,
+    /// Of another class (KITTI's -1).
+    Absent,
+}
+
+/// One frame, seen by one class, difficulty, metric and overlap limit.
+pub(crate) struct FrameMatching<'a> {
+    frame: &'a EvalFrame,
+    labels: Vec<Role>,
+    detections: Vec<Role>,
+    /// Detections that may match, but are no false alarm when left over: those beyond the range.
+    spared: Vec<bool>,
+    pairs: &'a [Pair],
+    dont_care: &'a [Pair],
+    min_overlap: f64,
+    taken: Vec<bool>,
+}
+
+impl<'a> FrameMatching<'a> {
+    pub(crate) fn new(
+        (frame, overlaps): (&'a EvalFrame, &'a FrameOverlaps),
+        class: &str,
+        difficulty: Difficulty,
+        (metric, min_overlap): (Metric, f64),
+        options: &EvalOptions,
+    ) -> Self {
+        let far = |line| options.max_range_m.is_some_and(|most| range_m(line, options.label_frame) > most);
+        let labels = frame.labels.iter().map(|line| label_role(line, class, difficulty, far(line))).collect();
+        let detections: Vec<Role> =
+            frame.detections.iter().map(|line| detection_role(line, class, difficulty)).collect();
+        let forgiving = matches!(metric, Metric::Bbox | Metric::Aos) && difficulty != Difficulty::All;
+        FrameMatching {
+            frame,
+            labels,
+            spared: frame.detections.iter().map(far).collect(),
+            taken: vec![false; detections.len()],
+            detections,
+            pairs: overlaps.of(metric),
+            dont_care: if forgiving { &overlaps.dont_care } else { &[] },
+            min_overlap,
+        }
+    }
+
+    /// Ground truths that count.
+    pub(crate) fn n_gt(&self) -> i64 {
+        self.labels.iter().filter(|role| **role == Role::Counted).count() as i64
+    }
+
+    fn score(&self, detection: usize) -> f64 {
+        self.frame.detections[detection].score.unwrap_or(0.0)
+    }
+
+    /// Scores of the detections that take part, falling, each once.
+    pub(crate) fn distinct_scores(&self) -> Vec<f64> {
+        let taking_part = (0..self.detections.len()).filter(|&j| self.detections[j] != Role::Absent);
+        let mut scores: Vec<f64> = taking_part.map(|j| self.score(j)).collect();
+        scores.sort_by(|a, b| b.total_cmp(a));
+        scores.dedup();
+        scores
+    }
+
+    /// The first pass, without a score limit: each ground truth takes the free detection of highest score among those that
+    /// overlap enough. Adds the scores of the hits.
+    pub(crate) fn collect_hit_scores(&mut self, scores: &mut Vec<f64>) {
+        self.taken.fill(false);
+        let mut pairs = self.pairs;
+        for label in 0..self.labels.len() {
+            let own = split_off_pairs(&mut pairs, label);
+            if self.labels[label] == Role::Absent {
+                continue;
+            }
+            let mut best: Option<usize> = None;
+            for pair in own.iter().filter(|pair| pair.overlap > self.min_overlap) {
+                let j = pair.detection;
+                if self.detections[j] == Role::Absent || self.taken[j] {
+                    continue;
+                }
+                if best.is_none_or(|best| self.score(j) > self.score(best)) {
+                    best = Some(j);
+                }
+            }
+            let Some(j) = best else { continue };
+            self.taken[j] = true;
+            if self.labels[label] == Role::Counted && self.detections[j] == Role::Counted {
+                scores.push(self.score(j));
+            }
+        }
+    }
+
+    /// The second pass, with the detections of at least this score: each ground truth takes the free detection of highest
+    /// overlap, an ignored one only where there is no other. What is left over is a false alarm, unless DontCare forgives it.
+    pub(crate) fn count(&mut self, least_score: f64) -> Counts {
+        self.taken.fill(false);
+        let mut counts = Counts::default();
+        let mut pairs = self.pairs;
+        for label in 0..self.labels.len() {
+            let own = split_off_pairs(&mut pairs, label);
+            if self.labels[label] == Role::Absent {
+                continue;
+            }
+            let mut best: Option<(usize, f64)> = None; // an ignored detection stands with overlap 0: any counted one is better
+            for pair in own.iter().filter(|pair| pair.overlap > self.min_overlap) {
+                let j = pair.detection;
+                if self.taken[j] || self.score(j) < least_score {
+                    continue;
+                }
+                match self.detections[j] {
+                    Role::Counted if best.is_none_or(|(_, overlap)| pair.overlap > overlap) => {
+                        best = Some((j, pair.overlap));
+                    }
+                    Role::Ignored if best.is_none() => best = Some((j, 0.0)),
+                    _ => {}
+                }
+            }
+            let counted = self.labels[label] == Role::Counted;
+            match best {
+                None => counts.fn_ += i64::from(counted),
+                Some((j, _)) => {
+                    self.taken[j] = true;
+                    if counted && self.detections[j] == Role::Counted {
+                        counts.tp += 1;
+                        let error = self.frame.labels[label].alpha - self.frame.detections[j].alpha;
+                        counts.similarity += (1.0 + error.cos()) / 2.0;
+                    }
+                }
+            }
+        }
+        for pair in self.dont_care.iter().filter(|pair| pair.overlap > self.min_overlap) {
+            self.taken[pair.detection] = true;
+        }
+        let left_over = (0..self.detections.len()).filter(|&j| {
+            self.detections[j] == Role::Counted && !self.taken[j] && !self.spared[j] && self.score(j) >= least_score
+        });
+        counts.fp = left_over.count() as i64;
+        counts
+    }
+}
+
+/// Takes the pairs of one label off the front; the rest begins with the next label.
+fn split_off_pairs<'a>(pairs: &mut &'a [Pair], label: usize) -> &'a [Pair] {
+    let (own, rest) = pairs.split_at(pairs.iter().take_while(|pair| pair.label == label).count());
+    *pairs = rest;
+    own
+}
+
+fn label_role(line: &KittiLine, class: &str, difficulty: Difficulty, far: bool) -> Role {
+    let is = |name: &str| line.class.eq_ignore_ascii_case(name);
+    let neighbour = difficulty != Difficulty::All
+        && ((class.eq_ignore_ascii_case("Car") && is("Van"))
+            || (class.eq_ignore_ascii_case("Pedestrian") && is("Person_sitting")));
+    let filtered = line.occlusion > difficulty.most_occlusion()
+        || line.truncation > difficulty.most_truncation()
+        || line.image_box[3] - line.image_box[1] <= difficulty.least_height_px();
+    match (is(class), neighbour) {
+        (true, _) if !filtered && !far => Role::Counted,
+        (true, _) | (_, true) => Role::Ignored,
+        _ => Role::Absent,
+    }
+}
+
+fn detection_role(line: &KittiLine, class: &str, difficulty: Difficulty) -> Role {
+    if (line.image_box[3] - line.image_box[1]).abs() < difficulty.least_height_px() {
+        Role::Ignored // of whatever class: the reference looks at the height first
+    } else if line.class.eq_ignore_ascii_case(class) {
+        Role::Counted
+    } else {
+        Role::Absent
+    }
+}

@@ -1,0 +1,128 @@
+//! What is evaluated and by which rules.
+
+use data::{KittiLine, LabelFrame};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// Ground truth and detections of one frame, as their texts write them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EvalFrame {
+    /// The file name without ending.
+    pub id: String,
+    /// Label lines, DontCare included.
+    pub labels: Vec<KittiLine>,
+    /// Detection lines; each has a score.
+    pub detections: Vec<KittiLine>,
+}
+
+/// What to evaluate.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EvalOptions {
+    /// Classes in the order of the report, compared without regard to case. Empty: [`default_classes`].
+    pub classes: Vec<String>,
+    /// The frame of labels and detections. Boxes are compared as they are written, never converted.
+    pub label_frame: LabelFrame,
+    /// Ground truth and detections whose centre is farther away on the ground are ignored: neither hit, miss nor false alarm.
+    pub max_range_m: Option<f64>,
+    /// Overlap limits in [0, 1) to report beside the two sets of the reference, for every class and metric.
+    pub more_overlaps: Vec<f64>,
+}
+
+impl Default for EvalOptions {
+    fn default() -> Self {
+        EvalOptions {
+            classes: Vec::new(),
+            label_frame: LabelFrame::Camera,
+            max_range_m: None,
+            more_overlaps: Vec::new(),
+        }
+    }
+}
+
+/// What two boxes are compared by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Metric {
+    /// Image boxes.
+    Bbox,
+    /// As [`Metric::Bbox`], but a hit counts by how well its observation angle fits.
+    Aos,
+    /// Rotated boxes seen from above.
+    Bev,
+    /// Upright boxes in space.
+    #[serde(rename = "3d")]
+    ThreeD,
+}
+
+impl fmt::Display for Metric {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Metric::Bbox => "bbox",
+            Metric::Aos => "aos",
+            Metric::Bev => "bev",
+            Metric::ThreeD => "3d",
+        })
+    }
+}
+
+/// Which ground truths count.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Difficulty {
+    /// Image box over 40 px high, not occluded, truncation up to 0.15.
+    Easy,
+    /// Over 25 px, partly occluded, up to 0.3.
+    Moderate,
+    /// Over 25 px, largely occluded, up to 0.5.
+    Hard,
+    /// Every label of the class counts: no filter, no neighbouring class, no DontCare; matched as KITTI does.
+    All,
+}
+
+impl Difficulty {
+    /// In the order of the report.
+    pub const ALL: [Difficulty; 4] = [Difficulty::Easy, Difficulty::Moderate, Difficulty::Hard, Difficulty::All];
+
+    /// A ground truth with an image box of this height or less does not count; lower detections are ignored. px.
+    pub(crate) fn least_height_px(self) -> f64 {
+        [40.0, 25.0, 25.0, f64::NEG_INFINITY][self as usize]
+    }
+
+    pub(crate) fn most_occlusion(self) -> f64 {
+        [0.0, 1.0, 2.0, f64::INFINITY][self as usize]
+    }
+
+    pub(crate) fn most_truncation(self) -> f64 {
+        [0.15, 0.3, 0.5, f64::INFINITY][self as usize]
+    }
+}
+
+/// Overlap limits of the reference for a class and a metric: the official one, and the one of OpenPCDet's second, loose set.
+/// Classes that the reference does not know have those of Car.
+pub fn reference_overlaps(class: &str, metric: Metric) -> [f64; 2] {
+    let small = ["pedestrian", "cyclist", "person_sitting"].iter().any(|name| name.eq_ignore_ascii_case(class));
+    let (official, loose) = if small { (0.5, 0.25) } else { (0.7, 0.5) };
+    match metric {
+        Metric::Bbox | Metric::Aos => [official, official],
+        Metric::Bev | Metric::ThreeD => [official, loose],
+    }
+}
+
+/// The classes that are reported when none is named: those of labels and detections, KITTI's three first. Without DontCare, and
+/// without what KITTI labels but does not evaluate.
+pub fn default_classes(frames: &[EvalFrame]) -> Vec<String> {
+    const LEFT_OUT: [&str; 6] = [data::DONT_CARE, "Van", "Person_sitting", "Truck", "Tram", "Misc"];
+    let mut found: Vec<&str> = Vec::new();
+    for class in frames.iter().flat_map(|f| f.labels.iter().chain(&f.detections)).map(|line| line.class.as_str()) {
+        if !LEFT_OUT.iter().chain(&found).any(|name| name.eq_ignore_ascii_case(class)) {
+            found.push(class);
+        }
+    }
+    let kitti = ["Car", "Pedestrian", "Cyclist"];
+    let of_kitti = kitti.iter().filter(|name| found.iter().any(|f| f.eq_ignore_ascii_case(name)));
+    let mut others: Vec<&str> =
+        found.iter().copied().filter(|f| !kitti.iter().any(|k| k.eq_ignore_ascii_case(f))).collect();
+    others.sort_unstable();
+    of_kitti.copied().chain(others).map(String::from).collect()
+}

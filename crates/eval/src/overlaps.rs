@@ -1,0 +1,121 @@
+//! Overlap of every label with every detection of a frame, in the image, seen from above and in space.
+
+use crate::{EvalFrame, Metric};
+use data::{KittiLine, LabelFrame};
+use geometry::{Box3, bev_intersection};
+
+/// A label and a detection, by their index, that overlap.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Pair {
+    pub label: usize,
+    pub detection: usize,
+    /// Intersection over union, over 0. For DontCare regions: intersection over the area of the detection.
+    pub overlap: f64,
+}
+
+/// All pairs of a frame that overlap, by label, then by detection.
+pub(crate) struct FrameOverlaps {
+    pub bbox: Vec<Pair>,
+    pub bev: Vec<Pair>,
+    pub three_d: Vec<Pair>,
+    /// Image boxes of DontCare regions.
+    pub dont_care: Vec<Pair>,
+}
+
+impl FrameOverlaps {
+    pub(crate) fn new(frame: &EvalFrame, label_frame: LabelFrame) -> Self {
+        let mut out = FrameOverlaps { bbox: vec![], bev: vec![], three_d: vec![], dont_care: vec![] };
+        let detected: Vec<Upright> = frame.detections.iter().map(|line| Upright::new(line, label_frame)).collect();
+        for (label, line) in frame.labels.iter().enumerate() {
+            let labelled = Upright::new(line, label_frame);
+            for (detection, other) in frame.detections.iter().enumerate() {
+                let push = |pairs: &mut Vec<Pair>, overlap: f64| {
+                    if overlap > 0.0 {
+                        pairs.push(Pair { label, detection, overlap });
+                    }
+                };
+                let shared = image_intersection(&line.image_box, &other.image_box);
+                let (area, other_area) = (image_area(&line.image_box), image_area(&other.image_box));
+                if line.is_dont_care() {
+                    push(&mut out.dont_care, shared / other_area);
+                    continue;
+                }
+                push(&mut out.bbox, shared / (other_area + area - shared));
+                let (bev, three_d) = detected[detection].overlaps(&labelled);
+                push(&mut out.bev, bev);
+                push(&mut out.three_d, three_d);
+            }
+        }
+        out
+    }
+
+    pub(crate) fn of(&self, metric: Metric) -> &[Pair] {
+        match metric {
+            Metric::Bbox | Metric::Aos => &self.bbox,
+            Metric::Bev => &self.bev,
+            Metric::ThreeD => &self.three_d,
+        }
+    }
+}
+
+fn image_area(b: &[f64; 4]) -> f64 {
+    (b[2] - b[0]) * (b[3] - b[1])
+}
+
+fn image_intersection(a: &[f64; 4], b: &[f64; 4]) -> f64 {
+    let width = a[2].min(b[2]) - a[0].max(b[0]);
+    let height = a[3].min(b[3]) - a[1].max(b[1]);
+    if width > 0.0 && height > 0.0 { width * height } else { 0.0 }
+}
+
+/// A box that stands on the ground plane of the frame its text is written in.
+struct Upright {
+    base: Box3,
+    /// Lowest and highest point, m.
+    height: (f64, f64),
+    area: f64,
+    volume: f64,
+}
+
+impl Upright {
+    fn new(line: &KittiLine, label_frame: LabelFrame) -> Self {
+        let [h, w, l] = line.size_hwl;
+        let (base, height) = match label_frame {
+            LabelFrame::Lidar => {
+                let b = line.lidar_box();
+                (b, b.z_range())
+            }
+            LabelFrame::Camera => {
+                // Up is -y, and x, z, -y is a right-handed frame.
+                let [x, y, z] = line.location;
+                let base = Box3 { center: [x, z, -y + h / 2.0], size: [l, w, h], yaw_rad: -line.rotation_y };
+                (base, (-y, -y + h))
+            }
+        };
+        Upright { base, height, area: l * w, volume: l * h * w }
+    }
+
+    /// Seen from above, and in space.
+    fn overlaps(&self, other: &Upright) -> (f64, f64) {
+        let shared = bev_intersection(&self.base, &other.base);
+        if shared <= 0.0 {
+            return (0.0, 0.0);
+        }
+        let bev = shared / (self.area + other.area - shared);
+        let high = self.height.1.min(other.height.1) - self.height.0.max(other.height.0);
+        if high <= 0.0 || self.volume <= 0.0 || other.volume <= 0.0 {
+            return (bev, 0.0);
+        }
+        let shared = high * shared;
+        (bev, shared / (self.volume + other.volume - shared))
+    }
+}
+
+/// Distance of a box on the ground, m.
+pub(crate) fn range_m(line: &KittiLine, label_frame: LabelFrame) -> f64 {
+    let [x, y, z] = line.location;
+    match label_frame {
+        LabelFrame::Camera => x.hypot(z),
+        LabelFrame::Lidar => x.hypot(y),
+    }
+}

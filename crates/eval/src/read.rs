@@ -1,0 +1,129 @@
+//! Labels and detections from folders of KITTI text.
+
+use crate::EvalFrame;
+use data::{DataError, KittiText, read_kitti_text};
+use rayon::prelude::*;
+use std::path::Path;
+
+/// Reads the labels and detections of these frames, in their order. A detection file that does not exist is an error: a frame in
+/// which nothing was detected has an empty one.
+pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<Vec<EvalFrame>, DataError> {
+    for folder in [labels, detections] {
+        if !folder.is_dir() {
+            return Err(DataError::file(folder, "is not a folder"));
+        }
+    }
+    let read = |id: &String| {
+        let detected = detections.join(format!("{id}.txt"));
+        if !detected.exists() {
+            return Err(DataError::file(&detected, "does not exist; a frame without detections has an empty file"));
+        }
+        Ok(EvalFrame {
+            id: id.clone(),
+            labels: read_kitti_text(&labels.join(format!("{id}.txt")), KittiText::Labels)?,
+            detections: read_kitti_text(&detected, KittiText::Detections)?,
+        })
+    };
+    // Collecting results of all frames first names the first bad frame, whatever the threads do.
+    ids.par_iter().map(read).collect::<Vec<_>>().into_iter().collect()
+}
+
+/// The frames of a folder of labels, sorted by name: every `.txt` in it.
+pub fn ids_of_folder(labels: &Path) -> Result<Vec<String>, DataError> {
+    let mut ids = Vec::new();
+    for entry in fs_err::read_dir(labels)? {
+        let path = entry?.path();
+        if path.extension().is_none_or(|ending| ending != "txt") {
+            continue;
+        }
+        match path.file_stem().and_then(|stem| stem.to_str()) {
+            Some(id) => ids.push(id.to_string()),
+            None => return Err(DataError::file(&path, "its name is not UTF-8")),
+        }
+    }
+    ids.sort_unstable();
+    if ids.is_empty() {
+        return Err(DataError::file(labels, "holds no label file (NAME.txt)"));
+    }
+    Ok(ids)
+}
+
+/// Reads a list of frames: file names without ending, one a line. Blank lines are left out.
+pub fn read_ids(path: &Path) -> Result<Vec<String>, DataError> {
+    let text = fs_err::read_to_string(path)?;
+    let mut ids: Vec<String> = Vec::new();
+    let mut known = std::collections::HashSet::new();
+    for (i, id) in text.lines().map(str::trim).enumerate().filter(|(_, id)| !id.is_empty()) {
+        let problem = if id.contains(['/', '\\', '\0']) || id == "." || id == ".." {
+            Some("is no file name: it must not contain a path separator")
+        } else if !known.insert(id) {
+            Some("is there twice")
+        } else {
+            None
+        };
+        if let Some(problem) = problem {
+            return Err(DataError::line(path, i + 1, format!("frame id {id:?} {problem}")));
+        }
+        ids.push(id.into());
+    }
+    if ids.is_empty() {
+        return Err(DataError::file(path, "names no frame"));
+    }
+    Ok(ids)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LABEL: &str = "Car 0 0 0 0 0 50 50 1.2 1.9 4.9 10 2 0 0.1";
+
+    fn folder() -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, text) in [("labels/a.txt", LABEL.to_string()), ("found/a.txt", format!("{LABEL} 0.5\n"))] {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        }
+        folder
+    }
+
+    #[test]
+    fn bad_files_are_named() {
+        let folder = folder();
+        let (labels, found) = (folder.path().join("labels"), folder.path().join("found"));
+        assert_eq!(ids_of_folder(&labels).unwrap(), ["a"]);
+        assert_eq!(read_frames(&labels, &found, &["a".into()]).unwrap()[0].detections[0].score, Some(0.5));
+
+        std::fs::write(labels.join("b.txt"), "").unwrap();
+        let ids = ids_of_folder(&labels).unwrap();
+        let error = read_frames(&labels, &found, &ids).unwrap_err().to_string();
+        assert!(error.contains("found/b.txt: does not exist"), "{error}");
+
+        std::fs::write(found.join("b.txt"), format!("\n{LABEL}\n")).unwrap();
+        let error = read_frames(&labels, &found, &ids).unwrap_err().to_string();
+        assert!(error.contains("found/b.txt:2: a detection has 16 values"), "{error}");
+
+        std::fs::remove_file(labels.join("b.txt")).unwrap();
+        let error = read_frames(&labels, &found, &ids).unwrap_err().to_string();
+        assert!(error.contains("labels/b.txt"), "{error}");
+        assert!(read_frames(&labels.join("none"), &found, &ids).unwrap_err().to_string().contains("is not a folder"));
+    }
+
+    #[test]
+    fn bad_lists_are_named() {
+        let folder = folder();
+        let list = folder.path().join("val.txt");
+        for (text, message) in [
+            ("a\n../b\n", "val.txt:2: frame id \"../b\" is no file name"),
+            ("a\n\nb\na\n", "val.txt:4: frame id \"a\" is there twice"),
+            (" \n", "val.txt: names no frame"),
+        ] {
+            std::fs::write(&list, text).unwrap();
+            let error = read_ids(&list).unwrap_err().to_string();
+            assert!(error.contains(message), "{error}");
+        }
+        std::fs::write(&list, " b \r\n\na").unwrap();
+        assert_eq!(read_ids(&list).unwrap(), ["b", "a"]);
+    }
+}

@@ -1,0 +1,192 @@
+//! The result: rows for machines, a table for people.
+
+use crate::{Difficulty, Metric, PrecisionCurve, Recall, RecallDefinition};
+use data::LabelFrame;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// Version of [`EvalReport`] as JSON.
+pub const SCHEMA: &str = "lidarshift.eval_ap/1";
+
+/// Where an overlap limit comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum OverlapSet {
+    /// KITTI's own: 0.7 for Car, 0.5 for Pedestrian and Cyclist.
+    Official,
+    /// OpenPCDet's second set: 0.5 and 0.25 from above and in space.
+    Loose,
+    /// Asked for.
+    Given,
+}
+
+/// Average precision of one class by one metric, overlap limit and difficulty.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Row {
+    /// Class name.
+    pub class: String,
+    /// What boxes are compared by.
+    pub metric: Metric,
+    /// Overlap that has to be exceeded.
+    pub overlap: f64,
+    /// Where it comes from; more than one where the sets agree.
+    pub overlap_sets: Vec<OverlapSet>,
+    /// Which ground truths count.
+    pub difficulty: Difficulty,
+    /// Mean of 11 points of KITTI's curve, percent; `None` where undefined (0/0).
+    pub ap11: Option<f64>,
+    /// Mean of 40 points of KITTI's curve, percent; `None` where undefined (0/0).
+    pub ap40: Option<f64>,
+    /// Area under the curve with a point at every distinct score, percent; has no ceiling for few ground truths.
+    pub ap_area: Option<f64>,
+    /// Ground truths that count.
+    pub n_gt: i64,
+    /// Hits, with all detections.
+    pub n_tp: i64,
+    /// False alarms, with all detections.
+    pub n_fp: i64,
+    /// Misses, with all detections. Ground truth that an ignored detection takes is neither hit nor miss.
+    pub n_fn: i64,
+    /// `n_tp / n_gt`, 0 to 1; `None` without ground truth.
+    pub recall: Option<f64>,
+    /// The most that `ap40` can be with `n_gt` ground truths: (n - 1) / 40, percent.
+    pub ceiling_ap40: Option<f64>,
+    /// Why a number is missing or says little.
+    pub note: Option<String>,
+    /// The curve behind `ap11` and `ap40`.
+    #[serde(skip)]
+    #[schemars(skip)]
+    pub curve: PrecisionCurve,
+}
+
+/// Everything that `evaluate` finds.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct EvalReport {
+    /// [`SCHEMA`].
+    pub schema: String,
+    /// Number of frames.
+    pub frames: usize,
+    /// The frame of the boxes.
+    pub label_frame: LabelFrame,
+    /// Ground truth and detections beyond are ignored.
+    pub max_range_m: Option<f64>,
+    /// What to know before reading the rows.
+    pub notes: Vec<String>,
+    /// By class, metric, overlap, difficulty.
+    pub rows: Vec<Row>,
+    /// In both definitions.
+    pub recall: Vec<Recall>,
+}
+
+impl EvalReport {
+    /// The row of a class, metric, overlap limit and difficulty.
+    pub fn row(&self, class: &str, metric: Metric, overlap: f64, difficulty: Difficulty) -> Option<&Row> {
+        self.rows.iter().find(|row| {
+            row.class == class && row.metric == metric && row.overlap == overlap && row.difficulty == difficulty
+        })
+    }
+
+    /// Easy, moderate, hard and all of one class, metric and overlap limit, for each of them in order.
+    fn lines(&self) -> Vec<Vec<&Row>> {
+        let mut lines: Vec<Vec<&Row>> = Vec::new();
+        for row in &self.rows {
+            let same = |line: &&mut Vec<&Row>| {
+                (line[0].class.as_str(), line[0].metric, line[0].overlap) == (&row.class, row.metric, row.overlap)
+            };
+            match lines.iter_mut().find(same) {
+                Some(line) => line.push(row),
+                None => lines.push(vec![row]),
+            }
+        }
+        lines
+    }
+}
+
+fn percent(v: Option<f64>) -> String {
+    v.map_or("undef.".into(), |v| format!("{v:.2}"))
+}
+
+fn four<'a>(line: &[&'a Row], cell: impl Fn(&'a Row) -> String) -> String {
+    line.iter().map(|row| format!("{:>7}", cell(row))).collect()
+}
+
+/// The table for people.
+impl fmt::Display for EvalReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let frame = match self.label_frame {
+            LabelFrame::Camera => "camera",
+            LabelFrame::Lidar => "LiDAR",
+        };
+        write!(f, "{} frames, boxes upright in the {frame} frame", self.frames)?;
+        self.max_range_m.map_or(Ok(()), |m| write!(f, ", up to {m} m"))?;
+        writeln!(f, "; AP in percent, columns easy, moderate, hard, all")?;
+        let mut class = "";
+        for line in self.lines() {
+            if line[0].class != class {
+                class = &line[0].class;
+                writeln!(
+                    f,
+                    "\n{class:<11}|{}",
+                    four(&line, |row| format!("{:?}", row.difficulty).to_lowercase().replace("moderate", "mod."))
+                )?;
+                writeln!(f, "  n_gt     |{}", four(&line, |row| row.n_gt.to_string()))?;
+                writeln!(f, "  AP40 <=  |{}", four(&line, |row| percent(row.ceiling_ap40)))?;
+                let title = |name: &str| format!("{name:<28}");
+                writeln!(
+                    f,
+                    "           | {}| {}| {}|  TP / FP (all)",
+                    title("AP40"),
+                    title("AP11"),
+                    title("exact area")
+                )?;
+            }
+            let all = line[line.len() - 1];
+            writeln!(
+                f,
+                "  {:<4} {:<4}|{} |{} |{} |  {} / {}",
+                line[0].metric,
+                line[0].overlap,
+                four(&line, |row| percent(row.ap40)),
+                four(&line, |row| percent(row.ap11)),
+                four(&line, |row| percent(row.ap_area)),
+                all.n_tp,
+                all.n_fp,
+            )?;
+        }
+        writeln!(f, "\nrecall, 3d, all difficulties")?;
+        for r in &self.recall {
+            let name = match (r.definition, &r.class) {
+                (RecallDefinition::AnyBox, _) => "covered by any box (OpenPCDet)".into(),
+                (RecallDefinition::Matched, class) => format!("{} hit / n_gt", class.as_deref().unwrap_or("")),
+            };
+            let share = percent(r.recall.map(|v| 100.0 * v));
+            writeln!(f, "  {name:<31} > {:<4} {share:>7}  ({} of {})", r.overlap, r.hits, r.n_gt)?;
+        }
+        writeln!(f)?;
+        for note in &self.notes {
+            writeln!(f, "Note: {note}.")?;
+        }
+        for row in self.rows.iter().filter(|row| row.n_gt > 0) {
+            if let Some(note) = &row.note {
+                let difficulty = format!("{:?}", row.difficulty).to_lowercase();
+                writeln!(f, "Note: {} {} {} {difficulty}: {note}.", row.class, row.metric, row.overlap)?;
+            }
+        }
+        if self.rows.iter().any(|row| row.n_gt == 0) {
+            writeln!(f, "Note: where n_gt is 0 there is nothing to find, and AP is 0 by the reference's definition.")?;
+        }
+        if self.rows.iter().any(|row| row.ceiling_ap40.is_some_and(|most| most < 100.0)) {
+            writeln!(
+                f,
+                "AP40 <= is what a perfect detector gets. KITTI's curve has at most one point a hit, and AP40 leaves out the\n\
+                 first: with n < 41 ground truths it cannot exceed (n - 1) / 40, whatever the precision. The exact area can."
+            )?;
+        }
+        writeln!(
+            f,
+            "all: every label of the class counts, with KITTI's matching but without its filters on image height, occlusion\n\
+             and truncation, without neighbouring classes (Van, Person_sitting) and without DontCare."
+        )
+    }
+}
