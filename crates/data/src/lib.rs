@@ -7,6 +7,7 @@ mod calibration;
 mod cloud_file;
 mod dataset;
 mod dataset_config;
+pub mod doctor;
 mod error;
 mod frame;
 mod gt_database;

@@ -1,0 +1,118 @@
+//! What is wrong with a data set: read every frame once, look at what a training would trip over, and say it in words.
+
+mod detector_fit;
+mod duplicates;
+mod ground;
+mod reading;
+mod report;
+mod statistics;
+mod survey;
+
+pub use report::{ClassFacts, DoctorReport, Finding, PointFacts, Severity, Spread};
+
+use crate::{DataError, Dataset};
+use rayon::prelude::*;
+use report::{Findings, at_most};
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use survey::{FrameFacts, survey};
+
+/// What a detector expects of its data, in plain numbers.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct DetectorFacts {
+    /// Classes that it tells apart.
+    pub classes: Vec<String>,
+    /// `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame.
+    pub range: [f64; 6],
+    /// Its anchors; none for a network without.
+    pub anchors: Vec<AnchorFacts>,
+}
+
+/// The anchors of one class.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct AnchorFacts {
+    /// The class.
+    pub class: String,
+    /// Length, width, height, m.
+    pub size: [f64; 3],
+    /// Height of the underside, m, LiDAR frame.
+    pub bottom: f64,
+}
+
+/// Frames in which the readings of the labels are compared; more would not say more.
+const FRAMES_READ_IN_ALL_WAYS: usize = 300;
+
+/// Examines a data set, and how it fits a detector. An error only where the data set cannot be listed; everything else is a finding.
+pub fn doctor(dataset: &Dataset, detector: Option<&DetectorFacts>) -> Result<DoctorReport, DataError> {
+    let ids = dataset.all_ids()?;
+    let mut findings = Findings::default();
+    let splits = splits(dataset, &ids, &mut findings);
+
+    let stride = ids.len().div_ceil(FRAMES_READ_IN_ALL_WAYS);
+    let outcomes: Vec<Result<FrameFacts, DataError>> =
+        ids.par_iter().enumerate().map(|(i, id)| survey(dataset, id, i % stride == 0)).collect();
+    let mut frames = Vec::new();
+    let mut bad = Vec::new();
+    for (id, outcome) in ids.iter().zip(outcomes) {
+        match outcome {
+            Ok(facts) => frames.push(facts),
+            Err(error) => bad.push((id.clone(), error.to_string())),
+        }
+    }
+    if !bad.is_empty() {
+        let messages: Vec<_> = bad.iter().map(|(_, message)| message.clone()).collect();
+        let message = format!("{} of {} frames cannot be used: {}", bad.len(), ids.len(), at_most(5, &messages, "; "));
+        findings.problem("bad files", message, bad.into_iter().map(|(id, _)| id));
+    }
+
+    let classes = statistics::classes(dataset, &frames, &mut findings);
+    let points = statistics::points(&frames, &mut findings);
+    statistics::ground(&frames, &mut findings);
+    let readings = reading::judge(dataset, &frames, &mut findings);
+    duplicates::compare(&frames, &splits, &mut findings);
+    if let Some(detector) = detector {
+        detector_fit::compare(dataset, detector, &frames, &mut findings);
+    }
+    Ok(DoctorReport::new(dataset, &ids, &frames, splits, points, classes, readings, findings))
+}
+
+/// The frames of every split that can be read; what is wrong with the lists becomes a finding.
+fn splits(dataset: &Dataset, all: &[String], findings: &mut Findings) -> BTreeMap<String, Vec<String>> {
+    let mut splits = BTreeMap::new();
+    for name in dataset.config.splits.keys() {
+        match dataset.ids(name) {
+            Ok(ids) => {
+                let mut seen = BTreeSet::new();
+                let twice: Vec<_> = ids.iter().filter(|id| !seen.insert(*id)).cloned().collect();
+                if !twice.is_empty() {
+                    let message = format!(
+                        "the split {name:?} lists {} frames more than once: {}",
+                        twice.len(),
+                        at_most(5, &twice, ", ")
+                    );
+                    findings.problem("splits", message, twice);
+                }
+                splits.insert(name.clone(), ids);
+            }
+            Err(error) => findings.problem("splits", error.to_string(), []),
+        }
+    }
+    if dataset.config.splits.is_empty() {
+        findings.note(
+            "splits",
+            "there are no splits: train on all frames, or write ImageSets/train.txt, val.txt and test.txt".into(),
+            [],
+        );
+    } else {
+        let listed: BTreeSet<_> = splits.values().flatten().collect();
+        let unlisted: Vec<_> = all.iter().filter(|id| !listed.contains(id)).cloned().collect();
+        if !unlisted.is_empty() {
+            let message = format!("{} of {} frames are in no split", unlisted.len(), all.len());
+            findings.note("splits", message, unlisted);
+        }
+    }
+    splits
+}
+
+#[cfg(test)]
+mod tests;
