@@ -5,6 +5,7 @@ use crate::write::{write_bin, write_dataset_toml, write_kitti_frame, write_kitti
 use crate::{Calibration, Cloud, DatasetConfig, Frame, KittiLine, LabelFrame, Object, stream};
 use geometry::Box3;
 use rand::RngExt;
+use std::f64::consts::FRAC_PI_2;
 use std::path::{Path, PathBuf};
 
 /// Ground, some walls, and six cars that stand at all angles.
@@ -118,11 +119,11 @@ fn wrong_conventions_are_told_from_the_points() {
     type Change = (LabelFrame, fn(&mut KittiLine), &'static str);
     let changes: [Change; 8] = [
         (LabelFrame::Lidar, |l| l.rotation_y *= -1.0, "clockwise"),
-        (LabelFrame::Lidar, |l| l.rotation_y += 1.5707963, "swapped"),
+        (LabelFrame::Lidar, |l| l.rotation_y += FRAC_PI_2, "swapped"),
         (LabelFrame::Lidar, |l| l.size_hwl.swap(1, 2), "swapped"),
         (LabelFrame::Lidar, |l| l.size_hwl.swap(0, 2), "sizes are length, width, height"),
         (LabelFrame::Lidar, |l| l.location[2] -= l.size_hwl[0] / 2.0, "the box's bottom in the cloud's frame"),
-        (LabelFrame::Lidar, |l| l.rotation_y = -l.rotation_y - 1.5707963, "rotation is KITTI's"),
+        (LabelFrame::Lidar, |l| l.rotation_y = -l.rotation_y - FRAC_PI_2, "rotation is KITTI's"),
         (LabelFrame::Camera, |l| l.location[1] -= l.size_hwl[0] / 2.0, "centre of the box in the camera's frame"),
         (LabelFrame::Camera, |l| l.rotation_y *= -1.0, "with the other sign"),
     ];
@@ -286,7 +287,7 @@ fn real_scans_are_called_sound_and_planted_faults_are_not() {
     };
     let sound = with(|_| ());
     assert!(sound.sound && sound.readings[0].declared, "{sound}");
-    finds(&with(|l| l.rotation_y += 1.5707963), Severity::Problem, "label frame", "swapped");
+    finds(&with(|l| l.rotation_y += FRAC_PI_2), Severity::Problem, "label frame", "swapped");
     finds(&with(|l| l.size_hwl.swap(1, 2)), Severity::Problem, "label frame", "swapped");
     finds(&with(|l| l.size_hwl.swap(0, 2)), Severity::Problem, "label frame", "sizes are length");
     finds(
