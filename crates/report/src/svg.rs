@@ -1,0 +1,94 @@
+//! A page as SVG.
+
+use crate::page::{Anchor, Mark, Page, Rgb};
+use std::fmt::Write;
+
+/// The page as the text of an SVG file.
+pub(crate) fn svg(page: &Page) -> String {
+    let [width, height] = page.size;
+    let mut out = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width:.0}\" height=\"{height:.0}\" viewBox=\"0 0 {width:.0} {height:.0}\" \
+         font-family=\"system-ui, sans-serif\">\n<rect width=\"100%\" height=\"100%\" fill=\"{}\"/>\n",
+        hex(page.background)
+    );
+    for mark in &page.marks {
+        write_mark(&mut out, mark, page.rimmed.then_some(page.background)).expect("writing to a String does not fail");
+        out.push('\n');
+    }
+    out.push_str("</svg>\n");
+    out
+}
+
+fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>) -> std::fmt::Result {
+    match mark {
+        Mark::Line { points, closed, color, width, fill } => {
+            let (word, hex) = (if *closed { "polygon" } else { "polyline" }, hex(*color));
+            write!(out, "<{word} points=\"")?;
+            for (i, [x, y]) in points.iter().enumerate() {
+                write!(out, "{}{x:.1},{y:.1}", if i > 0 { " " } else { "" })?;
+            }
+            write!(out, "\" stroke=\"{hex}\" stroke-width=\"{width}\" stroke-linejoin=\"round\"")?;
+            if *fill > 0.0 {
+                write!(out, " fill=\"{hex}\" fill-opacity=\"{fill}\"/>")
+            } else {
+                write!(out, " fill=\"none\"/>")
+            }
+        }
+        Mark::Ring { center: [x, y], radius, color, width } => {
+            let hex = hex(*color);
+            write!(
+                out,
+                "<circle cx=\"{x:.1}\" cy=\"{y:.1}\" r=\"{radius:.1}\" fill=\"none\" stroke=\"{hex}\" stroke-width=\"{width}\"/>"
+            )
+        }
+        Mark::Squares { corners, side, color } => {
+            write!(out, "<path fill=\"{}\" d=\"", hex(*color))?;
+            for [x, y] in corners {
+                write!(out, "M{x} {y}h{side}v{side}h-{side}z")?;
+            }
+            write!(out, "\"/>")
+        }
+        Mark::Text { at: [x, y], text, size, color, anchor, upright } => {
+            let turn = if *upright { String::new() } else { format!(" transform=\"rotate(-90 {x:.1} {y:.1})\"") };
+            let (anchor, text) = (word(*anchor), escaped(text));
+            let start = format!("<text x=\"{x:.1}\" y=\"{y:.1}\" font-size=\"{size}\" text-anchor=\"{anchor}\"{turn}");
+            if let Some(rim) = rim.map(hex) {
+                writeln!(
+                    out,
+                    "{start} stroke=\"{rim}\" stroke-width=\"4\" fill=\"{rim}\" aria-hidden=\"true\">{text}</text>"
+                )?;
+            }
+            write!(out, "{start} fill=\"{}\">{text}</text>", hex(*color))
+        }
+    }
+}
+
+fn hex([r, g, b]: Rgb) -> String {
+    format!("#{r:02x}{g:02x}{b:02x}")
+}
+
+fn word(anchor: Anchor) -> &'static str {
+    match anchor {
+        Anchor::Start => "start",
+        Anchor::Middle => "middle",
+        Anchor::End => "end",
+    }
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_cannot_leave_its_element() {
+        let mut page = Page::new([100.0, 50.0], [255; 3], true);
+        page.text([1.0, 2.0], "a < b & c", 10.0, [0; 3], Anchor::Middle);
+        let text = svg(&page);
+        assert!(text.contains(">a &lt; b &amp; c</text>") && text.contains("text-anchor=\"middle\""), "{text}");
+        assert_eq!(text.matches("<text").count(), 2, "the rim lies under the text");
+    }
+}
