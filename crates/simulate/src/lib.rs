@@ -2,6 +2,8 @@
 //!
 //! A road with cars, walls, poles and things that are no cars, seen by one spinning LiDAR. Everything is in the LiDAR frame: origin at the
 //! sensor, x forward, y left, z up, m; yaw counter-clockwise from +x, rad. A frame is a pure function of (configuration, split, index).
+//!
+//! Every car with at least five points on it is labelled, however much of it is hidden; its label says how much (KITTI's occlusion level).
 
 pub mod cars;
 mod config;
