@@ -80,6 +80,12 @@ pub enum Difficulty {
     All,
 }
 
+impl fmt::Display for Difficulty {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(["easy", "moderate", "hard", "all"][*self as usize])
+    }
+}
+
 impl Difficulty {
     /// In the order of the report.
     pub const ALL: [Difficulty; 4] = [Difficulty::Easy, Difficulty::Moderate, Difficulty::Hard, Difficulty::All];

@@ -127,32 +127,21 @@ impl fmt::Display for EvalReport {
                 class = &line[0].class;
                 writeln!(
                     f,
-                    "\n{class:<11}|{}",
-                    four(&line, |row| format!("{:?}", row.difficulty).to_lowercase().replace("moderate", "mod."))
+                    "\n{class:<12}|{}",
+                    four(&line, |row| row.difficulty.to_string().replace("moderate", "mod."))
                 )?;
-                writeln!(f, "  n_gt     |{}", four(&line, |row| row.n_gt.to_string()))?;
-                writeln!(f, "  AP40 <=  |{}", four(&line, |row| percent(row.ceiling_ap40)))?;
-                let title = |name: &str| format!("{name:<28}");
-                writeln!(
-                    f,
-                    "           | {}| {}| {}|  TP / FP (all)",
-                    title("AP40"),
-                    title("AP11"),
-                    title("exact area")
-                )?;
+                writeln!(f, "  n_gt      |{}", four(&line, |row| row.n_gt.to_string()))?;
+                writeln!(f, "  AP40 <=   |{}", four(&line, |row| percent(row.ceiling_ap40)))?;
+                writeln!(f, "            | {:<28}| {:<28}| {:<28}|  TP / FP (all)", "AP40", "AP11", "exact area")?;
             }
             let all = line[line.len() - 1];
-            writeln!(
-                f,
-                "  {:<4} {:<4}|{} |{} |{} |  {} / {}",
-                line[0].metric,
-                line[0].overlap,
+            let (ap40, ap11, area) = (
                 four(&line, |row| percent(row.ap40)),
                 four(&line, |row| percent(row.ap11)),
                 four(&line, |row| percent(row.ap_area)),
-                all.n_tp,
-                all.n_fp,
-            )?;
+            );
+            let (metric, overlap) = (line[0].metric, line[0].overlap);
+            writeln!(f, "  {metric:<4} {overlap:<4} |{ap40} |{ap11} |{area} |  {} / {}", all.n_tp, all.n_fp)?;
         }
         writeln!(f, "\nrecall, 3d, all difficulties")?;
         for r in &self.recall {
@@ -167,10 +156,16 @@ impl fmt::Display for EvalReport {
         for note in &self.notes {
             writeln!(f, "Note: {note}.")?;
         }
-        for row in self.rows.iter().filter(|row| row.n_gt > 0) {
-            if let Some(note) = &row.note {
-                let difficulty = format!("{:?}", row.difficulty).to_lowercase();
-                writeln!(f, "Note: {} {} {} {difficulty}: {note}.", row.class, row.metric, row.overlap)?;
+        for line in self.lines() {
+            let mut told: Vec<&str> = Vec::new();
+            for note in line.iter().filter(|row| row.n_gt > 0).filter_map(|row| row.note.as_deref()) {
+                if !told.contains(&note) {
+                    told.push(note);
+                    let same = line.iter().filter(|row| row.note.as_deref() == Some(note));
+                    let difficulties: Vec<String> = same.map(|row| row.difficulty.to_string()).collect();
+                    let (class, metric, overlap) = (&line[0].class, line[0].metric, line[0].overlap);
+                    writeln!(f, "Note: {class} {metric} {overlap} ({}): {note}.", difficulties.join(", "))?;
+                }
             }
         }
         if self.rows.iter().any(|row| row.n_gt == 0) {

@@ -14,7 +14,11 @@ const CELLS: usize = 64;
 /// # Shapes
 /// `points`: `[N * channels]`; out: one list a box.
 pub fn points_in_boxes(points: &[f32], channels: usize, boxes: &[Box3], margin_m: f64) -> Vec<Vec<u32>> {
-    assert!(channels >= 3 && points.len() % channels == 0, "points of {channels} values do not fill {}", points.len());
+    assert!(
+        channels >= 3 && points.len().is_multiple_of(channels),
+        "points of {channels} values do not fill {}",
+        points.len()
+    );
     let mut inside = vec![Vec::new(); boxes.len()];
     let tests: Vec<InsideTest> =
         boxes.iter().enumerate().filter_map(|(i, b)| InsideTest::new(i, b, margin_m)).collect();

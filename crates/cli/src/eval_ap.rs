@@ -1,0 +1,183 @@
+//! `lidarshift eval ap`: average precision and recall of detections in KITTI text.
+
+use anyhow::{Result, bail};
+use clap::Args;
+use data::{Dataset, LabelFrame, write_atomic};
+use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_frames, read_ids};
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// Average precision and recall of any detections in KITTI text.
+///
+/// Labels have 15 values a line, detections 16, the last one is the score. A frame without objects has an empty file.
+/// Boxes are compared in the frame they are written in.
+///
+/// Examples:
+///   lidarshift eval ap --labels tests/golden/evaluation/small/label_2 --detections tests/golden/evaluation/small/detections
+///   lidarshift eval ap --dataset datasets/road --split test --detections detections --json ap.json
+#[derive(Args, Debug)]
+#[command(verbatim_doc_comment)]
+pub struct EvalApArgs {
+    /// Folder of label files
+    #[arg(long, value_name = "DIR", required_unless_present = "dataset", conflicts_with = "dataset")]
+    labels: Option<PathBuf>,
+    /// Folder of detection files, named as the label files
+    #[arg(long, value_name = "DIR")]
+    detections: PathBuf,
+    /// Frame of both texts: `camera` (KITTI's own) or `lidar` (location is the box centre, rotation the yaw).
+    /// A data set says it itself [default: camera]
+    #[arg(long, value_name = "FRAME", value_parser = label_frame, conflicts_with = "dataset")]
+    label_frame: Option<LabelFrame>,
+    /// List of the frames, one a line [default: every label file]
+    #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
+    ids: Option<PathBuf>,
+    /// Data set, its folder or its TOML, in the place of --labels, --label-frame and --ids
+    #[arg(long, value_name = "DATASET")]
+    dataset: Option<PathBuf>,
+    /// Split of the data set
+    #[arg(long, value_name = "NAME", default_value = "test", conflicts_with = "labels")]
+    split: String,
+    /// Classes, with commas between them [default: those of the data set, or those found, without what KITTI does not evaluate]
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    classes: Vec<String>,
+    /// Overlap limits to report beside those of the reference, with commas between them
+    #[arg(long, value_name = "LIMITS", value_delimiter = ',', value_parser = overlap)]
+    overlaps: Vec<f64>,
+    /// Ignore ground truth and detections that are farther away on the ground, m
+    #[arg(long, value_name = "M", value_parser = range)]
+    max_range: Option<f64>,
+    /// Write the result as JSON, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+impl EvalApArgs {
+    /// Reads the texts, prints the table and writes the JSON.
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    pub fn run(self) -> Result<()> {
+        let (frames, mut options) = match (&self.dataset, &self.labels) {
+            (Some(dataset), _) => self.of_dataset(dataset)?,
+            (None, Some(labels)) => self.of_folder(labels)?,
+            (None, None) => bail!("say where the labels are: --labels DIR or --dataset DATASET"),
+        };
+        options.max_range_m = self.max_range;
+        options.more_overlaps = self.overlaps;
+        if !self.classes.is_empty() {
+            options.classes = self.classes;
+        } else if options.classes.is_empty() && default_classes(&frames).is_empty() {
+            bail!("labels and detections hold no object of a class to evaluate; name the classes with --classes");
+        }
+        let report = evaluate(&frames, &options);
+        if let Some(path) = &self.json {
+            let mut json = serde_json::to_string_pretty(&report)?;
+            json.push('\n');
+            write_atomic(path, json.as_bytes())?;
+        }
+        print!("{report}");
+        Ok(())
+    }
+
+    fn of_folder(&self, labels: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
+        let ids = match &self.ids {
+            Some(list) => read_ids(list)?,
+            None => ids_of_folder(labels)?,
+        };
+        let frames = read_frames(labels, &self.detections, &ids)?;
+        if self.ids.is_none() {
+            self.tell_of_files_without_labels(&ids);
+        }
+        let label_frame = self.label_frame.unwrap_or(LabelFrame::Camera);
+        Ok((frames, EvalOptions { label_frame, ..EvalOptions::default() }))
+    }
+
+    fn of_dataset(&self, dataset: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
+        let dataset = Dataset::open(dataset)?;
+        let ids = dataset.ids(&self.split)?;
+        let labels = dataset.labels_path("");
+        let labels = labels.parent().unwrap_or(Path::new("."));
+        let frames = read_frames(labels, &self.detections, &ids)?;
+        let config = dataset.config;
+        Ok((frames, EvalOptions { label_frame: config.label_frame, classes: config.classes, ..EvalOptions::default() }))
+    }
+
+    /// Without a list the labels say what the frames are. Detections of others are left out, but not in silence.
+    fn tell_of_files_without_labels(&self, ids: &[String]) {
+        let known: BTreeSet<&String> = ids.iter().collect();
+        let detected = ids_of_folder(&self.detections).unwrap_or_default();
+        let mut others = detected.iter().filter(|id| !known.contains(id));
+        if let Some(first) = others.next() {
+            let n = 1 + others.count();
+            eprintln!("left out: {n} detection files without a label file, {first}.txt first; --ids names the frames");
+        }
+    }
+}
+
+fn label_frame(text: &str) -> Result<LabelFrame, String> {
+    match text {
+        "camera" => Ok(LabelFrame::Camera),
+        "lidar" => Ok(LabelFrame::Lidar),
+        _ => Err("must be camera or lidar".into()),
+    }
+}
+
+fn overlap(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v| (0.0..1.0).contains(v)).ok_or("must be a number from 0 to below 1".into())
+}
+
+fn range(text: &str) -> Result<f64, String> {
+    text.parse().ok().filter(|v: &f64| *v > 0.0).ok_or("must be a number of metres above 0".into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Words {
+        #[command(flatten)]
+        args: EvalApArgs,
+    }
+
+    fn run(words: &[&str]) -> Result<()> {
+        Words::try_parse_from(std::iter::once(&"ap").chain(words))?.args.run()
+    }
+
+    fn golden(path: &str) -> String {
+        format!("{}/../../tests/golden/evaluation/{path}", env!("CARGO_MANIFEST_DIR"))
+    }
+
+    #[test]
+    fn json_has_rows_and_recall() {
+        let out = tempfile::tempdir().unwrap();
+        let json = out.path().join("new/ap.json");
+        let (labels, detections) = (golden("small/label_2"), golden("small/detections"));
+        run(&["--labels", &labels, "--detections", &detections, "--json", json.to_str().unwrap()]).unwrap();
+        let report: serde_json::Value = serde_json::from_slice(&std::fs::read(json).unwrap()).unwrap();
+        assert_eq!(report["schema"], eval::SCHEMA);
+        let car = report["rows"].as_array().unwrap().iter().find(|row| {
+            row["class"] == "Car" && row["metric"] == "3d" && row["overlap"] == 0.7 && row["difficulty"] == "moderate"
+        });
+        let car = car.unwrap();
+        assert!((car["ap40"].as_f64().unwrap() - 30.760652386177807).abs() < 1e-9, "{car}");
+        assert_eq!((car["n_gt"].as_i64(), car["n_tp"].as_i64(), car["n_fp"].as_i64()), (Some(43), Some(23), Some(60)));
+        assert!(report["recall"].as_array().unwrap().len() > 3);
+    }
+
+    #[test]
+    fn wrong_words_are_refused() {
+        let (labels, detections) = (golden("small/label_2"), golden("small/detections"));
+        let with = |more: &[&str]| {
+            let words = [&["--labels", &labels, "--detections", &detections], more].concat();
+            run(&words).unwrap_err().to_string()
+        };
+        assert!(with(&["--label-frame", "world"]).contains("must be camera or lidar"));
+        assert!(with(&["--overlaps", "0.5,1"]).contains("from 0 to below 1"));
+        assert!(with(&["--max-range", "nan"]).contains("above 0"));
+        assert!(with(&["--dataset", "x"]).contains("cannot be used with"));
+        assert!(with(&["--ids", "/nowhere/val.txt"]).contains("/nowhere/val.txt"));
+        assert!(run(&["--detections", &detections]).unwrap_err().to_string().contains("--labels"));
+        let error = run(&["--labels", &labels, "--detections", "/nowhere"]).unwrap_err().to_string();
+        assert!(error.contains("/nowhere: is not a folder"), "{error}");
+    }
+}
