@@ -1,1 +1,23 @@
-//! One run: optimiser, schedule, checkpoints, resume.
+//! One run: optimiser, schedule, run folder, checkpoints, resume, metrics.
+
+mod adam;
+mod error;
+mod frames;
+mod metrics;
+mod one_cycle;
+mod provenance;
+mod run_config;
+mod run_folder;
+mod trainer;
+mod validation;
+
+pub use adam::{Adam, GradientNorm, NameOf};
+pub use error::TrainError;
+pub use frames::{TrainingFrames, samples};
+pub use metrics::{EpochMetrics, StageSeconds, StepMetrics, ValidationMetrics};
+pub use one_cycle::OneCycle;
+pub use provenance::{DatasetProvenance, PROVENANCE_SCHEMA, Provenance, SessionProvenance};
+pub use run_config::{RunConfig, RunOptions, set_key};
+pub use run_folder::{Best, RunFolder, RunState, STATE_SCHEMA};
+pub use trainer::{Event, Session, Trained, train};
+pub use validation::{Evaluation, evaluate_detector};

@@ -1,0 +1,157 @@
+//! The frames of a training run: their order, augmentation and preparation, each a function of (seed, epoch, frame) alone.
+
+use crate::{RunConfig, TrainError};
+use data::augment::{AugmentConfig, augment, crop_to_range};
+use data::{Dataset, Frame, GtDatabase, Prefetch, Stream, prefetch, stream};
+use models::{Preparer, Sample};
+use rand::seq::SliceRandom;
+use sha2::{Digest, Sha256};
+use std::path::Path;
+use std::sync::Arc;
+
+/// The frames that a run learns from.
+pub struct TrainingFrames {
+    dataset: Dataset,
+    ids: Vec<String>,
+    seed: u64,
+    augmentation: Option<(AugmentConfig, Option<GtDatabase>)>,
+    classes: Vec<String>,
+    range_m: [f64; 6],
+    preparer: Preparer,
+}
+
+impl TrainingFrames {
+    /// Of a run's data set: the training split with augmentation, or all frames as they are to overfit.
+    ///
+    /// The objects for ground-truth sampling are collected once and kept in `cache_folder`.
+    ///
+    /// # Errors
+    /// A split that is missing or has no frame, classes or channels of the detector that the data set does not have, a frame that cannot be
+    /// read for the objects.
+    pub fn new(config: &RunConfig, dataset: &Dataset, cache_folder: &Path) -> Result<Self, TrainError> {
+        let detector = &config.detector;
+        check_fit(config, dataset)?;
+        let ids = if config.overfit { dataset.all_ids()? } else { dataset.ids(&config.run.train_split)? };
+        let gt_sampling = &detector.augmentation.gt_sampling;
+        let augmentation = if config.overfit {
+            None
+        } else if gt_sampling.enabled {
+            let database = GtDatabase::open_or_build(cache_folder, dataset, &ids, &detector.classes, gt_sampling)?;
+            Some((detector.augmentation.clone(), Some(database)))
+        } else {
+            Some((detector.augmentation.clone(), None))
+        };
+        Ok(TrainingFrames {
+            dataset: dataset.clone(),
+            ids,
+            seed: config.seed,
+            augmentation,
+            classes: detector.classes.clone(),
+            range_m: detector.range_m.map(f64::from),
+            preparer: Preparer::new(detector),
+        })
+    }
+
+    /// Their ids, in the order of the split.
+    pub fn ids(&self) -> &[String] {
+        &self.ids
+    }
+
+    /// SHA-256 of the ids, in hexadecimal.
+    pub fn sha256(&self) -> String {
+        crate::run_config::hex(&Sha256::digest(self.ids.join("\n")))
+    }
+
+    /// Indices of all frames in the order in which `epoch` sees them.
+    pub fn order(&self, epoch: u64) -> Vec<usize> {
+        let mut order: Vec<usize> = (0..self.ids.len()).collect();
+        order.shuffle(&mut stream(self.seed, "order", epoch, 0));
+        order
+    }
+
+    /// What the network gets when `epoch` comes to frame `index`.
+    ///
+    /// As in the reference, a frame without a box of the detector's classes in its range (after augmentation) is replaced by another one
+    /// drawn at random; not so when overfitting.
+    ///
+    /// # Errors
+    /// A frame that cannot be read, or no frame at all with a box.
+    pub fn sample(&self, epoch: u64, index: usize) -> Result<Sample, TrainError> {
+        let mut random = stream(self.seed, "augment", epoch, index as u64);
+        let frame = self.frame(index, &mut random)?;
+        if self.augmentation.is_none() || !frame.objects.is_empty() {
+            return Ok(self.preparer.training(&frame)?);
+        }
+        let mut others: Vec<usize> = (0..self.ids.len()).filter(|other| *other != index).collect();
+        others.shuffle(&mut random);
+        for other in others {
+            let frame = self.frame(other, &mut random)?;
+            if !frame.objects.is_empty() {
+                return Ok(self.preparer.training(&frame)?);
+            }
+        }
+        let message = format!(
+            "none of its {} training frames has a box of {} within the detector's range: there is nothing to learn; \
+             `lidarshift doctor` says what the labels hold",
+            self.ids.len(),
+            self.classes.join(", ")
+        );
+        Err(TrainError::folder(&self.dataset.config.root, message))
+    }
+
+    /// The frame, augmented, with what lies in range only.
+    fn frame(&self, index: usize, random: &mut Stream) -> Result<Frame, TrainError> {
+        let mut frame = self.dataset.load(&self.ids[index])?;
+        if let Some((config, database)) = &self.augmentation {
+            frame = augment(frame, config, database.as_ref(), random);
+        }
+        let mut frame = crop_to_range(frame, &self.range_m);
+        frame.objects.retain(|o| self.classes.contains(&o.class));
+        Ok(frame)
+    }
+}
+
+/// The samples of all epochs from `(epoch, position)` on, made ahead by `workers` threads; `depth` of them at most lie ready.
+pub fn samples(
+    frames: &Arc<TrainingFrames>,
+    (epoch, position): (u64, usize),
+    epochs: u64,
+    workers: usize,
+    depth: usize,
+) -> Prefetch<Result<Sample, TrainError>> {
+    let in_epoch =
+        |e: u64| frames.order(e).into_iter().skip(if e == epoch { position } else { 0 }).map(move |i| (e, i));
+    let jobs: Vec<(u64, usize)> = (epoch..epochs).flat_map(in_epoch).collect();
+    let frames = frames.clone();
+    prefetch(jobs, workers, depth, move |&(epoch, index)| frames.sample(epoch, index))
+}
+
+/// Whether the data set has what the detector needs.
+fn check_fit(config: &RunConfig, dataset: &Dataset) -> Result<(), TrainError> {
+    let (detector, path) = (&config.detector, &config.dataset);
+    let missing: Vec<&str> =
+        detector.classes.iter().filter(|c| !dataset.config.classes.contains(c)).map(String::as_str).collect();
+    if !missing.is_empty() {
+        let message = format!(
+            "the detector {} is to find {}, the data set has the classes {}; give a detector for these classes, or name them in the data \
+             set's TOML",
+            detector.name,
+            missing.join(", "),
+            dataset.config.classes.join(", ")
+        );
+        return Err(TrainError::folder(path, message));
+    }
+    let channels = dataset.config.points.channels();
+    if channels < detector.channels {
+        let message = format!(
+            "its points have {channels} values, the detector {} reads {}; give a detector for these points, or --set channels={channels}",
+            detector.name, detector.channels
+        );
+        return Err(TrainError::folder(path, message));
+    }
+    if !dataset.has_labels() {
+        let message = format!("there are no labels in {}", dataset.config.layout.label_folder());
+        return Err(TrainError::folder(&dataset.config.root, message));
+    }
+    Ok(())
+}

@@ -1,0 +1,117 @@
+//! `provenance.json`: what made a run, from what and where.
+
+use crate::run_config::hex;
+use crate::{RunConfig, TrainError};
+use data::write_atomic;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// Version of `provenance.json`.
+pub const PROVENANCE_SCHEMA: &str = "lidarshift/provenance/1";
+
+/// What made a run, from what and where.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Provenance {
+    /// [`PROVENANCE_SCHEMA`].
+    pub schema: String,
+    /// SHA-256 of the configuration.
+    pub config_sha256: String,
+    /// The data set.
+    pub dataset: DatasetProvenance,
+    /// SHA-256 of the checkpoint that the run began with.
+    pub init_sha256: Option<String>,
+    /// The processes that worked on it, in order.
+    pub sessions: Vec<SessionProvenance>,
+}
+
+/// What a run learned from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DatasetProvenance {
+    /// Its name.
+    pub name: String,
+    /// Its folder.
+    pub root: String,
+    /// Number of training frames.
+    pub frames: usize,
+    /// SHA-256 of their ids.
+    pub frames_sha256: String,
+}
+
+/// One process that worked on a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SessionProvenance {
+    /// Steps that had been done before it.
+    pub from_step: u64,
+    /// When it began, s since 1970.
+    pub began_unix_s: u64,
+    /// Its command line.
+    pub command: Vec<String>,
+    /// Version of the program.
+    pub version: String,
+    /// SHA-256 of the program's file.
+    pub program_sha256: Option<String>,
+    /// Operating system and architecture.
+    pub system: String,
+    /// Model of the processor, where the system says it.
+    pub processor: Option<String>,
+    /// Logical processors.
+    pub threads: usize,
+    /// What computed.
+    pub device: String,
+    /// Threads that loaded frames.
+    pub workers: usize,
+}
+
+impl SessionProvenance {
+    /// Of this process.
+    pub fn now(from_step: u64, device: &str, workers: usize) -> Self {
+        let program = std::env::current_exe().ok().and_then(|path| std::fs::read(path).ok());
+        let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+        let model = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+        SessionProvenance {
+            from_step,
+            began_unix_s: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |t| t.as_secs()),
+            command: std::env::args().collect(),
+            version: env!("CARGO_PKG_VERSION").into(),
+            program_sha256: program.map(|bytes| hex(&Sha256::digest(bytes))),
+            system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+            processor: model.map(|(_, name)| name.trim().into()),
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            device: device.into(),
+            workers,
+        }
+    }
+}
+
+/// Adds a session to the file, which the first one makes.
+pub(crate) fn record_session(
+    path: &Path,
+    config: &RunConfig,
+    dataset: DatasetProvenance,
+    session: SessionProvenance,
+) -> Result<(), TrainError> {
+    let mut provenance = match fs_err::read(path) {
+        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|e| {
+            TrainError::folder(path, format!("is damaged ({e}); remove it, the run can go on without it"))
+        })?,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Provenance {
+            schema: PROVENANCE_SCHEMA.into(),
+            config_sha256: config.sha256(),
+            dataset,
+            init_sha256: match &config.init {
+                Some(init) => Some(hex(&Sha256::digest(fs_err::read(init)?))),
+                None => None,
+            },
+            sessions: Vec::new(),
+        },
+        Err(e) => return Err(e.into()),
+    };
+    provenance.sessions.push(session);
+    let text = serde_json::to_string_pretty(&provenance).expect("provenance is plain JSON");
+    Ok(write_atomic(path, text.as_bytes())?)
+}

@@ -1,0 +1,363 @@
+//! The training loop, read top to bottom in [`train`].
+
+use crate::provenance::record_session;
+use crate::validation::loss_values;
+use crate::{
+    Adam, Best, DatasetProvenance, EpochMetrics, GradientNorm, OneCycle, RunConfig, RunFolder, RunState,
+    SessionProvenance, StageSeconds, StepMetrics, TrainError, TrainingFrames, ValidationMetrics, evaluate_detector,
+    metrics::MetricsFile, samples,
+};
+use burn::optim::GradientsParams;
+use burn::tensor::Device;
+use data::{Dataset, write_atomic};
+use models::checkpoint::read_checkpoint;
+use models::{Detector, ModelError, Sample, reference_name};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// How a process works on a run; nothing of it changes the weights, but for the rounding of another device.
+#[derive(Clone, Debug)]
+pub struct Session {
+    /// Where the network computes, without autodiff.
+    pub device: Device,
+    /// Its name, for the provenance.
+    pub device_name: String,
+    /// Threads that load and augment frames.
+    pub workers: usize,
+    /// Go on with a run that is there; without it such a folder is refused.
+    pub resume: bool,
+}
+
+/// What a run tells while it works.
+#[derive(Clone, Debug)]
+pub enum Event<'a> {
+    /// Before the first step.
+    Begin {
+        /// Where the run stands.
+        state: &'a RunState,
+        /// Epochs of the whole run.
+        epochs: u64,
+        /// Frames it learns from.
+        frames: usize,
+        /// Frames it is evaluated on; 0 without a validation split.
+        validation_frames: usize,
+    },
+    /// After each step.
+    Step {
+        /// What happened since the last line of `metrics.jsonl`, and in this step.
+        metrics: &'a StepMetrics,
+        /// This is a line of `metrics.jsonl`.
+        logged: bool,
+    },
+    /// After each epoch.
+    Epoch(&'a EpochMetrics),
+}
+
+/// A run that has come to its end.
+#[derive(Debug)]
+pub struct Trained {
+    /// With the weights of the last step.
+    pub detector: Detector,
+    /// Where the run stands.
+    pub state: RunState,
+    /// The last evaluation that this process did.
+    pub validation: Option<ValidationMetrics>,
+}
+
+/// Trains a detector in the run folder `out`, from the beginning or from where the run was stopped, to its end.
+///
+/// # Errors
+/// Another process in the folder, a run that is there already (without resume) or was begun otherwise, anything wrong with the data set,
+/// files that cannot be written, and the first loss or gradient that is not finite.
+pub fn train(
+    config: &RunConfig,
+    out: &Path,
+    session: &Session,
+    report: &mut dyn FnMut(Event),
+) -> Result<Trained, TrainError> {
+    let folder = RunFolder::open(out)?;
+    let (mut run, frames) = Run::begin(config, &folder, session)?;
+    let (batch_size, epochs) = (config.detector.optimization.batch_size, config.detector.optimization.epochs as u64);
+    let depth = 2 * batch_size + session.workers;
+    let mut samples = samples(&frames, (run.state.epoch, run.state.position), epochs, session.workers, depth);
+    let mut log = MetricsFile::open(&folder.metrics_path(), run.state.step)?;
+    let (state, validation_frames) = (&run.state, run.validation_ids.len());
+    report(Event::Begin { state, epochs, frames: frames.ids().len(), validation_frames });
+
+    let mut validation = None;
+    while run.state.epoch < epochs {
+        let mut clock = Clock::default();
+        while run.state.position < frames.ids().len() {
+            let wanted = batch_size.min(frames.ids().len() - run.state.position);
+            let batch = clock.wait(|| samples.by_ref().take(wanted).collect::<Result<Vec<Sample>, _>>())?;
+            let step = run.learn(&batch, &mut clock)?;
+
+            run.state.step += 1;
+            run.state.position += batch.len();
+            let epoch_ends = run.state.position >= frames.ids().len();
+            let metrics = clock.metrics(&run.state, step, batch.len());
+            let logged = epoch_ends || run.state.step.is_multiple_of(config.run.log_every_steps);
+            if logged {
+                log.step(&metrics)?;
+                clock.begin_line();
+            }
+            report(Event::Step { metrics: &metrics, logged });
+            if !epoch_ends && run.state.step.is_multiple_of(config.run.checkpoint_every_steps) {
+                run.checkpoint(&folder, &mut clock)?;
+            }
+        }
+        let turn = run.is_evaluation_due(epochs).then(|| run.validate(session.workers)).transpose()?;
+        run.state.epoch += 1;
+        run.state.position = 0;
+        let metrics = clock.epoch_metrics(&run.state, turn);
+        log.epoch(&metrics)?;
+        run.checkpoint(&folder, &mut clock)?;
+        report(Event::Epoch(&metrics));
+        validation = metrics.validation.or(validation);
+    }
+    Ok(Trained { detector: run.detector, state: run.state, validation })
+}
+
+/// What changes in the course of a run.
+struct Run<'a> {
+    config: &'a RunConfig,
+    dataset: Dataset,
+    validation_ids: Vec<String>,
+    schedule: OneCycle,
+    adam: Adam,
+    detector: Detector,
+    state: RunState,
+}
+
+/// What one step says of itself.
+struct Step {
+    losses: Vec<(&'static str, f64)>,
+    gradient_norm: f64,
+    lr: f64,
+    beta1: f64,
+}
+
+impl<'a> Run<'a> {
+    /// Opens data set and network, and takes up the last checkpoint if there is one.
+    fn begin(
+        config: &'a RunConfig,
+        folder: &RunFolder,
+        session: &Session,
+    ) -> Result<(Self, Arc<TrainingFrames>), TrainError> {
+        refuse_other_run(config, folder, session.resume)?;
+        let dataset = Dataset::open(&config.dataset)?;
+        let frames = Arc::new(TrainingFrames::new(config, &dataset, &folder.path().join("cache"))?);
+        let optimization = &config.detector.optimization;
+        let steps_per_epoch = frames.ids().len().div_ceil(optimization.batch_size) as u64;
+        let mut state = RunState {
+            step: 0,
+            total_steps: steps_per_epoch * optimization.epochs as u64,
+            epoch: 0,
+            position: 0,
+            seed: config.seed,
+            config_sha256: config.sha256(),
+            frames_sha256: frames.sha256(),
+            best: None,
+        };
+        let device = session.device.clone().autodiff();
+        let mut detector = Detector::new(&config.detector, config.seed, &device);
+        let mut adam = Adam::new(optimization.weight_decay, reference_name);
+        if let Some((saved, weights, moments)) = folder.load()? {
+            if (&saved.config_sha256, &saved.frames_sha256) != (&state.config_sha256, &state.frames_sha256) {
+                let message = "its checkpoint belongs to another configuration or to other training frames (has the data set changed?); \
+                               begin a new run with another --out";
+                return Err(TrainError::folder(folder.path(), message));
+            }
+            detector = detector.load_named(&weights)?;
+            adam.load_named(&moments, saved.step, &device).map_err(|m| TrainError::folder(folder.path(), m))?;
+            state = saved;
+        } else if let Some(init) = &config.init {
+            detector = detector.load_named(&read_checkpoint(init)?).map_err(|e| match e {
+                ModelError::Weights(message) => TrainError::folder(init, message),
+                other => other.into(),
+            })?;
+        }
+        let validation_ids = match () {
+            () if config.run.evaluate_every_epochs == 0 => Vec::new(),
+            () if config.overfit => frames.ids().to_vec(),
+            () if dataset.config.splits.contains_key(&config.run.val_split) => dataset.ids(&config.run.val_split)?,
+            () => Vec::new(),
+        };
+        write_atomic(&folder.config_path(), config.to_toml().as_bytes())?;
+        let learned_from = DatasetProvenance {
+            name: dataset.config.name.clone(),
+            root: dataset.config.root.display().to_string(),
+            frames: frames.ids().len(),
+            frames_sha256: frames.sha256(),
+        };
+        let this = SessionProvenance::now(state.step, &session.device_name, session.workers);
+        record_session(&folder.provenance_path(), config, learned_from, this)?;
+        let schedule = OneCycle::new(optimization, state.total_steps);
+        Ok((Run { config, dataset, validation_ids, schedule, adam, detector, state }, frames))
+    }
+
+    /// One step: forward, backward, clip, move.
+    fn learn(&mut self, batch: &[Sample], clock: &mut Clock) -> Result<Step, TrainError> {
+        let (losses, values) = clock.forward(|| {
+            let losses = self.detector.loss(batch);
+            loss_values(&losses).map(|values| (losses, values))
+        })?;
+        // The parts come before their sum, which is only as good as they are.
+        if let Some((name, _)) = values[1..].iter().chain(&values[..1]).find(|(_, value)| !value.is_finite()) {
+            return Err(self.not_finite(format!("the loss {name}"), batch));
+        }
+        let (gradients, norm) = clock.backward(|| {
+            let gradients = GradientsParams::from_grads(losses.total.backward(), &self.detector.network);
+            let norm = GradientNorm::of(&self.detector.network, &gradients, reference_name);
+            (gradients, norm)
+        });
+        if let Some(parameter) = norm.not_finite {
+            return Err(self.not_finite(format!("the gradient of {parameter}"), batch));
+        }
+        let (lr, beta1) = self.schedule.at(self.state.step);
+        let clip = norm.clip_scale(self.config.detector.optimization.clip_norm);
+        clock.optimizer(|| {
+            self.detector.network = self.adam.step(self.detector.network.clone(), gradients, clip, (lr, beta1));
+        });
+        Ok(Step { losses: values, gradient_norm: norm.total, lr, beta1 })
+    }
+
+    fn not_finite(&self, what: String, batch: &[Sample]) -> TrainError {
+        TrainError::NotFinite { step: self.state.step, what, frames: batch.iter().map(|s| s.id.clone()).collect() }
+    }
+
+    /// Whether the epoch that has just been trained is to be evaluated.
+    fn is_evaluation_due(&self, epochs: u64) -> bool {
+        let (done, every) = (self.state.epoch + 1, self.config.run.evaluate_every_epochs);
+        !self.validation_ids.is_empty() && (done == epochs || done.is_multiple_of(every))
+    }
+
+    fn validate(&mut self, workers: usize) -> Result<ValidationMetrics, TrainError> {
+        let found = evaluate_detector(&self.detector, &self.dataset, &self.validation_ids, workers, &mut |_| {})?;
+        let metrics = found.metrics(&self.config.detector.classes);
+        if let Some(ap) = metrics.ap
+            && self.state.best.as_ref().is_none_or(|best| ap > best.ap)
+        {
+            self.state.best = Some(Best { step: self.state.step, ap });
+        }
+        Ok(metrics)
+    }
+
+    fn checkpoint(&self, folder: &RunFolder, clock: &mut Clock) -> Result<(), TrainError> {
+        let metadata = BTreeMap::from([
+            ("detector".to_string(), toml::to_string(&self.config.detector).expect("a detector is plain TOML")),
+            ("seed".to_string(), self.config.seed.to_string()),
+            ("step".to_string(), self.state.step.to_string()),
+        ]);
+        clock.checkpoint(|| {
+            let weights = self.detector.to_named()?;
+            folder.save(&self.state, &weights, &metadata, &self.adam.to_named(), self.config.run.keep_checkpoints)
+        })
+    }
+}
+
+/// A folder with a run in it is only gone on with when that is asked for, and with the same configuration.
+fn refuse_other_run(config: &RunConfig, folder: &RunFolder, resume: bool) -> Result<(), TrainError> {
+    let path = folder.config_path();
+    if !path.is_file() {
+        return Ok(());
+    }
+    if !resume {
+        let message = "there is a run in this folder already: add --resume to go on with it, or give another --out";
+        return Err(TrainError::folder(folder.path(), message));
+    }
+    let differences = RunConfig::read(&path)?.differences(config);
+    if differences.is_empty() {
+        return Ok(());
+    }
+    let message = format!(
+        "this run was begun with other settings ({}); they cannot change on the way: leave them out to go on, or begin a new run with \
+         another --out",
+        differences.join("; ")
+    );
+    Err(TrainError::folder(&path, message))
+}
+
+/// Where the time of an epoch goes, and of the steps since the last line of metrics.
+struct Clock {
+    stages: StageSeconds,
+    losses: f64,
+    steps: u64,
+    line_began: Instant,
+    line_frames: usize,
+    line_wait: f64,
+}
+
+impl Default for Clock {
+    fn default() -> Self {
+        let stages = StageSeconds::default();
+        Clock { stages, losses: 0.0, steps: 0, line_began: Instant::now(), line_frames: 0, line_wait: 0.0 }
+    }
+}
+
+fn timed<T>(seconds: &mut f64, work: impl FnOnce() -> T) -> T {
+    let begin = Instant::now();
+    let result = work();
+    *seconds += begin.elapsed().as_secs_f64();
+    result
+}
+
+impl Clock {
+    fn wait<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        let before = self.stages.data_wait;
+        let result = timed(&mut self.stages.data_wait, work);
+        self.line_wait += self.stages.data_wait - before;
+        result
+    }
+
+    fn forward<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        timed(&mut self.stages.forward, work)
+    }
+
+    fn backward<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        timed(&mut self.stages.backward, work)
+    }
+
+    fn optimizer<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        timed(&mut self.stages.optimizer, work)
+    }
+
+    fn checkpoint<T>(&mut self, work: impl FnOnce() -> T) -> T {
+        timed(&mut self.stages.checkpoint, work)
+    }
+
+    fn metrics(&mut self, state: &RunState, step: Step, frames: usize) -> StepMetrics {
+        let (_, loss) = step.losses[0];
+        self.losses += loss;
+        self.steps += 1;
+        self.line_frames += frames;
+        let seconds = self.line_began.elapsed().as_secs_f64().max(1e-9);
+        StepMetrics {
+            step: state.step,
+            epoch: state.epoch,
+            loss,
+            losses: step.losses[1..].iter().map(|(name, value)| (name.to_string(), *value)).collect(),
+            lr: step.lr,
+            beta1: step.beta1,
+            gradient_norm: step.gradient_norm,
+            samples_per_s: self.line_frames as f64 / seconds,
+            data_wait_share: self.line_wait / seconds,
+        }
+    }
+
+    fn begin_line(&mut self) {
+        (self.line_began, self.line_frames, self.line_wait) = (Instant::now(), 0, 0.0);
+    }
+
+    fn epoch_metrics(&self, state: &RunState, validation: Option<ValidationMetrics>) -> EpochMetrics {
+        EpochMetrics {
+            step: state.step,
+            epoch: state.epoch - 1,
+            train_loss: self.losses / self.steps.max(1) as f64,
+            seconds: self.stages,
+            validation,
+        }
+    }
+}

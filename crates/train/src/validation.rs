@@ -1,0 +1,102 @@
+//! A detector on the frames of a split: detections, average precision and loss.
+
+use crate::{TrainError, ValidationMetrics};
+use burn::tensor::Tensor;
+use data::{Dataset, Detection, KittiLine, prefetch};
+use eval::{Difficulty, EvalFrame, EvalOptions, EvalReport, Metric, evaluate, reference_overlaps};
+use models::{Detector, Losses, ModelError, Preparer, Sample};
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+/// What a detector finds on labelled frames.
+#[derive(Clone, Debug)]
+pub struct Evaluation {
+    /// Labels and detections as texts, in the frame of the data set's labels.
+    pub frames: Vec<EvalFrame>,
+    /// The detections of each frame, by falling score, in the LiDAR frame.
+    pub detections: Vec<Vec<Detection>>,
+    /// Average precision and recall.
+    pub report: EvalReport,
+    /// Mean total loss over the batches, with the running statistics.
+    pub loss: f64,
+    /// How long it took, s.
+    pub seconds: f64,
+}
+
+/// Runs the detector over frames of a data set with labels. `progress` hears how many are done.
+///
+/// # Errors
+/// A frame that cannot be read, or scores that are not numbers.
+pub fn evaluate_detector(
+    detector: &Detector,
+    dataset: &Dataset,
+    ids: &[String],
+    workers: usize,
+    progress: &mut dyn FnMut(usize),
+) -> Result<Evaluation, TrainError> {
+    let begin = Instant::now();
+    let batch_size = detector.config().optimization.batch_size;
+    let preparer = Preparer::new(detector.config());
+    let set = dataset.clone();
+    let mut samples = prefetch(ids.to_vec(), workers, 2 * batch_size, move |id: &String| {
+        let frame = set.load(id)?;
+        Ok::<(Sample, Sample), TrainError>((preparer.inference(&frame)?, preparer.training(&frame)?))
+    });
+    let mut detections = Vec::with_capacity(ids.len());
+    let mut losses = Vec::new();
+    while detections.len() < ids.len() {
+        let batch: Vec<(Sample, Sample)> = samples.by_ref().take(batch_size).collect::<Result<_, _>>()?;
+        let (inference, training): (Vec<Sample>, Vec<Sample>) = batch.into_iter().unzip();
+        losses.push(loss_values(&detector.validation_loss(&training))?[0].1);
+        detections.extend(detector.predict(&inference)?);
+        progress(detections.len());
+    }
+    let frames = ids
+        .iter()
+        .zip(&detections)
+        .map(|(id, found)| {
+            let labels: Vec<KittiLine> = dataset.labels(id)?;
+            Ok(EvalFrame { id: id.clone(), labels, detections: dataset.detection_lines(id, found)? })
+        })
+        .collect::<Result<Vec<_>, TrainError>>()?;
+    let options = EvalOptions {
+        classes: detector.config().classes.clone(),
+        label_frame: dataset.config.label_frame,
+        ..EvalOptions::default()
+    };
+    let report = evaluate(&frames, &options);
+    let loss = losses.iter().sum::<f64>() / losses.len().max(1) as f64;
+    Ok(Evaluation { frames, detections, report, loss, seconds: begin.elapsed().as_secs_f64() })
+}
+
+impl Evaluation {
+    /// The numbers for `metrics.jsonl`.
+    pub fn metrics(&self, classes: &[String]) -> ValidationMetrics {
+        let of_set = |set: usize| -> BTreeMap<String, Option<f64>> {
+            let of_class = |class: &String| {
+                let overlap = reference_overlaps(class, Metric::ThreeD)[set];
+                let row = self.report.row(class, Metric::ThreeD, overlap, Difficulty::All);
+                row.filter(|row| row.n_gt > 0).and_then(|row| row.ap_area)
+            };
+            classes.iter().map(|class| (class.clone(), of_class(class))).collect()
+        };
+        let mean = |aps: &BTreeMap<String, Option<f64>>| {
+            let known: Vec<f64> = aps.values().flatten().copied().collect();
+            (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
+        };
+        let (official, loose) = (of_set(0), of_set(1));
+        let (ap, ap_loose) = (mean(&official), mean(&loose));
+        ValidationMetrics { loss: self.loss, ap, ap_loose, ap_of_class: official, seconds: self.seconds }
+    }
+}
+
+/// `total` and the parts of a loss by name, in one transfer from the device.
+pub(crate) fn loss_values(losses: &Losses) -> Result<Vec<(&'static str, f64)>, TrainError> {
+    let names: Vec<&'static str> = std::iter::once("total").chain(losses.parts.iter().map(|(name, _)| *name)).collect();
+    let tensors = std::iter::once(&losses.total).chain(losses.parts.iter().map(|(_, part)| part));
+    let values = Tensor::cat(tensors.map(|t| t.clone().inner()).collect(), 0)
+        .into_data()
+        .try_into_vec::<f32>()
+        .map_err(|e| ModelError::Tensor(format!("losses: {e:?}")))?;
+    Ok(names.into_iter().zip(values.into_iter().map(f64::from)).collect())
+}
