@@ -1,1 +1,76 @@
-//! The program: detectors trained in simulation, measured on the road.
+//! The program `lidarshift`: detectors trained in simulation, measured on the road. A file a command.
+
+pub mod detect;
+pub mod detectors;
+pub mod device;
+pub mod doctor;
+pub mod eval_ap;
+pub mod fuzz;
+pub mod parity;
+pub mod schema;
+pub mod simulate;
+pub mod train;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// What will my detector, trained in simulation, lose on the road; why; and what must change in the simulator?
+#[derive(Parser, Debug)]
+#[command(name = "lidarshift", version, about, arg_required_else_help = true)]
+struct Program {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Train a detector; without options on data made on the spot
+    Train(train::TrainArgs),
+    /// Numbers of detections
+    Eval {
+        #[command(subcommand)]
+        command: Eval,
+    },
+    /// Boxes in a cloud, or in a whole split of a data set
+    Detect(detect::DetectArgs),
+    /// Make a synthetic data set
+    Simulate(simulate::SimulateArgs),
+    /// What is wrong with a data set, in words
+    Doctor(doctor::DoctorArgs),
+    /// Compare every tensor with a folder of reference numbers
+    Parity(parity::ParityArgs),
+    /// Write the JSON schema and the reference of the configuration files
+    #[command(hide = true)]
+    Schema(schema::SchemaArgs),
+    /// Feed damaged files to every reader
+    #[command(hide = true)]
+    Fuzz(fuzz::FuzzArgs),
+}
+
+#[derive(Subcommand, Debug)]
+enum Eval {
+    /// Average precision and recall of detections in KITTI text
+    Ap(eval_ap::EvalApArgs),
+}
+
+/// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood.
+pub fn run() -> ExitCode {
+    let done = match Program::parse().command {
+        Command::Train(args) => args.run().map(|()| true),
+        Command::Eval { command: Eval::Ap(args) } => args.run().map(|()| true),
+        Command::Detect(args) => args.run().map(|()| true),
+        Command::Simulate(args) => args.run().map(|()| true),
+        Command::Doctor(args) => args.run(),
+        Command::Parity(args) => args.run(),
+        Command::Schema(args) => args.run().map(|()| true),
+        Command::Fuzz(args) => args.run(),
+    };
+    match done {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

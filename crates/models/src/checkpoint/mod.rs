@@ -64,10 +64,18 @@ impl NumberType {
 /// A file that cannot be read, is none of the three, is damaged or truncated, has bytes left over, or asks to run code.
 pub fn read_checkpoint(path: &Path) -> Result<NamedTensors, ModelError> {
     let bytes = fs_err::read(path).map_err(data::DataError::from)?;
-    parse_checkpoint(&bytes).map_err(|message| file_error(path, message))
+    parse_checkpoint(path, &bytes)
 }
 
-fn parse_checkpoint(bytes: &[u8]) -> Result<NamedTensors, String> {
+/// The same of a file that is in memory already; `path` is only for messages.
+///
+/// # Errors
+/// As [`read_checkpoint`].
+pub fn parse_checkpoint(path: &Path, bytes: &[u8]) -> Result<NamedTensors, ModelError> {
+    parse(bytes).map_err(|message| file_error(path, message))
+}
+
+fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
     match bytes {
         [] => Err("is empty".into()),
         [b'P', b'K', ..] => pth::parse_zip(bytes),

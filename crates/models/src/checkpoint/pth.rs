@@ -37,9 +37,11 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
         );
     }
     let damaged = |e: &dyn std::fmt::Display| format!("is a damaged zip archive: {e}");
-    let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| damaged(&e))?;
-    if archive.offset() != 0 || archive.has_duplicate_names() {
-        return Err("is a damaged zip archive: bytes before it, or a name twice".into());
+    // The archive begins where the file does: nothing is searched for.
+    let config = zip::read::Config { archive_offset: zip::read::ArchiveOffset::Known(0) };
+    let mut archive = zip::ZipArchive::with_config(config, Cursor::new(bytes)).map_err(|e| damaged(&e))?;
+    if archive.has_duplicate_names() {
+        return Err("is a damaged zip archive: it holds a name twice".into());
     }
     let mut roots = Vec::new();
     for name in archive.file_names() {

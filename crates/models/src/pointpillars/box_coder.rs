@@ -7,6 +7,10 @@ use std::f32::consts::TAU;
 /// Sizes below this are taken as this, m.
 const SMALLEST_SIZE_M: f32 = 1e-5;
 
+/// Where the reference's first direction bin begins, rad: a quarter of pi, as its configuration rounds it.
+#[expect(clippy::approx_constant, reason = "rounded as in the reference")]
+pub const DIRECTION_OFFSET_RAD: f32 = 0.78539;
+
 /// Direction bins that targets are made for.
 pub const DIRECTION_BINS: usize = 2;
 
@@ -71,8 +75,6 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const OFFSET: f32 = 0.78539;
-
     proptest! {
         #[test]
         fn decode_inverts_encode(
@@ -90,12 +92,12 @@ mod tests {
         /// Up to whole turns, heading = f(heading up to half a turn, bin).
         #[test]
         fn a_heading_survives_its_bin(yaw in -3.1f32..3.1, half_turns in -2i32..3) {
-            let bin = direction_target(yaw, OFFSET, DIRECTION_BINS);
+            let bin = direction_target(yaw, DIRECTION_OFFSET_RAD, DIRECTION_BINS);
             let folded = yaw + half_turns as f32 * std::f32::consts::PI;
-            let back = direction_decode(folded, bin, OFFSET, 0.0, DIRECTION_BINS);
+            let back = direction_decode(folded, bin, DIRECTION_OFFSET_RAD, 0.0, DIRECTION_BINS);
             let difference = limit_period(back - yaw, 0.5, TAU).abs();
             // At a border of the bins rounding may choose the other half turn.
-            let border = limit_period(yaw - OFFSET, 0.5, std::f32::consts::PI).abs();
+            let border = limit_period(yaw - DIRECTION_OFFSET_RAD, 0.5, std::f32::consts::PI).abs();
             prop_assert!(difference < 1e-4 || border < 1e-4, "{} {}", back, yaw);
         }
     }
@@ -103,7 +105,7 @@ mod tests {
     #[test]
     fn bins_of_the_reference() {
         let bins: Vec<usize> =
-            [0.0, 0.8, 3.0, 3.93, -3.0, -1.0].iter().map(|&y| direction_target(y, OFFSET, 2)).collect();
+            [0.0, 0.8, 3.0, 3.93, -3.0, -1.0].iter().map(|&y| direction_target(y, DIRECTION_OFFSET_RAD, 2)).collect();
         assert_eq!(bins, [1, 0, 0, 1, 0, 1]);
     }
 

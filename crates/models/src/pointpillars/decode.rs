@@ -128,7 +128,7 @@ mod tests {
             nms_iou: 0.01,
             nms_pre: 4096,
             nms_post: 500,
-            dir_offset: 0.78539,
+            dir_offset: box_coder::DIRECTION_OFFSET_RAD,
             dir_limit_offset: 0.0,
         }
     }
@@ -147,7 +147,7 @@ mod tests {
         let short: Vec<(usize, usize)> = found.iter().map(|raw| (raw.anchor, raw.class)).collect();
         assert_eq!(short, [(1, 0), (0, 1), (3, 1)]);
         assert!((found[0].score - 0.880797).abs() < 1e-6);
-        assert!((found[0].bbox[6]).abs() < 1e-5, "{:?}", found[0].bbox);
+        assert!((found[0].bbox[6] - std::f32::consts::TAU).abs() < 1e-5, "yaw 0 up to a turn: {:?}", found[0].bbox);
     }
 
     #[test]

@@ -163,10 +163,9 @@ impl NearestBev {
 #[cfg(test)]
 mod tests {
     use super::super::anchors::anchors;
+    use super::super::box_coder::DIRECTION_OFFSET_RAD;
     use super::*;
     use proptest::prelude::*;
-
-    const OFFSET: f32 = 0.78539;
 
     fn classes() -> Vec<AnchorClass> {
         let class = |name: &str, size, bottom, matched, unmatched| AnchorClass {
@@ -254,7 +253,7 @@ mod tests {
                 }
             }
             let anchors = small_map();
-            let targets = assign(&anchors, &classes(), MAP, &truth, OFFSET);
+            let targets = assign(&anchors, &classes(), MAP, &truth, DIRECTION_OFFSET_RAD);
             let (labels, positive) = assign_by_matrix(&anchors, &classes(), &truth);
             prop_assert_eq!(&targets.labels, &labels);
             prop_assert_eq!(&targets.positive, &positive);
@@ -263,7 +262,7 @@ mod tests {
 
     #[test]
     fn a_frame_without_boxes_is_background() {
-        let targets = assign(&small_map(), &classes(), MAP, &[], OFFSET);
+        let targets = assign(&small_map(), &classes(), MAP, &[], DIRECTION_OFFSET_RAD);
         assert!(targets.labels.iter().all(|&l| l == 0) && targets.positive.is_empty());
     }
 
@@ -272,14 +271,14 @@ mod tests {
         let far = [100.0, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0, 1.0];
         let flat = [4.0, 0.0, -1.0, 0.0, 1.6, 1.5, 0.0, 1.0];
         let broken = [f32::NAN, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0, 1.0];
-        let targets = assign(&small_map(), &classes(), MAP, &[far, flat, broken], OFFSET);
+        let targets = assign(&small_map(), &classes(), MAP, &[far, flat, broken], DIRECTION_OFFSET_RAD);
         assert!(targets.positive.is_empty());
     }
 
     #[test]
     fn the_best_anchor_is_forced_below_the_threshold() {
         let child = [3.1, 0.2, -1.0, 0.2, 0.2, 0.9, 0.3, 2.0];
-        let targets = assign(&small_map(), &classes(), MAP, &[child], OFFSET);
+        let targets = assign(&small_map(), &classes(), MAP, &[child], DIRECTION_OFFSET_RAD);
         assert!(!targets.positive.is_empty());
         assert!(targets.positive.iter().all(|&(a, t)| t == 0 && targets.labels[a] == 2));
         assert_eq!(targets.reg.len(), targets.positive.len());

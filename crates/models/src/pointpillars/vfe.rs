@@ -66,10 +66,22 @@ impl PillarVfe {
 fn padded_moments(x: Tensor<2>, count: usize) -> Moments {
     let [n, c] = x.dims();
     let rows = count as f64;
-    let mean = x.clone().sum_dim(0) / rows; // [1, C]
-    let deviation = (x - mean.clone()).powi_scalar(2).sum_dim(0); // [1, C]
+    let mean = sum_rows(x.clone()) / rows; // [1, C]
+    let deviation = sum_rows((x - mean.clone()).powi_scalar(2)); // [1, C]
     let variance = (deviation + mean.clone().powi_scalar(2) * (count - n) as f64) / rows;
     Moments { mean: mean.reshape([c]), variance: variance.reshape([c]), count }
+}
+
+/// Sum over the rows, first within groups of 64: one running f32 sum over tens of thousands of rows loses digits.
+///
+/// # Shapes
+/// `x`: `[N, C]`; result `[1, C]`.
+fn sum_rows(x: Tensor<2>) -> Tensor<2> {
+    const GROUP: usize = 64;
+    let [n, c] = x.dims();
+    let groups = n.div_ceil(GROUP);
+    let filled = Tensor::cat(vec![x.clone(), Tensor::zeros([groups * GROUP - n, c], &x.device())], 0);
+    filled.reshape([groups, GROUP, c]).sum_dim(1).reshape([groups, c]).sum_dim(0) // [G, 64, C] -> [G, C] -> [1, C]
 }
 
 /// For each pillar the rows of its points, filled up with the padding row `padding`. Slots: as many as the fullest pillar

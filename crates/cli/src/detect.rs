@@ -1,0 +1,173 @@
+//! `lidarshift detect`: boxes in one cloud, or in a whole split of a data set.
+
+use crate::detectors::find_detector;
+use crate::device::parse_device;
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
+use data::kitti_text::{KittiLine, KittiText, parse_kitti_text};
+use data::{Cloud, Dataset, Detection, Frame, PointColumns, read_cloud, write_atomic};
+use indicatif::{ProgressBar, ProgressStyle};
+use models::checkpoint::read_checkpoint;
+use models::config::DetectorConfig;
+use models::{Detector, Preparer};
+use report::{BirdsEyeOptions, Style, birds_eye_png};
+use std::path::{Path, PathBuf};
+
+/// Boxes in a cloud (KITTI text in the cloud's own frame, and a picture), or in a whole split of a data set.
+///
+/// Examples:
+///   lidarshift detect 000007.bin --checkpoint runs/my-run/checkpoint/last.safetensors
+///   lidarshift detect my-data --split test --checkpoint last.safetensors --out detections
+#[derive(Args, Debug)]
+#[command(verbatim_doc_comment)]
+pub struct DetectArgs {
+    /// A cloud (.bin or .pcd), or the folder or TOML of a data set
+    input: PathBuf,
+    /// Weights: safetensors of a run, or OpenPCDet's .pth
+    #[arg(long, value_name = "FILE")]
+    checkpoint: PathBuf,
+    /// Detector of the weights: a name or a TOML; a run's own weights know theirs
+    #[arg(long, value_name = "NAME|TOML")]
+    detector: Option<String>,
+    /// Columns of a .bin cloud
+    #[arg(long, value_enum)]
+    points: Option<Points>,
+    /// Split of the data set; all frames without it
+    #[arg(long, requires = "out")]
+    split: Option<String>,
+    /// Folder for the results; a cloud's picture goes to the present folder without it
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Ground truth to draw beside the boxes of a cloud: KITTI text in the label frame "lidar"
+    #[arg(long, value_name = "FILE")]
+    labels: Option<PathBuf>,
+    /// Also write the boxes of a cloud as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Where the network runs
+    #[arg(long, default_value = "flex")]
+    device: String,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Points {
+    Xyz,
+    Xyzi,
+}
+
+/// A detector with its weights.
+struct Loaded {
+    detector: Detector,
+    preparer: Preparer,
+}
+
+impl Loaded {
+    fn detect(&self, frame: &Frame) -> Result<Vec<Detection>> {
+        let sample = self.preparer.inference(frame)?;
+        if sample.pillars.num_points.is_empty() {
+            return Ok(Vec::new());
+        }
+        Ok(self.detector.predict(&[sample])?.remove(0))
+    }
+}
+
+impl DetectArgs {
+    /// Finds, prints and draws.
+    pub fn run(self) -> Result<()> {
+        let device = parse_device(&self.device)?;
+        let config = detector_of(&self.checkpoint, self.detector.as_deref())?;
+        let weights = read_checkpoint(&self.checkpoint)?;
+        let detector = Detector::new(&config, 0, &device)
+            .load_named(&weights)
+            .with_context(|| format!("{} does not fit the detector {}", self.checkpoint.display(), config.name))?;
+        let loaded = Loaded { preparer: Preparer::new(&config), detector };
+        let ending = self.input.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+        match ending.as_str() {
+            "bin" | "pcd" => self.cloud(&loaded),
+            _ => self.split(&loaded),
+        }
+    }
+
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    fn cloud(&self, loaded: &Loaded) -> Result<()> {
+        let columns = match self.points {
+            Some(Points::Xyz) => PointColumns::Xyz,
+            Some(Points::Xyzi) => PointColumns::Xyzi,
+            None if loaded.detector.config().channels == 3 && self.is_xyz_size()? => PointColumns::Xyz,
+            None => PointColumns::Xyzi,
+        };
+        let cloud = read_cloud(&self.input, columns)?;
+        let id = self.input.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let frame = Frame { id: id.clone(), cloud, objects: Vec::new() };
+        let detections = loaded.detect(&frame)?;
+        for detection in &detections {
+            println!("{}", KittiLine::from_box(&detection.class, &detection.bbox, Some(detection.score)));
+        }
+        if let Some(path) = &self.json {
+            write_atomic(path, &serde_json::to_vec_pretty(&detections)?)?;
+        }
+        let truth = match &self.labels {
+            Some(path) => parse_kitti_text(&fs_err::read_to_string(path)?, path, KittiText::Labels)?,
+            None => Vec::new(),
+        };
+        let picture = self.out.clone().unwrap_or_else(|| ".".into()).join(format!("{id}.png"));
+        draw(&picture, &frame.cloud, &truth, &detections)?;
+        eprintln!("{} boxes; picture in {}", detections.len(), picture.display());
+        Ok(())
+    }
+
+    /// A .bin whose size fits three columns and not four.
+    fn is_xyz_size(&self) -> Result<bool> {
+        let bytes = fs_err::metadata(&self.input)?.len();
+        Ok(bytes % 12 == 0 && bytes % 16 != 0)
+    }
+
+    fn split(&self, loaded: &Loaded) -> Result<()> {
+        let Some(out) = &self.out else { bail!("a data set needs --out DIR for its detections") };
+        let dataset = Dataset::open(&self.input)?;
+        let ids = match &self.split {
+            Some(split) => dataset.ids(split)?,
+            None => dataset.all_ids()?,
+        };
+        let progress = ProgressBar::new(ids.len() as u64)
+            .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
+        let mut boxes = 0;
+        for id in &ids {
+            let cloud = dataset.load_cloud(id)?;
+            let detections = loaded.detect(&Frame { id: id.clone(), cloud, objects: Vec::new() })?;
+            boxes += detections.len();
+            let lines = dataset.detection_lines(id, &detections)?;
+            data::write::write_kitti_text(&out.join(format!("{id}.txt")), &lines)?;
+            progress.inc(1);
+        }
+        progress.finish_and_clear();
+        eprintln!("{boxes} boxes in {} frames, in {}", ids.len(), out.display());
+        Ok(())
+    }
+}
+
+/// The detector that weights belong to: as told, or as the run folder around them says.
+fn detector_of(checkpoint: &Path, told: Option<&str>) -> Result<DetectorConfig> {
+    if let Some(name) = told {
+        return find_detector(name);
+    }
+    for folder in checkpoint.ancestors().skip(1).take(3) {
+        let path = folder.join("config.toml");
+        if path.is_file() {
+            let text = fs_err::read_to_string(&path)?;
+            let run: toml::Table = text.parse().with_context(|| path.display().to_string())?;
+            let Some(detector) = run.get("detector") else { continue };
+            let config: DetectorConfig = detector.clone().try_into().with_context(|| path.display().to_string())?;
+            return Ok(config);
+        }
+    }
+    bail!("{} does not say which detector it belongs to: name it with --detector", checkpoint.display())
+}
+
+/// Points, ground truth and detections from above.
+fn draw(path: &Path, cloud: &Cloud, truth: &[KittiLine], detections: &[Detection]) -> Result<()> {
+    let mut boxes: Vec<_> = truth.iter().map(|line| (line.lidar_box(), Style::GroundTruth)).collect();
+    boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));
+    let picture = birds_eye_png(cloud, &boxes, &BirdsEyeOptions::default())?;
+    Ok(write_atomic(path, &picture)?)
+}
