@@ -45,21 +45,13 @@ impl Dataset {
         let bytes = fs_err::read(&path)?;
         let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(&path, "is not text"))?;
         let mut ids = Vec::new();
-        for (i, line) in text.lines().enumerate() {
-            let id = line.trim();
-            if id.is_empty() {
-                continue;
-            }
-            check_frame_id(id).map_err(|message| DataError::line(&path, i + 1, message))?;
+        for (line, id) in parse_split(text, &path)? {
             let cloud = self.cloud_path(id);
             if !cloud.is_file() {
                 let message = format!("frame {id} has no cloud: {} does not exist", cloud.display());
-                return Err(DataError::line(&path, i + 1, message));
+                return Err(DataError::line(&path, line, message));
             }
             ids.push(id.to_string());
-        }
-        if ids.is_empty() {
-            return Err(DataError::file(&path, format!("the split {split:?} has no frame")));
         }
         Ok(ids)
     }
@@ -221,6 +213,19 @@ impl Dataset {
     }
 }
 
+/// The frame ids of a split's text with their lines, from 1; blank lines are left out, a text without an id is an error. `path` is for messages.
+pub fn parse_split<'a>(text: &'a str, path: &Path) -> Result<Vec<(usize, &'a str)>, DataError> {
+    let mut ids = Vec::new();
+    for (i, line) in text.lines().enumerate() {
+        let id = line.trim();
+        if !id.is_empty() {
+            check_frame_id(id).map_err(|message| DataError::line(path, i + 1, message))?;
+            ids.push((i + 1, id));
+        }
+    }
+    if ids.is_empty() { Err(DataError::file(path, "the split has no frame")) } else { Ok(ids) }
+}
+
 /// A frame id is a file name without ending: it names no folder.
 fn check_frame_id(id: &str) -> Result<(), String> {
     if id.is_empty() || id == "." || id == ".." || id.contains(['/', '\\', '\0']) {
@@ -324,7 +329,7 @@ mod tests {
         let folder = made_up(Layout::Kitti, 4);
         let dataset = Dataset::open(folder.path()).unwrap();
         let cases = [
-            ("", "train.txt: the split \"train\" has no frame"),
+            ("", "train.txt: the split has no frame"),
             ("\n  \n", "has no frame"),
             ("000000\n../000001\n", "train.txt:2: frame id \"../000001\""),
             ("a\\b\n", "path separator"),

@@ -108,7 +108,11 @@ impl DatasetConfig {
     /// Reads a data set's TOML; `root` is then relative to the working folder and every default is filled in but the classes.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bytes = fs_err::read(path)?;
-        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not text"))?;
+        Self::parse(std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not text"))?, path)
+    }
+
+    /// A data set's TOML in memory; `path` is where it lies, for messages and for `root`.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
         let mut config: DatasetConfig = toml::from_str(text).map_err(|e| {
             let line = 1 + e.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count());
             DataError::line(path, line, e.message())

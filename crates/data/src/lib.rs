@@ -21,7 +21,7 @@ pub mod write;
 pub use augment::{AugmentConfig, augment};
 pub use calibration::Calibration;
 pub use cloud_file::{FARTHEST_M, PointColumns, parse_bin, read_cloud};
-pub use dataset::Dataset;
+pub use dataset::{Dataset, parse_split};
 pub use dataset_config::{DatasetConfig, Layout};
 pub use error::DataError;
 pub use frame::{Cloud, Detection, Frame, Object};

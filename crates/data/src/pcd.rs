@@ -34,13 +34,14 @@ fn ascii(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Path) ->
     let text = std::str::from_utf8(body).map_err(|_| DataError::file(path, "says DATA ascii, but is not text"))?;
     // A point takes six bytes at least, so that the text bounds what is reserved.
     let mut values = Vec::with_capacity(columns.len() * header.points.min(body.len() as u64 / 6 + 1) as usize);
-    let mut points = 0;
+    let (mut points, mut tokens) = (0, Vec::new());
     for (i, line) in text.lines().enumerate() {
         if line.trim_ascii().is_empty() {
             continue;
         }
         let wrong = |message: String| DataError::line(path, header.body_line + i, message);
-        let tokens: Vec<&str> = line.split_ascii_whitespace().collect();
+        tokens.clear();
+        tokens.extend(line.split_ascii_whitespace());
         if tokens.len() != header.numbers_per_point {
             return Err(wrong(format!(
                 "{} numbers, where FIELDS and COUNT ask for {}",
@@ -49,7 +50,7 @@ fn ascii(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Path) ->
             )));
         }
         for field in columns {
-            let token = tokens[field.first_number];
+            let token: &str = tokens[field.first_number];
             let value: f32 = token.parse().map_err(|_| wrong(format!("{} = {token:?} is not a number", field.name)))?;
             values.push(value);
         }
