@@ -1,122 +1,163 @@
-//! `lidarshift train`: one run; without options on data made on the spot.
+//! `lidarshift train`: one run; without a data set on data made on the spot.
+
+mod progress;
+mod results;
 
 use crate::detectors::detector_text;
 use crate::device::parse_device;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::Args;
-use data::{Dataset, write_atomic};
-use eval::{Difficulty, Metric};
-use indicatif::{ProgressBar, ProgressStyle};
-use models::Detector;
-use report::{BirdsEyeOptions, Style, birds_eye_png};
+use data::Dataset;
+use progress::Progress;
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
-use train::{Event, RunConfig, Session, evaluate_detector, set_key, train};
+use train::{RunConfig, Session, evaluate_detector, set_key, train};
+
+const DEFAULT_DETECTOR: &str = "pointpillars_small";
 
 /// Train a detector. Without a data set one is made on the spot: roads with cars, seen by a spinning LiDAR.
+///
+/// A run folder holds config.toml, metrics.jsonl, provenance.json and checkpoint/; last.safetensors in there has OpenPCDet's names.
+/// A run that was stopped, whenever that was, goes on with --resume and ends with the same weights to the bit.
 ///
 /// Examples:
 ///   lidarshift train
 ///   lidarshift train --dataset my-data --detector pointpillars_small --seed 1 --out runs/mine
 ///   lidarshift train --dataset my-data --detector pointpillars_small --seed 1 --out runs/mine --resume
+///   lidarshift train --dataset my-data --set optimization.lr_max=0.001 --set run.checkpoint_every_steps=100
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct TrainArgs {
-    /// Folder or TOML of a data set; without it a synthetic one is made
+    /// Folder or TOML of a data set; without it a synthetic one is made [default: runs/default/data]
     #[arg(long, value_name = "DIR|TOML")]
     dataset: Option<PathBuf>,
-    /// Detector: a name or a TOML
-    #[arg(long, default_value = "pointpillars_small", value_name = "NAME|TOML")]
-    detector: String,
-    /// Of the weights, the order of the frames and the augmentation
-    #[arg(long, default_value_t = 0, value_name = "K")]
-    seed: u64,
-    /// Passes over the training set; the detector's own number without it
+    /// Detector: a name or a TOML [default: pointpillars_small]
+    #[arg(long, value_name = "NAME|TOML")]
+    detector: Option<String>,
+    /// Of the weights, the order of the frames and the augmentation [default: 0]
+    #[arg(long, value_name = "K")]
+    seed: Option<u64>,
+    /// Passes over the training set [default: the detector's own number]
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
-    /// Run folder
+    /// Run folder [default: runs/DETECTOR/DATASET/seed-K; without a data set runs/default/seed-K]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Where the network computes: flex, ndarray, wgpu or cuda
     #[arg(long, default_value = "flex")]
     device: String,
-    /// Changes a value of the run or of the detector, as optimization.lr_max=0.001; may be given more than once
+    /// Changes a key of the detector's TOML (optimization.lr_max=0.001) or of the run (run.log_every_steps=1); may be given more than once
     #[arg(long = "set", value_name = "A.B=C")]
     set: Vec<String>,
     /// Weights to begin with: safetensors, or OpenPCDet's .pth
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
-    /// Go on where a run was stopped, or begin it
+    /// Go on where a run was stopped, or begin it; what is not said again stays as it was
     #[arg(long)]
     resume: bool,
     /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all
     #[arg(long)]
     overfit: bool,
-    /// Threads that load and augment frames
+    /// Threads that load and augment frames; any number gives the same weights
     #[arg(long, default_value_t = 2, value_name = "N")]
     workers: usize,
-    /// A handful of frames and steps: shows that everything runs, learns nothing
-    #[arg(long, conflicts_with = "dataset")]
+    /// A handful of frames and steps in a temporary folder: shows that everything runs, learns nothing
+    #[arg(long, conflicts_with_all = ["dataset", "resume"])]
     smoke: bool,
 }
 
 impl TrainArgs {
     /// Trains, evaluates, and says where the results lie.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
-    pub fn run(self) -> Result<()> {
+    pub fn run(mut self) -> Result<()> {
         let device = parse_device(&self.device)?;
-        let home =
-            self.out.clone().unwrap_or_else(|| PathBuf::from(if self.smoke { "runs/smoke" } else { "runs/default" }));
-        let (dataset, out, resume) = match &self.dataset {
-            Some(path) => (path.clone(), home, self.resume),
-            // The data and the run lie side by side, and a second call goes on with both.
-            None => (self.make_data(&home)?, home.join("run"), true),
+        let temporary = self.smoke.then(tempfile::tempdir).transpose()?;
+        if let Some(folder) = &temporary
+            && self.out.is_none()
+        {
+            self.out = Some(folder.path().into());
+        }
+        let (config, out) = match self.stored()? {
+            Some((stored, out)) => (self.changed(stored.to_table())?, out),
+            None => self.fresh()?,
         };
-        let config = self.run_config(&dataset)?;
-        let session = Session { device, device_name: self.device.clone(), workers: self.workers.max(1), resume };
+        // The default run has nothing to lose: a second call goes on with it.
+        let resume = self.resume || self.dataset.is_none();
+        let session = Session { device, device_name: self.device.clone(), workers: self.workers, resume };
         let mut progress = Progress::default();
         let trained = train(&config, &out, &session, &mut |event| progress.show(&event))?;
         progress.finish();
-        let set = Dataset::open(&dataset)?;
-        let split = if config.overfit { None } else { ["test", "val"].into_iter().find(|s| set.ids(s).is_ok()) };
-        let ids = match split {
-            Some(split) => set.ids(split)?,
-            None => set.all_ids()?,
+
+        let set = Dataset::open(&config.dataset)?;
+        let named = ["test", config.run.val_split.as_str()].into_iter().find(|s| set.config.splits.contains_key(*s));
+        let (ids, what) = match named {
+            _ if config.overfit => (set.all_ids()?, "all frames, which it has learned from".to_string()),
+            Some(split) => (set.ids(split)?, format!("the split {split}")),
+            None => {
+                eprintln!("the data set has neither a split test nor {}: not evaluated", config.run.val_split);
+                return results::say_where(&out, temporary.is_none());
+            }
         };
-        println!("evaluated on {} ({} frames)", split.unwrap_or("all frames"), ids.len());
-        evaluate_and_draw(&trained.detector, &set, &ids, self.workers.max(1), &out)?;
-        println!("run folder: {}", out.display());
-        Ok(())
+        let counter = progress::bar("{bar:30} {pos}/{len} frames evaluated, {eta} left", ids.len())?;
+        let mut count = |done| counter.set_position(done as u64);
+        let found = evaluate_detector(&trained.detector, &set, &ids, self.workers, &mut count)?;
+        counter.finish_and_clear();
+        results::show(&found, &what)?;
+        results::write(&found, &set, &out)?;
+        results::say_where(&out, temporary.is_none())
     }
 
-    fn make_data(&self, home: &Path) -> Result<PathBuf> {
-        let mut road = RoadConfig { seed: self.seed, ..Default::default() };
-        if self.smoke {
-            road.frames = FrameCounts { train: 4, val: 1, test: 2 };
-        }
-        let folder = home.join("data");
-        let bar = bar("{bar:30} {pos}/{len} frames made, {eta} left", road.frames.total() as u64)?;
-        make_road_dataset(&road, &folder, &|done, _| bar.set_position(done as u64))?;
-        bar.finish_and_clear();
-        eprintln!("data set in {}", folder.display());
-        Ok(folder)
+    /// The run to go on with, if there is one: its own words need not be said again.
+    fn stored(&self) -> Result<Option<(RunConfig, PathBuf)>> {
+        let Some(out) = self.out.as_ref().filter(|_| self.resume) else { return Ok(None) };
+        let path = out.join("config.toml");
+        Ok(if path.is_file() { Some((RunConfig::read(&path)?, out.clone())) } else { None })
     }
 
-    /// Everything merged before the one typed parse.
-    fn run_config(&self, dataset: &Path) -> Result<RunConfig> {
-        let detector: Table = detector_text(&self.detector)?.parse().with_context(|| self.detector.clone())?;
+    /// A run from the command line alone, and its folder.
+    fn fresh(&self) -> Result<(RunConfig, PathBuf)> {
         let mut table = Table::new();
-        table.insert("seed".into(), Value::Integer(i64::try_from(self.seed).context("--seed is too large")?));
-        table.insert("dataset".into(), Value::String(dataset.to_string_lossy().into_owned()));
-        table.insert("overfit".into(), Value::Boolean(self.overfit));
-        if let Some(init) = &self.init {
-            table.insert("init".into(), Value::String(init.to_string_lossy().into_owned()));
+        table.insert("seed".into(), Value::Integer(0));
+        table.insert("detector".into(), Value::Table(detector_table(DEFAULT_DETECTOR)?));
+        let home = self.out.clone().unwrap_or_else(|| "runs/default".into());
+        if self.dataset.is_none() {
+            table.insert("dataset".into(), path_value(&make_data(&home.join("data"), self.smoke)?)?);
         }
-        table.insert("detector".into(), Value::Table(detector));
         if self.smoke {
             set_key(&mut table, "optimization.epochs=1")?;
+        }
+        let config = self.changed(table)?;
+        let seed = format!("seed-{}", config.seed);
+        let out = match (&self.out, &self.dataset) {
+            (Some(out), Some(_)) => out.clone(),
+            (_, None) => home.join(seed),
+            (None, Some(dataset)) => {
+                let mut name = Dataset::open(dataset)?.config.name;
+                if config.overfit {
+                    name += "-overfit";
+                }
+                Path::new("runs").join(&config.detector.name).join(name).join(seed)
+            }
+        };
+        Ok((config, out))
+    }
+
+    /// What the command line says, merged into a run's table before the one typed parse.
+    fn changed(&self, mut table: Table) -> Result<RunConfig> {
+        if let Some(seed) = self.seed {
+            table.insert("seed".into(), Value::Integer(i64::try_from(seed).context("--seed is too large")?));
+        }
+        if let Some(dataset) = &self.dataset {
+            table.insert("dataset".into(), path_value(dataset)?);
+        }
+        if let Some(init) = &self.init {
+            table.insert("init".into(), path_value(init)?);
+        }
+        if self.overfit {
+            table.insert("overfit".into(), Value::Boolean(true));
+        }
+        if let Some(detector) = &self.detector {
+            table.insert("detector".into(), Value::Table(detector_table(detector)?));
         }
         if let Some(epochs) = self.epochs {
             set_key(&mut table, &format!("optimization.epochs={epochs}"))?;
@@ -124,110 +165,33 @@ impl TrainArgs {
         for assignment in &self.set {
             set_key(&mut table, assignment)?;
         }
-        RunConfig::from_table(table).with_context(|| format!("detector {}", self.detector))
+        RunConfig::from_table(table)
+            .with_context(|| format!("detector {}", self.detector.as_deref().unwrap_or(DEFAULT_DETECTOR)))
     }
 }
 
-/// AP to stdout and `eval.json`, a picture of the first frame with objects.
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
-fn evaluate_and_draw(detector: &Detector, set: &Dataset, ids: &[String], workers: usize, out: &Path) -> Result<()> {
-    let bar = bar("{bar:30} {pos}/{len} frames evaluated, {eta} left", ids.len() as u64)?;
-    let evaluation = evaluate_detector(detector, set, ids, workers, &mut |done| bar.set_position(done as u64))?;
+fn detector_table(name_or_path: &str) -> Result<Table> {
+    detector_text(name_or_path)?.parse().with_context(|| name_or_path.to_string())
+}
+
+/// Absolute, so that a run can be resumed from anywhere.
+fn path_value(path: &Path) -> Result<Value> {
+    let absolute = fs_err::canonicalize(path)?;
+    match absolute.to_str() {
+        Some(text) => Ok(Value::String(text.into())),
+        None => bail!("{} cannot be written into a TOML: its name is not UTF-8", path.display()),
+    }
+}
+
+/// The synthetic data set of the default run; frames that are there already are kept.
+fn make_data(folder: &Path, smoke: bool) -> Result<PathBuf> {
+    let mut road = RoadConfig::default();
+    if smoke {
+        road.frames = FrameCounts { train: 4, val: 1, test: 2 };
+    }
+    let bar = progress::bar("{bar:30} {pos}/{len} frames made, {eta} left", road.frames.total())?;
+    make_road_dataset(&road, folder, &|done, _| bar.set_position(done as u64))?;
     bar.finish_and_clear();
-    let path = out.join("eval.json");
-    write_atomic(&path, &serde_json::to_vec_pretty(&evaluation.report)?)?;
-    println!(
-        "{:<12} {:>4} {:>7}  {:>7} {:>7}  {:>5} {:>5} {:>5}",
-        "class", "3d", "overlap", "AP area", "AP40", "truth", "hits", "false"
-    );
-    for row in evaluation.report.rows.iter().filter(|r| r.metric == Metric::ThreeD && r.difficulty == Difficulty::All) {
-        let percent = |ap: Option<f64>| ap.map_or("-".into(), |ap| format!("{ap:.2}"));
-        let (area, ap40) = (percent(row.ap_area), percent(row.ap40));
-        println!(
-            "{:<12} {:>4} {:>7.2}  {area:>7} {ap40:>7}  {:>5} {:>5} {:>5}",
-            row.class, "", row.overlap, row.n_gt, row.n_tp, row.n_fp
-        );
-    }
-    println!("numbers: {}", path.display());
-    for (id, detections) in ids.iter().zip(&evaluation.detections) {
-        let frame = set.load(id)?;
-        if frame.objects.is_empty() {
-            continue;
-        }
-        let mut boxes: Vec<_> = frame.objects.iter().map(|o| (o.bbox, Style::GroundTruth)).collect();
-        boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));
-        let path = out.join(format!("{id}.png"));
-        write_atomic(&path, &birds_eye_png(&frame.cloud, &boxes, &BirdsEyeOptions::default())?)?;
-        println!("picture: {}", path.display());
-        break;
-    }
-    Ok(())
-}
-
-fn bar(template: &str, length: u64) -> Result<ProgressBar> {
-    Ok(ProgressBar::new(length).with_style(ProgressStyle::with_template(template)?))
-}
-
-/// A bar on a terminal, plain lines elsewhere; on stderr.
-#[derive(Default)]
-struct Progress {
-    bar: Option<ProgressBar>,
-}
-
-impl Progress {
-    fn show(&mut self, event: &Event<'_>) {
-        match event {
-            Event::Begin { state, epochs, frames, validation_frames } => {
-                eprintln!(
-                    "{frames} frames to learn from, {validation_frames} to validate, {epochs} epochs, {} steps",
-                    state.total_steps
-                );
-                if state.step > 0 {
-                    eprintln!("going on from step {}", state.step);
-                }
-                if std::io::stderr().is_terminal() {
-                    let style = ProgressStyle::with_template("{bar:30} step {pos}/{len}, {msg}, {eta} left")
-                        .expect("a fixed template");
-                    self.bar = Some(ProgressBar::new(state.total_steps).with_style(style).with_position(state.step));
-                }
-            }
-            Event::Step { metrics, logged } => {
-                let message = format!("loss {:.4}, {:.1} samples/s", metrics.loss, metrics.samples_per_s);
-                match &self.bar {
-                    Some(bar) => {
-                        bar.set_position(metrics.step);
-                        bar.set_message(message);
-                    }
-                    None if *logged => eprintln!("step {}: {message}", metrics.step),
-                    None => {}
-                }
-            }
-            Event::Epoch(metrics) => {
-                let s = &metrics.seconds;
-                let mut line = format!(
-                    "epoch {}: loss {:.4}; s: data wait {:.1}, forward {:.1}, backward {:.1}, optimiser {:.1}, checkpoint {:.1}",
-                    metrics.epoch, metrics.train_loss, s.data_wait, s.forward, s.backward, s.optimizer, s.checkpoint
-                );
-                if let Some(v) = &metrics.validation {
-                    let percent = |ap: Option<f64>| ap.map_or("-".into(), |ap| format!("{ap:.1}"));
-                    line += &format!(
-                        "; validation loss {:.4}, AP {} (loose {})",
-                        v.loss,
-                        percent(v.ap),
-                        percent(v.ap_loose)
-                    );
-                }
-                match &self.bar {
-                    Some(bar) => bar.println(line),
-                    None => eprintln!("{line}"),
-                }
-            }
-        }
-    }
-
-    fn finish(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-    }
+    eprintln!("data set: {}", folder.display());
+    Ok(folder.into())
 }

@@ -24,8 +24,8 @@ pub fn rotated_nms(boxes: &[Box3], scores: &[f32], iou_threshold: f64) -> Vec<us
     for i in order {
         let [cx, cy] = cell(&boxes[i]);
         let near = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| [cx.saturating_add(dx), cy.saturating_add(dy)]));
-        let mut rivals = near.filter_map(|key| kept_in_cell.get(&key)).flatten();
-        if !rivals.any(|rival| overlaps(rival, &rectangles[i], iou_threshold)) {
+        let mut rivals = near.filter_map(|key| kept_in_cell.get(&key));
+        if !rivals.any(|cell| cell.iter().any(|rival| overlaps(rival, &rectangles[i], iou_threshold))) {
             kept.push(i);
             kept_in_cell.entry([cx, cy]).or_default().push(rectangles[i]);
         }

@@ -4,6 +4,7 @@
 //! edges matter. Boxes without extent, and such with values that are not finite, overlap nothing.
 
 use crate::Box3;
+use std::f64::consts::PI;
 
 /// The base of a box, seen from above, with what clipping needs of it worked out once.
 #[derive(Clone, Copy, Debug)]
@@ -14,7 +15,10 @@ pub(crate) struct BevRectangle {
     cos: f64,
     /// m2; 0 for a box that overlaps nothing.
     pub(crate) area: f64,
+    /// Of the circle around it, m.
     radius: f64,
+    /// Of the largest circle inside, m.
+    inner_radius: f64,
 }
 
 impl BevRectangle {
@@ -30,6 +34,7 @@ impl BevRectangle {
             cos,
             area: if sound { area } else { 0.0 },
             radius: half[0].hypot(half[1]),
+            inner_radius: half[0].min(half[1]),
         }
     }
 
@@ -45,8 +50,9 @@ impl BevRectangle {
             return 0.0;
         }
         let apart = [b.center[0] - a.center[0], b.center[1] - a.center[1]];
+        let apart_squared = apart[0] * apart[0] + apart[1] * apart[1];
         let reach = a.radius + b.radius;
-        if apart[0] * apart[0] + apart[1] * apart[1] >= reach * reach {
+        if apart_squared >= reach * reach || a.is_too_far(b, apart_squared, least) {
             return 0.0;
         }
         // b in the frame of a: its centre, and the sine and cosine of its yaw relative to a's.
@@ -68,6 +74,20 @@ impl BevRectangle {
             polygon = polygon.clipped(axis, 1.0, a.half[axis]).clipped(axis, -1.0, a.half[axis]);
         }
         polygon.area().clamp(0.0, a.area.min(b.area))
+    }
+}
+
+impl BevRectangle {
+    /// Whether the distance of the centres alone keeps the intersection at `least` or below.
+    ///
+    /// The line in the middle between the centres cuts the intersection into a piece of each rectangle: less than half of it, by a
+    /// strip half as wide as the centres are apart. The strip holds at least that of the circle inside, which is at least pi/4 of
+    /// its width times the diameter.
+    fn is_too_far(&self, other: &BevRectangle, apart_squared: f64, least: f64) -> bool {
+        let spare = (self.area + other.area) / 2.0 - least;
+        let strips_by_distance = PI / 4.0 * (self.inner_radius + other.inner_radius);
+        let width = 2.0 * self.inner_radius.min(other.inner_radius);
+        least > 0.0 && spare * spare <= strips_by_distance * strips_by_distance * apart_squared.min(width * width)
     }
 }
 
@@ -165,7 +185,7 @@ pub(crate) fn over_union(shared: f64, a: f64, b: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::f64::consts::{FRAC_PI_2, PI};
+    use std::f64::consts::FRAC_PI_2;
 
     fn car(x: f64, y: f64, yaw: f64) -> Box3 {
         Box3::from_array([x, y, 0.5, 4.88, 1.9, 1.18, yaw])
@@ -210,6 +230,36 @@ mod tests {
             moved.center = [shift[0] * scale, shift[1] * scale, 0.0];
             assert!(close(bev_iou(&b(0.0), &moved), 1.0 / 3.0), "{scale}");
             assert!(close(iou_3d(&b(0.0), &moved), 1.0 / 3.0), "{scale}");
+        }
+    }
+
+    #[test]
+    fn bounds_never_hide_an_overlap() {
+        for i in 0..20_000u32 {
+            let v = |k: u32, low: f64, high: f64| {
+                low + (high - low) * f64::from(i * 7919 % (89 + 14 * k)) / f64::from(89 + 14 * k)
+            };
+            let a = BevRectangle::new(&Box3::from_array([
+                0.0,
+                0.0,
+                0.0,
+                v(0, 0.5, 5.0),
+                v(1, 0.5, 5.0),
+                1.0,
+                v(2, -3.0, 3.0),
+            ]));
+            let b = Box3::from_array([
+                v(3, -2.0, 2.0),
+                v(4, -2.0, 2.0),
+                0.0,
+                v(5, 0.5, 5.0),
+                v(6, 0.5, 5.0),
+                1.0,
+                v(7, -3.0, 3.0),
+            ]);
+            let b = BevRectangle::new(&b);
+            let shared = a.intersection(&b);
+            assert_eq!(a.intersection_above(&b, shared * 0.999_999), shared);
         }
     }
 

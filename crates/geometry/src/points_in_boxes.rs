@@ -75,7 +75,6 @@ impl InsideTest {
 /// The boxes over each cell of a grid that covers all of them.
 struct BoxGrid {
     low: [f64; 2],
-    high: [f64; 2],
     cells_per_m: [f64; 2],
     /// Cell c has `boxes[starts[c]..starts[c + 1]]`.
     starts: Vec<u32>,
@@ -84,13 +83,12 @@ struct BoxGrid {
 
 impl BoxGrid {
     fn new(tests: &[InsideTest]) -> Option<Self> {
-        let first = tests.first()?;
-        let mut grid =
-            BoxGrid { low: first.low, high: first.high, cells_per_m: [0.0; 2], starts: Vec::new(), boxes: Vec::new() };
+        tests.first()?;
+        let mut grid = BoxGrid { low: [0.0; 2], cells_per_m: [0.0; 2], starts: vec![0], boxes: Vec::new() };
         for axis in [0, 1] {
             grid.low[axis] = tests.iter().map(|t| t.low[axis]).fold(f64::INFINITY, f64::min);
-            grid.high[axis] = tests.iter().map(|t| t.high[axis]).fold(f64::NEG_INFINITY, f64::max);
-            grid.cells_per_m[axis] = CELLS as f64 / (grid.high[axis] - grid.low[axis]);
+            let high = tests.iter().map(|t| t.high[axis]).fold(f64::NEG_INFINITY, f64::max);
+            grid.cells_per_m[axis] = CELLS as f64 / (high - grid.low[axis]);
         }
         let mut in_cell = vec![Vec::new(); CELLS * CELLS];
         for (k, test) in tests.iter().enumerate() {
@@ -100,7 +98,6 @@ impl BoxGrid {
                 in_cell[x * CELLS + y0..=x * CELLS + y1].iter_mut().for_each(|cell| cell.push(k as u32));
             }
         }
-        grid.starts.push(0);
         for cell in in_cell {
             grid.boxes.extend(cell);
             grid.starts.push(grid.boxes.len() as u32);
@@ -110,14 +107,11 @@ impl BoxGrid {
 
     /// Never falls when `v` grows, so that a point between the bounds of a box is in a cell between theirs.
     fn index(&self, axis: usize, v: f64) -> usize {
-        (((v - self.low[axis]) * self.cells_per_m[axis]) as usize).min(CELLS - 1)
+        (((v - self.low[axis]) * self.cells_per_m[axis]) as i32).clamp(0, CELLS as i32 - 1) as usize
     }
 
+    /// Points beyond the grid, and such that are not finite, get the boxes of a cell on its border: no branch to guess wrong.
     fn boxes_near(&self, x: f64, y: f64) -> &[u32] {
-        let within = x >= self.low[0] && x <= self.high[0] && y >= self.low[1] && y <= self.high[1];
-        if !within {
-            return &[]; // NaN comes here, too
-        }
         let cell = self.index(0, x) * CELLS + self.index(1, y);
         &self.boxes[self.starts[cell] as usize..self.starts[cell + 1] as usize]
     }

@@ -229,3 +229,15 @@ fn data_that_do_not_fit_are_refused() {
     let message = run(&config(dir.path(), &[]), &out, 1, false).unwrap_err().to_string();
     assert!(message.contains("nothing to learn"), "{message}");
 }
+
+#[test]
+fn frames_with_no_point_in_range_are_no_obstacle() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    for id in ["000001", "000006"] {
+        let far = Cloud { values: vec![90.0, 0.0, 0.0, 0.5], channels: 4 };
+        data::write::write_bin(&dir.path().join(format!("velodyne/{id}.bin")), &far).unwrap();
+    }
+    let config = config(dir.path(), &["optimization.batch_size=1", "optimization.epochs=1"]);
+    run(&config, &dir.path().join("run"), 1, false).unwrap();
+}
