@@ -1,18 +1,9 @@
-//! Synthetic LiDAR data sets by seeded ray casting.
-//!
-//! A road with cars, walls, poles and things that are no cars, seen by one spinning LiDAR. Everything is in the LiDAR frame: origin at the
-//! sensor, x forward, y left, z up, m; yaw counter-clockwise from +x, rad. A frame is a pure function of (configuration, split, index).
-//!
-//! Every car with at least five points on it is labelled, however much of it is hidden; its label says how much (KITTI's occlusion level).
+//! LiDAR data sets by seeded ray casting: a race as triangle meshes with any sensors, and a small synthetic street.
 
-pub mod cars;
-mod config;
-mod dataset;
+mod config_text;
+mod error;
 pub mod raycast;
-pub mod road;
-mod roadside;
-pub mod scene;
-pub mod sensor;
+pub mod street;
 
-pub use config::{FrameCounts, RoadConfig, SimulateError};
-pub use dataset::{MANIFEST_SCHEMA, Manifest, SplitCounts, make_road_dataset, make_road_frame};
+pub use error::SimulateError;
+pub use street::{FrameCounts, MANIFEST_SCHEMA, Manifest, RoadConfig, SplitCounts, make_road_dataset, make_road_frame};
