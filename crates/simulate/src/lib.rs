@@ -6,6 +6,7 @@ pub mod mesh;
 pub mod race_car;
 pub mod raycast;
 pub mod rig;
+pub mod scenario;
 pub mod street;
 pub mod track;
 

@@ -110,6 +110,11 @@ impl Track {
         [margin_m - station.width_right_m, station.width_left_m - margin_m]
     }
 
+    /// Where the face of the outer wall is at `way_m`, m to the left of the centre line: a negative number.
+    pub fn outer_wall_m(&self, way_m: f64) -> f64 {
+        -self.line.at(way_m).width_right_m - surface::WALL_GAP_M
+    }
+
     /// Everything that stands still, in the world's frame.
     pub fn mesh(&self, groups: &[Group], undulation: Option<Undulation>) -> Mesh {
         let mut mesh = Mesh::default();
