@@ -1,14 +1,19 @@
 //! LiDAR data sets by seeded ray casting: a race as triangle meshes with any sensors, and a small synthetic street.
 
+pub mod beams;
 mod config_text;
+pub mod effects;
 mod error;
+pub mod frame_scene;
 pub mod mesh;
 pub mod race_car;
 pub mod raycast;
 pub mod rig;
+pub mod scan;
 pub mod scenario;
 pub mod street;
 pub mod track;
+pub mod world;
 
 pub use error::SimulateError;
 pub use rig::{Rig, Sensor};

@@ -2,6 +2,7 @@
 
 mod pattern;
 
+pub(crate) use pattern::direction;
 pub use pattern::{Pattern, RowBlock, Shot, Sweep};
 
 use crate::SimulateError;
