@@ -1,11 +1,16 @@
 //! LiDAR data sets by seeded ray casting: a race as triangle meshes with any sensors, and a small synthetic street.
 
+pub mod attributes;
+pub mod auto_label;
 pub mod beams;
+pub mod cloud_scan;
 mod config_text;
 pub mod effects;
 mod error;
 pub mod frame_scene;
+pub mod matched;
 pub mod mesh;
+pub mod race;
 pub mod race_car;
 pub mod raycast;
 pub mod rig;

@@ -56,6 +56,7 @@ pub struct LabelledCar {
 }
 
 /// What is known of a frame besides its scan.
+#[derive(Clone, Copy)]
 pub struct FrameContext<'a> {
     /// Seed of the data set.
     pub seed: u64,

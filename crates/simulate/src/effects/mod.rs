@@ -18,7 +18,7 @@ mod context;
 mod local_plane;
 mod shot_grid;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 
 pub use context::{Draws, FrameContext, LabelledCar, Need, WorldPlan};
 

@@ -59,9 +59,9 @@ impl RunFiles {
         let ego = read(&self.ego)?;
         let rivals = self.rivals.iter().map(read).collect::<Result<Vec<_>, _>>()?;
         let cars = || std::iter::once(&ego).chain(&rivals);
-        // A scan begins before its middle and GPS needs a state before and after.
-        let first_s = cars().map(|c| c.span_s()[0]).fold(f64::MIN, f64::max) + 2.0 * FRAME_S;
-        let last_s = cars().map(|c| c.span_s()[1]).fold(f64::MAX, f64::min) - 2.0 * FRAME_S;
+        // A scan begins before its middle, and records of positions are needed before and after.
+        let first_s = cars().map(|c| c.span_s()[0]).fold(f64::MIN, f64::max) + 3.0 * FRAME_S;
+        let last_s = cars().map(|c| c.span_s()[1]).fold(f64::MAX, f64::min) - 3.0 * FRAME_S;
         if last_s <= first_s {
             let path = folder.join(&self.ego);
             return Err(DataError::file(&path, "there is no time at which all cars of its run have states").into());
