@@ -1,4 +1,4 @@
-//! Boxes in, numbers out: KITTI average precision and recall.
+//! Boxes in, numbers out: KITTI average precision and recall, and the statistics of two data sets.
 //!
 //! Everything is computed on the numbers of the texts, in the frame they are written in. KITTI's camera and LiDAR frames are
 //! tilted against each other, so that a box upright in one is not upright in the other: a conversion would change overlaps.
@@ -11,6 +11,7 @@ mod overlaps;
 mod read;
 mod recall;
 mod report;
+mod statistics;
 
 pub use curve::{PrecisionCurve, ceiling_ap40};
 pub use evaluate::evaluate;
@@ -19,3 +20,6 @@ pub use options::{Difficulty, EvalFrame, EvalOptions, Metric, default_classes, r
 pub use read::{ids_of_folder, read_frames, read_ids};
 pub use recall::{RECALL_OVERLAPS, Recall, RecallDefinition};
 pub use report::{EvalReport, OverlapSet, Row, SCHEMA};
+pub use statistics::{
+    Extent, FrameCounts, STATISTICS_SCHEMA, SetStatistics, StatisticsReport, compare_statistics, sum_up,
+};

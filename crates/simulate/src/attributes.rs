@@ -80,6 +80,18 @@ pub fn write_names(root: &Path, rig: &Rig, materials: &MaterialTable) -> Result<
     write_atomic(&root.join(FOLDER).join("names.json"), text.as_bytes())
 }
 
+/// The materials of a data set by the numbers in its attributes.
+pub fn read_materials(root: &Path) -> Result<MaterialTable, DataError> {
+    let path = root.join(FOLDER).join("names.json");
+    let value: serde_json::Value = serde_json::from_str(&fs_err::read_to_string(&path)?)
+        .map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
+    let names = value["materials"].as_array().into_iter().flatten().map(|n| n.as_str().map(String::from));
+    match names.collect::<Option<Vec<_>>>() {
+        Some(names) if (1..=256).contains(&names.len()) => Ok(MaterialTable::named(&names)),
+        _ => Err(DataError::file(&path, "has no list of names under \"materials\"")),
+    }
+}
+
 /// The returns of a frame from its attributes. Sensors stand where `rig` has them.
 pub fn read(path: &Path, rig: &Rig) -> Result<Scan, DataError> {
     let columns = parse_pcd_columns(&fs_err::read(path)?, path, &NAMES)?;
@@ -131,6 +143,7 @@ mod tests {
             );
         }
         let names = std::fs::read_to_string(folder.path().join("attributes/names.json")).unwrap();
+        assert_eq!(read_materials(folder.path()).unwrap(), MaterialTable::default());
         assert!(names.contains("outer_wall") && names.contains("rubber") && names.contains("front"));
     }
 }

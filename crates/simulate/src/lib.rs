@@ -13,6 +13,7 @@ pub mod mesh;
 pub mod race;
 pub mod race_car;
 pub mod raycast;
+pub mod resim;
 pub mod rig;
 pub mod scan;
 pub mod scenario;

@@ -23,8 +23,10 @@ pub enum Need {
     Grid,
     /// Times of the shots.
     Time,
-    /// What was hit: where the other cars are.
+    /// Where the other cars are.
     Cars,
+    /// How the own car and the others move.
+    Motion,
 }
 
 impl Need {
@@ -38,6 +40,7 @@ impl Need {
             Need::Grid => "the row and column of each point in the sensor's pattern",
             Need::Time => "the time of each shot",
             Need::Cars => "boxes of the cars",
+            Need::Motion => "the motion of the cars",
         }
     }
 }

@@ -1,6 +1,6 @@
 //! C5: labels and cloud are of different times.
 
-use super::{Draws, FrameContext, LabelledCar, SensorEffect};
+use super::{Draws, FrameContext, LabelledCar, Need, SensorEffect};
 use crate::SimulateError;
 use crate::error::within;
 use schemars::JsonSchema;
@@ -40,6 +40,10 @@ impl Default for LabelTimeOffset {
 impl SensorEffect for LabelTimeOffset {
     fn check(&self) -> Result<(), SimulateError> {
         within("offset_s", self.offset_s, -1.0, 1.0)
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(&[Need::Motion])
     }
 
     fn on_labels(&self, cars: &mut [LabelledCar], frame: &FrameContext, _draws: &Draws) {

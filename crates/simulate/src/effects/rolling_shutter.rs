@@ -32,7 +32,7 @@ impl SensorEffect for RollingShutter {
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Time, Need::Cars])
+        Some(&[Need::Time, Need::Cars, Need::Motion])
     }
 
     fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {

@@ -106,6 +106,13 @@ impl MaterialTable {
         Ok(table)
     }
 
+    /// A table with these names in this order, as a data set's attributes number them; names that are not built in reflect as "unknown".
+    pub fn named(names: &[String]) -> Self {
+        let built_in = MaterialTable::default();
+        let material = |name: &String| *built_in.get(built_in.find(name).unwrap_or(MaterialTable::built_in("unknown")));
+        MaterialTable { names: names.to_vec(), materials: names.iter().map(material).collect() }
+    }
+
     /// The number of a name.
     pub fn find(&self, name: &str) -> Option<MaterialId> {
         self.names.iter().position(|n| n == name).map(|i| MaterialId(i as u8))
