@@ -71,10 +71,8 @@ impl TrainArgs {
     /// Trains, evaluates, and says where the results lie.
     pub fn run(mut self) -> Result<()> {
         let device = parse_device(&self.device)?;
-        let temporary = self.smoke.then(tempfile::tempdir).transpose()?;
-        if let Some(folder) = &temporary
-            && self.out.is_none()
-        {
+        let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;
+        if let Some(folder) = &temporary {
             self.out = Some(folder.path().into());
         }
         let (config, out) = match self.stored()? {
@@ -148,6 +146,7 @@ impl TrainArgs {
             table.insert("seed".into(), Value::Integer(i64::try_from(seed).context("--seed is too large")?));
         }
         if let Some(dataset) = &self.dataset {
+            Dataset::open(dataset)?;
             table.insert("dataset".into(), path_value(dataset)?);
         }
         if let Some(init) = &self.init {

@@ -53,11 +53,18 @@ impl BatchNorm {
     /// # Shapes
     /// `x`: `[B, C, ...]`, the result alike.
     pub fn forward_train<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
-        let channels = x.dims()[1];
-        let count = x.shape().num_elements() / channels;
-        let out = burn::tensor::module::batch_norm_train(x, self.weight.val(), self.bias.val(), self.epsilon);
-        self.update(Moments { mean: out.mean, variance: out.variance, count });
-        out.output
+        let shape = x.dims();
+        let [batch, channels] = [shape[0], shape[1]];
+        let values = shape[2..].iter().product();
+        let count = batch * values;
+        let x = x.reshape([batch, channels, values]); // [B, C, L]
+        let mean = sum_per_channel(x.clone()) / count as f64; // [1, C, 1]
+        let centred = x - mean.clone(); // [B, C, L]
+        let variance = sum_per_channel(centred.clone().square()) / count as f64; // [1, C, 1]
+        let scale = self.weight.val().reshape([1, channels, 1]) / (variance.clone() + self.epsilon).sqrt();
+        let out = centred * scale + self.bias.val().reshape([1, channels, 1]); // [B, C, L]
+        self.update(Moments { mean: mean.reshape([channels]), variance: variance.reshape([channels]), count });
+        out.reshape(shape)
     }
 
     /// Normalises with the running statistics.
@@ -96,4 +103,16 @@ impl BatchNorm {
         self.num_batches_tracked.update(self.num_batches_tracked.value() + 1.0);
         self.num_batches_tracked.value_sync();
     }
+}
+
+/// Sum over all but the channels, first within groups: one running f32 sum over tens of thousands of values loses digits.
+///
+/// # Shapes
+/// `x`: `[B, C, L]`; result `[1, C, 1]`.
+fn sum_per_channel(x: Tensor<3>) -> Tensor<3> {
+    const LARGEST_GROUP: usize = 256;
+    let [batch, channels, values] = x.dims();
+    let group = (1..=LARGEST_GROUP).rev().find(|group| values % group == 0).unwrap_or(1);
+    let sums = x.reshape([batch, channels, values / group, group]).sum_dim(3); // [B, C, L / G, 1]
+    sums.sum_dim(2).sum_dim(0).reshape([1, channels, 1])
 }
