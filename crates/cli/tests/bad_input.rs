@@ -132,7 +132,8 @@ fn splits() {
 fn calibrations() {
     let camera = |calibration: &'static str| {
         move |f: &Path| {
-            fs::write(f.join("dataset.toml"), "name = \"camera\"\nlayout = \"kitti\"\nlabel_frame = \"camera\"\n").unwrap();
+            fs::write(f.join("dataset.toml"), "name = \"camera\"\nlayout = \"kitti\"\nlabel_frame = \"camera\"\n")
+                .unwrap();
             fs::create_dir_all(f.join("calib")).unwrap();
             for i in 0..7 {
                 fs::write(f.join(format!("calib/{i:06}.txt")), calibration).unwrap();

@@ -68,7 +68,8 @@ pub struct DatasetConfig {
     /// Name and file of each split, relative to the root. Default: those of train, val and test for which `ImageSets/NAME.txt` exists.
     #[serde(default)]
     pub splits: BTreeMap<String, PathBuf>,
-    /// Keep only the points that the camera sees (needs `calib`). The reference does so with KITTI in training and in test.
+    /// Keep only the points that the camera sees (needs `calib`). Default: where the labels are in the camera's frame, for only what the
+    /// camera sees is labelled there; the reference does so with KITTI in training and in test.
     #[serde(default)]
     pub fov_crop: bool,
     /// Width and height of the camera's image, px.
@@ -119,7 +120,7 @@ impl DatasetConfig {
         })?;
         config.root = path.parent().unwrap_or(Path::new("")).join(&config.root);
         let written: toml::Table = toml::from_str(text).expect("it was read above");
-        config.fill_in(!written.contains_key("label_frame"));
+        config.fill_in(!written.contains_key("label_frame"), !written.contains_key("fov_crop"));
         config.check(path)?;
         Ok(config)
     }
@@ -152,16 +153,19 @@ impl DatasetConfig {
         } else {
             return Err(DataError::file(folder, "does not exist; a data set is a folder or its TOML"));
         };
-        config.fill_in(true);
+        config.fill_in(true, true);
         Ok(config)
     }
 
-    fn fill_in(&mut self, label_frame_unsaid: bool) {
+    fn fill_in(&mut self, label_frame_unsaid: bool, fov_crop_unsaid: bool) {
         if self.name.is_empty() {
             self.name = folder_name(&self.root);
         }
         if label_frame_unsaid && self.layout == Layout::Kitti && self.root.join("calib").is_dir() {
             self.label_frame = LabelFrame::Camera;
+        }
+        if fov_crop_unsaid {
+            self.fov_crop = self.label_frame == LabelFrame::Camera;
         }
         if self.splits.is_empty() {
             for name in ["train", "val", "test"] {

@@ -123,7 +123,9 @@ fn run_folder(path: &Path) -> Result<Vec<Target>> {
             let sound = sound.clone();
             move |bytes: &[u8]| {
                 // A further name of the same file must not carry the damage on.
-                fs_err::remove_file(&damaged).and_then(|()| fs_err::write(&damaged, bytes)).map_err(|e| e.to_string())?;
+                fs_err::remove_file(&damaged)
+                    .and_then(|()| fs_err::write(&damaged, bytes))
+                    .map_err(|e| e.to_string())?;
                 let loaded = RunFolder::open(&path).and_then(|folder| folder.load());
                 fs_err::write(&damaged, &sound).map_err(|e| e.to_string())?;
                 match loaded {
@@ -170,4 +172,3 @@ fn text(read: impl Fn(&str) -> Option<bool> + 'static) -> Reader {
         Some(false) => Err("a value that is not finite".into()),
     })
 }
-
