@@ -11,6 +11,7 @@ use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
 use models::{Detector, Preparer};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
+use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Boxes in a cloud (KITTI text in the cloud's own frame, and a picture), or in a whole split of a data set.
@@ -53,6 +54,14 @@ pub struct DetectArgs {
 enum Points {
     Xyz,
     Xyzi,
+}
+
+/// The boxes of one cloud, in its frame.
+#[derive(Serialize)]
+struct Found<'a> {
+    schema: &'static str,
+    frame: &'a str,
+    detections: &'a [Detection],
 }
 
 /// A detector with its weights.
@@ -104,7 +113,8 @@ impl DetectArgs {
             println!("{}", KittiLine::from_box(&detection.class, &detection.bbox, Some(detection.score)));
         }
         if let Some(path) = &self.json {
-            write_atomic(path, &serde_json::to_vec_pretty(&detections)?)?;
+            let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
+            write_atomic(path, &serde_json::to_vec_pretty(&found)?)?;
         }
         let truth = match &self.labels {
             Some(path) => parse_kitti_text(&fs_err::read_to_string(path)?, path, KittiText::Labels)?,

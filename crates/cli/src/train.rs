@@ -15,6 +15,8 @@ use toml::{Table, Value};
 use train::{RunConfig, Session, evaluate_detector, set_key, train};
 
 const DEFAULT_DETECTOR: &str = "pointpillars_small";
+/// What a network needs at least to learn a few frames by heart, where nobody says how many epochs.
+const OVERFIT_STEPS: usize = 320;
 
 /// Train a detector. Without a data set one is made on the spot: roads with cars, seen by a spinning LiDAR.
 ///
@@ -56,7 +58,7 @@ pub struct TrainArgs {
     /// Go on where a run was stopped, or begin it; what is not said again stays as it was
     #[arg(long)]
     resume: bool,
-    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all
+    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default epochs: as many as make 320 steps]
     #[arg(long)]
     overfit: bool,
     /// Threads that load and augment frames; any number gives the same weights
@@ -124,7 +126,14 @@ impl TrainArgs {
         if self.smoke {
             set_key(&mut table, "optimization.epochs=1")?;
         }
-        let config = self.changed(table)?;
+        let mut config = self.changed(table)?;
+        if config.overfit && self.epochs.is_none() && !self.set.iter().any(|s| s.contains("optimization.epochs")) {
+            let frames = Dataset::open(&config.dataset)?.all_ids()?.len();
+            let optimization = &mut config.detector.optimization;
+            let steps = frames.div_ceil(optimization.batch_size);
+            optimization.epochs = OVERFIT_STEPS.div_ceil(steps).max(optimization.epochs);
+            config.run.evaluate_every_epochs = (optimization.epochs / 10).max(1) as u64;
+        }
         let seed = format!("seed-{}", config.seed);
         let out = match (&self.out, &self.dataset) {
             (Some(out), Some(_)) => out.clone(),

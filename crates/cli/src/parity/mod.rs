@@ -54,7 +54,7 @@ impl ParityArgs {
             None => operators::compare(&folder, &device)?,
         };
         if let Some(path) = &self.json {
-            let parity = Parity { schema: "lidarshift.parity/1", rows: &rows, not_built: &not_built };
+            let parity = Parity { schema: "lidarshift/parity/1", rows: &rows, not_built: &not_built };
             data::write_atomic(path, &serde_json::to_vec_pretty(&parity)?)?;
         }
         println!("{:<24} {:<44} {:>10} {:>10}  ", "file", "tensor", "error", "tolerance");
