@@ -1,7 +1,7 @@
 //! `lidarshift bench-step`: where the time of one training step goes, and how much memory it takes.
 
 use crate::detectors::find_detector;
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::Result;
 use burn::optim::GradientsParams;
 use clap::Args;
@@ -31,9 +31,8 @@ pub struct BenchStepArgs {
     /// Timed steps; two before them warm up
     #[arg(long, default_value_t = 7)]
     steps: usize,
-    /// Where the network computes
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Also write the medians as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -60,7 +59,7 @@ impl BenchStepArgs {
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let config = find_detector(&self.detector)?;
-        let device = parse_device(&self.device)?.autodiff();
+        let device = self.device.open()?.autodiff();
         let road = RoadConfig::default();
         let frames: Vec<Frame> = (0..self.batch).map(|i| make_road_frame(&road, "train", i)).collect();
         let mut detector = Detector::new(&config, 0, &device);
@@ -110,7 +109,7 @@ impl BenchStepArgs {
             median_ms: STAGES.into_iter().zip(times.into_iter().map(median)).collect(),
             peak_mib: crate::memory::peak_mib(),
             detector: config.name.clone(),
-            device: self.device,
+            device: self.device.describe(),
             batch: self.batch,
             steps: self.steps,
         };

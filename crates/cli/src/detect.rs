@@ -1,7 +1,7 @@
 //! `lidarshift detect`: boxes in one cloud, or in a whole split of a data set.
 
 use crate::detectors::find_detector;
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use data::kitti_text::{KittiLine, KittiText, parse_kitti_text};
@@ -45,9 +45,8 @@ pub struct DetectArgs {
     /// Also write the boxes of a cloud as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Where the network runs
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -83,7 +82,7 @@ impl Loaded {
 impl DetectArgs {
     /// Finds, prints and draws.
     pub fn run(self) -> Result<()> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let config = detector_of(&self.checkpoint, self.detector.as_deref())?;
         let weights = read_checkpoint(&self.checkpoint)?;
         let detector = Detector::new(&config, 0, &device)

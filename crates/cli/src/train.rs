@@ -4,7 +4,7 @@ mod progress;
 mod results;
 
 use crate::detectors::detector_text;
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
@@ -46,9 +46,8 @@ pub struct TrainArgs {
     /// Run folder [default: runs/DETECTOR/DATASET/seed-K; without a data set runs/default/seed-K]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Where the network computes: flex, ndarray, wgpu or cuda
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Changes a key of the detector's TOML (optimization.lr_max=0.001) or of the run (run.log_every_steps=1); may be given more than once
     #[arg(long = "set", value_name = "A.B=C")]
     set: Vec<String>,
@@ -72,7 +71,7 @@ pub struct TrainArgs {
 impl TrainArgs {
     /// Trains, evaluates, and says where the results lie.
     pub fn run(mut self) -> Result<()> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;
         if let Some(folder) = &temporary {
             self.out = Some(folder.path().into());
@@ -81,9 +80,10 @@ impl TrainArgs {
             Some((stored, out)) => (self.changed(stored.to_table())?, out),
             None => self.fresh()?,
         };
+        eprintln!("device: {}", self.device.describe());
         // The default run has nothing to lose: a second call goes on with it.
         let resume = self.resume || self.dataset.is_none();
-        let session = Session { device, device_name: self.device.clone(), workers: self.workers, resume };
+        let session = Session { device, device_name: self.device.describe(), workers: self.workers, resume };
         let mut progress = Progress::default();
         let trained = train(&config, &out, &session, &mut |event| progress.show(&event))?;
         progress.finish();

@@ -7,7 +7,7 @@ mod recipe;
 mod reference;
 mod toy_training;
 
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result};
 use clap::Args;
 use reference::Row;
@@ -21,9 +21,8 @@ use std::path::PathBuf;
 pub struct ParityArgs {
     /// Folder with manifest.json and safetensors files of a network, or of single operations
     dir: PathBuf,
-    /// Where the network runs
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Also write the rows as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -44,7 +43,7 @@ impl ParityArgs {
     /// Whether every tensor passed.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let folder = fs_err::canonicalize(&self.dir)?;
         let manifest = fs_err::read_to_string(folder.join("manifest.json"))
             .context("a folder of reference numbers has a manifest.json")?;

@@ -8,7 +8,7 @@ use super::vfe::{PillarRows, PillarVfe};
 use crate::config::{DetectorConfig, PointPillarsConfig};
 use crate::layers::{Init, Mode};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 
 /// The network. Field names are OpenPCDet's.
 #[derive(Module, Debug)]
@@ -62,15 +62,11 @@ impl PointPillars {
         Stages { pillar_features, spatial_features, backbone, predictions }
     }
 
-    /// The points of all pillars of a batch, one sample after the other, on the device of the weights.
+    /// The points of all pillars of a batch, one sample after the other.
     pub fn pillar_rows(&self, batch: &[Sample]) -> PillarRows {
-        let device = self.vfe.weight.val().device();
-        let inputs = self.vfe.weight.dims()[1];
         let features: Vec<f32> = batch.iter().flat_map(|s| s.features.iter().copied()).collect();
-        let rows = features.len() / inputs;
-        let num_points = batch.iter().flat_map(|s| s.pillars.num_points.iter().copied()).collect();
-        let features = Tensor::<2>::from_data(TensorData::new(features, [rows, inputs]), &device); // [N, F]
-        PillarRows { features, num_points }
+        let num_points: Vec<u32> = batch.iter().flat_map(|s| s.pillars.num_points.iter().copied()).collect();
+        PillarRows { features: features.into(), num_points: num_points.into() }
     }
 
     /// The cell of each pillar of a batch in the canvases laid end to end, and `[B, ny, nx]`.
