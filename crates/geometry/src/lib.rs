@@ -16,7 +16,7 @@ mod three_nn;
 pub use ball_query::ball_query;
 pub use box3::{Box3, limit_period};
 pub use farthest_point::{TieRule, farthest_point_sampling};
-pub use nms::rotated_nms;
+pub use nms::{rotated_nms, rotated_nms_first};
 pub use overlap::{bev_intersection, bev_iou, iou_3d};
 pub use points_in_boxes::points_in_boxes;
 pub use pose::{Pose, move_box, upright_pose, yaw_rad};

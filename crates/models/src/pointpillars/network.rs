@@ -42,7 +42,7 @@ impl PointPillars {
         let init = Init { seed, device };
         let neck = net.backbone.upsample_filters.iter().sum();
         let anchors = net.anchors.iter().map(|a| a.rotations_rad.len()).sum();
-        let [nx, ny, _] = config.grid_size();
+        let [nx, ny, _] = net.grid_size(config);
         PointPillars {
             vfe: PillarVfe::new(config.channels + 6, net.vfe_filters, net.pillars.max_points, &init),
             backbone_2d: BaseBevBackbone::new(net.vfe_filters, &net.backbone, &init),
@@ -53,7 +53,7 @@ impl PointPillars {
     }
 
     /// All stages of a batch.
-    pub fn forward(&self, batch: &[Sample], mode: Mode) -> Stages {
+    pub fn forward(&self, batch: &[&Sample], mode: Mode) -> Stages {
         let device = self.vfe.weight.val().device();
         let inputs = self.vfe.weight.dims()[1];
         let features: Vec<f32> = batch.iter().flat_map(|s| s.features.iter().copied()).collect();
