@@ -4,6 +4,7 @@ use crate::detectors::find_detector;
 use crate::device::DeviceArgs;
 use anyhow::Result;
 use burn::optim::GradientsParams;
+use burn::tensor::{Device, Tensor};
 use clap::Args;
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Frame, stream};
@@ -11,7 +12,7 @@ use models::config::NetworkConfig;
 use models::layers::Mode;
 use models::pointpillars::pillars::{PillarGrid, pillarise};
 use models::pointpillars::{losses, scatter::scatter};
-use models::{Detector, Preparer, reference_name};
+use models::{Detector, Network, Preparer, Sample, reference_name};
 use rand::RngExt;
 use serde::Serialize;
 use simulate::{RoadConfig, make_road_frame};
@@ -51,9 +52,6 @@ struct Report {
     peak_mib: Option<u64>,
 }
 
-const STAGES: [&str; 9] =
-    ["data", "encoder", "scatter", "backbone", "head", "loss", "backward", "optimizer", "whole step"];
-
 impl BenchStepArgs {
     /// Prints a table.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
@@ -65,48 +63,36 @@ impl BenchStepArgs {
         let mut detector = Detector::new(&config, 0, &device);
         let mut adam = Adam::new(config.optimization.weight_decay, reference_name);
         let preparer = Preparer::new(&config);
-        let mut times = vec![Vec::new(); STAGES.len()];
+        let mut times: Vec<(&'static str, Vec<f64>)> = Vec::new();
         for step in 0..self.steps + 2 {
-            let mut marks = vec![Instant::now()];
-            let mut mark = || device.sync().map(|()| marks.push(Instant::now()));
+            let mut clock = Clock { device: &device, marks: vec![("", Instant::now())] };
             let mut batch = Vec::with_capacity(frames.len());
             for (i, frame) in frames.iter().enumerate() {
                 let mut random = stream(0, "bench", step as u64, i as u64);
                 let augmented = augment(frame.clone(), &AugmentConfig::default(), None, &mut random);
-                batch.push(preparer.training(&crop_to_range(augmented, &config.range_m.map(f64::from)))?);
+                let cropped = crop_to_range(augmented, &config.range_m.map(f64::from));
+                batch.push(preparer.training(&cropped, &mut random)?);
             }
-            mark()?;
-            let NetworkConfig::PointPillars(net) = &config.network;
-            let network = &detector.network;
-            let rows = network.pillar_rows(&batch);
-            let pillars = network.vfe.forward(rows, Mode::Train);
-            mark()?;
-            let (cells, shape) = network.cells(&batch);
-            let canvas = scatter(pillars, cells, shape);
-            mark()?;
-            let features = network.backbone_2d.forward(canvas, Mode::Train).spatial_features_2d;
-            mark()?;
-            let predictions = network.dense_head.forward(features);
-            mark()?;
-            let total = losses(&predictions, &batch, &net.loss).total;
-            mark()?;
-            let gradients = GradientsParams::from_grads(total.backward(), network);
-            let norm = GradientNorm::of(network, &gradients, reference_name);
-            mark()?;
+            clock.mark("data")?;
+            let total = forward(&detector, &batch, &mut clock)?;
+            let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
+            let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
+            clock.mark("backward")?;
             let clip = norm.clip_scale(config.optimization.clip_norm);
-            detector.network = adam.step(network.clone(), gradients, clip, (1e-4, 0.9));
-            mark()?;
+            detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-4, 0.9));
+            clock.mark("optimizer")?;
             if step >= 2 {
-                let seconds = marks.windows(2).map(|pair| pair[1] - pair[0]);
-                let whole = *marks.last().expect("eight marks") - marks[0];
-                for (stage, time) in times.iter_mut().zip(seconds.chain([whole])) {
-                    stage.push(1e3 * time.as_secs_f64());
+                for (i, (stage, ms)) in clock.stages().into_iter().enumerate() {
+                    if times.len() == i {
+                        times.push((stage, Vec::new()));
+                    }
+                    times[i].1.push(ms);
                 }
             }
         }
         let report = Report {
             schema: "lidarshift/bench-step/1",
-            median_ms: STAGES.into_iter().zip(times.into_iter().map(median)).collect(),
+            median_ms: times.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
             peak_mib: crate::memory::peak_mib(),
             detector: config.name.clone(),
             device: self.device.describe(),
@@ -125,6 +111,58 @@ impl BenchStepArgs {
             data::write_atomic(path, &serde_json::to_vec_pretty(&report)?)?;
         }
         Ok(())
+    }
+}
+
+/// The losses of a batch, stage by stage where the network has stages that stand alone.
+fn forward(detector: &Detector, batch: &[Sample], clock: &mut Clock<'_>) -> Result<Tensor<1>> {
+    if let (Network::PointPillars(network), NetworkConfig::PointPillars(net)) =
+        (&detector.network, &detector.config().network)
+    {
+        let batch: Vec<_> = batch
+            .iter()
+            .filter_map(|sample| match sample {
+                Sample::PointPillars(sample) => Some(sample),
+                Sample::PointRcnn(_) => None,
+            })
+            .collect();
+        let pillars = network.vfe.forward(network.pillar_rows(&batch), Mode::Train);
+        clock.mark("encoder")?;
+        let (cells, shape) = network.cells(&batch);
+        let canvas = scatter(pillars, cells, shape);
+        clock.mark("scatter")?;
+        let features = network.backbone_2d.forward(canvas, Mode::Train).spatial_features_2d;
+        clock.mark("backbone")?;
+        let predictions = network.dense_head.forward(features);
+        clock.mark("head")?;
+        let total = losses(&predictions, &batch, &net.loss).total;
+        clock.mark("loss")?;
+        return Ok(total);
+    }
+    let total = detector.loss(batch)?.total;
+    clock.mark("forward")?;
+    Ok(total)
+}
+
+/// When each stage of a step ended, the device being done with it.
+struct Clock<'a> {
+    device: &'a Device,
+    marks: Vec<(&'static str, Instant)>,
+}
+
+impl Clock<'_> {
+    fn mark(&mut self, stage: &'static str) -> Result<()> {
+        self.device.sync()?;
+        self.marks.push((stage, Instant::now()));
+        Ok(())
+    }
+
+    /// Each stage and the whole step, ms.
+    fn stages(&self) -> Vec<(&'static str, f64)> {
+        let ms = |from: Instant, to: Instant| 1e3 * (to - from).as_secs_f64();
+        let (begin, end) = (self.marks[0].1, self.marks[self.marks.len() - 1].1);
+        let stages = self.marks.windows(2).map(|pair| (pair[1].0, ms(pair[0].1, pair[1].1)));
+        stages.chain([("whole step", ms(begin, end))]).collect()
     }
 }
 

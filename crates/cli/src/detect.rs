@@ -72,7 +72,7 @@ struct Loaded {
 impl Loaded {
     fn detect(&self, frame: &Frame) -> Result<Vec<Detection>> {
         let sample = self.preparer.inference(frame)?;
-        if sample.pillars.num_points.is_empty() {
+        if sample.is_empty() {
             return Ok(Vec::new());
         }
         Ok(self.detector.predict(&[sample])?.remove(0))

@@ -16,7 +16,7 @@ use train::{RunConfig, Session, evaluate_detector, set_key, train};
 
 const DEFAULT_DETECTOR: &str = "pointpillars_small";
 /// What a network needs at least to learn a few frames by heart, where nobody says how many epochs.
-const OVERFIT_STEPS: usize = 320;
+const OVERFIT_STEPS: usize = 400;
 
 /// Train a detector. Without a data set one is made on the spot: roads with cars, seen by a spinning LiDAR.
 ///
@@ -57,7 +57,7 @@ pub struct TrainArgs {
     /// Go on where a run was stopped, or begin it; what is not said again stays as it was
     #[arg(long)]
     resume: bool,
-    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default epochs: as many as make 320 steps]
+    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default: as many epochs as make 400 steps]
     #[arg(long)]
     overfit: bool,
     /// Threads that load and augment frames; any number gives the same weights
@@ -130,6 +130,8 @@ impl TrainArgs {
         if config.overfit && self.epochs.is_none() && !self.set.iter().any(|s| s.contains("optimization.epochs")) {
             let frames = Dataset::open(&config.dataset)?.all_ids()?.len();
             let optimization = &mut config.detector.optimization;
+            // The statistics of one frame alone are not those of all of them, which evaluation takes.
+            optimization.batch_size = optimization.batch_size.max(2);
             let steps = frames.div_ceil(optimization.batch_size);
             optimization.epochs = OVERFIT_STEPS.div_ceil(steps).max(optimization.epochs);
             config.run.evaluate_every_epochs = (optimization.epochs / 10).max(1) as u64;

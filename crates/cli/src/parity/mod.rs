@@ -3,6 +3,8 @@
 mod manifest;
 mod network;
 mod operators;
+mod pointpillars;
+mod pointrcnn;
 mod recipe;
 mod reference;
 mod toy_training;

@@ -2,7 +2,7 @@
 //!
 //! burn's own layer keeps the biased variance of a batch; PyTorch, and so every published checkpoint, the unbiased one.
 
-use super::{Init, host};
+use super::{Init, RowCounts, host};
 use crate::kernel_ops::norm_relu;
 use burn::module::{Module, Param, RunningState};
 use burn::tensor::activation::relu;
@@ -137,6 +137,31 @@ impl BatchNorm {
     pub fn normalise_rows(&self, x: Tensor<2>, moments: &Moments) -> Tensor<2> {
         let scale = self.weight.val() / (moments.variance.clone() + self.epsilon).sqrt(); // [C]
         (x - moments.mean.clone().unsqueeze::<2>()) * scale.unsqueeze() + self.bias.val().unsqueeze() // [N, C]
+    }
+
+    /// Normalises rows with their own statistics and takes these into the running ones.
+    ///
+    /// # Shapes
+    /// `x`: `[N, C]`, the result alike.
+    pub fn forward_rows_train(&self, x: Tensor<2>, counts: &RowCounts) -> Tensor<2> {
+        let channels = x.dims()[1];
+        let mean = counts.mean(x.clone()); // [1, C]
+        let centered = x - mean.clone(); // [N, C]
+        let variance = counts.mean(centered.clone() * centered.clone()); // [1, C]
+        let scale = self.weight.val().unsqueeze() / (variance.clone() + self.epsilon).sqrt(); // [1, C]
+        let (mean, variance) = (mean.reshape([channels]), variance.reshape([channels]));
+        self.update(Moments { mean, variance, count: counts.total() });
+        centered * scale + self.bias.val().unsqueeze()
+    }
+
+    /// Normalises rows with the running statistics.
+    ///
+    /// # Shapes
+    /// `x`: `[N, C]`, the result alike.
+    pub fn forward_rows_eval(&self, x: Tensor<2>) -> Tensor<2> {
+        let scale = self.weight.val() / (self.running_var.value() + self.epsilon).sqrt(); // [C]
+        let shift = self.bias.val() - self.running_mean.value() * scale.clone(); // [C]
+        x * scale.unsqueeze() + shift.unsqueeze()
     }
 
     /// The statistics of past batches, as [`BatchNorm::normalise_rows`] takes them.

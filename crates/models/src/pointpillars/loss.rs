@@ -12,7 +12,7 @@ use burn::tensor::{Int, Tensor, TensorData};
 ///
 /// # Panics
 /// When a sample was prepared without targets.
-pub fn losses(predictions: &Predictions, batch: &[Sample], weights: &LossConfig) -> Losses {
+pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig) -> Losses {
     let device = predictions.cls.device();
     let [b, anchors, classes] = predictions.cls.dims();
     let mut labels = Vec::with_capacity(b * anchors);
