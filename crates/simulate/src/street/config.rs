@@ -1,30 +1,13 @@
 //! What a synthetic road data set is made of, as people write it in TOML.
 
-use crate::scene::SceneConfig;
-use crate::sensor::SensorConfig;
-use data::DataError;
+use crate::SimulateError;
+use crate::config_text::read_toml;
+use crate::error::wrong;
+use crate::street::scene::SceneConfig;
+use crate::street::sensor::SensorConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
-
-/// Why a data set could not be made.
-#[derive(Debug, thiserror::Error)]
-pub enum SimulateError {
-    /// A file could not be read or written, or says something that cannot be.
-    #[error(transparent)]
-    Data(#[from] DataError),
-    /// The file system refused; the message names the path.
-    #[error(transparent)]
-    Io(#[from] std::io::Error),
-    /// A value of the configuration cannot be.
-    #[error("{field}: {message}")]
-    Config {
-        /// The key, as `sensor.range_noise_m`.
-        field: &'static str,
-        /// What is wrong and what would be right.
-        message: String,
-    },
-}
 
 /// A synthetic road data set. Every key may be left out.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -84,13 +67,7 @@ impl FrameCounts {
 impl RoadConfig {
     /// Reads a TOML; what it leaves out keeps its default.
     pub fn read(path: &Path) -> Result<Self, SimulateError> {
-        let text = fs_err::read_to_string(path)?;
-        let config: RoadConfig = toml::from_str(&text).map_err(|e| {
-            let line = 1 + e.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count());
-            DataError::line(path, line, e.message())
-        })?;
-        config.check().map_err(|e| DataError::file(path, e.to_string()))?;
-        Ok(config)
+        read_toml(path, RoadConfig::check)
     }
 
     /// Refuses what cannot be simulated, naming the key.
@@ -104,20 +81,6 @@ impl RoadConfig {
         }
         self.scene.check()?;
         self.sensor.check()
-    }
-}
-
-/// The error of one key.
-pub(crate) fn wrong(field: &'static str, message: impl Into<String>) -> SimulateError {
-    SimulateError::Config { field, message: message.into() }
-}
-
-/// Refuses a number outside of `low..=high`; not-a-number as well.
-pub(crate) fn within(field: &'static str, value: f64, low: f64, high: f64) -> Result<(), SimulateError> {
-    if (low..=high).contains(&value) {
-        Ok(())
-    } else {
-        Err(wrong(field, format!("{value} is not between {low} and {high}")))
     }
 }
 

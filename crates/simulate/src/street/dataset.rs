@@ -1,8 +1,9 @@
 //! A synthetic road data set on disk.
 
-use crate::config::{RoadConfig, SimulateError};
-use crate::scene::Scene;
-use crate::sensor::scan;
+use crate::SimulateError;
+use crate::street::config::RoadConfig;
+use crate::street::scene::Scene;
+use crate::street::sensor::scan;
 use data::write::{write_dataset_toml, write_kitti_frame, write_split};
 use data::{DataError, DatasetConfig, Frame, LabelFrame, Object, PointColumns, stream, write_atomic};
 use rayon::prelude::*;
@@ -171,7 +172,7 @@ fn dataset_config(config: &RoadConfig) -> DatasetConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::FrameCounts;
+    use crate::street::FrameCounts;
     use data::Dataset;
 
     fn small(seed: u64) -> RoadConfig {

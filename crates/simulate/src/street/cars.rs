@@ -1,6 +1,6 @@
 //! Cars: boxes to detect, and the solids in them that a LiDAR sees.
 
-use crate::raycast::{Material, Slice, Solid};
+use crate::street::solid::{Material, Slice, Solid};
 use data::Stream;
 use geometry::Box3;
 use rand::RngExt;

@@ -1,8 +1,8 @@
 //! What stands beside the road and is no car.
 
-use crate::raycast::{Material, Slice, Solid};
-use crate::road::Road;
-use crate::scene::Taken;
+use crate::street::road::Road;
+use crate::street::scene::Taken;
+use crate::street::solid::{Material, Slice, Solid};
 use data::Stream;
 use geometry::Box3;
 use rand::RngExt;

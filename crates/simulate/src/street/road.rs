@@ -1,7 +1,7 @@
 //! The road under the sensor: where its lanes run, what its ground is made of and how high it lies.
 
-use crate::raycast::{Hit, Material, dot};
-use crate::scene::SceneConfig;
+use crate::street::scene::SceneConfig;
+use crate::street::solid::{Hit, Material, dot};
 use data::Stream;
 use rand::RngExt;
 

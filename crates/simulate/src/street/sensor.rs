@@ -1,8 +1,9 @@
 //! A spinning LiDAR of many beams: which rays it sends, and what comes back.
 
-use crate::config::{SimulateError, within, wrong};
-use crate::raycast::{Hit, Material};
-use crate::scene::Scene;
+use crate::SimulateError;
+use crate::error::{within, wrong};
+use crate::street::scene::Scene;
+use crate::street::solid::{Hit, Material};
 use data::{Cloud, Stream};
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -155,7 +156,7 @@ pub fn scan(scene: &Scene, sensor: &SensorConfig, random: &mut Stream) -> Scan {
 
 /// The solids that a column of rays may meet.
 fn in_sight(scene: &Scene, azimuth_rad: f64) -> Vec<usize> {
-    let near = |solid: &crate::raycast::Solid| {
+    let near = |solid: &crate::street::solid::Solid| {
         let (middle, half) = solid.azimuths();
         geometry::limit_period(azimuth_rad - middle, 0.5, std::f64::consts::TAU).abs() <= half
     };
@@ -209,7 +210,7 @@ fn measure(hit: &Hit, sensor: &SensorConfig, random: &mut Stream) -> Option<[f64
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::SceneConfig;
+    use crate::street::scene::SceneConfig;
 
     fn scans() -> impl Iterator<Item = (Scene, Scan)> {
         let (config, sensor) = (SceneConfig::default(), SensorConfig::default());

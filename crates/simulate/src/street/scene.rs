@@ -1,11 +1,12 @@
 //! One scene: a road, cars on and beside it, and what stands around.
 
-use crate::cars::Car;
-use crate::config::{SimulateError, within, wrong};
-use crate::raycast::Solid;
-use crate::road::{LANE_M, PARKING_M, Road};
-use crate::roadside;
-use crate::sensor::SensorConfig;
+use crate::SimulateError;
+use crate::error::{within, wrong};
+use crate::street::cars::Car;
+use crate::street::road::{LANE_M, PARKING_M, Road};
+use crate::street::roadside;
+use crate::street::sensor::SensorConfig;
+use crate::street::solid::Solid;
 use data::Stream;
 use geometry::{Box3, bev_intersection};
 use rand::RngExt;
