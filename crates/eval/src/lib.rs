@@ -3,13 +3,18 @@
 //! Everything is computed on the numbers of the texts, in the frame they are written in. KITTI's camera and LiDAR frames are
 //! tilted against each other, so that a box upright in one is not upright in the other: a conversion would change overlaps.
 
+pub mod analysis;
 mod bootstrap;
 mod csv_text;
 mod curve;
 mod evaluate;
 mod evidence;
 mod matching;
+pub mod distance;
+pub mod features;
 pub mod matrix;
+pub mod study;
+pub mod targets;
 mod options;
 mod overlaps;
 mod read;

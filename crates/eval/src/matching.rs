@@ -80,6 +80,8 @@ pub(crate) struct FrameMatching<'a> {
     dont_care: &'a [Pair],
     min_overlap: f64,
     taken: Vec<bool>,
+    /// Detections that were hits when last counted.
+    hits: Vec<bool>,
 }
 
 impl<'a> FrameMatching<'a> {
@@ -100,6 +102,7 @@ impl<'a> FrameMatching<'a> {
             labels,
             spared: (0..detections.len()).map(|j| !inside(BoxIndex::Detection(j))).collect(),
             taken: vec![false; detections.len()],
+            hits: vec![false; detections.len()],
             detections,
             pairs: overlaps.of(metric),
             dont_care: if forgiving { &overlaps.dont_care } else { &[] },
@@ -157,6 +160,7 @@ impl<'a> FrameMatching<'a> {
     /// overlap, an ignored one only where there is no other. What is left over is a false alarm, unless DontCare forgives it.
     pub(crate) fn count(&mut self, least_score: f64) -> Counts {
         self.taken.fill(false);
+        self.hits.fill(false);
         let mut counts = Counts::default();
         let mut pairs = self.pairs;
         for label in 0..self.labels.len() {
@@ -185,6 +189,7 @@ impl<'a> FrameMatching<'a> {
                     self.taken[j] = true;
                     if counted && self.detections[j] == Role::Counted {
                         counts.tp += 1;
+                        self.hits[j] = true;
                         let error = self.frame.labels[label].alpha - self.frame.detections[j].alpha;
                         counts.similarity += (1.0 + error.cos()) / 2.0;
                     }
@@ -199,6 +204,19 @@ impl<'a> FrameMatching<'a> {
         });
         counts.fp = left_over.count() as i64;
         counts
+    }
+}
+
+impl FrameMatching<'_> {
+    /// Of each detection, with no score limit: whether it is a hit (`true`) or a false alarm; `None` where it counts neither way.
+    pub(crate) fn outcomes(&mut self) -> Vec<Option<bool>> {
+        self.count(f64::NEG_INFINITY);
+        let outcome = |j: usize| match self.detections[j] {
+            Role::Counted if self.hits[j] => Some(true),
+            Role::Counted if !self.taken[j] && !self.spared[j] => Some(false),
+            _ => None,
+        };
+        (0..self.detections.len()).map(outcome).collect()
     }
 }
 
