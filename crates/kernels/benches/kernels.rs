@@ -3,7 +3,8 @@
 //! Arguments choose what runs by parts of its name: `cargo bench -p lidarshift-kernels -- conv stride2`.
 
 use lidarshift_kernels::{
-    Algorithm, BatchNorm, Conv3x3, Epilogue, InstructionSet, PillarNet, PillarParameters, Pillars, Pointwise, TransposedConv,
+    Algorithm, BatchNorm, Conv3x3, Epilogue, InstructionSet, PillarNet, PillarParameters, Pillars, Pointwise,
+    TransposedConv,
 };
 use std::hint::black_box;
 use std::time::Instant;
@@ -28,7 +29,8 @@ impl Bench {
             })
             .collect();
         times_ms.sort_by(f64::total_cmp);
-        let rate = if operations > 0.0 { format!("{:6.0} GFLOP/s", operations / times_ms[0] / 1e6) } else { String::new() };
+        let rate =
+            if operations > 0.0 { format!("{:6.0} GFLOP/s", operations / times_ms[0] / 1e6) } else { String::new() };
         println!("{name:60} {:8.2} {:8.2}  {rate}", times_ms[RUNS / 2], times_ms[0]);
     }
 }
@@ -61,7 +63,9 @@ fn convolutions(bench: &Bench) {
             let (x, w, dy) = (values(conv.x_len(), 1), values(conv.weight_len(), 2), values(conv.y_len(), 3));
             let operations = 2.0 * (conv.y_len() * inputs * 9) as f64;
             let (mut y, mut dx) = (Vec::new(), Vec::new());
-            let name = |what: &str| format!("conv3x3 {inputs}->{outputs} {height}x{width} stride{stride} {algorithm:?} {what}");
+            let name = |what: &str| {
+                format!("conv3x3 {inputs}->{outputs} {height}x{width} stride{stride} {algorithm:?} {what}")
+            };
             bench.time(&name("forward"), operations, || {
                 conv.forward(&x, &conv.pack(&w), Epilogue::default(), &mut y);
             });
@@ -127,7 +131,8 @@ fn norms(bench: &Bench) {
 
 fn pillars(bench: &Bench) {
     let net = PillarNet { inputs: 10, outputs: 64, max_points: 32, epsilon: 1e-3 };
-    let num_points: Vec<u32> = values(6000, 5).iter().map(|v| 1 + ((v * 0.5 + 0.5).powi(6) * 32.0).min(31.0) as u32).collect();
+    let num_points: Vec<u32> =
+        values(6000, 5).iter().map(|v| 1 + ((v * 0.5 + 0.5).powi(6) * 32.0).min(31.0) as u32).collect();
     let n = num_points.iter().sum::<u32>() as usize;
     let (features, dout) = (values(n * 10, 1), values(6000 * 64, 6));
     let (weight, gamma, beta) = (values(640, 2), vec![1.0; 64], values(64, 4));
@@ -145,7 +150,11 @@ fn pillars(bench: &Bench) {
 
 fn main() {
     let bench = Bench { wanted: std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect() };
-    println!("{:?}, {} threads; median and fastest of {RUNS} in ms", InstructionSet::in_use(), rayon::current_num_threads());
+    println!(
+        "{:?}, {} threads; median and fastest of {RUNS} in ms",
+        InstructionSet::in_use(),
+        rayon::current_num_threads()
+    );
     convolutions(&bench);
     products(&bench);
     norms(&bench);

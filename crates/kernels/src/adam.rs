@@ -132,7 +132,8 @@ impl GradientNorm {
                 lanes.iter().sum::<f64>() + rest.iter().map(|&v| v as f64 * v as f64).sum::<f64>()
             })
         };
-        let of_one = |gradient: &&[f32]| gradient.par_chunks(CHUNK).map(squares).collect::<Vec<f64>>().iter().sum::<f64>();
+        let of_one =
+            |gradient: &&[f32]| gradient.par_chunks(CHUNK).map(squares).collect::<Vec<f64>>().iter().sum::<f64>();
         let sums: Vec<f64> = gradients.par_iter().map(of_one).collect();
         // Squares of finite f32 do not overflow f64.
         GradientNorm { total: sums.iter().sum::<f64>().sqrt(), not_finite: sums.iter().position(|s| !s.is_finite()) }

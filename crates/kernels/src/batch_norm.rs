@@ -84,7 +84,8 @@ impl BatchNorm {
             if self.relu && z < 0.0 { 0.0 } else { z }
         };
         // SAFETY: `two_passes` writes all of y.
-        let statistics = unsafe { fill(y, self.len(), |y| self.two_passes(x, x, y, |_| Affine::NONE, moments, affine, apply)) };
+        let statistics =
+            unsafe { fill(y, self.len(), |y| self.two_passes(x, x, y, |_| Affine::NONE, moments, affine, apply)) };
         let (mean, variance) = statistics.into_iter().map(|[mean, variance]| (mean, variance)).unzip();
         Statistics { mean, variance }
     }
@@ -143,7 +144,8 @@ impl BatchNorm {
         // scale (g - mean of g - (x - mean) / variance * mean of g (x - mean))
         let apply = |x: f32, dy: f32, a: &Affine| gradient(x, dy, a) * a.scale + ((x - a.mean) * a.slope + a.offset);
         // SAFETY: `two_passes` writes all of dx.
-        let sums = unsafe { fill(dx, self.len(), |dx| self.two_passes(x, dy, dx, |c| before[c], moments, affine, apply)) };
+        let sums =
+            unsafe { fill(dx, self.len(), |dx| self.two_passes(x, dy, dx, |c| before[c], moments, affine, apply)) };
         sums.into_iter().map(|[dgamma, dbeta]| (dgamma as f32, dbeta as f32)).unzip()
     }
 
@@ -233,7 +235,9 @@ impl BatchNorm {
             vectorized(|| {
                 for n in 0..self.batch {
                     let run = n * row + start..n * row + columns(start).end;
-                    for (((sum, &x), &other), a) in sums.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters) {
+                    for (((sum, &x), &other), a) in
+                        sums.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters)
+                    {
                         let [first, second] = moments(x, other, a);
                         sum[0] += first;
                         sum[1] += second;
@@ -253,7 +257,9 @@ impl BatchNorm {
                 // SAFETY: no other task has these columns.
                 let out = unsafe { out.part(run.start, run.len()) };
                 vectorized(|| {
-                    for (((out, &x), &other), a) in out.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters) {
+                    for (((out, &x), &other), a) in
+                        out.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters)
+                    {
                         out.write(apply(x, other, a));
                     }
                 });

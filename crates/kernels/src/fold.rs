@@ -42,7 +42,8 @@ impl NormParameters<'_> {
         let scale: Vec<f64> =
             self.gamma.iter().zip(variance).map(|(&g, v)| g as f64 / (v + self.epsilon).sqrt()).collect();
         let scaled = |(at, &w): (usize, &f32)| (w as f64 * scale[output(at, group)]) as f32;
-        let bias = self.beta.iter().zip(&scale).zip(mean).map(|((&beta, scale), mean)| (beta as f64 - mean * scale) as f32);
+        let bias =
+            self.beta.iter().zip(&scale).zip(mean).map(|((&beta, scale), mean)| (beta as f64 - mean * scale) as f32);
         Folded { weight: weight.iter().enumerate().map(scaled).collect(), bias: bias.collect() }
     }
 }
@@ -60,7 +61,13 @@ mod tests {
         (random(channels, 1), random(channels, 2), Statistics { mean: as_f64(random(channels, 3)), variance })
     }
 
-    fn check(plain: &[f32], folded: &[f32], outputs: usize, pixels: usize, (gamma, beta, statistics): (&[f32], &[f32], &Statistics)) {
+    fn check(
+        plain: &[f32],
+        folded: &[f32],
+        outputs: usize,
+        pixels: usize,
+        (gamma, beta, statistics): (&[f32], &[f32], &Statistics),
+    ) {
         let batch = plain.len() / (outputs * pixels);
         let norm = BatchNorm { batch, channels: outputs, pixels, epsilon: 1e-3, relu: true };
         let mut want = Vec::new();
@@ -73,7 +80,8 @@ mod tests {
     fn gives_what_both_give() {
         let (gamma, beta, statistics) = norm(5);
         let parameters = NormParameters { gamma: &gamma, beta: &beta, statistics: &statistics, epsilon: 1e-3 };
-        let conv = Conv3x3 { batch: 2, inputs: 3, outputs: 5, height: 6, width: 7, stride: 2, algorithm: Default::default() };
+        let conv =
+            Conv3x3 { batch: 2, inputs: 3, outputs: 5, height: 6, width: 7, stride: 2, algorithm: Default::default() };
         let (x, w) = (random(conv.x_len(), 5), random(conv.weight_len(), 6));
         let (mut plain, mut both) = (Vec::new(), Vec::new());
         let Folded { weight, bias } = parameters.fold_into_conv(&w);

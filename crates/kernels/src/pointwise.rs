@@ -78,7 +78,8 @@ impl Pointwise {
     pub fn bias_gradient(&self, dy: &[f32]) -> Vec<f32> {
         self.check_dy(dy);
         let plane = |image: usize, output: usize| &dy[(image * self.outputs + output) * self.pixels..][..self.pixels];
-        let sum = |output| (0..self.batch).map(|n| plane(n, output).iter().map(|&v| v as f64).sum::<f64>()).sum::<f64>();
+        let sum =
+            |output| (0..self.batch).map(|n| plane(n, output).iter().map(|&v| v as f64).sum::<f64>()).sum::<f64>();
         (0..self.outputs).into_par_iter().map(|output| sum(output) as f32).collect()
     }
 

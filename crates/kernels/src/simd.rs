@@ -190,7 +190,10 @@ mod tests {
             assert_eq!(InstructionSet::not_above(set.name()), Ok(set));
         }
         let error = InstructionSet::not_above("avx9").unwrap_err();
-        assert_eq!(error.to_string(), "LIDARSHIFT_SIMD is \"avx9\"; it may be portable, neon, avx2 or avx512, or not set at all");
+        assert_eq!(
+            error.to_string(),
+            "LIDARSHIFT_SIMD is \"avx9\"; it may be portable, neon, avx2 or avx512, or not set at all"
+        );
     }
 
     #[test]

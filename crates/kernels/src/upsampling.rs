@@ -217,15 +217,7 @@ impl<const M: usize, W: Fn(usize, usize) -> usize + Sync> Panels for PixelPanels
     }
 
     #[inline(always)]
-    fn read_x<S: Simd>(
-        &self,
-        _: S,
-        segments: &[Segment],
-        input: usize,
-        panel: &mut [Row],
-        _: usize,
-        work: &mut Work,
-    ) {
+    fn read_x<S: Simd>(&self, _: S, segments: &[Segment], input: usize, panel: &mut [Row], _: usize, work: &mut Work) {
         read_pixels(self.x, &self.x_shape, segments, input, &mut panel[0], work);
     }
 }

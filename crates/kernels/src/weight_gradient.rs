@@ -103,8 +103,7 @@ pub(crate) fn weight_gradient<P: Panels>(panels: &P) -> Vec<f32> {
     let parts = 1 << (blocks / BLOCKS_A_PART).clamp(1, MOST_PARTS).ilog2();
     let columns = outputs.min(OUTPUTS_AT_ONCE).next_multiple_of(PIXELS);
     let splits = outputs.div_ceil(columns);
-    let sums =
-        Sums { positions: P::POSITIONS, rows: (inputs * P::ROWS).next_multiple_of(tile_rows()), columns };
+    let sums = Sums { positions: P::POSITIONS, rows: (inputs * P::ROWS).next_multiple_of(tile_rows()), columns };
     let mut dw = Vec::new();
     scratch::with([parts * splits * sums.len()], |[memory]| {
         memory.par_chunks_mut(sums.len()).enumerate().for_each(|(task, memory)| {

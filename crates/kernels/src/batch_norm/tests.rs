@@ -61,7 +61,9 @@ fn equals_the_definition() {
         let (mut y, mut dx) = (Vec::new(), vec![1.0; 3]);
         let statistics = norm.forward_train(&x, &gamma, &beta, &mut y);
         let (dgamma, dbeta) = norm.backward((&x, &dy), (&gamma, &beta), &statistics, &mut dx);
-        for (name, got, want) in [("mean", &statistics.mean, &want.mean), ("variance", &statistics.variance, &want.variance)] {
+        for (name, got, want) in
+            [("mean", &statistics.mean, &want.mean), ("variance", &statistics.variance, &want.variance)]
+        {
             for (got, want) in got.iter().zip(want) {
                 assert!((got - want).abs() <= 1e-10 * want.abs().max(1.0), "{name} of {norm:?}: {got} {want}");
             }

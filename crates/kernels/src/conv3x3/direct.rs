@@ -31,11 +31,7 @@ impl<'a, const STRIDE: usize> Direct<'a, STRIDE> {
 }
 
 /// Weights in the order of [`read_neighbours`]; `kernel(output, input)` gives those of one pair of channels.
-pub(super) fn pack(
-    inputs: usize,
-    outputs: usize,
-    kernel: impl Fn(usize, usize) -> [f32; 9] + Sync,
-) -> PackedWeights {
+pub(super) fn pack(inputs: usize, outputs: usize, kernel: impl Fn(usize, usize) -> [f32; 9] + Sync) -> PackedWeights {
     PackedWeights::new(outputs, inputs * 9, |output, put| {
         for input in 0..inputs {
             for (tap, weight) in kernel(output, input).into_iter().enumerate() {

@@ -123,15 +123,7 @@ impl<const STRIDE: usize> Panels for DirectPanels<'_, STRIDE> {
     }
 
     #[inline(always)]
-    fn read_x<S: Simd>(
-        &self,
-        _: S,
-        segments: &[Segment],
-        input: usize,
-        panel: &mut [Row],
-        _: usize,
-        work: &mut Work,
-    ) {
+    fn read_x<S: Simd>(&self, _: S, segments: &[Segment], input: usize, panel: &mut [Row], _: usize, work: &mut Work) {
         read_neighbours::<STRIDE>((self.0.x, &self.0.x_shape), segments, input, panel, work);
     }
 }

@@ -149,8 +149,12 @@ impl Conv3x3 {
         let dy_shape = ImageShape { channels: self.outputs, height: self.out_height(), width: self.out_width() };
         let factors = Factors { batch: self.batch, x, x_shape, dy, dy_shape };
         match (self.stride, self.algorithm) {
-            (1, Algorithm::WinogradF2) => weight_gradient(&WinogradPanels::<F2, 2, 4> { factors, transforms: PhantomData }),
-            (1, Algorithm::WinogradF4) => weight_gradient(&WinogradPanels::<F4, 4, 6> { factors, transforms: PhantomData }),
+            (1, Algorithm::WinogradF2) => {
+                weight_gradient(&WinogradPanels::<F2, 2, 4> { factors, transforms: PhantomData })
+            }
+            (1, Algorithm::WinogradF4) => {
+                weight_gradient(&WinogradPanels::<F4, 4, 6> { factors, transforms: PhantomData })
+            }
             (1, Algorithm::Direct) => weight_gradient(&DirectPanels::<1>(factors)),
             _ => weight_gradient(&DirectPanels::<2>(factors)),
         }

@@ -64,9 +64,8 @@ fn equals_the_definition() {
         let (x, w) = (random(conv.x_len(), 1), random(conv.weight_len(), 2));
         let dy = random(conv.y_len(), 3);
         let tolerance = if conv.algorithm == Algorithm::WinogradF4 { 2e-5 } else { 2e-6 };
-        for (name, (got, want)) in ["y", "dx", "dw"]
-            .iter()
-            .zip(all_three(&conv, &x, &w, &dy).iter().zip(&reference(&conv, &x, &w, &dy)))
+        for (name, (got, want)) in
+            ["y", "dx", "dw"].iter().zip(all_three(&conv, &x, &w, &dy).iter().zip(&reference(&conv, &x, &w, &dy)))
         {
             assert_close(got, want, tolerance, &format!("{name} of {conv:?}"));
         }

@@ -112,7 +112,8 @@ mod tests {
     /// A^T [(G w G^T) . (B^T d B)] A is the convolution, and `gradient` is the transpose of `output`.
     fn check<F: Winograd<M, A>, const M: usize, const A: usize>() {
         let w: [f32; 9] = std::array::from_fn(|i| ((i * 7 + 3) % 11) as f32 - 5.0);
-        let d: [[f32; A]; A] = std::array::from_fn(|i| std::array::from_fn(|j| ((i * 5 + j * 3 + i * j) % 7) as f32 - 3.0));
+        let d: [[f32; A]; A] =
+            std::array::from_fn(|i| std::array::from_fn(|j| ((i * 5 + j * 3 + i * j) % 7) as f32 - 3.0));
         let column = |m: &[[f32; A]; A], j: usize| std::array::from_fn::<f32, A, _>(|i| m[i][j]);
         let v: [[f32; A]; A] = std::array::from_fn(|j| F::input(column(&d, j))); // columns of B^T d
         let v: [[f32; A]; A] = std::array::from_fn(|i| F::input(std::array::from_fn(|j| v[j][i])));

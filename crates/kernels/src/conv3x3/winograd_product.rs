@@ -1,7 +1,7 @@
 //! The convolution of stride 1 by Winograd's minimal filtering: a product for each of the A x A values of a transformed tile.
 
-use super::winograd::{Winograd, transform_kernel};
 use super::Conv3x3;
+use super::winograd::{Winograd, transform_kernel};
 use crate::blocks::{Segment, TileGrid};
 use crate::epilogue::Epilogue;
 use crate::images::{ImageShape, Work, rounded, write_tiles};
@@ -135,8 +135,7 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Scheme for WinogradProdu
     ) {
         for group in 0..PIXELS / S::F32_LANES {
             let value = |i, j| Lanes::new(simd, S::as_simd_f32s(products(i * A + j)).0[group]);
-            let columns: [[Lanes<S>; M]; A] =
-                std::array::from_fn(|j| F::output(std::array::from_fn(|i| value(i, j))));
+            let columns: [[Lanes<S>; M]; A] = std::array::from_fn(|j| F::output(std::array::from_fn(|i| value(i, j))));
             for i in 0..M {
                 for (j, pixel) in F::output(std::array::from_fn(|j| columns[j][i])).into_iter().enumerate() {
                     S::as_mut_simd_f32s(&mut work.rows[i * M + j]).0[group] = pixel.values;

@@ -135,7 +135,11 @@ impl PillarNet {
             assert!(n as usize <= self.max_points, "{n} points in a pillar of {self:?}");
             starts.push(starts[starts.len() - 1] + n as usize);
         }
-        assert_eq!(pillars.features.len(), starts[starts.len() - 1] * self.inputs, "elements of the points of {self:?}");
+        assert_eq!(
+            pillars.features.len(),
+            starts[starts.len() - 1] * self.inputs,
+            "elements of the points of {self:?}"
+        );
         starts
     }
 

@@ -59,8 +59,7 @@ impl Case {
         let [mut dw, mut dgamma, mut dbeta] = [vec![0.0; c * f], vec![0.0; c], vec![0.0; c]];
         for channel in 0..c {
             let w = &self.weight[channel * f..][..f];
-            let y: Vec<f64> =
-                rows.chunks_exact(f).map(|x| x.iter().zip(w).map(|(x, &w)| x * w as f64).sum()).collect();
+            let y: Vec<f64> = rows.chunks_exact(f).map(|x| x.iter().zip(w).map(|(x, &w)| x * w as f64).sum()).collect();
             let mu = y.iter().sum::<f64>() / n;
             let var = y.iter().map(|y| (y - mu).powi(2)).sum::<f64>() / n;
             let r = 1.0 / (var + self.net.epsilon).sqrt();
@@ -105,12 +104,17 @@ fn equals_the_padded_form() {
     for case in cases() {
         let ([out, dw, dgamma, dbeta], state) = case.run();
         let [want, mean, variance, want_dw, want_dgamma, want_dbeta] = case.reference();
-        for (got, want) in state.statistics.mean.iter().zip(&mean).chain(state.statistics.variance.iter().zip(&variance)) {
+        for (got, want) in
+            state.statistics.mean.iter().zip(&mean).chain(state.statistics.variance.iter().zip(&variance))
+        {
             assert!((got - want).abs() <= 1e-11 * want.abs().max(1.0), "{:?}: {got} {want}", case.net);
         }
-        for (name, got, want, tolerance) in
-            [("out", out, want, 1e-5), ("dgamma", dgamma, want_dgamma, 1e-5), ("dbeta", dbeta, want_dbeta, 1e-6), ("dw", dw, want_dw, 1e-5)]
-        {
+        for (name, got, want, tolerance) in [
+            ("out", out, want, 1e-5),
+            ("dgamma", dgamma, want_dgamma, 1e-5),
+            ("dbeta", dbeta, want_dbeta, 1e-6),
+            ("dw", dw, want_dw, 1e-5),
+        ] {
             assert_close(&got, &want, tolerance, &format!("{name} of {:?}", case.net));
         }
         let mut out = Vec::new();
