@@ -135,7 +135,7 @@ mod tests {
     fn planes_are_predicted_between_the_rays() {
         for (normal, h) in [(Vector3::new(0.0, 0.0, -1.0), 1.5), (Vector3::new(0.8, 0.6, 0.0), 20.0)] {
             let (index, window) = plane(normal, h, 0.004);
-            let (az, el) = (0.3017, -0.1031);
+            let (az, el) = (0.3017f64, -0.1031f64);
             let s = fit_surface(&index, window, az as f32, el as f32, |_| true).unwrap();
             let u = direction(f64::from(az as f32), f64::from(el as f32));
             let range = h / normal.dot(&u);
