@@ -1,11 +1,13 @@
 //! The program `lidarshift`: detectors trained in simulation, measured on the road. A file a command.
 
+pub mod bench_step;
 pub mod detect;
 pub mod detectors;
 pub mod device;
 pub mod doctor;
 pub mod eval_ap;
 pub mod fuzz;
+pub mod memory;
 pub mod parity;
 pub mod schema;
 pub mod simulate;
@@ -45,6 +47,9 @@ enum Command {
     /// Feed damaged files to every reader
     #[command(hide = true)]
     Fuzz(fuzz::FuzzArgs),
+    /// Time a training step by stage
+    #[command(hide = true)]
+    BenchStep(bench_step::BenchStepArgs),
 }
 
 #[derive(Subcommand, Debug)]
@@ -64,6 +69,7 @@ pub fn run() -> ExitCode {
         Command::Parity(args) => args.run(),
         Command::Schema(args) => args.run().map(|()| true),
         Command::Fuzz(args) => args.run(),
+        Command::BenchStep(args) => args.run().map(|()| true),
     };
     match done {
         Ok(true) => ExitCode::SUCCESS,

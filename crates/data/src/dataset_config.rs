@@ -72,7 +72,8 @@ pub struct DatasetConfig {
     /// wherever it matters.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<PathBuf>,
-    /// Keep only the points that the camera sees (needs `calib`). The reference does so with KITTI in training and in test.
+    /// Keep only the points that the camera sees (needs `calib`). Default: where the labels are in the camera's frame, for only what the
+    /// camera sees is labelled there; the reference does so with KITTI in training and in test.
     #[serde(default)]
     pub fov_crop: bool,
     /// Width and height of the camera's image, px.
@@ -126,7 +127,7 @@ impl DatasetConfig {
         config.root = folder.join(&config.root);
         config.rig = config.rig.map(|rig| folder.join(rig));
         let written: toml::Table = toml::from_str(text).expect("it was read above");
-        config.fill_in(!written.contains_key("label_frame"));
+        config.fill_in(!written.contains_key("label_frame"), !written.contains_key("fov_crop"));
         config.check(path)?;
         Ok(config)
     }
@@ -159,16 +160,19 @@ impl DatasetConfig {
         } else {
             return Err(DataError::file(folder, "does not exist; a data set is a folder or its TOML"));
         };
-        config.fill_in(true);
+        config.fill_in(true, true);
         Ok(config)
     }
 
-    fn fill_in(&mut self, label_frame_unsaid: bool) {
+    fn fill_in(&mut self, label_frame_unsaid: bool, fov_crop_unsaid: bool) {
         if self.name.is_empty() {
             self.name = folder_name(&self.root);
         }
         if label_frame_unsaid && self.layout == Layout::Kitti && self.root.join("calib").is_dir() {
             self.label_frame = LabelFrame::Camera;
+        }
+        if fov_crop_unsaid {
+            self.fov_crop = self.label_frame == LabelFrame::Camera;
         }
         if self.splits.is_empty() {
             for name in ["train", "val", "test"] {

@@ -3,11 +3,13 @@
 mod manifest;
 mod network;
 mod operators;
+mod pointpillars;
+mod pointrcnn;
 mod recipe;
 mod reference;
 mod toy_training;
 
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result};
 use clap::Args;
 use reference::Row;
@@ -21,9 +23,8 @@ use std::path::PathBuf;
 pub struct ParityArgs {
     /// Folder with manifest.json and safetensors files of a network, or of single operations
     dir: PathBuf,
-    /// Where the network runs
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Also write the rows as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -44,7 +45,7 @@ impl ParityArgs {
     /// Whether every tensor passed.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let folder = fs_err::canonicalize(&self.dir)?;
         let manifest = fs_err::read_to_string(folder.join("manifest.json"))
             .context("a folder of reference numbers has a manifest.json")?;
@@ -54,7 +55,7 @@ impl ParityArgs {
             None => operators::compare(&folder, &device)?,
         };
         if let Some(path) = &self.json {
-            let parity = Parity { schema: "lidarshift.parity/1", rows: &rows, not_built: &not_built };
+            let parity = Parity { schema: "lidarshift/parity/1", rows: &rows, not_built: &not_built };
             data::write_atomic(path, &serde_json::to_vec_pretty(&parity)?)?;
         }
         println!("{:<24} {:<44} {:>10} {:>10}  ", "file", "tensor", "error", "tolerance");

@@ -29,6 +29,7 @@ const POINT_BASED: [&str; 7] = [
 /// Losses and coders, absolute values around one.
 const LOSS: f64 = 1e-6;
 /// KITTI's anchors' direction bins begin here.
+#[expect(clippy::approx_constant, reason = "the reference's own digits, not a quarter of pi")]
 const DIR_OFFSET_RAD: f32 = 0.78539;
 
 /// Compares the files of PointPillars' operations; names those of others.
