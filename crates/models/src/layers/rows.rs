@@ -5,11 +5,17 @@ use burn::module::{Module, Param};
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
 
+/// Terms that are added one after the other, at most: one running f32 sum over tens of thousands of rows would lose digits.
+const BLOCK: usize = 16;
+
+/// Rows are filled up to a multiple of this, so that they fall into blocks.
+const FILL: usize = BLOCK * BLOCK;
+
 /// How often each row counts in the statistics of a batch: rows that the reference repeats are computed once.
 #[derive(Clone, Debug)]
 pub struct RowCounts {
-    /// `[1, N]`.
-    counts: Tensor<2>,
+    /// In blocks of equal length, `[N / K, 1, K]`.
+    counts: Tensor<3>,
     /// Their sum.
     total: usize,
 }
@@ -17,13 +23,20 @@ pub struct RowCounts {
 impl RowCounts {
     /// One count for each row.
     pub fn new(counts: Vec<f32>, device: &Device) -> Self {
-        let (n, total) = (counts.len(), counts.iter().map(|&c| f64::from(c)).sum::<f64>());
-        RowCounts { counts: Tensor::from_data(TensorData::new(counts, [1, n]), device), total: total as usize }
+        let n = counts.len();
+        let total = counts.iter().map(|&c| f64::from(c)).sum::<f64>() as usize;
+        let length = block(n);
+        RowCounts { counts: Tensor::from_data(TensorData::new(counts, [n / length, 1, length]), device), total }
     }
 
     /// Each of `rows` rows counts once.
     pub fn once(rows: usize, device: &Device) -> Self {
-        RowCounts { counts: Tensor::ones([1, rows], device), total: rows }
+        RowCounts::new(vec![1.0; rows], device)
+    }
+
+    /// The number of rows to fill up to, with rows that count nothing.
+    pub fn filled_up(rows: usize) -> usize {
+        rows.next_multiple_of(FILL)
     }
 
     /// Sum of the counts.
@@ -36,8 +49,20 @@ impl RowCounts {
     /// # Shapes
     /// `x`: `[N, C]`; result `[1, C]`.
     pub fn mean(&self, x: Tensor<2>) -> Tensor<2> {
-        self.counts.clone().matmul(x) / self.total.max(1) as f64
+        let ([mut blocks, _, length], [_, channels]) = (self.counts.dims(), x.dims());
+        let mut sums = self.counts.clone().matmul(x.reshape([blocks, length, channels])); // [N / K, 1, C]
+        while blocks > 1 {
+            let length = if block(blocks) > 1 { block(blocks) } else { blocks };
+            blocks /= length;
+            sums = sums.reshape([blocks, length, channels]).sum_dim(1); // [blocks, 1, C]
+        }
+        sums.reshape([1, channels]) / self.total.max(1) as f64
     }
+}
+
+/// The largest part of at most [`BLOCK`] that `n` falls into without rest.
+fn block(n: usize) -> usize {
+    (1..=BLOCK.min(n)).rev().find(|length| n.is_multiple_of(*length)).unwrap_or(1)
 }
 
 /// Linear layer without bias, batch normalisation, ReLU. `D` is the number of dimensions that the reference stores the weight with.
@@ -179,6 +204,19 @@ mod tests {
         let plain = run(&repeated, RowCounts::once(7, &device), &[0, 1, 2, 3, 4, 5, 6], &device);
         for (a, b) in once.iter().zip(&plain) {
             assert!(a.len() == b.len() && a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5), "{a:?} {b:?}");
+        }
+    }
+
+    #[test]
+    fn means_of_any_number_of_rows() {
+        let device = Device::flex();
+        for rows in [1usize, 2, 17, 97, 256, 1000, 4099, 70_000] {
+            let values: Vec<f32> = (0..rows).map(|i| 1.0 + (i % 7) as f32).collect();
+            let counts: Vec<f32> = (0..rows).map(|i| (i % 3) as f32 + 1.0).collect();
+            let both = || values.iter().zip(&counts).map(|(&v, &c)| (f64::from(v), f64::from(c)));
+            let want = both().map(|(v, c)| v * c).sum::<f64>() / both().map(|(_, c)| c).sum::<f64>();
+            let mean = RowCounts::new(counts.clone(), &device).mean(tensor(&values, [rows, 1], &device));
+            assert!((f64::from(host(mean).unwrap()[0]) / want - 1.0).abs() < 1e-6, "{rows}");
         }
     }
 

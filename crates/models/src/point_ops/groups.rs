@@ -46,8 +46,16 @@ impl Groups {
         self.ends.extend(other.ends.iter().map(|&end| end + begin));
     }
 
-    /// For the device.
+    /// For the device. Rows that count nothing fill up to a number whose sums are exact.
     pub fn to_device(&self, device: &Device) -> GroupTensors {
+        let filled = |values: &[f32], width: usize| {
+            let mut values = values.to_vec();
+            values.resize(RowCounts::filled_up(self.source.len()) * width, 0.0);
+            values
+        };
+        let mut source: Vec<i32> = self.source.iter().map(|&s| s as i32).collect();
+        source.resize(RowCounts::filled_up(source.len()), 0);
+        let rows = source.len();
         let mut begin = 0;
         let spans = self.ends.iter().map(|&end| (std::mem::replace(&mut begin, end), end));
         let spans: Vec<(u32, u32)> = spans.collect();
@@ -60,12 +68,9 @@ impl Groups {
             Tensor::<1, Int>::from_data(TensorData::new(values, [length]), device)
         };
         GroupTensors {
-            source: int(self.source.iter().map(|&s| s as i32).collect()),
-            offset: Tensor::from_data(
-                TensorData::new(self.offset_m.as_flattened().to_vec(), [self.offset_m.len(), 3]),
-                device,
-            ),
-            counts: RowCounts::new(self.count.clone(), device),
+            source: int(source),
+            offset: Tensor::from_data(TensorData::new(filled(self.offset_m.as_flattened(), 3), [rows, 3]), device),
+            counts: RowCounts::new(filled(&self.count, 1), device),
             places: int(places.collect()),
             groups: self.ends.len(),
             slots,
@@ -73,7 +78,7 @@ impl Groups {
     }
 }
 
-/// [`Groups`] on a device.
+/// [`Groups`] on a device; N is their number of rows, filled up.
 #[derive(Clone, Debug)]
 pub struct GroupTensors {
     /// `[N]`.
@@ -126,6 +131,7 @@ mod tests {
         let device = Device::flex().autodiff();
         let groups = two_groups().to_device(&device);
         assert_eq!(groups.counts.total(), 6);
+        assert_eq!((groups.source.dims(), groups.offset.dims()), ([256], [256, 3]));
         let x = Tensor::<2>::from_floats([[1.0, 5.0], [3.0, 2.0], [-1.0, -2.0]], &device).require_grad();
         let y = group_max(x.clone(), &groups);
         assert_eq!(host(y.clone()).unwrap(), [3.0, 5.0, -1.0, -2.0]);

@@ -63,11 +63,10 @@ pub fn detections(
             bbox: Box3::from_array(boxes[i].map(f64::from)),
             score,
         };
-        let kept = suppress(&boxes, cls, &net.detection);
-        if kept.iter().any(|&(i, _)| !boxes[i].iter().all(|v| v.is_finite())) {
-            return Err(not_finite(&sample.id));
-        }
-        found.push(kept.iter().map(of).collect());
+        // A size is an exponential: early in a training one can be beyond all numbers. No object is that large.
+        let is_number = |&(i, _): &(usize, f32)| boxes[i].iter().all(|v| v.is_finite());
+        let kept = suppress(&boxes, cls, &net.detection).into_iter().filter(is_number);
+        found.push(kept.map(|kept| of(&kept)).collect());
     }
     let mut found = found.into_iter();
     let of_sample = |s: &&Sample| if s.points.is_empty() { Vec::new() } else { found.next().unwrap_or_default() };
