@@ -259,7 +259,8 @@ impl StudyConfig {
                 return Some(format!("{what} {twice:?} is there twice"));
             }
         }
-        let seeds = self.detectors.iter().filter_map(|d| Some((format!("detector {}: seeds", d.name), d.seeds.as_ref()?)));
+        let seeds =
+            self.detectors.iter().filter_map(|d| Some((format!("detector {}: seeds", d.name), d.seeds.as_ref()?)));
         for (what, seeds) in std::iter::once(("seeds".to_string(), &self.seeds)).chain(seeds) {
             let distinct: BTreeSet<&u64> = seeds.iter().collect();
             if seeds.is_empty() || distinct.len() < seeds.len() {
@@ -272,19 +273,24 @@ impl StudyConfig {
         }
         let [datasets, detectors, _] = names.map(|(_, names)| names);
         let unknown = |what: String, name: &str, known: &[&str]| {
-            (!known.contains(&name)).then(|| format!("{what} names {name:?}, which the study does not have; it has {}", known.join(", ")))
+            (!known.contains(&name))
+                .then(|| format!("{what} names {name:?}, which the study does not have; it has {}", known.join(", ")))
         };
-        let of_train = self.detectors.iter().flat_map(|d| d.train.iter().flatten().map(|t| (d, t)));
+        let of_train = self.detectors.iter().flat_map(|d| d.train.iter().flatten().map(move |t| (d, t)));
         let of_train = of_train.filter_map(|(d, name)| unknown(format!("detector {}: train", d.name), name, &datasets));
         let of_variant = self.variants.iter().flat_map(|v| v.detectors.iter().flatten().map(move |d| (v, d)));
-        let of_variant = of_variant.filter_map(|(v, name)| unknown(format!("variant {}: detectors", v.name), name, &detectors));
+        let of_variant =
+            of_variant.filter_map(|(v, name)| unknown(format!("variant {}: detectors", v.name), name, &detectors));
         if let Some(problem) = of_train.chain(of_variant).next() {
             return Some(problem);
         }
         for (i, dataset) in self.datasets.iter().enumerate() {
             match &dataset.source {
                 Source::Resim { of, .. } if !datasets[..i].contains(&of.as_str()) => {
-                    return Some(format!("dataset {}: resim.of names {of:?}, which has to stand before it", dataset.name));
+                    return Some(format!(
+                        "dataset {}: resim.of names {of:?}, which has to stand before it",
+                        dataset.name
+                    ));
                 }
                 Source::Simulate { frames: 0, .. } => return Some(format!("dataset {}: frames is 0", dataset.name)),
                 _ => {}
@@ -488,7 +494,10 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             Path::new("runs/small/pointpillars_race_small+pillar-0.2/measured/seed-1/detections/sim")
         );
         let last = &runs[runs.len() - 1];
-        assert_eq!((last.id.seed, last.epochs, last.set.as_slice()), (7, Some(4), &["optimization.lr_max=0.01".to_string()][..]));
+        assert_eq!(
+            (last.id.seed, last.epochs, last.set.as_slice()),
+            (7, Some(4), &["optimization.lr_max=0.01".to_string()][..])
+        );
         let plan = study.plan();
         assert_eq!((plan.networks.len(), plan.test_sets.len()), (3, 3));
         assert_eq!(plan.networks[1].network.title, "PointPillars, pillar-0.4");
@@ -501,7 +510,11 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             ("epochs = 10", "epoch = 10", "small.toml:5: unknown field `epoch`"),
             ("epochs = 10", "epochs = 0", "epochs have to be 1 or more"),
             ("seeds = [1, 2]", "seeds = [1, 1]", "[1, 1] have to be distinct"),
-            ("train = [\"measured\", \"sim\"]", "train = [\"real\"]", "train names \"real\", which the study does not have"),
+            (
+                "train = [\"measured\", \"sim\"]",
+                "train = [\"real\"]",
+                "train names \"real\", which the study does not have",
+            ),
             ("of = \"sim\"", "of = \"other\"", "resim.of names \"other\""),
             ("frames = 100", "frames = 0", "frames is 0"),
             ("name = \"sim\"", "name = \"measured\"", "dataset \"measured\" is there twice"),
@@ -526,7 +539,10 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
         assert_eq!(changes.invalid[0].1, ["epochs was 10, is 11"]);
         // More simulated frames: all that is trained on sim or on what is made of it, and both as test sets.
         let changes = after("frames = 100", "frames = 200");
-        assert_eq!((changes.invalid.len(), changes.tests.clone()), (2 * 2 * 2 + 1, vec!["sim".into(), "sim-noise".into()]));
+        assert_eq!(
+            (changes.invalid.len(), changes.tests.clone()),
+            (2 * 2 * 2 + 1, vec!["sim".into(), "sim-noise".into()])
+        );
         assert_eq!(after("pillar-0.4", "pillar-0.5").removed.len(), 6);
     }
 
@@ -535,7 +551,12 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/studies");
         let paper = StudyConfig::read(&folder.join("paper.toml")).unwrap();
         assert_eq!((paper.runs().len(), paper.epochs), (2 * 4 * 5, Some(75)));
-        let known = paper.plan().networks.iter().flat_map(|n| std::iter::once(&n.network).chain(&n.train_sets)).all(|p| p.paper.is_some());
+        let known = paper
+            .plan()
+            .networks
+            .iter()
+            .flat_map(|n| std::iter::once(&n.network).chain(&n.train_sets))
+            .all(|p| p.paper.is_some());
         assert!(known, "the paper's numbers stand beside every cell");
         let quick = StudyConfig::read(&folder.join("quick.toml")).unwrap();
         assert_eq!(quick.runs().len(), 3 * 2 + 2);

@@ -195,10 +195,8 @@ fn of_frame(frame: &Frame, options: &TargetOptions) -> OfFrame {
         }
     }
     let of_class = frame.objects.iter().filter(|object| object.class.eq_ignore_ascii_case(&options.class));
-    let boxes: Vec<_> = of_class
-        .map(|object| object.bbox)
-        .filter(|b| b.center[0].hypot(b.center[1]) <= options.max_range_m)
-        .collect();
+    let boxes: Vec<_> =
+        of_class.map(|object| object.bbox).filter(|b| b.center[0].hypot(b.center[1]) <= options.max_range_m).collect();
     for (b, inside) in boxes.iter().zip(points_in_boxes(&cloud.values, cloud.channels, &boxes, 0.0)) {
         let local = |i: &u32| b.to_local(cloud.xyz(*i as usize).map(f64::from)).map(|v| v as f32);
         let points: Vec<[f32; 3]> = inside.iter().map(local).collect();

@@ -66,7 +66,12 @@ impl TableRow {
 
 impl Item {
     /// A figure with the numbers behind it: columns and lines.
-    pub fn figure(id: impl Into<String>, caption: impl Into<String>, figure: Figure, numbers: (&[&str], &[Vec<String>])) -> Self {
+    pub fn figure(
+        id: impl Into<String>,
+        caption: impl Into<String>,
+        figure: Figure,
+        numbers: (&[&str], &[Vec<String>]),
+    ) -> Self {
         let csv = if numbers.0.is_empty() { String::new() } else { csv_text(numbers.0, numbers.1) };
         let svg = figure.svg_for_report();
         let wide = figure.0.size[0] > 700.0;

@@ -76,7 +76,14 @@ impl Page {
 
     /// Text that runs upwards.
     pub fn text_upwards(&mut self, at: [f64; 2], text: impl Into<String>, size: f64) {
-        self.marks.push(Mark::Text { at, text: text.into(), size, color: INK, anchor: Anchor::Middle, turn_deg: -90.0 });
+        self.marks.push(Mark::Text {
+            at,
+            text: text.into(),
+            size,
+            color: INK,
+            anchor: Anchor::Middle,
+            turn_deg: -90.0,
+        });
     }
 
     /// Text that falls to the left end of its place, below an axis.

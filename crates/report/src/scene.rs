@@ -1,8 +1,8 @@
 //! Clouds and boxes for the interactive view.
 
+use base64::{Engine as _, prelude::BASE64_STANDARD};
 use data::Cloud;
 use geometry::Box3;
-use base64::{Engine as _, prelude::BASE64_STANDARD};
 use serde::Serialize;
 
 /// Beyond this a position does not fit into whole centimetres of 16 bits, m.
@@ -89,8 +89,12 @@ pub(crate) fn scenes_json(scenes: &[Scene]) -> String {
 /// Positions in whole centimetres, little-endian; what is not finite or too far is left out.
 fn centimetres(cloud: &Cloud) -> String {
     let near = |p: &&[f32]| p[..3].iter().all(|v| v.abs() <= FARTHEST_M);
-    let bytes: Vec<u8> =
-        cloud.points().filter(near).flat_map(|p| [p[0], p[1], p[2]]).flat_map(|v| ((v * 100.0).round() as i16).to_le_bytes()).collect();
+    let bytes: Vec<u8> = cloud
+        .points()
+        .filter(near)
+        .flat_map(|p| [p[0], p[1], p[2]])
+        .flat_map(|v| ((v * 100.0).round() as i16).to_le_bytes())
+        .collect();
     BASE64_STANDARD.encode(bytes)
 }
 

@@ -8,9 +8,9 @@ mod training;
 
 pub use training::{TrainingRun, read_training_run};
 
+use crate::ReportError;
 use crate::html::{Item, PageText, Section, page};
 use crate::scene::{Scene, scenes_json};
-use crate::ReportError;
 use data::write_atomic;
 use eval::analysis::RunAnalysis;
 use eval::distance::Distances;
@@ -127,7 +127,9 @@ impl StudyReport {
         }
         let footer = match self.command.as_str() {
             "" => "One file: figures, numbers and the view of clouds are inside; nothing is loaded.".to_string(),
-            command => format!("Made by: {command}. One file: figures, numbers and the view of clouds are inside; nothing is loaded."),
+            command => format!(
+                "Made by: {command}. One file: figures, numbers and the view of clouds are inside; nothing is loaded."
+            ),
         };
         page(&PageText { title: &self.title, about: &self.about, warnings: &warnings, footer: &footer }, sections)
     }
@@ -150,7 +152,8 @@ impl StudyReport {
 
     fn facts_section(&self) -> Section {
         use crate::html::{TableCell, TableRow};
-        let row = |(name, value): &(String, String)| TableRow::new(false, [TableCell::new(name), TableCell::new(value)]);
+        let row =
+            |(name, value): &(String, String)| TableRow::new(false, [TableCell::new(name), TableCell::new(value)]);
         let rows: Vec<TableRow> = self.facts.iter().map(row).collect();
         let items = match rows.is_empty() {
             true => Vec::new(),

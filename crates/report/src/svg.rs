@@ -27,7 +27,8 @@ pub(crate) fn svg(page: &Page, theme: Theme) -> String {
         hex(page.background)
     );
     for mark in &page.marks {
-        write_mark(&mut out, mark, page.rimmed.then_some(page.background), &hex).expect("writing to a String does not fail");
+        write_mark(&mut out, mark, page.rimmed.then_some(page.background), &hex)
+            .expect("writing to a String does not fail");
         out.push('\n');
     }
     out.push_str("</svg>\n");

@@ -48,7 +48,8 @@ mod tests {
         for seed in 0..30 {
             let mut rng = stream(seed, "emd test", 0, 0);
             let n = rng.random_range(1..8);
-            let mut cloud = || -> Vec<Point> { (0..n).map(|_| [0; 3].map(|_: i32| rng.random_range(-3..3) as f32)).collect() };
+            let mut cloud =
+                || -> Vec<Point> { (0..n).map(|_| [0; 3].map(|_: i32| rng.random_range(-3..3) as f32)).collect() };
             let (a, b) = (cloud(), cloud());
             let want = tried(&a, &b, &mut vec![false; n], 0) / n as f64;
             assert!((emd(&a, &b).unwrap() - want).abs() < 1e-9, "seed {seed}");

@@ -19,8 +19,7 @@ pub fn sliced_wasserstein(a: &[Point], b: &[Point], directions: usize, seed: u64
         let out = (1.0 - up * up).sqrt();
         let along = [out * around.cos(), out * around.sin(), up];
         let shadow = |cloud: &[Point]| {
-            let mut shadow: Vec<f64> =
-                cloud.iter().map(|p| (0..3).map(|k| f64::from(p[k]) * along[k]).sum()).collect();
+            let mut shadow: Vec<f64> = cloud.iter().map(|p| (0..3).map(|k| f64::from(p[k]) * along[k]).sum()).collect();
             shadow.sort_unstable_by(f64::total_cmp);
             shadow
         };

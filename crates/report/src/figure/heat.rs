@@ -8,7 +8,8 @@ pub fn heat_map(rows: &[String], columns: &[String], values: &[Vec<Option<f64>>]
     let longest = |names: &[String]| names.iter().map(|n| n.chars().count()).max().unwrap_or(0) as f64;
     let (left, top) = (20.0 + 7.0 * longest(rows), 24.0 + 5.2 * longest(columns));
     let (wide, high) = (54.0, 28.0);
-    let size = [left + wide * columns.len() as f64 + 20.0 + 5.0 * longest(columns), top + high * rows.len() as f64 + 12.0];
+    let size =
+        [left + wide * columns.len() as f64 + 20.0 + 5.0 * longest(columns), top + high * rows.len() as f64 + 12.0];
     let mut page = Page::new(size, [255; 3], false);
     for (j, name) in columns.iter().enumerate() {
         page.text_rising([left + (j as f64 + 0.5) * wide, top - 6.0], name, 12.0);

@@ -47,7 +47,8 @@ pub fn locations(sets: &[LocatedTargets], range_m: f64) -> Figure {
         let centers = set.at_m.iter().filter(inside).map(|p| [x_axis.px(p[0]), y_px(p[1])]).collect();
         page.dots(centers, if many { 1.5 } else { 2.4 }, color(k), if many { 0.35 } else { 0.6 });
     }
-    let shares: Vec<[Vec<f64>; 2]> = sets.iter().map(|set| [0, 1].map(|axis| histogram(&set.at_m, axis, range_m))).collect();
+    let shares: Vec<[Vec<f64>; 2]> =
+        sets.iter().map(|set| [0, 1].map(|axis| histogram(&set.at_m, axis, range_m))).collect();
     let highest = shares.iter().flatten().flatten().copied().fold(1e-9, f64::max);
     for (k, [of_x, of_y]) in shares.iter().enumerate() {
         let high = |share: f64| share / highest * (MARGIN - 16.0);

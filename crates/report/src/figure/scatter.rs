@@ -18,9 +18,8 @@ const SIZE: f64 = 640.0;
 pub fn scatter(groups: &[ScatterGroup]) -> Figure {
     let finite = |p: &&[f64; 2]| p.iter().all(|v| v.is_finite());
     let all = || groups.iter().flat_map(|g| &g.points).filter(finite);
-    let ends = |k: usize| {
-        all().map(|p| p[k]).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
-    };
+    let ends =
+        |k: usize| all().map(|p| p[k]).fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
     let ((x0, x1), (y0, y1)) = (ends(0), ends(1));
     let side = (x1 - x0).max(y1 - y0).max(1e-9);
     let mut page = Page::new([SIZE, SIZE], [255; 3], false);
@@ -33,7 +32,13 @@ pub fn scatter(groups: &[ScatterGroup]) -> Figure {
         [place(p[0], x0, x1), SIZE - place(p[1], y0, y1) + top - 4.0]
     };
     let many = all().count();
-    let radius = if many > 4000 { 1.3 } else if many > 800 { 1.8 } else { 2.6 };
+    let radius = if many > 4000 {
+        1.3
+    } else if many > 800 {
+        1.8
+    } else {
+        2.6
+    };
     for (k, group) in groups.iter().enumerate() {
         page.dots(group.points.iter().filter(finite).map(px).collect(), radius, color(k), 0.65);
     }

@@ -47,7 +47,14 @@ impl Look {
 }
 
 /// One view of one cloud into a panel; `half_m` is what fits to either side of the centre, across and up.
-fn draw(page: &mut Page, cloud: &TargetCloud, look: Look, [left, top, width, height]: [f64; 4], size_m: Option<[f64; 3]>, ink: Rgb) {
+fn draw(
+    page: &mut Page,
+    cloud: &TargetCloud,
+    look: Look,
+    [left, top, width, height]: [f64; 4],
+    size_m: Option<[f64; 3]>,
+    ink: Rgb,
+) {
     let size_m = size_m.unwrap_or([5.0, 2.0, 1.5]);
     let [length, wide, high] = size_m;
     let half = match look {
@@ -60,13 +67,15 @@ fn draw(page: &mut Page, cloud: &TargetCloud, look: Look, [left, top, width, hei
     let scale = (width / (2.0 * half[0])).min(height / (2.0 * half[1]));
     let px = |[u, v, _]: [f64; 3]| [left + width / 2.0 + u * scale, top + height / 2.0 - v * scale];
     // Nearer points are darker and lie on top.
-    let mut seen: Vec<[f64; 3]> = cloud.points_m.iter().map(|p| look.project(*p)).filter(|p| p.iter().all(|v| v.is_finite())).collect();
+    let mut seen: Vec<[f64; 3]> =
+        cloud.points_m.iter().map(|p| look.project(*p)).filter(|p| p.iter().all(|v| v.is_finite())).collect();
     seen.sort_by(|a, b| a[2].total_cmp(&b[2]));
     let layers = seen.chunks(seen.len().div_ceil(4).max(1));
     for (layer, opacity) in layers.zip([0.18, 0.3, 0.45, 0.7]) {
-        let inside = layer.iter().map(|p| px(*p)).filter(|[x, y]| {
-            (left..=left + width).contains(x) && (top..=top + height).contains(y)
-        });
+        let inside = layer
+            .iter()
+            .map(|p| px(*p))
+            .filter(|[x, y]| (left..=left + width).contains(x) && (top..=top + height).contains(y));
         page.dots(inside.collect(), 0.8, ink, opacity);
     }
     // The box.
@@ -89,7 +98,14 @@ pub fn aggregated_targets(clouds: &[TargetCloud], columns: usize, size_m: Option
     for (i, cloud) in clouds.iter().enumerate() {
         let (left, top) = ((i % columns) as f64 * width, (i / columns) as f64 * (height + 26.0));
         page.text([left + width / 2.0, top + 16.0], &cloud.title, 12.0, INK, Anchor::Middle);
-        draw(&mut page, cloud, Look::Slanted, [left + 6.0, top + 22.0, width - 12.0, height], size_m, color(i / columns));
+        draw(
+            &mut page,
+            cloud,
+            Look::Slanted,
+            [left + 6.0, top + 22.0, width - 12.0, height],
+            size_m,
+            color(i / columns),
+        );
     }
     Figure(page)
 }
@@ -105,7 +121,8 @@ pub fn target_views(cloud: &TargetCloud, size_m: Option<[f64; 3]>) -> Figure {
     ];
     for (look, name, area) in panels {
         let [left, top, width, height] = area;
-        let frame = vec![[left, top], [left + width, top], [left + width, top + height], [left, top + height], [left, top]];
+        let frame =
+            vec![[left, top], [left + width, top], [left + width, top + height], [left, top + height], [left, top]];
         page.line(frame, GRID, 1.0);
         page.text([left + width / 2.0, top - 8.0], name, 13.0, INK, Anchor::Middle);
         draw(&mut page, cloud, look, [left + 4.0, top + 4.0, width - 8.0, height - 8.0], size_m, color(0));
@@ -133,7 +150,9 @@ mod tests {
     #[test]
     fn empty_and_broken_clouds_give_figures() {
         let broken = TargetCloud { title: "long range".into(), points_m: vec![[f32::NAN, 0.0, 0.0]; 3] };
-        for figure in [aggregated_targets(&[broken.clone(), TargetCloud::default()], 3, None), target_views(&broken, None)] {
+        for figure in
+            [aggregated_targets(&[broken.clone(), TargetCloud::default()], 3, None), target_views(&broken, None)]
+        {
             assert!(figure.svg().contains("</svg>") && !figure.svg().contains("NaN"));
         }
     }

@@ -113,10 +113,17 @@ fn repairs(k: usize, (name, a): &Named) -> Item {
     let lines: Vec<Vec<String>> = a
         .oracle
         .iter()
-        .map(|r| vec![word(r.component).into(), csv_number(r.then.ap40), csv_number(r.then.ap_area), csv_number(r.gained)])
+        .map(|r| {
+            vec![word(r.component).into(), csv_number(r.then.ap40), csv_number(r.then.ap_area), csv_number(r.gained)]
+        })
         .collect();
     let figure = bars(&a.oracle.iter().map(bar).collect::<Vec<_>>(), "3D AP (%)");
-    Item::figure(format!("repairs-{}-{}", k + 1, slug(name)), caption, figure, (&["component", "ap40", "ap_area", "gained"], &lines))
+    Item::figure(
+        format!("repairs-{}-{}", k + 1, slug(name)),
+        caption,
+        figure,
+        (&["component", "ap40", "ap_area", "gained"], &lines),
+    )
 }
 
 fn strata(
@@ -135,7 +142,8 @@ fn strata(
         })
         .collect();
     let options = CurveOptions { x_label: x_label.into(), y_label: "3D AP (%)".into(), ..CurveOptions::default() };
-    let caption = format!("{caption} A gap stands where there is no ground truth; the numbers of ground truths are in the CSV.");
+    let caption =
+        format!("{caption} A gap stands where there is no ground truth; the numbers of ground truths are in the CSV.");
     Item::figure(id, caption, Figure::curves(&series, &options), (&STRATUM_COLUMNS, &lines(analyses, of)))
 }
 
@@ -153,7 +161,8 @@ fn by_points(analyses: &[Named]) -> Item {
     let mut rows = Vec::new();
     for (name, a) in analyses {
         for (i, s) in a.by_points.iter().enumerate() {
-            let points = if s.to.is_finite() { format!("{} to {}", s.from, s.to - 1.0) } else { format!("{} or more", s.from) };
+            let points =
+                if s.to.is_finite() { format!("{} to {}", s.from, s.to - 1.0) } else { format!("{} or more", s.from) };
             let numbers = [number(s.ap40, 1), number(s.ceiling_ap40, 1), number(s.ap_area, 1), number(s.recall, 1)];
             let cells = [name.clone(), points, s.n_gt.to_string()].into_iter().chain(numbers).map(TableCell::new);
             rows.push(TableRow::new(i == 0, cells));
@@ -182,7 +191,10 @@ fn calibration(analyses: &[Named]) -> Item {
         .flat_map(|(name, a)| {
             a.calibration.bins.iter().map(move |b| {
                 let numbers = [csv_number(b.mean_score), csv_number(b.precision)];
-                [name.clone(), b.from.to_string(), b.to.to_string(), b.n.to_string()].into_iter().chain(numbers).collect()
+                [name.clone(), b.from.to_string(), b.to.to_string(), b.n.to_string()]
+                    .into_iter()
+                    .chain(numbers)
+                    .collect()
             })
         })
         .collect();

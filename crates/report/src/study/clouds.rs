@@ -90,13 +90,25 @@ pub(super) fn target_section(all: &[Targets]) -> Section {
     let mut items = Vec::new();
     if !all.is_empty() {
         items.push(statistics(all));
-        let of = |t: &Targets| LocatedTargets { name: t.dataset.clone(), at_m: t.targets.iter().map(|t| t.at_m).collect() };
+        let of =
+            |t: &Targets| LocatedTargets { name: t.dataset.clone(), at_m: t.targets.iter().map(|t| t.at_m).collect() };
         let range_m = all.iter().map(|t| t.options.max_range_m).fold(1.0, f64::max);
-        let lines: Vec<Vec<String>> = all.iter().flat_map(|t| t.targets.iter().map(move |target| (t, target))).map(|(t, target)| {
-            let at = target.at_m.map(|v| format!("{v:.3}"));
-            let [x, y] = at;
-            vec![t.dataset.clone(), target.frame.clone(), x, y, format!("{:.4}", target.yaw_rad), target.points.to_string()]
-        }).collect();
+        let lines: Vec<Vec<String>> = all
+            .iter()
+            .flat_map(|t| t.targets.iter().map(move |target| (t, target)))
+            .map(|(t, target)| {
+                let at = target.at_m.map(|v| format!("{v:.3}"));
+                let [x, y] = at;
+                vec![
+                    t.dataset.clone(),
+                    target.frame.clone(),
+                    x,
+                    y,
+                    format!("{:.4}", target.yaw_rad),
+                    target.points.to_string(),
+                ]
+            })
+            .collect();
         let columns = ["dataset", "frame", "x_m", "y_m", "yaw_rad", "points"];
         items.push(Item::figure(
             "target-locations",
@@ -112,7 +124,8 @@ pub(super) fn target_section(all: &[Targets]) -> Section {
 
 fn statistics(all: &[Targets]) -> Item {
     let of_spread = |name: &str, digits: usize, of: &dyn Fn(&Targets) -> Spread| -> Vec<TableRow> {
-        let parts: [(&str, fn(&Spread) -> Option<f64>); 3] = [("mean", |s| s.mean), ("least", |s| s.min), ("greatest", |s| s.max)];
+        let parts: [(&str, fn(&Spread) -> Option<f64>); 3] =
+            [("mean", |s| s.mean), ("least", |s| s.min), ("greatest", |s| s.max)];
         parts
             .into_iter()
             .enumerate()
@@ -130,16 +143,23 @@ fn statistics(all: &[Targets]) -> Item {
     rows.extend(of_spread("points a cloud", 0, &|t: &Targets| t.points_per_cloud));
     rows.extend(of_spread("points a target", 0, &|t: &Targets| t.points_per_target));
     let count = |name: &str, of: &dyn Fn(&Targets) -> String| {
-        TableRow::new(true, [TableCell::new(name), TableCell::new("number")].into_iter().chain(all.iter().map(|t| TableCell::new(of(t)))))
+        TableRow::new(
+            true,
+            [TableCell::new(name), TableCell::new("number")]
+                .into_iter()
+                .chain(all.iter().map(|t| TableCell::new(of(t)))),
+        )
     };
     rows.push(count("frames", &|t| t.frames.to_string()));
     rows.push(count("targets", &|t| t.targets.len().to_string()));
     for (k, section) in all[0].options.sections.iter().enumerate() {
-        let of = |t: &Targets| t.sections.get(k).map_or("–".into(), |s| format!("{} ({} points)", s.targets, s.n_points));
+        let of =
+            |t: &Targets| t.sections.get(k).map_or("–".into(), |s| format!("{} ({} points)", s.targets, s.n_points));
         rows.push(count(&format!("targets in {section}"), &of));
     }
     let columns: Vec<&str> = ["attribute", ""].into_iter().chain(all.iter().map(|t| t.dataset.as_str())).collect();
-    let caption = format!("The data sets in numbers, points and targets up to {} m on the ground.", all[0].options.max_range_m);
+    let caption =
+        format!("The data sets in numbers, points and targets up to {} m on the ground.", all[0].options.max_range_m);
     Item::table("statistics", caption, (&columns, 2), rows, None)
 }
 
@@ -161,7 +181,14 @@ fn aggregated(all: &[Targets]) -> Item {
             t.sections.iter().map(|s| {
                 let ends = [s.section.from_m, s.section.to_m].map(|v| csv_number(Some(v)));
                 let [from, to] = ends;
-                vec![t.dataset.clone(), from, to, s.targets.to_string(), s.n_points.to_string(), s.points_m.len().to_string()]
+                vec![
+                    t.dataset.clone(),
+                    from,
+                    to,
+                    s.targets.to_string(),
+                    s.n_points.to_string(),
+                    s.points_m.len().to_string(),
+                ]
             })
         })
         .collect();
@@ -175,7 +202,8 @@ fn aggregated(all: &[Targets]) -> Item {
 fn views(t: &Targets) -> Option<Item> {
     // The first section that has points: the nearest targets show the most.
     let section = t.sections.iter().find(|s| !s.points_m.is_empty())?;
-    let cloud = TargetCloud { title: format!("{}, {}", t.dataset, section.section), points_m: section.points_m.clone() };
+    let cloud =
+        TargetCloud { title: format!("{}, {}", t.dataset, section.section), points_m: section.points_m.clone() };
     let caption = format!(
         "{} points of {} targets of {} in {}, in the frame of their box: closer points are darker and cover those behind.",
         section.points_m.len(),
@@ -183,5 +211,10 @@ fn views(t: &Targets) -> Option<Item> {
         t.dataset,
         section.section
     );
-    Some(Item::figure(format!("target-views-{}", slug(&t.dataset)), caption, target_views(&cloud, t.mean_size_m), (&[], &[])))
+    Some(Item::figure(
+        format!("target-views-{}", slug(&t.dataset)),
+        caption,
+        target_views(&cloud, t.mean_size_m),
+        (&[], &[]),
+    ))
 }

@@ -23,7 +23,12 @@ pub(super) fn section(report: &StudyReport) -> Section {
              the same clouds. 1: the same up to rotation and scale; 0: nothing in common."
         );
         let figure = heat_map(&table.layers_a, &table.layers_b, &table.values);
-        items.push(Item::figure(format!("cka-{}", slug(name)), caption, figure, (&["layer_a", "layer_b", "cka"], &lines)));
+        items.push(Item::figure(
+            format!("cka-{}", slug(name)),
+            caption,
+            figure,
+            (&["layer_a", "layer_b", "cka"], &lines),
+        ));
     }
     if !report.frechet.is_empty() {
         let row = |r: &super::FrechetRow| {
@@ -73,8 +78,19 @@ fn embedding(e: &Embedding) -> Item {
         e.kl_divergence
     );
     let line = |p: &eval::features::Embedded| {
-        vec![p.train_set.clone(), p.seed.to_string(), p.frame.clone(), format!("{:.4}", p.at[0]), format!("{:.4}", p.at[1])]
+        vec![
+            p.train_set.clone(),
+            p.seed.to_string(),
+            p.frame.clone(),
+            format!("{:.4}", p.at[0]),
+            format!("{:.4}", p.at[1]),
+        ]
     };
     let lines: Vec<Vec<String>> = e.points.iter().map(line).collect();
-    Item::figure(format!("tsne-{}", slug(&e.network)), caption, scatter(&groups), (&["train_set", "seed", "frame", "u", "v"], &lines))
+    Item::figure(
+        format!("tsne-{}", slug(&e.network)),
+        caption,
+        scatter(&groups),
+        (&["train_set", "seed", "frame", "u", "v"], &lines),
+    )
 }

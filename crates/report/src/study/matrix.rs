@@ -123,7 +123,8 @@ pub(super) fn range_section(m: &Matrix) -> Section {
                     });
                     let groups = groups.collect();
                     let place = section.map_or("all".into(), |s| s.to_string());
-                    let (least, most) = (n_gt.iter().min().copied().unwrap_or(0), n_gt.iter().max().copied().unwrap_or(0));
+                    let (least, most) =
+                        (n_gt.iter().min().copied().unwrap_or(0), n_gt.iter().max().copied().unwrap_or(0));
                     let count = if least == most { format!("n = {least}") } else { format!("n = {least} to {most}") };
                     DotPanel { title: format!("{place}, {count}"), groups }
                 };
@@ -147,7 +148,13 @@ pub(super) fn range_section(m: &Matrix) -> Section {
 const RANGE_COLUMNS: [&str; 9] =
     ["train_set", "test_set", "from_m", "to_m", "n_gt", "ceiling_ap40", "mean_ap40", "seed", "ap40"];
 
-fn range_lines(m: &Matrix, class: &str, network: &str, overlap: f64, sections: &[Option<RangeSection>]) -> Vec<Vec<String>> {
+fn range_lines(
+    m: &Matrix,
+    class: &str,
+    network: &str,
+    overlap: f64,
+    sections: &[Option<RangeSection>],
+) -> Vec<Vec<String>> {
     let mut lines = Vec::new();
     for c in m.cells.iter().filter(|c| c.network == network) {
         for n in sections.iter().filter_map(|section| c.number(class, *section, Quantity::Ap40, overlap)) {

@@ -47,7 +47,9 @@ pub(super) fn section(runs: &[TrainingRun]) -> Section {
     let mut items = Vec::new();
     let parts: [(&str, &str, &str, bool, fn(&TrainingRun) -> &Vec<[f64; 2]>); 2] = [
         ("training-loss", "loss", "Training loss of every run.", true, |run| &run.loss),
-        ("validation-ap", "3D AP (%)", "Average precision on the validation split during training.", false, |run| &run.validation_ap),
+        ("validation-ap", "3D AP (%)", "Average precision on the validation split during training.", false, |run| {
+            &run.validation_ap
+        }),
     ];
     for (id, y_label, caption, log_y, of) in parts {
         let series: Vec<Series> = runs
