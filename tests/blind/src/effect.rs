@@ -12,6 +12,7 @@ pub enum Clock {
     Cloud,
 }
 
+#[expect(missing_docs, reason = "the variants say what their numbers are, the names say the units")]
 /// A hidden difference. Forms differ on purpose from the usual textbook ones.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Effect {

@@ -10,6 +10,7 @@ mod case;
 mod effect;
 mod rig;
 mod scan;
+pub mod score;
 mod solid;
 mod track;
 mod world;

@@ -18,8 +18,6 @@ pub struct Mount {
     pub rows_rad: Vec<f64>,
     /// Shots a row.
     pub columns: usize,
-    /// Duration of a scan, s; columns are shot one after the other, centred on the frame's time.
-    pub scan_s: f64,
 }
 
 impl Mount {
@@ -55,7 +53,7 @@ pub fn draw_rig(rng: &mut Stream, shots: usize) -> (Vec<Mount>, f64) {
     };
     let mount = |position_m: [f64; 3], yaw: f64, fov: f64, share: f64| {
         let columns = (shots as f64 * share / rows as f64).round() as usize;
-        Mount { position_m, yaw_rad: yaw.to_radians(), fov_rad: fov.to_radians(), rows_rad: rows_of(rows), columns, scan_s: 0.05 }
+        Mount { position_m, yaw_rad: yaw.to_radians(), fov_rad: fov.to_radians(), rows_rad: rows_of(rows), columns }
     };
     match kind {
         0 => {

@@ -67,9 +67,11 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
             let scan = measured.scan(t, &mut data::stream(case.seed, "blind measured", 0, i as u64));
             let shown = if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
             let sums = scan.sums;
-            write_scan(&folder.join("measured"), shown, scan)?;
+            // Ids count scans at 20 Hz, whether all of them are kept or not.
+            let every = (case.step_s * 20.0).round() as usize;
+            write_scan(&folder.join("measured"), shown * every, scan)?;
             let scan = simulated.scan(t, &mut data::stream(case.seed, "blind simulated", 0, i as u64));
-            write_scan(&folder.join("simulated"), i, scan)?;
+            write_scan(&folder.join("simulated"), i * every, scan)?;
             Ok(sums)
         })
         .collect();
@@ -174,11 +176,12 @@ mod tests {
             folder
         });
         let read = |k: usize, name: &str| fs_err::read(folders[k].0.join(name)).unwrap();
-        for name in ["measured/velodyne/000001.bin", "simulated/velodyne/000001.bin", "sensor.toml"] {
+        let second = format!("velodyne/{:06}.bin", (case.step_s * 20.0).round() as usize);
+        for name in [&format!("measured/{second}"), &format!("simulated/{second}"), "sensor.toml"] {
             assert_eq!(read(0, name), read(1, name));
         }
         let points = |bytes: Vec<u8>| bytes.chunks_exact(12).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>();
-        let (a, b) = (points(read(0, "measured/velodyne/000001.bin")), points(read(0, "simulated/velodyne/000001.bin")));
+        let (a, b) = (points(read(0, &format!("measured/{second}"))), points(read(0, &format!("simulated/{second}"))));
         assert!(a.len() > 1_000 && a.intersection(&b).count() == 0, "{} points", a.len());
     }
 
