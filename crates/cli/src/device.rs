@@ -28,6 +28,12 @@ pub enum KernelChoice {
     Burn,
 }
 
+impl Default for DeviceArgs {
+    fn default() -> Self {
+        DeviceArgs { device: "flex".into(), kernels: KernelChoice::Auto }
+    }
+}
+
 impl DeviceArgs {
     /// The device; the choice of kernels holds for this process from now on.
     ///

@@ -43,7 +43,10 @@ pub fn diagnose(
     let sensors = find_sensors(measured, simulated, &ids, rig)?;
     for (mount, pattern) in rig.sensors.iter().zip(&sensors.patterns) {
         if pattern.rows_rad.is_empty() {
-            notes.push(format!("sensor {}: no rows stand out in its elevations; what depends on rows cannot be told", mount.name));
+            notes.push(format!(
+                "sensor {}: no rows stand out in its elevations; what depends on rows cannot be told",
+                mount.name
+            ));
         }
     }
     progress(Stage::Comparing, 1, 2);
@@ -57,7 +60,8 @@ pub fn diagnose(
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let (frames, more) = pair_all(measured, simulated, &ids, &sensors, &|done| progress(Stage::Pairing, done, ids.len()))?;
+    let (frames, more) =
+        pair_all(measured, simulated, &ids, &sensors, &|done| progress(Stage::Pairing, done, ids.len()))?;
     notes.extend(more);
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
@@ -159,12 +163,12 @@ fn gain(distance: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) ->
     let sum = |which: &[usize]| {
         which.iter().fold([0.0; 3], |s, &i| [s[0] + distance[i][0], s[1] + distance[i][1], s[2] + distance[i][2]])
     };
-    let closed = |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
+    let closed =
+        |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
     let all = sum(&(0..distance.len()).collect::<Vec<_>>());
     let members = by_block(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let mut drawn: Vec<f64> =
-        (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
+    let mut drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
     drawn.sort_by(f64::total_cmp);
     let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
     Gain {

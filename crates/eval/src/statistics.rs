@@ -137,7 +137,8 @@ impl StatisticsReport {
     fn rows(&self) -> Vec<(String, [Option<f64>; 2], usize)> {
         let mut rows = Vec::new();
         let both = |f: &dyn Fn(&SetStatistics) -> Option<f64>| [f(&self.sets[0]), f(&self.sets[1])];
-        let parts: [(&str, fn(&Extent) -> f64); 3] = [("mean", |e| e.mean), ("min", |e| e.min), ("max", |e| e.max)];
+        type Part = (&'static str, fn(&Extent) -> f64);
+        let parts: [Part; 3] = [("mean", |e| e.mean), ("min", |e| e.min), ("max", |e| e.max)];
         for (part, value) in parts {
             for (k, axis) in ["x", "y", "z"].into_iter().enumerate() {
                 rows.push((format!("{part} {axis}, m"), both(&|s| Some(value(&s.xyz_m[k]))), 1));

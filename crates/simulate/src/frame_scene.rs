@@ -102,7 +102,7 @@ impl<'a> FrameScene<'a> {
             }
             for echo in echoes.iter_mut().chain(&mut seconds) {
                 if !(sensor.limits_m[0]..=sensor.limits_m[1]).contains(&echo.range_m) {
-                    echo.drop();
+                    echo.lose();
                 }
             }
         }

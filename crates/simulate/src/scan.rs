@@ -73,7 +73,7 @@ impl Echo {
     }
 
     /// Nothing comes back of it any more.
-    pub fn drop(&mut self) {
+    pub fn lose(&mut self) {
         self.range_m = f32::INFINITY;
     }
 

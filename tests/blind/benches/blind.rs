@@ -4,10 +4,10 @@
 //! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N] [--shots N]
 //! [--out DIR] [--show] [--keep DIR]`
 
-use lidarshift_blind::score::{Outcome, score, summarise};
-use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
 use data::Dataset;
 use diagnose::{Options, SensorRig, diagnose};
+use lidarshift_blind::score::{Outcome, score, summarise};
+use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
 use rand::RngExt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -101,7 +101,8 @@ fn main() {
         let done = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice::<Outcome>(&bytes).ok());
         let outcome = done.unwrap_or_else(|| {
             let folder = tempfile::tempdir().expect("a temporary folder");
-            let place = arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
+            let place =
+                arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
             let (outcome, value) = run(seed, &arguments, &place);
             if arguments.show {
                 let mut short = value.clone();
@@ -113,7 +114,8 @@ fn main() {
             data::write_atomic(&path, &serde_json::to_vec_pretty(&outcome).expect("JSON")).expect("a result");
             outcome
         });
-        let hidden: Vec<String> = outcome.truth.hidden.iter().map(|h| format!("{} {:?}", h.cause, h.parameters)).collect();
+        let hidden: Vec<String> =
+            outcome.truth.hidden.iter().map(|h| format!("{} {:?}", h.cause, h.parameters)).collect();
         println!(
             "{seed}: {} [{}] -> {} named {:?} ambiguous {:?} unexplained {} closed {:?} {:.1} s",
             outcome.truth.kind,

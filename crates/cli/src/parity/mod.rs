@@ -81,7 +81,7 @@ mod tests {
 
     fn passes(folder: &str) -> bool {
         let dir = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden")).join(folder);
-        ParityArgs { dir, device: "flex".into(), json: None, all: false }.run().unwrap()
+        ParityArgs { dir, device: DeviceArgs::default(), json: None, all: false }.run().unwrap()
     }
 
     #[test]

@@ -65,10 +65,10 @@ pub fn scales(frames: &[FramePair]) -> Vec<f64> {
     };
     let both = [0, 1].map(|side| {
         let rays = |f: &FramePair| count(if side == 0 { &f.measured } else { &f.simulated });
-        frames.par_iter().fold(|| vec![0u32; CELLS * LOG_BINS], |sum, f| add(sum, &rays(f))).reduce(
-            || vec![0u32; CELLS * LOG_BINS],
-            |x, y| add(x, &y),
-        )
+        frames
+            .par_iter()
+            .fold(|| vec![0u32; CELLS * LOG_BINS], |sum, f| add(sum, &rays(f)))
+            .reduce(|| vec![0u32; CELLS * LOG_BINS], |x, y| add(x, &y))
     });
     (0..CELLS)
         .map(|c| {

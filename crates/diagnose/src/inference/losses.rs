@@ -68,7 +68,8 @@ impl LossTable {
         }
         let share = |z: usize| (by_zone[z][1] + 0.5) / (by_zone[z][0] + 1.0);
         let matches = cells.iter().enumerate().map(|(i, c)| {
-            ((c.measured_matched + PRIOR_RETURNS * share(zone_of(i))) / (c.measured.n + PRIOR_RETURNS)).clamp(0.02, 0.9999)
+            ((c.measured_matched + PRIOR_RETURNS * share(zone_of(i))) / (c.measured.n + PRIOR_RETURNS))
+                .clamp(0.02, 0.9999)
         });
         let matches = matches.collect();
         let places = cells
@@ -267,7 +268,13 @@ impl FittedLaw {
         let [a, b, c, d] = self.numbers;
         match self.law {
             Law::Random => (1.0 - a).clamp(1e-3, 1.5),
-            Law::Zone(zone) => if at.zone == zone { (1.0 - a).clamp(1e-3, 1.5) } else { 1.0 },
+            Law::Zone(zone) => {
+                if at.zone == zone {
+                    (1.0 - a).clamp(1e-3, 1.5)
+                } else {
+                    1.0
+                }
+            }
             Law::Range => logistic(-b.exp() * (at.ln_range - a)),
             Law::Incidence => logistic(b.exp() * (at.ln_cos - a)),
             Law::Signal => {

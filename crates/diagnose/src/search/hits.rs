@@ -118,7 +118,7 @@ fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
 /// Laws that tell the same story are not put on top of each other: a second one mends the form of the first.
 fn may_join(law: Law, chosen: &[Law]) -> bool {
     let smooth = |l: &Law| matches!(l, Law::Range | Law::Incidence | Law::Signal);
-    !chosen.contains(&law) && !(smooth(&law) && chosen.iter().any(smooth))
+    !(chosen.contains(&law) || smooth(&law) && chosen.iter().any(smooth))
 }
 
 /// Kullback-Leibler distance of a frame's losses, before and after, and of an independent draw.
@@ -162,19 +162,32 @@ fn found(
         .map(|(k, (name, estimate, unit))| {
             let drawn: Vec<f64> = draws.iter().map(|d| reading(law.law, d)[k].1).collect();
             let mean = drawn.iter().sum::<f64>() / drawn.len().max(1) as f64;
-            let sd = (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
+            let sd =
+                (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
             // The form of the truth may differ.
             let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs());
-            let parameter = Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
+            let parameter =
+                Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
             ((*name).to_owned(), parameter)
         })
         .collect();
     let name = law.law.name().to_owned();
     let says = match law.law {
-        Law::Random => format!("{:.1} % of the returns are lost wherever they come from; your simulator keeps them", 100.0 * law.numbers[0]),
-        Law::Zone(z) => format!("returns of {} are lost more than others: {:.0} %; your simulator keeps them", zone_words(z), 100.0 * law.numbers[0]),
-        Law::Cut => format!("nothing is measured beyond {:.1} m; your simulator has returns there", law.numbers[0].exp()),
-        Law::Range => format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.numbers[0].exp()),
+        Law::Random => format!(
+            "{:.1} % of the returns are lost wherever they come from; your simulator keeps them",
+            100.0 * law.numbers[0]
+        ),
+        Law::Zone(z) => format!(
+            "returns of {} are lost more than others: {:.0} %; your simulator keeps them",
+            zone_words(z),
+            100.0 * law.numbers[0]
+        ),
+        Law::Cut => {
+            format!("nothing is measured beyond {:.1} m; your simulator has returns there", law.numbers[0].exp())
+        }
+        Law::Range => {
+            format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.numbers[0].exp())
+        }
         Law::Incidence => format!(
             "returns are lost at grazing angles: 50 % at {:.1} degrees from the surface; your simulator keeps them all",
             law.numbers[0].exp().min(1.0).asin().to_degrees()
@@ -193,8 +206,9 @@ fn found(
         Law::Signal => "signal".into(),
     };
     let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
-    let separate_by = (!equals.is_empty())
-        .then(|| "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned());
+    let separate_by = (!equals.is_empty()).then(|| {
+        "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
+    });
     Found {
         status,
         causes: std::iter::once(name).chain(equals).collect(),
@@ -211,7 +225,8 @@ fn found(
 }
 
 fn zone_words(zone: usize) -> &'static str {
-    ["the ground", "standing surfaces", "bodies of labelled objects", "the lower corners of labelled objects (wheels)"][zone]
+    ["the ground", "standing surfaces", "bodies of labelled objects", "the lower corners of labelled objects (wheels)"]
+        [zone]
 }
 
 /// Share of a number by which a fit of another form may be off.

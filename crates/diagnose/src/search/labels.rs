@@ -112,12 +112,19 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
         if let Some(before) = before {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
         }
-        let least = if CANDIDATES[k].0 == "time_offset" { FLOOR_S } else if CANDIDATES[k].0 == "rolling_shutter" { 0.005 } else { floor };
+        let least = if CANDIDATES[k].0 == "time_offset" {
+            FLOOR_S
+        } else if CANDIDATES[k].0 == "rolling_shutter" {
+            0.005
+        } else {
+            floor
+        };
         Trial { candidate: k, name: CANDIDATES[k].0.into(), parameters: own.len(), gains, above_floor: size > least }
     };
     let allowed = |k: &usize| {
         let (name, columns) = CANDIDATES[*k];
-        columns.iter().all(|&c| usable[c]) && (side == Side::Objects || !matches!(name, "wrong_shape" | "rolling_shutter"))
+        columns.iter().all(|&c| usable[c])
+            && (side == Side::Objects || !matches!(name, "wrong_shape" | "rolling_shutter"))
     };
     let demands = Demands { nats: 6.0, slack: 0.03, ..first_demands() };
     let trials: Vec<Trial> = (0..CANDIDATES.len()).filter(allowed).map(|k| trial(k, CANDIDATES[k].1, None)).collect();
@@ -139,13 +146,16 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
         return result;
     };
     let mut chosen = vec![trials[first.chosen].candidate];
-    let mut stories = vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
+    let mut stories =
+        vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     let (first_gain, _) = total_and_z(&trials[first.chosen].gains);
     let second_demands = Demands { nats: (0.1 * first_gain).max(8.0), ..demands };
     let first_columns = CANDIDATES[chosen[0]].1;
     let rivals: Vec<Trial> = (0..CANDIDATES.len())
         .filter(allowed)
-        .filter(|&k| CANDIDATES[k].0 != CANDIDATES[chosen[0]].0 && CANDIDATES[k].1.iter().all(|c| !first_columns.contains(c)))
+        .filter(|&k| {
+            CANDIDATES[k].0 != CANDIDATES[chosen[0]].0 && CANDIDATES[k].1.iter().all(|c| !first_columns.contains(c))
+        })
         .map(|k| trial(k, &[first_columns, CANDIDATES[k].1].concat(), Some(&trials[first.chosen].gains)))
         .collect();
     if let Some(second) = choose(&rivals, &second_demands) {
@@ -189,7 +199,10 @@ fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<O
         return None;
     }
     let object = context.frames[s.frame].objects.iter().filter_map(|o| o.simulated).min_by(|a, b| {
-        let d = |b: &geometry::Box3| (b.center[1].atan2(b.center[0]) - s.azimuth_rad).abs() + (b.center[0].hypot(b.center[1]) - s.distance_m).abs();
+        let d = |b: &geometry::Box3| {
+            (b.center[1].atan2(b.center[0]) - s.azimuth_rad).abs()
+                + (b.center[0].hypot(b.center[1]) - s.distance_m).abs()
+        };
         d(a).total_cmp(&d(b))
     })?;
     let (sin, cos) = object.yaw_rad.sin_cos();
@@ -204,8 +217,11 @@ fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<O
     match s.seen_velocity_m_s {
         Some(seen) => {
             (0..3).for_each(|k| x[k][3] = seen[k]);
-            let phase = context.rig.sensors.iter().map(|m| (crate::rig::wrapped(s.azimuth_rad - m.yaw_deg.to_radians()), m));
-            let phase = phase.min_by(|a, b| a.0.abs().total_cmp(&b.0.abs())).map_or(0.0, |(az, m)| az / (2.0 * m.half_fov_rad()));
+            let phase =
+                context.rig.sensors.iter().map(|m| (crate::rig::wrapped(s.azimuth_rad - m.yaw_deg.to_radians()), m));
+            let phase = phase
+                .min_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))
+                .map_or(0.0, |(az, m)| az / (2.0 * m.half_fov_rad()));
             (0..3).for_each(|k| x[k][7] = seen[k] * phase);
             match motion.and_then(|m| m[s.frame]) {
                 Some(own) => {
@@ -276,7 +292,8 @@ fn distance(rows: &[Row], frame: usize, fitted: Option<&LinearFit>) -> [f64; 3] 
     let mut out = [0.0; 3];
     for r in rows.iter().filter(|r| r.frame == frame) {
         for axis in 0..3 {
-            let told = fitted.map_or(0.0, |f| f.columns.iter().zip(f.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
+            let told = fitted
+                .map_or(0.0, |f| f.columns.iter().zip(f.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
             let w = robust(r, axis) / r.variance[axis];
             out[0] += 0.5 * w * r.shift[axis].powi(2);
             out[1] += 0.5 * w * (r.shift[axis] - told).powi(2);
@@ -310,14 +327,25 @@ fn found(
             Cause::Left => parameters.push(parameter("left_m", sign * theta, error, "m")),
             Cause::Up if name == "wrong_shape" => parameters.push(parameter("higher_m", theta, error, "m")),
             Cause::Up => parameters.push(parameter("up_m", sign * theta, error, "m")),
-            Cause::SeenVelocity | Cause::Velocity => parameters.push(parameter("dt_s", sign * theta, error.hypot(0.02 * theta), "s")),
+            Cause::SeenVelocity | Cause::Velocity => {
+                parameters.push(parameter("dt_s", sign * theta, error.hypot(0.02 * theta), "s"))
+            }
             Cause::Longer => parameters.push(parameter("longer_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Wider => parameters.push(parameter("wider_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Swept => parameters.push(parameter("scan_s", -theta, error.hypot(0.05 * theta), "s")),
         }
-        words.push(format!("{} {:+.3} {}", parameters[parameters.len() - 1].0, parameters[parameters.len() - 1].1.estimate, parameters[parameters.len() - 1].1.unit));
+        words.push(format!(
+            "{} {:+.3} {}",
+            parameters[parameters.len() - 1].0,
+            parameters[parameters.len() - 1].1.estimate,
+            parameters[parameters.len() - 1].1.unit
+        ));
     }
-    let what = if side == Side::Labels { "measured labels stand beside the simulated ones, the returns do not" } else { "measured objects stand beside the simulated ones" };
+    let what = if side == Side::Labels {
+        "measured labels stand beside the simulated ones, the returns do not"
+    } else {
+        "measured objects stand beside the simulated ones"
+    };
     let clock = match columns {
         [3] => "; they move with the velocity that the sensor sees: all positions against the cloud",
         [4] => "; they move with the targets' velocity over the ground: the targets' clock",
@@ -332,7 +360,9 @@ fn found(
         _ => ("none", if usable[4] { 4 } else { 3 }),
     };
     let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
-    let separate_by = (!equals.is_empty()).then(|| "targets at very different speeds: a constant offset does not change with speed, a late clock's does".to_owned());
+    let separate_by = (!equals.is_empty()).then(|| {
+        "targets at very different speeds: a constant offset does not change with speed, a late clock's does".to_owned()
+    });
     let axis = match columns {
         [1] | [6] => 1,
         [2] => 2,
@@ -363,7 +393,11 @@ fn curve(rows: &[Row], column: usize, axis: usize, fitted: &LinearFit) -> Curve 
         .iter()
         .map(|r| {
             let told = fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>();
-            let x = if column == 4 { r.speed.unwrap_or(0.0) } else { r.x[axis.min(if column == 6 { 1 } else { 0 })][column] };
+            let x = if column == 4 {
+                r.speed.unwrap_or(0.0)
+            } else {
+                r.x[axis.min(if column == 6 { 1 } else { 0 })][column]
+            };
             (x, r.shift[axis], told)
         })
         .collect();

@@ -53,7 +53,11 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
     let constant = whole(&[0]);
     result.minimum.push((
         "range_noise".into(),
-        Minimum { parameter: "sigma_m".into(), value: (Z_STAR * constant.error(0)).sqrt().max(FLOOR_M), unit: "m".into() },
+        Minimum {
+            parameter: "sigma_m".into(),
+            value: (Z_STAR * constant.error(0)).sqrt().max(FLOOR_M),
+            unit: "m".into(),
+        },
     ));
     let angular = whole(&[1]);
     result.minimum.push((
@@ -92,12 +96,26 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
     let linear_e: Vec<LinearFrame> = estimate.iter().map(|&i| explained(&table_e, &rough[i], known)).collect();
     let fitted = fit(&linear_e.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &chosen, &precision);
     let table_h = NoiseTable::new(total(hold_out.iter().map(|&i| &rough[i])));
-    let terms: Vec<(NoiseLaw, f64)> =
-        known.iter().copied().chain(chosen.iter().zip(fitted.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t))).collect();
+    let terms: Vec<(NoiseLaw, f64)> = known
+        .iter()
+        .copied()
+        .chain(chosen.iter().zip(fitted.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)))
+        .collect();
     for (k, (equals, confidence)) in stories.into_iter().enumerate() {
-        let without: Vec<_> = terms.iter().enumerate().filter(|(i, _)| *i != known.len() + k).map(|(_, t)| *t).collect();
-        let gains = hold_out.iter().map(|&i| table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &without));
-        result.found.push(found(NOISE_LAWS[chosen[k]], &fitted, k, equals, confidence, gains.collect(), &table_h, &terms));
+        let without: Vec<_> =
+            terms.iter().enumerate().filter(|(i, _)| *i != known.len() + k).map(|(_, t)| *t).collect();
+        let gains =
+            hold_out.iter().map(|&i| table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &without));
+        result.found.push(found(
+            NOISE_LAWS[chosen[k]],
+            &fitted,
+            k,
+            equals,
+            confidence,
+            gains.collect(),
+            &table_h,
+            &terms,
+        ));
     }
     result.distance = hold_out.iter().map(|&i| distance(&table_h, &rough[i], &terms)).collect();
     result
@@ -175,23 +193,45 @@ fn found(
         NoiseLaw::Constant => {
             parameters.push(parameter("sigma_m", sigma, sigma_error, "m"));
             parameters.push(parameter("growth_per_m", 0.0, 0.002, "1/m"));
-            ("none".to_owned(), format!("measured ranges scatter by {:.1} cm more than simulated ones, everywhere alike", sigma * 100.0))
+            (
+                "none".to_owned(),
+                format!(
+                    "measured ranges scatter by {:.1} cm more than simulated ones, everywhere alike",
+                    sigma * 100.0
+                ),
+            )
         }
         NoiseLaw::Growing(g) => {
             parameters.push(parameter("sigma_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
             parameters.push(parameter("growth_per_m", g, 0.5 * g, "1/m"));
             let at = |r: f64| sigma * (1.0 + g * r) * 100.0;
-            ("range_m".into(), format!("measured ranges scatter more than simulated ones, and more with range: by {:.1} cm at 10 m, {:.1} cm at 50 m", at(10.0), at(50.0)))
+            (
+                "range_m".into(),
+                format!(
+                    "measured ranges scatter more than simulated ones, and more with range: by {:.1} cm at 10 m, {:.1} cm at 50 m",
+                    at(10.0),
+                    at(50.0)
+                ),
+            )
         }
         NoiseLaw::Signal(gamma) => {
             parameters.push(parameter("sigma_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
             parameters.push(parameter("gamma", gamma, 0.3 * gamma, "1"));
-            ("signal".into(), format!("measured ranges scatter more where the signal is weak: by {:.1} cm at u = 4", sigma * 100.0))
+            (
+                "signal".into(),
+                format!("measured ranges scatter more where the signal is weak: by {:.1} cm at u = 4", sigma * 100.0),
+            )
         }
         NoiseLaw::Angular => {
             let deg = f64::to_degrees;
             parameters.push(parameter("sigma_deg", deg(sigma), deg(sigma_error), "deg"));
-            ("range_m * tan(incidence)".into(), format!("the light goes elsewhere than the sensor says, by {:.3} degrees: grazing surfaces scatter, squarely met ones do not", deg(sigma)))
+            (
+                "range_m * tan(incidence)".into(),
+                format!(
+                    "the light goes elsewhere than the sensor says, by {:.3} degrees: grazing surfaces scatter, squarely met ones do not",
+                    deg(sigma)
+                ),
+            )
         }
     };
     let name = law.name().to_owned();
@@ -235,7 +275,13 @@ fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]) -> Curve 
         if sum[0] >= per || i + 1 == rows.len() && sum[0] > 0.2 * per {
             let [n, x, va, vb, vc] = sum;
             let sd = |v: f64| (v / n).sqrt();
-            points.push(CurvePoint { x: x / n, measured: sd(va), before: sd(vb), after: sd(vc), error: sd(va) / n.sqrt() });
+            points.push(CurvePoint {
+                x: x / n,
+                measured: sd(va),
+                before: sd(vb),
+                after: sd(vc),
+                error: sd(va) / n.sqrt(),
+            });
             sum = [0.0; 5];
         }
     }

@@ -27,7 +27,7 @@ pub fn locations(sets: &[LocatedTargets], range_m: f64) -> Figure {
     let (left, top) = (60.0, used + MARGIN);
     let (right, bottom) = (left + SIDE, top + SIDE);
     let x_axis = Axis::new([-range_m, range_m].into_iter(), [left, right], false);
-    let y_axis = Axis { ..Axis::new([-range_m, range_m].into_iter(), [left, right], false) };
+    let y_axis = Axis::new([-range_m, range_m].into_iter(), [left, right], false);
     let y_px = |v: f64| bottom - (y_axis.px(v) - left);
     for (value, name) in x_axis.ticks() {
         let (x, y) = (x_axis.px(value), y_px(value));
@@ -84,11 +84,11 @@ mod tests {
     fn forward_is_right_and_left_is_up() {
         let set = LocatedTargets { name: "real".into(), at_m: vec![[50.0, 20.0], [50.0, 30.0], [400.0, 0.0]] };
         let figure = locations(&[set], 100.0);
-        let dots = figure.0.marks.iter().filter_map(|mark| match mark {
+        let mut dots = figure.0.marks.iter().filter_map(|mark| match mark {
             crate::page::Mark::Dots { centers, .. } if centers.len() == 2 => Some(centers),
             _ => None,
         });
-        let centers = dots.last().unwrap();
+        let centers = dots.next_back().unwrap();
         let middle = 60.0 + SIDE / 2.0;
         assert!((centers[0][0] - middle - SIDE / 4.0).abs() < 1e-6 && centers[1][1] < centers[0][1]);
         assert_eq!(histogram(&[[0.0, 99.9], [0.0, 100.0]], 1, 100.0)[BINS - 1], 1.0);

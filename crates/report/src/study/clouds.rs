@@ -124,8 +124,8 @@ pub(super) fn target_section(all: &[Targets]) -> Section {
 
 fn statistics(all: &[Targets]) -> Item {
     let of_spread = |name: &str, digits: usize, of: &dyn Fn(&Targets) -> Spread| -> Vec<TableRow> {
-        let parts: [(&str, fn(&Spread) -> Option<f64>); 3] =
-            [("mean", |s| s.mean), ("least", |s| s.min), ("greatest", |s| s.max)];
+        type Part = (&'static str, fn(&Spread) -> Option<f64>);
+        let parts: [Part; 3] = [("mean", |s| s.mean), ("least", |s| s.min), ("greatest", |s| s.max)];
         parts
             .into_iter()
             .enumerate()

@@ -45,7 +45,8 @@ pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportE
 /// One figure of losses and one of validation.
 pub(super) fn section(runs: &[TrainingRun]) -> Section {
     let mut items = Vec::new();
-    let parts: [(&str, &str, &str, bool, fn(&TrainingRun) -> &Vec<[f64; 2]>); 2] = [
+    type Part = (&'static str, &'static str, &'static str, bool, fn(&TrainingRun) -> &Vec<[f64; 2]>);
+    let parts: [Part; 2] = [
         ("training-loss", "loss", "Training loss of every run.", true, |run| &run.loss),
         ("validation-ap", "3D AP (%)", "Average precision on the validation split during training.", false, |run| {
             &run.validation_ap

@@ -79,7 +79,7 @@ mod tests {
         let mut before = scene();
         // Behind the board there is nothing.
         for echo in before.echoes.iter_mut().filter(|e| e.object == 4 && e.reflectivity < 5.0) {
-            echo.drop();
+            echo.lose();
         }
         let effect = Blooming { returned_above: 5.0, halo_deg: 0.5, strength: 1.0 };
         let after = applied(&effect, &before);

@@ -56,7 +56,7 @@ impl SensorEffect for BrightTargetDropout {
         let mut random = draws.of_frame();
         for (echo, blinded) in scan.echoes.iter_mut().zip(blinded) {
             if echo.is_return() && blinded && random.random_range(0.0..1.0_f32) < self.share as f32 {
-                echo.drop();
+                echo.lose();
             }
         }
     }

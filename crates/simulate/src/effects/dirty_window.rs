@@ -75,7 +75,7 @@ impl SensorEffect for DirtyWindow {
             let noise: f32 = StandardNormal.sample(&mut random);
             echo.range_m = (echo.range_m + self.noise_m as f32 * (1.0 / passes - 1.0) * noise).max(0.01);
             if random.random_range(0.0..1.0_f32) < self.loss as f32 * (1.0 - passes * passes) {
-                echo.drop();
+                echo.lose();
             }
         }
     }

@@ -51,7 +51,7 @@ impl SensorEffect for EgoBodyMask {
         let boxes: Vec<[f32; 6]> = self.boxes.iter().map(|b| b.map(|v| v as f32)).collect();
         for echo in scan.returns_mut() {
             if boxes.iter().any(|b| passes(echo, b)) {
-                echo.drop();
+                echo.lose();
             }
         }
     }

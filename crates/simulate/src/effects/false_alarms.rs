@@ -70,7 +70,7 @@ mod tests {
     #[test]
     fn uniform_in_range_where_nothing_is() {
         let mut before = plate(40_000, 100.0, 0.5);
-        before.echoes.iter_mut().for_each(|e| e.drop());
+        before.echoes.iter_mut().for_each(|e| e.lose());
         let effect = FalseAlarms { rate: 0.05, reach_m: 200.0, ..FalseAlarms::default() };
         let ranges: Vec<f64> = applied(&effect, &before).returns().map(|e| e.range_m.into()).collect();
         let share = ranges.len() as f64 / 40_000.0;
@@ -82,7 +82,7 @@ mod tests {
     #[test]
     fn more_towards_the_sun() {
         let mut before = scene();
-        before.echoes.iter_mut().for_each(|e| e.drop());
+        before.echoes.iter_mut().for_each(|e| e.lose());
         let effect = FalseAlarms { rate: 0.0, sun_rate: 0.5, sun_azimuth_deg: 30.0, sun_width_deg: 10.0, ..FalseAlarms::default() };
         let azimuths: Vec<f64> =
             applied(&effect, &before).returns().map(|e| f64::from(e.direction[1].atan2(e.direction[0])).to_degrees()).collect();

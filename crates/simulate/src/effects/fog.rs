@@ -80,7 +80,7 @@ mod tests {
         let (mean, _) = moments(&droplets);
         assert!((mean - 1.0 - 0.5 / alpha).abs() < 0.3, "{mean}");
         let mut sky = before;
-        sky.echoes.iter_mut().for_each(|e| e.drop());
+        sky.echoes.iter_mut().for_each(|e| e.lose());
         assert!(applied(&effect, &sky).returns().all(|e| (1.0..=30.0).contains(&e.range_m)));
     }
 }

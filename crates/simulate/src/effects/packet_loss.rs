@@ -68,7 +68,7 @@ impl SensorEffect for PacketLoss {
         for echo in scan.returns_mut() {
             let (first, lost) = &lost[&echo.sensor];
             if lost[(packet(echo.time_s) - first) as usize] {
-                echo.drop();
+                echo.lose();
             }
         }
     }

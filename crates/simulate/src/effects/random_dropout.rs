@@ -39,7 +39,7 @@ pub(super) fn drop_some(scan: &mut Scan, draws: &Draws, share: impl Fn(&Echo) ->
     let mut random = draws.of_frame();
     for echo in scan.returns_mut() {
         if random.random_range(0.0..1.0_f32) < share(echo) {
-            echo.drop();
+            echo.lose();
         }
     }
 }

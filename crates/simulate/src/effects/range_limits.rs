@@ -34,7 +34,7 @@ impl SensorEffect for RangeLimits {
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
         let limits = self.min_m as f32..=self.max_m as f32;
         for echo in scan.returns_mut().filter(|e| !limits.contains(&e.range_m)) {
-            echo.drop();
+            echo.lose();
         }
     }
 }

@@ -91,7 +91,7 @@ fn equals_testing_every_triangle_to_the_bit() {
     let scene = Scene::new(Arc::new(Tree::new(&corners)), Vec::new());
     for set in sets() {
         for columns in [101, 1, rays.len(), 2] {
-            if rays.len() % columns != 0 {
+            if !rays.len().is_multiple_of(columns) {
                 continue;
             }
             let got = cast(&scene.clone().with_instructions(set), &rays, columns);
