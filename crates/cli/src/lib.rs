@@ -6,9 +6,11 @@ pub mod detectors;
 pub mod device;
 pub mod doctor;
 pub mod eval_ap;
+pub mod eval_statistics;
 pub mod fuzz;
 pub mod memory;
 pub mod parity;
+pub mod resim;
 pub mod schema;
 pub mod simulate;
 pub mod train;
@@ -35,8 +37,10 @@ enum Command {
     },
     /// Boxes in a cloud, or in a whole split of a data set
     Detect(detect::DetectArgs),
-    /// Make a synthetic data set
+    /// Make synthetic data sets: a race, or streets
     Simulate(simulate::SimulateArgs),
+    /// Make a data set from another one with physical effects on top
+    Resim(resim::ResimArgs),
     /// What is wrong with a data set, in words
     Doctor(doctor::DoctorArgs),
     /// Compare every tensor with a folder of reference numbers
@@ -56,6 +60,8 @@ enum Command {
 enum Eval {
     /// Average precision and recall of detections in KITTI text
     Ap(eval_ap::EvalApArgs),
+    /// Points and boxes of two data sets of the same frames
+    Statistics(eval_statistics::EvalStatisticsArgs),
 }
 
 /// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood.
@@ -63,8 +69,10 @@ pub fn run() -> ExitCode {
     let done = match Program::parse().command {
         Command::Train(args) => args.run().map(|()| true),
         Command::Eval { command: Eval::Ap(args) } => args.run().map(|()| true),
+        Command::Eval { command: Eval::Statistics(args) } => args.run().map(|()| true),
         Command::Detect(args) => args.run().map(|()| true),
         Command::Simulate(args) => args.run().map(|()| true),
+        Command::Resim(args) => args.run().map(|()| true),
         Command::Doctor(args) => args.run(),
         Command::Parity(args) => args.run(),
         Command::Schema(args) => args.run().map(|()| true),

@@ -95,14 +95,15 @@ mod tests {
         let mut after = before.clone();
         with_frame(0, |frame, draws| effect.on_cloud(&mut after, frame, draws));
         // On the ground an angle e makes R * tan(incidence) * e; head-on next to nothing.
-        let off = |object: u16, near: [f32; 2]| {
-            let both = before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && a.object == object && (near[0]..near[1]).contains(&a.range_m));
-            both.map(|(a, b)| f64::from(b.range_m - a.range_m)).collect::<Vec<_>>()
+        let off = |object: u16, size: &dyn Fn(&crate::scan::Echo) -> f64| {
+            let both = before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && a.object == object);
+            both.map(|(a, b)| f64::from(b.range_m - a.range_m) / size(a)).collect::<Vec<_>>()
         };
-        let (_, ground) = moments(&off(1, [19.0, 21.0]));
-        let want = 20.0 * (20.0_f64.powi(2) - 4.0).sqrt() / 2.0 * 0.02_f64.to_radians();
-        assert!((ground / want - 1.0).abs() < 0.15, "{ground} {want}");
-        let (_, wall) = moments(&off(4, [40.0, 40.5]));
-        assert!(wall < 3e-3, "{wall}");
+        let one = 0.02_f64.to_radians();
+        let tan = |c: f64| (1.0 - c * c).sqrt() / c;
+        let (_, ground) = moments(&off(1, &|a| f64::from(a.range_m) * tan(a.cos_incidence.into()) * one));
+        assert!((ground - 1.0).abs() < 0.05, "{ground}");
+        let (_, wall) = moments(&off(4, &|_| 1.0));
+        assert!(wall < 8e-3, "{wall}");
     }
 }

@@ -40,29 +40,22 @@ impl FrameKey {
 /// frame of one and the first of the next do not show the same moment.
 pub fn choose(runs: &[Run], kept: usize, kind: SplitKind, seed: u64) -> Result<Vec<FrameKey>, DataError> {
     let total: usize = runs.iter().map(|r| r.frames).sum();
-    let stride = total / kept;
-    let candidates: Vec<usize> = runs.iter().map(|r| r.frames / stride.max(1)).collect();
-    if stride == 0 || candidates.iter().sum::<usize>() < kept {
-        return Err(DataError::file(Path::new("frames"), format!("{kept} are more than the {total} of the runs")));
+    if kept > total || kept < SPLITS.len() * runs.len() {
+        let message = format!("{kept} are not between {} and the {total} of the runs", SPLITS.len() * runs.len());
+        return Err(DataError::file(Path::new("frames"), message));
     }
+    let candidates_at = |stride: usize| runs.iter().map(|r| r.frames.div_ceil(stride)).collect::<Vec<usize>>();
+    // At a stride of 1 there are as many candidates as frames.
+    let mut stride = total / kept;
+    while candidates_at(stride).iter().sum::<usize>() < kept {
+        stride -= 1;
+    }
+    let candidates = candidates_at(stride);
     let split_sizes = shared(kept, &SPLITS.map(|(_, share)| share));
     let mut keys = Vec::with_capacity(kept);
-    let mut left = split_sizes.clone();
     let mut first = 0;
-    for (run, candidates) in candidates.iter().enumerate() {
-        // What this run gives to each split: in proportion to its candidates among those not yet given out.
-        let rest: usize = (run..runs.len()).map(|r| runs[r].frames / stride).sum();
-        let own: Vec<usize> =
-            left.iter().map(|n| if run + 1 == runs.len() { *n } else { n * candidates / rest }).collect();
-        left.iter_mut().zip(&own).for_each(|(n, own)| *n -= own);
-        let own_total: usize = own.iter().sum();
-        if own_total > *candidates {
-            return Err(DataError::file(
-                Path::new("frames"),
-                format!("run {run} has {candidates} frames for {own_total}"),
-            ));
-        }
-        let gap = (candidates - own_total) / SPLITS.len();
+    for (run, own) in over_runs(&split_sizes, &candidates).into_iter().enumerate() {
+        let gap = (candidates[run] - own.iter().sum::<usize>()) / SPLITS.len();
         let mut at = 0;
         for (split, n) in own.iter().enumerate() {
             keys.extend((at..at + n).map(|i| FrameKey { number: first + i * stride, run, frame: i * stride, split }));
@@ -76,6 +69,26 @@ pub fn choose(runs: &[Run], kept: usize, kind: SplitKind, seed: u64) -> Result<V
         keys.iter_mut().zip(splits).for_each(|(key, split)| key.split = split);
     }
     Ok(keys)
+}
+
+/// How many frames of each split each run gives: in proportion to its candidates, and no run more than it has.
+fn over_runs(split_sizes: &[usize], candidates: &[usize]) -> Vec<Vec<usize>> {
+    let all: usize = candidates.iter().sum();
+    let mut before = 0;
+    let mut own: Vec<Vec<usize>> = Vec::new();
+    for n in candidates {
+        let upto = before + n;
+        own.push(split_sizes.iter().map(|size| size * upto / all - size * before / all).collect());
+        before = upto;
+    }
+    let given = |own: &[usize]| own.iter().sum::<usize>();
+    while let Some(from) = (0..own.len()).find(|r| given(&own[*r]) > candidates[*r]) {
+        let to = (0..own.len()).find(|r| given(&own[*r]) < candidates[*r]).expect("all candidates together are enough");
+        let split = (0..split_sizes.len()).max_by_key(|s| own[from][*s]).expect("there are splits");
+        own[from][split] -= 1;
+        own[to][split] += 1;
+    }
+    own
 }
 
 /// `total` in these shares, at least one each; the first takes what rounding leaves.
