@@ -75,12 +75,6 @@ pub(crate) fn color(k: usize) -> Rgb {
     COLORS[k % COLORS.len()]
 }
 
-/// The same colour as text for HTML.
-pub(crate) fn color_text(k: usize) -> String {
-    let [r, g, b] = color(k);
-    format!("#{r:02x}{g:02x}{b:02x}")
-}
-
 /// Names beside dots of their colours, from left to right, in rows; returns the height that they take, px.
 pub(crate) fn legend(page: &mut Page, names: &[&str], [left, top]: [f64; 2], width: f64) -> f64 {
     let (mut x, mut y) = (left, top + 12.0);

@@ -27,7 +27,7 @@ pub fn locations(sets: &[LocatedTargets], range_m: f64) -> Figure {
     let (left, top) = (60.0, used + MARGIN);
     let (right, bottom) = (left + SIDE, top + SIDE);
     let x_axis = Axis::new([-range_m, range_m].into_iter(), [left, right], false);
-    let y_axis = Axis { ..Axis::new([-range_m, range_m].into_iter(), [left, right], false) };
+    let y_axis = Axis::new([-range_m, range_m].into_iter(), [left, right], false);
     let y_px = |v: f64| bottom - (y_axis.px(v) - left);
     for (value, name) in x_axis.ticks() {
         let (x, y) = (x_axis.px(value), y_px(value));
