@@ -77,7 +77,7 @@ pub fn diagnose(
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
     let context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
-    let searches = 4;
+    let searches = 5;
     let mut results: Vec<ChannelResult> = Vec::new();
     progress(Stage::Weighing, 0, searches);
     results.push(search::noise::search(&context, &[]));
@@ -86,6 +86,8 @@ pub fn diagnose(
     progress(Stage::Weighing, 2, searches);
     results.push(search::labels::search(&context, Side::Labels));
     results.push(search::labels::search(&context, Side::Objects));
+    progress(Stage::Weighing, 4, searches);
+    results.push(search::geometry::search(&context));
     progress(Stage::Weighing, searches, searches);
     Ok(write_up(&context, results, notes))
 }

@@ -42,7 +42,7 @@ pub fn columns(rig: &SensorRig) -> Vec<Column> {
 pub const STRUCTURE_M: f64 = 0.015;
 
 /// Farther than that from the surface after the frame's own pose is taken out, a return is not of this surface, m.
-const STRAY_M: f64 = 0.30;
+pub const STRAY_M: f64 = 0.30;
 
 /// Surfaces are not flatter than that, m.
 const RIPPLE_M: f64 = 0.006;
@@ -58,9 +58,10 @@ pub struct MeanFrame {
     pub rays: f64,
     /// y' W y.
     pub squares: f64,
-    /// The frame's own pose, fitted alone: turns, rad, and shifts, m.
-    pub pose: SVector<f64, 6>,
 }
+
+/// Pose error of one frame as each sensor by itself sees it: turns about the cloud's origin, rad, and shifts, m.
+pub type OwnPoses = Vec<SVector<f64, 6>>;
 
 /// Range noise of the simulated side, m: the median over its smooth returns.
 pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
@@ -75,17 +76,27 @@ pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
 }
 
 /// Whether a measured ray says where a surface lies.
-fn usable(ray: &Ray) -> bool {
+pub fn usable(ray: &Ray) -> bool {
     ray.smooth && matches!(ray.surface, Surface::Ground | Surface::Standing) && ray.cos_incidence > 0.003
 }
 
-fn weight(ray: &Ray, noise_m: f64) -> f64 {
+/// Kind of its surface: ground, standing to the left, standing to the right.
+pub fn kind_of(ray: &Ray, origin: &Point3<f64>) -> usize {
+    match ray.surface {
+        Surface::Ground => 0,
+        _ if ray.predicted_point(origin).y > 0.0 => 1,
+        _ => 2,
+    }
+}
+
+/// Inverse variance of its distance across the surface, 1/m2.
+pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
     let c = f64::from(ray.cos_incidence);
     1.0 / ((c * noise_m).powi(2) * (1.0 + f64::from(ray.leverage)) + RIPPLE_M * RIPPLE_M)
 }
 
 /// Derivatives of the distance across the surface by a movement of the scene about `center`.
-fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVector<f64, 6> {
+pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVector<f64, 6> {
     let n = ray.normal_vector();
     let lever = (ray.predicted_point(origin) - center).cross(&n);
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
@@ -96,12 +107,16 @@ fn loose_prior() -> SVector<f64, 6> {
     SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
 }
 
-/// The pose error of one frame by itself, with redescending weights.
-pub fn frame_pose(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> SVector<f64, 6> {
+/// The pose error of one frame by itself, seen by each sensor, with redescending weights.
+pub fn own_poses(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> OwnPoses {
+    (0..origins.len()).map(|sensor| own_pose(frame, sensor, origins, noise_m)).collect()
+}
+
+fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: f64) -> SVector<f64, 6> {
     let rows: Vec<(SVector<f64, 6>, f64, f64)> = frame
         .measured
         .iter()
-        .filter(|r| usable(r))
+        .filter(|r| usable(r) && r.sensor as usize == sensor)
         .map(|r| {
             let row = pose_row(r, &origins[r.sensor as usize], &Point3::origin());
             (row, r.across_m(), weight(r, noise_m))
@@ -129,7 +144,7 @@ pub fn frame_pose(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> S
 }
 
 /// How many neighbouring residuals count as one: variance of means over patches of directions, against that of independent ones.
-pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[SVector<f64, 6>], noise_m: f64) -> f64 {
+pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[OwnPoses], noise_m: f64) -> f64 {
     let sums: Vec<[f64; 3]> = frames
         .par_iter()
         .zip(poses)
@@ -137,12 +152,12 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[SVe
             let mut patches = std::collections::BTreeMap::<(u8, i32, i32), [f64; 3]>::new();
             for ray in frame.measured.iter().filter(|r| usable(r)) {
                 let w = weight(ray, noise_m);
-                let y = ray.across_m() - pose_row(ray, &origins[ray.sensor as usize], &Point3::origin()).dot(pose);
+                let row = pose_row(ray, &origins[ray.sensor as usize], &Point3::origin());
+                let y = ray.across_m() - row.dot(&pose[ray.sensor as usize]);
                 if y.abs() > STRAY_M {
                     continue;
                 }
-                let key =
-                    (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
+                let key = (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
                 let patch = patches.entry(key).or_default();
                 patch[0] += 1.0;
                 patch[1] += w.sqrt() * y;
@@ -161,44 +176,38 @@ pub fn mean_frames(
     frames: &[FramePair],
     rig: &SensorRig,
     columns: &[Column],
-    poses: &[SVector<f64, 6>],
+    poses: &[OwnPoses],
     noise_m: f64,
     design: f64,
 ) -> Vec<MeanFrame> {
     let origins = origins(rig);
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
-    let one = |(frame, pose): (&FramePair, &SVector<f64, 6>)| {
+    let one = |(frame, pose): (&FramePair, &OwnPoses)| {
         let p = columns.len();
-        let mut out =
-            MeanFrame { gram: DMatrix::zeros(p, p), right: DVector::zeros(p), rays: 0.0, squares: 0.0, pose: *pose };
+        let mut out = MeanFrame {
+            gram: DMatrix::zeros(p, p),
+            right: DVector::zeros(p),
+            rays: 0.0,
+            squares: 0.0,
+        };
         let mut x = vec![0.0; p];
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
             let row = pose_row(ray, origin, &Point3::origin());
             let y = ray.across_m();
-            if (y - row.dot(pose)).abs() > STRAY_M {
+            if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
             }
             let own = pose_row(ray, origin, origin);
             let phase = f64::from(ray.azimuth_rad) / (2.0 * half_fov[ray.sensor as usize]);
             let c = f64::from(ray.cos_incidence);
-            let kind = match ray.surface {
-                Surface::Ground => 0,
-                _ if ray.predicted_point(origin).y > 0.0 => 1,
-                _ => 2,
-            };
+            let kind = kind_of(ray, origin);
             for (v, column) in x.iter_mut().zip(columns) {
                 *v = match *column {
                     Column::RangeOffset => -c,
                     Column::RangeScale => -c * f64::from(ray.range_m),
                     Column::Pose(k) => row[k],
-                    Column::SensorPose(s, k) => {
-                        if s == ray.sensor as usize {
-                            own[k]
-                        } else {
-                            0.0
-                        }
-                    }
+                    Column::SensorPose(s, k) => if s == ray.sensor as usize { own[k] } else { 0.0 },
                     Column::Sweep(k) => phase * [row[3], row[4], row[2]][k],
                     Column::Structure(k) => f64::from(u8::from(k == kind)),
                 };

@@ -1,5 +1,6 @@
 //! What each channel finds: candidates are weighed on the selecting frames, fitted on the estimating ones, measured on those held out.
 
+pub mod geometry;
 pub mod hits;
 pub mod labels;
 pub mod noise;
