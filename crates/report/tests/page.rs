@@ -37,8 +37,7 @@ fn frame(id: usize, noise: f32) -> Frame {
         let (u, v, w) = (rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
         push(car.from_local([u * 4.88, v * 1.9 * (1.0 - f64::abs(u)), w * 1.18]), &mut cloud);
     }
-    let object =
-        Object { class: "Car".into(), bbox: car, truncation: None, occlusion: None, image_box: None };
+    let object = Object { class: "Car".into(), bbox: car, truncation: None, occlusion: None, image_box: None };
     Frame { id: format!("{id:06}"), cloud, objects: vec![object] }
 }
 
@@ -78,7 +77,8 @@ fn report() -> StudyReport {
     let bootstrap = BootstrapOptions { replicates: 100, ..BootstrapOptions::default() };
     let frames: Vec<Frame> = (0..150).map(|i| frame(i, 0.0)).collect();
     let places = [("real", "Real"), ("sim", "Sim"), ("sim-noise", "Sim Noise")];
-    let place = |(name, title): (&str, &str)| Place { name: name.into(), title: title.into(), paper: Some(title.into()) };
+    let place =
+        |(name, title): (&str, &str)| Place { name: name.into(), title: title.into(), paper: Some(title.into()) };
     let network = |title: &str, n: u64| PlannedNetwork {
         network: Place { name: title.to_lowercase(), title: title.into(), paper: Some(title.into()) },
         train_sets: places.map(place).to_vec(),
@@ -201,7 +201,9 @@ fn report() -> StudyReport {
             CkaTable {
                 layers_a: layers.clone(),
                 layers_b: layers,
-                values: (0..4).map(|i| (0..4).map(|j| Some(1.0 - 0.2 * f64::from(i32::abs(i - j)))).collect()).collect(),
+                values: (0..4)
+                    .map(|i| (0..4).map(|j| Some(1.0 - 0.2 * f64::from(i32::abs(i - j)))).collect())
+                    .collect(),
             },
         )],
         frechet: vec![FrechetRow {
@@ -233,16 +235,22 @@ fn written() -> (PathBuf, String) {
 
 /// The page as the browser builds it, if there is one. It has no network.
 fn in_browser(page: &Path, more: &[&str]) -> Option<String> {
-    let browser = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
-        Command::new(name).arg("--version").output().is_ok_and(|out| out.status.success())
-    });
+    let browser = ["chromium", "chromium-browser", "google-chrome"]
+        .into_iter()
+        .find(|name| Command::new(name).arg("--version").output().is_ok_and(|out| out.status.success()));
     let Some(browser) = browser else {
         eprintln!("skipped: there is no Chromium");
         return None;
     };
     let profile = tempfile::tempdir().unwrap();
     let out = Command::new(browser)
-        .args(["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--virtual-time-budget=4000"])
+        .args([
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--enable-unsafe-swiftshader",
+            "--virtual-time-budget=4000",
+        ])
         .args(["--proxy-server=127.0.0.1:9", "--window-size=1200,900"])
         .arg(format!("--user-data-dir={}", profile.path().display()))
         .args(more)
@@ -261,7 +269,9 @@ fn the_page_is_whole_and_needs_nothing() {
     for part in ["src=", "<link", "@import", "url("] {
         assert!(!text.contains(part), "{part}");
     }
-    let addresses = text.match_indices("://").filter(|(at, _)| !text[..*at].ends_with("http") || !text[*at..].starts_with("://www.w3.org/"));
+    let addresses = text
+        .match_indices("://")
+        .filter(|(at, _)| !text[..*at].ends_with("http") || !text[*at..].starts_with("://www.w3.org/"));
     assert_eq!(addresses.count(), 0);
     // Text stays text.
     assert!(html.contains("A study of &#60;made up&#62; data") || html.contains("A study of &lt;made up&gt; data"));
