@@ -1,8 +1,8 @@
 //! A scan of the race: rays alone, a frame of `sim`, a frame of `measured`.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use simulate::beams::Beams;
-use simulate::race::{ConfigFiles, RaceConfig, Simulator};
+use lidarshift_simulate::beams::Beams;
+use lidarshift_simulate::race::{ConfigFiles, RaceConfig, Simulator};
 use std::hint::black_box;
 
 fn frames(criterion: &mut Criterion) {
