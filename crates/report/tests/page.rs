@@ -37,8 +37,7 @@ fn frame(id: usize, noise: f32) -> Frame {
         let (u, v, w) = (rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5), rng.random_range(-0.5..0.5));
         push(car.from_local([u * 4.88, v * 1.9 * (1.0 - f64::abs(u)), w * 1.18]), &mut cloud);
     }
-    let object =
-        Object { class: "Car".into(), bbox: car, truncation: None, occlusion: None, image_box: None };
+    let object = Object { class: "Car".into(), bbox: car, truncation: None, occlusion: None, image_box: None };
     Frame { id: format!("{id:06}"), cloud, objects: vec![object] }
 }
 
@@ -75,10 +74,11 @@ fn eval_frames(frames: &[Frame], seed: u64, noise: f64) -> Vec<EvalFrame> {
 }
 
 fn report() -> StudyReport {
-    let bootstrap = BootstrapOptions { replicates: 100, ..BootstrapOptions::default() };
-    let frames: Vec<Frame> = (0..150).map(|i| frame(i, 0.0)).collect();
+    let bootstrap = BootstrapOptions { replicates: 40, ..BootstrapOptions::default() };
+    let frames: Vec<Frame> = (0..60).map(|i| frame(i, 0.0)).collect();
     let places = [("real", "Real"), ("sim", "Sim"), ("sim-noise", "Sim Noise")];
-    let place = |(name, title): (&str, &str)| Place { name: name.into(), title: title.into(), paper: Some(title.into()) };
+    let place =
+        |(name, title): (&str, &str)| Place { name: name.into(), title: title.into(), paper: Some(title.into()) };
     let network = |title: &str, n: u64| PlannedNetwork {
         network: Place { name: title.to_lowercase(), title: title.into(), paper: Some(title.into()) },
         train_sets: places.map(place).to_vec(),
@@ -131,12 +131,12 @@ fn report() -> StudyReport {
             at: at.map(|v| v + rng.random_range(-1.0..1.0)),
         }
     };
-    let ids: Vec<String> = (0..20).map(|i| i.to_string()).collect();
+    let ids: Vec<String> = (0..6).map(|i| i.to_string()).collect();
     let distance_options = DistanceOptions {
         compared: "the raw cloud".into(),
-        emd_points: 64,
-        sinkhorn_points: 64,
-        sinkhorn_iterations: 30,
+        emd_points: 32,
+        sinkhorn_points: 32,
+        sinkhorn_iterations: 10,
         directions: 8,
         bootstrap,
         ..DistanceOptions::default()
@@ -158,7 +158,7 @@ fn report() -> StudyReport {
     };
     let distances = compare(["Real", "Sim"], &ids, of_pair, Some(&regions), &distance_options).unwrap();
     let of_set = |title: &str, noise: f32| {
-        let ids: Vec<String> = (0..150).map(|i| i.to_string()).collect();
+        let ids: Vec<String> = (0..60).map(|i| i.to_string()).collect();
         targets(title, &ids, |id| Ok(frame(id.parse().unwrap(), noise)), &TargetOptions::default()).unwrap()
     };
     let curve = |k: f64| TrainingRun {
@@ -201,7 +201,9 @@ fn report() -> StudyReport {
             CkaTable {
                 layers_a: layers.clone(),
                 layers_b: layers,
-                values: (0..4).map(|i| (0..4).map(|j| Some(1.0 - 0.2 * f64::from(i32::abs(i - j)))).collect()).collect(),
+                values: (0..4)
+                    .map(|i| (0..4).map(|j| Some(1.0 - 0.2 * f64::from(i32::abs(i - j)))).collect())
+                    .collect(),
             },
         )],
         frechet: vec![FrechetRow {
@@ -233,16 +235,22 @@ fn written() -> (PathBuf, String) {
 
 /// The page as the browser builds it, if there is one. It has no network.
 fn in_browser(page: &Path, more: &[&str]) -> Option<String> {
-    let browser = ["chromium", "chromium-browser", "google-chrome"].into_iter().find(|name| {
-        Command::new(name).arg("--version").output().is_ok_and(|out| out.status.success())
-    });
+    let browser = ["chromium", "chromium-browser", "google-chrome"]
+        .into_iter()
+        .find(|name| Command::new(name).arg("--version").output().is_ok_and(|out| out.status.success()));
     let Some(browser) = browser else {
         eprintln!("skipped: there is no Chromium");
         return None;
     };
     let profile = tempfile::tempdir().unwrap();
     let out = Command::new(browser)
-        .args(["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--virtual-time-budget=4000"])
+        .args([
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--enable-unsafe-swiftshader",
+            "--virtual-time-budget=4000",
+        ])
         .args(["--proxy-server=127.0.0.1:9", "--window-size=1200,900"])
         .arg(format!("--user-data-dir={}", profile.path().display()))
         .args(more)
@@ -261,7 +269,9 @@ fn the_page_is_whole_and_needs_nothing() {
     for part in ["src=", "<link", "@import", "url("] {
         assert!(!text.contains(part), "{part}");
     }
-    let addresses = text.match_indices("://").filter(|(at, _)| !text[..*at].ends_with("http") || !text[*at..].starts_with("://www.w3.org/"));
+    let addresses = text
+        .match_indices("://")
+        .filter(|(at, _)| !text[..*at].ends_with("http") || !text[*at..].starts_with("://www.w3.org/"));
     assert_eq!(addresses.count(), 0);
     // Text stays text.
     assert!(html.contains("A study of &#60;made up&#62; data") || html.contains("A study of &lt;made up&gt; data"));
