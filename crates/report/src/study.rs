@@ -17,6 +17,7 @@ use eval::distance::Distances;
 use eval::features::{CkaTable, Embedding};
 use eval::matrix::Matrix;
 use eval::targets::Targets;
+use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
 /// Everything that a report shows; what is empty is left out.
@@ -67,6 +68,9 @@ pub struct FrechetRow {
     pub floor: Option<f64>,
 }
 
+/// Pixels of a PNG for each of the figure's.
+const PNG_SCALE: f32 = 1.5;
+
 /// What was written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReportFiles {
@@ -95,6 +99,8 @@ impl StudyReport {
     pub fn write(&self, folder: &Path) -> Result<ReportFiles, ReportError> {
         let mut sections = self.sections();
         let html = self.render(&mut sections)?;
+        let page = folder.join("report.html");
+        write_atomic(&page, html.as_bytes())?;
         let mut others = Vec::new();
         let mut write = |name: String, bytes: &[u8]| -> Result<(), ReportError> {
             let path = folder.join(name);
@@ -102,21 +108,25 @@ impl StudyReport {
             others.push(path);
             Ok(())
         };
-        for item in sections.iter().flat_map(|section| &section.items) {
-            if let Some(figure) = &item.figure {
-                write(format!("figures/{}.svg", item.id), figure.svg().as_bytes())?;
-                write(format!("figures/{}.png", item.id), &figure.png(2.0)?)?;
-            }
-            if !item.csv.is_empty() {
-                write(format!("tables/{}.csv", item.id), item.csv.as_bytes())?;
-            }
-        }
         if let Some(matrix) = &self.matrix {
             write("tables/matrix.md".into(), matrix.to_markdown().as_bytes())?;
             write("tables/matrix.tex".into(), matrix.to_latex().as_bytes())?;
         }
-        let page = folder.join("report.html");
-        write_atomic(&page, html.as_bytes())?;
+        let items = || sections.iter().flat_map(|section| &section.items);
+        for item in items().filter(|item| !item.csv.is_empty()) {
+            write(format!("tables/{}.csv", item.id), item.csv.as_bytes())?;
+        }
+        let drawn = |item: &Item| {
+            let Some(figure) = &item.figure else { return Ok(None) };
+            Ok(Some((figure.svg(), figure.png(PNG_SCALE)?)))
+        };
+        let drawn: Vec<Result<_, ReportError>> = items().collect::<Vec<_>>().into_par_iter().map(drawn).collect();
+        for (item, drawn) in items().zip(drawn) {
+            if let Some((svg, png)) = drawn? {
+                write(format!("figures/{}.svg", item.id), svg.as_bytes())?;
+                write(format!("figures/{}.png", item.id), &png)?;
+            }
+        }
         Ok(ReportFiles { page, page_bytes: html.len(), others })
     }
 

@@ -74,8 +74,8 @@ fn eval_frames(frames: &[Frame], seed: u64, noise: f64) -> Vec<EvalFrame> {
 }
 
 fn report() -> StudyReport {
-    let bootstrap = BootstrapOptions { replicates: 100, ..BootstrapOptions::default() };
-    let frames: Vec<Frame> = (0..150).map(|i| frame(i, 0.0)).collect();
+    let bootstrap = BootstrapOptions { replicates: 40, ..BootstrapOptions::default() };
+    let frames: Vec<Frame> = (0..60).map(|i| frame(i, 0.0)).collect();
     let places = [("real", "Real"), ("sim", "Sim"), ("sim-noise", "Sim Noise")];
     let place =
         |(name, title): (&str, &str)| Place { name: name.into(), title: title.into(), paper: Some(title.into()) };
@@ -131,12 +131,12 @@ fn report() -> StudyReport {
             at: at.map(|v| v + rng.random_range(-1.0..1.0)),
         }
     };
-    let ids: Vec<String> = (0..20).map(|i| i.to_string()).collect();
+    let ids: Vec<String> = (0..6).map(|i| i.to_string()).collect();
     let distance_options = DistanceOptions {
         compared: "the raw cloud".into(),
-        emd_points: 64,
-        sinkhorn_points: 64,
-        sinkhorn_iterations: 30,
+        emd_points: 32,
+        sinkhorn_points: 32,
+        sinkhorn_iterations: 10,
         directions: 8,
         bootstrap,
         ..DistanceOptions::default()
@@ -158,7 +158,7 @@ fn report() -> StudyReport {
     };
     let distances = compare(["Real", "Sim"], &ids, of_pair, Some(&regions), &distance_options).unwrap();
     let of_set = |title: &str, noise: f32| {
-        let ids: Vec<String> = (0..150).map(|i| i.to_string()).collect();
+        let ids: Vec<String> = (0..60).map(|i| i.to_string()).collect();
         targets(title, &ids, |id| Ok(frame(id.parse().unwrap(), noise)), &TargetOptions::default()).unwrap()
     };
     let curve = |k: f64| TrainingRun {

@@ -1,6 +1,6 @@
-//! What a changed study file makes invalid.
+//! What a changed study file does to what was made before.
 
-use super::{StudyConfig, StudyRun};
+use super::{Source, StudyConfig, StudyRun};
 use crate::matrix::RunId;
 use std::collections::BTreeMap;
 
@@ -54,5 +54,14 @@ impl StudyConfig {
         });
         changes.tests = tests.map(|dataset| dataset.name.clone()).collect();
         changes
+    }
+
+    /// Where a data set comes from, with that of the one it is made of.
+    fn source_text(&self, name: &str) -> String {
+        let Some(dataset) = self.datasets.iter().find(|d| d.name == name) else { return "unknown".into() };
+        match &dataset.source {
+            Source::Resim { of, effects } => format!("{} with {}", self.source_text(of), effects.display()),
+            source => serde_json::to_string(source).unwrap_or_default(),
+        }
     }
 }
