@@ -297,6 +297,6 @@ fn the_page_is_whole_and_needs_nothing() {
     assert!(html.len() < 25_000_000, "{} bytes", html.len());
     let Some(dom) = in_browser(&page, &["--dump-dom"]) else { return };
     assert!(dom.contains("frame &lt;/script&gt; 000003</option>"), "the view lists its frames");
-    assert_eq!(dom.matches("type=\"checkbox\"").count(), 4, "a switch for each layer");
+    assert_eq!(dom.matches("<input type=\"checkbox\"").count(), 4, "a switch for each layer");
     assert!(!dom.contains("class=\"viewer no-webgl\""), "WebGL by SwiftShader");
 }
