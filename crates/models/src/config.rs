@@ -156,6 +156,7 @@ pub struct HeadConfig {
 }
 
 impl Default for HeadConfig {
+    #[expect(clippy::approx_constant, reason = "the reference's own digits, not a quarter of pi")]
     fn default() -> Self {
         HeadConfig { dir_offset_rad: 0.78539, dir_limit_offset: 0.0, dir_bins: 2 }
     }

@@ -46,14 +46,14 @@ pub struct Preparer {
 #[derive(Clone, Debug)]
 enum Preparation {
     PointPillars(pointpillars::Preparation),
-    PointRcnn(pointrcnn::Preparation),
+    PointRcnn(Box<pointrcnn::Preparation>),
 }
 
 impl Preparation {
     fn new(config: &DetectorConfig) -> Self {
         match &config.network {
             NetworkConfig::PointPillars(net) => Preparation::PointPillars(pointpillars::Preparation::new(config, net)),
-            NetworkConfig::PointRcnn(net) => Preparation::PointRcnn(pointrcnn::Preparation::new(config, net)),
+            NetworkConfig::PointRcnn(net) => Preparation::PointRcnn(Box::new(pointrcnn::Preparation::new(config, net))),
         }
     }
 }

@@ -2,6 +2,7 @@
 
 pub mod checkpoint;
 pub mod config;
+pub mod kernel_ops;
 pub mod layers;
 pub mod loss;
 pub mod named;

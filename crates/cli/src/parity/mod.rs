@@ -10,7 +10,7 @@ mod recipe;
 mod reference;
 mod toy_training;
 
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result};
 use clap::Args;
 use reference::Row;
@@ -24,9 +24,8 @@ use std::path::PathBuf;
 pub struct ParityArgs {
     /// Folder with manifest.json and safetensors files of a network, or of single operations
     dir: PathBuf,
-    /// Where the network runs
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Also write the rows as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -45,7 +44,7 @@ impl ParityArgs {
     /// Whether every tensor passed.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let folder = fs_err::canonicalize(&self.dir)?;
         let manifest = fs_err::read_to_string(folder.join("manifest.json"))
             .context("a folder of reference numbers has a manifest.json")?;
@@ -55,7 +54,7 @@ impl ParityArgs {
             None => operators::compare(&folder, &device)?,
         };
         if let Some(path) = &self.json {
-            let parity = Parity { schema: "lidarshift.parity/1", rows: &rows };
+            let parity = Parity { schema: "lidarshift/parity/1", rows: &rows };
             data::write_atomic(path, &serde_json::to_vec_pretty(&parity)?)?;
         }
         println!("{:<24} {:<44} {:>10} {:>10}  ", "file", "tensor", "error", "tolerance");
@@ -82,7 +81,7 @@ mod tests {
 
     fn passes(folder: &str) -> bool {
         let dir = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden")).join(folder);
-        ParityArgs { dir, device: "flex".into(), json: None, all: false }.run().unwrap()
+        ParityArgs { dir, device: DeviceArgs::default(), json: None, all: false }.run().unwrap()
     }
 
     #[test]

@@ -19,6 +19,7 @@ use train::OneCycle;
 /// Losses and coders, absolute values around one.
 pub(super) const LOSS: f64 = 1e-6;
 /// KITTI's anchors' direction bins begin here.
+#[expect(clippy::approx_constant, reason = "the reference's own digits, not a quarter of pi")]
 const DIR_OFFSET_RAD: f32 = 0.78539;
 
 /// Compares the file of every operation.
