@@ -79,7 +79,9 @@ impl RoiInput {
             let [x, y, z] = [0, 1, 2].map(|axis| p[axis] - roi[axis]);
             let depth_m = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt();
             let depth = depth_m / config.depth_normalizer_m - 0.5;
-            region.prefix.push([x * cos + y * sin, y * cos - x * sin, z, scene.scores[i as usize], depth]);
+            // Fused as in the reference's product of matrices: which of two points is farther may hang on the last digit.
+            let (x, y) = (y.mul_add(sin, x * cos), y.mul_add(cos, -(x * sin)));
+            region.prefix.push([x, y, z, scene.scores[i as usize], depth]);
             region.source.push(Some(scene.first_row + i));
         }
         region.count.push(members.len() as u32);
