@@ -2,7 +2,9 @@
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use data::{Dataset, write_atomic};
 use indicatif::{ProgressBar, ProgressStyle};
+use report::{BirdsEyeOptions, Style, birds_eye_png};
 use simulate::race::{ConfigFiles, RaceConfig, RaceManifest, make_race_datasets};
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
 use std::path::{Path, PathBuf};
@@ -110,6 +112,7 @@ impl SimulateArgs {
         let manifests = make_race_datasets(config, files, &out, &self.dataset, &hear)?;
         progress.finish_and_clear();
         manifests.iter().for_each(|manifest| print!("{}", summary(manifest)));
+        manifests.iter().try_for_each(|manifest| preview(&out.join(&manifest.name[1])))?;
         eprintln!("data sets in {}", out.display());
         Ok(())
     }
@@ -118,6 +121,20 @@ impl SimulateArgs {
 fn bar() -> Result<ProgressBar> {
     let style = ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?;
     Ok(ProgressBar::new(0).with_style(style))
+}
+
+/// The first frame of the test split from above: `preview.png`, the same frame in all data sets of a race.
+fn preview(folder: &Path) -> Result<()> {
+    let picture = folder.join("preview.png");
+    if picture.is_file() {
+        return Ok(());
+    }
+    let dataset = Dataset::open(folder)?;
+    let Some(id) = dataset.ids("test")?.into_iter().next() else { return Ok(()) };
+    let frame = dataset.load(&id)?;
+    let boxes: Vec<_> = frame.objects.iter().map(|o| (o.bbox, Style::GroundTruth)).collect();
+    let bytes = birds_eye_png(&frame.cloud, &boxes, &BirdsEyeOptions::default())?;
+    Ok(write_atomic(&picture, &bytes)?)
 }
 
 /// A line a split, and how far labels are off where they are made as on the road.

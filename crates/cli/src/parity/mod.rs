@@ -8,6 +8,7 @@ mod pointpillars;
 mod pointrcnn;
 mod recipe;
 mod reference;
+mod rotations;
 mod toy_training;
 
 use crate::device::DeviceArgs;

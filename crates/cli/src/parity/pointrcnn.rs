@@ -5,6 +5,7 @@
 
 use super::network::{Case, frame, wide};
 use super::reference::ReferenceFile;
+use super::rotations::{centers, reference_rotations};
 use anyhow::{Context, Result};
 use burn::tensor::Tensor;
 use data::Cloud;
@@ -89,11 +90,8 @@ impl View<'_> {
         let regions = input.regions();
         self.columns(file, "rcnn_xyz_up", &stages.xyz_up, Some(&input.dense[0]), regions, true)?;
         self.columns(file, "rcnn_merged", &stages.merged, Some(&input.dense[0]), regions, true)?;
-        let mut positions: Vec<[f32; 3]> = input.dense[0].iter().map(|&row| position(input, row)).collect();
-        for (l, picks) in input.picks.iter().enumerate() {
-            let (above, here) = (positions.len() / regions, picks.len() / regions);
-            let pick = |(k, &pick): (usize, &u32)| positions[k / here * above + pick as usize];
-            positions = picks.iter().enumerate().map(pick).collect();
+        for (l, positions) in centers(input).iter().enumerate() {
+            let here = positions.len() / regions;
             self.stage(file, &format!("rcnn_sa{l}.xyz"), &wide(positions.as_flattened()), &[regions, here, 3])?;
             let (rows, dense) = (&stages.set_abstraction[l], &input.dense[l + 1]);
             self.columns(file, &format!("rcnn_sa{l}.features"), rows, Some(dense), regions, false)?;
@@ -103,10 +101,6 @@ impl View<'_> {
         self.rows(file, "rcnn_cls", &stages.cls)?;
         self.rows(file, "rcnn_reg", &stages.reg)
     }
-}
-
-fn position(input: &RoiInput, row: u32) -> [f32; 3] {
-    std::array::from_fn(|axis| input.prefix[row as usize][axis])
 }
 
 fn whole(values: impl IntoIterator<Item = u32>) -> Vec<f64> {
@@ -150,7 +144,8 @@ pub fn eval(case: &mut Case, net: &PointRcnnConfig, network: &PointRcnn) -> Resu
     let rois = file.floats("proposals_test.rois")?.as_chunks::<7>().0.to_vec();
     let labels = file.ints("proposals_test.roi_labels")?;
     let scene = Scene { points: &sample.points, scores: &scores, first_row: 0 };
-    let input = RoiInput::new(scene, &rois, &net.roi_head);
+    let rotations = reference_rotations(&mut file, scene, &rois, 0, &net.roi_head)?;
+    let input = RoiInput::rotated(scene, &rois, &rotations, &net.roi_head);
     file.compare("pooled_count", &whole(input.count.iter().copied()), 0.0)?;
     pooled(&view, &mut file, &input, &stages.point_features(), &net.roi_head)?;
     for (l, picks) in input.picks.iter().enumerate() {
@@ -300,7 +295,8 @@ pub fn train(case: &mut Case, net: &PointRcnnConfig, network: &PointRcnn) -> Res
         truth_of_roi.extend(of);
         let scores = point_scores(&logits[f * points * classes..][..points * classes], classes);
         let scene = Scene { points: &sample.points, scores: &scores, first_row: (f * points) as u32 };
-        input.append(&RoiInput::new(scene, &rois[span], &net.roi_head));
+        let rotations = reference_rotations(&mut file, scene, &rois[span.clone()], span.start, &net.roi_head)?;
+        input.append(&RoiInput::rotated(scene, &rois[span], &rotations, &net.roi_head));
     }
     roi_targets(&mut file, &regions, &truth_of_roi)?;
     let roi = network.roi_head.forward(stages.point_features(), &input, Mode::Train);

@@ -62,6 +62,15 @@ impl ReferenceFile {
         Ok(numbers(self.input(tensor)?).into_iter().map(|v| v as i64).collect())
     }
 
+    /// The values of a stage that the file holds, and how many of the whole tensor's lie from one to the next.
+    pub fn sampled(&mut self, stage: &str) -> Result<(Vec<f32>, usize)> {
+        if self.has(stage) {
+            return Ok((self.floats(stage)?, 1));
+        }
+        let step = self.ints(&format!("{stage}.step"))?[0].max(1) as usize;
+        Ok((self.floats(&format!("{stage}.sample"))?, step))
+    }
+
     /// Compares one tensor, value by value.
     pub fn compare(&mut self, tensor: &str, ours: &[f64], tolerance: f64) -> Result<()> {
         let reference = self.input(tensor)?.clone();

@@ -45,6 +45,12 @@ pub struct Scene<'a> {
 impl RoiInput {
     /// Of the regions of one frame.
     pub fn new(scene: Scene<'_>, rois: &[[f32; 7]], config: &RoiHeadConfig) -> Self {
+        let rotations: Vec<[f32; 2]> = rois.iter().map(|roi| roi[6].sin_cos().into()).collect();
+        RoiInput::rotated(scene, rois, &rotations, config)
+    }
+
+    /// The same with the sine and cosine of each region's yaw as somebody else rounds them.
+    pub fn rotated(scene: Scene<'_>, rois: &[[f32; 7]], rotations: &[[f32; 2]], config: &RoiHeadConfig) -> Self {
         let extra = config.extra_width_m;
         let enlarged = |r: &[f32; 7]| [r[0], r[1], r[2], r[3] + extra[0], r[4] + extra[1], r[5] + extra[2], r[6]];
         let boxes: Vec<Box3> = rois.iter().map(|r| Box3::from_array(enlarged(r).map(f64::from))).collect();
@@ -53,7 +59,7 @@ impl RoiInput {
             .into_par_iter()
             .map(|r| {
                 let members = &pooled.index[r * config.points..][..pooled.count[r] as usize];
-                RoiInput::of_region(scene, &rois[r], members, config)
+                RoiInput::of_region(scene, &rois[r], rotations[r], members, config)
             })
             .collect();
         let mut all = RoiInput::empty(config);
@@ -71,9 +77,14 @@ impl RoiInput {
         }
     }
 
-    fn of_region(scene: Scene<'_>, roi: &[f32; 7], members: &[u32], config: &RoiHeadConfig) -> Self {
+    fn of_region(
+        scene: Scene<'_>,
+        roi: &[f32; 7],
+        [sin, cos]: [f32; 2],
+        members: &[u32],
+        config: &RoiHeadConfig,
+    ) -> Self {
         let mut region = RoiInput::empty(config);
-        let (sin, cos) = roi[6].sin_cos();
         for &i in members {
             let p = scene.points[i as usize];
             let [x, y, z] = [0, 1, 2].map(|axis| p[axis] - roi[axis]);
