@@ -1,7 +1,7 @@
 //! 1x1 convolution with an optional bias: the detection head.
 
 use crate::epilogue::Epilogue;
-use crate::images::ImageShape;
+use crate::images::{ImageShape, Images, ImagesOut};
 use crate::output::{Shared, fill};
 use crate::scheme::{PackedWeights, run};
 use crate::upsampling::{Expand, PixelPanels, pack_expand};
@@ -39,11 +39,12 @@ impl Pointwise {
     pub fn forward(&self, x: &[f32], weights: &PackedWeights, epilogue: Epilogue<'_>, y: &mut Vec<f32>) {
         assert_eq!(x.len(), self.batch * self.inputs * self.pixels, "elements of x of {self:?}");
         assert!(epilogue.bias.is_none_or(|b| b.len() == self.outputs), "one bias an output of {self:?}");
-        let (batch, x_shape, y_shape) = (self.batch, self.shape(self.inputs), self.shape(self.outputs));
+        let (batch, x) = (self.batch, Images { values: x, shape: self.shape(self.inputs) });
         // SAFETY: every pixel is in one of the blocks.
         unsafe {
             fill(y, batch * self.outputs * self.pixels, |y| {
-                run(&Expand::<1> { batch, x, x_shape, y: Shared::new(y), y_shape, epilogue }, weights);
+                let y = ImagesOut { values: Shared::new(y), shape: self.shape(self.outputs), epilogue };
+                run(&Expand::<1> { batch, x, y }, weights);
             });
         }
     }
@@ -66,9 +67,10 @@ impl Pointwise {
     pub fn weight_gradient(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
         assert_eq!(x.len(), self.batch * self.inputs * self.pixels, "elements of x of {self:?}");
         self.check_dy(dy);
-        let (batch, x_shape, dy_shape) = (self.batch, self.shape(self.inputs), self.shape(self.outputs));
+        let x = Images { values: x, shape: self.shape(self.inputs) };
+        let dy = Images { values: dy, shape: self.shape(self.outputs) };
         let weight_at = |input, output| output * self.inputs + input;
-        weight_gradient(&PixelPanels::<1, _> { batch, x, x_shape, dy, dy_shape, weight_at })
+        weight_gradient(&PixelPanels::<1, _> { batch: self.batch, x, dy, weight_at })
     }
 
     /// Gradient by the bias, `[outputs]`.
