@@ -1,18 +1,26 @@
-//! `lidarshift fuzz`: damaged files for every reader. A reader answers with data that keeps its promises or with an error; it never panics.
+//! `lidarshift fuzz`: damaged files for every reader. A reader answers with data that keeps its promises or with an error; it never
+//! panics, hangs, or takes memory that the file cannot fill.
 
-use anyhow::Result;
+mod targets;
+
+use crate::memory::{peak_mib, reset_peak_mib};
+use anyhow::{Result, bail};
 use clap::Args;
-use data::{
-    Calibration, Cloud, DatasetConfig, FARTHEST_M, KittiText, PcdEncoding, PointColumns, encode_pcd, parse_bin,
-};
-use data::{parse_kitti_text, parse_pcd, stream};
-use models::checkpoint::{HostTensor, HostValues, NamedTensors, read_checkpoint, write_safetensors};
-use models::config::DetectorConfig;
+use data::stream;
+use indicatif::{ProgressBar, ProgressStyle};
 use rand::RngExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+use targets::{Target, targets};
 
-/// Feeds damaged files to every reader: no panic, and nothing damaged beyond its promises is taken for data.
+/// The files are of a few kilobytes; a reader that takes this much more memory believes a size that it should have checked.
+const MEMORY_BOUND_MIB: u64 = 64;
+/// A reader that takes longer for one file hangs.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Feeds damaged files to every reader: no panic, no hanging, no more memory than the files need, no broken promise.
 #[derive(Args, Debug)]
 pub struct FuzzArgs {
     /// Damaged inputs for each reader
@@ -21,41 +29,116 @@ pub struct FuzzArgs {
     /// Of the damage
     #[arg(long, default_value_t = 0)]
     seed: u64,
-}
-
-/// Reads bytes; says whether they were taken, and fails when what was taken breaks a promise.
-type Reader = Box<dyn Fn(&[u8]) -> Result<bool, String>>;
-
-/// A reader with a sound file to start from.
-struct Target {
-    name: &'static str,
-    sound: Vec<u8>,
-    read: Reader,
+    /// Only the readers whose name contains this
+    #[arg(long, default_value = "", hide_default_value = true)]
+    only: String,
 }
 
 impl FuzzArgs {
     /// Whether every reader stood.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
-        let folder = tempfile::tempdir()?;
+        // In memory where the system offers it: the readers of run folders write millions of files.
+        let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir())?;
         let mut stood = true;
+        let hook = std::panic::take_hook();
         std::panic::set_hook(Box::new(|_| {}));
-        for target in targets(folder.path())? {
-            let (mut taken, mut broken) = (0u64, Vec::new());
-            for input in 0..self.inputs {
-                let bytes = damaged(&target.sound, self.seed, target.name, input);
-                match catch_unwind(AssertUnwindSafe(|| (target.read)(&bytes))) {
-                    Ok(Ok(was_taken)) => taken += u64::from(was_taken),
-                    Ok(Err(promise)) => broken.push(format!("input {input}: {promise}")),
-                    Err(_) => broken.push(format!("input {input}: panic")),
+        let mut targets = targets(folder.path())?;
+        let names: Vec<_> = targets.iter().map(|t| t.name).collect();
+        targets.retain(|t| t.name.contains(&self.only));
+        if targets.is_empty() {
+            bail!("no reader's name contains {:?}: {}", self.only, names.join(", "));
+        }
+        for target in &targets {
+            let found = self.face(target)?;
+            let memory = found.peak_mib.map_or("unknown".into(), |mib| format!("{mib} MiB"));
+            println!(
+                "{:<18} {} inputs, {} taken as data, {} broken, memory {memory}",
+                target.name,
+                self.inputs,
+                found.taken,
+                found.broken.len()
+            );
+            found.broken.iter().take(5).for_each(|b| println!("    {b}"));
+            stood &= found.broken.is_empty();
+        }
+        std::panic::set_hook(hook);
+        Ok(stood)
+    }
+
+    fn face(&self, target: &Target) -> Result<Found> {
+        let bar = ProgressBar::new(self.inputs)
+            .with_style(ProgressStyle::with_template("{msg} {bar:30} {pos}/{len}, {eta} left")?)
+            .with_message(target.name);
+        let watched = Watch::begin(target.name);
+        let before = reset_peak_mib();
+        let mut found = Found::default();
+        for input in 0..self.inputs {
+            let bytes = damaged(&target.sound, self.seed, target.name, input);
+            watched.input(input);
+            match catch_unwind(AssertUnwindSafe(|| (target.read)(&bytes))) {
+                Ok(Ok(was_taken)) => found.taken += u64::from(was_taken),
+                Ok(Err(promise)) => found.broken.push(format!("input {input}: {promise}")),
+                Err(_) => found.broken.push(format!("input {input}: panic")),
+            }
+            if input % 1024 == 0 {
+                bar.set_position(input);
+            }
+        }
+        bar.finish_and_clear();
+        found.peak_mib = before.and_then(|before| Some(peak_mib()?.saturating_sub(before)));
+        if let Some(mib) = found.peak_mib.filter(|&mib| mib > MEMORY_BOUND_MIB) {
+            found.broken.push(format!("took {mib} MiB, more than {MEMORY_BOUND_MIB}"));
+        }
+        Ok(found)
+    }
+}
+
+/// What a reader did with its inputs.
+#[derive(Default)]
+struct Found {
+    taken: u64,
+    broken: Vec<String>,
+    /// Beyond what was in use before; `None` where the system does not say.
+    peak_mib: Option<u64>,
+}
+
+/// Ends the program when a reader does not come back.
+struct Watch {
+    input: Arc<AtomicU64>,
+}
+
+impl Watch {
+    const OVER: u64 = u64::MAX;
+
+    fn begin(name: &'static str) -> Self {
+        let input = Arc::new(AtomicU64::new(0));
+        let seen = input.clone();
+        std::thread::spawn(move || {
+            let mut last = 0;
+            loop {
+                std::thread::sleep(PATIENCE);
+                match seen.load(Ordering::Relaxed) {
+                    Watch::OVER => return,
+                    now if now == last && now > 0 => {
+                        eprintln!("error: {name}: input {now} takes more than {} s", PATIENCE.as_secs());
+                        std::process::exit(1);
+                    }
+                    now => last = now,
                 }
             }
-            println!("{:<18} {} inputs, {taken} taken as data, {} broken", target.name, self.inputs, broken.len());
-            broken.iter().take(5).for_each(|b| println!("    {b}"));
-            stood &= broken.is_empty();
-        }
-        let _ = std::panic::take_hook();
-        Ok(stood)
+        });
+        Watch { input }
+    }
+
+    fn input(&self, input: u64) {
+        self.input.store(input + 1, Ordering::Relaxed);
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        self.input.store(Watch::OVER, Ordering::Relaxed);
     }
 }
 
@@ -89,104 +172,18 @@ fn damaged(sound: &[u8], seed: u64, name: &str, input: u64) -> Vec<u8> {
     bytes
 }
 
-fn targets(folder: &Path) -> Result<Vec<Target>> {
-    let cloud = Cloud { values: (0..400).map(|i| (i as f32 * 0.37).sin() * 40.0).collect(), channels: 4 };
-    let mut targets = vec![Target {
-        name: "bin",
-        sound: cloud.values.iter().flat_map(|v| v.to_le_bytes()).collect(),
-        read: Box::new(|bytes| cloud_promises(parse_bin(bytes, Path::new("fuzz.bin"), PointColumns::Xyzi).ok())),
-    }];
-    for (name, encoding) in [
-        ("pcd ascii", PcdEncoding::Ascii),
-        ("pcd binary", PcdEncoding::Binary),
-        ("pcd compressed", PcdEncoding::BinaryCompressed),
-    ] {
-        let read = |bytes: &[u8]| cloud_promises(parse_pcd(bytes, Path::new("fuzz.pcd")).ok());
-        targets.push(Target { name, sound: encode_pcd(&cloud, encoding), read: Box::new(read) });
-    }
-    let label = "Car 0.00 0 -1.57 599.41 156.40 629.75 189.25 2.85 2.63 12.34 0.47 1.49 69.44 -1.56\n\
-                 DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10\n";
-    targets.push(Target {
-        name: "label",
-        sound: label.into(),
-        read: text(|t| {
-            let lines = parse_kitti_text(t, Path::new("fuzz.txt"), KittiText::Labels).ok();
-            let sound = |line: &data::KittiLine| line.location.iter().chain(&line.size_hwl).all(|v| v.is_finite());
-            lines.map(|lines| lines.iter().all(sound))
-        }),
-    });
-    let calibration = "P2: 721.5 0 609.5 44.8 0 721.5 172.8 0.21 0 0 1 0.0027\n\
-                       R0_rect: 1 0 0 0 1 0 0 0 1\n\
-                       Tr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n";
-    targets.push(Target {
-        name: "calibration",
-        sound: calibration.into(),
-        read: text(|t| {
-            let read = Calibration::parse(t, Path::new("fuzz.txt")).ok();
-            read.map(|c| c.cam_point([1.0, 2.0, 3.0]).iter().all(|v| v.is_finite()))
-        }),
-    });
-    targets.push(Target {
-        name: "detector toml",
-        sound: crate::detectors::detector_text("pointpillars_small")?.into_bytes(),
-        read: text(|t| DetectorConfig::parse(t).ok().map(|c| c.check().is_ok())),
-    });
-    let path = folder.join("dataset.toml");
-    let toml = "name = \"track\"\nroot = \".\"\nlayout = \"kitti\"\nclasses = [\"Car\"]\n[splits]\ntrain = \"ImageSets/train.txt\"\n";
-    targets.push(Target {
-        name: "dataset toml",
-        sound: toml.into(),
-        read: Box::new(move |bytes| {
-            fs_err::write(&path, bytes).map_err(|e| e.to_string())?;
-            Ok(DatasetConfig::read(&path).is_ok())
-        }),
-    });
-    let path = folder.join("weights.safetensors");
-    let tensor = HostTensor { shape: vec![2, 3], values: HostValues::F32(vec![0.5; 6]) };
-    let weights: NamedTensors = [("a.weight".to_string(), tensor.clone()), ("b.weight".to_string(), tensor)].into();
-    write_safetensors(&path, &weights, &Default::default())?;
-    targets.push(Target {
-        name: "safetensors",
-        sound: fs_err::read(&path)?,
-        read: Box::new(move |bytes| {
-            fs_err::write(&path, bytes).map_err(|e| e.to_string())?;
-            let Ok(read) = read_checkpoint(&path) else { return Ok(false) };
-            let whole = |t: &HostTensor| match &t.values {
-                HostValues::F32(v) => v.len() == t.shape.iter().product::<usize>(),
-                HostValues::F64(v) => v.len() == t.shape.iter().product::<usize>(),
-                HostValues::I64(v) => v.len() == t.shape.iter().product::<usize>(),
-            };
-            if read.values().all(whole) { Ok(true) } else { Err("a tensor whose values do not fill its shape".into()) }
-        }),
-    });
-    Ok(targets)
-}
-
-/// Finite coordinates within 10 km, whole points, at least one.
-fn cloud_promises(cloud: Option<Cloud>) -> Result<bool, String> {
-    let Some(cloud) = cloud else { return Ok(false) };
-    let near = |i: usize| cloud.xyz(i).iter().all(|v| v.abs() <= FARTHEST_M);
-    if cloud.is_empty() || cloud.values.len() % cloud.channels != 0 || !(0..cloud.len()).all(near) {
-        return Err("a cloud that is empty, cut, or reaches beyond 10 km".into());
-    }
-    Ok(true)
-}
-
-/// A reader of text: `None` for an error, else whether the promises hold.
-fn text(read: impl Fn(&str) -> Option<bool> + 'static) -> Reader {
-    Box::new(move |bytes| match read(&String::from_utf8_lossy(bytes)) {
-        None => Ok(false),
-        Some(true) => Ok(true),
-        Some(false) => Err("a value that is not finite".into()),
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn readers_stand_damage() {
-        assert!(FuzzArgs { inputs: 300, seed: 1 }.run().unwrap());
+    fn a_reader_that_falls_is_found() {
+        let panics: Target = Target { name: "panics", sound: vec![7; 40], read: Box::new(|bytes| Ok(bytes[39] == 7)) };
+        let fuzz = FuzzArgs { inputs: 50, seed: 1, only: String::new() };
+        assert!(fuzz.face(&panics).unwrap().broken.iter().any(|b| b.contains("panic")));
+        let greedy = |_: &[u8]| Ok(std::hint::black_box(vec![1u8; 200 << 20]).len() > 7);
+        let fuzz = FuzzArgs { inputs: 2, ..fuzz };
+        let broken = fuzz.face(&Target { name: "greedy", sound: vec![7; 40], read: Box::new(greedy) }).unwrap().broken;
+        assert_eq!(broken.iter().any(|b| b.contains("MiB")), cfg!(target_os = "linux"));
     }
 }

@@ -2,6 +2,8 @@
 //!
 //! Arguments choose what runs by parts of its name: `cargo bench -p lidarshift-kernels -- conv stride2`.
 
+#![expect(clippy::print_stdout, reason = "results go to stdout")]
+
 use lidarshift_kernels::{
     Algorithm, BatchNorm, Conv3x3, Epilogue, InstructionSet, PillarNet, PillarParameters, Pillars, Pointwise,
     TransposedConv,

@@ -38,7 +38,11 @@ impl NormParameters<'_> {
 
     fn fold(&self, weight: &[f32], group: usize, output: impl Fn(usize, usize) -> usize) -> Folded {
         let Statistics { mean, variance } = self.statistics;
-        assert!(group > 0 && weight.len() % (group * self.gamma.len()) == 0, "weights of {} outputs", self.gamma.len());
+        assert!(
+            group > 0 && weight.len().is_multiple_of(group * self.gamma.len()),
+            "weights of {} outputs",
+            self.gamma.len()
+        );
         let scale: Vec<f64> =
             self.gamma.iter().zip(variance).map(|(&g, v)| g as f64 / (v + self.epsilon).sqrt()).collect();
         let scaled = |(at, &w): (usize, &f32)| (w as f64 * scale[output(at, group)]) as f32;

@@ -37,7 +37,7 @@ mod tests {
     fn buffers_are_aligned_apart_and_kept() {
         let first = with([3, 40, 0], |[a, b, c]| {
             assert_eq!((a.len(), b.len(), c.len()), (3, 40, 0));
-            assert!(a.as_ptr() as usize % 64 == 0 && b.as_ptr() as usize % 64 == 0);
+            assert!(a.as_ptr().addr().is_multiple_of(64) && b.as_ptr().addr().is_multiple_of(64));
             a.fill(1.0);
             b.fill(2.0);
             with([3], |[d]| d.fill(3.0));

@@ -1,22 +1,8 @@
-//! The focal loss by the kernel.
+//! The sigmoid focal loss of all anchors as one number.
 
-use super::algorithm;
-use super::operation::{Argument, Operation, run};
+use super::{Kernel, apply, input};
 use burn::tensor::Tensor;
-use kernels::sigmoid_focal_loss;
 use std::sync::Arc;
-
-/// The sum over all entries of the sigmoid focal loss with alpha 0.25 and gamma 2, each row weighted.
-///
-/// # Shapes
-/// `logits`: `[N, C]`; `labels`: N, 0 for background, k for the class with index k - 1; `weights`: N; result `[1]`. `None` where there is no
-/// kernel.
-pub fn focal_loss_sum(logits: &Tensor<2>, labels: &[i32], weights: &[f32]) -> Option<Tensor<1>> {
-    algorithm()?;
-    let [_, classes] = logits.dims();
-    let operation = FocalLoss { classes, labels: labels.into(), weights: weights.into() };
-    Some(run(operation, [Argument::of(logits)?])?.0)
-}
 
 #[derive(Clone, Debug)]
 struct FocalLoss {
@@ -25,18 +11,30 @@ struct FocalLoss {
     weights: Arc<[f32]>,
 }
 
-impl Operation<1> for FocalLoss {
-    /// The gradient.
-    type State = Vec<f32>;
+impl Kernel<1> for FocalLoss {
+    /// The gradient: it comes with the loss.
+    type State = Arc<[f32]>;
 
-    fn forward(&self, [logits]: [&[f32]; 1]) -> (Vec<f32>, Vec<usize>, Vec<f32>) {
+    fn forward(&self, [logits]: [&[f32]; 1]) -> (Vec<f32>, Arc<[f32]>) {
         let mut gradient = Vec::new();
-        let loss = sigmoid_focal_loss(logits, self.classes, &self.labels, &self.weights, &mut gradient);
-        (vec![loss as f32], vec![1], gradient)
+        let loss = kernels::sigmoid_focal_loss(logits, self.classes, &self.labels, &self.weights, &mut gradient);
+        (vec![loss as f32], gradient.into())
     }
 
-    fn backward(&self, _: [&[f32]; 1], state: &Vec<f32>, gradient: &[f32], _: [bool; 1]) -> [Option<Vec<f32>>; 1] {
-        let scale = gradient[0];
-        [Some(state.iter().map(|g| g * scale).collect())]
+    fn backward(&self, _: [&[f32]; 1], gradient: &Arc<[f32]>, dy: &[f32], _: [bool; 1]) -> [Option<Vec<f32>>; 1] {
+        [Some(gradient.iter().map(|g| g * dy[0]).collect())]
     }
+
+    fn shape(&self) -> Vec<usize> {
+        vec![1]
+    }
+}
+
+/// The weighted sum over all rows and classes.
+///
+/// # Shapes
+/// `logits`: `[N, C]`; `labels`: N, k for the class with index k - 1, no class for 0 and below; `weights`: N.
+pub fn focal_loss_sum(logits: &Tensor<2>, labels: &[i32], weights: &[f32]) -> Option<Tensor<1>> {
+    let classes = logits.dims()[1];
+    apply(FocalLoss { classes, labels: labels.into(), weights: weights.into() }, [input(logits)]).map(|(loss, _)| loss)
 }

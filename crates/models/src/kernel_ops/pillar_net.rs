@@ -1,61 +1,94 @@
-//! The pillar feature net by the kernels.
+//! The pillar feature net as one operation; the points are data and have no gradient.
 
-use super::operation::{Argument, Operation, run};
-use super::{algorithm, moments};
-use crate::layers::Moments;
+use super::{Input, Kernel, apply, input};
 use burn::tensor::Tensor;
-use kernels::{PillarNet, PillarParameters, PillarState, Pillars};
+use kernels::{PillarNet, PillarParameters, PillarState, Pillars, Statistics};
 use std::sync::Arc;
 
-/// Linear, batch norm over all rows with the padding, ReLU, maximum; the statistics are returned for the running ones.
-///
-/// # Shapes
-/// `features`: `[N, F]`; `weight`: `[C, F]`; `gamma`, `beta`: `[C]`; result `[P, C]`. `None` where there is no kernel.
-pub fn pillar_net(
-    (features, num_points): (&Tensor<2>, &[u32]),
-    weight: &Tensor<2>,
-    (gamma, beta): (&Tensor<1>, &Tensor<1>),
-    (max_points, epsilon): (usize, f64),
-) -> Option<(Tensor<2>, Moments)> {
-    algorithm()?;
-    let [outputs, inputs] = weight.dims();
-    if inputs > kernels::pillar_net::MOST_INPUTS {
-        return None;
-    }
-    let net = PillarNet { inputs, outputs, max_points, epsilon };
-    let operation = OnPillars { net, num_points: num_points.into() };
-    let arguments = [Argument::of(features)?, Argument::of(weight)?, Argument::of(gamma)?, Argument::of(beta)?];
-    let (y, state) = run(operation, arguments)?;
-    let moments = moments(&state.statistics, state.count, &y.device());
-    Some((y, moments))
-}
-
 #[derive(Clone, Debug)]
-struct OnPillars {
+struct PillarKernel {
     net: PillarNet,
+    features: Arc<[f32]>,
     num_points: Arc<[u32]>,
+    /// Those of past batches, for inference.
+    statistics: Option<Statistics>,
 }
 
-impl Operation<4> for OnPillars {
-    type State = PillarState;
+impl PillarKernel {
+    fn pillars(&self) -> Pillars<'_> {
+        Pillars { features: &self.features, num_points: &self.num_points }
+    }
+}
 
-    fn forward(&self, [features, weight, gamma, beta]: [&[f32]; 4]) -> (Vec<f32>, Vec<usize>, PillarState) {
+impl Kernel<3> for PillarKernel {
+    /// `None` at inference.
+    type State = Option<Arc<PillarState>>;
+
+    fn forward(&self, [weight, gamma, beta]: [&[f32]; 3]) -> (Vec<f32>, Self::State) {
+        let parameters = PillarParameters { weight, gamma, beta };
         let mut out = Vec::new();
-        let pillars = Pillars { features, num_points: &self.num_points };
-        let state = self.net.forward_train(pillars, PillarParameters { weight, gamma, beta }, &mut out);
-        (out, vec![self.num_points.len(), self.net.outputs], state)
+        let state = match &self.statistics {
+            None => Some(Arc::new(self.net.forward_train(self.pillars(), parameters, &mut out))),
+            Some(statistics) => {
+                self.net.forward(self.pillars(), parameters, statistics, &mut out);
+                None
+            }
+        };
+        (out, state)
     }
 
-    /// The points are data: there is no gradient by them.
     fn backward(
         &self,
-        [features, weight, gamma, beta]: [&[f32]; 4],
-        state: &PillarState,
-        gradient: &[f32],
-        _: [bool; 4],
-    ) -> [Option<Vec<f32>>; 4] {
-        let pillars = Pillars { features, num_points: &self.num_points };
-        let g = self.net.backward(pillars, PillarParameters { weight, gamma, beta }, state, gradient);
-        [None, Some(g.weight), Some(g.gamma), Some(g.beta)]
+        [weight, gamma, beta]: [&[f32]; 3],
+        state: &Self::State,
+        dy: &[f32],
+        _: [bool; 3],
+    ) -> [Option<Vec<f32>>; 3] {
+        let state = state.as_ref().expect("a graph is only kept in training");
+        let found = self.net.backward(self.pillars(), PillarParameters { weight, gamma, beta }, state, dy);
+        [Some(found.weight), Some(found.gamma), Some(found.beta)]
     }
+
+    fn shape(&self) -> Vec<usize> {
+        vec![self.num_points.len(), self.net.outputs]
+    }
+}
+
+/// The points of all pillars of a batch on the host: `[N, F]`, and how many each pillar has, `[P]`.
+type Points = (Arc<[f32]>, Arc<[u32]>);
+
+/// Features of all pillars, and the statistics over all rows, padding included, with their number.
+///
+/// # Shapes
+/// `weight`: `[C, F]`; `gamma`, `beta`: `[C]`; result `[P, C]`.
+pub fn pillar_net(
+    (features, num_points): Points,
+    (weight, gamma, beta): (&Tensor<2>, &Tensor<1>, &Tensor<1>),
+    max_points: usize,
+    epsilon: f64,
+) -> Option<(Tensor<2>, Statistics, usize)> {
+    let net = net(weight, max_points, epsilon)?;
+    let kernel = PillarKernel { net, features, num_points, statistics: None };
+    let (out, state) = apply(kernel, [input(weight), input(gamma), input(beta)])?;
+    let state = state.expect("in training there is one");
+    Some((out, state.statistics.clone(), state.count))
+}
+
+/// The same with the statistics of past batches, for tensors without a graph.
+pub fn pillar_net_inference(
+    (features, num_points): Points,
+    (weight, gamma, beta): (&Tensor<2>, &Tensor<1>, &Tensor<1>),
+    max_points: usize,
+    epsilon: f64,
+    statistics: impl FnOnce() -> Statistics,
+) -> Option<Tensor<2>> {
+    let net = net(weight, max_points, epsilon)?;
+    let Input::Plain(_) = input(weight)? else { return None };
+    let kernel = PillarKernel { net, features, num_points, statistics: Some(statistics()) };
+    apply(kernel, [input(weight), input(gamma), input(beta)]).map(|(out, _)| out)
+}
+
+fn net(weight: &Tensor<2>, max_points: usize, epsilon: f64) -> Option<PillarNet> {
+    let [outputs, inputs] = weight.dims();
+    (inputs <= kernels::pillar_net::MOST_INPUTS).then_some(PillarNet { inputs, outputs, max_points, epsilon })
 }

@@ -1,0 +1,96 @@
+//! One run through the program: killed and gone on with, on any number of threads, under one seed and under two.
+
+#[allow(dead_code, reason = "each test file uses a part of it")]
+mod program;
+
+use program::{data_set, must, program};
+use std::fs;
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+const TRAIN: &str = "train --dataset . --detector tiny.toml --epochs 4 --set run.checkpoint_every_steps=2";
+
+fn weights(folder: &Path, run: &str) -> Vec<u8> {
+    fs::read(folder.join(run).join("checkpoint/last.safetensors")).unwrap()
+}
+
+/// Steps that the run has written down.
+fn steps(folder: &Path, run: &str) -> usize {
+    fs::read_to_string(folder.join(run).join("metrics.jsonl")).map_or(0, |text| text.lines().count())
+}
+
+#[test]
+fn killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    must(dir.path(), &format!("{TRAIN} --seed 1 --out whole"));
+    let mut kills = 0;
+    for patience_ms in [0, 15, 40, 90, 150, 300] {
+        let words = format!("{TRAIN} --seed 1 --out killed --resume");
+        let mut child = program(dir.path(), &words).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
+        let before = steps(dir.path(), "killed");
+        while steps(dir.path(), "killed") == before && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        std::thread::sleep(Duration::from_millis(patience_ms));
+        kills += u32::from(child.try_wait().unwrap().is_none());
+        child.kill().unwrap(); // SIGKILL
+        child.wait().unwrap();
+    }
+    assert!(kills >= 2, "only {kills} runs were killed before their end");
+    must(dir.path(), &format!("{TRAIN} --seed 1 --out killed --resume"));
+    assert!(weights(dir.path(), "killed") == weights(dir.path(), "whole"), "the weights differ");
+}
+
+#[test]
+fn workers_and_repetition_change_no_bit_and_the_seed_does() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    for (seed, workers, out) in [(1, 1, "a"), (1, 4, "b"), (1, 1, "c"), (2, 1, "d")] {
+        must(dir.path(), &format!("{TRAIN} --seed {seed} --workers {workers} --out {out}"));
+    }
+    let [a, b, c, d] = ["a", "b", "c", "d"].map(|run| weights(dir.path(), run));
+    assert!(a == b, "four workers give other weights than one");
+    assert!(a == c, "a second run gives other weights");
+    assert!(a != d, "two seeds give the same weights");
+}
+
+#[test]
+fn a_split_is_detected_and_evaluated_from_texts_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    must(dir.path(), &format!("{TRAIN} --out run"));
+    must(dir.path(), "detect . --split val --checkpoint run/checkpoint/last.safetensors --out found");
+    for id in ["000005", "000006"] {
+        assert!(dir.path().join(format!("found/{id}.txt")).is_file());
+    }
+    must(
+        dir.path(),
+        "eval ap --labels label_2 --label-frame lidar --detections found --ids ImageSets/val.txt --json ap.json",
+    );
+    let ap: serde_json::Value = serde_json::from_slice(&fs::read(dir.path().join("ap.json")).unwrap()).unwrap();
+    let rows = ap["rows"].as_array().unwrap();
+    let all = rows.iter().find(|r| r["metric"] == "3d" && r["difficulty"] == "all").unwrap();
+    assert_eq!(all["n_gt"], 3);
+    let output = must(
+        dir.path(),
+        "detect velodyne/000005.bin --checkpoint run/checkpoint/last.safetensors --labels label_2/000005.txt --json boxes.json",
+    );
+    let boxes: serde_json::Value = serde_json::from_slice(&fs::read(dir.path().join("boxes.json")).unwrap()).unwrap();
+    assert_eq!(
+        boxes["detections"].as_array().unwrap().len(),
+        String::from_utf8(output.stdout).unwrap().lines().count()
+    );
+    assert!(fs::read(dir.path().join("000005.png")).unwrap().starts_with(b"\x89PNG"));
+}
+
+#[test]
+fn the_default_run_in_its_smallest_form() {
+    let dir = tempfile::tempdir().unwrap();
+    let output = must(dir.path(), "train --smoke --out smoke");
+    assert!(String::from_utf8_lossy(&output.stdout).contains("run folder"), "{}", program::said(&output));
+    for file in ["checkpoint/last.safetensors", "eval.json", "curve.svg", "config.toml", "provenance.json"] {
+        assert!(dir.path().join("smoke/seed-0").join(file).is_file(), "{file}");
+    }
+}

@@ -1,0 +1,93 @@
+//! The program, and a data set small enough to train on in seconds.
+
+use data::write::{write_kitti_frame, write_split};
+use data::{Cloud, Frame, Object, stream};
+use geometry::Box3;
+use rand::RngExt;
+use std::path::Path;
+use std::process::{Command, Output};
+
+/// A detector of a few thousand weights that reads 10 m ahead.
+pub const TINY_DETECTOR: &str = r#"
+name = "tiny"
+classes = ["Car"]
+channels = 4
+range_m = [0.0, -5.12, -3.0, 10.24, 5.12, 1.0]
+[network]
+kind = "pointpillars"
+vfe_filters = 8
+[network.pillars]
+size_m = [0.32, 0.32, 4.0]
+max_points = 8
+max_train = 1000
+max_test = 1000
+[network.backbone]
+layers = [0, 1]
+strides = [2, 2]
+filters = [8, 16]
+upsample_strides = [1, 2]
+upsample_filters = [8, 8]
+[[network.anchors]]
+class = "Car"
+size_m = [3.9, 1.6, 1.56]
+bottom_m = -1.78
+matched = 0.6
+unmatched = 0.45
+[optimization]
+epochs = 3
+batch_size = 2
+"#;
+
+/// Seven frames with a car or two on a flat ground in KITTI's layout with labels in the LiDAR frame, and `tiny.toml` beside them.
+pub fn data_set(folder: &Path) {
+    let mut ids = Vec::new();
+    for i in 0..7u64 {
+        let mut random = stream(5, "scene", 0, i);
+        let mut frame = Frame { id: format!("{i:06}"), cloud: Cloud::new(4), objects: Vec::new() };
+        for _ in 0..600 {
+            let at = [random.random_range(0.0..10.2), random.random_range(-5.1..5.1), -1.75];
+            frame.cloud.values.extend(at.map(|v: f64| v as f32));
+            frame.cloud.values.push(random.random());
+        }
+        for car in 0..1 + i % 2 {
+            let bbox =
+                Box3::from_array([3.0 + 4.5 * car as f64, random.random_range(-3.0..3.0), -1.0, 3.9, 1.6, 1.56, 0.1]);
+            for _ in 0..80 {
+                let local = [0, 1, 2].map(|k| random.random_range(-0.49..0.49) * bbox.size[k]);
+                frame.cloud.values.extend(bbox.from_local(local).map(|v| v as f32));
+                frame.cloud.values.push(random.random());
+            }
+            let class = "Car".into();
+            frame.objects.push(Object { class, bbox, truncation: None, occlusion: None, image_box: None });
+        }
+        write_kitti_frame(folder, &frame).unwrap();
+        ids.push(frame.id);
+    }
+    write_split(&folder.join("ImageSets/train.txt"), &ids[..5]).unwrap();
+    write_split(&folder.join("ImageSets/val.txt"), &ids[5..]).unwrap();
+    std::fs::write(folder.join("tiny.toml"), TINY_DETECTOR).unwrap();
+}
+
+/// The program with these words, in `folder`, in which relative paths are looked up.
+pub fn program(folder: &Path, words: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_lidarshift"));
+    command.args(words.split_whitespace()).current_dir(folder);
+    command
+}
+
+/// Runs the program to its end.
+pub fn run(folder: &Path, words: &str) -> Output {
+    program(folder, words).output().expect("the program starts")
+}
+
+/// Runs the program, which must succeed.
+pub fn must(folder: &Path, words: &str) -> Output {
+    let output = run(folder, words);
+    assert!(output.status.success(), "{words}: {}", said(&output));
+    output
+}
+
+/// What it said, on both streams.
+pub fn said(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}

@@ -1,0 +1,77 @@
+//! Cells of range, incidence and surface: what the channels of hits and of roughness are summed up in.
+
+use crate::pairing::{Ray, Surface};
+
+/// Bins of the logarithm of range, from 1 m.
+pub const RANGE_BINS: usize = 22;
+/// Bins of the logarithm of the cosine of incidence, from 1 down.
+pub const COS_BINS: usize = 14;
+/// Surfaces: ground, standing, objects, and the lower corners of objects, where cars have wheels.
+pub const ZONES: usize = 4;
+/// All cells.
+pub const CELLS: usize = RANGE_BINS * COS_BINS * ZONES;
+
+const RANGE_STEP: f64 = 0.25;
+const COS_STEP: f64 = 0.4;
+
+/// Zones by name, for findings.
+pub const ZONE_NAMES: [&str; ZONES] = ["ground", "standing", "object", "object_corner"];
+
+/// Where a ray falls.
+pub fn cell(ray: &Ray) -> Option<usize> {
+    let zone = zone(ray)?;
+    if !ray.smooth || !(ray.range_m > 0.5) || !(ray.cos_incidence > 0.0) {
+        return None;
+    }
+    let r = (f64::from(ray.range_m).ln() / RANGE_STEP).floor().clamp(0.0, RANGE_BINS as f64 - 1.0) as usize;
+    let c = (-f64::from(ray.cos_incidence).ln() / COS_STEP).floor().clamp(0.0, COS_BINS as f64 - 1.0) as usize;
+    Some((zone * COS_BINS + c) * RANGE_BINS + r)
+}
+
+/// Zone of a ray's surface.
+pub fn zone(ray: &Ray) -> Option<usize> {
+    match ray.surface {
+        Surface::Ground => Some(0),
+        Surface::Standing => Some(1),
+        Surface::Object => Some(if ray.corner { 3 } else { 2 }),
+        Surface::Open => None,
+    }
+}
+
+/// Zone of a cell.
+pub fn zone_of(cell: usize) -> usize {
+    cell / (COS_BINS * RANGE_BINS)
+}
+
+/// Sum, sum of logarithms and so on, to know where within its cell the mass lies.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Place {
+    /// Number of rays.
+    pub n: f64,
+    /// Sum of ln(range).
+    pub ln_range: f64,
+    /// Sum of ln(cos).
+    pub ln_cos: f64,
+}
+
+impl Place {
+    /// Counts a ray.
+    pub fn add(&mut self, ray: &Ray) {
+        self.n += 1.0;
+        self.ln_range += f64::from(ray.range_m).ln();
+        self.ln_cos += f64::from(ray.cos_incidence).max(1e-4).ln();
+    }
+
+    /// Adds another sum.
+    pub fn merge(&mut self, other: &Place) {
+        self.n += other.n;
+        self.ln_range += other.ln_range;
+        self.ln_cos += other.ln_cos;
+    }
+
+    /// Geometric means of range, m, and cosine.
+    pub fn mean(&self) -> (f64, f64) {
+        let n = self.n.max(1e-9);
+        ((self.ln_range / n).exp(), (self.ln_cos / n).exp())
+    }
+}

@@ -1,0 +1,133 @@
+//! Offsets of groups of rays: rows of a sensor, strips of azimuth. Each group has one number for its range, and rows one for their
+//! elevation as well; poses are taken out frame by frame before.
+
+use super::mean::{OwnPoses, STRAY_M, pose_row, usable, weight};
+use crate::pairing::{FramePair, Ray};
+use crate::rig::SensorRig;
+use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
+
+/// What makes rays a group.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Grouping {
+    /// Rows of each sensor.
+    Row,
+    /// Strips of azimuth of each sensor.
+    Azimuth,
+}
+
+/// Width of a strip of azimuth, rad.
+pub const STRIP_RAD: f64 = 0.0873;
+
+/// Strips of a full turn.
+const STRIPS: usize = 72;
+
+/// Rows that a sensor may have.
+const ROWS: usize = 256;
+
+/// Number of the group of a ray.
+pub fn group_of(ray: &Ray, grouping: Grouping) -> Option<usize> {
+    let sensor = ray.sensor as usize;
+    match grouping {
+        Grouping::Row => (usize::from(ray.row) < ROWS).then(|| sensor * ROWS + usize::from(ray.row)),
+        Grouping::Azimuth => {
+            let strip = ((f64::from(ray.azimuth_rad) + std::f64::consts::PI) / STRIP_RAD).floor() as usize;
+            Some(sensor * STRIPS + strip.min(STRIPS - 1))
+        }
+    }
+}
+
+/// Sensor and place of a group: row, or middle azimuth in rad.
+pub fn place_of(group: usize, grouping: Grouping) -> (usize, f64) {
+    match grouping {
+        Grouping::Row => (group / ROWS, (group % ROWS) as f64),
+        Grouping::Azimuth => (group / STRIPS, ((group % STRIPS) as f64 + 0.5) * STRIP_RAD - std::f64::consts::PI),
+    }
+}
+
+/// Sums of one group of one frame, over an offset of range (m) and one of elevation (rad).
+#[derive(Clone, Copy, Debug, Default)]
+pub struct GroupSums {
+    /// Squares and product of the two columns.
+    pub gram: [f64; 3],
+    /// Their products with the distance.
+    pub right: [f64; 2],
+    /// Rays.
+    pub n: f64,
+}
+
+impl GroupSums {
+    /// Adds another sum.
+    pub fn merge(&mut self, other: &GroupSums) {
+        (0..3).for_each(|k| self.gram[k] += other.gram[k]);
+        (0..2).for_each(|k| self.right[k] += other.right[k]);
+        self.n += other.n;
+    }
+
+    /// Best offset of one of the columns with a prior precision.
+    pub fn offset(&self, column: usize, precision: f64) -> f64 {
+        self.right[column] / (self.gram[2 * column] + precision)
+    }
+
+    /// Gain of a frame's group by an offset, nats.
+    pub fn gain(&self, column: usize, offset: f64) -> f64 {
+        offset * self.right[column] - 0.5 * offset * offset * self.gram[2 * column]
+    }
+}
+
+/// Groups of one frame, by number.
+pub type GroupFrame = Vec<(u32, GroupSums)>;
+
+/// Derivative of the distance across the surface by the row's elevation, m/rad.
+pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -> f64 {
+    let (az, el) = (f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
+    let up = sensor_turn * Vector3::new(-el.sin() * az.cos(), -el.sin() * az.sin(), el.cos());
+    // The light went up by this angle: the surface met stands where the ray says less.
+    -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
+}
+
+/// Sums of all frames. `structure` is what each kind of surface (ground, left, right) is off by, m.
+pub fn group_frames(
+    frames: &[FramePair],
+    rig: &SensorRig,
+    poses: &[OwnPoses],
+    structure: [f64; 3],
+    grouping: Grouping,
+    noise_m: f64,
+    design: f64,
+) -> Vec<GroupFrame> {
+    let origins = super::mean::origins(rig);
+    let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
+    let groups = rig.sensors.len() * if grouping == Grouping::Row { ROWS } else { STRIPS };
+    let one = |(frame, poses): (&FramePair, &OwnPoses)| -> GroupFrame {
+        let mut sums = vec![GroupSums::default(); groups];
+        for ray in frame.measured.iter().filter(|r| usable(r)) {
+            let Some(group) = group_of(ray, grouping) else { continue };
+            let sensor = ray.sensor as usize;
+            let row = pose_row(ray, &origins[sensor], &Point3::origin());
+            let y = ray.across_m() - row.dot(&poses[sensor]);
+            if y.abs() > STRAY_M {
+                continue;
+            }
+            let y = y - structure[super::mean::kind_of(ray, &origins[sensor])];
+            let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
+            let w = weight(ray, noise_m) / design;
+            sums[group].merge(&GroupSums {
+                gram: [w * x[0] * x[0], w * x[0] * x[1], w * x[1] * x[1]],
+                right: [w * x[0] * y, w * x[1] * y],
+                n: 1.0,
+            });
+        }
+        sums.into_iter().enumerate().filter(|(_, s)| s.n > 0.0).map(|(i, s)| (i as u32, s)).collect()
+    };
+    frames.par_iter().zip(poses).map(one).collect()
+}
+
+/// Sums over frames, by group.
+pub fn total<'a>(frames: impl Iterator<Item = &'a GroupFrame>) -> std::collections::BTreeMap<u32, GroupSums> {
+    let mut all = std::collections::BTreeMap::<u32, GroupSums>::new();
+    for (i, sums) in frames.flatten() {
+        all.entry(*i).or_default().merge(sums);
+    }
+    all
+}

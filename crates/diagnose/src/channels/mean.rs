@@ -1,0 +1,260 @@
+//! Where the surfaces lie: distances of measured returns from the simulated surfaces, across them, as sums that every linear cause can
+//! be fitted from. Each frame has a small pose error of its own, which is integrated out.
+//!
+//! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
+
+use crate::pairing::{FramePair, Ray, Surface};
+use crate::rig::SensorRig;
+use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
+use rayon::prelude::*;
+
+/// A linear cause: one column of the fit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Column {
+    /// An offset of all ranges, m.
+    RangeOffset,
+    /// A share of the range.
+    RangeScale,
+    /// Pose of the scene in the cloud's frame: turns about x, y, z (rad), then shifts (m).
+    Pose(usize),
+    /// The same for what one sensor sees, about its own origin and in the cloud's axes.
+    SensorPose(usize, usize),
+    /// A shift along x, y or a turn about z that grows over a scan from -1/2 to +1/2.
+    Sweep(usize),
+    /// Offset across one kind of surface, m: ground, standing to the left, standing to the right. No cause: what simulated surfaces are
+    /// wrong by.
+    Structure(usize),
+}
+
+/// All columns for a rig, the six of the frames' own poses first.
+pub fn columns(rig: &SensorRig) -> Vec<Column> {
+    let mut all: Vec<Column> = (0..6).map(Column::Pose).collect();
+    all.extend([Column::RangeOffset, Column::RangeScale]);
+    all.extend((0..3).map(Column::Sweep));
+    all.extend((0..3).map(Column::Structure));
+    if rig.sensors.len() > 1 {
+        all.extend((0..rig.sensors.len()).flat_map(|s| (0..6).map(move |k| Column::SensorPose(s, k))));
+    }
+    all
+}
+
+/// What a structure may be wrong by, m: standard deviation.
+pub const STRUCTURE_M: f64 = 0.015;
+
+/// Farther than that from the surface after the frame's own pose is taken out, a return is not of this surface, m.
+pub const STRAY_M: f64 = 0.30;
+
+/// Surfaces are not flatter than that, m.
+const RIPPLE_M: f64 = 0.006;
+
+/// Sums of one frame, in units of its noise.
+#[derive(Clone, Debug)]
+pub struct MeanFrame {
+    /// X' W X.
+    pub gram: DMatrix<f64>,
+    /// X' W y.
+    pub right: DVector<f64>,
+    /// Rays used.
+    pub rays: f64,
+    /// y' W y.
+    pub squares: f64,
+}
+
+/// Pose error of one frame as each sensor by itself sees it: turns about the cloud's origin, rad, and shifts, m.
+pub type OwnPoses = Vec<SVector<f64, 6>>;
+
+/// Range noise of the simulated side, m: the median over its smooth returns.
+pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
+    let mut values: Vec<f32> = frames
+        .iter()
+        .flat_map(|f| f.simulated.iter().step_by(17))
+        .filter(|r| r.smooth && r.cos_incidence > 0.2 && r.roughness_m.is_finite())
+        .map(|r| r.roughness_m.abs() / (1.0 + r.roughness_leverage).sqrt())
+        .collect();
+    values.sort_by(f32::total_cmp);
+    values.get(values.len() / 2).map_or(0.01, |v| f64::from(*v) / 0.6745).max(0.002)
+}
+
+/// Whether a measured ray says where a surface lies.
+pub fn usable(ray: &Ray) -> bool {
+    ray.smooth && matches!(ray.surface, Surface::Ground | Surface::Standing) && ray.cos_incidence > 0.003
+}
+
+/// Kind of its surface: ground, standing to the left, standing to the right.
+pub fn kind_of(ray: &Ray, origin: &Point3<f64>) -> usize {
+    match ray.surface {
+        Surface::Ground => 0,
+        _ if ray.predicted_point(origin).y > 0.0 => 1,
+        _ => 2,
+    }
+}
+
+/// Inverse variance of its distance across the surface, 1/m2.
+pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
+    let c = f64::from(ray.cos_incidence);
+    1.0 / ((c * noise_m).powi(2) * (1.0 + f64::from(ray.leverage)) + RIPPLE_M * RIPPLE_M)
+}
+
+/// Derivatives of the distance across the surface by a movement of the scene about `center`.
+pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVector<f64, 6> {
+    let n = ray.normal_vector();
+    let lever = (ray.predicted_point(origin) - center).cross(&n);
+    SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
+}
+
+/// Prior of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m.
+fn loose_prior() -> SVector<f64, 6> {
+    SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
+}
+
+/// The pose error of one frame by itself, seen by each sensor, with redescending weights.
+pub fn own_poses(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> OwnPoses {
+    (0..origins.len()).map(|sensor| own_pose(frame, sensor, origins, noise_m)).collect()
+}
+
+fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: f64) -> SVector<f64, 6> {
+    let rows: Vec<(SVector<f64, 6>, f64, f64)> = frame
+        .measured
+        .iter()
+        .filter(|r| usable(r) && r.sensor as usize == sensor)
+        .map(|r| {
+            let row = pose_row(r, &origins[r.sensor as usize], &Point3::origin());
+            (row, r.across_m(), weight(r, noise_m))
+        })
+        .collect();
+    let mut pose = SVector::<f64, 6>::zeros();
+    for scale in [0.5, 0.3, 0.15, 0.1, 0.07, 0.07] {
+        let mut system = SMatrix::<f64, 6, 6>::from_diagonal(&loose_prior());
+        let mut right = SVector::<f64, 6>::zeros();
+        for (row, y, w) in &rows {
+            let u = (y - row.dot(&pose)) / (4.0 * scale);
+            if u.abs() < 1.0 {
+                // Neighbours err alike; a fiftieth keeps the prior meaningful.
+                let w = w * (1.0 - u * u).powi(2) / 50.0;
+                system += row * row.transpose() * w;
+                right += row * (w * y);
+            }
+        }
+        match system.try_inverse() {
+            Some(inverse) => pose = inverse * right,
+            None => return SVector::zeros(),
+        }
+    }
+    pose
+}
+
+/// How many neighbouring residuals count as one: variance of means over patches of directions, against that of independent ones.
+pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[OwnPoses], noise_m: f64) -> f64 {
+    let sums: Vec<[f64; 3]> = frames
+        .par_iter()
+        .zip(poses)
+        .map(|(frame, pose)| {
+            let mut patches = std::collections::BTreeMap::<(u8, i32, i32), [f64; 3]>::new();
+            for ray in frame.measured.iter().filter(|r| usable(r)) {
+                let w = weight(ray, noise_m);
+                let row = pose_row(ray, &origins[ray.sensor as usize], &Point3::origin());
+                let y = ray.across_m() - row.dot(&pose[ray.sensor as usize]);
+                if y.abs() > STRAY_M {
+                    continue;
+                }
+                let key =
+                    (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
+                let patch = patches.entry(key).or_default();
+                patch[0] += 1.0;
+                patch[1] += w.sqrt() * y;
+                patch[2] += w * y * y;
+            }
+            let big = patches.values().filter(|p| p[0] >= 10.0);
+            big.fold([0.0; 3], |s, p| [s[0] + p[1] * p[1] / p[0], s[1] + p[2] / p[0], s[2] + 1.0])
+        })
+        .collect();
+    let sum = sums.iter().fold([0.0; 3], |s, p| [s[0] + p[0], s[1] + p[1], s[2] + p[2]]);
+    if sum[2] < 1.0 { 1.0 } else { (sum[0] / sum[2]).max(1.0) }
+}
+
+/// Sums of all frames.
+pub fn mean_frames(
+    frames: &[FramePair],
+    rig: &SensorRig,
+    columns: &[Column],
+    poses: &[OwnPoses],
+    noise_m: f64,
+    design: f64,
+) -> Vec<MeanFrame> {
+    let origins = origins(rig);
+    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let one = |(frame, pose): (&FramePair, &OwnPoses)| {
+        let p = columns.len();
+        let mut out = MeanFrame { gram: DMatrix::zeros(p, p), right: DVector::zeros(p), rays: 0.0, squares: 0.0 };
+        let mut x = vec![0.0; p];
+        for ray in frame.measured.iter().filter(|r| usable(r)) {
+            let origin = &origins[ray.sensor as usize];
+            let row = pose_row(ray, origin, &Point3::origin());
+            let y = ray.across_m();
+            if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
+                continue;
+            }
+            let own = pose_row(ray, origin, origin);
+            let phase = f64::from(ray.azimuth_rad) / (2.0 * half_fov[ray.sensor as usize]);
+            let c = f64::from(ray.cos_incidence);
+            let kind = kind_of(ray, origin);
+            for (v, column) in x.iter_mut().zip(columns) {
+                *v = match *column {
+                    Column::RangeOffset => -c,
+                    Column::RangeScale => -c * f64::from(ray.range_m),
+                    Column::Pose(k) => row[k],
+                    Column::SensorPose(s, k) => {
+                        if s == ray.sensor as usize {
+                            own[k]
+                        } else {
+                            0.0
+                        }
+                    }
+                    Column::Sweep(k) => phase * [row[3], row[4], row[2]][k],
+                    Column::Structure(k) => f64::from(u8::from(k == kind)),
+                };
+            }
+            let w = weight(ray, noise_m) / design;
+            for i in 0..p {
+                let wx = w * x[i];
+                if wx != 0.0 {
+                    out.right[i] += wx * y;
+                    for j in 0..=i {
+                        out.gram[(i, j)] += wx * x[j];
+                    }
+                }
+            }
+            out.rays += 1.0;
+            out.squares += w * y * y;
+        }
+        for i in 0..p {
+            for j in 0..i {
+                out.gram[(j, i)] = out.gram[(i, j)];
+            }
+        }
+        out
+    };
+    frames.par_iter().zip(poses).map(one).collect()
+}
+
+/// Origins of the sensors in the cloud's frame.
+pub fn origins(rig: &SensorRig) -> Vec<Point3<f64>> {
+    rig.sensors.iter().map(|s| Point3::from(Vector3::from(s.position))).collect()
+}
+
+impl MeanFrame {
+    /// The same sums with the frame's own pose integrated out; `prior` holds the variances of its six numbers.
+    pub fn without_own_pose(&self, prior: &SVector<f64, 6>) -> (DMatrix<f64>, DVector<f64>) {
+        let p = self.gram.nrows();
+        let mut own = self.gram.view((0, 0), (6, 6)).into_owned();
+        for k in 0..6 {
+            own[(k, k)] += 1.0 / prior[k].max(1e-16);
+        }
+        let Some(inverse) = own.try_inverse() else { return (self.gram.clone(), self.right.clone()) };
+        let across = self.gram.view((0, 0), (p, 6)).into_owned();
+        let part = &across * inverse;
+        let gram = &self.gram - &part * across.transpose();
+        let right = &self.right - &part * self.right.rows(0, 6);
+        (gram, right)
+    }
+}

@@ -1,0 +1,189 @@
+//! What a diagnosis says: the file `diagnosis.json`.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// Version of the file.
+pub const SCHEMA: &str = "lidarshift/diagnosis/1";
+
+/// A diagnosis: the file `diagnosis.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Diagnosis {
+    /// [`SCHEMA`].
+    pub schema: String,
+    /// What is said of the whole.
+    pub verdict: Verdict,
+    /// Ids of the frames by what they were used for; no frame is used twice.
+    pub frames: FrameRoles,
+    /// What was found, the largest gain first.
+    pub findings: Vec<Finding>,
+    /// For each cause the smallest effect that would have been seen, as far as these data tell.
+    pub minimum_detectable: BTreeMap<String, Minimum>,
+    /// Distance of the measured held-out frames from the simulation, before and after it is extended.
+    pub gain: Gain,
+    /// Candidates that were weighed and what became of them.
+    pub considered: Vec<Considered>,
+    /// What could not be looked at or must be known to read the rest, in words.
+    pub notes: Vec<String>,
+}
+
+/// What is said of the whole.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// Nothing differs by more than the smallest effects that would have been seen.
+    NothingFound,
+    /// Everything found has a name.
+    Explained,
+    /// Some of what was found has a name.
+    PartlyExplained,
+    /// Nothing of what was found has a name.
+    Unexplained,
+    /// The two sides do not show the same scenes; nothing else is said.
+    NotScenarioIdentical,
+}
+
+/// Ids of the frames by what they were used for.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct FrameRoles {
+    /// To find and to name.
+    pub select: Vec<String>,
+    /// To fit parameters and intervals.
+    pub estimate: Vec<String>,
+    /// To measure the gain.
+    pub hold_out: Vec<String>,
+}
+
+/// One difference between measured and simulated data.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Finding {
+    /// Whether it has a name.
+    pub status: Status,
+    /// Name of the cause, where it is named.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub cause: Option<String>,
+    /// Names of the causes that explain it equally well, where it is ambiguous.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub candidates: Option<Vec<String>>,
+    /// `range_error`, `detection`, `geometry`, `timing`, `labels`, `returns` or `unknown`.
+    pub family: String,
+    /// Fitted parameters; docs/diagnosis.md has names, units and signs.
+    pub parameters: BTreeMap<String, Parameter>,
+    /// Share of block-bootstrap repetitions that choose the same name.
+    pub confidence: f64,
+    /// `residuals`, `roughness`, `hits`, `returns`, `objects`, `labels` or `ranges`.
+    pub channel: String,
+    /// On what it depends.
+    pub covariate: String,
+    /// What it brings on frames held out.
+    pub gain: FindingGain,
+    /// The finding in a sentence.
+    pub says: String,
+    /// What to record to tell the candidates apart.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub separate_by: Option<String>,
+    /// The picture: what is measured along the covariate, before and after.
+    pub curve: Curve,
+}
+
+/// Whether a finding has a name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Status {
+    /// One cause of the catalogue explains it.
+    Named,
+    /// Several do, and these data do not tell which.
+    Ambiguous,
+    /// None does.
+    Unexplained,
+}
+
+/// A fitted number.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Parameter {
+    /// Best value.
+    pub estimate: f64,
+    /// Its unit; `1` for a share.
+    pub unit: String,
+    /// Interval that holds the true value with a probability of 95 %.
+    pub ci95: [f64; 2],
+}
+
+/// Gain of one finding.
+#[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct FindingGain {
+    /// Logarithm of the likelihood ratio on held-out frames by simulated return.
+    pub nats_per_ray: f64,
+    /// From a bootstrap over blocks of held-out frames.
+    pub ci95: [f64; 2],
+}
+
+/// The smallest effect that would have been seen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Minimum {
+    /// Which number.
+    pub parameter: String,
+    /// Its smallest value.
+    pub value: f64,
+    /// Its unit.
+    pub unit: String,
+}
+
+/// Distance between measured and simulated held-out frames.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Gain {
+    /// `nats_per_ray`: Kullback-Leibler distance of what the channels see, by simulated return.
+    pub metric: String,
+    /// With the simulation as it is.
+    pub before: f64,
+    /// With the extended simulation.
+    pub after: f64,
+    /// Of an independent draw of the extended simulation itself.
+    pub floor: f64,
+    /// (before - after) / (before - floor); null where before is not above the floor.
+    pub closed: Option<f64>,
+    /// Interval of `closed`, from a bootstrap over blocks of held-out frames.
+    pub ci95: Option<[f64; 2]>,
+}
+
+/// A candidate that was weighed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Considered {
+    /// Cause.
+    pub cause: String,
+    /// Channel.
+    pub channel: String,
+    /// Gain on blocks of the selecting frames that it was not fitted on, nats per ray.
+    pub nats_per_ray: f64,
+    /// That over its standard error.
+    pub z: f64,
+    /// `chosen`, or why not.
+    pub outcome: String,
+}
+
+/// Points of a picture.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct Curve {
+    /// Name and unit along the horizontal axis.
+    pub x: String,
+    /// Name and unit of what is shown.
+    pub y: String,
+    /// The points.
+    pub points: Vec<CurvePoint>,
+}
+
+/// A point of a picture.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct CurvePoint {
+    /// Covariate.
+    pub x: f64,
+    /// Measured.
+    pub measured: f64,
+    /// Simulated as it is.
+    pub before: f64,
+    /// With the extended simulation.
+    pub after: f64,
+    /// Standard error of the measured value.
+    pub error: f64,
+}

@@ -1,0 +1,184 @@
+//! The whole way from two data sets to a diagnosis.
+
+use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::error::DiagnoseError;
+use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
+use crate::pairing::{check_identity, common_ids, find_sensors, pair_all};
+use crate::rig::SensorRig;
+use crate::search::labels::Side;
+use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
+use data::Dataset;
+
+/// What to look at.
+#[derive(Clone, Debug, Default)]
+pub struct Options {
+    /// A split of both data sets; all frames without one.
+    pub split: Option<String>,
+}
+
+/// What is being done, for whoever shows progress.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Looking for scan patterns and whether the scenes are the same.
+    Comparing,
+    /// Pairing frames.
+    Pairing,
+    /// Weighing causes.
+    Weighing,
+}
+
+/// Told what is being done, how much of it is finished and how much there is.
+pub type Progress<'a> = &'a (dyn Fn(Stage, usize, usize) + Sync);
+
+/// Diagnoses a pair of data sets.
+pub fn diagnose(
+    measured: &Dataset,
+    simulated: &Dataset,
+    rig: &SensorRig,
+    options: &Options,
+    progress: Progress,
+) -> Result<Diagnosis, DiagnoseError> {
+    let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
+    progress(Stage::Comparing, 0, 2);
+    let sensors = find_sensors(measured, simulated, &ids, rig)?;
+    for (mount, pattern) in rig.sensors.iter().zip(&sensors.patterns) {
+        if pattern.rows_rad.is_empty() {
+            notes.push(format!(
+                "sensor {}: no rows stand out in its elevations; what depends on rows cannot be told",
+                mount.name
+            ));
+        }
+    }
+    progress(Stage::Comparing, 1, 2);
+    let identity = check_identity(measured, simulated, &ids, &sensors)?;
+    progress(Stage::Comparing, 2, 2);
+    if !identity.identical {
+        notes.insert(0, identity.reason);
+        return Ok(refused(notes));
+    }
+    for id in &identity.strangers {
+        notes.push(format!("frame {id}: the two sides do not show the same scene"));
+    }
+    let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
+    let (frames, more) =
+        pair_all(measured, simulated, &ids, &sensors, &|done| progress(Stage::Pairing, done, ids.len()))?;
+    notes.extend(more);
+    if frames.len() < FEWEST_FRAMES {
+        notes.push(format!(
+            "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
+            frames.len()
+        ));
+        return Ok(Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) });
+    }
+    let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
+    let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
+    let times = crate::channels::labels::times_s(&used, rate_hz);
+    if times.is_none() {
+        notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
+    }
+    let context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
+    let searches = 5;
+    let mut results: Vec<ChannelResult> = Vec::new();
+    progress(Stage::Weighing, 0, searches);
+    results.push(search::noise::search(&context, &[]));
+    progress(Stage::Weighing, 1, searches);
+    results.push(search::hits::search(&context));
+    progress(Stage::Weighing, 2, searches);
+    results.push(search::labels::search(&context, Side::Labels));
+    results.push(search::labels::search(&context, Side::Objects));
+    progress(Stage::Weighing, 4, searches);
+    results.push(search::geometry::search(&context));
+    progress(Stage::Weighing, searches, searches);
+    Ok(write_up(&context, results, notes))
+}
+
+/// A diagnosis that says nothing but its notes.
+fn refused(notes: Vec<String>) -> Diagnosis {
+    Diagnosis {
+        schema: SCHEMA.into(),
+        verdict: Verdict::NotScenarioIdentical,
+        frames: FrameRoles::default(),
+        findings: vec![],
+        minimum_detectable: Default::default(),
+        gain: Gain { metric: "nats_per_ray".into(), before: 0.0, after: 0.0, floor: 0.0, closed: None, ci95: None },
+        considered: vec![],
+        notes,
+    }
+}
+
+/// Puts the results of all channels together.
+fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) -> Diagnosis {
+    let hold_out = context.of(Role::HoldOut);
+    let blocks = context.blocks(&hold_out);
+    let returns = context.returns(&hold_out).max(1.0);
+    let mut findings = Vec::new();
+    let mut considered = Vec::new();
+    let mut minimum_detectable = std::collections::BTreeMap::new();
+    let mut distance = vec![[0.0; 3]; hold_out.len()];
+    for result in results {
+        considered.extend(result.considered);
+        minimum_detectable.extend(result.minimum);
+        for (sum, d) in distance.iter_mut().zip(&result.distance) {
+            (0..3).for_each(|k| sum[k] += d[k]);
+        }
+        for f in result.found {
+            let named = f.status == Status::Named;
+            findings.push(Finding {
+                status: f.status,
+                cause: named.then(|| f.causes[0].clone()),
+                candidates: (f.status == Status::Ambiguous).then(|| f.causes.clone()),
+                family: f.family.into(),
+                parameters: f.parameters.into_iter().collect(),
+                confidence: f.confidence,
+                channel: f.channel.into(),
+                covariate: f.covariate,
+                gain: mean_interval(&f.held_out_gains, &blocks, returns),
+                says: f.says,
+                separate_by: f.separate_by,
+                curve: f.curve,
+            });
+        }
+    }
+    findings.sort_by(|a, b| b.gain.nats_per_ray.total_cmp(&a.gain.nats_per_ray));
+    let named = findings.iter().filter(|f| f.status == Status::Named).count();
+    let verdict = match (findings.len(), named) {
+        (0, _) => Verdict::NothingFound,
+        (all, named) if all == named => Verdict::Explained,
+        (_, 0) => Verdict::Unexplained,
+        _ => Verdict::PartlyExplained,
+    };
+    let ids = |role| context.of(role).into_iter().map(|i| context.frames[i].id.clone()).collect();
+    Diagnosis {
+        schema: SCHEMA.into(),
+        verdict,
+        frames: FrameRoles { select: ids(Role::Select), estimate: ids(Role::Estimate), hold_out: ids(Role::HoldOut) },
+        gain: gain(&distance, &blocks, returns, findings.is_empty()),
+        findings,
+        minimum_detectable,
+        considered,
+        notes,
+    }
+}
+
+/// Distances of the held-out frames together, with the interval of what is closed.
+fn gain(distance: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
+    let sum = |which: &[usize]| {
+        which.iter().fold([0.0; 3], |s, &i| [s[0] + distance[i][0], s[1] + distance[i][1], s[2] + distance[i][2]])
+    };
+    let closed =
+        |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
+    let all = sum(&(0..distance.len()).collect::<Vec<_>>());
+    let members = by_block(blocks);
+    let mut rng = data::stream(0, "diagnose closed", 0, 0);
+    let mut drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
+    drawn.sort_by(f64::total_cmp);
+    let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
+    Gain {
+        metric: "nats_per_ray".into(),
+        before: all[0] / returns,
+        after: all[1] / returns,
+        floor: all[2] / returns,
+        closed: closed(all),
+        ci95: closed(all).and_then(|_| Some([at(0.025)?, at(0.975)?])),
+    }
+}

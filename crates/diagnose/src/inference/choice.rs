@@ -1,0 +1,112 @@
+//! One step of forward selection: which candidate explains frames that it was not fitted on, and which others could as well.
+
+/// What a candidate brought on each frame, when it was fitted on other blocks.
+#[derive(Clone, Debug)]
+pub struct Trial {
+    /// Its place in the list of candidates.
+    pub candidate: usize,
+    /// Causes that tell the same story differently share a name.
+    pub name: String,
+    /// Number of free parameters.
+    pub parameters: usize,
+    /// Gain of each frame over the model so far, nats.
+    pub gains: Vec<f64>,
+    /// Whether the effect fitted on all frames is large enough to speak of.
+    pub above_floor: bool,
+}
+
+/// What a step must bring.
+#[derive(Clone, Copy, Debug)]
+pub struct Demands {
+    /// Mean gain of a frame over its standard error.
+    pub z: f64,
+    /// Gain of all frames together, nats.
+    pub nats: f64,
+    /// Share of the best gain by which a simpler candidate may fall behind.
+    pub slack: f64,
+}
+
+/// The outcome of a step.
+#[derive(Clone, Debug)]
+pub struct Choice {
+    /// The chosen trial.
+    pub chosen: usize,
+    /// Other names that explain as much, as far as these frames tell.
+    pub equals: Vec<usize>,
+}
+
+/// Sum and z of gains; z of a candidate that brings the same on every frame is bounded by the square root of their number times 30.
+pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
+    let n = gains.len() as f64;
+    let total: f64 = gains.iter().sum();
+    if gains.len() < 2 {
+        return (total, 0.0);
+    }
+    let mean = total / n;
+    let variance = gains.iter().map(|g| (g - mean).powi(2)).sum::<f64>() / (n - 1.0);
+    let error = (variance / n).sqrt().max(mean.abs() / (30.0 * n.sqrt())).max(1e-12);
+    (total, mean / error)
+}
+
+/// Chooses, or finds nothing worth choosing.
+pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
+    let eligible: Vec<usize> = (0..trials.len())
+        .filter(|&i| {
+            let (total, z) = total_and_z(&trials[i].gains);
+            trials[i].above_floor && total > demands.nats && z > demands.z
+        })
+        .collect();
+    let total = |i: usize| total_and_z(&trials[i].gains).0;
+    let best = eligible.iter().copied().max_by(|a, b| total(*a).total_cmp(&total(*b)))?;
+    // How much of the gain a rival leaves, and whether these frames can tell.
+    let near = |i: usize, than: usize| {
+        let differences: Vec<f64> = trials[than].gains.iter().zip(&trials[i].gains).map(|(a, b)| a - b).collect();
+        let (deficit, z) = total_and_z(&differences);
+        deficit < demands.slack * total(than) || z < 2.0
+    };
+    let simpler = eligible.iter().copied().filter(|&i| near(i, best));
+    let chosen = simpler
+        .min_by(|a, b| trials[*a].parameters.cmp(&trials[*b].parameters).then(total(*b).total_cmp(&total(*a))))
+        .unwrap_or(best);
+    let equals = eligible
+        .iter()
+        .copied()
+        .filter(|&i| trials[i].name != trials[chosen].name && trials[i].parameters <= trials[chosen].parameters)
+        .filter(|&i| {
+            let differences: Vec<f64> = trials[chosen].gains.iter().zip(&trials[i].gains).map(|(a, b)| a - b).collect();
+            let (deficit, z) = total_and_z(&differences);
+            z < 2.0 && deficit < 0.1 * total(chosen)
+        })
+        .collect();
+    Some(Choice { chosen, equals })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn trial(name: &str, parameters: usize, gains: &[f64]) -> Trial {
+        Trial { candidate: 0, name: name.into(), parameters, gains: gains.to_vec(), above_floor: true }
+    }
+
+    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02 };
+
+    #[test]
+    fn the_simplest_of_equals_wins() {
+        let simple = trial("simple", 1, &[10.0, 11.0, 9.0, 10.0]);
+        let complex = trial("complex", 3, &[10.1, 11.2, 9.0, 10.2]);
+        let choice = choose(&[complex.clone(), simple.clone()], &DEMANDS).unwrap();
+        assert_eq!((choice.chosen, choice.equals.len()), (1, 0));
+        let better = trial("better", 3, &[20.0, 21.0, 19.0, 20.0]);
+        assert_eq!(choose(&[better, simple], &DEMANDS).unwrap().chosen, 0);
+    }
+
+    #[test]
+    fn equals_are_told_and_noise_is_not_chosen() {
+        let a = trial("a", 1, &[10.0, 11.0, 9.0, 10.0]);
+        let b = trial("b", 1, &[10.4, 10.5, 9.6, 9.3]);
+        assert_eq!(choose(&[a.clone(), b], &DEMANDS).unwrap().equals.len(), 1);
+        assert!(choose(&[trial("noise", 1, &[30.0, -20.0, 25.0, -10.0])], &DEMANDS).is_none());
+        assert!(choose(&[Trial { above_floor: false, ..a }], &DEMANDS).is_none());
+    }
+}

@@ -1,0 +1,143 @@
+//! Laws of noise: how much rougher the measured returns are than the simulated ones, in variance, cell by cell.
+
+use super::linear::LinearFrame;
+use crate::channels::cells::CELLS;
+use crate::channels::roughness::{RoughCell, RoughFrame};
+use nalgebra::{DMatrix, DVector};
+
+/// A law of added variance; each is one column.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum NoiseLaw {
+    /// The same everywhere.
+    Constant,
+    /// Standard deviation grows with range: 1 + growth R.
+    Growing(f64),
+    /// Standard deviation falls with the signal u: exp(-gamma u / 2).
+    Signal(f64),
+    /// Directions jitter: (R tan(incidence))^2.
+    Angular,
+}
+
+/// All laws that are tried.
+pub const NOISE_LAWS: [NoiseLaw; 10] = [
+    NoiseLaw::Constant,
+    NoiseLaw::Angular,
+    NoiseLaw::Growing(0.01),
+    NoiseLaw::Growing(0.02),
+    NoiseLaw::Growing(0.04),
+    NoiseLaw::Growing(0.08),
+    NoiseLaw::Growing(0.3),
+    NoiseLaw::Signal(0.3),
+    NoiseLaw::Signal(0.6),
+    NoiseLaw::Signal(1.0),
+];
+
+/// Signal at which [`NoiseLaw::Signal`] is one.
+pub const USUAL_SIGNAL: f64 = 4.0;
+
+/// Levers beyond this are cut: tangents of grazing rays are not known well.
+const LONGEST_LEVER_M: f64 = 400.0;
+
+impl NoiseLaw {
+    /// The cause's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            NoiseLaw::Angular => "angular_jitter",
+            NoiseLaw::Signal(_) => "signal_noise",
+            _ => "range_noise",
+        }
+    }
+
+    /// Free parameters.
+    pub fn parameters(self) -> usize {
+        match self {
+            NoiseLaw::Constant | NoiseLaw::Angular => 1,
+            NoiseLaw::Growing(_) | NoiseLaw::Signal(_) => 2,
+        }
+    }
+
+    /// Variance at a range and a cosine of incidence, in units of the coefficient.
+    pub fn variance(self, range_m: f64, cos: f64) -> f64 {
+        match self {
+            NoiseLaw::Constant => 1.0,
+            NoiseLaw::Growing(g) => (1.0 + g * range_m).powi(2),
+            NoiseLaw::Signal(gamma) => (-gamma * (cos.ln() + 2.0 * (250.0 / range_m).ln() - USUAL_SIGNAL)).exp(),
+            NoiseLaw::Angular => {
+                let lever = range_m * (1.0 / (cos * cos) - 1.0).max(0.0).sqrt();
+                lever.min(LONGEST_LEVER_M).powi(2)
+            }
+        }
+    }
+}
+
+/// What the variances of the cells are weighed with: those of all frames that select.
+#[derive(Clone, Debug)]
+pub struct NoiseTable {
+    cells: Vec<RoughCell>,
+    used: Vec<bool>,
+}
+
+/// Fewer returns of either side say nothing.
+const FEWEST: f64 = 40.0;
+
+/// Neighbouring returns share neighbours: this many count as one.
+const SHARED: f64 = 2.0;
+
+impl NoiseTable {
+    /// From the sums over some frames.
+    pub fn new(cells: Vec<RoughCell>) -> Self {
+        let used = cells.iter().map(|c| c.measured.n >= FEWEST && c.simulated.n >= FEWEST).collect();
+        NoiseTable { cells, used }
+    }
+
+    /// Variances of a cell, measured and simulated, m2; `None` where there are too few returns.
+    pub fn variances(&self, cell: usize) -> Option<[f64; 2]> {
+        self.used[cell].then(|| self.cells[cell].variances().map(|v| v.max(1e-8)))
+    }
+
+    /// Sums of one frame over its cells: differences of the two sides' mean squares against the laws.
+    pub fn linear(&self, frame: &RoughFrame, laws: &[NoiseLaw]) -> LinearFrame {
+        let k = laws.len();
+        let mut out = LinearFrame { gram: DMatrix::zeros(k, k), right: DVector::zeros(k) };
+        for (i, cell) in frame {
+            let Some([va, vb]) = self.variances(*i as usize) else { continue };
+            let (na, nb) = (cell.measured.n, cell.simulated.n);
+            if na < 3.0 || nb < 3.0 {
+                continue;
+            }
+            let [ya, yb] = cell.variances();
+            let weight = 1.0 / (SHARED * (2.0 * va * va / na + 2.0 * vb * vb / nb));
+            let (range, cos) = cell.measured.mean();
+            let x = DVector::from_iterator(k, laws.iter().map(|l| l.variance(range, cos)));
+            out.right += &x * (weight * (ya - yb));
+            out.gram += &x * x.transpose() * weight;
+        }
+        out
+    }
+
+    /// Nats of a frame's measured returns under the simulated variance plus laws with coefficients.
+    pub fn likelihood(&self, frame: &RoughFrame, laws: &[(NoiseLaw, f64)]) -> f64 {
+        frame
+            .iter()
+            .filter_map(|(i, cell)| {
+                let [_, vb] = self.variances(*i as usize)?;
+                let (range, cos) = cell.measured.mean();
+                let added: f64 = laws.iter().map(|(l, theta)| theta * l.variance(range, cos)).sum();
+                let v = (vb + added).max(0.1 * vb);
+                let n = cell.measured.n / SHARED;
+                (n > 0.0).then(|| -0.5 * n * (v.ln() + cell.variances()[0] / v))
+            })
+            .sum()
+    }
+
+    /// Cells with enough returns: mean range, mean cosine, returns, variances.
+    pub fn rows(&self) -> Vec<(f64, f64, f64, [f64; 2])> {
+        (0..CELLS)
+            .filter_map(|i| {
+                let v = self.variances(i)?;
+                let (range, cos) = self.cells[i].measured.mean();
+                Some((range, cos, self.cells[i].measured.n, v))
+            })
+            .collect()
+    }
+}

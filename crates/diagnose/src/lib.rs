@@ -1,0 +1,18 @@
+//! Measured against simulated: what differs, why, and what is gained by mending it.
+//!
+//! `pairing` brings two data sets together return by return, `channels` sums up what is looked at, `inference` weighs causes, `search`
+//! goes through the channels, `engine` is the whole way. Nothing here knows a simulator: clouds, labels and the places of the sensors do.
+
+pub mod channels;
+pub mod diagnosis;
+mod engine;
+mod error;
+pub mod inference;
+pub mod pairing;
+mod rig;
+pub mod search;
+
+pub use diagnosis::{Diagnosis, Finding, SCHEMA, Status, Verdict};
+pub use engine::{Options, Progress, Stage, diagnose};
+pub use error::DiagnoseError;
+pub use rig::{SensorMount, SensorRig, wrapped};

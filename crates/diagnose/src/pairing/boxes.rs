@@ -1,0 +1,128 @@
+//! How far an object of the measured cloud stands from the same one of the simulation: fitted to the surface, so that lost returns and
+//! other shots do not shift it.
+
+use geometry::Box3;
+use nalgebra::{Matrix3, Point3, Vector3};
+
+/// A return with the surface it lies on, in the cloud's frame.
+#[derive(Clone, Copy, Debug)]
+pub struct SurfacePoint {
+    /// Place, m.
+    pub point: Point3<f64>,
+    /// Unit normal, or zero where it is not known.
+    pub normal: Vector3<f64>,
+}
+
+/// A fitted shift in the box's own frame (forward, left, up).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BoxShift {
+    /// Measured minus simulated, m.
+    pub shift_m: [f64; 3],
+    /// Its standard errors, m; large where the visible faces do not tell.
+    pub error_m: [f64; 3],
+    /// Measured returns used.
+    pub points: usize,
+}
+
+/// Standard deviation of what is known of a shift beforehand, m.
+const PRIOR_M: f64 = 1.0;
+
+/// Fits the shift that brings the simulated surfaces onto the measured returns: nearest surface point, distance across the surface,
+/// redescending weights, gates that narrow.
+pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoint]) -> Option<BoxShift> {
+    if measured.len() < 8 || simulated.len() < 8 {
+        return None;
+    }
+    let local: Vec<(Vector3<f64>, Vector3<f64>)> = simulated
+        .iter()
+        .map(|s| {
+            let tip = bbox.to_local((s.point + s.normal).into());
+            let foot = Vector3::from(bbox.to_local(s.point.into()));
+            (foot, Vector3::from(tip) - foot)
+        })
+        .collect();
+    let points: Vec<Vector3<f64>> = measured.iter().map(|p| Vector3::from(bbox.to_local((*p).into()))).collect();
+    let mut shift = Vector3::zeros();
+    let mut result = None;
+    for (gate, scale) in [(1.2, 0.6), (1.0, 0.4), (0.8, 0.25), (0.6, 0.15), (0.5, 0.1), (0.4, 0.08), (0.4, 0.08)] {
+        let mut information = Matrix3::identity() / (PRIOR_M * PRIOR_M);
+        let mut right = Vector3::zeros();
+        let (mut used, mut squares) = (0usize, 0.0);
+        let mut system = Matrix3::zeros();
+        for p in &points {
+            let back = p - shift;
+            let nearest =
+                local.iter().map(|(q, n)| ((back - q).norm_squared(), q, n)).min_by(|a, b| a.0.total_cmp(&b.0));
+            let Some((d2, q, n)) = nearest else { continue };
+            if d2 > gate * gate || n.norm_squared() < 0.5 {
+                continue;
+            }
+            let off = n.dot(&(p - q)); // across the surface, before any shift
+            let now = off - n.dot(&shift);
+            let u = now / (4.0 * scale);
+            if u.abs() >= 1.0 {
+                continue;
+            }
+            let w = (1.0 - u * u).powi(2);
+            system += n * n.transpose() * w;
+            right += n * (w * off);
+            squares += w * now * now;
+            used += 1;
+        }
+        if used < 8 {
+            return None;
+        }
+        // Neighbouring returns err alike: a fifth of them counts.
+        let variance = (squares / used as f64).max(1e-5) * 5.0;
+        information += system / variance;
+        let inverse = information.try_inverse()?;
+        shift = inverse * (right / variance);
+        result =
+            Some(BoxShift { shift_m: shift.into(), error_m: [0, 1, 2].map(|k| inverse[(k, k)].sqrt()), points: used });
+    }
+    result
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Returns on the rear and the left side of a box, seen from behind.
+    fn faces(b: &Box3, shift: [f64; 3], step: f64, keep: impl Fn(f64) -> bool) -> Vec<SurfacePoint> {
+        let [l, w, h] = b.size;
+        let mut points = Vec::new();
+        let mut push = |p: [f64; 3], n: [f64; 3]| {
+            let at = b.from_local([p[0] + shift[0], p[1] + shift[1], p[2] + shift[2]]);
+            let tip = b.from_local([p[0] + shift[0] + n[0], p[1] + shift[1] + n[1], p[2] + shift[2] + n[2]]);
+            if keep(p[2]) {
+                points.push(SurfacePoint { point: at.into(), normal: Vector3::from(tip) - Vector3::from(at) });
+            }
+        };
+        let (mut z, mut k) = (-h / 2.0 + 0.1, 0);
+        while z < h / 2.0 {
+            let mut u = step * 0.3 * f64::from(k % 3);
+            while u < w {
+                push([-l / 2.0, u - w / 2.0, z], [-1.0, 0.0, 0.0]);
+                u += step;
+            }
+            let mut u = step * 0.5 * f64::from(k % 2);
+            while u < l {
+                push([u - l / 2.0, w / 2.0, z], [0.0, 1.0, 0.0]);
+                u += step;
+            }
+            (z, k) = (z + 0.2, k + 1);
+        }
+        points
+    }
+
+    #[test]
+    fn a_shift_is_found_although_half_of_the_returns_are_lost() {
+        let b = Box3::from_array([20.0, 3.0, 0.0, 4.8, 1.9, 1.2, 0.4]);
+        let simulated = faces(&b, [0.0; 3], 0.13, |_| true);
+        let measured = faces(&b, [0.4, -0.1, 0.0], 0.11, |z| z > 0.0);
+        let points: Vec<_> = measured.iter().map(|s| s.point).collect();
+        let fit = fit_shift(&b, &points, &simulated).unwrap();
+        assert!((fit.shift_m[0] - 0.4).abs() < 0.02 && (fit.shift_m[1] + 0.1).abs() < 0.02, "{fit:?}");
+        assert!(fit.error_m[2] > 0.5, "no horizontal face, no height: {fit:?}");
+    }
+}

@@ -1,0 +1,292 @@
+//! One frame of both sides, return by return.
+
+use super::boxes::{BoxShift, SurfacePoint, fit_shift};
+use super::matching::match_directions;
+use super::pattern::ScanPattern;
+use super::ray::{Ray, Surface};
+use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
+use super::surface::{LocalSurface, fit_surface};
+use crate::rig::SensorRig;
+use data::{Cloud, Object};
+use geometry::Box3;
+use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
+
+/// One frame of both sides.
+#[derive(Clone, Debug)]
+pub struct FramePair {
+    /// Its id.
+    pub id: String,
+    /// Returns of the measured side.
+    pub measured: Vec<Ray>,
+    /// Returns of the simulated side.
+    pub simulated: Vec<Ray>,
+    /// Objects, those of the simulation first.
+    pub objects: Vec<ObjectPair>,
+}
+
+/// A labelled object of the two sides.
+#[derive(Clone, Debug)]
+pub struct ObjectPair {
+    /// The simulation's label; `None` where only the measured side has it.
+    pub simulated: Option<Box3>,
+    /// The measured side's label.
+    pub measured: Option<Box3>,
+    /// How far the measured returns stand from the simulated ones.
+    pub shift: Option<BoxShift>,
+    /// Returns of the measured and the simulated side in the box.
+    pub points: [usize; 2],
+}
+
+/// What is known of the sensors before any frame is looked at.
+pub struct Sensors {
+    /// Mounts.
+    pub rig: SensorRig,
+    /// Scan pattern of each.
+    pub patterns: Vec<ScanPattern>,
+    /// Farther than that across a plane a neighbour belongs to something else, m.
+    pub edge_m: f64,
+}
+
+/// Half widths of the window of neighbours, in steps.
+const WINDOW: [f32; 2] = [2.2, 1.4];
+
+/// A measured return farther than that from the surface says nothing of its neighbours, m across.
+const STRAY_M: f64 = 0.5;
+
+impl Sensors {
+    fn window(&self, sensor: usize) -> Steps {
+        let steps = self.patterns[sensor].steps;
+        Steps { azimuth_rad: WINDOW[0] * steps.azimuth_rad, elevation_rad: WINDOW[1] * steps.elevation_rad }
+    }
+}
+
+/// Pairs a frame, return by return.
+pub fn pair_frame(
+    id: &str,
+    measured: (&Cloud, &[Object]),
+    simulated: (&Cloud, &[Object]),
+    sensors: &Sensors,
+) -> FramePair {
+    let mut objects = pair_labels(measured.1, simulated.1);
+    let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
+    let scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
+    let mut frame = FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
+    for sensor in 0..sensors.rig.sensors.len() {
+        let [a, b] = [&scans[0][sensor], &scans[1][sensor]];
+        let closes = sensors.rig.sensors[sensor].closes();
+        let (of_a, of_b) = match_directions(a, b, &sensors.patterns[sensor], closes);
+        let sight = Sight::new(sensors, sensor, b, &boxes);
+        let mut simulated: Vec<Ray> = (0..b.len()).map(|i| sight.ray(b, i, true)).collect();
+        for (ray, matched) in simulated.iter_mut().zip(of_b) {
+            ray.matched = matched;
+            (ray.roughness_m, ray.roughness_leverage) =
+                if ray.smooth { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
+        }
+        let mut measured: Vec<Ray> = (0..a.len()).map(|i| sight.ray(a, i, false)).collect();
+        let own = DirectionIndex::new(a, sensors.window(sensor), closes);
+        let stray: Vec<bool> = measured.iter().map(|r| r.smooth && r.across_m().abs() > STRAY_M).collect();
+        for (i, (ray, matched)) in measured.iter_mut().zip(of_a).enumerate() {
+            ray.matched = matched;
+            if ray.smooth && !stray[i] {
+                let others = |e: &super::scan::Entry| e.index != i as u32 && !stray[e.index as usize];
+                if let Some(s) = fit_surface(&own, sight.window, a.azimuth_rad[i], a.elevation_rad[i], others) {
+                    ray.roughness_m = (f64::from(a.range_m[i]) - s.range_m) as f32;
+                    ray.roughness_leverage = s.leverage as f32;
+                }
+            }
+        }
+        frame.measured.append(&mut measured);
+        frame.simulated.append(&mut simulated);
+    }
+    fit_objects(&mut objects, &frame, sensors);
+    frame.objects = objects;
+    frame
+}
+
+/// The simulated side of one sensor, to be looked at from any direction.
+struct Sight<'a> {
+    sensor: usize,
+    sensors: &'a Sensors,
+    cloud_from_sensor: Isometry3<f64>,
+    index: DirectionIndex,
+    window: [f64; 2],
+    boxes: &'a [Box3],
+}
+
+impl<'a> Sight<'a> {
+    fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
+        let mount = &sensors.rig.sensors[sensor];
+        let window = sensors.window(sensor);
+        Sight {
+            sensor,
+            sensors,
+            cloud_from_sensor: mount.pose(),
+            index: DirectionIndex::new(simulated, window, mount.closes()),
+            window: [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)],
+            boxes,
+        }
+    }
+
+    fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
+        let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
+        let direction = unit(&self.cloud_from_sensor.rotation, az, el);
+        let row = self.sensors.patterns[self.sensor].row(el).map_or(u16::MAX, |r| r as u16);
+        let mut ray = Ray {
+            sensor: self.sensor as u8,
+            surface: Surface::Open,
+            smooth: false,
+            corner: false,
+            matched: false,
+            row,
+            object: u16::MAX,
+            azimuth_rad: az,
+            elevation_rad: el,
+            range_m: range,
+            cos_incidence: 0.0,
+            direction: direction.cast::<f32>().into(),
+            normal: [0.0; 3],
+            residual_m: 0.0,
+            leverage: 0.0,
+            roughness_m: f32::NAN,
+            roughness_leverage: 0.0,
+            near_far_m: [0.0; 2],
+        };
+        let others = |e: &super::scan::Entry| !without_itself || e.index != i as u32;
+        let Some(surface) = fit_surface(&self.index, self.window, az, el, others) else {
+            let mut near_far = [f32::INFINITY, 0.0f32];
+            self.index.around(az, el, |e, _, _| {
+                if others(e) {
+                    near_far = [near_far[0].min(e.range_m), near_far[1].max(e.range_m)];
+                }
+            });
+            if near_far[1] > 0.0 {
+                ray.near_far_m = near_far;
+                ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
+            }
+            return ray;
+        };
+        ray.near_far_m = surface.near_far_m.map(|v| v as f32);
+        ray.smooth = surface.misfit_m < self.sensors.edge_m;
+        if !ray.smooth {
+            ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
+            return ray;
+        }
+        let normal = self.normal(&surface, az, el);
+        ray.range_m = surface.range_m as f32;
+        ray.residual_m = (f64::from(range) - surface.range_m) as f32;
+        ray.cos_incidence = surface.cos_incidence as f32;
+        ray.leverage = surface.leverage as f32;
+        ray.normal = normal.cast::<f32>().into();
+        ray.surface = self.surface_at(&direction, surface.range_m, Some(&normal), &mut ray);
+        ray
+    }
+
+    fn normal(&self, surface: &LocalSurface, az: f32, el: f32) -> Vector3<f64> {
+        let (az, el) = (f64::from(az), f64::from(el));
+        let [along, side, up] = surface.normal();
+        let u = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin());
+        let left = Vector3::new(-az.sin(), az.cos(), 0.0);
+        let n = u * along + left * side + u.cross(&left) * up;
+        self.cloud_from_sensor.rotation * n
+    }
+
+    fn surface_at(
+        &self,
+        direction: &Vector3<f64>,
+        range: f64,
+        normal: Option<&Vector3<f64>>,
+        ray: &mut Ray,
+    ) -> Surface {
+        let p: [f64; 3] = (self.cloud_from_sensor.translation.vector + direction * range).into();
+        for (k, b) in self.boxes.iter().enumerate() {
+            let local = b.to_local(p);
+            let inside = |axis: usize, margin: f64| local[axis].abs() < b.size[axis] / 2.0 + margin;
+            let on_the_floor = local[2] < -b.size[2] / 2.0 + 0.12;
+            if inside(0, 0.2) && inside(1, 0.2) && inside(2, 0.2) && !on_the_floor {
+                ray.object = k as u16;
+                let beyond = |axis: usize, share: f64| local[axis].abs() > share * b.size[axis];
+                ray.corner = beyond(0, 0.18) && beyond(1, 0.3) && local[2] < 0.06 * b.size[2];
+                return Surface::Object;
+            }
+        }
+        if normal.is_some_and(|n| n.z > 0.85) { Surface::Ground } else { Surface::Standing }
+    }
+}
+
+fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
+    let (az, el) = (f64::from(az), f64::from(el));
+    turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
+}
+
+/// Labels farther apart than that are not of the same object, m.
+const SAME_OBJECT_M: f64 = 4.0;
+
+/// Labels of the simulation in their order, each with the nearest one of the measured side; then what only the measured side has.
+fn pair_labels(measured: &[Object], simulated: &[Object]) -> Vec<ObjectPair> {
+    let mut candidates = Vec::new();
+    for (i, s) in simulated.iter().enumerate() {
+        for (j, m) in measured.iter().enumerate() {
+            let d = (Vector3::from(s.bbox.center) - Vector3::from(m.bbox.center)).norm();
+            if d < SAME_OBJECT_M {
+                candidates.push((d, i, j));
+            }
+        }
+    }
+    candidates.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)).then(a.2.cmp(&b.2)));
+    let mut partner = vec![None; simulated.len()];
+    let mut taken = vec![false; measured.len()];
+    for (_, i, j) in candidates {
+        if partner[i].is_none() && !taken[j] {
+            (partner[i], taken[j]) = (Some(j), true);
+        }
+    }
+    let both = simulated.iter().zip(partner).map(|(s, j)| ObjectPair {
+        simulated: Some(s.bbox),
+        measured: j.map(|j| measured[j].bbox),
+        shift: None,
+        points: [0; 2],
+    });
+    let alone = measured.iter().zip(&taken).filter(|(_, taken)| !**taken).map(|(m, _)| ObjectPair {
+        simulated: None,
+        measured: Some(m.bbox),
+        shift: None,
+        points: [0; 2],
+    });
+    both.chain(alone).collect()
+}
+
+/// Returns around an object, this far beside its box, may be its own after a shift, m.
+const AROUND_M: f64 = 1.2;
+
+fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors) {
+    let origins: Vec<Point3<f64>> =
+        sensors.rig.sensors.iter().map(|s| Point3::from(Vector3::from(s.position))).collect();
+    let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
+    let near = |p: &Point3<f64>, b: &Box3| {
+        let local = b.to_local((*p).into());
+        (0..3).all(|k| local[k].abs() < b.size[k] / 2.0 + AROUND_M) && local[2] > -b.size[2] / 2.0 + 0.12
+    };
+    let mut measured = vec![Vec::new(); boxes.len()];
+    let mut simulated = vec![Vec::new(); boxes.len()];
+    for ray in &frame.measured {
+        let p = origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m();
+        // What the simulation says is ground, and lies on it, is ground.
+        let ground = ray.surface == Surface::Ground && ray.across_m().abs() < 0.15;
+        for (k, b) in boxes.iter().enumerate() {
+            if !ground && near(&p, b) {
+                measured[k].push(p);
+            }
+        }
+    }
+    for ray in &frame.simulated {
+        if ray.surface != Surface::Object {
+            continue;
+        }
+        let point = origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m();
+        simulated[ray.object as usize].push(SurfacePoint { point, normal: ray.normal_vector() });
+    }
+    for (k, object) in objects.iter_mut().take(boxes.len()).enumerate() {
+        object.points = [measured[k].len(), simulated[k].len()];
+        object.shift = fit_shift(&boxes[k], &measured[k], &simulated[k]);
+    }
+}

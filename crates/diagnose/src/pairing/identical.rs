@@ -1,0 +1,178 @@
+//! Do the two sides show the same scenes? Each measured frame must fit its own simulated frame better than others.
+
+use super::frame::Sensors;
+use super::load;
+use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
+use super::surface::fit_surface;
+use crate::error::DiagnoseError;
+use data::{Dataset, Object};
+use nalgebra::Vector3;
+use rayon::prelude::*;
+
+/// What the comparison with other frames says.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Identity {
+    /// Whether the two sides show the same scenes.
+    pub identical: bool,
+    /// Why not, in words; empty where they do.
+    pub reason: String,
+    /// Frames whose own partner fits no better than strangers though those of the others do.
+    pub strangers: Vec<String>,
+}
+
+/// Frames that are compared.
+const FRAMES: usize = 16;
+
+/// Measured returns of a frame that are looked at.
+const RETURNS: usize = 1_500;
+
+/// Mean distance at which two frames show the same, whatever strangers do, m.
+const SAME_M: f64 = 0.05;
+
+/// Compares some measured frames with their own simulated frame, its neighbours and frames far away.
+pub fn check_identity(
+    measured: &Dataset,
+    simulated: &Dataset,
+    ids: &[String],
+    sensors: &Sensors,
+) -> Result<Identity, DiagnoseError> {
+    let n = ids.len();
+    if n < 2 {
+        return Ok(Identity { identical: true, reason: String::new(), strangers: vec![] });
+    }
+    let step = n.div_ceil(FRAMES).max(1);
+    let chosen: Vec<usize> = (0..n).step_by(step).collect();
+    let lags: Vec<i64> = [-2i64, -1, 1, 2].into_iter().filter(|l| l.unsigned_abs() < n as u64 / 4).collect();
+    let far: Vec<usize> = [n / 4, n / 2, (3 * n) / 4].into_iter().filter(|&k| k > 2 || n < 12 && k > 0).collect();
+    let rows: Vec<FrameScores> = chosen
+        .par_iter()
+        .map(|&i| {
+            let score = |j: usize| distance(measured, &ids[i], simulated, &ids[j], sensors);
+            let own = score(i)?;
+            let mut near = Vec::new();
+            for lag in &lags {
+                let j = i as i64 + lag;
+                near.push(if (0..n as i64).contains(&j) { Some(score(j as usize)?) } else { None });
+            }
+            let strangers = far.iter().map(|k| score((i + k) % n)).collect::<Result<Vec<_>, _>>()?;
+            Ok(FrameScores { frame: i, own, near, strangers })
+        })
+        .collect::<Result<_, DiagnoseError>>()?;
+    Ok(judge(&rows, &lags, ids))
+}
+
+struct FrameScores {
+    frame: usize,
+    own: f64,
+    near: Vec<Option<f64>>,
+    strangers: Vec<f64>,
+}
+
+fn judge(rows: &[FrameScores], lags: &[i64], ids: &[String]) -> Identity {
+    let beaten = |r: &FrameScores| r.own > SAME_M && r.strangers.iter().any(|s| *s <= r.own);
+    let fits = rows.iter().filter(|r| !beaten(r)).count();
+    let strangers: Vec<String> = rows.iter().filter(|r| beaten(r)).map(|r| ids[r.frame].clone()).collect();
+    let own_mean = rows.iter().map(|r| r.own).sum::<f64>() / rows.len() as f64;
+    // Among four by chance the own frame is nearest in a quarter of the cases.
+    if (fits as f64) < 0.7 * rows.len() as f64 {
+        return Identity {
+            identical: false,
+            reason: format!(
+                "not scenario-identical: of {} measured frames only {fits} fit the simulated frame of the same id better than frames of other ids (mean distance {own_mean:.2} m)",
+                rows.len()
+            ),
+            strangers,
+        };
+    }
+    for (k, lag) in lags.iter().enumerate() {
+        let both: Vec<(f64, f64)> = rows.iter().filter_map(|r| Some((r.own, r.near[k]?))).collect();
+        let better = both.iter().filter(|(own, near)| *near < 0.7 * own && *own > 2.0 * SAME_M).count();
+        if both.len() >= 4 && better as f64 > 0.7 * both.len() as f64 {
+            return Identity {
+                identical: false,
+                reason: format!(
+                    "not scenario-identical: measured frames fit the simulated frame {} places {} better than that of their own id ({better} of {})",
+                    lag.abs(),
+                    if *lag > 0 { "later" } else { "earlier" },
+                    both.len()
+                ),
+                strangers,
+            };
+        }
+    }
+    Identity { identical: true, reason: String::new(), strangers }
+}
+
+/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each; labels count like returns.
+fn distance(
+    measured: &Dataset,
+    measured_id: &str,
+    simulated: &Dataset,
+    simulated_id: &str,
+    sensors: &Sensors,
+) -> Result<f64, DiagnoseError> {
+    let ((a, labels_a), (b, labels_b)) = (load(measured, measured_id)?, load(simulated, simulated_id)?);
+    let scans_a = split_by_sensor(&a, &sensors.rig);
+    let scans_b = split_by_sensor(&b, &sensors.rig);
+    let total: usize = scans_a.iter().map(SensorScan::len).sum();
+    let stride = (total / RETURNS).max(1);
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (k, (a, b)) in scans_a.iter().zip(&scans_b).enumerate() {
+        let steps = sensors.patterns[k].steps;
+        let window = Steps { azimuth_rad: 2.2 * steps.azimuth_rad, elevation_rad: 1.4 * steps.elevation_rad };
+        let index = DirectionIndex::new(b, window, sensors.rig.sensors[k].closes());
+        let size = [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)];
+        for i in (0..a.len()).step_by(stride) {
+            let Some(s) = fit_surface(&index, size, a.azimuth_rad[i], a.elevation_rad[i], |_| true) else { continue };
+            // Far ground is the same in every frame; what stands is not.
+            let weight = if s.cos_incidence > 0.15 { 1.0 } else { 0.2 };
+            let off = ((f64::from(a.range_m[i]) - s.range_m) * s.cos_incidence).abs();
+            sum += weight * if s.misfit_m < sensors.edge_m { off.min(1.0) } else { (off - s.misfit_m).clamp(0.0, 1.0) };
+            count += weight;
+        }
+    }
+    let cloud = if count > 0.0 { sum / count } else { 1.0 };
+    Ok(cloud + 0.5 * label_distance(&labels_a, &labels_b))
+}
+
+/// Mean distance of each label from the nearest one of the other side, at most 4 m, in units of that.
+fn label_distance(a: &[Object], b: &[Object]) -> f64 {
+    if a.is_empty() && b.is_empty() {
+        return 0.0;
+    }
+    let nearest = |from: &[Object], to: &[Object]| -> f64 {
+        from.iter()
+            .map(|x| {
+                let d = |y: &Object| (Vector3::from(x.bbox.center) - Vector3::from(y.bbox.center)).norm();
+                to.iter().map(d).fold(4.0, f64::min)
+            })
+            .sum()
+    };
+    // Up to 1 m is no other scene.
+    let mean = (nearest(a, b) + nearest(b, a)) / (a.len() + b.len()) as f64;
+    (mean - 1.0).max(0.0) / 4.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rows(own: f64, near: f64, far: f64) -> Vec<FrameScores> {
+        (0..10)
+            .map(|i| FrameScores { frame: i, own, near: vec![Some(near)], strangers: vec![far, far * 1.1] })
+            .collect()
+    }
+
+    #[test]
+    fn own_frames_must_fit_best() {
+        let ids: Vec<String> = (0..10).map(|i| i.to_string()).collect();
+        assert!(judge(&rows(0.1, 0.2, 0.5), &[1], &ids).identical);
+        assert!(judge(&rows(0.01, 0.01, 0.01), &[1], &ids).identical, "nothing moves");
+        let shuffled = judge(&rows(0.5, 0.4, 0.4), &[1], &ids);
+        assert!(
+            !shuffled.identical && shuffled.reason.contains("not scenario-identical") && shuffled.strangers.len() == 10
+        );
+        let late = judge(&rows(0.3, 0.02, 0.5), &[1], &ids);
+        assert!(!late.identical && late.reason.contains("1 places later"), "{}", late.reason);
+    }
+}

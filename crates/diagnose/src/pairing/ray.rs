@@ -1,0 +1,90 @@
+//! One return with everything that is known of it.
+
+use nalgebra::{Point3, Vector3};
+
+/// What a ray meets in the simulation.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Surface {
+    /// A level surface below the sensor.
+    Ground,
+    /// Walls, posts, anything else that stands.
+    Standing,
+    /// A labelled object.
+    Object,
+    /// The simulation has no return around this direction.
+    Open,
+}
+
+/// A return of either side. Predictions are those of the simulated side's returns around its direction, for a simulated return without
+/// itself, so that both sides are looked at alike.
+#[derive(Clone, Copy, Debug)]
+pub struct Ray {
+    /// Number of the sensor.
+    pub sensor: u8,
+    /// What the simulation has in this direction.
+    pub surface: Surface,
+    /// The simulation has one smooth surface around this direction: no edge.
+    pub smooth: bool,
+    /// In a lower corner of the labelled object's box, where cars have wheels.
+    pub corner: bool,
+    /// The other side has a return in this direction, at whatever range.
+    pub matched: bool,
+    /// Row of the sensor; `u16::MAX` where rows are not known.
+    pub row: u16,
+    /// Number of the labelled object in the frame; `u16::MAX` for none.
+    pub object: u16,
+    /// In the sensor's frame, rad.
+    pub azimuth_rad: f32,
+    /// In the sensor's frame, rad.
+    pub elevation_rad: f32,
+    /// Predicted range, m; of a direction without a smooth surface the return's own.
+    pub range_m: f32,
+    /// Cosine of the angle of incidence on the predicted surface; 0 without one.
+    pub cos_incidence: f32,
+    /// Unit vector of the ray in the cloud's frame.
+    pub direction: [f32; 3],
+    /// Unit normal of the predicted surface in the cloud's frame, towards the sensor.
+    pub normal: [f32; 3],
+    /// Range minus predicted range, m.
+    pub residual_m: f32,
+    /// Variance of the prediction in units of that of one simulated range.
+    pub leverage: f32,
+    /// Range minus what the own side's returns around it predict, m; NaN where they do not.
+    pub roughness_m: f32,
+    /// Variance of that prediction in units of that of one range.
+    pub roughness_leverage: f32,
+    /// Nearest and farthest simulated return around the direction, m; 0 without any.
+    pub near_far_m: [f32; 2],
+}
+
+impl Ray {
+    /// Its own range, m.
+    pub fn own_range_m(&self) -> f64 {
+        f64::from(self.range_m) + f64::from(self.residual_m)
+    }
+
+    /// The predicted point in the cloud's frame, from the sensor's origin.
+    pub fn predicted_point(&self, origin: &Point3<f64>) -> Point3<f64> {
+        origin + self.direction_vector() * f64::from(self.range_m)
+    }
+
+    /// The direction as a vector.
+    pub fn direction_vector(&self) -> Vector3<f64> {
+        Vector3::from(self.direction.map(f64::from))
+    }
+
+    /// The normal as a vector.
+    pub fn normal_vector(&self) -> Vector3<f64> {
+        Vector3::from(self.normal.map(f64::from))
+    }
+
+    /// Distance of the return from the predicted surface, across it, m; positive on the sensor's side.
+    pub fn across_m(&self) -> f64 {
+        -f64::from(self.residual_m) * f64::from(self.cos_incidence)
+    }
+
+    /// ln(0.1 cos / R^2) - ln(0.1 / 250^2): 0 for a surface at 250 m met squarely.
+    pub fn signal(&self) -> f64 {
+        f64::from(self.cos_incidence.max(1e-4)).ln() + 2.0 * (250.0 / f64::from(self.range_m.max(0.1))).ln()
+    }
+}

@@ -1,0 +1,159 @@
+//! The surface around a direction, from the returns around it.
+//!
+//! A plane n . p = h seen from the origin along the unit direction u has the inverse range q = n . u / h: linear in u, so that a linear
+//! fit of q in the two angles is exact for planes up to second order of the window.
+
+use super::scan::{DirectionIndex, Entry};
+
+/// A local plane in inverse range.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LocalSurface {
+    /// Predicted range along the direction, m.
+    pub range_m: f64,
+    /// Change of range with azimuth times cos(elevation), and with elevation, m/rad.
+    pub slope_m_per_rad: [f64; 2],
+    /// Cosine of the angle of incidence.
+    pub cos_incidence: f64,
+    /// Variance of the prediction in units of the variance of one range.
+    pub leverage: f64,
+    /// Largest distance of a neighbour from the plane, across it, m.
+    pub misfit_m: f64,
+    /// Nearest and farthest neighbour, m.
+    pub near_far_m: [f64; 2],
+}
+
+/// At least that many neighbours make a surface.
+const FEWEST: usize = 5;
+
+/// Fits the surface around a direction; `keep` chooses the neighbours. `None` where there are too few, or they lie on a line.
+pub fn fit_surface(
+    index: &DirectionIndex,
+    window: [f64; 2],
+    az: f32,
+    el: f32,
+    keep: impl Fn(&Entry) -> bool,
+) -> Option<LocalSurface> {
+    // Offsets in windows, inverse range, weight.
+    let mut near = [[0.0f64; 4]; 32];
+    let mut n = 0;
+    index.around(az, el, |entry, dx, dy| {
+        if n < near.len() && keep(entry) {
+            let (dx, dy) = (f64::from(dx), f64::from(dy));
+            let weight = (1.0 - 0.7 * (dx * dx + dy * dy).min(1.2)).max(0.05);
+            near[n] = [dx, dy, 1.0 / f64::from(entry.range_m), weight];
+            n += 1;
+        }
+    });
+    if n < FEWEST {
+        return None;
+    }
+    let near = &near[..n];
+    let mut s = [0.0f64; 9]; // w, wx, wy, wxx, wxy, wyy, wq, wxq, wyq
+    for [x, y, q, w] in near {
+        for (sum, v) in s.iter_mut().zip([1.0, *x, *y, x * x, x * y, y * y, *q, x * q, y * q]) {
+            *sum += w * v;
+        }
+    }
+    let (mx, my, mq) = (s[1] / s[0], s[2] / s[0], s[6] / s[0]);
+    let (xx, xy, yy) = (s[3] - s[0] * mx * mx, s[4] - s[0] * mx * my, s[5] - s[0] * my * my);
+    let (xq, yq) = (s[7] - s[0] * mx * mq, s[8] - s[0] * my * mq);
+    let det = xx * yy - xy * xy;
+    // Neighbours on both sides in both angles, or the plane is a guess.
+    if xx < 0.02 * s[0] || yy < 0.02 * s[0] || det < 0.1 * xx * yy || mx.abs() > 0.6 || my.abs() > 0.6 {
+        return None;
+    }
+    let (bx, by) = ((yy * xq - xy * yq) / det, (xx * yq - xy * xq) / det);
+    let q0 = mq - bx * mx - by * my;
+    if q0 <= 1e-4 {
+        return None;
+    }
+    let range = 1.0 / q0;
+    // Effective weights: derivative of q0 by each q.
+    let (mut leverage, mut misfit) = (0.0f64, 0.0f64);
+    let mut near_far = [f64::INFINITY, 0.0f64];
+    let (gx, gy) = (bx / window[0] / f64::from(el.cos()), by / window[1]);
+    let cos = 1.0 / (1.0 + (gx * gx + gy * gy) * range * range).sqrt();
+    for [x, y, q, w] in near {
+        let (cx, cy) = (x - mx, y - my);
+        let from_slope = mx * (yy * cx - xy * cy) / det + my * (xx * cy - xy * cx) / det;
+        let share = w * (1.0 / s[0] - from_slope);
+        // A range's error dR is one of q^2 dR of inverse range.
+        leverage += (share * (q / q0).powi(2)).powi(2);
+        let predicted = q0 + bx * x + by * y;
+        let off = if predicted > 1e-4 { (1.0 / q - 1.0 / predicted).abs() } else { f64::INFINITY };
+        misfit = misfit.max(off * cos * (1.0 / predicted.max(1e-4)).min(range) / range.max(1.0 / predicted.max(1e-4)));
+        near_far = [near_far[0].min(1.0 / q), near_far[1].max(1.0 / q)];
+    }
+    Some(LocalSurface {
+        range_m: range,
+        slope_m_per_rad: [-gx * range * range, -gy * range * range],
+        cos_incidence: cos,
+        leverage,
+        misfit_m: misfit,
+        near_far_m: near_far,
+    })
+}
+
+impl LocalSurface {
+    /// Unit normal towards the sensor, in the basis (along the ray, along growing azimuth, along growing elevation).
+    pub fn normal(&self) -> [f64; 3] {
+        let c = self.cos_incidence;
+        [-c, c * self.slope_m_per_rad[0] / self.range_m, c * self.slope_m_per_rad[1] / self.range_m]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::scan::{SensorScan, Steps};
+    use super::*;
+    use nalgebra::Vector3;
+
+    fn direction(az: f64, el: f64) -> Vector3<f64> {
+        Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
+    }
+
+    /// A plane n . p = h seen by a grid of rays.
+    fn plane(normal: Vector3<f64>, h: f64, step: f64) -> (DirectionIndex, [f64; 2]) {
+        let mut scan = SensorScan::default();
+        for i in -10..10 {
+            for j in -10..10 {
+                let (az, el) = (0.3 + i as f64 * step, -0.1 + j as f64 * 2.0 * step);
+                let range = h / normal.dot(&direction(az, el));
+                if range > 0.0 {
+                    scan.azimuth_rad.push(az as f32);
+                    scan.elevation_rad.push(el as f32);
+                    scan.range_m.push(range as f32);
+                }
+            }
+        }
+        let window = [2.1 * step, 2.6 * step];
+        let steps = Steps { azimuth_rad: window[0] as f32, elevation_rad: window[1] as f32 };
+        (DirectionIndex::new(&scan, steps, false), window)
+    }
+
+    #[test]
+    fn planes_are_predicted_between_the_rays() {
+        for (normal, h) in [(Vector3::new(0.0, 0.0, -1.0), 1.5), (Vector3::new(0.8, 0.6, 0.0), 20.0)] {
+            let (index, window) = plane(normal, h, 0.004);
+            let (az, el) = (0.3017f64, -0.1031f64);
+            let s = fit_surface(&index, window, az as f32, el as f32, |_| true).unwrap();
+            let u = direction(f64::from(az as f32), f64::from(el as f32));
+            let range = h / normal.dot(&u);
+            assert!((s.range_m - range).abs() < 2e-3, "{} {range}", s.range_m);
+            assert!((s.cos_incidence / normal.dot(&u).abs() - 1.0).abs() < 0.01);
+            assert!(s.misfit_m < 1e-2 && s.leverage < 0.5, "{s:?}");
+            let side = Vector3::new(-az.sin(), az.cos(), 0.0);
+            let up = u.cross(&side);
+            let [a, b, c] = s.normal();
+            let n = u * a + side * b + up * c;
+            assert!((n + normal).norm() < 0.02, "{n} {normal}");
+        }
+    }
+
+    #[test]
+    fn an_edge_misfits_and_a_line_is_no_surface() {
+        let (index, window) = plane(Vector3::x(), 10.0, 0.004);
+        let far = fit_surface(&index, window, 0.3, -0.1, |e| e.elevation_rad > -0.104 && e.elevation_rad < -0.096);
+        assert!(far.is_none());
+    }
+}

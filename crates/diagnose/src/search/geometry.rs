@@ -1,0 +1,395 @@
+//! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
+
+mod finding;
+
+use finding::*;
+
+use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
+use crate::channels::groups::{GroupFrame, GroupSums, Grouping, group_frames, place_of, total};
+use crate::channels::mean::{
+    Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
+};
+use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
+use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
+use crate::inference::roles::Role;
+use nalgebra::{SVector, Vector3};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
+const FLOOR_OFFSET_M: f64 = 0.01;
+const FLOOR_TURN_RAD: f64 = 3.5e-4;
+const FLOOR_SHIFT_M: f64 = 0.02;
+/// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
+const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
+
+/// What may be wrong.
+#[derive(Clone, Debug, PartialEq)]
+enum Suspect {
+    Linear { name: &'static str, columns: Vec<usize> },
+    Groups { name: &'static str, grouping: Grouping, column: usize },
+}
+
+/// Everything that candidates are weighed on.
+struct Sums {
+    columns: Vec<Column>,
+    precision: Vec<f64>,
+    base: Vec<usize>,
+    linear: Vec<LinearFrame>,
+    rows: Vec<GroupFrame>,
+    strips: Vec<GroupFrame>,
+}
+
+/// The search.
+pub fn search(context: &Context) -> ChannelResult {
+    let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
+    let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
+    let sums = sums(context, &select);
+    let blocks = context.blocks(&select);
+    let returns = context.returns(&select);
+    let demands = first_demands();
+    let all = suspects(context, &sums.columns);
+    let mut chosen: Vec<Suspect> = Vec::new();
+    let mut stories = Vec::new();
+    let mut first_gain = 0.0f64;
+    for step in 0..2 {
+        let candidates: Vec<&Suspect> = all.iter().filter(|s| may_join(s, &chosen)).collect();
+        let before = gains(&sums, &select, &blocks, &chosen);
+        let trials: Vec<Trial> = candidates
+            .par_iter()
+            .enumerate()
+            .map(|(k, suspect)| {
+                let with: Vec<Suspect> = chosen.iter().cloned().chain([(*suspect).clone()]).collect();
+                let mut g = gains(&sums, &select, &blocks, &with);
+                g.iter_mut().zip(&before).for_each(|(g, b)| *g -= b);
+                Trial {
+                    candidate: k,
+                    name: suspect.name().into(),
+                    parameters: suspect.parameters(),
+                    gains: g,
+                    above_floor: above_floor(&sums, &select, &blocks, &with),
+                }
+            })
+            .collect();
+        let demands = if step == 0 { demands } else { Demands { nats: (0.1 * first_gain).max(8.0), ..demands } };
+        let choice = choose(&trials, &demands);
+        result.considered.extend(record(&trials, choice.as_ref(), "residuals", returns, &demands));
+        if step == 0 {
+            result.minimum = minimum(&sums, &select, &blocks);
+        }
+        let Some(choice) = choice else { break };
+        let t = &trials[choice.chosen];
+        first_gain = total_and_z(&t.gains).0;
+        let mut equals: Vec<String> = choice.equals.iter().map(|&i| trials[i].name.clone()).collect();
+        equals.sort();
+        equals.dedup();
+        stories.push((equals, confidence(&trials, &blocks, &t.name, &demands)));
+        chosen.push(candidates[t.candidate].clone());
+    }
+    let estimate_blocks = context.blocks(&estimate);
+    for (k, (equals, confidence)) in stories.into_iter().enumerate() {
+        let alone = &chosen[k];
+        let held: Vec<f64> =
+            hold_out.iter().map(|&f| told(&sums, &estimate, &estimate_blocks, alone, &chosen, f)).collect();
+        result.found.push(found(context, &sums, &estimate, &estimate_blocks, alone, &chosen, equals, confidence, held));
+    }
+    for (i, &f) in hold_out.iter().enumerate() {
+        let gain: f64 = chosen.iter().map(|s| told(&sums, &estimate, &estimate_blocks, s, &chosen, f)).sum();
+        let best = best_gain(&sums, f);
+        // What the best fit of this very frame explains stands for what could be told at all.
+        result.distance[i] = [best, (best - gain).max(0.0), 0.5 * sums.columns.len() as f64];
+    }
+    result
+}
+
+impl Suspect {
+    fn name(&self) -> &'static str {
+        match self {
+            Suspect::Linear { name, .. } | Suspect::Groups { name, .. } => name,
+        }
+    }
+
+    fn parameters(&self) -> usize {
+        match self {
+            Suspect::Linear { columns, .. } => columns.len(),
+            Suspect::Groups { grouping: Grouping::Row, .. } => 12,
+            Suspect::Groups { .. } => 14,
+        }
+    }
+}
+
+fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
+    let at = |c: Column| columns.iter().position(|x| *x == c);
+    let pick = |list: &[Column]| list.iter().filter_map(|c| at(*c)).collect::<Vec<_>>();
+    let linear = |name, list: &[Column]| Suspect::Linear { name, columns: pick(list) };
+    let mut all = vec![
+        linear("range_bias", &[Column::RangeOffset]),
+        linear("range_bias", &[Column::RangeScale]),
+        linear("range_bias", &[Column::RangeOffset, Column::RangeScale]),
+        linear("pitch_roll", &[Column::Pose(1)]),
+        linear("pitch_roll", &[Column::Pose(0)]),
+        linear("pitch_roll", &[Column::Pose(0), Column::Pose(1)]),
+        linear("rolling_shutter", &[Column::Sweep(0)]),
+        linear("rolling_shutter", &[Column::Sweep(0), Column::Sweep(2)]),
+    ];
+    if context.rig.sensors.len() > 1 {
+        for s in 0..context.rig.sensors.len() {
+            for k in 0..3 {
+                all.push(linear("sensor_extrinsics", &[Column::SensorPose(s, k)]));
+            }
+            all.push(linear("sensor_extrinsics", &[0, 1, 2].map(|k| Column::SensorPose(s, k))));
+            all.push(linear("sensor_extrinsics", &[3, 4, 5].map(|k| Column::SensorPose(s, k))));
+            all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(|k| Column::SensorPose(s, k))));
+        }
+    } else {
+        for k in 0..3 {
+            all.push(linear("sensor_extrinsics", &[Column::Pose(k)]));
+        }
+        all.push(linear("sensor_extrinsics", &[0, 1, 2].map(Column::Pose)));
+        all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(Column::Pose)));
+    }
+    all.push(Suspect::Groups { name: "beam_range_offset", grouping: Grouping::Row, column: 0 });
+    all.push(Suspect::Groups { name: "beam_elevation_offset", grouping: Grouping::Row, column: 1 });
+    all.push(Suspect::Groups { name: UNNAMED, grouping: Grouping::Azimuth, column: 0 });
+    all
+}
+
+/// Name among the trials of what depends on azimuth: no cause of the catalogue.
+const UNNAMED: &str = "unexplained";
+
+fn may_join(suspect: &Suspect, chosen: &[Suspect]) -> bool {
+    chosen.iter().all(|c| {
+        let grouped = |s: &Suspect| matches!(s, Suspect::Groups { .. });
+        c.name() != suspect.name() && !(grouped(c) && grouped(suspect))
+    })
+}
+
+fn sums(context: &Context, select: &[usize]) -> Sums {
+    let (frames, rig) = (context.frames, context.rig);
+    let origins = origins(rig);
+    let noise_m = usual_noise_m(frames);
+    let poses: Vec<OwnPoses> = frames.par_iter().map(|f| own_poses(f, &origins, noise_m)).collect();
+    let design = design_effect(frames, &origins, &poses, noise_m);
+    let columns = columns(rig);
+    let means: Vec<MeanFrame> = mean_frames(frames, rig, &columns, &poses, noise_m, design);
+    let prior = pose_scatter(&poses, select);
+    let linear: Vec<LinearFrame> = means
+        .iter()
+        .map(|m| {
+            let (gram, right) = m.without_own_pose(&prior);
+            LinearFrame { gram, right }
+        })
+        .collect();
+    let precision: Vec<f64> = columns
+        .iter()
+        .map(|c| {
+            let sd: f64 = match c {
+                Column::RangeOffset => 0.5,
+                Column::RangeScale => 0.02,
+                Column::Pose(k) | Column::SensorPose(_, k) => {
+                    if *k < 3 {
+                        0.035
+                    } else {
+                        0.2
+                    }
+                }
+                Column::Sweep(k) => {
+                    if *k < 2 {
+                        8.0
+                    } else {
+                        0.2
+                    }
+                }
+                Column::Structure(_) => STRUCTURE_M,
+            };
+            1.0 / (sd * sd)
+        })
+        .collect();
+    let base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
+    let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
+    let structure = fit(&selected, &context.blocks(select), &base, &precision);
+    let structure = [structure.theta[0], structure.theta[1], structure.theta[2]];
+    let groups = |g| group_frames(frames, rig, &poses, structure, g, noise_m, design);
+    Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear }
+}
+
+/// Variances of the frames' own poses, robust, about the mean of each sensor.
+fn pose_scatter(poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 6> {
+    let least = SVector::<f64, 6>::from([2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4]);
+    SVector::from_fn(|k, _| {
+        let mut deviations = Vec::new();
+        for sensor in 0..poses.first().map_or(0, Vec::len) {
+            let mut values: Vec<f64> = select.iter().map(|&f| poses[f][sensor][k]).collect();
+            values.sort_by(f64::total_cmp);
+            let middle = values[values.len() / 2];
+            deviations.extend(values.iter().map(|v| (v - middle).abs()));
+        }
+        deviations.sort_by(f64::total_cmp);
+        let sd = deviations.get(deviations.len() / 2).copied().unwrap_or(0.0) / 0.6745;
+        (sd * sd).max(least[k] * least[k])
+    })
+}
+
+fn split(suspects: &[Suspect]) -> (Vec<usize>, Vec<(Grouping, usize)>) {
+    let mut columns: Vec<usize> = Vec::new();
+    let mut groups = Vec::new();
+    for s in suspects {
+        match s {
+            Suspect::Linear { columns: own, .. } => {
+                for &c in own {
+                    if !columns.contains(&c) {
+                        columns.push(c);
+                    }
+                }
+            }
+            Suspect::Groups { grouping, column, .. } => groups.push((*grouping, *column)),
+        }
+    }
+    (columns, groups)
+}
+
+/// Gains over structures that are a little wrong, fitted on other folds.
+fn gains(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> Vec<f64> {
+    let (columns, groups) = split(suspects);
+    let mut out = vec![0.0; select.len()];
+    if !columns.is_empty() {
+        let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
+        let with: Vec<usize> = sums.base.iter().chain(&columns).copied().collect();
+        let base = cross_gains(&frames, blocks, &sums.base, &sums.precision);
+        let all = cross_gains(&frames, blocks, &with, &sums.precision);
+        (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
+    }
+    for (grouping, column) in groups {
+        let frames = grouped(sums, grouping);
+        let folds = fold_of(blocks);
+        for fold in 0..FOLDS {
+            let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]);
+            let offsets = offsets(&total(train), column);
+            for i in (0..select.len()).filter(|&i| folds[i] == fold) {
+                out[i] += group_gain(&frames[select[i]], column, &offsets);
+            }
+        }
+    }
+    out
+}
+
+fn grouped(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
+    if grouping == Grouping::Row { &sums.rows } else { &sums.strips }
+}
+
+/// Prior spread of offsets: 10 cm, 0.3 degrees.
+fn group_precision(column: usize) -> f64 {
+    [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column]
+}
+
+/// Offset of each group; what all have in common belongs to other causes.
+fn offsets(sums: &BTreeMap<u32, GroupSums>, column: usize) -> BTreeMap<u32, f64> {
+    let precision = group_precision(column);
+    let mut out: BTreeMap<u32, f64> = sums.iter().map(|(k, s)| (*k, s.offset(column, precision))).collect();
+    let (mut sum, mut weight) = (0.0, 0.0);
+    for (k, s) in sums {
+        let w = s.gram[2 * column].min(1e4 * precision);
+        sum += w * out[k];
+        weight += w;
+    }
+    let mean = if weight > 0.0 { sum / weight } else { 0.0 };
+    out.values_mut().for_each(|v| *v -= mean);
+    out
+}
+
+fn group_gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> f64 {
+    frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
+}
+
+/// Root mean square of the offsets beyond what their errors make.
+fn spread(sums: &BTreeMap<u32, GroupSums>, column: usize) -> (f64, f64) {
+    let offsets = offsets(sums, column);
+    let (mut square, mut noise, mut n) = (0.0, 0.0, 0.0);
+    for (k, s) in sums {
+        let g = s.gram[2 * column];
+        if g > 3.0 * group_precision(column) {
+            square += offsets[k].powi(2);
+            noise += 1.0 / g;
+            n += 1.0;
+        }
+    }
+    if n < 4.0 { (0.0, 0.0) } else { (((square - noise) / n).max(0.0).sqrt(), n) }
+}
+
+fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
+    let Some(last) = suspects.last() else { return false };
+    match last {
+        Suspect::Groups { grouping, column, .. } => {
+            let frames = grouped(sums, *grouping);
+            let floor = FLOOR_GROUPS[if *grouping == Grouping::Row { *column } else { 2 }];
+            spread(&total(select.iter().map(|&i| &frames[i])), *column).0 > floor
+        }
+        Suspect::Linear { columns, .. } => {
+            let fitted = fit_all(sums, select, blocks, suspects);
+            fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
+                columns.contains(c)
+                    && t.abs()
+                        > match sums.columns[*c] {
+                            Column::RangeOffset => FLOOR_OFFSET_M,
+                            Column::RangeScale => 3e-4,
+                            Column::Pose(k) | Column::SensorPose(_, k) => {
+                                if k < 3 {
+                                    FLOOR_TURN_RAD
+                                } else {
+                                    FLOOR_SHIFT_M
+                                }
+                            }
+                            Column::Sweep(k) => {
+                                if k < 2 {
+                                    0.3
+                                } else {
+                                    0.01
+                                }
+                            }
+                            Column::Structure(_) => f64::INFINITY,
+                        }
+            })
+        }
+    }
+}
+
+fn fit_all(sums: &Sums, frames: &[usize], blocks: &[usize], suspects: &[Suspect]) -> LinearFit {
+    let (columns, _) = split(suspects);
+    let with: Vec<usize> = sums.base.iter().chain(&columns).copied().collect();
+    let frames: Vec<&LinearFrame> = frames.iter().map(|&i| &sums.linear[i]).collect();
+    fit(&frames, blocks, &with, &sums.precision)
+}
+
+/// Gain of one frame by one of the chosen, fitted on `estimate`.
+fn told(sums: &Sums, estimate: &[usize], blocks: &[usize], suspect: &Suspect, chosen: &[Suspect], frame: usize) -> f64 {
+    match suspect {
+        Suspect::Linear { columns, .. } => {
+            let fitted = fit_all(sums, estimate, blocks, chosen);
+            let mut without = fitted.clone();
+            for (i, c) in fitted.columns.iter().enumerate() {
+                if columns.contains(c) {
+                    without.theta[i] = 0.0;
+                }
+            }
+            fitted.gain(&sums.linear[frame]) - without.gain(&sums.linear[frame])
+        }
+        Suspect::Groups { grouping, column, .. } => {
+            let frames = grouped(sums, *grouping);
+            let offsets = offsets(&total(estimate.iter().map(|&i| &frames[i])), *column);
+            group_gain(&frames[frame], *column, &offsets)
+        }
+    }
+}
+
+/// What could be told of a frame at all: the best of its own fits.
+fn best_gain(sums: &Sums, frame: usize) -> f64 {
+    let alone = [&sums.linear[frame]];
+    let all: Vec<usize> = (0..sums.columns.len()).collect();
+    let linear = fit(&alone, &[0], &all, &sums.precision).gain(alone[0]).max(0.0);
+    let groups = [(Grouping::Row, 0), (Grouping::Row, 1), (Grouping::Azimuth, 0)].map(|(g, c)| {
+        let frames = grouped(sums, g);
+        group_gain(&frames[frame], c, &offsets(&total([&frames[frame]].into_iter()), c)).max(0.0)
+    });
+    linear + groups.into_iter().fold(0.0, f64::max)
+}

@@ -1,0 +1,290 @@
+//! Noise: are measured returns rougher than simulated ones, and on what does it depend?
+
+use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
+use crate::channels::roughness::{RoughFrame, rough_frames, scales, total};
+use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
+use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
+use crate::inference::noise::{NOISE_LAWS, NoiseLaw, NoiseTable};
+use crate::inference::roles::Role;
+
+/// Smaller standard deviations along the ray are not spoken of, m.
+const FLOOR_M: f64 = 0.003;
+
+/// Nor jitter of directions below this, rad.
+const FLOOR_RAD: f64 = 1.7e-4;
+
+/// Nor variances that grow by less than this share over the places that matter.
+const FLOOR_SHARE: f64 = 0.04;
+
+/// The search; `known` lists variances that other findings explain already (a step of rounding).
+pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
+    let scales = scales(context.frames);
+    let rough = rough_frames(context.frames, &scales);
+    let mut result = ChannelResult::default();
+    let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
+    let blocks = context.blocks(&select);
+    let table = NoiseTable::new(total(select.iter().map(|&i| &rough[i])));
+    let linear: Vec<LinearFrame> = select.iter().map(|&i| explained(&table, &rough[i], known)).collect();
+    let frames: Vec<&LinearFrame> = linear.iter().collect();
+    let precision = vec![0.0; NOISE_LAWS.len()];
+    let whole = |columns: &[usize]| fit(&frames, &blocks, columns, &precision);
+    let trial = |columns: &[usize], before: Option<&[f64]>| {
+        let fitted = whole(columns);
+        let last = columns.len() - 1;
+        let law = NOISE_LAWS[columns[last]];
+        let mut gains = cross_gains(&frames, &blocks, columns, &precision);
+        if let Some(before) = before {
+            gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
+        }
+        Trial {
+            candidate: columns[last],
+            name: law.name().into(),
+            parameters: law.parameters(),
+            gains,
+            above_floor: above_floor(&table, law, fitted.theta[last]),
+        }
+    };
+    let demands = first_demands();
+    let trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| trial(&[k], None)).collect();
+    let choice = choose(&trials, &demands);
+    let returns = context.returns(&select);
+    result.considered = record(&trials, choice.as_ref(), "roughness", returns, &demands);
+    let constant = whole(&[0]);
+    result.minimum.push((
+        "range_noise".into(),
+        Minimum {
+            parameter: "sigma_m".into(),
+            value: (Z_STAR * constant.error(0)).sqrt().max(FLOOR_M),
+            unit: "m".into(),
+        },
+    ));
+    let angular = whole(&[1]);
+    result.minimum.push((
+        "angular_jitter".into(),
+        Minimum {
+            parameter: "sigma_deg".into(),
+            value: (Z_STAR * angular.error(0)).sqrt().max(FLOOR_RAD).to_degrees(),
+            unit: "deg".into(),
+        },
+    ));
+    let mut chosen = Vec::new();
+    let mut stories = Vec::new();
+    if let Some(first) = &choice {
+        let t = &trials[first.chosen];
+        chosen.push(t.candidate);
+        let equals: Vec<String> = unique(first.equals.iter().map(|&i| trials[i].name.clone()));
+        stories.push((equals, confidence(&trials, &blocks, &t.name, &demands)));
+        // A second one must be of another kind and bring a good part of what the first brought.
+        let (first_gain, _) = total_and_z(&t.gains);
+        let second_demands = Demands { nats: (0.05 * first_gain).max(8.0), ..demands };
+        let rivals: Vec<Trial> = (0..NOISE_LAWS.len())
+            .filter(|&k| NOISE_LAWS[k].name() != NOISE_LAWS[t.candidate].name())
+            .map(|k| trial(&[t.candidate, k], Some(&t.gains)))
+            .collect();
+        let second = choose(&rivals, &second_demands);
+        result.considered.extend(record(&rivals, second.as_ref(), "roughness", returns, &second_demands));
+        if let Some(second) = second {
+            let t = &rivals[second.chosen];
+            chosen.push(t.candidate);
+            let equals = unique(second.equals.iter().map(|&i| rivals[i].name.clone()));
+            stories.push((equals, confidence(&rivals, &blocks, &t.name, &second_demands)));
+        }
+    }
+    // Parameters from other frames.
+    let table_e = NoiseTable::new(total(estimate.iter().map(|&i| &rough[i])));
+    let linear_e: Vec<LinearFrame> = estimate.iter().map(|&i| explained(&table_e, &rough[i], known)).collect();
+    let fitted = fit(&linear_e.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &chosen, &precision);
+    let table_h = NoiseTable::new(total(hold_out.iter().map(|&i| &rough[i])));
+    let terms: Vec<(NoiseLaw, f64)> = known
+        .iter()
+        .copied()
+        .chain(chosen.iter().zip(fitted.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)))
+        .collect();
+    for (k, (equals, confidence)) in stories.into_iter().enumerate() {
+        let without: Vec<_> =
+            terms.iter().enumerate().filter(|(i, _)| *i != known.len() + k).map(|(_, t)| *t).collect();
+        let gains =
+            hold_out.iter().map(|&i| table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &without));
+        result.found.push(found(
+            NOISE_LAWS[chosen[k]],
+            &fitted,
+            k,
+            equals,
+            confidence,
+            gains.collect(),
+            &table_h,
+            &terms,
+        ));
+    }
+    result.distance = hold_out.iter().map(|&i| distance(&table_h, &rough[i], &terms)).collect();
+    result
+}
+
+/// Sums of a frame after the variance that is explained already.
+fn explained(table: &NoiseTable, frame: &RoughFrame, known: &[(NoiseLaw, f64)]) -> LinearFrame {
+    let mut laws = NOISE_LAWS.to_vec();
+    laws.extend(known.iter().map(|k| k.0));
+    let all = table.linear(frame, &laws);
+    let n = NOISE_LAWS.len();
+    let mut right = all.right.rows(0, n).into_owned();
+    for (j, (_, theta)) in known.iter().enumerate() {
+        right -= all.gram.view((0, n + j), (n, 1)) * *theta;
+    }
+    LinearFrame { gram: all.gram.view((0, 0), (n, n)).into_owned(), right }
+}
+
+fn above_floor(table: &NoiseTable, law: NoiseLaw, theta: f64) -> bool {
+    // Where the law says most, in units of what is there anyhow.
+    let (mut share, mut along, mut n) = (0.0, 0.0, 0.0);
+    for (range, cos, returns, [_, vb]) in table.rows() {
+        let added = theta.abs() * law.variance(range, cos);
+        let w = returns / vb;
+        share += returns * (added / vb).min(1.0);
+        along += w * added;
+        n += returns;
+    }
+    let typical = table.rows().iter().map(|r| r.2 / r.3[1]).sum::<f64>();
+    let enough = match law {
+        NoiseLaw::Angular => theta.abs().sqrt() > FLOOR_RAD,
+        _ => (along / typical.max(1e-12)).sqrt() > FLOOR_M,
+    };
+    enough && share / n.max(1.0) > FLOOR_SHARE
+}
+
+/// Kullback-Leibler distance of a frame's roughness, before and after, and of an independent draw: half a nat a cell.
+fn distance(table: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -> [f64; 3] {
+    let best: f64 = frame
+        .iter()
+        .filter_map(|(i, cell)| {
+            table.variances(*i as usize)?;
+            let n = cell.measured.n / 2.0;
+            (n > 0.0).then(|| -0.5 * n * (cell.variances()[0].max(1e-12).ln() + 1.0))
+        })
+        .sum();
+    let cells = frame.iter().filter(|(i, c)| table.variances(*i as usize).is_some() && c.measured.n > 0.0).count();
+    [best - table.likelihood(frame, &[]), best - table.likelihood(frame, terms), 0.55 * cells as f64]
+}
+
+fn unique(names: impl Iterator<Item = String>) -> Vec<String> {
+    let mut all: Vec<String> = names.collect();
+    all.sort();
+    all.dedup();
+    all
+}
+
+#[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
+fn found(
+    law: NoiseLaw,
+    fitted: &LinearFit,
+    k: usize,
+    equals: Vec<String>,
+    confidence: f64,
+    held_out_gains: Vec<f64>,
+    table: &NoiseTable,
+    terms: &[(NoiseLaw, f64)],
+) -> Found {
+    let (theta, error) = (fitted.theta[k], fitted.error(k));
+    let sigma = theta.signum() * theta.abs().sqrt();
+    // The form of the truth may differ: two per cent of the value on top.
+    let sigma_error = (error / (2.0 * theta.abs().sqrt()).max(1e-9)).hypot(0.02 * sigma);
+    let mut parameters = Vec::new();
+    let (covariate, says) = match law {
+        NoiseLaw::Constant => {
+            parameters.push(parameter("sigma_m", sigma, sigma_error, "m"));
+            parameters.push(parameter("growth_per_m", 0.0, 0.002, "1/m"));
+            (
+                "none".to_owned(),
+                format!(
+                    "measured ranges scatter by {:.1} cm more than simulated ones, everywhere alike",
+                    sigma * 100.0
+                ),
+            )
+        }
+        NoiseLaw::Growing(g) => {
+            parameters.push(parameter("sigma_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
+            parameters.push(parameter("growth_per_m", g, 0.5 * g, "1/m"));
+            let at = |r: f64| sigma * (1.0 + g * r) * 100.0;
+            (
+                "range_m".into(),
+                format!(
+                    "measured ranges scatter more than simulated ones, and more with range: by {:.1} cm at 10 m, {:.1} cm at 50 m",
+                    at(10.0),
+                    at(50.0)
+                ),
+            )
+        }
+        NoiseLaw::Signal(gamma) => {
+            parameters.push(parameter("sigma_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
+            parameters.push(parameter("gamma", gamma, 0.3 * gamma, "1"));
+            (
+                "signal".into(),
+                format!("measured ranges scatter more where the signal is weak: by {:.1} cm at u = 4", sigma * 100.0),
+            )
+        }
+        NoiseLaw::Angular => {
+            let deg = f64::to_degrees;
+            parameters.push(parameter("sigma_deg", deg(sigma), deg(sigma_error), "deg"));
+            (
+                "range_m * tan(incidence)".into(),
+                format!(
+                    "the light goes elsewhere than the sensor says, by {:.3} degrees: grazing surfaces scatter, squarely met ones do not",
+                    deg(sigma)
+                ),
+            )
+        }
+    };
+    let name = law.name().to_owned();
+    let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
+    let separate_by = (!equals.is_empty()).then(|| "surfaces met squarely and at grazing angles at the same range (a wall or a board beside the road, near and far)".to_owned());
+    Found {
+        status,
+        causes: std::iter::once(name).chain(equals).collect(),
+        family: "range_error",
+        parameters,
+        confidence,
+        channel: "roughness",
+        covariate,
+        held_out_gains,
+        says,
+        separate_by,
+        curve: curve(table, law, terms),
+    }
+}
+
+/// Standard deviation along what the law depends on.
+fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]) -> Curve {
+    let angular = law == NoiseLaw::Angular;
+    let x_of = |range: f64, cos: f64| if angular { range * (1.0 / (cos * cos) - 1.0).max(0.0).sqrt() } else { range };
+    let mut rows: Vec<(f64, f64, f64, f64, f64)> = table
+        .rows()
+        .into_iter()
+        .map(|(range, cos, n, [va, vb])| {
+            let added: f64 = terms.iter().map(|(l, t)| t * l.variance(range, cos)).sum();
+            (x_of(range, cos), n, va, vb, (vb + added).max(0.0))
+        })
+        .collect();
+    rows.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let per = (rows.iter().map(|r| r.1).sum::<f64>() / 14.0).max(1.0);
+    let mut points = Vec::new();
+    let mut sum = [0.0f64; 5];
+    for (i, (x, n, va, vb, vc)) in rows.iter().enumerate() {
+        for (s, v) in sum.iter_mut().zip([1.0, *x, *va, *vb, *vc]) {
+            *s += n * v;
+        }
+        if sum[0] >= per || i + 1 == rows.len() && sum[0] > 0.2 * per {
+            let [n, x, va, vb, vc] = sum;
+            let sd = |v: f64| (v / n).sqrt();
+            points.push(CurvePoint {
+                x: x / n,
+                measured: sd(va),
+                before: sd(vb),
+                after: sd(vc),
+                error: sd(va) / n.sqrt(),
+            });
+            sum = [0.0; 5];
+        }
+    }
+    let x = if angular { "range x tan(incidence), m" } else { "range, m" };
+    Curve { x: x.into(), y: "standard deviation along the ray, m".into(), points }
+}

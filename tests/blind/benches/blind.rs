@@ -1,0 +1,136 @@
+//! The large blind set: many cases with something hidden, or nothing; each result is written as soon as it is there, so that a stopped
+//! run goes on.
+//!
+//! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N] [--shots N]
+//! [--out DIR] [--show] [--keep DIR]`
+
+use data::Dataset;
+use diagnose::{Options, SensorRig, diagnose};
+use lidarshift_blind::score::{Outcome, score, summarise};
+use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
+use rand::RngExt;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+struct Arguments {
+    kinds: Vec<String>,
+    cases: u64,
+    first: u64,
+    size: CaseSize,
+    out: PathBuf,
+    show: bool,
+    keep: Option<PathBuf>,
+}
+
+fn arguments() -> Arguments {
+    let mut out = Arguments {
+        kinds: vec![],
+        cases: 200,
+        first: 1,
+        size: CaseSize::USUAL,
+        out: PathBuf::from("bench/blind"),
+        show: false,
+        keep: None,
+    };
+    let mut words = std::env::args().skip(1);
+    while let Some(word) = words.next() {
+        let mut value = || words.next().unwrap_or_else(|| panic!("{word} wants a value"));
+        match word.as_str() {
+            "--kind" => out.kinds.push(value()),
+            "--cases" => out.cases = value().parse().expect("a number of cases"),
+            "--first" => out.first = value().parse().expect("a seed"),
+            "--frames" => out.size.frames = value().parse().expect("a number of frames"),
+            "--shots" => out.size.shots = value().parse().expect("a number of shots"),
+            "--out" => out.out = value().into(),
+            "--keep" => out.keep = Some(value().into()),
+            "--show" => out.show = true,
+            "--bench" => {}
+            other => panic!("unknown word {other}"),
+        }
+    }
+    out
+}
+
+/// The kind of a seed: a quarter nulls, four tenths single, and so on; or one of those asked for.
+fn kind_of(seed: u64, kinds: &[String]) -> Kind {
+    let mut rng = data::stream(seed, "blind kind", 0, 0);
+    let cause = |name: &str| CAUSES.iter().position(|c| *c == name);
+    let drawn = rng.random_range(0..100u32);
+    let name = match kinds {
+        [] if drawn < 25 => "null".to_owned(),
+        [] if drawn < 72 => "single".into(),
+        [] if drawn < 87 => "pair".into(),
+        [] if drawn < 97 => "off".into(),
+        [] => "shuffled".into(),
+        kinds => kinds[(seed % kinds.len() as u64) as usize].clone(),
+    };
+    match name.as_str() {
+        "null" => Kind::Null,
+        "single" => Kind::Single(rng.random_range(0..CAUSES.len())),
+        "pair" => {
+            let i = rng.random_range(0..CAUSES.len());
+            Kind::Pair(i, (i + rng.random_range(1..CAUSES.len())) % CAUSES.len())
+        }
+        "off" => Kind::OffCatalogue(rng.random_range(0..OFF_CATALOGUE)),
+        "shuffled" => Kind::Shuffled,
+        other => Kind::Single(cause(other).unwrap_or_else(|| panic!("no such kind or cause: {other}"))),
+    }
+}
+
+fn run(seed: u64, arguments: &Arguments, folder: &Path) -> (Outcome, serde_json::Value) {
+    let case = draw_case(seed, kind_of(seed, &arguments.kinds), arguments.size);
+    let truth = write_case(&case, folder).expect("a case can be written");
+    let begin = Instant::now();
+    let open = |side: &str| Dataset::open(&folder.join(side)).expect("a data set");
+    let rig = SensorRig::read(&folder.join("sensor.toml")).expect("a rig");
+    let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
+    let value = match found {
+        Ok(d) => serde_json::to_value(&d).expect("JSON"),
+        Err(e) => serde_json::json!({ "verdict": format!("error: {e}") }),
+    };
+    (score(&truth, &value, begin.elapsed().as_secs_f64()), value)
+}
+
+#[expect(clippy::print_stdout, reason = "results go to stdout")]
+fn main() {
+    let arguments = arguments();
+    std::fs::create_dir_all(&arguments.out).expect("a folder for results");
+    let mut outcomes = Vec::new();
+    for seed in arguments.first..arguments.first + arguments.cases {
+        let path = arguments.out.join(format!("case-{seed}.json"));
+        let done = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice::<Outcome>(&bytes).ok());
+        let outcome = done.unwrap_or_else(|| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let place =
+                arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
+            let (outcome, value) = run(seed, &arguments, &place);
+            if arguments.show {
+                let mut short = value.clone();
+                for f in short["findings"].as_array_mut().into_iter().flatten() {
+                    f.as_object_mut().map(|f| f.remove("curve"));
+                }
+                println!("{}", serde_json::to_string_pretty(&short).expect("JSON"));
+            }
+            data::write_atomic(&path, &serde_json::to_vec_pretty(&outcome).expect("JSON")).expect("a result");
+            outcome
+        });
+        let hidden: Vec<String> =
+            outcome.truth.hidden.iter().map(|h| format!("{} {:?}", h.cause, h.parameters)).collect();
+        println!(
+            "{seed}: {} [{}] -> {} named {:?} ambiguous {:?} unexplained {} closed {:?} {:.1} s",
+            outcome.truth.kind,
+            hidden.join("; "),
+            outcome.word(),
+            outcome.named,
+            outcome.ambiguous,
+            outcome.unexplained,
+            outcome.closed.map(|c| (c * 100.0).round() / 100.0),
+            outcome.seconds
+        );
+        outcomes.push(outcome);
+    }
+    let summary = summarise(&outcomes);
+    let text = serde_json::to_vec_pretty(&summary).expect("JSON");
+    data::write_atomic(&arguments.out.join("summary.json"), &text).expect("a summary");
+    println!("{}", String::from_utf8_lossy(&text));
+}

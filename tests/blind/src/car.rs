@@ -1,0 +1,86 @@
+//! Cars of different makes: a few boxes and four wheels. Own frame: x forward, z up, origin at the middle of the box around it.
+
+use crate::solid::{Form, Solid, Stuff};
+use data::Stream;
+use nalgebra::{Isometry3, Vector3};
+use rand::RngExt;
+
+/// A make of car.
+#[derive(Clone, Debug)]
+pub struct CarShape {
+    /// Length, width, height of the box around it, m.
+    pub size_m: [f64; 3],
+    /// Its parts.
+    pub parts: Vec<Solid>,
+}
+
+/// Reflectivity of paint is drawn a car; the others are those of the material.
+pub fn draw_shape(rng: &mut Stream) -> CarShape {
+    if rng.random_bool(0.6) { open_wheeler(rng) } else { saloon(rng) }
+}
+
+fn part(center: [f64; 3], size: [f64; 3], stuff: Stuff) -> Solid {
+    Solid {
+        pose: Isometry3::translation(center[0], center[1], center[2]),
+        form: Form::Cuboid(Vector3::from(size) / 2.0),
+        stuff,
+    }
+}
+
+fn wheels(size: [f64; 3], axles: [f64; 2], radius: f64, width: f64) -> Vec<Solid> {
+    let y = size[1] / 2.0 - width / 2.0;
+    let at = |x: f64, y: f64| Solid {
+        pose: Isometry3::translation(x, y, radius - size[2] / 2.0),
+        form: Form::Wheel(radius, width / 2.0),
+        stuff: Stuff::Rubber,
+    };
+    axles.iter().flat_map(|&x| [at(x, y), at(x, -y)]).collect()
+}
+
+fn open_wheeler(rng: &mut Stream) -> CarShape {
+    let [l, w, h] =
+        [4.7 + 0.5 * rng.random::<f64>(), 1.85 + 0.15 * rng.random::<f64>(), 1.1 + 0.15 * rng.random::<f64>()];
+    let floor = -h / 2.0;
+    let mut parts = wheels([l, w, h], [0.33 * l, -0.30 * l], 0.32, 0.33);
+    parts.push(part([0.30 * l, 0.0, floor + 0.30], [0.40 * l, 0.34, 0.24], Stuff::Paint)); // nose
+    parts.push(part([-0.03 * l, 0.0, floor + 0.36], [0.36 * l, 0.70, 0.46], Stuff::Paint)); // tub
+    parts.push(part([-0.14 * l, 0.0, floor + 0.26], [0.30 * l, 1.35, 0.34], Stuff::Paint)); // side pods
+    parts.push(part([-0.16 * l, 0.0, floor + 0.72], [0.22 * l, 0.38, 0.50], Stuff::Paint)); // engine cover
+    parts.push(part([0.47 * l, 0.0, floor + 0.14], [0.06 * l, w, 0.08], Stuff::Carbon)); // front wing
+    parts.push(part([-0.46 * l, 0.0, floor + 0.86], [0.08 * l, 0.9 * w, 0.24], Stuff::Carbon)); // rear wing
+    parts.push(part([-0.43 * l, 0.0, floor + 0.5], [0.10 * l, 0.2, 0.6], Stuff::Carbon)); // its pillar
+    parts.push(part([-0.2 * l, 0.0, h / 2.0 - 0.06], [0.3, 0.2, 0.12], Stuff::Carbon)); // head of the sensors
+    CarShape { size_m: [l, w, h], parts }
+}
+
+fn saloon(rng: &mut Stream) -> CarShape {
+    let [l, w, h] =
+        [4.1 + 0.8 * rng.random::<f64>(), 1.75 + 0.2 * rng.random::<f64>(), 1.35 + 0.25 * rng.random::<f64>()];
+    let floor = -h / 2.0;
+    let mut parts = wheels([l, w, h], [0.3 * l, -0.3 * l], 0.31, 0.22);
+    parts.push(part([0.0, 0.0, floor + 0.5], [l, 0.94 * w, 0.6], Stuff::Paint));
+    parts.push(part([-0.06 * l, 0.0, (floor + 0.8 + h / 2.0) / 2.0], [0.52 * l, 0.86 * w, h - 0.8], Stuff::Paint));
+    CarShape { size_m: [l, w, h], parts }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parts_lie_inside_of_the_box() {
+        for seed in 0..20 {
+            let shape = draw_shape(&mut data::stream(seed, "car", 0, 0));
+            for p in &shape.parts {
+                let half = match p.form {
+                    Form::Cuboid(half) => half,
+                    Form::Wheel(r, w) => Vector3::new(r, w, r),
+                };
+                for k in 0..3 {
+                    let end = p.pose.translation.vector[k].abs() + half[k];
+                    assert!(end <= shape.size_m[k] / 2.0 + 0.02, "axis {k}: {end} of {:?}", shape.size_m);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! Cases: a seed, a size, and what is hidden.
+
+use crate::effect::{Clock, Effect};
+use data::Stream;
+use rand::RngExt;
+
+/// How much data a case has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CaseSize {
+    /// Frames of each side.
+    pub frames: usize,
+    /// Shots a scan.
+    pub shots: usize,
+}
+
+impl CaseSize {
+    /// For tests of minutes.
+    pub const SMALL: CaseSize = CaseSize { frames: 40, shots: 9_000 };
+    /// Of the large set.
+    pub const USUAL: CaseSize = CaseSize { frames: 40, shots: 25_000 };
+    /// Of real recordings.
+    pub const FULL: CaseSize = CaseSize { frames: 200, shots: 75_000 };
+}
+
+/// What a case is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// Nothing is hidden.
+    Null,
+    /// One effect of the catalogue, by its place in [`CAUSES`].
+    Single(usize),
+    /// Two of the catalogue.
+    Pair(usize, usize),
+    /// One that is not in the catalogue.
+    OffCatalogue(usize),
+    /// Nothing is hidden, but the frames are paired wrongly.
+    Shuffled,
+}
+
+/// A case to be written.
+#[derive(Clone, Debug)]
+pub struct Case {
+    /// Everything is drawn from it.
+    pub seed: u64,
+    /// Frames and shots.
+    pub size: CaseSize,
+    /// What it is for.
+    pub kind: Kind,
+    /// What is hidden in the measured side.
+    pub effects: Vec<Effect>,
+    /// Time between frames, s.
+    pub step_s: f64,
+}
+
+/// Causes that a case can hide.
+pub const CAUSES: [&str; 22] = [
+    "range_noise",
+    "range_bias",
+    "beam_range_offset",
+    "beam_elevation_offset",
+    "quantisation",
+    "angular_jitter",
+    "random_dropout",
+    "signal_dropout",
+    "range_dropout",
+    "incidence_dropout",
+    "material_dropout",
+    "range_cut",
+    "ego_occlusion",
+    "time_offset",
+    "label_offset",
+    "sensor_extrinsics",
+    "pitch_roll",
+    "rolling_shutter",
+    "outliers",
+    "mixed_pixels",
+    "missing_object",
+    "wrong_shape",
+];
+
+/// Number of effects that are in no catalogue.
+pub const OFF_CATALOGUE: usize = 3;
+
+/// The case of a seed.
+pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
+    let mut rng = data::stream(seed, "blind case", 0, 0);
+    let step_s = if rng.random_bool(0.5) { 0.25 } else { 0.05 };
+    let effects = match kind {
+        Kind::Null | Kind::Shuffled => vec![],
+        Kind::Single(i) => vec![draw_effect(i, &mut rng)],
+        Kind::Pair(i, j) => vec![draw_effect(i, &mut rng), draw_effect(j, &mut rng)],
+        Kind::OffCatalogue(i) => vec![draw_off_catalogue(i, &mut rng)],
+    };
+    Case { seed, size, kind, effects, step_s }
+}
+
+/// Uniform in the logarithm.
+fn log_uniform(rng: &mut Stream, low: f64, high: f64) -> f64 {
+    (low.ln() + (high / low).ln() * rng.random::<f64>()).exp()
+}
+
+fn sign(rng: &mut Stream) -> f64 {
+    if rng.random_bool(0.5) { 1.0 } else { -1.0 }
+}
+
+fn draw_effect(i: usize, rng: &mut Stream) -> Effect {
+    let deg = f64::to_radians;
+    match CAUSES[i] {
+        "range_noise" => Effect::RangeNoise {
+            sigma_m: log_uniform(rng, 0.01, 0.06),
+            growth_per_m: if rng.random_bool(0.3) { rng.random_range(0.01..0.05) } else { 0.0 },
+        },
+        "range_bias" => Effect::RangeBias {
+            offset_m: sign(rng) * log_uniform(rng, 0.05, 0.25),
+            scale: if rng.random_bool(0.3) { sign(rng) * log_uniform(rng, 1e-3, 4e-3) } else { 0.0 },
+        },
+        "beam_range_offset" => Effect::BeamRangeOffset { std_m: log_uniform(rng, 0.015, 0.08) },
+        "beam_elevation_offset" => Effect::BeamElevationOffset { std_rad: deg(log_uniform(rng, 0.04, 0.2)) },
+        "quantisation" => Effect::Quantisation { step_m: log_uniform(rng, 0.04, 0.2) },
+        "angular_jitter" => Effect::AngularJitter { sigma_rad: deg(log_uniform(rng, 0.02, 0.1)) },
+        "random_dropout" => Effect::RandomDropout { share: log_uniform(rng, 0.02, 0.3) },
+        "signal_dropout" => {
+            Effect::SignalDropout { half_at: rng.random_range(-11.5..-9.0), speckle: rng.random_range(0.2..0.7) }
+        }
+        "range_dropout" => {
+            Effect::RangeDropout { half_at_m: rng.random_range(30.0..75.0), softness_m: rng.random_range(5.0..20.0) }
+        }
+        "incidence_dropout" => {
+            Effect::IncidenceDropout { half_at_cos: log_uniform(rng, 0.03, 0.15), power: rng.random_range(1.5..3.5) }
+        }
+        "material_dropout" => {
+            Effect::MaterialDropout { tyres: rng.random_bool(0.5), share: rng.random_range(0.3..0.9) }
+        }
+        "range_cut" => Effect::RangeCut { max_m: rng.random_range(35.0..90.0) },
+        "ego_occlusion" => {
+            let side = sign(rng);
+            let size_m = [rng.random_range(0.2..0.6), rng.random_range(0.5..1.1), rng.random_range(0.1..0.3)];
+            Effect::EgoOcclusion {
+                center_m: [-1.9, side * rng.random_range(0.0..0.5), rng.random_range(0.5..0.9)],
+                size_m,
+            }
+        }
+        "time_offset" => Effect::TimeOffset {
+            seconds: sign(rng) * log_uniform(rng, 0.006, 0.04),
+            clock: if rng.random_bool(0.7) { Clock::Targets } else { Clock::Cloud },
+        },
+        "label_offset" => {
+            let axis = rng.random_range(0..3usize);
+            let mut offset_m = [0.0; 3];
+            offset_m[axis] = sign(rng) * log_uniform(rng, 0.08, 0.6);
+            Effect::LabelOffset { offset_m }
+        }
+        "sensor_extrinsics" => {
+            let mut turn_rad = [0.0; 3];
+            turn_rad[rng.random_range(0..3usize)] = sign(rng) * deg(log_uniform(rng, 0.15, 0.8));
+            Effect::SensorExtrinsics { sensor: 0, turn_rad, shift_m: [0.0; 3] }
+        }
+        "pitch_roll" => Effect::PitchRoll {
+            pitch_rad: sign(rng) * deg(log_uniform(rng, 0.1, 0.5)),
+            roll_rad: sign(rng) * deg(log_uniform(rng, 0.05, 0.4)),
+        },
+        "rolling_shutter" => Effect::RollingShutter { scan_s: rng.random_range(0.03..0.1) },
+        "outliers" => Effect::Outliers { share: log_uniform(rng, 0.003, 0.03) },
+        "mixed_pixels" => Effect::MixedPixels { divergence_rad: log_uniform(rng, 2e-3, 8e-3) },
+        "missing_object" => Effect::MissingObject { things: rng.random_range(6..20) },
+        _ => Effect::WrongShape { length: rng.random_range(0.05..0.15), height: rng.random_range(0.05..0.2) },
+    }
+}
+
+fn draw_off_catalogue(i: usize, rng: &mut Stream) -> Effect {
+    match i % OFF_CATALOGUE {
+        0 => Effect::AzimuthRipple { amplitude_m: log_uniform(rng, 0.04, 0.15), waves: rng.random_range(6..14) as f64 },
+        1 => Effect::StripedLoss { share: rng.random_range(0.15..0.5), stripes: rng.random_range(3..7) as f64 },
+        _ => Effect::SidedNoise { sigma_m: log_uniform(rng, 0.04, 0.12) },
+    }
+}

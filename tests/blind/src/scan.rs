@@ -1,0 +1,349 @@
+//! One scan: which shots, what they meet, what comes back, and what the sensor says of it.
+
+use crate::effect::{Clock, Effect};
+use crate::rig::Mount;
+use crate::solid::{Form, Hit, Solid, Stuff};
+use crate::world::{REACH_M, World};
+use data::Stream;
+use geometry::Box3;
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+
+/// What both sides have: no difference.
+#[derive(Clone, Copy, Debug)]
+pub struct Nuisances {
+    /// Noise along the ray, standard deviation, m.
+    pub noise_m: f64,
+    /// Share of returns lost at random.
+    pub lost: f64,
+    /// Share of shots with a false return.
+    pub false_returns: f64,
+    /// Weakest energy that still returns, as a logarithm of rho cos / R^2.
+    pub weakest: f64,
+    /// Jitter of the shots' directions, in shares of the step between columns and rows. The sensor knows them.
+    pub dither: [f64; 2],
+}
+
+/// What one side has by itself: small errors that nobody would call a finding.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct OwnErrors {
+    /// Standard deviation of the ego pose: m, rad.
+    pub pose: [f64; 2],
+    /// Standard deviation of the labels, m.
+    pub labels_m: f64,
+}
+
+/// A side of a pair: the world as it is there, and what happens to its scans.
+pub struct Side<'a> {
+    /// Cars, walls, road.
+    pub world: &'a World,
+    /// Sensors as the user believes them to be.
+    pub rig: &'a [Mount],
+    /// The same on both sides.
+    pub nuisances: Nuisances,
+    /// Only here.
+    pub own: OwnErrors,
+    /// What is hidden.
+    pub effects: &'a [Effect],
+    /// Per sensor and row: offset of range, m, and of elevation, rad.
+    pub beams: &'a [Vec<[f64; 2]>],
+}
+
+/// What a side writes for one frame.
+pub struct Scan {
+    /// Points in the ego frame, m, in no order.
+    pub points: Vec<[f32; 3]>,
+    /// Labels in the ego frame.
+    pub boxes: Vec<Box3>,
+    /// Sums for the bounds of estimators that know the form.
+    pub sums: Sums,
+}
+
+/// Sums over shots that met something.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Sums {
+    /// Shots that came back before anything hidden was lost.
+    pub returns: f64,
+    /// Sum of (R tan(incidence))^2 where it is below 100 m^2.
+    pub lever: f64,
+    /// Boxes with five points or more, and the sum of their squared speeds.
+    pub boxes: [f64; 2],
+}
+
+fn normal(rng: &mut Stream) -> f64 {
+    StandardNormal.sample(rng)
+}
+
+/// Zero mean, unit variance, lighter tails than the normal law.
+fn bell(rng: &mut Stream) -> f64 {
+    (0..6).map(|_| rng.random::<f64>()).sum::<f64>() * 2f64.sqrt() - 3.0 * 2f64.sqrt()
+}
+
+fn small_turn(rad: [f64; 3]) -> UnitQuaternion<f64> {
+    UnitQuaternion::from_scaled_axis(Vector3::from(rad))
+}
+
+impl Side<'_> {
+    /// The scan at `t` seconds.
+    pub fn scan(&self, t: f64, rng: &mut Stream) -> Scan {
+        let believed = self.world.pose(0, t);
+        let mut pose_error = Isometry3::from_parts(
+            Translation3::new(
+                normal(rng) * self.own.pose[0],
+                normal(rng) * self.own.pose[0],
+                normal(rng) * self.own.pose[0],
+            ),
+            small_turn([0, 1, 2].map(|_| normal(rng) * self.own.pose[1])),
+        );
+        let mut scan_s = 0.0;
+        for effect in self.effects {
+            match effect {
+                Effect::PitchRoll { pitch_rad, roll_rad } => {
+                    pose_error *= Isometry3::from_parts(
+                        Translation3::identity(),
+                        UnitQuaternion::from_euler_angles(*roll_rad, *pitch_rad, 0.0),
+                    );
+                }
+                Effect::RollingShutter { scan_s: s } => scan_s = *s,
+                _ => {}
+            }
+        }
+        let slices = if scan_s > 0.0 { 24 } else { 1 };
+        let moments: Vec<_> = (0..slices)
+            .map(|i| {
+                let late = if slices > 1 { ((f64::from(i) + 0.5) / f64::from(slices) - 0.5) * scan_s } else { 0.0 };
+                let world_from_ego = if slices > 1 { self.world.pose(0, t + late) } else { believed };
+                self.world.moment(t + late, world_from_ego * pose_error)
+            })
+            .collect();
+        let wing = self.effects.iter().find_map(|e| match e {
+            Effect::EgoOcclusion { center_m, size_m } => Some(Solid {
+                pose: Isometry3::translation(center_m[0], center_m[1], center_m[2]),
+                form: Form::Cuboid(Vector3::from(*size_m) / 2.0),
+                stuff: Stuff::Carbon,
+            }),
+            _ => None,
+        });
+        let mut scan = Scan { points: Vec::new(), boxes: Vec::new(), sums: Sums::default() };
+        let mut on_car = vec![0usize; self.world.drivers.len()];
+        for (k, mount) in self.rig.iter().enumerate() {
+            let believed_pose = mount.pose();
+            let mut true_pose = believed_pose;
+            for effect in self.effects {
+                if let Effect::SensorExtrinsics { sensor, turn_rad, shift_m } = effect
+                    && *sensor == k
+                {
+                    let error = Isometry3::from_parts(Translation3::from(*shift_m), small_turn(*turn_rad));
+                    true_pose = believed_pose * error;
+                }
+            }
+            let phase = rng.random::<f64>();
+            let (column_step, row_step) = (mount.column_step_rad(), mount.row_step_rad());
+            for (row, &elevation) in mount.rows_rad.iter().enumerate() {
+                for column in 0..mount.columns {
+                    let az = mount.fov_rad / 2.0
+                        - (column as f64 + phase + normal(rng) * self.nuisances.dither[0]) * column_step;
+                    let el = elevation + normal(rng) * self.nuisances.dither[1] * row_step;
+                    let direction = |az: f64, el: f64| Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin());
+                    let said = direction(az, el);
+                    let mut shot = direction(az, el + self.beams[k][row][1]);
+                    let mut divergence = 0.0;
+                    for effect in self.effects {
+                        match effect {
+                            Effect::AngularJitter { sigma_rad } => {
+                                let radius = 2.0 * sigma_rad * rng.random::<f64>().sqrt();
+                                let angle = rng.random::<f64>() * std::f64::consts::TAU;
+                                shot = small_turn([0.0, -radius * angle.sin(), radius * angle.cos()]) * shot;
+                            }
+                            Effect::MixedPixels { divergence_rad } => divergence = *divergence_rad,
+                            _ => {}
+                        }
+                    }
+                    let origin = true_pose * Point3::origin();
+                    let ray = true_pose.rotation * shot;
+                    let moment = &moments[column * slices as usize / mount.columns];
+                    let met = wing.as_ref().and_then(|w| w.cast(&origin, &ray)).map(|(range_m, n)| Hit {
+                        range_m,
+                        normal: n,
+                        stuff: Stuff::Carbon,
+                        car: None,
+                    });
+                    let met = met.or_else(|| moment.cast(&origin, &ray));
+                    let hit = met.map(|mut hit| {
+                        if divergence > 0.0 && hit.range_m > 1.0 {
+                            hit.range_m = blurred(&hit, divergence, &shot, |d| {
+                                moment.cast(&origin, &(true_pose.rotation * d)).map(|h| h.range_m)
+                            });
+                        }
+                        hit
+                    });
+                    if let Some(hit) = &hit {
+                        let c = hit.cos_incidence(&ray).max(1e-3);
+                        scan.sums.returns += 1.0;
+                        scan.sums.lever += (hit.range_m.powi(2) * (1.0 / (c * c) - 1.0)).min(100.0);
+                        if let Some(car) = hit.car {
+                            on_car[car] += 1;
+                        }
+                    }
+                    let angles = [az, el];
+                    if let Some(range) = self.returned(hit, &ray, k, row, angles, mount, rng) {
+                        let p = believed_pose * Point3::from(said * range);
+                        scan.points.push([p.x as f32, p.y as f32, p.z as f32]);
+                    }
+                }
+            }
+        }
+        for i in (1..scan.points.len()).rev() {
+            scan.points.swap(i, rng.random_range(0..=i));
+        }
+        self.label(t, &believed, &on_car, rng, &mut scan);
+        scan
+    }
+
+    /// The range that the sensor reports, if it reports any.
+    #[expect(clippy::too_many_arguments, reason = "one shot and all that is known of it")]
+    fn returned(
+        &self,
+        hit: Option<Hit>,
+        ray: &Vector3<f64>,
+        sensor: usize,
+        row: usize,
+        [az, el]: [f64; 2],
+        mount: &Mount,
+        rng: &mut Stream,
+    ) -> Option<f64> {
+        let false_share = self.effects.iter().find_map(|e| match e {
+            Effect::Outliers { share } => Some(*share),
+            _ => None,
+        });
+        if rng.random::<f64>() < self.nuisances.false_returns + false_share.unwrap_or(0.0) {
+            return Some(rng.random_range(0.8..REACH_M));
+        }
+        let hit = hit?;
+        let (range, c) = (hit.range_m, hit.cos_incidence(ray).clamp(1e-4, 1.0));
+        let energy = (self.world.reflectivity(&hit) * c / (range * range)).ln();
+        if rng.random::<f64>() < self.nuisances.lost || energy < self.nuisances.weakest {
+            return None;
+        }
+        let mut said = range + normal(rng) * self.nuisances.noise_m + self.beams[sensor][row][0];
+        for effect in self.effects {
+            let kept = match effect {
+                Effect::RandomDropout { share } => 1.0 - share,
+                Effect::SignalDropout { half_at, speckle } => {
+                    let received = energy + speckle * normal(rng);
+                    if received > *half_at { 1.0 } else { 0.0 }
+                }
+                Effect::RangeDropout { half_at_m, softness_m } => {
+                    0.5 - (range - half_at_m) / (2.0 * (softness_m.powi(2) + (range - half_at_m).powi(2)).sqrt())
+                }
+                Effect::IncidenceDropout { half_at_cos, power } => {
+                    let u = (c / half_at_cos).powf(*power);
+                    u / (1.0 + u)
+                }
+                Effect::MaterialDropout { tyres, share } => {
+                    let dark = if *tyres { hit.stuff == Stuff::Rubber } else { hit.stuff == Stuff::Paint };
+                    if dark { 1.0 - share } else { 1.0 }
+                }
+                Effect::RangeCut { max_m } => f64::from(u8::from(range <= *max_m)),
+                Effect::StripedLoss { share, stripes } => {
+                    let u = (el - mount.rows_rad[mount.rows_rad.len() - 1])
+                        / (mount.rows_rad[0] - mount.rows_rad[mount.rows_rad.len() - 1]);
+                    1.0 - share * (1.0 + (std::f64::consts::TAU * stripes * u).sin()) / 2.0
+                }
+                _ => 1.0,
+            };
+            if rng.random::<f64>() >= kept {
+                return None;
+            }
+            match effect {
+                Effect::RangeNoise { sigma_m, growth_per_m } => {
+                    said += bell(rng) * sigma_m * (1.0 + growth_per_m * range)
+                }
+                Effect::RangeBias { offset_m, scale } => said += offset_m + scale * range,
+                Effect::AzimuthRipple { amplitude_m, waves } => said += amplitude_m * (waves * az).sin(),
+                Effect::SidedNoise { sigma_m } => {
+                    said += bell(rng) * sigma_m * (0.5 + az / mount.fov_rad).clamp(0.0, 1.0);
+                }
+                _ => {}
+            }
+        }
+        for effect in self.effects {
+            if let Effect::Quantisation { step_m } = effect {
+                said = (said / step_m).round() * step_m;
+            }
+        }
+        (said > 0.5 && said < REACH_M).then_some(said)
+    }
+
+    fn label(&self, t: f64, believed: &Isometry3<f64>, on_car: &[usize], rng: &mut Stream, scan: &mut Scan) {
+        for driver in 1..self.world.drivers.len() {
+            let (mut cars_at, mut ego) = (t, *believed);
+            for effect in self.effects {
+                if let Effect::TimeOffset { seconds, clock } = effect {
+                    cars_at = t + seconds;
+                    if *clock == Clock::Cloud {
+                        ego = self.world.pose(0, t + seconds);
+                    }
+                }
+            }
+            let mut pose = ego.inverse() * self.world.pose(driver, cars_at);
+            let mut shift = Vector3::from([0, 1, 2].map(|_| normal(rng) * self.own.labels_m));
+            for effect in self.effects {
+                if let Effect::LabelOffset { offset_m } = effect {
+                    shift += Vector3::from(*offset_m);
+                }
+            }
+            pose *= Isometry3::translation(shift.x, shift.y, shift.z);
+            let ahead = pose.rotation * Vector3::x();
+            let cm = |v: f64| (v * 100.0).round() / 100.0;
+            let p = pose.translation.vector;
+            let size = self.world.shape(driver).size_m;
+            if p.norm() < 100.0 && on_car[driver] >= 3 {
+                scan.boxes.push(Box3 {
+                    center: [cm(p.x), cm(p.y), cm(p.z)],
+                    size: size.map(cm),
+                    yaw_rad: cm(ahead.y.atan2(ahead.x)),
+                });
+                if on_car[driver] >= 5 {
+                    let v = self.world.drivers[driver].speed_m_s(t);
+                    scan.sums.boxes[0] += 1.0;
+                    scan.sums.boxes[1] += v * v;
+                }
+            }
+        }
+    }
+}
+
+/// Range of a beam with a width: energy of nineteen rays over its section, those within a pulse's length of the strongest group mix.
+fn blurred(hit: &Hit, divergence: f64, shot: &Vector3<f64>, cast: impl Fn(Vector3<f64>) -> Option<f64>) -> f64 {
+    let side = shot.cross(&Vector3::z()).normalize();
+    let up = side.cross(shot);
+    let mut ranges = vec![hit.range_m];
+    for (ring, n) in [(0.5, 6), (1.0, 12)] {
+        for i in 0..n {
+            let a = std::f64::consts::TAU * f64::from(i) / f64::from(n);
+            let d = (shot + (side * a.cos() + up * a.sin()) * (ring * divergence / 2.0)).normalize();
+            ranges.extend(cast(d));
+        }
+    }
+    let near = ranges.iter().copied().fold(f64::INFINITY, f64::min);
+    let far = ranges.iter().copied().fold(0.0, f64::max);
+    // Smooth surfaces do not mix: a tilted plane spreads evenly and its mean is its middle.
+    if far - near < 0.25 + 0.1 * near * 0.2 {
+        return hit.range_m;
+    }
+    let middle = 0.5 * (near + far);
+    let (mut low, mut high) = ((0.0, 0.0), (0.0, 0.0));
+    for r in &ranges {
+        let group = if *r < middle { &mut low } else { &mut high };
+        group.0 += 1.0;
+        group.1 += r;
+    }
+    let (a, b) = (low.1 / f64::max(low.0, 1.0), high.1 / f64::max(high.0, 1.0));
+    let share = low.0 / (low.0 + high.0);
+    if !(0.12..=0.88).contains(&share) || b - a > 12.0 {
+        return if share >= 0.5 { a } else { b };
+    }
+    share * a + (1.0 - share) * b
+}

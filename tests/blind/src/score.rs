@@ -1,0 +1,174 @@
+//! How well a diagnosis tells what was hidden. Reads the file `diagnosis.json` alone.
+
+use crate::effect::Truth;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
+
+/// What became of one case.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Outcome {
+    /// What was hidden.
+    pub truth: Truth,
+    /// The diagnosis' word on the whole.
+    pub verdict: String,
+    /// Causes that it names.
+    pub named: Vec<String>,
+    /// Causes that it cannot tell apart, one list a finding.
+    pub ambiguous: Vec<Vec<String>>,
+    /// Findings without a name.
+    pub unexplained: usize,
+    /// Parameters of hidden causes that were named: true value, estimate, interval, bound.
+    pub parameters: Vec<Judged>,
+    /// What the diagnosis says was closed of the gap.
+    pub closed: Option<f64>,
+    /// Seconds that the diagnosis took.
+    pub seconds: f64,
+}
+
+/// One parameter beside its true value.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Judged {
+    /// Cause and parameter.
+    pub name: String,
+    /// As it was hidden.
+    pub truth: f64,
+    /// As it was found.
+    pub estimate: f64,
+    /// Interval.
+    pub ci95: [f64; 2],
+    /// Standard error of an estimator that knows the form, where it is known.
+    pub bound: Option<f64>,
+}
+
+/// Compares a diagnosis with the truth.
+pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
+    let findings = diagnosis["findings"].as_array().cloned().unwrap_or_default();
+    let with = |status: &str| findings.iter().filter(|f| f["status"] == status).cloned().collect::<Vec<_>>();
+    let text = |v: &Value| v.as_str().unwrap_or_default().to_owned();
+    let mut parameters = Vec::new();
+    for finding in with("named") {
+        let Some(hidden) = truth.hidden.iter().find(|h| finding["cause"] == h.cause.as_str()) else { continue };
+        for (name, value) in &hidden.parameters {
+            let said = &finding["parameters"][name];
+            if let (Some(estimate), Some(low), Some(high)) =
+                (said["estimate"].as_f64(), said["ci95"][0].as_f64(), said["ci95"][1].as_f64())
+            {
+                let name_of = format!("{}.{name}", hidden.cause);
+                let bound = hidden.bound.get(name).copied();
+                parameters.push(Judged { name: name_of, truth: *value, estimate, ci95: [low, high], bound });
+            }
+        }
+    }
+    Outcome {
+        truth: truth.clone(),
+        verdict: text(&diagnosis["verdict"]),
+        named: with("named").iter().map(|f| text(&f["cause"])).collect(),
+        ambiguous: with("ambiguous")
+            .iter()
+            .map(|f| f["candidates"].as_array().into_iter().flatten().map(text).collect())
+            .collect(),
+        unexplained: with("unexplained").len(),
+        parameters,
+        closed: diagnosis["gain"]["closed"].as_f64(),
+        seconds,
+    }
+}
+
+impl Outcome {
+    /// In a few words.
+    pub fn word(&self) -> &'static str {
+        let hidden: Vec<&str> = self.truth.hidden.iter().filter(|h| h.in_catalogue).map(|h| h.cause.as_str()).collect();
+        let nothing = self.named.is_empty() && self.ambiguous.is_empty() && self.unexplained == 0;
+        let wrong = self.named.iter().any(|n| !hidden.contains(&n.as_str()));
+        match self.truth.kind.as_str() {
+            "shuffled" => {
+                if self.verdict == "not_scenario_identical" {
+                    "refused"
+                } else {
+                    "not refused"
+                }
+            }
+            _ if self.verdict == "not_scenario_identical" => "refused wrongly",
+            "null" => {
+                if nothing {
+                    "clean"
+                } else {
+                    "false alarm"
+                }
+            }
+            "off_catalogue" => match (nothing, wrong) {
+                (true, _) => "missed",
+                (_, true) => "wrong name",
+                _ => "unexplained",
+            },
+            _ if wrong => "wrong name",
+            _ if nothing => "missed",
+            _ if hidden.iter().all(|h| self.named.iter().any(|n| n == h)) => "right",
+            _ if hidden.iter().all(|h| {
+                self.named.iter().any(|n| n == h) || self.ambiguous.iter().any(|a| a.iter().any(|n| n == h))
+            }) =>
+            {
+                "ambiguous"
+            }
+            _ if !self.named.is_empty() => "partly",
+            _ => "unexplained",
+        }
+    }
+}
+
+/// Counts over a set of cases.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Number of cases by kind and word.
+    pub words: BTreeMap<String, BTreeMap<String, usize>>,
+    /// By hidden cause (of single cases) what was said: `confusion[hidden][said]`.
+    pub confusion: BTreeMap<String, BTreeMap<String, usize>>,
+    /// By parameter: cases, share inside the interval, median of |error| / |truth|, root mean square of error over bound where it is known.
+    pub parameters: BTreeMap<String, [f64; 4]>,
+    /// Median of what was closed where something was named rightly.
+    pub closed: Option<f64>,
+    /// Median and largest time of a diagnosis, s.
+    pub seconds: [f64; 2],
+}
+
+/// Sums outcomes up.
+pub fn summarise(outcomes: &[Outcome]) -> Summary {
+    let mut summary = Summary::default();
+    let mut judged: BTreeMap<String, Vec<Judged>> = BTreeMap::new();
+    for o in outcomes {
+        *summary.words.entry(o.truth.kind.clone()).or_default().entry(o.word().into()).or_default() += 1;
+        if o.truth.kind == "single" || o.truth.kind == "off_catalogue" {
+            let hidden = o.truth.hidden[0].cause.split(' ').next().unwrap_or_default().to_owned();
+            let mut said: Vec<String> = o.named.clone();
+            said.extend(o.ambiguous.iter().map(|a| format!("ambiguous({})", a.join("|"))));
+            said.extend((0..o.unexplained).map(|_| "unexplained".to_owned()));
+            if said.is_empty() {
+                said.push("nothing".into());
+            }
+            for s in said {
+                *summary.confusion.entry(hidden.clone()).or_default().entry(s).or_default() += 1;
+            }
+        }
+        for p in &o.parameters {
+            judged.entry(p.name.clone()).or_default().push(p.clone());
+        }
+    }
+    let median = |mut v: Vec<f64>| {
+        v.sort_by(f64::total_cmp);
+        v.get(v.len() / 2).copied()
+    };
+    for (name, list) in judged {
+        let n = list.len() as f64;
+        let inside = list.iter().filter(|p| p.ci95[0] <= p.truth && p.truth <= p.ci95[1]).count() as f64 / n;
+        let relative = median(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
+        let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
+        let rms =
+            if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
+        summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms]);
+    }
+    summary.closed = median(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());
+    let times: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
+    summary.seconds = [median(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
+    summary
+}

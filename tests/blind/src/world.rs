@@ -1,0 +1,345 @@
+//! The scene: road, walls, things beside the road, cars on their way; and what a ray meets.
+
+use crate::car::{CarShape, draw_shape};
+use crate::solid::{Form, Hit, Solid, Stuff};
+use crate::track::Track;
+use data::Stream;
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use rand::RngExt;
+
+/// Farther than this nothing is met, m.
+pub const REACH_M: f64 = 150.0;
+
+/// A wall along the road.
+#[derive(Clone, Debug)]
+pub struct Wall {
+    /// Where it stands, to the left of the centre line, m.
+    pub left_m: f64,
+    /// Height over the road beside it, m.
+    pub height_m: f64,
+    /// Gaps: begin and end along the centre line, m.
+    pub gaps_m: Vec<(f64, f64)>,
+}
+
+/// A car on its way: position along the centre line is `s + v t` with a slow change of speed, beside it `left` with a slow swing.
+#[derive(Clone, Debug)]
+pub struct Driver {
+    /// Index of its make.
+    pub shape: usize,
+    /// Reflectivity of its paint.
+    pub paint: f64,
+    start_m: f64,
+    speed_m_s: f64,
+    left_m: f64,
+    swing: [f64; 3],
+    surge: [f64; 3],
+}
+
+impl Driver {
+    /// Position along and beside the centre line at `t` seconds.
+    pub fn place(&self, t: f64) -> (f64, f64) {
+        let wave = |[size, rate, phase]: [f64; 3]| size * (rate * t + phase).sin();
+        (self.start_m + self.speed_m_s * t + wave(self.surge), self.left_m + wave(self.swing))
+    }
+
+    /// Speed along the centre line, m/s.
+    pub fn speed_m_s(&self, t: f64) -> f64 {
+        (self.place(t + 1e-3).0 - self.place(t - 1e-3).0) / 2e-3
+    }
+}
+
+/// Everything that does not depend on the sensor.
+#[derive(Clone, Debug)]
+pub struct World {
+    /// The road.
+    pub track: Track,
+    /// Walls.
+    pub walls: Vec<Wall>,
+    /// Things beside the road, in the world's frame.
+    pub things: Vec<Solid>,
+    /// Makes of cars.
+    pub shapes: Vec<CarShape>,
+    /// The ego car comes first.
+    pub drivers: Vec<Driver>,
+    /// Height of the ego car's reference over the road, m.
+    pub ego_above_m: f64,
+    /// Reflectivity of asphalt and of concrete.
+    pub reflectivity: [f64; 2],
+}
+
+/// The scene at one moment, ready to be shot at; in the frame of the ego car at that moment.
+pub struct Moment<'a> {
+    world: &'a World,
+    world_from_ego: Isometry3<f64>,
+    things: Vec<(Solid, Point3<f64>, f64)>,
+    cars: Vec<(usize, Vec<Solid>, Point3<f64>, f64)>,
+}
+
+/// Draws a world with a race in it.
+pub fn draw_world(rng: &mut Stream, ego_above_m: f64) -> World {
+    let track = Track {
+        straight_m: rng.random_range(120.0..420.0),
+        radius_m: rng.random_range(70.0..220.0),
+        bank_rad: [rng.random_range(0.0..0.12), rng.random_range(0.1..0.33)],
+        half_width_m: rng.random_range(5.5..8.0),
+        waves_m: rng.random_range(0.0..0.02),
+    };
+    let outer = -(track.half_width_m + rng.random_range(0.4..1.0));
+    let mut walls = vec![Wall { left_m: outer, height_m: rng.random_range(0.9..1.3), gaps_m: vec![] }];
+    let inner = track.half_width_m + rng.random_range(2.0..6.0);
+    let lap = track.lap_m();
+    let gap = rng.random_range(0.0..lap * 0.7);
+    walls.push(Wall { left_m: inner, height_m: rng.random_range(0.6..1.1), gaps_m: vec![(gap, gap + 0.2 * lap)] });
+    let things = draw_things(rng, &track, outer, inner);
+    let shapes: Vec<CarShape> = (0..2).map(|_| draw_shape(rng)).collect();
+    let start = rng.random_range(0.0..lap);
+    let speed = rng.random_range(25.0..55.0);
+    let driver = |rng: &mut Stream, ahead: f64, left: f64| Driver {
+        shape: rng.random_range(0..2),
+        paint: rng.random_range(0.12..0.8),
+        start_m: start + ahead,
+        speed_m_s: speed,
+        left_m: left,
+        swing: [rng.random_range(0.2..0.9), rng.random_range(0.2..0.9), rng.random_range(0.0..6.0)],
+        surge: [rng.random_range(2.0..9.0), rng.random_range(0.25..0.8), rng.random_range(0.0..6.0)],
+    };
+    let mut drivers = vec![driver(rng, 0.0, 0.0)];
+    let n = rng.random_range(4..7);
+    for k in 0..n {
+        let side = if k % 2 == 0 { 1.0 } else { -1.0 };
+        let ahead = side * (12.0 + 17.0 * (k / 2) as f64 + rng.random_range(0.0..8.0));
+        let left = rng.random_range(1.2..3.2) * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+        drivers.push(driver(rng, ahead, left));
+    }
+    let reflectivity = [rng.random_range(0.1..0.25), rng.random_range(0.3..0.6)];
+    World { track, walls, things, shapes, drivers, ego_above_m, reflectivity }
+}
+
+fn draw_things(rng: &mut Stream, track: &Track, outer: f64, inner: f64) -> Vec<Solid> {
+    let mut things = Vec::new();
+    let mut stand = |rng: &mut Stream, s: f64, left: f64, size: [f64; 3], lift: f64, stuff: Stuff| {
+        let ([x, y], heading) = track.at(s, left);
+        let z = track.height_m(x, y) + lift + size[2] / 2.0;
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading + rng.random_range(-0.05..0.05));
+        let pose = Isometry3::from_parts(Translation3::new(x, y, z), turn);
+        things.push(Solid { pose, form: Form::Cuboid(Vector3::from(size) / 2.0), stuff });
+    };
+    let lap = track.lap_m();
+    let every = rng.random_range(12.0..20.0);
+    let mut s = 0.0;
+    while s < lap {
+        stand(rng, s, outer - 0.4, [0.25, 0.25, 4.5], -0.3, Stuff::Metal);
+        if rng.random_bool(0.3) {
+            let size = [rng.random_range(4.0..18.0), rng.random_range(2.0..6.0), rng.random_range(3.0..8.0)];
+            stand(rng, s, outer - 8.0, size, -1.0, Stuff::Concrete);
+        }
+        if rng.random_bool(0.25) {
+            let size = [rng.random_range(1.0..6.0), rng.random_range(0.4..3.0), rng.random_range(1.6..3.5)];
+            stand(rng, s, inner + 4.0, size, -0.3, Stuff::Concrete);
+        }
+        s += every;
+    }
+    things
+}
+
+impl World {
+    /// Pose of a car at a time: the ego's reference, or the middle of another's box.
+    pub fn pose(&self, driver: usize, t: f64) -> Isometry3<f64> {
+        let (s, left) = self.drivers[driver].place(t);
+        let above = if driver == 0 { self.ego_above_m } else { self.shape(driver).size_m[2] / 2.0 };
+        self.track.pose(s, left, above)
+    }
+
+    /// Make of a car.
+    pub fn shape(&self, driver: usize) -> &CarShape {
+        &self.shapes[self.drivers[driver].shape]
+    }
+
+    /// Reflectivity of what was met.
+    pub fn reflectivity(&self, hit: &Hit) -> f64 {
+        match hit.stuff {
+            Stuff::Asphalt => self.reflectivity[0],
+            Stuff::Concrete => self.reflectivity[1],
+            Stuff::Metal => 0.5,
+            Stuff::Paint => hit.car.map_or(0.4, |car| self.drivers[car].paint),
+            Stuff::Carbon => 0.07,
+            Stuff::Rubber => 0.04,
+        }
+    }
+
+    /// The scene at `t` seconds in the frame `world_from_ego`.
+    pub fn moment(&self, t: f64, world_from_ego: Isometry3<f64>) -> Moment<'_> {
+        let ego_from_world = world_from_ego.inverse();
+        let near = |p: &Point3<f64>, reach: f64| p.coords.norm() < REACH_M + reach;
+        let things = self.things.iter().map(|s| Solid { pose: ego_from_world * s.pose, ..*s });
+        let things = things.map(|s| (s, Point3::from(s.pose.translation.vector), s.reach_m()));
+        let things = things.filter(|(_, p, reach)| near(p, *reach)).collect();
+        let mut cars = Vec::new();
+        for driver in 1..self.drivers.len() {
+            let pose = ego_from_world * self.pose(driver, t);
+            let center = Point3::from(pose.translation.vector);
+            let reach = Vector3::from(self.shape(driver).size_m).norm() / 2.0 + 0.1;
+            if near(&center, reach) {
+                let parts = self.shape(driver).parts.iter().map(|p| Solid { pose: pose * p.pose, ..*p }).collect();
+                cars.push((driver, parts, center, reach));
+            }
+        }
+        Moment { world: self, world_from_ego, things, cars }
+    }
+}
+
+impl Moment<'_> {
+    /// What a ray of the ego's frame meets first.
+    pub fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<Hit> {
+        let mut best = Hit { range_m: REACH_M, normal: Vector3::z(), stuff: Stuff::Asphalt, car: None };
+        let mut found = false;
+        let passes = |center: &Point3<f64>, reach: f64| {
+            let to = center - origin;
+            let along = to.dot(direction);
+            along > -reach && to.norm_squared() - along * along < reach * reach
+        };
+        let mut try_solid = |solid: &Solid, car: Option<usize>| {
+            if let Some((t, normal)) = solid.cast(origin, direction)
+                && t < best.range_m
+            {
+                (best, found) = (Hit { range_m: t, normal, stuff: solid.stuff, car }, true);
+            }
+        };
+        for (solid, center, reach) in &self.things {
+            if passes(center, *reach) {
+                try_solid(solid, None);
+            }
+        }
+        for (car, parts, center, reach) in &self.cars {
+            if passes(center, *reach) {
+                parts.iter().for_each(|p| try_solid(p, Some(*car)));
+            }
+        }
+        let o = self.world_from_ego * origin;
+        let d = self.world_from_ego.rotation * direction;
+        let mut meet = |t: f64, normal_world: Vector3<f64>, stuff: Stuff| {
+            if t < best.range_m {
+                let normal = self.world_from_ego.rotation.inverse_transform_vector(&normal_world);
+                (best, found) = (Hit { range_m: t, normal, stuff, car: None }, true);
+            }
+        };
+        for wall in &self.world.walls {
+            if let Some((t, normal)) = self.world.cast_wall(wall, &o, &d) {
+                meet(t, normal, Stuff::Concrete);
+            }
+        }
+        if let Some((t, normal)) = self.world.cast_road(&o, &d, best.range_m) {
+            let normal = self.world_from_ego.rotation.inverse_transform_vector(&normal);
+            (best, found) = (Hit { range_m: t, normal, stuff: Stuff::Asphalt, car: None }, true);
+        }
+        found.then_some(best)
+    }
+}
+
+impl World {
+    fn cast_wall(&self, wall: &Wall, o: &Point3<f64>, d: &Vector3<f64>) -> Option<(f64, Vector3<f64>)> {
+        let track = &self.track;
+        let half = track.straight_m / 2.0;
+        let mut candidates = [(f64::INFINITY, Vector3::zeros()); 6];
+        let mut n = 0;
+        let mut push = |t: f64, normal: Vector3<f64>| {
+            if t > 1e-6 && t < REACH_M && n < 6 {
+                candidates[n] = (t, normal);
+                n += 1;
+            }
+        };
+        for (y, sign) in [(-track.radius_m + wall.left_m, 1.0), (track.radius_m - wall.left_m, -1.0)] {
+            let t = (y - o.y) / d.y;
+            if (o.x + t * d.x).abs() <= half {
+                push(t, Vector3::y() * sign);
+            }
+        }
+        let radius = track.radius_m - wall.left_m;
+        for side in [1.0, -1.0] {
+            let (px, py) = (o.x - side * half, o.y);
+            let (a, b, c) = (d.x * d.x + d.y * d.y, px * d.x + py * d.y, px * px + py * py - radius * radius);
+            let disc = b * b - a * c;
+            if disc > 0.0 {
+                for root in [-1.0, 1.0] {
+                    let t = (-b + root * disc.sqrt()) / a;
+                    let (x, y) = (px + t * d.x, py + t * d.y);
+                    if x * side > 0.0 {
+                        push(t, Vector3::new(-x / radius, -y / radius, 0.0));
+                    }
+                }
+            }
+        }
+        candidates[..n].sort_by(|a, b| a.0.total_cmp(&b.0));
+        candidates[..n].iter().copied().find_map(|(t, normal)| {
+            let p = o + d * t;
+            let foot = track.height_m(p.x, p.y);
+            let s = track.curve_coordinates(p.x, p.y).0;
+            let lap = track.lap_m();
+            let open = wall.gaps_m.iter().any(|(a, b)| (s - a).rem_euclid(lap) < b - a);
+            let stands = !open && p.z > foot - 0.3 && p.z < foot + wall.height_m;
+            stands.then(|| (t, if normal.dot(d) > 0.0 { -normal } else { normal }))
+        })
+    }
+
+    /// Marches with steps that cannot pass the surface, then halves the last one.
+    fn cast_road(&self, o: &Point3<f64>, d: &Vector3<f64>, before_m: f64) -> Option<(f64, Vector3<f64>)> {
+        let gap = |t: f64| {
+            let p = o + d * t;
+            p.z - self.track.height_m(p.x, p.y)
+        };
+        let steepest = (self.track.bank_rad[1].max(self.track.bank_rad[0])).tan() + 0.02;
+        let fall = (steepest * d.xy().norm() - d.z).max(1e-3);
+        let (mut t, mut g) = (0.0, gap(0.0));
+        while g > 0.0 {
+            let next = t + (g / fall).max(0.25);
+            if t > before_m || next > REACH_M {
+                return None;
+            }
+            let after = gap(next);
+            if after <= 0.0 {
+                let (mut low, mut high) = (t, next);
+                for _ in 0..40 {
+                    let middle = 0.5 * (low + high);
+                    if gap(middle) > 0.0 { low = middle } else { high = middle }
+                }
+                if high >= before_m {
+                    return None;
+                }
+                let p = o + d * high;
+                let h = 0.05;
+                let slope = |dx: f64, dy: f64| {
+                    (self.track.height_m(p.x + dx, p.y + dy) - self.track.height_m(p.x - dx, p.y - dy)) / (2.0 * h)
+                };
+                return Some((high, Vector3::new(-slope(h, 0.0), -slope(0.0, h), 1.0).normalize()));
+            }
+            (t, g) = (next, after);
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rays_from_the_ego_car_meet_road_wall_and_cars() {
+        let world = draw_world(&mut data::stream(3, "world", 0, 0), 0.3);
+        let pose = world.pose(0, 1.0);
+        let moment = world.moment(1.0, pose);
+        let mount = Point3::new(0.0, 0.0, 1.5);
+        let down = moment.cast(&mount, &Vector3::new(0.3, 0.0, -1.0).normalize()).unwrap();
+        assert_eq!(down.stuff, Stuff::Asphalt);
+        assert!((down.range_m - 1.8 * 1.09f64.sqrt()).abs() < 0.05, "{}", down.range_m);
+        assert!((down.normal.z - 1.0).abs() < 0.01);
+        let right = moment.cast(&mount, &Vector3::new(0.0, -1.0, -0.12).normalize()).unwrap();
+        assert!(right.range_m < 12.0 && right.normal.y > 0.9 || right.stuff == Stuff::Asphalt, "{right:?}");
+        let mut cars = 0;
+        for driver in 1..world.drivers.len() {
+            let center = Point3::from((pose.inverse() * world.pose(driver, 1.0)).translation.vector);
+            let hit = moment.cast(&mount, &(center - mount).normalize());
+            cars += usize::from(hit.is_some_and(|h| h.car == Some(driver)));
+        }
+        assert!(cars >= 1);
+    }
+}

@@ -1,0 +1,204 @@
+//! A case on disk: `measured/`, `simulated/`, `sensor.toml`; the truth is handed back and lies nowhere beside them.
+
+use crate::case::{Case, Kind};
+use crate::effect::{Effect, Hidden, Truth};
+use crate::rig::{draw_rig, rig_toml};
+use crate::scan::{Nuisances, OwnErrors, Scan, Side, Sums};
+use crate::solid::{Form, Solid, Stuff};
+use crate::world::{World, draw_world};
+use data::write::write_kitti_frame;
+use data::{Cloud, DataError, Frame, Object, write_atomic};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use rand::RngExt;
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Writes both sides and the rig into `folder`; returns what is hidden.
+pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
+    let mut rng = data::stream(case.seed, "blind world", 0, 0);
+    let (rig, above_m) = draw_rig(&mut rng, case.size.shots);
+    let simulated_world = draw_world(&mut rng, above_m);
+    let mut measured_world = simulated_world.clone();
+    for wall in &mut measured_world.walls {
+        wall.left_m += rng.random_range(-0.02..0.02);
+    }
+    for shape in &mut measured_world.shapes {
+        let grown = 1.0 + rng.random_range(-0.006..0.006);
+        scale_parts(&mut shape.parts, [grown; 3]);
+    }
+    let nuisances = Nuisances {
+        noise_m: rng.random_range(0.003..0.012),
+        lost: rng.random_range(0.001..0.015),
+        false_returns: rng.random_range(0.0..3e-4),
+        weakest: rng.random_range(-14.0..-12.0),
+        dither: if rng.random_bool(0.5) { [0.1, 0.03] } else { [0.0, 0.0] },
+    };
+    let mut beams: Vec<Vec<[f64; 2]>> = rig.iter().map(|m| vec![[0.0; 2]; m.rows_rad.len()]).collect();
+    let level = beams.clone();
+    for effect in &case.effects {
+        match effect {
+            Effect::BeamRangeOffset { std_m } => {
+                beams.iter_mut().flatten().for_each(|b| b[0] = std_m * 3f64.sqrt() * rng.random_range(-1.0..1.0));
+            }
+            Effect::BeamElevationOffset { std_rad } => {
+                beams.iter_mut().flatten().for_each(|b| b[1] = std_rad * 3f64.sqrt() * rng.random_range(-1.0..1.0));
+            }
+            Effect::MissingObject { things } => add_things(&mut measured_world, *things, &mut rng),
+            Effect::WrongShape { length, height } => {
+                for shape in &mut measured_world.shapes {
+                    let h = shape.size_m[2];
+                    scale_parts(&mut shape.parts, [1.0 + length, 1.0, 1.0 + height]);
+                    shape.parts.iter_mut().for_each(|p| p.pose.translation.z += height * h / 2.0);
+                }
+            }
+            _ => {}
+        }
+    }
+    let own = OwnErrors { pose: [0.003, 8e-5], labels_m: rng.random_range(0.02..0.05) };
+    let measured = Side { world: &measured_world, rig: &rig, nuisances, own, effects: &case.effects, beams: &beams };
+    let simulated =
+        Side { world: &simulated_world, rig: &rig, nuisances, own: OwnErrors::default(), effects: &[], beams: &level };
+    write_atomic(&folder.join("sensor.toml"), rig_toml(&rig).as_bytes())?;
+    let sums: Vec<Result<Sums, DataError>> = (0..case.size.frames)
+        .into_par_iter()
+        .map(|i| {
+            let t = i as f64 * case.step_s;
+            let scan = measured.scan(t, &mut data::stream(case.seed, "blind measured", 0, i as u64));
+            let shown =
+                if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
+            let sums = scan.sums;
+            // Ids count scans at 20 Hz, whether all of them are kept or not.
+            let every = (case.step_s * 20.0).round() as usize;
+            write_scan(&folder.join("measured"), shown * every, scan)?;
+            let scan = simulated.scan(t, &mut data::stream(case.seed, "blind simulated", 0, i as u64));
+            write_scan(&folder.join("simulated"), i * every, scan)?;
+            Ok(sums)
+        })
+        .collect();
+    let mut total = Sums::default();
+    for s in sums {
+        let s = s?;
+        total.returns += s.returns;
+        total.lever += s.lever;
+        total.boxes = [total.boxes[0] + s.boxes[0], total.boxes[1] + s.boxes[1]];
+    }
+    Ok(truth(case, &nuisances, &own, &total))
+}
+
+fn write_scan(root: &Path, id: usize, scan: Scan) -> Result<(), DataError> {
+    let values = scan.points.into_iter().flatten().collect();
+    let object = |bbox| Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None };
+    let frame = Frame {
+        id: format!("{id:06}"),
+        cloud: Cloud { values, channels: 3 },
+        objects: scan.boxes.into_iter().map(object).collect(),
+    };
+    write_kitti_frame(root, &frame)?;
+    write_atomic(&root.join("dataset.toml"), b"points = \"xyz\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\"]\n")
+}
+
+fn scale_parts(parts: &mut [Solid], by: [f64; 3]) {
+    for part in parts {
+        let p = part.pose.translation.vector.component_mul(&Vector3::from(by));
+        part.pose = Isometry3::from_parts(Translation3::from(p), part.pose.rotation);
+        if let Form::Cuboid(half) = &mut part.form {
+            half.component_mul_assign(&Vector3::from(by));
+        }
+    }
+}
+
+/// Containers beside and behind the walls.
+fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
+    for _ in 0..n {
+        let s = rng.random_range(0.0..world.track.lap_m());
+        let left = world.walls[0].left_m - rng.random_range(1.5..5.0);
+        let ([x, y], heading) = world.track.at(s, left);
+        let size = Vector3::new(rng.random_range(2.0..6.0), rng.random_range(0.5..2.5), rng.random_range(2.5..5.0));
+        let z = world.track.height_m(x, y) + size.z / 2.0;
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading);
+        let pose = Isometry3::from_parts(Translation3::new(x, y, z), turn);
+        world.things.push(Solid { pose, form: Form::Cuboid(size / 2.0), stuff: Stuff::Metal });
+    }
+}
+
+/// The truth with standard errors of estimators that know the form: Fisher information of the frames' returns.
+fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, sums: &Sums) -> Truth {
+    let bound = |effect: &Effect| -> BTreeMap<String, f64> {
+        let own_variance = 2.0 * nuisances.noise_m.powi(2);
+        let n = sums.returns.max(1.0);
+        let list: Vec<(&str, f64)> = match effect {
+            Effect::RangeNoise { sigma_m, .. } => {
+                vec![("sigma_m", (sigma_m.powi(2) + own_variance) / sigma_m / (2.0 * n).sqrt())]
+            }
+            Effect::RandomDropout { share } => vec![("share", (share * (1.0 - share) / n).sqrt())],
+            Effect::Outliers { share } => vec![("share", (share / n).sqrt())],
+            Effect::AngularJitter { sigma_rad } => {
+                let signal = sigma_rad.powi(2) * sums.lever / n;
+                vec![("sigma_deg", sigma_rad.to_degrees() * (signal + own_variance) / signal / (2.0 * n).sqrt())]
+            }
+            Effect::TimeOffset { .. } => vec![("dt_s", own.labels_m / sums.boxes[1].max(1.0).sqrt())],
+            Effect::LabelOffset { .. } => {
+                let se = own.labels_m / sums.boxes[0].max(1.0).sqrt();
+                vec![("forward_m", se), ("left_m", se), ("up_m", se)]
+            }
+            _ => vec![],
+        };
+        list.into_iter().map(|(k, v)| (k.to_owned(), v)).collect()
+    };
+    let hidden = case.effects.iter().map(|effect| Hidden {
+        cause: effect.cause().map_or_else(|| format!("{effect:?}"), str::to_owned),
+        in_catalogue: effect.cause().is_some(),
+        parameters: effect.parameters(),
+        bound: bound(effect),
+    });
+    let kind = match case.kind {
+        Kind::Null => "null",
+        Kind::Single(_) => "single",
+        Kind::Pair(..) => "pair",
+        Kind::OffCatalogue(_) => "off_catalogue",
+        Kind::Shuffled => "shuffled",
+    };
+    Truth { seed: case.seed, kind: kind.into(), hidden: hidden.collect() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::case::{CaseSize, draw_case};
+
+    #[test]
+    fn a_case_is_a_pure_function_of_its_seed_and_leaks_nothing() {
+        let size = CaseSize { frames: 2, shots: 3_000 };
+        let case = draw_case(5, Kind::Null, size);
+        let folders = [(); 2].map(|()| {
+            let folder = tempfile();
+            write_case(&case, &folder.0).unwrap();
+            folder
+        });
+        let read = |k: usize, name: &str| fs_err::read(folders[k].0.join(name)).unwrap();
+        let second = format!("velodyne/{:06}.bin", (case.step_s * 20.0).round() as usize);
+        for name in [&format!("measured/{second}"), &format!("simulated/{second}"), "sensor.toml"] {
+            assert_eq!(read(0, name), read(1, name));
+        }
+        let points =
+            |bytes: Vec<u8>| bytes.chunks_exact(12).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>();
+        let (a, b) = (points(read(0, &format!("measured/{second}"))), points(read(0, &format!("simulated/{second}"))));
+        assert!(a.len() > 1_000 && a.intersection(&b).count() == 0, "{} points", a.len());
+    }
+
+    struct Folder(std::path::PathBuf);
+
+    impl Drop for Folder {
+        fn drop(&mut self) {
+            let _ = fs_err::remove_dir_all(&self.0);
+        }
+    }
+
+    fn tempfile() -> Folder {
+        use std::sync::atomic::{AtomicUsize, Ordering};
+        static N: AtomicUsize = AtomicUsize::new(0);
+        let name = format!("lidarshift-blind-{}-{}", std::process::id(), N.fetch_add(1, Ordering::Relaxed));
+        Folder(std::env::temp_dir().join(name))
+    }
+}
