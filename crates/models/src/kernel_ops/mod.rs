@@ -7,11 +7,13 @@ mod convolution;
 mod focal_loss;
 mod norm_relu;
 mod pillar_net;
+mod shared_mlp;
 
 pub use convolution::{conv3x3, folded_conv3x3, folded_transposed, pointwise, transposed};
 pub use focal_loss::focal_loss_sum;
 pub use norm_relu::norm_relu;
 pub use pillar_net::{pillar_net, pillar_net_inference};
+pub use shared_mlp::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
