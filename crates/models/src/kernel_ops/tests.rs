@@ -77,9 +77,23 @@ fn convolutions() {
         );
     }
     assert!(transposed(&random([1, 1, 2, 2], 1), &random([1, 1, 3, 3], 1), 3).is_none(), "no kernel for a stride of 3");
-    let (x, w, b) = (random([2, 6, 5, 3], 5), random([4, 6, 1, 1], 6), random([4], 7));
-    let theirs = conv2d(x.clone(), w.clone(), Some(b.clone()), ConvOptions::new([1, 1], [0, 0], [1, 1], 1));
-    check!("1x1", [x, w, b], pointwise(&x, &w, &b).unwrap(), theirs);
+}
+
+#[test]
+fn heads_of_an_image() {
+    for shape in [[2, 6, 5, 3], [1, 1, 1, 1], [1, 40, 20, 19]] {
+        let (x, channels) = (random(shape, 5), shape[1]);
+        let (w1, b1) = (random([4, channels, 1, 1], 6), random([4], 7));
+        let (w2, b2) = (random([7, channels, 1, 1], 8), random([7], 9));
+        let ours = Tensor::cat(pixel_heads(&x, [(&w1, &b1), (&w2, &b2)]).unwrap().to_vec(), 1);
+        let burns = |w: &Tensor<4>, b: &Tensor<1>| {
+            let y = conv2d(x.clone(), w.clone(), Some(b.clone()), ConvOptions::new([1, 1], [0, 0], [1, 1], 1));
+            let [n, k, h, w] = y.dims();
+            y.permute([0, 2, 3, 1]).reshape([n * h * w, k])
+        };
+        let theirs = Tensor::cat(vec![burns(&w1, &b1), burns(&w2, &b2)], 1);
+        check!(format!("heads, {shape:?}"), [x, w1, b1, w2, b2], ours, theirs);
+    }
 }
 
 #[test]
