@@ -10,6 +10,7 @@ mod norm_relu;
 mod pillar_net;
 mod pixel_heads;
 mod shared_mlp;
+mod values;
 
 pub use canvas::scatter;
 pub use convolution::{conv3x3, folded_conv3x3, folded_transposed, transposed};
@@ -18,6 +19,7 @@ pub use norm_relu::norm_relu;
 pub use pillar_net::{pillar_net, pillar_net_inference};
 pub use pixel_heads::pixel_heads;
 pub use shared_mlp::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
+pub use values::FlexValues;
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
