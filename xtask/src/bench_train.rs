@@ -37,10 +37,10 @@ struct Row {
     reference_ms: f64,
     /// The first over the second.
     ratio: f64,
-    /// Largest resident memory of the process, MiB.
-    ours_peak_mib: u64,
+    /// Largest resident memory of the process, MiB; only where the system says it.
+    ours_peak_mib: Option<u64>,
     /// Largest resident memory of the process, PyTorch's libraries included, MiB.
-    reference_peak_mib: u64,
+    reference_peak_mib: Option<u64>,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -53,7 +53,7 @@ struct Rows {
 #[derive(Clone, Debug, Deserialize)]
 struct Turn {
     whole_ms: Vec<f64>,
-    peak_mib: u64,
+    peak_mib: Option<u64>,
     /// Only ours has stages.
     #[serde(default)]
     median_ms: Vec<(String, f64)>,
@@ -79,7 +79,7 @@ pub fn bench_train(root: &Path, words: &[String]) -> Result<()> {
         measured.extend(case.measure(root, &program, &python)?);
     }
     let file = root.join(FILE);
-    let known = match std::fs::read(&file) {
+    let known = match fs_err::read(&file) {
         Ok(bytes) => serde_json::from_slice::<Rows>(&bytes).with_context(|| format!("{FILE} is damaged"))?.rows,
         Err(_) => Vec::new(),
     };
@@ -122,7 +122,7 @@ impl Case {
             step.args(["--steps", &STEPS.to_string(), "--json"]).arg(&report);
             step.env("RAYON_NUM_THREADS", threads.to_string()).current_dir(root);
             output(&mut step)?;
-            ours.push(serde_json::from_slice::<Turn>(&std::fs::read(&report)?)?);
+            ours.push(serde_json::from_slice::<Turn>(&fs_err::read(&report)?)?);
             for ((_, form), theirs) in references.iter().zip(&mut theirs) {
                 let mut step = Command::new(python);
                 step.arg(root.join("xtask/bench_train/step.py")).arg(&report);
@@ -131,7 +131,7 @@ impl Case {
                 theirs.push(serde_json::from_slice::<Turn>(&output(&mut step)?)?);
             }
         }
-        std::fs::remove_file(&report)?;
+        fs_err::remove_file(&report)?;
         for (stage, ms) in ours.last().iter().flat_map(|turn| &turn.median_ms) {
             eprintln!("  {stage:<11} {ms:>9.1} ms");
         }
@@ -143,7 +143,7 @@ impl Case {
 impl Row {
     fn new(id: &str, ours: &[Turn], theirs: &[Turn]) -> Self {
         let ms = |turns: &[Turn]| median(turns.iter().flat_map(|turn| turn.whole_ms.iter().copied()).collect());
-        let peak = |turns: &[Turn]| turns.iter().map(|turn| turn.peak_mib).max().unwrap_or(0);
+        let peak = |turns: &[Turn]| turns.iter().filter_map(|turn| turn.peak_mib).max();
         let round = |value: f64, digits: f64| (value * digits).round() / digits;
         let (ours_ms, reference_ms) = (ms(ours), ms(theirs));
         Row {
@@ -176,16 +176,18 @@ fn print_table(rows: &[Row]) {
         "| step | here, ms | reference, ms | ratio | memory here, MiB | reference, MiB |\n|---|---|---|---|---|---|"
     );
     for Row { id, ours_ms, reference_ms, ratio, ours_peak_mib, reference_peak_mib } in rows {
-        println!("| `{id}` | {ours_ms} | {reference_ms} | {ratio} | {ours_peak_mib} | {reference_peak_mib} |");
+        let [ours, theirs] =
+            [ours_peak_mib, reference_peak_mib].map(|peak| peak.map_or(String::new(), |p| p.to_string()));
+        println!("| `{id}` | {ours_ms} | {reference_ms} | {ratio} | {ours} | {theirs} |");
     }
 }
 
 fn write(file: &Path, rows: &Rows) -> Result<()> {
     let folder = file.parent().context("a file in a folder")?;
-    std::fs::create_dir_all(folder)?;
+    fs_err::create_dir_all(folder)?;
     let partial = file.with_extension("json.partial");
-    std::fs::write(&partial, serde_json::to_string_pretty(rows)? + "\n")?;
-    std::fs::rename(&partial, file).with_context(|| format!("could not write {}", file.display()))
+    fs_err::write(&partial, serde_json::to_string_pretty(rows)? + "\n")?;
+    Ok(fs_err::rename(&partial, file)?)
 }
 
 /// The Python that has all that the reference needs.
@@ -216,7 +218,7 @@ mod tests {
     use super::*;
 
     fn row(id: &str, ours_ms: f64) -> Row {
-        Row { id: id.into(), ours_ms, reference_ms: 2.0, ratio: 0.5, ours_peak_mib: 1, reference_peak_mib: 2 }
+        Row { id: id.into(), ours_ms, reference_ms: 2.0, ratio: 0.5, ours_peak_mib: Some(1), reference_peak_mib: None }
     }
 
     #[test]
@@ -246,9 +248,9 @@ mod tests {
 
     #[test]
     fn medians_over_all_turns() {
-        let turn = |whole_ms: &[f64], peak_mib| Turn { whole_ms: whole_ms.to_vec(), peak_mib, median_ms: vec![] };
+        let turn = |whole_ms: &[f64], mib| Turn { whole_ms: whole_ms.to_vec(), peak_mib: Some(mib), median_ms: vec![] };
         let row = Row::new("x", &[turn(&[1.0, 9.0], 5), turn(&[2.0], 7)], &[turn(&[8.0], 100)]);
         assert_eq!((row.ours_ms, row.reference_ms, row.ratio), (2.0, 8.0, 0.25));
-        assert_eq!((row.ours_peak_mib, row.reference_peak_mib), (7, 100));
+        assert_eq!((row.ours_peak_mib, row.reference_peak_mib), (Some(7), Some(100)));
     }
 }
