@@ -1,15 +1,16 @@
-//! `cargo xtask bench [NAME]`: the benchmarks that the crates have, and a training step of every detector by stage.
+//! `cargo xtask bench [NAME]`: the benchmarks that the crates have, and training steps beside PyTorch's.
 
-use crate::{cargo, program, tidy::manifests};
+use crate::bench_train::bench_train;
+use crate::{cargo, tidy::manifests};
 use anyhow::{Result, bail};
-use std::ffi::OsString;
 use std::path::Path;
 
-/// Detectors whose training step is timed.
-const DETECTORS: [&str; 2] = ["pointpillars_small", "pointpillars"];
-
-/// Runs the benchmarks called `name`, those of the crate folder `name`, the training steps (`train`), or all.
-pub fn bench(root: &Path, name: Option<&str>, criterion: &[String]) -> Result<()> {
+/// Runs the benchmarks called `name`, those of the crate folder `name`, the training steps beside PyTorch's (`train`; `words` are parts of the ids
+/// of the wanted rows), or all benchmarks of crates.
+pub fn bench(root: &Path, name: Option<&str>, words: &[String]) -> Result<()> {
+    if name == Some("train") {
+        return bench_train(root, words);
+    }
     let mut known = Vec::new();
     let mut ran = false;
     for manifest in manifests(root)? {
@@ -22,18 +23,11 @@ pub fn bench(root: &Path, name: Option<&str>, criterion: &[String]) -> Result<()
             ran = true;
             let status = cargo(root)
                 .args(["bench", "--quiet", "--package", &manifest.package, "--bench", &bench, "--"])
-                .args(criterion)
+                .args(words)
                 .status()?;
             if !status.success() {
                 bail!("the benchmark {bench} failed");
             }
-        }
-    }
-    if name.is_none_or(|name| name == "train") {
-        ran = true;
-        // Each in a process of its own, whose memory is measured.
-        for detector in DETECTORS {
-            program::run(root, &["bench-step", "--detector", detector].map(OsString::from))?;
         }
     }
     known.push("train".into());

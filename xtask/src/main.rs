@@ -1,6 +1,7 @@
 //! `cargo xtask WORD ...`: the program `lidarshift`, built in release and run with the same words; and the chores of who works on it.
 
 mod bench;
+mod bench_train;
 mod ci;
 mod program;
 mod tidy;
@@ -34,13 +35,13 @@ enum Word {
     Tidy,
     /// Write configs/schema.json and docs/configuration.md from the Rust types.
     Schema,
-    /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion.
+    /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's.
     Bench {
-        /// A benchmark (`crates/*/benches/NAME.rs`) or the folder of a crate; all when left out.
+        /// A benchmark (`crates/*/benches/NAME.rs`), the folder of a crate, or `train`; all but `train` when left out.
         name: Option<String>,
-        /// For Criterion, as `--quick` or a filter.
+        /// For Criterion, as `--quick` or a filter; for `train` parts of the ids of the wanted rows.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        criterion: Vec<String>,
+        words: Vec<String>,
     },
     /// Face every reader of files with mutated inputs: `fuzz --inputs 1000000`.
     Fuzz {
@@ -58,7 +59,7 @@ fn main() -> ExitCode {
         Word::Ci => ci::ci(&root()),
         Word::Tidy => tidy(),
         Word::Schema => program::run(&root(), &["schema".into()]),
-        Word::Bench { name, criterion } => bench::bench(&root(), name.as_deref(), &criterion),
+        Word::Bench { name, words } => bench::bench(&root(), name.as_deref(), &words),
         Word::Fuzz { args } => program::hand_over(&root(), &[vec!["fuzz".into()], args].concat()),
         Word::Program(args) => program::hand_over(&root(), &args),
     };

@@ -8,7 +8,7 @@ use burn::tensor::{Device, Tensor};
 use clap::Args;
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Frame, stream};
-use models::config::NetworkConfig;
+use models::config::{DetectorConfig, NetworkConfig};
 use models::layers::Mode;
 use models::pointpillars::pillars::{PillarGrid, pillarise};
 use models::pointpillars::{losses, scatter::scatter};
@@ -46,10 +46,15 @@ struct Report {
     device: String,
     batch: usize,
     steps: usize,
+    /// What the detector reads of the last batch: points that are in pillars or are drawn, and pillars.
+    read: [usize; 2],
+    /// The whole of each timed step, ms.
+    whole_ms: Vec<f64>,
     /// Median of each stage and of the whole step, ms.
     median_ms: Vec<(&'static str, f64)>,
     /// Largest resident memory of the process, MiB.
     peak_mib: Option<u64>,
+    config: DetectorConfig,
 }
 
 impl BenchStepArgs {
@@ -63,6 +68,7 @@ impl BenchStepArgs {
         let mut detector = Detector::new(&config, 0, &device);
         let mut adam = Adam::new(config.optimization.weight_decay, reference_name);
         let preparer = Preparer::new(&config);
+        let mut read = [0, 0];
         let mut times: Vec<(&'static str, Vec<f64>)> = Vec::new();
         for step in 0..self.steps + 2 {
             let mut clock = Clock { device: &device, marks: vec![("", Instant::now())] };
@@ -73,6 +79,7 @@ impl BenchStepArgs {
                 let cropped = crop_to_range(augmented, &config.range_m.map(f64::from));
                 batch.push(preparer.training(&cropped, &mut random)?);
             }
+            read = batch.iter().map(read_of).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]));
             clock.mark("data")?;
             let total = forward(&detector, &batch, &mut clock)?;
             let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
@@ -91,13 +98,16 @@ impl BenchStepArgs {
             }
         }
         let report = Report {
-            schema: "lidarshift/bench-step/1",
+            schema: "lidarshift/bench-step/2",
+            read,
+            whole_ms: times.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
             median_ms: times.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
             peak_mib: crate::memory::peak_mib(),
             detector: config.name.clone(),
             device: self.device.describe(),
             batch: self.batch,
             steps: self.steps,
+            config,
         };
         println!("pillars of 120,000 points, cells of 0.16 m: {:.1} ms", median(pillarise_ms()));
         println!("{}, batch {}, {}: medians of {} steps", report.detector, report.batch, report.device, report.steps);
@@ -111,6 +121,17 @@ impl BenchStepArgs {
             data::write_atomic(path, &serde_json::to_vec_pretty(&report)?)?;
         }
         Ok(())
+    }
+}
+
+/// Points and pillars of a sample.
+fn read_of(sample: &Sample) -> [usize; 2] {
+    match sample {
+        Sample::PointPillars(sample) => {
+            let num_points = &sample.pillars.num_points;
+            [num_points.iter().map(|&n| n as usize).sum(), num_points.len()]
+        }
+        Sample::PointRcnn(sample) => [sample.points.len(), 0],
     }
 }
 
@@ -129,7 +150,7 @@ fn forward(detector: &Detector, batch: &[Sample], clock: &mut Clock<'_>) -> Resu
         let pillars = network.vfe.forward(network.pillar_rows(&batch), Mode::Train);
         clock.mark("encoder")?;
         let (cells, shape) = network.cells(&batch);
-        let canvas = scatter(pillars, cells, shape);
+        let canvas = scatter(pillars, &cells, shape);
         clock.mark("scatter")?;
         let features = network.backbone_2d.forward(canvas, Mode::Train).spatial_features_2d;
         clock.mark("backbone")?;

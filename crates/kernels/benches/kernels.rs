@@ -5,7 +5,7 @@
 #![expect(clippy::print_stdout, reason = "results go to stdout")]
 
 use lidarshift_kernels::{
-    Algorithm, BatchNorm, Conv3x3, Epilogue, InstructionSet, PillarNet, PillarParameters, Pillars, Pointwise,
+    Algorithm, BatchNorm, Conv3x3, Epilogue, InstructionSet, PillarNet, PillarParameters, Pillars, PixelHeads,
     TransposedConv,
 };
 use std::hint::black_box;
@@ -97,19 +97,13 @@ fn products(bench: &Bench) {
             black_box(conv.weight_gradient(&x, &dy));
         });
     }
-    let conv = Pointwise { batch: 1, inputs: 384, outputs: 72, pixels: 248 * 216 };
-    let (x, w, dy) = (values(384 * conv.pixels, 1), values(384 * 72, 2), values(72 * conv.pixels, 3));
-    let operations = 2.0 * (conv.pixels * 384 * 72) as f64;
-    let (mut y, mut dx) = (Vec::new(), Vec::new());
-    bench.time("pointwise 384->72 248x216 forward", operations, || {
-        conv.forward(&x, &conv.pack(&w), Epilogue::default(), &mut y);
-    });
-    bench.time("pointwise 384->72 248x216 data", operations, || conv.data_gradient(&dy, &w, &mut dx));
-    bench.time("pointwise 384->72 248x216 weight", operations, || {
-        black_box(conv.weight_gradient(&x, &dy));
-    });
-    bench.time("pointwise 384->72 248x216 bias", 0.0, || {
-        black_box(conv.bias_gradient(&dy));
+    let heads = PixelHeads { batch: 1, inputs: 384, pixels: 248 * 216, outputs: vec![18, 42, 12] };
+    let (x, w, dy) = (values(384 * heads.pixels, 1), values(384 * 72, 2), values(72 * heads.pixels, 3));
+    let operations = 2.0 * (heads.pixels * 384 * 72) as f64;
+    let (bias, mut y) = (values(72, 4), Vec::new());
+    bench.time("heads 384->18, 42, 12 248x216 forward", operations, || heads.forward(&x, &w, &bias, &mut y));
+    bench.time("heads 384->18, 42, 12 248x216 backward", 2.0 * operations, || {
+        black_box(heads.backward(&x, &w, &dy));
     });
 }
 

@@ -58,7 +58,7 @@ impl TileGrid {
         self.tiles().div_ceil(PIXELS)
     }
 
-    /// The segments of a block.
+    /// The segments of a block; none behind the last.
     pub fn segments(&self, block: usize) -> Segments {
         let mut segments = Segments { all: [Segment::default(); PIXELS], count: 0 };
         let (from, to) = (block * PIXELS, self.tiles().min((block + 1) * PIXELS));

@@ -1,5 +1,7 @@
 //! What follows a convolution at inference.
 
+use pulp::Simd;
+
 /// What is done to each output before it is stored: what is left of a batch norm and a ReLU at inference.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Epilogue<'a> {
@@ -11,17 +13,15 @@ pub struct Epilogue<'a> {
 
 impl Epilogue<'_> {
     #[inline(always)]
-    pub(crate) fn apply(&self, channel: usize, values: &mut [f32]) {
-        if let Some(bias) = self.bias {
-            let bias = bias[channel];
-            for value in values.iter_mut() {
-                *value += bias;
-            }
+    pub(crate) fn apply<S: Simd>(&self, simd: S, channel: usize, values: S::f32s) -> S::f32s {
+        let values = match self.bias {
+            Some(bias) => simd.add_f32s(values, simd.splat_f32s(bias[channel])),
+            None => values,
+        };
+        if !self.relu {
+            return values;
         }
-        if self.relu {
-            for value in values.iter_mut() {
-                *value = if *value < 0.0 { 0.0 } else { *value }; // NaN stays
-            }
-        }
+        let zero = simd.splat_f32s(0.0);
+        simd.select_f32s(simd.less_than_f32s(values, zero), zero, values) // NaN stays
     }
 }

@@ -1,11 +1,13 @@
 //! Batches of images as the schemes read and write them.
 
 use crate::blocks::Segment;
-use crate::line::{self, ImageRow, LINE, Line};
+use crate::epilogue::Epilogue;
 use crate::output::Shared;
-use crate::tile::PIXELS;
+use crate::registers::{ImageRow, deinterleave, get, interleave, load, prefetch, put, store};
+use crate::tile::Row;
+use pulp::Simd;
 
-/// The shape `[batch, channels, height, width]` of a tensor.
+/// The shape of an image.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ImageShape {
     /// Channels of an image.
@@ -26,55 +28,144 @@ impl ImageShape {
     }
 }
 
-/// Values of the tiles of a block, with room for the rounding of its last segment.
-pub(crate) type WideRow = [f32; 2 * PIXELS];
-
-/// Memory for one channel of one block.
-pub(crate) struct Work {
-    /// Pixels of a row.
-    pub line: Line,
-    /// One row a value of a tile; F(4x4, 3x3) has 36.
-    pub rows: [WideRow; 36],
+/// Images that are read.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Images<'a> {
+    /// `[batch, channels, height, width]`.
+    pub values: &'a [f32],
+    /// Of one image.
+    pub shape: ImageShape,
 }
 
-impl Work {
-    /// Zeros.
+impl Images<'_> {
+    /// Every M-th pixel of a row, from `first` on, which may be -1: register j has pixels `first + j`, `first + j + M`, ... Zeros outside.
     #[inline(always)]
-    pub fn new() -> Self {
-        Work { line: [0.0; LINE], rows: [[0.0; 2 * PIXELS]; 36] }
+    pub fn every<S: Simd, const M: usize>(&self, simd: S, row: Option<ImageRow>, first: isize) -> [S::f32s; M] {
+        let mut pixels = [simd.splat_f32s(0.0); M];
+        let Some(row) = row else { return pixels };
+        for (k, pixels) in pixels.iter_mut().enumerate() {
+            *pixels = load(simd, self.values, row, first + (k * S::F32_LANES) as isize);
+        }
+        deinterleave(simd, pixels)
+    }
+
+    /// Has the processor fetch what a later block reads of a channel: of each tile `rows` rows from `above` over its first on, a tile being
+    /// `size` pixels wide.
+    #[inline(always)]
+    pub fn prefetch(&self, segments: &[Segment], channel: usize, size: usize, (above, rows): (usize, usize)) {
+        prefetch_tiles(self.values.as_ptr(), &self.shape, segments, channel, size, (above, rows));
+    }
+
+    /// The `M x M` pixels of each tile of a block in one channel: pixel `(i, j)` to `panel[i * M + j]`.
+    #[inline(always)]
+    pub fn read_tiles<S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        segments: &[Segment],
+        channel: usize,
+        panel: &mut [Row],
+    ) {
+        for s in segments {
+            for i in 0..M {
+                let row = self.shape.row(s.image, channel, (s.row * M + i) as isize);
+                for group in (0..s.len).step_by(S::F32_LANES) {
+                    let pixels: [S::f32s; M] = self.every(simd, row, ((s.column + group) * M) as isize);
+                    for (j, values) in pixels.into_iter().enumerate() {
+                        put(simd, &mut panel[i * M + j], s.at + group, values);
+                    }
+                }
+            }
+        }
     }
 }
 
-/// The number of tiles that loops over a segment take: whole registers, which is more than the segment has. What they do beyond its end is
-/// overwritten by the next segment.
-#[inline(always)]
-pub(crate) fn rounded(segment: &Segment) -> usize {
-    segment.len.next_multiple_of(16)
-}
+/// Floats in a cache line.
+const LINE: usize = 16;
 
-/// Writes the tiles of `M x M` pixels of one channel; `work.rows[i * M + j]` has pixel `(i, j)` of each tile.
-///
-/// # Safety
-/// As [`Shared::write`].
 #[inline(always)]
-pub(crate) unsafe fn write_tiles<const M: usize>(
-    tensor: &Shared<'_>,
+fn prefetch_tiles(
+    values: *const f32,
     shape: &ImageShape,
-    channel: usize,
     segments: &[Segment],
-    work: &mut Work,
+    channel: usize,
+    size: usize,
+    (above, rows): (usize, usize),
 ) {
     for s in segments {
-        let count = rounded(s);
-        for i in 0..M {
-            let Some(row) = shape.row(s.image, channel, (s.row * M + i) as isize) else { continue };
-            let mut rows = work.rows[i * M..].iter();
-            let pixels: [&[f32]; M] = std::array::from_fn(|_| rows.next().map_or(&[][..], |r| &r[s.at..s.at + count]));
-            for (t, pixel) in work.line.as_chunks_mut::<M>().0[..count].iter_mut().enumerate() {
-                *pixel = std::array::from_fn(|j| pixels[j][t]);
+        for y in 0..rows {
+            if let Some(row) = shape.row(s.image, channel, (s.row * size + y) as isize - above as isize) {
+                for pixel in (s.column * size..(s.column + s.len) * size + LINE).step_by(LINE) {
+                    prefetch(values.wrapping_add(row.start + pixel));
+                }
             }
-            // SAFETY: passed on to the caller.
-            unsafe { line::write(tensor, row, s.column * M, &work.line[..s.len * M]) };
+        }
+    }
+}
+
+/// Images that are written, by several threads.
+#[derive(Clone, Copy)]
+pub(crate) struct ImagesOut<'a> {
+    /// `[batch, channels, height, width]`.
+    pub values: Shared<'a>,
+    /// Of one image.
+    pub shape: ImageShape,
+    /// What is done to each value first.
+    pub epilogue: Epilogue<'a>,
+}
+
+impl ImagesOut<'_> {
+    /// As [`Images::prefetch`], for tiles of `size` times `size` pixels that are going to be written.
+    #[inline(always)]
+    pub fn prefetch(&self, segments: &[Segment], channel: usize, size: usize) {
+        prefetch_tiles(self.values.start(), &self.shape, segments, channel, size, (0, size));
+    }
+
+    /// Writes the `M x M` pixels of the tiles of a segment from its tile `group` on, a register of tiles for each pixel, in one channel.
+    ///
+    /// # Safety
+    /// No other thread writes these tiles.
+    #[inline(always)]
+    pub unsafe fn write_tiles<S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        (segment, group): (&Segment, usize),
+        channel: usize,
+        tiles: [[S::f32s; M]; M],
+    ) {
+        let (begin, end) = ((segment.column + group) * M, (segment.column + segment.len) * M);
+        for (i, mut pixels) in tiles.into_iter().enumerate() {
+            let Some(row) = self.shape.row(segment.image, channel, (segment.row * M + i) as isize) else { continue };
+            for pixel in &mut pixels {
+                *pixel = self.epilogue.apply(simd, channel, *pixel);
+            }
+            for (k, values) in interleave(simd, pixels).into_iter().enumerate() {
+                // SAFETY: passed on to the caller.
+                unsafe { store(simd, &self.values, row, (begin + k * S::F32_LANES, end), values) };
+            }
+        }
+    }
+
+    /// Writes the `M x M` pixels of all tiles of a block in one channel, pixel `(i, j)` from `rows(i * M + j)`.
+    ///
+    /// # Safety
+    /// No other thread writes these tiles.
+    #[inline(always)]
+    pub unsafe fn write_rows<'r, S: Simd, const M: usize>(
+        &self,
+        simd: S,
+        segments: &[Segment],
+        channel: usize,
+        rows: impl Fn(usize) -> &'r Row,
+    ) {
+        for segment in segments {
+            for group in (0..segment.len).step_by(S::F32_LANES) {
+                let mut tiles = [[simd.splat_f32s(0.0); M]; M];
+                for (k, pixel) in tiles.as_flattened_mut().iter_mut().enumerate() {
+                    *pixel = get(simd, rows(k), segment.at + group);
+                }
+                // SAFETY: passed on to the caller.
+                unsafe { self.write_tiles(simd, (segment, group), channel, tiles) };
+            }
         }
     }
 }

@@ -9,18 +9,19 @@
 pub mod adam;
 pub mod batch_norm;
 mod blocks;
+pub mod canvas;
 pub mod conv3x3;
 pub mod epilogue;
 pub mod focal_loss;
 pub mod fold;
 mod images;
-mod line;
 mod matrix;
 mod output;
 pub mod pillar_net;
-pub mod pointwise;
+pub mod pixel_heads;
 #[cfg(test)]
 mod reference;
+mod registers;
 mod scheme;
 mod scratch;
 pub mod shared_mlp;
@@ -32,13 +33,14 @@ mod weight_gradient;
 
 pub use adam::{AdamStep, GradientNorm, Parameter};
 pub use batch_norm::{BatchNorm, Statistics};
+pub use canvas::Canvas;
 pub use conv3x3::{Algorithm, Conv3x3};
 pub use epilogue::Epilogue;
 pub use focal_loss::sigmoid_focal_loss;
 pub use fold::{Folded, NormParameters};
 pub use pillar_net::{PillarGradients, PillarNet, PillarParameters, PillarState, Pillars};
-pub use pointwise::Pointwise;
+pub use pixel_heads::{PixelHeadGradients, PixelHeads};
 pub use scheme::PackedWeights;
-pub use shared_mlp::{MlpGradients, MlpLayer, MlpState, SharedMlp};
+pub use shared_mlp::{MlpGradients, MlpInput, MlpLayer, MlpState, RowGroups, SharedMlp};
 pub use simd::{InstructionSet, UnknownInstructionSet, VARIABLE};
 pub use transposed::TransposedConv;

@@ -18,6 +18,13 @@ impl<'a> Matrix<'a> {
         Matrix { values, rows, columns, row_stride: columns, column_stride: 1 }
     }
 
+    /// `[rows, columns]` whose rows begin `row_stride` apart.
+    pub fn window(values: &'a [f32], rows: usize, columns: usize, row_stride: usize) -> Self {
+        let needed = if rows == 0 { 0 } else { (rows - 1) * row_stride + columns };
+        assert!(columns <= row_stride && values.len() >= needed, "{rows} rows of {columns} values");
+        Matrix { values, rows, columns, row_stride, column_stride: 1 }
+    }
+
     /// Rows and columns exchanged.
     pub fn transposed(self) -> Self {
         let Matrix { rows, columns, row_stride, column_stride, .. } = self;
@@ -44,7 +51,7 @@ pub(crate) fn multiply(a: Matrix<'_>, b: Matrix<'_>, out: &mut [f32], then: Then
     if out.is_empty() || a.columns == 0 {
         return;
     }
-    // SAFETY: `Matrix::new` and `transposed` keep all elements of the factors inside of their slices, `out` has as many as the product and is
+    // SAFETY: `Matrix::new`, `window` and `transposed` keep all elements of the factors inside of their slices, `out` has as many as the product and is
     // row-major, and a mutable slice overlaps nothing.
     unsafe {
         gemm::gemm(

@@ -56,6 +56,12 @@ impl<'a, T: Number> Shared<'a, T> {
         Shared { start: memory.as_mut_ptr(), len: memory.len(), memory: PhantomData }
     }
 
+    /// Where the memory begins.
+    #[inline(always)]
+    pub fn start(&self) -> *const T {
+        self.start.cast()
+    }
+
     /// Puts `values` at `at`.
     ///
     /// # Safety

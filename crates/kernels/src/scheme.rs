@@ -1,7 +1,6 @@
 //! Convolutions as products of small matrices, block by block in cache.
 
 use crate::blocks::{Segment, TileGrid};
-use crate::images::Work;
 use crate::scratch;
 use crate::tile::{PIXELS, Row, Tile, TileWork, dispatch_tiles, product, tile_rows, zeros};
 use pulp::Simd;
@@ -28,18 +27,17 @@ pub(crate) trait Scheme: Sync {
     /// The rows of the panel that each product takes.
     fn products(&self) -> Vec<Range<usize>>;
 
+    /// Has the processor fetch what [`Scheme::read`] will read of another block.
+    fn prefetch_input(&self, segments: &[Segment], channel: usize);
+
+    /// Has the processor fetch what [`Scheme::write`] will write.
+    fn prefetch_output(&self, segments: &[Segment], channel: usize);
+
     /// Writes the rows of one input channel into the panel.
-    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work);
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row]);
 
     /// Writes one output channel from its products.
-    fn write<'r, S: Simd>(
-        &self,
-        simd: S,
-        segments: &[Segment],
-        channel: usize,
-        products: impl Fn(usize) -> &'r Row,
-        work: &mut Work,
-    );
+    fn write<'r, S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, products: impl Fn(usize) -> &'r Row);
 }
 
 /// Weights in the order in which the products read them: `[outputs / R, rows of all products, R]`.
@@ -98,9 +96,13 @@ impl<C: Scheme> TileWork for Block<'_, C> {
     fn run<S: Simd, const R: usize, const V: usize>(self, simd: S) {
         let Block { scheme, products, weights, block, panel, sums } = self;
         let segments = scheme.grid().segments(block);
-        let mut work = Work::new();
+        let next = scheme.grid().segments(block + 1);
         for channel in 0..scheme.inputs() {
-            scheme.read(simd, segments.list(), channel, panel, &mut work);
+            scheme.prefetch_input(next.list(), channel);
+            scheme.read(simd, segments.list(), channel, panel);
+        }
+        for channel in 0..scheme.outputs() {
+            scheme.prefetch_output(segments.list(), channel);
         }
         let mut weights = weights.as_chunks::<R>().0;
         for first in (0..scheme.outputs()).step_by(R) {
@@ -117,7 +119,7 @@ impl<C: Scheme> TileWork for Block<'_, C> {
                 }
             }
             for r in 0..R.min(scheme.outputs() - first) {
-                scheme.write(simd, segments.list(), first + r, |p| &sums[p * R + r], &mut work);
+                scheme.write(simd, segments.list(), first + r, |p| &sums[p * R + r]);
             }
         }
     }

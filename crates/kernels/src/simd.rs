@@ -96,8 +96,8 @@ static TOKEN: LazyLock<Token> = LazyLock::new(|| {
     token.unwrap_or(Token::Portable)
 });
 
-/// Runs `kernel` with the instructions in use. Everything that it calls has to be `#[inline(always)]`, or goes through
-/// [`Simd::vectorize`] again, to be compiled with them.
+/// Runs `kernel` with the instructions in use. Everything that it calls has to be `#[inline(always)]` to be compiled with them; registers are
+/// not to be worked on in closures given to the standard library (`array::from_fn`, `map`), which are functions of their own.
 pub(crate) fn dispatch<K: WithSimd>(kernel: K) -> K::Output {
     match *TOKEN {
         #[cfg(target_arch = "aarch64")]
@@ -194,6 +194,33 @@ mod tests {
             error.to_string(),
             "LIDARSHIFT_SIMD is \"avx9\"; it may be portable, neon, avx2 or avx512, or not set at all"
         );
+    }
+
+    /// The comparisons with the definitions, each in a process of its own: a set is chosen once.
+    #[test]
+    fn kernels_equal_their_definitions_with_older_instructions() {
+        if std::env::var_os(VARIABLE).is_some() {
+            return;
+        }
+        let mut sets = InstructionSet::available();
+        sets.pop();
+        for set in sets {
+            let tests = std::env::current_exe().unwrap();
+            let run = std::process::Command::new(tests)
+                .args(["equals_the", "comes_out", "the_named_set_is_in_use"])
+                .env(VARIABLE, set.name())
+                .output()
+                .unwrap();
+            let said = String::from_utf8_lossy(&run.stdout);
+            assert!(run.status.success() && said.contains("the_named_set_is_in_use ... ok"), "{}: {said}", set.name());
+        }
+    }
+
+    #[test]
+    fn the_named_set_is_in_use() {
+        if let Ok(name) = std::env::var(VARIABLE) {
+            assert_eq!(InstructionSet::in_use().unwrap().name(), name);
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Transposed convolution whose kernel is its stride, without bias: the neck that brings all blocks to one size.
 
 use crate::epilogue::Epilogue;
-use crate::images::ImageShape;
+use crate::images::{ImageShape, Images, ImagesOut};
 use crate::output::{Shared, fill};
 use crate::scheme::{PackedWeights, run};
 use crate::upsampling::{Expand, Gather, PixelPanels, pack_expand, pack_gather};
@@ -92,12 +92,12 @@ impl TransposedConv {
     pub fn forward(&self, x: &[f32], weights: &PackedWeights, epilogue: Epilogue<'_>, y: &mut Vec<f32>) {
         assert_eq!(x.len(), self.x_len(), "elements of x of {self:?}");
         assert!(epilogue.bias.is_none_or(|b| b.len() == self.outputs), "one bias an output of {self:?}");
-        let (batch, x_shape, y_shape) = (self.batch, self.x_shape(), self.y_shape());
+        let (batch, x) = (self.batch, Images { values: x, shape: self.x_shape() });
         // SAFETY: every pixel of x is in one of the blocks, and the pixels that it becomes cover y.
         unsafe {
             fill(y, self.y_len(), |y| {
-                let y = Shared::new(y);
-                with_stride!(self, M => run(&Expand::<M> { batch, x, x_shape, y, y_shape, epilogue }, weights));
+                let y = ImagesOut { values: Shared::new(y), shape: self.y_shape(), epilogue };
+                with_stride!(self, M => run(&Expand::<M> { batch, x, y }, weights));
             });
         }
     }
@@ -110,14 +110,15 @@ impl TransposedConv {
         assert_eq!(dy.len(), self.y_len(), "elements of dy of {self:?}");
         assert_eq!(weight.len(), self.weight_len(), "elements of the weights of {self:?}");
         let weight = |input, output, pixel| weight[self.weight_at(input, output) + pixel];
-        let (batch, dy_shape, dx_shape) = (self.batch, self.y_shape(), self.x_shape());
+        let (batch, dy) = (self.batch, Images { values: dy, shape: self.y_shape() });
         // SAFETY: every pixel of dx is in one of the blocks.
         unsafe {
             fill(dx, self.x_len(), |dx| {
-                let dx = Shared::new(dx);
+                let epilogue = Epilogue::default();
+                let dx = ImagesOut { values: Shared::new(dx), shape: self.x_shape(), epilogue };
                 with_stride!(self, M => {
                     let weights = pack_gather::<M>(self.inputs, self.outputs, weight);
-                    run(&Gather::<M> { batch, dy, dy_shape, dx, dx_shape }, &weights);
+                    run(&Gather::<M> { batch, dy, dx }, &weights);
                 });
             });
         }
@@ -130,9 +131,10 @@ impl TransposedConv {
     pub fn weight_gradient(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
         assert_eq!(x.len(), self.x_len(), "elements of x of {self:?}");
         assert_eq!(dy.len(), self.y_len(), "elements of dy of {self:?}");
-        let (batch, x_shape, dy_shape) = (self.batch, self.x_shape(), self.y_shape());
+        let (batch, x) = (self.batch, Images { values: x, shape: self.x_shape() });
+        let dy = Images { values: dy, shape: self.y_shape() };
         let weight_at = |input, output| self.weight_at(input, output);
-        with_stride!(self, M => weight_gradient(&PixelPanels::<M, _> { batch, x, x_shape, dy, dy_shape, weight_at }))
+        with_stride!(self, M => weight_gradient(&PixelPanels::<M, _> { batch, x, dy, weight_at }))
     }
 }
 

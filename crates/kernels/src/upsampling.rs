@@ -2,25 +2,18 @@
 //! transposed convolution whose kernel is its stride, and its gradients.
 
 use crate::blocks::{Segment, TileGrid};
-use crate::epilogue::Epilogue;
-use crate::images::{ImageShape, Work, rounded, write_tiles};
-use crate::line;
-use crate::output::Shared;
+use crate::images::{ImageShape, Images, ImagesOut};
 use crate::scheme::{PackedWeights, Scheme};
-use crate::tile::{PIXELS, Row};
+use crate::tile::Row;
 use crate::weight_gradient::Panels;
 use pulp::Simd;
 use std::ops::Range;
 
-/// From each pixel of `x` `M x M` pixels of `y`.
+/// From each pixel of `x` `M x M` pixels of `y`. Nothing else may be writing there.
 pub(crate) struct Expand<'a, const M: usize> {
     pub batch: usize,
-    pub x: &'a [f32],
-    pub x_shape: ImageShape,
-    /// Nothing else may be writing here.
-    pub y: Shared<'a>,
-    pub y_shape: ImageShape,
-    pub epilogue: Epilogue<'a>,
+    pub x: Images<'a>,
+    pub y: ImagesOut<'a>,
 }
 
 /// Weights of [`Expand`]; `weight(output, input, pixel)`.
@@ -42,30 +35,17 @@ fn grid(batch: usize, shape: &ImageShape) -> TileGrid {
     TileGrid { batch, rows: shape.height, columns: shape.width }
 }
 
-/// The pixels of a block in one channel.
-#[inline(always)]
-fn read_pixels(x: &[f32], shape: &ImageShape, segments: &[Segment], channel: usize, row: &mut Row, work: &mut Work) {
-    for s in segments {
-        if let Some(row) = shape.row(s.image, channel, s.row as isize) {
-            line::read(x, row, s.column as isize, s.len, &mut work.line);
-            let count = rounded(s);
-            work.rows[0][s.at..s.at + count].copy_from_slice(&work.line[..count]);
-        }
-    }
-    row.copy_from_slice(&work.rows[0][..PIXELS]);
-}
-
 impl<const M: usize> Scheme for Expand<'_, M> {
     fn grid(&self) -> TileGrid {
-        grid(self.batch, &self.x_shape)
+        grid(self.batch, &self.x.shape)
     }
 
     fn inputs(&self) -> usize {
-        self.x_shape.channels
+        self.x.shape.channels
     }
 
     fn outputs(&self) -> usize {
-        self.y_shape.channels
+        self.y.shape.channels
     }
 
     fn panel_rows(&self) -> usize {
@@ -77,36 +57,32 @@ impl<const M: usize> Scheme for Expand<'_, M> {
     }
 
     #[inline(always)]
-    fn read<S: Simd>(&self, _: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work) {
-        read_pixels(self.x, &self.x_shape, segments, channel, &mut panel[channel], work);
+    fn prefetch_input(&self, segments: &[Segment], channel: usize) {
+        self.x.prefetch(segments, channel, 1, (0, 1));
     }
 
     #[inline(always)]
-    fn write<'r, S: Simd>(
-        &self,
-        _: S,
-        segments: &[Segment],
-        channel: usize,
-        products: impl Fn(usize) -> &'r Row,
-        work: &mut Work,
-    ) {
-        for (pixel, row) in work.rows[..M * M].iter_mut().enumerate() {
-            row[..PIXELS].copy_from_slice(products(pixel));
-            self.epilogue.apply(channel, &mut row[..PIXELS]);
-        }
+    fn prefetch_output(&self, segments: &[Segment], channel: usize) {
+        self.y.prefetch(segments, channel, M);
+    }
+
+    #[inline(always)]
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row]) {
+        self.x.read_tiles::<S, 1>(simd, segments, channel, &mut panel[channel..]);
+    }
+
+    #[inline(always)]
+    fn write<'r, S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, products: impl Fn(usize) -> &'r Row) {
         // SAFETY: no pixel of `x` is in two blocks, and one thread works on a block.
-        unsafe { write_tiles::<M>(&self.y, &self.y_shape, channel, segments, work) };
+        unsafe { self.y.write_rows::<S, M>(simd, segments, channel, products) };
     }
 }
 
-/// From `M x M` pixels of `dy` one pixel of `dx`.
+/// From `M x M` pixels of `dy` one pixel of `dx`. Nothing else may be writing there.
 pub(crate) struct Gather<'a, const M: usize> {
     pub batch: usize,
-    pub dy: &'a [f32],
-    pub dy_shape: ImageShape,
-    /// Nothing else may be writing here.
-    pub dx: Shared<'a>,
-    pub dx_shape: ImageShape,
+    pub dy: Images<'a>,
+    pub dx: ImagesOut<'a>,
 }
 
 /// Weights of [`Gather`]; `weight(channel of dx, channel of dy, pixel)`.
@@ -126,15 +102,15 @@ pub(crate) fn pack_gather<const M: usize>(
 
 impl<const M: usize> Scheme for Gather<'_, M> {
     fn grid(&self) -> TileGrid {
-        grid(self.batch, &self.dx_shape)
+        grid(self.batch, &self.dx.shape)
     }
 
     fn inputs(&self) -> usize {
-        self.dy_shape.channels
+        self.dy.shape.channels
     }
 
     fn outputs(&self) -> usize {
-        self.dx_shape.channels
+        self.dx.shape.channels
     }
 
     fn panel_rows(&self) -> usize {
@@ -146,49 +122,32 @@ impl<const M: usize> Scheme for Gather<'_, M> {
     }
 
     #[inline(always)]
-    fn read<S: Simd>(&self, _: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work) {
-        for s in segments {
-            let count = rounded(s);
-            for i in 0..M {
-                let Some(row) = self.dy_shape.row(s.image, channel, (s.row * M + i) as isize) else { continue };
-                line::read(self.dy, row, (s.column * M) as isize, s.len * M, &mut work.line);
-                let mut rows = work.rows[i * M..].iter_mut();
-                let to: [&mut [f32]; M] =
-                    std::array::from_fn(|_| rows.next().map_or(&mut [][..], |r| &mut r[s.at..s.at + count]));
-                for (t, pixel) in work.line.as_chunks::<M>().0[..count].iter().enumerate() {
-                    for j in 0..M {
-                        to[j][t] = pixel[j];
-                    }
-                }
-            }
-        }
-        for (to, from) in panel[channel * M * M..].iter_mut().zip(&work.rows[..M * M]) {
-            to.copy_from_slice(&from[..PIXELS]);
-        }
+    fn prefetch_input(&self, segments: &[Segment], channel: usize) {
+        self.dy.prefetch(segments, channel, M, (0, M));
     }
 
     #[inline(always)]
-    fn write<'r, S: Simd>(
-        &self,
-        _: S,
-        segments: &[Segment],
-        channel: usize,
-        products: impl Fn(usize) -> &'r Row,
-        work: &mut Work,
-    ) {
-        work.rows[0][..PIXELS].copy_from_slice(products(0));
+    fn prefetch_output(&self, segments: &[Segment], channel: usize) {
+        self.dx.prefetch(segments, channel, 1);
+    }
+
+    #[inline(always)]
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row]) {
+        self.dy.read_tiles::<S, M>(simd, segments, channel, &mut panel[channel * M * M..]);
+    }
+
+    #[inline(always)]
+    fn write<'r, S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, products: impl Fn(usize) -> &'r Row) {
         // SAFETY: no pixel of `dx` is in two blocks, and one thread works on a block.
-        unsafe { write_tiles::<1>(&self.dx, &self.dx_shape, channel, segments, work) };
+        unsafe { self.dx.write_rows::<S, 1>(simd, segments, channel, products) };
     }
 }
 
 /// The factors of the gradient by the weights of [`Expand`].
 pub(crate) struct PixelPanels<'a, const M: usize, W> {
     pub batch: usize,
-    pub x: &'a [f32],
-    pub x_shape: ImageShape,
-    pub dy: &'a [f32],
-    pub dy_shape: ImageShape,
+    pub x: Images<'a>,
+    pub dy: Images<'a>,
     /// Place of the first weight of (input, output).
     pub weight_at: W,
 }
@@ -201,15 +160,15 @@ impl<const M: usize, W: Fn(usize, usize) -> usize + Sync> Panels for PixelPanels
     const TAPS: usize = M * M;
 
     fn grid(&self) -> TileGrid {
-        grid(self.batch, &self.x_shape)
+        grid(self.batch, &self.x.shape)
     }
 
     fn inputs(&self) -> usize {
-        self.x_shape.channels
+        self.x.shape.channels
     }
 
-    fn dy(&self) -> (&[f32], &ImageShape) {
-        (self.dy, &self.dy_shape)
+    fn dy(&self) -> Images<'_> {
+        self.dy
     }
 
     fn weight_at(&self, input: usize, output: usize) -> usize {
@@ -217,7 +176,12 @@ impl<const M: usize, W: Fn(usize, usize) -> usize + Sync> Panels for PixelPanels
     }
 
     #[inline(always)]
-    fn read_x<S: Simd>(&self, _: S, segments: &[Segment], input: usize, panel: &mut [Row], _: usize, work: &mut Work) {
-        read_pixels(self.x, &self.x_shape, segments, input, &mut panel[0], work);
+    fn prefetch_x(&self, segments: &[Segment], input: usize) {
+        self.x.prefetch(segments, input, 1, (0, 1));
+    }
+
+    #[inline(always)]
+    fn read_x<S: Simd>(&self, simd: S, segments: &[Segment], input: usize, panel: &mut [Row], _: usize) {
+        self.x.read_tiles::<S, 1>(simd, segments, input, panel);
     }
 }

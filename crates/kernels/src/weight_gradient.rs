@@ -4,8 +4,7 @@
 //! number of threads.
 
 use crate::blocks::{Segment, TileGrid};
-use crate::images::{ImageShape, Work};
-use crate::line;
+use crate::images::Images;
 use crate::output::{Shared, fill};
 use crate::scratch;
 use crate::tile::{PIXELS, Row, TileWork, dispatch_tiles, outer, tile_rows, zeros};
@@ -48,21 +47,16 @@ pub(crate) trait Panels: Sync {
     fn inputs(&self) -> usize;
 
     /// `dy`, its channels the outputs.
-    fn dy(&self) -> (&[f32], &ImageShape);
+    fn dy(&self) -> Images<'_>;
 
     /// Place of the first weight of a pair of channels.
     fn weight_at(&self, input: usize, output: usize) -> usize;
 
+    /// Has the processor fetch what [`Panels::read_x`] will read of another block.
+    fn prefetch_x(&self, segments: &[Segment], input: usize);
+
     /// Writes the rows of an input: row r of position p to `panel[p * stride + r]`.
-    fn read_x<S: Simd>(
-        &self,
-        simd: S,
-        segments: &[Segment],
-        input: usize,
-        panel: &mut [Row],
-        stride: usize,
-        work: &mut Work,
-    );
+    fn read_x<S: Simd>(&self, simd: S, segments: &[Segment], input: usize, panel: &mut [Row], stride: usize);
 
     /// From the pixels of `dy` of one tile, `[TILE * TILE, columns]`, the values of each position p, to `to[p * step..][..columns]`.
     #[inline(always)]
@@ -95,7 +89,7 @@ impl Sums {
 
 /// The gradient, each pair of channels where [`Panels::weight_at`] puts it.
 pub(crate) fn weight_gradient<P: Panels>(panels: &P) -> Vec<f32> {
-    let (blocks, inputs, outputs) = (panels.grid().blocks(), panels.inputs(), panels.dy().1.channels);
+    let (blocks, inputs, outputs) = (panels.grid().blocks(), panels.inputs(), panels.dy().shape.channels);
     let len = inputs * outputs * P::TAPS;
     if blocks == 0 || len == 0 {
         return vec![0.0; len];
@@ -163,15 +157,16 @@ impl<P: Panels> TileWork for Part<'_, P> {
         let Sums { rows, columns, .. } = self.sums;
         let dy_step = (PIXELS + 1) * columns;
         let x_step = if P::X_SHARED { 0 } else { rows + 1 };
-        let mut work = Work::new();
         for block in self.blocks.clone() {
             let segments = self.panels.grid().segments(block);
             let tiles = segments.tiles();
+            let next = self.panels.grid().segments(block + 1);
             for input in 0..self.panels.inputs() {
+                self.panels.prefetch_x(next.list(), input);
                 let panel = &mut self.x_panel[input * P::ROWS..];
-                self.panels.read_x(simd, segments.list(), input, panel, rows + 1, &mut work);
+                self.panels.read_x(simd, segments.list(), input, panel, rows + 1);
             }
-            self.read_dy(segments.list(), &mut work);
+            self.read_dy(simd, segments.list(), next.list());
             for (t, pixels) in self.pixels.chunks_exact(P::TILE * P::TILE * columns).take(tiles).enumerate() {
                 self.panels.transform_dy(simd, pixels, columns, &mut self.dy_panel[t * columns..], dy_step);
             }
@@ -202,22 +197,21 @@ impl<P: Panels> TileWork for Part<'_, P> {
 impl<P: Panels> Part<'_, P> {
     /// The pixels of `dy` of each tile, outputs side by side: `[PIXELS, TILE * TILE, columns]`.
     #[inline(always)]
-    fn read_dy(&mut self, segments: &[Segment], work: &mut Work) {
-        let (size, columns) = (P::TILE, self.sums.columns);
-        let (dy, shape) = self.panels.dy();
+    fn read_dy<S: Simd>(&mut self, simd: S, segments: &[Segment], next: &[Segment]) {
+        let (size, columns) = (P::TILE * P::TILE, self.sums.columns);
+        let dy = self.panels.dy();
+        let mut tiles = [[0.0; PIXELS]; 16];
         for output in self.outputs.clone() {
+            dy.prefetch(next, output, P::TILE, (0, P::TILE));
+            match P::TILE {
+                1 => dy.read_tiles::<S, 1>(simd, segments, output, &mut tiles),
+                2 => dy.read_tiles::<S, 2>(simd, segments, output, &mut tiles),
+                _ => dy.read_tiles::<S, 4>(simd, segments, output, &mut tiles),
+            }
             let to = &mut self.pixels[output - self.outputs.start..];
-            for s in segments {
-                for i in 0..size {
-                    match shape.row(s.image, output, (s.row * size + i) as isize) {
-                        Some(row) => line::read(dy, row, (s.column * size) as isize, s.len * size, &mut work.line),
-                        None => work.line[..s.len * size].fill(0.0),
-                    }
-                    for t in 0..s.len {
-                        for j in 0..size {
-                            to[((s.at + t) * size * size + i * size + j) * columns] = work.line[t * size + j];
-                        }
-                    }
+            for (pixel, tiles) in tiles[..size].iter().enumerate() {
+                for (t, &value) in tiles.iter().enumerate() {
+                    to[(t * size + pixel) * columns] = value;
                 }
             }
         }
@@ -246,9 +240,11 @@ impl<'a, P: Panels, I: Iterator<Item = &'a [f32]> + Clone> TileWork for Finish<'
                 for p in 0..P::POSITIONS {
                     for r in 0..P::ROWS {
                         let at = (p * rows + input * P::ROWS + r) * columns + first % columns;
-                        let value = |part: &[f32]| S::as_simd_f32s(&part[at..at + S::F32_LANES]).0[0];
-                        total[p * P::ROWS + r] =
-                            self.parts.clone().fold(zero, |sum, part| simd.add_f32s(sum, value(part)));
+                        let mut sum = zero;
+                        for part in self.parts.clone() {
+                            sum = simd.add_f32s(sum, S::as_simd_f32s(&part[at..at + S::F32_LANES]).0[0]);
+                        }
+                        total[p * P::ROWS + r] = sum;
                     }
                 }
                 self.panels.finish(simd, &total[..P::POSITIONS * P::ROWS], &mut taps[..P::TAPS]);

@@ -3,7 +3,9 @@
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
+use kernels::{AdamStep, Parameter};
 use models::checkpoint::{HostTensor, HostValues, NamedTensors};
+use models::kernel_ops::FlexValues;
 use std::collections::BTreeMap;
 
 const BETA2: f64 = 0.99;
@@ -47,7 +49,16 @@ impl Adam {
         (lr, beta1): (f64, f64),
     ) -> M {
         self.steps += 1;
-        let mut stepper = Stepper { adam: self, gradients, gradient_scale, lr, beta1, path: Vec::new() };
+        let step = AdamStep {
+            learning_rate: lr,
+            beta1,
+            beta2: BETA2,
+            epsilon: EPSILON,
+            weight_decay: self.weight_decay,
+            step: self.steps,
+            gradient_scale,
+        };
+        let mut stepper = Stepper { adam: self, gradients, step, path: Vec::new() };
         module.map(&mut stepper)
     }
 
@@ -96,33 +107,59 @@ impl Adam {
         value: Tensor<1>,
         shape: Vec<usize>,
         gradient: Option<Tensor<1>>,
-        lr: f64,
-        beta1: f64,
+        step: &AdamStep,
     ) -> Tensor<1> {
-        let decayed = value.mul_scalar(1.0 - lr * self.weight_decay);
-        let Some(gradient) = gradient else { return decayed };
+        let Some(gradient) = gradient else {
+            return value.mul_scalar(1.0 - step.learning_rate * step.weight_decay);
+        };
         let (exp_avg, exp_avg_sq) = match self.moments.remove(&name) {
             Some(m) => (m.exp_avg, m.exp_avg_sq),
             None => (gradient.zeros_like(), gradient.zeros_like()),
         };
-        let exp_avg = exp_avg.mul_scalar(beta1).add(gradient.clone().mul_scalar(1.0 - beta1));
-        let exp_avg_sq = exp_avg_sq.mul_scalar(BETA2).add(gradient.clone().mul(gradient).mul_scalar(1.0 - BETA2));
-        let steps = self.steps as f64;
-        let correction1 = 1.0 - beta1.powf(steps);
-        let correction2 = 1.0 - BETA2.powf(steps);
-        let denominator = exp_avg_sq.clone().sqrt().div_scalar(correction2.sqrt()).add_scalar(EPSILON);
-        let moved = decayed.sub(exp_avg.clone().div(denominator).mul_scalar(lr / correction1));
+        let tensors = [value, gradient, exp_avg, exp_avg_sq];
+        let [moved, exp_avg, exp_avg_sq] =
+            move_by_kernel(tensors, step).unwrap_or_else(|tensors| move_on_device(tensors, step));
         self.moments.insert(name, Moments { shape, exp_avg, exp_avg_sq });
         moved
     }
 }
 
+/// Value, gradient and moments to the new value and moments, in one pass where there is a kernel for it; else they come back.
+fn move_by_kernel(tensors: [Tensor<1>; 4], step: &AdamStep) -> Result<[Tensor<1>; 3], [Tensor<1>; 4]> {
+    let Some(values) = tensors.iter().map(FlexValues::of).collect::<Option<Vec<_>>>() else { return Err(tensors) };
+    let [value, gradient, exp_avg, exp_avg_sq] = <[FlexValues; 4]>::try_from(values).expect("one for each tensor");
+    let device = tensors[0].device();
+    drop(tensors); // so that the moments are changed in their own memory
+    let [mut value, mut exp_avg, mut exp_avg_sq] = [value, exp_avg, exp_avg_sq].map(FlexValues::into_vec);
+    step.apply(vec![Parameter {
+        value: &mut value,
+        gradient: Some(gradient.as_slice()),
+        exp_avg: &mut exp_avg,
+        exp_avg_sq: &mut exp_avg_sq,
+    }]);
+    let length = value.len();
+    Ok([value, exp_avg, exp_avg_sq].map(|values| Tensor::from_data(TensorData::new(values, [length]), &device)))
+}
+
+/// The same by burn's operations.
+fn move_on_device([value, gradient, exp_avg, exp_avg_sq]: [Tensor<1>; 4], step: &AdamStep) -> [Tensor<1>; 3] {
+    let AdamStep { learning_rate, beta1, beta2, epsilon, weight_decay, step, gradient_scale } = *step;
+    let gradient = if gradient_scale == 1.0 { gradient } else { gradient.mul_scalar(gradient_scale) };
+    let exp_avg = exp_avg.mul_scalar(beta1).add(gradient.clone().mul_scalar(1.0 - beta1));
+    let exp_avg_sq = exp_avg_sq.mul_scalar(beta2).add(gradient.clone().mul(gradient).mul_scalar(1.0 - beta2));
+    let steps = step as f64;
+    let correction1 = 1.0 - beta1.powf(steps);
+    let correction2 = 1.0 - beta2.powf(steps);
+    let denominator = exp_avg_sq.clone().sqrt().div_scalar(correction2.sqrt()).add_scalar(epsilon);
+    let decayed = value.mul_scalar(1.0 - learning_rate * weight_decay);
+    let moved = decayed.sub(exp_avg.clone().div(denominator).mul_scalar(learning_rate / correction1));
+    [moved, exp_avg, exp_avg_sq]
+}
+
 struct Stepper<'a> {
     adam: &'a mut Adam,
     gradients: GradientsParams,
-    gradient_scale: f64,
-    lr: f64,
-    beta1: f64,
+    step: AdamStep,
     path: Vec<String>,
 }
 
@@ -140,14 +177,11 @@ impl ModuleMapper for Stepper<'_> {
             return param; // a running statistic, or frozen
         }
         let name = (self.adam.name_of)(&self.path.join("."));
-        let gradient = self.gradients.remove::<D>(param.id).map(|g| {
-            let flat = g.flatten::<1>(0, D - 1);
-            if self.gradient_scale == 1.0 { flat } else { flat.mul_scalar(self.gradient_scale) }
-        });
+        let gradient = self.gradients.remove::<D>(param.id).map(|gradient| gradient.flatten::<1>(0, D - 1));
         param.map(|tensor| {
             let shape = tensor.dims();
             let value = tensor.inner().flatten::<1>(0, D - 1);
-            let moved = self.adam.update(name, value, shape.to_vec(), gradient, self.lr, self.beta1);
+            let moved = self.adam.update(name, value, shape.to_vec(), gradient, &self.step);
             Tensor::from_inner(moved.reshape(shape)).require_grad()
         })
     }
@@ -158,20 +192,27 @@ impl ModuleMapper for Stepper<'_> {
 pub struct GradientNorm {
     /// Norm, before any clipping.
     pub total: f64,
-    /// The first parameter, in the module's order, whose gradient has a NaN or an infinity (or overflows f32 when squared).
+    /// The first parameter, in the module's order, whose gradient has a NaN or an infinity (or, on a GPU, overflows f32 when squared).
     pub not_finite: Option<String>,
 }
 
 impl GradientNorm {
     /// Of the gradients of `module`; one transfer from the device.
     pub fn of<M: Module>(module: &M, gradients: &GradientsParams, name_of: NameOf) -> Self {
-        let mut visitor = SquaredNorms { gradients, path: Vec::new(), names: Vec::new(), sums: Vec::new() };
+        let mut visitor = FlatGradients { gradients, path: Vec::new(), names: Vec::new(), flat: Vec::new() };
         module.visit(&mut visitor);
-        if visitor.sums.is_empty() {
+        let FlatGradients { names, flat, .. } = visitor;
+        if flat.is_empty() {
             return GradientNorm { total: 0.0, not_finite: None };
         }
-        let sums = Tensor::cat(visitor.sums, 0).into_data().try_into_vec::<f32>().expect("gradients are f32");
-        let not_finite = sums.iter().position(|s| !s.is_finite()).map(|i| name_of(&visitor.names[i]));
+        let name = |i: usize| name_of(&names[i]);
+        if let Some(values) = flat.iter().map(FlexValues::of).collect::<Option<Vec<_>>>() {
+            let norm = kernels::GradientNorm::of(&values.iter().map(FlexValues::as_slice).collect::<Vec<_>>());
+            return GradientNorm { total: norm.total, not_finite: norm.not_finite.map(name) };
+        }
+        let sums = flat.into_iter().map(|gradient| gradient.clone().mul(gradient).sum()).collect();
+        let sums = Tensor::cat(sums, 0).into_data().try_into_vec::<f32>().expect("gradients are f32");
+        let not_finite = sums.iter().position(|s| !s.is_finite()).map(name);
         GradientNorm { total: sums.iter().map(|&s| s as f64).sum::<f64>().sqrt(), not_finite }
     }
 
@@ -181,14 +222,14 @@ impl GradientNorm {
     }
 }
 
-struct SquaredNorms<'a> {
+struct FlatGradients<'a> {
     gradients: &'a GradientsParams,
     path: Vec<String>,
     names: Vec<String>,
-    sums: Vec<Tensor<1>>,
+    flat: Vec<Tensor<1>>,
 }
 
-impl ModuleVisitor for SquaredNorms<'_> {
+impl ModuleVisitor for FlatGradients<'_> {
     fn enter_module(&mut self, name: &str, _container_type: &str) {
         self.path.push(name.into());
     }
@@ -200,7 +241,7 @@ impl ModuleVisitor for SquaredNorms<'_> {
     fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
         if let Some(gradient) = self.gradients.get::<D>(param.id) {
             self.names.push(self.path.join("."));
-            self.sums.push(gradient.clone().mul(gradient).sum());
+            self.flat.push(gradient.flatten(0, D - 1));
         }
     }
 }

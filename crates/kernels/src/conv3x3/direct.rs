@@ -1,33 +1,18 @@
 //! The convolution as one product with the nine neighbours of each pixel.
 
-use super::Conv3x3;
 use crate::blocks::{Segment, TileGrid};
-use crate::epilogue::Epilogue;
-use crate::images::{ImageShape, Work, rounded, write_tiles};
-use crate::line;
-use crate::output::Shared;
+use crate::images::{Images, ImagesOut};
+use crate::registers::{load, put};
 use crate::scheme::{PackedWeights, Scheme};
-use crate::tile::{PIXELS, Row};
+use crate::tile::Row;
 use pulp::Simd;
 use std::ops::Range;
 
-/// A tile is one pixel of the output.
+/// A tile is one pixel of the output. Nothing else may be writing to `y`.
 pub(super) struct Direct<'a, const STRIDE: usize> {
-    batch: usize,
-    x: &'a [f32],
-    x_shape: ImageShape,
-    y: Shared<'a>,
-    y_shape: ImageShape,
-    epilogue: Epilogue<'a>,
-}
-
-impl<'a, const STRIDE: usize> Direct<'a, STRIDE> {
-    /// `y` is written to; nothing else may be writing there.
-    pub fn new(conv: &Conv3x3, x: &'a [f32], y: Shared<'a>, epilogue: Epilogue<'a>) -> Self {
-        let x_shape = ImageShape { channels: conv.inputs, height: conv.height, width: conv.width };
-        let y_shape = ImageShape { channels: conv.outputs, height: conv.out_height(), width: conv.out_width() };
-        Direct { batch: conv.batch, x, x_shape, y, y_shape, epilogue }
-    }
+    pub batch: usize,
+    pub x: Images<'a>,
+    pub y: ImagesOut<'a>,
 }
 
 /// Weights in the order of [`read_neighbours`]; `kernel(output, input)` gives those of one pair of channels.
@@ -43,52 +28,47 @@ pub(super) fn pack(inputs: usize, outputs: usize, kernel: impl Fn(usize, usize) 
 
 /// The neighbours of each pixel of a block in one channel: `panel[ky * 3 + kx]`.
 #[inline(always)]
-pub(super) fn read_neighbours<const STRIDE: usize>(
-    (x, shape): (&[f32], &ImageShape),
+pub(super) fn read_neighbours<S: Simd, const STRIDE: usize>(
+    simd: S,
+    x: &Images<'_>,
     segments: &[Segment],
     channel: usize,
     panel: &mut [Row],
-    work: &mut Work,
 ) {
     for s in segments {
-        let count = rounded(s);
         for ky in 0..3 {
-            let mut rows = work.rows[ky * 3..].iter_mut();
-            let mut to: [&mut [f32]; 3] =
-                std::array::from_fn(|_| rows.next().map_or(&mut [][..], |r| &mut r[s.at..s.at + count]));
-            let Some(row) = shape.row(s.image, channel, (s.row * STRIDE + ky) as isize - 1) else {
-                to.iter_mut().for_each(|row| row.fill(0.0));
-                continue;
-            };
-            line::read(x, row, (s.column * STRIDE) as isize - 1, (s.len - 1) * STRIDE + 3, &mut work.line);
-            if STRIDE == 1 {
-                for (kx, to) in to.iter_mut().enumerate() {
-                    to.copy_from_slice(&work.line[kx..kx + count]);
+            let row = x.shape.row(s.image, channel, (s.row * STRIDE + ky) as isize - 1);
+            for group in (0..s.len).step_by(S::F32_LANES) {
+                let first = ((s.column + group) * STRIDE) as isize - 1;
+                let mut neighbours = [simd.splat_f32s(0.0); 3];
+                if STRIDE == 2 {
+                    let pixels: [S::f32s; 2] = x.every(simd, row, first);
+                    let behind: [S::f32s; 2] = x.every(simd, row, first + 2);
+                    neighbours = [pixels[0], pixels[1], behind[0]];
+                } else if let Some(row) = row {
+                    for (kx, values) in neighbours.iter_mut().enumerate() {
+                        *values = load(simd, x.values, row, first + kx as isize);
+                    }
                 }
-            } else {
-                let pixels = work.line.as_chunks::<2>().0;
-                for (t, (own, next)) in pixels[..count].iter().zip(&pixels[1..count + 1]).enumerate() {
-                    (to[0][t], to[1][t], to[2][t]) = (own[0], own[1], next[0]);
+                for (kx, values) in neighbours.into_iter().enumerate() {
+                    put(simd, &mut panel[ky * 3 + kx], s.at + group, values);
                 }
             }
         }
-    }
-    for (to, from) in panel[..9].iter_mut().zip(&work.rows) {
-        to.copy_from_slice(&from[..PIXELS]);
     }
 }
 
 impl<const STRIDE: usize> Scheme for Direct<'_, STRIDE> {
     fn grid(&self) -> TileGrid {
-        TileGrid { batch: self.batch, rows: self.y_shape.height, columns: self.y_shape.width }
+        TileGrid { batch: self.batch, rows: self.y.shape.height, columns: self.y.shape.width }
     }
 
     fn inputs(&self) -> usize {
-        self.x_shape.channels
+        self.x.shape.channels
     }
 
     fn outputs(&self) -> usize {
-        self.y_shape.channels
+        self.y.shape.channels
     }
 
     fn panel_rows(&self) -> usize {
@@ -100,22 +80,23 @@ impl<const STRIDE: usize> Scheme for Direct<'_, STRIDE> {
     }
 
     #[inline(always)]
-    fn read<S: Simd>(&self, _: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work) {
-        read_neighbours::<STRIDE>((self.x, &self.x_shape), segments, channel, &mut panel[channel * 9..], work);
+    fn prefetch_input(&self, segments: &[Segment], channel: usize) {
+        self.x.prefetch(segments, channel, STRIDE, (1, 3));
     }
 
     #[inline(always)]
-    fn write<'r, S: Simd>(
-        &self,
-        _: S,
-        segments: &[Segment],
-        channel: usize,
-        products: impl Fn(usize) -> &'r Row,
-        work: &mut Work,
-    ) {
-        work.rows[0][..PIXELS].copy_from_slice(products(0));
-        self.epilogue.apply(channel, &mut work.rows[0][..PIXELS]);
+    fn prefetch_output(&self, segments: &[Segment], channel: usize) {
+        self.y.prefetch(segments, channel, 1);
+    }
+
+    #[inline(always)]
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row]) {
+        read_neighbours::<S, STRIDE>(simd, &self.x, segments, channel, &mut panel[channel * 9..]);
+    }
+
+    #[inline(always)]
+    fn write<'r, S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, products: impl Fn(usize) -> &'r Row) {
         // SAFETY: no pixel is in two blocks, and one thread works on a block.
-        unsafe { write_tiles::<1>(&self.y, &self.y_shape, channel, segments, work) };
+        unsafe { self.y.write_rows::<S, 1>(simd, segments, channel, products) };
     }
 }

@@ -4,7 +4,7 @@ use super::direct::read_neighbours;
 use super::winograd::{Winograd, transform_kernel_back};
 use super::winograd_product::{read_tiles, tiles};
 use crate::blocks::{Segment, TileGrid};
-use crate::images::{ImageShape, Work};
+use crate::images::Images;
 use crate::simd::Lanes;
 use crate::tile::Row;
 use crate::weight_gradient::Panels;
@@ -15,15 +15,13 @@ use std::marker::PhantomData;
 #[derive(Clone, Copy)]
 pub(super) struct Factors<'a> {
     pub batch: usize,
-    pub x: &'a [f32],
-    pub x_shape: ImageShape,
-    pub dy: &'a [f32],
-    pub dy_shape: ImageShape,
+    pub x: Images<'a>,
+    pub dy: Images<'a>,
 }
 
 impl Factors<'_> {
     fn weight_at(&self, input: usize, output: usize) -> usize {
-        (output * self.x_shape.channels + input) * 9
+        (output * self.x.shape.channels + input) * 9
     }
 }
 
@@ -41,15 +39,15 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Panels for WinogradPanel
     const TAPS: usize = 9;
 
     fn grid(&self) -> TileGrid {
-        tiles::<M>(self.factors.batch, self.factors.x_shape.height, self.factors.x_shape.width)
+        tiles::<M>(self.factors.batch, self.factors.x.shape.height, self.factors.x.shape.width)
     }
 
     fn inputs(&self) -> usize {
-        self.factors.x_shape.channels
+        self.factors.x.shape.channels
     }
 
-    fn dy(&self) -> (&[f32], &ImageShape) {
-        (self.factors.dy, &self.factors.dy_shape)
+    fn dy(&self) -> Images<'_> {
+        self.factors.dy
     }
 
     fn weight_at(&self, input: usize, output: usize) -> usize {
@@ -57,31 +55,34 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Panels for WinogradPanel
     }
 
     #[inline(always)]
-    fn read_x<S: Simd>(
-        &self,
-        simd: S,
-        segments: &[Segment],
-        input: usize,
-        panel: &mut [Row],
-        stride: usize,
-        work: &mut Work,
-    ) {
-        let image = (self.factors.x, &self.factors.x_shape);
-        read_tiles::<S, F, M, A>(simd, image, segments, input, panel, stride, work);
+    fn prefetch_x(&self, segments: &[Segment], input: usize) {
+        self.factors.x.prefetch(segments, input, M, (1, A));
+    }
+
+    #[inline(always)]
+    fn read_x<S: Simd>(&self, simd: S, segments: &[Segment], input: usize, panel: &mut [Row], stride: usize) {
+        read_tiles::<S, F, M, A>(simd, &self.factors.x, segments, input, panel, stride);
     }
 
     #[inline(always)]
     fn transform_dy<S: Simd>(&self, simd: S, pixels: &[f32], columns: usize, to: &mut [f32], step: usize) {
-        for group in 0..columns / S::F32_LANES {
-            let at = group * S::F32_LANES;
-            let pixel = |i, j| {
-                let pixel = &pixels[(i * M + j) * columns + at..][..S::F32_LANES];
-                Lanes::new(simd, S::as_simd_f32s(pixel).0[0])
-            };
-            let down: [[Lanes<S>; A]; M] = std::array::from_fn(|j| F::gradient(std::array::from_fn(|i| pixel(i, j))));
+        let zero = Lanes::new(simd, simd.splat_f32s(0.0));
+        for at in (0..columns).step_by(S::F32_LANES) {
+            let mut down = [[zero; A]; M];
+            for (j, to) in down.iter_mut().enumerate() {
+                let mut column = [zero; M];
+                for (i, value) in column.iter_mut().enumerate() {
+                    let pixel = &pixels[(i * M + j) * columns + at..][..S::F32_LANES];
+                    value.values = S::as_simd_f32s(pixel).0[0];
+                }
+                *to = F::gradient(column);
+            }
             for i in 0..A {
-                let row = F::gradient(std::array::from_fn(|j| down[j][i]));
-                for (j, value) in row.into_iter().enumerate() {
+                let mut row = [zero; M];
+                for j in 0..M {
+                    row[j] = down[j][i];
+                }
+                for (j, value) in F::gradient(row).into_iter().enumerate() {
                     let to = &mut to[(i * A + j) * step + at..][..S::F32_LANES];
                     S::as_mut_simd_f32s(to).0[0] = value.values;
                 }
@@ -91,8 +92,13 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Panels for WinogradPanel
 
     #[inline(always)]
     fn finish<S: Simd>(&self, simd: S, sums: &[S::f32s], taps: &mut [S::f32s]) {
-        let u = std::array::from_fn(|i| std::array::from_fn(|j| Lanes::new(simd, sums[i * A + j])));
-        taps.copy_from_slice(&transform_kernel_back::<F, _, M, A>(&u).map(|weight| weight.values));
+        let mut u = [[Lanes::new(simd, simd.splat_f32s(0.0)); A]; A];
+        for (u, &sum) in u.as_flattened_mut().iter_mut().zip(sums) {
+            u.values = sum;
+        }
+        for (tap, weight) in taps.iter_mut().zip(transform_kernel_back::<F, _, M, A>(&u)) {
+            *tap = weight.values;
+        }
     }
 }
 
@@ -107,15 +113,15 @@ impl<const STRIDE: usize> Panels for DirectPanels<'_, STRIDE> {
     const TAPS: usize = 9;
 
     fn grid(&self) -> TileGrid {
-        TileGrid { batch: self.0.batch, rows: self.0.dy_shape.height, columns: self.0.dy_shape.width }
+        TileGrid { batch: self.0.batch, rows: self.0.dy.shape.height, columns: self.0.dy.shape.width }
     }
 
     fn inputs(&self) -> usize {
-        self.0.x_shape.channels
+        self.0.x.shape.channels
     }
 
-    fn dy(&self) -> (&[f32], &ImageShape) {
-        (self.0.dy, &self.0.dy_shape)
+    fn dy(&self) -> Images<'_> {
+        self.0.dy
     }
 
     fn weight_at(&self, input: usize, output: usize) -> usize {
@@ -123,7 +129,12 @@ impl<const STRIDE: usize> Panels for DirectPanels<'_, STRIDE> {
     }
 
     #[inline(always)]
-    fn read_x<S: Simd>(&self, _: S, segments: &[Segment], input: usize, panel: &mut [Row], _: usize, work: &mut Work) {
-        read_neighbours::<STRIDE>((self.0.x, &self.0.x_shape), segments, input, panel, work);
+    fn prefetch_x(&self, segments: &[Segment], input: usize) {
+        self.0.x.prefetch(segments, input, STRIDE, (1, 3));
+    }
+
+    #[inline(always)]
+    fn read_x<S: Simd>(&self, simd: S, segments: &[Segment], input: usize, panel: &mut [Row], _: usize) {
+        read_neighbours::<S, STRIDE>(simd, &self.0.x, segments, input, panel);
     }
 }

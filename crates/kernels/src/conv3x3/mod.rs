@@ -7,7 +7,7 @@ mod winograd;
 mod winograd_product;
 
 use crate::epilogue::Epilogue;
-use crate::images::ImageShape;
+use crate::images::{ImageShape, Images, ImagesOut};
 use crate::output::{Shared, fill};
 use crate::scheme::{PackedWeights, run};
 use crate::weight_gradient::weight_gradient;
@@ -61,6 +61,14 @@ impl Conv3x3 {
         self.width.div_ceil(self.stride)
     }
 
+    fn x_shape(&self) -> ImageShape {
+        ImageShape { channels: self.inputs, height: self.height, width: self.width }
+    }
+
+    fn y_shape(&self) -> ImageShape {
+        ImageShape { channels: self.outputs, height: self.out_height(), width: self.out_width() }
+    }
+
     /// Elements of `x`.
     pub fn x_len(&self) -> usize {
         self.batch * self.inputs * self.height * self.width
@@ -97,12 +105,13 @@ impl Conv3x3 {
         // SAFETY: the tiles of each scheme cover all pixels of all outputs.
         unsafe {
             fill(y, self.y_len(), |y| {
-                let y = Shared::new(y);
+                let x = Images { values: x, shape: self.x_shape() };
+                let y = ImagesOut { values: Shared::new(y), shape: self.y_shape(), epilogue };
                 match (self.stride, self.algorithm) {
-                    (1, Algorithm::WinogradF2) => run(&WinogradProduct::<F2, 2, 4>::new(self, x, y, epilogue), weights),
-                    (1, Algorithm::WinogradF4) => run(&WinogradProduct::<F4, 4, 6>::new(self, x, y, epilogue), weights),
-                    (1, Algorithm::Direct) => run(&Direct::<1>::new(self, x, y, epilogue), weights),
-                    _ => run(&Direct::<2>::new(self, x, y, epilogue), weights),
+                    (1, Algorithm::WinogradF2) => run(&WinogradProduct::<F2, 2, 4>::new(self.batch, x, y), weights),
+                    (1, Algorithm::WinogradF4) => run(&WinogradProduct::<F4, 4, 6>::new(self.batch, x, y), weights),
+                    (1, Algorithm::Direct) => run(&Direct::<1> { batch: self.batch, x, y }, weights),
+                    _ => run(&Direct::<2> { batch: self.batch, x, y }, weights),
                 }
             });
         }
@@ -133,7 +142,12 @@ impl Conv3x3 {
             let weights = strided_gradient::pack(self, weight);
             // SAFETY: the four pixels of each tile cover the image.
             unsafe {
-                fill(dx, self.x_len(), |dx| run(&StridedGradient::new(self, dy, Shared::new(dx)), &weights));
+                fill(dx, self.x_len(), |dx| {
+                    let dy = Images { values: dy, shape: self.y_shape() };
+                    let epilogue = Epilogue::default();
+                    let dx = ImagesOut { values: Shared::new(dx), shape: self.x_shape(), epilogue };
+                    run(&StridedGradient { batch: self.batch, dy, dx }, &weights);
+                });
             }
         }
     }
@@ -145,9 +159,8 @@ impl Conv3x3 {
     pub fn weight_gradient(&self, x: &[f32], dy: &[f32]) -> Vec<f32> {
         assert_eq!(x.len(), self.x_len(), "elements of x of {self:?}");
         assert_eq!(dy.len(), self.y_len(), "elements of dy of {self:?}");
-        let x_shape = ImageShape { channels: self.inputs, height: self.height, width: self.width };
-        let dy_shape = ImageShape { channels: self.outputs, height: self.out_height(), width: self.out_width() };
-        let factors = Factors { batch: self.batch, x, x_shape, dy, dy_shape };
+        let (x, dy) = (Images { values: x, shape: self.x_shape() }, Images { values: dy, shape: self.y_shape() });
+        let factors = Factors { batch: self.batch, x, dy };
         match (self.stride, self.algorithm) {
             (1, Algorithm::WinogradF2) => {
                 weight_gradient(&WinogradPanels::<F2, 2, 4> { factors, transforms: PhantomData })

@@ -3,11 +3,10 @@
 
 use super::Conv3x3;
 use crate::blocks::{Segment, TileGrid};
-use crate::images::{ImageShape, Work, rounded, write_tiles};
-use crate::line;
-use crate::output::Shared;
+use crate::images::{Images, ImagesOut};
+use crate::registers::put;
 use crate::scheme::{PackedWeights, Scheme};
-use crate::tile::{PIXELS, Row};
+use crate::tile::Row;
 use pulp::Simd;
 use std::ops::Range;
 
@@ -17,21 +16,11 @@ const SHIFTS: [(usize, usize); 4] = [(1, 0), (0, 0), (0, 1), (1, 1)];
 /// For each pixel of a tile the range of [`SHIFTS`] and, for each of them, the tap `ky * 3 + kx`.
 const PRODUCTS: [(Range<usize>, &[usize]); 4] = [(1..2, &[4]), (1..3, &[5, 3]), (0..2, &[1, 7]), (0..4, &[2, 8, 6, 0])];
 
+/// Nothing else may be writing to `dx`.
 pub(super) struct StridedGradient<'a> {
-    batch: usize,
-    dy: &'a [f32],
-    dy_shape: ImageShape,
-    dx: Shared<'a>,
-    dx_shape: ImageShape,
-}
-
-impl<'a> StridedGradient<'a> {
-    /// `dx` is written to; nothing else may be writing there.
-    pub fn new(conv: &Conv3x3, dy: &'a [f32], dx: Shared<'a>) -> Self {
-        let dy_shape = ImageShape { channels: conv.outputs, height: conv.out_height(), width: conv.out_width() };
-        let dx_shape = ImageShape { channels: conv.inputs, height: conv.height, width: conv.width };
-        StridedGradient { batch: conv.batch, dy, dy_shape, dx, dx_shape }
-    }
+    pub batch: usize,
+    pub dy: Images<'a>,
+    pub dx: ImagesOut<'a>,
 }
 
 /// The weights `[outputs, inputs, 3, 3]` of `conv` for [`StridedGradient`].
@@ -48,15 +37,15 @@ pub(super) fn pack(conv: &Conv3x3, weight: &[f32]) -> PackedWeights {
 
 impl Scheme for StridedGradient<'_> {
     fn grid(&self) -> TileGrid {
-        TileGrid { batch: self.batch, rows: self.dy_shape.height, columns: self.dy_shape.width }
+        TileGrid { batch: self.batch, rows: self.dy.shape.height, columns: self.dy.shape.width }
     }
 
     fn inputs(&self) -> usize {
-        self.dy_shape.channels
+        self.dy.shape.channels
     }
 
     fn outputs(&self) -> usize {
-        self.dx_shape.channels
+        self.dx.shape.channels
     }
 
     fn panel_rows(&self) -> usize {
@@ -68,42 +57,31 @@ impl Scheme for StridedGradient<'_> {
     }
 
     #[inline(always)]
-    fn read<S: Simd>(&self, _: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work) {
+    fn prefetch_input(&self, segments: &[Segment], channel: usize) {
+        self.dy.prefetch(segments, channel, 1, (0, 2));
+    }
+
+    #[inline(always)]
+    fn prefetch_output(&self, segments: &[Segment], channel: usize) {
+        self.dx.prefetch(segments, channel, 2);
+    }
+
+    #[inline(always)]
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row]) {
         for s in segments {
-            let count = rounded(s);
-            for down in 0..2 {
-                let row = self.dy_shape.row(s.image, channel, (s.row + down) as isize);
-                if let Some(row) = row {
-                    line::read(self.dy, row, s.column as isize, s.len + 1, &mut work.line);
-                }
-                for (shift, to) in SHIFTS.iter().zip(&mut work.rows) {
-                    let to = &mut to[s.at..s.at + count];
-                    match row {
-                        _ if shift.0 != down => {}
-                        Some(_) => to.copy_from_slice(&work.line[shift.1..shift.1 + count]),
-                        None => to.fill(0.0),
-                    }
+            for (k, (down, right)) in SHIFTS.into_iter().enumerate() {
+                let row = self.dy.shape.row(s.image, channel, (s.row + down) as isize);
+                for group in (0..s.len).step_by(S::F32_LANES) {
+                    let [values] = self.dy.every(simd, row, (s.column + group + right) as isize);
+                    put(simd, &mut panel[k * self.inputs() + channel], s.at + group, values);
                 }
             }
-        }
-        for (k, from) in work.rows[..SHIFTS.len()].iter().enumerate() {
-            panel[k * self.inputs() + channel].copy_from_slice(&from[..PIXELS]);
         }
     }
 
     #[inline(always)]
-    fn write<'r, S: Simd>(
-        &self,
-        _: S,
-        segments: &[Segment],
-        channel: usize,
-        products: impl Fn(usize) -> &'r Row,
-        work: &mut Work,
-    ) {
-        for (k, row) in work.rows[..4].iter_mut().enumerate() {
-            row[..PIXELS].copy_from_slice(products(k));
-        }
+    fn write<'r, S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, products: impl Fn(usize) -> &'r Row) {
         // SAFETY: no tile is in two blocks, and one thread works on a block.
-        unsafe { write_tiles::<2>(&self.dx, &self.dx_shape, channel, segments, work) };
+        unsafe { self.dx.write_rows::<S, 2>(simd, segments, channel, products) };
     }
 }

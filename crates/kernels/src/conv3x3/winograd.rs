@@ -83,9 +83,17 @@ impl Winograd<4, 6> for F4 {
 /// G w G^T of one kernel `[3, 3]`.
 #[inline(always)]
 pub(crate) fn transform_kernel<F: Winograd<M, A>, const M: usize, const A: usize>(w: &[f32; 9]) -> [[f32; A]; A] {
-    let dot = |g: &[f32; 3], v: [f32; 3]| g[0] * v[0] + g[1] * v[1] + g[2] * v[2];
-    let rows = F::KERNEL.map(|g| [0, 1, 2].map(|c| dot(&g, [w[c], w[3 + c], w[6 + c]]))); // [A, 3]
-    rows.map(|row| F::KERNEL.map(|g| dot(&g, row)))
+    let mut u = [[0.0; A]; A];
+    for (g, u) in F::KERNEL.iter().zip(&mut u) {
+        let mut row = [0.0; 3]; // of G w
+        for (c, value) in row.iter_mut().enumerate() {
+            *value = g[0] * w[c] + g[1] * w[3 + c] + g[2] * w[6 + c];
+        }
+        for (g, u) in F::KERNEL.iter().zip(u) {
+            *u = g[0] * row[0] + g[1] * row[1] + g[2] * row[2];
+        }
+    }
+    u
 }
 
 /// G^T u G, the transpose of [`transform_kernel`].
@@ -93,16 +101,24 @@ pub(crate) fn transform_kernel<F: Winograd<M, A>, const M: usize, const A: usize
 pub(crate) fn transform_kernel_back<F: Winograd<M, A>, T: Value, const M: usize, const A: usize>(
     u: &[[T; A]; A],
 ) -> [T; 9] {
-    // Sum over a of G[a][column] values[a].
-    let dot = |column: usize, values: [T; A]| {
-        let mut sum = values[0] * F::KERNEL[0][column];
-        for a in 1..A {
-            sum = sum + values[a] * F::KERNEL[a][column];
+    let mut weights = [u[0][0]; 9];
+    for r in 0..3 {
+        let mut row = u[0]; // of G^T u
+        for c in 0..A {
+            row[c] = u[0][c] * F::KERNEL[0][r];
+            for a in 1..A {
+                row[c] = row[c] + u[a][c] * F::KERNEL[a][r];
+            }
         }
-        sum
-    };
-    let rows: [[T; A]; 3] = std::array::from_fn(|r| std::array::from_fn(|c| dot(r, std::array::from_fn(|a| u[a][c]))));
-    std::array::from_fn(|tap| dot(tap % 3, rows[tap / 3]))
+        for c in 0..3 {
+            let mut sum = row[0] * F::KERNEL[0][c];
+            for a in 1..A {
+                sum = sum + row[a] * F::KERNEL[a][c];
+            }
+            weights[r * 3 + c] = sum;
+        }
+    }
+    weights
 }
 
 #[cfg(test)]

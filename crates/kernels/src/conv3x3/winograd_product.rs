@@ -1,15 +1,12 @@
 //! The convolution of stride 1 by Winograd's minimal filtering: a product for each of the A x A values of a transformed tile.
 
-use super::Conv3x3;
 use super::winograd::{Winograd, transform_kernel};
 use crate::blocks::{Segment, TileGrid};
-use crate::epilogue::Epilogue;
-use crate::images::{ImageShape, Work, rounded, write_tiles};
-use crate::line;
-use crate::output::Shared;
+use crate::images::{Images, ImagesOut};
+use crate::registers::{get, put};
 use crate::scheme::{PackedWeights, Scheme};
 use crate::simd::Lanes;
-use crate::tile::{PIXELS, Row};
+use crate::tile::Row;
 use pulp::Simd;
 use std::marker::PhantomData;
 use std::ops::Range;
@@ -17,20 +14,15 @@ use std::ops::Range;
 /// A tile is M x M pixels of the output.
 pub(super) struct WinogradProduct<'a, F, const M: usize, const A: usize> {
     batch: usize,
-    x: &'a [f32],
-    x_shape: ImageShape,
-    y: Shared<'a>,
-    y_shape: ImageShape,
-    epilogue: Epilogue<'a>,
+    x: Images<'a>,
+    y: ImagesOut<'a>,
     transforms: PhantomData<F>,
 }
 
 impl<'a, F: Winograd<M, A>, const M: usize, const A: usize> WinogradProduct<'a, F, M, A> {
-    /// `y` is written to; nothing else may be writing there.
-    pub fn new(conv: &Conv3x3, x: &'a [f32], y: Shared<'a>, epilogue: Epilogue<'a>) -> Self {
-        let shape = |channels| ImageShape { channels, height: conv.height, width: conv.width };
-        let (x_shape, y_shape) = (shape(conv.inputs), shape(conv.outputs));
-        WinogradProduct { batch: conv.batch, x, x_shape, y, y_shape, epilogue, transforms: PhantomData }
+    /// Nothing else may be writing to `y`.
+    pub fn new(batch: usize, x: Images<'a>, y: ImagesOut<'a>) -> Self {
+        WinogradProduct { batch, x, y, transforms: PhantomData }
     }
 }
 
@@ -59,38 +51,35 @@ pub(super) fn pack<F: Winograd<M, A>, const M: usize, const A: usize>(
 #[inline(always)]
 pub(super) fn read_tiles<S: Simd, F: Winograd<M, A>, const M: usize, const A: usize>(
     simd: S,
-    (x, shape): (&[f32], &ImageShape),
+    x: &Images<'_>,
     segments: &[Segment],
     channel: usize,
     panel: &mut [Row],
     stride: usize,
-    work: &mut Work,
 ) {
+    let zero = Lanes::new(simd, simd.splat_f32s(0.0));
     for s in segments {
-        let count = rounded(s);
-        for i in 0..A {
-            let mut rows = work.rows[i * A..].iter_mut();
-            let mut to: [&mut [f32]; A] =
-                std::array::from_fn(|_| rows.next().map_or(&mut [][..], |r| &mut r[s.at..s.at + count]));
-            let Some(row) = shape.row(s.image, channel, (s.row * M + i) as isize - 1) else {
-                to.iter_mut().for_each(|row| row.fill(0.0));
-                continue;
-            };
-            line::read(x, row, (s.column * M) as isize - 1, s.len * M + 2, &mut work.line);
-            let pixels = work.line.as_chunks::<M>().0;
-            for (t, (own, next)) in pixels[..count].iter().zip(&pixels[1..count + 1]).enumerate() {
-                let d = F::input(std::array::from_fn(|j| if j < M { own[j] } else { next[j - M] }));
+        for group in (0..s.len).step_by(S::F32_LANES) {
+            let first = ((s.column + group) * M) as isize - 1;
+            let mut rows = [[zero; A]; A]; // B^T of each row
+            for (i, to) in rows.iter_mut().enumerate() {
+                let row = x.shape.row(s.image, channel, (s.row * M + i) as isize - 1);
+                let own: [S::f32s; M] = x.every(simd, row, first);
+                let next: [S::f32s; M] = x.every(simd, row, first + M as isize);
+                let mut d = [zero; A];
                 for j in 0..A {
-                    to[j][t] = d[j];
+                    d[j].values = if j < M { own[j] } else { next[j - M] };
                 }
+                *to = F::input(d);
             }
-        }
-    }
-    for j in 0..A {
-        for group in 0..PIXELS / S::F32_LANES {
-            let column = std::array::from_fn(|i| Lanes::new(simd, S::as_simd_f32s(&work.rows[i * A + j]).0[group]));
-            for (i, value) in F::input(column).into_iter().enumerate() {
-                S::as_mut_simd_f32s(&mut panel[(i * A + j) * stride]).0[group] = value.values;
+            for j in 0..A {
+                let mut column = [zero; A];
+                for i in 0..A {
+                    column[i] = rows[i][j];
+                }
+                for (i, value) in F::input(column).into_iter().enumerate() {
+                    put(simd, &mut panel[(i * A + j) * stride], s.at + group, value.values);
+                }
             }
         }
     }
@@ -98,15 +87,15 @@ pub(super) fn read_tiles<S: Simd, F: Winograd<M, A>, const M: usize, const A: us
 
 impl<F: Winograd<M, A>, const M: usize, const A: usize> Scheme for WinogradProduct<'_, F, M, A> {
     fn grid(&self) -> TileGrid {
-        tiles::<M>(self.batch, self.x_shape.height, self.x_shape.width)
+        tiles::<M>(self.batch, self.x.shape.height, self.x.shape.width)
     }
 
     fn inputs(&self) -> usize {
-        self.x_shape.channels
+        self.x.shape.channels
     }
 
     fn outputs(&self) -> usize {
-        self.y_shape.channels
+        self.y.shape.channels
     }
 
     fn panel_rows(&self) -> usize {
@@ -119,33 +108,47 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Scheme for WinogradProdu
     }
 
     #[inline(always)]
-    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work) {
-        let (image, stride) = ((self.x, &self.x_shape), self.inputs() + 1);
-        read_tiles::<S, F, M, A>(simd, image, segments, channel, &mut panel[channel..], stride, work);
+    fn prefetch_input(&self, segments: &[Segment], channel: usize) {
+        self.x.prefetch(segments, channel, M, (1, A));
     }
 
     #[inline(always)]
-    fn write<'r, S: Simd>(
-        &self,
-        simd: S,
-        segments: &[Segment],
-        channel: usize,
-        products: impl Fn(usize) -> &'r Row,
-        work: &mut Work,
-    ) {
-        for group in 0..PIXELS / S::F32_LANES {
-            let value = |i, j| Lanes::new(simd, S::as_simd_f32s(products(i * A + j)).0[group]);
-            let columns: [[Lanes<S>; M]; A] = std::array::from_fn(|j| F::output(std::array::from_fn(|i| value(i, j))));
-            for i in 0..M {
-                for (j, pixel) in F::output(std::array::from_fn(|j| columns[j][i])).into_iter().enumerate() {
-                    S::as_mut_simd_f32s(&mut work.rows[i * M + j]).0[group] = pixel.values;
+    fn prefetch_output(&self, segments: &[Segment], channel: usize) {
+        self.y.prefetch(segments, channel, M);
+    }
+
+    #[inline(always)]
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row]) {
+        let stride = self.inputs() + 1;
+        read_tiles::<S, F, M, A>(simd, &self.x, segments, channel, &mut panel[channel..], stride);
+    }
+
+    #[inline(always)]
+    fn write<'r, S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, products: impl Fn(usize) -> &'r Row) {
+        let zero = Lanes::new(simd, simd.splat_f32s(0.0));
+        for s in segments {
+            for group in (0..s.len).step_by(S::F32_LANES) {
+                let mut columns = [[zero; M]; A]; // A^T of each column
+                for (j, to) in columns.iter_mut().enumerate() {
+                    let mut column = [zero; A];
+                    for (i, value) in column.iter_mut().enumerate() {
+                        value.values = get(simd, products(i * A + j), s.at + group);
+                    }
+                    *to = F::output(column);
                 }
+                let mut tiles = [[zero.values; M]; M];
+                for (i, to) in tiles.iter_mut().enumerate() {
+                    let mut row = [zero; A];
+                    for j in 0..A {
+                        row[j] = columns[j][i];
+                    }
+                    for (to, pixel) in to.iter_mut().zip(F::output(row)) {
+                        *to = pixel.values;
+                    }
+                }
+                // SAFETY: no tile is in two blocks, and one thread works on a block.
+                unsafe { self.y.write_tiles(simd, (s, group), channel, tiles) };
             }
         }
-        for row in &mut work.rows[..M * M] {
-            self.epilogue.apply(channel, &mut row[..PIXELS]);
-        }
-        // SAFETY: no tile is in two blocks, and one thread works on a block.
-        unsafe { write_tiles::<M>(&self.y, &self.y_shape, channel, segments, work) };
     }
 }

@@ -68,7 +68,10 @@ impl<W: Fn(usize, usize, &[f32])> WithSimd for OverPillars<'_, W> {
             for (group, ((weights, bias), argmax)) in groups.enumerate() {
                 let (mut values, mut places) = ([0.0; GROUP], [NOWHERE; GROUP]);
                 for part in 0..GROUP / S::F32_LANES {
-                    let weights: [S::f32s; MOST_INPUTS] = std::array::from_fn(|k| S::as_simd_f32s(&weights[k]).0[part]);
+                    let mut registers = [simd.splat_f32s(0.0); MOST_INPUTS];
+                    for (register, weights) in registers.iter_mut().zip(weights) {
+                        *register = S::as_simd_f32s(weights).0[part];
+                    }
                     let bias = S::as_simd_f32s(bias).0[part];
                     // The ReLU: zero stands unless something is larger.
                     let mut best = simd.splat_f32s(0.0);
@@ -78,7 +81,7 @@ impl<W: Fn(usize, usize, &[f32])> WithSimd for OverPillars<'_, W> {
                     }
                     for (row, x) in rows.chunks_exact(inputs).enumerate() {
                         let mut y = bias;
-                        for (&x, &weight) in x.iter().zip(&weights) {
+                        for (&x, &weight) in x.iter().zip(&registers) {
                             y = multiply_add(simd, simd.splat_f32s(x), weight, y);
                         }
                         (best, place) = larger(simd, (best, place), (y, (points.start + row) as u32));

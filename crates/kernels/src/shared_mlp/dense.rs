@@ -1,8 +1,8 @@
 //! A layer whose output is kept for all rows.
 
-use super::norm::mask;
-use super::norm::{ColumnSums, Norm, NormGradient};
-use super::rows::{Input, Rows, sum};
+use super::blocks::{Block, Blocks, sum};
+use super::input::{Before, Input};
+use super::norm::{ColumnSums, Norm, NormGradient, mask};
 use crate::batch_norm::Statistics;
 use crate::matrix::{Matrix, Then, multiply};
 use crate::output::{Shared, fill};
@@ -10,29 +10,44 @@ use crate::scratch;
 use std::mem::MaybeUninit;
 
 /// `y = input W^T`, `[rows, outputs]`, overwritten; returns its statistics.
-pub(super) fn forward(rows: &Rows, input: Input<'_>, weight: &[f32], y: &mut Vec<f32>) -> Statistics {
-    let outputs = weight.len() / input.channels();
-    // SAFETY: the blocks cover all rows.
-    let parts = unsafe {
-        fill(y, rows.count * outputs, |y| {
-            let y = Shared::new(y);
-            rows.parts(|blocks| {
-                let mut sums = ColumnSums::new(outputs);
-                scratch::with([rows.block() * input.channels(), rows.block() * outputs], |[memory, product]| {
-                    for block in blocks {
-                        let (start, product) = (block.start * outputs, &mut product[..block.len() * outputs]);
-                        let a = Matrix::new(input.rows(block, memory), input.channels());
-                        multiply(a, Matrix::new(weight, input.channels()).transposed(), product, Then::Store);
-                        sums.add_moments(product);
-                        // SAFETY: no row is in two blocks.
-                        y.write(start, product);
-                    }
-                });
-                sums
-            })
+pub(super) fn forward(blocks: &Blocks<'_>, input: Input<'_>, weight: &[f32], y: &mut Vec<f32>) -> Statistics {
+    let inputs = input.channels();
+    let outputs = weight.len() / inputs;
+    let lengths = [blocks.most_rows * inputs, blocks.most_rows * inputs, blocks.most_rows * outputs];
+    let work = |y: &mut [MaybeUninit<f32>]| {
+        let y = Shared::new(y);
+        blocks.parts(|part| {
+            let mut sums = ColumnSums::new(outputs);
+            scratch::with(lengths, |[memory, before, product]| {
+                for block in part {
+                    let product = &mut product[..block.rows.len() * outputs];
+                    let a = Matrix::new(input.rows(block, memory, before).0, inputs);
+                    multiply(a, Matrix::new(weight, inputs).transposed(), product, Then::Store);
+                    sums.add_moments(product, blocks.counts(block));
+                    // SAFETY: no row is in two blocks.
+                    unsafe { y.write(block.rows.start * outputs, product) };
+                }
+            });
+            sums
         })
     };
-    ColumnSums::total(outputs, parts.iter()).statistics(rows.count)
+    // SAFETY: the blocks cover all rows.
+    let parts = unsafe { fill(y, blocks.rows * outputs, work) };
+    ColumnSums::total(outputs, parts.iter()).statistics(blocks.total)
+}
+
+/// The statistics of rows that need no product.
+pub(super) fn statistics(blocks: &Blocks<'_>, before: Before<'_>, channels: usize) -> Statistics {
+    let parts = blocks.parts(|part| {
+        let mut sums = ColumnSums::new(channels);
+        scratch::with([blocks.most_rows * channels], |[memory]| {
+            for block in part {
+                sums.add_moments(before.rows(block, channels, memory), blocks.counts(block));
+            }
+        });
+        sums
+    });
+    ColumnSums::total(channels, parts.iter()).statistics(blocks.total)
 }
 
 /// What a layer hands to the one before it: the gradient behind that one's batch norm, `[rows, channels]`, and its sums.
@@ -41,93 +56,144 @@ pub(super) struct Upstream {
     pub sums: ColumnSums,
 }
 
-/// Masks the gradient by the output of the last layer: `relu(norm(y))`.
-pub(super) fn last(rows: &Rows, y: &[f32], norm: &Norm, dout: &[f32]) -> Upstream {
-    let channels = norm.mean.len();
+/// Masks the gradient by the output of the last layer, `relu(norm(before))`.
+pub(super) fn last(blocks: &Blocks<'_>, before: Before<'_>, norm: &Norm, dout: &[f32]) -> Upstream {
+    let channels = norm.channels();
     let mut gradient = Vec::new();
-    // SAFETY: the blocks cover all rows.
-    let parts = unsafe {
-        fill(&mut gradient, y.len(), |gradient| {
-            let gradient = Shared::new(gradient);
-            rows.parts(|blocks| {
-                let mut sums = ColumnSums::new(channels);
-                scratch::with([rows.block() * channels; 2], |[activation, masked]| {
-                    for block in blocks {
-                        let values = block.start * channels..block.end * channels;
-                        let (activation, masked) = (&mut activation[..values.len()], &mut masked[..values.len()]);
-                        norm.relu(&y[values.clone()], activation);
-                        masked.copy_from_slice(&dout[values.clone()]);
-                        mask(masked, activation);
-                        sums.add_gradients(masked, &y[values.clone()], norm);
-                        // SAFETY: no row is in two blocks.
-                        gradient.write(values.start, masked);
-                    }
-                });
-                sums
-            })
+    let work = |gradient: &mut [MaybeUninit<f32>]| {
+        let gradient = Shared::new(gradient);
+        blocks.parts(|part| {
+            let mut sums = ColumnSums::new(channels);
+            scratch::with([blocks.most_rows * channels; 3], |[memory, activation, masked]| {
+                for block in part {
+                    let y = before.rows(block, channels, memory);
+                    let (activation, masked) = (&mut activation[..y.len()], &mut masked[..y.len()]);
+                    norm.relu(y, activation);
+                    masked.copy_from_slice(&dout[block.rows.start * channels..][..y.len()]);
+                    mask(masked, activation);
+                    sums.add_gradients(masked, y, norm);
+                    // SAFETY: no row is in two blocks.
+                    unsafe { gradient.write(block.rows.start * channels, masked) };
+                }
+            });
+            sums
         })
     };
+    // SAFETY: the blocks cover all rows.
+    let parts = unsafe { fill(&mut gradient, blocks.rows * channels, work) };
     Upstream { gradient, sums: ColumnSums::total(channels, parts.iter()) }
 }
 
-/// What a layer was in the forward pass.
+/// A layer as the backward pass sees it.
 #[derive(Clone, Copy)]
 pub(super) struct Layer<'a> {
     /// `[outputs, inputs]`.
     pub weight: &'a [f32],
-    pub y: &'a [f32],
+    /// The output before the batch norm.
+    pub before: Before<'a>,
     pub norm: &'a Norm,
+    pub gradient: &'a NormGradient,
 }
 
-/// The gradient by the weights, and what goes to the layer before; for the first layer the gradient by the rows instead, if it is wanted.
+impl Layer<'_> {
+    /// The gradient by the output before the batch norm of the rows of a block.
+    fn dy<'m>(
+        &self,
+        blocks: &Blocks<'_>,
+        block: &Block,
+        upstream: &Upstream,
+        memory: &mut [f32],
+        dy: &'m mut [f32],
+    ) -> &'m [f32] {
+        let channels = self.norm.channels();
+        let y = self.before.rows(block, channels, memory);
+        let dy = &mut dy[..y.len()];
+        let g = &upstream.gradient[block.rows.start * channels..][..y.len()];
+        self.gradient.apply(g, y, blocks.counts(block), self.norm, dy);
+        dy
+    }
+}
+
+/// The gradient by the weights, and what goes to the layer before; for the rows of the net the gradient by them instead, if it is wanted.
 pub(super) fn backward(
-    rows: &Rows,
+    blocks: &Blocks<'_>,
     input: Input<'_>,
     layer: Layer<'_>,
     upstream: &Upstream,
-    gradient: &NormGradient,
     wanted: bool,
 ) -> (Vec<f32>, Upstream) {
-    let (inputs, outputs) = (input.channels(), layer.norm.mean.len());
+    let (inputs, outputs) = (input.channels(), layer.norm.channels());
+    let most = blocks.most_rows;
+    let lengths = [most * inputs, most * inputs, most * outputs, most * outputs, most * inputs];
     let mut before = Vec::new();
-    let lengths = [rows.block() * inputs, rows.block() * outputs, rows.block() * inputs];
     let work = |before: &mut [MaybeUninit<f32>]| {
         let before = Shared::new(before);
-        rows.parts(|blocks| {
+        blocks.parts(|part| {
             let mut dw = vec![0.0; layer.weight.len()];
             let mut sums = ColumnSums::new(inputs);
-            scratch::with(lengths, |[memory, dy, da]| {
-                for block in blocks {
-                    let values = block.start * outputs..block.end * outputs;
-                    let dy = &mut dy[..values.len()];
-                    gradient.apply(&upstream.gradient[values.clone()], &layer.y[values], layer.norm, dy);
-                    let dy = Matrix::new(dy, outputs);
-                    let a = input.rows(block.clone(), memory);
+            scratch::with(lengths, |[memory, input_before, own_before, dy, da]| {
+                for block in part {
+                    let dy = Matrix::new(layer.dy(blocks, block, upstream, own_before, dy), outputs);
+                    let (a, y) = input.rows(block, memory, input_before);
                     multiply(dy.transposed(), Matrix::new(a, inputs), &mut dw, Then::Add);
-                    if !wanted {
-                        continue;
+                    if wanted {
+                        let da = &mut da[..block.rows.len() * inputs];
+                        multiply(dy, Matrix::new(layer.weight, inputs), da, Then::Store);
+                        pass_on(input, a, y, da, &mut sums);
+                        // SAFETY: no row is in two blocks.
+                        unsafe { before.write(block.rows.start * inputs, da) };
                     }
-                    let da = &mut da[..block.len() * inputs];
-                    multiply(dy, Matrix::new(layer.weight, inputs), da, Then::Store);
-                    pass_on(input, a, block.start, da, &mut sums);
-                    // SAFETY: no row is in two blocks.
-                    unsafe { before.write(block.start * inputs, da) };
                 }
             });
             (dw, sums)
         })
     };
     // SAFETY: the blocks cover all rows.
-    let parts = unsafe { fill(&mut before, if wanted { rows.count * inputs } else { 0 }, work) };
+    let parts = unsafe { fill(&mut before, if wanted { blocks.rows * inputs } else { 0 }, work) };
     let (weights, sums): (Vec<_>, Vec<_>) = parts.into_iter().unzip();
     let sums = ColumnSums::total(inputs, sums.iter());
     (sum(weights, layer.weight.len()), Upstream { gradient: before, sums })
 }
 
-/// Masks the gradient by the activations `a` of some rows and takes its sums, unless they are the rows of the net itself.
-pub(super) fn pass_on(input: Input<'_>, a: &[f32], first_row: usize, da: &mut [f32], sums: &mut ColumnSums) {
-    if let Input::Hidden { y, norm } = input {
+/// Masks the gradient by the activations `a` of some rows and takes its sums, `y` what they were before their batch norm; nothing of this for
+/// the rows of the net itself.
+pub(super) fn pass_on(input: Input<'_>, a: &[f32], y: &[f32], da: &mut [f32], sums: &mut ColumnSums) {
+    if let Input::Hidden { norm, .. } = input {
         mask(da, a);
-        sums.add_gradients(da, &y[first_row * input.channels()..][..da.len()], norm);
+        sums.add_gradients(da, y, norm);
     }
+}
+
+/// For a layer without a product: the gradient by its rows, `[rows, channels]`, and the sums over the rows of it times their offsets,
+/// `[channels, 3]`, where there are offsets.
+pub(super) fn backward_first(
+    blocks: &Blocks<'_>,
+    layer: Layer<'_>,
+    offset: Option<&[[f32; 3]]>,
+    upstream: &Upstream,
+) -> (Vec<f32>, Vec<f32>) {
+    let channels = layer.norm.channels();
+    let weights = if offset.is_some() { channels * 3 } else { 0 };
+    let mut gradient = Vec::new();
+    let work = |gradient: &mut [MaybeUninit<f32>]| {
+        let gradient = Shared::new(gradient);
+        blocks.parts(|part| {
+            let mut dw = vec![0.0; weights];
+            scratch::with([blocks.most_rows * channels; 2], |[memory, dy]| {
+                for block in part {
+                    let dy = layer.dy(blocks, block, upstream, memory, dy);
+                    if let Some(offset) = offset {
+                        let offset = Matrix::new(offset[block.rows.clone()].as_flattened(), 3);
+                        multiply(Matrix::new(dy, channels).transposed(), offset, &mut dw, Then::Add);
+                    }
+                    // SAFETY: no row is in two blocks.
+                    unsafe { gradient.write(block.rows.start * channels, dy) };
+                }
+            });
+            dw
+        })
+    };
+    // SAFETY: the blocks cover all rows.
+    let parts = unsafe { fill(&mut gradient, blocks.rows * channels, work) };
+    (gradient, sum(parts, weights))
 }

@@ -1,36 +1,62 @@
 //! Shared MLP (PointNet++'s set abstraction, feature propagation and heads): layers of linear without bias, batch norm and ReLU on rows, and
 //! the maximum over groups of rows.
 //!
-//! Blocks of rows are worked on while they are in the cache. In training the rows of a layer before its batch norm are kept, but for the last
-//! layer before a maximum.
+//! Blocks of rows are worked on while they are in the cache. In training the rows of a layer before its batch norm are kept, but for a first
+//! layer that is gathered and for the last before a maximum.
 
+mod blocks;
 mod dense;
+mod inference;
+mod input;
 mod norm;
 mod pooling;
-mod rows;
+mod scatter;
 
 use crate::batch_norm::Statistics;
-use crate::fold::{Folded, NormParameters};
-use crate::matrix::{Matrix, Then, multiply};
 use crate::output::{Shared, fill};
 use crate::scratch;
-use crate::simd::vectorized;
-use dense::Layer;
+use blocks::Blocks;
+use dense::{Layer, Upstream};
+use input::{Before, Input};
 use norm::{Norm, NormGradient};
-use pooling::Extremes;
-use rows::{Input, Rows};
+use pooling::{Extremes, Pooled};
 
 /// The shape of a net.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SharedMlp {
-    /// Rows of `x`: groups times `group`.
+    /// Rows, N.
     pub rows: usize,
-    /// Rows that the maximum is taken over; with 1 there is none.
-    pub group: usize,
-    /// Channels: of `x`, and behind each layer.
+    /// Channels of the rows, C0, and behind each layer. C0 is 0 for [`MlpInput::Projected`] and 3 for [`MlpInput::Gathered`].
     pub channels: Vec<usize>,
     /// Added to the variances.
     pub epsilon: f64,
+}
+
+/// What the first layer reads.
+#[derive(Clone, Copy, Debug)]
+pub enum MlpInput<'a> {
+    /// Rows, `[N, C0]`.
+    Rows(&'a [f32]),
+    /// What the first layer's linear part makes of them, `[N, C1]`.
+    Projected(&'a [f32]),
+    /// Rows of neighbours: the linear part of features, computed once for each point, and offsets, on which the layer's weights `[C1, 3]` work.
+    Gathered {
+        /// The linear part of the features of each point, `[P, C1]`.
+        features: &'a [f32],
+        /// The point of each row, `[N]`.
+        source: &'a [u32],
+        /// Offset of each row from the centre of its group, `[N]`.
+        offset: &'a [[f32; 3]],
+    },
+}
+
+/// How rows belong together, and how often each counts.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct RowGroups<'a> {
+    /// Where each group ends, the first beginning at 0; none may be empty. Without, there is no maximum: each row is an output.
+    pub ends: Option<&'a [u32]>,
+    /// How often each row counts in the statistics, `[N]`; once if not given. A row that counts twice is as good as two equal rows of its group.
+    pub counts: Option<&'a [f32]>,
 }
 
 /// Learned parameters of a layer.
@@ -49,7 +75,9 @@ pub struct MlpLayer<'a> {
 pub struct MlpState {
     /// Mean and variance of each layer; zero where there are no rows.
     pub statistics: Vec<Statistics>,
-    /// The rows of each layer before the batch norm, but for the last before a maximum.
+    /// Rows, as often as they count.
+    pub count: f64,
+    /// The rows of each layer before the batch norm; empty where they are not kept.
     hidden: Vec<Vec<f32>>,
     extremes: Option<Extremes>,
 }
@@ -66,200 +94,200 @@ pub struct MlpGradients {
 }
 
 impl SharedMlp {
-    /// Elements of the output, `[rows / group, channels of the last layer]`.
-    pub fn out_len(&self) -> usize {
-        self.rows / self.group * self.channels[self.channels.len() - 1]
-    }
-
-    /// Normalises by the statistics of the rows. `out`, `[rows / group, outputs]`, is overwritten, whatever it held.
-    ///
-    /// # Shapes
-    /// `x`: `[rows, channels[0]]`, the rows of a group one after the other.
-    pub fn forward_train(&self, x: &[f32], layers: &[MlpLayer<'_>], out: &mut Vec<f32>) -> MlpState {
-        let rows = self.check(x, layers);
-        let mut state = MlpState { statistics: Vec::new(), hidden: Vec::new(), extremes: None };
+    /// Normalises by the statistics of the rows. `out`, `[groups, outputs]`, is overwritten, whatever it held.
+    pub fn forward_train(
+        &self,
+        input: MlpInput<'_>,
+        groups: RowGroups<'_>,
+        layers: &[MlpLayer<'_>],
+        out: &mut Vec<f32>,
+    ) -> MlpState {
+        let blocks = self.check(input, groups, layers);
+        let mut state = MlpState { statistics: vec![], count: blocks.total, hidden: vec![], extremes: None };
         let mut norms: Vec<Norm> = Vec::new();
         for (l, layer) in layers.iter().enumerate() {
-            let input = self.input(x, &state.hidden, &norms, l);
-            let statistics = if self.pools(l) {
-                let (statistics, extremes) = pooling::forward(&rows, input, layer.weight, layer.gamma);
-                state.extremes = Some(extremes);
-                statistics
-            } else {
-                let mut y = Vec::new();
-                let statistics = dense::forward(&rows, input, layer.weight, &mut y);
-                state.hidden.push(y);
-                statistics
+            let mut y = Vec::new();
+            let statistics = match (l, Before::first(input, layer.weight)) {
+                (0, Some(before)) => dense::statistics(&blocks, before, layer.gamma.len()),
+                _ => {
+                    let input = self.input(input, layers, &state.hidden, &norms, l);
+                    if self.pools(groups, l) {
+                        let (statistics, extremes) = pooling::forward(&blocks, input, layer.weight, layer.gamma);
+                        state.extremes = Some(extremes);
+                        statistics
+                    } else {
+                        dense::forward(&blocks, input, layer.weight, &mut y)
+                    }
+                }
             };
             norms.push(Norm::new(&statistics, layer.gamma, layer.beta, self.epsilon));
             state.statistics.push(statistics);
+            state.hidden.push(y);
         }
-        let norm = &norms[norms.len() - 1];
         match &state.extremes {
-            Some(extremes) => pooling::output(extremes, norm, out),
-            None => {
-                let input = Input::Hidden { y: &state.hidden[layers.len() - 1], norm };
-                self.write_rows(&rows, input, out);
-            }
+            Some(extremes) => pooling::output(extremes, &norms[layers.len() - 1], out),
+            None => write_rows(&blocks, self.input(input, layers, &state.hidden, &norms, layers.len()), out),
         }
         state
     }
 
-    /// Gradients by the parameters of each layer, and by the rows, if `dx` is given: it is overwritten, whatever it held.
+    /// Gradients by the parameters of each layer, and by the input, if `dx` is given: it is overwritten, whatever it held.
     ///
     /// # Shapes
-    /// `x`, `dx`: `[rows, channels[0]]`; `dout`: `[rows / group, outputs]`.
+    /// `dout`: `[groups, outputs]`; `dx`: as the rows, their projections, or the features that are gathered.
     pub fn backward(
         &self,
-        x: &[f32],
+        input: MlpInput<'_>,
+        groups: RowGroups<'_>,
         layers: &[MlpLayer<'_>],
         state: &MlpState,
         dout: &[f32],
         mut dx: Option<&mut Vec<f32>>,
     ) -> Vec<MlpGradients> {
-        let rows = self.check(x, layers);
-        assert_eq!(dout.len(), self.out_len(), "elements of dout of {self:?}");
+        let blocks = self.check(input, groups, layers);
+        let last = layers.len() - 1;
+        assert_eq!(dout.len(), blocks.groups() * self.channels[last + 1], "elements of dout of {self:?}");
         let norm =
             |(layer, statistics): (&MlpLayer<'_>, _)| Norm::new(statistics, layer.gamma, layer.beta, self.epsilon);
         let norms: Vec<Norm> = layers.iter().zip(&state.statistics).map(norm).collect();
-        let last = layers.len() - 1;
+        let before = |l: usize| match (l, Before::first(input, layers[0].weight)) {
+            (0, Some(before)) => before,
+            _ => Before::Stored(&state.hidden[l]),
+        };
         let mut upstream = match &state.extremes {
             Some(extremes) => pooling::last(extremes, &norms[last], dout),
-            None => dense::last(&rows, &state.hidden[last], &norms[last], dout),
+            None => dense::last(&blocks, before(last), &norms[last], dout),
         };
         let mut gradients = Vec::new();
-        for l in (0..layers.len()).rev() {
-            let (layer, statistics, norm) = (&layers[l], &state.statistics[l], &norms[l]);
-            let gradient = NormGradient::new(&upstream.sums, self.rows, statistics, layer.gamma, self.epsilon);
-            let input = self.input(x, &state.hidden, &norms, l);
-            let wanted = l > 0 || dx.is_some();
-            let (weight, before) = match &state.extremes {
-                Some(extremes) if self.pools(l) => {
-                    let parameters = (layer.weight, statistics, norm);
-                    pooling::backward(&rows, input, parameters, (extremes, &upstream), &gradient, wanted)
+        for (l, layer) in layers.iter().enumerate().rev() {
+            let (weight, statistics, norm) = (layer.weight, &state.statistics[l], &norms[l]);
+            let gradient = NormGradient::new(&upstream.sums, blocks.total, statistics, layer.gamma, self.epsilon);
+            let dense = Layer { weight, before: before(l), norm, gradient: &gradient };
+            let weight = if l == 0 && Before::first(input, weight).is_some() {
+                backward_first(&blocks, input, dense, &upstream, dx.as_deref_mut())
+            } else {
+                let input = self.input(input, layers, &state.hidden, &norms, l);
+                let wanted = l > 0 || dx.is_some();
+                let (weight, before) = match &state.extremes {
+                    Some(extremes) if l == last => {
+                        let pooled = Pooled { weight, statistics, norm, gradient: &gradient, extremes };
+                        pooling::backward(&blocks, input, pooled, &upstream, wanted)
+                    }
+                    _ => dense::backward(&blocks, input, dense, &upstream, wanted),
+                };
+                upstream = before;
+                if let (0, Some(dx)) = (l, &mut dx) {
+                    **dx = std::mem::take(&mut upstream.gradient);
                 }
-                _ => {
-                    let layer = Layer { weight: layer.weight, y: &state.hidden[l], norm };
-                    dense::backward(&rows, input, layer, &upstream, &gradient, wanted)
-                }
+                weight
             };
             gradients.push(MlpGradients { weight, gamma: gradient.gamma, beta: gradient.beta });
-            upstream = before;
-        }
-        if let Some(dx) = &mut dx {
-            **dx = upstream.gradient;
         }
         gradients.reverse();
         gradients
     }
 
-    /// Normalises by given statistics, all layers of a block of rows at once. `out` is overwritten, whatever it held.
-    ///
-    /// # Shapes
-    /// `x`: `[rows, channels[0]]`; `out`: `[rows / group, outputs]`.
-    pub fn forward(&self, x: &[f32], layers: &[MlpLayer<'_>], statistics: &[Statistics], out: &mut Vec<f32>) {
-        let rows = self.check(x, layers);
-        let fold = |(layer, statistics): (&MlpLayer<'_>, &Statistics)| {
-            let MlpLayer { weight, gamma, beta } = *layer;
-            NormParameters { gamma, beta, statistics, epsilon: self.epsilon }.fold_into_conv(weight)
-        };
-        let folded: Vec<Folded> = layers.iter().zip(statistics).map(fold).collect();
-        assert_eq!(folded.len(), layers.len(), "statistics of each layer of {self:?}");
-        let widest = self.channels.iter().max().copied().unwrap_or(0);
-        let outputs = self.channels[layers.len()];
-        // SAFETY: the blocks cover all groups.
-        unsafe {
-            fill(out, self.out_len(), |out| {
-                let out = Shared::new(out);
-                rows.parts(|blocks| {
-                    scratch::with([rows.block() * widest, rows.block() * widest, outputs], |[from, to, best]| {
-                        let (mut from, mut to) = (from, to);
-                        for block in blocks {
-                            for (l, layer) in folded.iter().enumerate() {
-                                let [inputs, outputs] = [self.channels[l], self.channels[l + 1]];
-                                let input = match l {
-                                    0 => &x[block.start * inputs..block.end * inputs],
-                                    _ => &from[..block.len() * inputs],
-                                };
-                                let product = &mut to[..block.len() * outputs];
-                                let weight = Matrix::new(&layer.weight, inputs).transposed();
-                                multiply(Matrix::new(input, inputs), weight, product, Then::Store);
-                                vectorized(|| bias_relu(product, &layer.bias));
-                                std::mem::swap(&mut from, &mut to);
-                            }
-                            let values = &from[..block.len() * outputs];
-                            for (k, group) in values.chunks_exact(self.group * outputs).enumerate() {
-                                vectorized(|| maximum(group, best));
-                                // SAFETY: no group is in two blocks.
-                                out.write((block.start / self.group + k) * outputs, best);
-                            }
-                        }
-                    });
-                });
-            });
+    /// Normalises by given statistics. `out`, `[groups, outputs]`, is overwritten, whatever it held.
+    pub fn forward(
+        &self,
+        input: MlpInput<'_>,
+        groups: RowGroups<'_>,
+        layers: &[MlpLayer<'_>],
+        statistics: &[Statistics],
+        out: &mut Vec<f32>,
+    ) {
+        let blocks = self.check(input, groups, layers);
+        inference::forward(self, &blocks, input, layers, statistics, out);
+    }
+
+    /// Whether a maximum follows a layer and its rows need not be kept.
+    fn pools(&self, groups: RowGroups<'_>, layer: usize) -> bool {
+        groups.ends.is_some() && layer + 2 == self.channels.len()
+    }
+
+    /// What a layer reads, or what comes out behind the last.
+    fn input<'a>(
+        &self,
+        input: MlpInput<'a>,
+        layers: &[MlpLayer<'a>],
+        hidden: &'a [Vec<f32>],
+        norms: &'a [Norm],
+        layer: usize,
+    ) -> Input<'a> {
+        match (layer, input) {
+            (0, MlpInput::Rows(x)) => Input::Given { x, channels: self.channels[0] },
+            _ => {
+                let before = match (layer, Before::first(input, layers[0].weight)) {
+                    (1, Some(before)) => before,
+                    _ => Before::Stored(&hidden[layer - 1]),
+                };
+                Input::Hidden { before, norm: &norms[layer - 1] }
+            }
         }
     }
 
-    fn pools(&self, layer: usize) -> bool {
-        self.group > 1 && layer + 2 == self.channels.len()
-    }
-
-    fn input<'a>(&self, x: &'a [f32], hidden: &'a [Vec<f32>], norms: &'a [Norm], layer: usize) -> Input<'a> {
-        match layer {
-            0 => Input::Given { x, channels: self.channels[0] },
-            _ => Input::Hidden { y: &hidden[layer - 1], norm: &norms[layer - 1] },
-        }
-    }
-
-    fn write_rows(&self, rows: &Rows, input: Input<'_>, out: &mut Vec<f32>) {
-        let channels = input.channels();
-        // SAFETY: the blocks cover all rows.
-        unsafe {
-            fill(out, self.out_len(), |out| {
-                let out = Shared::new(out);
-                rows.parts(|blocks| {
-                    scratch::with([rows.block() * channels], |[memory]| {
-                        for block in blocks {
-                            // SAFETY: no row is in two blocks.
-                            out.write(block.start * channels, input.rows(block, memory));
-                        }
-                    });
-                });
-            });
-        }
-    }
-
-    fn check(&self, x: &[f32], layers: &[MlpLayer<'_>]) -> Rows {
-        assert!(self.group > 0 && self.rows.is_multiple_of(self.group), "whole groups: {self:?}");
+    fn check<'a>(&self, input: MlpInput<'_>, groups: RowGroups<'a>, layers: &[MlpLayer<'_>]) -> Blocks<'a> {
         assert!(!layers.is_empty() && layers.len() + 1 == self.channels.len(), "a layer for each width of {self:?}");
-        assert!(self.channels.iter().all(|&c| c > 0), "channels: {self:?}");
-        assert_eq!(x.len(), self.rows * self.channels[0], "elements of x of {self:?}");
+        let [first, second] = [self.channels[0], self.channels[1]];
+        match input {
+            MlpInput::Rows(x) => assert!(first > 0 && x.len() == self.rows * first, "elements of x of {self:?}"),
+            MlpInput::Projected(y) => assert!(first == 0 && y.len() == self.rows * second, "elements of y of {self:?}"),
+            MlpInput::Gathered { features, source, offset } => {
+                assert!(first == 3 && features.len() % second == 0, "features of {self:?}");
+                assert_eq!((source.len(), offset.len()), (self.rows, self.rows), "sources and offsets of {self:?}");
+            }
+        }
+        let only_gathered = groups.ends.is_some() && layers.len() == 1 && !matches!(input, MlpInput::Rows(_));
+        assert!(!only_gathered, "a layer with a product before the maximum: {self:?}");
         for (layer, widths) in layers.iter().zip(self.channels.windows(2)) {
+            assert!(widths[1] > 0, "channels of {self:?}");
             assert_eq!(layer.weight.len(), widths[0] * widths[1], "weights of {self:?}");
             assert_eq!((layer.gamma.len(), layer.beta.len()), (widths[1], widths[1]), "norm of {self:?}");
         }
-        Rows { count: self.rows, group: self.group }
+        Blocks::new(self.rows, groups)
     }
 }
 
-#[inline(always)]
-fn bias_relu(values: &mut [f32], bias: &[f32]) {
-    for row in values.chunks_exact_mut(bias.len()) {
-        for (value, bias) in row.iter_mut().zip(bias) {
-            let z = *value + bias;
-            *value = if z < 0.0 { 0.0 } else { z };
+/// The gradient by the weights of a first layer without a product, and by its input.
+fn backward_first(
+    blocks: &Blocks<'_>,
+    input: MlpInput<'_>,
+    layer: Layer<'_>,
+    upstream: &Upstream,
+    dx: Option<&mut Vec<f32>>,
+) -> Vec<f32> {
+    let offset = match input {
+        MlpInput::Gathered { offset, .. } => Some(offset),
+        _ => None,
+    };
+    let (rows, weight) = dense::backward_first(blocks, layer, offset, upstream);
+    match (input, dx) {
+        (MlpInput::Gathered { features, source, .. }, Some(dx)) => {
+            let channels = layer.norm.channels();
+            scatter::add_up(&rows, source, features.len() / channels, channels, dx);
         }
+        (_, Some(dx)) => *dx = rows,
+        _ => {}
     }
+    weight
 }
 
-/// The maximum of each column; NaN, once there, stays.
-#[inline(always)]
-fn maximum(group: &[f32], best: &mut [f32]) {
-    best.fill(f32::NEG_INFINITY);
-    for row in group.chunks_exact(best.len()) {
-        for (best, &value) in best.iter_mut().zip(row) {
-            *best = if value > *best || value.is_nan() { value } else { *best };
-        }
+/// `relu(norm(y))` of all rows.
+fn write_rows(blocks: &Blocks<'_>, input: Input<'_>, out: &mut Vec<f32>) {
+    let channels = input.channels();
+    // SAFETY: the blocks cover all rows.
+    unsafe {
+        fill(out, blocks.rows * channels, |out| {
+            let out = Shared::new(out);
+            blocks.parts(|part| {
+                scratch::with([blocks.most_rows * channels; 2], |[memory, before]| {
+                    for block in part {
+                        // SAFETY: no row is in two blocks.
+                        out.write(block.rows.start * channels, input.rows(block, memory, before).0);
+                    }
+                });
+            });
+        });
     }
 }
 

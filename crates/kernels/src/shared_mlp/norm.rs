@@ -18,27 +18,27 @@ impl ColumnSums {
         ColumnSums { first: vec![0.0; columns], second: vec![0.0; columns] }
     }
 
-    /// Adds to the sums `terms(a, b, column)` of each element of `a` and of `b`, both `[rows, columns]`.
+    /// Adds to the sums `terms(a, b, weight of the row, column)` of each element of `a` and of `b`, both `[rows, columns]`.
     #[inline(always)]
-    fn add(&mut self, a: &[f32], b: &[f32], terms: impl Fn(f32, f32, usize) -> [f64; 2]) {
+    fn add(&mut self, a: &[f32], b: &[f32], weights: &[f32], terms: impl Fn(f32, f32, f64, usize) -> [f64; 2]) {
         let columns = self.first.len();
         for start in (0..columns).step_by(COLUMNS) {
             let width = COLUMNS.min(columns - start);
             let [mut first, mut second] = [[0.0; COLUMNS]; 2];
-            let rows = a.chunks_exact(columns).zip(b.chunks_exact(columns));
+            let rows = a.chunks_exact(columns).zip(b.chunks_exact(columns)).zip(weights);
             if width == COLUMNS {
-                for (a, b) in rows {
+                for ((a, b), &weight) in rows {
                     let (a, b) = (&a[start..start + COLUMNS], &b[start..start + COLUMNS]);
                     for j in 0..COLUMNS {
-                        let [x, y] = terms(a[j], b[j], start + j);
+                        let [x, y] = terms(a[j], b[j], weight as f64, start + j);
                         first[j] += x;
                         second[j] += y;
                     }
                 }
             } else {
-                for (a, b) in rows {
+                for ((a, b), &weight) in rows {
                     for j in 0..width {
-                        let [x, y] = terms(a[start + j], b[start + j], start + j);
+                        let [x, y] = terms(a[start + j], b[start + j], weight as f64, start + j);
                         first[j] += x;
                         second[j] += y;
                     }
@@ -51,15 +51,19 @@ impl ColumnSums {
         }
     }
 
-    /// Adds values and squares.
-    pub fn add_moments(&mut self, y: &[f32]) {
-        vectorized(|| self.add(y, y, |y, _, _| [y as f64, y as f64 * y as f64]));
+    /// Adds values and squares, each row as often as it counts.
+    pub fn add_moments(&mut self, y: &[f32], counts: &[f32]) {
+        vectorized(|| self.add(y, y, counts, |y, _, n, _| [n * y as f64, n * (y as f64 * y as f64)]));
     }
 
     /// Adds gradients and gradients times deviations from the mean.
     pub fn add_gradients(&mut self, gradient: &[f32], y: &[f32], norm: &Norm) {
         let mean = &norm.mean[..self.first.len()];
-        vectorized(|| self.add(gradient, y, |g, y, c| [g as f64, g as f64 * (y - mean[c]) as f64]));
+        let ones = [1.0; 64];
+        let rows = ones.len() * self.first.len();
+        for (gradient, y) in gradient.chunks(rows).zip(y.chunks(rows)) {
+            vectorized(|| self.add(gradient, y, &ones, |g, y, _, c| [g as f64, g as f64 * (y - mean[c]) as f64]));
+        }
     }
 
     /// The sums of parts, added in order.
@@ -76,10 +80,10 @@ impl ColumnSums {
         total
     }
 
-    /// Mean and variance, if these are the sums of [`ColumnSums::add_moments`] over `rows` rows; zero where there are none.
-    pub fn statistics(&self, rows: usize) -> Statistics {
-        let n = rows.max(1) as f64;
-        let moments = |(sum, squares): (&f64, &f64)| (sum / n, non_negative(squares / n - (sum / n).powi(2)));
+    /// Mean and variance, if these are the sums of [`ColumnSums::add_moments`] over rows that count `total` together.
+    pub fn statistics(&self, total: f64) -> Statistics {
+        let moments =
+            |(sum, squares): (&f64, &f64)| (sum / total, non_negative(squares / total - (sum / total).powi(2)));
         let (mean, variance) = self.first.iter().zip(&self.second).map(moments).unzip();
         Statistics { mean, variance }
     }
@@ -108,6 +112,10 @@ impl Norm {
         }
     }
 
+    pub fn channels(&self) -> usize {
+        self.mean.len()
+    }
+
     #[inline(always)]
     pub fn of(&self, y: f32, channel: usize) -> f32 {
         (y - self.mean[channel]) * self.scale[channel] + self.beta[channel]
@@ -115,7 +123,7 @@ impl Norm {
 
     /// `relu(z)` of the rows `y` into `out`.
     pub fn relu(&self, y: &[f32], out: &mut [f32]) {
-        let channels = self.mean.len();
+        let channels = self.channels();
         let (mean, scale, beta) = (&self.mean[..channels], &self.scale[..channels], &self.beta[..channels]);
         vectorized(|| {
             for (y, out) in y.chunks_exact(channels).zip(out.chunks_exact_mut(channels)) {
@@ -128,7 +136,7 @@ impl Norm {
     }
 }
 
-/// The gradient of a batch norm: `dy = g scale + (y - mean) slope + offset`, g the gradient by z.
+/// The gradient of a batch norm for a row that counts n times: `dy = g scale + n ((y - mean) slope + offset)`, g the gradient by z.
 #[derive(Clone, Debug)]
 pub(super) struct NormGradient {
     pub slope: Vec<f64>,
@@ -140,15 +148,14 @@ pub(super) struct NormGradient {
 }
 
 impl NormGradient {
-    /// From the sums of [`ColumnSums::add_gradients`] over `rows` rows.
-    pub fn new(sums: &ColumnSums, rows: usize, statistics: &Statistics, gamma: &[f32], epsilon: f64) -> Self {
-        let n = rows.max(1) as f64;
+    /// From the sums of [`ColumnSums::add_gradients`] over rows that count `total` together.
+    pub fn new(sums: &ColumnSums, total: f64, statistics: &Statistics, gamma: &[f32], epsilon: f64) -> Self {
         let mut gradient = NormGradient { slope: vec![], offset: vec![], gamma: vec![], beta: vec![] };
         for (c, (sum, product)) in sums.first.iter().zip(&sums.second).enumerate() {
             let inverse = 1.0 / (statistics.variance[c] + epsilon);
             let scale = gamma[c] as f64 * inverse.sqrt();
-            gradient.slope.push(-scale * inverse * product / n);
-            gradient.offset.push(-scale * sum / n);
+            gradient.slope.push(-scale * inverse * product / total);
+            gradient.offset.push(-scale * sum / total);
             gradient.gamma.push((product * inverse.sqrt()) as f32);
             gradient.beta.push(*sum as f32);
         }
@@ -156,24 +163,24 @@ impl NormGradient {
     }
 
     /// `dy` of rows into `out`.
-    pub fn apply(&self, g: &[f32], y: &[f32], norm: &Norm, out: &mut [f32]) {
-        let channels = norm.mean.len();
+    pub fn apply(&self, g: &[f32], y: &[f32], counts: &[f32], norm: &Norm, out: &mut [f32]) {
+        let channels = norm.channels();
         let slope: Vec<f32> = self.slope.iter().map(|&v| v as f32).collect();
         let offset: Vec<f32> = self.offset.iter().map(|&v| v as f32).collect();
         let (slope, offset) = (&slope[..channels], &offset[..channels]);
         let (mean, scale) = (&norm.mean[..channels], &norm.scale[..channels]);
         vectorized(|| {
-            let rows = g.chunks_exact(channels).zip(y.chunks_exact(channels));
-            for ((g, y), out) in rows.zip(out.chunks_exact_mut(channels)) {
+            let rows = g.chunks_exact(channels).zip(y.chunks_exact(channels)).zip(counts);
+            for (((g, y), n), out) in rows.zip(out.chunks_exact_mut(channels)) {
                 for c in 0..channels {
-                    out[c] = g[c] * scale[c] + ((y[c] - mean[c]) * slope[c] + offset[c]);
+                    out[c] = g[c] * scale[c] + n * ((y[c] - mean[c]) * slope[c] + offset[c]);
                 }
             }
         });
     }
 }
 
-/// Zero where the ReLU was: `activation` is not above zero. NaN in the gradient stays where it passes.
+/// Zero where the ReLU was: `activation` is not above zero.
 pub(super) fn mask(gradient: &mut [f32], activation: &[f32]) {
     vectorized(|| {
         for (g, &a) in gradient.iter_mut().zip(activation) {

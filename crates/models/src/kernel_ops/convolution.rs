@@ -2,7 +2,7 @@
 
 use super::{Input, Kernel, Kernels, apply, chosen_kernels, input};
 use burn::tensor::Tensor;
-use kernels::{Algorithm, Conv3x3, Epilogue, Folded, Pointwise, TransposedConv};
+use kernels::{Algorithm, Conv3x3, Epilogue, Folded, TransposedConv};
 
 fn algorithm() -> Algorithm {
     if chosen_kernels() == Kernels::AutoF4 { Algorithm::WinogradF4 } else { Algorithm::WinogradF2 }
@@ -154,45 +154,4 @@ pub fn folded_transposed(x: &Tensor<4>, stride: usize, folded: impl FnOnce() -> 
     let folded = folded();
     let conv = transposed_conv(x.dims(), folded.bias.len(), stride)?;
     apply(Inference { conv, folded }, [Some(plain)]).map(|(y, ())| y)
-}
-
-/// A 1x1 convolution with bias, and the size of its images.
-#[derive(Clone, Debug)]
-struct PointwiseKernel {
-    conv: Pointwise,
-    size: [usize; 2],
-}
-
-impl Kernel<3> for PointwiseKernel {
-    type State = ();
-
-    fn forward(&self, [x, weight, bias]: [&[f32]; 3]) -> (Vec<f32>, ()) {
-        let mut y = Vec::new();
-        let epilogue = Epilogue { bias: Some(bias), relu: false };
-        self.conv.forward(x, &self.conv.pack(weight), epilogue, &mut y);
-        (y, ())
-    }
-
-    fn backward(&self, [x, weight, _]: [&[f32]; 3], (): &(), dy: &[f32], wanted: [bool; 3]) -> [Option<Vec<f32>>; 3] {
-        let dx = wanted[0].then(|| {
-            let mut dx = Vec::new();
-            self.conv.data_gradient(dy, weight, &mut dx);
-            dx
-        });
-        [dx, wanted[1].then(|| self.conv.weight_gradient(x, dy)), wanted[2].then(|| self.conv.bias_gradient(dy))]
-    }
-
-    fn shape(&self) -> Vec<usize> {
-        vec![self.conv.batch, self.conv.outputs, self.size[0], self.size[1]]
-    }
-}
-
-/// 1x1 convolution with bias.
-///
-/// # Shapes
-/// `x`: `[B, C_in, H, W]`; `weight`: `[C_out, C_in, 1, 1]`; `bias`: `[C_out]`; result `[B, C_out, H, W]`.
-pub fn pointwise(x: &Tensor<4>, weight: &Tensor<4>, bias: &Tensor<1>) -> Option<Tensor<4>> {
-    let [batch, inputs, height, width] = x.dims();
-    let conv = Pointwise { batch, inputs, outputs: weight.dims()[0], pixels: height * width };
-    apply(PointwiseKernel { conv, size: [height, width] }, [input(x), input(weight), input(bias)]).map(|(y, ())| y)
 }

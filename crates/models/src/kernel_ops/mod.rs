@@ -3,15 +3,23 @@
 //! A layer asks for its kernel; where the tensors live on the CPU device `flex` it gets the result, elsewhere `None`, and takes burn's own
 //! operations instead.
 
+mod canvas;
 mod convolution;
 mod focal_loss;
 mod norm_relu;
 mod pillar_net;
+mod pixel_heads;
+mod shared_mlp;
+mod values;
 
-pub use convolution::{conv3x3, folded_conv3x3, folded_transposed, pointwise, transposed};
+pub use canvas::scatter;
+pub use convolution::{conv3x3, folded_conv3x3, folded_transposed, transposed};
 pub use focal_loss::focal_loss_sum;
 pub use norm_relu::norm_relu;
 pub use pillar_net::{pillar_net, pillar_net_inference};
+pub use pixel_heads::pixel_heads;
+pub use shared_mlp::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
+pub use values::FlexValues;
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;

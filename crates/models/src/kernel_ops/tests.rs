@@ -1,10 +1,14 @@
 //! Every operation in both forms: the kernel's values and gradients against burn's own.
 
 use super::*;
+use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, rows_kernel};
+use crate::point_ops::{Groups, group_max};
+use burn::module::Module;
 use burn::tensor::Device;
 use burn::tensor::activation::relu;
 use burn::tensor::module::{conv_transpose2d, conv2d};
 use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
+use std::sync::Arc;
 
 fn device() -> Device {
     Device::flex().autodiff()
@@ -73,9 +77,23 @@ fn convolutions() {
         );
     }
     assert!(transposed(&random([1, 1, 2, 2], 1), &random([1, 1, 3, 3], 1), 3).is_none(), "no kernel for a stride of 3");
-    let (x, w, b) = (random([2, 6, 5, 3], 5), random([4, 6, 1, 1], 6), random([4], 7));
-    let theirs = conv2d(x.clone(), w.clone(), Some(b.clone()), ConvOptions::new([1, 1], [0, 0], [1, 1], 1));
-    check!("1x1", [x, w, b], pointwise(&x, &w, &b).unwrap(), theirs);
+}
+
+#[test]
+fn heads_of_an_image() {
+    for shape in [[2, 6, 5, 3], [1, 1, 1, 1], [1, 40, 20, 19]] {
+        let (x, channels) = (random(shape, 5), shape[1]);
+        let (w1, b1) = (random([4, channels, 1, 1], 6), random([4], 7));
+        let (w2, b2) = (random([7, channels, 1, 1], 8), random([7], 9));
+        let ours = Tensor::cat(pixel_heads(&x, [(&w1, &b1), (&w2, &b2)]).unwrap().to_vec(), 1);
+        let burns = |w: &Tensor<4>, b: &Tensor<1>| {
+            let y = conv2d(x.clone(), w.clone(), Some(b.clone()), ConvOptions::new([1, 1], [0, 0], [1, 1], 1));
+            let [n, k, h, w] = y.dims();
+            y.permute([0, 2, 3, 1]).reshape([n * h * w, k])
+        };
+        let theirs = Tensor::cat(vec![burns(&w1, &b1), burns(&w2, &b2)], 1);
+        check!(format!("heads, {shape:?}"), [x, w1, b1, w2, b2], ours, theirs);
+    }
 }
 
 #[test]
@@ -88,6 +106,141 @@ fn batch_norm_and_relu() {
     let variance: Vec<f32> = statistics.variance.iter().map(|&v| v as f32).collect();
     assert_close("variance", &variance, &host(theirs.variance));
     check!("batch norm", [x, gamma, beta], ours, relu(theirs.output));
+}
+
+/// Groups of 1 to `largest` rows that are taken from `points` points; rows that the reference repeats count more than once.
+fn groups(count: usize, largest: usize, points: usize) -> Groups {
+    let mut groups = Groups::default();
+    let mut row = 0;
+    for g in 0..count {
+        let slots = (0..1 + g * 5 % largest).map(|_| {
+            row += 1;
+            let at = values(3, row as u32);
+            ((row * 7 % points) as u32, [at[0], at[1], at[2]])
+        });
+        groups.push([0.1, -0.2, 0.3], slots, (1 + g % 3) as f32);
+    }
+    groups
+}
+
+/// Layers with the names that their weights are drawn by.
+fn mlp(channels: &[usize]) -> Vec<RowsBnRelu<4>> {
+    let device = device();
+    let init = Init { seed: 3, device: &device };
+    let layer = |(l, c): (usize, &[usize])| {
+        let mut norm = BatchNorm::new(c[1], 0.1, 1e-5, &init);
+        norm.weight = init.uniform(&format!("{l}.gamma"), [c[1]], 1);
+        norm.bias = init.uniform(&format!("{l}.beta"), [c[1]], 1);
+        RowsBnRelu::new(&format!("{l}.weight"), [c[0], c[1]], norm, &init)
+    };
+    channels.windows(2).enumerate().map(layer).collect()
+}
+
+/// Both forms of a net: values, gradients by the rows and by all parameters, and running statistics.
+fn check_mlp(
+    what: &str,
+    channels: &[usize],
+    rows: Tensor<2>,
+    ours: impl Fn(&[RowsBnRelu<4>], Tensor<2>) -> Option<Tensor<2>>,
+    theirs: impl Fn(&[RowsBnRelu<4>], Tensor<2>) -> Tensor<2>,
+) {
+    let (a, b) = (mlp(channels), mlp(channels));
+    let (mine, burns) = (ours(&a, rows.clone()).unwrap(), theirs(&b, rows.clone()));
+    assert_eq!(mine.dims(), burns.dims(), "{what}");
+    assert_close(&format!("{what}: values"), &host(mine.clone()), &host(burns.clone()));
+    let weights = random(burns.dims(), 99).detach();
+    let gradients = ((mine * weights.clone()).sum().backward(), (burns * weights).sum().backward());
+    let close = |name: &str, mine: Option<Vec<f32>>, burns: Option<Vec<f32>>| {
+        assert_close(&format!("{what}: {name}"), &mine.unwrap(), &burns.unwrap());
+    };
+    close("gradient by the rows", rows.grad(&gradients.0).map(host), rows.grad(&gradients.1).map(host));
+    for (l, (a, b)) in a.iter().zip(&b).enumerate() {
+        let gradient = |layer: &RowsBnRelu<4>, from| layer.weight.val().grad(from).map(host);
+        close(&format!("weight {l}"), gradient(a, &gradients.0), gradient(b, &gradients.1));
+        for (name, a, b) in [("gamma", &a.norm.weight, &b.norm.weight), ("beta", &a.norm.bias, &b.norm.bias)] {
+            close(&format!("{name} {l}"), a.val().grad(&gradients.0).map(host), b.val().grad(&gradients.1).map(host));
+        }
+        for (a, b) in [(&a.norm.running_mean, &b.norm.running_mean), (&a.norm.running_var, &b.norm.running_var)] {
+            close(&format!("statistics {l}"), Some(host(a.value())), Some(host(b.value())));
+        }
+    }
+}
+
+#[test]
+fn shared_mlp_over_groups_of_neighbours() {
+    for (count, largest, channels) in
+        [(1, 1, vec![7, 5, 3]), (9, 7, vec![5, 9, 17]), (60, 33, vec![19, 16, 16, 33]), (500, 4, vec![4, 32, 40, 64])]
+    {
+        let groups = Arc::new(groups(count, largest, 11));
+        let (on_device, features) = (groups.to_device(&device()), random([11, channels[0] - 3], 21));
+        let ours = |layers: &[RowsBnRelu<4>], x: Tensor<2>| {
+            let rows = MlpRows::Gathered(layers[0].project(x, 3));
+            rows_kernel(layers, &rows, Some(&groups), Mode::Train)
+        };
+        let theirs = |layers: &[RowsBnRelu<4>], x: Tensor<2>| {
+            let y = layers[0].project(on_device.offset.clone(), 0);
+            let y = y + layers[0].project(x, 3).select(0, on_device.source.clone());
+            let x = layers[0].norm_relu(y, &on_device.counts, Mode::Train);
+            group_max(layers[1..].iter().fold(x, |x, l| l.forward(x, &on_device.counts, Mode::Train)), &on_device)
+        };
+        check_mlp(&format!("gathered, {channels:?}"), &channels, features, ours, theirs);
+
+        let channels = [&[3], &channels[1..]].concat();
+        let ours = |layers: &[RowsBnRelu<4>], x| rows_kernel(layers, &MlpRows::Rows(x), Some(&groups), Mode::Train);
+        let theirs = |layers: &[RowsBnRelu<4>], x: Tensor<2>| {
+            let [n, filled] = [x.dims()[0], on_device.offset.dims()[0]];
+            let x = Tensor::cat(vec![x, Tensor::zeros([filled - n, 3], &device())], 0);
+            group_max(layers.iter().fold(x, |x, l| l.forward(x, &on_device.counts, Mode::Train)), &on_device)
+        };
+        check_mlp(&format!("rows, {channels:?}"), &channels, groups.offsets(&device()).require_grad(), ours, theirs);
+    }
+}
+
+#[test]
+fn shared_mlp_over_single_rows() {
+    for (rows, channels) in [(2, vec![1, 1]), (3, vec![5, 7, 2]), (300, vec![17, 33, 16]), (1030, vec![6, 8, 9, 10])] {
+        let counts = RowCounts::once(rows, &device());
+        let all = |layers: &[RowsBnRelu<4>], x| layers.iter().fold(x, |x, l| l.forward(x, &counts, Mode::Train));
+        let ours = |layers: &[RowsBnRelu<4>], x| rows_kernel(layers, &MlpRows::Rows(x), None, Mode::Train);
+        check_mlp(&format!("{rows} rows, {channels:?}"), &channels, random([rows, channels[0]], 22), ours, all);
+        let ours = |layers: &[RowsBnRelu<4>], x| {
+            rows_kernel(layers, &MlpRows::Projected(layers[0].project(x, 0)), None, Mode::Train)
+        };
+        check_mlp(&format!("{rows} projected, {channels:?}"), &channels, random([rows, channels[0]], 23), ours, all);
+    }
+}
+
+#[test]
+fn shared_mlp_at_inference() {
+    let layers = mlp(&[6, 9, 5]);
+    let layers: Vec<_> = layers.into_iter().map(|layer| layer.valid()).collect();
+    let (device, groups) = (Device::flex(), Arc::new(groups(20, 6, 11)));
+    let features = random([11, 3], 24).inner();
+    let ours = MlpRows::Gathered(layers[0].project(features.clone(), 3));
+    let ours = rows_kernel(&layers, &ours, Some(&groups), Mode::Eval).unwrap();
+    let on_device = groups.to_device(&device);
+    let y = layers[0].project(on_device.offset.clone(), 0)
+        + layers[0].project(features, 3).select(0, on_device.source.clone());
+    let x = layers[0].norm_relu(y, &on_device.counts, Mode::Eval);
+    let theirs = group_max(layers[1].forward(x, &on_device.counts, Mode::Eval), &on_device);
+    assert_close("inference", &host(ours), &host(theirs));
+}
+
+#[test]
+fn shared_mlp_without_rows_and_with_what_is_no_number() {
+    let layers = mlp(&[4, 6, 5]);
+    let none = |groups: Option<&Arc<Groups>>, rows| rows_kernel(&layers, &rows, groups, Mode::Train).unwrap();
+    let empty = || Tensor::<2>::zeros([0, 4], &device());
+    assert_eq!(none(None, MlpRows::Rows(empty())).dims(), [0, 5]);
+    assert_eq!(none(Some(&Arc::new(Groups::default())), MlpRows::Rows(empty())).dims(), [0, 5]);
+
+    let mut features = values(11 * 6, 25);
+    features[8] = f32::NAN;
+    let features = Tensor::<2>::from_data(TensorData::new(features, [11, 6]), &device()).require_grad();
+    let y = none(Some(&Arc::new(groups(20, 6, 11))), MlpRows::Gathered(features.clone()));
+    assert!(host(y.clone()).iter().all(|v| v.is_nan()));
+    let gradient = host(features.grad(&y.sum().backward()).unwrap());
+    assert!(gradient.iter().any(|v| v.is_nan()));
 }
 
 #[test]

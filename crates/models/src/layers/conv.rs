@@ -1,7 +1,7 @@
 //! Convolutions with what follows them.
 
 use super::{BatchNorm, Init, Mode, host};
-use crate::kernel_ops::{conv3x3, folded_conv3x3, folded_transposed, pointwise, transposed};
+use crate::kernel_ops::{conv3x3, folded_conv3x3, folded_transposed, pixel_heads, transposed};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
@@ -105,11 +105,18 @@ impl PointwiseConv {
         }
     }
 
+    /// Some of them on one image, with the outputs of each pixel in a row.
+    ///
     /// # Shapes
-    /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H, W]`.
-    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        let (weight, bias) = (self.weight.val(), self.bias.val());
-        pointwise(&x, &weight, &bias)
-            .unwrap_or_else(|| conv2d(x, weight, Some(bias), ConvOptions::new([1, 1], [0, 0], [1, 1], 1)))
+    /// `x`: `[B, C_in, H, W]`; results `[B * H * W, C_out]`.
+    pub fn forward_rows<const N: usize>(convs: [&PointwiseConv; N], x: Tensor<4>) -> [Tensor<2>; N] {
+        let parameters = convs.map(|conv| (conv.weight.val(), conv.bias.val()));
+        pixel_heads(&x, parameters.each_ref().map(|(weight, bias)| (weight, bias))).unwrap_or_else(|| {
+            parameters.map(|(weight, bias)| {
+                let y = conv2d(x.clone(), weight, Some(bias), ConvOptions::new([1, 1], [0, 0], [1, 1], 1));
+                let [b, k, h, w] = y.dims();
+                y.permute([0, 2, 3, 1]).reshape([b * h * w, k]) // [B, H, W, C_out] -> [B * H * W, C_out]
+            })
+        })
     }
 }

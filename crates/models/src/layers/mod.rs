@@ -10,7 +10,7 @@ pub use batch_norm::{BatchNorm, Moments};
 pub use conv::{ConvBnRelu, DeconvBnRelu, PointwiseConv};
 pub use host::host;
 pub use init::Init;
-pub use rows::{RowCounts, RowsBnRelu, RowsLinear};
+pub use rows::{RowCounts, RowsBnRelu, RowsLinear, rows_kernel};
 
 /// Whether a pass learns (batch statistics, running ones updated) or only looks (running statistics).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

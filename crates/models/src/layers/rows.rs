@@ -1,9 +1,12 @@
 //! Layers over rows: each row is a point, or a point of a group. What PyTorch writes as linear layers and 1x1 convolutions.
 
 use super::{BatchNorm, Init, Mode};
+use crate::kernel_ops::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
+use crate::point_ops::Groups;
 use burn::module::{Module, Param};
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
+use std::sync::Arc;
 
 /// Terms that are added one after the other, at most: one running f32 sum over tens of thousands of rows would lose digits.
 const BLOCK: usize = 16;
@@ -112,6 +115,40 @@ impl<const D: usize> RowsBnRelu<D> {
     }
 }
 
+/// Layers one behind the other and the maximum over groups, as one operation; `None` where there is no kernel for it.
+///
+/// # Shapes
+/// `rows`: as [`MlpRows`] says; result `[G, C]`, or `[N, C]` without groups.
+pub fn rows_kernel<const D: usize>(
+    layers: &[RowsBnRelu<D>],
+    rows: &MlpRows,
+    groups: Option<&Arc<Groups>>,
+    mode: Mode,
+) -> Option<Tensor<2>> {
+    let first_columns = if matches!(rows, MlpRows::Gathered(_)) { 3 } else { usize::MAX };
+    let parameters = |(l, layer): (usize, &RowsBnRelu<D>)| {
+        let weight = matrix(&layer.weight);
+        let columns = if l == 0 { weight.dims()[1].min(first_columns) } else { weight.dims()[1] };
+        let weight = weight.narrow(1, 0, columns);
+        MlpParameters { weight, gamma: layer.norm.weight.val(), beta: layer.norm.bias.val() }
+    };
+    let parameters: Vec<_> = layers.iter().enumerate().map(parameters).collect();
+    let epsilon = layers.first()?.norm.epsilon();
+    match mode {
+        Mode::Train => {
+            let (out, statistics, count) = shared_mlp(rows, groups, &parameters, epsilon)?;
+            for (layer, statistics) in layers.iter().zip(&statistics) {
+                layer.norm.update(layer.norm.moments(statistics, count));
+            }
+            Some(out)
+        }
+        Mode::Eval => {
+            let statistics = || layers.iter().map(|layer| layer.norm.running_statistics()).collect();
+            shared_mlp_inference(rows, groups, &parameters, epsilon, statistics)
+        }
+    }
+}
+
 /// Linear layer with bias.
 #[derive(Module, Debug)]
 pub struct RowsLinear<const D: usize> {
@@ -161,11 +198,15 @@ fn stored<const D: usize>([input, output]: [usize; 2]) -> [usize; D] {
     })
 }
 
-fn project<const D: usize>(weight: &Param<Tensor<D>>, x: Tensor<2>, first: usize) -> Tensor<2> {
+/// `[C_out, C_in]`.
+fn matrix<const D: usize>(weight: &Param<Tensor<D>>) -> Tensor<2> {
     let dims = weight.dims();
-    let (output, input, columns) = (dims[0], dims[1], x.dims()[1]);
-    let matrix: Tensor<2> = weight.val().reshape([output, input]);
-    let matrix = if columns == input { matrix } else { matrix.narrow(1, first, columns) };
+    weight.val().reshape([dims[0], dims[1]])
+}
+
+fn project<const D: usize>(weight: &Param<Tensor<D>>, x: Tensor<2>, first: usize) -> Tensor<2> {
+    let (matrix, columns) = (matrix(weight), x.dims()[1]);
+    let matrix = if columns == matrix.dims()[1] { matrix } else { matrix.narrow(1, first, columns) };
     x.matmul(matrix.transpose())
 }
 

@@ -46,6 +46,12 @@ impl Groups {
         self.ends.extend(other.ends.iter().map(|&end| end + begin));
     }
 
+    /// The offsets on the device, `[N, 3]`, m.
+    pub fn offsets(&self, device: &Device) -> Tensor<2> {
+        let values = self.offset_m.as_flattened().to_vec();
+        Tensor::from_data(TensorData::new(values, [self.offset_m.len(), 3]), device)
+    }
+
     /// For the device. Rows that count nothing fill up to a number whose sums are exact.
     pub fn to_device(&self, device: &Device) -> GroupTensors {
         let filled = |values: &[f32], width: usize| {

@@ -46,18 +46,13 @@ impl AnchorHead {
     /// # Shapes
     /// `x`: `[B, C, H, W]`.
     pub fn forward(&self, x: Tensor<4>) -> Predictions {
-        let [_, _, h, w] = x.dims();
+        let [b, _, h, w] = x.dims();
         let anchors = self.conv_box.bias.dims()[0] / 7;
-        let per_anchor = |conv: &PointwiseConv| {
-            let y = conv.forward(x.clone()).permute([0, 2, 3, 1]); // [B, H, W, anchors * k]
-            let [b, h, w, k] = y.dims();
+        let convs = [&self.conv_cls, &self.conv_box, &self.conv_dir_cls];
+        let [cls, boxes, dir] = PointwiseConv::forward_rows(convs, x).map(|y| {
+            let k = y.dims()[1];
             y.reshape([b, h * w * anchors, k / anchors]) // [B, A, k]
-        };
-        Predictions {
-            cls: per_anchor(&self.conv_cls),
-            boxes: per_anchor(&self.conv_box),
-            dir: per_anchor(&self.conv_dir_cls),
-            map: [h, w],
-        }
+        });
+        Predictions { cls, boxes, dir, map: [h, w] }
     }
 }

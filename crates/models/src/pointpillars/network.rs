@@ -56,7 +56,7 @@ impl PointPillars {
     pub fn forward(&self, batch: &[&Sample], mode: Mode) -> Stages {
         let pillar_features = self.vfe.forward(self.pillar_rows(batch), mode);
         let (cells, shape) = self.cells(batch);
-        let spatial_features = scatter(pillar_features.clone(), cells, shape);
+        let spatial_features = scatter(pillar_features.clone(), &cells, shape);
         let backbone = self.backbone_2d.forward(spatial_features.clone(), mode);
         let predictions = self.dense_head.forward(backbone.spatial_features_2d.clone());
         Stages { pillar_features, spatial_features, backbone, predictions }
@@ -70,9 +70,9 @@ impl PointPillars {
     }
 
     /// The cell of each pillar of a batch in the canvases laid end to end, and `[B, ny, nx]`.
-    pub fn cells(&self, batch: &[&Sample]) -> (Vec<i32>, [usize; 3]) {
+    pub fn cells(&self, batch: &[&Sample]) -> (Vec<u32>, [usize; 3]) {
         let cells = batch.iter().enumerate().flat_map(|(b, sample)| {
-            let cell = move |&[_, y, x]: &[u32; 3]| ((b * self.ny + y as usize) * self.nx + x as usize) as i32;
+            let cell = move |&[_, y, x]: &[u32; 3]| ((b * self.ny + y as usize) * self.nx + x as usize) as u32;
             sample.pillars.coords_zyx.iter().map(cell)
         });
         (cells.collect(), [batch.len(), self.ny, self.nx])

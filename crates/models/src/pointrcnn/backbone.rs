@@ -3,7 +3,8 @@
 use super::hierarchy::Hierarchy;
 use super::set_abstraction::SharedMlp;
 use crate::config::PointRcnnConfig;
-use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu};
+use crate::kernel_ops::MlpRows;
+use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, rows_kernel};
 use crate::point_ops::{Groups, Interpolation, InterpolationTensors, interpolate};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -99,7 +100,7 @@ impl PointNet2Msg {
                     groups.append(&cloud.levels[i].scales[g], first_row);
                     first_row += sizes(i, cloud);
                 }
-                mlp.forward(down[i].clone(), &groups.to_device(device), mode)
+                mlp.forward(down[i].clone(), groups, device, mode)
             });
             down.push(Some(Tensor::cat(scales.collect(), 1))); // [B * M, sum of the scales' channels]
         }
@@ -140,8 +141,10 @@ impl FeaturePropagation {
         if let Some(own) = own {
             y = y + first.project(own, interpolated);
         }
-        let counts = RowCounts::once(y.dims()[0], &y.device());
-        let x = first.norm_relu(y, &counts, mode);
-        rest.iter().fold(x, |x, layer| layer.forward(x, &counts, mode))
+        rows_kernel(&self.mlp, &MlpRows::Projected(y.clone()), None, mode).unwrap_or_else(|| {
+            let counts = RowCounts::once(y.dims()[0], &y.device());
+            let x = first.norm_relu(y, &counts, mode);
+            rest.iter().fold(x, |x, layer| layer.forward(x, &counts, mode))
+        })
     }
 }

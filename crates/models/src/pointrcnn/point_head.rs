@@ -1,7 +1,8 @@
 //! The first stage's head: what single points say (OpenPCDet: `PointHeadBox`).
 
 use crate::config::PointHeadConfig;
-use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear};
+use crate::kernel_ops::MlpRows;
+use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear, rows_kernel};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
@@ -69,6 +70,7 @@ impl<const D: usize> HiddenLayers<D> {
     /// # Shapes
     /// `x`: `[N, C]`; result `[N, outputs]`.
     pub fn forward(&self, x: Tensor<2>, counts: &RowCounts, mode: Mode) -> Tensor<2> {
-        self.last.forward(self.hidden.iter().fold(x, |x, layer| layer.forward(x, counts, mode)))
+        let hidden = rows_kernel(&self.hidden, &MlpRows::Rows(x.clone()), None, mode);
+        self.last.forward(hidden.unwrap_or_else(|| self.hidden.iter().fold(x, |x, l| l.forward(x, counts, mode))))
     }
 }

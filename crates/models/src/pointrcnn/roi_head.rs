@@ -104,7 +104,7 @@ impl RoiHead {
         let mut set_abstraction: Vec<Tensor<2>> = Vec::new();
         for (module, groups) in self.sa_modules.iter().zip(input.levels.iter().chain([&input.global])) {
             let from = set_abstraction.last().unwrap_or(&merged).clone();
-            set_abstraction.push(module.mlps[0].forward(Some(from), &groups.to_device(&device), mode));
+            set_abstraction.push(module.mlps[0].forward(Some(from), groups.clone(), &device, mode));
         }
         let regions = set_abstraction[set_abstraction.len() - 1].clone(); // [R, C]
         let counts = RowCounts::once(input.regions(), &device);

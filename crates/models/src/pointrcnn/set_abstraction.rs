@@ -1,9 +1,11 @@
 //! Layers shared by all points of a group, and the maximum over it (Qi et al. 2017, PointNet).
 
-use crate::layers::{Mode, RowsBnRelu};
-use crate::point_ops::{GroupTensors, group_max};
+use crate::kernel_ops::MlpRows;
+use crate::layers::{Mode, RowsBnRelu, rows_kernel};
+use crate::point_ops::{GroupTensors, Groups, group_max};
 use burn::module::Module;
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
+use std::sync::Arc;
 
 /// The layers of one grouping.
 #[derive(Module, Debug)]
@@ -30,11 +32,23 @@ impl SharedMlp {
     ///
     /// # Shapes
     /// `features`: `[P, C]`; result `[G, C']`.
-    pub fn forward(&self, features: Option<Tensor<2>>, groups: &GroupTensors, mode: Mode) -> Tensor<2> {
+    pub fn forward(&self, features: Option<Tensor<2>>, groups: Groups, device: &Device, mode: Mode) -> Tensor<2> {
+        let groups = Arc::new(groups);
+        let projected = features.map(|features| self.layers[0].project(features, 3)); // [P, C]
+        let rows = match &projected {
+            Some(projected) => MlpRows::Gathered(projected.clone()),
+            None => MlpRows::Rows(groups.offsets(device)),
+        };
+        rows_kernel(&self.layers, &rows, Some(&groups), mode)
+            .unwrap_or_else(|| self.forward_on_device(projected, &groups.to_device(device), mode))
+    }
+
+    /// The same by burn's operations, behind the first layer's share of the features.
+    fn forward_on_device(&self, projected: Option<Tensor<2>>, groups: &GroupTensors, mode: Mode) -> Tensor<2> {
         let (first, rest) = (&self.layers[0], &self.layers[1..]);
         let mut y = first.project(groups.offset.clone(), 0); // [N, C]
-        if let Some(features) = features {
-            y = y + first.project(features, 3).select(0, groups.source.clone());
+        if let Some(projected) = projected {
+            y = y + projected.select(0, groups.source.clone());
         }
         let x = first.norm_relu(y, &groups.counts, mode);
         let x = rest.iter().fold(x, |x, layer| layer.forward(x, &groups.counts, mode)); // [N, C']

@@ -1,0 +1,165 @@
+"""A training step of PointPillars (Lang et al. 2019), in two forms.
+
+As OpenPCDet runs it: pillars padded to their full number of points, images NCHW, box losses over all anchors. `best`: the points alone with
+the padding's exact share in the statistics, images channels-last, box losses over the positive anchors, a fused optimiser.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+POSITIVES = 60  # anchors of a frame that have a box
+INPUTS_BESIDE_CHANNELS = 6  # offsets of a point from its pillar's mean and centre
+
+
+class PillarNet(nn.Module):
+    def __init__(self, inputs, filters, max_points):
+        super().__init__()
+        self.linear = nn.Linear(inputs, filters, bias=False)
+        self.norm = nn.BatchNorm1d(filters, eps=1e-3, momentum=0.01)
+        self.max_points = max_points
+
+    def padded(self, x):  # [P, M, F] -> [P, C]
+        y = self.linear(x)
+        y = self.norm(y.permute(0, 2, 1)).permute(0, 2, 1)
+        return F.relu(y).max(dim=1)[0]
+
+    def of_points(self, x, pillar, pillars):  # [N, F] -> [P, C]
+        y = self.linear(x)
+        rows = pillars * self.max_points
+        mean = y.sum(0) / rows
+        variance = (y.square().sum(0) / rows - mean.square()).clamp(min=0)
+        with torch.no_grad():
+            self.norm.running_mean.lerp_(mean, 0.01)
+            self.norm.running_var.lerp_(variance * rows / (rows - 1), 0.01)
+        scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
+        y = F.relu(torch.addcmul(self.norm.bias - mean * scale, y, scale))
+        empty = F.relu(self.norm.bias - mean * scale)
+        out = empty.expand(pillars, -1).clone()
+        return out.scatter_reduce(0, pillar[:, None].expand(-1, y.shape[1]), y, "amax", include_self=True)
+
+
+class Network(nn.Module):
+    def __init__(self, config):
+        super().__init__()
+        net = config["network"]
+        size, extent = net["pillars"]["size_m"], config["range_m"]
+        self.nx, self.ny = (round((extent[3 + i] - extent[i]) / size[i]) for i in range(2))
+        self.vfe = PillarNet(config["channels"] + INPUTS_BESIDE_CHANNELS, net["vfe_filters"], net["pillars"]["max_points"])
+        norm = lambda channels: nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+        backbone = net["backbone"]
+        self.blocks, self.deblocks = nn.ModuleList(), nn.ModuleList()
+        before = net["vfe_filters"]
+        for i, filters in enumerate(backbone["filters"]):
+            strides = [backbone["strides"][i]] + [1] * backbone["layers"][i]
+            layers = []
+            for stride in strides:
+                layers += [nn.Conv2d(before, filters, 3, stride, 1, bias=False), norm(filters), nn.ReLU()]
+                before = filters
+            self.blocks.append(nn.Sequential(*layers))
+            up, up_filters = backbone["upsample_strides"][i], backbone["upsample_filters"][i]
+            deconv = nn.ConvTranspose2d(filters, up_filters, up, up, bias=False)
+            self.deblocks.append(nn.Sequential(deconv, norm(up_filters), nn.ReLU()))
+        neck = sum(backbone["upsample_filters"])
+        self.classes = len(config["classes"])
+        self.bins = net["head"]["dir_bins"]
+        self.anchors = sum(len(anchor["rotations_rad"]) for anchor in net["anchors"])
+        self.conv_cls = nn.Conv2d(neck, self.anchors * self.classes, 1)
+        self.conv_box = nn.Conv2d(neck, self.anchors * 7, 1)
+        self.conv_dir_cls = nn.Conv2d(neck, self.anchors * self.bins, 1)
+        nn.init.constant_(self.conv_cls.bias, -4.595)
+        nn.init.normal_(self.conv_box.weight, std=0.001)
+
+    def canvas(self, features, cells, batch, best):
+        channels = features.shape[1]
+        if best:
+            canvas = features.new_zeros(batch * self.ny * self.nx, channels).index_put((cells,), features)
+            return canvas.view(batch, self.ny, self.nx, channels).permute(0, 3, 1, 2)
+        frames = []
+        for frame in range(batch):
+            of_frame = cells // (self.ny * self.nx) == frame
+            canvas = features.new_zeros(channels, self.ny * self.nx)
+            canvas[:, cells[of_frame] - frame * self.ny * self.nx] = features[of_frame].t()
+            frames.append(canvas)
+        return torch.stack(frames).view(batch, channels, self.ny, self.nx)
+
+    def heads(self, x):
+        batch, ups = x.shape[0], []
+        for block, deblock in zip(self.blocks, self.deblocks):
+            x = block(x)
+            ups.append(deblock(x))
+        x = torch.cat(ups, dim=1)
+        heads = [(self.conv_cls, self.classes), (self.conv_box, 7), (self.conv_dir_cls, self.bins)]
+        return [conv(x).permute(0, 2, 3, 1).reshape(batch, -1, k) for conv, k in heads]
+
+
+def focal(logits, one_hot, weights):
+    p = torch.sigmoid(logits)
+    alpha = one_hot * 0.25 + (1 - one_hot) * 0.75
+    miss = one_hot * (1 - p) + (1 - one_hot) * p
+    entropy = logits.clamp(min=0) - logits * one_hot + torch.log1p(torch.exp(-logits.abs()))
+    return (alpha * miss.square() * entropy * weights[..., None]).sum()
+
+
+def box_loss(said, truth):
+    heading, true_heading = said[..., 6:], truth[..., 6:]
+    said = torch.cat([said[..., :6], torch.sin(heading) * torch.cos(true_heading)], dim=-1)
+    truth = torch.cat([truth[..., :6], torch.cos(heading) * torch.sin(true_heading)], dim=-1)
+    n = (said - truth).abs()
+    return torch.where(n < 1 / 9, 4.5 * n.square(), n - 0.5 / 9)
+
+
+def make_step(config, batch, points, pillars, best):
+    """One step on `points` points in `pillars` pillars, of `batch` frames together."""
+    network = Network(config)
+    max_points = config["network"]["pillars"]["max_points"]
+    inputs = config["channels"] + INPUTS_BESIDE_CHANNELS
+    # As many points in each pillar as the total allows, at least one.
+    num_points = torch.ones(pillars, dtype=torch.long)
+    share = torch.rand(pillars).pow(4)
+    num_points += (share / share.sum() * (points - pillars)).long().clamp(max=max_points - 1)
+    is_point = torch.arange(max_points)[None] < num_points[:, None]
+    padded = torch.randn(pillars, max_points, inputs) * is_point[..., None]
+    rows, pillar = padded[is_point], torch.repeat_interleave(torch.arange(pillars), num_points)
+    each = pillars // batch
+    sizes = [each] * (batch - 1) + [pillars - each * (batch - 1)]
+    area = network.ny * network.nx
+    cells = torch.cat([torch.randperm(area)[:n] + frame * area for frame, n in enumerate(sizes)])
+    if best:
+        network = network.to(memory_format=torch.channels_last)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-4, betas=(0.9, 0.99), fused=best or None)
+    targets = {}
+
+    def make_targets(anchors):
+        positive = torch.stack([torch.randperm(anchors)[:POSITIVES] for _ in range(batch)])
+        labels = torch.zeros(batch, anchors, dtype=torch.long).scatter_(1, positive, 1)
+        targets["one_hot"] = F.one_hot(labels, network.classes + 1)[..., 1:].float()
+        targets["positive"], targets["is_positive"] = positive, (labels > 0).float() / POSITIVES
+        targets["boxes"] = torch.randn(batch, anchors, 7) * 0.1
+        targets["bins"] = torch.randint(0, network.bins, (batch, anchors))
+
+    def step():
+        features = network.vfe.of_points(rows, pillar, pillars) if best else network.vfe.padded(padded)
+        cls, boxes, bins = network.heads(network.canvas(features, cells, batch, best))
+        if not targets:
+            make_targets(cls.shape[1])
+        loss = focal(cls, targets["one_hot"], torch.full(cls.shape[:2], 1 / POSITIVES)) / batch
+        if best:
+            index = targets["positive"][..., None]
+            pick = lambda tensor: tensor.gather(1, index.expand(-1, -1, tensor.shape[2]))
+            box = box_loss(pick(boxes), pick(targets["boxes"])).sum() / POSITIVES
+            direction = F.cross_entropy(pick(bins).flatten(0, 1), targets["bins"].gather(1, targets["positive"]).flatten())
+        else:
+            weights = targets["is_positive"]
+            box = (box_loss(boxes, targets["boxes"]) * weights[..., None]).sum()
+            of_all = F.cross_entropy(bins.flatten(0, 1), targets["bins"].flatten(), reduction="none")
+            direction = (of_all.view_as(weights) * weights).sum() / batch
+        loss = loss + 2 * box / batch + 0.2 * direction
+        optimizer.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_(network.parameters(), 10)
+        with torch.no_grad():
+            torch._foreach_mul_(list(network.parameters()), 1 - 1e-4 * 0.01)
+        optimizer.step()
+
+    return step

@@ -1,0 +1,54 @@
+"""Times training steps of the two networks in PyTorch on the CPU, on made-up inputs of given sizes.
+
+Reads the report of `lidarshift bench-step --json` and builds the same network from the configuration in it, so that both sides have the
+same layers, the same number of points and the same number of pillars. Prints one line of JSON.
+
+What the reference is spared: reading and augmenting, making pillars, anchors and targets, proposals and their suppression. The times here
+begin with tensors in memory and end with updated weights.
+"""
+
+import argparse
+import json
+import resource
+import sys
+import time
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("report", help="JSON of `lidarshift bench-step --json`")
+    parser.add_argument("--form", choices=["openpcdet", "best"], default="openpcdet")
+    parser.add_argument("--threads", type=int, required=True)
+    parser.add_argument("--steps", type=int, required=True)
+    arguments = parser.parse_args()
+    with open(arguments.report) as file:
+        report = json.load(file)
+
+    import torch
+
+    torch.set_num_threads(arguments.threads)
+    torch.manual_seed(0)
+    config = report["config"]
+    if config["network"]["kind"] == "pointpillars":
+        import pointpillars
+
+        points, pillars = report["read"]
+        step = pointpillars.make_step(config, report["batch"], points, pillars, arguments.form == "best")
+    else:
+        import pointrcnn
+
+        step = pointrcnn.make_step(config, report["batch"])
+
+    times_ms = []
+    for i in range(arguments.steps + 2):  # two to warm up
+        begin = time.perf_counter()
+        step()
+        if i >= 2:
+            times_ms.append(1e3 * (time.perf_counter() - begin))
+    peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    json.dump({"torch": torch.__version__, "whole_ms": times_ms, "peak_mib": peak_mib}, sys.stdout)
+    print()
+
+
+if __name__ == "__main__":
+    main()
