@@ -38,6 +38,20 @@ fn base(name: &str) -> f64 {
     }
 }
 
+/// The same tensors with every float off by at most so many last digits, by lot.
+pub fn nudged(mut tensors: NamedTensors, trial: u64, digits: u64) -> NamedTensors {
+    for (name, tensor) in &mut tensors {
+        let key = fnv1a(&format!("{trial}/{name}"));
+        if let HostValues::F32(values) = &mut tensor.values {
+            for (i, value) in values.iter_mut().enumerate() {
+                let step = (splitmix64(key ^ i as u64) % (2 * digits + 1)) as i32 - digits as i32;
+                *value = f32::from_bits(value.to_bits().wrapping_add_signed(step));
+            }
+        }
+    }
+    tensors
+}
+
 /// The recipe's values for a tensor of that name and shape. `is_norm`: it belongs to a batch normalisation.
 pub fn values(seed: u64, name: &str, shape: &[usize], is_norm: bool) -> Vec<f32> {
     let key = fnv1a(&format!("{seed}/{name}"));
