@@ -13,6 +13,7 @@ pub mod parity;
 pub mod resim;
 pub mod schema;
 pub mod simulate;
+pub mod study;
 pub mod train;
 
 use clap::{Parser, Subcommand};
@@ -39,6 +40,11 @@ enum Command {
     Detect(detect::DetectArgs),
     /// Make synthetic data sets: a race, or streets
     Simulate(simulate::SimulateArgs),
+    /// A whole study: data sets, runs, matrix, report
+    Study(study::StudyArgs),
+    /// One run of a study
+    #[command(hide = true)]
+    StudyRun(study::work::StudyRunArgs),
     /// Make a data set from another one with physical effects on top
     Resim(resim::ResimArgs),
     /// What is wrong with a data set, in words
@@ -72,6 +78,8 @@ pub fn run() -> ExitCode {
         Command::Eval { command: Eval::Statistics(args) } => args.run().map(|()| true),
         Command::Detect(args) => args.run().map(|()| true),
         Command::Simulate(args) => args.run().map(|()| true),
+        Command::Study(args) => args.run().map(|()| true),
+        Command::StudyRun(args) => args.run().map(|()| true),
         Command::Resim(args) => args.run().map(|()| true),
         Command::Doctor(args) => args.run(),
         Command::Parity(args) => args.run(),
