@@ -107,8 +107,9 @@ pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]
         }
         eprintln!("measuring a step of {network}");
         let output = Command::new(std::env::current_exe()?)
-            .args(["study-run", &study.named, "--run", &run.to_string(), "--parts", "measure", "--out"])
+            .arg("study-run")
             .arg(&study.folder)
+            .args(["--run", &run.to_string(), "--parts", "measure"])
             .args(device)
             .env("RAYON_NUM_THREADS", threads.to_string())
             .stdin(Stdio::null())

@@ -4,6 +4,7 @@ use crate::detectors::detector_text;
 use anyhow::{Context, Result, bail};
 use data::write_atomic;
 use eval::study::{Source, StudyConfig, StudyDataset, StudyRun};
+use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 use train::{RunConfig, set_key};
@@ -14,6 +15,16 @@ const BUILT_IN: [(&str, &str); 3] = [
     ("cpu", include_str!("../../../../configs/studies/cpu.toml")),
     ("paper", include_str!("../../../../configs/studies/paper.toml")),
 ];
+
+/// The copy of a study's file in its folder, as it was when the folder was last worked on; and where the file came from.
+const COPY: &str = "study.toml";
+const ORIGIN: &str = "origin.json";
+
+#[derive(Serialize, Deserialize)]
+struct Origin {
+    named: String,
+    base: PathBuf,
+}
 
 /// A study with its folder.
 #[derive(Clone, Debug)]
@@ -31,12 +42,15 @@ pub struct Study {
 }
 
 impl Study {
-    /// A study by the path of its TOML, or by the name of one in configs/studies or in the program. Its folder is `out`, or
+    /// A study by the path of its TOML, by the name of one in configs/studies or in the program, or by its folder. Its folder is `out`, or
     /// `runs/NAME`.
     ///
     /// # Errors
     /// Neither a file nor a name, or a file that is wrong.
     pub fn open(named: &str, out: Option<&Path>) -> Result<Study> {
+        if Path::new(named).join(COPY).is_file() {
+            return Self::of_folder(Path::new(named));
+        }
         let below = PathBuf::from(format!("configs/studies/{named}.toml"));
         let path = [PathBuf::from(named), below.clone()].into_iter().find(|path| path.is_file());
         let built_in = BUILT_IN.iter().find(|(name, _)| *name == named);
@@ -52,6 +66,16 @@ impl Study {
         let base = std::path::absolute(path.parent().unwrap_or(Path::new("")))?;
         let folder = out.map_or_else(|| Path::new("runs").join(&config.name), Path::to_path_buf);
         Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
+    }
+
+    /// The study that made a folder, by the copy of its file.
+    fn of_folder(folder: &Path) -> Result<Study> {
+        let path = folder.join(COPY);
+        let text = fs_err::read_to_string(&path)?;
+        let config = StudyConfig::parse(&text, &path)?;
+        let origin: Origin = serde_json::from_slice(&fs_err::read(folder.join(ORIGIN))?)
+            .with_context(|| format!("{}: is damaged", folder.join(ORIGIN).display()))?;
+        Ok(Study { config, named: origin.named, text, base: origin.base, folder: std::path::absolute(folder)? })
     }
 
     /// A path that the study's file names.
@@ -142,17 +166,12 @@ impl Study {
         self.config.evaluation.tsne_dataset.as_ref().unwrap_or(&self.config.datasets[0].name)
     }
 
-    /// The copy of the study's file as it was when its folder was last worked on.
-    fn copy(&self) -> PathBuf {
-        self.folder.join("study.toml")
-    }
-
     /// What changed in the study's file since its folder was last worked on, in sentences; then the new file takes the place of the old.
     ///
     /// # Errors
     /// A copy that cannot be read or written.
     pub fn note_changes(&self) -> Result<Vec<String>> {
-        let copy = self.copy();
+        let copy = self.folder.join(COPY);
         let mut said = Vec::new();
         if copy.is_file() {
             let changes = self.config.changes_since(&StudyConfig::read(&copy)?);
@@ -168,6 +187,8 @@ impl Study {
             };
             said.extend(changes.removed.iter().map(removed));
         }
+        let origin = Origin { named: self.named.clone(), base: self.base.clone() };
+        write_atomic(&self.folder.join(ORIGIN), &serde_json::to_vec_pretty(&origin)?)?;
         write_atomic(&copy, self.text.as_bytes())?;
         Ok(said)
     }

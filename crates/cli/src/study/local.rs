@@ -104,7 +104,7 @@ fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> 
     fs_err::create_dir_all(&folder)?;
     let log = || fs_err::OpenOptions::new().create(true).append(true).open(folder.join("log.txt"));
     let mut command = Command::new(std::env::current_exe()?);
-    command.args(["study-run", &study.named, "--attached", "--run", &run.to_string(), "--out"]).arg(&study.folder);
+    command.arg("study-run").arg(&study.folder).args(["--attached", "--run", &run.to_string()]);
     command.args(["--parts", &words(parts)]).args(&jobs.device);
     command.env("RAYON_NUM_THREADS", jobs.threads.to_string());
     command.stdin(Stdio::piped()).stdout(log()?.into_file()).stderr(log()?.into_file());

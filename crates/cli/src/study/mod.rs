@@ -2,6 +2,7 @@
 
 pub mod clouds;
 pub mod cost;
+pub mod features;
 pub mod folder;
 pub mod numbers;
 pub mod present;
@@ -10,7 +11,6 @@ pub mod work;
 mod cache;
 mod data_sets;
 mod detections;
-mod features;
 mod local;
 mod slurm;
 mod standing;
@@ -58,7 +58,7 @@ enum StudyCommand {
 /// Which study.
 #[derive(Args, Clone, Debug)]
 pub struct StudyPlace {
-    /// A name (quick, cpu, paper) or a TOML
+    /// A name (quick, cpu, paper), a TOML, or the folder of a study
     #[arg(value_name = "STUDY")]
     study: String,
     /// Folder of the study [default: runs/NAME]
@@ -85,6 +85,8 @@ struct WholeStudy {
     only: Vec<Step>,
     #[command(flatten)]
     how: HowToRun,
+    #[command(flatten)]
+    device: DeviceArgs,
 }
 
 /// How the runs of a study are worked on.
@@ -102,8 +104,6 @@ pub struct HowToRun {
     /// Remove runs that were made with other settings than the study's, and make them anew
     #[arg(long)]
     replace: bool,
-    #[command(flatten)]
-    device: DeviceArgs,
     /// Words for sbatch, behind --
     #[arg(last = true, value_name = "SBATCH")]
     sbatch: Vec<String>,
@@ -138,7 +138,7 @@ impl StudyArgs {
             (Some(StudyCommand::Status(place)), _) => status::print_status(&place.open()?),
             (None, Some(whole)) => {
                 let steps = if whole.only.is_empty() { Step::value_variants().to_vec() } else { whole.only };
-                run_study(&whole.place.open()?, &steps, &whole.how)
+                run_study(&whole.place.open()?, &steps, &whole.how, &whole.device)
             }
             (None, None) => bail!("which study? `lidarshift study quick`, for one"),
         }
@@ -149,14 +149,14 @@ impl StudyArgs {
 ///
 /// # Errors
 /// As [`StudyArgs::run`].
-pub fn run_study(study: &Study, steps: &[Step], how: &HowToRun) -> Result<()> {
+pub fn run_study(study: &Study, steps: &[Step], how: &HowToRun, device: &DeviceArgs) -> Result<()> {
     for line in study.note_changes()? {
         eprintln!("the study's file changed: {line}");
     }
     if steps.contains(&Step::Data) {
         data_sets::make_datasets(study)?;
     }
-    let device = how.device.words();
+    let device = device.words();
     let wanted = |step, part| steps.contains(&step).then_some(part);
     let parts: Vec<RunPart> = [wanted(Step::Train, RunPart::Train), wanted(Step::Detect, RunPart::Detect)]
         .into_iter()

@@ -143,7 +143,7 @@ fn scenes(study: &Study, found: &Found) -> Result<Vec<Scene>> {
             layers.push(layer(study.title(name), color, LayerContent::Cloud(frame.cloud.with_channels(3))));
         }
         let mut seen = Vec::new();
-        for (run, standing) in found.standings.iter().filter(|(_, standing)| Found::has(standing, names[0])) {
+        for (run, _) in found.standings.iter().filter(|(_, standing)| Found::has(standing, names[0])) {
             let of = (&run.id.network, &run.id.train_set);
             if seen.contains(&of) || first.config.label_frame != data::LabelFrame::Lidar {
                 continue;

@@ -30,10 +30,9 @@ pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[Str
         let array = format!("--array=0-{}", names.len() - 1);
         let task = |parts: &str| {
             format!(
-                "run=$(sed -n \"$((SLURM_ARRAY_TASK_ID + 1))p\" {})\nexec {} study-run {} --out {} --run \"$run\" --parts {parts} {}",
+                "run=$(sed -n \"$((SLURM_ARRAY_TASK_ID + 1))p\" {})\nexec {} study-run {} --run \"$run\" --parts {parts} {}",
                 quoted(&list.display().to_string()),
                 submission.program,
-                quoted(&study.named),
                 quoted(&study.folder.display().to_string()),
                 submission.device
             )
@@ -52,9 +51,8 @@ pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[Str
     }
     if steps.contains(&Step::Report) {
         let text = format!(
-            "exec {} study {} --out {} --only report",
+            "exec {} report {}",
             submission.program,
-            quoted(&study.named),
             quoted(&study.folder.display().to_string())
         );
         let ids = jobs(study)?;

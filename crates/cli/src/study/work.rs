@@ -11,7 +11,7 @@ use eval::study::StudyRun;
 use models::Detector;
 use models::checkpoint::read_checkpoint;
 use std::io::Read as _;
-use std::path::PathBuf;
+use std::path::Path;
 use std::time::{Duration, Instant};
 use train::{Event, RunConfig, Session, read_run_state, train};
 
@@ -29,11 +29,8 @@ pub enum RunPart {
 /// One run of a study; the study itself, or a cluster, starts as many of these as there are runs.
 #[derive(Args, Debug)]
 pub struct StudyRunArgs {
-    /// The study: a name or a TOML
-    study: String,
     /// Folder of the study
-    #[arg(long, value_name = "DIR")]
-    out: Option<PathBuf>,
+    study: String,
     /// The run: NETWORK/TRAIN SET/seed-K
     #[arg(long, value_name = "NAME")]
     run: String,
@@ -56,7 +53,7 @@ impl StudyRunArgs {
         if self.attached {
             std::thread::spawn(end_with_stdin);
         }
-        let study = Study::open(&self.study, self.out.as_deref())?;
+        let study = Study::open(&self.study, None)?;
         let run = study.run(&self.run)?;
         if self.parts.contains(&RunPart::Measure) {
             return measure(&study, &run, &self.device.open()?, &self.device.describe());
@@ -109,7 +106,7 @@ impl StudyRunArgs {
 }
 
 /// Whether the run in a folder has come to its end, with this configuration.
-fn is_trained(folder: &std::path::Path, config: &RunConfig) -> Result<bool> {
+fn is_trained(folder: &Path, config: &RunConfig) -> Result<bool> {
     let state = read_run_state(folder)?;
     Ok(state.is_some_and(|s| s.step == s.total_steps && s.total_steps > 0 && s.config_sha256 == config.sha256()))
 }
