@@ -4,14 +4,14 @@ use super::data_sets::open;
 use super::folder::Study;
 use super::standing::{Standing, standing};
 use crate::memory::peak_mib;
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result};
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use data::{Dataset, Frame, write_atomic};
 use eval::study::StudyRun;
 use models::{Detector, Preparer, reference_name};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::process::{Command, Stdio};
 use std::time::Instant;
 use train::{Adam, GradientNorm, TrainingFrames};
@@ -32,7 +32,7 @@ pub struct NetworkCost {
     pub peak_mib: u64,
     /// Threads that computed.
     pub threads: usize,
-    /// What computed.
+    /// Words for the device that computed.
     pub device: String,
 }
 
@@ -41,7 +41,7 @@ pub type Costs = BTreeMap<String, NetworkCost>;
 
 /// Measures a run's network in this process and prints [`NetworkCost`] as JSON.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
-pub fn measure(study: &Study, run: &StudyRun, device: &Device, device_name: &str) -> Result<()> {
+pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<()> {
     let config = study.run_config(run)?;
     let set = Dataset::open(&config.dataset)?;
     let frames = TrainingFrames::new(&config, &set, &run.folder(&study.folder).join("cache"))?;
@@ -78,7 +78,7 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device, device_name: &str
         detection_s: mean(&detection),
         peak_mib: peak_mib().unwrap_or(0),
         threads: rayon::current_num_threads(),
-        device: device_name.into(),
+        device: String::new(),
     };
     println!("{}", serde_json::to_string(&cost)?);
     Ok(())
@@ -94,15 +94,18 @@ pub fn known(study: &Study) -> Costs {
     serde_json::from_slice(&bytes).unwrap_or_default()
 }
 
-/// The costs of the networks of these runs: known ones, and the others measured in a process each, with so many threads.
+/// The costs of the networks of these runs: known ones, and the others measured in a process each, with so many threads. A network that
+/// cannot be measured is left out, and said.
 ///
 /// # Errors
-/// A network that cannot do a step.
+/// A process that cannot be started, a file that cannot be written.
 pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]) -> Result<Costs> {
     let mut costs = known(study);
+    let mut tried = BTreeSet::new();
     for run in runs {
         let network = &run.id.network;
-        if costs.get(network).is_some_and(|cost| cost.threads == threads) {
+        let is_same = |cost: &NetworkCost| cost.threads == threads && cost.device == device.join(" ");
+        if !tried.insert(network) || costs.get(network).is_some_and(is_same) {
             continue;
         }
         eprintln!("measuring a step of {network}");
@@ -116,9 +119,12 @@ pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]
             .output()?;
         if !output.status.success() {
             let said = String::from_utf8_lossy(&output.stderr);
-            bail!("{network}: {}", said.trim().trim_start_matches("error: "));
+            eprintln!("{network} could not be measured: {}", said.trim().trim_start_matches("error: "));
+            continue;
         }
-        let cost = serde_json::from_slice(&output.stdout).with_context(|| format!("{network}: no measurement"))?;
+        let mut cost: NetworkCost =
+            serde_json::from_slice(&output.stdout).with_context(|| format!("{network}: no measurement"))?;
+        cost.device = device.join(" ");
         costs.insert(network.clone(), cost);
         write_atomic(&study.folder.join("costs.json"), &serde_json::to_vec_pretty(&costs)?)?;
     }

@@ -225,6 +225,7 @@ fn missing_runs(study: &Study, parts: &[RunPart]) -> Result<Vec<StudyRun>> {
 
 fn say_costs(study: &Study, missing: &[StudyRun], costs: &Costs, jobs: &LocalJobs) -> Result<()> {
     let mut total_s = 0.0;
+    let unknown = missing.iter().filter(|run| !costs.contains_key(&run.id.network)).count();
     for (network, cost) in costs {
         let of_network: Vec<_> = missing.iter().filter(|run| run.id.network == *network).collect();
         let lefts = of_network.iter().map(|run| left(study, run, costs)).collect::<Result<Vec<_>>>()?;
@@ -246,6 +247,7 @@ fn say_costs(study: &Study, missing: &[StudyRun], costs: &Costs, jobs: &LocalJob
     }
     match missing.len() {
         0 => eprintln!("no run is missing"),
+        _ if unknown > 0 => eprintln!("what {unknown} runs will take is not known"),
         n => eprintln!("{n} runs, {} at once: about {}", jobs.at_once, duration(total_s / jobs.at_once.min(n) as f64)),
     }
     Ok(())

@@ -90,8 +90,14 @@ impl<'a> Submission<'a> {
     /// Writes the script and gives it to Slurm; the number of the job.
     fn submit(&self, word: &str, text: &str, words: &[String]) -> Result<String> {
         let script = self.folder.join(format!("{word}.sh"));
-        let log = self.folder.join(format!("{word}-%A_%a.log"));
-        write_atomic(&script, format!("#!/bin/sh\n{text}\n").as_bytes())?;
+        let log = self.folder.join(if words.iter().any(|w| w.starts_with("--array")) {
+            format!("{word}-%A_%a.log")
+        } else {
+            format!("{word}-%j.log")
+        });
+        // As many threads as Slurm gives cores.
+        let threads = "export RAYON_NUM_THREADS=\"${SLURM_CPUS_PER_TASK:-$(nproc)}\"";
+        write_atomic(&script, format!("#!/bin/sh\n{threads}\n{text}\n").as_bytes())?;
         let mut command = Command::new("sbatch");
         command.arg("--parsable").arg(format!("--job-name={}-{word}", self.name));
         // A job whose dependency can no longer come true would wait for ever.

@@ -56,7 +56,7 @@ impl StudyRunArgs {
         let study = Study::open(&self.study, None)?;
         let run = study.run(&self.run)?;
         if self.parts.contains(&RunPart::Measure) {
-            return measure(&study, &run, &self.device.open()?, &self.device.describe());
+            return measure(&study, &run, &self.device.open()?);
         }
         let folder = run.folder(&study.folder);
         let Some(_at_work) = AtWork::take(&folder)? else {
