@@ -125,12 +125,12 @@ pub fn refine(cloud: &Cloud, bbox: &Box3) -> Box3 {
         values.sort_by(f64::total_cmp);
         let trim = (values.len() as f64 * TRIMMED) as usize;
         let (low, high, half) = (values[trim], values[values.len() - 1 - trim], bbox.size[axis] / 2.0);
-        let off = if high - low > 1.6 * half {
-            (low + high) / 2.0 // both faces are seen
-        } else if sensor[axis] < -half {
+        let off = if sensor[axis] < -half {
             low + half
         } else if sensor[axis] > half {
             high - half
+        } else if high - low > 1.6 * half {
+            (low + high) / 2.0 // both faces are seen
         } else {
             0.0
         };

@@ -1,6 +1,7 @@
 //! What comes back of one scan: a list of echoes, one a shot, that the sensor model works on.
 
 use crate::mesh::MaterialId;
+use crate::track::FIRST_CAR;
 use data::Cloud;
 
 /// The signal at the reach of the data sheet, 250 m at a reflectivity of 10 %, is index 0.
@@ -70,6 +71,11 @@ impl Echo {
     /// Whether anything came back.
     pub fn is_return(&self) -> bool {
         self.range_m < f32::INFINITY
+    }
+
+    /// Number of the car that was hit.
+    pub fn car(&self) -> Option<usize> {
+        self.object.checked_sub(FIRST_CAR).map(usize::from)
     }
 
     /// Nothing comes back of it any more.

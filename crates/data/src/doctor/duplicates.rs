@@ -69,6 +69,18 @@ fn jaccard(a: &[u64], b: &[u64]) -> f64 {
     if size == 0 { 0.0 } else { shared as f64 / size as f64 }
 }
 
+/// Objects of the same scene are at most that far apart, m.
+const SAME_PLACE_M: f64 = 1.0;
+
+/// Whether the labelled objects of two frames are at the same places: scenery alone looks alike wherever a road is straight, and again
+/// on every lap of a track. Frames without objects are told by their clouds.
+fn objects_agree(a: &FrameFacts, b: &FrameFacts) -> bool {
+    let near =
+        |p: &[f64; 3], q: &[f64; 3]| p.iter().zip(q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt() <= SAME_PLACE_M;
+    a.objects.len() == b.objects.len()
+        && a.objects.iter().all(|o| b.objects.iter().any(|p| near(&o.bbox.center, &p.bbox.center)))
+}
+
 pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<String>>, findings: &mut Findings) {
     let mut split_of: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     for (split, ids) in splits {
@@ -112,7 +124,10 @@ pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<Strin
         let candidates: BTreeSet<usize> = first.iter().filter_map(|h| by_hash.get(h)).flatten().copied().collect();
         let alike = |i: &usize| {
             let (a, b) = (&frames[*i].signature, &frame.signature);
-            apart(*i, j) && a.exact != b.exact && jaccard(&a.sketch, &b.sketch) >= NEAR_DUPLICATE
+            apart(*i, j)
+                && a.exact != b.exact
+                && objects_agree(&frames[*i], frame)
+                && jaccard(&a.sketch, &b.sketch) >= NEAR_DUPLICATE
         };
         if let Some(i) = candidates.into_iter().find(alike) {
             near.push((i, j));

@@ -40,6 +40,9 @@ pub struct RaceConfig {
     /// Cars whose middle is farther away, seen from above, have no label, m.
     #[serde(default = "hundred")]
     pub label_range_m: f64,
+    /// Cars of which the rig without any effect has fewer returns, because others hide them or no shot meets them, have no label.
+    #[serde(default = "five")]
+    pub label_points: usize,
     /// Class of the cars in the labels.
     #[serde(default = "car")]
     pub class: String,
@@ -120,6 +123,10 @@ fn one() -> f64 {
 
 fn hundred() -> f64 {
     100.0
+}
+
+fn five() -> usize {
+    5
 }
 
 fn car() -> String {

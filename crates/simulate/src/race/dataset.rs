@@ -213,15 +213,15 @@ fn matched(target: &Path, from: &Path) -> Result<crate::effects::RangeDropout, S
 
 /// Labels on disk against where the cars really are.
 fn errors_of_labels(simulator: &Simulator, root: &Path) -> Result<Vec<LabelError>, SimulateError> {
-    let mut pairs = Vec::new();
-    for key in simulator.keys() {
+    let of_frame = |key: &FrameKey| {
         let (_, path) = frame_paths(simulator.config.layout, root, &key.id());
         let labels = read_kitti_text(&path, KittiText::Labels)?;
-        let cars = simulator.cars(key)?;
-        let truth = cars.iter().map(|car| car.true_box).filter(|b| simulator.is_labelled(b));
-        pairs.extend(labels.iter().map(|line| line.lidar_box()).zip(truth));
-    }
-    Ok(label_errors(pairs.into_iter()))
+        let cars = simulator.cars(key)?.into_iter().zip(simulator.labelled(key)?);
+        let truth = cars.filter(|(_, labelled)| *labelled).map(|(car, _)| car.true_box);
+        Ok(labels.iter().map(|line| line.lidar_box()).zip(truth).collect())
+    };
+    let pairs: Result<Vec<Vec<_>>, SimulateError> = simulator.keys().par_iter().map(of_frame).collect();
+    Ok(label_errors(pairs?.into_iter().flatten()))
 }
 
 /// A hash of all that decides the frames of a data set.

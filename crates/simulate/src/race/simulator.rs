@@ -37,6 +37,26 @@ pub struct Simulator {
     keys: Vec<FrameKey>,
     pub(super) car: Mesh,
     beams: Beams,
+    ideal: Surroundings,
+}
+
+/// What rays can meet, apart from where the cars are.
+#[derive(Clone, Debug)]
+struct Surroundings {
+    world: World,
+    car: CarShape,
+}
+
+impl Surroundings {
+    fn new(track: &Track, car: &Mesh, plan: &WorldPlan) -> Surroundings {
+        let groups: Vec<_> = plan.groups.iter().copied().collect();
+        let world = World::new(&track.mesh(&groups, plan.undulation));
+        let bbox = car_box();
+        let foot = [bbox.center[0], bbox.center[1], bbox.z_range().0];
+        let place =
+            |v: [f64; 3]| std::array::from_fn(|k| foot[k] + (v[k] - foot[k]) * plan.car_scale[k] + plan.car_shift_m[k]);
+        Surroundings { world, car: CarShape::new(&car.clone().mapped(place)) }
+    }
 }
 
 /// One data set: its world and its effects.
@@ -47,8 +67,7 @@ pub struct PreparedSet {
     /// Labels as on the road; exact without.
     pub auto_label: Option<AutoLabel>,
     plan: WorldPlan,
-    world: World,
-    car: CarShape,
+    surroundings: Surroundings,
 }
 
 /// A frame of one data set.
@@ -89,7 +108,8 @@ impl Simulator {
         };
         let keys = choose(&runs, config.frames, config.split, config.seed)?;
         let beams = Beams::of(&rig);
-        Ok(Simulator { config, rig, materials, track, runs, keys, car, beams })
+        let ideal = Surroundings::new(&track, &car, &WorldPlan::default());
+        Ok(Simulator { config, rig, materials, track, runs, keys, car, beams, ideal })
     }
 
     /// The frames, in the order of their numbers.
@@ -116,16 +136,8 @@ impl Simulator {
     pub fn prepare(&self, lists: Vec<(String, EffectList)>, auto_label: Option<AutoLabel>) -> PreparedSet {
         let mut plan = WorldPlan::default();
         lists.iter().for_each(|(_, list)| list.on_world(&mut plan));
-        let groups: Vec<_> = plan.groups.iter().copied().collect();
-        let world = World::new(&self.track.mesh(&groups, plan.undulation));
-        let bbox = car_box();
-        let bottom = bbox.z_range().0;
-        let foot = [bbox.center[0], bbox.center[1], bottom];
-        let car = self
-            .car
-            .clone()
-            .mapped(|v| std::array::from_fn(|k| foot[k] + (v[k] - foot[k]) * plan.car_scale[k] + plan.car_shift_m[k]));
-        PreparedSet { lists, auto_label, plan, world, car: CarShape::new(&car) }
+        let surroundings = Surroundings::new(&self.track, &self.car, &plan);
+        PreparedSet { lists, auto_label, plan, surroundings }
     }
 
     /// How the own car and the others move at the middle of a frame's scan.
@@ -143,7 +155,11 @@ impl Simulator {
     pub fn scene<'a>(&'a self, set: &'a PreparedSet, key: &FrameKey) -> Result<FrameScene<'a>, SimulateError> {
         let (ego, mut cars) = self.motions(key)?;
         self.tilt(set, key, &mut cars);
-        Ok(FrameScene::new(&set.world, &set.car, &self.materials, ego, &cars))
+        Ok(self.scene_of(&set.surroundings, ego, &cars))
+    }
+
+    fn scene_of<'a>(&'a self, surroundings: &'a Surroundings, ego: Motion, cars: &[Motion]) -> FrameScene<'a> {
+        FrameScene::new(&surroundings.world, &surroundings.car, &self.materials, ego, cars)
     }
 
     fn tilt(&self, set: &PreparedSet, key: &FrameKey, cars: &mut [Motion]) {
@@ -171,9 +187,21 @@ impl Simulator {
         Ok(cars.iter().enumerate().map(labelled).collect())
     }
 
-    /// Whether a car at this place has a label: by where it really is, so that all data sets of a race label the same cars.
-    pub fn is_labelled(&self, true_box: &Box3) -> bool {
-        true_box.center[0].hypot(true_box.center[1]) <= self.config.label_range_m
+    /// Which of the cars of a frame have a label: those in range that the rig meets when there are no effects, so that all data sets of a
+    /// race label the same cars.
+    pub fn labelled(&self, key: &FrameKey) -> Result<Vec<bool>, SimulateError> {
+        let (ego, motions) = self.motions(key)?;
+        let scene = self.scene_of(&self.ideal, ego, &motions);
+        let mut returns = vec![0; motions.len()];
+        for echo in scene.scan(&self.beams).echoes.iter().filter(|echo| echo.is_return()) {
+            if let Some(car) = echo.car() {
+                returns[car] += 1;
+            }
+        }
+        let in_range =
+            |car: &LabelledCar| car.true_box.center[0].hypot(car.true_box.center[1]) <= self.config.label_range_m;
+        let cars = self.cars(key)?;
+        Ok(cars.iter().zip(returns).map(|(car, n)| in_range(car) && n >= self.config.label_points).collect())
     }
 
     /// One frame of a data set.
@@ -182,7 +210,7 @@ impl Simulator {
         let (ego, mut motions) = self.motions(key)?;
         let exact = cars.clone();
         self.tilt(set, key, &mut motions);
-        let scene = FrameScene::new(&set.world, &set.car, &self.materials, ego, &motions);
+        let scene = self.scene_of(&set.surroundings, ego, &motions);
         let cloud_from_world = ego.pose.rotation.inverse();
         let context = FrameContext {
             seed: self.config.seed,
@@ -208,7 +236,8 @@ impl Simulator {
             self.record(auto, key, &mut cars)?;
         }
         set.lists.iter().for_each(|(name, list)| list.on_labels(&mut cars, &FrameContext { set: name, ..context }));
-        cars.retain(|car| self.is_labelled(&car.true_box));
+        let labelled = self.labelled(key)?;
+        cars.retain(|car| labelled[car.number]);
         if set.auto_label.is_some_and(|auto| auto.refine) {
             cars.iter_mut().for_each(|car| car.label = refine(&cloud, &car.label));
         }

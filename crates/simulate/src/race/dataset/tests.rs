@@ -4,7 +4,7 @@ use data::doctor::doctor;
 /// A small race in a folder of its own: few frames, few shots, all kinds of data sets.
 fn small(folder: &Path, more: &str) -> (RaceConfig, ConfigFiles) {
     let text = format!(
-        "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 18\nresolution = 0.25\nrace = {{ runs = 2, frames = 400 }}\n{more}\n\
+        "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 18\nresolution = 0.25\nlabel_points = 1\nrace = {{ runs = 2, frames = 400 }}\n{more}\n\
          [[dataset]]\nname = \"measured\"\neffects = \"measured.toml\"\nhidden = true\nauto_label = {{}}\n\
          [[dataset]]\nname = \"sim\"\neffects = \"sim.toml\"\n\
          [[dataset]]\nname = \"sim_noise\"\nfrom = \"sim\"\neffects = \"sim_noise.toml\"\n\
