@@ -88,7 +88,8 @@ fn table(found: &Distances) -> String {
     for row in &found.rows {
         let interval = row.interval.map_or("-".into(), |i| format!("{:.4} to {:.4}", i.low, i.high));
         let (part, measure) = (row.part.to_string(), row.measure.to_string());
-        text += &format!("{part:<20} {measure:<30} {:>12} {interval:>25} {:>12}\n", number(row.mean), number(row.floor));
+        text +=
+            &format!("{part:<20} {measure:<30} {:>12} {interval:>25} {:>12}\n", number(row.mean), number(row.floor));
     }
     for region in &found.regions {
         text += &format!("{:>5.1} % of the Chamfer sum: {}\n", 100.0 * region.share, region.region);

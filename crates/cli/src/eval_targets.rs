@@ -76,7 +76,12 @@ fn table(found: &Targets) -> String {
         text += &format!("  mean size        {length:.2} x {width:.2} x {height:.2} m\n");
     }
     for section in &found.sections {
-        text += &format!("  {:<16} {} targets, {} points\n", section.section.to_string(), section.targets, section.n_points);
+        text += &format!(
+            "  {:<16} {} targets, {} points\n",
+            section.section.to_string(),
+            section.targets,
+            section.n_points
+        );
     }
     text
 }

@@ -63,10 +63,19 @@ fn a_study_is_made_and_gone_on_with_after_kills() {
     let text = said(&output);
     assert!(text.contains("4 runs") && text.contains("steps of") && text.contains("| Car | trained on"), "{text}");
     let html = page(whole.path());
-    for part in ["Plain", "Noisy", "4 of", "t-SNE", "linear CKA", "Chamfer", "seeds 1, 2", "lidarshift study tiny-study.toml"] {
+    for part in
+        ["Plain", "Noisy", "4 of", "t-SNE", "linear CKA", "Chamfer", "seeds 1, 2", "lidarshift study tiny-study.toml"]
+    {
         assert!(html.contains(part) || part == "4 of", "{part} is not in the report");
     }
-    for file in ["matrix.json", "analyses.json", "features.json", "distances/plain--noisy.json", "targets/noisy.json", "tables/matrix.tex"] {
+    for file in [
+        "matrix.json",
+        "analyses.json",
+        "features.json",
+        "distances/plain--noisy.json",
+        "targets/noisy.json",
+        "tables/matrix.tex",
+    ] {
         assert!(whole.path().join("runs/tiny").join(file).is_file(), "{file}");
     }
     let status = said(&must(whole.path(), "study status tiny-study.toml"));
@@ -165,7 +174,8 @@ fn bad_studies_are_refused_in_words() {
     }
     fs::write(dir.path().join("tiny-study.toml"), STUDY).unwrap();
     // Without Slurm on the path.
-    let output = program(dir.path(), "study tiny-study.toml --launcher slurm").env("PATH", dir.path()).output().unwrap();
+    let output =
+        program(dir.path(), "study tiny-study.toml --launcher slurm").env("PATH", dir.path()).output().unwrap();
     let text = said(&output);
     assert!(!output.status.success() && text.contains("there is no squeue on this machine"), "{text}");
     // Frames that the other data set does not have.

@@ -11,7 +11,11 @@ use std::path::Path;
 ///
 /// # Errors
 /// What `make` returns, and files that cannot be written.
-pub fn cached<T: Serialize + DeserializeOwned>(path: &Path, parts: &impl Serialize, make: impl FnOnce() -> Result<T>) -> Result<T> {
+pub fn cached<T: Serialize + DeserializeOwned>(
+    path: &Path,
+    parts: &impl Serialize,
+    make: impl FnOnce() -> Result<T>,
+) -> Result<T> {
     let mut hash = Sha256::new();
     hash.update(env!("CARGO_PKG_VERSION"));
     hash.update(serde_json::to_vec(parts)?);

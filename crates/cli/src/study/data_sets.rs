@@ -25,7 +25,8 @@ pub fn make_datasets(study: &Study) -> Result<()> {
 }
 
 fn make(study: &Study, dataset: &StudyDataset) -> Result<()> {
-    let bar = ProgressBar::new(0).with_style(ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} frames, {eta} left")?);
+    let bar =
+        ProgressBar::new(0).with_style(ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} frames, {eta} left")?);
     bar.set_message(dataset.name.clone());
     let show = |done: usize, total: usize| {
         bar.set_length(total as u64);
@@ -53,7 +54,9 @@ fn make(study: &Study, dataset: &StudyDataset) -> Result<()> {
                     let only = with_sources(&race.0, name);
                     make_race_datasets(&race.0, &race.1, &out, &only, &|_, done, total| show(done, total))?;
                 }
-                (Scenery::Street(_), Some(name)) => bail!("a street has but one data set: leave dataset = {name:?} out"),
+                (Scenery::Street(_), Some(name)) => {
+                    bail!("a street has but one data set: leave dataset = {name:?} out")
+                }
                 (Scenery::Race(race), None) => {
                     let names: Vec<&str> = race.0.datasets.iter().map(|set| set.name.as_str()).collect();
                     bail!("{} makes several data sets: say dataset = one of {}", config.display(), names.join(", "));

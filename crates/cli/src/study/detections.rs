@@ -53,7 +53,12 @@ fn features_path(study: &Study, run: &StudyRun) -> PathBuf {
 }
 
 /// What the cell of a run and a test set has to be made of.
-fn wanted(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> Result<(Dataset, Vec<String>, DetectionCell)> {
+fn wanted(
+    study: &Study,
+    run: &StudyRun,
+    test_set: &str,
+    weights: &str,
+) -> Result<(Dataset, Vec<String>, DetectionCell)> {
     let dataset = open(study, test_set)?;
     let ids = dataset.ids(&study.config.splits.test)?;
     let cell = DetectionCell {
@@ -86,7 +91,13 @@ pub fn is_done(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> 
 ///
 /// # Errors
 /// A test set that is not there, a frame that cannot be read, scores that are not numbers.
-pub fn detect_all(study: &Study, run: &StudyRun, detector: &Detector, workers: usize, say: &dyn Fn(&str)) -> Result<()> {
+pub fn detect_all(
+    study: &Study,
+    run: &StudyRun,
+    detector: &Detector,
+    workers: usize,
+    say: &dyn Fn(&str),
+) -> Result<()> {
     let weights = weights_sha256(&run.folder(&study.folder))?;
     for dataset in &study.config.datasets {
         if is_done(study, run, &dataset.name, &weights)? {

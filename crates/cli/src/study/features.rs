@@ -121,7 +121,8 @@ fn similarities(study: &Study, runs: &[&Seen], out: &mut FeatureResults) -> Resu
         } else {
             out.warnings.push(format!("no CKA of {name}: they did not see the same clouds"));
         }
-        let with_seed = |title: &str, seed: u64| if same_set { format!("{title}, seed {seed}") } else { title.to_string() };
+        let with_seed =
+            |title: &str, seed: u64| if same_set { format!("{title}, seed {seed}") } else { title.to_string() };
         out.frechet.push(FrechetRow {
             network: network.clone(),
             a: with_seed(a_title, first.id.seed),

@@ -97,7 +97,11 @@ impl Study {
     /// # Errors
     /// A name that the study does not have.
     pub fn dataset(&self, name: &str) -> Result<&StudyDataset> {
-        self.config.datasets.iter().find(|d| d.name == name).with_context(|| format!("the study has no data set {name:?}"))
+        self.config
+            .datasets
+            .iter()
+            .find(|d| d.name == name)
+            .with_context(|| format!("the study has no data set {name:?}"))
     }
 
     /// The title of a data set.
@@ -178,12 +182,17 @@ impl Study {
             said.extend(changes.invalid.iter().map(|(id, reasons)| {
                 format!("{}/{}/seed-{} is no longer valid: {}", id.network, id.train_set, id.seed, reasons.join("; "))
             }));
-            said.extend(changes.tests.iter().map(|set| format!("the detections on {set} are no longer valid: it changed")));
+            said.extend(
+                changes.tests.iter().map(|set| format!("the detections on {set} are no longer valid: it changed")),
+            );
             said.extend(
                 changes.added.iter().map(|id| format!("{}/{}/seed-{} is new", id.network, id.train_set, id.seed)),
             );
             let removed = |id: &eval::matrix::RunId| {
-                format!("{}/{}/seed-{} is no longer part of the study; its folder stays", id.network, id.train_set, id.seed)
+                format!(
+                    "{}/{}/seed-{} is no longer part of the study; its folder stays",
+                    id.network, id.train_set, id.seed
+                )
             };
             said.extend(changes.removed.iter().map(removed));
         }

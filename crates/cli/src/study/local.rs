@@ -64,7 +64,13 @@ struct Job<'a> {
 ///
 /// # Errors
 /// A process that cannot be started.
-pub fn work_on(study: &Study, runs: &[StudyRun], parts: &[RunPart], jobs: &LocalJobs, costs: &Costs) -> Result<Vec<(String, String)>> {
+pub fn work_on(
+    study: &Study,
+    runs: &[StudyRun],
+    parts: &[RunPart],
+    jobs: &LocalJobs,
+    costs: &Costs,
+) -> Result<Vec<(String, String)>> {
     let mut waiting: Vec<&StudyRun> = runs.iter().rev().collect();
     let (mut at_work, mut failed, mut done) = (Vec::<Job>::new(), Vec::new(), 0);
     let mut progress = Progress::new(study, runs, costs, jobs.at_once)?;
@@ -152,7 +158,8 @@ struct Progress {
 impl Progress {
     fn new(study: &Study, runs: &[StudyRun], costs: &Costs, at_once: usize) -> Result<Self> {
         let now = Instant::now();
-        let whole_s = runs.iter().map(|run| Ok(left(study, run, costs)?.seconds.unwrap_or(0.0))).sum::<Result<f64>>()?;
+        let whole_s =
+            runs.iter().map(|run| Ok(left(study, run, costs)?.seconds.unwrap_or(0.0))).sum::<Result<f64>>()?;
         Ok(Progress { began: now, last: now, every: Duration::from_secs(30), at_once, whole_s })
     }
 
@@ -167,7 +174,11 @@ impl Progress {
         }
         // What was measured before the first step is corrected by what has been done since.
         let done_s = self.whole_s - left_s;
-        let pace = if done_s > 0.05 * self.whole_s { self.began.elapsed().as_secs_f64() / done_s } else { 1.0 / self.at_once as f64 };
+        let pace = if done_s > 0.05 * self.whole_s {
+            self.began.elapsed().as_secs_f64() / done_s
+        } else {
+            1.0 / self.at_once as f64
+        };
         let stands: Vec<String> = at_work
             .iter()
             .map(|run| {

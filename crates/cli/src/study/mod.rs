@@ -93,19 +93,19 @@ struct WholeStudy {
 #[derive(Args, Clone, Debug)]
 pub struct HowToRun {
     /// Who starts the runs of a study: this machine, or Slurm as job arrays
-    #[arg(long, value_enum, default_value = "local")]
+    #[arg(long, value_enum, default_value = "local", requires = "study")]
     launcher: Launcher,
     /// Say what is missing and what it will cost, and stop
-    #[arg(long)]
+    #[arg(long, requires = "study")]
     dry_run: bool,
     /// Runs at once on this machine [default: by cores and memory]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", requires = "study")]
     jobs: Option<usize>,
     /// Remove runs that were made with other settings than the study's, and make them anew
-    #[arg(long)]
+    #[arg(long, requires = "study")]
     replace: bool,
     /// Words for sbatch, behind --
-    #[arg(last = true, value_name = "SBATCH")]
+    #[arg(last = true, value_name = "SBATCH", requires = "study")]
     sbatch: Vec<String>,
 }
 
@@ -158,10 +158,8 @@ pub fn run_study(study: &Study, steps: &[Step], how: &HowToRun, device: &DeviceA
     }
     let device = device.words();
     let wanted = |step, part| steps.contains(&step).then_some(part);
-    let parts: Vec<RunPart> = [wanted(Step::Train, RunPart::Train), wanted(Step::Detect, RunPart::Detect)]
-        .into_iter()
-        .flatten()
-        .collect();
+    let parts: Vec<RunPart> =
+        [wanted(Step::Train, RunPart::Train), wanted(Step::Detect, RunPart::Detect)].into_iter().flatten().collect();
     let mut failed = Vec::new();
     if !parts.is_empty() {
         let invalid = invalid_runs(study, how.replace && !how.dry_run)?;
@@ -199,7 +197,8 @@ fn invalid_runs(study: &Study, replace: bool) -> Result<Vec<(String, String)>> {
         let differences = differences.join("; ");
         if !replace {
             eprintln!("{run} was made with other settings ({differences}); --replace makes it anew");
-            invalid.push((run.to_string(), format!("made with other settings ({differences}); --replace makes it anew")));
+            invalid
+                .push((run.to_string(), format!("made with other settings ({differences}); --replace makes it anew")));
             continue;
         }
         let Some(_at_work) = AtWork::take(&folder)? else { bail!("another process is working on {run}; wait for it") };

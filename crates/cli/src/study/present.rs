@@ -64,9 +64,8 @@ fn facts(study: &Study) -> Result<Vec<(String, String)>> {
     for dataset in &study.config.datasets {
         let set = open(study, &dataset.name)?;
         let splits = &study.config.splits;
-        let counts = [&splits.train, &splits.val, &splits.test].map(|split| {
-            set.ids(split).map_or("no frames".to_string(), |ids| format!("{} frames", ids.len()))
-        });
+        let counts = [&splits.train, &splits.val, &splits.test]
+            .map(|split| set.ids(split).map_or("no frames".to_string(), |ids| format!("{} frames", ids.len())));
         let [train, val, test] = counts;
         fact(
             &format!("data set {}", dataset.title),

@@ -50,11 +50,7 @@ pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[Str
         record(study, last.as_deref().unwrap_or_default(), &list)?;
     }
     if steps.contains(&Step::Report) {
-        let text = format!(
-            "exec {} report {}",
-            submission.program,
-            quoted(&study.folder.display().to_string())
-        );
+        let text = format!("exec {} report {}", submission.program, quoted(&study.folder.display().to_string()));
         let ids = jobs(study)?;
         let words: Vec<String> = match ids.is_empty() {
             true => Vec::new(),
@@ -63,7 +59,11 @@ pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[Str
         let id = submission.submit("report", &text, &words)?;
         println!("report: job {id}");
     }
-    println!("`lidarshift study status {}` says where they stand; logs lie in {}", study.named, submission.folder.display());
+    println!(
+        "`lidarshift study status {}` says where they stand; logs lie in {}",
+        study.named,
+        submission.folder.display()
+    );
     Ok(())
 }
 

@@ -52,7 +52,9 @@ fn words(standing: &Standing) -> (&'static str, String, String) {
         Standing::Running(step, total) => ("running", of(step, total), String::new()),
         Standing::Stopped(step, total) => ("stopped", of(step, total), String::new()),
         Standing::Failed(reason) => ("failed", String::new(), reason.clone()),
-        Standing::Other(differences) => ("invalid", String::new(), format!("made with other settings: {}", differences.join("; "))),
+        Standing::Other(differences) => {
+            ("invalid", String::new(), format!("made with other settings: {}", differences.join("; ")))
+        }
         Standing::Missing => ("missing", String::new(), String::new()),
     }
 }
