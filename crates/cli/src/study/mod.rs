@@ -41,12 +41,23 @@ use work::RunPart;
 ///   lidarshift study my-study.toml --out runs/mine --only data,train
 ///   lidarshift study paper --launcher slurm -- --gres=gpu:1 --time=24:00:00
 #[derive(Args, Debug)]
-#[command(verbatim_doc_comment, args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(verbatim_doc_comment, args_conflicts_with_subcommands = true)]
 pub struct StudyArgs {
     #[command(subcommand)]
     command: Option<StudyCommand>,
+    /// A name (quick, cpu, paper), a TOML, or the folder of a study
+    #[arg(value_name = "STUDY")]
+    study: Option<String>,
+    /// Folder of the study [default: runs/NAME]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Only these steps, with commas between them [default: all]
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "STEPS")]
+    only: Vec<Step>,
     #[command(flatten)]
-    of: Option<WholeStudy>,
+    how: HowToRun,
+    #[command(flatten)]
+    device: DeviceArgs,
 }
 
 #[derive(Subcommand, Debug)]
@@ -74,19 +85,6 @@ impl StudyPlace {
     pub fn open(&self) -> Result<Study> {
         Study::open(&self.study, self.out.as_deref())
     }
-}
-
-#[derive(Args, Debug)]
-struct WholeStudy {
-    #[command(flatten)]
-    place: StudyPlace,
-    /// Only these steps, with commas between them [default: all]
-    #[arg(long, value_enum, value_delimiter = ',', value_name = "STEPS")]
-    only: Vec<Step>,
-    #[command(flatten)]
-    how: HowToRun,
-    #[command(flatten)]
-    device: DeviceArgs,
 }
 
 /// How the runs of a study are worked on.
@@ -134,14 +132,12 @@ impl StudyArgs {
     /// # Errors
     /// What cannot be made; runs that failed, behind everything else.
     pub fn run(self) -> Result<()> {
-        match (self.command, self.of) {
-            (Some(StudyCommand::Status(place)), _) => status::print_status(&place.open()?),
-            (None, Some(whole)) => {
-                let steps = if whole.only.is_empty() { Step::value_variants().to_vec() } else { whole.only };
-                run_study(&whole.place.open()?, &steps, &whole.how, &whole.device)
-            }
-            (None, None) => bail!("which study? `lidarshift study quick`, for one"),
+        if let Some(StudyCommand::Status(place)) = self.command {
+            return status::print_status(&place.open()?);
         }
+        let Some(named) = self.study else { bail!("which study? `lidarshift study quick`, for one") };
+        let steps = if self.only.is_empty() { Step::value_variants().to_vec() } else { self.only };
+        run_study(&Study::open(&named, self.out.as_deref())?, &steps, &self.how, &self.device)
     }
 }
 
