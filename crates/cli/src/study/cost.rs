@@ -17,7 +17,7 @@ use std::time::Instant;
 use train::{Adam, GradientNorm, TrainingFrames};
 
 /// Steps that are measured, behind one that warms up.
-const MEASURED_STEPS: u64 = 3;
+const MEASURED_STEPS: u64 = 5;
 /// Test frames that are measured.
 const MEASURED_FRAMES: usize = 3;
 
@@ -74,8 +74,8 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<()> {
         detection.push(begin.elapsed().as_secs_f64());
     }
     let cost = NetworkCost {
-        step_s: mean(&seconds[1..]),
-        detection_s: mean(&detection),
+        step_s: median(seconds.split_off(1)),
+        detection_s: median(detection),
         peak_mib: peak_mib().unwrap_or(0),
         threads: rayon::current_num_threads(),
         device: String::new(),
@@ -84,8 +84,10 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<()> {
     Ok(())
 }
 
-fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len().max(1) as f64
+/// A machine that pauses for a moment does not change it.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
 /// The costs that are known of a study.

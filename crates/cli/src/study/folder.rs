@@ -63,7 +63,7 @@ impl Study {
             }
         };
         let config = StudyConfig::parse(&text, &path)?;
-        let base = std::path::absolute(path.parent().unwrap_or(Path::new("")))?;
+        let base = std::path::absolute(&path)?.parent().map(Path::to_path_buf).unwrap_or_default();
         let folder = out.map_or_else(|| Path::new("runs").join(&config.name), Path::to_path_buf);
         Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
     }
