@@ -26,7 +26,7 @@ impl Regions<'static> {
     pub fn of_scenery() -> Self {
         let names = [
             "targets".to_string(),
-            format!("ground, up to {GROUND_M} m over the lowest point of its square metre"),
+            format!("ground (lowest {GROUND_M} m of a m²)"),
             format!("scenery up to {FAR_M} m"),
             format!("scenery beyond {FAR_M} m"),
         ];
