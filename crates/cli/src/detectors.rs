@@ -4,13 +4,14 @@ use anyhow::{Context, Result, bail};
 use models::config::DetectorConfig;
 use std::path::Path;
 
-const BUILT_IN: [(&str, &str); 7] = [
+const BUILT_IN: [(&str, &str); 8] = [
     ("pointpillars", include_str!("../../../configs/detectors/pointpillars.toml")),
     ("pointpillars_small", include_str!("../../../configs/detectors/pointpillars_small.toml")),
+    ("pointpillars_race", include_str!("../../../configs/detectors/pointpillars_race.toml")),
+    ("pointpillars_race_small", include_str!("../../../configs/detectors/pointpillars_race_small.toml")),
     ("pointrcnn", include_str!("../../../configs/detectors/pointrcnn.toml")),
     ("pointrcnn_small", include_str!("../../../configs/detectors/pointrcnn_small.toml")),
     ("pointrcnn_race", include_str!("../../../configs/detectors/pointrcnn_race.toml")),
-    ("pointpillars_race_small", include_str!("../../../configs/detectors/pointpillars_race_small.toml")),
     ("pointrcnn_race_small", include_str!("../../../configs/detectors/pointrcnn_race_small.toml")),
 ];
 

@@ -49,6 +49,12 @@ impl DeviceArgs {
         parse_device(&self.device)
     }
 
+    /// The words that say the same to another process.
+    pub fn words(&self) -> Vec<String> {
+        let kernels = self.kernels.to_possible_value().map_or(String::new(), |value| value.get_name().to_string());
+        ["--device", &self.device, "--kernels", &kernels].map(String::from).to_vec()
+    }
+
     /// Device and kernels in words.
     pub fn describe(&self) -> String {
         match (self.device.as_str(), self.kernels) {

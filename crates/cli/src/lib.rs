@@ -6,13 +6,19 @@ pub mod detectors;
 pub mod device;
 pub mod doctor;
 pub mod eval_ap;
+pub mod eval_distances;
+pub mod eval_matrix;
 pub mod eval_statistics;
+pub mod eval_targets;
+pub mod eval_tsne;
 pub mod fuzz;
 pub mod memory;
 pub mod parity;
+pub mod report_command;
 pub mod resim;
 pub mod schema;
 pub mod simulate;
+pub mod study;
 pub mod train;
 
 use clap::{Parser, Subcommand};
@@ -39,6 +45,13 @@ enum Command {
     Detect(detect::DetectArgs),
     /// Make synthetic data sets: a race, or streets
     Simulate(simulate::SimulateArgs),
+    /// A whole study: data sets, runs, matrix, report
+    Study(study::StudyArgs),
+    /// One run of a study
+    #[command(hide = true)]
+    StudyRun(study::work::StudyRunArgs),
+    /// The page of a study
+    Report(report_command::ReportArgs),
     /// Make a data set from another one with physical effects on top
     Resim(resim::ResimArgs),
     /// What is wrong with a data set, in words
@@ -62,16 +75,39 @@ enum Eval {
     Ap(eval_ap::EvalApArgs),
     /// Points and boxes of two data sets of the same frames
     Statistics(eval_statistics::EvalStatisticsArgs),
+    /// Train set x test set of a study
+    Matrix(eval_matrix::EvalMatrixArgs),
+    /// How far the clouds of two data sets are from each other
+    Distances(eval_distances::EvalDistancesArgs),
+    /// Targets of data sets
+    Targets(eval_targets::EvalTargetsArgs),
+    /// What the networks of a study see
+    Tsne(eval_tsne::EvalTsneArgs),
+}
+
+impl Eval {
+    fn run(self) -> anyhow::Result<()> {
+        match self {
+            Eval::Ap(args) => args.run(),
+            Eval::Statistics(args) => args.run(),
+            Eval::Matrix(args) => args.run(),
+            Eval::Distances(args) => args.run(),
+            Eval::Targets(args) => args.run(),
+            Eval::Tsne(args) => args.run(),
+        }
+    }
 }
 
 /// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood.
 pub fn run() -> ExitCode {
     let done = match Program::parse().command {
         Command::Train(args) => args.run().map(|()| true),
-        Command::Eval { command: Eval::Ap(args) } => args.run().map(|()| true),
-        Command::Eval { command: Eval::Statistics(args) } => args.run().map(|()| true),
+        Command::Eval { command } => command.run().map(|()| true),
+        Command::Report(args) => args.run().map(|()| true),
         Command::Detect(args) => args.run().map(|()| true),
         Command::Simulate(args) => args.run().map(|()| true),
+        Command::Study(args) => args.run().map(|()| true),
+        Command::StudyRun(args) => args.run().map(|()| true),
         Command::Resim(args) => args.run().map(|()| true),
         Command::Doctor(args) => args.run(),
         Command::Parity(args) => args.run(),

@@ -3,6 +3,7 @@
 use anyhow::Result;
 use clap::Args;
 use data::{DatasetConfig, write_atomic};
+use eval::study::StudyConfig;
 use models::config::DetectorConfig;
 use schemars::{JsonSchema, Schema, schema_for};
 use serde_json::{Map, Value, json};
@@ -39,13 +40,14 @@ impl SchemaArgs {
 }
 
 /// The files that people write: title, where they live, schema.
-fn files() -> [(&'static str, &'static str, Schema); 6] {
+fn files() -> [(&'static str, &'static str, Schema); 7] {
     fn of<T: JsonSchema>() -> Schema {
         schema_for!(T)
     }
     [
         ("detector", "configs/detectors/NAME.toml", of::<DetectorConfig>()),
         ("dataset", "datasets/NAME.toml, or dataset.toml in the data set's folder", of::<DatasetConfig>()),
+        ("study", "configs/studies/NAME.toml", of::<StudyConfig>()),
         ("race", "the file of `simulate --config`, with a rig", of::<RaceConfig>()),
         ("rig", "configs/sensors/NAME.toml", of::<Rig>()),
         ("effects", "lists of effects, as configs/simulate/measured.toml", of::<EffectList>()),

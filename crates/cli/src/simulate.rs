@@ -23,24 +23,26 @@ use std::path::{Path, PathBuf};
 pub struct SimulateArgs {
     /// What to make: race, race_small, race_full, street, or a TOML; docs/configuration.md lists the keys
     #[arg(long, value_name = "CONFIG", default_value = "race")]
-    config: String,
+    pub config: String,
     /// Folder for the data sets: new, empty, or begun with the same words [default: datasets/NAME]
     #[arg(long, value_name = "DIR")]
-    out: Option<PathBuf>,
+    pub out: Option<PathBuf>,
     /// Frames of each data set
     #[arg(long, value_name = "N")]
-    frames: Option<usize>,
+    pub frames: Option<usize>,
     /// Another seed gives other scenes
     #[arg(long, value_name = "K")]
-    seed: Option<u64>,
+    pub seed: Option<u64>,
     /// Of a race only these data sets, with commas between them
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
-    dataset: Vec<String>,
+    pub dataset: Vec<String>,
 }
 
 /// What a configuration describes.
-enum Scenery {
+pub enum Scenery {
+    /// Streets.
     Street(RoadConfig),
+    /// A race, and the files that it names.
     Race(Box<(RaceConfig, ConfigFiles)>),
 }
 
@@ -53,7 +55,8 @@ impl SimulateArgs {
         }
     }
 
-    fn scenery(&self) -> Result<Scenery> {
+    /// The configuration that the words name.
+    pub fn scenery(&self) -> Result<Scenery> {
         let path = Path::new(&self.config);
         let is_street = if path.is_file() {
             let text = fs_err::read_to_string(path)?;

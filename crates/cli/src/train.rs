@@ -5,6 +5,8 @@ mod results;
 
 use crate::detectors::detector_text;
 use crate::device::DeviceArgs;
+use crate::study::folder::Study;
+use crate::study::{HowToRun, Step, run_study};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
@@ -27,6 +29,7 @@ const OVERFIT_STEPS: usize = 400;
 ///   lidarshift train
 ///   lidarshift train --dataset my-data --detector pointpillars_small --seed 1 --out runs/mine
 ///   lidarshift train --dataset my-data --detector pointpillars_small --seed 1 --out runs/mine --resume
+///   lidarshift train --study quick --dry-run
 ///   lidarshift train --dataset my-data --set optimization.lr_max=0.001 --set run.checkpoint_every_steps=100
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
@@ -66,11 +69,20 @@ pub struct TrainArgs {
     /// A handful of frames and steps in a temporary folder: shows that everything runs, learns nothing
     #[arg(long, conflicts_with_all = ["dataset", "resume"])]
     smoke: bool,
+    /// All runs of a study that are missing, instead of one run: a name (quick, cpu, paper) or a TOML
+    #[arg(long, value_name = "STUDY", conflicts_with_all = ["dataset", "detector", "seed", "epochs", "set", "init", "resume", "overfit", "smoke"])]
+    study: Option<String>,
+    #[command(flatten)]
+    how: HowToRun,
 }
 
 impl TrainArgs {
     /// Trains, evaluates, and says where the results lie.
     pub fn run(mut self) -> Result<()> {
+        if let Some(study) = &self.study {
+            let study = Study::open(study, self.out.as_deref())?;
+            return run_study(&study, &[Step::Data, Step::Train], &self.how, &self.device);
+        }
         let device = self.device.open()?;
         let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;
         if let Some(folder) = &temporary {

@@ -12,7 +12,9 @@ mod sinkhorn;
 mod sliced;
 
 pub use chamfer::{Chamfer, chamfer};
-pub use compare::{DISTANCES_SCHEMA, DistanceOptions, Distances, Measure, MeasureRow, Part, compare, paired_ids};
+pub use compare::{
+    Compared, DISTANCES_SCHEMA, DistanceOptions, Distances, Measure, MeasureRow, Part, compare, paired_ids,
+};
 pub use emd::emd;
 pub use nearest::{Nearest, nearest};
 pub use regions::{RegionRow, Regions};

@@ -16,6 +16,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 /// A study.
@@ -90,9 +91,11 @@ pub enum Source {
     Path(PathBuf),
     /// Made by `simulate`.
     Simulate {
-        /// The file of `simulate --config`. Default: the built-in scene.
+        /// What `simulate --config` takes: a file, or a name (`race_small`, `street`, ...).
+        config: PathBuf,
+        /// Which of its data sets; a street has but one.
         #[serde(default)]
-        config: Option<PathBuf>,
+        dataset: Option<String>,
         /// Number of frames.
         frames: usize,
         /// Seed of the scenes.
@@ -114,6 +117,9 @@ pub enum Source {
 pub struct StudyDetector {
     /// Name of its file in configs/detectors, and of its folders.
     pub name: String,
+    /// Its file, relative to the study's. Default: the one that comes with the program.
+    #[serde(default)]
+    pub config: Option<PathBuf>,
     /// As tables call it. Default: its name.
     #[serde(default)]
     pub title: String,
@@ -160,6 +166,8 @@ pub struct StudyEvaluation {
     pub tsne: TsneOptions,
     /// Test clouds for features; the paper takes 500.
     pub tsne_frames: Option<usize>,
+    /// The data set whose test clouds they are. Default: the first of the study.
+    pub tsne_dataset: Option<String>,
     /// Distances between the data sets.
     pub distances: DistanceOptions,
     /// Frames for distances. Default: all of the train split.
@@ -173,8 +181,10 @@ pub struct StudyEvaluation {
 pub struct StudyRun {
     /// Network (the detector, and behind a plus sign its variant), train set and seed.
     pub id: RunId,
-    /// Name of the detector's file.
+    /// Name of the detector.
     pub detector: String,
+    /// Its own file.
+    pub config: Option<PathBuf>,
     /// Epochs; `None`: as the detector's file says.
     pub epochs: Option<u64>,
     /// What to set, `key=value` each, in the order of the keys; the variant's behind the detector's.
@@ -183,10 +193,17 @@ pub struct StudyRun {
     pub source: Source,
 }
 
+impl fmt::Display for StudyRun {
+    /// Its folder below that of the study.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}/seed-{}", self.id.network, self.id.train_set, self.id.seed)
+    }
+}
+
 impl StudyRun {
     /// The folder of the run below that of the study.
     pub fn folder(&self, study: &Path) -> PathBuf {
-        study.join(&self.id.network).join(&self.id.train_set).join(format!("seed-{}", self.id.seed))
+        study.join(self.to_string())
     }
 
     /// Where its detections on a test set lie, a text a frame.
@@ -263,6 +280,7 @@ impl StudyConfig {
                     runs.push(StudyRun {
                         id: RunId { network: network.clone(), train_set: dataset.name.clone(), seed },
                         detector: detector.name.clone(),
+                        config: detector.config.clone(),
                         epochs: detector.epochs.or(self.epochs),
                         set: set.clone(),
                         source: dataset.source.clone(),
@@ -324,7 +342,7 @@ source = { path = "measured" }
 
 [[dataset]]
 name = "sim"
-source = { simulate = { frames = 100 } }
+source = { simulate = { config = "street", frames = 100 } }
 
 [[dataset]]
 name = "sim-noise"

@@ -12,7 +12,9 @@ pub mod pointrcnn;
 
 mod detector;
 mod error;
+mod layer_features;
 
 pub use detector::{Detector, Losses, Network, Preparer, Sample, parameter_count};
 pub use error::ModelError;
+pub use layer_features::LayerFeatures;
 pub use named::reference_name;

@@ -18,6 +18,7 @@ use eval::features::{CkaTable, Embedding};
 use eval::matrix::Matrix;
 use eval::targets::Targets;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 /// Everything that a report shows; what is empty is left out.
@@ -54,7 +55,7 @@ pub struct StudyReport {
 }
 
 /// The Fréchet distance between the features of two train sets.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrechetRow {
     /// The network.
     pub network: String,

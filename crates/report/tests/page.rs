@@ -133,7 +133,6 @@ fn report() -> StudyReport {
     };
     let ids: Vec<String> = (0..6).map(|i| i.to_string()).collect();
     let distance_options = DistanceOptions {
-        compared: "the raw cloud".into(),
         emd_points: 32,
         sinkhorn_points: 32,
         sinkhorn_iterations: 10,
@@ -143,11 +142,14 @@ fn report() -> StudyReport {
     };
     let regions = Regions {
         names: ["ground", "target", "behind the wall", "other"].map(String::from).to_vec(),
-        of: Box::new(|frame, p| match p {
-            [_, _, z] if z < -0.8 => 0,
-            p if frame.objects[0].bbox.to_local(p.map(f64::from))[0].abs() < 2.5 => 1,
-            [_, y, _] if y > 13.5 => 2,
-            _ => 3,
+        of: Box::new(|frame, points| {
+            let of = |p: &[f32; 3]| match *p {
+                [_, _, z] if z < -0.8 => 0,
+                p if frame.objects[0].bbox.to_local(p.map(f64::from))[0].abs() < 2.5 => 1,
+                [_, y, _] if y > 13.5 => 2,
+                _ => 3,
+            };
+            points.iter().map(of).collect()
         }),
     };
     let of_pair = |id: &str| {

@@ -18,6 +18,6 @@ pub use metrics::{EpochMetrics, StageSeconds, StepMetrics, ValidationMetrics};
 pub use one_cycle::OneCycle;
 pub use provenance::{DatasetProvenance, PROVENANCE_SCHEMA, Provenance, SessionProvenance};
 pub use run_config::{RunConfig, RunOptions, set_key};
-pub use run_folder::{Best, RunFolder, RunState, STATE_SCHEMA};
+pub use run_folder::{Best, RunFolder, RunState, STATE_SCHEMA, read_run_state};
 pub use trainer::{Event, Session, Trained, train};
 pub use validation::{Evaluation, evaluate_detector};

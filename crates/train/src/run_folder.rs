@@ -132,22 +132,7 @@ impl RunFolder {
     }
 
     fn state_file(&self) -> Result<Option<StateFile>, TrainError> {
-        let path = self.state_path();
-        let bytes = match fs_err::read(&path) {
-            Ok(bytes) => bytes,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(e.into()),
-        };
-        let damaged =
-            |e: String| TrainError::folder(&path, format!("is damaged ({e}); begin the run anew in another folder"));
-        let file: StateFile = serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
-        if file.schema != STATE_SCHEMA {
-            return Err(damaged(format!("schema is {:?}, this program writes {STATE_SCHEMA:?}", file.schema)));
-        }
-        if file.sha256.get("state") != Some(&state_sha256(&file.state)) {
-            return Err(damaged("the checksum is wrong".into()));
-        }
-        Ok(Some(file))
+        read_state_file(&self.state_path())
     }
 
     /// Writes a checkpoint; when this returns, a resume goes on from it. Older ones go but `keep`, and the best.
@@ -225,6 +210,32 @@ impl RunFolder {
         }
         Ok(())
     }
+}
+
+/// Where the run in a folder stands, without opening it: another process may be at work in it. `None` before its first checkpoint.
+///
+/// # Errors
+/// A state that is damaged.
+pub fn read_run_state(folder: &Path) -> Result<Option<RunState>, TrainError> {
+    Ok(read_state_file(&folder.join("checkpoint/state.json"))?.map(|file| file.state))
+}
+
+fn read_state_file(path: &Path) -> Result<Option<StateFile>, TrainError> {
+    let bytes = match fs_err::read(path) {
+        Ok(bytes) => bytes,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(e) => return Err(e.into()),
+    };
+    let damaged =
+        |e: String| TrainError::folder(path, format!("is damaged ({e}); begin the run anew in another folder"));
+    let file: StateFile = serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
+    if file.schema != STATE_SCHEMA {
+        return Err(damaged(format!("schema is {:?}, this program writes {STATE_SCHEMA:?}", file.schema)));
+    }
+    if file.sha256.get("state") != Some(&state_sha256(&file.state)) {
+        return Err(damaged("the checksum is wrong".into()));
+    }
+    Ok(Some(file))
 }
 
 fn names(step: u64) -> [String; 2] {

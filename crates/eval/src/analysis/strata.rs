@@ -9,7 +9,7 @@ use data::{Cloud, KittiLine};
 use geometry::{Box3, limit_period, points_in_boxes};
 use rayon::prelude::*;
 use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use std::f64::consts::PI;
 
 /// The boxes of one kind.
@@ -17,7 +17,8 @@ use std::f64::consts::PI;
 pub struct Stratum {
     /// Values from (of the overlap limit: the limit).
     pub from: f64,
-    /// Values to, itself not included.
+    /// Values to, itself not included; infinite (`null` in JSON) for the last of those without an end.
+    #[serde(deserialize_with = "or_infinite")]
     pub to: f64,
     /// Ground truths of that kind.
     pub n_gt: i64,
@@ -29,6 +30,10 @@ pub struct Stratum {
     pub ap_area: Option<f64>,
     /// Share of the ground truths that are hit, percent; `None` without one.
     pub recall: Option<f64>,
+}
+
+fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
+    Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
 /// How many points of a frame's cloud lie in each of its boxes.

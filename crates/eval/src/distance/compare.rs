@@ -93,12 +93,35 @@ impl fmt::Display for Part {
     }
 }
 
+/// What the clouds are that are compared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Compared {
+    /// As the data set holds them.
+    #[default]
+    Raw,
+    /// What the training loader gives before augmentation: cut to the detector's range.
+    Loader,
+    /// What the network is trained on: the same after augmentation.
+    Augmented,
+}
+
+impl fmt::Display for Compared {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(match self {
+            Compared::Raw => "raw clouds",
+            Compared::Loader => "the training loader's clouds before augmentation",
+            Compared::Augmented => "the training loader's clouds after augmentation",
+        })
+    }
+}
+
 /// By which rules distances are made.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DistanceOptions {
-    /// What the clouds are, in words, for every table: the raw cloud, or what the training loader gives, before or after augmentation.
-    pub compared: String,
+    /// What the clouds are; every table says it.
+    pub compared: Compared,
     /// Points farther away on the ground are left out, m.
     pub max_range_m: f64,
     /// Sections of distance beside the whole and the targets.
@@ -122,7 +145,7 @@ pub struct DistanceOptions {
 impl Default for DistanceOptions {
     fn default() -> Self {
         DistanceOptions {
-            compared: "raw cloud".into(),
+            compared: Compared::Raw,
             max_range_m: 100.0,
             sections: RangeSection::PAPER.into(),
             emd_points: 512,
@@ -225,10 +248,7 @@ pub fn compare(
             }
             let (forth, back) = (nearest(&a, &b)?, nearest(&b, &a)?);
             if let (Part::Whole, Some(regions)) = (part, regions) {
-                let of = |frame: &Frame, points: &[Point]| -> Vec<usize> {
-                    points.iter().map(|p| (regions.of)(frame, *p)).collect()
-                };
-                let (of_a, of_b) = (of(&frames[0], &a), of(&frames[1], &b));
+                let (of_a, of_b) = ((regions.of)(&frames[0], &a), (regions.of)(&frames[1], &b));
                 sums = RegionSums::new(regions.names.len(), [(&of_a, &forth), (&of_b, &back)]);
             }
             let distance = measures(&Chamfer::of_nearest(&forth, &back), &a, &b, i, options)?;
@@ -392,8 +412,23 @@ mod tests {
         DistanceOptions { emd_points: 64, sinkhorn_points: 64, sinkhorn_iterations: 30, ..DistanceOptions::default() }
     }
 
-    fn region(_: &Frame, p: Point) -> usize {
-        if p[0] > 50.0 { 2 } else { usize::from(p[2] > 0.1) }
+    fn region(_: &Frame, points: &[Point]) -> Vec<usize> {
+        points.iter().map(|p| if p[0] > 50.0 { 2 } else { usize::from(p[2] > 0.1) }).collect()
+    }
+
+    #[test]
+    fn scenery_is_told_from_ground_and_targets() {
+        let regions = Regions::of_scenery();
+        let [_, frame] = frames("0");
+        let points: Vec<Point> = (0..frame.cloud.len()).map(|i| frame.cloud.xyz(i)).collect();
+        let found = (regions.of)(&frame, &points);
+        for (p, region) in points.iter().zip(found) {
+            match region {
+                0 => assert!((p[0] - 10.0).abs() <= 2.25 && (p[1] - 4.0).abs() <= 0.5, "{p:?}"),
+                3 => assert!(p[0] == 60.0 && p[2] > 0.4, "{p:?}"),
+                region => assert_eq!(region, 1, "{p:?}"),
+            }
+        }
     }
 
     fn run(threads: usize) -> Distances {

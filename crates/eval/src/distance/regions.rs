@@ -1,17 +1,58 @@
 //! Which part of the Chamfer distance comes from which region.
 
-use super::Nearest;
+use super::{Nearest, Point};
 use data::Frame;
+use geometry::points_in_boxes;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::collections::HashMap;
 
-/// Regions of a frame: their names, and which one a point belongs to (m, LiDAR frame), an index into the names.
+/// Regions of a frame: their names, and which ones points belong to (m, LiDAR frame), indices into the names.
 pub struct Regions<'a> {
     /// For tables.
     pub names: Vec<String>,
-    /// The region of a point.
+    /// The region of each point of a frame's cloud.
     #[expect(clippy::type_complexity, reason = "one closure, said once")]
-    pub of: Box<dyn Fn(&Frame, [f32; 3]) -> usize + Sync + 'a>,
+    pub of: Box<dyn Fn(&Frame, &[Point]) -> Vec<usize> + Sync + 'a>,
+}
+
+/// So far over the lowest point of its square metre a point still counts as ground, m.
+const GROUND_M: f32 = 0.4;
+/// From here on scenery counts as far, m on the ground.
+const FAR_M: f32 = 33.3;
+
+impl Regions<'static> {
+    /// What any labelled cloud can be divided into: targets, ground, and what rises over it, near and far.
+    pub fn of_scenery() -> Self {
+        let names = [
+            "targets".to_string(),
+            format!("ground (lowest {GROUND_M} m of a m²)"),
+            format!("scenery up to {FAR_M} m"),
+            format!("scenery beyond {FAR_M} m"),
+        ];
+        Regions { names: names.into(), of: Box::new(scenery) }
+    }
+}
+
+fn scenery(frame: &Frame, points: &[Point]) -> Vec<usize> {
+    let cell = |p: &Point| (p[0].floor() as i32, p[1].floor() as i32);
+    let mut lowest: HashMap<(i32, i32), f32> = HashMap::new();
+    for p in points {
+        let z = lowest.entry(cell(p)).or_insert(f32::INFINITY);
+        *z = z.min(p[2]);
+    }
+    let boxes: Vec<_> = frame.objects.iter().map(|object| object.bbox).collect();
+    let flat: Vec<f32> = points.iter().flatten().copied().collect();
+    let mut regions: Vec<usize> = points
+        .iter()
+        .map(|p| match p {
+            p if p[2] <= lowest[&cell(p)] + GROUND_M => 1,
+            p if p[0].hypot(p[1]) <= FAR_M => 2,
+            _ => 3,
+        })
+        .collect();
+    points_in_boxes(&flat, 3, &boxes, 0.0).into_iter().flatten().for_each(|i| regions[i as usize] = 0);
+    regions
 }
 
 /// What one region contributes to the Chamfer sum, over all frames.

@@ -38,6 +38,7 @@ impl StudyConfig {
                 }
             };
             let epochs = |run: &StudyRun| run.epochs.map_or("the detector's own".into(), |n| n.to_string());
+            differs("the detector's file", format!("{:?}", was.config), format!("{:?}", run.config));
             differs("epochs", epochs(was), epochs(run));
             differs("set", format!("{:?}", was.set), format!("{:?}", run.set));
             differs("the train set's source", before.source_text(&was.id.train_set), self.source_text(&id.train_set));

@@ -48,7 +48,9 @@ impl StudyConfig {
         let of_variant = self.variants.iter().flat_map(|v| v.detectors.iter().flatten().map(move |d| (v, d)));
         let of_variant =
             of_variant.filter_map(|(v, name)| unknown(format!("variant {}: detectors", v.name), name, &detectors));
-        if let Some(problem) = of_train.chain(of_variant).next() {
+        let of_tsne = self.evaluation.tsne_dataset.iter();
+        let of_tsne = of_tsne.filter_map(|name| unknown("evaluation.tsne_dataset".into(), name, &datasets));
+        if let Some(problem) = of_train.chain(of_variant).chain(of_tsne).next() {
             return Some(problem);
         }
         for (i, dataset) in self.datasets.iter().enumerate() {

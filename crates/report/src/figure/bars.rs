@@ -26,7 +26,9 @@ pub fn bars(bars: &[Bar], x_label: &str) -> Figure {
     let bottom = 16.0 + 26.0 * bars.len() as f64;
     let mut page = Page::new([WIDTH, bottom + 52.0], [255; 3], false);
     let values = bars.iter().filter_map(|b| b.value).filter(|v| v.is_finite());
-    let axis = Axis::new(values.chain([0.0]), [left, right], false);
+    // Where all bars are nothing, the axis still begins at zero.
+    let ends = if values.clone().all(|v| v == 0.0) { [0.0, 1.0] } else { [0.0, 0.0] };
+    let axis = Axis::new(values.chain(ends), [left, right], false);
     for (value, name) in axis.ticks() {
         let x = axis.px(value);
         page.line(vec![[x, 10.0], [x, bottom]], GRID, 1.0);

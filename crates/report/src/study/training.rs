@@ -10,7 +10,7 @@ use std::path::Path;
 pub struct TrainingRun {
     /// For the legend.
     pub name: String,
-    /// Step and mean loss of each epoch, or where there is none, the loss at each logged step.
+    /// Step and mean loss of the logged steps of each epoch, or before the second epoch, the loss at each logged step.
     pub loss: Vec<[f64; 2]>,
     /// Step and average precision on the validation split, percent.
     pub validation_ap: Vec<[f64; 2]>,
@@ -22,7 +22,8 @@ pub struct TrainingRun {
 /// A file that cannot be read, or a line in it that is no JSON.
 pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportError> {
     let text = fs_err::read_to_string(path).map_err(data::DataError::from)?;
-    let (mut of_steps, mut of_epochs) = (Vec::new(), Vec::new());
+    let (mut of_steps, mut of_epochs) = (Vec::<[f64; 2]>::new(), Vec::new());
+    let mut epoch_begins = 0;
     let mut run = TrainingRun { name: name.into(), ..TrainingRun::default() };
     let whole = text.rfind('\n').map_or(0, |end| end + 1);
     for (i, line) in text[..whole].lines().enumerate() {
@@ -32,7 +33,12 @@ pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportE
         match (value["kind"].as_str(), at("step")) {
             (Some("step"), Some(step)) => of_steps.extend(at("loss").map(|loss| [step, loss])),
             (Some("epoch"), Some(step)) => {
-                of_epochs.extend(at("train_loss").map(|loss| [step, loss]));
+                // The lines' own mean is that of one process: it would tell where a run was interrupted.
+                let of_epoch = &of_steps[epoch_begins..];
+                epoch_begins = of_steps.len();
+                if !of_epoch.is_empty() {
+                    of_epochs.push([step, of_epoch.iter().map(|p| p[1]).sum::<f64>() / of_epoch.len() as f64]);
+                }
                 run.validation_ap.extend(value["validation"]["ap"].as_f64().map(|ap| [step, ap]));
             }
             _ => {}
@@ -86,9 +92,10 @@ mod tests {
         let epoch = |step: u32, ap: &str| {
             format!("{{\"kind\":\"epoch\",\"step\":{step},\"train_loss\":2.0,\"validation\":{ap}}}\n")
         };
-        std::fs::write(&path, format!("{step}{}{}", epoch(5, "null"), epoch(10, "{\"ap\":40.5}"))).unwrap();
+        let (first, second) = (epoch(5, "null"), epoch(10, "{\"ap\":40.5}"));
+        std::fs::write(&path, format!("{step}{}{first}{step}{second}", step.replace("3.5", "1.5"))).unwrap();
         let run = read_training_run("a", &path).unwrap();
-        assert_eq!((run.loss, run.validation_ap), (vec![[5.0, 2.0], [10.0, 2.0]], vec![[10.0, 40.5]]));
+        assert_eq!((run.loss, run.validation_ap), (vec![[5.0, 2.5], [10.0, 3.5]], vec![[10.0, 40.5]]));
         std::fs::write(&path, format!("{step}nonsense\n{step}")).unwrap();
         let error = read_training_run("a", &path).unwrap_err().to_string();
         assert!(error.contains("metrics.jsonl:2"), "{error}");

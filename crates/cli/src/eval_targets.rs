@@ -1,0 +1,87 @@
+//! `lidarshift eval targets`: the targets of data sets.
+
+use anyhow::{Result, bail};
+use clap::Args;
+use data::{Dataset, write_atomic};
+use eval::targets::{Spread, TargetOptions, Targets, targets};
+use report::StudyReport;
+use std::path::PathBuf;
+
+/// Targets of one or more data sets: how many, where they are, how many points they have; laid over each other in the frame of their boxes by
+/// distance. With --out also as figures.
+///
+/// Examples:
+///   lidarshift eval targets datasets/race/measured datasets/race/sim
+///   lidarshift eval targets my-data --split test --class Pedestrian --out targets
+#[derive(Args, Debug)]
+#[command(verbatim_doc_comment)]
+pub struct EvalTargetsArgs {
+    /// Data sets: their folders or their TOMLs
+    #[arg(value_name = "DATASET", required = true)]
+    datasets: Vec<PathBuf>,
+    /// Split whose frames are looked at
+    #[arg(long, value_name = "NAME", default_value = "train")]
+    split: String,
+    /// Class of the targets
+    #[arg(long, value_name = "NAME", default_value = "Car")]
+    class: String,
+    /// Folder for report.html, figures and tables
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Write the result as JSON, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+impl EvalTargetsArgs {
+    /// Prints the numbers.
+    ///
+    /// # Errors
+    /// Frames that cannot be read, or no target at all.
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    pub fn run(self) -> Result<()> {
+        let options = TargetOptions { class: self.class.clone(), ..TargetOptions::default() };
+        let mut all = Vec::new();
+        for path in &self.datasets {
+            let set = Dataset::open(path)?;
+            let ids = set.ids(&self.split)?;
+            all.push(targets(&set.config.name, &ids, |id| set.load(id), &options)?);
+        }
+        if all.iter().all(|found| found.targets.is_empty()) {
+            bail!("no frame of the split {} has a {} within {} m", self.split, self.class, options.max_range_m);
+        }
+        if let Some(path) = &self.json {
+            write_atomic(path, &serde_json::to_vec_pretty(&all)?)?;
+        }
+        all.iter().for_each(|found| print!("{}", table(found)));
+        if let Some(out) = &self.out {
+            let names: Vec<&str> = all.iter().map(|found| found.dataset.as_str()).collect();
+            let title = format!("Targets of {}", names.join(", "));
+            let files = StudyReport { title, targets: all, ..StudyReport::default() }.write(out)?;
+            println!("figures: {}", files.page.display());
+        }
+        Ok(())
+    }
+}
+
+fn table(found: &Targets) -> String {
+    let mut text = format!("{}: {} frames, {} targets\n", found.dataset, found.frames, found.targets.len());
+    let spread = |s: &Spread| match (s.mean, s.min, s.max) {
+        (Some(mean), Some(min), Some(max)) => format!("{mean:.1} ({min:.1} to {max:.1})"),
+        _ => "-".into(),
+    };
+    text += &format!("  points a cloud   {}\n", spread(&found.points_per_cloud));
+    text += &format!("  points a target  {}\n", spread(&found.points_per_target));
+    if let Some([length, width, height]) = found.mean_size_m {
+        text += &format!("  mean size        {length:.2} x {width:.2} x {height:.2} m\n");
+    }
+    for section in &found.sections {
+        text += &format!(
+            "  {:<16} {} targets, {} points\n",
+            section.section.to_string(),
+            section.targets,
+            section.n_points
+        );
+    }
+    text
+}

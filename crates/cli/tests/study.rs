@@ -1,0 +1,229 @@
+//! A whole study through the program: killed and gone on with, with a run that fails, with a changed file, with frames that do not pair.
+
+#[allow(dead_code, reason = "each test file uses a part of it")]
+mod program;
+
+use program::{data_set, must, program, run, said};
+use std::fs;
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+/// Two data sets of the same seven frames, two seeds of the tiny network, everything small.
+const STUDY: &str = r#"
+name = "tiny"
+about = ["A test."]
+seeds = [1, 2]
+epochs = 2
+splits = { test = "val" }
+
+[[dataset]]
+name = "plain"
+title = "Plain"
+source = { path = "." }
+
+[[dataset]]
+name = "noisy"
+title = "Noisy"
+source = { resim = { of = "plain", effects = "noise.toml" } }
+
+[[detector]]
+name = "tiny"
+config = "tiny.toml"
+
+[evaluation]
+tsne = { perplexity = 1.0, steps = 50 }
+distances = { emd_points = 32, sinkhorn_points = 32, sinkhorn_iterations = 5, directions = 4 }
+
+[evaluation.matrix.bootstrap]
+replicates = 40
+"#;
+
+fn study(folder: &Path) {
+    data_set(folder);
+    fs::write(folder.join("noise.toml"), "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n").unwrap();
+    fs::write(folder.join("tiny-study.toml"), STUDY).unwrap();
+}
+
+fn page(folder: &Path) -> String {
+    fs::read_to_string(folder.join("runs/tiny/report.html")).unwrap()
+}
+
+fn steps_done(folder: &Path) -> usize {
+    let runs = ["plain/seed-1", "plain/seed-2", "noisy/seed-1", "noisy/seed-2"];
+    let lines = |run: &&str| fs::read_to_string(folder.join("runs/tiny/tiny").join(run).join("metrics.jsonl"));
+    runs.iter().filter_map(|run| lines(run).ok()).map(|text| text.lines().count()).sum()
+}
+
+#[test]
+fn a_study_is_made_and_gone_on_with_after_kills() {
+    let whole = tempfile::tempdir().unwrap();
+    study(whole.path());
+    let output = must(whole.path(), "study tiny-study.toml");
+    let text = said(&output);
+    assert!(text.contains("4 runs") && text.contains("steps of") && text.contains("| Car | trained on"), "{text}");
+    let html = page(whole.path());
+    for part in
+        ["Plain", "Noisy", "4 of", "t-SNE", "linear CKA", "Chamfer", "seeds 1, 2", "lidarshift study tiny-study.toml"]
+    {
+        assert!(html.contains(part) || part == "4 of", "{part} is not in the report");
+    }
+    for file in [
+        "matrix.json",
+        "analyses.json",
+        "features.json",
+        "distances/plain--noisy.json",
+        "targets/noisy.json",
+        "tables/matrix.tex",
+    ] {
+        assert!(whole.path().join("runs/tiny").join(file).is_file(), "{file}");
+    }
+    let status = said(&must(whole.path(), "study status tiny-study.toml"));
+    assert!(status.contains("4 runs, each tested on 2 data sets: 4 done"), "{status}");
+
+    // The same study in another folder, killed again and again, ends with the same page.
+    let killed = tempfile::tempdir().unwrap();
+    study(killed.path());
+    let mut kills = 0;
+    for patience_ms in [5, 40, 120, 250, 60] {
+        let before = steps_done(killed.path());
+        let mut child = program(killed.path(), "study tiny-study.toml")
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        while steps_done(killed.path()) == before && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        std::thread::sleep(Duration::from_millis(patience_ms));
+        kills += u32::from(child.try_wait().unwrap().is_none());
+        child.kill().unwrap(); // SIGKILL
+        child.wait().unwrap();
+    }
+    assert!(kills >= 2, "only {kills} studies were killed before their end");
+    must(killed.path(), "study tiny-study.toml");
+    assert!(page(killed.path()) == html, "the report differs");
+
+    // A second call finds everything there; the parts are commands of their own.
+    let again = said(&must(whole.path(), "study tiny-study.toml"));
+    assert!(again.contains("no run is missing"), "{again}");
+    assert!(page(whole.path()) == html, "a second call changes the report");
+    let table = said(&must(whole.path(), "eval matrix tiny-study.toml --latex t.tex"));
+    assert!(table.contains("| Car | trained on"), "{table}");
+    must(whole.path(), "eval tsne runs/tiny --figures features");
+    must(whole.path(), "eval targets . runs/tiny/data/noisy --out targets");
+    let distances = said(&must(whole.path(), "eval distances . runs/tiny/data/noisy --frames 2"));
+    assert!(distances.contains("Chamfer, sum") && distances.contains("of the Chamfer sum: targets"), "{distances}");
+    let said = said(&must(whole.path(), "report runs/tiny"));
+    assert!(said.contains("report.html") && page(whole.path()) == html, "{said}");
+}
+
+#[test]
+fn a_failed_run_and_a_changed_file_are_told() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    let one = STUDY.replace("seeds = [1, 2]", "seeds = [1]");
+    // A learning rate beyond all measure: the loss is not finite, in every run.
+    let wild = one.replace("config = \"tiny.toml\"", "config = \"tiny.toml\"\nset = { optimization.lr_max = 1e30 }");
+    fs::write(dir.path().join("tiny-study.toml"), wild).unwrap();
+    let output = run(dir.path(), "study tiny-study.toml");
+    let text = said(&output);
+    assert!(!output.status.success() && text.contains("tiny/plain/seed-1") && text.contains("not finite"), "{text}");
+    assert!(page(dir.path()).contains("not finite"), "the report does not show the failure");
+    let status = said(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("2 failed"), "{status}");
+
+    // Another learning rate: the runs are no longer those of the study.
+    fs::write(dir.path().join("tiny-study.toml"), &one).unwrap();
+    let output = run(dir.path(), "study tiny-study.toml --only train");
+    let text = said(&output);
+    assert!(!output.status.success(), "{text}");
+    assert!(text.contains("tiny/plain/seed-1 is no longer valid: set was"), "{text}");
+    assert!(text.contains("lr_max") && text.contains("--replace makes it anew"), "{text}");
+    let text = said(&must(dir.path(), "train --study tiny-study.toml --replace"));
+    assert!(text.contains("removed") && text.contains("is done"), "{text}");
+    let status = said(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("2 trained") && status.contains("to be tested on plain, noisy"), "{status}");
+
+    // Weights of another configuration in a run folder.
+    must(dir.path(), "study tiny-study.toml --only detect");
+    let state = dir.path().join("runs/tiny/tiny/plain/seed-1/checkpoint/state.json");
+    let other = dir.path().join("runs/tiny/tiny/noisy/seed-1/checkpoint/state.json");
+    fs::copy(other, state).unwrap();
+    let text = said(&must(dir.path(), "report tiny-study.toml"));
+    assert!(text.contains("report.html"), "{text}");
+    assert!(page(dir.path()).contains("belongs to another configuration"));
+}
+
+#[test]
+fn bad_studies_are_refused_in_words() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    for (from, to, words, want) in [
+        ("", "", "study none", "no study \"none\": neither a file nor one of quick, cpu, paper"),
+        ("", "", "study", "which study?"),
+        ("", "", "report tiny-study.toml", "is not there: `lidarshift study tiny-study.toml --only data` makes it"),
+        ("config = \"tiny.toml\"", "config = \"no.toml\"", "study tiny-study.toml", "no.toml"),
+        ("seeds = [1, 2]", "seeds = [1, 1]", "study tiny-study.toml", "have to be distinct"),
+        ("path = \".\"", "path = \"nowhere\"", "study tiny-study.toml", "data set plain"),
+    ] {
+        fs::write(dir.path().join("tiny-study.toml"), STUDY.replacen(from, to, usize::from(!from.is_empty()))).unwrap();
+        let output = run(dir.path(), words);
+        let text = said(&output);
+        assert!(!output.status.success() && text.contains(want), "{words}: {text}");
+    }
+    fs::write(dir.path().join("tiny-study.toml"), STUDY).unwrap();
+    // Without Slurm on the path.
+    let output =
+        program(dir.path(), "study tiny-study.toml --launcher slurm").env("PATH", dir.path()).output().unwrap();
+    let text = said(&output);
+    assert!(!output.status.success() && text.contains("there is no squeue on this machine"), "{text}");
+    // Frames that the other data set does not have.
+    let other = dir.path().join("other");
+    fs::create_dir(&other).unwrap();
+    data_set(&other);
+    fs::rename(other.join("velodyne/000000.bin"), other.join("velodyne/000099.bin")).unwrap();
+    fs::rename(other.join("label_2/000000.txt"), other.join("label_2/000099.txt")).unwrap();
+    let ids = fs::read_to_string(other.join("ImageSets/train.txt")).unwrap().replace("000000", "000099");
+    fs::write(other.join("ImageSets/train.txt"), ids).unwrap();
+    let output = run(dir.path(), "eval distances . other");
+    let text = said(&output);
+    assert!(!output.status.success() && text.contains("do not pair") && text.contains("000000"), "{text}");
+}
+
+/// Whether `condition` comes true within two minutes.
+fn waits_for(mut condition: impl FnMut() -> bool) -> bool {
+    (0..600).any(|_| {
+        std::thread::sleep(Duration::from_millis(200));
+        condition()
+    })
+}
+
+#[test]
+fn on_slurm_the_numbers_are_the_same() {
+    let there = std::process::Command::new("sinfo").output().is_ok_and(|output| output.status.success());
+    if !there {
+        eprintln!("skipped: there is no Slurm");
+        return;
+    }
+    let local = tempfile::tempdir().unwrap();
+    study(local.path());
+    must(local.path(), "study tiny-study.toml");
+
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    let text = said(&must(dir.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(text.contains("train: job") && text.contains("4 tasks") && text.contains("report: job"), "{text}");
+    let job = text.lines().find_map(|line| line.strip_prefix("train: job ")?.split(',').next()).unwrap().to_string();
+    // One task is killed; what depends on it is dropped, and the report shows the gap.
+    assert!(std::process::Command::new("scancel").arg(format!("{job}_3")).status().unwrap().success());
+    assert!(waits_for(|| dir.path().join("runs/tiny/report.html").is_file()), "no report");
+    let status = said(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("3 done"), "{status}");
+    // A second submission fills the gap alone.
+    let text = said(&must(dir.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(text.contains("1 tasks"), "{text}");
+    let matrix = |folder: &Path| fs::read_to_string(folder.join("runs/tiny/matrix.json")).unwrap();
+    assert!(waits_for(|| matrix(dir.path()) == matrix(local.path())), "the numbers differ");
+    assert!(waits_for(|| page(dir.path()) == page(local.path())), "the report differs");
+}
