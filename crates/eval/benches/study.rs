@@ -64,7 +64,8 @@ fn cloud(seed: u64, n: usize) -> Vec<Point> {
     let mut random = stream(seed, "study bench", 0, 0);
     let mut point = || {
         let (range, azimuth) = (100.0 * random.random::<f32>().powi(2), random.random_range(-PI..PI));
-        let up = if random.random::<f32>() < 0.3 { random.random_range(0.0..4.0) } else { random.random_range(0.0..0.1) };
+        let up =
+            if random.random::<f32>() < 0.3 { random.random_range(0.0..4.0) } else { random.random_range(0.0..0.1) };
         [range * azimuth.cos(), range * azimuth.sin(), up]
     };
     (0..n).map(|_| point()).collect()

@@ -125,6 +125,7 @@ impl Adam {
 }
 
 /// Value, gradient and moments to the new value and moments, in one pass where there is a kernel for it; else they come back.
+#[expect(clippy::result_large_err, reason = "the tensors come back where there is no kernel")]
 fn move_by_kernel(tensors: [Tensor<1>; 4], step: &AdamStep) -> Result<[Tensor<1>; 3], [Tensor<1>; 4]> {
     let Some(values) = tensors.iter().map(FlexValues::of).collect::<Option<Vec<_>>>() else { return Err(tensors) };
     let [value, gradient, exp_avg, exp_avg_sq] = <[FlexValues; 4]>::try_from(values).expect("one for each tensor");
