@@ -6,6 +6,22 @@ use crate::{Cloud, DataError, Frame, KittiLine, PcdEncoding, encode_pcd};
 use std::io::Write as _;
 use std::path::Path;
 
+/// Begins the names of files that are not whole yet.
+const UNFINISHED: &str = ".writing-";
+
+/// Removes what writers that were killed left in a folder, which need not exist. Nobody may be writing there.
+pub fn remove_unfinished(folder: &Path) -> Result<(), DataError> {
+    if folder.is_dir() {
+        for entry in fs_err::read_dir(folder)? {
+            let entry = entry?;
+            if entry.file_name().to_string_lossy().starts_with(UNFINISHED) {
+                fs_err::remove_file(entry.path())?;
+            }
+        }
+    }
+    Ok(())
+}
+
 /// Writes `bytes` to `path`, making its folder where needed. A reader sees the old file or the new one, never a part of it.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
@@ -15,7 +31,7 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     };
     fs_err::create_dir_all(folder)?;
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".writing-");
+    builder.prefix(UNFINISHED);
     #[cfg(unix)]
     let permissions = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
     #[cfg(unix)]

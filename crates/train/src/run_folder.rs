@@ -6,6 +6,7 @@
 
 use crate::TrainError;
 use crate::run_config::hex;
+use data::write::remove_unfinished;
 use data::write_atomic;
 use models::checkpoint::{NamedTensors, read_safetensors, write_safetensors};
 use serde::{Deserialize, Serialize};
@@ -75,12 +76,7 @@ impl RunFolder {
         fs_err::create_dir_all(path.join("checkpoint"))?;
         let folder = RunFolder { path: path.into(), _lock: lock(path)? };
         for inside in [folder.path.clone(), folder.checkpoints()] {
-            for entry in fs_err::read_dir(&inside)? {
-                let entry = entry?;
-                if entry.file_name().to_string_lossy().starts_with(".writing-") {
-                    fs_err::remove_file(entry.path())?;
-                }
-            }
+            remove_unfinished(&inside)?;
         }
         Ok(folder)
     }

@@ -10,7 +10,7 @@ use crate::auto_label::{LabelError, label_errors};
 use crate::effects::{Effect, EffectList};
 use crate::matched::{RangeHistogram, fit_range_dropout};
 use crate::street::SplitCounts;
-use data::write::{write_dataset_toml, write_frame, write_split};
+use data::write::{remove_unfinished, write_dataset_toml, write_frame, write_split};
 use data::{
     DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Layout, PointColumns, read_kitti_text, write_atomic,
 };
@@ -98,6 +98,10 @@ fn make_set(
     };
     let manifest_path = root.join("manifest.json");
     check_folder(&root, &manifest_path, &manifest)?;
+    let layout = simulator.config.layout;
+    for inside in ["", layout.cloud_folder(), layout.label_folder(), attributes::FOLDER, "ImageSets"] {
+        remove_unfinished(&root.join(inside))?;
+    }
     write_json(&manifest_path, &manifest)?;
     write_descriptions(simulator, &root, set, &prepared)?;
 

@@ -4,7 +4,7 @@ use crate::SimulateError;
 use crate::street::config::RoadConfig;
 use crate::street::scene::Scene;
 use crate::street::sensor::scan;
-use data::write::{write_dataset_toml, write_kitti_frame, write_split};
+use data::write::{remove_unfinished, write_dataset_toml, write_kitti_frame, write_split};
 use data::{DataError, DatasetConfig, Frame, LabelFrame, Object, PointColumns, stream, write_atomic};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -88,6 +88,9 @@ pub fn make_road_dataset(
         splits: BTreeMap::new(),
     };
     check_folder(out, &manifest_path, &manifest)?;
+    for inside in ["", "velodyne", "label_2", "ImageSets"] {
+        remove_unfinished(&out.join(inside))?;
+    }
     write_manifest(&manifest_path, &manifest)?;
 
     let jobs: Vec<(&str, usize)> =
