@@ -5,6 +5,8 @@ use lidarshift_geometry::{Box3, TieRule, ball_query, farthest_point_sampling, ro
 use rand::RngExt;
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use std::hint::black_box;
+use std::process::Command;
+use std::time::{Duration, Instant};
 
 /// Ground in rings, as a turning LiDAR sees it, and things that stand on it.
 fn scan(points: usize) -> Vec<[f32; 3]> {
@@ -51,5 +53,40 @@ fn point_operations(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, point_operations);
+/// The same three operations in PyTorch on the same points, in the same run, where `LIDARSHIFT_PYTHON` names a Python that has it; and how many
+/// of its indices ours equal.
+#[expect(clippy::print_stdout, reason = "it is what it is for")]
+fn beside_torch(_: &mut Criterion) {
+    let Ok(python) = std::env::var("LIDARSHIFT_PYTHON") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let cloud = scan(16_384);
+    let bytes: Vec<u8> = cloud.as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    std::fs::write(folder.path().join("points.f32"), bytes).unwrap();
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/benches/points_torch.py");
+    let ours = || {
+        let start = Instant::now();
+        let picks = farthest_point_sampling(&cloud, 4096, TieRule::LowestIndex);
+        let centers: Vec<[f32; 3]> = picks.iter().map(|&i| cloud[i as usize]).collect();
+        let sampled = start.elapsed();
+        let start = Instant::now();
+        let balls = ball_query(&cloud, &centers, 0.5, 32);
+        let queried = start.elapsed();
+        let start = Instant::now();
+        let three = three_nearest(&cloud, &centers).index.concat();
+        ([sampled, queried, start.elapsed()], [picks, balls, three])
+    };
+    let times: Vec<[Duration; 3]> = (0..9).map(|_| ours().0).collect();
+    assert!(Command::new(&python).arg(script).arg(folder.path()).status().unwrap().success(), "{python} {script}");
+    for (i, name) in ["sampling", "ball query", "three nearest"].into_iter().enumerate() {
+        let mut sorted: Vec<Duration> = times.iter().map(|t| t[i]).collect();
+        sorted.sort();
+        let bytes = std::fs::read(folder.path().join(format!("{i}.i64"))).unwrap();
+        let theirs = bytes.as_chunks::<8>().0.iter().map(|b| i64::from_le_bytes(*b));
+        let mine = &ours().1[i];
+        let equal = theirs.zip(mine).filter(|(a, b)| *a == i64::from(**b)).count();
+        println!("{name}: here {:.2} ms, {equal} of {} indices equal", sorted[4].as_secs_f64() * 1e3, mine.len());
+    }
+}
+
+criterion_group!(benches, point_operations, beside_torch);
 criterion_main!(benches);
