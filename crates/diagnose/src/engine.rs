@@ -2,12 +2,14 @@
 
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
 use crate::error::DiagnoseError;
+use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
-use crate::pairing::{check_identity, common_ids, find_sensors, pair_all};
+use crate::pairing::{Ray, check_identity, common_ids, find_sensors, pair_all};
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
+use geometry::Box3;
 
 /// What to look at.
 #[derive(Clone, Debug, Default)]
@@ -30,6 +32,15 @@ pub enum Stage {
 /// Told what is being done, how much of it is finished and how much there is.
 pub type Progress<'a> = &'a (dyn Fn(Stage, usize, usize) + Sync);
 
+/// A diagnosis with what follows from it.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// What is said.
+    pub diagnosis: Diagnosis,
+    /// Boxes of the measured labels moved to where they belong, by frame id; empty where the labels are not at fault.
+    pub corrected: Vec<(String, Vec<Box3>)>,
+}
+
 /// Diagnoses a pair of data sets.
 pub fn diagnose(
     measured: &Dataset,
@@ -37,7 +48,7 @@ pub fn diagnose(
     rig: &SensorRig,
     options: &Options,
     progress: Progress,
-) -> Result<Diagnosis, DiagnoseError> {
+) -> Result<Outcome, DiagnoseError> {
     let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
     progress(Stage::Comparing, 0, 2);
     let sensors = find_sensors(measured, simulated, &ids, rig)?;
@@ -51,20 +62,22 @@ pub fn diagnose(
     progress(Stage::Comparing, 2, 2);
     if !identity.identical {
         notes.insert(0, identity.reason);
-        return Ok(refused(notes));
+        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![] });
     }
     for id in &identity.strangers {
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let (frames, more) = pair_all(measured, simulated, &ids, &sensors, &|done| progress(Stage::Pairing, done, ids.len()))?;
+    let (frames, more) =
+        pair_all(measured, simulated, &ids, &sensors, None, &|done| progress(Stage::Pairing, done, ids.len()))?;
     notes.extend(more);
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
             frames.len()
         ));
-        return Ok(Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) });
+        let diagnosis = Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) };
+        return Ok(Outcome { diagnosis, corrected: vec![] });
     }
     let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
@@ -72,20 +85,64 @@ pub fn diagnose(
     if times.is_none() {
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
-    let context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
-    let searches = 5;
+    let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
+    let searches = 7;
     let mut results: Vec<ChannelResult> = Vec::new();
     progress(Stage::Weighing, 0, searches);
-    results.push(search::noise::search(&context, &[]));
+    let (geometry, displaced) = search::geometry::search(&context);
+    results.push(geometry);
     progress(Stage::Weighing, 1, searches);
-    results.push(search::hits::search(&context));
+    let (rounding, added) = search::quantisation::search(&context);
+    let known: Vec<_> = added.map(|v| (NoiseLaw::Constant, v)).into_iter().collect();
+    results.push(rounding);
     progress(Stage::Weighing, 2, searches);
-    results.push(search::labels::search(&context, Side::Labels));
-    results.push(search::labels::search(&context, Side::Objects));
+    let (hidden, mask) = search::mask::search(&context);
+    results.push(hidden);
+    results.push(search::hits::search(&context, &mask, displaced.moves()));
+    progress(Stage::Weighing, 3, searches);
+    results.push(search::labels::search(&context, Side::Labels, &displaced));
+    results.push(search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, 4, searches);
-    results.push(search::geometry::search(&context));
+    results.push(search::returns::search(&context));
+    progress(Stage::Weighing, 5, searches);
+    // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
+    let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
+    let mended = match &displaced.groups {
+        Some(_) => {
+            let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
+            let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
+            Some(pair_all(measured, simulated, &used, &sensors, Some(&off), &|_| ())?.0)
+        }
+        None => None,
+    };
+    if let Some(mended) = &mended {
+        context.frames = mended;
+    }
+    let least_cos = if mended.is_some() { 0.12 } else { 0.0 };
+    results.push(search::noise::search(&context, &known, least_cos));
+    context.frames = &frames;
     progress(Stage::Weighing, searches, searches);
-    Ok(write_up(&context, results, notes))
+    let corrected = corrected(&context, &results);
+    Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected })
+}
+
+/// Measured boxes after all repairs; nothing where there is none.
+fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
+    let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
+    if repairs.is_empty() {
+        return vec![];
+    }
+    let boxes = |(f, frame): (usize, &crate::pairing::FramePair)| {
+        let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
+            let mut b = o.measured?;
+            for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {
+                (0..3).for_each(|axis| b.center[axis] += r.shift_m[axis]);
+            }
+            Some(b)
+        });
+        (frame.id.clone(), moved.collect())
+    };
+    context.frames.iter().enumerate().map(boxes).collect()
 }
 
 /// A diagnosis that says nothing but its notes.
@@ -107,7 +164,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
     let hold_out = context.of(Role::HoldOut);
     let blocks = context.blocks(&hold_out);
     let returns = context.returns(&hold_out).max(1.0);
-    let mut findings = Vec::new();
+    let mut findings: Vec<Finding> = Vec::new();
     let mut considered = Vec::new();
     let mut minimum_detectable = std::collections::BTreeMap::new();
     let mut distance = vec![[0.0; 3]; hold_out.len()];
@@ -119,6 +176,17 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
         }
         for f in result.found {
             let named = f.status == Status::Named;
+            let gain = mean_interval(&f.held_out_gains, &blocks, returns);
+            // One cause seen in two channels is one finding.
+            let same = findings.iter_mut().find(|g: &&mut Finding| named && g.cause.as_deref() == f.causes.first().map(String::as_str));
+            if let Some(same) = same {
+                same.gain.nats_per_ray += gain.nats_per_ray;
+                (0..2).for_each(|k| same.gain.ci95[k] += gain.ci95[k]);
+                for (name, p) in f.parameters {
+                    same.parameters.entry(name).or_insert(p);
+                }
+                continue;
+            }
             findings.push(Finding {
                 status: f.status,
                 cause: named.then(|| f.causes[0].clone()),
@@ -128,7 +196,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
                 confidence: f.confidence,
                 channel: f.channel.into(),
                 covariate: f.covariate,
-                gain: mean_interval(&f.held_out_gains, &blocks, returns),
+                gain,
                 says: f.says,
                 separate_by: f.separate_by,
                 curve: f.curve,

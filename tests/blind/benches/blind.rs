@@ -85,7 +85,7 @@ fn run(seed: u64, arguments: &Arguments, folder: &Path) -> (Outcome, serde_json:
     let rig = SensorRig::read(&folder.join("sensor.toml")).expect("a rig");
     let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
     let value = match found {
-        Ok(d) => serde_json::to_value(&d).expect("JSON"),
+        Ok(o) => serde_json::to_value(&o.diagnosis).expect("JSON"),
         Err(e) => serde_json::json!({ "verdict": format!("error: {e}") }),
     };
     (score(&truth, &value, begin.elapsed().as_secs_f64()), value)
@@ -105,6 +105,10 @@ fn main() {
             let (outcome, value) = run(seed, &arguments, &place);
             if arguments.show {
                 let mut short = value.clone();
+                let dull = |c: &serde_json::Value| c["z"].as_f64().is_none_or(|z| z < 2.0);
+                if let Some(list) = short["considered"].as_array_mut() {
+                    list.retain(|c| !dull(c));
+                }
                 for f in short["findings"].as_array_mut().into_iter().flatten() {
                     f.as_object_mut().map(|f| f.remove("curve"));
                 }

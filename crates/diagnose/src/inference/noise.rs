@@ -84,9 +84,10 @@ const FEWEST: f64 = 40.0;
 const SHARED: f64 = 2.0;
 
 impl NoiseTable {
-    /// From the sums over some frames.
-    pub fn new(cells: Vec<RoughCell>) -> Self {
-        let used = cells.iter().map(|c| c.measured.n >= FEWEST && c.simulated.n >= FEWEST).collect();
+    /// From the sums over some frames; cells met at less than `least_cos` are left out.
+    pub fn new(cells: Vec<RoughCell>, least_cos: f64) -> Self {
+        let enough = |c: &RoughCell| c.measured.n >= FEWEST && c.simulated.n >= FEWEST && c.simulated.mean().1 > least_cos;
+        let used = cells.iter().map(enough).collect();
         NoiseTable { cells, used }
     }
 

@@ -1,6 +1,7 @@
 //! Labels and objects: do measured labels stand where the measured returns are, and do the objects stand where the simulation has them?
 
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
+use super::geometry::Displacement;
+use super::{ChannelResult, Context, Found, Repair, Z_STAR, confidence, first_demands, parameter, record};
 use crate::channels::labels::{ObjectShift, object_shifts};
 use crate::channels::mean::origins;
 use crate::channels::motion::{OwnMotion, own_motion};
@@ -74,6 +75,8 @@ const FLOOR_S: f64 = 0.001;
 /// One object's shift with its covariates.
 struct Row {
     frame: usize,
+    object: usize,
+    yaw_rad: f64,
     shift: [f64; 3],
     variance: [f64; 3],
     x: [[f64; 8]; 3],
@@ -81,11 +84,11 @@ struct Row {
     known: [bool; 8],
 }
 
-/// The search on one side.
-pub fn search(context: &Context, side: Side) -> ChannelResult {
+/// The search on one side; `displaced` tells how far things are shown from where they are for reasons of the geometry.
+pub fn search(context: &Context, side: Side, displaced: &Displacement) -> ChannelResult {
     let motion = context.times.as_ref().map(|t| own_motion(context.frames, t, &origins(context.rig)));
     let shifts = object_shifts(context.frames, context.times.as_deref());
-    let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref())).collect();
+    let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref(), displaced)).collect();
     let mut result = ChannelResult::default();
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let channel = if side == Side::Labels { "labels" } else { "objects" };
@@ -131,7 +134,7 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
         };
         result.minimum.push(least("label_offset", "forward_m", (Z_STAR * error(0)).max(floor), "m"));
         if let Some(k) = [4, 3].into_iter().find(|&k| usable[k]) {
-            result.minimum.push(least("time_offset", "dt_s", (Z_STAR * error(k)).max(FLOOR_S), "s"));
+            result.minimum.push(least("time_offset", "offset_s", (Z_STAR * error(k)).max(FLOOR_S), "s"));
         }
     }
     let Some(first) = choice else {
@@ -167,7 +170,21 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
         result.found.push(found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
     }
     result.distance = hold_out.iter().map(|&f| distance(&rows, f, Some(&fitted))).collect();
+    let of_labels = |k: &usize| matches!(CANDIDATES[*k].0, "label_offset" | "time_offset");
+    if chosen.iter().all(of_labels) {
+        result.repairs = rows.iter().map(|r| repair(r, &fitted, side)).collect();
+    }
     result
+}
+
+/// How a measured label is to be moved so that it stands on its returns.
+fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
+    let told = [0, 1, 2].map(|axis: usize| fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
+    // Labels that are off go back; objects that stand elsewhere take their labels along.
+    let sign = if side == Side::Labels { -1.0 } else { 1.0 };
+    let (s, c) = r.yaw_rad.sin_cos();
+    let shift = Vector3::new(told[0] * c - told[1] * s, told[0] * s + told[1] * c, told[2]) * sign;
+    Repair { frame: r.frame, object: r.object, shift_m: shift.into() }
 }
 
 fn equals(trials: &[Trial], which: &[usize]) -> Vec<String> {
@@ -177,24 +194,40 @@ fn equals(trials: &[Trial], which: &[usize]) -> Vec<String> {
     names
 }
 
-fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<OwnMotion>]>) -> Option<Row> {
-    let (shift, variance) = match side {
+fn row(
+    context: &Context,
+    s: &ObjectShift,
+    side: Side,
+    motion: Option<&[Option<OwnMotion>]>,
+    displaced: &Displacement,
+) -> Option<Row> {
+    let (mut shift, variance) = match side {
         Side::Labels => (s.label_m, [1.0; 3]),
         Side::Objects => {
             let (shift, error) = s.cloud_m?;
             (shift, error.map(|e| e * e))
         }
     };
-    if shift.iter().any(|v| v.abs() > 3.0) {
-        return None;
-    }
-    let object = context.frames[s.frame].objects.iter().filter_map(|o| o.simulated).min_by(|a, b| {
-        let d = |b: &geometry::Box3| (b.center[1].atan2(b.center[0]) - s.azimuth_rad).abs() + (b.center[0].hypot(b.center[1]) - s.distance_m).abs();
-        d(a).total_cmp(&d(b))
-    })?;
+    let object = context.frames[s.frame].objects[s.object].simulated?;
     let (sin, cos) = object.yaw_rad.sin_cos();
     let axes = |v: Vector3<f64>| [v.x * cos + v.y * sin, -v.x * sin + v.y * cos, v.z];
     let center = Vector3::from(object.center);
+    let nearest = (0..context.rig.sensors.len()).min_by(|&a, &b| {
+        let off = |k: usize| {
+            let mount = &context.rig.sensors[k];
+            crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()).abs() / mount.half_fov_rad()
+        };
+        off(a).total_cmp(&off(b))
+    });
+    let sensor = nearest.unwrap_or(0);
+    if side == Side::Objects {
+        let origin = origins(context.rig)[sensor];
+        let known = axes(displaced.of_point(&center, sensor, &origin));
+        (0..3).for_each(|k| shift[k] -= known[k]);
+    }
+    if shift.iter().any(|v| v.abs() > 3.0) {
+        return None;
+    }
     let mut x = [[0.0; 8]; 3];
     let mut known = [true; 8];
     for (k, x) in x.iter_mut().enumerate() {
@@ -204,8 +237,8 @@ fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<O
     match s.seen_velocity_m_s {
         Some(seen) => {
             (0..3).for_each(|k| x[k][3] = seen[k]);
-            let phase = context.rig.sensors.iter().map(|m| (crate::rig::wrapped(s.azimuth_rad - m.yaw_deg.to_radians()), m));
-            let phase = phase.min_by(|a, b| a.0.abs().total_cmp(&b.0.abs())).map_or(0.0, |(az, m)| az / (2.0 * m.half_fov_rad()));
+            let mount = &context.rig.sensors[sensor];
+            let phase = crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()) / (2.0 * mount.half_fov_rad());
             (0..3).for_each(|k| x[k][7] = seen[k] * phase);
             match motion.and_then(|m| m[s.frame]) {
                 Some(own) => {
@@ -223,7 +256,7 @@ fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<O
     let towards = axes(-center / center.norm().max(1e-6));
     x[0][5] = towards[0];
     x[1][6] = towards[1];
-    Some(Row { frame: s.frame, shift, variance, x, speed, known })
+    Some(Row { frame: s.frame, object: s.object, yaw_rad: object.yaw_rad, shift, variance, x, speed, known })
 }
 
 /// Variances from what a fit of all columns leaves: robust, an axis at a time.
@@ -310,7 +343,7 @@ fn found(
             Cause::Left => parameters.push(parameter("left_m", sign * theta, error, "m")),
             Cause::Up if name == "wrong_shape" => parameters.push(parameter("higher_m", theta, error, "m")),
             Cause::Up => parameters.push(parameter("up_m", sign * theta, error, "m")),
-            Cause::SeenVelocity | Cause::Velocity => parameters.push(parameter("dt_s", sign * theta, error.hypot(0.02 * theta), "s")),
+            Cause::SeenVelocity | Cause::Velocity => parameters.push(parameter("offset_s", -sign * theta, error.hypot(0.02 * theta), "s")),
             Cause::Longer => parameters.push(parameter("longer_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Wider => parameters.push(parameter("wider_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Swept => parameters.push(parameter("scan_s", -theta, error.hypot(0.05 * theta), "s")),

@@ -3,7 +3,10 @@
 pub mod geometry;
 pub mod hits;
 pub mod labels;
+pub mod mask;
 pub mod noise;
+pub mod quantisation;
+pub mod returns;
 
 use crate::diagnosis::{Considered, Curve, FindingGain, Minimum, Parameter, Status};
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
@@ -79,6 +82,19 @@ pub struct ChannelResult {
     pub minimum: Vec<(String, Minimum)>,
     /// Distance on held-out frames, nats, frame by frame: before, after, and what an independent draw would have.
     pub distance: Vec<[f64; 3]>,
+    /// How measured labels are to be moved.
+    pub repairs: Vec<Repair>,
+}
+
+/// How a measured label is to be moved.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Repair {
+    /// Number of the frame.
+    pub frame: usize,
+    /// Number of the object in the frame.
+    pub object: usize,
+    /// By how much, in the cloud's frame, m.
+    pub shift_m: [f64; 3],
 }
 
 /// Mean gain over its standard error that a finding must have: no null of the blind set came near.

@@ -1,15 +1,20 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
-use crate::channels::groups::{GroupFrame, GroupSums, Grouping, group_frames, place_of, total};
+mod words;
+
+use super::{ChannelResult, Context, Z_STAR, confidence, first_demands, record};
+use crate::channels::groups::{GroupFrame, Grouping, elevation_lever, group_frames, group_of, total};
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
-use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
+use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
-use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
+use crate::inference::grouped::{self, GroupFit};
+use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
-use nalgebra::{SVector, Vector3};
+use crate::pairing::Ray;
+use crate::rig::SensorRig;
+use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -37,8 +42,70 @@ struct Sums {
     strips: Vec<GroupFrame>,
 }
 
-/// The search.
-pub fn search(context: &Context) -> ChannelResult {
+/// What was found of the geometry, to be taken out before other channels are looked at.
+#[derive(Clone, Debug, Default)]
+pub struct Displacement {
+    /// The scene's turn and shift in the cloud's frame, rad and m.
+    pub scene: SVector<f64, 6>,
+    /// The same for what single sensors see, about their origins.
+    pub sensors: Vec<SVector<f64, 6>>,
+    /// Offset of range, m, and share of it.
+    pub bias: [f64; 2],
+    /// Offsets of groups of rays: which, of range or elevation, by group.
+    pub groups: Option<(Grouping, usize, BTreeMap<u32, f64>)>,
+}
+
+impl Displacement {
+    /// Whether the scene as a whole is turned or moved.
+    pub fn moves(&self) -> bool {
+        self.scene.norm() > 0.0 || self.sensors.iter().any(|s| s.norm() > 0.0)
+    }
+
+    /// How far a thing at `point` seen by a sensor is shown from where it is, m.
+    pub fn of_point(&self, point: &Vector3<f64>, sensor: usize, origin: &Point3<f64>) -> Vector3<f64> {
+        let turned = |p: &SVector<f64, 6>, about: Vector3<f64>| {
+            Vector3::new(p[0], p[1], p[2]).cross(&(point - about)) + Vector3::new(p[3], p[4], p[5])
+        };
+        let to = point - origin.coords;
+        let own = self.sensors.get(sensor).map_or_else(Vector3::zeros, |p| turned(p, origin.coords));
+        turned(&self.scene, Vector3::zeros()) + own + to.normalize() * (self.bias[0] + self.bias[1] * to.norm())
+    }
+
+    /// What is to be taken off the range of a measured ray of a row or strip that measures or aims wrongly, m.
+    pub fn of_range(&self, ray: &Ray, turn: &UnitQuaternion<f64>) -> f64 {
+        let Some((grouping, column, offsets)) = &self.groups else { return 0.0 };
+        let Some(offset) = group_of(ray, *grouping).and_then(|g| offsets.get(&(g as u32))) else { return 0.0 };
+        if *column == 0 {
+            *offset
+        } else {
+            -offset * elevation_lever(ray, turn) / f64::from(ray.cos_incidence.max(0.01))
+        }
+    }
+}
+
+fn displacement(rig: &SensorRig, sums: &Sums, select: &[usize], blocks: &[usize], chosen: &[Suspect]) -> Displacement {
+    let mut out = Displacement { sensors: vec![SVector::zeros(); rig.sensors.len()], ..Displacement::default() };
+    let (columns, groups) = split(chosen);
+    let fitted = fit_all(sums, select, blocks, chosen);
+    for (c, theta) in fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c)) {
+        match sums.columns[*c] {
+            Column::Pose(k) => out.scene[k] += theta,
+            Column::SensorPose(s, k) => out.sensors[s][k] += theta,
+            Column::RangeOffset => out.bias[0] = *theta,
+            Column::RangeScale => out.bias[1] = *theta,
+            Column::Sweep(_) | Column::Structure(_) => {}
+        }
+    }
+    if let Some((grouping, column)) = groups.first() {
+        let frames = groups_of(sums, *grouping);
+        let offsets = grouped::offsets(&total(select.iter().map(|&i| &frames[i])), how(*column));
+        out.groups = Some((*grouping, *column, offsets));
+    }
+    out
+}
+
+/// The search; also what is to be taken out for the others.
+pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
     let sums = sums(context, &select);
@@ -87,7 +154,7 @@ pub fn search(context: &Context) -> ChannelResult {
     for (k, (equals, confidence)) in stories.into_iter().enumerate() {
         let alone = &chosen[k];
         let held: Vec<f64> = hold_out.iter().map(|&f| told(&sums, &estimate, &estimate_blocks, alone, &chosen, f)).collect();
-        result.found.push(found(context, &sums, &estimate, &estimate_blocks, alone, &chosen, equals, confidence, held));
+        result.found.push(words::found(context, &sums, &estimate, &estimate_blocks, alone, &chosen, equals, confidence, held));
     }
     for (i, &f) in hold_out.iter().enumerate() {
         let gain: f64 = chosen.iter().map(|s| told(&sums, &estimate, &estimate_blocks, s, &chosen, f)).sum();
@@ -95,7 +162,8 @@ pub fn search(context: &Context) -> ChannelResult {
         // What the best fit of this very frame explains stands for what could be told at all.
         result.distance[i] = [best, (best - gain).max(0.0), 0.5 * sums.columns.len() as f64];
     }
-    result
+    let out = displacement(context.rig, &sums, &select, &blocks, &chosen);
+    (result, out)
 }
 
 impl Suspect {
@@ -244,69 +312,31 @@ fn gains(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) 
         (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
     }
     for (grouping, column) in groups {
-        let frames = grouped(sums, grouping);
-        let folds = fold_of(blocks);
-        for fold in 0..FOLDS {
-            let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]);
-            let offsets = offsets(&total(train), column);
-            for i in (0..select.len()).filter(|&i| folds[i] == fold) {
-                out[i] += group_gain(&frames[select[i]], column, &offsets);
-            }
-        }
+        let more = grouped::cross_gains(groups_of(sums, grouping), select, blocks, how(column));
+        out.iter_mut().zip(more).for_each(|(o, g)| *o += g);
     }
     out
 }
 
-fn grouped(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
+fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
     if grouping == Grouping::Row { &sums.rows } else { &sums.strips }
 }
 
 /// Prior spread of offsets: 10 cm, 0.3 degrees.
-fn group_precision(column: usize) -> f64 {
-    [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column]
+fn how(column: usize) -> GroupFit {
+    GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true }
 }
 
-/// Offset of each group; what all have in common belongs to other causes.
-fn offsets(sums: &BTreeMap<u32, GroupSums>, column: usize) -> BTreeMap<u32, f64> {
-    let precision = group_precision(column);
-    let mut out: BTreeMap<u32, f64> = sums.iter().map(|(k, s)| (*k, s.offset(column, precision))).collect();
-    let (mut sum, mut weight) = (0.0, 0.0);
-    for (k, s) in sums {
-        let w = s.gram[2 * column].min(1e4 * precision);
-        sum += w * out[k];
-        weight += w;
-    }
-    let mean = if weight > 0.0 { sum / weight } else { 0.0 };
-    out.values_mut().for_each(|v| *v -= mean);
-    out
-}
 
-fn group_gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> f64 {
-    frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
-}
 
-/// Root mean square of the offsets beyond what their errors make.
-fn spread(sums: &BTreeMap<u32, GroupSums>, column: usize) -> (f64, f64) {
-    let offsets = offsets(sums, column);
-    let (mut square, mut noise, mut n) = (0.0, 0.0, 0.0);
-    for (k, s) in sums {
-        let g = s.gram[2 * column];
-        if g > 3.0 * group_precision(column) {
-            square += offsets[k].powi(2);
-            noise += 1.0 / g;
-            n += 1.0;
-        }
-    }
-    if n < 4.0 { (0.0, 0.0) } else { (((square - noise) / n).max(0.0).sqrt(), n) }
-}
 
 fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
     let Some(last) = suspects.last() else { return false };
     match last {
         Suspect::Groups { grouping, column, .. } => {
-            let frames = grouped(sums, *grouping);
+            let frames = groups_of(sums, *grouping);
             let floor = FLOOR_GROUPS[if *grouping == Grouping::Row { *column } else { 2 }];
-            spread(&total(select.iter().map(|&i| &frames[i])), *column).0 > floor
+            grouped::spread(&total(select.iter().map(|&i| &frames[i])), how(*column)).0 > floor
         }
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, select, blocks, suspects);
@@ -346,9 +376,9 @@ fn told(sums: &Sums, estimate: &[usize], blocks: &[usize], suspect: &Suspect, ch
             fitted.gain(&sums.linear[frame]) - without.gain(&sums.linear[frame])
         }
         Suspect::Groups { grouping, column, .. } => {
-            let frames = grouped(sums, *grouping);
-            let offsets = offsets(&total(estimate.iter().map(|&i| &frames[i])), *column);
-            group_gain(&frames[frame], *column, &offsets)
+            let frames = groups_of(sums, *grouping);
+            let offsets = grouped::offsets(&total(estimate.iter().map(|&i| &frames[i])), how(*column));
+            grouped::gain(&frames[frame], *column, &offsets)
         }
     }
 }
@@ -359,8 +389,8 @@ fn best_gain(sums: &Sums, frame: usize) -> f64 {
     let all: Vec<usize> = (0..sums.columns.len()).collect();
     let linear = fit(&alone, &[0], &all, &sums.precision).gain(alone[0]).max(0.0);
     let groups = [(Grouping::Row, 0), (Grouping::Row, 1), (Grouping::Azimuth, 0)].map(|(g, c)| {
-        let frames = grouped(sums, g);
-        group_gain(&frames[frame], c, &offsets(&total([&frames[frame]].into_iter()), c)).max(0.0)
+        let frames = groups_of(sums, g);
+        grouped::gain(&frames[frame], c, &grouped::offsets(&total([&frames[frame]].into_iter()), how(c))).max(0.0)
     });
     linear + groups.into_iter().fold(0.0, f64::max)
 }
@@ -389,176 +419,3 @@ fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Mini
     all
 }
 
-#[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
-fn found(
-    context: &Context,
-    sums: &Sums,
-    estimate: &[usize],
-    blocks: &[usize],
-    suspect: &Suspect,
-    chosen: &[Suspect],
-    equals: Vec<String>,
-    confidence: f64,
-    held_out_gains: Vec<f64>,
-) -> Found {
-    let mut parameters: Vec<(String, Parameter)> = Vec::new();
-    let name = suspect.name();
-    let (covariate, says, curve) = match suspect {
-        Suspect::Linear { columns, .. } => {
-            let fitted = fit_all(sums, estimate, blocks, chosen);
-            linear_parameters(context, sums, &fitted, columns, name, &mut parameters);
-            let list: Vec<String> = parameters.iter().map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
-            let what = match name {
-                "range_bias" => "all ranges are measured longer (shorter where negative) than they are",
-                "pitch_roll" => "the whole scene is tilted: the car leans otherwise than the simulation believes",
-                "rolling_shutter" => "the scene shears over a scan: points of a moving car are put where the car is at one moment",
-                _ => "one sensor sees the scene displaced: it is mounted otherwise than believed",
-            };
-            let covariate = match name {
-                "range_bias" => "cos_incidence",
-                "rolling_shutter" => "scan_phase",
-                "pitch_roll" => "range_m",
-                _ => "sensor",
-            };
-            (covariate.to_owned(), format!("{what}: {}", list.join(", ")), Curve::default())
-        }
-        Suspect::Groups { grouping, column, .. } => {
-            let frames = grouped(sums, *grouping);
-            let all = total(estimate.iter().map(|&i| &frames[i]));
-            let (std, n) = spread(&all, *column);
-            let error = std / (2.0 * n.max(1.0)).sqrt();
-            let unit = if *column == 0 { (1.0, "m") } else { (1f64.to_degrees(), "deg") };
-            if name != UNNAMED {
-                let label = if *column == 0 { "std_m" } else { "std_deg" };
-                parameters.push(parameter(label, std * unit.0, (error.hypot(0.05 * std)) * unit.0, unit.1));
-            }
-            let offsets = offsets(&all, *column);
-            if name != UNNAMED {
-                for (k, v) in &offsets {
-                    let (sensor, row) = place_of(*k as usize, *grouping);
-                    let e = 1.0 / (all[k].gram[2 * column] + group_precision(*column)).sqrt();
-                    let label = format!("{}/{}", context.rig.sensors[sensor].name, row as usize);
-                    parameters.push(parameter(&label, v * unit.0, e * unit.0, unit.1));
-                }
-            }
-            let curve = group_curve(&all, &offsets, *grouping, *column, unit.0);
-            match (grouping, column) {
-                (Grouping::Row, 0) => ("row".to_owned(), format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0), curve),
-                (Grouping::Row, _) => ("row".into(), format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * unit.0), curve),
-                _ => ("azimuth".into(), format!("ranges are off by {:.1} cm in a way that depends on the azimuth; no cause of the catalogue does that", std * 100.0), curve),
-            }
-        }
-    };
-    let status = match (name, equals.is_empty()) {
-        (UNNAMED, _) => Status::Unexplained,
-        (_, true) => Status::Named,
-        _ => Status::Ambiguous,
-    };
-    let mut causes: Vec<String> = std::iter::once(name.to_owned()).chain(equals.into_iter().filter(|e| e != UNNAMED)).collect();
-    let status = if status == Status::Ambiguous && causes.len() == 1 { Status::Named } else { status };
-    if name == UNNAMED {
-        causes.clear();
-    }
-    let separate_by = (status == Status::Ambiguous)
-        .then(|| "surfaces on all sides at many ranges, and a second sensor that sees the same ones".to_owned());
-    let family = match name {
-        "range_bias" | "beam_range_offset" => "range_error",
-        "rolling_shutter" => "timing",
-        UNNAMED => "unknown",
-        _ => "geometry",
-    };
-    Found {
-        status,
-        causes,
-        family,
-        parameters,
-        confidence,
-        channel: "residuals",
-        covariate,
-        held_out_gains,
-        says,
-        separate_by,
-        curve,
-    }
-}
-
-fn linear_parameters(
-    context: &Context,
-    sums: &Sums,
-    fitted: &LinearFit,
-    columns: &[usize],
-    name: &str,
-    parameters: &mut Vec<(String, Parameter)>,
-) {
-    let value = |c: usize| {
-        let i = fitted.columns.iter().position(|x| *x == c)?;
-        Some((fitted.theta[i], fitted.error(i)))
-    };
-    let deg = f64::to_degrees;
-    let shift_names = ["x_m", "y_m", "z_m"];
-    let mut turn = Vector3::zeros();
-    let mut turn_error = Vector3::zeros();
-    let mut sensor = None;
-    for &c in columns {
-        let Some((theta, error)) = value(c) else { continue };
-        match sums.columns[c] {
-            Column::RangeOffset => parameters.push(parameter("offset_m", theta, error.hypot(0.003), "m")),
-            Column::RangeScale => parameters.push(parameter("scale", theta, error.hypot(1e-4), "1")),
-            Column::Sweep(k) => {
-                let (label, unit) = [("shear_x_m", "m"), ("shear_y_m", "m"), ("shear_yaw_deg", "deg")][k];
-                let by = if k == 2 { deg(1.0) } else { 1.0 };
-                parameters.push(parameter(label, by * theta, by * error, unit));
-            }
-            // The scene turns and moves against the car: the car leans the other way.
-            Column::Pose(k) | Column::SensorPose(_, k) => {
-                if let Column::SensorPose(s, _) = sums.columns[c] {
-                    sensor = Some(s);
-                }
-                if k < 3 {
-                    (turn[k], turn_error[k]) = (-theta, error);
-                } else {
-                    parameters.push(parameter(shift_names[k - 3], -theta, error.hypot(0.003), "m"));
-                }
-            }
-            Column::Structure(_) => {}
-        }
-    }
-    if turn == Vector3::zeros() {
-        return;
-    }
-    let mut own = [turn.x, turn.y, turn.z];
-    let mut own_error = [turn_error.x, turn_error.y, turn_error.z];
-    if name == "sensor_extrinsics" {
-        let s = sensor.unwrap_or(0);
-        parameters.push(("sensor".into(), Parameter { estimate: s as f64, unit: "number".into(), ci95: [s as f64; 2] }));
-        // About the sensor's own axes, as the rig's file has them.
-        let turn_of = context.rig.sensors[s].pose().rotation;
-        let t = turn_of.inverse_transform_vector(&turn);
-        let matrix = turn_of.inverse().to_rotation_matrix();
-        let e = Vector3::from_fn(|i, _| (0..3).map(|j| (matrix[(i, j)] * turn_error[j]).powi(2)).sum::<f64>().sqrt());
-        (own, own_error) = ([t.x, t.y, t.z], [e.x, e.y, e.z]);
-    }
-    for (k, label) in ["roll_deg", "pitch_deg", "yaw_deg"].into_iter().enumerate() {
-        if own[k] != 0.0 && (own[k].abs() > 1e-9) {
-            parameters.push(parameter(label, deg(own[k]), deg(own_error[k]).hypot(0.002).hypot(0.02 * deg(own[k])), "deg"));
-        }
-    }
-}
-
-fn group_curve(
-    sums: &BTreeMap<u32, GroupSums>,
-    offsets: &BTreeMap<u32, f64>,
-    grouping: Grouping,
-    column: usize,
-    unit: f64,
-) -> Curve {
-    let points = offsets.iter().map(|(k, v)| {
-        let (sensor, place) = place_of(*k as usize, grouping);
-        let x = if grouping == Grouping::Row { place + 1000.0 * sensor as f64 } else { place.to_degrees() + 1000.0 * sensor as f64 };
-        let error = 1.0 / (sums[k].gram[2 * column] + group_precision(column)).sqrt();
-        CurvePoint { x, measured: v * unit, before: 0.0, after: v * unit, error: error * unit }
-    });
-    let x = if grouping == Grouping::Row { "row (1000 a sensor)" } else { "azimuth, degrees (1000 a sensor)" };
-    let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
-    Curve { x: x.into(), y: y.into(), points: points.collect() }
-}

@@ -1,0 +1,99 @@
+//! Offsets of groups, one number each, shrunk by a prior; weighed on frames that they were not fitted on.
+
+use super::linear::{FOLDS, fold_of};
+use crate::channels::groups::{GroupFrame, GroupSums, total};
+use std::collections::BTreeMap;
+
+/// How offsets of groups are fitted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroupFit {
+    /// Which of the two columns of the sums.
+    pub column: usize,
+    /// Prior precision of an offset.
+    pub precision: f64,
+    /// Whether what all groups have in common is taken out: it belongs to other causes.
+    pub centred: bool,
+}
+
+/// Offset of each group.
+pub fn offsets(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, f64> {
+    let mut out: BTreeMap<u32, f64> = sums.iter().map(|(k, s)| (*k, s.offset(how.column, how.precision))).collect();
+    if how.centred {
+        let (mut sum, mut weight) = (0.0, 0.0);
+        for (k, s) in sums {
+            let w = s.gram[2 * how.column].min(1e4 * how.precision);
+            sum += w * out[k];
+            weight += w;
+        }
+        let mean = if weight > 0.0 { sum / weight } else { 0.0 };
+        out.values_mut().for_each(|v| *v -= mean);
+    }
+    out
+}
+
+/// Gain of a frame by offsets, nats.
+pub fn gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> f64 {
+    frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
+}
+
+/// Gains of frames by offsets that were fitted on other folds.
+pub fn cross_gains(frames: &[GroupFrame], select: &[usize], blocks: &[usize], how: GroupFit) -> Vec<f64> {
+    let folds = fold_of(blocks);
+    let mut out = vec![0.0; select.len()];
+    for fold in 0..FOLDS {
+        let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]);
+        let offsets = offsets(&total(train), how);
+        for i in (0..select.len()).filter(|&i| folds[i] == fold) {
+            out[i] = gain(&frames[select[i]], how.column, &offsets);
+        }
+    }
+    out
+}
+
+/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well.
+pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> (f64, f64) {
+    let offsets = offsets(sums, how);
+    let (mut square, mut noise, mut n) = (0.0, 0.0, 0.0);
+    for (k, s) in sums {
+        let g = s.gram[2 * how.column];
+        if g > 3.0 * how.precision {
+            square += offsets[k].powi(2);
+            noise += 1.0 / g;
+            n += 1.0;
+        }
+    }
+    if n < 4.0 { (0.0, 0.0) } else { (((square - noise) / n).max(0.0).sqrt(), n) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand_distr::{Distribution, StandardNormal};
+
+    #[test]
+    fn offsets_and_their_spread_are_found_and_noise_gains_nothing() {
+        let mut rng = data::stream(3, "grouped", 0, 0);
+        let mut made = |size: f64| -> Vec<GroupFrame> {
+            (0..16)
+                .map(|_| {
+                    (0..20u32)
+                        .map(|k| {
+                            let truth = if k % 2 == 0 { size } else { -size };
+                            let noise: f64 = StandardNormal.sample(&mut rng);
+                            let w = 400.0;
+                            let sums = GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.05 * noise), 0.0], n: 1.0 };
+                            (k, sums)
+                        })
+                        .collect()
+                })
+                .collect()
+        };
+        let how = GroupFit { column: 0, precision: 1.0, centred: true };
+        let select: Vec<usize> = (0..16).collect();
+        let frames = made(0.05);
+        assert!(cross_gains(&frames, &select, &select, how).iter().sum::<f64>() > 50.0);
+        assert!((spread(&total(frames.iter()), how).0 - 0.05).abs() < 0.01);
+        let nothing = made(0.0);
+        assert!(cross_gains(&nothing, &select, &select, how).iter().sum::<f64>() < 5.0);
+    }
+}
