@@ -1,11 +1,11 @@
 //! The published PointPillars: its size, its names, and one step on a real scan.
 
 use burn::tensor::Device;
-use data::Dataset;
+use data::{Dataset, stream};
 use lidarshift::detectors::find_detector;
 use lidarshift_tests::shared;
 use models::checkpoint::HostValues;
-use models::config::DetectorConfig;
+use models::config::{DetectorConfig, NetworkConfig};
 use models::{Detector, Preparer, parameter_count};
 use std::collections::BTreeMap;
 
@@ -15,8 +15,9 @@ fn published() -> [(DetectorConfig, usize, &'static str); 2] {
     let mut car = kitti.clone();
     car.classes = vec!["Car".into()];
     car.channels = 3;
-    let models::config::NetworkConfig::PointPillars(net) = &mut car.network;
-    net.anchors.retain(|a| a.class == "Car");
+    if let NetworkConfig::PointPillars(net) = &mut car.network {
+        net.anchors.retain(|a| a.class == "Car");
+    }
     [(kitti, 4_834_888, "kitti"), (car, 4_814_804, "car_xyz")]
 }
 
@@ -42,9 +43,10 @@ fn one_step_on_a_real_scan() {
     let Some(folder) = shared("data/kitti/training") else { return };
     let [(config, ..), _] = published();
     let set = Dataset::open(&folder).unwrap();
-    let sample = Preparer::new(&config).training(&set.load("000007").unwrap()).unwrap();
+    let frame = set.load("000007").unwrap();
+    let sample = Preparer::new(&config).training(&frame, &mut stream(0, "test", 0, 0)).unwrap();
     let detector = Detector::new(&config, 0, &Device::flex().autodiff());
-    let losses = detector.loss(&[sample]);
+    let losses = detector.loss(&[sample]).unwrap();
     let total: f32 = losses.total.clone().into_scalar();
     assert!(total.is_finite() && total > 0.0);
     let gradients = losses.total.backward();

@@ -1,10 +1,14 @@
-//! `cargo xtask bench [NAME]`: the benchmarks that the crates have.
+//! `cargo xtask bench [NAME]`: the benchmarks that the crates have, and a training step of every detector by stage.
 
-use crate::{cargo, tidy::manifests};
+use crate::{cargo, program, tidy::manifests};
 use anyhow::{Result, bail};
+use std::ffi::OsString;
 use std::path::Path;
 
-/// Runs the benchmarks called `name`, those of the crate folder `name`, or all.
+/// Detectors whose training step is timed.
+const DETECTORS: [&str; 2] = ["pointpillars_small", "pointpillars"];
+
+/// Runs the benchmarks called `name`, those of the crate folder `name`, the training steps (`train`), or all.
 pub fn bench(root: &Path, name: Option<&str>, criterion: &[String]) -> Result<()> {
     let mut known = Vec::new();
     let mut ran = false;
@@ -25,8 +29,16 @@ pub fn bench(root: &Path, name: Option<&str>, criterion: &[String]) -> Result<()
             }
         }
     }
+    if name.is_none_or(|name| name == "train") {
+        ran = true;
+        // Each in a process of its own, whose memory is measured.
+        for detector in DETECTORS {
+            program::run(root, &["bench-step", "--detector", detector].map(OsString::from))?;
+        }
+    }
+    known.push("train".into());
     if !ran {
-        bail!("no such benchmark; there are: {}", if known.is_empty() { "none".into() } else { known.join(", ") });
+        bail!("no such benchmark; there are: {}", known.join(", "));
     }
     Ok(())
 }

@@ -1,7 +1,7 @@
 //! `lidarshift detect`: boxes in one cloud, or in a whole split of a data set.
 
 use crate::detectors::find_detector;
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use data::kitti_text::{KittiLine, KittiText, parse_kitti_text};
@@ -11,6 +11,7 @@ use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
 use models::{Detector, Preparer};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
+use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Boxes in a cloud (KITTI text in the cloud's own frame, and a picture), or in a whole split of a data set.
@@ -44,15 +45,22 @@ pub struct DetectArgs {
     /// Also write the boxes of a cloud as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Where the network runs
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Points {
     Xyz,
     Xyzi,
+}
+
+/// The boxes of one cloud, in its frame.
+#[derive(Serialize)]
+struct Found<'a> {
+    schema: &'static str,
+    frame: &'a str,
+    detections: &'a [Detection],
 }
 
 /// A detector with its weights.
@@ -64,7 +72,7 @@ struct Loaded {
 impl Loaded {
     fn detect(&self, frame: &Frame) -> Result<Vec<Detection>> {
         let sample = self.preparer.inference(frame)?;
-        if sample.pillars.num_points.is_empty() {
+        if sample.is_empty() {
             return Ok(Vec::new());
         }
         Ok(self.detector.predict(&[sample])?.remove(0))
@@ -74,7 +82,7 @@ impl Loaded {
 impl DetectArgs {
     /// Finds, prints and draws.
     pub fn run(self) -> Result<()> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let config = detector_of(&self.checkpoint, self.detector.as_deref())?;
         let weights = read_checkpoint(&self.checkpoint)?;
         let detector = Detector::new(&config, 0, &device)
@@ -104,7 +112,8 @@ impl DetectArgs {
             println!("{}", KittiLine::from_box(&detection.class, &detection.bbox, Some(detection.score)));
         }
         if let Some(path) = &self.json {
-            write_atomic(path, &serde_json::to_vec_pretty(&detections)?)?;
+            let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
+            write_atomic(path, &serde_json::to_vec_pretty(&found)?)?;
         }
         let truth = match &self.labels {
             Some(path) => parse_kitti_text(&fs_err::read_to_string(path)?, path, KittiText::Labels)?,

@@ -4,9 +4,13 @@ use anyhow::{Context, Result, bail};
 use models::config::DetectorConfig;
 use std::path::Path;
 
-const BUILT_IN: [(&str, &str); 2] = [
+const BUILT_IN: [(&str, &str); 6] = [
     ("pointpillars", include_str!("../../../configs/detectors/pointpillars.toml")),
     ("pointpillars_small", include_str!("../../../configs/detectors/pointpillars_small.toml")),
+    ("pointrcnn", include_str!("../../../configs/detectors/pointrcnn.toml")),
+    ("pointrcnn_small", include_str!("../../../configs/detectors/pointrcnn_small.toml")),
+    ("pointrcnn_race", include_str!("../../../configs/detectors/pointrcnn_race.toml")),
+    ("pointrcnn_race_small", include_str!("../../../configs/detectors/pointrcnn_race_small.toml")),
 ];
 
 /// The text of a detector's TOML, by its name or its path.

@@ -2,6 +2,66 @@
 
 use anyhow::{Result, bail};
 use burn::tensor::Device;
+use clap::{Args, ValueEnum};
+use kernels::InstructionSet;
+use models::kernel_ops::{Kernels, choose_kernels};
+
+/// Where the network computes, and how.
+#[derive(Args, Clone, Debug)]
+pub struct DeviceArgs {
+    /// Where the network computes: flex (the CPU), ndarray, wgpu or cuda
+    #[arg(long, default_value = "flex")]
+    pub device: String,
+    /// What computes on flex
+    #[arg(long, value_enum, default_value = "auto")]
+    pub kernels: KernelChoice,
+}
+
+/// The forms of the hot operations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum KernelChoice {
+    /// This program's kernels, convolutions by Winograd's F(2x2, 3x3)
+    Auto,
+    /// The same with F(4x4, 3x3): a little faster, a digit less exact
+    F4,
+    /// burn's own operations
+    Burn,
+}
+
+impl Default for DeviceArgs {
+    fn default() -> Self {
+        DeviceArgs { device: "flex".into(), kernels: KernelChoice::Auto }
+    }
+}
+
+impl DeviceArgs {
+    /// The device; the choice of kernels holds for this process from now on.
+    ///
+    /// # Errors
+    /// As [`parse_device`]; an instruction set named in the environment that does not exist.
+    pub fn open(&self) -> Result<Device> {
+        choose_kernels(match self.kernels {
+            KernelChoice::Auto => Kernels::Auto,
+            KernelChoice::F4 => Kernels::AutoF4,
+            KernelChoice::Burn => Kernels::Burn,
+        });
+        InstructionSet::in_use()?;
+        parse_device(&self.device)
+    }
+
+    /// Device and kernels in words.
+    pub fn describe(&self) -> String {
+        match (self.device.as_str(), self.kernels) {
+            ("flex", KernelChoice::Burn) => "flex, burn's operations".into(),
+            ("flex", choice) => {
+                let transform = if choice == KernelChoice::F4 { "F(4x4)" } else { "F(2x2)" };
+                let instructions = InstructionSet::in_use().map_or("best", InstructionSet::name);
+                format!("flex, own kernels, {instructions}, {transform}")
+            }
+            (device, _) => device.into(),
+        }
+    }
+}
 
 /// The device of that name: `flex` (the CPU, the default), `ndarray`, `wgpu` or `cuda`.
 ///

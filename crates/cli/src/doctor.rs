@@ -46,15 +46,19 @@ impl DoctorArgs {
 
 /// What the doctor needs to know of a detector.
 fn facts(detector: &DetectorConfig) -> DetectorFacts {
-    let NetworkConfig::PointPillars(network) = &detector.network;
     // By way of the decimal text, so that an f32 of 3.9 does not print as 3.9000000953674316.
     let number = |v: f32| v.to_string().parse::<f64>().unwrap_or(v.into());
-    let anchors = network.anchors.iter().map(|anchor| AnchorFacts {
+    let anchors = match &detector.network {
+        NetworkConfig::PointPillars(network) => network.anchors.as_slice(),
+        NetworkConfig::PointRcnn(_) => &[], // its boxes begin at points
+    };
+    let anchors = anchors.iter().map(|anchor| AnchorFacts {
         class: anchor.class.clone(),
         size: anchor.size_m.map(number),
         bottom: number(anchor.bottom_m),
     });
-    DetectorFacts { classes: detector.classes.clone(), range: detector.range_m.map(number), anchors: anchors.collect() }
+    let anchors = anchors.collect();
+    DetectorFacts { classes: detector.classes.clone(), range: detector.range_m.map(number), anchors }
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 
 mod targets;
 
+use crate::memory::{peak_mib, reset_peak_mib};
 use anyhow::{Result, bail};
 use clap::Args;
 use data::stream;
@@ -139,19 +140,6 @@ impl Drop for Watch {
     fn drop(&mut self) {
         self.input.store(Watch::OVER, Ordering::Relaxed);
     }
-}
-
-/// Largest resident memory of this process so far, where the system says it.
-fn peak_mib() -> Option<u64> {
-    let status = fs_err::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
-    line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib / 1024)
-}
-
-/// Makes the largest the present one, and says it.
-fn reset_peak_mib() -> Option<u64> {
-    fs_err::write("/proc/self/clear_refs", "5").ok()?;
-    peak_mib()
 }
 
 /// One to four changes: a bit, a byte, a cut, a repeated piece, a swapped piece.

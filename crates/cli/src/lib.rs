@@ -1,12 +1,16 @@
 //! The program `lidarshift`: detectors trained in simulation, measured on the road. A file a command.
 
+pub mod bench_step;
 pub mod detect;
 pub mod detectors;
 pub mod device;
 pub mod doctor;
 pub mod eval_ap;
+pub mod eval_statistics;
 pub mod fuzz;
+pub mod memory;
 pub mod parity;
+pub mod resim;
 pub mod schema;
 pub mod simulate;
 pub mod train;
@@ -33,8 +37,10 @@ enum Command {
     },
     /// Boxes in a cloud, or in a whole split of a data set
     Detect(detect::DetectArgs),
-    /// Make a synthetic data set
+    /// Make synthetic data sets: a race, or streets
     Simulate(simulate::SimulateArgs),
+    /// Make a data set from another one with physical effects on top
+    Resim(resim::ResimArgs),
     /// What is wrong with a data set, in words
     Doctor(doctor::DoctorArgs),
     /// Compare every tensor with a folder of reference numbers
@@ -45,12 +51,17 @@ enum Command {
     /// Feed damaged files to every reader
     #[command(hide = true)]
     Fuzz(fuzz::FuzzArgs),
+    /// Time a training step by stage
+    #[command(hide = true)]
+    BenchStep(bench_step::BenchStepArgs),
 }
 
 #[derive(Subcommand, Debug)]
 enum Eval {
     /// Average precision and recall of detections in KITTI text
     Ap(eval_ap::EvalApArgs),
+    /// Points and boxes of two data sets of the same frames
+    Statistics(eval_statistics::EvalStatisticsArgs),
 }
 
 /// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood.
@@ -58,12 +69,15 @@ pub fn run() -> ExitCode {
     let done = match Program::parse().command {
         Command::Train(args) => args.run().map(|()| true),
         Command::Eval { command: Eval::Ap(args) } => args.run().map(|()| true),
+        Command::Eval { command: Eval::Statistics(args) } => args.run().map(|()| true),
         Command::Detect(args) => args.run().map(|()| true),
         Command::Simulate(args) => args.run().map(|()| true),
+        Command::Resim(args) => args.run().map(|()| true),
         Command::Doctor(args) => args.run(),
         Command::Parity(args) => args.run(),
         Command::Schema(args) => args.run().map(|()| true),
         Command::Fuzz(args) => args.run(),
+        Command::BenchStep(args) => args.run().map(|()| true),
     };
     match done {
         Ok(true) => ExitCode::SUCCESS,

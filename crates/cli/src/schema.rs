@@ -6,7 +6,9 @@ use data::{DatasetConfig, write_atomic};
 use models::config::DetectorConfig;
 use schemars::{JsonSchema, Schema, schema_for};
 use serde_json::{Map, Value, json};
-use simulate::RoadConfig;
+use simulate::effects::EffectList;
+use simulate::race::RaceConfig;
+use simulate::{Rig, RoadConfig};
 use std::fmt::Write;
 use std::path::PathBuf;
 
@@ -37,14 +39,17 @@ impl SchemaArgs {
 }
 
 /// The files that people write: title, where they live, schema.
-fn files() -> [(&'static str, &'static str, Schema); 3] {
+fn files() -> [(&'static str, &'static str, Schema); 6] {
     fn of<T: JsonSchema>() -> Schema {
         schema_for!(T)
     }
     [
         ("detector", "configs/detectors/NAME.toml", of::<DetectorConfig>()),
         ("dataset", "datasets/NAME.toml, or dataset.toml in the data set's folder", of::<DatasetConfig>()),
-        ("road", "the file of `simulate --config`", of::<RoadConfig>()),
+        ("race", "the file of `simulate --config`, with a rig", of::<RaceConfig>()),
+        ("rig", "configs/sensors/NAME.toml", of::<Rig>()),
+        ("effects", "lists of effects, as configs/simulate/measured.toml", of::<EffectList>()),
+        ("road", "the file of `simulate --config`, without a rig", of::<RoadConfig>()),
     ]
 }
 

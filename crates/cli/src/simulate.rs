@@ -1,58 +1,77 @@
-//! `lidarshift simulate`: a synthetic data set on disk.
+//! `lidarshift simulate`: synthetic data sets on disk.
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
+use simulate::race::{ConfigFiles, RaceConfig, RaceManifest, make_race_datasets};
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-/// Make a data set: roads with cars, seen by a spinning LiDAR. The same seed gives the same bytes.
+/// Make data sets: a race on an oval as it stands for the road and as simulators show it, or streets with cars. The same seed gives the
+/// same bytes.
 ///
 /// A run that was stopped goes on where it was when it is started again with the same words.
 ///
 /// Examples:
-///   lidarshift simulate --out datasets/road
-///   lidarshift simulate --frames 100 --seed 7 --out datasets/road-7
+///   lidarshift simulate
+///   lidarshift simulate --config race_small --out datasets/small
+///   lidarshift simulate --config street --frames 100 --seed 7 --out datasets/road-7
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct SimulateArgs {
-    /// Folder for the data set: new, empty, or begun with the same words
-    #[arg(long, value_name = "DIR", default_value = "datasets/road")]
-    out: PathBuf,
-    /// Frames of all splits together, in the proportions of the configuration
+    /// What to make: race, race_small, race_full, street, or a TOML; docs/configuration.md lists the keys
+    #[arg(long, value_name = "CONFIG", default_value = "race")]
+    config: String,
+    /// Folder for the data sets: new, empty, or begun with the same words [default: datasets/NAME]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Frames of each data set
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
     /// Another seed gives other scenes
     #[arg(long, value_name = "K")]
     seed: Option<u64>,
-    /// Numbers of frames, scenes and sensor as TOML; docs/configuration.md lists the keys
-    #[arg(long, value_name = "TOML")]
-    config: Option<PathBuf>,
+    /// Of a race only these data sets, with commas between them
+    #[arg(long, value_name = "NAMES", value_delimiter = ',')]
+    dataset: Vec<String>,
+}
+
+/// What a configuration describes.
+enum Scenery {
+    Street(RoadConfig),
+    Race(Box<(RaceConfig, ConfigFiles)>),
 }
 
 impl SimulateArgs {
-    /// Makes the data set and says what is in it.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    /// Makes the data sets and says what is in them.
     pub fn run(self) -> Result<()> {
-        let config = self.road_config()?;
-        let progress = ProgressBar::new(config.frames.total() as u64)
-            .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
-        let manifest = make_road_dataset(&config, &self.out, &|done, _| progress.set_position(done as u64))?;
-        progress.finish_and_clear();
-        for (split, _) in config.frames.splits() {
-            let counts = manifest.splits[split];
-            let points = counts.points / counts.frames;
-            println!("{split}: {} frames, {} cars, {points} points a frame", counts.frames, counts.cars);
+        match self.scenery()? {
+            Scenery::Street(config) => self.street(&config),
+            Scenery::Race(race) => self.race(&race.0, &race.1),
         }
-        eprintln!("data set in {}", self.out.display());
-        Ok(())
     }
 
-    fn road_config(&self) -> Result<RoadConfig> {
-        let mut config = match &self.config {
-            Some(path) => RoadConfig::read(path)?,
-            None => RoadConfig::default(),
+    fn scenery(&self) -> Result<Scenery> {
+        let path = Path::new(&self.config);
+        let is_street = if path.is_file() {
+            let text = fs_err::read_to_string(path)?;
+            // A race names its sensors; a file that is no TOML at all is refused by line where it is read.
+            text.parse::<toml::Table>().is_ok_and(|table| !table.contains_key("rig"))
+        } else {
+            self.config == "street"
         };
+        if is_street {
+            return Ok(Scenery::Street(self.street_config(path.is_file().then_some(path))?));
+        }
+        let (mut config, files) = RaceConfig::find(&self.config)?;
+        config.seed = self.seed.unwrap_or(config.seed);
+        config.frames = self.frames.unwrap_or(config.frames);
+        config.check().context("--frames or --seed do not fit the configuration")?;
+        Ok(Scenery::Race(Box::new((config, files))))
+    }
+
+    fn street_config(&self, path: Option<&Path>) -> Result<RoadConfig> {
+        let mut config = path.map_or(Ok(RoadConfig::default()), RoadConfig::read)?;
         config.seed = self.seed.unwrap_or(config.seed);
         if let Some(total) = self.frames {
             config.frames = match FrameCounts::scaled_to(&config.frames, total) {
@@ -62,21 +81,91 @@ impl SimulateArgs {
         }
         Ok(config)
     }
+
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    fn street(&self, config: &RoadConfig) -> Result<()> {
+        let out = self.out.clone().unwrap_or_else(|| "datasets/road".into());
+        let progress = bar()?;
+        progress.set_length(config.frames.total() as u64);
+        let manifest = make_road_dataset(config, &out, &|done, _| progress.set_position(done as u64))?;
+        progress.finish_and_clear();
+        for (split, _) in config.frames.splits() {
+            let counts = manifest.splits[split];
+            let points = counts.points / counts.frames;
+            println!("{split}: {} frames, {} cars, {points} points a frame", counts.frames, counts.cars);
+        }
+        eprintln!("data set in {}", out.display());
+        Ok(())
+    }
+
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    fn race(&self, config: &RaceConfig, files: &ConfigFiles) -> Result<()> {
+        let out = self.out.clone().unwrap_or_else(|| Path::new("datasets").join(&config.name));
+        let progress = bar()?;
+        let hear = |name: &str, done: usize, total: usize| {
+            progress.set_message(name.to_string());
+            progress.set_length(total as u64);
+            progress.set_position(done as u64);
+        };
+        let manifests = make_race_datasets(config, files, &out, &self.dataset, &hear)?;
+        progress.finish_and_clear();
+        manifests.iter().for_each(|manifest| print!("{}", summary(manifest)));
+        eprintln!("data sets in {}", out.display());
+        Ok(())
+    }
+}
+
+fn bar() -> Result<ProgressBar> {
+    let style = ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?;
+    Ok(ProgressBar::new(0).with_style(style))
+}
+
+/// A line a split, and how far labels are off where they are made as on the road.
+fn summary(manifest: &RaceManifest) -> String {
+    let name = &manifest.name[1];
+    let mut text = String::new();
+    for (split, counts) in &manifest.splits {
+        let points = counts.points / counts.frames.max(1);
+        text += &format!("{name} {split}: {} frames, {} cars, {points} points a frame\n", counts.frames, counts.cars);
+    }
+    for error in manifest.label_errors.iter().filter(|e| e.labels > 0) {
+        let [along, across, up] = error.rms_m;
+        text += &format!(
+            "{name} labels at {:.0} to {:.0} m: off by {along:.2} m along, {across:.2} m across, {up:.2} m up (rms of {})\n",
+            error.range_m[0], error.range_m[1], error.labels
+        );
+    }
+    text
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn args(frames: Option<usize>, seed: Option<u64>) -> SimulateArgs {
-        SimulateArgs { out: "unused".into(), frames, seed, config: None }
+    fn args(config: &str, frames: Option<usize>, seed: Option<u64>) -> SimulateArgs {
+        SimulateArgs { config: config.into(), out: None, frames, seed, dataset: Vec::new() }
     }
 
     #[test]
     fn words_win_over_the_configuration() {
-        let config = args(Some(36), Some(9)).road_config().unwrap();
+        let Scenery::Street(config) = args("street", Some(36), Some(9)).scenery().unwrap() else { panic!("a street") };
         assert_eq!((config.frames.total(), config.seed), (36, 9));
-        assert_eq!(args(None, None).road_config().unwrap(), RoadConfig::default());
-        assert!(args(Some(2), None).road_config().unwrap_err().to_string().contains("--frames 2"));
+        assert!(args("street", Some(2), None).scenery().is_err());
+        let Scenery::Race(race) = args("race", Some(36), Some(9)).scenery().unwrap() else { panic!("a race") };
+        assert_eq!((race.0.frames, race.0.seed), (36, 9));
+        assert!(args("race", Some(2), None).scenery().is_err());
+        let error = args("rce", None, None).scenery().err().unwrap().to_string();
+        assert!(error.contains("race_small"), "{error}");
+    }
+
+    #[test]
+    fn files_are_told_apart_by_their_sensors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.toml");
+        std::fs::write(&path, "[frames]\ntrain = 5\n").unwrap();
+        assert!(matches!(args(path.to_str().unwrap(), None, None).scenery(), Ok(Scenery::Street(_))));
+        std::fs::write(&path, "name = \"a\"\nrig = \"r.toml\"\nframes = 2\n").unwrap();
+        let error = args(path.to_str().unwrap(), None, None).scenery().err().unwrap().to_string();
+        assert!(error.contains("a.toml:3: frames"), "{error}");
     }
 }

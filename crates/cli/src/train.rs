@@ -4,7 +4,7 @@ mod progress;
 mod results;
 
 use crate::detectors::detector_text;
-use crate::device::parse_device;
+use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
@@ -15,6 +15,8 @@ use toml::{Table, Value};
 use train::{RunConfig, Session, evaluate_detector, set_key, train};
 
 const DEFAULT_DETECTOR: &str = "pointpillars_small";
+/// What a network needs at least to learn a few frames by heart, where nobody says how many epochs.
+const OVERFIT_STEPS: usize = 400;
 
 /// Train a detector. Without a data set one is made on the spot: roads with cars, seen by a spinning LiDAR.
 ///
@@ -44,9 +46,8 @@ pub struct TrainArgs {
     /// Run folder [default: runs/DETECTOR/DATASET/seed-K; without a data set runs/default/seed-K]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Where the network computes: flex, ndarray, wgpu or cuda
-    #[arg(long, default_value = "flex")]
-    device: String,
+    #[command(flatten)]
+    device: DeviceArgs,
     /// Changes a key of the detector's TOML (optimization.lr_max=0.001) or of the run (run.log_every_steps=1); may be given more than once
     #[arg(long = "set", value_name = "A.B=C")]
     set: Vec<String>,
@@ -56,7 +57,7 @@ pub struct TrainArgs {
     /// Go on where a run was stopped, or begin it; what is not said again stays as it was
     #[arg(long)]
     resume: bool,
-    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all
+    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default: as many epochs as make 400 steps]
     #[arg(long)]
     overfit: bool,
     /// Threads that load and augment frames; any number gives the same weights
@@ -70,7 +71,7 @@ pub struct TrainArgs {
 impl TrainArgs {
     /// Trains, evaluates, and says where the results lie.
     pub fn run(mut self) -> Result<()> {
-        let device = parse_device(&self.device)?;
+        let device = self.device.open()?;
         let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;
         if let Some(folder) = &temporary {
             self.out = Some(folder.path().into());
@@ -79,9 +80,10 @@ impl TrainArgs {
             Some((stored, out)) => (self.changed(stored.to_table())?, out),
             None => self.fresh()?,
         };
+        eprintln!("device: {}", self.device.describe());
         // The default run has nothing to lose: a second call goes on with it.
         let resume = self.resume || self.dataset.is_none();
-        let session = Session { device, device_name: self.device.clone(), workers: self.workers, resume };
+        let session = Session { device, device_name: self.device.describe(), workers: self.workers, resume };
         let mut progress = Progress::default();
         let trained = train(&config, &out, &session, &mut |event| progress.show(&event))?;
         progress.finish();
@@ -124,7 +126,16 @@ impl TrainArgs {
         if self.smoke {
             set_key(&mut table, "optimization.epochs=1")?;
         }
-        let config = self.changed(table)?;
+        let mut config = self.changed(table)?;
+        if config.overfit && self.epochs.is_none() && !self.set.iter().any(|s| s.contains("optimization.epochs")) {
+            let frames = Dataset::open(&config.dataset)?.all_ids()?.len();
+            let optimization = &mut config.detector.optimization;
+            // The statistics of one frame alone are not those of all of them, which evaluation takes.
+            optimization.batch_size = optimization.batch_size.max(2);
+            let steps = frames.div_ceil(optimization.batch_size);
+            optimization.epochs = OVERFIT_STEPS.div_ceil(steps).max(optimization.epochs);
+            config.run.evaluate_every_epochs = (optimization.epochs / 10).max(1) as u64;
+        }
         let seed = format!("seed-{}", config.seed);
         let out = match (&self.out, &self.dataset) {
             (Some(out), Some(_)) => out.clone(),

@@ -78,7 +78,10 @@ fn a_split_is_detected_and_evaluated_from_texts_alone() {
         "detect velodyne/000005.bin --checkpoint run/checkpoint/last.safetensors --labels label_2/000005.txt --json boxes.json",
     );
     let boxes: serde_json::Value = serde_json::from_slice(&fs::read(dir.path().join("boxes.json")).unwrap()).unwrap();
-    assert_eq!(boxes.as_array().unwrap().len(), String::from_utf8(output.stdout).unwrap().lines().count());
+    assert_eq!(
+        boxes["detections"].as_array().unwrap().len(),
+        String::from_utf8(output.stdout).unwrap().lines().count()
+    );
     assert!(fs::read(dir.path().join("000005.png")).unwrap().starts_with(b"\x89PNG"));
 }
 

@@ -384,7 +384,12 @@ mod tests {
         assert_eq!(ids.len(), 8);
         for id in ids {
             let frame = dataset.load(&id).unwrap();
-            assert!(frame.cloud.len() > 100_000 && !frame.objects.is_empty());
+            assert!(dataset.load_whole_cloud(&id).unwrap().len() > 100_000 && !frame.objects.is_empty());
+            assert!(
+                (10_000..30_000).contains(&frame.cloud.len()),
+                "cropped to the camera's view: {}",
+                frame.cloud.len()
+            );
             let calibration = dataset.calibration(&id).unwrap();
             let lines = dataset.labels(&id).unwrap();
             for (line, object) in lines.iter().filter(|l| l.has_box()).zip(&frame.objects) {

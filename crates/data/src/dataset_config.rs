@@ -68,6 +68,10 @@ pub struct DatasetConfig {
     /// Name and file of each split, relative to the root. Default: those of train, val and test for which `ImageSets/NAME.txt` exists.
     #[serde(default)]
     pub splits: BTreeMap<String, PathBuf>,
+    /// The sensors, relative to this file: a rig as those in `configs/sensors`. Without one, one sensor at the cloud's origin is assumed
+    /// wherever it matters.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rig: Option<PathBuf>,
     /// Keep only the points that the camera sees (needs `calib`). Default: where the labels are in the camera's frame, for only what the
     /// camera sees is labelled there; the reference does so with KITTI in training and in test.
     #[serde(default)]
@@ -99,6 +103,7 @@ impl Default for DatasetConfig {
             label_frame: lidar(),
             classes: Vec::new(),
             splits: BTreeMap::new(),
+            rig: None,
             fov_crop: false,
             image_size: kitti_image_size(),
         }
@@ -106,19 +111,21 @@ impl Default for DatasetConfig {
 }
 
 impl DatasetConfig {
-    /// Reads a data set's TOML; `root` is then relative to the working folder and every default is filled in but the classes.
+    /// Reads a data set's TOML; `root` and `rig` are then relative to the working folder and every default is filled in but the classes.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bytes = fs_err::read(path)?;
         Self::parse(std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not text"))?, path)
     }
 
-    /// A data set's TOML in memory; `path` is where it lies, for messages and for `root`.
+    /// A data set's TOML in memory; `path` is where it lies, for messages, `root` and `rig`.
     pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
         let mut config: DatasetConfig = toml::from_str(text).map_err(|e| {
             let line = 1 + e.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count());
             DataError::line(path, line, e.message())
         })?;
-        config.root = path.parent().unwrap_or(Path::new("")).join(&config.root);
+        let folder = path.parent().unwrap_or(Path::new(""));
+        config.root = folder.join(&config.root);
+        config.rig = config.rig.map(|rig| folder.join(rig));
         let written: toml::Table = toml::from_str(text).expect("it was read above");
         config.fill_in(!written.contains_key("label_frame"), !written.contains_key("fov_crop"));
         config.check(path)?;

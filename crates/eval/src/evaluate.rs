@@ -1,8 +1,9 @@
 //! From frames to rows.
 
 use crate::curve::{CountsByScore, PrecisionCurve, ceiling_ap40};
-use crate::matching::FrameMatching;
-use crate::overlaps::FrameOverlaps;
+use crate::evidence::FrameEvidence;
+use crate::matching::{BoxIndex, CurveKey};
+use crate::overlaps::{FrameOverlaps, range_m};
 use crate::recall::{Recall, RecallDefinition, any_box_recall};
 use crate::report::{EvalReport, OverlapSet, Row, SCHEMA};
 use crate::{Difficulty, EvalFrame, EvalOptions, Metric, default_classes, reference_overlaps};
@@ -77,20 +78,20 @@ fn jobs(classes: &[String], options: &EvalOptions) -> Vec<Job> {
 
 /// The row of a job; for image boxes that of aos, too.
 fn draw(job: Job, frames: &[(&EvalFrame, FrameOverlaps)], options: &EvalOptions, orientation: bool) -> Vec<Row> {
+    let near = |frame: &EvalFrame, index: BoxIndex| {
+        let line = match index {
+            BoxIndex::Label(i) => &frame.labels[i],
+            BoxIndex::Detection(j) => &frame.detections[j],
+        };
+        options.max_range_m.is_none_or(|most| range_m(line, options.label_frame) <= most)
+    };
+    let key = CurveKey { class: &job.class, metric: job.metric, overlap: job.overlap, difficulty: job.difficulty };
     let (mut n_gt, mut hit_scores, mut changes) = (0, Vec::new(), Vec::new());
     for (frame, overlaps) in frames {
-        let limit = (job.metric, job.overlap);
-        let mut matching = FrameMatching::new((frame, overlaps), &job.class, job.difficulty, limit, options);
-        n_gt += matching.n_gt();
-        matching.collect_hit_scores(&mut hit_scores);
-        let mut before = matching.count(f64::INFINITY);
-        for score in matching.distinct_scores() {
-            let now = matching.count(score);
-            if now != before {
-                changes.push((score, now - before));
-                before = now;
-            }
-        }
+        let found = FrameEvidence::collect((frame, overlaps), &key, |index| near(frame, index));
+        n_gt += found.n_gt;
+        hit_scores.extend(found.hit_scores);
+        changes.extend(found.changes);
     }
     let counts = CountsByScore::new(changes, n_gt);
     let all = counts.all();

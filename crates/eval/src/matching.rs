@@ -1,7 +1,7 @@
 //! KITTI's assignment of detections to ground truths in one frame, step by step as OpenPCDet's `kitti_object_eval_python/eval.py`.
 
-use crate::overlaps::{FrameOverlaps, Pair, range_m};
-use crate::{Difficulty, EvalFrame, EvalOptions, Metric};
+use crate::overlaps::{FrameOverlaps, Pair};
+use crate::{Difficulty, EvalFrame, Metric};
 use data::KittiLine;
 use serde::{Deserialize, Serialize};
 use std::ops::{AddAssign, Sub};
@@ -52,37 +52,57 @@ enum Role {
     Absent,
 }
 
+/// What one curve is drawn of.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct CurveKey<'a> {
+    pub class: &'a str,
+    pub metric: Metric,
+    /// Overlap that has to be exceeded.
+    pub overlap: f64,
+    pub difficulty: Difficulty,
+}
+
+/// A box of a frame, by its index.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum BoxIndex {
+    Label(usize),
+    Detection(usize),
+}
+
 /// One frame, seen by one class, difficulty, metric and overlap limit.
 pub(crate) struct FrameMatching<'a> {
     frame: &'a EvalFrame,
     labels: Vec<Role>,
     detections: Vec<Role>,
-    /// Detections that may match, but are no false alarm when left over: those beyond the range.
+    /// Detections that may match, but are no false alarm when left over: those outside what is looked at.
     spared: Vec<bool>,
     pairs: &'a [Pair],
     dont_care: &'a [Pair],
     min_overlap: f64,
     taken: Vec<bool>,
+    /// Detections that were hits when last counted.
+    hits: Vec<bool>,
 }
 
 impl<'a> FrameMatching<'a> {
+    /// `inside` says which boxes are looked at. Ground truth outside is ignored, and so is a detection outside that finds nothing.
     pub(crate) fn new(
         (frame, overlaps): (&'a EvalFrame, &'a FrameOverlaps),
-        class: &str,
-        difficulty: Difficulty,
-        (metric, min_overlap): (Metric, f64),
-        options: &EvalOptions,
+        key: &CurveKey,
+        inside: impl Fn(BoxIndex) -> bool,
     ) -> Self {
-        let far = |line| options.max_range_m.is_some_and(|most| range_m(line, options.label_frame) > most);
-        let labels = frame.labels.iter().map(|line| label_role(line, class, difficulty, far(line))).collect();
+        let CurveKey { class, metric, overlap: min_overlap, difficulty } = *key;
+        let label = |(i, line)| label_role(line, class, difficulty, !inside(BoxIndex::Label(i)));
+        let labels = frame.labels.iter().enumerate().map(label).collect();
         let detections: Vec<Role> =
             frame.detections.iter().map(|line| detection_role(line, class, difficulty)).collect();
         let forgiving = matches!(metric, Metric::Bbox | Metric::Aos) && difficulty != Difficulty::All;
         FrameMatching {
             frame,
             labels,
-            spared: frame.detections.iter().map(far).collect(),
+            spared: (0..detections.len()).map(|j| !inside(BoxIndex::Detection(j))).collect(),
             taken: vec![false; detections.len()],
+            hits: vec![false; detections.len()],
             detections,
             pairs: overlaps.of(metric),
             dont_care: if forgiving { &overlaps.dont_care } else { &[] },
@@ -140,6 +160,7 @@ impl<'a> FrameMatching<'a> {
     /// overlap, an ignored one only where there is no other. What is left over is a false alarm, unless DontCare forgives it.
     pub(crate) fn count(&mut self, least_score: f64) -> Counts {
         self.taken.fill(false);
+        self.hits.fill(false);
         let mut counts = Counts::default();
         let mut pairs = self.pairs;
         for label in 0..self.labels.len() {
@@ -168,6 +189,7 @@ impl<'a> FrameMatching<'a> {
                     self.taken[j] = true;
                     if counted && self.detections[j] == Role::Counted {
                         counts.tp += 1;
+                        self.hits[j] = true;
                         let error = self.frame.labels[label].alpha - self.frame.detections[j].alpha;
                         counts.similarity += (1.0 + error.cos()) / 2.0;
                     }
@@ -182,6 +204,19 @@ impl<'a> FrameMatching<'a> {
         });
         counts.fp = left_over.count() as i64;
         counts
+    }
+}
+
+impl FrameMatching<'_> {
+    /// Of each detection, with no score limit: whether it is a hit (`true`) or a false alarm; `None` where it counts neither way.
+    pub(crate) fn outcomes(&mut self) -> Vec<Option<bool>> {
+        self.count(f64::NEG_INFINITY);
+        let outcome = |j: usize| match self.detections[j] {
+            Role::Counted if self.hits[j] => Some(true),
+            Role::Counted if !self.taken[j] && !self.spared[j] => Some(false),
+            _ => None,
+        };
+        (0..self.detections.len()).map(outcome).collect()
     }
 }
 

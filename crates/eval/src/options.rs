@@ -40,6 +40,44 @@ impl Default for EvalOptions {
     }
 }
 
+/// A section of distances on the ground, m.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RangeSection {
+    /// The first distance in it, m.
+    pub from_m: f64,
+    /// Where it ends, m.
+    pub to_m: f64,
+    /// Whether `to_m` itself is in it.
+    #[serde(default)]
+    pub closed: bool,
+}
+
+impl RangeSection {
+    /// The paper's close, mid and long range: [0, 33.3), [33.3, 66.6), [66.6, 100] m (section III-B).
+    pub const PAPER: [RangeSection; 3] = [
+        RangeSection { from_m: 0.0, to_m: 33.3, closed: false },
+        RangeSection { from_m: 33.3, to_m: 66.6, closed: false },
+        RangeSection { from_m: 66.6, to_m: 100.0, closed: true },
+    ];
+
+    /// Everything up to a distance, itself included.
+    pub fn up_to(to_m: f64) -> Self {
+        RangeSection { from_m: 0.0, to_m, closed: true }
+    }
+
+    /// Whether a distance on the ground is in it, m.
+    pub fn contains(&self, range_m: f64) -> bool {
+        range_m >= self.from_m && (range_m < self.to_m || (self.closed && range_m == self.to_m))
+    }
+}
+
+impl fmt::Display for RangeSection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "[{}, {}{} m", self.from_m, self.to_m, if self.closed { ']' } else { ')' })
+    }
+}
+
 /// What two boxes are compared by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]

@@ -77,20 +77,35 @@ struct Upright {
     volume: f64,
 }
 
+/// The box of a line in a frame with z up: its own for [`LabelFrame::Lidar`]; for [`LabelFrame::Camera`] x to the right, y forward
+/// (KITTI's z) and z up (KITTI's -y), which is right-handed.
+pub(crate) fn upright_box(line: &KittiLine, label_frame: LabelFrame) -> Box3 {
+    match label_frame {
+        LabelFrame::Lidar => line.lidar_box(),
+        LabelFrame::Camera => {
+            let ([x, y, z], [h, w, l]) = (line.location, line.size_hwl);
+            Box3 { center: [x, z, -y + h / 2.0], size: [l, w, h], yaw_rad: -line.rotation_y }
+        }
+    }
+}
+
+/// The inverse of [`upright_box`]: the line with another box.
+pub(crate) fn with_upright_box(line: &KittiLine, b: &Box3, label_frame: LabelFrame) -> KittiLine {
+    let ([x, y, z], [l, w, h]) = (b.center, b.size);
+    let (location, rotation_y) = match label_frame {
+        LabelFrame::Lidar => (b.center, b.yaw_rad),
+        LabelFrame::Camera => ([x, -(z - h / 2.0), y], -b.yaw_rad),
+    };
+    KittiLine { location, rotation_y, size_hwl: [h, w, l], ..line.clone() }
+}
+
 impl Upright {
     fn new(line: &KittiLine, label_frame: LabelFrame) -> Self {
         let [h, w, l] = line.size_hwl;
-        let (base, height) = match label_frame {
-            LabelFrame::Lidar => {
-                let b = line.lidar_box();
-                (b, b.z_range())
-            }
-            LabelFrame::Camera => {
-                // Up is -y, and x, z, -y is a right-handed frame.
-                let [x, y, z] = line.location;
-                let base = Box3 { center: [x, z, -y + h / 2.0], size: [l, w, h], yaw_rad: -line.rotation_y };
-                (base, (-y, -y + h))
-            }
+        let base = upright_box(line, label_frame);
+        let height = match label_frame {
+            LabelFrame::Lidar => base.z_range(),
+            LabelFrame::Camera => (-line.location[1], -line.location[1] + h),
         };
         Upright { base, height, area: l * w, volume: l * h * w }
     }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use std::fmt;
 
 /// Version of [`EvalReport`] as JSON.
-pub const SCHEMA: &str = "lidarshift.eval_ap/1";
+pub const SCHEMA: &str = "lidarshift/eval-ap/1";
 
 /// Where an overlap limit comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]

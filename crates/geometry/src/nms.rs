@@ -8,6 +8,11 @@ use std::{cmp::Ordering, collections::HashMap};
 ///
 /// Only boxes whose bounding circles may meet are compared, found in a grid of cells as large as the largest circle.
 pub fn rotated_nms(boxes: &[Box3], scores: &[f32], iou_threshold: f64) -> Vec<usize> {
+    rotated_nms_first(boxes, scores, iou_threshold, usize::MAX)
+}
+
+/// The first `most` indices of [`rotated_nms`]; the rest is not looked at.
+pub fn rotated_nms_first(boxes: &[Box3], scores: &[f32], iou_threshold: f64, most: usize) -> Vec<usize> {
     assert_eq!(boxes.len(), scores.len(), "one score a box");
     let mut order: Vec<usize> = (0..boxes.len()).collect();
     order.sort_by(|&i, &j| falling(scores[i], scores[j]));
@@ -22,8 +27,14 @@ pub fn rotated_nms(boxes: &[Box3], scores: &[f32], iou_threshold: f64) -> Vec<us
     let mut kept = Vec::new();
     let mut kept_in_cell: HashMap<[i64; 2], Vec<BevRectangle>> = HashMap::new();
     for i in order {
+        if kept.len() == most {
+            break;
+        }
         let [cx, cy] = cell(&boxes[i]);
-        let near = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| [cx.saturating_add(dx), cy.saturating_add(dy)]));
+        // The own cell first: there the rival is most likely to be.
+        let near = [0, -1, 1].into_iter();
+        let near =
+            near.clone().flat_map(|dx| near.clone().map(move |dy| [cx.saturating_add(dx), cy.saturating_add(dy)]));
         let mut rivals = near.filter_map(|key| kept_in_cell.get(&key));
         if !rivals.any(|cell| cell.iter().any(|rival| overlaps(rival, &rectangles[i], iou_threshold))) {
             kept.push(i);
@@ -93,7 +104,11 @@ mod tests {
             let boxes: Vec<Box3> =
                 values.iter().map(|v| Box3::from_array([v.0, v.1, 0.0, v.2, v.3, 1.0, v.4])).collect();
             let scores: Vec<f32> = values.iter().map(|v| f32::from(v.5)).collect();
-            prop_assert_eq!(rotated_nms(&boxes, &scores, threshold), plain_nms(&boxes, &scores, threshold));
+            let plain = plain_nms(&boxes, &scores, threshold);
+            prop_assert_eq!(&rotated_nms(&boxes, &scores, threshold), &plain);
+            for most in [0, 1, 7] {
+                prop_assert_eq!(&rotated_nms_first(&boxes, &scores, threshold, most), &plain[..most.min(plain.len())]);
+            }
         }
     }
 }

@@ -1,5 +1,9 @@
 //! What a detector is: one TOML file in `configs/detectors`, typed once.
 
+mod pointrcnn;
+
+pub use pointrcnn::*;
+
 use crate::ModelError;
 use data::augment::AugmentConfig;
 use schemars::JsonSchema;
@@ -34,6 +38,8 @@ pub struct DetectorConfig {
 pub enum NetworkConfig {
     /// PointPillars (Lang et al. 2019) as OpenPCDet builds it.
     PointPillars(PointPillarsConfig),
+    /// PointRCNN (Shi et al. 2019) as OpenPCDet builds it.
+    PointRcnn(PointRcnnConfig),
 }
 
 /// Sizes of PointPillars; the defaults are the published KITTI network.
@@ -252,7 +258,6 @@ impl DetectorConfig {
 
     /// Whether the sizes fit together; the message names the key.
     pub fn check(&self) -> Result<(), String> {
-        let NetworkConfig::PointPillars(net) = &self.network;
         let fail = |message: String| Err(message);
         if self.classes.is_empty() {
             return fail("classes: a detector needs at least one class".into());
@@ -263,11 +268,34 @@ impl DetectorConfig {
         if (0..3).any(|i| !(self.range_m[i] < self.range_m[i + 3]) || !self.range_m[i].is_finite()) {
             return fail(format!("range_m = {:?}: each minimum must lie below its maximum", self.range_m));
         }
+        let o = &self.optimization;
+        if o.epochs == 0 || o.batch_size == 0 || !(o.lr_max > 0.0) || !(o.clip_norm > 0.0) || !(o.div_factor >= 1.0) {
+            return fail(
+                "optimization: epochs, batch_size, lr_max and clip_norm must be above 0, div_factor at least 1".into(),
+            );
+        }
+        if !(0.0..=1.0).contains(&o.pct_start)
+            || o.momentum.iter().any(|m| !(0.0..1.0).contains(m))
+            || !(o.weight_decay >= 0.0)
+        {
+            return fail("optimization: pct_start in [0, 1], momentum in [0, 1), weight_decay not negative".into());
+        }
+        match &self.network {
+            NetworkConfig::PointPillars(net) => net.check(self),
+            NetworkConfig::PointRcnn(net) => net.check(self),
+        }
+    }
+}
+
+impl PointPillarsConfig {
+    /// Whether the sizes fit together and to the detector's range and classes; the message names the key.
+    pub fn check(&self, detector: &DetectorConfig) -> Result<(), String> {
+        let (net, fail) = (self, |message: String| Err(message));
         let named: Vec<&String> = net.anchors.iter().map(|a| &a.class).collect();
-        if named != self.classes.iter().collect::<Vec<_>>() {
+        if named != detector.classes.iter().collect::<Vec<_>>() {
             return fail(format!(
                 "network.anchors name {named:?}, classes are {:?}: one anchor a class, in order",
-                self.classes
+                detector.classes
             ));
         }
         for a in &net.anchors {
@@ -313,7 +341,7 @@ impl DetectorConfig {
         {
             return fail("network.pillars: sizes and limits must be above 0".into());
         }
-        let [nx, ny, nz] = self.grid_size();
+        let [nx, ny, nz] = self.grid_size(detector);
         if nz != 1 {
             return fail(format!("network.pillars.size_m: {nz} pillars above each other; z must span the whole range"));
         }
@@ -325,25 +353,12 @@ impl DetectorConfig {
         if net.vfe_filters == 0 || net.head.dir_bins < 2 {
             return fail("network.vfe_filters must be above 0, network.head.dir_bins at least 2".into());
         }
-        let o = &self.optimization;
-        if o.epochs == 0 || o.batch_size == 0 || !(o.lr_max > 0.0) || !(o.clip_norm > 0.0) || !(o.div_factor >= 1.0) {
-            return fail(
-                "optimization: epochs, batch_size, lr_max and clip_norm must be above 0, div_factor at least 1".into(),
-            );
-        }
-        if !(0.0..=1.0).contains(&o.pct_start)
-            || o.momentum.iter().any(|m| !(0.0..1.0).contains(m))
-            || !(o.weight_decay >= 0.0)
-        {
-            return fail("optimization: pct_start in [0, 1], momentum in [0, 1), weight_decay not negative".into());
-        }
         Ok(())
     }
 
     /// Pillars along x, y and z.
-    pub fn grid_size(&self) -> [usize; 3] {
-        let NetworkConfig::PointPillars(net) = &self.network;
-        [0, 1, 2]
-            .map(|i| ((self.range_m[i + 3] - self.range_m[i]) as f64 / net.pillars.size_m[i] as f64).round() as usize)
+    pub fn grid_size(&self, detector: &DetectorConfig) -> [usize; 3] {
+        let range = detector.range_m;
+        [0, 1, 2].map(|i| ((range[i + 3] - range[i]) as f64 / self.pillars.size_m[i] as f64).round() as usize)
     }
 }

@@ -1,15 +1,18 @@
-//! PointPillars in burn, faithful to the published network to the last tensor.
+//! PointPillars and PointRCNN in burn, faithful to the published networks to the last tensor.
 
 pub mod checkpoint;
 pub mod config;
+pub mod kernel_ops;
 pub mod layers;
 pub mod loss;
 pub mod named;
+pub mod point_ops;
 pub mod pointpillars;
+pub mod pointrcnn;
 
 mod detector;
 mod error;
 
-pub use detector::{Detector, Losses, Preparer, Sample, parameter_count};
+pub use detector::{Detector, Losses, Network, Preparer, Sample, parameter_count};
 pub use error::ModelError;
 pub use named::reference_name;

@@ -1,7 +1,8 @@
 //! Losses of the detectors, as OpenPCDet computes them.
 
+use crate::kernel_ops::focal_loss_sum;
 use burn::tensor::activation::{log_softmax, sigmoid};
-use burn::tensor::{Int, Tensor};
+use burn::tensor::{Int, Tensor, TensorData};
 
 /// Sigmoid focal loss with alpha 0.25 and gamma 2, one value an entry.
 ///
@@ -13,6 +14,22 @@ pub fn sigmoid_focal(logits: Tensor<2>, target: Tensor<2>) -> Tensor<2> {
     let miss = target.clone() + p.clone() - target.clone() * p * 2.0; // t (1 - p) + (1 - t) p
     let cross_entropy = logits.clone().clamp_min(0.0) - logits.clone() * target + (-logits.abs()).exp().log1p();
     alpha * miss.clone() * miss * cross_entropy
+}
+
+/// The weighted sum of [`sigmoid_focal`] over rows and classes, in one operation where there is a kernel for it.
+///
+/// # Shapes
+/// `logits`: `[N, C]`; `labels`: N, k for the class with index k - 1, no class for 0 and below; `weights`: N; result `[1]`.
+pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: Vec<i32>, weights: Vec<f32>) -> Tensor<1> {
+    let ([rows, classes], device) = (logits.dims(), logits.device());
+    focal_loss_sum(&logits, &labels, &weights).unwrap_or_else(|| {
+        let mut one_hot = vec![0f32; rows * classes];
+        for (row, &label) in labels.iter().enumerate().filter(|(_, label)| **label > 0) {
+            one_hot[row * classes + label as usize - 1] = 1.0;
+        }
+        let tensor = |values, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
+        (sigmoid_focal(logits, tensor(one_hot, [rows, classes])) * tensor(weights, [rows, 1])).sum()
+    })
 }
 
 /// Smooth L1 of a difference: quadratic below `beta`, linear above.

@@ -1,14 +1,16 @@
 //! A cloud and its boxes from above: forward is up, left is left.
 
 use crate::ReportError;
-use crate::page::{Anchor, Mark, Page, Rgb};
-use crate::{png::png, svg::svg};
+use crate::page::{Anchor, INK, Mark, Page, Rgb};
+use crate::{
+    png::png,
+    svg::{Theme, svg},
+};
 use data::Cloud;
 use geometry::Box3;
 
 const PAPER: Rgb = [252, 252, 250];
 const RING: Rgb = [205, 212, 220];
-const INK: Rgb = [70, 78, 88];
 const TRUTH: Rgb = [22, 140, 62];
 const SURE: Rgb = [226, 98, 8];
 const UNSURE: Rgb = [36, 104, 190];
@@ -63,7 +65,7 @@ pub fn birds_eye_svg(cloud: &Cloud, boxes: &[(Box3, Style)], options: &BirdsEyeO
     let view = View::new(cloud, boxes, options)?;
     let mut page = view.page(cloud, boxes, options);
     legend(&mut page, boxes);
-    Ok(svg(&page))
+    Ok(svg(&page, Theme::Paper))
 }
 
 /// From metres to pixels.

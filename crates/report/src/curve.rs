@@ -1,13 +1,9 @@
 //! Curves over a common axis, as training losses.
 
-use crate::page::{Anchor, Mark, Page, Rgb};
-use crate::svg::svg;
+use crate::axis::Axis;
+use crate::page::{Anchor, COLORS, GRID, INK, Mark, Page};
+use crate::svg::{Theme, svg};
 
-const INK: Rgb = [70, 78, 88];
-const GRID: Rgb = [226, 230, 235];
-/// Colours that people with any colour vision tell apart (Okabe and Ito).
-const COLORS: [Rgb; 7] =
-    [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [230, 159, 0], [86, 180, 233], [60, 60, 60]];
 const SIZE: [f64; 2] = [860.0, 480.0];
 /// Left, right, top and bottom of the axes on the page, px.
 const FRAME: [f64; 4] = [84.0, 836.0, 56.0, 420.0];
@@ -36,6 +32,11 @@ pub struct CurveOptions {
 
 /// Curves with axes, grid and legend as the text of an SVG file.
 pub fn curve_svg(series: &[Series], options: &CurveOptions) -> String {
+    svg(&curve_page(series, options), Theme::Paper)
+}
+
+/// The marks of the curves.
+pub(crate) fn curve_page(series: &[Series], options: &CurveOptions) -> Page {
     let drawable = |[x, y]: [f64; 2]| x.is_finite() && y.is_finite() && (!options.log_y || y > 0.0);
     let height = |y: f64| if options.log_y { y.log10() } else { y };
     let shown = || series.iter().flat_map(|s| &s.points).copied().filter(|p| drawable(*p));
@@ -54,7 +55,7 @@ pub fn curve_svg(series: &[Series], options: &CurveOptions) -> String {
         }
     }
     legend(&mut page, series);
-    svg(&page)
+    page
 }
 
 fn axes(page: &mut Page, x_axis: &Axis, y_axis: &Axis, options: &CurveOptions) {
@@ -72,8 +73,7 @@ fn axes(page: &mut Page, x_axis: &Axis, y_axis: &Axis, options: &CurveOptions) {
     page.line(vec![[left, top], [left, bottom], [right, bottom]], INK, 1.2);
     page.text([left, 28.0], &options.title, 16.0, INK, Anchor::Start);
     page.text([(left + right) / 2.0, SIZE[1] - 16.0], &options.x_label, 13.0, INK, Anchor::Middle);
-    let (at, text) = ([20.0, (top + bottom) / 2.0], options.y_label.clone());
-    page.marks.push(Mark::Text { at, text, size: 13.0, color: INK, anchor: Anchor::Middle, upright: false });
+    page.text_upwards([20.0, (top + bottom) / 2.0], &options.y_label, 13.0);
 }
 
 fn legend(page: &mut Page, series: &[Series]) {
@@ -85,71 +85,10 @@ fn legend(page: &mut Page, series: &[Series]) {
     }
 }
 
-/// One axis: the values it spans, and where its ends lie on the page.
-struct Axis {
-    low: f64,
-    high: f64,
-    px: [f64; 2],
-    /// Distance of two ticks.
-    step: f64,
-    /// Values are powers of ten.
-    log: bool,
-}
-
-impl Axis {
-    /// An axis for all values, its ends at ticks where they are near.
-    fn new(values: impl Iterator<Item = f64>, px: [f64; 2], log: bool) -> Axis {
-        let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
-        let (low, high) = match (low, high) {
-            (low, high) if low > high => (0.0, 1.0),
-            (low, high) if low == high => (low - 0.5, high + 0.5),
-            ends => ends,
-        };
-        let rough = (high - low) / 6.0;
-        let power = 10f64.powf(rough.log10().floor());
-        let step = [1.0, 2.0, 5.0, 10.0].into_iter().map(|k| k * power).find(|s| *s >= rough * 0.999).unwrap_or(power);
-        let step = if log { step.max(1.0).round() } else { step };
-        let vertical = px[0] > px[1];
-        let (low, high) =
-            if vertical { ((low / step).floor() * step, (high / step).ceil() * step) } else { (low, high) };
-        Axis { low, high, px, step, log }
-    }
-
-    fn px(&self, value: f64) -> f64 {
-        self.px[0] + (value - self.low) / (self.high - self.low) * (self.px[1] - self.px[0])
-    }
-
-    /// Value and name of each tick.
-    fn ticks(&self) -> Vec<(f64, String)> {
-        let (first, last) =
-            ((self.low / self.step - 1e-9).ceil() as i64, (self.high / self.step + 1e-9).floor() as i64);
-        let digits = (-self.step.log10().floor()).clamp(0.0, 12.0) as usize;
-        let name = |value: f64| match (self.log, value.abs()) {
-            (true, _) if value.abs() < 5.0 => format!("{}", 10f64.powi(value as i32)),
-            (true, _) => format!("1e{value:.0}"),
-            (false, size) if size >= 1e5 => format!("{value:.1e}"),
-            _ => format!("{value:.digits$}"),
-        };
-        (first..=last).map(|i| i as f64 * self.step).map(|value| (value, name(value))).collect()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn tick_names(values: [f64; 2], log: bool) -> Vec<String> {
-        let values = values.map(|v| if log { v.log10() } else { v });
-        Axis::new(values.into_iter(), [100.0, 0.0], log).ticks().into_iter().map(|(_, name)| name).collect()
-    }
-
-    #[test]
-    fn ticks_are_round_numbers_around_all_values() {
-        assert_eq!(tick_names([0.0, 1.0], false), ["0.0", "0.2", "0.4", "0.6", "0.8", "1.0"]);
-        assert_eq!(tick_names([0.0, 4000.0], false), ["0", "1000", "2000", "3000", "4000"]);
-        assert_eq!(tick_names([3.0, 3.0], false).len(), 7);
-        assert_eq!(tick_names([0.02, 7.0], true), ["0.01", "0.1", "1", "10"]);
-    }
+    use crate::page::Rgb;
 
     #[test]
     fn curves_have_names_and_gaps() {

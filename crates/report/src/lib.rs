@@ -1,16 +1,24 @@
-//! Pictures and tables.
+//! Pictures, tables, and the report of a study as one page.
 //!
 //! Every picture is first a list of marks on a page, then written as SVG text or as PNG: both show the same.
 
+mod axis;
 mod birds_eye;
 mod curve;
+mod figure;
+mod html;
 mod page;
 mod png;
+mod scene;
 mod stroke_font;
+mod study;
 mod svg;
 
 pub use birds_eye::{BirdsEyeOptions, Style, birds_eye_png, birds_eye_svg};
 pub use curve::{CurveOptions, Series, curve_svg};
+pub use figure::*;
+pub use scene::{Layer, LayerContent, Scene};
+pub use study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
 
 /// Why a picture could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -29,6 +37,12 @@ pub enum ReportError {
         /// Pixels.
         height: f64,
     },
+    /// The page could not be rendered.
+    #[error("the page could not be rendered: {0}")]
+    Page(String),
+    /// A file could not be read or written.
+    #[error(transparent)]
+    Data(#[from] data::DataError),
     /// The PNG could not be encoded.
     #[error("the PNG could not be encoded: {0}")]
     Png(String),

@@ -38,6 +38,14 @@ fn draw(pixels: &mut Pixmap, mark: &Mark, rim: Option<Rgb>) {
                 }
             }
         }
+        Mark::Dots { centers, radius, color, opacity } => {
+            for [x, y] in centers {
+                if let Some(path) = PathBuilder::from_circle(*x as f32, *y as f32, *radius as f32) {
+                    let paint = paint(*color, *opacity);
+                    pixels.fill_path(&path, &paint, FillRule::Winding, Transform::identity(), None);
+                }
+            }
+        }
         Mark::Text { at: [x, y], text, size, color, anchor, .. } => {
             let digits = size * 0.72;
             let back = match anchor {

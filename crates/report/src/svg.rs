@@ -1,10 +1,25 @@
 //! A page as SVG.
 
-use crate::page::{Anchor, Mark, Page, Rgb};
+use crate::page::{Anchor, GRID, INK, Mark, Page, Rgb};
 use std::fmt::Write;
 
+/// Where the picture is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Theme {
+    /// On paper: a file of its own, always light.
+    Paper,
+    /// Inside the report, which has the colours of paper, ink and grid as CSS variables, light and dark.
+    Report,
+}
+
 /// The page as the text of an SVG file.
-pub(crate) fn svg(page: &Page) -> String {
+pub(crate) fn svg(page: &Page, theme: Theme) -> String {
+    let hex = |color: Rgb| match theme {
+        Theme::Report if color == INK => "var(--ink)".into(),
+        Theme::Report if color == GRID => "var(--grid)".into(),
+        Theme::Report if color == page.background => "var(--plot)".into(),
+        _ => hex(color),
+    };
     let [width, height] = page.size;
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width:.0}\" height=\"{height:.0}\" viewBox=\"0 0 {width:.0} {height:.0}\" \
@@ -12,14 +27,15 @@ pub(crate) fn svg(page: &Page) -> String {
         hex(page.background)
     );
     for mark in &page.marks {
-        write_mark(&mut out, mark, page.rimmed.then_some(page.background)).expect("writing to a String does not fail");
+        write_mark(&mut out, mark, page.rimmed.then_some(page.background), &hex)
+            .expect("writing to a String does not fail");
         out.push('\n');
     }
     out.push_str("</svg>\n");
     out
 }
 
-fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>) -> std::fmt::Result {
+fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>, hex: &dyn Fn(Rgb) -> String) -> std::fmt::Result {
     match mark {
         Mark::Line { points, closed, color, width, fill } => {
             let (word, hex) = (if *closed { "polygon" } else { "polyline" }, hex(*color));
@@ -48,11 +64,23 @@ fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>) -> std::fmt::Resu
             }
             write!(out, "\"/>")
         }
-        Mark::Text { at: [x, y], text, size, color, anchor, upright } => {
-            let turn = if *upright { String::new() } else { format!(" transform=\"rotate(-90 {x:.1} {y:.1})\"") };
+        Mark::Dots { centers, radius, color, opacity } => {
+            // Lines without length and with round ends: a tenth of the text of as many circles.
+            write!(out, "<path fill=\"none\" stroke=\"{}\" stroke-linecap=\"round\" ", hex(*color))?;
+            write!(out, "stroke-width=\"{:.1}\" stroke-opacity=\"{opacity}\" d=\"", 2.0 * radius)?;
+            for [x, y] in centers {
+                write!(out, "M{x:.1} {y:.1}h.01")?;
+            }
+            write!(out, "\"/>")
+        }
+        Mark::Text { at: [x, y], text, size, color, anchor, turn_deg } => {
+            let turn = match *turn_deg {
+                0.0 => String::new(),
+                turn => format!(" transform=\"rotate({turn} {x:.1} {y:.1})\""),
+            };
             let (anchor, text) = (word(*anchor), escaped(text));
             let start = format!("<text x=\"{x:.1}\" y=\"{y:.1}\" font-size=\"{size}\" text-anchor=\"{anchor}\"{turn}");
-            if let Some(rim) = rim.map(hex) {
+            if let Some(rim) = rim.map(&hex) {
                 writeln!(
                     out,
                     "{start} stroke=\"{rim}\" stroke-width=\"4\" fill=\"{rim}\" aria-hidden=\"true\">{text}</text>"
@@ -87,7 +115,7 @@ mod tests {
     fn text_cannot_leave_its_element() {
         let mut page = Page::new([100.0, 50.0], [255; 3], true);
         page.text([1.0, 2.0], "a < b & c", 10.0, [0; 3], Anchor::Middle);
-        let text = svg(&page);
+        let text = svg(&page, Theme::Paper);
         assert!(text.contains(">a &lt; b &amp; c</text>") && text.contains("text-anchor=\"middle\""), "{text}");
         assert_eq!(text.matches("<text").count(), 2, "the rim lies under the text");
     }

@@ -1,18 +1,26 @@
-//! Synthetic LiDAR data sets by seeded ray casting.
-//!
-//! A road with cars, walls, poles and things that are no cars, seen by one spinning LiDAR. Everything is in the LiDAR frame: origin at the
-//! sensor, x forward, y left, z up, m; yaw counter-clockwise from +x, rad. A frame is a pure function of (configuration, split, index).
-//!
-//! Every car with at least five points on it is labelled, however much of it is hidden; its label says how much (KITTI's occlusion level).
+//! LiDAR data sets by seeded ray casting: a race as triangle meshes with any sensors, and a small synthetic street.
 
-pub mod cars;
-mod config;
-mod dataset;
+pub mod attributes;
+pub mod auto_label;
+pub mod beams;
+pub mod cloud_scan;
+mod config_text;
+pub mod effects;
+mod error;
+pub mod frame_scene;
+pub mod matched;
+pub mod mesh;
+pub mod race;
+pub mod race_car;
 pub mod raycast;
-pub mod road;
-mod roadside;
-pub mod scene;
-pub mod sensor;
+pub mod resim;
+pub mod rig;
+pub mod scan;
+pub mod scenario;
+pub mod street;
+pub mod track;
+pub mod world;
 
-pub use config::{FrameCounts, RoadConfig, SimulateError};
-pub use dataset::{MANIFEST_SCHEMA, Manifest, SplitCounts, make_road_dataset, make_road_frame};
+pub use error::SimulateError;
+pub use rig::{Rig, Sensor};
+pub use street::{FrameCounts, MANIFEST_SCHEMA, Manifest, RoadConfig, SplitCounts, make_road_dataset, make_road_frame};

@@ -80,14 +80,14 @@ impl TrainingFrames {
         let mut random = stream(self.seed, "augment", epoch, index as u64);
         let frame = self.frame(index, &mut random)?;
         if self.augmentation.is_none() || !frame.objects.is_empty() {
-            return Ok(self.preparer.training(&frame)?);
+            return Ok(self.preparer.training(&frame, &mut random)?);
         }
         let mut others: Vec<usize> = (0..self.ids.len()).filter(|other| *other != index).collect();
         others.shuffle(&mut random);
         for other in others {
             let frame = self.frame(other, &mut random)?;
             if !frame.objects.is_empty() {
-                return Ok(self.preparer.training(&frame)?);
+                return Ok(self.preparer.training(&frame, &mut random)?);
             }
         }
         let message = format!(

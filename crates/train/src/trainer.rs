@@ -201,7 +201,7 @@ impl<'a> Run<'a> {
     /// One step: forward, backward, clip, move.
     fn learn(&mut self, batch: &[Sample], clock: &mut Clock) -> Result<Step, TrainError> {
         let (losses, values) = clock.forward(|| {
-            let losses = self.detector.loss(batch);
+            let losses = self.detector.loss(batch)?;
             loss_values(&losses).map(|values| (losses, values))
         })?;
         // The parts come before their sum, which is only as good as they are.
@@ -225,7 +225,11 @@ impl<'a> Run<'a> {
     }
 
     fn not_finite(&self, what: String, batch: &[Sample]) -> TrainError {
-        TrainError::NotFinite { step: self.state.step, what, frames: batch.iter().map(|s| s.id.clone()).collect() }
+        TrainError::NotFinite {
+            step: self.state.step,
+            what,
+            frames: batch.iter().map(|s| s.id().to_string()).collect(),
+        }
     }
 
     /// Whether the epoch that has just been trained is to be evaluated.

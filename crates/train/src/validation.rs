@@ -2,7 +2,7 @@
 
 use crate::{TrainError, ValidationMetrics};
 use burn::tensor::Tensor;
-use data::{Dataset, Detection, KittiLine, prefetch};
+use data::{Dataset, Detection, KittiLine, prefetch, stream};
 use eval::{Difficulty, EvalFrame, EvalOptions, EvalReport, Metric, evaluate, reference_overlaps};
 use models::{Detector, Losses, ModelError, Preparer, Sample};
 use std::collections::BTreeMap;
@@ -40,14 +40,17 @@ pub fn evaluate_detector(
     let set = dataset.clone();
     let mut samples = prefetch(ids.to_vec(), workers, 2 * batch_size, move |id: &String| {
         let frame = set.load(id)?;
-        Ok::<(Sample, Sample), TrainError>((preparer.inference(&frame)?, preparer.training(&frame)?))
+        Ok::<(Sample, Sample), TrainError>((
+            preparer.inference(&frame)?,
+            preparer.training(&frame, &mut stream(0, "validation", 0, 0))?,
+        ))
     });
     let mut detections = Vec::with_capacity(ids.len());
     let mut losses = Vec::new();
     while detections.len() < ids.len() {
         let batch: Vec<(Sample, Sample)> = samples.by_ref().take(batch_size).collect::<Result<_, _>>()?;
         let (inference, training): (Vec<Sample>, Vec<Sample>) = batch.into_iter().unzip();
-        losses.push(loss_values(&detector.validation_loss(&training))?[0].1);
+        losses.push(loss_values(&detector.validation_loss(&training)?)?[0].1);
         detections.extend(detector.predict(&inference)?);
         progress(detections.len());
     }

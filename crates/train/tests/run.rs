@@ -89,6 +89,32 @@ fn config(dataset: &Path, assignments: &[&str]) -> RunConfig {
     RunConfig::from_table(table).unwrap()
 }
 
+/// The same run of a tiny PointRCNN.
+fn pointrcnn(dataset: &Path, assignments: &[&str]) -> RunConfig {
+    let mut table = config(dataset, assignments).to_table();
+    let network = r#"
+        kind = "pointrcnn"
+        sampling = { points = 256 }
+        levels = [
+            { centers = 64, scales = [{ radius_m = 0.5, samples = 8, filters = [8, 8] }] },
+            { centers = 16, scales = [{ radius_m = 1.5, samples = 8, filters = [12, 16] }] },
+        ]
+        propagation = [[16], [16]]
+        point_head = { mean_sizes = [{ class = "Car", size_m = [3.9, 1.6, 1.56] }], class_filters = [8, 8], box_filters = [8, 8] }
+        proposals = { train = { iou = 0.8, pre = 256, post = 32 }, test = { iou = 0.85, pre = 256, post = 16 } }
+        roi_sampling = { regions = 16 }
+        [roi_head]
+        points = 32
+        xyz_filters = [8, 8]
+        levels = [{ centers = 8, radius_m = 0.4, samples = 8, filters = [8, 8] }]
+        global_filters = [8, 16]
+        class_filters = [8, 8]
+        box_filters = [8, 8]
+    "#;
+    table["detector"]["network"] = toml::Value::Table(network.parse().unwrap());
+    RunConfig::from_table(table).unwrap()
+}
+
 fn session(workers: usize, resume: bool) -> Session {
     Session { device: Device::flex(), device_name: "flex".into(), workers, resume }
 }
@@ -134,6 +160,32 @@ fn a_run_stopped_at_any_step_and_resumed_ends_with_the_same_bits() {
     }
     let again = run(&config, &whole, 1, true).unwrap();
     assert_eq!(again.state, trained.state);
+}
+
+#[test]
+fn pointrcnn_resumes_to_the_bit_whatever_the_workers() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    let config = pointrcnn(dir.path(), &[]);
+    let whole = dir.path().join("whole");
+    let trained = run(&config, &whole, 1, false).unwrap();
+    assert!(trained.validation.is_some_and(|v| v.loss.is_finite()));
+    for (stop, workers) in [(1, 4), (4, 1), (6, 2)] {
+        let out = dir.path().join(format!("stopped-{stop}"));
+        let mut stopper = |event: Event| {
+            if let Event::Step { metrics, .. } = event {
+                assert!(metrics.step != stop, "stopped on purpose");
+            }
+        };
+        let session = session(workers, false);
+        catch_unwind(AssertUnwindSafe(|| train(&config, &out, &session, &mut stopper))).unwrap_err();
+        let resumed = run(&config, &out, 2, true).unwrap();
+        assert_eq!(weights(&whole), weights(&out), "stopped after step {stop}");
+        assert_eq!(resumed.state, trained.state, "stopped after step {stop}");
+    }
+    let other = dir.path().join("other");
+    run(&pointrcnn(dir.path(), &["seed=2"]), &other, 1, false).unwrap();
+    assert_ne!(weights(&whole), weights(&other));
 }
 
 #[test]

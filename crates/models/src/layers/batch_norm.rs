@@ -2,9 +2,12 @@
 //!
 //! burn's own layer keeps the biased variance of a batch; PyTorch, and so every published checkpoint, the unbiased one.
 
-use super::Init;
+use super::{Init, RowCounts, host};
+use crate::kernel_ops::norm_relu;
 use burn::module::{Module, Param, RunningState};
-use burn::tensor::Tensor;
+use burn::tensor::activation::relu;
+use burn::tensor::{Tensor, TensorData};
+use kernels::{Folded, NormParameters, Statistics};
 
 /// Normalisation over all but the channel dimension, with a learned scale and shift.
 #[derive(Module, Debug)]
@@ -67,6 +70,57 @@ impl BatchNorm {
         out.reshape(shape)
     }
 
+    /// [`BatchNorm::forward_train`] and a ReLU, in one operation where there is a kernel for it.
+    ///
+    /// # Shapes
+    /// `x`: `[B, C, ...]`, the result alike.
+    pub fn forward_train_relu<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        match norm_relu(&x, &self.weight.val(), &self.bias.val(), self.epsilon, true) {
+            Some((y, statistics)) => {
+                let count = x.shape().num_elements() / x.dims()[1];
+                self.update(self.moments(&statistics, count));
+                y
+            }
+            None => relu(self.forward_train(x)),
+        }
+    }
+
+    /// Statistics from the host.
+    pub fn moments(&self, statistics: &Statistics, count: usize) -> Moments {
+        let device = self.running_mean.value().device();
+        let tensor = |values: &[f64]| {
+            let values: Vec<f32> = values.iter().map(|&v| v as f32).collect();
+            Tensor::from_data(TensorData::new(values, [statistics.mean.len()]), &device)
+        };
+        Moments { mean: tensor(&statistics.mean), variance: tensor(&statistics.variance), count }
+    }
+
+    /// The statistics of past batches on the host.
+    ///
+    /// # Panics
+    /// When they are not f32.
+    pub fn running_statistics(&self) -> Statistics {
+        let of = |state: &RunningState<Tensor<1>>| {
+            host(state.value()).expect("statistics are f32").into_iter().map(f64::from).collect()
+        };
+        Statistics { mean: of(&self.running_mean), variance: of(&self.running_var) }
+    }
+
+    /// `fold` of this norm with its running statistics into the weights of what is before it.
+    ///
+    /// # Panics
+    /// When the parameters are not f32.
+    pub fn folded(&self, fold: impl FnOnce(&NormParameters<'_>) -> Folded) -> Folded {
+        let [gamma, beta] = [&self.weight, &self.bias].map(|p| host(p.val()).expect("parameters are f32"));
+        let statistics = self.running_statistics();
+        fold(&NormParameters { gamma: &gamma, beta: &beta, statistics: &statistics, epsilon: self.epsilon })
+    }
+
+    /// Added to a variance before its root.
+    pub fn epsilon(&self) -> f64 {
+        self.epsilon
+    }
+
     /// Normalises with the running statistics.
     ///
     /// # Shapes
@@ -83,6 +137,31 @@ impl BatchNorm {
     pub fn normalise_rows(&self, x: Tensor<2>, moments: &Moments) -> Tensor<2> {
         let scale = self.weight.val() / (moments.variance.clone() + self.epsilon).sqrt(); // [C]
         (x - moments.mean.clone().unsqueeze::<2>()) * scale.unsqueeze() + self.bias.val().unsqueeze() // [N, C]
+    }
+
+    /// Normalises rows with their own statistics and takes these into the running ones.
+    ///
+    /// # Shapes
+    /// `x`: `[N, C]`, the result alike.
+    pub fn forward_rows_train(&self, x: Tensor<2>, counts: &RowCounts) -> Tensor<2> {
+        let channels = x.dims()[1];
+        let mean = counts.mean(x.clone()); // [1, C]
+        let centered = x - mean.clone(); // [N, C]
+        let variance = counts.mean(centered.clone() * centered.clone()); // [1, C]
+        let scale = self.weight.val().unsqueeze() / (variance.clone() + self.epsilon).sqrt(); // [1, C]
+        let (mean, variance) = (mean.reshape([channels]), variance.reshape([channels]));
+        self.update(Moments { mean, variance, count: counts.total() });
+        centered * scale + self.bias.val().unsqueeze()
+    }
+
+    /// Normalises rows with the running statistics.
+    ///
+    /// # Shapes
+    /// `x`: `[N, C]`, the result alike.
+    pub fn forward_rows_eval(&self, x: Tensor<2>) -> Tensor<2> {
+        let scale = self.weight.val() / (self.running_var.value() + self.epsilon).sqrt(); // [C]
+        let shift = self.bias.val() - self.running_mean.value() * scale.clone(); // [C]
+        x * scale.unsqueeze() + shift.unsqueeze()
     }
 
     /// The statistics of past batches, as [`BatchNorm::normalise_rows`] takes them.

@@ -1,6 +1,7 @@
 //! Convolutions with what follows them.
 
-use super::{BatchNorm, Init, Mode};
+use super::{BatchNorm, Init, Mode, host};
+use crate::kernel_ops::{conv3x3, folded_conv3x3, folded_transposed, pointwise, transposed};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use burn::tensor::activation::relu;
@@ -27,8 +28,15 @@ impl ConvBnRelu {
     /// # Shapes
     /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H / stride, W / stride]`.
     pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
-        let options = ConvOptions::new([self.stride; 2], [1, 1], [1, 1], 1);
-        norm_relu(&self.norm, conv2d(x, self.weight.val(), None, options), mode)
+        let (weight, stride) = (self.weight.val(), self.stride);
+        if mode == Mode::Eval
+            && let Some(y) = folded_conv3x3(&x, stride, || self.norm.folded(|n| n.fold_into_conv(&values(&weight))))
+        {
+            return y;
+        }
+        let y = conv3x3(&x, &weight, stride)
+            .unwrap_or_else(|| conv2d(x, weight, None, ConvOptions::new([stride; 2], [1, 1], [1, 1], 1)));
+        norm_relu(&self.norm, y, mode)
     }
 }
 
@@ -53,16 +61,29 @@ impl DeconvBnRelu {
     /// # Shapes
     /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H * stride, W * stride]`.
     pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
-        let options = ConvTransposeOptions::new([self.stride; 2], [0, 0], [0, 0], [1, 1], 1);
-        norm_relu(&self.norm, conv_transpose2d(x, self.weight.val(), None, options), mode)
+        let (weight, stride) = (self.weight.val(), self.stride);
+        let fold = || self.norm.folded(|n| n.fold_into_transposed(&values(&weight), stride));
+        if mode == Mode::Eval
+            && let Some(y) = folded_transposed(&x, stride, fold)
+        {
+            return y;
+        }
+        let y = transposed(&x, &weight, stride).unwrap_or_else(|| {
+            conv_transpose2d(x, weight, None, ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1))
+        });
+        norm_relu(&self.norm, y, mode)
     }
 }
 
 fn norm_relu(norm: &BatchNorm, x: Tensor<4>, mode: Mode) -> Tensor<4> {
-    relu(match mode {
-        Mode::Train => norm.forward_train(x),
-        Mode::Eval => norm.forward_eval(x),
-    })
+    match mode {
+        Mode::Train => norm.forward_train_relu(x),
+        Mode::Eval => relu(norm.forward_eval(x)),
+    }
+}
+
+fn values(weight: &Tensor<4>) -> Vec<f32> {
+    host(weight.clone()).expect("weights are f32")
 }
 
 /// 1x1 convolution with bias.
@@ -87,6 +108,8 @@ impl PointwiseConv {
     /// # Shapes
     /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H, W]`.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
-        conv2d(x, self.weight.val(), Some(self.bias.val()), ConvOptions::new([1, 1], [0, 0], [1, 1], 1))
+        let (weight, bias) = (self.weight.val(), self.bias.val());
+        pointwise(&x, &weight, &bias)
+            .unwrap_or_else(|| conv2d(x, weight, Some(bias), ConvOptions::new([1, 1], [0, 0], [1, 1], 1)))
     }
 }

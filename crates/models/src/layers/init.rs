@@ -34,6 +34,11 @@ impl Init<'_> {
         })
     }
 
+    /// Normal with variance `2 / (fan_in + fan_out)` (Glorot and Bengio 2010): PyTorch's `xavier_normal_`.
+    pub fn xavier_normal<const D: usize>(&self, name: &str, shape: [usize; D], fans: [usize; 2]) -> Param<Tensor<D>> {
+        self.normal(name, shape, (2.0 / (fans[0] + fans[1]) as f32).sqrt())
+    }
+
     fn draw<const D: usize>(
         &self,
         name: &str,

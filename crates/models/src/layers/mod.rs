@@ -4,11 +4,13 @@ mod batch_norm;
 mod conv;
 mod host;
 mod init;
+mod rows;
 
 pub use batch_norm::{BatchNorm, Moments};
 pub use conv::{ConvBnRelu, DeconvBnRelu, PointwiseConv};
 pub use host::host;
 pub use init::Init;
+pub use rows::{RowCounts, RowsBnRelu, RowsLinear};
 
 /// Whether a pass learns (batch statistics, running ones updated) or only looks (running statistics).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -52,7 +52,7 @@ pub struct NonFinite {
 /// `cls` `[A, classes]`, `boxes` `[A, 7]`, `dir` `[A, bins]`, all raw outputs.
 ///
 /// # Errors
-/// A score that is NaN or infinite anywhere, or such a box among those that enter the suppression.
+/// A score that is NaN or infinite anywhere, or such an output for a box among those that enter the suppression.
 pub fn decode(
     cls: &[f32],
     boxes: &[f32],
@@ -82,9 +82,13 @@ pub fn decode(
     for &(anchor, score) in &best {
         let logits = &cls[anchor * classes..][..classes];
         let (residual, direction) = (&boxes[anchor * 7..][..7], &dir[anchor * bins..][..bins]);
-        let bbox = decode_box(residual, direction, anchors[anchor], options);
-        if !bbox.iter().chain(direction).all(|v| v.is_finite()) {
+        if !residual.iter().chain(direction).all(|v| v.is_finite()) {
             return Err(NonFinite { anchor, output: "box" });
+        }
+        let bbox = decode_box(residual, direction, anchors[anchor], options);
+        // A size is an exponential: early in a training one can be beyond all numbers. No object is that large.
+        if !bbox.iter().all(|v| v.is_finite()) {
+            continue;
         }
         // Scores of different logits may be equal; then the first class counts, as in the reference.
         let class = logits.iter().position(|&logit| sigmoid(logit) == score).unwrap_or(0);
@@ -167,13 +171,21 @@ mod tests {
     }
 
     #[test]
+    fn a_size_beyond_all_numbers_is_no_object() {
+        let (mut boxes, dir, anchors) = outputs(2);
+        boxes[7 + 3] = 200.0; // its exponential overflows
+        let found = decode(&[2.0, 3.0], &boxes, &dir, &anchors, &options()).unwrap();
+        assert_eq!(found.iter().map(|raw| raw.anchor).collect::<Vec<_>>(), [0]);
+    }
+
+    #[test]
     fn what_is_no_number_is_an_error() {
         let (boxes, dir, anchors) = outputs(2);
         let of = |cls: [f32; 2], boxes: &[f32], dir: &[f32]| decode(&cls, boxes, dir, &anchors, &options());
         assert_eq!(of([-5.0, f32::NAN], &boxes, &dir), Err(NonFinite { anchor: 1, output: "class score" }));
         assert!(of([f32::INFINITY, 0.0], &boxes, &dir).is_err());
         let mut broken = boxes.clone();
-        broken[7 + 3] = 200.0; // exp overflows
+        broken[7 + 3] = f32::NAN;
         assert_eq!(of([0.0, 0.0], &broken, &dir), Err(NonFinite { anchor: 1, output: "box" }));
         assert!(of([0.0, -9.0], &broken, &dir).is_ok(), "boxes that nobody asks for do not matter");
         assert!(of([0.0, 0.0], &boxes, &[0.0, f32::NAN, 0.0, 0.0]).is_err());

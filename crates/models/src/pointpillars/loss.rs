@@ -4,7 +4,7 @@ use super::Sample;
 use super::head::Predictions;
 use crate::Losses;
 use crate::config::LossConfig;
-use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal, smooth_l1};
+use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal_sum, smooth_l1};
 use burn::tensor::{Int, Tensor, TensorData};
 
 /// Weighted losses of a batch: classes over all anchors that count, boxes and directions over the positive ones, each
@@ -12,24 +12,18 @@ use burn::tensor::{Int, Tensor, TensorData};
 ///
 /// # Panics
 /// When a sample was prepared without targets.
-pub fn losses(predictions: &Predictions, batch: &[Sample], weights: &LossConfig) -> Losses {
+pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig) -> Losses {
     let device = predictions.cls.device();
     let [b, anchors, classes] = predictions.cls.dims();
-    let mut one_hot = vec![0f32; b * anchors * classes];
+    let mut labels = Vec::with_capacity(b * anchors);
     let mut class_weight = vec![0f32; b * anchors];
     let (mut positive, mut share, mut residuals, mut bins) = (vec![], vec![], vec![], vec![]);
     for (frame, sample) in batch.iter().enumerate() {
         let targets = sample.targets.as_ref().expect("a training sample has targets");
         let norm = 1.0 / (targets.positive.len().max(1) * b) as f32;
-        for (a, &label) in targets.labels.iter().enumerate() {
-            let row = frame * anchors + a;
-            if label >= 0 {
-                class_weight[row] = norm;
-            }
-            if label > 0 {
-                one_hot[row * classes + label as usize - 1] = 1.0;
-            }
-        }
+        labels.extend_from_slice(&targets.labels);
+        let weights = class_weight[frame * anchors..].iter_mut().zip(&targets.labels);
+        weights.filter(|(_, label)| **label >= 0).for_each(|(weight, _)| *weight = norm);
         for (k, &(anchor, _)) in targets.positive.iter().enumerate() {
             positive.push((frame * anchors + anchor) as i32);
             share.push(norm);
@@ -39,8 +33,8 @@ pub fn losses(predictions: &Predictions, batch: &[Sample], weights: &LossConfig)
     }
     let tensor = |values, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
     let rows = b * anchors;
-    let focal = sigmoid_focal(predictions.cls.clone().reshape([rows, classes]), tensor(one_hot, [rows, classes]));
-    let cls = (focal * tensor(class_weight, [rows, 1])).sum() * weights.class_weight;
+    let logits = predictions.cls.clone().reshape([rows, classes]);
+    let cls = sigmoid_focal_sum(logits, labels, class_weight) * weights.class_weight;
     let n = positive.len();
     let (boxes, dir) = if n == 0 {
         (Tensor::zeros([1], &device), Tensor::zeros([1], &device))

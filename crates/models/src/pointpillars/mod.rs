@@ -5,13 +5,13 @@ mod head;
 mod loss;
 mod network;
 mod sample;
-mod scatter;
 mod vfe;
 
 pub mod anchors;
 pub mod box_coder;
 pub mod decode;
 pub mod pillars;
+pub mod scatter;
 pub mod target_assigner;
 
 pub use backbone::{BackboneStages, BaseBevBackbone, Block};

@@ -8,7 +8,7 @@ use super::vfe::{PillarRows, PillarVfe};
 use crate::config::{DetectorConfig, PointPillarsConfig};
 use crate::layers::{Init, Mode};
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Device, Tensor};
 
 /// The network. Field names are OpenPCDet's.
 #[derive(Module, Debug)]
@@ -42,7 +42,7 @@ impl PointPillars {
         let init = Init { seed, device };
         let neck = net.backbone.upsample_filters.iter().sum();
         let anchors = net.anchors.iter().map(|a| a.rotations_rad.len()).sum();
-        let [nx, ny, _] = config.grid_size();
+        let [nx, ny, _] = net.grid_size(config);
         PointPillars {
             vfe: PillarVfe::new(config.channels + 6, net.vfe_filters, net.pillars.max_points, &init),
             backbone_2d: BaseBevBackbone::new(net.vfe_filters, &net.backbone, &init),
@@ -53,21 +53,28 @@ impl PointPillars {
     }
 
     /// All stages of a batch.
-    pub fn forward(&self, batch: &[Sample], mode: Mode) -> Stages {
-        let device = self.vfe.weight.val().device();
-        let inputs = self.vfe.weight.dims()[1];
+    pub fn forward(&self, batch: &[&Sample], mode: Mode) -> Stages {
+        let pillar_features = self.vfe.forward(self.pillar_rows(batch), mode);
+        let (cells, shape) = self.cells(batch);
+        let spatial_features = scatter(pillar_features.clone(), cells, shape);
+        let backbone = self.backbone_2d.forward(spatial_features.clone(), mode);
+        let predictions = self.dense_head.forward(backbone.spatial_features_2d.clone());
+        Stages { pillar_features, spatial_features, backbone, predictions }
+    }
+
+    /// The points of all pillars of a batch, one sample after the other.
+    pub fn pillar_rows(&self, batch: &[&Sample]) -> PillarRows {
         let features: Vec<f32> = batch.iter().flat_map(|s| s.features.iter().copied()).collect();
-        let rows = features.len() / inputs;
-        let num_points = batch.iter().flat_map(|s| s.pillars.num_points.iter().copied()).collect();
-        let features = Tensor::<2>::from_data(TensorData::new(features, [rows, inputs]), &device); // [N, F]
-        let pillar_features = self.vfe.forward(PillarRows { features, num_points }, mode);
+        let num_points: Vec<u32> = batch.iter().flat_map(|s| s.pillars.num_points.iter().copied()).collect();
+        PillarRows { features: features.into(), num_points: num_points.into() }
+    }
+
+    /// The cell of each pillar of a batch in the canvases laid end to end, and `[B, ny, nx]`.
+    pub fn cells(&self, batch: &[&Sample]) -> (Vec<i32>, [usize; 3]) {
         let cells = batch.iter().enumerate().flat_map(|(b, sample)| {
             let cell = move |&[_, y, x]: &[u32; 3]| ((b * self.ny + y as usize) * self.nx + x as usize) as i32;
             sample.pillars.coords_zyx.iter().map(cell)
         });
-        let spatial_features = scatter(pillar_features.clone(), cells.collect(), [batch.len(), self.ny, self.nx]);
-        let backbone = self.backbone_2d.forward(spatial_features.clone(), mode);
-        let predictions = self.dense_head.forward(backbone.spatial_features_2d.clone());
-        Stages { pillar_features, spatial_features, backbone, predictions }
+        (cells.collect(), [batch.len(), self.ny, self.nx])
     }
 }

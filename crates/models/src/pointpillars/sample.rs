@@ -41,7 +41,7 @@ impl Preparation {
     pub fn new(config: &DetectorConfig, net: &PointPillarsConfig) -> Self {
         let range = config.range_m;
         let stride = net.backbone.strides[0] / net.backbone.upsample_strides[0];
-        let [nx, ny, _] = config.grid_size();
+        let [nx, ny, _] = net.grid_size(config);
         let map = [ny / stride, nx / stride];
         let anchor_classes: Vec<AnchorClass> = net
             .anchors
@@ -147,7 +147,7 @@ impl Preparation {
     ///
     /// # Errors
     /// Scores that are not numbers.
-    pub fn detections(&self, predictions: Predictions, batch: &[Sample]) -> Result<Vec<Vec<Detection>>, ModelError> {
+    pub fn detections(&self, predictions: Predictions, batch: &[&Sample]) -> Result<Vec<Vec<Detection>>, ModelError> {
         let [b, anchors, classes] = predictions.cls.dims();
         let bins = predictions.dir.dims()[2];
         let cls = layers::host(predictions.cls)?;

@@ -1,9 +1,11 @@
 //! Pillar feature net (OpenPCDet: `PillarVFE`): what the points of a pillar become on the canvas.
 
+use crate::kernel_ops::{pillar_net, pillar_net_inference};
 use crate::layers::{BatchNorm, Init, Mode, Moments};
 use burn::module::{Module, Param};
 use burn::tensor::activation::relu;
 use burn::tensor::{Int, Tensor, TensorData};
+use std::sync::Arc;
 
 /// Linear without bias, batch normalisation, ReLU, maximum over the pillar.
 ///
@@ -19,13 +21,13 @@ pub struct PillarVfe {
     max_points: usize,
 }
 
-/// The points of all pillars of a batch, pillar after pillar.
+/// The points of all pillars of a batch, pillar after pillar, on the host.
 #[derive(Clone, Debug)]
 pub struct PillarRows {
     /// Decorated points, `[N, F]`.
-    pub features: Tensor<2>,
+    pub features: Arc<[f32]>,
     /// Points in each pillar; their sum is N.
-    pub num_points: Vec<u32>,
+    pub num_points: Arc<[u32]>,
 }
 
 impl PillarVfe {
@@ -41,10 +43,34 @@ impl PillarVfe {
     /// # Shapes
     /// `rows.features`: `[N, F]`; result `[P, C]`.
     pub fn forward(&self, rows: PillarRows, mode: Mode) -> Tensor<2> {
-        let device = rows.features.device();
-        let [n, _] = rows.features.dims();
+        let points = (rows.features.clone(), rows.num_points.clone());
+        let (weight, gamma, beta) = (self.weight.val(), self.norm.weight.val(), self.norm.bias.val());
+        let (parameters, epsilon) = ((&weight, &gamma, &beta), self.norm.epsilon());
+        match mode {
+            Mode::Train => match pillar_net(points, parameters, self.max_points, epsilon) {
+                Some((out, statistics, count)) => {
+                    self.norm.update(self.norm.moments(&statistics, count));
+                    out
+                }
+                None => self.forward_on_device(rows, mode),
+            },
+            Mode::Eval => {
+                let statistics = || self.norm.running_statistics();
+                pillar_net_inference(points, parameters, self.max_points, epsilon, statistics)
+                    .unwrap_or_else(|| self.forward_on_device(rows, mode))
+            }
+        }
+    }
+
+    /// The same by burn's operations.
+    fn forward_on_device(&self, rows: PillarRows, mode: Mode) -> Tensor<2> {
+        let weight = self.weight.val();
+        let device = weight.device();
+        let inputs = weight.dims()[1];
+        let n = rows.features.len() / inputs;
+        let features = Tensor::<2>::from_data(TensorData::new(rows.features.to_vec(), [n, inputs]), &device); // [N, F]
         let pillars = rows.num_points.len();
-        let x = rows.features.matmul(self.weight.val().transpose()); // [N, C]
+        let x = features.matmul(weight.transpose()); // [N, C]
         let [_, c] = x.dims();
         let moments = match mode {
             Mode::Train => {
@@ -109,8 +135,10 @@ mod tests {
         let vfe = PillarVfe::new(3, 5, 4, &Init { seed: 3, device: &device });
         let (num_points, max_points) = (vec![2u32, 4, 1], 4);
         let values: Vec<f32> = (0..21).map(|i| ((i * 37 % 23) as f32 - 9.0) / 5.0).collect();
-        let features = Tensor::<2>::from_data(TensorData::new(values.clone(), [7, 3]), &device);
-        let got = vfe.forward(PillarRows { features, num_points: num_points.clone() }, Mode::Train);
+        let rows = || PillarRows { features: values.clone().into(), num_points: num_points.clone().into() };
+        let got = vfe.forward(rows(), Mode::Train);
+        let other = PillarVfe::new(3, 5, 4, &Init { seed: 3, device: &device });
+        let on_device = other.forward_on_device(rows(), Mode::Train);
 
         let mut padded = vec![0.0f32; 3 * max_points * 3];
         let mut from = 0;
@@ -123,8 +151,10 @@ mod tests {
         let x =
             Tensor::<2>::from_data(TensorData::new(padded, [12, 3]), &device).matmul(fresh.weight.val().transpose());
         let want = relu(fresh.norm.forward_train(x)).reshape([3, 4, 5]).max_dim(1).reshape([3, 5]);
-        let difference: f32 = (got - want).abs().max().into_scalar();
-        assert!(difference < 1e-5, "{difference}");
+        for got in [got, on_device] {
+            let difference: f32 = (got - want.clone()).abs().max().into_scalar();
+            assert!(difference < 1e-5, "{difference}");
+        }
         let statistics = |v: &PillarVfe| crate::layers::host(v.norm.running_var.value()).unwrap();
         for (a, b) in statistics(&vfe).iter().zip(statistics(&fresh)) {
             assert!((a - b).abs() < 1e-6, "{a} {b}");

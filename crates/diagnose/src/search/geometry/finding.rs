@@ -1,0 +1,231 @@
+//! What a finding says: parameters with intervals, curves, and the smallest effect that would have been seen.
+
+use super::*;
+
+pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Minimum)> {
+    let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
+    let error = |c: Column| {
+        let k = sums.columns.iter().position(|x| *x == c)?;
+        let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
+        Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
+    };
+    let mut all = Vec::new();
+    let mut push = |name: &str, parameter: &str, value: Option<f64>, floor: f64, unit: &str, factor: f64| {
+        if let Some(v) = value {
+            let minimum =
+                Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
+            all.push((name.to_owned(), minimum));
+        }
+    };
+    let deg = 1f64.to_degrees();
+    push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
+    push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
+    let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
+    push("sensor_extrinsics", "yaw_deg", error(one), FLOOR_TURN_RAD, "deg", deg);
+    push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
+    push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
+    all
+}
+
+#[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
+pub(super) fn found(
+    context: &Context,
+    sums: &Sums,
+    estimate: &[usize],
+    blocks: &[usize],
+    suspect: &Suspect,
+    chosen: &[Suspect],
+    equals: Vec<String>,
+    confidence: f64,
+    held_out_gains: Vec<f64>,
+) -> Found {
+    let mut parameters: Vec<(String, Parameter)> = Vec::new();
+    let name = suspect.name();
+    let (covariate, says, curve) = match suspect {
+        Suspect::Linear { columns, .. } => {
+            let fitted = fit_all(sums, estimate, blocks, chosen);
+            linear_parameters(context, sums, &fitted, columns, name, &mut parameters);
+            let list: Vec<String> =
+                parameters.iter().map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
+            let what = match name {
+                "range_bias" => "all ranges are measured longer (shorter where negative) than they are",
+                "pitch_roll" => "the whole scene is tilted: the car leans otherwise than the simulation believes",
+                "rolling_shutter" => {
+                    "the scene shears over a scan: points of a moving car are put where the car is at one moment"
+                }
+                _ => "one sensor sees the scene displaced: it is mounted otherwise than believed",
+            };
+            let covariate = match name {
+                "range_bias" => "cos_incidence",
+                "rolling_shutter" => "scan_phase",
+                "pitch_roll" => "range_m",
+                _ => "sensor",
+            };
+            (covariate.to_owned(), format!("{what}: {}", list.join(", ")), Curve::default())
+        }
+        Suspect::Groups { grouping, column, .. } => {
+            let frames = grouped(sums, *grouping);
+            let all = total(estimate.iter().map(|&i| &frames[i]));
+            let (std, n) = spread(&all, *column);
+            let error = std / (2.0 * n.max(1.0)).sqrt();
+            let unit = if *column == 0 { (1.0, "m") } else { (1f64.to_degrees(), "deg") };
+            if name != UNNAMED {
+                let label = if *column == 0 { "std_m" } else { "std_deg" };
+                parameters.push(parameter(label, std * unit.0, (error.hypot(0.05 * std)) * unit.0, unit.1));
+            }
+            let offsets = offsets(&all, *column);
+            if name != UNNAMED {
+                for (k, v) in &offsets {
+                    let (sensor, row) = place_of(*k as usize, *grouping);
+                    let e = 1.0 / (all[k].gram[2 * column] + group_precision(*column)).sqrt();
+                    let label = format!("{}/{}", context.rig.sensors[sensor].name, row as usize);
+                    parameters.push(parameter(&label, v * unit.0, e * unit.0, unit.1));
+                }
+            }
+            let curve = group_curve(&all, &offsets, *grouping, *column, unit.0);
+            match (grouping, column) {
+                (Grouping::Row, 0) => (
+                    "row".to_owned(),
+                    format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0),
+                    curve,
+                ),
+                (Grouping::Row, _) => (
+                    "row".into(),
+                    format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * unit.0),
+                    curve,
+                ),
+                _ => (
+                    "azimuth".into(),
+                    format!(
+                        "ranges are off by {:.1} cm in a way that depends on the azimuth; no cause of the catalogue does that",
+                        std * 100.0
+                    ),
+                    curve,
+                ),
+            }
+        }
+    };
+    let status = match (name, equals.is_empty()) {
+        (UNNAMED, _) => Status::Unexplained,
+        (_, true) => Status::Named,
+        _ => Status::Ambiguous,
+    };
+    let mut causes: Vec<String> =
+        std::iter::once(name.to_owned()).chain(equals.into_iter().filter(|e| e != UNNAMED)).collect();
+    let status = if status == Status::Ambiguous && causes.len() == 1 { Status::Named } else { status };
+    if name == UNNAMED {
+        causes.clear();
+    }
+    let separate_by = (status == Status::Ambiguous)
+        .then(|| "surfaces on all sides at many ranges, and a second sensor that sees the same ones".to_owned());
+    let family = match name {
+        "range_bias" | "beam_range_offset" => "range_error",
+        "rolling_shutter" => "timing",
+        UNNAMED => "unknown",
+        _ => "geometry",
+    };
+    Found {
+        status,
+        causes,
+        family,
+        parameters,
+        confidence,
+        channel: "residuals",
+        covariate,
+        held_out_gains,
+        says,
+        separate_by,
+        curve,
+    }
+}
+
+pub(super) fn linear_parameters(
+    context: &Context,
+    sums: &Sums,
+    fitted: &LinearFit,
+    columns: &[usize],
+    name: &str,
+    parameters: &mut Vec<(String, Parameter)>,
+) {
+    let value = |c: usize| {
+        let i = fitted.columns.iter().position(|x| *x == c)?;
+        Some((fitted.theta[i], fitted.error(i)))
+    };
+    let deg = f64::to_degrees;
+    let shift_names = ["x_m", "y_m", "z_m"];
+    let mut turn = Vector3::zeros();
+    let mut turn_error = Vector3::zeros();
+    let mut sensor = None;
+    for &c in columns {
+        let Some((theta, error)) = value(c) else { continue };
+        match sums.columns[c] {
+            Column::RangeOffset => parameters.push(parameter("offset_m", theta, error.hypot(0.003), "m")),
+            Column::RangeScale => parameters.push(parameter("scale", theta, error.hypot(1e-4), "1")),
+            Column::Sweep(k) => {
+                let (label, unit) = [("shear_x_m", "m"), ("shear_y_m", "m"), ("shear_yaw_deg", "deg")][k];
+                let by = if k == 2 { deg(1.0) } else { 1.0 };
+                parameters.push(parameter(label, by * theta, by * error, unit));
+            }
+            // The scene turns and moves against the car: the car leans the other way.
+            Column::Pose(k) | Column::SensorPose(_, k) => {
+                if let Column::SensorPose(s, _) = sums.columns[c] {
+                    sensor = Some(s);
+                }
+                if k < 3 {
+                    (turn[k], turn_error[k]) = (-theta, error);
+                } else {
+                    parameters.push(parameter(shift_names[k - 3], -theta, error.hypot(0.003), "m"));
+                }
+            }
+            Column::Structure(_) => {}
+        }
+    }
+    if turn == Vector3::zeros() {
+        return;
+    }
+    let mut own = [turn.x, turn.y, turn.z];
+    let mut own_error = [turn_error.x, turn_error.y, turn_error.z];
+    if name == "sensor_extrinsics" {
+        let s = sensor.unwrap_or(0);
+        parameters
+            .push(("sensor".into(), Parameter { estimate: s as f64, unit: "number".into(), ci95: [s as f64; 2] }));
+        // About the sensor's own axes, as the rig's file has them.
+        let turn_of = context.rig.sensors[s].pose().rotation;
+        let t = turn_of.inverse_transform_vector(&turn);
+        let matrix = turn_of.inverse().to_rotation_matrix();
+        let e = Vector3::from_fn(|i, _| (0..3).map(|j| (matrix[(i, j)] * turn_error[j]).powi(2)).sum::<f64>().sqrt());
+        (own, own_error) = ([t.x, t.y, t.z], [e.x, e.y, e.z]);
+    }
+    for (k, label) in ["roll_deg", "pitch_deg", "yaw_deg"].into_iter().enumerate() {
+        if own[k] != 0.0 && (own[k].abs() > 1e-9) {
+            parameters.push(parameter(
+                label,
+                deg(own[k]),
+                deg(own_error[k]).hypot(0.002).hypot(0.02 * deg(own[k])),
+                "deg",
+            ));
+        }
+    }
+}
+
+pub(super) fn group_curve(
+    sums: &BTreeMap<u32, GroupSums>,
+    offsets: &BTreeMap<u32, f64>,
+    grouping: Grouping,
+    column: usize,
+    unit: f64,
+) -> Curve {
+    let points = offsets.iter().map(|(k, v)| {
+        let (sensor, place) = place_of(*k as usize, grouping);
+        let x = if grouping == Grouping::Row {
+            place + 1000.0 * sensor as f64
+        } else {
+            place.to_degrees() + 1000.0 * sensor as f64
+        };
+        let error = 1.0 / (sums[k].gram[2 * column] + group_precision(column)).sqrt();
+        CurvePoint { x, measured: v * unit, before: 0.0, after: v * unit, error: error * unit }
+    });
+    let x = if grouping == Grouping::Row { "row (1000 a sensor)" } else { "azimuth, degrees (1000 a sensor)" };
+    let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
+    Curve { x: x.into(), y: y.into(), points: points.collect() }
+}

@@ -1,0 +1,165 @@
+//! Average precision of the boxes of one kind: at one distance, of one heading, with so many points.
+
+use super::AnalysisOptions;
+use crate::evidence::{Evidence, FrameEvidence};
+use crate::matching::{BoxIndex, CurveKey};
+use crate::overlaps::{FrameOverlaps, range_m, upright_box};
+use crate::{Difficulty, EvalFrame, Metric, ceiling_ap40};
+use data::{Cloud, KittiLine};
+use geometry::{Box3, limit_period, points_in_boxes};
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::f64::consts::PI;
+
+/// The boxes of one kind.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Stratum {
+    /// Values from (of the overlap limit: the limit).
+    pub from: f64,
+    /// Values to, itself not included.
+    pub to: f64,
+    /// Ground truths of that kind.
+    pub n_gt: i64,
+    /// KITTI's average precision over 40 recalls, percent; `None` where undefined.
+    pub ap40: Option<f64>,
+    /// The most that it can be with so few ground truths, percent.
+    pub ceiling_ap40: Option<f64>,
+    /// Area with a point at every score, percent; `None` without ground truth.
+    pub ap_area: Option<f64>,
+    /// Share of the ground truths that are hit, percent; `None` without one.
+    pub recall: Option<f64>,
+}
+
+/// How many points of a frame's cloud lie in each of its boxes.
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
+pub struct BoxPoints {
+    /// Of each label.
+    pub labels: Vec<u32>,
+    /// Of each detection.
+    pub detections: Vec<u32>,
+}
+
+impl BoxPoints {
+    /// Counts the points of a cloud in boxes of the LiDAR frame.
+    pub fn count(cloud: &Cloud, labels: &[Box3], detections: &[Box3]) -> Self {
+        let count = |boxes: &[Box3]| {
+            let inside = points_in_boxes(&cloud.values, cloud.channels, boxes, 0.0);
+            inside.iter().map(|points| points.len() as u32).collect()
+        };
+        BoxPoints { labels: count(labels), detections: count(detections) }
+    }
+}
+
+/// Whether a box is near enough to be looked at.
+pub(super) fn near(frame: &EvalFrame, index: BoxIndex, options: &AnalysisOptions) -> bool {
+    range_m(line(frame, index), options.label_frame) <= options.max_range_m
+}
+
+fn line(frame: &EvalFrame, index: BoxIndex) -> &KittiLine {
+    match index {
+        BoxIndex::Label(i) => &frame.labels[i],
+        BoxIndex::Detection(j) => &frame.detections[j],
+    }
+}
+
+/// By distance on the ground, in steps of [`AnalysisOptions::step_m`]. As everywhere, what lies outside a step is ignored on both
+/// sides, and a detection outside that finds an ignored ground truth is no false alarm.
+pub fn by_distance(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratum> {
+    let n = (options.max_range_m / options.step_m).ceil().clamp(1.0, 1000.0) as usize;
+    let edges: Vec<f64> = (0..=n).map(|i| i as f64 * options.step_m).collect();
+    strata(frames, options, &edges, |f, index| range_m(line(&frames[f], index), options.label_frame))
+}
+
+/// By heading relative to the ray from the sensor, modulo a half turn: 0 degrees is seen from the front or the back, 90 from the
+/// side. Six steps of 15 degrees.
+pub fn by_heading(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratum> {
+    let edges: Vec<f64> = (0..=6).map(|i| f64::from(i) * 15.0 + if i == 6 { 1e-9 } else { 0.0 }).collect();
+    strata(frames, options, &edges, |f, index| {
+        let b = upright_box(line(&frames[f], index), options.label_frame);
+        let ray = b.center[1].atan2(b.center[0]);
+        limit_period(b.yaw_rad - ray, 0.5, PI).abs().to_degrees()
+    })
+}
+
+/// By the number of points in the box: of a ground truth in the true one, of a false alarm in its own.
+///
+/// # Panics
+/// Where `points` are not those of `frames`.
+pub fn by_points(frames: &[EvalFrame], points: &[BoxPoints], options: &AnalysisOptions) -> Vec<Stratum> {
+    let edges = [0.0, 1.0, 5.0, 20.0, 100.0, 500.0, 2000.0, f64::INFINITY];
+    strata(frames, options, &edges, |f, index| {
+        f64::from(match index {
+            BoxIndex::Label(i) => points[f].labels[i],
+            BoxIndex::Detection(j) => points[f].detections[j],
+        })
+    })
+}
+
+/// By the overlap that is asked for, 0.05 to 0.95.
+pub fn by_overlap(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratum> {
+    let overlaps = overlaps(frames, options);
+    let of_limit = |k: u32| {
+        let limit = f64::from(k) / 20.0;
+        let evidence = evidence(frames, &overlaps, options, limit, |f, index| near(&frames[f], index, options));
+        stratum(limit, limit + 0.05, &evidence)
+    };
+    (1..20u32).collect::<Vec<_>>().into_par_iter().map(of_limit).collect()
+}
+
+/// AP of all boxes at the asked overlap, with overlaps at hand.
+pub(super) fn whole(frames: &[EvalFrame], options: &AnalysisOptions) -> Stratum {
+    let overlaps = overlaps(frames, options);
+    let near = |f: usize, index| near(&frames[f], index, options);
+    stratum(0.0, options.max_range_m, &evidence(frames, &overlaps, options, options.overlap, near))
+}
+
+fn strata(
+    frames: &[EvalFrame],
+    options: &AnalysisOptions,
+    edges: &[f64],
+    value: impl Fn(usize, BoxIndex) -> f64 + Sync,
+) -> Vec<Stratum> {
+    let overlaps = overlaps(frames, options);
+    let of_step = |edge: &[f64]| {
+        let inside =
+            |f: usize, index| near(&frames[f], index, options) && (edge[0]..edge[1]).contains(&value(f, index));
+        stratum(edge[0], edge[1], &evidence(frames, &overlaps, options, options.overlap, inside))
+    };
+    edges.windows(2).collect::<Vec<_>>().into_par_iter().map(of_step).collect()
+}
+
+fn overlaps(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<FrameOverlaps> {
+    frames.par_iter().map(|frame| FrameOverlaps::new(frame, options.label_frame)).collect()
+}
+
+fn evidence(
+    frames: &[EvalFrame],
+    overlaps: &[FrameOverlaps],
+    options: &AnalysisOptions,
+    overlap: f64,
+    inside: impl Fn(usize, BoxIndex) -> bool,
+) -> Evidence {
+    let key = CurveKey { class: &options.class, metric: Metric::ThreeD, overlap, difficulty: Difficulty::All };
+    Evidence::new(
+        frames
+            .iter()
+            .zip(overlaps)
+            .enumerate()
+            .map(|(f, (frame, overlaps))| FrameEvidence::collect((frame, overlaps), &key, |index| inside(f, index))),
+    )
+}
+
+fn stratum(from: f64, to: f64, evidence: &Evidence) -> Stratum {
+    let p = evidence.precisions(None);
+    let known = |v: f64| (p.n_gt > 0 && !v.is_nan()).then_some(v);
+    Stratum {
+        from,
+        to,
+        n_gt: p.n_gt,
+        ap40: known(p.ap40),
+        ceiling_ap40: ceiling_ap40(p.n_gt),
+        ap_area: known(p.ap_area),
+        recall: known(100.0 * p.n_tp as f64 / p.n_gt as f64),
+    }
+}

@@ -1,0 +1,303 @@
+//! From the scores of runs to cells, gaps and warnings.
+
+use super::scores::RunScores;
+use super::{
+    Cell, CellNumber, CellRun, Gap, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity,
+    RunId, RunNumber, RunState, published,
+};
+use crate::bootstrap::{deviation, mean};
+use crate::{RangeSection, ceiling_ap40};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
+
+/// A run on a test set: its scores, or why there are none.
+pub type RunResult = Result<RunScores, String>;
+
+/// Below this AP at overlap 0.5 on the set that it was trained on, a network is called undertrained, percent.
+const UNDERTRAINED_AP: f64 = 60.0;
+
+/// A cell with the draws behind its intervals.
+struct Drawn {
+    cell: Cell,
+    /// Of each number of the cell, in its order: the mean over seeds and frames drawn again.
+    draws: Vec<Vec<f64>>,
+}
+
+/// Builds the matrix. `results` are keyed by run and by [`Place::name`] of the test set; a planned run that is not among them is
+/// missing, one that is not planned is left out.
+///
+/// The same numbers for any number of threads.
+pub fn build(plan: &MatrixPlan, results: &BTreeMap<(RunId, String), RunResult>, options: &MatrixOptions) -> Matrix {
+    let mut keys = Vec::new();
+    for network in &plan.networks {
+        for train_set in &network.train_sets {
+            keys.extend(plan.test_sets.iter().map(|test_set| (network, train_set, test_set)));
+        }
+    }
+    let drawn: Vec<Drawn> = keys.into_par_iter().map(|key| draw(key, results, options)).collect();
+    let gaps = gaps(plan, &drawn, options);
+    let mut warnings = plan_warnings(plan);
+    warnings.extend(drawn.iter().flat_map(|d| cell_warnings(&d.cell, results)));
+    warnings.extend(plan.test_sets.iter().flat_map(|test_set| ceiling_warnings(test_set, &drawn)));
+    Matrix {
+        schema: MATRIX_SCHEMA.into(),
+        plan: plan.clone(),
+        options: options.clone(),
+        cells: drawn.into_iter().map(|d| d.cell).collect(),
+        gaps,
+        warnings,
+    }
+}
+
+fn draw(
+    (network, train_set, test_set): (&PlannedNetwork, &Place, &Place),
+    results: &BTreeMap<(RunId, String), RunResult>,
+    options: &MatrixOptions,
+) -> Drawn {
+    let (mut runs, mut done) = (Vec::new(), Vec::new());
+    for &seed in &network.seeds {
+        let id = RunId { network: network.network.name.clone(), train_set: train_set.name.clone(), seed };
+        let state = match results.get(&(id, test_set.name.clone())) {
+            Some(Ok(scores)) => {
+                done.push((seed, scores));
+                RunState::Done
+            }
+            Some(Err(reason)) => RunState::Failed(reason.clone()),
+            None => RunState::Missing,
+        };
+        runs.push(CellRun { seed, state });
+    }
+    // A run over other frames cannot be drawn together with the rest.
+    if let Some(first) = done.first().map(|(_, scores)| scores.frames) {
+        for run in &mut runs {
+            if let Some((_, scores)) = done.iter().find(|(seed, s)| *seed == run.seed && s.frames != first) {
+                let reason = format!("has {} test frames, the first run of this cell {first}", scores.frames);
+                run.state = RunState::Failed(reason);
+            }
+        }
+        done.retain(|(_, scores)| scores.frames == first);
+    }
+    let frames = done.first().map(|(_, scores)| scores.frames);
+    let mut out = Drawn {
+        cell: Cell {
+            network: network.network.name.clone(),
+            train_set: train_set.name.clone(),
+            test_set: test_set.name.clone(),
+            frames,
+            runs,
+            numbers: Vec::new(),
+        },
+        draws: Vec::new(),
+    };
+    let n_curves = done.first().map_or(0, |(_, scores)| scores.curves.len());
+    let weights: Vec<Vec<u32>> = (0..options.bootstrap.replicates)
+        .map(|r| {
+            let purpose = format!("matrix frames {}", test_set.name);
+            options.bootstrap.frame_weights(&purpose, r, frames.unwrap_or(0))
+        })
+        .collect();
+    let seeds: Vec<Vec<usize>> = (0..options.bootstrap.replicates)
+        .map(|r| {
+            let purpose = format!("matrix seeds {} {}", network.network.name, train_set.name);
+            options.bootstrap.draws(&purpose, r, done.len())
+        })
+        .collect();
+    for k in 0..n_curves {
+        let curves: Vec<_> = done.iter().map(|(_, scores)| &scores.curves[k]).collect();
+        let whole: Vec<_> = curves.iter().map(|curve| curve.numbers(None)).collect();
+        let draws: Vec<[f64; 4]> = weights
+            .par_iter()
+            .zip(&seeds)
+            .map(|(weights, seeds)| {
+                let mut known: Vec<Option<[f64; 4]>> = vec![None; curves.len()];
+                let mut sum = [0.0; 4];
+                for &i in seeds {
+                    let numbers = known[i].get_or_insert_with(|| curves[i].numbers(Some(weights)).0);
+                    sum.iter_mut().zip(numbers).for_each(|(sum, v)| *sum += *v);
+                }
+                sum.map(|sum| sum / seeds.len() as f64)
+            })
+            .collect();
+        for (q, quantity) in Quantity::ALL.into_iter().enumerate() {
+            let values = done.iter().zip(&whole).map(|((seed, _), (numbers, _))| (*seed, numbers[q])).collect();
+            let draws: Vec<f64> = draws.iter().map(|d| d[q]).collect();
+            let curve = curves[0];
+            let key =
+                NumberKey { class: curve.class.clone(), section: curve.section, quantity, overlap: curve.overlap };
+            let mut number = CellNumber::of_runs(key, values, [&network.network, train_set, test_set]);
+            number.n_gt = Some(whole[0].1);
+            number.ceiling = (quantity == Quantity::Ap40).then(|| ceiling_ap40(whole[0].1)).flatten();
+            number.interval = options.bootstrap.interval(draws.clone());
+            out.cell.numbers.push(number);
+            out.draws.push(draws);
+        }
+    }
+    out
+}
+
+/// What a number of a cell is about.
+pub(super) struct NumberKey {
+    pub class: String,
+    pub section: Option<RangeSection>,
+    pub quantity: Quantity,
+    pub overlap: f64,
+}
+
+impl CellNumber {
+    /// Mean and deviation over runs, seed and value (NaN where undefined) of each; without an interval. `places` are the network,
+    /// the train set and the test set.
+    pub(super) fn of_runs(key: NumberKey, runs: Vec<(u64, f64)>, places: [&Place; 3]) -> Self {
+        let NumberKey { class, section, quantity, overlap } = key;
+        let values: Vec<f64> = runs.iter().map(|(_, value)| *value).collect();
+        let defined = |v: f64| Some(v).filter(|v| !v.is_nan());
+        let published = match places.map(|place| place.paper.as_deref()) {
+            [Some(network), Some(train), Some(test)] if section.is_none() => {
+                published(network, train, test, quantity, overlap)
+            }
+            _ => None,
+        };
+        CellNumber {
+            class,
+            section,
+            quantity,
+            overlap,
+            n_gt: None,
+            ceiling: None,
+            mean: defined(mean(&values)),
+            deviation: (values.len() > 1).then(|| defined(deviation(&values))).flatten(),
+            interval: None,
+            of_runs: runs.iter().map(|(seed, value)| RunNumber { seed: *seed, value: defined(*value) }).collect(),
+            published,
+        }
+    }
+}
+
+fn gaps(plan: &MatrixPlan, drawn: &[Drawn], options: &MatrixOptions) -> Vec<Gap> {
+    let mut gaps = Vec::new();
+    let find = |network: &str, train: &str, test: &str| {
+        drawn.iter().find(|d| (&*d.cell.network, &*d.cell.train_set, &*d.cell.test_set) == (network, train, test))
+    };
+    for planned in &plan.networks {
+        let network = &planned.network.name;
+        for test_set in &plan.test_sets {
+            let Some(own) = find(network, &test_set.name, &test_set.name) else { continue };
+            for train_set in planned.train_sets.iter().filter(|train| train.name != test_set.name) {
+                let Some(other) = find(network, &train_set.name, &test_set.name) else { continue };
+                let numbers = own.cell.numbers.iter().zip(&other.cell.numbers);
+                for (i, (a, b)) in numbers.enumerate() {
+                    let (Some(own_mean), Some(other_mean)) = (a.mean, b.mean) else { continue };
+                    let draws = own.draws[i].iter().zip(&other.draws[i]).map(|(a, b)| a - b).collect();
+                    gaps.push(Gap {
+                        network: network.clone(),
+                        test_set: test_set.name.clone(),
+                        train_set: train_set.name.clone(),
+                        class: a.class.clone(),
+                        section: a.section,
+                        quantity: a.quantity,
+                        overlap: a.overlap,
+                        gap: own_mean - other_mean,
+                        interval: options.bootstrap.interval(draws),
+                    });
+                }
+            }
+        }
+    }
+    gaps
+}
+
+pub(super) fn plan_warnings(plan: &MatrixPlan) -> Vec<String> {
+    let mut warnings = Vec::new();
+    for planned in &plan.networks {
+        let mut seeds = planned.seeds.clone();
+        seeds.sort_unstable();
+        if let Some(pair) = seeds.windows(2).find(|pair| pair[0] == pair[1]) {
+            warnings.push(format!(
+                "{}: seed {} is there twice: its runs are one run, not two",
+                planned.network.title, pair[0]
+            ));
+        }
+    }
+    warnings
+}
+
+pub(super) fn cell_warnings(cell: &Cell, results: &BTreeMap<(RunId, String), RunResult>) -> Vec<String> {
+    let mut warnings = Vec::new();
+    let name = format!("{}, {} to {}", cell.network, cell.train_set, cell.test_set);
+    for run in &cell.runs {
+        match &run.state {
+            RunState::Failed(reason) => warnings.push(format!("{name}: seed {} failed: {reason}", run.seed)),
+            RunState::Missing => warnings.push(format!("{name}: seed {} is missing", run.seed)),
+            RunState::Done => {}
+        }
+    }
+    let of_seed = |seed: u64| {
+        let id = RunId { network: cell.network.clone(), train_set: cell.train_set.clone(), seed };
+        results.get(&(id, cell.test_set.clone())).and_then(|result| result.as_ref().ok())
+    };
+    let done: Vec<u64> = cell.runs.iter().filter(|run| run.state == RunState::Done).map(|run| run.seed).collect();
+    for (i, &a) in done.iter().enumerate() {
+        for &b in &done[i + 1..] {
+            if let (Some(x), Some(y)) = (of_seed(a), of_seed(b))
+                && x.is_same_as(y)
+            {
+                warnings.push(format!(
+                    "{name}: seeds {a} and {b} do the same on every frame: the seed was not used, or one folder was copied"
+                ));
+            }
+        }
+    }
+    let zero: Vec<String> = cell
+        .numbers
+        .iter()
+        .filter(|n| n.section.is_none() && n.deviation == Some(0.0))
+        .map(|n| format!("{} ({})", n.quantity, n.overlap))
+        .collect();
+    if !zero.is_empty() {
+        warnings.push(format!(
+            "{name}: the deviation of {} is exactly 0 over {} runs: unless they find everything or nothing, independent \
+             runs do not agree so; check that the seeds are used",
+            zero.join(", "),
+            done.len()
+        ));
+    }
+    if cell.train_set == cell.test_set {
+        let low = cell.numbers.iter().find(|n| {
+            n.section.is_none()
+                && n.quantity == Quantity::Ap40
+                && n.overlap == 0.5
+                && n.mean.is_some_and(|mean| mean < UNDERTRAINED_AP.min(n.ceiling.unwrap_or(100.0)))
+        });
+        if let Some(low) = low {
+            warnings.push(format!(
+                "{name}: undertrained: AP {:.1} at overlap 0.5 on the set that it was trained on, below {UNDERTRAINED_AP}; \
+                 what it loses on other sets says little",
+                low.mean.unwrap_or(f64::NAN)
+            ));
+        }
+    }
+    warnings
+}
+
+/// Where a test set has so few ground truths that AP40 is capped, or none.
+fn ceiling_warnings(test_set: &Place, drawn: &[Drawn]) -> Vec<String> {
+    let Some(known) = drawn.iter().find(|d| d.cell.test_set == test_set.name && !d.cell.numbers.is_empty()) else {
+        return Vec::new();
+    };
+    let (mut warnings, mut told) = (Vec::new(), Vec::new());
+    for n in known.cell.numbers.iter().filter(|n| n.quantity == Quantity::Ap40) {
+        if told.contains(&(&n.class, n.section)) {
+            continue;
+        }
+        told.push((&n.class, n.section));
+        let place = n.section.map_or(String::new(), |section| format!(", {section}"));
+        let place = format!("test set {}, {}{place}", test_set.title, n.class);
+        match (n.n_gt, n.ceiling) {
+            (Some(0), _) => warnings.push(format!("{place}: no ground truth, hence no number")),
+            (Some(n_gt), Some(most)) if most < 100.0 => warnings.push(format!(
+                "{place}: {n_gt} ground truths, so that AP40 cannot exceed {most:.1}; see the exact area"
+            )),
+            _ => {}
+        }
+    }
+    warnings
+}

@@ -1,0 +1,65 @@
+//! The matrix as CSV: a line a number.
+
+use super::{Matrix, markdown::runs};
+use crate::csv_text;
+
+const COLUMNS: [&str; 19] = [
+    "network",
+    "train_set",
+    "test_set",
+    "runs",
+    "frames",
+    "class",
+    "from_m",
+    "to_m",
+    "quantity",
+    "overlap",
+    "n_gt",
+    "ceiling",
+    "mean",
+    "deviation",
+    "low",
+    "high",
+    "paper_mean",
+    "paper_deviation",
+    "of_runs",
+];
+
+impl Matrix {
+    /// One line for every number of every cell, with the values of the single runs; a cell without a run has one line without
+    /// numbers.
+    pub fn to_csv(&self) -> String {
+        let mut lines: Vec<Vec<String>> = Vec::new();
+        let number = |v: Option<f64>| v.map_or(String::new(), |v| v.to_string());
+        for cell in &self.cells {
+            let head = [cell.network.clone(), cell.train_set.clone(), cell.test_set.clone(), runs(cell)];
+            let frames = cell.frames.map_or(String::new(), |n| n.to_string());
+            if cell.numbers.is_empty() {
+                let empty = std::iter::repeat_n(String::new(), COLUMNS.len() - head.len());
+                lines.push(head.iter().cloned().chain(empty).collect());
+            }
+            for n in &cell.numbers {
+                let of_runs = n.of_runs.iter().map(|run| format!("{}:{}", run.seed, number(run.value)));
+                let fields = [
+                    frames.clone(),
+                    n.class.clone(),
+                    number(n.section.map(|s| s.from_m)),
+                    number(n.section.map(|s| s.to_m)),
+                    n.quantity.key().into(),
+                    n.overlap.to_string(),
+                    n.n_gt.map_or(String::new(), |n| n.to_string()),
+                    number(n.ceiling),
+                    number(n.mean),
+                    number(n.deviation),
+                    number(n.interval.map(|i| i.low)),
+                    number(n.interval.map(|i| i.high)),
+                    number(n.published.map(|p| p.mean)),
+                    number(n.published.map(|p| p.deviation)),
+                    of_runs.collect::<Vec<_>>().join(" "),
+                ];
+                lines.push(head.iter().cloned().chain(fields).collect());
+            }
+        }
+        csv_text(&COLUMNS, &lines)
+    }
+}

@@ -1,0 +1,163 @@
+//! What one run does on one test set.
+
+use super::{MatrixOptions, Quantity};
+use crate::evidence::{Evidence, FrameEvidence};
+use crate::matching::{BoxIndex, CurveKey};
+use crate::overlaps::{FrameOverlaps, range_m};
+use crate::{EvalFrame, Metric, RangeSection};
+use data::{DataError, Dataset, KittiText, LabelFrame, read_kitti_text};
+use rayon::prelude::*;
+use std::path::Path;
+
+/// The labels of a test set, read once for all runs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TestSet {
+    /// The frame of labels and detections.
+    pub label_frame: LabelFrame,
+    frames: Vec<EvalFrame>,
+}
+
+impl TestSet {
+    /// The labels of a split of a data set.
+    ///
+    /// # Errors
+    /// A label file that is missing or wrong.
+    pub fn read(dataset: &Dataset, split: &str) -> Result<Self, DataError> {
+        let ids = dataset.ids(split)?;
+        let read = |id: &String| Ok(EvalFrame { id: id.clone(), labels: dataset.labels(id)?, detections: vec![] });
+        // Collecting all first names the first bad frame, whatever the threads do.
+        let frames: Vec<Result<EvalFrame, DataError>> = ids.par_iter().map(read).collect();
+        let frames = frames.into_iter().collect::<Result<_, _>>()?;
+        Ok(TestSet { label_frame: dataset.config.label_frame, frames })
+    }
+
+    /// From labels at hand; detections in the frames are dropped.
+    pub fn new(label_frame: LabelFrame, mut frames: Vec<EvalFrame>) -> Self {
+        frames.iter_mut().for_each(|frame| frame.detections.clear());
+        TestSet { label_frame, frames }
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// No frame at all.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// The frames with the detections of a run: `folder/ID.txt`, a frame without detections has an empty file.
+    ///
+    /// # Errors
+    /// A detection file that is missing or wrong.
+    pub fn with_detections(&self, folder: &Path) -> Result<Vec<EvalFrame>, DataError> {
+        let read = |frame: &EvalFrame| {
+            let path = folder.join(format!("{}.txt", frame.id));
+            if !path.exists() {
+                let message =
+                    "does not exist; a frame without detections has an empty file. Detect this test set again";
+                return Err(DataError::file(&path, message));
+            }
+            let detections = read_kitti_text(&path, KittiText::Detections)?;
+            Ok(EvalFrame { id: frame.id.clone(), labels: frame.labels.clone(), detections })
+        };
+        let frames: Vec<Result<EvalFrame, DataError>> = self.frames.par_iter().map(read).collect();
+        frames.into_iter().collect()
+    }
+}
+
+/// What one run does on one test set: enough to draw its curves again with any choice of frames.
+#[derive(Clone, Debug)]
+pub struct RunScores {
+    pub(super) frames: usize,
+    pub(super) curves: Vec<RunCurve>,
+}
+
+/// One class, section and overlap of a run.
+#[derive(Clone, Debug)]
+pub(super) struct RunCurve {
+    pub class: String,
+    pub section: Option<RangeSection>,
+    pub overlap: f64,
+    evidence: Evidence,
+    /// Of each frame: ground truths, and those that any box covers.
+    covered: Vec<[u32; 2]>,
+}
+
+impl RunScores {
+    /// The scores of a run's detections. Every overlap is computed once.
+    ///
+    /// `proposals` are the boxes that OpenPCDet's recall looks at where they are not the detections: of two-stage networks it
+    /// takes all refined RoIs, before the score limit and the last NMS. Their frames are those of `frames`, in that order.
+    pub fn new(
+        frames: &[EvalFrame],
+        proposals: Option<&[EvalFrame]>,
+        label_frame: LabelFrame,
+        options: &MatrixOptions,
+    ) -> Self {
+        let overlaps: Vec<FrameOverlaps> = frames.par_iter().map(|f| FrameOverlaps::new(f, label_frame)).collect();
+        let of_proposals: Option<Vec<FrameOverlaps>> =
+            proposals.map(|p| p.par_iter().map(|f| FrameOverlaps::new(f, label_frame)).collect());
+        let recall_overlaps = of_proposals.as_ref().unwrap_or(&overlaps);
+        let mut keys = Vec::new();
+        for class in &options.classes {
+            for section in std::iter::once(None).chain(options.sections.iter().copied().map(Some)) {
+                keys.extend(options.overlaps.iter().map(|overlap| (class.clone(), section, *overlap)));
+            }
+        }
+        let curve = |(class, section, overlap): (String, Option<RangeSection>, f64)| {
+            let whole = options.max_range_m.map(RangeSection::up_to);
+            let looked_at = section.or(whole);
+            let inside = |line| looked_at.is_none_or(|s| s.contains(range_m(line, label_frame)));
+            let key = CurveKey { class: &class, metric: Metric::ThreeD, overlap, difficulty: options.difficulty };
+            let evidence = Evidence::new(frames.iter().zip(&overlaps).map(|(frame, overlaps)| {
+                FrameEvidence::collect((frame, overlaps), &key, |index| match index {
+                    BoxIndex::Label(i) => inside(&frame.labels[i]),
+                    BoxIndex::Detection(j) => inside(&frame.detections[j]),
+                })
+            }));
+            let covered = frames
+                .iter()
+                .zip(recall_overlaps)
+                .map(|(frame, overlaps)| {
+                    let mut best = vec![0.0f64; frame.labels.len()];
+                    for pair in &overlaps.three_d {
+                        best[pair.label] = best[pair.label].max(pair.overlap);
+                    }
+                    let counts = frame.labels.iter().zip(best);
+                    let counts = counts.filter(|(line, _)| line.class.eq_ignore_ascii_case(&class) && inside(line));
+                    counts.fold([0, 0], |[n, hits], (_, best)| [n + 1, hits + u32::from(best > overlap)])
+                })
+                .collect();
+            RunCurve { class, section, overlap, evidence, covered }
+        };
+        RunScores { frames: frames.len(), curves: keys.into_par_iter().map(curve).collect() }
+    }
+
+    /// Whether a run does the same on every frame as another: two seeds that do were one.
+    pub(super) fn is_same_as(&self, other: &RunScores) -> bool {
+        self.curves.iter().zip(&other.curves).all(|(a, b)| a.evidence == b.evidence && a.covered == b.covered)
+    }
+}
+
+impl RunCurve {
+    /// The numbers in the order of [`Quantity::ALL`], percent, NaN where undefined; and the ground truths that count.
+    pub(super) fn numbers(&self, weights: Option<&[u32]>) -> ([f64; Quantity::ALL.len()], i64) {
+        let p = self.evidence.precisions(weights);
+        let (mut n, mut covered) = (0u64, 0u64);
+        for (i, [gt, hits]) in self.covered.iter().enumerate() {
+            let weight = weights.map_or(1, |w| u64::from(w[i]));
+            (n, covered) = (n + weight * u64::from(*gt), covered + weight * u64::from(*hits));
+        }
+        let share = |part: f64, of: f64| 100.0 * part / of; // NaN for 0/0
+        let or_undefined = |v: f64| if p.n_gt == 0 { f64::NAN } else { v };
+        let numbers = [
+            or_undefined(p.ap40),
+            or_undefined(p.ap_area),
+            share(covered as f64, n as f64),
+            share(p.n_tp as f64, p.n_gt as f64),
+        ];
+        (numbers, p.n_gt)
+    }
+}

@@ -1,0 +1,76 @@
+//! What makes no sense in a study.
+
+use super::{Source, StudyConfig};
+use std::collections::BTreeSet;
+
+impl StudyConfig {
+    /// The first thing that makes no sense, with its key.
+    pub(super) fn problem(&self) -> Option<String> {
+        let names = [
+            ("dataset", self.datasets.iter().map(|d| d.name.as_str()).collect::<Vec<_>>()),
+            ("detector", self.detectors.iter().map(|d| d.name.as_str()).collect()),
+            ("variant", self.variants.iter().map(|v| v.name.as_str()).collect()),
+        ];
+        if !is_name(&self.name) {
+            return Some(format!("name {:?} has to be a file name", self.name));
+        }
+        for (what, names) in &names {
+            if names.is_empty() && *what != "variant" {
+                return Some(format!("there is no [[{what}]]"));
+            }
+            if let Some(bad) = names.iter().find(|name| !is_name(name)) {
+                return Some(format!("{what}.name {bad:?} has to be a file name of letters, digits, '-', '_' and '.'"));
+            }
+            let mut known = BTreeSet::new();
+            if let Some(twice) = names.iter().find(|name| !known.insert(**name)) {
+                return Some(format!("{what} {twice:?} is there twice"));
+            }
+        }
+        let seeds =
+            self.detectors.iter().filter_map(|d| Some((format!("detector {}: seeds", d.name), d.seeds.as_ref()?)));
+        for (what, seeds) in std::iter::once(("seeds".to_string(), &self.seeds)).chain(seeds) {
+            let distinct: BTreeSet<&u64> = seeds.iter().collect();
+            if seeds.is_empty() || distinct.len() < seeds.len() {
+                return Some(format!("{what} {seeds:?} have to be distinct, at least one: equal seeds are one run"));
+            }
+        }
+        let epochs = self.detectors.iter().filter_map(|d| d.epochs).chain(self.epochs);
+        if epochs.min() == Some(0) {
+            return Some("epochs have to be 1 or more".into());
+        }
+        let [datasets, detectors, _] = names.map(|(_, names)| names);
+        let unknown = |what: String, name: &str, known: &[&str]| {
+            (!known.contains(&name))
+                .then(|| format!("{what} names {name:?}, which the study does not have; it has {}", known.join(", ")))
+        };
+        let of_train = self.detectors.iter().flat_map(|d| d.train.iter().flatten().map(move |t| (d, t)));
+        let of_train = of_train.filter_map(|(d, name)| unknown(format!("detector {}: train", d.name), name, &datasets));
+        let of_variant = self.variants.iter().flat_map(|v| v.detectors.iter().flatten().map(move |d| (v, d)));
+        let of_variant =
+            of_variant.filter_map(|(v, name)| unknown(format!("variant {}: detectors", v.name), name, &detectors));
+        if let Some(problem) = of_train.chain(of_variant).next() {
+            return Some(problem);
+        }
+        for (i, dataset) in self.datasets.iter().enumerate() {
+            match &dataset.source {
+                Source::Resim { of, .. } if !datasets[..i].contains(&of.as_str()) => {
+                    return Some(format!(
+                        "dataset {}: resim.of names {of:?}, which has to stand before it",
+                        dataset.name
+                    ));
+                }
+                Source::Simulate { frames: 0, .. } => return Some(format!("dataset {}: frames is 0", dataset.name)),
+                _ => {}
+            }
+        }
+        if self.evaluation.matrix.overlaps.iter().any(|o| !(0.0..1.0).contains(o)) {
+            return Some("evaluation.matrix.overlaps have to lie in [0, 1)".into());
+        }
+        None
+    }
+}
+
+fn is_name(name: &str) -> bool {
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    !name.is_empty() && !name.starts_with('.') && name.chars().all(plain)
+}

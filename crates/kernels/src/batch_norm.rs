@@ -1,0 +1,302 @@
+//! Batch normalisation with the ReLU behind it, and folded into the convolution before it.
+
+use crate::output::{Shared, fill};
+use crate::simd::vectorized;
+use rayon::prelude::*;
+use std::mem::MaybeUninit;
+
+/// Normalisation of `[batch, channels, pixels]` over batch and pixels, each channel by itself.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BatchNorm {
+    /// Images, or rows.
+    pub batch: usize,
+    /// Channels.
+    pub channels: usize,
+    /// Pixels of an image; 1 for rows `[batch, channels]`.
+    pub pixels: usize,
+    /// Added to the variance.
+    pub epsilon: f64,
+    /// Whether a ReLU follows.
+    pub relu: bool,
+}
+
+/// Mean and variance of each channel, `[channels]`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Statistics {
+    /// Mean.
+    pub mean: Vec<f64>,
+    /// Variance with divisor n.
+    pub variance: Vec<f64>,
+}
+
+/// Values in a group of columns that a task takes where channels lie side by side.
+const COLUMNS: usize = 32;
+
+/// Below this many pixels an image is a row of its channels' values instead of one run for each of them.
+const SHORT: usize = 32;
+
+/// Sums of single precision values, exact as far as double precision goes.
+#[derive(Clone, Copy)]
+struct Sums([[f64; 16]; 2]);
+
+impl Sums {
+    #[inline(always)]
+    fn add(&mut self, lane: usize, [first, second]: [f64; 2]) {
+        self.0[0][lane] += first;
+        self.0[1][lane] += second;
+    }
+
+    fn total(&self) -> [f64; 2] {
+        self.0.map(|lanes| lanes.iter().sum())
+    }
+}
+
+impl BatchNorm {
+    /// Elements of `x`.
+    pub fn len(&self) -> usize {
+        self.batch * self.channels * self.pixels
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Values of a channel.
+    fn count(&self) -> f64 {
+        (self.batch * self.pixels) as f64
+    }
+
+    /// Normalises by the statistics of `x`, which are returned; of an empty `x` they are zero. `y` is overwritten, whatever it held.
+    ///
+    /// # Shapes
+    /// `x`, `y`: `[batch, channels, pixels]`; `gamma`, `beta`: `[channels]`.
+    pub fn forward_train(&self, x: &[f32], gamma: &[f32], beta: &[f32], y: &mut Vec<f32>) -> Statistics {
+        self.check(x, gamma, beta);
+        let moments = |x: f32, _: f32, _: &Affine| [x as f64, x as f64 * x as f64];
+        let affine = |channel: usize, [sum, squares]: [f64; 2]| {
+            let mean = sum / self.count();
+            let variance = non_negative(squares / self.count() - mean * mean);
+            (Affine::new(gamma[channel], beta[channel], mean, variance, self.epsilon), [mean, variance])
+        };
+        let apply = |x: f32, _: f32, a: &Affine| {
+            let z = a.of(x);
+            if self.relu && z < 0.0 { 0.0 } else { z }
+        };
+        // SAFETY: `two_passes` writes all of y.
+        let statistics =
+            unsafe { fill(y, self.len(), |y| self.two_passes(x, x, y, |_| Affine::NONE, moments, affine, apply)) };
+        let (mean, variance) = statistics.into_iter().map(|[mean, variance]| (mean, variance)).unzip();
+        Statistics { mean, variance }
+    }
+
+    /// Normalises by given statistics. `y` is overwritten, whatever it held.
+    ///
+    /// # Shapes
+    /// `x`, `y`: `[batch, channels, pixels]`; `gamma`, `beta`: `[channels]`.
+    pub fn forward(&self, x: &[f32], gamma: &[f32], beta: &[f32], statistics: &Statistics, y: &mut Vec<f32>) {
+        self.check(x, gamma, beta);
+        let affine = self.affine(gamma, beta, statistics);
+        // SAFETY: every run of a channel is written.
+        unsafe {
+            fill(y, self.len(), |y| {
+                let runs = y.par_chunks_mut(self.pixels.max(1)).zip(x.par_chunks(self.pixels.max(1)));
+                runs.with_min_len(1 + 4096 / self.pixels.max(1)).enumerate().for_each(|(run, (y, x))| {
+                    let a = &affine[run % self.channels];
+                    vectorized(|| {
+                        for (y, &x) in y.iter_mut().zip(x) {
+                            let z = a.of(x);
+                            y.write(if self.relu && z < 0.0 { 0.0 } else { z });
+                        }
+                    });
+                });
+            });
+        }
+    }
+
+    /// Gradients by `x` (`dx`, overwritten), by gamma and by beta, `statistics` those of [`BatchNorm::forward_train`].
+    ///
+    /// # Shapes
+    /// `x`, `dy`, `dx`: `[batch, channels, pixels]`; all others: `[channels]`.
+    pub fn backward(
+        &self,
+        (x, dy): (&[f32], &[f32]),
+        (gamma, beta): (&[f32], &[f32]),
+        statistics: &Statistics,
+        dx: &mut Vec<f32>,
+    ) -> (Vec<f32>, Vec<f32>) {
+        self.check(x, gamma, beta);
+        assert_eq!(dy.len(), self.len(), "elements of dy of {self:?}");
+        let before = self.affine(gamma, beta, statistics);
+        let gradient = |x: f32, dy: f32, a: &Affine| if self.relu && !(a.of(x) > 0.0) { 0.0 } else { dy };
+        // Sums of g and of g (x - mean).
+        let moments = |x: f32, dy: f32, a: &Affine| {
+            let g = gradient(x, dy, a) as f64;
+            [g, g * (x - a.mean) as f64]
+        };
+        let affine = |channel: usize, [sum, product]: [f64; 2]| {
+            let inverse = 1.0 / (statistics.variance[channel] + self.epsilon);
+            let scale = gamma[channel] as f64 * inverse.sqrt();
+            let slope = (-scale * inverse * product / self.count()) as f32;
+            let offset = (-scale * sum / self.count()) as f32;
+            (Affine { slope, offset, ..before[channel] }, [product * inverse.sqrt(), sum])
+        };
+        // scale (g - mean of g - (x - mean) / variance * mean of g (x - mean))
+        let apply = |x: f32, dy: f32, a: &Affine| gradient(x, dy, a) * a.scale + ((x - a.mean) * a.slope + a.offset);
+        // SAFETY: `two_passes` writes all of dx.
+        let sums =
+            unsafe { fill(dx, self.len(), |dx| self.two_passes(x, dy, dx, |c| before[c], moments, affine, apply)) };
+        sums.into_iter().map(|[dgamma, dbeta]| (dgamma as f32, dbeta as f32)).unzip()
+    }
+
+    fn check(&self, x: &[f32], gamma: &[f32], beta: &[f32]) {
+        assert_eq!(x.len(), self.len(), "elements of x of {self:?}");
+        assert_eq!((gamma.len(), beta.len()), (self.channels, self.channels), "gamma and beta of {self:?}");
+    }
+
+    fn affine(&self, gamma: &[f32], beta: &[f32], statistics: &Statistics) -> Vec<Affine> {
+        let Statistics { mean, variance } = statistics;
+        (0..self.channels).map(|c| Affine::new(gamma[c], beta[c], mean[c], variance[c], self.epsilon)).collect()
+    }
+
+    /// For each channel: sums two values over all of its elements, makes parameters of them, and writes a function of each element. Where an
+    /// image is long, a channel's elements are still in the cache for the second pass.
+    #[allow(clippy::too_many_arguments)] // two tensors in, one out, and the four steps
+    fn two_passes(
+        &self,
+        x: &[f32],
+        other: &[f32],
+        out: &mut [MaybeUninit<f32>],
+        before: impl Fn(usize) -> Affine + Sync,
+        moments: impl Fn(f32, f32, &Affine) -> [f64; 2] + Sync,
+        affine: impl Fn(usize, [f64; 2]) -> (Affine, [f64; 2]) + Sync,
+        apply: impl Fn(f32, f32, &Affine) -> f32 + Sync,
+    ) -> Vec<[f64; 2]> {
+        if out.is_empty() {
+            return vec![[0.0; 2]; self.channels];
+        }
+        let out = Shared::new(out);
+        if self.pixels < SHORT {
+            return self.short_passes(x, other, out, before, moments, affine, apply);
+        }
+        let channel = |channel: usize| {
+            let run = |n: usize| (n * self.channels + channel) * self.pixels;
+            let before = before(channel);
+            let mut sums = Sums([[0.0; 16]; 2]);
+            for at in (0..self.batch).map(run) {
+                let (x, other) = (&x[at..at + self.pixels], &other[at..at + self.pixels]);
+                vectorized(|| {
+                    let (x, x_rest) = x.as_chunks::<16>();
+                    let (other, other_rest) = other.as_chunks::<16>();
+                    for (x, other) in x.iter().zip(other) {
+                        for lane in 0..16 {
+                            sums.add(lane, moments(x[lane], other[lane], &before));
+                        }
+                    }
+                    for (lane, (&x, &other)) in x_rest.iter().zip(other_rest).enumerate() {
+                        sums.add(lane, moments(x, other, &before));
+                    }
+                });
+            }
+            let (parameters, result) = affine(channel, sums.total());
+            for at in (0..self.batch).map(run) {
+                // SAFETY: no other task has this channel.
+                let out = unsafe { out.part(at, self.pixels) };
+                let (x, other) = (&x[at..at + self.pixels], &other[at..at + self.pixels]);
+                vectorized(|| {
+                    for ((out, &x), &other) in out.iter_mut().zip(x).zip(other) {
+                        out.write(apply(x, other, &parameters));
+                    }
+                });
+            }
+            result
+        };
+        (0..self.channels).into_par_iter().map(channel).collect()
+    }
+
+    /// [`BatchNorm::two_passes`] where an image has few pixels: a row of `channels * pixels` columns, some of which a task takes.
+    #[allow(clippy::too_many_arguments)]
+    fn short_passes(
+        &self,
+        x: &[f32],
+        other: &[f32],
+        out: Shared<'_>,
+        before: impl Fn(usize) -> Affine + Sync,
+        moments: impl Fn(f32, f32, &Affine) -> [f64; 2] + Sync,
+        affine: impl Fn(usize, [f64; 2]) -> (Affine, [f64; 2]) + Sync,
+        apply: impl Fn(f32, f32, &Affine) -> f32 + Sync,
+    ) -> Vec<[f64; 2]> {
+        let row = self.channels * self.pixels;
+        let starts: Vec<usize> = (0..row).step_by(COLUMNS).collect();
+        let columns = |start: usize| start..row.min(start + COLUMNS);
+        let column_sums = |&start: &usize| {
+            let parameters: Vec<Affine> = columns(start).map(|column| before(column / self.pixels)).collect();
+            let mut sums = vec![[0.0; 2]; parameters.len()];
+            vectorized(|| {
+                for n in 0..self.batch {
+                    let run = n * row + start..n * row + columns(start).end;
+                    for (((sum, &x), &other), a) in
+                        sums.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters)
+                    {
+                        let [first, second] = moments(x, other, a);
+                        sum[0] += first;
+                        sum[1] += second;
+                    }
+                }
+            });
+            sums
+        };
+        let sums: Vec<[f64; 2]> = starts.par_iter().map(column_sums).collect::<Vec<_>>().concat();
+        let channel_sum = |columns: &[[f64; 2]]| columns.iter().fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+        let of_channels: Vec<(Affine, [f64; 2])> =
+            sums.chunks_exact(self.pixels).enumerate().map(|(c, columns)| affine(c, channel_sum(columns))).collect();
+        starts.par_iter().for_each(|&start| {
+            let parameters: Vec<Affine> = columns(start).map(|column| of_channels[column / self.pixels].0).collect();
+            for n in 0..self.batch {
+                let run = n * row + start..n * row + columns(start).end;
+                // SAFETY: no other task has these columns.
+                let out = unsafe { out.part(run.start, run.len()) };
+                vectorized(|| {
+                    for (((out, &x), &other), a) in
+                        out.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters)
+                    {
+                        out.write(apply(x, other, a));
+                    }
+                });
+            }
+        });
+        of_channels.into_iter().map(|(_, result)| result).collect()
+    }
+}
+
+/// What is done to each value of a channel: `(x - mean) scale + beta`, and in the gradient `(x - mean) slope + offset` besides.
+#[derive(Clone, Copy, Debug)]
+struct Affine {
+    mean: f32,
+    scale: f32,
+    beta: f32,
+    slope: f32,
+    offset: f32,
+}
+
+impl Affine {
+    const NONE: Affine = Affine { mean: 0.0, scale: 1.0, beta: 0.0, slope: 0.0, offset: 0.0 };
+
+    fn new(gamma: f32, beta: f32, mean: f64, variance: f64, epsilon: f64) -> Self {
+        let scale = (gamma as f64 / (variance + epsilon).sqrt()) as f32;
+        Affine { mean: mean as f32, scale, beta, ..Affine::NONE }
+    }
+
+    #[inline(always)]
+    fn of(&self, x: f32) -> f32 {
+        (x - self.mean) * self.scale + self.beta
+    }
+}
+
+/// A variance may come out a little below zero; NaN stays.
+pub(crate) fn non_negative(variance: f64) -> f64 {
+    if variance < 0.0 { 0.0 } else { variance }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,124 @@
+//! Convolutions as products of small matrices, block by block in cache.
+
+use crate::blocks::{Segment, TileGrid};
+use crate::images::Work;
+use crate::scratch;
+use crate::tile::{PIXELS, Row, Tile, TileWork, dispatch_tiles, product, tile_rows, zeros};
+use pulp::Simd;
+use rayon::prelude::*;
+use std::ops::Range;
+
+/// What a convolution reads for a block of tiles, which products it takes, and what it makes of them.
+///
+/// The panel of a block has rows of [`PIXELS`] values, one a tile. A product multiplies weights `[outputs, rows]` with some of
+/// the panel's rows.
+pub(crate) trait Scheme: Sync {
+    /// The tiles.
+    fn grid(&self) -> TileGrid;
+
+    /// Channels read.
+    fn inputs(&self) -> usize;
+
+    /// Channels written.
+    fn outputs(&self) -> usize;
+
+    /// Rows of the panel.
+    fn panel_rows(&self) -> usize;
+
+    /// The rows of the panel that each product takes.
+    fn products(&self) -> Vec<Range<usize>>;
+
+    /// Writes the rows of one input channel into the panel.
+    fn read<S: Simd>(&self, simd: S, segments: &[Segment], channel: usize, panel: &mut [Row], work: &mut Work);
+
+    /// Writes one output channel from its products.
+    fn write<'r, S: Simd>(
+        &self,
+        simd: S,
+        segments: &[Segment],
+        channel: usize,
+        products: impl Fn(usize) -> &'r Row,
+        work: &mut Work,
+    );
+}
+
+/// Weights in the order in which the products read them: `[outputs / R, rows of all products, R]`.
+#[derive(Clone, Debug)]
+pub struct PackedWeights {
+    tile_rows: usize,
+    rows: usize,
+    outputs: usize,
+    values: Vec<f32>,
+}
+
+impl PackedWeights {
+    /// `column(output, put)` gives the weights of an output by `put(row, weight)`; rows count through all products.
+    pub(crate) fn new(outputs: usize, rows: usize, column: impl Fn(usize, &mut dyn FnMut(usize, f32)) + Sync) -> Self {
+        let tile_rows = tile_rows();
+        let mut values = vec![0.0; outputs.div_ceil(tile_rows) * rows * tile_rows];
+        if rows > 0 {
+            values.par_chunks_mut(rows * tile_rows).enumerate().for_each(|(tile, values)| {
+                for r in 0..tile_rows.min(outputs - tile * tile_rows) {
+                    column(tile * tile_rows + r, &mut |row, weight| values[row * tile_rows + r] = weight);
+                }
+            });
+        }
+        PackedWeights { tile_rows, rows, outputs, values }
+    }
+}
+
+/// Runs a scheme over all its blocks.
+pub(crate) fn run<C: Scheme>(scheme: &C, weights: &PackedWeights) {
+    let products = scheme.products();
+    let rows: usize = products.iter().map(Range::len).sum();
+    assert_eq!((weights.outputs, weights.rows), (scheme.outputs(), rows), "weights packed for another convolution");
+    let tile_rows = weights.tile_rows;
+    (0..scheme.grid().blocks()).into_par_iter().for_each(|block| {
+        let lengths = [scheme.panel_rows() * PIXELS, products.len() * tile_rows * PIXELS];
+        scratch::with(lengths, |[panel, sums]| {
+            let (panel, sums) = (panel.as_chunks_mut().0, sums.as_chunks_mut().0);
+            dispatch_tiles(Block { scheme, products: &products, weights: &weights.values, block, panel, sums });
+        });
+    });
+}
+
+struct Block<'a, C> {
+    scheme: &'a C,
+    products: &'a [Range<usize>],
+    weights: &'a [f32],
+    block: usize,
+    panel: &'a mut [Row],
+    sums: &'a mut [Row],
+}
+
+impl<C: Scheme> TileWork for Block<'_, C> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd, const R: usize, const V: usize>(self, simd: S) {
+        let Block { scheme, products, weights, block, panel, sums } = self;
+        let segments = scheme.grid().segments(block);
+        let mut work = Work::new();
+        for channel in 0..scheme.inputs() {
+            scheme.read(simd, segments.list(), channel, panel, &mut work);
+        }
+        let mut weights = weights.as_chunks::<R>().0;
+        for first in (0..scheme.outputs()).step_by(R) {
+            for (p, range) in products.iter().enumerate() {
+                let (left, behind) = weights.split_at(range.len());
+                weights = behind;
+                let right = &panel[range.clone()];
+                for group in 0..PIXELS / (V * S::F32_LANES) {
+                    let tile: Tile<S, R, V> = product(simd, zeros(simd), left, right, group);
+                    for r in 0..R {
+                        let sums = S::as_mut_simd_f32s(&mut sums[p * R + r]).0;
+                        sums.as_chunks_mut::<V>().0[group] = tile[r];
+                    }
+                }
+            }
+            for r in 0..R.min(scheme.outputs() - first) {
+                scheme.write(simd, segments.list(), first + r, |p| &sums[p * R + r], &mut work);
+            }
+        }
+    }
+}

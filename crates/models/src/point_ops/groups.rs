@@ -1,0 +1,142 @@
+//! Groups of neighbours (OpenPCDet: `QueryAndGroup`, `GroupAll`), without the repetitions that fill them up.
+
+use crate::layers::RowCounts;
+use burn::tensor::{Device, Int, Tensor, TensorData};
+
+/// Neighbours of many centres, group after group. G groups have N rows.
+///
+/// The reference gives every group the same number of rows and fills up with repetitions of the first neighbour. These count in the batch
+/// statistics and change no maximum; so each neighbour is one row here, and says how often it counts.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Groups {
+    /// Input row that each row is taken from. Length N.
+    pub source: Vec<u32>,
+    /// Position of each row, seen from the centre of its group, m. Length N.
+    pub offset_m: Vec<[f32; 3]>,
+    /// How often each row counts. Length N.
+    pub count: Vec<f32>,
+    /// Where each group ends; the first begins at 0. Length G.
+    pub ends: Vec<u32>,
+}
+
+impl Groups {
+    /// Adds a group: `slots` are its neighbours as `(source, position)`, repetitions included; all of it counts `times`.
+    pub fn push(&mut self, center_m: [f32; 3], slots: impl Iterator<Item = (u32, [f32; 3])>, times: f32) {
+        let begin = self.source.len();
+        for (source, position) in slots {
+            // Groups are small, and repetitions are mostly of the first row.
+            match self.source[begin..].iter().position(|&known| known == source) {
+                Some(known) => self.count[begin + known] += times,
+                None => {
+                    self.source.push(source);
+                    self.offset_m.push([0, 1, 2].map(|axis| position[axis] - center_m[axis]));
+                    self.count.push(times);
+                }
+            }
+        }
+        self.ends.push(self.source.len() as u32);
+    }
+
+    /// Adds the groups of another cloud, whose input rows begin at `first_row`.
+    pub fn append(&mut self, other: &Groups, first_row: u32) {
+        let begin = self.source.len() as u32;
+        self.source.extend(other.source.iter().map(|&source| source + first_row));
+        self.offset_m.extend_from_slice(&other.offset_m);
+        self.count.extend_from_slice(&other.count);
+        self.ends.extend(other.ends.iter().map(|&end| end + begin));
+    }
+
+    /// For the device. Rows that count nothing fill up to a number whose sums are exact.
+    pub fn to_device(&self, device: &Device) -> GroupTensors {
+        let filled = |values: &[f32], width: usize| {
+            let mut values = values.to_vec();
+            values.resize(RowCounts::filled_up(self.source.len()) * width, 0.0);
+            values
+        };
+        let mut source: Vec<i32> = self.source.iter().map(|&s| s as i32).collect();
+        source.resize(RowCounts::filled_up(source.len()), 0);
+        let rows = source.len();
+        let mut begin = 0;
+        let spans = self.ends.iter().map(|&end| (std::mem::replace(&mut begin, end), end));
+        let spans: Vec<(u32, u32)> = spans.collect();
+        let slots = spans.iter().map(|(begin, end)| end - begin).max().unwrap_or(0) as usize;
+        // Groups are filled up with their first row, which changes no maximum.
+        let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
+        let places = spans.iter().flat_map(|&(b, e)| (0..slots as u32).map(move |s| place(b, e, s) as i32));
+        let int = |values: Vec<i32>| {
+            let length = values.len();
+            Tensor::<1, Int>::from_data(TensorData::new(values, [length]), device)
+        };
+        GroupTensors {
+            source: int(source),
+            offset: Tensor::from_data(TensorData::new(filled(self.offset_m.as_flattened(), 3), [rows, 3]), device),
+            counts: RowCounts::new(filled(&self.count, 1), device),
+            places: int(places.collect()),
+            groups: self.ends.len(),
+            slots,
+        }
+    }
+}
+
+/// [`Groups`] on a device; N is their number of rows, filled up.
+#[derive(Clone, Debug)]
+pub struct GroupTensors {
+    /// `[N]`.
+    pub source: Tensor<1, Int>,
+    /// `[N, 3]`, m.
+    pub offset: Tensor<2>,
+    /// N rows.
+    pub counts: RowCounts,
+    /// Rows of each group, filled up, `[G * S]`.
+    places: Tensor<1, Int>,
+    groups: usize,
+    slots: usize,
+}
+
+/// The maximum over each group.
+///
+/// # Shapes
+/// `x`: `[N, C]`; result `[G, C]`.
+pub fn group_max(x: Tensor<2>, groups: &GroupTensors) -> Tensor<2> {
+    let channels = x.dims()[1];
+    let filled = x.select(0, groups.places.clone()).reshape([groups.groups, groups.slots, channels]); // [G, S, C]
+    filled.max_dim(1).reshape([groups.groups, channels]) // [G, C]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::layers::host;
+
+    fn two_groups() -> Groups {
+        let mut groups = Groups::default();
+        let at = |x: f32| [x, 0.0, 0.0];
+        groups.push(at(1.0), [(4, at(1.5)), (6, at(2.0)), (4, at(1.5)), (4, at(1.5))].into_iter(), 1.0);
+        groups.push(at(0.0), [(2, at(0.5))].into_iter(), 2.0);
+        groups
+    }
+
+    #[test]
+    fn repetitions_are_counted() {
+        let mut groups = two_groups();
+        assert_eq!((&groups.source, &groups.count, &groups.ends), (&vec![4, 6, 2], &vec![3.0, 1.0, 2.0], &vec![2, 3]));
+        assert_eq!(groups.offset_m, [[0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, 0.0, 0.0]]);
+        groups.append(&two_groups(), 10);
+        assert_eq!(groups.source, [4, 6, 2, 14, 16, 12]);
+        assert_eq!(groups.ends, [2, 3, 5, 6]);
+    }
+
+    #[test]
+    fn maximum_and_its_gradient() {
+        let device = Device::flex().autodiff();
+        let groups = two_groups().to_device(&device);
+        assert_eq!(groups.counts.total(), 6);
+        assert_eq!((groups.source.dims(), groups.offset.dims()), ([256], [256, 3]));
+        let x = Tensor::<2>::from_floats([[1.0, 5.0], [3.0, 2.0], [-1.0, -2.0]], &device).require_grad();
+        let y = group_max(x.clone(), &groups);
+        assert_eq!(host(y.clone()).unwrap(), [3.0, 5.0, -1.0, -2.0]);
+        let weights = Tensor::<2>::from_floats([[1.0, 10.0], [100.0, 1000.0]], &device);
+        let gradients = (y * weights).sum().backward();
+        assert_eq!(host(x.grad(&gradients).unwrap()).unwrap(), [0.0, 10.0, 1.0, 0.0, 100.0, 1000.0]);
+    }
+}

@@ -1,0 +1,93 @@
+//! Which points each level of the backbone keeps, and who is whose neighbour. Coordinates alone decide it, so it is found on loader threads.
+
+use crate::config::LevelConfig;
+use crate::point_ops::{Groups, Interpolation};
+use geometry::{TieRule, ball_query, farthest_point_sampling};
+
+/// The levels of one cloud, finest first, and the ways back.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Hierarchy {
+    /// Set abstraction.
+    pub levels: Vec<Level>,
+    /// Feature propagation from level i to the points above it: level i - 1, or the cloud itself.
+    pub up: Vec<Interpolation>,
+}
+
+/// Points that one level keeps.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Level {
+    /// Where each of them is among the points above.
+    pub picks: Vec<u32>,
+    /// Their positions, m, LiDAR frame.
+    pub points: Vec<[f32; 3]>,
+    /// Neighbours among the points above, one entry a scale.
+    pub scales: Vec<Groups>,
+}
+
+impl Hierarchy {
+    /// Of a cloud that is not empty.
+    pub fn new(points: &[[f32; 3]], config: &[LevelConfig]) -> Self {
+        let mut hierarchy = Hierarchy::default();
+        let mut above = points;
+        for level in config {
+            hierarchy.levels.push(Level::new(above, level));
+            above = &hierarchy.levels[hierarchy.levels.len() - 1].points;
+        }
+        let mut above = points;
+        for level in &hierarchy.levels {
+            hierarchy.up.push(Interpolation::new(above, &level.points));
+            above = &level.points;
+        }
+        hierarchy
+    }
+}
+
+impl Level {
+    fn new(above: &[[f32; 3]], config: &LevelConfig) -> Self {
+        let picks = farthest_point_sampling(above, config.centers, TieRule::ReferenceKernel);
+        let points: Vec<[f32; 3]> = picks.iter().map(|&i| above[i as usize]).collect();
+        let scale = |radius_m: f32, samples: usize| {
+            let slots = ball_query(above, &points, radius_m, samples);
+            let mut groups = Groups::default();
+            for (&center, slots) in points.iter().zip(slots.chunks_exact(samples)) {
+                groups.push(center, slots.iter().map(|&i| (i, above[i as usize])), 1.0);
+            }
+            groups
+        };
+        let scales = config.scales.iter().map(|s| scale(s.radius_m, s.samples)).collect();
+        Level { picks, points, scales }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::ScaleConfig;
+
+    #[test]
+    fn every_group_counts_as_many_rows_as_the_reference_s() {
+        let points: Vec<[f32; 3]> = (0..200).map(|i| [(i % 20) as f32 * 0.3, (i / 20) as f32 * 0.4, 0.0]).collect();
+        let scale = |radius_m| ScaleConfig { radius_m, samples: 8, filters: vec![4] };
+        let level = |centers, radius_m| LevelConfig { centers, scales: vec![scale(radius_m), scale(3.0 * radius_m)] };
+        let hierarchy = Hierarchy::new(&points, &[level(50, 0.35), level(10, 0.7)]);
+        assert_eq!(hierarchy.levels[0].picks[0], 0);
+        for (level, centers) in hierarchy.levels.iter().zip([50, 10]) {
+            for groups in &level.scales {
+                assert_eq!(groups.ends.len(), centers);
+                assert_eq!(groups.count.iter().sum::<f32>(), 8.0 * centers as f32);
+                assert!(groups.source.len() <= 8 * centers);
+            }
+            assert!(level.scales[0].source.len() < 8 * centers, "repetitions are not rows");
+        }
+        assert_eq!(hierarchy.up.iter().map(|up| up.source.len()).collect::<Vec<_>>(), [200, 50]);
+    }
+
+    #[test]
+    fn a_cloud_of_equal_points() {
+        let level =
+            LevelConfig { centers: 4, scales: vec![ScaleConfig { radius_m: 0.5, samples: 4, filters: vec![4] }] };
+        let hierarchy = Hierarchy::new(&[[1.0, 2.0, 3.0]; 9], &[level]);
+        assert_eq!(hierarchy.levels[0].picks, [0; 4]);
+        assert!(hierarchy.up[0].weight.iter().flatten().all(|w| (w - 1.0 / 3.0).abs() < 1e-6));
+    }
+}

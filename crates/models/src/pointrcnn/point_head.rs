@@ -1,0 +1,74 @@
+//! The first stage's head: what single points say (OpenPCDet: `PointHeadBox`).
+
+use crate::config::PointHeadConfig;
+use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear};
+use burn::module::Module;
+use burn::tensor::Tensor;
+
+/// Values that describe a box at a point.
+pub const POINT_CODE: usize = 8;
+
+/// Two chains of layers over each point's features.
+#[derive(Module, Debug)]
+pub struct PointHead {
+    /// To the logits of the classes.
+    pub cls_layers: HiddenLayers<2>,
+    /// To the codes of the boxes.
+    pub box_layers: HiddenLayers<2>,
+}
+
+/// Two hidden layers and a last one.
+#[derive(Module, Debug)]
+pub struct HiddenLayers<const D: usize> {
+    /// With normalisation.
+    pub hidden: Vec<RowsBnRelu<D>>,
+    /// Without.
+    pub last: RowsLinear<D>,
+}
+
+/// What the head says of every point. Clouds of a batch follow each other.
+#[derive(Clone, Debug)]
+pub struct PointPredictions {
+    /// Logits, `[B * N, classes]`.
+    pub cls: Tensor<2>,
+    /// Codes, `[B * N, 8]`.
+    pub boxes: Tensor<2>,
+}
+
+impl PointHead {
+    /// For points with `inputs` features.
+    pub fn new(inputs: usize, classes: usize, config: &PointHeadConfig, init: &Init<'_>) -> Self {
+        let chain = |name: &str, [first, second]: [usize; 2], outputs: usize| {
+            let hidden = |index: usize, channels: [usize; 2]| {
+                let norm = BatchNorm::new(channels[1], 0.1, 1e-5, init);
+                RowsBnRelu::new(&format!("point_head.{name}.{index}.weight"), channels, norm, init)
+            };
+            HiddenLayers {
+                hidden: vec![hidden(0, [inputs, first]), hidden(3, [first, second])],
+                last: RowsLinear::new(&format!("point_head.{name}.6"), [second, outputs], init),
+            }
+        };
+        PointHead {
+            cls_layers: chain("cls_layers", config.class_filters, classes),
+            box_layers: chain("box_layers", config.box_filters, POINT_CODE),
+        }
+    }
+
+    /// # Shapes
+    /// `features`: `[B * N, C]`.
+    pub fn forward(&self, features: Tensor<2>, mode: Mode) -> PointPredictions {
+        let counts = RowCounts::once(features.dims()[0], &features.device());
+        PointPredictions {
+            cls: self.cls_layers.forward(features.clone(), &counts, mode),
+            boxes: self.box_layers.forward(features, &counts, mode),
+        }
+    }
+}
+
+impl<const D: usize> HiddenLayers<D> {
+    /// # Shapes
+    /// `x`: `[N, C]`; result `[N, outputs]`.
+    pub fn forward(&self, x: Tensor<2>, counts: &RowCounts, mode: Mode) -> Tensor<2> {
+        self.last.forward(self.hidden.iter().fold(x, |x, layer| layer.forward(x, counts, mode)))
+    }
+}

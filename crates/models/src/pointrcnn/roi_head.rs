@@ -1,0 +1,115 @@
+//! The second stage's network (Shi et al. 2019, PointRCNN, section 3.3; OpenPCDet: `PointRCNNHead`).
+
+use super::backbone::SetAbstraction;
+use super::point_head::HiddenLayers;
+use super::roi_input::{PREFIX, RoiInput};
+use super::set_abstraction::SharedMlp;
+use crate::config::RoiHeadConfig;
+use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear};
+use burn::module::Module;
+use burn::tensor::activation::relu;
+use burn::tensor::{Int, Tensor, TensorData};
+
+/// Refines regions of interest. Its set abstraction has batch normalisation, as in OpenPCDet, where `USE_BN` does not reach it.
+#[derive(Module, Debug)]
+pub struct RoiHead {
+    /// Levels inside a region, then one over all of it.
+    pub sa_modules: Vec<SetAbstraction>,
+    /// Position, score and distance of a point.
+    pub xyz_up_layer: Vec<RowsLinear<4>>,
+    /// The former beside the point's features.
+    pub merge_down_layer: Vec<RowsLinear<4>>,
+    /// To the score.
+    pub cls_layers: HiddenLayers<3>,
+    /// To the box.
+    pub reg_layers: HiddenLayers<3>,
+}
+
+/// What the second stage computes on its way. P rows of points, see [`RoiInput`]; R regions.
+#[derive(Clone, Debug)]
+pub struct RoiStages {
+    /// `[P, C]`.
+    pub xyz_up: Tensor<2>,
+    /// `[P, C]`.
+    pub merged: Tensor<2>,
+    /// Behind each level, rows as [`RoiInput::dense`] says; the last one `[R, C]`.
+    pub set_abstraction: Vec<Tensor<2>>,
+    /// Logits, `[R, 1]`.
+    pub cls: Tensor<2>,
+    /// Residuals, `[R, 7]`.
+    pub reg: Tensor<2>,
+}
+
+impl RoiHead {
+    /// For points with `inputs` features.
+    pub fn new(inputs: usize, config: &RoiHeadConfig, init: &Init<'_>) -> Self {
+        let norm = |channels| BatchNorm::new(channels, 0.1, 1e-5, init);
+        let [first, second] = config.xyz_filters;
+        let linear = |name: &str, channels| RowsLinear::xavier(&format!("roi_head.{name}"), channels, init);
+        let filters = config.levels.iter().map(|l| &l.filters).chain([&config.global_filters]);
+        let mut from = second;
+        let mut sa_modules = Vec::new();
+        for (i, filters) in filters.enumerate() {
+            let name = format!("roi_head.SA_modules.{i}.mlps.0");
+            let mlp = SharedMlp::new(from, filters, |j, c| {
+                RowsBnRelu::xavier(&format!("{name}.{}.weight", 3 * j), c, norm(c[1]), init)
+            });
+            sa_modules.push(SetAbstraction { mlps: vec![mlp] });
+            from = filters[filters.len() - 1];
+        }
+        let chain = |name: &str, [first, second]: [usize; 2], outputs: usize| {
+            let hidden = |index: usize, c: [usize; 2]| {
+                RowsBnRelu::xavier(&format!("roi_head.{name}.{index}.weight"), c, norm(c[1]), init)
+            };
+            HiddenLayers {
+                hidden: vec![hidden(0, [from, first]), hidden(4, [first, second])],
+                last: RowsLinear::xavier(&format!("roi_head.{name}.7"), [second, outputs], init),
+            }
+        };
+        let mut reg_layers = chain("reg_layers", config.box_filters, 7);
+        let inputs_of_last = config.box_filters[1];
+        reg_layers.last.weight = init.normal("roi_head.reg_layers.7.weight", [7, inputs_of_last, 1], 0.001);
+        RoiHead {
+            sa_modules,
+            xyz_up_layer: vec![linear("xyz_up_layer.0", [PREFIX, first]), linear("xyz_up_layer.2", [first, second])],
+            merge_down_layer: vec![linear("merge_down_layer.0", [second + inputs, second])],
+            cls_layers: chain("cls_layers", config.class_filters, 1),
+            reg_layers,
+        }
+    }
+
+    /// No gradient reaches `point_features`, as in the reference.
+    ///
+    /// # Shapes
+    /// `point_features`: `[B * N, C]`.
+    pub fn forward(&self, point_features: Tensor<2>, input: &RoiInput, mode: Mode) -> RoiStages {
+        let device = point_features.device();
+        let [rows, channels] = point_features.dims();
+        let points = input.prefix.len();
+        let prefix = TensorData::new(input.prefix.as_flattened().to_vec(), [points, PREFIX]);
+        let prefix = Tensor::<2>::from_data(prefix, &device); // [P, 5]
+        let xyz_up = self.xyz_up_layer.iter().fold(prefix, |x, layer| relu(layer.forward(x)));
+
+        // A region without points reads zeros, from a row behind the last.
+        let source: Vec<i32> = input.source.iter().map(|s| s.map_or(rows as i32, |row| row as i32)).collect();
+        let source = Tensor::<1, Int>::from_data(TensorData::new(source, [points]), &device);
+        let features = Tensor::cat(vec![point_features.detach(), Tensor::zeros([1, channels], &device)], 0);
+        let features = features.select(0, source); // [P, C]
+        let merge = &self.merge_down_layer[0];
+        let positions = xyz_up.dims()[1];
+        let merged =
+            merge.project(xyz_up.clone(), 0) + merge.project(features, positions) + merge.bias.val().unsqueeze();
+        let merged = relu(merged); // [P, C]
+
+        let mut set_abstraction: Vec<Tensor<2>> = Vec::new();
+        for (module, groups) in self.sa_modules.iter().zip(input.levels.iter().chain([&input.global])) {
+            let from = set_abstraction.last().unwrap_or(&merged).clone();
+            set_abstraction.push(module.mlps[0].forward(Some(from), &groups.to_device(&device), mode));
+        }
+        let regions = set_abstraction[set_abstraction.len() - 1].clone(); // [R, C]
+        let counts = RowCounts::once(input.regions(), &device);
+        let cls = self.cls_layers.forward(regions.clone(), &counts, mode);
+        let reg = self.reg_layers.forward(regions, &counts, mode);
+        RoiStages { xyz_up, merged, set_abstraction, cls, reg }
+    }
+}

@@ -1,0 +1,115 @@
+//! Figures of a study. Each is made once and written as SVG, as PNG, or into the report.
+
+mod bars;
+mod dots;
+mod heat;
+mod marginals;
+mod scatter;
+mod target_views;
+
+pub use bars::{Bar, bars};
+pub use dots::{DotGroup, DotPanel, dots};
+pub use heat::heat_map;
+pub use marginals::{LocatedTargets, locations};
+pub use scatter::{ScatterGroup, scatter};
+pub use target_views::{TargetCloud, aggregated_targets, target_views};
+
+use crate::curve::curve_page;
+use crate::page::{Anchor, COLORS, INK, Page, Rgb};
+use crate::svg::{Theme, svg};
+use crate::{CurveOptions, ReportError, Series};
+use resvg::{tiny_skia, usvg};
+use std::sync::{Arc, LazyLock};
+
+/// A figure, to be written in any form.
+pub struct Figure(pub(crate) Page);
+
+/// What PNG figures write text with.
+static FONT: &[u8] = include_bytes!("../assets/DejaVuSans-subset.ttf");
+
+static FONTS: LazyLock<Arc<usvg::fontdb::Database>> = LazyLock::new(|| {
+    let mut fonts = usvg::fontdb::Database::new();
+    fonts.load_font_data(FONT.to_vec());
+    Arc::new(fonts)
+});
+
+impl Figure {
+    /// Curves over a common axis.
+    pub fn curves(series: &[Series], options: &CurveOptions) -> Self {
+        Figure(curve_page(series, options))
+    }
+
+    /// The text of an SVG file, light.
+    pub fn svg(&self) -> String {
+        svg(&self.0, Theme::Paper)
+    }
+
+    /// SVG for inside the report: its neutral colours are the report's, light or dark.
+    pub(crate) fn svg_for_report(&self) -> String {
+        svg(&self.0, Theme::Report)
+    }
+
+    /// The bytes of a PNG file, `scale` pixels for each of the figure's.
+    ///
+    /// # Errors
+    /// A figure that is far too large.
+    pub fn png(&self, scale: f32) -> Result<Vec<u8>, ReportError> {
+        let failed = |e: String| ReportError::Png(e);
+        let options =
+            usvg::Options { font_family: "DejaVu Sans".into(), fontdb: FONTS.clone(), ..usvg::Options::default() };
+        let text = self.svg().replace("system-ui, sans-serif", "DejaVu Sans");
+        let tree = usvg::Tree::from_str(&text, &options).map_err(|e| failed(e.to_string()))?;
+        let [width, height] = self.0.size.map(|px| (px as f32 * scale).round());
+        let size = ReportError::Size { width: width.into(), height: height.into() };
+        if !(1.0..=20_000.0).contains(&width) || !(1.0..=20_000.0).contains(&height) {
+            return Err(size);
+        }
+        let mut pixels = tiny_skia::Pixmap::new(width as u32, height as u32).ok_or(size)?;
+        resvg::render(&tree, tiny_skia::Transform::from_scale(scale, scale), &mut pixels.as_mut());
+        pixels.encode_png().map_err(|e| failed(e.to_string()))
+    }
+}
+
+/// The colour of the k-th group.
+pub(crate) fn color(k: usize) -> Rgb {
+    COLORS[k % COLORS.len()]
+}
+
+/// Names beside dots of their colours, from left to right, in rows; returns the height that they take, px.
+pub(crate) fn legend(page: &mut Page, names: &[&str], [left, top]: [f64; 2], width: f64) -> f64 {
+    let (mut x, mut y) = (left, top + 12.0);
+    for (k, name) in names.iter().enumerate() {
+        let wide = 30.0 + 7.0 * name.chars().count() as f64;
+        if x > left && x + wide > left + width {
+            (x, y) = (left, y + 18.0);
+        }
+        page.dots(vec![[x + 6.0, y - 4.0]], 5.0, color(k), 1.0);
+        page.text([x + 16.0, y], *name, 12.0, INK, Anchor::Start);
+        x += wide;
+    }
+    y - top + 8.0
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_reaches_the_png() {
+        let figure = |title: &str| {
+            let options = CurveOptions { title: title.into(), ..CurveOptions::default() };
+            Figure::curves(&[], &options)
+        };
+        let (with, without) = (figure("Zoom 12 m² → α").png(1.0).unwrap(), figure("").png(1.0).unwrap());
+        assert_ne!(with, without, "the title is drawn");
+        let pixels = tiny_skia::Pixmap::decode_png(&with).unwrap();
+        assert_eq!((pixels.width(), pixels.height()), (860, 480));
+        assert!(figure("").png(100.0).is_err());
+    }
+
+    #[test]
+    fn the_report_has_its_own_neutral_colours() {
+        let figure = Figure::curves(&[], &CurveOptions::default());
+        assert!(figure.svg_for_report().contains("var(--plot)") && !figure.svg().contains("var("));
+    }
+}

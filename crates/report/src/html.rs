@@ -1,0 +1,159 @@
+//! The page: sections of figures, tables and views, as one HTML file that needs nothing else.
+
+use crate::ReportError;
+use crate::figure::Figure;
+use askama::Template;
+use base64::{Engine as _, prelude::BASE64_STANDARD};
+use eval::csv_text;
+
+/// One section of the page.
+pub(crate) struct Section {
+    pub id: &'static str,
+    pub title: &'static str,
+    pub text: Vec<String>,
+    pub items: Vec<Item>,
+}
+
+/// A figure, a table or a view, with what stands beside it.
+pub(crate) struct Item {
+    /// Name of its files and its anchor.
+    pub id: String,
+    /// "Figure 3".
+    pub label: String,
+    pub caption: String,
+    /// The numbers behind it.
+    pub csv: String,
+    pub csv_base64: String,
+    pub body: Body,
+    /// To be written as a file of its own.
+    pub figure: Option<Figure>,
+}
+
+/// What an item shows.
+pub(crate) enum Body {
+    Figure { svg: String, wide: bool },
+    Table { columns: Vec<String>, rows: Vec<TableRow>, text_columns: usize },
+    View { scenes_json: String },
+}
+
+/// A row of a table; `begins` draws a line above it.
+pub(crate) struct TableRow {
+    pub begins: bool,
+    pub cells: Vec<TableCell>,
+}
+
+/// A cell, with small text below.
+pub(crate) struct TableCell {
+    pub text: String,
+    pub small: String,
+}
+
+impl TableCell {
+    pub fn new(text: impl Into<String>) -> Self {
+        TableCell { text: text.into(), small: String::new() }
+    }
+
+    pub fn with_small(text: impl Into<String>, small: impl Into<String>) -> Self {
+        TableCell { text: text.into(), small: small.into() }
+    }
+}
+
+impl TableRow {
+    pub fn new(begins: bool, cells: impl IntoIterator<Item = TableCell>) -> Self {
+        TableRow { begins, cells: cells.into_iter().collect() }
+    }
+}
+
+impl Item {
+    /// A figure with the numbers behind it: columns and lines.
+    pub fn figure(
+        id: impl Into<String>,
+        caption: impl Into<String>,
+        figure: Figure,
+        numbers: (&[&str], &[Vec<String>]),
+    ) -> Self {
+        let csv = if numbers.0.is_empty() { String::new() } else { csv_text(numbers.0, numbers.1) };
+        let svg = figure.svg_for_report();
+        let wide = figure.0.size[0] > 700.0;
+        Item { figure: Some(figure), ..Item::new(id.into(), caption.into(), csv, Body::Figure { svg, wide }) }
+    }
+
+    /// A table; the first `text_columns` columns are words, the others numbers. `csv`: all of it as CSV, or empty: the table itself.
+    pub fn table(
+        id: impl Into<String>,
+        caption: impl Into<String>,
+        (columns, text_columns): (&[&str], usize),
+        rows: Vec<TableRow>,
+        csv: Option<String>,
+    ) -> Self {
+        let csv = csv.unwrap_or_else(|| {
+            let text = |cell: &TableCell| match cell.small.as_str() {
+                "" => cell.text.clone(),
+                small => format!("{} {small}", cell.text),
+            };
+            let lines: Vec<Vec<String>> = rows.iter().map(|row| row.cells.iter().map(text).collect()).collect();
+            csv_text(columns, &lines)
+        });
+        let columns = columns.iter().map(|c| (*c).into()).collect();
+        Item::new(id.into(), caption.into(), csv, Body::Table { columns, rows, text_columns })
+    }
+
+    pub fn view(id: impl Into<String>, caption: impl Into<String>, scenes_json: String) -> Self {
+        Item::new(id.into(), caption.into(), String::new(), Body::View { scenes_json })
+    }
+
+    fn new(id: String, caption: String, csv: String, body: Body) -> Self {
+        let csv_base64 = BASE64_STANDARD.encode(&csv);
+        Item { id, label: String::new(), caption, csv, csv_base64, body, figure: None }
+    }
+}
+
+#[derive(Template)]
+#[template(path = "report.html")]
+struct PageTemplate<'a> {
+    title: &'a str,
+    about: &'a [String],
+    warnings: &'a [String],
+    sections: &'a [Section],
+    footer: &'a str,
+    style: &'static str,
+    viewer: bool,
+    viewer_script: &'static str,
+}
+
+/// What stands around the sections.
+pub(crate) struct PageText<'a> {
+    pub title: &'a str,
+    pub about: &'a [String],
+    pub warnings: &'a [String],
+    pub footer: &'a str,
+}
+
+/// Numbers figures and tables, and writes the page.
+pub(crate) fn page(text: &PageText, sections: &mut [Section]) -> Result<String, ReportError> {
+    let (mut figures, mut tables, mut viewer) = (0, 0, false);
+    for item in sections.iter_mut().flat_map(|section| &mut section.items) {
+        item.label = match item.body {
+            Body::Table { .. } => {
+                tables += 1;
+                format!("Table {tables}")
+            }
+            _ => {
+                figures += 1;
+                viewer |= matches!(item.body, Body::View { .. });
+                format!("Figure {figures}")
+            }
+        };
+    }
+    let template = PageTemplate {
+        title: text.title,
+        about: text.about,
+        warnings: text.warnings,
+        sections,
+        footer: text.footer,
+        style: include_str!("../templates/report.css"),
+        viewer,
+        viewer_script: include_str!("../assets/viewer.min.js"),
+    };
+    template.render().map_err(|e| ReportError::Page(e.to_string()))
+}

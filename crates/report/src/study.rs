@@ -1,0 +1,204 @@
+//! The report of a study: one page, and its figures and tables as files beside it.
+
+mod analyses;
+mod clouds;
+mod features;
+mod matrix;
+mod training;
+
+pub use training::{TrainingRun, read_training_run};
+
+use crate::ReportError;
+use crate::html::{Item, PageText, Section, page};
+use crate::scene::{Scene, scenes_json};
+use data::write_atomic;
+use eval::analysis::RunAnalysis;
+use eval::distance::Distances;
+use eval::features::{CkaTable, Embedding};
+use eval::matrix::Matrix;
+use eval::targets::Targets;
+use rayon::prelude::*;
+use std::path::{Path, PathBuf};
+
+/// Everything that a report shows; what is empty is left out.
+#[derive(Clone, Debug, Default)]
+pub struct StudyReport {
+    /// Above all.
+    pub title: String,
+    /// What the study is, what it scales down from the paper, and what was compared; a paragraph each.
+    pub about: Vec<String>,
+    /// The command that makes this report again.
+    pub command: String,
+    /// Name and value: seeds, machine, versions, times.
+    pub facts: Vec<(String, String)>,
+    /// What to know before reading, beside the warnings of the matrix.
+    pub warnings: Vec<String>,
+    /// Train sets x test sets.
+    pub matrix: Option<Matrix>,
+    /// What is behind the average precision of single runs, by name.
+    pub analyses: Vec<(String, RunAnalysis)>,
+    /// Pictures of features.
+    pub embeddings: Vec<Embedding>,
+    /// Layers of two networks, by name.
+    pub cka: Vec<(String, CkaTable)>,
+    /// Distances of features.
+    pub frechet: Vec<FrechetRow>,
+    /// Distances of data sets.
+    pub distances: Vec<Distances>,
+    /// Targets of the data sets.
+    pub targets: Vec<Targets>,
+    /// Losses and validation.
+    pub training: Vec<TrainingRun>,
+    /// Clouds with boxes.
+    pub scenes: Vec<Scene>,
+}
+
+/// The Fréchet distance between the features of two train sets.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrechetRow {
+    /// The network.
+    pub network: String,
+    /// One train set.
+    pub a: String,
+    /// The other.
+    pub b: String,
+    /// Squared units of the features.
+    pub distance: f64,
+    /// That of two halves of the first's features: nearer is no difference.
+    pub floor: Option<f64>,
+}
+
+/// Pixels of a PNG for each of the figure's.
+const PNG_SCALE: f32 = 1.5;
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ReportFiles {
+    /// The page.
+    pub page: PathBuf,
+    /// Bytes of the page.
+    pub page_bytes: usize,
+    /// Figures (each as SVG and PNG) and tables.
+    pub others: Vec<PathBuf>,
+}
+
+impl StudyReport {
+    /// The page alone: it needs no other file and no network.
+    ///
+    /// # Errors
+    /// Only what cannot be rendered.
+    pub fn html(&self) -> Result<String, ReportError> {
+        self.render(&mut self.sections())
+    }
+
+    /// Writes `report.html`, `figures/NAME.svg`, `figures/NAME.png` and `tables/NAME.csv` into a folder; of the matrix, `matrix.md` and
+    /// `matrix.tex`, too.
+    ///
+    /// # Errors
+    /// A file that cannot be written, or a figure that cannot be drawn.
+    pub fn write(&self, folder: &Path) -> Result<ReportFiles, ReportError> {
+        let mut sections = self.sections();
+        let html = self.render(&mut sections)?;
+        let page = folder.join("report.html");
+        write_atomic(&page, html.as_bytes())?;
+        let mut others = Vec::new();
+        let mut write = |name: String, bytes: &[u8]| -> Result<(), ReportError> {
+            let path = folder.join(name);
+            write_atomic(&path, bytes)?;
+            others.push(path);
+            Ok(())
+        };
+        if let Some(matrix) = &self.matrix {
+            write("tables/matrix.md".into(), matrix.to_markdown().as_bytes())?;
+            write("tables/matrix.tex".into(), matrix.to_latex().as_bytes())?;
+        }
+        let items = || sections.iter().flat_map(|section| &section.items);
+        for item in items().filter(|item| !item.csv.is_empty()) {
+            write(format!("tables/{}.csv", item.id), item.csv.as_bytes())?;
+        }
+        let drawn = |item: &Item| {
+            let Some(figure) = &item.figure else { return Ok(None) };
+            Ok(Some((figure.svg(), figure.png(PNG_SCALE)?)))
+        };
+        let drawn: Vec<Result<_, ReportError>> = items().collect::<Vec<_>>().into_par_iter().map(drawn).collect();
+        for (item, drawn) in items().zip(drawn) {
+            if let Some((svg, png)) = drawn? {
+                write(format!("figures/{}.svg", item.id), svg.as_bytes())?;
+                write(format!("figures/{}.png", item.id), &png)?;
+            }
+        }
+        Ok(ReportFiles { page, page_bytes: html.len(), others })
+    }
+
+    fn render(&self, sections: &mut [Section]) -> Result<String, ReportError> {
+        let mut warnings = self.warnings.clone();
+        if let Some(matrix) = &self.matrix {
+            warnings.extend(matrix.warnings.iter().cloned());
+        }
+        let footer = match self.command.as_str() {
+            "" => "One file: figures, numbers and the view of clouds are inside; nothing is loaded.".to_string(),
+            command => format!(
+                "Made by: {command}. One file: figures, numbers and the view of clouds are inside; nothing is loaded."
+            ),
+        };
+        page(&PageText { title: &self.title, about: &self.about, warnings: &warnings, footer: &footer }, sections)
+    }
+
+    fn sections(&self) -> Vec<Section> {
+        let mut sections = vec![self.facts_section()];
+        if let Some(m) = &self.matrix {
+            sections.push(matrix::matrix_section(m));
+            sections.push(matrix::range_section(m));
+        }
+        sections.push(analyses::section(&self.analyses));
+        sections.push(features::section(self));
+        sections.push(clouds::distance_section(&self.distances));
+        sections.push(clouds::target_section(&self.targets));
+        sections.push(training::section(&self.training));
+        sections.push(self.scene_section());
+        sections.retain(|section| !section.items.is_empty());
+        sections
+    }
+
+    fn facts_section(&self) -> Section {
+        use crate::html::{TableCell, TableRow};
+        let row =
+            |(name, value): &(String, String)| TableRow::new(false, [TableCell::new(name), TableCell::new(value)]);
+        let rows: Vec<TableRow> = self.facts.iter().map(row).collect();
+        let items = match rows.is_empty() {
+            true => Vec::new(),
+            false => vec![Item::table("study", "What was run.", (&["what", "value"], 2), rows, None)],
+        };
+        Section { id: "facts", title: "The study", text: Vec::new(), items }
+    }
+
+    fn scene_section(&self) -> Section {
+        let items = match self.scenes.is_empty() {
+            true => Vec::new(),
+            false => vec![Item::view(
+                "scenes",
+                "Clouds with boxes. Drag to turn, scroll or pinch to come nearer, drag with the right button or two fingers to move. The \
+                 line out of a box shows its front. Positions are rounded to whole centimetres.",
+                scenes_json(&self.scenes),
+            )],
+        };
+        Section { id: "clouds-3d", title: "Clouds and boxes", text: Vec::new(), items }
+    }
+}
+
+/// A file name out of words.
+pub(crate) fn slug(words: &str) -> String {
+    let kept = words.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' });
+    let parts: String = kept.collect();
+    parts.split('-').filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-")
+}
+
+/// A number with so many digits behind the point; a dash for none.
+pub(crate) fn number(value: Option<f64>, digits: usize) -> String {
+    value.filter(|v| v.is_finite()).map_or("–".into(), |v| format!("{v:.digits$}"))
+}
+
+/// A number for CSV; empty for none.
+pub(crate) fn csv_number(value: Option<f64>) -> String {
+    value.map_or(String::new(), |v| v.to_string())
+}

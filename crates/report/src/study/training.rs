@@ -1,0 +1,96 @@
+//! Losses and validation of the runs.
+
+use crate::figure::Figure;
+use crate::html::{Item, Section};
+use crate::{CurveOptions, ReportError, Series};
+use std::path::Path;
+
+/// The curves of one run.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct TrainingRun {
+    /// For the legend.
+    pub name: String,
+    /// Step and mean loss of each epoch, or where there is none, the loss at each logged step.
+    pub loss: Vec<[f64; 2]>,
+    /// Step and average precision on the validation split, percent.
+    pub validation_ap: Vec<[f64; 2]>,
+}
+
+/// Reads the `metrics.jsonl` of a run folder. A line that was cut off at the end of the file is left out: the run is being written.
+///
+/// # Errors
+/// A file that cannot be read, or a line in it that is no JSON.
+pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportError> {
+    let text = fs_err::read_to_string(path).map_err(data::DataError::from)?;
+    let (mut of_steps, mut of_epochs) = (Vec::new(), Vec::new());
+    let mut run = TrainingRun { name: name.into(), ..TrainingRun::default() };
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    for (i, line) in text[..whole].lines().enumerate() {
+        let value: serde_json::Value = serde_json::from_str(line)
+            .map_err(|e| data::DataError::line(path, i + 1, format!("is not a line of metrics: {e}")))?;
+        let at = |key: &str| value[key].as_f64();
+        match (value["kind"].as_str(), at("step")) {
+            (Some("step"), Some(step)) => of_steps.extend(at("loss").map(|loss| [step, loss])),
+            (Some("epoch"), Some(step)) => {
+                of_epochs.extend(at("train_loss").map(|loss| [step, loss]));
+                run.validation_ap.extend(value["validation"]["ap"].as_f64().map(|ap| [step, ap]));
+            }
+            _ => {}
+        }
+    }
+    run.loss = if of_epochs.len() > 1 { of_epochs } else { of_steps };
+    Ok(run)
+}
+
+/// One figure of losses and one of validation.
+pub(super) fn section(runs: &[TrainingRun]) -> Section {
+    let mut items = Vec::new();
+    type Part = (&'static str, &'static str, &'static str, bool, fn(&TrainingRun) -> &Vec<[f64; 2]>);
+    let parts: [Part; 2] = [
+        ("training-loss", "loss", "Training loss of every run.", true, |run| &run.loss),
+        ("validation-ap", "3D AP (%)", "Average precision on the validation split during training.", false, |run| {
+            &run.validation_ap
+        }),
+    ];
+    for (id, y_label, caption, log_y, of) in parts {
+        let series: Vec<Series> = runs
+            .iter()
+            .filter(|run| !of(run).is_empty())
+            .map(|run| Series { name: run.name.clone(), points: of(run).clone() })
+            .collect();
+        if series.is_empty() {
+            continue;
+        }
+        let lines: Vec<Vec<String>> = series
+            .iter()
+            .flat_map(|s| s.points.iter().map(|[step, v]| vec![s.name.clone(), step.to_string(), v.to_string()]))
+            .collect();
+        let options =
+            CurveOptions { x_label: "step".into(), y_label: y_label.into(), log_y, ..CurveOptions::default() };
+        items.push(Item::figure(id, caption, Figure::curves(&series, &options), (&["run", "step", "value"], &lines)));
+    }
+    Section { id: "training", title: "Training", text: Vec::new(), items }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn curves_are_read_from_the_metrics_of_a_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("metrics.jsonl");
+        let step = "{\"kind\":\"step\",\"step\":1,\"loss\":3.5}\n";
+        std::fs::write(&path, format!("{step}{{\"kind\":\"st")).unwrap();
+        assert_eq!(read_training_run("a", &path).unwrap().loss, [[1.0, 3.5]]);
+        let epoch = |step: u32, ap: &str| {
+            format!("{{\"kind\":\"epoch\",\"step\":{step},\"train_loss\":2.0,\"validation\":{ap}}}\n")
+        };
+        std::fs::write(&path, format!("{step}{}{}", epoch(5, "null"), epoch(10, "{\"ap\":40.5}"))).unwrap();
+        let run = read_training_run("a", &path).unwrap();
+        assert_eq!((run.loss, run.validation_ap), (vec![[5.0, 2.0], [10.0, 2.0]], vec![[10.0, 40.5]]));
+        std::fs::write(&path, format!("{step}nonsense\n{step}")).unwrap();
+        let error = read_training_run("a", &path).unwrap_err().to_string();
+        assert!(error.contains("metrics.jsonl:2"), "{error}");
+    }
+}

@@ -1,0 +1,289 @@
+//! Labels as they are made on the road: recorded positions of all cars, brought to the time of the cloud, as boxes in the own car's frame,
+//! shifted to where the points are (Huch et al. 2023, section III-A).
+
+use crate::SimulateError;
+use crate::error::within;
+use crate::race_car::car_box;
+use crate::scenario::{CarState, Trajectory};
+use data::{Cloud, stream};
+use geometry::{Box3, move_box, points_in_boxes};
+use nalgebra::Vector3;
+use rand_distr::{Distribution, StandardNormal};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// How positions are recorded and labels made of them.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct AutoLabel {
+    /// Records a second of each car.
+    pub rate_hz: f64,
+    /// Records come that long after the middle of a scan, s: positions and clouds are not taken together.
+    pub phase_s: f64,
+    /// Error of each recorded position along each axis, m.
+    pub position_std_m: f64,
+    /// Error of each recorded heading, degrees.
+    pub heading_std_deg: f64,
+    /// Error of each recorded roll and pitch, degrees.
+    pub tilt_std_deg: f64,
+    /// Shift the boxes to the points.
+    pub refine: bool,
+}
+
+impl Default for AutoLabel {
+    fn default() -> Self {
+        AutoLabel {
+            rate_hz: 20.0,
+            phase_s: 0.017,
+            position_std_m: 0.03,
+            heading_std_deg: 0.1,
+            tilt_std_deg: 0.05,
+            refine: true,
+        }
+    }
+}
+
+impl AutoLabel {
+    pub(crate) fn check(&self) -> Result<(), SimulateError> {
+        within("rate_hz", self.rate_hz, 2.0, 1000.0)?;
+        within("phase_s", self.phase_s, 0.0, 1.0 / self.rate_hz)?;
+        within("position_std_m", self.position_std_m, 0.0, 10.0)?;
+        within("heading_std_deg", self.heading_std_deg, 0.0, 45.0)?;
+        within("tilt_std_deg", self.tilt_std_deg, 0.0, 45.0)
+    }
+
+    /// What is recorded of a car around `time_s`: two records before and two after, with their errors. The errors of a record are the same
+    /// whoever asks: they depend on (seed, purpose, number of the record).
+    fn records(&self, car: &Trajectory, time_s: f64, seed: u64, purpose: &str) -> Option<Trajectory> {
+        let number = ((time_s - self.phase_s) * self.rate_hz).floor() as i64;
+        let record = |number: i64| {
+            let time_s = number as f64 / self.rate_hz + self.phase_s;
+            let motion = car.at(time_s)?;
+            let mut state = CarState::of(time_s, &motion.pose, motion.velocity);
+            let mut random = stream(seed, purpose, 0, number as u64);
+            let mut error = |std: f64| {
+                let unit: f64 = StandardNormal.sample(&mut random);
+                std * unit
+            };
+            state.x_m += error(self.position_std_m);
+            state.y_m += error(self.position_std_m);
+            state.z_m += error(self.position_std_m);
+            state.yaw_rad += error(self.heading_std_deg.to_radians());
+            state.roll_rad += error(self.tilt_std_deg.to_radians());
+            state.pitch_rad += error(self.tilt_std_deg.to_radians());
+            Some(state)
+        };
+        let states: Option<Vec<CarState>> = (number - 1..=number + 2).map(record).collect();
+        states.map(Trajectory::from_states)
+    }
+
+    /// The boxes of `cars` at the time of a cloud in the frame of `ego`, from what is recorded of all of them; upright, as labels are. `None`
+    /// for a car without records around that time. `purpose` names the run.
+    pub fn boxes(
+        &self,
+        ego: &Trajectory,
+        cars: &[Trajectory],
+        time_s: f64,
+        seed: u64,
+        purpose: &str,
+    ) -> Vec<Option<Box3>> {
+        let pose = |car: &Trajectory, number: usize| {
+            let records = self.records(car, time_s, seed, &format!("{purpose}/record {number}"))?;
+            Some(records.at(time_s)?.pose)
+        };
+        let own = pose(ego, 0);
+        let label = |(i, car): (usize, &Trajectory)| Some(move_box(&(own?.inverse() * pose(car, i + 1)?), &car_box()));
+        cars.iter().enumerate().map(label).collect()
+    }
+}
+
+/// Points needed to believe them rather than the record.
+const FEWEST: usize = 20;
+/// Points lower above the bottom of a box may be ground, m.
+const GROUND_M: f64 = 0.15;
+/// Boxes are shifted no farther than this along and across, m.
+const FARTHEST_M: [f64; 2] = [1.2, 0.5];
+/// Share of the points at either end that are not believed.
+const TRIMMED: f64 = 0.02;
+
+/// The box shifted so that the points in and around it touch the faces that the sensor sees. Boxes with few points stay where they are, and a
+/// shift that would lose points is not made.
+pub fn refine(cloud: &Cloud, bbox: &Box3) -> Box3 {
+    let around = Box3 {
+        center: [bbox.center[0], bbox.center[1], bbox.center[2] + GROUND_M],
+        size: [bbox.size[0] + 2.0 * FARTHEST_M[0], bbox.size[1] + 2.0 * FARTHEST_M[1], bbox.size[2]],
+        ..*bbox
+    };
+    let found = points_in_boxes(&cloud.values, cloud.channels, &[around], 0.0);
+    let local: Vec<[f64; 3]> = found[0].iter().map(|i| bbox.to_local(cloud.xyz(*i as usize).map(f64::from))).collect();
+    if local.len() < FEWEST {
+        return *bbox;
+    }
+    let sensor = bbox.to_local([0.0; 3]);
+    let shift = |axis: usize| {
+        let mut values: Vec<f64> = local.iter().map(|p| p[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        let trim = (values.len() as f64 * TRIMMED) as usize;
+        let (low, high, half) = (values[trim], values[values.len() - 1 - trim], bbox.size[axis] / 2.0);
+        let off = if high - low > 1.6 * half {
+            (low + high) / 2.0 // both faces are seen
+        } else if sensor[axis] < -half {
+            low + half
+        } else if sensor[axis] > half {
+            high - half
+        } else {
+            0.0
+        };
+        off.clamp(-FARTHEST_M[axis], FARTHEST_M[axis])
+    };
+    let inside = |by: [f64; 2]| {
+        let holds = |p: &&[f64; 3]| (0..2).all(|k| (p[k] - by[k]).abs() <= bbox.size[k] / 2.0 + 0.05);
+        local.iter().filter(holds).count()
+    };
+    let by = [shift(0), shift(1)];
+    if inside(by) < inside([0.0; 2]) {
+        return *bbox;
+    }
+    Box3 { center: bbox.from_local([by[0], by[1], 0.0]), ..*bbox }
+}
+
+/// Range sections of the paper, m.
+pub const SECTIONS_M: [[f64; 2]; 3] = [[0.0, 33.3], [33.3, 66.6], [66.6, 100.0]];
+
+/// How far labels are from the true boxes in one section of ranges.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, Default)]
+pub struct LabelError {
+    /// From and to, m.
+    pub range_m: [f64; 2],
+    /// Labels.
+    pub labels: usize,
+    /// Root mean square along the true heading, across it, and up, m.
+    pub rms_m: [f64; 3],
+    /// Mean along the true heading, across it, and up, m.
+    pub mean_m: [f64; 3],
+    /// Root mean square of the heading, degrees.
+    pub yaw_rms_deg: f64,
+    /// Share of the labels that overlap their car by less than 0.7 (IoU of boxes).
+    pub below_iou_0_7: f64,
+}
+
+/// The errors of labels against true boxes, by section of ranges.
+pub fn label_errors(pairs: impl Iterator<Item = (Box3, Box3)>) -> Vec<LabelError> {
+    let mut sums = [[0.0; 8]; 3];
+    let mut counts = [0_usize; 3];
+    for (label, truth) in pairs {
+        let range = truth.center[0].hypot(truth.center[1]);
+        let Some(section) = SECTIONS_M.iter().position(|[low, high]| (*low..*high).contains(&range)) else { continue };
+        counts[section] += 1;
+        let off = Vector3::from(truth.to_local(label.center));
+        let turn = geometry::limit_period(label.yaw_rad - truth.yaw_rad, 0.5, std::f64::consts::TAU);
+        let missed = f64::from(u8::from(geometry::iou_3d(&label, &truth) < 0.7));
+        let values = [off.x, off.y, off.z, off.x * off.x, off.y * off.y, off.z * off.z, turn * turn, missed];
+        sums[section].iter_mut().zip(values).for_each(|(sum, v)| *sum += v);
+    }
+    let error = |i: usize| {
+        let mean = sums[i].map(|v| v / counts[i].max(1) as f64);
+        LabelError {
+            range_m: SECTIONS_M[i],
+            labels: counts[i],
+            mean_m: [mean[0], mean[1], mean[2]],
+            rms_m: [mean[3].sqrt(), mean[4].sqrt(), mean[5].sqrt()],
+            yaw_rms_deg: mean[6].sqrt().to_degrees(),
+            below_iou_0_7: mean[7],
+        }
+    };
+    (0..3).map(error).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame_scene::FrameScene;
+    use crate::mesh::{MaterialTable, cuboid};
+    use crate::race_car::race_car;
+    use crate::rig::{Pattern, Rig, RowBlock};
+    use crate::scenario::Motion;
+    use crate::world::{CarShape, World};
+    use std::path::Path;
+
+    fn straight(x: f64, y: f64, speed: f64) -> Trajectory {
+        let state = |i: i32| {
+            let t = f64::from(i) * 0.05;
+            let pose = geometry::upright_pose([x + speed * t, y, 0.198], 0.0);
+            CarState::of(t, &pose, Vector3::new(speed, 0.0, 0.0))
+        };
+        Trajectory::from_states((-20..2100).map(state).collect())
+    }
+
+    #[test]
+    fn records_without_errors_give_the_true_boxes() {
+        let exact = AutoLabel { position_std_m: 0.0, heading_std_deg: 0.0, tilt_std_deg: 0.0, ..AutoLabel::default() };
+        let (ego, cars) = (straight(0.0, 0.0, 50.0), [straight(30.0, 4.0, 55.0)]);
+        for i in 0..20 {
+            let t = 0.05 * f64::from(i);
+            let label = exact.boxes(&ego, &cars, t, 1, "run 0")[0].unwrap();
+            let truth = move_box(&geometry::upright_pose([30.0 + 5.0 * t, 4.0, 0.0], 0.0), &car_box());
+            assert!(
+                label.to_array().iter().zip(truth.to_array()).all(|(a, b)| (a - b).abs() < 1e-9),
+                "{label:?} {truth:?}"
+            );
+        }
+        assert_eq!(exact.boxes(&ego, &[straight(0.0, 5.0, 50.0)], 500.0, 1, "run 0"), [None]);
+    }
+
+    #[test]
+    fn errors_have_the_size_of_the_records() {
+        let auto = AutoLabel { position_std_m: 0.1, heading_std_deg: 0.0, tilt_std_deg: 0.0, ..AutoLabel::default() };
+        let (ego, cars) = (straight(0.0, 0.0, 50.0), [straight(30.0, 4.0, 50.0)]);
+        let truth = move_box(&geometry::upright_pose([30.0, 4.0, 0.0], 0.0), &car_box());
+        let pairs = (0..2000).map(|i| (auto.boxes(&ego, &cars, 0.05 * f64::from(i), 1, "run 0")[0].unwrap(), truth));
+        let errors = label_errors(pairs);
+        assert_eq!(errors.iter().map(|e| e.labels).collect::<Vec<_>>(), [2000, 0, 0]);
+        // Two cars; between two records (17 of 50 ms after the first) errors are averaged: weights 0.74 and 0.26 of the cubic.
+        for (rms, mean) in errors[0].rms_m.iter().zip(errors[0].mean_m) {
+            assert!((0.08..0.14).contains(rms) && mean.abs() < 0.01, "{errors:?}");
+        }
+        assert_eq!(errors[0].yaw_rms_deg, 0.0);
+    }
+
+    /// The cloud of a car at a place, seen from above the own car, on a level ground.
+    fn cloud_of(x: f64, y: f64, yaw: f64) -> (Cloud, Box3) {
+        let ground = cuboid([-200.0, -200.0, -2.0], [200.0, 200.0, 0.0], MaterialTable::built_in("asphalt"));
+        let (world, car, materials) = (World::new(&ground), CarShape::new(&race_car()), MaterialTable::default());
+        let still = |x, y, yaw| Motion {
+            pose: geometry::upright_pose([x, y, 0.198], yaw),
+            velocity: Vector3::zeros(),
+            turn_rate: Vector3::zeros(),
+        };
+        let scene = FrameScene::new(&world, &car, &materials, still(0.0, 0.0, 0.0), &[still(x, y, yaw)]);
+        let mut rig = Rig::parse("[[sensor]]\nname = \"a\"\nposition = [0, 0, 0.6]\n", Path::new("r.toml")).unwrap();
+        rig.sensors[0].pattern =
+            Some(Pattern::grid(RowBlock { rows: 64, top_deg: 5.0, bottom_deg: -19.0 }, 1440, 360.0, 20.0));
+        let cloud = scene.scan(&crate::beams::Beams::of(&rig)).cloud();
+        (cloud, move_box(&geometry::upright_pose([x, y, 0.0], yaw), &car_box()))
+    }
+
+    #[test]
+    fn boxes_are_shifted_to_the_points() {
+        for (x, y, yaw) in [(20.0, 5.0, 0.0), (-28.0, -5.0, 0.02), (12.0, -4.0, -0.1), (35.0, 5.0, 0.1)] {
+            let (cloud, truth) = cloud_of(x, y, yaw);
+            let off = |b: &Box3| truth.to_local(b.center);
+            // Farther away fewer points lie on the edges of a car.
+            let allowed = if x < 30.0 { 0.25 } else { 0.45 };
+            for shift in [[0.7, 0.1], [-0.7, -0.1], [0.4, -0.25]] {
+                let wrong = Box3 { center: truth.from_local([shift[0], shift[1], 0.0]), ..truth };
+                let [along, across, _] = off(&refine(&cloud, &wrong));
+                assert!(along.abs() < allowed && across.abs() < 0.2, "({x}, {y}) {shift:?}: {along} {across}");
+            }
+            let [along, across, _] = off(&refine(&cloud, &truth));
+            assert!(along.abs() < allowed && across.abs() < 0.15, "a right box stays about right: {along} {across}");
+        }
+    }
+
+    #[test]
+    fn a_box_without_points_stays() {
+        let (cloud, _) = cloud_of(20.0, 5.0, 0.0);
+        let alone = Box3::from_array([60.0, -20.0, 0.4, 4.88, 1.9, 1.18, 0.0]);
+        assert_eq!(refine(&cloud, &alone), alone);
+    }
+}

@@ -1,0 +1,117 @@
+//! Triangle meshes: what the world and the cars are made of.
+
+mod file;
+mod material;
+mod shapes;
+
+pub use file::{MeshFile, UpAxis};
+pub use material::{Material, MaterialId, MaterialTable};
+pub use shapes::{cuboid, cylinder, grid, loft};
+
+use crate::raycast::Tree;
+use geometry::Pose;
+use nalgebra::Point3;
+use std::collections::BTreeMap;
+
+/// One triangle: corners as indices of vertices, what it is made of and what it belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Face {
+    /// Indices into [`Mesh::vertices`].
+    pub corners: [u32; 3],
+    /// Its material.
+    pub material: MaterialId,
+    /// Number of the object that it belongs to; see [`crate::track::Group`].
+    pub object: u16,
+}
+
+/// Triangles with shared vertices, m.
+#[derive(Clone, Debug, PartialEq, Default)]
+pub struct Mesh {
+    /// Positions, m.
+    pub vertices: Vec<[f64; 3]>,
+    /// Triangles.
+    pub faces: Vec<Face>,
+}
+
+impl Mesh {
+    /// Adds the triangles of another mesh.
+    pub fn append(&mut self, other: &Mesh) {
+        let first = self.vertices.len() as u32;
+        self.vertices.extend(&other.vertices);
+        self.faces.extend(other.faces.iter().map(|face| Face { corners: face.corners.map(|c| c + first), ..*face }));
+    }
+
+    /// The same mesh with every vertex changed.
+    pub fn mapped(mut self, change: impl Fn([f64; 3]) -> [f64; 3]) -> Mesh {
+        self.vertices.iter_mut().for_each(|v| *v = change(*v));
+        self
+    }
+
+    /// The same mesh in the frame `dst`.
+    pub fn moved(self, dst_from_mesh: &Pose) -> Mesh {
+        self.mapped(|v| (dst_from_mesh * Point3::from(v)).coords.into())
+    }
+
+    /// The same mesh as a part of one object.
+    pub fn of_object(mut self, object: u16) -> Mesh {
+        self.faces.iter_mut().for_each(|face| face.object = object);
+        self
+    }
+
+    /// Least and greatest x, y, z, m; `None` for an empty mesh.
+    pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
+        let first = *self.vertices.first()?;
+        Some(self.vertices.iter().fold([first; 2], |[low, high], v| {
+            [std::array::from_fn(|k| low[k].min(v[k])), std::array::from_fn(|k| high[k].max(v[k]))]
+        }))
+    }
+
+    /// The tree for casting rays. `origin` (m) becomes the origin of its coordinates, in f64, before they are rounded to f32.
+    pub fn tree(&self, origin: [f64; 3]) -> Tree {
+        let corner = |i: u32| {
+            let v = self.vertices[i as usize];
+            std::array::from_fn(|k| (v[k] - origin[k]) as f32)
+        };
+        let corners: Vec<[[f32; 3]; 3]> = self.faces.iter().map(|face| face.corners.map(corner)).collect();
+        Tree::new(&corners)
+    }
+
+    /// What makes the mesh unusable, in words.
+    pub fn check(&self) -> Result<(), String> {
+        if self.faces.is_empty() {
+            return Err("the mesh has no triangle".into());
+        }
+        if let Some(i) = self.vertices.iter().position(|v| v.iter().any(|c| !c.is_finite())) {
+            return Err(format!("vertex {i} (from 0) is {:?}, not a place", self.vertices[i]));
+        }
+        let outside = |face: &Face| face.corners.iter().any(|c| *c as usize >= self.vertices.len());
+        if let Some(i) = self.faces.iter().position(outside) {
+            return Err(format!("triangle {i} (from 0) names a vertex that does not exist"));
+        }
+        Ok(())
+    }
+
+    /// Edges that an odd number of triangles share: none for a closed surface. Vertices at one place count as one.
+    pub fn open_edges(&self) -> usize {
+        let mut place_of: BTreeMap<[u64; 3], usize> = BTreeMap::new();
+        let place: Vec<usize> = self
+            .vertices
+            .iter()
+            .map(|v| {
+                let key = v.map(|c| (c + 0.0).to_bits()); // -0.0 is 0.0
+                let next = place_of.len();
+                *place_of.entry(key).or_insert(next)
+            })
+            .collect();
+        let mut edges: BTreeMap<(usize, usize), usize> = BTreeMap::new();
+        for face in &self.faces {
+            let [a, b, c] = face.corners.map(|i| place[i as usize]);
+            for (from, to) in [(a, b), (b, c), (c, a)] {
+                if from != to {
+                    *edges.entry((from.min(to), from.max(to))).or_default() += 1;
+                }
+            }
+        }
+        edges.values().filter(|n| **n % 2 == 1).count()
+    }
+}

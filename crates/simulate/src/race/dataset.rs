@@ -1,0 +1,318 @@
+//! The data sets of a race on disk.
+
+use super::config::{RaceConfig, SetConfig};
+use super::files::ConfigFiles;
+use super::frames::{FrameKey, SPLITS};
+use super::simulator::{PreparedSet, Simulator};
+use crate::SimulateError;
+use crate::attributes;
+use crate::auto_label::{LabelError, label_errors};
+use crate::effects::{Effect, EffectList};
+use crate::matched::{RangeHistogram, fit_range_dropout};
+use crate::street::SplitCounts;
+use data::write::{write_dataset_toml, write_frame, write_split};
+use data::{
+    DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Layout, PointColumns, read_kitti_text, write_atomic,
+};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Version of the manifest.
+pub const RACE_MANIFEST_SCHEMA: &str = "lidarshift/race-dataset/1";
+/// Bytes of a point in a cloud and in its attributes.
+const POINT_BYTES: (u64, u64) = (16, 53);
+/// Free space that stays untouched, bytes.
+const SPARE_BYTES: u64 = 200 << 20;
+
+/// What a data set's folder holds: its `manifest.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RaceManifest {
+    /// [`RACE_MANIFEST_SCHEMA`].
+    pub schema: String,
+    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    pub complete: bool,
+    /// Name of the race and of the data set.
+    pub name: [String; 2],
+    /// Seed of the race.
+    pub seed: u64,
+    /// SHA-256 of all that decides the frames: configuration, rig, trajectories, effects, and the version of this program.
+    pub config_sha256: String,
+    /// What is there, by split.
+    pub splits: BTreeMap<String, SplitCounts>,
+    /// How far labels are from the true boxes, for labels made as on the road.
+    pub label_errors: Vec<LabelError>,
+}
+
+/// Makes the data sets of a race below `out`, a folder each: clouds, labels, `ImageSets/`, `dataset.toml`, `rig.toml`, `manifest.json`, and
+/// `effects.toml` unless it is hidden. `only` names those to make; all when empty.
+///
+/// `progress` hears the name of the data set and how many of its frames of how many are there, from several threads. Frames that an earlier
+/// run with the same configuration finished are kept; a folder with other content is refused. The files do not depend on the number of
+/// threads.
+pub fn make_race_datasets(
+    config: &RaceConfig,
+    files: &ConfigFiles,
+    out: &Path,
+    only: &[String],
+    progress: &(dyn Fn(&str, usize, usize) + Sync),
+) -> Result<Vec<RaceManifest>, SimulateError> {
+    config.check()?;
+    if let Some(name) = only.iter().find(|name| !config.datasets.iter().any(|s| s.name == **name)) {
+        let known: Vec<&str> = config.datasets.iter().map(|s| s.name.as_str()).collect();
+        return Err(crate::error::wrong("dataset", format!("there is no {name:?}; there are: {}", known.join(", "))));
+    }
+    let simulator = Simulator::new(config.clone(), files)?;
+    let wanted: Vec<&SetConfig> =
+        config.datasets.iter().filter(|s| only.is_empty() || only.contains(&s.name)).collect();
+    check_space(&simulator, out, &wanted)?;
+    wanted.into_iter().map(|set| make_set(&simulator, files, out, set, progress)).collect()
+}
+
+fn make_set(
+    simulator: &Simulator,
+    files: &ConfigFiles,
+    out: &Path,
+    set: &SetConfig,
+    progress: &(dyn Fn(&str, usize, usize) + Sync),
+) -> Result<RaceManifest, SimulateError> {
+    let mut lists = simulator.config.effects_of(set, files)?;
+    if let (Some(target), Some(from)) = (&set.matched_to, &set.from) {
+        let effects = vec![Effect::RangeDropout(matched(&out.join(target), &out.join(from))?)];
+        lists.push((format!("{}/matched", set.name), EffectList { effects }));
+    }
+    let prepared = simulator.prepare(lists, set.auto_label);
+    let root = out.join(&set.name);
+    let mut manifest = RaceManifest {
+        schema: RACE_MANIFEST_SCHEMA.into(),
+        complete: false,
+        name: [simulator.config.name.clone(), set.name.clone()],
+        seed: simulator.config.seed,
+        config_sha256: fingerprint(simulator, &prepared),
+        splits: BTreeMap::new(),
+        label_errors: Vec::new(),
+    };
+    let manifest_path = root.join("manifest.json");
+    check_folder(&root, &manifest_path, &manifest)?;
+    write_json(&manifest_path, &manifest)?;
+    write_descriptions(simulator, &root, set, &prepared)?;
+
+    let (done, total) = (AtomicUsize::new(0), simulator.keys().len());
+    progress(&set.name, 0, total);
+    let made = simulator.keys().par_iter().map(|key| {
+        let counts = make_frame_file(simulator, &prepared, &root, key)?;
+        progress(&set.name, done.fetch_add(1, Ordering::Relaxed) + 1, total);
+        Ok((key.split_name(), counts))
+    });
+    for (split, counts) in made.collect::<Result<Vec<_>, SimulateError>>()? {
+        let sum = manifest.splits.entry(split.into()).or_default();
+        sum.frames += counts.frames;
+        sum.cars += counts.cars;
+        sum.points += counts.points;
+    }
+    if set.auto_label.is_some() {
+        manifest.label_errors = errors_of_labels(simulator, &root)?;
+    }
+    manifest.complete = true;
+    write_json(&manifest_path, &manifest)?;
+    Ok(manifest)
+}
+
+/// Writes one frame, unless it is there; counts what it holds.
+fn make_frame_file(
+    simulator: &Simulator,
+    set: &PreparedSet,
+    root: &Path,
+    key: &FrameKey,
+) -> Result<SplitCounts, SimulateError> {
+    let (config, id) = (&simulator.config, key.id());
+    let (cloud, label) = frame_paths(config.layout, root, &id);
+    let beside = attributes::path(root, &id);
+    if !(cloud.is_file() && label.is_file() && (!config.attributes || beside.is_file())) {
+        let made = simulator.make(set, key)?;
+        if made.frame.cloud.is_empty() {
+            let message = "would be empty: no shot has a return within the crop; check rig, effects and crop_m";
+            return Err(DataError::file(&cloud, message).into());
+        }
+        if config.attributes {
+            write_atomic(&beside, &attributes::encode(&made.scan))?;
+        }
+        write_frame(root, config.layout, &made.frame)?;
+    }
+    let cars = fs_err::read_to_string(&label)?.lines().count();
+    let points = match config.layout {
+        Layout::Kitti => (fs_err::metadata(&cloud)?.len() / POINT_BYTES.0) as usize,
+        Layout::S2rDad => data::read_cloud(&cloud, PointColumns::Xyzi)?.len(),
+    };
+    Ok(SplitCounts { frames: 1, cars, points })
+}
+
+fn frame_paths(layout: Layout, root: &Path, id: &str) -> (PathBuf, PathBuf) {
+    let ending = match layout {
+        Layout::Kitti => "bin",
+        Layout::S2rDad => "pcd",
+    };
+    (
+        root.join(layout.cloud_folder()).join(format!("{id}.{ending}")),
+        root.join(layout.label_folder()).join(format!("{id}.txt")),
+    )
+}
+
+/// Everything about the data set that is no frame.
+fn write_descriptions(
+    simulator: &Simulator,
+    root: &Path,
+    set: &SetConfig,
+    prepared: &PreparedSet,
+) -> Result<(), SimulateError> {
+    let config = &simulator.config;
+    for (split, (name, _)) in SPLITS.iter().enumerate() {
+        let ids: Vec<String> = simulator.keys().iter().filter(|k| k.split == split).map(FrameKey::id).collect();
+        write_split(&root.join(format!("ImageSets/{name}.txt")), &ids)?;
+    }
+    let splits = SPLITS.map(|(name, _)| (name.to_string(), format!("ImageSets/{name}.txt").into()));
+    let dataset = DatasetConfig {
+        name: format!("{}-{}", config.name, set.name),
+        layout: config.layout,
+        points: PointColumns::Xyzi,
+        label_frame: LabelFrame::Lidar,
+        classes: vec![config.class.clone()],
+        splits: splits.into(),
+        rig: Some("rig.toml".into()),
+        ..DatasetConfig::default()
+    };
+    write_dataset_toml(&root.join("dataset.toml"), &dataset)?;
+    write_atomic(&root.join("rig.toml"), to_toml(&simulator.rig)?.as_bytes())?;
+    if config.attributes {
+        attributes::write_names(root, &simulator.rig, &simulator.materials)?;
+    }
+    if !set.hidden {
+        let effects = prepared.lists.iter().flat_map(|(_, list)| list.effects.clone()).collect();
+        write_atomic(&root.join("effects.toml"), to_toml(&EffectList { effects })?.as_bytes())?;
+    }
+    Ok(())
+}
+
+fn to_toml<T: Serialize>(value: &T) -> Result<String, SimulateError> {
+    toml::to_string_pretty(value).map_err(|e| crate::error::wrong("", e.to_string()))
+}
+
+/// The loss that makes the ranges of `from` those of `target`, from the frames that both have to train on.
+fn matched(target: &Path, from: &Path) -> Result<crate::effects::RangeDropout, SimulateError> {
+    let histogram = |folder: &Path| {
+        let dataset = Dataset::open(folder)?;
+        let ids = dataset.ids("train")?;
+        RangeHistogram::of_dataset(&dataset, &ids)
+    };
+    Ok(fit_range_dropout(&histogram(target)?, &histogram(from)?))
+}
+
+/// Labels on disk against where the cars really are.
+fn errors_of_labels(simulator: &Simulator, root: &Path) -> Result<Vec<LabelError>, SimulateError> {
+    let mut pairs = Vec::new();
+    for key in simulator.keys() {
+        let (_, path) = frame_paths(simulator.config.layout, root, &key.id());
+        let labels = read_kitti_text(&path, KittiText::Labels)?;
+        let cars = simulator.cars(key)?;
+        let truth = cars.iter().map(|car| car.true_box).filter(|b| simulator.is_labelled(b));
+        pairs.extend(labels.iter().map(|line| line.lidar_box()).zip(truth));
+    }
+    Ok(label_errors(pairs.into_iter()))
+}
+
+/// A hash of all that decides the frames of a data set.
+fn fingerprint(simulator: &Simulator, set: &PreparedSet) -> String {
+    // The other data sets of the configuration do not matter, nor where its files lie: what is in them does.
+    let config = RaceConfig { datasets: Vec::new(), runs: Vec::new(), car: None, ..simulator.config.clone() };
+    let mut hash = Sha256::new();
+    for text in [
+        env!("CARGO_PKG_VERSION").into(),
+        json(&config),
+        json(&simulator.rig),
+        json(&set.lists),
+        json(&set.auto_label),
+        simulator.track.line.to_csv(),
+        format!("{:?}", simulator.materials),
+        format!("{:?}", simulator.car),
+    ] {
+        hash.update(text.as_bytes());
+        hash.update([0]);
+    }
+    for shot in simulator.rig.sensors.iter().flat_map(|s| s.pattern.iter().flat_map(|p| p.shots())) {
+        hash.update(format!("{shot:?}").as_bytes());
+    }
+    if !simulator.config.runs.is_empty() {
+        for car in simulator.runs.iter().flat_map(|run| std::iter::once(&run.ego).chain(&run.rivals)) {
+            hash.update(car.to_csv().as_bytes());
+        }
+    }
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn json<T: Serialize>(value: &T) -> String {
+    serde_json::to_string(value).expect("a configuration is plain data")
+}
+
+/// The folder must be empty, or begun with the same configuration.
+fn check_folder(root: &Path, manifest_path: &Path, wanted: &RaceManifest) -> Result<(), SimulateError> {
+    if manifest_path.is_file() {
+        let text = fs_err::read_to_string(manifest_path)?;
+        let found: RaceManifest =
+            serde_json::from_str(&text).map_err(|e| DataError::line(manifest_path, e.line(), e.to_string()))?;
+        if found.config_sha256 != wanted.config_sha256 || found.schema != wanted.schema {
+            let message = "was made from another configuration or version; choose another folder, or remove this one";
+            return Err(DataError::file(root, message).into());
+        }
+    } else if root.is_dir() && fs_err::read_dir(root)?.next().is_some() {
+        return Err(DataError::file(root, "is not empty and has no manifest.json; choose another folder").into());
+    }
+    Ok(())
+}
+
+/// Refuses to begin what the disk cannot hold.
+fn check_space(simulator: &Simulator, out: &Path, sets: &[&SetConfig]) -> Result<(), SimulateError> {
+    let point = POINT_BYTES.0 + if simulator.config.attributes { POINT_BYTES.1 } else { 0 };
+    let frame = simulator.shots() as u64 * point + 1024;
+    let missing = |set: &&SetConfig| {
+        let root = out.join(&set.name);
+        let there = |key: &&FrameKey| frame_paths(simulator.config.layout, &root, &key.id()).0.is_file();
+        (simulator.keys().len() - simulator.keys().iter().filter(there).count()) as u64
+    };
+    let needed = sets.iter().map(missing).sum::<u64>() * frame;
+    check_free(out, needed, &format!("{} data sets of {} frames", sets.len(), simulator.keys().len()))
+}
+
+/// Refuses when the disk of `folder` (which need not exist yet) has no room for `needed` bytes.
+fn check_free(folder: &Path, needed: u64, what: &str) -> Result<(), SimulateError> {
+    let mut existing = folder;
+    while !existing.is_dir() {
+        existing = match existing.parent() {
+            Some(parent) if !parent.as_os_str().is_empty() => parent,
+            _ => Path::new("."),
+        };
+    }
+    let free = fs4::available_space(existing)?;
+    if free < needed.saturating_add(SPARE_BYTES) {
+        let gb = |bytes: u64| bytes as f64 / 1e9;
+        let message = format!(
+            "has {:.1} GB free, but up to {:.1} GB are needed for {what}; make room, choose another folder, or lower `frames` or `resolution`",
+            gb(free),
+            gb(needed.saturating_add(SPARE_BYTES)),
+        );
+        return Err(DataError::file(existing, message).into());
+    }
+    Ok(())
+}
+
+fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), SimulateError> {
+    let mut text = serde_json::to_string_pretty(value).map_err(|e| DataError::file(path, e.to_string()))?;
+    text.push('\n');
+    Ok(write_atomic(path, text.as_bytes())?)
+}
+
+#[cfg(test)]
+mod tests;

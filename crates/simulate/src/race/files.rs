@@ -1,0 +1,97 @@
+//! Where configurations come from: a folder, or the program itself.
+
+use crate::SimulateError;
+use data::DataError;
+use std::path::{Path, PathBuf};
+
+/// The files next to a configuration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ConfigFiles {
+    /// The folder of the configuration; `None` for one that comes with the program.
+    folder: Option<PathBuf>,
+}
+
+/// Every file that comes with the program, by its path below `configs/`.
+const BUILT_IN: [(&str, &str); 8] = [
+    ("simulate/race.toml", include_str!("../../../../configs/simulate/race.toml")),
+    ("simulate/race_small.toml", include_str!("../../../../configs/simulate/race_small.toml")),
+    ("simulate/race_full.toml", include_str!("../../../../configs/simulate/race_full.toml")),
+    ("simulate/measured.toml", include_str!("../../../../configs/simulate/measured.toml")),
+    ("simulate/sim.toml", include_str!("../../../../configs/simulate/sim.toml")),
+    ("simulate/sim_noise.toml", include_str!("../../../../configs/simulate/sim_noise.toml")),
+    ("simulate/sim_downsampled.toml", include_str!("../../../../configs/simulate/sim_downsampled.toml")),
+    ("sensors/av21.toml", include_str!("../../../../configs/sensors/av21.toml")),
+];
+
+impl ConfigFiles {
+    /// Names of the configurations that come with the program.
+    pub const NAMES: [&str; 3] = ["race", "race_small", "race_full"];
+
+    /// The files of a folder.
+    pub fn in_folder(folder: &Path) -> ConfigFiles {
+        ConfigFiles { folder: Some(folder.into()) }
+    }
+
+    /// Text and path of a configuration, by its path or by the name of one that comes with the program, and the files next to it.
+    pub fn open(name_or_path: &str) -> Result<(String, PathBuf, ConfigFiles), SimulateError> {
+        let path = PathBuf::from(name_or_path);
+        if !path.is_file() && ConfigFiles::NAMES.contains(&name_or_path) {
+            let files = ConfigFiles { folder: None };
+            let (text, path) = files.text(Path::new(&format!("{name_or_path}.toml")))?;
+            return Ok((text, path, files));
+        }
+        if !path.is_file() {
+            let message =
+                format!("does not exist, and is none that comes with the program ({})", ConfigFiles::NAMES.join(", "));
+            return Err(DataError::file(&path, message).into());
+        }
+        let files = ConfigFiles::in_folder(path.parent().unwrap_or(Path::new("")));
+        Ok((read(&path)?, path, files))
+    }
+
+    /// Text and path of a file that the configuration names.
+    pub fn text(&self, file: &Path) -> Result<(String, PathBuf), SimulateError> {
+        match &self.folder {
+            Some(folder) => {
+                let path = folder.join(file);
+                Ok((read(&path)?, path))
+            }
+            None => {
+                let below = Path::new("simulate").join(file);
+                let name = below.to_string_lossy().replace("simulate/../", "");
+                match BUILT_IN.iter().find(|(known, _)| *known == name) {
+                    Some((_, text)) => Ok(((*text).into(), Path::new("configs").join(name))),
+                    None => Err(DataError::file(file, "does not come with the program").into()),
+                }
+            }
+        }
+    }
+
+    /// The folder that further paths are relative to.
+    pub fn folder(&self) -> PathBuf {
+        self.folder.clone().unwrap_or_default()
+    }
+}
+
+fn read(path: &Path) -> Result<String, SimulateError> {
+    let bytes = fs_err::read(path)?;
+    Ok(String::from_utf8(bytes).map_err(|_| DataError::file(path, "is not text"))?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn by_name_and_by_path() {
+        let (by_name, path, files) = ConfigFiles::open("race").unwrap();
+        assert_eq!(path, Path::new("configs/simulate/race.toml"));
+        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/simulate");
+        let (by_path, _, near) = ConfigFiles::open(&root.join("race.toml").display().to_string()).unwrap();
+        assert_eq!(by_name, by_path);
+        let rig = Path::new("../sensors/av21.toml");
+        assert_eq!(files.text(rig).unwrap().0, near.text(rig).unwrap().0);
+        let error = ConfigFiles::open("races").unwrap_err().to_string();
+        assert!(error.contains("races: does not exist") && error.contains("race_small"), "{error}");
+    }
+}

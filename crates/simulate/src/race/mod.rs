@@ -1,0 +1,14 @@
+//! A race on an oval and the data sets that are made of it: `measured`, which stands for the road on machines without road data, and what
+//! simulators make of the same race.
+
+mod config;
+mod dataset;
+mod files;
+mod frames;
+mod simulator;
+
+pub use config::{RaceConfig, SetConfig, SplitKind, TrackConfig};
+pub use dataset::{RACE_MANIFEST_SCHEMA, RaceManifest, make_race_datasets};
+pub use files::ConfigFiles;
+pub use frames::{FrameKey, SPLITS};
+pub use simulator::{PreparedSet, SimulatedFrame, Simulator};

@@ -1,0 +1,182 @@
+//! A packet of rays through one tree.
+
+use super::lanes::Lanes;
+use super::tree::{COUNT_BITS, LEAF, PackedTriangle, Tree};
+use std::mem::MaybeUninit;
+
+/// Deeper than any tree gets: a level holds at least one triangle more than the one below it, and the builder balances.
+const DEEPEST: usize = 128;
+/// The widest packet.
+pub(super) const MOST_LANES: usize = 16;
+/// A box that begins farther away than the best hit by less than this factor is still looked into: both are rounded.
+const SLACK: f32 = 1.000_000_5;
+/// Takes the place of a component of exactly 0, for which slabs would give 0 * infinity.
+const LEAST_COMPONENT: f32 = 1e-20;
+
+/// Rays side by side: lane i of each vector belongs to ray i.
+#[derive(Clone, Copy)]
+pub(super) struct Packet<L: Lanes> {
+    pub(super) origin: [L; 3],
+    pub(super) direction: [L; 3],
+    pub(super) inverse: [L; 3],
+}
+
+impl<L: Lanes> Packet<L> {
+    /// # Safety
+    /// See [`Lanes`].
+    #[inline(always)]
+    pub(super) unsafe fn new(origin: [L; 3], direction: [L; 3]) -> Self {
+        unsafe {
+            let [least, zero, one] = [LEAST_COMPONENT, 0.0, 1.0].map(|v| L::splat(v));
+            let inverse = direction.map(|d| one.div(L::select(d.eq(zero), d, least)));
+            Packet { origin, direction, inverse }
+        }
+    }
+
+    /// Where each ray enters a box, and which rays do so before their best hit.
+    ///
+    /// # Safety
+    /// See [`Lanes`].
+    #[inline(always)]
+    pub(super) unsafe fn enter(&self, bounds: &[f32; 6], range: L) -> (L, L::Mask) {
+        unsafe {
+            let (mut near, mut far) = (L::splat(0.0), range);
+            for k in 0..3 {
+                let low = L::splat(bounds[k]).sub(self.origin[k]).mul(self.inverse[k]);
+                let high = L::splat(bounds[k + 3]).sub(self.origin[k]).mul(self.inverse[k]);
+                near = near.max(low.min(high));
+                far = far.min(low.max(high));
+            }
+            (near, near.le(far.mul(L::splat(SLACK))))
+        }
+    }
+}
+
+/// Best hits of a packet so far.
+pub(super) struct Best<L: Lanes> {
+    /// Range of each lane, m.
+    pub(super) range: L,
+    /// Place in [`Tree::triangles`] of each lane's hit.
+    pub(super) place: [u32; MOST_LANES],
+}
+
+/// Finds what the rays hit nearer than `best`; bit i of the answer is set when lane i was improved.
+///
+/// # Safety
+/// See [`Lanes`].
+#[inline(always)]
+pub(super) unsafe fn traverse<L: Lanes>(tree: &Tree, packet: &Packet<L>, best: &mut Best<L>) -> u32 {
+    unsafe {
+        let mut stack = [const { MaybeUninit::<(L, u32)>::uninit() }; DEEPEST];
+        let (mut depth, mut at, mut improved) = (0, tree.root, 0);
+        loop {
+            if at & LEAF == 0 {
+                let node = tree.nodes.get_unchecked(at as usize);
+                let (near0, enters0) = packet.enter(&node.boxes[0], best.range);
+                let (near1, enters1) = packet.enter(&node.boxes[1], best.range);
+                let (bits0, bits1) = (L::bits(enters0), L::bits(enters1));
+                if bits0 != 0 && bits1 != 0 {
+                    // The child that most rays meet first goes first.
+                    let both = bits0 & bits1;
+                    let first0 = (L::bits(near0.le(near1)) & both).count_ones() * 2 >= both.count_ones();
+                    let (first, second, near, enters) = if first0 {
+                        (node.children[0], node.children[1], near1, enters1)
+                    } else {
+                        (node.children[1], node.children[0], near0, enters0)
+                    };
+                    assert!(depth < DEEPEST, "the tree is deeper than any builder makes it");
+                    stack[depth].write((L::select(enters, L::splat(f32::INFINITY), near), second));
+                    depth += 1;
+                    at = first;
+                    continue;
+                }
+                if bits0 != 0 {
+                    at = node.children[0];
+                    continue;
+                }
+                if bits1 != 0 {
+                    at = node.children[1];
+                    continue;
+                }
+            } else {
+                let count = at & ((1 << COUNT_BITS) - 1);
+                let first = (at & !LEAF) >> COUNT_BITS;
+                for place in first..first + count {
+                    improved |= test(tree, packet, place, best, improved);
+                }
+            }
+            loop {
+                if depth == 0 {
+                    return improved;
+                }
+                depth -= 1;
+                let (near, node) = stack[depth].assume_init();
+                if L::bits(near.le(best.range.mul(L::splat(SLACK)))) != 0 {
+                    at = node;
+                    break;
+                }
+            }
+        }
+    }
+}
+
+/// One triangle against all rays (Möller-Trumbore without a division for rays that miss); both sides can be hit.
+#[inline(always)]
+unsafe fn test<L: Lanes>(tree: &Tree, packet: &Packet<L>, place: u32, best: &mut Best<L>, improved: u32) -> u32 {
+    unsafe {
+        let triangle = tree.triangles.get_unchecked(place as usize);
+        let (o, d) = (&packet.origin, &packet.direction);
+        let PackedTriangle { corner, edge1, edge2, normal } = triangle;
+        let c: [L; 3] = std::array::from_fn(|k| L::splat(corner[k]).sub(o[k]));
+        let r = [
+            d[1].mul(c[2]).sub(d[2].mul(c[1])),
+            d[2].mul(c[0]).sub(d[0].mul(c[2])),
+            d[0].mul(c[1]).sub(d[1].mul(c[0])),
+        ];
+        let (u, v, det, along) = (dot(&r, edge2), dot(&r, edge1), dot(d, normal), dot(&c, normal));
+        let zero = L::splat(0.0);
+        let squared = det.mul(det);
+        let inside = L::and(
+            L::and(zero.le(u.mul(det)), zero.le(v.mul(det))),
+            L::and(u.add(v).mul(det).le(squared), zero.lt(squared)),
+        );
+        if L::bits(inside) == 0 {
+            return 0;
+        }
+        let range = along.div(det);
+        let nearer = L::and(inside, L::and(zero.le(range), range.lt(best.range)));
+        let mut better = L::bits(nearer);
+        // Equal ranges go to the lower triangle, so that the order of the visits does not matter.
+        let equal = L::bits(L::and(inside, range.eq(best.range))) & improved;
+        if equal != 0 {
+            for lane in lanes_of(equal) {
+                let now = best.place[lane];
+                if *tree.ids.get_unchecked(place as usize) < *tree.ids.get_unchecked(now as usize) {
+                    better |= 1 << lane;
+                }
+            }
+        }
+        if better != 0 {
+            best.range = L::select(nearer, best.range, range);
+            for lane in lanes_of(better) {
+                best.place[lane] = place;
+            }
+        }
+        better
+    }
+}
+
+/// The set bits, from the lowest.
+pub(super) fn lanes_of(mut bits: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        let lane = bits.trailing_zeros() as usize;
+        let some = bits != 0;
+        bits &= bits.wrapping_sub(1);
+        some.then_some(lane)
+    })
+}
+
+#[inline(always)]
+unsafe fn dot<L: Lanes>(a: &[L; 3], b: &[f32; 3]) -> L {
+    unsafe { a[2].mul_add(L::splat(b[2]), a[1].mul_add(L::splat(b[1]), a[0].mul(L::splat(b[0])))) }
+}

@@ -1,0 +1,135 @@
+//! The tree of one mesh: built by `obvhs`, laid out for the packet traversal.
+
+use obvhs::BvhBuildParams;
+use obvhs::bvh2::Bvh2;
+use obvhs::bvh2::builder::build_bvh2_from_tris;
+use obvhs::triangle::Triangle;
+use std::time::Duration;
+
+/// Marks a reference to a leaf: the bit, then first triangle, then number of triangles.
+pub(super) const LEAF: u32 = 1 << 31;
+/// Low bits of a leaf that hold its number of triangles.
+pub(super) const COUNT_BITS: u32 = 4;
+const TRIANGLES_PER_LEAF: u32 = 4;
+/// Rays are not longer than this where the padding of boxes is concerned, m.
+const LONGEST_RAY_M: f32 = 300.0;
+
+/// An inner node: the boxes of both children (low x, y, z, high x, y, z) and where they are.
+#[repr(C, align(64))]
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Node {
+    pub(super) boxes: [[f32; 6]; 2],
+    pub(super) children: [u32; 2],
+}
+
+/// A triangle as the test wants it: a corner, two edges from it (the first reversed), their cross product.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub(super) struct PackedTriangle {
+    pub(super) corner: [f32; 3],
+    pub(super) edge1: [f32; 3],
+    pub(super) edge2: [f32; 3],
+    pub(super) normal: [f32; 3],
+}
+
+/// A mesh of triangles, ready to be hit.
+#[derive(Clone, Debug)]
+pub struct Tree {
+    pub(super) nodes: Vec<Node>,
+    pub(super) triangles: Vec<PackedTriangle>,
+    /// Index in the mesh of each of `triangles`.
+    pub(super) ids: Vec<u32>,
+    pub(super) root: u32,
+    /// Least and greatest coordinates, m.
+    pub(super) low: [f32; 3],
+    pub(super) high: [f32; 3],
+}
+
+impl Tree {
+    /// The tree of these triangles, m. A corner that is not finite makes its triangle unhittable; without any triangle nothing is hit.
+    pub fn new(corners: &[[[f32; 3]; 3]]) -> Tree {
+        let sound: Vec<u32> = (0..corners.len() as u32)
+            .filter(|i| corners[*i as usize].iter().flatten().all(|v| v.is_finite()))
+            .collect();
+        let mut tree = Tree {
+            nodes: Vec::new(),
+            triangles: Vec::new(),
+            ids: Vec::new(),
+            root: LEAF,
+            low: [f32::INFINITY; 3],
+            high: [f32::NEG_INFINITY; 3],
+        };
+        if sound.is_empty() {
+            return tree;
+        }
+        for corner in sound.iter().flat_map(|i| corners[*i as usize]) {
+            for (k, v) in corner.into_iter().enumerate() {
+                tree.low[k] = tree.low[k].min(v);
+                tree.high[k] = tree.high[k].max(v);
+            }
+        }
+        let triangle = |i: &u32| {
+            let [v0, v1, v2] = corners[*i as usize].map(Into::into);
+            Triangle { v0, v1, v2 }
+        };
+        let mut params = BvhBuildParams::medium_build();
+        params.max_prims_per_leaf = TRIANGLES_PER_LEAF;
+        let triangles: Vec<Triangle> = sound.iter().map(triangle).collect();
+        let bvh = build_bvh2_from_tris(&triangles, params, &mut Duration::default());
+        tree.ids = bvh.primitive_indices.iter().map(|i| sound[*i as usize]).collect();
+        tree.triangles = tree.ids.iter().map(|i| pack(&corners[*i as usize])).collect();
+        tree.lay_out(&bvh);
+        tree
+    }
+
+    /// Number of triangles that can be hit.
+    pub fn len(&self) -> usize {
+        self.triangles.len()
+    }
+
+    /// Nothing can be hit.
+    pub fn is_empty(&self) -> bool {
+        self.triangles.is_empty()
+    }
+
+    /// Inner nodes in depth-first order, boxes padded beyond the rounding of a hit.
+    fn lay_out(&mut self, bvh: &Bvh2) {
+        let mut place = vec![0_u32; bvh.nodes.len()];
+        let (mut order, mut open) = (Vec::new(), vec![0_usize]);
+        while let Some(i) = open.pop() {
+            let node = &bvh.nodes[i];
+            if node.prim_count == 0 {
+                place[i] = order.len() as u32;
+                order.push(i);
+                open.extend([node.first_index as usize + 1, node.first_index as usize]);
+            }
+        }
+        let reference = |i: usize| {
+            let node = &bvh.nodes[i];
+            if node.prim_count == 0 { place[i] } else { LEAF | node.first_index << COUNT_BITS | node.prim_count }
+        };
+        let extent = self.low.iter().chain(&self.high).fold(0.0, |most: f32, v| most.max(v.abs()));
+        let pad = 32.0 * f32::EPSILON * (extent + LONGEST_RAY_M);
+        let padded = |i: usize| {
+            let aabb = bvh.nodes[i].aabb;
+            let ([x, y, z], [u, v, w]) = (aabb.min.to_array(), aabb.max.to_array());
+            [x - pad, y - pad, z - pad, u + pad, v + pad, w + pad]
+        };
+        let node = |i: &usize| {
+            let first = bvh.nodes[*i].first_index as usize;
+            Node { boxes: [padded(first), padded(first + 1)], children: [reference(first), reference(first + 1)] }
+        };
+        self.nodes = order.iter().map(node).collect();
+        self.root = reference(0);
+    }
+}
+
+pub(super) fn pack(&[a, b, c]: &[[f32; 3]; 3]) -> PackedTriangle {
+    let edge1 = std::array::from_fn(|k| a[k] - b[k]);
+    let edge2 = std::array::from_fn(|k| c[k] - a[k]);
+    PackedTriangle { corner: a, edge1, edge2, normal: cross(edge1, edge2) }
+}
+
+fn cross(a: [f32; 3], b: [f32; 3]) -> [f32; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}

@@ -1,0 +1,268 @@
+//! A synthetic road data set on disk.
+
+use crate::SimulateError;
+use crate::street::config::RoadConfig;
+use crate::street::scene::Scene;
+use crate::street::sensor::scan;
+use data::write::{write_dataset_toml, write_kitti_frame, write_split};
+use data::{DataError, DatasetConfig, Frame, LabelFrame, Object, PointColumns, stream, write_atomic};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// Version of the manifest.
+pub const MANIFEST_SCHEMA: &str = "lidarshift/simulated-dataset/1";
+
+/// A car with fewer points is not labelled: nobody could find it.
+const LEAST_POINTS: usize = 5;
+
+/// What a folder made by [`make_road_dataset`] holds: its `manifest.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// [`MANIFEST_SCHEMA`].
+    pub schema: String,
+    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    pub complete: bool,
+    /// Seed of the scenes.
+    pub seed: u64,
+    /// SHA-256 of the configuration, seed and numbers of frames included; another version of this program counts as another configuration.
+    pub config_sha256: String,
+    /// The whole configuration.
+    pub config: RoadConfig,
+    /// What is there, by split.
+    pub splits: BTreeMap<String, SplitCounts>,
+}
+
+/// What a split holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct SplitCounts {
+    /// Frames.
+    pub frames: usize,
+    /// Labelled cars.
+    pub cars: usize,
+    /// Points.
+    pub points: usize,
+}
+
+/// One frame: its cloud and the cars with at least five points on them, in the LiDAR frame.
+pub fn make_road_frame(config: &RoadConfig, split: &str, index: usize) -> Frame {
+    let random = |purpose: &str| stream(config.seed, &format!("road/{split}/{purpose}"), 0, index as u64);
+    let scene = Scene::make(&config.scene, &config.sensor, &mut random("scene"));
+    let scan = scan(&scene, &config.sensor, &mut random("sensor"));
+    let seen = scene.cars.iter().zip(&scan.cars).filter(|(_, sight)| sight.points >= LEAST_POINTS);
+    let objects = seen.map(|(bbox, sight)| Object {
+        class: "Car".into(),
+        bbox: *bbox,
+        truncation: Some(0.0),
+        occlusion: Some(sight.occlusion()),
+        image_box: None,
+    });
+    Frame { id: frame_id(split, index), objects: objects.collect(), cloud: scan.cloud }
+}
+
+fn frame_id(split: &str, index: usize) -> String {
+    format!("{split}_{index:06}")
+}
+
+/// Makes a data set in the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`, `manifest.json`.
+///
+/// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same configuration
+/// finished are kept; a folder with other content is refused. The files do not depend on the number of threads.
+pub fn make_road_dataset(
+    config: &RoadConfig,
+    out: &Path,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Result<Manifest, SimulateError> {
+    config.check()?;
+    let manifest_path = out.join("manifest.json");
+    let mut manifest = Manifest {
+        schema: MANIFEST_SCHEMA.into(),
+        complete: false,
+        seed: config.seed,
+        config_sha256: config_sha256(config),
+        config: config.clone(),
+        splits: BTreeMap::new(),
+    };
+    check_folder(out, &manifest_path, &manifest)?;
+    write_manifest(&manifest_path, &manifest)?;
+
+    let jobs: Vec<(&str, usize)> =
+        config.frames.splits().into_iter().flat_map(|(split, n)| (0..n).map(move |i| (split, i))).collect();
+    let done = AtomicUsize::new(0);
+    progress(0, jobs.len());
+    let counts = jobs.par_iter().map(|(split, index)| {
+        let counts = make_frame_file(config, out, split, *index);
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, jobs.len());
+        counts.map(|counts| (*split, counts))
+    });
+    for (split, frame) in counts.collect::<Result<Vec<_>, _>>()? {
+        let sum = manifest.splits.entry(split.to_string()).or_default();
+        sum.frames += frame.frames;
+        sum.cars += frame.cars;
+        sum.points += frame.points;
+    }
+
+    for (split, n) in config.frames.splits() {
+        let ids: Vec<String> = (0..n).map(|i| frame_id(split, i)).collect();
+        write_split(&out.join(format!("ImageSets/{split}.txt")), &ids)?;
+    }
+    write_dataset_toml(&out.join("dataset.toml"), &dataset_config(config))?;
+    manifest.complete = true;
+    write_manifest(&manifest_path, &manifest)?;
+    Ok(manifest)
+}
+
+/// Writes one frame, unless it is there; counts what it holds.
+fn make_frame_file(config: &RoadConfig, out: &Path, split: &str, index: usize) -> Result<SplitCounts, SimulateError> {
+    let id = frame_id(split, index);
+    let (cloud, label) = (out.join(format!("velodyne/{id}.bin")), out.join(format!("label_2/{id}.txt")));
+    if !(cloud.is_file() && label.is_file()) {
+        write_kitti_frame(out, &make_road_frame(config, split, index))?;
+    }
+    let cars = fs_err::read_to_string(&label)?.lines().count();
+    let points = fs_err::metadata(&cloud)?.len() as usize / (4 * size_of::<f32>());
+    Ok(SplitCounts { frames: 1, cars, points })
+}
+
+/// The folder must be empty, or begun with the same configuration.
+fn check_folder(out: &Path, manifest_path: &Path, wanted: &Manifest) -> Result<(), SimulateError> {
+    if manifest_path.is_file() {
+        let text = fs_err::read_to_string(manifest_path)?;
+        let found: Manifest =
+            serde_json::from_str(&text).map_err(|e| DataError::line(manifest_path, e.line(), e.to_string()))?;
+        if found.config_sha256 != wanted.config_sha256 || found.schema != wanted.schema {
+            let message = "was made from another configuration or version; choose another folder, or remove this one";
+            return Err(DataError::file(out, message).into());
+        }
+    } else if out.is_dir() && fs_err::read_dir(out)?.next().is_some() {
+        return Err(DataError::file(out, "is not empty and has no manifest.json; choose another folder").into());
+    }
+    Ok(())
+}
+
+fn write_manifest(path: &Path, manifest: &Manifest) -> Result<(), SimulateError> {
+    let mut text = serde_json::to_string_pretty(manifest).expect("a manifest is plain data");
+    text.push('\n');
+    Ok(write_atomic(path, text.as_bytes())?)
+}
+
+fn config_sha256(config: &RoadConfig) -> String {
+    let text = serde_json::to_string(config).expect("a configuration is plain data");
+    let digest = Sha256::digest(format!("{}\n{text}", env!("CARGO_PKG_VERSION")));
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn dataset_config(config: &RoadConfig) -> DatasetConfig {
+    let splits = config.frames.splits().map(|(split, _)| (split.to_string(), format!("ImageSets/{split}.txt").into()));
+    DatasetConfig {
+        name: "synthetic-road".into(),
+        root: ".".into(),
+        points: PointColumns::Xyzi,
+        label_frame: LabelFrame::Lidar,
+        classes: vec!["Car".into()],
+        splits: splits.into(),
+        ..DatasetConfig::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::street::FrameCounts;
+    use data::Dataset;
+
+    fn small(seed: u64) -> RoadConfig {
+        RoadConfig { seed, frames: FrameCounts { train: 4, val: 2, test: 2 }, ..RoadConfig::default() }
+    }
+
+    /// Every file below a folder with its bytes, by path.
+    fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
+        let (mut open, mut found) = (vec![root.to_owned()], BTreeMap::new());
+        while let Some(folder) = open.pop() {
+            for entry in std::fs::read_dir(folder).unwrap() {
+                let path = entry.unwrap().path();
+                if path.is_dir() {
+                    open.push(path);
+                } else {
+                    let name = path.strip_prefix(root).unwrap().display().to_string();
+                    found.insert(name, std::fs::read(path).unwrap());
+                }
+            }
+        }
+        found
+    }
+
+    fn make(config: &RoadConfig, out: &Path, threads: usize) -> Result<Manifest, SimulateError> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| make_road_dataset(config, out, &|_, _| ()))
+    }
+
+    #[test]
+    fn same_bytes_for_any_number_of_threads_and_after_a_stop() {
+        let folder = tempfile::tempdir().unwrap();
+        let [one, four, resumed] = ["one", "four", "resumed"].map(|name| folder.path().join(name));
+        let manifest = make(&small(3), &one, 1).unwrap();
+        assert_eq!(make(&small(3), &four, 4).unwrap(), manifest);
+        make(&small(3), &resumed, 2).unwrap();
+        for lost in ["velodyne/train_000001.bin", "label_2/test_000000.txt", "dataset.toml", "ImageSets/val.txt"] {
+            std::fs::remove_file(resumed.join(lost)).unwrap();
+        }
+        assert_eq!(make(&small(3), &resumed, 2).unwrap(), manifest);
+        assert_eq!(files(&one), files(&four));
+        assert_eq!(files(&one), files(&resumed));
+        assert_eq!(files(&one).len(), 2 * 8 + 3 + 2);
+        assert!(manifest.complete && manifest.splits["train"].frames == 4 && manifest.splits["test"].cars > 0);
+
+        let mut clouds: Vec<_> =
+            files(&one).into_iter().filter(|(name, _)| name.ends_with(".bin")).map(|(_, b)| b).collect();
+        clouds.sort();
+        clouds.dedup();
+        assert_eq!(clouds.len(), 8, "every frame is a scene of its own");
+    }
+
+    #[test]
+    fn what_is_written_reads_back() {
+        let folder = tempfile::tempdir().unwrap();
+        make(&small(4), folder.path(), 2).unwrap();
+        let dataset = Dataset::open(folder.path()).unwrap();
+        assert_eq!(dataset.config.classes, ["Car"]);
+        for split in ["train", "val", "test"] {
+            for (index, id) in dataset.ids(split).unwrap().iter().enumerate() {
+                let (read, made) = (dataset.load(id).unwrap(), make_road_frame(&small(4), split, index));
+                assert_eq!(read.cloud, made.cloud);
+                assert_eq!(read.objects.len(), made.objects.len());
+                for (a, b) in read.objects.iter().zip(&made.objects) {
+                    let (a_box, b_box) = (a.bbox.to_array(), b.bbox.to_array());
+                    assert!((0..7).all(|k| (a_box[k] - b_box[k]).abs() < 0.011), "{a_box:?} {b_box:?}");
+                    assert_eq!(a.occlusion, b.occlusion);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn another_folder_is_not_touched() {
+        let folder = tempfile::tempdir().unwrap();
+        make(&small(5), folder.path(), 2).unwrap();
+        let before = files(folder.path());
+        let error = make(&small(6), folder.path(), 2).unwrap_err().to_string();
+        assert!(error.contains("another configuration"), "{error}");
+        assert_eq!(files(folder.path()), before);
+
+        let foreign = tempfile::tempdir().unwrap();
+        std::fs::write(foreign.path().join("thesis.txt"), "").unwrap();
+        assert!(make(&small(5), foreign.path(), 2).unwrap_err().to_string().contains("not empty"));
+    }
+
+    #[test]
+    fn another_seed_is_another_world() {
+        let config = small(7);
+        assert_eq!(make_road_frame(&config, "train", 0), make_road_frame(&config, "train", 0));
+        assert_ne!(make_road_frame(&config, "train", 0).cloud, make_road_frame(&small(8), "train", 0).cloud);
+        assert_ne!(make_road_frame(&config, "train", 0).cloud, make_road_frame(&config, "test", 0).cloud);
+    }
+}

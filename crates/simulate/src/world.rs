@@ -1,0 +1,50 @@
+//! The static world and the shape of the cars, ready for rays, with what each triangle is made of.
+
+use crate::mesh::{Face, MaterialId, Mesh};
+use crate::raycast::Tree;
+use std::sync::Arc;
+
+/// Everything that stands still.
+#[derive(Clone, Debug)]
+pub struct World {
+    pub(crate) tree: Arc<Tree>,
+    surfaces: Vec<(MaterialId, u16)>,
+    /// The place in the world that is the origin of the tree's coordinates, m.
+    pub(crate) origin: [f64; 3],
+}
+
+impl World {
+    /// From a mesh in the world's frame, which may lie anywhere: rays are cast relative to its middle.
+    pub fn new(mesh: &Mesh) -> World {
+        let [low, high] = mesh.bounds().unwrap_or_default();
+        let origin = [(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, 0.0];
+        World { tree: Arc::new(mesh.tree(origin)), surfaces: surfaces(&mesh.faces), origin }
+    }
+
+    /// Material and object of a triangle.
+    pub(crate) fn surface(&self, triangle: u32) -> (MaterialId, u16) {
+        self.surfaces[triangle as usize]
+    }
+}
+
+/// What all cars look like, in the car's frame.
+#[derive(Clone, Debug)]
+pub struct CarShape {
+    pub(crate) tree: Arc<Tree>,
+    surfaces: Vec<(MaterialId, u16)>,
+}
+
+impl CarShape {
+    /// From a mesh in the car's frame.
+    pub fn new(mesh: &Mesh) -> CarShape {
+        CarShape { tree: Arc::new(mesh.tree([0.0; 3])), surfaces: surfaces(&mesh.faces) }
+    }
+
+    pub(crate) fn material(&self, triangle: u32) -> MaterialId {
+        self.surfaces[triangle as usize].0
+    }
+}
+
+fn surfaces(faces: &[Face]) -> Vec<(MaterialId, u16)> {
+    faces.iter().map(|face| (face.material, face.object)).collect()
+}
