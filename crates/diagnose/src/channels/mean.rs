@@ -92,7 +92,7 @@ pub fn kind_of(ray: &Ray, origin: &Point3<f64>) -> usize {
 /// Inverse variance of its distance across the surface, 1/m2.
 pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
     let c = f64::from(ray.cos_incidence);
-    1.0 / ((c * noise_m).powi(2) * (1.0 + f64::from(ray.leverage)) + RIPPLE_M * RIPPLE_M)
+    1.0 / ((c * noise_m).powi(2) * 2.0 + RIPPLE_M * RIPPLE_M)
 }
 
 /// Derivatives of the distance across the surface by a movement of the scene about `center`.
@@ -119,7 +119,7 @@ fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: 
         .filter(|r| usable(r) && r.sensor as usize == sensor)
         .map(|r| {
             let row = pose_row(r, &origins[r.sensor as usize], &Point3::origin());
-            (row, r.across_m(), weight(r, noise_m))
+            (row, r.across_nearest_m(), weight(r, noise_m))
         })
         .collect();
     let mut pose = SVector::<f64, 6>::zeros();
@@ -153,7 +153,7 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
             for ray in frame.measured.iter().filter(|r| usable(r)) {
                 let w = weight(ray, noise_m);
                 let row = pose_row(ray, &origins[ray.sensor as usize], &Point3::origin());
-                let y = ray.across_m() - row.dot(&pose[ray.sensor as usize]);
+                let y = ray.across_nearest_m() - row.dot(&pose[ray.sensor as usize]);
                 if y.abs() > STRAY_M {
                     continue;
                 }
@@ -194,7 +194,7 @@ pub fn mean_frames(
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
             let row = pose_row(ray, origin, &Point3::origin());
-            let y = ray.across_m();
+            let y = ray.across_nearest_m();
             if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
             }

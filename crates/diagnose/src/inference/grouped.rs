@@ -1,7 +1,7 @@
 //! Offsets of groups, one number each, shrunk by a prior; weighed on frames that they were not fitted on.
 
 use super::linear::{FOLDS, fold_of};
-use crate::channels::groups::{GroupFrame, GroupSums, total};
+use crate::channels::groups::{GroupFrame, GroupSums, PARTS, PartedFrame, total};
 use std::collections::BTreeMap;
 
 /// How offsets of groups are fitted.
@@ -48,6 +48,61 @@ pub fn cross_gains(frames: &[GroupFrame], select: &[usize], blocks: &[usize], ho
         }
     }
     out
+}
+
+/// Groups on either side whose offsets a smooth law would tell.
+const NEIGHBOURS: u32 = 3;
+
+/// Mean offset of the neighbours of each group: what a law that is smooth from group to group would say.
+pub fn smooth(sums: &BTreeMap<u32, GroupSums>, offsets: &BTreeMap<u32, f64>, how: GroupFit) -> BTreeMap<u32, f64> {
+    let near = |k: u32| {
+        let around = sums.range(k.saturating_sub(NEIGHBOURS)..=k + NEIGHBOURS).filter(|(g, _)| **g != k);
+        let (sum, weight) = around.fold((0.0, 0.0), |(sum, weight), (g, s)| {
+            let w = s.gram[2 * how.column].min(10.0 * how.precision);
+            (sum + w * offsets[g], weight + w)
+        });
+        if weight > 0.0 { sum / weight } else { 0.0 }
+    };
+    sums.keys().map(|k| (*k, near(*k))).collect()
+}
+
+/// Gains of frames by offsets that were fitted on other folds and on other parts of each group: what surfaces of one part are wrong by does
+/// not tell the other parts. With `rough` over what a smooth law would gain.
+pub fn cross_part_gains(frames: &[PartedFrame], select: &[usize], blocks: &[usize], how: GroupFit, rough: bool) -> Vec<f64> {
+    let folds = fold_of(blocks);
+    let mut out = vec![0.0; select.len()];
+    for fold in 0..FOLDS {
+        let train: Vec<_> = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]).collect();
+        let parts: [_; PARTS] = std::array::from_fn(|part| total(train.iter().map(|f| &f[part])));
+        for part in 0..PARTS {
+            let mut others = BTreeMap::<u32, GroupSums>::new();
+            for (_, sums) in parts.iter().enumerate().filter(|(p, _)| *p != part) {
+                sums.iter().for_each(|(k, s)| others.entry(*k).or_default().merge(s));
+            }
+            let told = offsets(&others, how);
+            let smooth = if rough { smooth(&others, &told, how) } else { BTreeMap::new() };
+            for i in (0..select.len()).filter(|&i| folds[i] == fold) {
+                let frame = &frames[select[i]][part];
+                out[i] += gain(frame, how.column, &told) - gain(frame, how.column, &smooth);
+            }
+        }
+    }
+    out
+}
+
+/// Root mean square of the offsets against those of their neighbours, beyond what errors make.
+pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
+    let offsets = offsets(sums, how);
+    let smooth = smooth(sums, &offsets, how);
+    let (mut square, mut n) = (0.0, 0.0);
+    for (k, s) in sums {
+        let g = s.gram[2 * how.column];
+        if g > 3.0 * how.precision {
+            square += (offsets[k] - smooth[k]).powi(2) - 1.0 / g;
+            n += 1.0;
+        }
+    }
+    if n < 4.0 { 0.0 } else { f64::max(square / n, 0.0).sqrt() }
 }
 
 /// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well.

@@ -174,6 +174,7 @@ impl<'a> Sight<'a> {
             direction: direction.cast::<f32>().into(),
             normal: [0.0; 3],
             residual_m: 0.0,
+            bulge_m: 0.0,
             leverage: 0.0,
             roughness_m: f32::NAN,
             roughness_leverage: 0.0,
@@ -204,6 +205,7 @@ impl<'a> Sight<'a> {
         ray.residual_m = (f64::from(range) - surface.range_m) as f32;
         ray.cos_incidence = surface.cos_incidence as f32;
         ray.leverage = surface.leverage as f32;
+        ray.bulge_m = surface.bulge_m as f32;
         ray.normal = normal.cast::<f32>().into();
         ray.surface = self.surface_at(&direction, surface.range_m, Some(&normal), &mut ray);
         ray

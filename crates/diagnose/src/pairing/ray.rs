@@ -64,6 +64,8 @@ pub struct Ray {
     pub normal: [f32; 3],
     /// Range minus predicted range, m.
     pub residual_m: f32,
+    /// Range of the simulated return closest in direction minus what the plane around says of it, m.
+    pub bulge_m: f32,
     /// Variance of the prediction in units of that of one simulated range.
     pub leverage: f32,
     /// Range minus what the own side's returns around it predict, m; NaN where they do not.
@@ -98,6 +100,12 @@ impl Ray {
     /// Distance of the return from the predicted surface, across it, m; positive on the sensor's side.
     pub fn across_m(&self) -> f64 {
         -f64::from(self.residual_m) * f64::from(self.cos_incidence)
+    }
+
+    /// [`Ray::across_m`] from the simulated return closest in direction, carried along the plane: free of the error that a plane makes on a
+    /// surface that is not flat.
+    pub fn across_nearest_m(&self) -> f64 {
+        -f64::from(self.residual_m - self.bulge_m) * f64::from(self.cos_incidence)
     }
 
     /// Where it lies against the simulated returns around its direction.

@@ -3,7 +3,7 @@
 mod words;
 
 use super::{ChannelResult, Context, Z_STAR, confidence, first_demands, record};
-use crate::channels::groups::{GroupFrame, Grouping, elevation_lever, group_frames, group_of, total};
+use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
@@ -38,8 +38,14 @@ struct Sums {
     precision: Vec<f64>,
     base: Vec<usize>,
     linear: Vec<LinearFrame>,
-    rows: Vec<GroupFrame>,
-    strips: Vec<GroupFrame>,
+    rows: Groups,
+    strips: Groups,
+}
+
+/// Groups of every frame, by part and whole.
+struct Groups {
+    parted: Vec<PartedFrame>,
+    whole: Vec<GroupFrame>,
 }
 
 /// What was found of the geometry, to be taken out before other channels are looked at.
@@ -261,7 +267,10 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = [structure.theta[0], structure.theta[1], structure.theta[2]];
-    let groups = |g| group_frames(frames, rig, &poses, structure, g, noise_m, design);
+    let groups = |g| {
+        let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
+        Groups { whole: parted.iter().map(whole).collect(), parted }
+    };
     Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear }
 }
 
@@ -312,14 +321,15 @@ fn gains(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) 
         (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
     }
     for (grouping, column) in groups {
-        let more = grouped::cross_gains(groups_of(sums, grouping), select, blocks, how(column));
+        let parted = if grouping == Grouping::Row { &sums.rows.parted } else { &sums.strips.parted };
+        let more = grouped::cross_part_gains(parted, select, blocks, how(column), grouping == Grouping::Row);
         out.iter_mut().zip(more).for_each(|(o, g)| *o += g);
     }
     out
 }
 
 fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
-    if grouping == Grouping::Row { &sums.rows } else { &sums.strips }
+    if grouping == Grouping::Row { &sums.rows.whole } else { &sums.strips.whole }
 }
 
 /// Prior spread of offsets: 10 cm, 0.3 degrees.
@@ -327,16 +337,16 @@ fn how(column: usize) -> GroupFit {
     GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true }
 }
 
-
-
-
 fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
     let Some(last) = suspects.last() else { return false };
     match last {
         Suspect::Groups { grouping, column, .. } => {
             let frames = groups_of(sums, *grouping);
-            let floor = FLOOR_GROUPS[if *grouping == Grouping::Row { *column } else { 2 }];
-            grouped::spread(&total(select.iter().map(|&i| &frames[i])), how(*column)).0 > floor
+            let all = total(select.iter().map(|&i| &frames[i]));
+            match grouping {
+                Grouping::Row => grouped::rough_spread(&all, how(*column)) > FLOOR_GROUPS[*column],
+                Grouping::Azimuth => grouped::spread(&all, how(*column)).0 > FLOOR_GROUPS[2],
+            }
         }
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, select, blocks, suspects);
