@@ -87,7 +87,7 @@ pub const PARTS: usize = 4;
 pub type PartedFrame = [GroupFrame; PARTS];
 
 /// Part of a ray within its group.
-fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
+pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
     let at = match grouping {
         Grouping::Row => f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad) + 0.5,
         // Bands that hold about as many rays of a car's sensor each: edges at -10, -5 and -1 degrees.

@@ -1,9 +1,10 @@
 //! Which returns have a counterpart on the other side, by direction.
 
 use super::cells::{CELLS, Place, cell};
-use super::groups::{GroupFrame, GroupSums, Grouping, group_of};
+use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use super::mask::Mask;
 use crate::pairing::FramePair;
+use crate::rig::SensorRig;
 use rayon::prelude::*;
 
 /// Counts of one cell of one frame.
@@ -66,20 +67,22 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a HitFrame>) -> Vec<HitCell> {
 /// Shares of returns that groups of directions lose beyond what `kept` tells of each cell, as sums of every frame.
 pub fn loss_groups(
     frames: &[FramePair],
+    rig: &SensorRig,
     mask: &Mask,
     grouping: Grouping,
     kept: &(dyn Fn(usize) -> f64 + Sync),
-) -> Vec<GroupFrame> {
-    let one = |frame: &FramePair| -> GroupFrame {
+) -> Vec<PartedFrame> {
+    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let one = |frame: &FramePair| -> PartedFrame {
         // Simulated returns, measured ones, those expected to be lost, those without a counterpart.
-        let mut sums = std::collections::BTreeMap::<usize, [f64; 4]>::new();
+        let mut sums = std::collections::BTreeMap::<(usize, usize), [f64; 4]>::new();
         for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
             for ray in rays {
                 let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
                 if mask.hides(ray) {
                     continue;
                 }
-                let sum = sums.entry(g).or_default();
+                let sum = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
                 sum[side] += 1.0;
                 sum[3] += f64::from(u8::from(!ray.matched));
                 if side == 0 {
@@ -87,15 +90,14 @@ pub fn loss_groups(
                 }
             }
         }
-        let enough = sums.into_iter().filter(|(_, s)| s[0] >= 5.0);
-        enough
-            .map(|(g, [n, seen, lost, odd])| {
-                // Twice the count of odd ones: neighbours are lost together.
-                let w = n * n / (2.0 * (odd + 2.0));
-                let y = (n - seen - lost) / n;
-                (g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n })
-            })
-            .collect()
+        let mut out: PartedFrame = [const { Vec::new() }; PARTS];
+        for ((g, part), [n, seen, lost, odd]) in sums.into_iter().filter(|(_, s)| s[0] >= 5.0) {
+            // Twice the count of odd ones: neighbours are lost together.
+            let w = n * n / (2.0 * (odd + 2.0));
+            let y = (n - seen - lost) / n;
+            out[part].push((g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
+        }
+        out
     };
     frames.par_iter().map(one).collect()
 }

@@ -36,20 +36,6 @@ pub fn gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> 
     frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
 }
 
-/// Gains of frames by offsets that were fitted on other folds.
-pub fn cross_gains(frames: &[GroupFrame], select: &[usize], blocks: &[usize], how: GroupFit) -> Vec<f64> {
-    let folds = fold_of(blocks);
-    let mut out = vec![0.0; select.len()];
-    for fold in 0..FOLDS {
-        let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]);
-        let offsets = offsets(&total(train), how);
-        for i in (0..select.len()).filter(|&i| folds[i] == fold) {
-            out[i] = gain(&frames[select[i]], how.column, &offsets);
-        }
-    }
-    out
-}
-
 /// Groups on either side whose offsets a smooth law would tell.
 const NEIGHBOURS: u32 = 3;
 
@@ -90,19 +76,18 @@ pub fn cross_part_gains(frames: &[PartedFrame], select: &[usize], blocks: &[usiz
     out
 }
 
-/// Root mean square of the offsets against those of their neighbours, beyond what errors make.
+/// Spread of the offsets from row to row: from the median of second differences between neighbouring groups, so that offsets that are
+/// smooth but for a few jumps have none.
 pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
     let offsets = offsets(sums, how);
-    let smooth = smooth(sums, &offsets, how);
-    let (mut square, mut n) = (0.0, 0.0);
-    for (k, s) in sums {
-        let g = s.gram[2 * how.column];
-        if g > 3.0 * how.precision {
-            square += (offsets[k] - smooth[k]).powi(2) - 1.0 / g;
-            n += 1.0;
-        }
+    let known = |k: u32| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
+    let second = |k: &u32| Some((known(*k)? - 0.5 * (known(k.checked_sub(1)?)? + known(k + 1)?)).abs());
+    let mut differences: Vec<f64> = sums.keys().filter_map(second).collect();
+    if differences.len() < 4 {
+        return 0.0;
     }
-    if n < 4.0 { 0.0 } else { f64::max(square / n, 0.0).sqrt() }
+    differences.sort_by(f64::total_cmp);
+    differences[differences.len() / 2] / 0.6745 / 1.5f64.sqrt()
 }
 
 /// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well.
@@ -128,27 +113,30 @@ mod tests {
     #[test]
     fn offsets_and_their_spread_are_found_and_noise_gains_nothing() {
         let mut rng = data::stream(3, "grouped", 0, 0);
-        let mut made = |size: f64| -> Vec<GroupFrame> {
-            (0..16)
-                .map(|_| {
-                    (0..20u32)
-                        .map(|k| {
-                            let truth = if k % 2 == 0 { size } else { -size };
-                            let noise: f64 = StandardNormal.sample(&mut rng);
-                            let w = 400.0;
-                            let sums = GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.05 * noise), 0.0], n: 1.0 };
-                            (k, sums)
-                        })
-                        .collect()
-                })
-                .collect()
+        // Offsets of groups, and what the surfaces of one part are wrong by.
+        let mut made = |size: f64, of_a_part: f64| -> Vec<PartedFrame> {
+            let mut group = |k: u32, part: usize| {
+                let own = if k % 2 == 0 { size } else { -size };
+                let truth = own + if part == 1 && k > 9 { of_a_part } else { 0.0 };
+                let noise: f64 = StandardNormal.sample(&mut rng);
+                let w = 100.0;
+                (k, GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.1 * noise), 0.0], n: 1.0 })
+            };
+            (0..16).map(|_| std::array::from_fn(|part| (0..20).map(|k| group(k, part)).collect())).collect()
         };
         let how = GroupFit { column: 0, precision: 1.0, centred: true };
         let select: Vec<usize> = (0..16).collect();
-        let frames = made(0.05);
-        assert!(cross_gains(&frames, &select, &select, how).iter().sum::<f64>() > 50.0);
-        assert!((spread(&total(frames.iter()), how).0 - 0.05).abs() < 0.01);
-        let nothing = made(0.0);
-        assert!(cross_gains(&nothing, &select, &select, how).iter().sum::<f64>() < 5.0);
+        let all = |frames: &[PartedFrame]| total(frames.iter().flatten());
+        for rough in [false, true] {
+            let frames = made(0.05, 0.0);
+            assert!(cross_part_gains(&frames, &select, &select, how, rough).iter().sum::<f64>() > 50.0);
+            assert!((spread(&all(&frames), how).0 - 0.05).abs() < 0.01);
+            assert!((rough_spread(&all(&frames), how) - 0.05).abs() < 0.06, "{}", rough_spread(&all(&frames), how));
+            let nothing = made(0.0, 0.0);
+            assert!(cross_part_gains(&nothing, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
+            let surface = made(0.0, 0.2);
+            assert!(cross_part_gains(&surface, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
+            assert!(rough_spread(&all(&surface), how) < 0.02);
+        }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record};
 use crate::channels::cells::ZONE_NAMES;
-use crate::channels::groups::{Grouping, place_of, total as group_total};
+use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
@@ -72,13 +72,13 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
         // What depends on the direction has no name.
         let laws = refit(&table, &chosen);
         for grouping in [Grouping::Row, Grouping::Azimuth] {
-            let groups = loss_groups(context.frames, mask, grouping, &|c| table.kept(&laws, c));
-            let (spread, _) = grouped::spread(&group_total(select.iter().map(|&i| &groups[i])), GROUPED);
+            let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table.kept(&laws, c));
+            let (spread, _) = grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED);
             trials.push(Trial {
                 candidate: LAWS.len() + grouping as usize,
                 name: UNNAMED.into(),
                 parameters: 12,
-                gains: grouped::cross_gains(&groups, &select, &blocks, GROUPED),
+                gains: grouped::cross_part_gains(&groups, &select, &blocks, GROUPED, false),
                 above_floor: spread > GROUP_FLOOR,
             });
         }
@@ -139,7 +139,7 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     }
     result.distance = hold_out.iter().map(|&i| distance(&table_h, &hits[i], &fitted)).collect();
     if let Some((grouping, confidence)) = unnamed {
-        let groups = loss_groups(context.frames, mask, grouping, &|c| table_e.kept(&fitted, c));
+        let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table_e.kept(&fitted, c));
         let found = unnamed_found(&groups, grouping, &estimate, &hold_out, confidence);
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
             d[1] = (d[1] - g).max(0.0);
@@ -156,13 +156,13 @@ const UNNAMED: &str = "unexplained";
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false };
 
 fn unnamed_found(
-    groups: &[crate::channels::groups::GroupFrame],
+    groups: &[PartedFrame],
     grouping: Grouping,
     estimate: &[usize],
     hold_out: &[usize],
     confidence: f64,
 ) -> Found {
-    let all = group_total(estimate.iter().map(|&i| &groups[i]));
+    let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
     let offsets = grouped::offsets(&all, GROUPED);
     let (spread, _) = grouped::spread(&all, GROUPED);
     let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
@@ -180,7 +180,7 @@ fn unnamed_found(
         confidence,
         channel: "hits",
         covariate: word.into(),
-        held_out_gains: hold_out.iter().map(|&i| grouped::gain(&groups[i], 0, &offsets)).collect(),
+        held_out_gains: hold_out.iter().map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum()).collect(),
         says: format!(
             "the share of lost returns depends on the {word}, by {:.1} % from one to the next; no cause of the catalogue does that",
             100.0 * spread

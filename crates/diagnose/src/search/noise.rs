@@ -1,7 +1,7 @@
 //! Noise: are measured returns rougher than simulated ones, and on what does it depend?
 
 use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
-use crate::channels::groups::{GroupFrame, Grouping, place_of, total as group_total};
+use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
 use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
@@ -54,13 +54,13 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
     let directions = |terms: &[(NoiseLaw, f64)]| -> Vec<Trial> {
         let expected = |c: usize, ray: &Ray| expected(&table, c, ray, terms);
         let one = |grouping: Grouping| {
-            let groups = rough_groups(context.frames, &scales, grouping, &|c| table.variances(c), &expected);
-            let (spread, _) = grouped::spread(&group_total(select.iter().map(|&i| &groups[i])), GROUPED);
+            let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table.variances(c), &expected);
+            let (spread, _) = grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED);
             Trial {
                 candidate: NOISE_LAWS.len() + grouping as usize,
                 name: UNNAMED.into(),
                 parameters: 12,
-                gains: grouped::cross_gains(&groups, &select, &blocks, GROUPED),
+                gains: grouped::cross_part_gains(&groups, &select, &blocks, GROUPED, false),
                 above_floor: spread > GROUP_FLOOR,
             }
         };
@@ -150,7 +150,7 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
     if let Some(candidate) = unnamed {
         let grouping = if candidate == NOISE_LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
         let expected = |c: usize, ray: &Ray| expected(&table_e, c, ray, &terms);
-        let groups = rough_groups(context.frames, &scales, grouping, &|c| table_e.variances(c), &expected);
+        let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table_e.variances(c), &expected);
         let found = unnamed_found(&groups, grouping, &estimate, &hold_out);
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
             d[1] = (d[1] - g).max(0.0);
@@ -176,8 +176,8 @@ fn expected(table: &NoiseTable, cell: usize, ray: &Ray, terms: &[(NoiseLaw, f64)
     1.0 + terms.iter().map(|(l, t)| t * l.variance(range, cos)).sum::<f64>() / vb
 }
 
-fn unnamed_found(groups: &[GroupFrame], grouping: Grouping, estimate: &[usize], hold_out: &[usize]) -> Found {
-    let all = group_total(estimate.iter().map(|&i| &groups[i]));
+fn unnamed_found(groups: &[PartedFrame], grouping: Grouping, estimate: &[usize], hold_out: &[usize]) -> Found {
+    let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
     let offsets = grouped::offsets(&all, GROUPED);
     let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
     let points = offsets.iter().map(|(k, added)| {
@@ -195,7 +195,7 @@ fn unnamed_found(groups: &[GroupFrame], grouping: Grouping, estimate: &[usize], 
         confidence: 1.0,
         channel: "roughness",
         covariate: word.into(),
-        held_out_gains: hold_out.iter().map(|&i| grouped::gain(&groups[i], 0, &offsets)).collect(),
+        held_out_gains: hold_out.iter().map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum()).collect(),
         says: format!(
             "measured ranges scatter more in some directions than in others: it depends on the {word}, and no cause of the catalogue does that"
         ),
