@@ -54,7 +54,10 @@ pub fn diagnose(
     let sensors = find_sensors(measured, simulated, &ids, rig)?;
     for (mount, pattern) in rig.sensors.iter().zip(&sensors.patterns) {
         if pattern.rows_rad.is_empty() {
-            notes.push(format!("sensor {}: no rows stand out in its elevations; what depends on rows cannot be told", mount.name));
+            notes.push(format!(
+                "sensor {}: no rows stand out in its elevations; what depends on rows cannot be told",
+                mount.name
+            ));
         }
     }
     progress(Stage::Comparing, 1, 2);
@@ -178,7 +181,9 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
             let named = f.status == Status::Named;
             let gain = mean_interval(&f.held_out_gains, &blocks, returns);
             // One cause seen in two channels is one finding.
-            let same = findings.iter_mut().find(|g: &&mut Finding| named && g.cause.as_deref() == f.causes.first().map(String::as_str));
+            let same = findings
+                .iter_mut()
+                .find(|g: &&mut Finding| named && g.cause.as_deref() == f.causes.first().map(String::as_str));
             if let Some(same) = same {
                 same.gain.nats_per_ray += gain.nats_per_ray;
                 (0..2).for_each(|k| same.gain.ci95[k] += gain.ci95[k]);
@@ -229,12 +234,12 @@ fn gain(distance: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) ->
     let sum = |which: &[usize]| {
         which.iter().fold([0.0; 3], |s, &i| [s[0] + distance[i][0], s[1] + distance[i][1], s[2] + distance[i][2]])
     };
-    let closed = |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
+    let closed =
+        |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
     let all = sum(&(0..distance.len()).collect::<Vec<_>>());
     let members = by_block(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let mut drawn: Vec<f64> =
-        (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
+    let mut drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
     drawn.sort_by(f64::total_cmp);
     let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
     Gain {

@@ -34,8 +34,11 @@ const ORDER: [&str; 23] = [
 
 /// The text of `extended.toml`.
 pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig) -> String {
-    let mut text = String::from("# What the diagnosis adds to the simulation's sensor model: a list of effects. Intervals (95 %) stand behind the values.\n");
-    let place = |f: &Finding| f.cause.as_deref().and_then(|c| ORDER.iter().position(|o| *o == c)).unwrap_or(ORDER.len());
+    let mut text = String::from(
+        "# What the diagnosis adds to the simulation's sensor model: a list of effects. Intervals (95 %) stand behind the values.\n",
+    );
+    let place =
+        |f: &Finding| f.cause.as_deref().and_then(|c| ORDER.iter().position(|o| *o == c)).unwrap_or(ORDER.len());
     let mut findings: Vec<&Finding> = diagnosis.findings.iter().collect();
     findings.sort_by_key(|f| place(f));
     if findings.is_empty() {
@@ -47,7 +50,11 @@ pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig) -> String {
             Status::Named => text.push_str(&named(f, rig)),
             Status::Ambiguous => {
                 let names = f.candidates.clone().unwrap_or_default();
-                let _ = writeln!(text, "# These data do not tell {} apart; the first of them stands here.", names.join(" and "));
+                let _ = writeln!(
+                    text,
+                    "# These data do not tell {} apart; the first of them stands here.",
+                    names.join(" and ")
+                );
                 let first = Finding { cause: names.first().cloned(), ..f.clone() };
                 text.push_str(&named(&first, rig));
             }
@@ -74,7 +81,9 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
         "range_noise" => positive(f, "std_m", with("range_noise", key("std_m", "std_m"))),
         "signal_noise" => with(
             "range_noise_by_signal",
-            key("std_m", "std_m") + &key("exponent", "exponent") + &format!("signal = {:?}\n", crate::inference::noise::USUAL_SIGNAL),
+            key("std_m", "std_m")
+                + &key("exponent", "exponent")
+                + &format!("signal = {:?}\n", crate::inference::noise::USUAL_SIGNAL),
         ),
         "range_bias" => with("range_bias", key("offset_m", "offset_m") + &key("scale", "scale")),
         "beam_range_offset" => with("beam_range_offset", row_table(f, rig)),
@@ -103,7 +112,11 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
                 "surface: object_corner" => "\"rubber\"",
                 _ => "\"paint\"",
             };
-            positive(f, "share", with("material_dropout", format!("materials = [{materials}]\n") + &key("share", "share")))
+            positive(
+                f,
+                "share",
+                with("material_dropout", format!("materials = [{materials}]\n") + &key("share", "share")),
+            )
         }
         "range_cut" => with("range_limits", key("max_m", "max_m")),
         "ego_occlusion" => blocked_box(f, rig),
@@ -127,7 +140,9 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
             )
         }
         "pitch_roll" => {
-            let steady = |key: &str, name: &str| if f.parameters.contains_key(name) { String::new() } else { format!("{key} = 0.0\n") };
+            let steady = |key: &str, name: &str| {
+                if f.parameters.contains_key(name) { String::new() } else { format!("{key} = 0.0\n") }
+            };
             let lines = key("roll_deg", "roll_deg")
                 + &key("pitch_deg", "pitch_deg")
                 + &steady("roll_deg", "roll_deg")
@@ -152,7 +167,10 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
 /// A simulation that has too much of something is mended by taking it out, not by an effect.
 fn positive(f: &Finding, name: &str, text: String) -> String {
     if f.parameters.get(name).is_some_and(|p| p.estimate < 0.0) {
-        return format!("# The simulation has more of it than the measurement: take it out there ({name} by {}).\n", short(f.parameters[name].estimate));
+        return format!(
+            "# The simulation has more of it than the measurement: take it out there ({name} by {}).\n",
+            short(f.parameters[name].estimate)
+        );
     }
     text
 }
@@ -162,7 +180,10 @@ fn row_table(f: &Finding, rig: &SensorRig) -> String {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sensor in &rig.sensors {
         for (name, p) in &f.parameters {
-            let Some(row) = name.strip_prefix(&format!("{}/", sensor.name)).and_then(|r| r.parse::<usize>().ok()) else { continue };
+            let Some(row) = name.strip_prefix(&format!("{}/", sensor.name)).and_then(|r| r.parse::<usize>().ok())
+            else {
+                continue;
+            };
             if rows.len() <= row {
                 rows.resize(row + 1, Vec::new());
             }
@@ -185,7 +206,12 @@ fn blocked_box(f: &Finding, rig: &SensorRig) -> String {
         for el in ["elevation_from_deg", "elevation_to_deg"] {
             for distance in [1.0, 1.05] {
                 let (a, e) = (value(az).to_radians(), value(el).to_radians());
-                let p = pose * nalgebra::Point3::new(distance * e.cos() * a.cos(), distance * e.cos() * a.sin(), distance * e.sin());
+                let p = pose
+                    * nalgebra::Point3::new(
+                        distance * e.cos() * a.cos(),
+                        distance * e.cos() * a.sin(),
+                        distance * e.sin(),
+                    );
                 for k in 0..3 {
                     low[k] = f64::min(low[k], p[k]);
                     high[k] = f64::max(high[k], p[k]);
@@ -207,7 +233,12 @@ fn empirical(f: &Finding) -> String {
         "roughness" => "std_m",
         _ => "offset_m",
     };
-    format!("[[effect]]\nkind = \"empirical\"\ncovariate = \"{}\"\nat = [{}]\n{what} = [{}]\n", f.covariate, list(|p| p.x), list(|p| p.after))
+    format!(
+        "[[effect]]\nkind = \"empirical\"\ncovariate = \"{}\"\nat = [{}]\n{what} = [{}]\n",
+        f.covariate,
+        list(|p| p.x),
+        list(|p| p.after)
+    )
 }
 
 fn short(v: f64) -> String {
@@ -256,7 +287,14 @@ mod tests {
                 finding("wrong_shape", &[("longer_m", 0.2)]),
             ],
             minimum_detectable: Default::default(),
-            gain: Gain { metric: "nats_per_ray".into(), before: 1.0, after: 0.1, floor: 0.0, closed: Some(0.9), ci95: None },
+            gain: Gain {
+                metric: "nats_per_ray".into(),
+                before: 1.0,
+                after: 0.1,
+                floor: 0.0,
+                closed: Some(0.9),
+                ci95: None,
+            },
             considered: vec![],
             notes: vec![],
         };

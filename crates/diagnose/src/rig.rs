@@ -64,7 +64,10 @@ impl SensorRig {
         for (i, s) in rig.sensors.iter().enumerate() {
             let numbers = [s.yaw_deg, s.pitch_deg, s.roll_deg, s.rate_hz];
             if s.position.iter().any(|v| !(v.abs() <= 100.0)) || numbers.iter().any(|v| !(v.abs() <= 1e4)) {
-                return Err(DataError::file(path, format!("sensor[{i}]: position within 100 m and finite angles are wanted")));
+                return Err(DataError::file(
+                    path,
+                    format!("sensor[{i}]: position within 100 m and finite angles are wanted"),
+                ));
             }
             if !(s.horizontal_fov_deg > 0.0 && s.horizontal_fov_deg <= 360.0 && s.rate_hz > 0.0) {
                 return Err(DataError::file(
@@ -129,7 +132,11 @@ mod tests {
     fn a_rig_needs_only_places() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.toml");
-        fs_err::write(&path, "[[sensor]]\nname = \"a\"\nposition = [1, 0, 2.5]\nyaw_deg = 90\npattern = { columns = 3 }\n").unwrap();
+        fs_err::write(
+            &path,
+            "[[sensor]]\nname = \"a\"\nposition = [1, 0, 2.5]\nyaw_deg = 90\npattern = { columns = 3 }\n",
+        )
+        .unwrap();
         let rig = SensorRig::read(&path).unwrap();
         let at = rig.sensors[0].pose() * Point3::new(2.0, 0.0, 0.0);
         assert!((at - Point3::new(1.0, 2.0, 2.5)).norm() < 1e-12 && rig.sensors[0].closes());

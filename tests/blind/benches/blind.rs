@@ -2,12 +2,12 @@
 //! run goes on.
 //!
 //! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N] [--shots N]
-//! [--out DIR] [--show] [--keep DIR]`
+//! [--out DIR] [--keep DIR]`
 
-use lidarshift_blind::score::{Outcome, score, summarise};
-use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
 use data::Dataset;
 use diagnose::{Options, SensorRig, diagnose};
+use lidarshift_blind::score::{Outcome, score, summarise};
+use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
 use rand::RngExt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -18,7 +18,6 @@ struct Arguments {
     first: u64,
     size: CaseSize,
     out: PathBuf,
-    show: bool,
     keep: Option<PathBuf>,
 }
 
@@ -29,7 +28,6 @@ fn arguments() -> Arguments {
         first: 1,
         size: CaseSize::USUAL,
         out: PathBuf::from("bench/blind"),
-        show: false,
         keep: None,
     };
     let mut words = std::env::args().skip(1);
@@ -43,7 +41,6 @@ fn arguments() -> Arguments {
             "--shots" => out.size.shots = value().parse().expect("a number of shots"),
             "--out" => out.out = value().into(),
             "--keep" => out.keep = Some(value().into()),
-            "--show" => out.show = true,
             "--bench" => {}
             other => panic!("unknown word {other}"),
         }
@@ -101,23 +98,16 @@ fn main() {
         let done = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice::<Outcome>(&bytes).ok());
         let outcome = done.unwrap_or_else(|| {
             let folder = tempfile::tempdir().expect("a temporary folder");
-            let place = arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
+            let place =
+                arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
             let (outcome, value) = run(seed, &arguments, &place);
-            if arguments.show {
-                let mut short = value.clone();
-                let dull = |c: &serde_json::Value| c["z"].as_f64().is_none_or(|z| z < 2.0);
-                if let Some(list) = short["considered"].as_array_mut() {
-                    list.retain(|c| !dull(c));
-                }
-                for f in short["findings"].as_array_mut().into_iter().flatten() {
-                    f.as_object_mut().map(|f| f.remove("curve"));
-                }
-                println!("{}", serde_json::to_string_pretty(&short).expect("JSON"));
-            }
+            let told = arguments.out.join(format!("diagnosis-{seed}.json"));
+            data::write_atomic(&told, &serde_json::to_vec_pretty(&value).expect("JSON")).expect("a diagnosis");
             data::write_atomic(&path, &serde_json::to_vec_pretty(&outcome).expect("JSON")).expect("a result");
             outcome
         });
-        let hidden: Vec<String> = outcome.truth.hidden.iter().map(|h| format!("{} {:?}", h.cause, h.parameters)).collect();
+        let hidden: Vec<String> =
+            outcome.truth.hidden.iter().map(|h| format!("{} {:?}", h.cause, h.parameters)).collect();
         println!(
             "{seed}: {} [{}] -> {} named {:?} ambiguous {:?} unexplained {} closed {:?} {:.1} s",
             outcome.truth.kind,

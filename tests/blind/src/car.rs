@@ -38,7 +38,8 @@ fn wheels(size: [f64; 3], axles: [f64; 2], radius: f64, width: f64) -> Vec<Solid
 }
 
 fn open_wheeler(rng: &mut Stream) -> CarShape {
-    let [l, w, h] = [4.7 + 0.5 * rng.random::<f64>(), 1.85 + 0.15 * rng.random::<f64>(), 1.1 + 0.15 * rng.random::<f64>()];
+    let [l, w, h] =
+        [4.7 + 0.5 * rng.random::<f64>(), 1.85 + 0.15 * rng.random::<f64>(), 1.1 + 0.15 * rng.random::<f64>()];
     let floor = -h / 2.0;
     let mut parts = wheels([l, w, h], [0.33 * l, -0.30 * l], 0.32, 0.33);
     parts.push(part([0.30 * l, 0.0, floor + 0.30], [0.40 * l, 0.34, 0.24], Stuff::Paint)); // nose
@@ -53,7 +54,8 @@ fn open_wheeler(rng: &mut Stream) -> CarShape {
 }
 
 fn saloon(rng: &mut Stream) -> CarShape {
-    let [l, w, h] = [4.1 + 0.8 * rng.random::<f64>(), 1.75 + 0.2 * rng.random::<f64>(), 1.35 + 0.25 * rng.random::<f64>()];
+    let [l, w, h] =
+        [4.1 + 0.8 * rng.random::<f64>(), 1.75 + 0.2 * rng.random::<f64>(), 1.35 + 0.25 * rng.random::<f64>()];
     let floor = -h / 2.0;
     let mut parts = wheels([l, w, h], [0.3 * l, -0.3 * l], 0.31, 0.22);
     parts.push(part([0.0, 0.0, floor + 0.5], [l, 0.94 * w, 0.6], Stuff::Paint));

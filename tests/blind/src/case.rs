@@ -119,15 +119,26 @@ fn draw_effect(i: usize, rng: &mut Stream) -> Effect {
         "quantisation" => Effect::Quantisation { step_m: log_uniform(rng, 0.04, 0.2) },
         "angular_jitter" => Effect::AngularJitter { sigma_rad: deg(log_uniform(rng, 0.02, 0.1)) },
         "random_dropout" => Effect::RandomDropout { share: log_uniform(rng, 0.02, 0.3) },
-        "signal_dropout" => Effect::SignalDropout { half_at: rng.random_range(-11.5..-9.0), speckle: rng.random_range(0.2..0.7) },
-        "range_dropout" => Effect::RangeDropout { half_at_m: rng.random_range(30.0..75.0), softness_m: rng.random_range(5.0..20.0) },
-        "incidence_dropout" => Effect::IncidenceDropout { half_at_cos: log_uniform(rng, 0.03, 0.15), power: rng.random_range(1.5..3.5) },
-        "material_dropout" => Effect::MaterialDropout { tyres: rng.random_bool(0.5), share: rng.random_range(0.3..0.9) },
+        "signal_dropout" => {
+            Effect::SignalDropout { half_at: rng.random_range(-11.5..-9.0), speckle: rng.random_range(0.2..0.7) }
+        }
+        "range_dropout" => {
+            Effect::RangeDropout { half_at_m: rng.random_range(30.0..75.0), softness_m: rng.random_range(5.0..20.0) }
+        }
+        "incidence_dropout" => {
+            Effect::IncidenceDropout { half_at_cos: log_uniform(rng, 0.03, 0.15), power: rng.random_range(1.5..3.5) }
+        }
+        "material_dropout" => {
+            Effect::MaterialDropout { tyres: rng.random_bool(0.5), share: rng.random_range(0.3..0.9) }
+        }
         "range_cut" => Effect::RangeCut { max_m: rng.random_range(35.0..90.0) },
         "ego_occlusion" => {
             let side = sign(rng);
             let size_m = [rng.random_range(0.2..0.6), rng.random_range(0.5..1.1), rng.random_range(0.1..0.3)];
-            Effect::EgoOcclusion { center_m: [-1.9, side * rng.random_range(0.0..0.5), rng.random_range(0.5..0.9)], size_m }
+            Effect::EgoOcclusion {
+                center_m: [-1.9, side * rng.random_range(0.0..0.5), rng.random_range(0.5..0.9)],
+                size_m,
+            }
         }
         "time_offset" => Effect::TimeOffset {
             seconds: sign(rng) * log_uniform(rng, 0.006, 0.04),

@@ -128,7 +128,9 @@ impl Effect {
     pub fn parameters(&self) -> BTreeMap<String, f64> {
         let deg = f64::to_degrees;
         let list: Vec<(&str, f64)> = match self {
-            Effect::RangeNoise { sigma_m, growth_per_m } => vec![("std_m", *sigma_m), ("per_m", growth_per_m * sigma_m)],
+            Effect::RangeNoise { sigma_m, growth_per_m } => {
+                vec![("std_m", *sigma_m), ("per_m", growth_per_m * sigma_m)]
+            }
             Effect::RangeBias { offset_m, scale } => vec![("offset_m", *offset_m), ("scale", *scale)],
             Effect::BeamRangeOffset { std_m } => vec![("std_m", *std_m)],
             Effect::BeamElevationOffset { std_rad } => vec![("std_deg", deg(*std_rad))],
@@ -136,7 +138,9 @@ impl Effect {
             Effect::AngularJitter { sigma_rad } => vec![("std_deg", deg(*sigma_rad))],
             Effect::RandomDropout { share } => vec![("share", *share)],
             Effect::SignalDropout { half_at, speckle } => vec![("half_at", *half_at), ("speckle", *speckle)],
-            Effect::RangeDropout { half_at_m, softness_m } => vec![("half_at_m", *half_at_m), ("softness_m", *softness_m)],
+            Effect::RangeDropout { half_at_m, softness_m } => {
+                vec![("half_at_m", *half_at_m), ("softness_m", *softness_m)]
+            }
             Effect::IncidenceDropout { half_at_cos, power } => vec![("cos_half", *half_at_cos), ("power", *power)],
             Effect::MaterialDropout { share, .. } => vec![("share", *share)],
             Effect::RangeCut { max_m } => vec![("max_m", *max_m)],
@@ -154,7 +158,9 @@ impl Effect {
                 ("left_m", shift_m[1]),
                 ("up_m", shift_m[2]),
             ],
-            Effect::PitchRoll { pitch_rad, roll_rad } => vec![("pitch_deg", deg(*pitch_rad)), ("roll_deg", deg(*roll_rad))],
+            Effect::PitchRoll { pitch_rad, roll_rad } => {
+                vec![("pitch_deg", deg(*pitch_rad)), ("roll_deg", deg(*roll_rad))]
+            }
             Effect::RollingShutter { scan_s } => vec![("scan_s", *scan_s)],
             Effect::Outliers { share } => vec![("rate", *share)],
             Effect::MixedPixels { divergence_rad } => vec![("divergence_rad", *divergence_rad)],

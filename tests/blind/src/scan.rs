@@ -89,7 +89,11 @@ impl Side<'_> {
     pub fn scan(&self, t: f64, rng: &mut Stream) -> Scan {
         let believed = self.world.pose(0, t);
         let mut pose_error = Isometry3::from_parts(
-            Translation3::new(normal(rng) * self.own.pose[0], normal(rng) * self.own.pose[0], normal(rng) * self.own.pose[0]),
+            Translation3::new(
+                normal(rng) * self.own.pose[0],
+                normal(rng) * self.own.pose[0],
+                normal(rng) * self.own.pose[0],
+            ),
             small_turn([0, 1, 2].map(|_| normal(rng) * self.own.pose[1])),
         );
         let mut scan_s = 0.0;
@@ -243,7 +247,8 @@ impl Side<'_> {
                 }
                 Effect::RangeCut { max_m } => f64::from(u8::from(range <= *max_m)),
                 Effect::StripedLoss { share, stripes } => {
-                    let u = (el - mount.rows_rad[mount.rows_rad.len() - 1]) / (mount.rows_rad[0] - mount.rows_rad[mount.rows_rad.len() - 1]);
+                    let u = (el - mount.rows_rad[mount.rows_rad.len() - 1])
+                        / (mount.rows_rad[0] - mount.rows_rad[mount.rows_rad.len() - 1]);
                     1.0 - share * (1.0 + (std::f64::consts::TAU * stripes * u).sin()) / 2.0
                 }
                 _ => 1.0,
@@ -252,7 +257,9 @@ impl Side<'_> {
                 return None;
             }
             match effect {
-                Effect::RangeNoise { sigma_m, growth_per_m } => said += bell(rng) * sigma_m * (1.0 + growth_per_m * range),
+                Effect::RangeNoise { sigma_m, growth_per_m } => {
+                    said += bell(rng) * sigma_m * (1.0 + growth_per_m * range)
+                }
                 Effect::RangeBias { offset_m, scale } => said += offset_m + scale * range,
                 Effect::AzimuthRipple { amplitude_m, waves } => said += amplitude_m * (waves * az).sin(),
                 Effect::SidedNoise { sigma_m } => {

@@ -82,9 +82,21 @@ impl Outcome {
         let nothing = self.named.is_empty() && self.ambiguous.is_empty() && self.unexplained == 0;
         let wrong = self.named.iter().any(|n| !hidden.contains(&n.as_str()));
         match self.truth.kind.as_str() {
-            "shuffled" => if self.verdict == "not_scenario_identical" { "refused" } else { "not refused" },
+            "shuffled" => {
+                if self.verdict == "not_scenario_identical" {
+                    "refused"
+                } else {
+                    "not refused"
+                }
+            }
             _ if self.verdict == "not_scenario_identical" => "refused wrongly",
-            "null" => if nothing { "clean" } else { "false alarm" },
+            "null" => {
+                if nothing {
+                    "clean"
+                } else {
+                    "false alarm"
+                }
+            }
             "off_catalogue" => match (nothing, wrong) {
                 (true, _) => "missed",
                 (_, true) => "wrong name",
@@ -151,7 +163,8 @@ pub fn summarise(outcomes: &[Outcome]) -> Summary {
         let inside = list.iter().filter(|p| p.ci95[0] <= p.truth && p.truth <= p.ci95[1]).count() as f64 / n;
         let relative = median(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
         let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
-        let rms = if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
+        let rms =
+            if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
         summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms]);
     }
     summary.closed = median(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());

@@ -28,7 +28,11 @@ impl Track {
     pub fn curve_coordinates(&self, x: f64, y: f64) -> (f64, f64) {
         let (half, radius) = (self.straight_m / 2.0, self.radius_m);
         if x.abs() <= half {
-            return if y < 0.0 { (x + half, y + radius) } else { (self.straight_m + PI * radius + half - x, radius - y) };
+            return if y < 0.0 {
+                (x + half, y + radius)
+            } else {
+                (self.straight_m + PI * radius + half - x, radius - y)
+            };
         }
         let side = x.signum();
         let (dx, dy) = (x - side * half, y);
@@ -64,7 +68,10 @@ impl Track {
     fn bank_rad(&self, s: f64) -> f64 {
         let turn = PI * self.radius_m;
         let ramp = 50.0;
-        let soft = |d: f64| { let u = (d / ramp).clamp(-0.5, 0.5) + 0.5; u * u * (3.0 - 2.0 * u) };
+        let soft = |d: f64| {
+            let u = (d / ramp).clamp(-0.5, 0.5) + 0.5;
+            u * u * (3.0 - 2.0 * u)
+        };
         let s = s.rem_euclid(self.lap_m());
         let one = |begin: f64| soft(s - begin) * (1.0 - soft(s - begin - turn));
         let lap = self.lap_m();

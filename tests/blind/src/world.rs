@@ -7,7 +7,6 @@ use data::Stream;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 
-
 /// Farther than this nothing is met, m.
 pub const REACH_M: f64 = 150.0;
 

@@ -65,7 +65,8 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
         .map(|i| {
             let t = i as f64 * case.step_s;
             let scan = measured.scan(t, &mut data::stream(case.seed, "blind measured", 0, i as u64));
-            let shown = if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
+            let shown =
+                if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
             let sums = scan.sums;
             // Ids count scans at 20 Hz, whether all of them are kept or not.
             let every = (case.step_s * 20.0).round() as usize;
@@ -180,7 +181,8 @@ mod tests {
         for name in [&format!("measured/{second}"), &format!("simulated/{second}"), "sensor.toml"] {
             assert_eq!(read(0, name), read(1, name));
         }
-        let points = |bytes: Vec<u8>| bytes.chunks_exact(12).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>();
+        let points =
+            |bytes: Vec<u8>| bytes.chunks_exact(12).map(<[u8]>::to_vec).collect::<std::collections::BTreeSet<_>>();
         let (a, b) = (points(read(0, &format!("measured/{second}"))), points(read(0, &format!("simulated/{second}"))));
         assert!(a.len() > 1_000 && a.intersection(&b).count() == 0, "{} points", a.len());
     }

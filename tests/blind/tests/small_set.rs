@@ -37,7 +37,13 @@ fn what_is_hidden_is_named() {
         .par_iter()
         .filter_map(|&(seed, kind, want)| {
             let o = outcome(seed, kind);
-            let told = format!("{seed}: {:?} gives {} ({:?} {:?}), not {want}", o.truth.hidden, o.word(), o.named, o.ambiguous);
+            let told = format!(
+                "{seed}: {:?} gives {} ({:?} {:?}), not {want}",
+                o.truth.hidden,
+                o.word(),
+                o.named,
+                o.ambiguous
+            );
             (o.word() != want).then_some(told)
         })
         .collect();

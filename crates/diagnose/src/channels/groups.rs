@@ -41,9 +41,7 @@ pub fn group_of(ray: &Ray, grouping: Grouping) -> Option<usize> {
 pub fn place_of(group: usize, grouping: Grouping) -> (usize, f64) {
     match grouping {
         Grouping::Row => (group / ROWS, (group % ROWS) as f64),
-        Grouping::Azimuth => {
-            (group / STRIPS, ((group % STRIPS) as f64 + 0.5) * STRIP_RAD - std::f64::consts::PI)
-        }
+        Grouping::Azimuth => (group / STRIPS, ((group % STRIPS) as f64 + 0.5) * STRIP_RAD - std::f64::consts::PI),
     }
 }
 

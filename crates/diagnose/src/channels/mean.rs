@@ -157,7 +157,8 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
                 if y.abs() > STRAY_M {
                     continue;
                 }
-                let key = (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
+                let key =
+                    (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
                 let patch = patches.entry(key).or_default();
                 patch[0] += 1.0;
                 patch[1] += w.sqrt() * y;
@@ -184,12 +185,7 @@ pub fn mean_frames(
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |(frame, pose): (&FramePair, &OwnPoses)| {
         let p = columns.len();
-        let mut out = MeanFrame {
-            gram: DMatrix::zeros(p, p),
-            right: DVector::zeros(p),
-            rays: 0.0,
-            squares: 0.0,
-        };
+        let mut out = MeanFrame { gram: DMatrix::zeros(p, p), right: DVector::zeros(p), rays: 0.0, squares: 0.0 };
         let mut x = vec![0.0; p];
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
@@ -207,7 +203,13 @@ pub fn mean_frames(
                     Column::RangeOffset => -c,
                     Column::RangeScale => -c * f64::from(ray.range_m),
                     Column::Pose(k) => row[k],
-                    Column::SensorPose(s, k) => if s == ray.sensor as usize { own[k] } else { 0.0 },
+                    Column::SensorPose(s, k) => {
+                        if s == ray.sensor as usize {
+                            own[k]
+                        } else {
+                            0.0
+                        }
+                    }
                     Column::Sweep(k) => phase * [row[3], row[4], row[2]][k],
                     Column::Structure(k) => f64::from(u8::from(k == kind)),
                 };

@@ -155,8 +155,11 @@ mod tests {
 
     #[test]
     fn posts_tell_the_motion_and_walls_do_not() {
-        let posts: Vec<Vector2<f64>> =
-            (0..60).map(|i| Vector2::new(-60.0 + 2.2 * f64::from(i) + f64::from(i * i % 7) * 0.23, f64::from(i % 5) * 2.1 - 9.3)).collect();
+        let posts: Vec<Vector2<f64>> = (0..60)
+            .map(|i| {
+                Vector2::new(-60.0 + 2.2 * f64::from(i) + f64::from(i * i % 7) * 0.23, f64::from(i % 5) * 2.1 - 9.3)
+            })
+            .collect();
         let (d, yaw): (f64, f64) = (2.4, 0.012);
         let moved: Vec<Vector2<f64>> = posts
             .iter()

@@ -61,7 +61,8 @@ pub fn odd_frames(frames: &[FramePair]) -> Vec<OddFrame> {
     frames
         .par_iter()
         .map(|frame| {
-            let mut out = OddFrame { all: [frame.measured.len() as f64, frame.simulated.len() as f64], ..OddFrame::default() };
+            let mut out =
+                OddFrame { all: [frame.measured.len() as f64, frame.simulated.len() as f64], ..OddFrame::default() };
             for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
                 for ray in rays {
                     if let Some(kind) = odd(ray) {

@@ -67,10 +67,10 @@ pub fn scales(frames: &[FramePair]) -> Vec<f64> {
     };
     let both = [0, 1].map(|side| {
         let rays = |f: &FramePair| count(if side == 0 { &f.measured } else { &f.simulated });
-        frames.par_iter().fold(|| vec![0u32; CELLS * LOG_BINS], |sum, f| add(sum, &rays(f))).reduce(
-            || vec![0u32; CELLS * LOG_BINS],
-            |x, y| add(x, &y),
-        )
+        frames
+            .par_iter()
+            .fold(|| vec![0u32; CELLS * LOG_BINS], |sum, f| add(sum, &rays(f)))
+            .reduce(|| vec![0u32; CELLS * LOG_BINS], |x, y| add(x, &y))
     });
     (0..CELLS)
         .map(|c| {
@@ -142,11 +142,14 @@ pub fn rough_groups(
         let mut sums = std::collections::BTreeMap::<(usize, usize), [[f64; 3]; 2]>::new();
         for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
             for ray in rays {
-                let (Some(c), Some(v), Some(g)) = (cell(ray), own_roughness_m(ray), group_of(ray, grouping)) else { continue };
+                let (Some(c), Some(v), Some(g)) = (cell(ray), own_roughness_m(ray), group_of(ray, grouping)) else {
+                    continue;
+                };
                 let Some([va, vb]) = variances(c) else { continue };
                 let square = v.abs().min(CAP * scales[c]).powi(2) / vb;
                 let (mean, spread) = if side == 0 { (expected(c, ray), va / vb) } else { (1.0, 1.0) };
-                let sum = &mut sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default()[side];
+                let sum =
+                    &mut sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default()[side];
                 sum[0] += 1.0;
                 sum[1] += square - mean;
                 sum[2] += 2.0 * spread * spread;

@@ -54,7 +54,13 @@ pub fn smooth(sums: &BTreeMap<u32, GroupSums>, offsets: &BTreeMap<u32, f64>, how
 
 /// Gains of frames by offsets that were fitted on other folds and on other parts of each group: what surfaces of one part are wrong by does
 /// not tell the other parts. With `rough` over what a smooth law would gain.
-pub fn cross_part_gains(frames: &[PartedFrame], select: &[usize], blocks: &[usize], how: GroupFit, rough: bool) -> Vec<f64> {
+pub fn cross_part_gains(
+    frames: &[PartedFrame],
+    select: &[usize],
+    blocks: &[usize],
+    how: GroupFit,
+    rough: bool,
+) -> Vec<f64> {
     let folds = fold_of(blocks);
     let mut out = vec![0.0; select.len()];
     for fold in 0..FOLDS {

@@ -20,16 +20,8 @@ pub enum Law {
 }
 
 /// All laws, in the order of how much they assume.
-pub const LAWS: [Law; 8] = [
-    Law::Random,
-    Law::Zone(0),
-    Law::Zone(1),
-    Law::Zone(2),
-    Law::Zone(3),
-    Law::Range,
-    Law::Incidence,
-    Law::Signal,
-];
+pub const LAWS: [Law; 8] =
+    [Law::Random, Law::Zone(0), Law::Zone(1), Law::Zone(2), Law::Zone(3), Law::Range, Law::Incidence, Law::Signal];
 
 /// Rows of a table: what the laws need to know of a cell.
 #[derive(Clone, Copy, Debug)]
@@ -65,7 +57,8 @@ impl LossTable {
         }
         let share = |z: usize| (by_zone[z][1] + 0.5) / (by_zone[z][0] + 1.0);
         let matches = cells.iter().enumerate().map(|(i, c)| {
-            ((c.measured_matched + PRIOR_RETURNS * share(zone_of(i))) / (c.measured.n + PRIOR_RETURNS)).clamp(0.02, 0.9999)
+            ((c.measured_matched + PRIOR_RETURNS * share(zone_of(i))) / (c.measured.n + PRIOR_RETURNS))
+                .clamp(0.02, 0.9999)
         });
         let matches = matches.collect();
         let places = cells
@@ -288,7 +281,13 @@ impl FittedLaw {
         let [a, b, s, c, d] = self.numbers;
         match self.law {
             Law::Random => (1.0 - a).clamp(1e-3, 1.5),
-            Law::Zone(zone) => if at.zone == zone { (1.0 - a).clamp(1e-3, 1.5) } else { 1.0 },
+            Law::Zone(zone) => {
+                if at.zone == zone {
+                    (1.0 - a).clamp(1e-3, 1.5)
+                } else {
+                    1.0
+                }
+            }
             Law::Range => step(-at.ln_range, [-a, b, s]),
             Law::Incidence => step(at.ln_cos, [a, b, s]),
             Law::Signal => {

@@ -86,7 +86,8 @@ const SHARED: f64 = 2.0;
 impl NoiseTable {
     /// From the sums over some frames; cells met at less than `least_cos` are left out.
     pub fn new(cells: Vec<RoughCell>, least_cos: f64) -> Self {
-        let enough = |c: &RoughCell| c.measured.n >= FEWEST && c.simulated.n >= FEWEST && c.simulated.mean().1 > least_cos;
+        let enough =
+            |c: &RoughCell| c.measured.n >= FEWEST && c.simulated.n >= FEWEST && c.simulated.mean().1 > least_cos;
         let used = cells.iter().map(enough).collect();
         NoiseTable { cells, used }
     }

@@ -51,10 +51,8 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
         let mut system = Matrix3::zeros();
         for p in &points {
             let back = p - shift;
-            let nearest = local
-                .iter()
-                .map(|(q, n)| ((back - q).norm_squared(), q, n))
-                .min_by(|a, b| a.0.total_cmp(&b.0));
+            let nearest =
+                local.iter().map(|(q, n)| ((back - q).norm_squared(), q, n)).min_by(|a, b| a.0.total_cmp(&b.0));
             let Some((d2, q, n)) = nearest else { continue };
             if d2 > gate * gate || n.norm_squared() < 0.5 {
                 continue;
@@ -79,11 +77,8 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
         information += system / variance;
         let inverse = information.try_inverse()?;
         shift = inverse * (right / variance);
-        result = Some(BoxShift {
-            shift_m: shift.into(),
-            error_m: [0, 1, 2].map(|k| inverse[(k, k)].sqrt()),
-            points: used,
-        });
+        result =
+            Some(BoxShift { shift_m: shift.into(), error_m: [0, 1, 2].map(|k| inverse[(k, k)].sqrt()), points: used });
     }
     result
 }

@@ -74,8 +74,7 @@ pub fn pair_frame(
     let mut objects = pair_labels(measured.1, simulated.1);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
     let mut scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
-    let mut frame =
-        FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
+    let mut frame = FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
     for sensor in 0..sensors.rig.sensors.len() {
         let (measured_scans, simulated_scans) = scans.split_at_mut(1);
         let (a, b) = (&mut measured_scans[0][sensor], &simulated_scans[0][sensor]);
@@ -220,7 +219,13 @@ impl<'a> Sight<'a> {
         self.cloud_from_sensor.rotation * n
     }
 
-    fn surface_at(&self, direction: &Vector3<f64>, range: f64, normal: Option<&Vector3<f64>>, ray: &mut Ray) -> Surface {
+    fn surface_at(
+        &self,
+        direction: &Vector3<f64>,
+        range: f64,
+        normal: Option<&Vector3<f64>>,
+        ray: &mut Ray,
+    ) -> Surface {
         let p: [f64; 3] = (self.cloud_from_sensor.translation.vector + direction * range).into();
         for (k, b) in self.boxes.iter().enumerate() {
             let local = b.to_local(p);

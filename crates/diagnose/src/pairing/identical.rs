@@ -158,7 +158,9 @@ mod tests {
     use super::*;
 
     fn rows(own: f64, near: f64, far: f64) -> Vec<FrameScores> {
-        (0..10).map(|i| FrameScores { frame: i, own, near: vec![Some(near)], strangers: vec![far, far * 1.1] }).collect()
+        (0..10)
+            .map(|i| FrameScores { frame: i, own, near: vec![Some(near)], strangers: vec![far, far * 1.1] })
+            .collect()
     }
 
     #[test]
@@ -167,7 +169,9 @@ mod tests {
         assert!(judge(&rows(0.1, 0.2, 0.5), &[1], &ids).identical);
         assert!(judge(&rows(0.01, 0.01, 0.01), &[1], &ids).identical, "nothing moves");
         let shuffled = judge(&rows(0.5, 0.4, 0.4), &[1], &ids);
-        assert!(!shuffled.identical && shuffled.reason.contains("not scenario-identical") && shuffled.strangers.len() == 10);
+        assert!(
+            !shuffled.identical && shuffled.reason.contains("not scenario-identical") && shuffled.strangers.len() == 10
+        );
         let late = judge(&rows(0.3, 0.02, 0.5), &[1], &ids);
         assert!(!late.identical && late.reason.contains("1 places later"), "{}", late.reason);
     }

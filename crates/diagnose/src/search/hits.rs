@@ -6,8 +6,8 @@ use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_to
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
-use crate::inference::grouped::{self, GroupFit};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable};
 use crate::inference::roles::Role;
@@ -180,7 +180,10 @@ fn unnamed_found(
         confidence,
         channel: "hits",
         covariate: word.into(),
-        held_out_gains: hold_out.iter().map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum()).collect(),
+        held_out_gains: hold_out
+            .iter()
+            .map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum())
+            .collect(),
         says: format!(
             "the share of lost returns depends on the {word}, by {:.1} % from one to the next; no cause of the catalogue does that",
             100.0 * spread
@@ -244,18 +247,29 @@ fn found(
         .map(|(k, (name, estimate, unit))| {
             let drawn: Vec<f64> = draws.iter().map(|d| reading(d)[k].1).collect();
             let mean = drawn.iter().sum::<f64>() / drawn.len().max(1) as f64;
-            let sd = (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
+            let sd =
+                (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
             // The form of the truth may differ.
             let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs());
-            let parameter = Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
+            let parameter =
+                Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
             ((*name).to_owned(), parameter)
         })
         .collect();
     let name = law.law.name().to_owned();
     let says = match law.law {
-        Law::Random => format!("{:.1} % of the returns are lost wherever they come from; your simulator keeps them", 100.0 * law.numbers[0]),
-        Law::Zone(z) => format!("returns of {} are lost more than others: {:.0} %; your simulator keeps them", zone_words(z), 100.0 * law.numbers[0]),
-        Law::Range => format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.half().exp()),
+        Law::Random => format!(
+            "{:.1} % of the returns are lost wherever they come from; your simulator keeps them",
+            100.0 * law.numbers[0]
+        ),
+        Law::Zone(z) => format!(
+            "returns of {} are lost more than others: {:.0} %; your simulator keeps them",
+            zone_words(z),
+            100.0 * law.numbers[0]
+        ),
+        Law::Range => {
+            format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.half().exp())
+        }
         Law::Incidence => format!(
             "returns are lost at grazing angles: 50 % at {:.1} degrees from the surface; your simulator keeps them all",
             law.half().exp().min(1.0).asin().to_degrees()
@@ -274,8 +288,9 @@ fn found(
         Law::Signal => "signal".into(),
     };
     let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
-    let separate_by = (!equals.is_empty())
-        .then(|| "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned());
+    let separate_by = (!equals.is_empty()).then(|| {
+        "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
+    });
     Found {
         status,
         causes: std::iter::once(name).chain(equals).collect(),
@@ -292,7 +307,8 @@ fn found(
 }
 
 fn zone_words(zone: usize) -> &'static str {
-    ["the ground", "standing surfaces", "bodies of labelled objects", "the lower corners of labelled objects (wheels)"][zone]
+    ["the ground", "standing surfaces", "bodies of labelled objects", "the lower corners of labelled objects (wheels)"]
+        [zone]
 }
 
 /// Share of a number by which a fit of another form may be off.

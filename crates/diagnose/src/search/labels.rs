@@ -84,11 +84,15 @@ struct Row {
     known: [bool; 8],
 }
 
+/// Objects that move by less are not spoken of, m: labels, objects.
+const LEAST_MOVED_M: [f64; 2] = [0.02, 0.04];
+
 /// The search on one side; `displaced` tells how far things are shown from where they are for reasons of the geometry.
 pub fn search(context: &Context, side: Side, displaced: &Displacement) -> ChannelResult {
     let motion = context.times.as_ref().map(|t| own_motion(context.frames, t, &origins(context.rig)));
     let shifts = object_shifts(context.frames, context.times.as_deref());
-    let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref(), displaced)).collect();
+    let mut rows: Vec<Row> =
+        shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref(), displaced)).collect();
     let mut result = ChannelResult::default();
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let channel = if side == Side::Labels { "labels" } else { "objects" };
@@ -110,17 +114,32 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let trial = |k: usize, columns: &[usize], before: Option<&[f64]>| {
         let fitted = fit(&frames, &blocks, columns, &precision);
         let own = CANDIDATES[k].1;
-        let size = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i].abs()).fold(0.0, f64::max);
+        let theta: Vec<f64> = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i]).collect();
+        let size = theta.iter().map(|t| t.abs()).fold(0.0, f64::max);
+        let moved = moved_m(&rows, own, &theta);
         let mut gains = cross_gains(&frames, &blocks, columns, &precision);
         if let Some(before) = before {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
         }
-        let least = if CANDIDATES[k].0 == "time_offset" { FLOOR_S } else if CANDIDATES[k].0 == "rolling_shutter" { 0.005 } else { floor };
-        Trial { candidate: k, name: CANDIDATES[k].0.into(), parameters: own.len(), gains, above_floor: size > least }
+        let least = if CANDIDATES[k].0 == "time_offset" {
+            FLOOR_S
+        } else if CANDIDATES[k].0 == "rolling_shutter" {
+            0.005
+        } else {
+            floor
+        };
+        Trial {
+            candidate: k,
+            name: CANDIDATES[k].0.into(),
+            parameters: own.len(),
+            gains,
+            above_floor: size > least && moved > LEAST_MOVED_M[usize::from(side == Side::Objects)],
+        }
     };
     let allowed = |k: &usize| {
         let (name, columns) = CANDIDATES[*k];
-        columns.iter().all(|&c| usable[c]) && (side == Side::Objects || !matches!(name, "wrong_shape" | "rolling_shutter"))
+        columns.iter().all(|&c| usable[c])
+            && (side == Side::Objects || !matches!(name, "wrong_shape" | "rolling_shutter"))
     };
     let demands = Demands { nats: 6.0, slack: 0.03, ..first_demands() };
     let trials: Vec<Trial> = (0..CANDIDATES.len()).filter(allowed).map(|k| trial(k, CANDIDATES[k].1, None)).collect();
@@ -142,13 +161,16 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         return result;
     };
     let mut chosen = vec![trials[first.chosen].candidate];
-    let mut stories = vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
+    let mut stories =
+        vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     let (first_gain, _) = total_and_z(&trials[first.chosen].gains);
     let second_demands = Demands { nats: (0.1 * first_gain).max(8.0), ..demands };
     let first_columns = CANDIDATES[chosen[0]].1;
     let rivals: Vec<Trial> = (0..CANDIDATES.len())
         .filter(allowed)
-        .filter(|&k| CANDIDATES[k].0 != CANDIDATES[chosen[0]].0 && CANDIDATES[k].1.iter().all(|c| !first_columns.contains(c)))
+        .filter(|&k| {
+            CANDIDATES[k].0 != CANDIDATES[chosen[0]].0 && CANDIDATES[k].1.iter().all(|c| !first_columns.contains(c))
+        })
         .map(|k| trial(k, &[first_columns, CANDIDATES[k].1].concat(), Some(&trials[first.chosen].gains)))
         .collect();
     if let Some(second) = choose(&rivals, &second_demands) {
@@ -179,7 +201,8 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
 
 /// How a measured label is to be moved so that it stands on its returns.
 fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
-    let told = [0, 1, 2].map(|axis: usize| fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
+    let told = [0, 1, 2]
+        .map(|axis: usize| fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
     // Labels that are off go back; objects that stand elsewhere take their labels along.
     let sign = if side == Side::Labels { -1.0 } else { 1.0 };
     let (s, c) = r.yaw_rad.sin_cos();
@@ -304,12 +327,20 @@ fn robust(r: &Row, axis: usize) -> f64 {
     if u < 1.0 { 1.0 } else { 1.0 / u }
 }
 
+/// Root mean square of what columns with coefficients move objects by, m.
+fn moved_m(rows: &[Row], columns: &[usize], theta: &[f64]) -> f64 {
+    let told = |r: &Row, axis: usize| columns.iter().zip(theta).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>();
+    let squares: f64 = rows.iter().map(|r| (0..3).map(|axis| told(r, axis).powi(2)).sum::<f64>()).sum();
+    (squares / rows.len().max(1) as f64).sqrt()
+}
+
 /// Half the squared shifts in units of their noise, before and after; of an independent draw half for each number.
 fn distance(rows: &[Row], frame: usize, fitted: Option<&LinearFit>) -> [f64; 3] {
     let mut out = [0.0; 3];
     for r in rows.iter().filter(|r| r.frame == frame) {
         for axis in 0..3 {
-            let told = fitted.map_or(0.0, |f| f.columns.iter().zip(f.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
+            let told = fitted
+                .map_or(0.0, |f| f.columns.iter().zip(f.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
             let w = robust(r, axis) / r.variance[axis];
             out[0] += 0.5 * w * r.shift[axis].powi(2);
             out[1] += 0.5 * w * (r.shift[axis] - told).powi(2);
@@ -343,14 +374,25 @@ fn found(
             Cause::Left => parameters.push(parameter("left_m", sign * theta, error, "m")),
             Cause::Up if name == "wrong_shape" => parameters.push(parameter("higher_m", theta, error, "m")),
             Cause::Up => parameters.push(parameter("up_m", sign * theta, error, "m")),
-            Cause::SeenVelocity | Cause::Velocity => parameters.push(parameter("offset_s", -sign * theta, error.hypot(0.02 * theta), "s")),
+            Cause::SeenVelocity | Cause::Velocity => {
+                parameters.push(parameter("offset_s", -sign * theta, error.hypot(0.02 * theta), "s"))
+            }
             Cause::Longer => parameters.push(parameter("longer_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Wider => parameters.push(parameter("wider_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Swept => parameters.push(parameter("scan_s", -theta, error.hypot(0.05 * theta), "s")),
         }
-        words.push(format!("{} {:+.3} {}", parameters[parameters.len() - 1].0, parameters[parameters.len() - 1].1.estimate, parameters[parameters.len() - 1].1.unit));
+        words.push(format!(
+            "{} {:+.3} {}",
+            parameters[parameters.len() - 1].0,
+            parameters[parameters.len() - 1].1.estimate,
+            parameters[parameters.len() - 1].1.unit
+        ));
     }
-    let what = if side == Side::Labels { "measured labels stand beside the simulated ones, the returns do not" } else { "measured objects stand beside the simulated ones" };
+    let what = if side == Side::Labels {
+        "measured labels stand beside the simulated ones, the returns do not"
+    } else {
+        "measured objects stand beside the simulated ones"
+    };
     let clock = match columns {
         [3] => "; they move with the velocity that the sensor sees: all positions against the cloud",
         [4] => "; they move with the targets' velocity over the ground: the targets' clock",
@@ -365,7 +407,9 @@ fn found(
         _ => ("none", if usable[4] { 4 } else { 3 }),
     };
     let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
-    let separate_by = (!equals.is_empty()).then(|| "targets at very different speeds: a constant offset does not change with speed, a late clock's does".to_owned());
+    let separate_by = (!equals.is_empty()).then(|| {
+        "targets at very different speeds: a constant offset does not change with speed, a late clock's does".to_owned()
+    });
     let axis = match columns {
         [1] | [6] => 1,
         [2] => 2,
@@ -396,7 +440,11 @@ fn curve(rows: &[Row], column: usize, axis: usize, fitted: &LinearFit) -> Curve 
         .iter()
         .map(|r| {
             let told = fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>();
-            let x = if column == 4 { r.speed.unwrap_or(0.0) } else { r.x[axis.min(if column == 6 { 1 } else { 0 })][column] };
+            let x = if column == 4 {
+                r.speed.unwrap_or(0.0)
+            } else {
+                r.x[axis.min(if column == 6 { 1 } else { 0 })][column]
+            };
             (x, r.shift[axis], told)
         })
         .collect();

@@ -5,7 +5,8 @@ use super::{ChannelResult, Context, Found, parameter};
 use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
-    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, blocked_cells, direction_cell, direction_counts, range_cut, with_neighbours,
+    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, blocked_cells, direction_cell, direction_counts, range_cut,
+    with_neighbours,
 };
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::losses::{FittedLaw, Law, LossTable};
@@ -25,7 +26,8 @@ pub fn search(context: &Context) -> (ChannelResult, Mask) {
     let expected = expected_shares(context, &select, &mask, &table, &laws);
     mask.blocked = blocked_cells(&counts, |cell| expected.get(cell).copied().unwrap_or(0.0));
     mask.around = with_neighbours(&mask.blocked);
-    let mut result = ChannelResult { distance: vec![[0.0; 3]; context.of(Role::HoldOut).len()], ..ChannelResult::default() };
+    let mut result =
+        ChannelResult { distance: vec![[0.0; 3]; context.of(Role::HoldOut).len()], ..ChannelResult::default() };
     if let Some(cut) = mask.cut_m {
         result.found.push(cut_found(context, cut));
     }
@@ -35,7 +37,13 @@ pub fn search(context: &Context) -> (ChannelResult, Mask) {
     let outcome = |found: bool| if found { "chosen" } else { "no such place" };
     for (cause, found) in [("range_cut", mask.cut_m.is_some()), ("ego_occlusion", !mask.blocked.is_empty())] {
         let outcome = outcome(found).into();
-        result.considered.push(Considered { cause: cause.into(), channel: "hits".into(), nats_per_ray: 0.0, z: 0.0, outcome });
+        result.considered.push(Considered {
+            cause: cause.into(),
+            channel: "hits".into(),
+            nats_per_ray: 0.0,
+            z: 0.0,
+            outcome,
+        });
     }
     let cell_deg = AZIMUTH_RAD.to_degrees();
     let minimum = Minimum { parameter: "azimuth_width_deg".into(), value: 2.0 * cell_deg, unit: "deg".into() };
@@ -83,7 +91,13 @@ fn cut_found(context: &Context, on_select: f64) -> Found {
             rays.filter(|r| (low..high).contains(&r.own_range_m())).count() as f64
         };
         let (a, b) = (count(|f| &f.measured), count(|f| &f.simulated));
-        CurvePoint { x: 0.5 * (low + high), measured: a, before: b, after: if low >= cut { 0.0 } else { b }, error: a.sqrt() }
+        CurvePoint {
+            x: 0.5 * (low + high),
+            measured: a,
+            before: b,
+            after: if low >= cut { 0.0 } else { b },
+            error: a.sqrt(),
+        }
     });
     Found {
         status: Status::Named,
@@ -123,7 +137,8 @@ fn blocked_found(context: &Context, mask: &Mask) -> Found {
     let all: f64 = context.returns(&estimate);
     let hidden = estimate.iter().flat_map(|&i| &context.frames[i].simulated).filter(|r| inside(r)).count() as f64;
     let counts = direction_counts(context.frames, &estimate);
-    let points = counts.iter().filter(|(c, _)| c.0 == sensor && (el[0]..el[1]).contains(&((f64::from(c.2) + 0.5) * el_step)));
+    let points =
+        counts.iter().filter(|(c, _)| c.0 == sensor && (el[0]..el[1]).contains(&((f64::from(c.2) + 0.5) * el_step)));
     let points = points.map(|(c, [n, seen, _])| CurvePoint {
         x: (f64::from(c.1) + 0.5) * az_step,
         measured: seen / n.max(1.0),
@@ -137,7 +152,10 @@ fn blocked_found(context: &Context, mask: &Mask) -> Found {
         causes: vec!["ego_occlusion".into()],
         family: "detection",
         parameters: vec![
-            ("sensor".into(), Parameter { estimate: f64::from(sensor), unit: "number".into(), ci95: [f64::from(sensor); 2] }),
+            (
+                "sensor".into(),
+                Parameter { estimate: f64::from(sensor), unit: "number".into(), ci95: [f64::from(sensor); 2] },
+            ),
             edge("azimuth_from_deg", az[0], az_step),
             edge("azimuth_to_deg", az[1], az_step),
             edge("elevation_from_deg", el[0], el_step),
@@ -153,7 +171,10 @@ fn blocked_found(context: &Context, mask: &Mask) -> Found {
             context.rig.sensors[sensor as usize].name, az[0], az[1], el[0], el[1]
         ),
         separate_by: None,
-        curve: Curve { x: "azimuth, degrees".into(), y: "share of simulated returns that are measured".into(), points: points.collect() },
+        curve: Curve {
+            x: "azimuth, degrees".into(),
+            y: "share of simulated returns that are measured".into(),
+            points: points.collect(),
+        },
     }
 }
-

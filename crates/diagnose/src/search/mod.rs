@@ -141,8 +141,10 @@ pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: &str, demands: &De
     let same = (0..repetitions)
         .filter(|_| {
             let drawn = draw_blocks(&members, &mut rng);
-            let again: Vec<Trial> =
-                trials.iter().map(|t| Trial { gains: drawn.iter().map(|&i| t.gains[i]).collect(), ..t.clone() }).collect();
+            let again: Vec<Trial> = trials
+                .iter()
+                .map(|t| Trial { gains: drawn.iter().map(|&i| t.gains[i]).collect(), ..t.clone() })
+                .collect();
             let easier = Demands { z: 0.0, nats: 0.0, ..*demands };
             choose(&again, &easier).is_some_and(|c| again[c.chosen].name == chosen)
         })
@@ -166,7 +168,13 @@ pub fn mean_interval(values: &[f64], blocks: &[usize], per: f64) -> FindingGain 
 }
 
 /// Writes down what became of every trial.
-pub fn record(trials: &[Trial], choice: Option<&Choice>, channel: &str, rays: f64, demands: &Demands) -> Vec<Considered> {
+pub fn record(
+    trials: &[Trial],
+    choice: Option<&Choice>,
+    channel: &str,
+    rays: f64,
+    demands: &Demands,
+) -> Vec<Considered> {
     let line = |(i, t): (usize, &Trial)| {
         let (total, z) = total_and_z(&t.gains);
         let outcome = match choice {

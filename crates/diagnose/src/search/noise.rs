@@ -54,7 +54,8 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
     let directions = |terms: &[(NoiseLaw, f64)]| -> Vec<Trial> {
         let expected = |c: usize, ray: &Ray| expected(&table, c, ray, terms);
         let one = |grouping: Grouping| {
-            let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table.variances(c), &expected);
+            let groups =
+                rough_groups(context.frames, context.rig, &scales, grouping, &|c| table.variances(c), &expected);
             let (spread, _) = grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED);
             Trial {
                 candidate: NOISE_LAWS.len() + grouping as usize,
@@ -195,7 +196,10 @@ fn unnamed_found(groups: &[PartedFrame], grouping: Grouping, estimate: &[usize],
         confidence: 1.0,
         channel: "roughness",
         covariate: word.into(),
-        held_out_gains: hold_out.iter().map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum()).collect(),
+        held_out_gains: hold_out
+            .iter()
+            .map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum())
+            .collect(),
         says: format!(
             "measured ranges scatter more in some directions than in others: it depends on the {word}, and no cause of the catalogue does that"
         ),

@@ -28,7 +28,13 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
         let side = |i: usize| if measured { &context.frames[i].measured } else { &context.frames[i].simulated };
         let all: usize = frames.iter().map(|&i| side(i).len()).sum();
         let step = (all / RETURNS).max(1);
-        frames.iter().flat_map(|&i| side(i)).step_by(step).map(|r| r.own_range_m()).filter(|r| *r < BIN_M * BINS as f64).collect()
+        frames
+            .iter()
+            .flat_map(|&i| side(i))
+            .step_by(step)
+            .map(|r| r.own_range_m())
+            .filter(|r| *r < BIN_M * BINS as f64)
+            .collect()
     };
     let (a, b) = (ranges(&select, true), ranges(&select, false));
     if a.len() < 500 || b.len() < 500 {

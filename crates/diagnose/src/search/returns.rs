@@ -68,7 +68,8 @@ pub fn search(context: &Context) -> ChannelResult {
             outcome: outcome.into(),
         };
         result.considered.push(considered);
-        let minimum = Minimum { parameter: "share".into(), value: (Z_STAR * error.min(0.1)).max(floor), unit: "1".into() };
+        let minimum =
+            Minimum { parameter: "share".into(), value: (Z_STAR * error.min(0.1)).max(floor), unit: "1".into() };
         if kind != Odd::GroupBehind {
             result.minimum.push((name.into(), minimum));
         }
@@ -142,22 +143,51 @@ fn found(
             // Those that fall onto a surface by chance are not seen.
             let share = share / 0.97;
             parameters.push(parameter("rate", share, error.hypot(0.05 * share), "1"));
-            ("none", format!("{:.2} % of the measured returns stand alone where nothing is: false alarms that your simulator does not make", 100.0 * share))
+            (
+                "none",
+                format!(
+                    "{:.2} % of the measured returns stand alone where nothing is: false alarms that your simulator does not make",
+                    100.0 * share
+                ),
+            )
         }
         Odd::Between => {
             parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
             let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
             let of_edges = share * sum(|f| f.all[0]) / sum(|f| f.at_edges).max(1.0);
-            parameters.push(parameter("share_at_edges", of_edges, (error / share.max(1e-9) * of_edges).hypot(0.05 * of_edges), "1"));
-            ("edge", format!("{:.2} % of the returns at edges lie between the two surfaces: beams have a width, your simulator's are lines", 100.0 * of_edges))
+            parameters.push(parameter(
+                "share_at_edges",
+                of_edges,
+                (error / share.max(1e-9) * of_edges).hypot(0.05 * of_edges),
+                "1",
+            ));
+            (
+                "edge",
+                format!(
+                    "{:.2} % of the returns at edges lie between the two surfaces: beams have a width, your simulator's are lines",
+                    100.0 * of_edges
+                ),
+            )
         }
         Odd::GroupInFront => {
             parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
-            ("place", format!("{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it", 100.0 * share))
+            (
+                "place",
+                format!(
+                    "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
+                    100.0 * share
+                ),
+            )
         }
         Odd::GroupBehind => {
             parameters.push(parameter("share", -share, error.hypot(0.05 * share), "1"));
-            ("place", format!("{:.2} % of the measured returns lie together behind what the simulation has there: it has things that are not on the road", 100.0 * share))
+            (
+                "place",
+                format!(
+                    "{:.2} % of the measured returns lie together behind what the simulation has there: it has things that are not on the road",
+                    100.0 * share
+                ),
+            )
         }
     };
     let family = if matches!(kind, Odd::Alone | Odd::Between) { "returns" } else { "geometry" };

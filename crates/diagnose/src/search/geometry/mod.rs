@@ -3,7 +3,9 @@
 mod words;
 
 use super::{ChannelResult, Context, Z_STAR, confidence, first_demands, record};
-use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole};
+use crate::channels::groups::{
+    GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole,
+};
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
@@ -19,7 +21,7 @@ use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
-const FLOOR_OFFSET_M: f64 = 0.01;
+const FLOOR_OFFSET_M: f64 = 0.012;
 const FLOOR_TURN_RAD: f64 = 3.5e-4;
 const FLOOR_SHIFT_M: f64 = 0.02;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
@@ -159,8 +161,19 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     let estimate_blocks = context.blocks(&estimate);
     for (k, (equals, confidence)) in stories.into_iter().enumerate() {
         let alone = &chosen[k];
-        let held: Vec<f64> = hold_out.iter().map(|&f| told(&sums, &estimate, &estimate_blocks, alone, &chosen, f)).collect();
-        result.found.push(words::found(context, &sums, &estimate, &estimate_blocks, alone, &chosen, equals, confidence, held));
+        let held: Vec<f64> =
+            hold_out.iter().map(|&f| told(&sums, &estimate, &estimate_blocks, alone, &chosen, f)).collect();
+        result.found.push(words::found(
+            context,
+            &sums,
+            &estimate,
+            &estimate_blocks,
+            alone,
+            &chosen,
+            equals,
+            confidence,
+            held,
+        ));
     }
     for (i, &f) in hold_out.iter().enumerate() {
         let gain: f64 = chosen.iter().map(|s| told(&sums, &estimate, &estimate_blocks, s, &chosen, f)).sum();
@@ -256,8 +269,20 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
             let sd: f64 = match c {
                 Column::RangeOffset => 0.5,
                 Column::RangeScale => 0.02,
-                Column::Pose(k) | Column::SensorPose(_, k) => if *k < 3 { 0.035 } else { 0.2 },
-                Column::Sweep(k) => if *k < 2 { 8.0 } else { 0.2 },
+                Column::Pose(k) | Column::SensorPose(_, k) => {
+                    if *k < 3 {
+                        0.035
+                    } else {
+                        0.2
+                    }
+                }
+                Column::Sweep(k) => {
+                    if *k < 2 {
+                        8.0
+                    } else {
+                        0.2
+                    }
+                }
                 Column::Structure(_) => STRUCTURE_M,
             };
             1.0 / (sd * sd)
@@ -350,17 +375,39 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
         }
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, select, blocks, suspects);
-            fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
-                columns.contains(c)
-                    && t.abs()
-                        > match sums.columns[*c] {
-                            Column::RangeOffset => FLOOR_OFFSET_M,
-                            Column::RangeScale => 3e-4,
-                            Column::Pose(k) | Column::SensorPose(_, k) => if k < 3 { FLOOR_TURN_RAD } else { FLOOR_SHIFT_M },
-                            Column::Sweep(k) => if k < 2 { 0.3 } else { 0.01 },
-                            Column::Structure(_) => f64::INFINITY,
-                        }
-            })
+            let bias = |range_m: f64| -> f64 {
+                let told = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
+                told.map(|(c, t)| match sums.columns[*c] {
+                    Column::RangeOffset => *t,
+                    Column::RangeScale => t * range_m,
+                    _ => 0.0,
+                })
+                .sum()
+            };
+            let biased = [10.0, 40.0].iter().any(|r| bias(*r).abs() > FLOOR_OFFSET_M);
+            biased
+                || fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
+                    columns.contains(c)
+                        && t.abs()
+                            > match sums.columns[*c] {
+                                Column::RangeOffset | Column::RangeScale => f64::INFINITY,
+                                Column::Pose(k) | Column::SensorPose(_, k) => {
+                                    if k < 3 {
+                                        FLOOR_TURN_RAD
+                                    } else {
+                                        FLOOR_SHIFT_M
+                                    }
+                                }
+                                Column::Sweep(k) => {
+                                    if k < 2 {
+                                        0.3
+                                    } else {
+                                        0.01
+                                    }
+                                }
+                                Column::Structure(_) => f64::INFINITY,
+                            }
+                })
         }
     }
 }
@@ -415,7 +462,8 @@ fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Mini
     let mut all = Vec::new();
     let mut push = |name: &str, parameter: &str, value: Option<f64>, floor: f64, unit: &str, factor: f64| {
         if let Some(v) = value {
-            let minimum = Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
+            let minimum =
+                Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
             all.push((name.to_owned(), minimum));
         }
     };
@@ -428,4 +476,3 @@ fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Mini
     push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
     all
 }
-

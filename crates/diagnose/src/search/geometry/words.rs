@@ -1,6 +1,6 @@
 //! What the search of geometry found, in words and numbers.
 
-use super::{Suspect, Sums, UNNAMED, fit_all, groups_of, how};
+use super::{Sums, Suspect, UNNAMED, fit_all, groups_of, how};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
 use crate::diagnosis::{Curve, CurvePoint, Parameter, Status};
@@ -28,11 +28,14 @@ pub(super) fn found(
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, estimate, blocks, chosen);
             linear_parameters(context, sums, &fitted, columns, name, &mut parameters);
-            let list: Vec<String> = parameters.iter().map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
+            let list: Vec<String> =
+                parameters.iter().map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
             let what = match name {
                 "range_bias" => "all ranges are measured longer (shorter where negative) than they are",
                 "pitch_roll" => "the whole scene is tilted: the car leans otherwise than the simulation believes",
-                "rolling_shutter" => "the scene shears over a scan: points of a moving car are put where the car is at one moment",
+                "rolling_shutter" => {
+                    "the scene shears over a scan: points of a moving car are put where the car is at one moment"
+                }
                 _ => "one sensor sees the scene displaced: it is mounted otherwise than believed",
             };
             let covariate = match name {
@@ -64,9 +67,24 @@ pub(super) fn found(
             }
             let curve = group_curve(&all, &offsets, *grouping, *column, unit.0);
             match (grouping, column) {
-                (Grouping::Row, 0) => ("row".to_owned(), format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0), curve),
-                (Grouping::Row, _) => ("row".into(), format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * unit.0), curve),
-                _ => ("azimuth".into(), format!("ranges are off by {:.1} cm in a way that depends on the azimuth; no cause of the catalogue does that", std * 100.0), curve),
+                (Grouping::Row, 0) => (
+                    "row".to_owned(),
+                    format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0),
+                    curve,
+                ),
+                (Grouping::Row, _) => (
+                    "row".into(),
+                    format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * unit.0),
+                    curve,
+                ),
+                _ => (
+                    "azimuth".into(),
+                    format!(
+                        "ranges are off by {:.1} cm in a way that depends on the azimuth; no cause of the catalogue does that",
+                        std * 100.0
+                    ),
+                    curve,
+                ),
             }
         }
     };
@@ -75,7 +93,8 @@ pub(super) fn found(
         (_, true) => Status::Named,
         _ => Status::Ambiguous,
     };
-    let mut causes: Vec<String> = std::iter::once(name.to_owned()).chain(equals.into_iter().filter(|e| e != UNNAMED)).collect();
+    let mut causes: Vec<String> =
+        std::iter::once(name.to_owned()).chain(equals.into_iter().filter(|e| e != UNNAMED)).collect();
     let status = if status == Status::Ambiguous && causes.len() == 1 { Status::Named } else { status };
     if name == UNNAMED {
         causes.clear();
@@ -147,7 +166,8 @@ fn linear_parameters(
     }
     if name == "sensor_extrinsics" {
         let s = sensor.unwrap_or(0);
-        parameters.push(("sensor".into(), Parameter { estimate: s as f64, unit: "number".into(), ci95: [s as f64; 2] }));
+        parameters
+            .push(("sensor".into(), Parameter { estimate: s as f64, unit: "number".into(), ci95: [s as f64; 2] }));
         // In the sensor's own frame, as the effect of the simulator has them.
         let turn_of = context.rig.sensors[s].pose().rotation;
         let matrix = turn_of.inverse().to_rotation_matrix();
@@ -179,7 +199,11 @@ fn group_curve(
 ) -> Curve {
     let points = offsets.iter().map(|(k, v)| {
         let (sensor, place) = place_of(*k as usize, grouping);
-        let x = if grouping == Grouping::Row { place + 1000.0 * sensor as f64 } else { place.to_degrees() + 1000.0 * sensor as f64 };
+        let x = if grouping == Grouping::Row {
+            place + 1000.0 * sensor as f64
+        } else {
+            place.to_degrees() + 1000.0 * sensor as f64
+        };
         let error = 1.0 / (sums[k].gram[2 * column] + how(column).precision).sqrt();
         CurvePoint { x, measured: v * unit, before: 0.0, after: v * unit, error: error * unit }
     });
