@@ -139,7 +139,7 @@ pub struct Gain {
     pub before: f64,
     /// With the extended simulation.
     pub after: f64,
-    /// Of an independent draw of the extended simulation itself.
+    /// What would be left with tables without any form, fitted on the same frames as the findings: what no sensor model can close.
     pub floor: f64,
     /// (before - after) / (before - floor); null where before is not above the floor.
     pub closed: Option<f64>,

@@ -39,6 +39,8 @@ pub struct Outcome {
     pub diagnosis: Diagnosis,
     /// Boxes of the measured labels moved to where they belong, by frame id; empty where the labels are not at fault.
     pub corrected: Vec<(String, Vec<Box3>)>,
+    /// Elevations of the rows of every sensor, from the lowest, degrees; empty where none stand out.
+    pub rows_deg: Vec<Vec<f64>>,
 }
 
 /// Diagnoses a pair of data sets.
@@ -65,7 +67,7 @@ pub fn diagnose(
     progress(Stage::Comparing, 2, 2);
     if !identity.identical {
         notes.insert(0, identity.reason);
-        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![] });
+        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![], rows_deg: vec![] });
     }
     for id in &identity.strangers {
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
@@ -80,7 +82,7 @@ pub fn diagnose(
             frames.len()
         ));
         let diagnosis = Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) };
-        return Ok(Outcome { diagnosis, corrected: vec![] });
+        return Ok(Outcome { diagnosis, corrected: vec![], rows_deg: vec![] });
     }
     let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
@@ -125,8 +127,13 @@ pub fn diagnose(
     results.push(search::noise::search(&context, &known, least_cos));
     context.frames = &frames;
     progress(Stage::Weighing, searches, searches);
+    if let Some(note) = search::set_aside(&mut results) {
+        notes.push(note);
+    }
     let corrected = corrected(&context, &results);
-    Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected })
+    let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
+    let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
+    Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
 }
 
 /// Measured boxes after all repairs; nothing where there is none.
@@ -229,24 +236,29 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
     }
 }
 
-/// Distances of the held-out frames together, with the interval of what is closed.
-fn gain(distance: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
-    let sum = |which: &[usize]| {
-        which.iter().fold([0.0; 3], |s, &i| [s[0] + distance[i][0], s[1] + distance[i][1], s[2] + distance[i][2]])
+/// Distances of the held-out frames together, with the interval of what is closed. `sums` holds of every frame its distance, what the findings
+/// gain, and what tables without any form would gain.
+fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
+    let total = |which: &[usize]| {
+        which.iter().fold([0.0; 3], |s, &i| [s[0] + sums[i][0], s[1] + sums[i][1], s[2] + sums[i][2]])
     };
     let closed =
-        |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
-    let all = sum(&(0..distance.len()).collect::<Vec<_>>());
+        |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0 && !nothing).then(|| gained / gained.max(table));
+    let all = total(&(0..sums.len()).collect::<Vec<_>>());
     let members = by_block(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let mut drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
+    let mut drawn: Vec<f64> =
+        (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
     drawn.sort_by(f64::total_cmp);
     let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
+    let gained = if nothing { 0.0 } else { all[1] };
+    let least = gained.max(if nothing { 0.0 } else { all[2] });
+    let before = all[0].max(least);
     Gain {
         metric: "nats_per_ray".into(),
-        before: all[0] / returns,
-        after: all[1] / returns,
-        floor: all[2] / returns,
+        before: before / returns,
+        after: (before - gained) / returns,
+        floor: (before - least) / returns,
         closed: closed(all),
         ci95: closed(all).and_then(|_| Some([at(0.025)?, at(0.975)?])),
     }

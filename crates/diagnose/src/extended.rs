@@ -32,8 +32,8 @@ const ORDER: [&str; 23] = [
     "time_offset",
 ];
 
-/// The text of `extended.toml`.
-pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig) -> String {
+/// The text of `extended.toml`. `rows_deg` holds the elevations of the rows of every sensor.
+pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
     let mut text = String::from(
         "# What the diagnosis adds to the simulation's sensor model: a list of effects. Intervals (95 %) stand behind the values.\n",
     );
@@ -58,7 +58,7 @@ pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig) -> String {
                 let first = Finding { cause: names.first().cloned(), ..f.clone() };
                 text.push_str(&named(&first, rig));
             }
-            Status::Unexplained => text.push_str(&empirical(f)),
+            Status::Unexplained => text.push_str(&empirical(f, rig, rows_deg)),
         }
     }
     text
@@ -223,22 +223,50 @@ fn blocked_box(f: &Finding, rig: &SensorRig) -> String {
     format!("[[effect]]\nkind = \"ego_body_mask\"\nboxes = [[{}]]\n", numbers.join(", "))
 }
 
-/// What has no name: a table along its covariate.
-fn empirical(f: &Finding) -> String {
-    let list = |g: fn(&crate::diagnosis::CurvePoint) -> f64| {
-        f.curve.points.iter().map(|p| format!("{:.4}", g(p))).collect::<Vec<_>>().join(", ")
-    };
-    let what = match f.channel.as_str() {
-        "hits" => "kept",
-        "roughness" => "std_m",
-        _ => "offset_m",
-    };
-    format!(
-        "[[effect]]\nkind = \"empirical\"\ncovariate = \"{}\"\nat = [{}]\n{what} = [{}]\n",
-        f.covariate,
-        list(|p| p.x),
-        list(|p| p.after)
-    )
+/// What has no name: a table along its covariate for each sensor.
+fn empirical(f: &Finding, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
+    let usual = f.parameters.get("simulated_std_m").map_or(0.0, |p| p.estimate);
+    let mut text = String::new();
+    for (sensor, mount) in rig.sensors.iter().enumerate() {
+        // Curves of sensors stand a thousand apart.
+        let own = f.curve.points.iter().filter(|p| (p.x / 1000.0).round() == sensor as f64);
+        let mut table: Vec<(f64, f64)> = own
+            .filter_map(|p| {
+                let x = p.x - 1000.0 * sensor as f64;
+                let at = if f.covariate == "row" {
+                    *rows_deg.get(sensor)?.get(x as usize)?
+                } else {
+                    crate::rig::wrapped((x + mount.yaw_deg).to_radians()).to_degrees()
+                };
+                let value = match f.channel.as_str() {
+                    "hits" => p.after.clamp(0.0, 1.0),
+                    "roughness" => usual * (p.after * p.after - 1.0).max(0.0).sqrt(),
+                    _ => p.after,
+                };
+                Some((at, value))
+            })
+            .collect();
+        table.sort_by(|a, b| a.0.total_cmp(&b.0));
+        table.dedup_by(|a, b| a.0 - b.0 < 1e-3);
+        if table.is_empty() {
+            continue;
+        }
+        let list =
+            |g: fn(&(f64, f64)) -> f64| table.iter().map(|p| format!("{:.4}", g(p))).collect::<Vec<_>>().join(", ");
+        let what = match f.channel.as_str() {
+            "hits" => "kept",
+            "roughness" => "std_m",
+            _ => "offset_m",
+        };
+        let covariate = if f.covariate == "row" { "elevation_deg" } else { "azimuth_deg" };
+        let _ = write!(
+            text,
+            "[[effect]]\nkind = \"empirical\"\nsensor = {sensor}\ncovariate = \"{covariate}\"\nat = [{}]\n{what} = [{}]\n",
+            list(|p| p.0),
+            list(|p| p.1)
+        );
+    }
+    text
 }
 
 fn short(v: f64) -> String {
@@ -252,7 +280,7 @@ fn toml_number(v: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnosis::{Curve, FindingGain, Gain, Parameter, SCHEMA, Verdict};
+    use crate::diagnosis::{Curve, CurvePoint, FindingGain, Gain, Parameter, SCHEMA, Verdict};
     use std::collections::BTreeMap;
 
     fn finding(cause: &str, parameters: &[(&str, f64)]) -> Finding {
@@ -298,12 +326,92 @@ mod tests {
             considered: vec![],
             notes: vec![],
         };
-        let text = extended_toml(&diagnosis, &SensorRig::single());
+        let text = extended_toml(&diagnosis, &SensorRig::single(), &[]);
         let table: toml::Table = toml::from_str(&text).unwrap();
         let kinds: Vec<&str> =
             table["effect"].as_array().unwrap().iter().map(|e| e["kind"].as_str().unwrap()).collect();
         assert_eq!(kinds, ["random_dropout", "range_noise", "label_offset"]);
         assert!(text.contains("share = 0.2 # 0.18 to 0.22") && text.contains("take it out there"), "{text}");
         assert!(text.contains("mend its world"), "{text}");
+    }
+
+    #[test]
+    fn the_simulator_reads_every_cause() {
+        let unexplained = |channel: &str, covariate: &str, at: &[f64]| Finding {
+            status: Status::Unexplained,
+            cause: None,
+            channel: channel.into(),
+            covariate: covariate.into(),
+            curve: Curve {
+                points: at
+                    .iter()
+                    .map(|x| CurvePoint { x: *x, measured: 0.9, before: 1.0, after: 0.9, error: 0.1 })
+                    .collect(),
+                ..Curve::default()
+            },
+            ..finding("", &[("simulated_std_m", 0.01)])
+        };
+        let findings = vec![
+            finding("range_noise", &[("std_m", 0.02), ("per_m", 1e-4)]),
+            finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
+            finding("signal_noise", &[("std_m", 0.02), ("exponent", 0.5)]),
+            finding("range_bias", &[("offset_m", -0.02), ("scale", 1e-3)]),
+            finding("beam_range_offset", &[("std_m", 0.02), ("lidar/0", 0.01), ("lidar/1", -0.01)]),
+            finding("beam_elevation_offset", &[("std_deg", 0.1)]),
+            finding("quantisation", &[("step_m", 0.02)]),
+            finding("angular_jitter", &[("std_deg", 0.05)]),
+            finding("random_dropout", &[("share", 0.2)]),
+            finding("signal_dropout", &[("threshold", 1.0), ("steepness", 3.0)]),
+            finding("incidence_dropout", &[("cos_half", 0.1), ("steepness", 3.0)]),
+            finding("range_dropout", &[("half_at_m", 50.0), ("steepness", 6.0)]),
+            finding("material_dropout", &[("share", 0.5)]),
+            finding("range_cut", &[("max_m", 80.0)]),
+            finding(
+                "ego_occlusion",
+                &[
+                    ("azimuth_from_deg", -10.0),
+                    ("azimuth_to_deg", 10.0),
+                    ("elevation_from_deg", -4.0),
+                    ("elevation_to_deg", 1.0),
+                ],
+            ),
+            finding("sensor_extrinsics", &[("sensor", 0.0), ("yaw_deg", 0.2)]),
+            finding("pitch_roll", &[("pitch_deg", 0.2)]),
+            finding("rolling_shutter", &[("scan_s", 0.1)]),
+            finding("outliers", &[("rate", 0.01)]),
+            finding("mixed_pixels", &[("share", 0.01)]),
+            finding("label_offset", &[("forward_m", 0.2)]),
+            finding("time_offset", &[("offset_s", 0.02)]),
+            finding("wrong_shape", &[("longer_m", 0.2)]),
+            finding("missing_object", &[("share", 0.02)]),
+            unexplained("hits", "azimuth", &[-30.0, 10.0, 50.0]),
+            unexplained("roughness", "row", &[0.0, 1.0]),
+            unexplained("residuals", "azimuth", &[-30.0, 10.0]),
+        ];
+        for f in findings {
+            let what = f.cause.clone().unwrap_or_else(|| f.channel.clone());
+            let diagnosis = Diagnosis {
+                schema: SCHEMA.into(),
+                verdict: Verdict::Explained,
+                frames: Default::default(),
+                findings: vec![f],
+                minimum_detectable: Default::default(),
+                gain: Gain {
+                    metric: "nats_per_ray".into(),
+                    before: 1.0,
+                    after: 0.1,
+                    floor: 0.0,
+                    closed: Some(0.9),
+                    ci95: None,
+                },
+                considered: vec![],
+                notes: vec![],
+            };
+            let text = extended_toml(&diagnosis, &SensorRig::single(), &[vec![-5.0, -4.0]]);
+            let read = simulate::effects::EffectList::parse(&text, std::path::Path::new("extended.toml"));
+            let effects = read.unwrap_or_else(|e| panic!("{what}: {e}\n{text}")).effects;
+            let of_the_world = matches!(what.as_str(), "wrong_shape" | "missing_object");
+            assert_eq!(effects.is_empty(), of_the_world, "{what}: {text}");
+        }
     }
 }

@@ -128,12 +128,43 @@ pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
     let beyond = above(&a, 1.01 * farthest) / above(&b, 1.01 * farthest).max(1.0);
     let step = lost > 60.0 && lost > 0.0005 * b.len() as f64 && beyond < 0.05;
-    (step && before_b > 40.0 && before_a > 0.7 * before_b).then_some(farthest)
+    (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
+}
+
+/// Where the share of measured returns among all falls, beyond `from_m`, m: the most likely single step.
+fn change(measured: &[f64], simulated: &[f64], from_m: f64) -> f64 {
+    let mut all: Vec<(f64, f64)> =
+        measured.iter().map(|r| (*r, 1.0)).chain(simulated.iter().map(|r| (*r, 0.0))).collect();
+    all.retain(|(r, _)| *r > from_m);
+    all.sort_by(|x, y| x.0.total_cmp(&y.0));
+    let total: f64 = all.iter().map(|(_, m)| m).sum();
+    let count = all.len() as f64;
+    let likelihood = |n: f64, m: f64| {
+        let p = ((m + 0.5) / (n + 1.0)).clamp(1e-6, 1.0 - 1e-6);
+        m * p.ln() + (n - m) * (1.0 - p).ln()
+    };
+    let (mut best, mut at, mut m) = (f64::NEG_INFINITY, from_m, 0.0);
+    for (i, (range, measured)) in all.iter().enumerate() {
+        m += measured;
+        let n = i as f64 + 1.0;
+        let value = likelihood(n, m) + likelihood(count - n, total - m);
+        if value > best {
+            (best, at) = (value, *range);
+        }
+    }
+    at
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_step_of_returns_is_found() {
+        let simulated: Vec<f64> = (0..2000).map(|i| 0.1 * f64::from(i) + 0.03).collect();
+        let measured: Vec<f64> = (0..800).map(|i| 0.1 * f64::from(i)).chain([130.0]).collect();
+        assert!((change(&measured, &simulated, 60.0) - 80.0).abs() < 0.2);
+    }
 
     #[test]
     fn a_hole_in_all_frames_is_found_and_a_single_dark_cell_is_not() {

@@ -96,19 +96,17 @@ pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
     differences[differences.len() / 2] / 0.6745 / 1.5f64.sqrt()
 }
 
-/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well.
-pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> (f64, f64) {
+/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well. The largest `trimmed` share of
+/// them does not count.
+pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
     let offsets = offsets(sums, how);
-    let (mut square, mut noise, mut n) = (0.0, 0.0, 0.0);
-    for (k, s) in sums {
-        let g = s.gram[2 * how.column];
-        if g > 3.0 * how.precision {
-            square += offsets[k].powi(2);
-            noise += 1.0 / g;
-            n += 1.0;
-        }
-    }
-    if n < 4.0 { (0.0, 0.0) } else { (((square - noise) / n).max(0.0).sqrt(), n) }
+    let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
+    let mut squares: Vec<(f64, f64)> = known.map(|(k, s)| (offsets[k].powi(2), 1.0 / s.gram[2 * how.column])).collect();
+    squares.sort_by(|a, b| a.0.total_cmp(&b.0));
+    squares.truncate(((1.0 - trimmed) * squares.len() as f64).ceil() as usize);
+    let n = squares.len() as f64;
+    let excess: f64 = squares.iter().map(|(square, noise)| square - noise).sum();
+    if n < 4.0 { (0.0, 0.0) } else { ((excess / n).max(0.0).sqrt(), n) }
 }
 
 #[cfg(test)]
@@ -136,7 +134,7 @@ mod tests {
         for rough in [false, true] {
             let frames = made(0.05, 0.0);
             assert!(cross_part_gains(&frames, &select, &select, how, rough).iter().sum::<f64>() > 50.0);
-            assert!((spread(&all(&frames), how).0 - 0.05).abs() < 0.01);
+            assert!((spread(&all(&frames), how, 0.0).0 - 0.05).abs() < 0.01);
             assert!((rough_spread(&all(&frames), how) - 0.05).abs() < 0.06, "{}", rough_spread(&all(&frames), how));
             let nothing = made(0.0, 0.0);
             assert!(cross_part_gains(&nothing, &select, &select, how, rough).iter().sum::<f64>() < 5.0);

@@ -124,20 +124,39 @@ impl LossTable {
         self.likelihood(laws, counts()) - self.likelihood(before, counts())
     }
 
-    /// Kullback-Leibler distance of a frame's counts from the laws, nats, and the number of cells that it sums over.
-    pub fn distance(&self, frame: &HitFrame, laws: &[FittedLaw]) -> (f64, f64) {
-        let (mut sum, mut cells) = (0.0, 0.0);
+    /// Share of matched returns of each cell as these frames have it, drawn a little towards the laws.
+    pub fn told(&self, laws: &[FittedLaw]) -> Vec<f64> {
+        let share = |(i, c): (usize, &HitCell)| {
+            let towards = self.matched(laws, i);
+            ((c.simulated_matched + PRIOR_RETURNS * towards) / (c.simulated.n + PRIOR_RETURNS)).clamp(1e-4, 1.0 - 1e-4)
+        };
+        self.cells.iter().enumerate().map(share).collect()
+    }
+
+    /// Gain of a frame by a table of matched shares, nats.
+    pub fn gain_by_table(&self, frame: &HitFrame, told: &[f64]) -> f64 {
+        let used = frame.iter().filter(|(i, _)| self.cells[*i as usize].simulated.n >= FEWEST);
+        used.map(|(i, c)| {
+            let (p, q) = (self.matched(&[], *i as usize), told[*i as usize]);
+            let (n, matched) = (c.simulated.n, c.simulated_matched);
+            matched * (q / p).ln() + (n - matched) * ((1.0 - q) / (1.0 - p)).ln()
+        })
+        .sum()
+    }
+
+    /// Kullback-Leibler distance of a frame's counts from a simulation that loses nothing, nats.
+    pub fn distance(&self, frame: &HitFrame) -> f64 {
+        let mut sum = 0.0;
         for (i, c) in frame {
             let (n, matched) = (c.simulated.n, c.simulated_matched);
             if self.cells[*i as usize].simulated.n < FEWEST || n < 1.0 {
                 continue;
             }
-            let p = self.matched(laws, *i as usize);
+            let p = self.matched(&[], *i as usize);
             let part = |k: f64, q: f64| if k > 0.0 { k * (k / n / q).ln() } else { 0.0 };
             sum += part(matched, p) + part(n - matched, 1.0 - p);
-            cells += 1.0;
         }
-        (sum, cells)
+        sum
     }
 
     /// Share that laws keep, in the order of [`LossTable::shares`].

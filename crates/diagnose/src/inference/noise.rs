@@ -132,6 +132,19 @@ impl NoiseTable {
             .sum()
     }
 
+    /// The same under the ratios of variances of `other` frames, cell by cell.
+    pub fn likelihood_by_table(&self, frame: &RoughFrame, other: &NoiseTable) -> f64 {
+        frame
+            .iter()
+            .filter_map(|(i, cell)| {
+                let [_, vb] = self.variances(*i as usize)?;
+                let ratio = other.variances(*i as usize).map_or(1.0, |[a, b]| a / b);
+                let (v, n) = (vb * ratio.max(0.1), cell.measured.n / SHARED);
+                (n > 0.0).then(|| -0.5 * n * (v.ln() + cell.variances()[0] / v))
+            })
+            .sum()
+    }
+
     /// Cells with enough returns: mean range, mean cosine, returns, variances.
     pub fn rows(&self) -> Vec<(f64, f64, f64, [f64; 2])> {
         (0..CELLS)

@@ -1,6 +1,6 @@
 //! Lost returns: which simulated returns has the measured side not, and on what does it depend?
 
-use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record};
+use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
 use crate::channels::cells::ZONE_NAMES;
 use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
@@ -73,7 +73,8 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
         let laws = refit(&table, &chosen);
         for grouping in [Grouping::Row, Grouping::Azimuth] {
             let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table.kept(&laws, c));
-            let (spread, _) = grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED);
+            let (spread, _) =
+                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED, trimmed(grouping));
             trials.push(Trial {
                 candidate: LAWS.len() + grouping as usize,
                 name: UNNAMED.into(),
@@ -137,12 +138,19 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
         let draws: Vec<FittedLaw> = repeated.iter().map(|r| r[k]).collect();
         result.found.push(found(&fitted[k], &draws, equals, confidence, gains, &table_h, &fitted));
     }
-    result.distance = hold_out.iter().map(|&i| distance(&table_h, &hits[i], &fitted)).collect();
+    let told = table_e.told(&fitted);
+    result.distance = hold_out
+        .iter()
+        .map(|&i| {
+            [table_h.distance(&hits[i]), table_h.gain(&hits[i], &fitted, &[]), table_h.gain_by_table(&hits[i], &told)]
+        })
+        .collect();
     if let Some((grouping, confidence)) = unnamed {
         let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table_e.kept(&fitted, c));
         let found = unnamed_found(&groups, grouping, &estimate, &hold_out, confidence);
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
-            d[1] = (d[1] - g).max(0.0);
+            d[1] += g;
+            d[2] += g.max(0.0);
         }
         result.found.push(found);
     }
@@ -164,7 +172,7 @@ fn unnamed_found(
 ) -> Found {
     let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
     let offsets = grouped::offsets(&all, GROUPED);
-    let (spread, _) = grouped::spread(&all, GROUPED);
+    let (spread, _) = grouped::spread(&all, GROUPED, trimmed(grouping));
     let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
     let points = offsets.iter().map(|(k, lost)| {
         let (sensor, place) = place_of(*k as usize, grouping);
@@ -206,13 +214,6 @@ pub(super) fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
 fn may_join(law: Law, chosen: &[Law]) -> bool {
     let smooth = |l: &Law| matches!(l, Law::Range | Law::Incidence | Law::Signal);
     !chosen.contains(&law) && !(smooth(&law) && chosen.iter().any(smooth))
-}
-
-/// Kullback-Leibler distance of a frame's losses, before and after, and of an independent draw.
-fn distance(table: &LossTable, frame: &HitFrame, laws: &[FittedLaw]) -> [f64; 3] {
-    let (before, cells) = table.distance(frame, &[]);
-    let (after, _) = table.distance(frame, laws);
-    [before, after, 0.5 * cells]
 }
 
 /// Numbers of a law as people read them.

@@ -50,7 +50,7 @@ const CAUSES: [Cause; 8] = [
 ];
 
 /// Names and their columns.
-const CANDIDATES: [(&str, &[usize]); 13] = [
+const CANDIDATES: [(&str, &[usize]); 14] = [
     ("label_offset", &[0]),
     ("label_offset", &[1]),
     ("label_offset", &[2]),
@@ -64,6 +64,8 @@ const CANDIDATES: [(&str, &[usize]); 13] = [
     ("wrong_shape", &[6]),
     ("wrong_shape", &[5, 2]),
     ("rolling_shutter", &[7]),
+    // The targets' clock where the own speed is not known: the constant is the own speed's share of it.
+    ("time_offset", &[0, 3]),
 ];
 
 /// Smaller constant shifts of labels and of objects are not spoken of, m.
@@ -111,17 +113,24 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let frames: Vec<&LinearFrame> = on_select.iter().collect();
     let precision = [0.0; 8];
     let floor = FLOOR_M[usize::from(side == Side::Objects)];
+    let speeds = own_speeds(motion.as_deref());
     let trial = |k: usize, columns: &[usize], before: Option<&[f64]>| {
         let fitted = fit(&frames, &blocks, columns, &precision);
         let own = CANDIDATES[k].1;
         let theta: Vec<f64> = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i]).collect();
         let size = theta.iter().map(|t| t.abs()).fold(0.0, f64::max);
         let moved = moved_m(&rows, own, &theta);
+        let plausible = own != [0, 3] || {
+            let at = columns.len() - 2;
+            theta[1].abs() > 3.0 * fitted.error(at + 1) && (speeds[0]..speeds[1]).contains(&(theta[0] / theta[1]))
+        };
         let mut gains = cross_gains(&frames, &blocks, columns, &precision);
         if let Some(before) = before {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
         }
-        let least = if CANDIDATES[k].0 == "time_offset" {
+        let least = if own == [0, 3] {
+            floor
+        } else if CANDIDATES[k].0 == "time_offset" {
             FLOOR_S
         } else if CANDIDATES[k].0 == "rolling_shutter" {
             0.005
@@ -133,7 +142,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
             name: CANDIDATES[k].0.into(),
             parameters: own.len(),
             gains,
-            above_floor: size > least && moved > LEAST_MOVED_M[usize::from(side == Side::Objects)],
+            above_floor: plausible && size > least && moved > LEAST_MOVED_M[usize::from(side == Side::Objects)],
         }
     };
     let allowed = |k: &usize| {
@@ -157,12 +166,17 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         }
     }
     let Some(first) = choice else {
-        result.distance = hold_out.iter().map(|&f| distance(&rows, f, None)).collect();
+        result.distance = hold_out.iter().map(|&f| [distance(&rows, f), 0.0, 0.0]).collect();
         return result;
     };
     let mut chosen = vec![trials[first.chosen].candidate];
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
+    let (name, own) = CANDIDATES[chosen[0]];
+    if name == "label_offset" && own.contains(&0) && usable[3] && late(&frames, &blocks, own, speeds) {
+        stories[0].0.push("time_offset".into());
+        stories[0].0.dedup();
+    }
     let (first_gain, _) = total_and_z(&trials[first.chosen].gains);
     let second_demands = Demands { nats: (0.1 * first_gain).max(8.0), ..demands };
     let first_columns = CANDIDATES[chosen[0]].1;
@@ -191,7 +205,10 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         let gains = on_hold_out.iter().map(|f| fitted.gain(f) - without.gain(f)).collect();
         result.found.push(found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
     }
-    result.distance = hold_out.iter().map(|&f| distance(&rows, f, Some(&fitted))).collect();
+    let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
+    let best = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &known, &[1e-3; 8]);
+    let of_frame = |(&f, sums): (&usize, &LinearFrame)| [distance(&rows, f), fitted.gain(sums), best.gain(sums)];
+    result.distance = hold_out.iter().zip(&on_hold_out).map(of_frame).collect();
     let of_labels = |k: &usize| matches!(CANDIDATES[*k].0, "label_offset" | "time_offset");
     if chosen.iter().all(of_labels) {
         result.repairs = rows.iter().map(|r| repair(r, &fitted, side)).collect();
@@ -327,6 +344,28 @@ fn robust(r: &Row, axis: usize) -> f64 {
     if u < 1.0 { 1.0 } else { 1.0 / u }
 }
 
+/// What the own speed may be, m/s: from the scene, or anything that a car does.
+fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
+    let mut known: Vec<f64> = motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect();
+    known.sort_by(f64::total_cmp);
+    match known.get(known.len() / 2) {
+        Some(&v) if v > 5.0 => [0.7 * v, 1.4 * v],
+        _ => [4.0, 90.0],
+    }
+}
+
+/// Whether an offset that is the same for all could as well be a late clock: the dependence on the seen velocity that this would make is
+/// not excluded.
+fn late(frames: &[&LinearFrame], blocks: &[usize], own: &[usize], speeds: [f64; 2]) -> bool {
+    let columns: Vec<usize> = own.iter().copied().chain([3]).collect();
+    let fitted = fit(frames, blocks, &columns, &[0.0; 8]);
+    let slope = fitted.theta[columns.len() - 1];
+    let reach = 2.5 * fitted.error(columns.len() - 1);
+    let forward = own.iter().position(|c| *c == 0).map_or(0.0, |i| fitted.theta[i]);
+    let ends = speeds.map(|v| forward / v);
+    slope + reach > ends[0].min(ends[1]) && slope - reach < ends[0].max(ends[1])
+}
+
 /// Root mean square of what columns with coefficients move objects by, m.
 fn moved_m(rows: &[Row], columns: &[usize], theta: &[f64]) -> f64 {
     let told = |r: &Row, axis: usize| columns.iter().zip(theta).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>();
@@ -334,20 +373,10 @@ fn moved_m(rows: &[Row], columns: &[usize], theta: &[f64]) -> f64 {
     (squares / rows.len().max(1) as f64).sqrt()
 }
 
-/// Half the squared shifts in units of their noise, before and after; of an independent draw half for each number.
-fn distance(rows: &[Row], frame: usize, fitted: Option<&LinearFit>) -> [f64; 3] {
-    let mut out = [0.0; 3];
-    for r in rows.iter().filter(|r| r.frame == frame) {
-        for axis in 0..3 {
-            let told = fitted
-                .map_or(0.0, |f| f.columns.iter().zip(f.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
-            let w = robust(r, axis) / r.variance[axis];
-            out[0] += 0.5 * w * r.shift[axis].powi(2);
-            out[1] += 0.5 * w * (r.shift[axis] - told).powi(2);
-            out[2] += 0.5;
-        }
-    }
-    out
+/// Half the squared shifts in units of their noise.
+fn distance(rows: &[Row], frame: usize) -> f64 {
+    let of = |r: &Row| (0..3).map(|axis| 0.5 * robust(r, axis) / r.variance[axis] * r.shift[axis].powi(2)).sum::<f64>();
+    rows.iter().filter(|r| r.frame == frame).map(of).sum()
 }
 
 #[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
@@ -370,6 +399,7 @@ fn found(
     for (i, &c) in own.clone().zip(columns) {
         let (theta, error) = (fitted.theta[i], fitted.error(i));
         match CAUSES[c] {
+            Cause::Forward if name == "time_offset" => continue,
             Cause::Forward => parameters.push(parameter("forward_m", sign * theta, error, "m")),
             Cause::Left => parameters.push(parameter("left_m", sign * theta, error, "m")),
             Cause::Up if name == "wrong_shape" => parameters.push(parameter("higher_m", theta, error, "m")),
@@ -395,13 +425,14 @@ fn found(
     };
     let clock = match columns {
         [3] => "; they move with the velocity that the sensor sees: all positions against the cloud",
-        [4] => "; they move with the targets' velocity over the ground: the targets' clock",
+        [4] | [0, 3] => "; they move with the targets' velocity over the ground: the targets' clock",
         _ => "",
     };
     let says = format!("{what}: {}{clock}", words.join(", "));
     let (covariate, x_column) = match columns {
         [3] => ("seen_velocity_m_s", 3),
         [4] => ("velocity_m_s", 4),
+        [0, 3] => ("velocity_m_s", 3),
         [7] => ("scan_phase * velocity", 7),
         [5, ..] | [6] => ("side_seen", columns[0]),
         _ => ("none", if usable[4] { 4 } else { 3 }),

@@ -49,7 +49,7 @@ pub fn search(context: &Context) -> (ChannelResult, Mask) {
     let minimum = Minimum { parameter: "azimuth_width_deg".into(), value: 2.0 * cell_deg, unit: "deg".into() };
     result.minimum.push(("ego_occlusion".into(), minimum));
     for found in &result.found {
-        result.distance.iter_mut().zip(&found.held_out_gains).for_each(|(d, g)| d[0] += g);
+        result.distance.iter_mut().zip(&found.held_out_gains).for_each(|(d, g)| (0..3).for_each(|k| d[k] += g));
     }
     (result, mask)
 }

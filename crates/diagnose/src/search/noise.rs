@@ -1,7 +1,8 @@
 //! Noise: are measured returns rougher than simulated ones, and on what does it depend?
 
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
+use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed};
 use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
+use crate::channels::mean::usual_noise_m;
 use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
@@ -56,7 +57,8 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
         let one = |grouping: Grouping| {
             let groups =
                 rough_groups(context.frames, context.rig, &scales, grouping, &|c| table.variances(c), &expected);
-            let (spread, _) = grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED);
+            let (spread, _) =
+                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED, trimmed(grouping));
             Trial {
                 candidate: NOISE_LAWS.len() + grouping as usize,
                 name: UNNAMED.into(),
@@ -147,14 +149,15 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
             &terms,
         ));
     }
-    result.distance = hold_out.iter().map(|&i| distance(&table_h, &rough[i], &terms)).collect();
+    result.distance = hold_out.iter().map(|&i| distance(&table_h, &table_e, &rough[i], &terms)).collect();
     if let Some(candidate) = unnamed {
         let grouping = if candidate == NOISE_LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
         let expected = |c: usize, ray: &Ray| expected(&table_e, c, ray, &terms);
         let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table_e.variances(c), &expected);
-        let found = unnamed_found(&groups, grouping, &estimate, &hold_out);
+        let found = unnamed_found(&groups, grouping, &estimate, &hold_out, usual_noise_m(context.frames));
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
-            d[1] = (d[1] - g).max(0.0);
+            d[1] += g;
+            d[2] += g.max(0.0);
         }
         result.found.push(found);
     }
@@ -177,7 +180,13 @@ fn expected(table: &NoiseTable, cell: usize, ray: &Ray, terms: &[(NoiseLaw, f64)
     1.0 + terms.iter().map(|(l, t)| t * l.variance(range, cos)).sum::<f64>() / vb
 }
 
-fn unnamed_found(groups: &[PartedFrame], grouping: Grouping, estimate: &[usize], hold_out: &[usize]) -> Found {
+fn unnamed_found(
+    groups: &[PartedFrame],
+    grouping: Grouping,
+    estimate: &[usize],
+    hold_out: &[usize],
+    usual_m: f64,
+) -> Found {
     let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
     let offsets = grouped::offsets(&all, GROUPED);
     let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
@@ -192,7 +201,7 @@ fn unnamed_found(groups: &[PartedFrame], grouping: Grouping, estimate: &[usize],
         status: Status::Unexplained,
         causes: vec![],
         family: "unknown",
-        parameters: vec![],
+        parameters: vec![parameter("simulated_std_m", usual_m, 0.05 * usual_m, "m")],
         confidence: 1.0,
         channel: "roughness",
         covariate: word.into(),
@@ -243,8 +252,8 @@ fn above_floor(table: &NoiseTable, law: NoiseLaw, theta: f64) -> bool {
     enough && share / n.max(1.0) > FLOOR_SHARE
 }
 
-/// Kullback-Leibler distance of a frame's roughness, before and after, and of an independent draw: half a nat a cell.
-fn distance(table: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -> [f64; 3] {
+/// Kullback-Leibler distance of a frame's roughness from the simulation, the gain of laws, and that of the variances of `other` frames.
+fn distance(table: &NoiseTable, other: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -> [f64; 3] {
     let best: f64 = frame
         .iter()
         .filter_map(|(i, cell)| {
@@ -253,8 +262,8 @@ fn distance(table: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -
             (n > 0.0).then(|| -0.5 * n * (cell.variances()[0].max(1e-12).ln() + 1.0))
         })
         .sum();
-    let cells = frame.iter().filter(|(i, c)| table.variances(*i as usize).is_some() && c.measured.n > 0.0).count();
-    [best - table.likelihood(frame, &[]), best - table.likelihood(frame, terms), 0.55 * cells as f64]
+    let before = table.likelihood(frame, &[]);
+    [best - before, table.likelihood(frame, terms) - before, table.likelihood_by_table(frame, other) - before]
 }
 
 fn unique(names: impl Iterator<Item = String>) -> Vec<String> {

@@ -69,7 +69,7 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
         })
         .collect();
     for (d, g) in result.distance.iter_mut().zip(&held) {
-        *d = [*g, 0.02 * g, 0.0];
+        *d = [*g; 3];
     }
     let mut fractions = [0.0f64; 20];
     let mut simulated = [0.0f64; 20];

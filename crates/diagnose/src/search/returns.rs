@@ -56,8 +56,8 @@ pub fn search(context: &Context) -> ChannelResult {
             let held: Vec<f64> = hold_out.iter().map(|&i| gain(&odd[i], k, base_e, more_e)).collect();
             result.found.push(found(context, kind, more_e, share_error, held, &odd, &estimate, z));
             for (d, &i) in result.distance.iter_mut().zip(&hold_out) {
-                let [b, a, f] = distance(&odd[i], k, base_e, more_e);
-                *d = [d[0] + b, d[1] + a, d[2] + f];
+                let (before, after) = distance(&odd[i], k, base_e, more_e);
+                *d = [d[0] + before, d[1] + before - after, d[2] + before - after];
             }
         }
         let considered = Considered {
@@ -103,13 +103,14 @@ fn gain(frame: &OddFrame, k: usize, base: f64, more: f64) -> f64 {
     frame.counts[k][0] * (rate / base).ln() - frame.all[0] * (rate - base)
 }
 
-fn distance(frame: &OddFrame, k: usize, base: f64, more: f64) -> [f64; 3] {
+/// Distance of a frame's count from the simulated share, and from that with what was found.
+fn distance(frame: &OddFrame, k: usize, base: f64, more: f64) -> (f64, f64) {
     let n = frame.counts[k][0];
     let from = |rate: f64| {
         let expected = frame.all[0] * rate.max(1e-9);
         (if n > 0.0 { n * (n / expected).ln() } else { 0.0 }) - (n - expected)
     };
-    [from(base), from((base + more).max(0.05 * base)), 0.5]
+    (from(base), from((base + more).max(0.05 * base)))
 }
 
 fn cross_gains(odd: &[OddFrame], select: &[usize], blocks: &[usize], k: usize) -> Vec<f64> {

@@ -23,7 +23,7 @@ use std::collections::BTreeMap;
 /// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
 const FLOOR_OFFSET_M: f64 = 0.012;
 const FLOOR_TURN_RAD: f64 = 3.5e-4;
-const FLOOR_SHIFT_M: f64 = 0.02;
+const FLOOR_SHIFT_M: f64 = 0.04;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
 
@@ -175,11 +175,17 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
             held,
         ));
     }
+    let every = everything(&sums, &estimate, &estimate_blocks);
     for (i, &f) in hold_out.iter().enumerate() {
-        let gain: f64 = chosen.iter().map(|s| told(&sums, &estimate, &estimate_blocks, s, &chosen, f)).sum();
-        let best = best_gain(&sums, f);
-        // What the best fit of this very frame explains stands for what could be told at all.
-        result.distance[i] = [best, (best - gain).max(0.0), 0.5 * sums.columns.len() as f64];
+        let each: Vec<(bool, f64)> = chosen
+            .iter()
+            .map(|s| (matches!(s, Suspect::Groups { .. }), told(&sums, &estimate, &estimate_blocks, s, &chosen, f)))
+            .collect();
+        let gain: f64 = each.iter().map(|e| e.1).sum();
+        let groups: f64 = each.iter().filter(|e| e.0).map(|e| e.1).sum();
+        let best = every.0.gain(&sums.linear[f]) - every.1.gain(&sums.linear[f]) + groups.max(0.0);
+        // The sums have no distance of their own: it is what they could gain at most.
+        result.distance[i] = [best.max(gain).max(0.0), gain, best];
     }
     let out = displacement(context.rig, &sums, &select, &blocks, &chosen);
     (result, out)
@@ -370,7 +376,7 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
             let all = total(select.iter().map(|&i| &frames[i]));
             match grouping {
                 Grouping::Row => grouped::rough_spread(&all, how(*column)) > FLOOR_GROUPS[*column],
-                Grouping::Azimuth => grouped::spread(&all, how(*column)).0 > FLOOR_GROUPS[2],
+                Grouping::Azimuth => grouped::spread(&all, how(*column), 0.0).0 > FLOOR_GROUPS[2],
             }
         }
         Suspect::Linear { columns, .. } => {
@@ -384,7 +390,7 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
                 })
                 .sum()
             };
-            let biased = [10.0, 40.0].iter().any(|r| bias(*r).abs() > FLOOR_OFFSET_M);
+            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 2.0 * FLOOR_OFFSET_M;
             biased
                 || fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
                     columns.contains(c)
@@ -440,16 +446,11 @@ fn told(sums: &Sums, estimate: &[usize], blocks: &[usize], suspect: &Suspect, ch
     }
 }
 
-/// What could be told of a frame at all: the best of its own fits.
-fn best_gain(sums: &Sums, frame: usize) -> f64 {
-    let alone = [&sums.linear[frame]];
+/// Fits of all columns and of the structures alone.
+fn everything(sums: &Sums, frames: &[usize], blocks: &[usize]) -> (LinearFit, LinearFit) {
+    let frames: Vec<&LinearFrame> = frames.iter().map(|&i| &sums.linear[i]).collect();
     let all: Vec<usize> = (0..sums.columns.len()).collect();
-    let linear = fit(&alone, &[0], &all, &sums.precision).gain(alone[0]).max(0.0);
-    let groups = [(Grouping::Row, 0), (Grouping::Row, 1), (Grouping::Azimuth, 0)].map(|(g, c)| {
-        let frames = groups_of(sums, g);
-        grouped::gain(&frames[frame], c, &grouped::offsets(&total([&frames[frame]].into_iter()), how(c))).max(0.0)
-    });
-    linear + groups.into_iter().fold(0.0, f64::max)
+    (fit(&frames, blocks, &all, &sums.precision), fit(&frames, blocks, &sums.base, &sums.precision))
 }
 
 fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Minimum)> {
