@@ -1,10 +1,11 @@
 //! The whole way from two data sets to a diagnosis.
 
+use crate::channels::returns;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
 use crate::error::DiagnoseError;
 use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
-use crate::pairing::{Ray, check_identity, common_ids, find_sensors, pair_all};
+use crate::pairing::{FramePair, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all};
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
@@ -90,6 +91,7 @@ pub fn diagnose(
     if times.is_none() {
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
+    notes.extend(limits(&frames));
     let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
     let searches = 7;
     let mut results: Vec<ChannelResult> = Vec::new();
@@ -136,13 +138,39 @@ pub fn diagnose(
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
 }
 
+/// What the pairs themselves do not let be judged: labels that do not meet, and a simulation that ends earlier.
+fn limits(frames: &[FramePair]) -> Vec<String> {
+    let mut notes = Vec::new();
+    let count = |f: fn(&ObjectPair) -> bool| frames.iter().flat_map(|p| &p.objects).filter(|o| f(o)).count();
+    let [both, simulated, measured] = [
+        count(|o| o.simulated.is_some() && o.measured.is_some()),
+        count(|o| o.simulated.is_some()),
+        count(|o| o.measured.is_some()),
+    ];
+    if simulated.min(measured) > 10 && both * 5 < simulated.min(measured) {
+        notes.push(format!(
+            "of {measured} measured and {simulated} simulated labels only {both} lie within 4 m of each other: are they written in the same frame (label_frame, calib)?"
+        ));
+    }
+    let end = returns::end_m(frames);
+    let all: usize = frames.iter().map(|f| f.measured.len()).sum();
+    let beyond = frames.iter().flat_map(|f| &f.measured).filter(|r| r.own_range_m() > 1.05 * end).count();
+    if beyond * 200 > all {
+        notes.push(format!(
+            "{:.1} % of the measured returns lie beyond {end:.0} m, where the simulation ends: they were not looked at",
+            100.0 * beyond as f64 / all as f64
+        ));
+    }
+    notes
+}
+
 /// Measured boxes after all repairs; nothing where there is none.
 fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
     let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
     if repairs.is_empty() {
         return vec![];
     }
-    let boxes = |(f, frame): (usize, &crate::pairing::FramePair)| {
+    let boxes = |(f, frame): (usize, &FramePair)| {
         let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
             let mut b = o.measured?;
             for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {

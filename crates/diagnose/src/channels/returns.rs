@@ -56,15 +56,24 @@ pub struct OddFrame {
     pub at_edges: f64,
 }
 
-/// Counts of every frame. The two sides may have been thinned differently: simulated counts are scaled to the measured share.
-pub fn odd_frames(frames: &[FramePair]) -> Vec<OddFrame> {
+/// Where the simulation ends, m: but for a few, no return lies farther. Beyond it the measured side cannot be judged.
+pub fn end_m(frames: &[FramePair]) -> f64 {
+    let mut ranges: Vec<f64> =
+        frames.iter().flat_map(|f| f.simulated.iter().step_by(7)).map(Ray::own_range_m).collect();
+    ranges.sort_by(f64::total_cmp);
+    let last = ranges.len().saturating_sub(1 + ranges.len() / 2000);
+    ranges.get(last).copied().unwrap_or(f64::INFINITY)
+}
+
+/// Counts of every frame, of returns nearer than `end_m`. The two sides may have been thinned differently: simulated counts are scaled to the measured share.
+pub fn odd_frames(frames: &[FramePair], end_m: f64) -> Vec<OddFrame> {
     frames
         .par_iter()
         .map(|frame| {
             let mut out =
                 OddFrame { all: [frame.measured.len() as f64, frame.simulated.len() as f64], ..OddFrame::default() };
             for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
-                for ray in rays {
+                for ray in rays.iter().filter(|r| r.own_range_m() < end_m) {
                     if let Some(kind) = odd(ray) {
                         out.counts[kind as usize][side] += 1.0;
                     }

@@ -3,7 +3,7 @@
 use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
 use crate::channels::cells::ZONE_NAMES;
 use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
-use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
+use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};

@@ -71,6 +71,12 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
     };
     let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| trial(&[k], None)).collect();
     trials.extend(directions(known));
+    // A table of directions follows the range and the incidence of each: a cause that explains most of it is preferred.
+    let best_named = total_of_best(&trials, &demands);
+    trials
+        .iter_mut()
+        .filter(|t| t.name == UNNAMED)
+        .for_each(|t| t.above_floor &= best_named < PREFERRED * total_and_z(&t.gains).0);
     let choice = choose(&trials, &demands);
     let returns = context.returns(&select);
     result.considered = record(&trials, choice.as_ref(), "roughness", returns, &demands);
@@ -109,7 +115,9 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
             .collect();
         let alone = whole(&[t.candidate]);
         let so_far: Vec<_> = known.iter().copied().chain([(NOISE_LAWS[t.candidate], alone.theta[0])]).collect();
-        rivals.extend(directions(&so_far));
+        let mut tables = directions(&so_far);
+        tables.iter_mut().for_each(|t| t.above_floor &= total_and_z(&t.gains).0 > REMAINING * first_gain);
+        rivals.extend(tables);
         let second = choose(&rivals, &second_demands);
         result.considered.extend(record(&rivals, second.as_ref(), "roughness", returns, &second_demands));
         if let Some(second) = second {
@@ -162,6 +170,18 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
         result.found.push(found);
     }
     result
+}
+
+/// Share of the gain of a table of directions from which on a named cause is preferred.
+const PREFERRED: f64 = 0.75;
+
+/// Share of a named cause's gain that a table of directions must bring on top of it.
+const REMAINING: f64 = 0.3;
+
+/// Gain of the best trial with a name.
+fn total_of_best(trials: &[Trial], demands: &Demands) -> f64 {
+    let named: Vec<Trial> = trials.iter().filter(|t| t.name != UNNAMED).cloned().collect();
+    choose(&named, demands).map_or(0.0, |c| total_and_z(&named[c.chosen].gains).0)
 }
 
 /// Name among the trials of what is in no catalogue.

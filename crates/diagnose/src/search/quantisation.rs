@@ -42,7 +42,10 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     }
     let spectrum = [&a, &b].map(|r| spectrum(r));
     let from = (BIN_M * BINS as f64 / LARGEST_M) as usize;
-    let peak = (from..BINS / 2).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
+    let first = (from..BINS / 2).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
+    // The flank of a peak comes before its top.
+    let peak =
+        first.and_then(|k| (k..(k + 6).min(BINS / 2)).max_by(|&i, &j| spectrum[0][i].total_cmp(&spectrum[0][j])));
     let strongest = (from..BINS / 2).map(|k| spectrum[0][k]).fold(0.0, f64::max);
     result.considered.push(Considered {
         cause: "quantisation".into(),

@@ -1,7 +1,7 @@
 //! Returns too many: false alarms, mixed ranges at edges, things that the simulation has not got.
 
 use super::{ChannelResult, Context, Found, Z_STAR, parameter};
-use crate::channels::returns::{ODD, Odd, OddFrame, odd_frames};
+use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{FOLDS, fold_of};
@@ -13,7 +13,7 @@ const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.003, 0.003];
 
 /// The search.
 pub fn search(context: &Context) -> ChannelResult {
-    let odd = odd_frames(context.frames);
+    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let blocks = context.blocks(&select);
     let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
