@@ -1,7 +1,7 @@
 //! Offsets of groups of rays: rows of a sensor, strips of azimuth. Each group has one number for its range, and rows one for their
 //! elevation as well; poses are taken out frame by frame before.
 
-use super::mean::{OwnPoses, STRAY_M, pose_row, usable, weight};
+use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
 use crate::pairing::{FramePair, Ray};
 use crate::rig::SensorRig;
 use nalgebra::{Point3, Vector3};
@@ -105,12 +105,12 @@ pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -
     -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
 }
 
-/// Sums of all frames. `structure` is what each kind of surface (ground, left, right) is off by, m.
+/// Sums of all frames. `structure` is what each kind of surface is off by, m.
 pub fn group_frames(
     frames: &[FramePair],
     rig: &SensorRig,
     poses: &[OwnPoses],
-    structure: [f64; 3],
+    structure: [f64; KINDS],
     grouping: Grouping,
     noise_m: f64,
     design: f64,
@@ -129,7 +129,7 @@ pub fn group_frames(
             if y.abs() > STRAY_M {
                 continue;
             }
-            let y = y - structure[super::mean::kind_of(ray, &origins[sensor])];
+            let y = y - structure[super::mean::kind_of(ray)];
             let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
             let w = weight(ray, noise_m) / design;
             sums[group][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {

@@ -159,6 +159,20 @@ impl LossTable {
         sum
     }
 
+    /// Range beyond which one simulated return in fifty lies, m.
+    pub fn farthest_m(&self) -> f64 {
+        let mut ranges: Vec<(f64, f64)> =
+            self.used.iter().map(|&i| (self.places[i].ln_range, self.cells[i].simulated.n)).collect();
+        ranges.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let all: f64 = ranges.iter().map(|r| r.1).sum();
+        let mut beyond = 0.0;
+        let at = ranges.iter().find(|(_, n)| {
+            beyond += n;
+            beyond > 0.02 * all
+        });
+        at.map_or(0.0, |r| r.0.exp())
+    }
+
     /// Share that laws keep, in the order of [`LossTable::shares`].
     pub fn kept_shares(&self, laws: &[FittedLaw]) -> Vec<f64> {
         self.used.iter().map(|&i| self.kept(laws, i)).collect()

@@ -250,8 +250,9 @@ fn found(
             let mean = drawn.iter().sum::<f64>() / drawn.len().max(1) as f64;
             let sd =
                 (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
-            // The form of the truth may differ.
-            let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs());
+            // The form of the truth may differ, the more so beyond the returns that there are.
+            let beyond = if *name == "half_at_m" { (estimate - table.farthest_m()).max(0.0) } else { 0.0 };
+            let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs()) + beyond;
             let parameter =
                 Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
             ((*name).to_owned(), parameter)
@@ -317,7 +318,8 @@ fn form_error(law: Law) -> f64 {
     match law {
         Law::Random => 0.01,
         Law::Zone(_) => 0.04,
-        _ => 0.04,
+        Law::Incidence => 0.1,
+        _ => 0.05,
     }
 }
 

@@ -1,11 +1,13 @@
 //! Labels and objects: do measured labels stand where the measured returns are, and do the objects stand where the simulation has them?
 
+mod words;
+
 use super::geometry::Displacement;
-use super::{ChannelResult, Context, Found, Repair, Z_STAR, confidence, first_demands, parameter, record};
+use super::{ChannelResult, Context, Repair, Z_STAR, confidence, first_demands, record};
 use crate::channels::labels::{ObjectShift, object_shifts};
 use crate::channels::mean::origins;
 use crate::channels::motion::{OwnMotion, own_motion};
-use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
+use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
@@ -203,7 +205,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         let mut without = fitted.clone();
         own.clone().for_each(|i| without.theta[i] = 0.0);
         let gains = on_hold_out.iter().map(|f| fitted.gain(f) - without.gain(f)).collect();
-        result.found.push(found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
+        result.found.push(words::found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
     }
     let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
     let best = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &known, &[1e-3; 8]);
@@ -377,122 +379,4 @@ fn moved_m(rows: &[Row], columns: &[usize], theta: &[f64]) -> f64 {
 fn distance(rows: &[Row], frame: usize) -> f64 {
     let of = |r: &Row| (0..3).map(|axis| 0.5 * robust(r, axis) / r.variance[axis] * r.shift[axis].powi(2)).sum::<f64>();
     rows.iter().filter(|r| r.frame == frame).map(of).sum()
-}
-
-#[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
-fn found(
-    candidate: usize,
-    fitted: &LinearFit,
-    own: std::ops::Range<usize>,
-    equals: Vec<String>,
-    confidence: f64,
-    held_out_gains: Vec<f64>,
-    side: Side,
-    rows: &[Row],
-    usable: &[bool],
-) -> Found {
-    let (name, columns) = CANDIDATES[candidate];
-    // Labels that stand ahead of the returns are the same as returns that stand behind the labels.
-    let sign = if side == Side::Labels { 1.0 } else { -1.0 };
-    let mut parameters = Vec::new();
-    let mut words = Vec::new();
-    for (i, &c) in own.clone().zip(columns) {
-        let (theta, error) = (fitted.theta[i], fitted.error(i));
-        match CAUSES[c] {
-            Cause::Forward if name == "time_offset" => continue,
-            Cause::Forward => parameters.push(parameter("forward_m", sign * theta, error, "m")),
-            Cause::Left => parameters.push(parameter("left_m", sign * theta, error, "m")),
-            Cause::Up if name == "wrong_shape" => parameters.push(parameter("higher_m", theta, error, "m")),
-            Cause::Up => parameters.push(parameter("up_m", sign * theta, error, "m")),
-            Cause::SeenVelocity | Cause::Velocity => {
-                parameters.push(parameter("offset_s", -sign * theta, error.hypot(0.02 * theta), "s"))
-            }
-            Cause::Longer => parameters.push(parameter("longer_m", 2.0 * theta, 2.0 * error, "m")),
-            Cause::Wider => parameters.push(parameter("wider_m", 2.0 * theta, 2.0 * error, "m")),
-            Cause::Swept => parameters.push(parameter("scan_s", -theta, error.hypot(0.05 * theta), "s")),
-        }
-        words.push(format!(
-            "{} {:+.3} {}",
-            parameters[parameters.len() - 1].0,
-            parameters[parameters.len() - 1].1.estimate,
-            parameters[parameters.len() - 1].1.unit
-        ));
-    }
-    let what = if side == Side::Labels {
-        "measured labels stand beside the simulated ones, the returns do not"
-    } else {
-        "measured objects stand beside the simulated ones"
-    };
-    let clock = match columns {
-        [3] => "; they move with the velocity that the sensor sees: all positions against the cloud",
-        [4] | [0, 3] => "; they move with the targets' velocity over the ground: the targets' clock",
-        _ => "",
-    };
-    let says = format!("{what}: {}{clock}", words.join(", "));
-    let (covariate, x_column) = match columns {
-        [3] => ("seen_velocity_m_s", 3),
-        [4] => ("velocity_m_s", 4),
-        [0, 3] => ("velocity_m_s", 3),
-        [7] => ("scan_phase * velocity", 7),
-        [5, ..] | [6] => ("side_seen", columns[0]),
-        _ => ("none", if usable[4] { 4 } else { 3 }),
-    };
-    let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
-    let separate_by = (!equals.is_empty()).then(|| {
-        "targets at very different speeds: a constant offset does not change with speed, a late clock's does".to_owned()
-    });
-    let axis = match columns {
-        [1] | [6] => 1,
-        [2] => 2,
-        _ => 0,
-    };
-    let family = match name {
-        "time_offset" | "rolling_shutter" => "timing",
-        "wrong_shape" => "geometry",
-        _ => "labels",
-    };
-    Found {
-        status,
-        causes: std::iter::once(name.to_owned()).chain(equals).collect(),
-        family,
-        parameters,
-        confidence,
-        channel: if side == Side::Labels { "labels" } else { "objects" },
-        covariate: covariate.into(),
-        held_out_gains,
-        says,
-        separate_by,
-        curve: curve(rows, x_column, axis, fitted),
-    }
-}
-
-fn curve(rows: &[Row], column: usize, axis: usize, fitted: &LinearFit) -> Curve {
-    let mut points: Vec<(f64, f64, f64)> = rows
-        .iter()
-        .map(|r| {
-            let told = fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>();
-            let x = if column == 4 {
-                r.speed.unwrap_or(0.0)
-            } else {
-                r.x[axis.min(if column == 6 { 1 } else { 0 })][column]
-            };
-            (x, r.shift[axis], told)
-        })
-        .collect();
-    points.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let per = (points.len() / 12).max(1);
-    let points = points.chunks(per).map(|chunk| {
-        let n = chunk.len() as f64;
-        let mean = |f: fn(&(f64, f64, f64)) -> f64| chunk.iter().map(f).sum::<f64>() / n;
-        let measured = mean(|p| p.1);
-        let sd = (chunk.iter().map(|p| (p.1 - measured).powi(2)).sum::<f64>() / n).sqrt();
-        CurvePoint { x: mean(|p| p.0), measured, before: 0.0, after: mean(|p| p.2), error: sd / n.sqrt() }
-    });
-    let x = match column {
-        3 => "velocity that the sensor sees, forward, m/s",
-        4 => "velocity over the ground, m/s",
-        7 => "velocity times phase of the scan, m/s",
-        _ => "side seen (1: front or left, -1: rear or right)",
-    };
-    Curve { x: x.into(), y: format!("shift {}, m", ["forward", "left", "up"][axis]), points: points.collect() }
 }

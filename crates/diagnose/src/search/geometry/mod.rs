@@ -1,15 +1,16 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
+mod suspects;
 mod words;
 
-use super::{ChannelResult, Context, Z_STAR, confidence, first_demands, record};
+use self::suspects::{Suspect, UNNAMED, may_join, suspects};
+use super::{ChannelResult, Context, confidence, first_demands, record};
 use crate::channels::groups::{
     GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole,
 };
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
-use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
@@ -26,13 +27,6 @@ const FLOOR_TURN_RAD: f64 = 3.5e-4;
 const FLOOR_SHIFT_M: f64 = 0.04;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
-
-/// What may be wrong.
-#[derive(Clone, Debug, PartialEq)]
-enum Suspect {
-    Linear { name: &'static str, columns: Vec<usize> },
-    Groups { name: &'static str, grouping: Grouping, column: usize },
-}
 
 /// Everything that candidates are weighed on.
 struct Sums {
@@ -147,7 +141,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "residuals", returns, &demands));
         if step == 0 {
-            result.minimum = minimum(&sums, &select, &blocks);
+            result.minimum = words::minimum(&sums, &select, &blocks);
         }
         let Some(choice) = choice else { break };
         let t = &trials[choice.chosen];
@@ -189,68 +183,6 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     }
     let out = displacement(context.rig, &sums, &select, &blocks, &chosen);
     (result, out)
-}
-
-impl Suspect {
-    fn name(&self) -> &'static str {
-        match self {
-            Suspect::Linear { name, .. } | Suspect::Groups { name, .. } => name,
-        }
-    }
-
-    fn parameters(&self) -> usize {
-        match self {
-            Suspect::Linear { columns, .. } => columns.len(),
-            Suspect::Groups { grouping: Grouping::Row, .. } => 12,
-            Suspect::Groups { .. } => 14,
-        }
-    }
-}
-
-fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
-    let at = |c: Column| columns.iter().position(|x| *x == c);
-    let pick = |list: &[Column]| list.iter().filter_map(|c| at(*c)).collect::<Vec<_>>();
-    let linear = |name, list: &[Column]| Suspect::Linear { name, columns: pick(list) };
-    let mut all = vec![
-        linear("range_bias", &[Column::RangeOffset]),
-        linear("range_bias", &[Column::RangeScale]),
-        linear("range_bias", &[Column::RangeOffset, Column::RangeScale]),
-        linear("pitch_roll", &[Column::Pose(1)]),
-        linear("pitch_roll", &[Column::Pose(0)]),
-        linear("pitch_roll", &[Column::Pose(0), Column::Pose(1)]),
-        linear("rolling_shutter", &[Column::Sweep(0)]),
-        linear("rolling_shutter", &[Column::Sweep(0), Column::Sweep(2)]),
-    ];
-    if context.rig.sensors.len() > 1 {
-        for s in 0..context.rig.sensors.len() {
-            for k in 0..3 {
-                all.push(linear("sensor_extrinsics", &[Column::SensorPose(s, k)]));
-            }
-            all.push(linear("sensor_extrinsics", &[0, 1, 2].map(|k| Column::SensorPose(s, k))));
-            all.push(linear("sensor_extrinsics", &[3, 4, 5].map(|k| Column::SensorPose(s, k))));
-            all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(|k| Column::SensorPose(s, k))));
-        }
-    } else {
-        for k in 0..3 {
-            all.push(linear("sensor_extrinsics", &[Column::Pose(k)]));
-        }
-        all.push(linear("sensor_extrinsics", &[0, 1, 2].map(Column::Pose)));
-        all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(Column::Pose)));
-    }
-    all.push(Suspect::Groups { name: "beam_range_offset", grouping: Grouping::Row, column: 0 });
-    all.push(Suspect::Groups { name: "beam_elevation_offset", grouping: Grouping::Row, column: 1 });
-    all.push(Suspect::Groups { name: UNNAMED, grouping: Grouping::Azimuth, column: 0 });
-    all
-}
-
-/// Name among the trials of what depends on azimuth: no cause of the catalogue.
-const UNNAMED: &str = "unexplained";
-
-fn may_join(suspect: &Suspect, chosen: &[Suspect]) -> bool {
-    chosen.iter().all(|c| {
-        let grouped = |s: &Suspect| matches!(s, Suspect::Groups { .. });
-        c.name() != suspect.name() && !(grouped(c) && grouped(suspect))
-    })
 }
 
 fn sums(context: &Context, select: &[usize]) -> Sums {
@@ -297,7 +229,7 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
     let base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
-    let structure = [structure.theta[0], structure.theta[1], structure.theta[2]];
+    let structure = std::array::from_fn(|k| structure.theta[k]);
     let groups = |g| {
         let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
         Groups { whole: parted.iter().map(whole).collect(), parted }
@@ -390,7 +322,7 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
                 })
                 .sum()
             };
-            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 2.0 * FLOOR_OFFSET_M;
+            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 2.5 * FLOOR_OFFSET_M;
             biased
                 || fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
                     columns.contains(c)
@@ -451,29 +383,4 @@ fn everything(sums: &Sums, frames: &[usize], blocks: &[usize]) -> (LinearFit, Li
     let frames: Vec<&LinearFrame> = frames.iter().map(|&i| &sums.linear[i]).collect();
     let all: Vec<usize> = (0..sums.columns.len()).collect();
     (fit(&frames, blocks, &all, &sums.precision), fit(&frames, blocks, &sums.base, &sums.precision))
-}
-
-fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Minimum)> {
-    let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
-    let error = |c: Column| {
-        let k = sums.columns.iter().position(|x| *x == c)?;
-        let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
-        Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
-    };
-    let mut all = Vec::new();
-    let mut push = |name: &str, parameter: &str, value: Option<f64>, floor: f64, unit: &str, factor: f64| {
-        if let Some(v) = value {
-            let minimum =
-                Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
-            all.push((name.to_owned(), minimum));
-        }
-    };
-    let deg = 1f64.to_degrees();
-    push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
-    push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
-    let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
-    push("sensor_extrinsics", "yaw_deg", error(one), FLOOR_TURN_RAD, "deg", deg);
-    push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
-    push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
-    all
 }

@@ -3,10 +3,10 @@
 use super::{Sums, Suspect, UNNAMED, fit_all, groups_of, how};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
-use crate::diagnosis::{Curve, CurvePoint, Parameter, Status};
+use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::grouped;
-use crate::inference::linear::LinearFit;
-use crate::search::{Context, Found, parameter};
+use crate::inference::linear::{LinearFit, LinearFrame, fit};
+use crate::search::{Context, Found, Z_STAR, parameter};
 use nalgebra::Vector3;
 use std::collections::BTreeMap;
 
@@ -210,4 +210,30 @@ fn group_curve(
     let x = if grouping == Grouping::Row { "row (1000 a sensor)" } else { "azimuth, degrees (1000 a sensor)" };
     let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
     Curve { x: x.into(), y: y.into(), points: points.collect() }
+}
+
+/// Smallest effects that would have been seen.
+pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Minimum)> {
+    let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
+    let error = |c: Column| {
+        let k = sums.columns.iter().position(|x| *x == c)?;
+        let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
+        Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
+    };
+    let mut all = Vec::new();
+    let mut push = |name: &str, parameter: &str, value: Option<f64>, floor: f64, unit: &str, factor: f64| {
+        if let Some(v) = value {
+            let minimum =
+                Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
+            all.push((name.to_owned(), minimum));
+        }
+    };
+    let deg = 1f64.to_degrees();
+    push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
+    push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
+    let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
+    push("sensor_extrinsics", "yaw_deg", error(one), FLOOR_TURN_RAD, "deg", deg);
+    push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
+    push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
+    all
 }
