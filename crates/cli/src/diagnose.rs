@@ -98,7 +98,7 @@ impl DiagnoseArgs {
     }
 }
 
-/// Corrected labels, in the clouds' frame, with the classes of the measured ones.
+/// Corrected labels, in the clouds' frame and of the data set's first class.
 fn write_labels(out: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box3]) -> Result<()> {
     let class = measured.config.classes.first().map_or("Car", String::as_str);
     let lines: Vec<KittiLine> = boxes.iter().map(|b| KittiLine::from_box(class, b, None)).collect();

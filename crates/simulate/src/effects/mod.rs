@@ -148,7 +148,6 @@ effects! {
     encoder_ripple::EncoderRipple "E1",
     mount_vibration::MountVibration "E2",
     point_order::PointOrder "E3",
-    empirical::Empirical "E4",
 }
 
 /// An ordered list of effects, as a TOML of `[[effect]]` tables.

@@ -1,6 +1,6 @@
 //! What the search of geometry found, in words and numbers.
 
-use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Suspect, Sums, UNNAMED, fit_all, groups_of, how};
+use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, UNNAMED, fit_all, groups_of, how};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
