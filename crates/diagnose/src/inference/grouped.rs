@@ -135,7 +135,8 @@ mod tests {
             let frames = made(0.05, 0.0);
             assert!(cross_part_gains(&frames, &select, &select, how, rough).iter().sum::<f64>() > 50.0);
             assert!((spread(&all(&frames), how, 0.0).0 - 0.05).abs() < 0.01);
-            assert!((rough_spread(&all(&frames), how) - 0.05).abs() < 0.06, "{}", rough_spread(&all(&frames), how));
+            // Neighbours differ by twice the offset each time.
+            assert!((rough_spread(&all(&frames), how) - 0.12).abs() < 0.03, "{}", rough_spread(&all(&frames), how));
             let nothing = made(0.0, 0.0);
             assert!(cross_part_gains(&nothing, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
             let surface = made(0.0, 0.2);

@@ -144,6 +144,7 @@ mod tests {
         assert!(fitted.theta[0].abs() < 3.5 * fitted.error(0));
         let gain: f64 = cross_gains(&refs, &blocks, &[1], &[0.0, 0.0]).iter().sum();
         let none: f64 = cross_gains(&refs, &blocks, &[0], &[0.0, 0.0]).iter().sum();
-        assert!(gain > 20.0 && none < 3.0, "{gain} {none}");
+        // Chance gains less than a choice demands.
+        assert!(gain > 20.0 && none < 8.0, "{gain} {none}");
     }
 }
