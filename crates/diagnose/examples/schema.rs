@@ -2,5 +2,5 @@
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn main() {
-    print!("{}", diagnose::diagnosis::schema_json());
+    print!("{}", lidarshift_diagnose::diagnosis::schema_json());
 }
