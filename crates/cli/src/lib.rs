@@ -4,6 +4,7 @@ pub mod bench_step;
 pub mod detect;
 pub mod detectors;
 pub mod device;
+pub mod diagnose;
 pub mod doctor;
 pub mod eval_ap;
 pub mod eval_distances;
@@ -54,6 +55,8 @@ enum Command {
     Report(report_command::ReportArgs),
     /// Make a data set from another one with physical effects on top
     Resim(resim::ResimArgs),
+    /// What a simulation gets wrong against measured data, why, and what mending it gains
+    Diagnose(diagnose::DiagnoseArgs),
     /// What is wrong with a data set, in words
     Doctor(doctor::DoctorArgs),
     /// Compare every tensor with a folder of reference numbers
@@ -98,7 +101,10 @@ impl Eval {
     }
 }
 
-/// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood.
+/// Exit code of a diagnosis whose two sides do not show the same scenes.
+const NOT_THE_SAME_SCENES: u8 = 3;
+
+/// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood; a diagnosis has a code of its own.
 pub fn run() -> ExitCode {
     let done = match Program::parse().command {
         Command::Train(args) => args.run().map(|()| true),
@@ -109,6 +115,10 @@ pub fn run() -> ExitCode {
         Command::Study(args) => args.run().map(|()| true),
         Command::StudyRun(args) => args.run().map(|()| true),
         Command::Resim(args) => args.run().map(|()| true),
+        Command::Diagnose(args) => match args.run() {
+            Ok(false) => return ExitCode::from(NOT_THE_SAME_SCENES),
+            done => done,
+        },
         Command::Doctor(args) => args.run(),
         Command::Parity(args) => args.run(),
         Command::Schema(args) => args.run().map(|()| true),

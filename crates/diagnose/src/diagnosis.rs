@@ -139,7 +139,7 @@ pub struct Gain {
     pub before: f64,
     /// With the extended simulation.
     pub after: f64,
-    /// Of an independent draw of the extended simulation itself.
+    /// What would be left with tables without any form, fitted on the same frames as the findings: what no sensor model can close.
     pub floor: f64,
     /// (before - after) / (before - floor); null where before is not above the floor.
     pub closed: Option<f64>,
@@ -186,4 +186,40 @@ pub struct CurvePoint {
     pub after: f64,
     /// Standard error of the measured value.
     pub error: f64,
+}
+
+/// The JSON schema of the file, as docs/diagnosis.schema.json has it.
+pub fn schema_json() -> String {
+    format!("{:#}\n", schemars::schema_for!(Diagnosis).to_value())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_schema_in_the_docs_is_up_to_date() {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/diagnosis.schema.json");
+        let text = fs_err::read_to_string(path).unwrap();
+        let how = "run `cargo run -p lidarshift-diagnose --example schema > docs/diagnosis.schema.json`";
+        assert!(text == schema_json(), "docs/diagnosis.schema.json is stale: {how}");
+    }
+
+    #[test]
+    fn names_in_the_file_are_those_of_the_schema() {
+        let schema = schemars::schema_for!(Diagnosis).to_value();
+        let required: Vec<&str> = schema["required"].as_array().unwrap().iter().filter_map(|v| v.as_str()).collect();
+        for name in ["schema", "verdict", "frames", "findings", "minimum_detectable", "gain"] {
+            assert!(required.contains(&name), "{name}");
+        }
+        for (verdict, name) in [
+            (Verdict::NothingFound, "nothing_found"),
+            (Verdict::Explained, "explained"),
+            (Verdict::PartlyExplained, "partly_explained"),
+            (Verdict::Unexplained, "unexplained"),
+            (Verdict::NotScenarioIdentical, "not_scenario_identical"),
+        ] {
+            assert_eq!(serde_json::to_value(verdict).unwrap(), name);
+        }
+    }
 }

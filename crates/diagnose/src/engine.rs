@@ -1,13 +1,16 @@
 //! The whole way from two data sets to a diagnosis.
 
+use crate::channels::returns;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
 use crate::error::DiagnoseError;
+use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
-use crate::pairing::{check_identity, common_ids, find_sensors, pair_all};
+use crate::pairing::{FramePair, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all};
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
+use geometry::Box3;
 
 /// What to look at.
 #[derive(Clone, Debug, Default)]
@@ -30,6 +33,17 @@ pub enum Stage {
 /// Told what is being done, how much of it is finished and how much there is.
 pub type Progress<'a> = &'a (dyn Fn(Stage, usize, usize) + Sync);
 
+/// A diagnosis with what follows from it.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// What is said.
+    pub diagnosis: Diagnosis,
+    /// Boxes of the measured labels moved to where they belong, by frame id; empty where the labels are not at fault.
+    pub corrected: Vec<(String, Vec<Box3>)>,
+    /// Elevations of the rows of every sensor, from the lowest, degrees; empty where none stand out.
+    pub rows_deg: Vec<Vec<f64>>,
+}
+
 /// Diagnoses a pair of data sets.
 pub fn diagnose(
     measured: &Dataset,
@@ -37,7 +51,7 @@ pub fn diagnose(
     rig: &SensorRig,
     options: &Options,
     progress: Progress,
-) -> Result<Diagnosis, DiagnoseError> {
+) -> Result<Outcome, DiagnoseError> {
     let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
     progress(Stage::Comparing, 0, 2);
     let sensors = find_sensors(measured, simulated, &ids, rig)?;
@@ -54,21 +68,22 @@ pub fn diagnose(
     progress(Stage::Comparing, 2, 2);
     if !identity.identical {
         notes.insert(0, identity.reason);
-        return Ok(refused(notes));
+        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![], rows_deg: vec![] });
     }
     for id in &identity.strangers {
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
     let (frames, more) =
-        pair_all(measured, simulated, &ids, &sensors, &|done| progress(Stage::Pairing, done, ids.len()))?;
+        pair_all(measured, simulated, &ids, &sensors, None, &|done| progress(Stage::Pairing, done, ids.len()))?;
     notes.extend(more);
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
             frames.len()
         ));
-        return Ok(Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) });
+        let diagnosis = Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) };
+        return Ok(Outcome { diagnosis, corrected: vec![], rows_deg: vec![] });
     }
     let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
@@ -76,20 +91,96 @@ pub fn diagnose(
     if times.is_none() {
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
-    let context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
-    let searches = 5;
+    notes.extend(limits(&frames));
+    let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
+    let searches = 7;
     let mut results: Vec<ChannelResult> = Vec::new();
     progress(Stage::Weighing, 0, searches);
-    results.push(search::noise::search(&context, &[]));
+    let (geometry, displaced) = search::geometry::search(&context);
+    results.push(geometry);
     progress(Stage::Weighing, 1, searches);
-    results.push(search::hits::search(&context));
+    let (rounding, added) = search::quantisation::search(&context);
+    let known: Vec<_> = added.map(|v| (NoiseLaw::Constant, v)).into_iter().collect();
+    results.push(rounding);
     progress(Stage::Weighing, 2, searches);
-    results.push(search::labels::search(&context, Side::Labels));
-    results.push(search::labels::search(&context, Side::Objects));
+    let (hidden, mask) = search::mask::search(&context);
+    results.push(hidden);
+    results.push(search::hits::search(&context, &mask, displaced.moves()));
+    progress(Stage::Weighing, 3, searches);
+    results.push(search::labels::search(&context, Side::Labels, &displaced));
+    results.push(search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, 4, searches);
-    results.push(search::geometry::search(&context));
+    results.push(search::returns::search(&context));
+    progress(Stage::Weighing, 5, searches);
+    // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
+    let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
+    let mended = match &displaced.groups {
+        Some(_) => {
+            let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
+            let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
+            Some(pair_all(measured, simulated, &used, &sensors, Some(&off), &|_| ())?.0)
+        }
+        None => None,
+    };
+    if let Some(mended) = &mended {
+        context.frames = mended;
+    }
+    let least_cos = if mended.is_some() { 0.12 } else { 0.0 };
+    results.push(search::noise::search(&context, &known, least_cos));
+    context.frames = &frames;
     progress(Stage::Weighing, searches, searches);
-    Ok(write_up(&context, results, notes))
+    if let Some(note) = search::set_aside(&mut results) {
+        notes.push(note);
+    }
+    let corrected = corrected(&context, &results);
+    let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
+    let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
+    Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
+}
+
+/// What the pairs themselves do not let be judged: labels that do not meet, and a simulation that ends earlier.
+fn limits(frames: &[FramePair]) -> Vec<String> {
+    let mut notes = Vec::new();
+    let count = |f: fn(&ObjectPair) -> bool| frames.iter().flat_map(|p| &p.objects).filter(|o| f(o)).count();
+    let [both, simulated, measured] = [
+        count(|o| o.simulated.is_some() && o.measured.is_some()),
+        count(|o| o.simulated.is_some()),
+        count(|o| o.measured.is_some()),
+    ];
+    if simulated.min(measured) > 10 && both * 5 < simulated.min(measured) {
+        notes.push(format!(
+            "of {measured} measured and {simulated} simulated labels only {both} lie within 4 m of each other: are they written in the same frame (label_frame, calib)?"
+        ));
+    }
+    let end = returns::end_m(frames);
+    let all: usize = frames.iter().map(|f| f.measured.len()).sum();
+    let beyond = frames.iter().flat_map(|f| &f.measured).filter(|r| r.own_range_m() > 1.05 * end).count();
+    if beyond * 200 > all {
+        notes.push(format!(
+            "{:.1} % of the measured returns lie beyond {end:.0} m, where the simulation ends: they were not looked at",
+            100.0 * beyond as f64 / all as f64
+        ));
+    }
+    notes
+}
+
+/// Measured boxes after all repairs; nothing where there is none.
+fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
+    let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
+    if repairs.is_empty() {
+        return vec![];
+    }
+    let boxes = |(f, frame): (usize, &FramePair)| {
+        let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
+            let mut b = o.measured?;
+            for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {
+                (0..3).for_each(|axis| b.center[axis] += r.shift_m[axis]);
+            }
+            Some(b)
+        });
+        (frame.id.clone(), moved.collect())
+    };
+    context.frames.iter().enumerate().map(boxes).collect()
 }
 
 /// A diagnosis that says nothing but its notes.
@@ -111,7 +202,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
     let hold_out = context.of(Role::HoldOut);
     let blocks = context.blocks(&hold_out);
     let returns = context.returns(&hold_out).max(1.0);
-    let mut findings = Vec::new();
+    let mut findings: Vec<Finding> = Vec::new();
     let mut considered = Vec::new();
     let mut minimum_detectable = std::collections::BTreeMap::new();
     let mut distance = vec![[0.0; 3]; hold_out.len()];
@@ -123,6 +214,19 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
         }
         for f in result.found {
             let named = f.status == Status::Named;
+            let gain = mean_interval(&f.held_out_gains, &blocks, returns);
+            // One cause seen in two channels is one finding.
+            let same = findings
+                .iter_mut()
+                .find(|g: &&mut Finding| named && g.cause.as_deref() == f.causes.first().map(String::as_str));
+            if let Some(same) = same {
+                same.gain.nats_per_ray += gain.nats_per_ray;
+                (0..2).for_each(|k| same.gain.ci95[k] += gain.ci95[k]);
+                for (name, p) in f.parameters {
+                    same.parameters.entry(name).or_insert(p);
+                }
+                continue;
+            }
             findings.push(Finding {
                 status: f.status,
                 cause: named.then(|| f.causes[0].clone()),
@@ -132,7 +236,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
                 confidence: f.confidence,
                 channel: f.channel.into(),
                 covariate: f.covariate,
-                gain: mean_interval(&f.held_out_gains, &blocks, returns),
+                gain,
                 says: f.says,
                 separate_by: f.separate_by,
                 curve: f.curve,
@@ -160,24 +264,29 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
     }
 }
 
-/// Distances of the held-out frames together, with the interval of what is closed.
-fn gain(distance: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
-    let sum = |which: &[usize]| {
-        which.iter().fold([0.0; 3], |s, &i| [s[0] + distance[i][0], s[1] + distance[i][1], s[2] + distance[i][2]])
+/// Distances of the held-out frames together, with the interval of what is closed. `sums` holds of every frame its distance, what the findings
+/// gain, and what tables without any form would gain.
+fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
+    let total = |which: &[usize]| {
+        which.iter().fold([0.0; 3], |s, &i| [s[0] + sums[i][0], s[1] + sums[i][1], s[2] + sums[i][2]])
     };
     let closed =
-        |[before, after, floor]: [f64; 3]| (before > floor && !nothing).then(|| (before - after) / (before - floor));
-    let all = sum(&(0..distance.len()).collect::<Vec<_>>());
+        |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0 && !nothing).then(|| gained / gained.max(table));
+    let all = total(&(0..sums.len()).collect::<Vec<_>>());
     let members = by_block(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let mut drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(sum(&draw_blocks(&members, &mut rng)))).collect();
+    let mut drawn: Vec<f64> =
+        (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
     drawn.sort_by(f64::total_cmp);
     let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
+    let gained = if nothing { 0.0 } else { all[1] };
+    let least = gained.max(if nothing { 0.0 } else { all[2] });
+    let before = all[0].max(least);
     Gain {
         metric: "nats_per_ray".into(),
-        before: all[0] / returns,
-        after: all[1] / returns,
-        floor: all[2] / returns,
+        before: before / returns,
+        after: (before - gained) / returns,
+        floor: (before - least) / returns,
         closed: closed(all),
         ci95: closed(all).and_then(|_| Some([at(0.025)?, at(0.975)?])),
     }

@@ -7,12 +7,14 @@ pub mod channels;
 pub mod diagnosis;
 mod engine;
 mod error;
+mod extended;
 pub mod inference;
 pub mod pairing;
 mod rig;
 pub mod search;
 
-pub use diagnosis::{Diagnosis, Finding, SCHEMA, Status, Verdict};
-pub use engine::{Options, Progress, Stage, diagnose};
+pub use diagnosis::{Curve, CurvePoint, Diagnosis, Finding, FindingGain, SCHEMA, Status, Verdict};
+pub use engine::{Options, Outcome, Progress, Stage, diagnose};
 pub use error::DiagnoseError;
+pub use extended::extended_toml;
 pub use rig::{SensorMount, SensorRig, wrapped};

@@ -50,8 +50,12 @@ fn twenty() -> f64 {
 impl SensorRig {
     /// Reads a rig.
     pub fn read(path: &Path) -> Result<Self, DataError> {
-        let text = fs_err::read_to_string(path)?;
-        let rig: SensorRig = toml::from_str(&text).map_err(|e| {
+        Self::parse(&fs_err::read_to_string(path)?, path)
+    }
+
+    /// A rig in memory; `path` is for messages.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
+        let rig: SensorRig = toml::from_str(text).map_err(|e| {
             let line = 1 + e.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count());
             DataError::line(path, line, e.message())
         })?;

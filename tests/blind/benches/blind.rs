@@ -2,7 +2,7 @@
 //! run goes on.
 //!
 //! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N] [--shots N]
-//! [--out DIR] [--show] [--keep DIR]`
+//! [--out DIR] [--keep DIR]`
 
 use data::Dataset;
 use diagnose::{Options, SensorRig, diagnose};
@@ -18,7 +18,6 @@ struct Arguments {
     first: u64,
     size: CaseSize,
     out: PathBuf,
-    show: bool,
     keep: Option<PathBuf>,
 }
 
@@ -29,7 +28,6 @@ fn arguments() -> Arguments {
         first: 1,
         size: CaseSize::USUAL,
         out: PathBuf::from("bench/blind"),
-        show: false,
         keep: None,
     };
     let mut words = std::env::args().skip(1);
@@ -43,7 +41,6 @@ fn arguments() -> Arguments {
             "--shots" => out.size.shots = value().parse().expect("a number of shots"),
             "--out" => out.out = value().into(),
             "--keep" => out.keep = Some(value().into()),
-            "--show" => out.show = true,
             "--bench" => {}
             other => panic!("unknown word {other}"),
         }
@@ -85,7 +82,7 @@ fn run(seed: u64, arguments: &Arguments, folder: &Path) -> (Outcome, serde_json:
     let rig = SensorRig::read(&folder.join("sensor.toml")).expect("a rig");
     let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
     let value = match found {
-        Ok(d) => serde_json::to_value(&d).expect("JSON"),
+        Ok(o) => serde_json::to_value(&o.diagnosis).expect("JSON"),
         Err(e) => serde_json::json!({ "verdict": format!("error: {e}") }),
     };
     (score(&truth, &value, begin.elapsed().as_secs_f64()), value)
@@ -104,13 +101,8 @@ fn main() {
             let place =
                 arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
             let (outcome, value) = run(seed, &arguments, &place);
-            if arguments.show {
-                let mut short = value.clone();
-                for f in short["findings"].as_array_mut().into_iter().flatten() {
-                    f.as_object_mut().map(|f| f.remove("curve"));
-                }
-                println!("{}", serde_json::to_string_pretty(&short).expect("JSON"));
-            }
+            let told = arguments.out.join(format!("diagnosis-{seed}.json"));
+            data::write_atomic(&told, &serde_json::to_vec_pretty(&value).expect("JSON")).expect("a diagnosis");
             data::write_atomic(&path, &serde_json::to_vec_pretty(&outcome).expect("JSON")).expect("a result");
             outcome
         });

@@ -14,8 +14,6 @@ pub struct CaseSize {
 }
 
 impl CaseSize {
-    /// For tests of minutes.
-    pub const SMALL: CaseSize = CaseSize { frames: 40, shots: 9_000 };
     /// Of the large set.
     pub const USUAL: CaseSize = CaseSize { frames: 40, shots: 25_000 };
     /// Of real recordings.

@@ -129,23 +129,23 @@ impl Effect {
         let deg = f64::to_degrees;
         let list: Vec<(&str, f64)> = match self {
             Effect::RangeNoise { sigma_m, growth_per_m } => {
-                vec![("sigma_m", *sigma_m), ("growth_per_m", *growth_per_m)]
+                vec![("std_m", *sigma_m), ("per_m", growth_per_m * sigma_m)]
             }
             Effect::RangeBias { offset_m, scale } => vec![("offset_m", *offset_m), ("scale", *scale)],
             Effect::BeamRangeOffset { std_m } => vec![("std_m", *std_m)],
             Effect::BeamElevationOffset { std_rad } => vec![("std_deg", deg(*std_rad))],
             Effect::Quantisation { step_m } => vec![("step_m", *step_m)],
-            Effect::AngularJitter { sigma_rad } => vec![("sigma_deg", deg(*sigma_rad))],
+            Effect::AngularJitter { sigma_rad } => vec![("std_deg", deg(*sigma_rad))],
             Effect::RandomDropout { share } => vec![("share", *share)],
             Effect::SignalDropout { half_at, speckle } => vec![("half_at", *half_at), ("speckle", *speckle)],
             Effect::RangeDropout { half_at_m, softness_m } => {
                 vec![("half_at_m", *half_at_m), ("softness_m", *softness_m)]
             }
-            Effect::IncidenceDropout { half_at_cos, power } => vec![("half_at_cos", *half_at_cos), ("power", *power)],
+            Effect::IncidenceDropout { half_at_cos, power } => vec![("cos_half", *half_at_cos), ("power", *power)],
             Effect::MaterialDropout { share, .. } => vec![("share", *share)],
-            Effect::RangeCut { max_m } => vec![("max_range_m", *max_m)],
+            Effect::RangeCut { max_m } => vec![("max_m", *max_m)],
             Effect::EgoOcclusion { center_m, .. } => vec![("center_x_m", center_m[0]), ("center_y_m", center_m[1])],
-            Effect::TimeOffset { seconds, .. } => vec![("dt_s", *seconds)],
+            Effect::TimeOffset { seconds, .. } => vec![("offset_s", -seconds)],
             Effect::LabelOffset { offset_m } => {
                 vec![("forward_m", offset_m[0]), ("left_m", offset_m[1]), ("up_m", offset_m[2])]
             }
@@ -154,16 +154,16 @@ impl Effect {
                 ("roll_deg", deg(turn_rad[0])),
                 ("pitch_deg", deg(turn_rad[1])),
                 ("yaw_deg", deg(turn_rad[2])),
-                ("x_m", shift_m[0]),
-                ("y_m", shift_m[1]),
-                ("z_m", shift_m[2]),
+                ("forward_m", shift_m[0]),
+                ("left_m", shift_m[1]),
+                ("up_m", shift_m[2]),
             ],
             Effect::PitchRoll { pitch_rad, roll_rad } => {
                 vec![("pitch_deg", deg(*pitch_rad)), ("roll_deg", deg(*roll_rad))]
             }
             Effect::RollingShutter { scan_s } => vec![("scan_s", *scan_s)],
-            Effect::Outliers { share } => vec![("share", *share)],
-            Effect::MixedPixels { divergence_rad } => vec![("divergence_mrad", divergence_rad * 1e3)],
+            Effect::Outliers { share } => vec![("rate", *share)],
+            Effect::MixedPixels { divergence_rad } => vec![("divergence_rad", *divergence_rad)],
             Effect::MissingObject { things } => vec![("things", *things as f64)],
             Effect::WrongShape { length, height } => vec![("length_share", *length), ("height_share", *height)],
             Effect::AzimuthRipple { amplitude_m, waves } => vec![("amplitude_m", *amplitude_m), ("waves", *waves)],

@@ -129,15 +129,15 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, sums: &Sums) -> Tr
         let n = sums.returns.max(1.0);
         let list: Vec<(&str, f64)> = match effect {
             Effect::RangeNoise { sigma_m, .. } => {
-                vec![("sigma_m", (sigma_m.powi(2) + own_variance) / sigma_m / (2.0 * n).sqrt())]
+                vec![("std_m", (sigma_m.powi(2) + own_variance) / sigma_m / (2.0 * n).sqrt())]
             }
             Effect::RandomDropout { share } => vec![("share", (share * (1.0 - share) / n).sqrt())],
-            Effect::Outliers { share } => vec![("share", (share / n).sqrt())],
+            Effect::Outliers { share } => vec![("rate", (share / n).sqrt())],
             Effect::AngularJitter { sigma_rad } => {
                 let signal = sigma_rad.powi(2) * sums.lever / n;
-                vec![("sigma_deg", sigma_rad.to_degrees() * (signal + own_variance) / signal / (2.0 * n).sqrt())]
+                vec![("std_deg", sigma_rad.to_degrees() * (signal + own_variance) / signal / (2.0 * n).sqrt())]
             }
-            Effect::TimeOffset { .. } => vec![("dt_s", own.labels_m / sums.boxes[1].max(1.0).sqrt())],
+            Effect::TimeOffset { .. } => vec![("offset_s", own.labels_m / sums.boxes[1].max(1.0).sqrt())],
             Effect::LabelOffset { .. } => {
                 let se = own.labels_m / sums.boxes[0].max(1.0).sqrt();
                 vec![("forward_m", se), ("left_m", se), ("up_m", se)]

@@ -1,7 +1,7 @@
 //! Offsets of groups of rays: rows of a sensor, strips of azimuth. Each group has one number for its range, and rows one for their
 //! elevation as well; poses are taken out frame by frame before.
 
-use super::mean::{OwnPoses, STRAY_M, pose_row, usable, weight};
+use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
 use crate::pairing::{FramePair, Ray};
 use crate::rig::SensorRig;
 use nalgebra::{Point3, Vector3};
@@ -78,6 +78,25 @@ impl GroupSums {
 /// Groups of one frame, by number.
 pub type GroupFrame = Vec<(u32, GroupSums)>;
 
+/// Parts that the rays of a group are cut into.
+pub const PARTS: usize = 4;
+
+/// Groups of one frame by part: rows by quarters of the field of view, strips of azimuth by bands of elevation.
+pub type PartedFrame = [GroupFrame; PARTS];
+
+/// Part of a ray within its group.
+pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
+    let at = match grouping {
+        Grouping::Row => f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad) + 0.5,
+        // Bands that hold about as many rays of a car's sensor each: edges at -10, -5 and -1 degrees.
+        Grouping::Azimuth => {
+            let below = [-0.175, -0.087, -0.017].iter().filter(|edge| f64::from(ray.elevation_rad) > **edge).count();
+            (below as f64 + 0.5) / PARTS as f64
+        }
+    };
+    ((at * PARTS as f64).floor().max(0.0) as usize).min(PARTS - 1)
+}
+
 /// Derivative of the distance across the surface by the row's elevation, m/rad.
 pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -> f64 {
     let (az, el) = (f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
@@ -86,41 +105,49 @@ pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -
     -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
 }
 
-/// Sums of all frames. `structure` is what each kind of surface (ground, left, right) is off by, m.
+/// Sums of all frames. `structure` is what each kind of surface is off by, m.
 pub fn group_frames(
     frames: &[FramePair],
     rig: &SensorRig,
     poses: &[OwnPoses],
-    structure: [f64; 3],
+    structure: [f64; KINDS],
     grouping: Grouping,
     noise_m: f64,
     design: f64,
-) -> Vec<GroupFrame> {
+) -> Vec<PartedFrame> {
     let origins = super::mean::origins(rig);
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let groups = rig.sensors.len() * if grouping == Grouping::Row { ROWS } else { STRIPS };
-    let one = |(frame, poses): (&FramePair, &OwnPoses)| -> GroupFrame {
-        let mut sums = vec![GroupSums::default(); groups];
+    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let one = |(frame, poses): (&FramePair, &OwnPoses)| -> PartedFrame {
+        let mut sums = vec![[GroupSums::default(); PARTS]; groups];
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let Some(group) = group_of(ray, grouping) else { continue };
             let sensor = ray.sensor as usize;
             let row = pose_row(ray, &origins[sensor], &Point3::origin());
-            let y = ray.across_m() - row.dot(&poses[sensor]);
+            let y = ray.across_nearest_m() - row.dot(&poses[sensor]);
             if y.abs() > STRAY_M {
                 continue;
             }
-            let y = y - structure[super::mean::kind_of(ray, &origins[sensor])];
+            let y = y - structure[super::mean::kind_of(ray)];
             let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
             let w = weight(ray, noise_m) / design;
-            sums[group].merge(&GroupSums {
+            sums[group][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {
                 gram: [w * x[0] * x[0], w * x[0] * x[1], w * x[1] * x[1]],
                 right: [w * x[0] * y, w * x[1] * y],
                 n: 1.0,
             });
         }
-        sums.into_iter().enumerate().filter(|(_, s)| s.n > 0.0).map(|(i, s)| (i as u32, s)).collect()
+        std::array::from_fn(|part| {
+            sums.iter().enumerate().filter(|(_, s)| s[part].n > 0.0).map(|(i, s)| (i as u32, s[part])).collect()
+        })
     };
     frames.par_iter().zip(poses).map(one).collect()
+}
+
+/// The parts of a frame together.
+pub fn whole(frame: &PartedFrame) -> GroupFrame {
+    total(frame.iter()).into_iter().collect()
 }
 
 /// Sums over frames, by group.

@@ -1,7 +1,10 @@
 //! Which returns have a counterpart on the other side, by direction.
 
 use super::cells::{CELLS, Place, cell};
+use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
+use super::mask::Mask;
 use crate::pairing::FramePair;
+use crate::rig::SensorRig;
 use rayon::prelude::*;
 
 /// Counts of one cell of one frame.
@@ -30,18 +33,18 @@ impl HitCell {
 /// Cells of one frame: those that hold something, by number.
 pub type HitFrame = Vec<(u32, HitCell)>;
 
-/// The cells of every frame.
-pub fn hit_frames(frames: &[FramePair]) -> Vec<HitFrame> {
+/// The cells of every frame; hidden rays are left out.
+pub fn hit_frames(frames: &[FramePair], mask: &Mask) -> Vec<HitFrame> {
     let one = |frame: &FramePair| -> HitFrame {
         let mut cells = vec![HitCell::default(); CELLS];
         for ray in &frame.simulated {
-            if let Some(c) = cell(ray) {
+            if let Some(c) = cell(ray).filter(|_| !mask.hides(ray)) {
                 cells[c].simulated.add(ray);
                 cells[c].simulated_matched += f64::from(u8::from(ray.matched));
             }
         }
         for ray in &frame.measured {
-            if let Some(c) = cell(ray) {
+            if let Some(c) = cell(ray).filter(|_| !mask.hides(ray)) {
                 cells[c].measured.add(ray);
                 cells[c].measured_matched += f64::from(u8::from(ray.matched));
             }
@@ -59,4 +62,42 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a HitFrame>) -> Vec<HitCell> {
         sum[*i as usize].merge(cell);
     }
     sum
+}
+
+/// Shares of returns that groups of directions lose beyond what `kept` tells of each cell, as sums of every frame.
+pub fn loss_groups(
+    frames: &[FramePair],
+    rig: &SensorRig,
+    mask: &Mask,
+    grouping: Grouping,
+    kept: &(dyn Fn(usize) -> f64 + Sync),
+) -> Vec<PartedFrame> {
+    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let one = |frame: &FramePair| -> PartedFrame {
+        // Simulated returns, measured ones, those expected to be lost, those without a counterpart.
+        let mut sums = std::collections::BTreeMap::<(usize, usize), [f64; 4]>::new();
+        for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
+            for ray in rays {
+                let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
+                if mask.hides(ray) {
+                    continue;
+                }
+                let sum = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
+                sum[side] += 1.0;
+                sum[3] += f64::from(u8::from(!ray.matched));
+                if side == 0 {
+                    sum[2] += 1.0 - kept(c);
+                }
+            }
+        }
+        let mut out: PartedFrame = [const { Vec::new() }; PARTS];
+        for ((g, part), [n, seen, lost, odd]) in sums.into_iter().filter(|(_, s)| s[0] >= 5.0) {
+            // Twice the count of odd ones: neighbours are lost together.
+            let w = n * n / (2.0 * (odd + 2.0));
+            let y = (n - seen - lost) / n;
+            out[part].push((g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
+        }
+        out
+    };
+    frames.par_iter().map(one).collect()
 }

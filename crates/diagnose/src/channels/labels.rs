@@ -11,6 +11,8 @@ use std::f64::consts::PI;
 pub struct ObjectShift {
     /// Number of the frame.
     pub frame: usize,
+    /// Number of the object in the frame.
+    pub object: usize,
     /// Measured label minus simulated label, m.
     pub label_m: [f64; 3],
     /// Difference of the headings, rad.
@@ -51,11 +53,12 @@ const FASTEST_M_S: f64 = 60.0;
 pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectShift> {
     let mut shifts = Vec::new();
     for (f, frame) in frames.iter().enumerate() {
-        for object in &frame.objects {
+        for (k, object) in frame.objects.iter().enumerate() {
             let (Some(simulated), Some(measured)) = (object.simulated, object.measured) else { continue };
             let center = Vector3::from(simulated.center);
             shifts.push(ObjectShift {
                 frame: f,
+                object: k,
                 label_m: simulated.to_local(measured.center),
                 label_yaw_rad: limit_period(measured.yaw_rad - simulated.yaw_rad, 0.5, PI),
                 cloud_m: object.shift.map(|s| (s.shift_m, s.error_m)),

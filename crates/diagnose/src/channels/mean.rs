@@ -21,8 +21,7 @@ pub enum Column {
     SensorPose(usize, usize),
     /// A shift along x, y or a turn about z that grows over a scan from -1/2 to +1/2.
     Sweep(usize),
-    /// Offset across one kind of surface, m: ground, standing to the left, standing to the right. No cause: what simulated surfaces are
-    /// wrong by.
+    /// Offset across one kind of surface, m: see [`kind_of`]. No cause: what simulated surfaces are wrong by.
     Structure(usize),
 }
 
@@ -31,7 +30,7 @@ pub fn columns(rig: &SensorRig) -> Vec<Column> {
     let mut all: Vec<Column> = (0..6).map(Column::Pose).collect();
     all.extend([Column::RangeOffset, Column::RangeScale]);
     all.extend((0..3).map(Column::Sweep));
-    all.extend((0..3).map(Column::Structure));
+    all.extend((0..KINDS).map(Column::Structure));
     if rig.sensors.len() > 1 {
         all.extend((0..rig.sensors.len()).flat_map(|s| (0..6).map(move |k| Column::SensorPose(s, k))));
     }
@@ -39,7 +38,7 @@ pub fn columns(rig: &SensorRig) -> Vec<Column> {
 }
 
 /// What a structure may be wrong by, m: standard deviation.
-pub const STRUCTURE_M: f64 = 0.015;
+pub const STRUCTURE_M: f64 = 0.02;
 
 /// Farther than that from the surface after the frame's own pose is taken out, a return is not of this surface, m.
 pub const STRAY_M: f64 = 0.30;
@@ -80,19 +79,23 @@ pub fn usable(ray: &Ray) -> bool {
     ray.smooth && matches!(ray.surface, Surface::Ground | Surface::Standing) && ray.cos_incidence > 0.003
 }
 
-/// Kind of its surface: ground, standing to the left, standing to the right.
-pub fn kind_of(ray: &Ray, origin: &Point3<f64>) -> usize {
+/// Kinds of surfaces.
+pub const KINDS: usize = 4;
+
+/// Kind of its surface: ground; standing and facing right, facing left, or facing along the car. A wall that follows a turn keeps its kind.
+pub fn kind_of(ray: &Ray) -> usize {
     match ray.surface {
         Surface::Ground => 0,
-        _ if ray.predicted_point(origin).y > 0.0 => 1,
-        _ => 2,
+        _ if ray.normal[1] < -0.3 => 1,
+        _ if ray.normal[1] > 0.3 => 2,
+        _ => 3,
     }
 }
 
 /// Inverse variance of its distance across the surface, 1/m2.
 pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
     let c = f64::from(ray.cos_incidence);
-    1.0 / ((c * noise_m).powi(2) * (1.0 + f64::from(ray.leverage)) + RIPPLE_M * RIPPLE_M)
+    1.0 / ((c * noise_m).powi(2) * 2.0 + RIPPLE_M * RIPPLE_M)
 }
 
 /// Derivatives of the distance across the surface by a movement of the scene about `center`.
@@ -119,7 +122,7 @@ fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: 
         .filter(|r| usable(r) && r.sensor as usize == sensor)
         .map(|r| {
             let row = pose_row(r, &origins[r.sensor as usize], &Point3::origin());
-            (row, r.across_m(), weight(r, noise_m))
+            (row, r.across_nearest_m(), weight(r, noise_m))
         })
         .collect();
     let mut pose = SVector::<f64, 6>::zeros();
@@ -153,7 +156,7 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
             for ray in frame.measured.iter().filter(|r| usable(r)) {
                 let w = weight(ray, noise_m);
                 let row = pose_row(ray, &origins[ray.sensor as usize], &Point3::origin());
-                let y = ray.across_m() - row.dot(&pose[ray.sensor as usize]);
+                let y = ray.across_nearest_m() - row.dot(&pose[ray.sensor as usize]);
                 if y.abs() > STRAY_M {
                     continue;
                 }
@@ -190,14 +193,14 @@ pub fn mean_frames(
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
             let row = pose_row(ray, origin, &Point3::origin());
-            let y = ray.across_m();
+            let y = ray.across_nearest_m();
             if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
             }
             let own = pose_row(ray, origin, origin);
             let phase = f64::from(ray.azimuth_rad) / (2.0 * half_fov[ray.sensor as usize]);
             let c = f64::from(ray.cos_incidence);
-            let kind = kind_of(ray, origin);
+            let kind = kind_of(ray);
             for (v, column) in x.iter_mut().zip(columns) {
                 *v = match *column {
                     Column::RangeOffset => -c,

@@ -4,6 +4,8 @@ pub mod cells;
 pub mod groups;
 pub mod hits;
 pub mod labels;
+pub mod mask;
 pub mod mean;
 pub mod motion;
+pub mod returns;
 pub mod roughness;

@@ -2,7 +2,9 @@
 //! slightly wrong walls cancel; noise along the ray and of the direction does not.
 
 use super::cells::{CELLS, Place, cell};
+use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use crate::pairing::{FramePair, Ray};
+use crate::rig::SensorRig;
 use rayon::prelude::*;
 
 /// Sums of one cell of one frame.
@@ -122,4 +124,45 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a RoughFrame>) -> Vec<RoughCell>
         sum[*i as usize].merge(cell);
     }
     sum
+}
+
+/// By how much the measured returns of groups of directions are rougher than `expected` tells, in units of the simulated variance, as sums
+/// of every frame. `variances` gives the two sides' variances of a cell, `expected` the measured one in units of the simulated one.
+pub fn rough_groups(
+    frames: &[FramePair],
+    rig: &SensorRig,
+    scales: &[f64],
+    grouping: Grouping,
+    variances: &(dyn Fn(usize) -> Option<[f64; 2]> + Sync),
+    expected: &(dyn Fn(usize, &Ray) -> f64 + Sync),
+) -> Vec<PartedFrame> {
+    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let one = |frame: &FramePair| -> PartedFrame {
+        // Of each side: returns, sum of squares less what is expected, sum of variances of the squares.
+        let mut sums = std::collections::BTreeMap::<(usize, usize), [[f64; 3]; 2]>::new();
+        for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
+            for ray in rays {
+                let (Some(c), Some(v), Some(g)) = (cell(ray), own_roughness_m(ray), group_of(ray, grouping)) else {
+                    continue;
+                };
+                let Some([va, vb]) = variances(c) else { continue };
+                let square = v.abs().min(CAP * scales[c]).powi(2) / vb;
+                let (mean, spread) = if side == 0 { (expected(c, ray), va / vb) } else { (1.0, 1.0) };
+                let sum =
+                    &mut sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default()[side];
+                sum[0] += 1.0;
+                sum[1] += square - mean;
+                sum[2] += 2.0 * spread * spread;
+            }
+        }
+        let mut out: PartedFrame = [const { Vec::new() }; PARTS];
+        for ((g, part), [a, b]) in sums.into_iter().filter(|(_, [a, b])| a[0] >= 5.0 && b[0] >= 5.0) {
+            let y = a[1] / a[0] - b[1] / b[0];
+            // Neighbours share neighbours.
+            let w = 1.0 / (2.0 * (a[2] / (a[0] * a[0]) + b[2] / (b[0] * b[0])));
+            out[part].push((g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n: a[0] }));
+        }
+        out
+    };
+    frames.par_iter().map(one).collect()
 }

@@ -17,22 +17,11 @@ pub enum Law {
     Signal,
     /// One kind of surface loses a share.
     Zone(usize),
-    /// Nothing beyond a range.
-    Cut,
 }
 
 /// All laws, in the order of how much they assume.
-pub const LAWS: [Law; 9] = [
-    Law::Random,
-    Law::Zone(0),
-    Law::Zone(1),
-    Law::Zone(2),
-    Law::Zone(3),
-    Law::Cut,
-    Law::Range,
-    Law::Incidence,
-    Law::Signal,
-];
+pub const LAWS: [Law; 8] =
+    [Law::Random, Law::Zone(0), Law::Zone(1), Law::Zone(2), Law::Zone(3), Law::Range, Law::Incidence, Law::Signal];
 
 /// Rows of a table: what the laws need to know of a cell.
 #[derive(Clone, Copy, Debug)]
@@ -135,20 +124,53 @@ impl LossTable {
         self.likelihood(laws, counts()) - self.likelihood(before, counts())
     }
 
-    /// Kullback-Leibler distance of a frame's counts from the laws, nats, and the number of cells that it sums over.
-    pub fn distance(&self, frame: &HitFrame, laws: &[FittedLaw]) -> (f64, f64) {
-        let (mut sum, mut cells) = (0.0, 0.0);
+    /// Share of matched returns of each cell as these frames have it, drawn a little towards the laws.
+    pub fn told(&self, laws: &[FittedLaw]) -> Vec<f64> {
+        let share = |(i, c): (usize, &HitCell)| {
+            let towards = self.matched(laws, i);
+            ((c.simulated_matched + PRIOR_RETURNS * towards) / (c.simulated.n + PRIOR_RETURNS)).clamp(1e-4, 1.0 - 1e-4)
+        };
+        self.cells.iter().enumerate().map(share).collect()
+    }
+
+    /// Gain of a frame by a table of matched shares, nats.
+    pub fn gain_by_table(&self, frame: &HitFrame, told: &[f64]) -> f64 {
+        let used = frame.iter().filter(|(i, _)| self.cells[*i as usize].simulated.n >= FEWEST);
+        used.map(|(i, c)| {
+            let (p, q) = (self.matched(&[], *i as usize), told[*i as usize]);
+            let (n, matched) = (c.simulated.n, c.simulated_matched);
+            matched * (q / p).ln() + (n - matched) * ((1.0 - q) / (1.0 - p)).ln()
+        })
+        .sum()
+    }
+
+    /// Kullback-Leibler distance of a frame's counts from a simulation that loses nothing, nats.
+    pub fn distance(&self, frame: &HitFrame) -> f64 {
+        let mut sum = 0.0;
         for (i, c) in frame {
             let (n, matched) = (c.simulated.n, c.simulated_matched);
             if self.cells[*i as usize].simulated.n < FEWEST || n < 1.0 {
                 continue;
             }
-            let p = self.matched(laws, *i as usize);
+            let p = self.matched(&[], *i as usize);
             let part = |k: f64, q: f64| if k > 0.0 { k * (k / n / q).ln() } else { 0.0 };
             sum += part(matched, p) + part(n - matched, 1.0 - p);
-            cells += 1.0;
         }
-        (sum, cells)
+        sum
+    }
+
+    /// Range beyond which one simulated return in fifty lies, m.
+    pub fn farthest_m(&self) -> f64 {
+        let mut ranges: Vec<(f64, f64)> =
+            self.used.iter().map(|&i| (self.places[i].ln_range, self.cells[i].simulated.n)).collect();
+        ranges.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let all: f64 = ranges.iter().map(|r| r.1).sum();
+        let mut beyond = 0.0;
+        let at = ranges.iter().find(|(_, n)| {
+            beyond += n;
+            beyond > 0.02 * all
+        });
+        at.map_or(0.0, |r| r.0.exp())
     }
 
     /// Share that laws keep, in the order of [`LossTable::shares`].
@@ -193,13 +215,19 @@ fn with_numbers(laws: &[FittedLaw], numbers: &[f64]) -> Vec<FittedLaw> {
 pub struct FittedLaw {
     /// Which.
     pub law: Law,
-    /// Random, zone: share lost. Range, incidence, signal: place of one half, then the logarithm of the steepness; signal: then by how
-    /// much standing surfaces and objects are brighter, in ln. Cut: ln of the range.
-    pub numbers: [f64; 4],
+    /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew; signal: then by how
+    /// much standing surfaces and objects are brighter, in ln.
+    pub numbers: [f64; 5],
 }
 
-fn logistic(x: f64) -> f64 {
-    1.0 / (1.0 + (-x).exp())
+/// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. Real laws have other tails than the logistic one; the skew lets both differ.
+fn step(x: f64, [a, ln_k, ln_skew]: [f64; 3]) -> f64 {
+    (1.0 + (-ln_k.exp() * (x - a)).exp()).powf(-ln_skew.exp())
+}
+
+/// Where the step is at one half.
+fn half([a, ln_k, ln_skew]: [f64; 3]) -> f64 {
+    a - ((0.5f64.powf(-(-ln_skew).exp()) - 1.0).max(1e-12)).ln() / ln_k.exp()
 }
 
 /// Reflectivities of unlike surfaces differ by about this factor, as a logarithm.
@@ -214,38 +242,36 @@ impl Law {
             Law::Incidence => "incidence_dropout",
             Law::Signal => "signal_dropout",
             Law::Zone(_) => "material_dropout",
-            Law::Cut => "range_cut",
         }
     }
 
-    /// Free parameters, for parsimony: brightness counts for half.
+    /// Free parameters.
     pub fn parameters(self) -> usize {
         match self {
-            Law::Random | Law::Zone(_) | Law::Cut => 1,
+            Law::Random | Law::Zone(_) => 1,
             Law::Range | Law::Incidence => 2,
-            Law::Signal => 2,
+            Law::Signal => 4,
         }
     }
 
     fn count(self) -> usize {
         match self {
-            Law::Random | Law::Zone(_) | Law::Cut => 1,
-            Law::Range | Law::Incidence => 2,
-            Law::Signal => 4,
+            Law::Random | Law::Zone(_) => 1,
+            Law::Range | Law::Incidence => 3,
+            Law::Signal => 5,
         }
     }
 
     fn steps(self) -> Vec<f64> {
         match self {
             Law::Random | Law::Zone(_) => vec![0.05],
-            Law::Cut => vec![0.1],
-            Law::Range | Law::Incidence => vec![0.3, 0.4],
-            Law::Signal => vec![0.5, 0.4, 0.4, 0.4],
+            Law::Range | Law::Incidence => vec![0.3, 0.4, 0.3],
+            Law::Signal => vec![0.5, 0.4, 0.3, 0.4, 0.4],
         }
     }
 
     fn starts(self, table: &LossTable) -> Vec<FittedLaw> {
-        let with = |numbers: [f64; 4]| FittedLaw { law: self, numbers };
+        let with = |numbers: [f64; 5]| FittedLaw { law: self, numbers };
         let value = |i: usize| match self {
             Law::Incidence => table.places[i].ln_cos,
             Law::Signal => table.places[i].ln_cos - 2.0 * table.places[i].ln_range,
@@ -255,17 +281,37 @@ impl Law {
         values.sort_by(f64::total_cmp);
         let quantile = |q: f64| values.get(((values.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(0.0);
         match self {
-            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0])],
-            Law::Cut => [0.5, 0.65, 0.8, 0.9, 0.97].map(|q| with([quantile(q), 0.0, 0.0, 0.0])).to_vec(),
-            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0])).to_vec(),
-            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0])).to_vec(),
+            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0, 0.0])],
+            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0, 0.0])).to_vec(),
+            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0, 0.0])).to_vec(),
         }
     }
 }
 
+/// Steepness and skew are not expected to be extreme.
+fn shape_penalty(ln_k: f64, ln_skew: f64) -> f64 {
+    0.5 * ln_k.powi(2) + 0.5 * (ln_skew / 0.7).powi(2)
+}
+
 impl FittedLaw {
+    /// Where one half is kept: of range ln(m), of incidence ln(cos), of signal ln(cos / R^2) on the ground.
+    pub fn half(&self) -> f64 {
+        let [a, b, s, ..] = self.numbers;
+        match self.law {
+            Law::Range => -half([-a, b, s]),
+            _ => half([a, b, s]),
+        }
+    }
+
+    /// Steepness of a step without skew that falls as fast at one half.
+    pub fn steepness(&self) -> f64 {
+        let [_, b, s, ..] = self.numbers;
+        // d ln(kept) / dx at one half, over that of a logistic step.
+        2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
+    }
+
     fn kept(&self, at: &Where) -> f64 {
-        let [a, b, c, d] = self.numbers;
+        let [a, b, s, c, d] = self.numbers;
         match self.law {
             Law::Random => (1.0 - a).clamp(1e-3, 1.5),
             Law::Zone(zone) => {
@@ -275,24 +321,22 @@ impl FittedLaw {
                     1.0
                 }
             }
-            Law::Range => logistic(-b.exp() * (at.ln_range - a)),
-            Law::Incidence => logistic(b.exp() * (at.ln_cos - a)),
+            Law::Range => step(-at.ln_range, [-a, b, s]),
+            Law::Incidence => step(at.ln_cos, [a, b, s]),
             Law::Signal => {
                 let brighter = [0.0, c, d, d][at.zone];
-                logistic(b.exp() * (at.ln_cos - 2.0 * at.ln_range + brighter - a))
+                step(at.ln_cos - 2.0 * at.ln_range + brighter, [a, b, s])
             }
-            // Cells are wider than the step is.
-            Law::Cut => logistic(-12.0 * (at.ln_range - a)).max(2e-3),
         }
     }
 
     fn penalty(&self) -> f64 {
         match self.law {
             Law::Signal => {
-                let [_, steep, c, d] = self.numbers;
-                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS) + 0.5 * ((steep - 0.8) / 1.0).powi(2)
+                let [_, steep, skew, c, d] = self.numbers;
+                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS) + shape_penalty(steep - 0.8, skew)
             }
-            Law::Range | Law::Incidence => 0.5 * ((self.numbers[1] - 1.0) / 1.0).powi(2),
+            Law::Range | Law::Incidence => shape_penalty(self.numbers[1] - 1.0, self.numbers[2]),
             _ => 0.0,
         }
     }
@@ -336,24 +380,22 @@ mod tests {
     }
 
     #[test]
-    #[ignore = "the laws of losses are not told apart yet: the engine is not finished"]
     fn each_law_is_told_from_the_others() {
         let (law, fit) = best(&table(|_, _, _| 0.8));
         assert_eq!(law, Law::Random);
         assert!((fit.numbers[0] - 0.2).abs() < 5e-3, "{fit:?}");
         let (law, fit) = best(&table(|r, _, _| 1.0 / (1.0 + (r / 40.0).powi(4))));
         assert_eq!(law, Law::Range);
-        assert!((fit.numbers[0].exp() - 40.0).abs() < 2.0, "{fit:?}");
+        assert!((fit.half().exp() - 40.0).abs() < 2.0, "{fit:?}");
         assert_eq!(best(&table(|_, c, _| c * c / (c * c + 0.01))).0, Law::Incidence);
         let (law, fit) = best(&table(|r, c, z| {
             let u = (c / (r * r)).ln() + if z > 0 { 1.0 } else { 0.0 };
             0.5 * (1.0 + (2.0 * (u + 10.5)).tanh())
         }));
         assert_eq!(law, Law::Signal);
-        assert!((fit.numbers[0] + 10.5).abs() < 0.3 && (fit.numbers[2] - 1.0).abs() < 0.3, "{fit:?}");
+        assert!((fit.half() + 10.5).abs() < 0.3 && (fit.numbers[3] - 1.0).abs() < 0.3, "{fit:?}");
         let (law, fit) = best(&table(|_, _, z| if z == 2 { 0.4 } else { 1.0 }));
         assert_eq!(law, Law::Zone(2));
         assert!((fit.numbers[0] - 0.6).abs() < 0.02);
-        assert_eq!(best(&table(|r, _, _| if r < 50.0 { 1.0 } else { 0.0 })).0, Law::Cut);
     }
 }

@@ -1,6 +1,7 @@
 //! How causes are weighed against each other.
 
 pub mod choice;
+pub mod grouped;
 pub mod linear;
 pub mod losses;
 pub mod noise;

@@ -84,9 +84,11 @@ const FEWEST: f64 = 40.0;
 const SHARED: f64 = 2.0;
 
 impl NoiseTable {
-    /// From the sums over some frames.
-    pub fn new(cells: Vec<RoughCell>) -> Self {
-        let used = cells.iter().map(|c| c.measured.n >= FEWEST && c.simulated.n >= FEWEST).collect();
+    /// From the sums over some frames; cells met at less than `least_cos` are left out.
+    pub fn new(cells: Vec<RoughCell>, least_cos: f64) -> Self {
+        let enough =
+            |c: &RoughCell| c.measured.n >= FEWEST && c.simulated.n >= FEWEST && c.simulated.mean().1 > least_cos;
+        let used = cells.iter().map(enough).collect();
         NoiseTable { cells, used }
     }
 
@@ -125,6 +127,19 @@ impl NoiseTable {
                 let added: f64 = laws.iter().map(|(l, theta)| theta * l.variance(range, cos)).sum();
                 let v = (vb + added).max(0.1 * vb);
                 let n = cell.measured.n / SHARED;
+                (n > 0.0).then(|| -0.5 * n * (v.ln() + cell.variances()[0] / v))
+            })
+            .sum()
+    }
+
+    /// The same under the ratios of variances of `other` frames, cell by cell.
+    pub fn likelihood_by_table(&self, frame: &RoughFrame, other: &NoiseTable) -> f64 {
+        frame
+            .iter()
+            .filter_map(|(i, cell)| {
+                let [_, vb] = self.variances(*i as usize)?;
+                let ratio = other.variances(*i as usize).map_or(1.0, |[a, b]| a / b);
+                let (v, n) = (vb * ratio.max(0.1), cell.measured.n / SHARED);
                 (n > 0.0).then(|| -0.5 * n * (v.ln() + cell.variances()[0] / v))
             })
             .sum()

@@ -60,33 +60,47 @@ impl Sensors {
     }
 }
 
+/// What is to be taken off the range of a measured ray, m.
+pub type RangeCorrection<'a> = &'a (dyn Fn(&Ray) -> f64 + Sync);
+
 /// Pairs a frame, return by return.
 pub fn pair_frame(
     id: &str,
     measured: (&Cloud, &[Object]),
     simulated: (&Cloud, &[Object]),
     sensors: &Sensors,
+    correction: Option<RangeCorrection>,
 ) -> FramePair {
     let mut objects = pair_labels(measured.1, simulated.1);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
-    let scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
+    let mut scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
     let mut frame = FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
     for sensor in 0..sensors.rig.sensors.len() {
-        let [a, b] = [&scans[0][sensor], &scans[1][sensor]];
+        let (measured_scans, simulated_scans) = scans.split_at_mut(1);
+        let (a, b) = (&mut measured_scans[0][sensor], &simulated_scans[0][sensor]);
         let closes = sensors.rig.sensors[sensor].closes();
         let (of_a, of_b) = match_directions(a, b, &sensors.patterns[sensor], closes);
         let sight = Sight::new(sensors, sensor, b, &boxes);
         let mut simulated: Vec<Ray> = (0..b.len()).map(|i| sight.ray(b, i, true)).collect();
-        for (ray, matched) in simulated.iter_mut().zip(of_b) {
+        for (i, (ray, matched)) in simulated.iter_mut().zip(of_b).enumerate() {
             ray.matched = matched;
+            ray.company = company(&sight.index, b, i);
             (ray.roughness_m, ray.roughness_leverage) =
                 if ray.smooth { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
         }
         let mut measured: Vec<Ray> = (0..a.len()).map(|i| sight.ray(a, i, false)).collect();
+        if let Some(correction) = correction {
+            for (i, ray) in measured.iter_mut().enumerate().filter(|(_, r)| r.smooth) {
+                let off = correction(ray) as f32;
+                ray.residual_m -= off;
+                a.range_m[i] = (a.range_m[i] - off).max(0.05);
+            }
+        }
         let own = DirectionIndex::new(a, sensors.window(sensor), closes);
         let stray: Vec<bool> = measured.iter().map(|r| r.smooth && r.across_m().abs() > STRAY_M).collect();
         for (i, (ray, matched)) in measured.iter_mut().zip(of_a).enumerate() {
             ray.matched = matched;
+            ray.company = company(&own, a, i);
             if ray.smooth && !stray[i] {
                 let others = |e: &super::scan::Entry| e.index != i as u32 && !stray[e.index as usize];
                 if let Some(s) = fit_surface(&own, sight.window, a.azimuth_rad[i], a.elevation_rad[i], others) {
@@ -101,6 +115,18 @@ pub fn pair_frame(
     fit_objects(&mut objects, &frame, sensors);
     frame.objects = objects;
     frame
+}
+
+/// Number of returns of a scan around one of its own that lie at about its range.
+fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
+    let range = scan.range_m[i];
+    let mut n = 0u8;
+    index.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
+        if e.index != i as u32 && (e.range_m - range).abs() < 0.3 + 0.03 * range {
+            n = n.saturating_add(1);
+        }
+    });
+    n
 }
 
 /// The simulated side of one sensor, to be looked at from any direction.
@@ -137,6 +163,7 @@ impl<'a> Sight<'a> {
             smooth: false,
             corner: false,
             matched: false,
+            company: 0,
             row,
             object: u16::MAX,
             azimuth_rad: az,
@@ -146,6 +173,7 @@ impl<'a> Sight<'a> {
             direction: direction.cast::<f32>().into(),
             normal: [0.0; 3],
             residual_m: 0.0,
+            bulge_m: 0.0,
             leverage: 0.0,
             roughness_m: f32::NAN,
             roughness_leverage: 0.0,
@@ -176,6 +204,7 @@ impl<'a> Sight<'a> {
         ray.residual_m = (f64::from(range) - surface.range_m) as f32;
         ray.cos_incidence = surface.cos_incidence as f32;
         ray.leverage = surface.leverage as f32;
+        ray.bulge_m = surface.bulge_m as f32;
         ray.normal = normal.cast::<f32>().into();
         ray.surface = self.surface_at(&direction, surface.range_m, Some(&normal), &mut ray);
         ray

@@ -10,11 +10,11 @@ mod scan;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, ObjectPair, Sensors, pair_frame};
+pub use frame::{FramePair, ObjectPair, RangeCorrection, Sensors, pair_frame};
 pub use identical::{Identity, check_identity};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;
-pub use ray::{Ray, Surface};
+pub use ray::{Lies, Ray, Surface};
 pub use scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
 pub use surface::{LocalSurface, fit_surface};
 
@@ -115,6 +115,7 @@ pub fn pair_all(
     simulated: &Dataset,
     ids: &[String],
     sensors: &Sensors,
+    correction: Option<RangeCorrection>,
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<(Vec<FramePair>, Vec<String>), DiagnoseError> {
     let kept = (KEPT / ids.len()).max(500);
@@ -125,7 +126,7 @@ pub fn pair_all(
         .map(|(i, id)| {
             let (a, b) = (load(measured, id)?, load(simulated, id)?);
             let counts = [a.0.len(), b.0.len()];
-            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors);
+            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors, correction);
             for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
                 thin(rays, kept, i as u64, k as u64);
             }

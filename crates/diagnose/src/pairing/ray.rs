@@ -15,6 +15,21 @@ pub enum Surface {
     Open,
 }
 
+/// Where a return lies against the simulated returns around its direction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Lies {
+    /// On their surface, or on one of two at an edge.
+    On,
+    /// Nearer.
+    InFront,
+    /// Farther.
+    Behind,
+    /// Between the two surfaces of an edge.
+    Between,
+    /// There are none.
+    Open,
+}
+
 /// A return of either side. Predictions are those of the simulated side's returns around its direction, for a simulated return without
 /// itself, so that both sides are looked at alike.
 #[derive(Clone, Copy, Debug)]
@@ -29,6 +44,8 @@ pub struct Ray {
     pub corner: bool,
     /// The other side has a return in this direction, at whatever range.
     pub matched: bool,
+    /// Returns of its own side around it at about its range.
+    pub company: u8,
     /// Row of the sensor; `u16::MAX` where rows are not known.
     pub row: u16,
     /// Number of the labelled object in the frame; `u16::MAX` for none.
@@ -47,6 +64,8 @@ pub struct Ray {
     pub normal: [f32; 3],
     /// Range minus predicted range, m.
     pub residual_m: f32,
+    /// Range of the simulated return closest in direction minus what the plane around says of it, m.
+    pub bulge_m: f32,
     /// Variance of the prediction in units of that of one simulated range.
     pub leverage: f32,
     /// Range minus what the own side's returns around it predict, m; NaN where they do not.
@@ -81,6 +100,35 @@ impl Ray {
     /// Distance of the return from the predicted surface, across it, m; positive on the sensor's side.
     pub fn across_m(&self) -> f64 {
         -f64::from(self.residual_m) * f64::from(self.cos_incidence)
+    }
+
+    /// [`Ray::across_m`] from the simulated return closest in direction, carried along the plane: free of the error that a plane makes on a
+    /// surface that is not flat.
+    pub fn across_nearest_m(&self) -> f64 {
+        -f64::from(self.residual_m - self.bulge_m) * f64::from(self.cos_incidence)
+    }
+
+    /// Where it lies against the simulated returns around its direction.
+    pub fn lies(&self) -> Lies {
+        if self.near_far_m[1] <= 0.0 {
+            return Lies::Open;
+        }
+        let own = self.own_range_m();
+        if self.smooth {
+            return match self.residual_m {
+                d if self.across_m().abs() < 0.3 || d.abs() < 0.6 => Lies::On,
+                d if d < 0.0 => Lies::InFront,
+                _ => Lies::Behind,
+            };
+        }
+        let [near, far] = self.near_far_m.map(f64::from);
+        let margin = 0.35 + 0.015 * near;
+        match own {
+            r if r < near - margin => Lies::InFront,
+            r if r > far + margin => Lies::Behind,
+            r if r > near + margin && r < far - margin => Lies::Between,
+            _ => Lies::On,
+        }
     }
 
     /// ln(0.1 cos / R^2) - ln(0.1 / 250^2): 0 for a surface at 250 m met squarely.

@@ -20,6 +20,8 @@ pub struct LocalSurface {
     pub misfit_m: f64,
     /// Nearest and farthest neighbour, m.
     pub near_far_m: [f64; 2],
+    /// Range of the neighbour closest in direction minus what the plane says of it, m: by how much the surface is not flat there.
+    pub bulge_m: f64,
 }
 
 /// At least that many neighbours make a surface.
@@ -71,6 +73,7 @@ pub fn fit_surface(
     // Effective weights: derivative of q0 by each q.
     let (mut leverage, mut misfit) = (0.0f64, 0.0f64);
     let mut near_far = [f64::INFINITY, 0.0f64];
+    let (mut closest, mut bulge) = (f64::INFINITY, 0.0);
     let (gx, gy) = (bx / window[0] / f64::from(el.cos()), by / window[1]);
     let cos = 1.0 / (1.0 + (gx * gx + gy * gy) * range * range).sqrt();
     for [x, y, q, w] in near {
@@ -83,6 +86,10 @@ pub fn fit_surface(
         let off = if predicted > 1e-4 { (1.0 / q - 1.0 / predicted).abs() } else { f64::INFINITY };
         misfit = misfit.max(off * cos * (1.0 / predicted.max(1e-4)).min(range) / range.max(1.0 / predicted.max(1e-4)));
         near_far = [near_far[0].min(1.0 / q), near_far[1].max(1.0 / q)];
+        let distance = x * x + y * y;
+        if distance < closest && predicted > 1e-4 {
+            (closest, bulge) = (distance, 1.0 / q - 1.0 / predicted);
+        }
     }
     Some(LocalSurface {
         range_m: range,
@@ -91,6 +98,7 @@ pub fn fit_surface(
         leverage,
         misfit_m: misfit,
         near_far_m: near_far,
+        bulge_m: bulge,
     })
 }
 

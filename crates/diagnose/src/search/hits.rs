@@ -1,10 +1,13 @@
 //! Lost returns: which simulated returns has the measured side not, and on what does it depend?
 
-use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record};
+use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
 use crate::channels::cells::ZONE_NAMES;
-use crate::channels::hits::{HitFrame, hit_frames, total};
+use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
+use crate::channels::hits::{hit_frames, loss_groups, total};
+use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable};
 use crate::inference::roles::Role;
@@ -19,9 +22,13 @@ const ZONE_FLOOR: f64 = 0.03;
 /// Repetitions of the bootstrap of fits.
 const REFITS: usize = 40;
 
-/// The search.
-pub fn search(context: &Context) -> ChannelResult {
-    let hits = hit_frames(context.frames);
+/// Spread of the share lost from group to group of directions below which nothing is said.
+const GROUP_FLOOR: f64 = 0.02;
+
+/// The search, beside what hides rays altogether. `displaced` tells that the measured scene is turned or moved as a whole: silhouettes do not fit any more, and small losses are theirs.
+pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult {
+    let displaced = f64::from(u8::from(displaced));
+    let hits = hit_frames(context.frames, mask);
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let of = |frames: &[usize]| LossTable::new(total(frames.iter().map(|&i| &hits[i])));
     let blocks = context.blocks(&select);
@@ -32,6 +39,7 @@ pub fn search(context: &Context) -> ChannelResult {
     let mut result = ChannelResult::default();
     let mut chosen: Vec<Law> = Vec::new();
     let mut stories = Vec::new();
+    let mut unnamed = None;
     let mut first_gain = 0.0f64;
     // One law, then at most one more of another kind.
     for step in 0..2 {
@@ -40,7 +48,7 @@ pub fn search(context: &Context) -> ChannelResult {
             .collect();
         let before: Vec<Vec<FittedLaw>> = tables.iter().map(|t| refit(t, &chosen)).collect();
         let candidates: Vec<Law> = LAWS.into_iter().filter(|l| step == 0 || may_join(*l, &chosen)).collect();
-        let trials: Vec<Trial> = candidates
+        let mut trials: Vec<Trial> = candidates
             .par_iter()
             .enumerate()
             .map(|(k, &law)| {
@@ -51,21 +59,44 @@ pub fn search(context: &Context) -> ChannelResult {
                 let whole = table.fit(&refit(&table, &chosen), law);
                 let lost = table.lost(&whole) - table.lost(&whole[..whole.len() - 1]);
                 let own = whole.last().map_or(0.0, |l| l.numbers[0].abs());
+                // On top of another law a small share only mends the form of that.
+                let joins = f64::from(u8::from(step > 0));
                 let above_floor = match law {
-                    Law::Zone(_) => own > ZONE_FLOOR,
-                    _ => lost.abs() > FLOOR,
+                    Law::Zone(_) => own > ZONE_FLOOR + 0.07 * joins + 0.1 * displaced,
+                    Law::Random => own > FLOOR + 0.02 * joins + 0.01 * displaced,
+                    _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * displaced,
                 };
                 Trial { candidate: k, name: law.name().into(), parameters: law.parameters(), gains, above_floor }
             })
             .collect();
+        // What depends on the direction has no name.
+        let laws = refit(&table, &chosen);
+        for grouping in [Grouping::Row, Grouping::Azimuth] {
+            let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table.kept(&laws, c));
+            let (spread, _) =
+                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED, trimmed(grouping));
+            trials.push(Trial {
+                candidate: LAWS.len() + grouping as usize,
+                name: UNNAMED.into(),
+                parameters: 12,
+                gains: grouped::cross_part_gains(&groups, &select, &blocks, GROUPED, false),
+                above_floor: spread > GROUP_FLOOR,
+            });
+        }
         let demands = if step == 0 { demands } else { Demands { nats: (0.04 * first_gain).max(8.0), ..demands } };
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "hits", returns, &demands));
         let Some(choice) = choice else { break };
         let trial = &trials[choice.chosen];
         first_gain = total_and_z(&trial.gains).0;
+        if trial.name == UNNAMED {
+            let grouping = if trial.candidate == LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
+            unnamed = Some((grouping, confidence(&trials, &blocks, UNNAMED, &demands)));
+            break;
+        }
         chosen.push(candidates[trial.candidate]);
-        let mut equals: Vec<String> = choice.equals.iter().map(|&i| trials[i].name.clone()).collect();
+        let mut equals: Vec<String> =
+            choice.equals.iter().map(|&i| trials[i].name.clone()).filter(|n| n != UNNAMED).collect();
         equals.sort();
         equals.dedup();
         stories.push((equals, confidence(&trials, &blocks, &trial.name, &demands)));
@@ -104,68 +135,124 @@ pub fn search(context: &Context) -> ChannelResult {
     for (k, (equals, confidence)) in stories.into_iter().enumerate() {
         let without: Vec<FittedLaw> = fitted.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, l)| *l).collect();
         let gains = hold_out.iter().map(|&i| table_h.gain(&hits[i], &fitted, &without)).collect();
-        let draws: Vec<[f64; 4]> = repeated.iter().map(|r| r[k].numbers).collect();
+        let draws: Vec<FittedLaw> = repeated.iter().map(|r| r[k]).collect();
         result.found.push(found(&fitted[k], &draws, equals, confidence, gains, &table_h, &fitted));
     }
-    result.distance = hold_out.iter().map(|&i| distance(&table_h, &hits[i], &fitted)).collect();
+    let told = table_e.told(&fitted);
+    result.distance = hold_out
+        .iter()
+        .map(|&i| {
+            [table_h.distance(&hits[i]), table_h.gain(&hits[i], &fitted, &[]), table_h.gain_by_table(&hits[i], &told)]
+        })
+        .collect();
+    if let Some((grouping, confidence)) = unnamed {
+        let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table_e.kept(&fitted, c));
+        let found = unnamed_found(&groups, grouping, &estimate, &hold_out, confidence);
+        for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
+            d[1] += g;
+            d[2] += g.max(0.0);
+        }
+        result.found.push(found);
+    }
     result
 }
 
-fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
+/// Name among the trials of what is in no catalogue.
+const UNNAMED: &str = "unexplained";
+
+/// Shares lost by groups of directions: prior spread of a fifth.
+const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false };
+
+fn unnamed_found(
+    groups: &[PartedFrame],
+    grouping: Grouping,
+    estimate: &[usize],
+    hold_out: &[usize],
+    confidence: f64,
+) -> Found {
+    let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
+    let offsets = grouped::offsets(&all, GROUPED);
+    let (spread, _) = grouped::spread(&all, GROUPED, trimmed(grouping));
+    let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
+    let points = offsets.iter().map(|(k, lost)| {
+        let (sensor, place) = place_of(*k as usize, grouping);
+        let place = if grouping == Grouping::Row { place } else { place.to_degrees() };
+        let error = 1.0 / (all[k].gram[0] + GROUPED.precision).sqrt();
+        CurvePoint { x: place + 1000.0 * sensor as f64, measured: 1.0 - lost, before: 1.0, after: 1.0 - lost, error }
+    });
+    Found {
+        status: Status::Unexplained,
+        causes: vec![],
+        family: "unknown",
+        parameters: vec![],
+        confidence,
+        channel: "hits",
+        covariate: word.into(),
+        held_out_gains: hold_out
+            .iter()
+            .map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum())
+            .collect(),
+        says: format!(
+            "the share of lost returns depends on the {word}, by {:.1} % from one to the next; no cause of the catalogue does that",
+            100.0 * spread
+        ),
+        separate_by: None,
+        curve: Curve {
+            x: format!("{word} (1000 a sensor)"),
+            y: "share of simulated returns that are measured".into(),
+            points: points.collect(),
+        },
+    }
+}
+
+/// Fits laws one on top of the other.
+pub(super) fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
     laws.iter().fold(Vec::new(), |before, &law| table.fit(&before, law))
 }
 
 /// Laws that tell the same story are not put on top of each other: a second one mends the form of the first.
 fn may_join(law: Law, chosen: &[Law]) -> bool {
     let smooth = |l: &Law| matches!(l, Law::Range | Law::Incidence | Law::Signal);
-    !(chosen.contains(&law) || smooth(&law) && chosen.iter().any(smooth))
-}
-
-/// Kullback-Leibler distance of a frame's losses, before and after, and of an independent draw.
-fn distance(table: &LossTable, frame: &HitFrame, laws: &[FittedLaw]) -> [f64; 3] {
-    let (before, cells) = table.distance(frame, &[]);
-    let (after, _) = table.distance(frame, laws);
-    [before, after, 0.5 * cells]
+    !chosen.contains(&law) && !(smooth(&law) && chosen.iter().any(smooth))
 }
 
 /// Numbers of a law as people read them.
-fn reading(law: Law, n: &[f64; 4]) -> Vec<(&'static str, f64, &'static str)> {
-    match law {
-        Law::Random => vec![("share", n[0], "1")],
-        Law::Zone(_) => vec![("share", n[0], "1")],
-        Law::Cut => vec![("max_range_m", n[0].exp(), "m")],
-        Law::Range => vec![("half_at_m", n[0].exp(), "m"), ("steepness", n[1].exp(), "1")],
-        Law::Incidence => vec![("half_at_cos", n[0].exp(), "1"), ("steepness", n[1].exp(), "1")],
+fn reading(law: &FittedLaw) -> Vec<(&'static str, f64, &'static str)> {
+    match law.law {
+        Law::Random | Law::Zone(_) => vec![("share", law.numbers[0], "1")],
+        Law::Range => vec![("half_at_m", law.half().exp(), "m"), ("steepness", law.steepness(), "1")],
+        Law::Incidence => vec![("cos_half", law.half().exp(), "1"), ("steepness", law.steepness(), "1")],
         // u: ln(0.1 cos / R^2) - ln(0.1 / 250^2).
         Law::Signal => vec![
-            ("half_at_u", n[0] + 2.0 * 250f64.ln(), "1"),
-            ("steepness", n[1].exp(), "1"),
-            ("brighter_standing", n[2], "1"),
-            ("brighter_objects", n[3], "1"),
+            ("threshold", law.half() + 2.0 * 250f64.ln(), "1"),
+            ("steepness", law.steepness(), "1"),
+            ("brighter_standing", law.numbers[3], "1"),
+            ("brighter_objects", law.numbers[4], "1"),
         ],
     }
 }
 
 fn found(
     law: &FittedLaw,
-    draws: &[[f64; 4]],
+    draws: &[FittedLaw],
     equals: Vec<String>,
     confidence: f64,
     held_out_gains: Vec<f64>,
     table: &LossTable,
     all: &[FittedLaw],
 ) -> Found {
-    let values = reading(law.law, &law.numbers);
+    let values = reading(law);
     let parameters = values
         .iter()
         .enumerate()
         .map(|(k, (name, estimate, unit))| {
-            let drawn: Vec<f64> = draws.iter().map(|d| reading(law.law, d)[k].1).collect();
+            let drawn: Vec<f64> = draws.iter().map(|d| reading(d)[k].1).collect();
             let mean = drawn.iter().sum::<f64>() / drawn.len().max(1) as f64;
             let sd =
                 (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
-            // The form of the truth may differ.
-            let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs());
+            // The form of the truth may differ, the more so beyond the returns that there are.
+            let beyond = if *name == "half_at_m" { (estimate - table.farthest_m()).max(0.0) } else { 0.0 };
+            let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs()) + beyond;
             let parameter =
                 Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
             ((*name).to_owned(), parameter)
@@ -182,26 +269,23 @@ fn found(
             zone_words(z),
             100.0 * law.numbers[0]
         ),
-        Law::Cut => {
-            format!("nothing is measured beyond {:.1} m; your simulator has returns there", law.numbers[0].exp())
-        }
         Law::Range => {
-            format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.numbers[0].exp())
+            format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.half().exp())
         }
         Law::Incidence => format!(
             "returns are lost at grazing angles: 50 % at {:.1} degrees from the surface; your simulator keeps them all",
-            law.numbers[0].exp().min(1.0).asin().to_degrees()
+            law.half().exp().min(1.0).asin().to_degrees()
         ),
         Law::Signal => format!(
             "returns are lost as the signal falls: 50 % at u = {:.1}, on the road at {:.0} m if it is met at 2 degrees; your simulator keeps them all",
             values[0].1,
-            (0.5 * (2f64.to_radians().sin().ln() - law.numbers[0])).exp()
+            (0.5 * (2f64.to_radians().sin().ln() - law.half())).exp()
         ),
     };
     let covariate = match law.law {
         Law::Random => "none".to_owned(),
         Law::Zone(z) => format!("surface: {}", ZONE_NAMES[z]),
-        Law::Cut | Law::Range => "range_m".into(),
+        Law::Range => "range_m".into(),
         Law::Incidence => "cos_incidence".into(),
         Law::Signal => "signal".into(),
     };
@@ -232,9 +316,10 @@ fn zone_words(zone: usize) -> &'static str {
 /// Share of a number by which a fit of another form may be off.
 fn form_error(law: Law) -> f64 {
     match law {
-        Law::Random | Law::Cut => 0.01,
+        Law::Random => 0.01,
         Law::Zone(_) => 0.04,
-        _ => 0.04,
+        Law::Incidence => 0.1,
+        _ => 0.05,
     }
 }
 

@@ -1,14 +1,13 @@
 //! Labels and objects: do measured labels stand where the measured returns are, and do the objects stand where the simulation has them?
 
-mod finding;
+mod words;
 
-use finding::*;
-
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
+use super::geometry::Displacement;
+use super::{ChannelResult, Context, Repair, Z_STAR, confidence, first_demands, record};
 use crate::channels::labels::{ObjectShift, object_shifts};
 use crate::channels::mean::origins;
 use crate::channels::motion::{OwnMotion, own_motion};
-use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
+use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
@@ -53,7 +52,7 @@ const CAUSES: [Cause; 8] = [
 ];
 
 /// Names and their columns.
-const CANDIDATES: [(&str, &[usize]); 13] = [
+const CANDIDATES: [(&str, &[usize]); 14] = [
     ("label_offset", &[0]),
     ("label_offset", &[1]),
     ("label_offset", &[2]),
@@ -67,6 +66,8 @@ const CANDIDATES: [(&str, &[usize]); 13] = [
     ("wrong_shape", &[6]),
     ("wrong_shape", &[5, 2]),
     ("rolling_shutter", &[7]),
+    // The targets' clock where the own speed is not known: the constant is the own speed's share of it.
+    ("time_offset", &[0, 3]),
 ];
 
 /// Smaller constant shifts of labels and of objects are not spoken of, m.
@@ -78,6 +79,8 @@ const FLOOR_S: f64 = 0.001;
 /// One object's shift with its covariates.
 struct Row {
     frame: usize,
+    object: usize,
+    yaw_rad: f64,
     shift: [f64; 3],
     variance: [f64; 3],
     x: [[f64; 8]; 3],
@@ -85,11 +88,15 @@ struct Row {
     known: [bool; 8],
 }
 
-/// The search on one side.
-pub fn search(context: &Context, side: Side) -> ChannelResult {
+/// Objects that move by less are not spoken of, m: labels, objects.
+const LEAST_MOVED_M: [f64; 2] = [0.02, 0.04];
+
+/// The search on one side; `displaced` tells how far things are shown from where they are for reasons of the geometry.
+pub fn search(context: &Context, side: Side, displaced: &Displacement) -> ChannelResult {
     let motion = context.times.as_ref().map(|t| own_motion(context.frames, t, &origins(context.rig)));
     let shifts = object_shifts(context.frames, context.times.as_deref());
-    let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref())).collect();
+    let mut rows: Vec<Row> =
+        shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref(), displaced)).collect();
     let mut result = ChannelResult::default();
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let channel = if side == Side::Labels { "labels" } else { "objects" };
@@ -108,22 +115,37 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
     let frames: Vec<&LinearFrame> = on_select.iter().collect();
     let precision = [0.0; 8];
     let floor = FLOOR_M[usize::from(side == Side::Objects)];
+    let speeds = own_speeds(motion.as_deref());
     let trial = |k: usize, columns: &[usize], before: Option<&[f64]>| {
         let fitted = fit(&frames, &blocks, columns, &precision);
         let own = CANDIDATES[k].1;
-        let size = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i].abs()).fold(0.0, f64::max);
+        let theta: Vec<f64> = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i]).collect();
+        let size = theta.iter().map(|t| t.abs()).fold(0.0, f64::max);
+        let moved = moved_m(&rows, own, &theta);
+        let plausible = own != [0, 3] || {
+            let at = columns.len() - 2;
+            theta[1].abs() > 3.0 * fitted.error(at + 1) && (speeds[0]..speeds[1]).contains(&(theta[0] / theta[1]))
+        };
         let mut gains = cross_gains(&frames, &blocks, columns, &precision);
         if let Some(before) = before {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
         }
-        let least = if CANDIDATES[k].0 == "time_offset" {
+        let least = if own == [0, 3] {
+            floor
+        } else if CANDIDATES[k].0 == "time_offset" {
             FLOOR_S
         } else if CANDIDATES[k].0 == "rolling_shutter" {
             0.005
         } else {
             floor
         };
-        Trial { candidate: k, name: CANDIDATES[k].0.into(), parameters: own.len(), gains, above_floor: size > least }
+        Trial {
+            candidate: k,
+            name: CANDIDATES[k].0.into(),
+            parameters: own.len(),
+            gains,
+            above_floor: plausible && size > least && moved > LEAST_MOVED_M[usize::from(side == Side::Objects)],
+        }
     };
     let allowed = |k: &usize| {
         let (name, columns) = CANDIDATES[*k];
@@ -142,16 +164,21 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
         };
         result.minimum.push(least("label_offset", "forward_m", (Z_STAR * error(0)).max(floor), "m"));
         if let Some(k) = [4, 3].into_iter().find(|&k| usable[k]) {
-            result.minimum.push(least("time_offset", "dt_s", (Z_STAR * error(k)).max(FLOOR_S), "s"));
+            result.minimum.push(least("time_offset", "offset_s", (Z_STAR * error(k)).max(FLOOR_S), "s"));
         }
     }
     let Some(first) = choice else {
-        result.distance = hold_out.iter().map(|&f| distance(&rows, f, None)).collect();
+        result.distance = hold_out.iter().map(|&f| [distance(&rows, f), 0.0, 0.0]).collect();
         return result;
     };
     let mut chosen = vec![trials[first.chosen].candidate];
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
+    let (name, own) = CANDIDATES[chosen[0]];
+    if name == "label_offset" && own.contains(&0) && usable[3] && late(&frames, &blocks, own, speeds) {
+        stories[0].0.push("time_offset".into());
+        stories[0].0.dedup();
+    }
     let (first_gain, _) = total_and_z(&trials[first.chosen].gains);
     let second_demands = Demands { nats: (0.1 * first_gain).max(8.0), ..demands };
     let first_columns = CANDIDATES[chosen[0]].1;
@@ -178,10 +205,28 @@ pub fn search(context: &Context, side: Side) -> ChannelResult {
         let mut without = fitted.clone();
         own.clone().for_each(|i| without.theta[i] = 0.0);
         let gains = on_hold_out.iter().map(|f| fitted.gain(f) - without.gain(f)).collect();
-        result.found.push(found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
+        result.found.push(words::found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
     }
-    result.distance = hold_out.iter().map(|&f| distance(&rows, f, Some(&fitted))).collect();
+    let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
+    let best = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &known, &[1e-3; 8]);
+    let of_frame = |(&f, sums): (&usize, &LinearFrame)| [distance(&rows, f), fitted.gain(sums), best.gain(sums)];
+    result.distance = hold_out.iter().zip(&on_hold_out).map(of_frame).collect();
+    let of_labels = |k: &usize| matches!(CANDIDATES[*k].0, "label_offset" | "time_offset");
+    if chosen.iter().all(of_labels) {
+        result.repairs = rows.iter().map(|r| repair(r, &fitted, side)).collect();
+    }
     result
+}
+
+/// How a measured label is to be moved so that it stands on its returns.
+fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
+    let told = [0, 1, 2]
+        .map(|axis: usize| fitted.columns.iter().zip(fitted.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
+    // Labels that are off go back; objects that stand elsewhere take their labels along.
+    let sign = if side == Side::Labels { -1.0 } else { 1.0 };
+    let (s, c) = r.yaw_rad.sin_cos();
+    let shift = Vector3::new(told[0] * c - told[1] * s, told[0] * s + told[1] * c, told[2]) * sign;
+    Repair { frame: r.frame, object: r.object, shift_m: shift.into() }
 }
 
 fn equals(trials: &[Trial], which: &[usize]) -> Vec<String> {
@@ -191,27 +236,40 @@ fn equals(trials: &[Trial], which: &[usize]) -> Vec<String> {
     names
 }
 
-fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<OwnMotion>]>) -> Option<Row> {
-    let (shift, variance) = match side {
+fn row(
+    context: &Context,
+    s: &ObjectShift,
+    side: Side,
+    motion: Option<&[Option<OwnMotion>]>,
+    displaced: &Displacement,
+) -> Option<Row> {
+    let (mut shift, variance) = match side {
         Side::Labels => (s.label_m, [1.0; 3]),
         Side::Objects => {
             let (shift, error) = s.cloud_m?;
             (shift, error.map(|e| e * e))
         }
     };
-    if shift.iter().any(|v| v.abs() > 3.0) {
-        return None;
-    }
-    let object = context.frames[s.frame].objects.iter().filter_map(|o| o.simulated).min_by(|a, b| {
-        let d = |b: &geometry::Box3| {
-            (b.center[1].atan2(b.center[0]) - s.azimuth_rad).abs()
-                + (b.center[0].hypot(b.center[1]) - s.distance_m).abs()
-        };
-        d(a).total_cmp(&d(b))
-    })?;
+    let object = context.frames[s.frame].objects[s.object].simulated?;
     let (sin, cos) = object.yaw_rad.sin_cos();
     let axes = |v: Vector3<f64>| [v.x * cos + v.y * sin, -v.x * sin + v.y * cos, v.z];
     let center = Vector3::from(object.center);
+    let nearest = (0..context.rig.sensors.len()).min_by(|&a, &b| {
+        let off = |k: usize| {
+            let mount = &context.rig.sensors[k];
+            crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()).abs() / mount.half_fov_rad()
+        };
+        off(a).total_cmp(&off(b))
+    });
+    let sensor = nearest.unwrap_or(0);
+    if side == Side::Objects {
+        let origin = origins(context.rig)[sensor];
+        let known = axes(displaced.of_point(&center, sensor, &origin));
+        (0..3).for_each(|k| shift[k] -= known[k]);
+    }
+    if shift.iter().any(|v| v.abs() > 3.0) {
+        return None;
+    }
     let mut x = [[0.0; 8]; 3];
     let mut known = [true; 8];
     for (k, x) in x.iter_mut().enumerate() {
@@ -221,11 +279,8 @@ fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<O
     match s.seen_velocity_m_s {
         Some(seen) => {
             (0..3).for_each(|k| x[k][3] = seen[k]);
-            let phase =
-                context.rig.sensors.iter().map(|m| (crate::rig::wrapped(s.azimuth_rad - m.yaw_deg.to_radians()), m));
-            let phase = phase
-                .min_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))
-                .map_or(0.0, |(az, m)| az / (2.0 * m.half_fov_rad()));
+            let mount = &context.rig.sensors[sensor];
+            let phase = crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()) / (2.0 * mount.half_fov_rad());
             (0..3).for_each(|k| x[k][7] = seen[k] * phase);
             match motion.and_then(|m| m[s.frame]) {
                 Some(own) => {
@@ -243,7 +298,7 @@ fn row(context: &Context, s: &ObjectShift, side: Side, motion: Option<&[Option<O
     let towards = axes(-center / center.norm().max(1e-6));
     x[0][5] = towards[0];
     x[1][6] = towards[1];
-    Some(Row { frame: s.frame, shift, variance, x, speed, known })
+    Some(Row { frame: s.frame, object: s.object, yaw_rad: object.yaw_rad, shift, variance, x, speed, known })
 }
 
 /// Variances from what a fit of all columns leaves: robust, an axis at a time.
@@ -270,4 +325,58 @@ fn set_noise(rows: &mut [Row], select: &[usize], side: Side) {
             r.variance[axis] = if side == Side::Labels { scale * scale } else { r.variance[axis] + scale * scale };
         }
     }
+}
+
+fn sums(rows: &[Row], frame: usize) -> LinearFrame {
+    let mut out = LinearFrame { gram: DMatrix::zeros(8, 8), right: DVector::zeros(8) };
+    for r in rows.iter().filter(|r| r.frame == frame) {
+        for axis in 0..3 {
+            let x = DVector::from_row_slice(&r.x[axis]);
+            let w = robust(r, axis) / r.variance[axis];
+            out.gram += &x * x.transpose() * w;
+            out.right += &x * (w * r.shift[axis]);
+        }
+    }
+    out
+}
+
+/// A wild shift counts less.
+fn robust(r: &Row, axis: usize) -> f64 {
+    let u = r.shift[axis].abs() / (2.0 + 6.0 * r.variance[axis].sqrt());
+    if u < 1.0 { 1.0 } else { 1.0 / u }
+}
+
+/// What the own speed may be, m/s: from the scene, or anything that a car does.
+fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
+    let mut known: Vec<f64> = motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect();
+    known.sort_by(f64::total_cmp);
+    match known.get(known.len() / 2) {
+        Some(&v) if v > 5.0 => [0.7 * v, 1.4 * v],
+        _ => [4.0, 90.0],
+    }
+}
+
+/// Whether an offset that is the same for all could as well be a late clock: the dependence on the seen velocity that this would make is
+/// not excluded.
+fn late(frames: &[&LinearFrame], blocks: &[usize], own: &[usize], speeds: [f64; 2]) -> bool {
+    let columns: Vec<usize> = own.iter().copied().chain([3]).collect();
+    let fitted = fit(frames, blocks, &columns, &[0.0; 8]);
+    let slope = fitted.theta[columns.len() - 1];
+    let reach = 2.5 * fitted.error(columns.len() - 1);
+    let forward = own.iter().position(|c| *c == 0).map_or(0.0, |i| fitted.theta[i]);
+    let ends = speeds.map(|v| forward / v);
+    slope + reach > ends[0].min(ends[1]) && slope - reach < ends[0].max(ends[1])
+}
+
+/// Root mean square of what columns with coefficients move objects by, m.
+fn moved_m(rows: &[Row], columns: &[usize], theta: &[f64]) -> f64 {
+    let told = |r: &Row, axis: usize| columns.iter().zip(theta).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>();
+    let squares: f64 = rows.iter().map(|r| (0..3).map(|axis| told(r, axis).powi(2)).sum::<f64>()).sum();
+    (squares / rows.len().max(1) as f64).sqrt()
+}
+
+/// Half the squared shifts in units of their noise.
+fn distance(rows: &[Row], frame: usize) -> f64 {
+    let of = |r: &Row| (0..3).map(|axis| 0.5 * robust(r, axis) / r.variance[axis] * r.shift[axis].powi(2)).sum::<f64>();
+    rows.iter().filter(|r| r.frame == frame).map(of).sum()
 }

@@ -3,8 +3,12 @@
 pub mod geometry;
 pub mod hits;
 pub mod labels;
+pub mod mask;
 pub mod noise;
+pub mod quantisation;
+pub mod returns;
 
+use crate::channels::groups::Grouping;
 use crate::diagnosis::{Considered, Curve, FindingGain, Minimum, Parameter, Status};
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::roles::Role;
@@ -77,8 +81,22 @@ pub struct ChannelResult {
     pub considered: Vec<Considered>,
     /// Smallest effects that would have been seen.
     pub minimum: Vec<(String, Minimum)>,
-    /// Distance on held-out frames, nats, frame by frame: before, after, and what an independent draw would have.
+    /// On held-out frames, frame by frame, nats: distance of the simulation, what the findings gain, and what tables without any form, fitted
+    /// on the same frames as the findings, would gain.
     pub distance: Vec<[f64; 3]>,
+    /// How measured labels are to be moved.
+    pub repairs: Vec<Repair>,
+}
+
+/// How a measured label is to be moved.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Repair {
+    /// Number of the frame.
+    pub frame: usize,
+    /// Number of the object in the frame.
+    pub object: usize,
+    /// By how much, in the cloud's frame, m.
+    pub shift_m: [f64; 3],
 }
 
 /// Mean gain over its standard error that a finding must have: no null of the blind set came near.
@@ -87,6 +105,49 @@ pub const Z_STAR: f64 = 3.2;
 /// The demands of a first step.
 pub fn first_demands() -> Demands {
     Demands { z: Z_STAR, nats: 8.0, slack: 0.02 }
+}
+
+/// Share of rows whose offsets do not count in their spread: a row may follow the upper edge of a wall, which every shift of the wall
+/// moves.
+pub fn trimmed(grouping: Grouping) -> f64 {
+    if grouping == Grouping::Row { 0.12 } else { 0.0 }
+}
+
+/// Objects that are swept by more than that over a scan leave nothing else to be judged by, m.
+const SWEPT_M: f64 = 0.8;
+
+/// Sets aside what a scan that takes its time makes in the other channels: whole scenes shear, and surfaces, silhouettes and directions do not
+/// fit any more. Says so.
+pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
+    let of_objects = |f: &Found| f.channel == "objects" && f.causes == ["rolling_shutter"];
+    let found = results.iter().flat_map(|r| &r.found).find(|f| of_objects(f))?;
+    let scan_s = found.parameters.iter().find(|(name, _)| name == "scan_s")?.1.estimate.abs();
+    let fastest = found.curve.points.iter().map(|p| p.x.abs()).fold(0.0, f64::max);
+    // Cars are met at tens of m/s over the ground, whatever the sensor sees of them.
+    if scan_s * fastest.max(20.0) < SWEPT_M {
+        return None;
+    }
+    let mut set_aside = Vec::new();
+    for result in results.iter_mut() {
+        let sheared = |f: &Found| matches!(f.channel, "residuals" | "hits" | "roughness" | "returns");
+        set_aside.extend(
+            result
+                .found
+                .iter()
+                .filter(|f| sheared(f))
+                .map(|f| f.causes.first().map_or("unexplained", String::as_str).to_owned()),
+        );
+        result.found.retain(|f| !sheared(f));
+        if result.found.is_empty() {
+            result.distance.iter_mut().for_each(|d| *d = [0.0; 3]);
+        }
+    }
+    set_aside.sort();
+    set_aside.dedup();
+    let list = set_aside.join(", ");
+    (!set_aside.is_empty()).then(|| {
+        format!("the scan takes its time and shears the whole scene: what that does in other channels ({list}) was set aside; correct the scans and diagnose again")
+    })
 }
 
 /// Number of bootstrap repetitions.

@@ -1,12 +1,16 @@
 //! Noise: are measured returns rougher than simulated ones, and on what does it depend?
 
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
-use crate::channels::roughness::{RoughFrame, rough_frames, scales, total};
+use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed};
+use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
+use crate::channels::mean::usual_noise_m;
+use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::noise::{NOISE_LAWS, NoiseLaw, NoiseTable};
 use crate::inference::roles::Role;
+use crate::pairing::Ray;
 
 /// Smaller standard deviations along the ray are not spoken of, m.
 const FLOOR_M: f64 = 0.003;
@@ -18,13 +22,14 @@ const FLOOR_RAD: f64 = 1.7e-4;
 const FLOOR_SHARE: f64 = 0.04;
 
 /// The search; `known` lists variances that other findings explain already (a step of rounding).
-pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
+/// Surfaces met at less than `least_cos` are left out.
+pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> ChannelResult {
     let scales = scales(context.frames);
     let rough = rough_frames(context.frames, &scales);
     let mut result = ChannelResult::default();
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let blocks = context.blocks(&select);
-    let table = NoiseTable::new(total(select.iter().map(|&i| &rough[i])));
+    let table = NoiseTable::new(total(select.iter().map(|&i| &rough[i])), least_cos);
     let linear: Vec<LinearFrame> = select.iter().map(|&i| explained(&table, &rough[i], known)).collect();
     let frames: Vec<&LinearFrame> = linear.iter().collect();
     let precision = vec![0.0; NOISE_LAWS.len()];
@@ -46,7 +51,32 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
         }
     };
     let demands = first_demands();
-    let trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| trial(&[k], None)).collect();
+    // What depends on the direction has no name.
+    let directions = |terms: &[(NoiseLaw, f64)]| -> Vec<Trial> {
+        let expected = |c: usize, ray: &Ray| expected(&table, c, ray, terms);
+        let one = |grouping: Grouping| {
+            let groups =
+                rough_groups(context.frames, context.rig, &scales, grouping, &|c| table.variances(c), &expected);
+            let (spread, _) =
+                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED, trimmed(grouping));
+            Trial {
+                candidate: NOISE_LAWS.len() + grouping as usize,
+                name: UNNAMED.into(),
+                parameters: 12,
+                gains: grouped::cross_part_gains(&groups, &select, &blocks, GROUPED, false),
+                above_floor: spread > GROUP_FLOOR,
+            }
+        };
+        vec![one(Grouping::Row), one(Grouping::Azimuth)]
+    };
+    let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| trial(&[k], None)).collect();
+    trials.extend(directions(known));
+    // A table of directions follows the range and the incidence of each: a cause that explains most of it is preferred.
+    let best_named = total_of_best(&trials, &demands);
+    trials
+        .iter_mut()
+        .filter(|t| t.name == UNNAMED)
+        .for_each(|t| t.above_floor &= best_named < PREFERRED * total_and_z(&t.gains).0);
     let choice = choose(&trials, &demands);
     let returns = context.returns(&select);
     result.considered = record(&trials, choice.as_ref(), "roughness", returns, &demands);
@@ -54,7 +84,7 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
     result.minimum.push((
         "range_noise".into(),
         Minimum {
-            parameter: "sigma_m".into(),
+            parameter: "std_m".into(),
             value: (Z_STAR * constant.error(0)).sqrt().max(FLOOR_M),
             unit: "m".into(),
         },
@@ -63,14 +93,15 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
     result.minimum.push((
         "angular_jitter".into(),
         Minimum {
-            parameter: "sigma_deg".into(),
+            parameter: "std_deg".into(),
             value: (Z_STAR * angular.error(0)).sqrt().max(FLOOR_RAD).to_degrees(),
             unit: "deg".into(),
         },
     ));
     let mut chosen = Vec::new();
     let mut stories = Vec::new();
-    if let Some(first) = &choice {
+    let mut unnamed = choice.as_ref().map(|c| &trials[c.chosen]).filter(|t| t.name == UNNAMED).map(|t| t.candidate);
+    if let Some(first) = choice.as_ref().filter(|_| unnamed.is_none()) {
         let t = &trials[first.chosen];
         chosen.push(t.candidate);
         let equals: Vec<String> = unique(first.equals.iter().map(|&i| trials[i].name.clone()));
@@ -78,24 +109,33 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
         // A second one must be of another kind and bring a good part of what the first brought.
         let (first_gain, _) = total_and_z(&t.gains);
         let second_demands = Demands { nats: (0.05 * first_gain).max(8.0), ..demands };
-        let rivals: Vec<Trial> = (0..NOISE_LAWS.len())
+        let mut rivals: Vec<Trial> = (0..NOISE_LAWS.len())
             .filter(|&k| NOISE_LAWS[k].name() != NOISE_LAWS[t.candidate].name())
             .map(|k| trial(&[t.candidate, k], Some(&t.gains)))
             .collect();
+        let alone = whole(&[t.candidate]);
+        let so_far: Vec<_> = known.iter().copied().chain([(NOISE_LAWS[t.candidate], alone.theta[0])]).collect();
+        let mut tables = directions(&so_far);
+        tables.iter_mut().for_each(|t| t.above_floor &= total_and_z(&t.gains).0 > REMAINING * first_gain);
+        rivals.extend(tables);
         let second = choose(&rivals, &second_demands);
         result.considered.extend(record(&rivals, second.as_ref(), "roughness", returns, &second_demands));
         if let Some(second) = second {
             let t = &rivals[second.chosen];
-            chosen.push(t.candidate);
-            let equals = unique(second.equals.iter().map(|&i| rivals[i].name.clone()));
-            stories.push((equals, confidence(&rivals, &blocks, &t.name, &second_demands)));
+            if t.name == UNNAMED {
+                unnamed = Some(t.candidate);
+            } else {
+                chosen.push(t.candidate);
+                let equals = unique(second.equals.iter().map(|&i| rivals[i].name.clone()));
+                stories.push((equals, confidence(&rivals, &blocks, &t.name, &second_demands)));
+            }
         }
     }
     // Parameters from other frames.
-    let table_e = NoiseTable::new(total(estimate.iter().map(|&i| &rough[i])));
+    let table_e = NoiseTable::new(total(estimate.iter().map(|&i| &rough[i])), least_cos);
     let linear_e: Vec<LinearFrame> = estimate.iter().map(|&i| explained(&table_e, &rough[i], known)).collect();
     let fitted = fit(&linear_e.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &chosen, &precision);
-    let table_h = NoiseTable::new(total(hold_out.iter().map(|&i| &rough[i])));
+    let table_h = NoiseTable::new(total(hold_out.iter().map(|&i| &rough[i])), least_cos);
     let terms: Vec<(NoiseLaw, f64)> = known
         .iter()
         .copied()
@@ -117,8 +157,88 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)]) -> ChannelResult {
             &terms,
         ));
     }
-    result.distance = hold_out.iter().map(|&i| distance(&table_h, &rough[i], &terms)).collect();
+    result.distance = hold_out.iter().map(|&i| distance(&table_h, &table_e, &rough[i], &terms)).collect();
+    if let Some(candidate) = unnamed {
+        let grouping = if candidate == NOISE_LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
+        let expected = |c: usize, ray: &Ray| expected(&table_e, c, ray, &terms);
+        let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table_e.variances(c), &expected);
+        let found = unnamed_found(&groups, grouping, &estimate, &hold_out, usual_noise_m(context.frames));
+        for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
+            d[1] += g;
+            d[2] += g.max(0.0);
+        }
+        result.found.push(found);
+    }
     result
+}
+
+/// Share of the gain of a table of directions from which on a named cause is preferred.
+const PREFERRED: f64 = 0.75;
+
+/// Share of a named cause's gain that a table of directions must bring on top of it.
+const REMAINING: f64 = 0.3;
+
+/// Gain of the best trial with a name.
+fn total_of_best(trials: &[Trial], demands: &Demands) -> f64 {
+    let named: Vec<Trial> = trials.iter().filter(|t| t.name != UNNAMED).cloned().collect();
+    choose(&named, demands).map_or(0.0, |c| total_and_z(&named[c.chosen].gains).0)
+}
+
+/// Name among the trials of what is in no catalogue.
+const UNNAMED: &str = "unexplained";
+
+/// Added variances of groups of directions in units of the simulated one: prior spread of three.
+const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false };
+
+/// Spread of them below which nothing is said.
+const GROUP_FLOOR: f64 = 0.25;
+
+/// Measured variance that laws tell of a ray, in units of the simulated one.
+fn expected(table: &NoiseTable, cell: usize, ray: &Ray, terms: &[(NoiseLaw, f64)]) -> f64 {
+    let Some([_, vb]) = table.variances(cell) else { return 1.0 };
+    let (range, cos) = (f64::from(ray.range_m), f64::from(ray.cos_incidence));
+    1.0 + terms.iter().map(|(l, t)| t * l.variance(range, cos)).sum::<f64>() / vb
+}
+
+fn unnamed_found(
+    groups: &[PartedFrame],
+    grouping: Grouping,
+    estimate: &[usize],
+    hold_out: &[usize],
+    usual_m: f64,
+) -> Found {
+    let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
+    let offsets = grouped::offsets(&all, GROUPED);
+    let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
+    let points = offsets.iter().map(|(k, added)| {
+        let (sensor, place) = place_of(*k as usize, grouping);
+        let place = if grouping == Grouping::Row { place } else { place.to_degrees() };
+        let measured = (1.0 + added).max(0.0).sqrt();
+        let error = 0.5 / (all[k].gram[0] + GROUPED.precision).sqrt() / measured.max(0.1);
+        CurvePoint { x: place + 1000.0 * sensor as f64, measured, before: 1.0, after: measured, error }
+    });
+    Found {
+        status: Status::Unexplained,
+        causes: vec![],
+        family: "unknown",
+        parameters: vec![parameter("simulated_std_m", usual_m, 0.05 * usual_m, "m")],
+        confidence: 1.0,
+        channel: "roughness",
+        covariate: word.into(),
+        held_out_gains: hold_out
+            .iter()
+            .map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum())
+            .collect(),
+        says: format!(
+            "measured ranges scatter more in some directions than in others: it depends on the {word}, and no cause of the catalogue does that"
+        ),
+        separate_by: None,
+        curve: Curve {
+            x: format!("{word} (1000 a sensor)"),
+            y: "standard deviation in units of the simulated one".into(),
+            points: points.collect(),
+        },
+    }
 }
 
 /// Sums of a frame after the variance that is explained already.
@@ -152,8 +272,8 @@ fn above_floor(table: &NoiseTable, law: NoiseLaw, theta: f64) -> bool {
     enough && share / n.max(1.0) > FLOOR_SHARE
 }
 
-/// Kullback-Leibler distance of a frame's roughness, before and after, and of an independent draw: half a nat a cell.
-fn distance(table: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -> [f64; 3] {
+/// Kullback-Leibler distance of a frame's roughness from the simulation, the gain of laws, and that of the variances of `other` frames.
+fn distance(table: &NoiseTable, other: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -> [f64; 3] {
     let best: f64 = frame
         .iter()
         .filter_map(|(i, cell)| {
@@ -162,8 +282,8 @@ fn distance(table: &NoiseTable, frame: &RoughFrame, terms: &[(NoiseLaw, f64)]) -
             (n > 0.0).then(|| -0.5 * n * (cell.variances()[0].max(1e-12).ln() + 1.0))
         })
         .sum();
-    let cells = frame.iter().filter(|(i, c)| table.variances(*i as usize).is_some() && c.measured.n > 0.0).count();
-    [best - table.likelihood(frame, &[]), best - table.likelihood(frame, terms), 0.55 * cells as f64]
+    let before = table.likelihood(frame, &[]);
+    [best - before, table.likelihood(frame, terms) - before, table.likelihood_by_table(frame, other) - before]
 }
 
 fn unique(names: impl Iterator<Item = String>) -> Vec<String> {
@@ -191,8 +311,8 @@ fn found(
     let mut parameters = Vec::new();
     let (covariate, says) = match law {
         NoiseLaw::Constant => {
-            parameters.push(parameter("sigma_m", sigma, sigma_error, "m"));
-            parameters.push(parameter("growth_per_m", 0.0, 0.002, "1/m"));
+            parameters.push(parameter("std_m", sigma, sigma_error, "m"));
+            parameters.push(parameter("per_m", 0.0, 1e-4, "m/m"));
             (
                 "none".to_owned(),
                 format!(
@@ -202,8 +322,8 @@ fn found(
             )
         }
         NoiseLaw::Growing(g) => {
-            parameters.push(parameter("sigma_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
-            parameters.push(parameter("growth_per_m", g, 0.5 * g, "1/m"));
+            parameters.push(parameter("std_m", sigma, sigma_error.hypot(0.15 * sigma), "m"));
+            parameters.push(parameter("per_m", g * sigma, 0.3 * g * sigma, "m/m"));
             let at = |r: f64| sigma * (1.0 + g * r) * 100.0;
             (
                 "range_m".into(),
@@ -215,8 +335,8 @@ fn found(
             )
         }
         NoiseLaw::Signal(gamma) => {
-            parameters.push(parameter("sigma_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
-            parameters.push(parameter("gamma", gamma, 0.3 * gamma, "1"));
+            parameters.push(parameter("std_m", sigma, sigma_error.hypot(0.1 * sigma), "m"));
+            parameters.push(parameter("exponent", 0.5 * gamma, 0.15 * gamma, "1"));
             (
                 "signal".into(),
                 format!("measured ranges scatter more where the signal is weak: by {:.1} cm at u = 4", sigma * 100.0),
@@ -224,7 +344,7 @@ fn found(
         }
         NoiseLaw::Angular => {
             let deg = f64::to_degrees;
-            parameters.push(parameter("sigma_deg", deg(sigma), deg(sigma_error), "deg"));
+            parameters.push(parameter("std_deg", deg(sigma), deg(sigma_error), "deg"));
             (
                 "range_m * tan(incidence)".into(),
                 format!(

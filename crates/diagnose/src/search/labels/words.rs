@@ -1,41 +1,9 @@
-//! Sums over objects, and what a finding says.
+//! What the search of labels and objects found, in words and numbers.
 
-use super::*;
-
-pub(super) fn sums(rows: &[Row], frame: usize) -> LinearFrame {
-    let mut out = LinearFrame { gram: DMatrix::zeros(8, 8), right: DVector::zeros(8) };
-    for r in rows.iter().filter(|r| r.frame == frame) {
-        for axis in 0..3 {
-            let x = DVector::from_row_slice(&r.x[axis]);
-            let w = robust(r, axis) / r.variance[axis];
-            out.gram += &x * x.transpose() * w;
-            out.right += &x * (w * r.shift[axis]);
-        }
-    }
-    out
-}
-
-/// A wild shift counts less.
-pub(super) fn robust(r: &Row, axis: usize) -> f64 {
-    let u = r.shift[axis].abs() / (2.0 + 6.0 * r.variance[axis].sqrt());
-    if u < 1.0 { 1.0 } else { 1.0 / u }
-}
-
-/// Half the squared shifts in units of their noise, before and after; of an independent draw half for each number.
-pub(super) fn distance(rows: &[Row], frame: usize, fitted: Option<&LinearFit>) -> [f64; 3] {
-    let mut out = [0.0; 3];
-    for r in rows.iter().filter(|r| r.frame == frame) {
-        for axis in 0..3 {
-            let told = fitted
-                .map_or(0.0, |f| f.columns.iter().zip(f.theta.iter()).map(|(&c, t)| r.x[axis][c] * t).sum::<f64>());
-            let w = robust(r, axis) / r.variance[axis];
-            out[0] += 0.5 * w * r.shift[axis].powi(2);
-            out[1] += 0.5 * w * (r.shift[axis] - told).powi(2);
-            out[2] += 0.5;
-        }
-    }
-    out
-}
+use super::{CANDIDATES, CAUSES, Cause, Row, Side};
+use crate::diagnosis::{Curve, CurvePoint, Status};
+use crate::inference::linear::LinearFit;
+use crate::search::{Found, parameter};
 
 #[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
 pub(super) fn found(
@@ -57,12 +25,13 @@ pub(super) fn found(
     for (i, &c) in own.clone().zip(columns) {
         let (theta, error) = (fitted.theta[i], fitted.error(i));
         match CAUSES[c] {
+            Cause::Forward if name == "time_offset" => continue,
             Cause::Forward => parameters.push(parameter("forward_m", sign * theta, error, "m")),
             Cause::Left => parameters.push(parameter("left_m", sign * theta, error, "m")),
             Cause::Up if name == "wrong_shape" => parameters.push(parameter("higher_m", theta, error, "m")),
             Cause::Up => parameters.push(parameter("up_m", sign * theta, error, "m")),
             Cause::SeenVelocity | Cause::Velocity => {
-                parameters.push(parameter("dt_s", sign * theta, error.hypot(0.02 * theta), "s"))
+                parameters.push(parameter("offset_s", -sign * theta, error.hypot(0.02 * theta), "s"))
             }
             Cause::Longer => parameters.push(parameter("longer_m", 2.0 * theta, 2.0 * error, "m")),
             Cause::Wider => parameters.push(parameter("wider_m", 2.0 * theta, 2.0 * error, "m")),
@@ -82,13 +51,14 @@ pub(super) fn found(
     };
     let clock = match columns {
         [3] => "; they move with the velocity that the sensor sees: all positions against the cloud",
-        [4] => "; they move with the targets' velocity over the ground: the targets' clock",
+        [4] | [0, 3] => "; they move with the targets' velocity over the ground: the targets' clock",
         _ => "",
     };
     let says = format!("{what}: {}{clock}", words.join(", "));
     let (covariate, x_column) = match columns {
         [3] => ("seen_velocity_m_s", 3),
         [4] => ("velocity_m_s", 4),
+        [0, 3] => ("velocity_m_s", 3),
         [7] => ("scan_phase * velocity", 7),
         [5, ..] | [6] => ("side_seen", columns[0]),
         _ => ("none", if usable[4] { 4 } else { 3 }),
@@ -122,7 +92,7 @@ pub(super) fn found(
     }
 }
 
-pub(super) fn curve(rows: &[Row], column: usize, axis: usize, fitted: &LinearFit) -> Curve {
+fn curve(rows: &[Row], column: usize, axis: usize, fitted: &LinearFit) -> Curve {
     let mut points: Vec<(f64, f64, f64)> = rows
         .iter()
         .map(|r| {

@@ -1,31 +1,14 @@
-//! What a finding says: parameters with intervals, curves, and the smallest effect that would have been seen.
+//! What the search of geometry found, in words and numbers.
 
-use super::*;
-
-pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Minimum)> {
-    let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
-    let error = |c: Column| {
-        let k = sums.columns.iter().position(|x| *x == c)?;
-        let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
-        Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
-    };
-    let mut all = Vec::new();
-    let mut push = |name: &str, parameter: &str, value: Option<f64>, floor: f64, unit: &str, factor: f64| {
-        if let Some(v) = value {
-            let minimum =
-                Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
-            all.push((name.to_owned(), minimum));
-        }
-    };
-    let deg = 1f64.to_degrees();
-    push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
-    push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
-    let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
-    push("sensor_extrinsics", "yaw_deg", error(one), FLOOR_TURN_RAD, "deg", deg);
-    push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
-    push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
-    all
-}
+use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, UNNAMED, fit_all, groups_of, how};
+use crate::channels::groups::{GroupSums, Grouping, place_of, total};
+use crate::channels::mean::Column;
+use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
+use crate::inference::grouped;
+use crate::inference::linear::{LinearFit, LinearFrame, fit};
+use crate::search::{Context, Found, Z_STAR, parameter};
+use nalgebra::Vector3;
+use std::collections::BTreeMap;
 
 #[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
 pub(super) fn found(
@@ -64,20 +47,20 @@ pub(super) fn found(
             (covariate.to_owned(), format!("{what}: {}", list.join(", ")), Curve::default())
         }
         Suspect::Groups { grouping, column, .. } => {
-            let frames = grouped(sums, *grouping);
+            let frames = groups_of(sums, *grouping);
             let all = total(estimate.iter().map(|&i| &frames[i]));
-            let (std, n) = spread(&all, *column);
+            let (std, n) = grouped::spread(&all, how(*column), 0.0);
             let error = std / (2.0 * n.max(1.0)).sqrt();
             let unit = if *column == 0 { (1.0, "m") } else { (1f64.to_degrees(), "deg") };
             if name != UNNAMED {
                 let label = if *column == 0 { "std_m" } else { "std_deg" };
                 parameters.push(parameter(label, std * unit.0, (error.hypot(0.05 * std)) * unit.0, unit.1));
             }
-            let offsets = offsets(&all, *column);
+            let offsets = grouped::offsets(&all, how(*column));
             if name != UNNAMED {
                 for (k, v) in &offsets {
                     let (sensor, row) = place_of(*k as usize, *grouping);
-                    let e = 1.0 / (all[k].gram[2 * column] + group_precision(*column)).sqrt();
+                    let e = 1.0 / (all[k].gram[2 * column] + how(*column).precision).sqrt();
                     let label = format!("{}/{}", context.rig.sensors[sensor].name, row as usize);
                     parameters.push(parameter(&label, v * unit.0, e * unit.0, unit.1));
                 }
@@ -139,7 +122,7 @@ pub(super) fn found(
     }
 }
 
-pub(super) fn linear_parameters(
+fn linear_parameters(
     context: &Context,
     sums: &Sums,
     fitted: &LinearFit,
@@ -152,9 +135,7 @@ pub(super) fn linear_parameters(
         Some((fitted.theta[i], fitted.error(i)))
     };
     let deg = f64::to_degrees;
-    let shift_names = ["x_m", "y_m", "z_m"];
-    let mut turn = Vector3::zeros();
-    let mut turn_error = Vector3::zeros();
+    let [mut turn, mut turn_error, mut shift, mut shift_error] = [Vector3::<f64>::zeros(); 4];
     let mut sensor = None;
     for &c in columns {
         let Some((theta, error)) = value(c) else { continue };
@@ -174,41 +155,42 @@ pub(super) fn linear_parameters(
                 if k < 3 {
                     (turn[k], turn_error[k]) = (-theta, error);
                 } else {
-                    parameters.push(parameter(shift_names[k - 3], -theta, error.hypot(0.003), "m"));
+                    (shift[k - 3], shift_error[k - 3]) = (-theta, error.hypot(0.003));
                 }
             }
             Column::Structure(_) => {}
         }
     }
-    if turn == Vector3::zeros() {
+    if turn == Vector3::zeros() && shift == Vector3::zeros() {
         return;
     }
-    let mut own = [turn.x, turn.y, turn.z];
-    let mut own_error = [turn_error.x, turn_error.y, turn_error.z];
     if name == "sensor_extrinsics" {
         let s = sensor.unwrap_or(0);
         parameters
             .push(("sensor".into(), Parameter { estimate: s as f64, unit: "number".into(), ci95: [s as f64; 2] }));
-        // About the sensor's own axes, as the rig's file has them.
+        // In the sensor's own frame, as the effect of the simulator has them.
         let turn_of = context.rig.sensors[s].pose().rotation;
-        let t = turn_of.inverse_transform_vector(&turn);
         let matrix = turn_of.inverse().to_rotation_matrix();
-        let e = Vector3::from_fn(|i, _| (0..3).map(|j| (matrix[(i, j)] * turn_error[j]).powi(2)).sum::<f64>().sqrt());
-        (own, own_error) = ([t.x, t.y, t.z], [e.x, e.y, e.z]);
+        let error_of = |e: Vector3<f64>| {
+            Vector3::from_fn(|i, _| (0..3).map(|j| (matrix[(i, j)] * e[j]).powi(2)).sum::<f64>().sqrt())
+        };
+        (turn, shift) = (turn_of.inverse_transform_vector(&turn), turn_of.inverse_transform_vector(&shift));
+        (turn_error, shift_error) = (error_of(turn_error), error_of(shift_error));
     }
     for (k, label) in ["roll_deg", "pitch_deg", "yaw_deg"].into_iter().enumerate() {
-        if own[k] != 0.0 && (own[k].abs() > 1e-9) {
-            parameters.push(parameter(
-                label,
-                deg(own[k]),
-                deg(own_error[k]).hypot(0.002).hypot(0.02 * deg(own[k])),
-                "deg",
-            ));
+        if turn[k].abs() > 1e-9 {
+            let value = deg(turn[k]);
+            parameters.push(parameter(label, value, deg(turn_error[k]).hypot(0.002).hypot(0.02 * value), "deg"));
+        }
+    }
+    for (k, label) in ["forward_m", "left_m", "up_m"].into_iter().enumerate() {
+        if shift[k].abs() > 1e-9 {
+            parameters.push(parameter(label, shift[k], shift_error[k], "m"));
         }
     }
 }
 
-pub(super) fn group_curve(
+fn group_curve(
     sums: &BTreeMap<u32, GroupSums>,
     offsets: &BTreeMap<u32, f64>,
     grouping: Grouping,
@@ -222,10 +204,36 @@ pub(super) fn group_curve(
         } else {
             place.to_degrees() + 1000.0 * sensor as f64
         };
-        let error = 1.0 / (sums[k].gram[2 * column] + group_precision(column)).sqrt();
+        let error = 1.0 / (sums[k].gram[2 * column] + how(column).precision).sqrt();
         CurvePoint { x, measured: v * unit, before: 0.0, after: v * unit, error: error * unit }
     });
     let x = if grouping == Grouping::Row { "row (1000 a sensor)" } else { "azimuth, degrees (1000 a sensor)" };
     let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
     Curve { x: x.into(), y: y.into(), points: points.collect() }
+}
+
+/// Smallest effects that would have been seen.
+pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(String, Minimum)> {
+    let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
+    let error = |c: Column| {
+        let k = sums.columns.iter().position(|x| *x == c)?;
+        let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
+        Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
+    };
+    let mut all = Vec::new();
+    let mut push = |name: &str, parameter: &str, value: Option<f64>, floor: f64, unit: &str, factor: f64| {
+        if let Some(v) = value {
+            let minimum =
+                Minimum { parameter: parameter.into(), value: factor * (Z_STAR * v).max(floor), unit: unit.into() };
+            all.push((name.to_owned(), minimum));
+        }
+    };
+    let deg = 1f64.to_degrees();
+    push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
+    push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
+    let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
+    push("sensor_extrinsics", "yaw_deg", error(one), FLOOR_TURN_RAD, "deg", deg);
+    push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
+    push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
+    all
 }

@@ -1,35 +1,32 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
-mod finding;
+mod suspects;
+mod words;
 
-use finding::*;
-
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record};
-use crate::channels::groups::{GroupFrame, GroupSums, Grouping, group_frames, place_of, total};
+use self::suspects::{Suspect, UNNAMED, may_join, suspects};
+use super::{ChannelResult, Context, confidence, first_demands, record};
+use crate::channels::groups::{
+    GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole,
+};
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
-use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
-use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
+use crate::inference::grouped::{self, GroupFit};
+use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
-use nalgebra::{SVector, Vector3};
+use crate::pairing::Ray;
+use crate::rig::SensorRig;
+use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
-const FLOOR_OFFSET_M: f64 = 0.01;
+const FLOOR_OFFSET_M: f64 = 0.012;
 const FLOOR_TURN_RAD: f64 = 3.5e-4;
-const FLOOR_SHIFT_M: f64 = 0.02;
+const FLOOR_SHIFT_M: f64 = 0.04;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
-
-/// What may be wrong.
-#[derive(Clone, Debug, PartialEq)]
-enum Suspect {
-    Linear { name: &'static str, columns: Vec<usize> },
-    Groups { name: &'static str, grouping: Grouping, column: usize },
-}
 
 /// Everything that candidates are weighed on.
 struct Sums {
@@ -37,12 +34,80 @@ struct Sums {
     precision: Vec<f64>,
     base: Vec<usize>,
     linear: Vec<LinearFrame>,
-    rows: Vec<GroupFrame>,
-    strips: Vec<GroupFrame>,
+    rows: Groups,
+    strips: Groups,
 }
 
-/// The search.
-pub fn search(context: &Context) -> ChannelResult {
+/// Groups of every frame, by part and whole.
+struct Groups {
+    parted: Vec<PartedFrame>,
+    whole: Vec<GroupFrame>,
+}
+
+/// What was found of the geometry, to be taken out before other channels are looked at.
+#[derive(Clone, Debug, Default)]
+pub struct Displacement {
+    /// The scene's turn and shift in the cloud's frame, rad and m.
+    pub scene: SVector<f64, 6>,
+    /// The same for what single sensors see, about their origins.
+    pub sensors: Vec<SVector<f64, 6>>,
+    /// Offset of range, m, and share of it.
+    pub bias: [f64; 2],
+    /// Offsets of groups of rays: which, of range or elevation, by group.
+    pub groups: Option<(Grouping, usize, BTreeMap<u32, f64>)>,
+}
+
+impl Displacement {
+    /// Whether the scene as a whole is turned or moved.
+    pub fn moves(&self) -> bool {
+        self.scene.norm() > 0.0 || self.sensors.iter().any(|s| s.norm() > 0.0)
+    }
+
+    /// How far a thing at `point` seen by a sensor is shown from where it is, m.
+    pub fn of_point(&self, point: &Vector3<f64>, sensor: usize, origin: &Point3<f64>) -> Vector3<f64> {
+        let turned = |p: &SVector<f64, 6>, about: Vector3<f64>| {
+            Vector3::new(p[0], p[1], p[2]).cross(&(point - about)) + Vector3::new(p[3], p[4], p[5])
+        };
+        let to = point - origin.coords;
+        let own = self.sensors.get(sensor).map_or_else(Vector3::zeros, |p| turned(p, origin.coords));
+        turned(&self.scene, Vector3::zeros()) + own + to.normalize() * (self.bias[0] + self.bias[1] * to.norm())
+    }
+
+    /// What is to be taken off the range of a measured ray of a row or strip that measures or aims wrongly, m.
+    pub fn of_range(&self, ray: &Ray, turn: &UnitQuaternion<f64>) -> f64 {
+        let Some((grouping, column, offsets)) = &self.groups else { return 0.0 };
+        let Some(offset) = group_of(ray, *grouping).and_then(|g| offsets.get(&(g as u32))) else { return 0.0 };
+        if *column == 0 {
+            *offset
+        } else {
+            -offset * elevation_lever(ray, turn) / f64::from(ray.cos_incidence.max(0.01))
+        }
+    }
+}
+
+fn displacement(rig: &SensorRig, sums: &Sums, select: &[usize], blocks: &[usize], chosen: &[Suspect]) -> Displacement {
+    let mut out = Displacement { sensors: vec![SVector::zeros(); rig.sensors.len()], ..Displacement::default() };
+    let (columns, groups) = split(chosen);
+    let fitted = fit_all(sums, select, blocks, chosen);
+    for (c, theta) in fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c)) {
+        match sums.columns[*c] {
+            Column::Pose(k) => out.scene[k] += theta,
+            Column::SensorPose(s, k) => out.sensors[s][k] += theta,
+            Column::RangeOffset => out.bias[0] = *theta,
+            Column::RangeScale => out.bias[1] = *theta,
+            Column::Sweep(_) | Column::Structure(_) => {}
+        }
+    }
+    if let Some((grouping, column)) = groups.first() {
+        let frames = groups_of(sums, *grouping);
+        let offsets = grouped::offsets(&total(select.iter().map(|&i| &frames[i])), how(*column));
+        out.groups = Some((*grouping, *column, offsets));
+    }
+    out
+}
+
+/// The search; also what is to be taken out for the others.
+pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
     let sums = sums(context, &select);
@@ -76,7 +141,7 @@ pub fn search(context: &Context) -> ChannelResult {
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "residuals", returns, &demands));
         if step == 0 {
-            result.minimum = minimum(&sums, &select, &blocks);
+            result.minimum = words::minimum(&sums, &select, &blocks);
         }
         let Some(choice) = choice else { break };
         let t = &trials[choice.chosen];
@@ -92,77 +157,32 @@ pub fn search(context: &Context) -> ChannelResult {
         let alone = &chosen[k];
         let held: Vec<f64> =
             hold_out.iter().map(|&f| told(&sums, &estimate, &estimate_blocks, alone, &chosen, f)).collect();
-        result.found.push(found(context, &sums, &estimate, &estimate_blocks, alone, &chosen, equals, confidence, held));
+        result.found.push(words::found(
+            context,
+            &sums,
+            &estimate,
+            &estimate_blocks,
+            alone,
+            &chosen,
+            equals,
+            confidence,
+            held,
+        ));
     }
+    let every = everything(&sums, &estimate, &estimate_blocks);
     for (i, &f) in hold_out.iter().enumerate() {
-        let gain: f64 = chosen.iter().map(|s| told(&sums, &estimate, &estimate_blocks, s, &chosen, f)).sum();
-        let best = best_gain(&sums, f);
-        // What the best fit of this very frame explains stands for what could be told at all.
-        result.distance[i] = [best, (best - gain).max(0.0), 0.5 * sums.columns.len() as f64];
+        let each: Vec<(bool, f64)> = chosen
+            .iter()
+            .map(|s| (matches!(s, Suspect::Groups { .. }), told(&sums, &estimate, &estimate_blocks, s, &chosen, f)))
+            .collect();
+        let gain: f64 = each.iter().map(|e| e.1).sum();
+        let groups: f64 = each.iter().filter(|e| e.0).map(|e| e.1).sum();
+        let best = every.0.gain(&sums.linear[f]) - every.1.gain(&sums.linear[f]) + groups.max(0.0);
+        // The sums have no distance of their own: it is what they could gain at most.
+        result.distance[i] = [best.max(gain).max(0.0), gain, best];
     }
-    result
-}
-
-impl Suspect {
-    fn name(&self) -> &'static str {
-        match self {
-            Suspect::Linear { name, .. } | Suspect::Groups { name, .. } => name,
-        }
-    }
-
-    fn parameters(&self) -> usize {
-        match self {
-            Suspect::Linear { columns, .. } => columns.len(),
-            Suspect::Groups { grouping: Grouping::Row, .. } => 12,
-            Suspect::Groups { .. } => 14,
-        }
-    }
-}
-
-fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
-    let at = |c: Column| columns.iter().position(|x| *x == c);
-    let pick = |list: &[Column]| list.iter().filter_map(|c| at(*c)).collect::<Vec<_>>();
-    let linear = |name, list: &[Column]| Suspect::Linear { name, columns: pick(list) };
-    let mut all = vec![
-        linear("range_bias", &[Column::RangeOffset]),
-        linear("range_bias", &[Column::RangeScale]),
-        linear("range_bias", &[Column::RangeOffset, Column::RangeScale]),
-        linear("pitch_roll", &[Column::Pose(1)]),
-        linear("pitch_roll", &[Column::Pose(0)]),
-        linear("pitch_roll", &[Column::Pose(0), Column::Pose(1)]),
-        linear("rolling_shutter", &[Column::Sweep(0)]),
-        linear("rolling_shutter", &[Column::Sweep(0), Column::Sweep(2)]),
-    ];
-    if context.rig.sensors.len() > 1 {
-        for s in 0..context.rig.sensors.len() {
-            for k in 0..3 {
-                all.push(linear("sensor_extrinsics", &[Column::SensorPose(s, k)]));
-            }
-            all.push(linear("sensor_extrinsics", &[0, 1, 2].map(|k| Column::SensorPose(s, k))));
-            all.push(linear("sensor_extrinsics", &[3, 4, 5].map(|k| Column::SensorPose(s, k))));
-            all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(|k| Column::SensorPose(s, k))));
-        }
-    } else {
-        for k in 0..3 {
-            all.push(linear("sensor_extrinsics", &[Column::Pose(k)]));
-        }
-        all.push(linear("sensor_extrinsics", &[0, 1, 2].map(Column::Pose)));
-        all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(Column::Pose)));
-    }
-    all.push(Suspect::Groups { name: "beam_range_offset", grouping: Grouping::Row, column: 0 });
-    all.push(Suspect::Groups { name: "beam_elevation_offset", grouping: Grouping::Row, column: 1 });
-    all.push(Suspect::Groups { name: UNNAMED, grouping: Grouping::Azimuth, column: 0 });
-    all
-}
-
-/// Name among the trials of what depends on azimuth: no cause of the catalogue.
-const UNNAMED: &str = "unexplained";
-
-fn may_join(suspect: &Suspect, chosen: &[Suspect]) -> bool {
-    chosen.iter().all(|c| {
-        let grouped = |s: &Suspect| matches!(s, Suspect::Groups { .. });
-        c.name() != suspect.name() && !(grouped(c) && grouped(suspect))
-    })
+    let out = displacement(context.rig, &sums, &select, &blocks, &chosen);
+    (result, out)
 }
 
 fn sums(context: &Context, select: &[usize]) -> Sums {
@@ -209,8 +229,11 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
     let base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
-    let structure = [structure.theta[0], structure.theta[1], structure.theta[2]];
-    let groups = |g| group_frames(frames, rig, &poses, structure, g, noise_m, design);
+    let structure = std::array::from_fn(|k| structure.theta[k]);
+    let groups = |g| {
+        let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
+        Groups { whole: parted.iter().map(whole).collect(), parted }
+    };
     Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear }
 }
 
@@ -261,95 +284,68 @@ fn gains(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) 
         (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
     }
     for (grouping, column) in groups {
-        let frames = grouped(sums, grouping);
-        let folds = fold_of(blocks);
-        for fold in 0..FOLDS {
-            let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]);
-            let offsets = offsets(&total(train), column);
-            for i in (0..select.len()).filter(|&i| folds[i] == fold) {
-                out[i] += group_gain(&frames[select[i]], column, &offsets);
-            }
-        }
+        let parted = if grouping == Grouping::Row { &sums.rows.parted } else { &sums.strips.parted };
+        let more = grouped::cross_part_gains(parted, select, blocks, how(column), grouping == Grouping::Row);
+        out.iter_mut().zip(more).for_each(|(o, g)| *o += g);
     }
     out
 }
 
-fn grouped(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
-    if grouping == Grouping::Row { &sums.rows } else { &sums.strips }
+fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
+    if grouping == Grouping::Row { &sums.rows.whole } else { &sums.strips.whole }
 }
 
 /// Prior spread of offsets: 10 cm, 0.3 degrees.
-fn group_precision(column: usize) -> f64 {
-    [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column]
-}
-
-/// Offset of each group; what all have in common belongs to other causes.
-fn offsets(sums: &BTreeMap<u32, GroupSums>, column: usize) -> BTreeMap<u32, f64> {
-    let precision = group_precision(column);
-    let mut out: BTreeMap<u32, f64> = sums.iter().map(|(k, s)| (*k, s.offset(column, precision))).collect();
-    let (mut sum, mut weight) = (0.0, 0.0);
-    for (k, s) in sums {
-        let w = s.gram[2 * column].min(1e4 * precision);
-        sum += w * out[k];
-        weight += w;
-    }
-    let mean = if weight > 0.0 { sum / weight } else { 0.0 };
-    out.values_mut().for_each(|v| *v -= mean);
-    out
-}
-
-fn group_gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> f64 {
-    frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
-}
-
-/// Root mean square of the offsets beyond what their errors make.
-fn spread(sums: &BTreeMap<u32, GroupSums>, column: usize) -> (f64, f64) {
-    let offsets = offsets(sums, column);
-    let (mut square, mut noise, mut n) = (0.0, 0.0, 0.0);
-    for (k, s) in sums {
-        let g = s.gram[2 * column];
-        if g > 3.0 * group_precision(column) {
-            square += offsets[k].powi(2);
-            noise += 1.0 / g;
-            n += 1.0;
-        }
-    }
-    if n < 4.0 { (0.0, 0.0) } else { (((square - noise) / n).max(0.0).sqrt(), n) }
+fn how(column: usize) -> GroupFit {
+    GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true }
 }
 
 fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
     let Some(last) = suspects.last() else { return false };
     match last {
         Suspect::Groups { grouping, column, .. } => {
-            let frames = grouped(sums, *grouping);
-            let floor = FLOOR_GROUPS[if *grouping == Grouping::Row { *column } else { 2 }];
-            spread(&total(select.iter().map(|&i| &frames[i])), *column).0 > floor
+            let frames = groups_of(sums, *grouping);
+            let all = total(select.iter().map(|&i| &frames[i]));
+            match grouping {
+                Grouping::Row => grouped::rough_spread(&all, how(*column)) > FLOOR_GROUPS[*column],
+                Grouping::Azimuth => grouped::spread(&all, how(*column), 0.0).0 > FLOOR_GROUPS[2],
+            }
         }
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, select, blocks, suspects);
-            fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
-                columns.contains(c)
-                    && t.abs()
-                        > match sums.columns[*c] {
-                            Column::RangeOffset => FLOOR_OFFSET_M,
-                            Column::RangeScale => 3e-4,
-                            Column::Pose(k) | Column::SensorPose(_, k) => {
-                                if k < 3 {
-                                    FLOOR_TURN_RAD
-                                } else {
-                                    FLOOR_SHIFT_M
+            let bias = |range_m: f64| -> f64 {
+                let told = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
+                told.map(|(c, t)| match sums.columns[*c] {
+                    Column::RangeOffset => *t,
+                    Column::RangeScale => t * range_m,
+                    _ => 0.0,
+                })
+                .sum()
+            };
+            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 2.5 * FLOOR_OFFSET_M;
+            biased
+                || fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
+                    columns.contains(c)
+                        && t.abs()
+                            > match sums.columns[*c] {
+                                Column::RangeOffset | Column::RangeScale => f64::INFINITY,
+                                Column::Pose(k) | Column::SensorPose(_, k) => {
+                                    if k < 3 {
+                                        FLOOR_TURN_RAD
+                                    } else {
+                                        FLOOR_SHIFT_M
+                                    }
                                 }
-                            }
-                            Column::Sweep(k) => {
-                                if k < 2 {
-                                    0.3
-                                } else {
-                                    0.01
+                                Column::Sweep(k) => {
+                                    if k < 2 {
+                                        0.3
+                                    } else {
+                                        0.01
+                                    }
                                 }
+                                Column::Structure(_) => f64::INFINITY,
                             }
-                            Column::Structure(_) => f64::INFINITY,
-                        }
-            })
+                })
         }
     }
 }
@@ -375,21 +371,16 @@ fn told(sums: &Sums, estimate: &[usize], blocks: &[usize], suspect: &Suspect, ch
             fitted.gain(&sums.linear[frame]) - without.gain(&sums.linear[frame])
         }
         Suspect::Groups { grouping, column, .. } => {
-            let frames = grouped(sums, *grouping);
-            let offsets = offsets(&total(estimate.iter().map(|&i| &frames[i])), *column);
-            group_gain(&frames[frame], *column, &offsets)
+            let frames = groups_of(sums, *grouping);
+            let offsets = grouped::offsets(&total(estimate.iter().map(|&i| &frames[i])), how(*column));
+            grouped::gain(&frames[frame], *column, &offsets)
         }
     }
 }
 
-/// What could be told of a frame at all: the best of its own fits.
-fn best_gain(sums: &Sums, frame: usize) -> f64 {
-    let alone = [&sums.linear[frame]];
+/// Fits of all columns and of the structures alone.
+fn everything(sums: &Sums, frames: &[usize], blocks: &[usize]) -> (LinearFit, LinearFit) {
+    let frames: Vec<&LinearFrame> = frames.iter().map(|&i| &sums.linear[i]).collect();
     let all: Vec<usize> = (0..sums.columns.len()).collect();
-    let linear = fit(&alone, &[0], &all, &sums.precision).gain(alone[0]).max(0.0);
-    let groups = [(Grouping::Row, 0), (Grouping::Row, 1), (Grouping::Azimuth, 0)].map(|(g, c)| {
-        let frames = grouped(sums, g);
-        group_gain(&frames[frame], c, &offsets(&total([&frames[frame]].into_iter()), c)).max(0.0)
-    });
-    linear + groups.into_iter().fold(0.0, f64::max)
+    (fit(&frames, blocks, &all, &sums.precision), fit(&frames, blocks, &sums.base, &sums.precision))
 }

@@ -1,0 +1,143 @@
+//! `lidarshift diagnose`: what does the simulation get wrong, why, and what is gained by mending it.
+
+mod pictures;
+
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use data::write::write_kitti_text;
+use data::{Dataset, KittiLine, write_atomic};
+use diagnose::{Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, extended_toml};
+use indicatif::{ProgressBar, ProgressStyle};
+use simulate::race::RaceConfig;
+use std::path::{Path, PathBuf};
+
+/// Compare measured data with their scenario-identical simulation: name what differs, with parameters and intervals, and measure what is
+/// gained by mending it.
+///
+/// Exit codes: 0 when the diagnosis could be made, whatever it says; 3 when the two do not show the same scenes (diagnosis.json says so); 1 when
+/// it could not be made; 2 when the words could not be understood.
+///
+/// Examples:
+///   lidarshift diagnose --measured datasets/measured --simulated datasets/sim --sensor configs/sensors/av21.toml
+///   lidarshift diagnose --measured real --simulated sim --sensor rig.toml --split test --out runs/diagnosis
+#[derive(Args, Debug)]
+#[command(verbatim_doc_comment)]
+pub struct DiagnoseArgs {
+    /// Measured data set: its folder or its TOML
+    #[arg(long, value_name = "DATASET")]
+    measured: PathBuf,
+    /// Simulated data set with the same frame ids
+    #[arg(long, value_name = "DATASET")]
+    simulated: PathBuf,
+    /// Places and directions of the sensors; without it one sensor at the origin of the clouds is assumed
+    #[arg(long, value_name = "TOML")]
+    sensor: Option<PathBuf>,
+    /// Configuration of the simulation, for the places of its sensors where --sensor is not given
+    #[arg(long, value_name = "CONFIG", conflicts_with = "sensor")]
+    simulator: Option<String>,
+    /// Only the frames of this split; without it all frames that both have
+    #[arg(long, value_name = "NAME")]
+    split: Option<String>,
+    /// Folder for diagnosis.json, extended.toml, a picture of each finding and, where labels are at fault, label_2/
+    #[arg(long, value_name = "DIR", default_value = "runs/diagnosis")]
+    out: PathBuf,
+    /// Write diagnosis.json here as well
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+impl DiagnoseArgs {
+    /// Diagnoses, writes the files and says what was found; `false` when the two do not show the same scenes.
+    pub fn run(self) -> Result<bool> {
+        let (measured, simulated) = (Dataset::open(&self.measured)?, Dataset::open(&self.simulated)?);
+        let rig = self.rig()?;
+        if self.out.is_file() {
+            bail!("--out {}: is a file; a folder is wanted", self.out.display());
+        }
+        let bar = ProgressBar::new(1).with_style(
+            ProgressStyle::with_template("{msg:<20} {bar:30} {pos}/{len}, {eta} left").context("a template")?,
+        );
+        let told = |stage: Stage, done: usize, of: usize| {
+            bar.set_message(match stage {
+                Stage::Comparing => "comparing scenes",
+                Stage::Pairing => "pairing frames",
+                Stage::Weighing => "weighing causes",
+            });
+            bar.set_length(of as u64);
+            bar.set_position(done as u64);
+        };
+        let outcome = diagnose(&measured, &simulated, &rig, &Options { split: self.split.clone() }, &told)?;
+        bar.finish_and_clear();
+        let json = serde_json::to_vec_pretty(&outcome.diagnosis)?;
+        write_atomic(&self.out.join("diagnosis.json"), &json)?;
+        if let Some(path) = &self.json {
+            write_atomic(path, &json)?;
+        }
+        write_atomic(
+            &self.out.join("extended.toml"),
+            extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg).as_bytes(),
+        )?;
+        pictures::write(&outcome.diagnosis, &self.out)?;
+        for (id, boxes) in &outcome.corrected {
+            write_labels(&self.out, &measured, id, boxes)?;
+        }
+        say(&outcome.diagnosis, &self.out, outcome.corrected.len());
+        Ok(outcome.diagnosis.verdict != Verdict::NotScenarioIdentical)
+    }
+
+    fn rig(&self) -> Result<SensorRig> {
+        match (&self.sensor, &self.simulator) {
+            (Some(path), _) => Ok(SensorRig::read(path)?),
+            (None, Some(config)) => {
+                let (race, files) = RaceConfig::find(config).with_context(|| format!("--simulator {config}"))?;
+                let (text, path) = files.text(&race.rig)?;
+                Ok(SensorRig::parse(&text, &path)?)
+            }
+            (None, None) => Ok(SensorRig::single()),
+        }
+    }
+}
+
+/// Corrected labels, in the clouds' frame and of the data set's first class.
+fn write_labels(out: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box3]) -> Result<()> {
+    let class = measured.config.classes.first().map_or("Car", String::as_str);
+    let lines: Vec<KittiLine> = boxes.iter().map(|b| KittiLine::from_box(class, b, None)).collect();
+    Ok(write_kitti_text(&out.join(format!("label_2/{id}.txt")), &lines)?)
+}
+
+#[expect(clippy::print_stdout, reason = "results go to stdout")]
+fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
+    for note in &diagnosis.notes {
+        eprintln!("note: {note}");
+    }
+    match diagnosis.verdict {
+        Verdict::NotScenarioIdentical => println!("not scenario-identical: nothing else can be said"),
+        Verdict::NothingFound => {
+            println!("nothing found. The smallest effects that would have been seen:");
+            for (cause, m) in &diagnosis.minimum_detectable {
+                println!("  {cause}: {} {:.4} {}", m.parameter, m.value, m.unit);
+            }
+        }
+        _ => {}
+    }
+    for f in &diagnosis.findings {
+        let name = pictures::name(f);
+        println!("{name}: {}", f.says);
+        for (parameter, p) in f.parameters.iter().filter(|(n, _)| !n.contains('/')) {
+            println!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
+        }
+        if let Some(how) = &f.separate_by {
+            println!("  to tell them apart: {how}");
+        }
+    }
+    if let Some(closed) = diagnosis.gain.closed {
+        println!(
+            "of what the simulation was off on frames held out, {:.0} % are gone with the extended model",
+            100.0 * closed
+        );
+    }
+    if corrected > 0 {
+        println!("corrected labels of {corrected} frames in {}", out.join("label_2").display());
+    }
+    eprintln!("diagnosis.json and extended.toml in {}", out.display());
+}

@@ -1,0 +1,102 @@
+//! One picture of each finding: what was measured along its covariate, what the simulation shows, and what it shows with the finding.
+
+use anyhow::Result;
+use data::write_atomic;
+use diagnose::{Diagnosis, Finding, Status};
+use report::{CurveOptions, Figure, Series};
+use std::path::Path;
+
+/// Curves of several sensors lie this far apart along the covariate.
+const A_SENSOR: f64 = 1000.0;
+
+/// Pixels of a PNG for each of the SVG's.
+const SCALE: f32 = 2.0;
+
+/// Writes `finding-N-NAME.svg` and `.png` into `out`.
+pub fn write(diagnosis: &Diagnosis, out: &Path) -> Result<()> {
+    for (i, finding) in diagnosis.findings.iter().enumerate().filter(|(_, f)| !f.curve.points.is_empty()) {
+        let figure = figure(finding);
+        let name = format!("finding-{}-{}", i + 1, name(finding).replace(' ', "-"));
+        write_atomic(&out.join(format!("{name}.svg")), figure.svg().as_bytes())?;
+        write_atomic(&out.join(format!("{name}.png")), &figure.png(SCALE)?)?;
+    }
+    Ok(())
+}
+
+/// The cause, the candidates, or that there is none.
+pub fn name(finding: &Finding) -> String {
+    match finding.status {
+        Status::Named => finding.cause.clone().unwrap_or_default(),
+        Status::Ambiguous => finding.candidates.clone().unwrap_or_default().join(" or "),
+        Status::Unexplained => "unexplained".into(),
+    }
+}
+
+fn figure(finding: &Finding) -> Figure {
+    let curve = &finding.curve;
+    let of_sensors = curve.x.contains("1000 a sensor");
+    let sensor = |x: f64| if of_sensors { (x / A_SENSOR).round().max(0.0) } else { 0.0 };
+    let last = curve.points.iter().map(|p| sensor(p.x)).fold(0.0, f64::max) as usize;
+    let mut series = Vec::new();
+    for k in 0..=last {
+        let own: Vec<_> = curve.points.iter().filter(|p| sensor(p.x) as usize == k).collect();
+        let word = |what: &str| if last > 0 { format!("{what}, sensor {k}") } else { what.to_owned() };
+        let mut push = |what: &str, value: &dyn Fn(&diagnose::CurvePoint) -> f64| {
+            let points = own.iter().map(|p| [p.x - A_SENSOR * sensor(p.x), value(p)]).collect();
+            series.push(Series { name: word(what), points });
+        };
+        push("measured", &|p| p.measured);
+        if k == 0 {
+            push("simulated", &|p| p.before);
+        }
+        if own.iter().any(|p| p.after != p.measured) {
+            push("simulated with the finding", &|p| p.after);
+        }
+    }
+    let options = CurveOptions {
+        title: name(finding),
+        x_label: curve.x.replace(" (1000 a sensor)", ""),
+        y_label: curve.y.clone(),
+        log_y: false,
+    };
+    Figure::curves(&series, &options)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use diagnose::{Curve, CurvePoint, FindingGain};
+
+    #[test]
+    fn a_picture_shows_before_and_after_by_sensor() {
+        let point = |x: f64| CurvePoint { x, measured: 0.8, before: 1.0, after: 0.79, error: 0.01 };
+        let finding = Finding {
+            status: Status::Unexplained,
+            cause: None,
+            candidates: None,
+            family: "unknown".into(),
+            parameters: Default::default(),
+            confidence: 1.0,
+            channel: "hits".into(),
+            covariate: "row".into(),
+            gain: FindingGain::default(),
+            says: String::new(),
+            separate_by: None,
+            curve: Curve {
+                x: "row (1000 a sensor)".into(),
+                y: "share".into(),
+                points: vec![point(0.0), point(5.0), point(1000.0), point(1005.0)],
+            },
+        };
+        let svg = figure(&finding).svg();
+        for words in [
+            "measured, sensor 0",
+            "measured, sensor 1",
+            "simulated, sensor 0",
+            "simulated with the finding, sensor 1",
+            ">row<",
+        ] {
+            assert!(svg.contains(words), "{words}");
+        }
+    }
+}

@@ -1,0 +1,184 @@
+//! Directions and ranges from which nothing comes back whatever is there: parts of the own car in the way, an end of the range.
+
+use super::returns::OWN_CAR_M;
+use crate::pairing::{FramePair, Ray};
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// What hides a ray before any law of losses applies.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Mask {
+    /// Nothing is measured beyond this, m.
+    pub cut_m: Option<f64>,
+    /// Cells of directions with nothing behind.
+    pub blocked: BTreeSet<DirectionCell>,
+    /// Those and the cells around them, which may be blocked in part.
+    pub around: BTreeSet<DirectionCell>,
+}
+
+/// Sensor and cell of azimuth and elevation.
+pub type DirectionCell = (u8, i32, i32);
+
+/// Size of a cell, rad.
+pub const AZIMUTH_RAD: f64 = 0.0436;
+/// Size of a cell, rad.
+pub const ELEVATION_RAD: f64 = 0.0262;
+
+/// The cell of a ray.
+pub fn direction_cell(ray: &Ray) -> DirectionCell {
+    let az = (f64::from(ray.azimuth_rad) / AZIMUTH_RAD).floor() as i32;
+    let el = (f64::from(ray.elevation_rad) / ELEVATION_RAD).floor() as i32;
+    (ray.sensor, az, el)
+}
+
+impl Mask {
+    /// Whether a ray is hidden, or may be.
+    pub fn hides(&self, ray: &Ray) -> bool {
+        // Just before the end noise moves returns across it.
+        self.cut_m.is_some_and(|cut| f64::from(ray.range_m) > 0.985 * cut)
+            || !self.around.is_empty() && self.around.contains(&direction_cell(ray))
+    }
+
+    /// Whether it hides nothing.
+    pub fn is_empty(&self) -> bool {
+        self.cut_m.is_none() && self.blocked.is_empty()
+    }
+}
+
+/// Returns of a cell of directions: simulated, measured beyond the own car, measured on it.
+pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 3]>;
+
+/// Counts over some frames.
+pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCounts {
+    let one = |i: &usize| {
+        let frame = &frames[*i];
+        let mut counts = DirectionCounts::new();
+        for ray in frame.simulated.iter().filter(|r| r.own_range_m() > OWN_CAR_M) {
+            counts.entry(direction_cell(ray)).or_default()[0] += 1.0;
+        }
+        for ray in &frame.measured {
+            let k = if ray.own_range_m() > OWN_CAR_M { 1 } else { 2 };
+            counts.entry(direction_cell(ray)).or_default()[k] += 1.0;
+        }
+        counts
+    };
+    let merge = |mut a: DirectionCounts, b: DirectionCounts| {
+        for (k, v) in b {
+            let sum = a.entry(k).or_default();
+            (0..3).for_each(|j| sum[j] += v[j]);
+        }
+        a
+    };
+    which.par_iter().map(one).reduce(DirectionCounts::new, merge)
+}
+
+/// Simulated returns that a cell needs to be judged.
+const FEWEST: f64 = 25.0;
+
+/// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
+/// in a cell.
+pub fn blocked_cells(counts: &DirectionCounts, expected: impl Fn(&DirectionCell) -> f64) -> BTreeSet<DirectionCell> {
+    let dark: BTreeSet<DirectionCell> = counts
+        .iter()
+        .filter(|(cell, [n, seen, _])| *n >= FEWEST && seen / n < 0.1 && expected(cell) > 0.5)
+        .map(|(cell, _)| *cell)
+        .collect();
+    // Single cells are chance; what stands in the way has neighbours.
+    dark.iter()
+        .filter(|(s, az, el)| {
+            [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().any(|(da, de)| dark.contains(&(*s, az + da, el + de)))
+        })
+        .copied()
+        .collect()
+}
+
+/// A set of cells and those around them.
+pub fn with_neighbours(cells: &BTreeSet<DirectionCell>) -> BTreeSet<DirectionCell> {
+    let mut all = BTreeSet::new();
+    for (s, az, el) in cells {
+        for da in -1..=1 {
+            all.extend((-1..=1).map(|de| (*s, az + da, el + de)));
+        }
+    }
+    all
+}
+
+/// The end of the range, m: beyond it the simulation has returns and the measured side none, before it both have.
+pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
+    // Returns in company only: false alarms come from everywhere.
+    let ranges = |measured: bool| {
+        let mut all: Vec<f64> = which
+            .iter()
+            .flat_map(|&i| if measured { &frames[i].measured } else { &frames[i].simulated })
+            .filter(|r| r.company >= 2)
+            .map(Ray::own_range_m)
+            .collect();
+        all.sort_by(f64::total_cmp);
+        all
+    };
+    let (a, b) = (ranges(true), ranges(false));
+    if a.len() < 200 || b.len() < 200 {
+        return None;
+    }
+    let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
+    let between = |v: &[f64], low: f64, high: f64| above(v, low) - above(v, high);
+    // The farthest measured return, but for one in two thousand.
+    let farthest = a[a.len() - 1 - a.len() / 2000];
+    let lost = above(&b, farthest);
+    let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
+    let beyond = above(&a, 1.01 * farthest) / above(&b, 1.01 * farthest).max(1.0);
+    let step = lost > 60.0 && lost > 0.0005 * b.len() as f64 && beyond < 0.05;
+    (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
+}
+
+/// Where the share of measured returns among all falls, beyond `from_m`, m: the most likely single step.
+fn change(measured: &[f64], simulated: &[f64], from_m: f64) -> f64 {
+    let mut all: Vec<(f64, f64)> =
+        measured.iter().map(|r| (*r, 1.0)).chain(simulated.iter().map(|r| (*r, 0.0))).collect();
+    all.retain(|(r, _)| *r > from_m);
+    all.sort_by(|x, y| x.0.total_cmp(&y.0));
+    let total: f64 = all.iter().map(|(_, m)| m).sum();
+    let count = all.len() as f64;
+    let likelihood = |n: f64, m: f64| {
+        let p = ((m + 0.5) / (n + 1.0)).clamp(1e-6, 1.0 - 1e-6);
+        m * p.ln() + (n - m) * (1.0 - p).ln()
+    };
+    let (mut best, mut at, mut m) = (f64::NEG_INFINITY, from_m, 0.0);
+    for (i, (range, measured)) in all.iter().enumerate() {
+        m += measured;
+        let n = i as f64 + 1.0;
+        let value = likelihood(n, m) + likelihood(count - n, total - m);
+        if value > best {
+            (best, at) = (value, *range);
+        }
+    }
+    at
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_step_of_returns_is_found() {
+        let simulated: Vec<f64> = (0..2000).map(|i| 0.1 * f64::from(i) + 0.03).collect();
+        let measured: Vec<f64> = (0..800).map(|i| 0.1 * f64::from(i)).chain([130.0]).collect();
+        assert!((change(&measured, &simulated, 60.0) - 80.0).abs() < 0.2);
+    }
+
+    #[test]
+    fn a_hole_in_all_frames_is_found_and_a_single_dark_cell_is_not() {
+        let mut counts = DirectionCounts::new();
+        for az in -10..10 {
+            for el in -5..5 {
+                let hole = (2..5).contains(&az) && (-3..-1).contains(&el) || (az, el) == (-8, 0);
+                counts.insert((0, az, el), [100.0, if hole { 2.0 } else { 97.0 }, 0.0]);
+            }
+        }
+        let blocked = blocked_cells(&counts, |_| 1.0);
+        assert_eq!(blocked.len(), 6);
+        assert!(!blocked.contains(&(0, -8, 0)));
+        assert!(blocked_cells(&counts, |_| 0.2).is_empty(), "other losses explain it");
+        assert_eq!(with_neighbours(&blocked).len(), 20);
+    }
+}

@@ -1,0 +1,147 @@
+//! Offsets of groups, one number each, shrunk by a prior; weighed on frames that they were not fitted on.
+
+use super::linear::{FOLDS, fold_of};
+use crate::channels::groups::{GroupFrame, GroupSums, PARTS, PartedFrame, total};
+use std::collections::BTreeMap;
+
+/// How offsets of groups are fitted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroupFit {
+    /// Which of the two columns of the sums.
+    pub column: usize,
+    /// Prior precision of an offset.
+    pub precision: f64,
+    /// Whether what all groups have in common is taken out: it belongs to other causes.
+    pub centred: bool,
+}
+
+/// Offset of each group.
+pub fn offsets(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, f64> {
+    let mut out: BTreeMap<u32, f64> = sums.iter().map(|(k, s)| (*k, s.offset(how.column, how.precision))).collect();
+    if how.centred {
+        let (mut sum, mut weight) = (0.0, 0.0);
+        for (k, s) in sums {
+            let w = s.gram[2 * how.column].min(1e4 * how.precision);
+            sum += w * out[k];
+            weight += w;
+        }
+        let mean = if weight > 0.0 { sum / weight } else { 0.0 };
+        out.values_mut().for_each(|v| *v -= mean);
+    }
+    out
+}
+
+/// Gain of a frame by offsets, nats.
+pub fn gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> f64 {
+    frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
+}
+
+/// Groups on either side whose offsets a smooth law would tell.
+const NEIGHBOURS: u32 = 3;
+
+/// Mean offset of the neighbours of each group: what a law that is smooth from group to group would say.
+pub fn smooth(sums: &BTreeMap<u32, GroupSums>, offsets: &BTreeMap<u32, f64>, how: GroupFit) -> BTreeMap<u32, f64> {
+    let near = |k: u32| {
+        let around = sums.range(k.saturating_sub(NEIGHBOURS)..=k + NEIGHBOURS).filter(|(g, _)| **g != k);
+        let (sum, weight) = around.fold((0.0, 0.0), |(sum, weight), (g, s)| {
+            let w = s.gram[2 * how.column].min(10.0 * how.precision);
+            (sum + w * offsets[g], weight + w)
+        });
+        if weight > 0.0 { sum / weight } else { 0.0 }
+    };
+    sums.keys().map(|k| (*k, near(*k))).collect()
+}
+
+/// Gains of frames by offsets that were fitted on other folds and on other parts of each group: what surfaces of one part are wrong by does
+/// not tell the other parts. With `rough` over what a smooth law would gain.
+pub fn cross_part_gains(
+    frames: &[PartedFrame],
+    select: &[usize],
+    blocks: &[usize],
+    how: GroupFit,
+    rough: bool,
+) -> Vec<f64> {
+    let folds = fold_of(blocks);
+    let mut out = vec![0.0; select.len()];
+    for fold in 0..FOLDS {
+        let train: Vec<_> = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]).collect();
+        let parts: [_; PARTS] = std::array::from_fn(|part| total(train.iter().map(|f| &f[part])));
+        for part in 0..PARTS {
+            let mut others = BTreeMap::<u32, GroupSums>::new();
+            for (_, sums) in parts.iter().enumerate().filter(|(p, _)| *p != part) {
+                sums.iter().for_each(|(k, s)| others.entry(*k).or_default().merge(s));
+            }
+            let told = offsets(&others, how);
+            let smooth = if rough { smooth(&others, &told, how) } else { BTreeMap::new() };
+            for i in (0..select.len()).filter(|&i| folds[i] == fold) {
+                let frame = &frames[select[i]][part];
+                out[i] += gain(frame, how.column, &told) - gain(frame, how.column, &smooth);
+            }
+        }
+    }
+    out
+}
+
+/// Spread of the offsets from row to row: from the median of second differences between neighbouring groups, so that offsets that are
+/// smooth but for a few jumps have none.
+pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
+    let offsets = offsets(sums, how);
+    let known = |k: u32| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
+    let second = |k: &u32| Some((known(*k)? - 0.5 * (known(k.checked_sub(1)?)? + known(k + 1)?)).abs());
+    let mut differences: Vec<f64> = sums.keys().filter_map(second).collect();
+    if differences.len() < 4 {
+        return 0.0;
+    }
+    differences.sort_by(f64::total_cmp);
+    differences[differences.len() / 2] / 0.6745 / 1.5f64.sqrt()
+}
+
+/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well. The largest `trimmed` share of
+/// them does not count.
+pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
+    let offsets = offsets(sums, how);
+    let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
+    let mut squares: Vec<(f64, f64)> = known.map(|(k, s)| (offsets[k].powi(2), 1.0 / s.gram[2 * how.column])).collect();
+    squares.sort_by(|a, b| a.0.total_cmp(&b.0));
+    squares.truncate(((1.0 - trimmed) * squares.len() as f64).ceil() as usize);
+    let n = squares.len() as f64;
+    let excess: f64 = squares.iter().map(|(square, noise)| square - noise).sum();
+    if n < 4.0 { (0.0, 0.0) } else { ((excess / n).max(0.0).sqrt(), n) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand_distr::{Distribution, StandardNormal};
+
+    #[test]
+    fn offsets_and_their_spread_are_found_and_noise_gains_nothing() {
+        let mut rng = data::stream(3, "grouped", 0, 0);
+        // Offsets of groups, and what the surfaces of one part are wrong by.
+        let mut made = |size: f64, of_a_part: f64| -> Vec<PartedFrame> {
+            let mut group = |k: u32, part: usize| {
+                let own = if k % 2 == 0 { size } else { -size };
+                let truth = own + if part == 1 && k > 9 { of_a_part } else { 0.0 };
+                let noise: f64 = StandardNormal.sample(&mut rng);
+                let w = 100.0;
+                (k, GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.1 * noise), 0.0], n: 1.0 })
+            };
+            (0..16).map(|_| std::array::from_fn(|part| (0..20).map(|k| group(k, part)).collect())).collect()
+        };
+        let how = GroupFit { column: 0, precision: 1.0, centred: true };
+        let select: Vec<usize> = (0..16).collect();
+        let all = |frames: &[PartedFrame]| total(frames.iter().flatten());
+        for rough in [false, true] {
+            let frames = made(0.05, 0.0);
+            assert!(cross_part_gains(&frames, &select, &select, how, rough).iter().sum::<f64>() > 50.0);
+            assert!((spread(&all(&frames), how, 0.0).0 - 0.05).abs() < 0.01);
+            // Neighbours differ by twice the offset each time.
+            assert!((rough_spread(&all(&frames), how) - 0.12).abs() < 0.03, "{}", rough_spread(&all(&frames), how));
+            let nothing = made(0.0, 0.0);
+            assert!(cross_part_gains(&nothing, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
+            let surface = made(0.0, 0.2);
+            assert!(cross_part_gains(&surface, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
+            assert!(rough_spread(&all(&surface), how) < 0.02);
+        }
+    }
+}

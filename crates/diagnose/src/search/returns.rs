@@ -1,0 +1,234 @@
+//! Returns too many: false alarms, mixed ranges at edges, things that the simulation has not got.
+
+use super::{ChannelResult, Context, Found, Z_STAR, parameter};
+use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
+use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Status};
+use crate::inference::choice::total_and_z;
+use crate::inference::linear::{FOLDS, fold_of};
+use crate::inference::roles::Role;
+use crate::pairing::Ray;
+
+/// Share of returns below which nothing is said, by kind.
+const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.003, 0.003];
+
+/// The search.
+pub fn search(context: &Context) -> ChannelResult {
+    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
+    let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
+    let blocks = context.blocks(&select);
+    let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
+    let excess_of = |frames: &[usize], kind: usize| excess(frames.iter().map(|&i| &odd[i]), kind);
+    for kind in ODD {
+        let k = kind as usize;
+        let name = name(kind);
+        let gains = cross_gains(&odd, &select, &blocks, k);
+        let (total, z) = total_and_z(&gains);
+        let [base, more] = excess_of(&select, k);
+        // How much more there is on each frame by itself.
+        let differences: Vec<f64> = select
+            .iter()
+            .map(|&i| odd[i].counts[k][0] / odd[i].all[0].max(1.0) - odd[i].counts[k][1] / odd[i].all[1].max(1.0))
+            .collect();
+        let (_, z_difference) = total_and_z(&differences);
+        let error = base.max(more.abs() / 30.0) / z_difference.abs().max(1e-9);
+        let floor = FLOORS[k].max(0.3 * base);
+        let mut outcome = "no more of them than on the simulated side";
+        let seen = total > 8.0 && z > Z_STAR && z_difference > Z_STAR;
+        // Surfaces that only stand elsewhere are missed in one place and found in another.
+        let one_sided = match kind {
+            Odd::GroupInFront => more > 3.0 * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
+            Odd::GroupBehind => more > 3.0 * excess_of(&select, Odd::GroupInFront as usize)[1].max(0.0),
+            _ => true,
+        };
+        if seen && more <= floor {
+            outcome = "too small to speak of";
+        } else if seen && !one_sided {
+            outcome = "as many are missing elsewhere: surfaces stand elsewhere, nothing was added";
+        } else if seen {
+            outcome = "chosen";
+            let [base_e, more_e] = excess_of(&estimate, k);
+            let values: Vec<f64> = estimate
+                .iter()
+                .map(|&i| odd[i].counts[k][0] / odd[i].all[0].max(1.0) - odd[i].counts[k][1] / odd[i].all[1].max(1.0))
+                .collect();
+            let (_, z_e) = total_and_z(&values);
+            let share_error = more_e.abs() / z_e.abs().max(1e-9);
+            let held: Vec<f64> = hold_out.iter().map(|&i| gain(&odd[i], k, base_e, more_e)).collect();
+            result.found.push(found(context, kind, more_e, share_error, held, &odd, &estimate, z));
+            for (d, &i) in result.distance.iter_mut().zip(&hold_out) {
+                let (before, after) = distance(&odd[i], k, base_e, more_e);
+                *d = [d[0] + before, d[1] + before - after, d[2] + before - after];
+            }
+        }
+        let considered = Considered {
+            cause: name.into(),
+            channel: "returns".into(),
+            nats_per_ray: total / context.returns(&select),
+            z,
+            outcome: outcome.into(),
+        };
+        result.considered.push(considered);
+        let minimum =
+            Minimum { parameter: "share".into(), value: (Z_STAR * error.min(0.1)).max(floor), unit: "1".into() };
+        if kind != Odd::GroupBehind {
+            result.minimum.push((name.into(), minimum));
+        }
+    }
+    result
+}
+
+fn name(kind: Odd) -> &'static str {
+    match kind {
+        Odd::Alone => "outliers",
+        Odd::Between => "mixed_pixels",
+        Odd::GroupInFront | Odd::GroupBehind => "missing_object",
+    }
+}
+
+/// Share on the simulated side, and how much more the measured side has.
+fn excess<'a>(frames: impl Iterator<Item = &'a OddFrame>, k: usize) -> [f64; 2] {
+    let mut sum = [0.0; 4];
+    for f in frames {
+        for (s, v) in sum.iter_mut().zip([f.counts[k][0], f.counts[k][1], f.all[0], f.all[1]]) {
+            *s += v;
+        }
+    }
+    let base = (sum[1] + 0.5) / sum[3].max(1.0);
+    [base, sum[0] / sum[2].max(1.0) - base]
+}
+
+/// Gain of a frame's count, nats.
+fn gain(frame: &OddFrame, k: usize, base: f64, more: f64) -> f64 {
+    let rate = (base + more).max(0.05 * base);
+    frame.counts[k][0] * (rate / base).ln() - frame.all[0] * (rate - base)
+}
+
+/// Distance of a frame's count from the simulated share, and from that with what was found.
+fn distance(frame: &OddFrame, k: usize, base: f64, more: f64) -> (f64, f64) {
+    let n = frame.counts[k][0];
+    let from = |rate: f64| {
+        let expected = frame.all[0] * rate.max(1e-9);
+        (if n > 0.0 { n * (n / expected).ln() } else { 0.0 }) - (n - expected)
+    };
+    (from(base), from((base + more).max(0.05 * base)))
+}
+
+fn cross_gains(odd: &[OddFrame], select: &[usize], blocks: &[usize], k: usize) -> Vec<f64> {
+    let folds = fold_of(blocks);
+    let mut gains = vec![0.0; select.len()];
+    for fold in 0..FOLDS {
+        let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &odd[select[i]]);
+        let [base, more] = excess(train, k);
+        for i in (0..select.len()).filter(|&i| folds[i] == fold) {
+            gains[i] = gain(&odd[select[i]], k, base, more.max(0.0));
+        }
+    }
+    gains
+}
+
+#[expect(clippy::too_many_arguments, reason = "the parts of a finding")]
+fn found(
+    context: &Context,
+    kind: Odd,
+    share: f64,
+    error: f64,
+    held_out_gains: Vec<f64>,
+    odd: &[OddFrame],
+    estimate: &[usize],
+    z: f64,
+) -> Found {
+    let name = name(kind);
+    let mut parameters = vec![];
+    let (covariate, says) = match kind {
+        Odd::Alone => {
+            // Those that fall onto a surface by chance are not seen.
+            let share = share / 0.97;
+            parameters.push(parameter("rate", share, error.hypot(0.05 * share), "1"));
+            (
+                "none",
+                format!(
+                    "{:.2} % of the measured returns stand alone where nothing is: false alarms that your simulator does not make",
+                    100.0 * share
+                ),
+            )
+        }
+        Odd::Between => {
+            parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
+            let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
+            let of_edges = share * sum(|f| f.all[0]) / sum(|f| f.at_edges).max(1.0);
+            parameters.push(parameter(
+                "share_at_edges",
+                of_edges,
+                (error / share.max(1e-9) * of_edges).hypot(0.05 * of_edges),
+                "1",
+            ));
+            (
+                "edge",
+                format!(
+                    "{:.2} % of the returns at edges lie between the two surfaces: beams have a width, your simulator's are lines",
+                    100.0 * of_edges
+                ),
+            )
+        }
+        Odd::GroupInFront => {
+            parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
+            (
+                "place",
+                format!(
+                    "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
+                    100.0 * share
+                ),
+            )
+        }
+        Odd::GroupBehind => {
+            parameters.push(parameter("share", -share, error.hypot(0.05 * share), "1"));
+            (
+                "place",
+                format!(
+                    "{:.2} % of the measured returns lie together behind what the simulation has there: it has things that are not on the road",
+                    100.0 * share
+                ),
+            )
+        }
+    };
+    let family = if matches!(kind, Odd::Alone | Odd::Between) { "returns" } else { "geometry" };
+    Found {
+        status: Status::Named,
+        causes: vec![name.into()],
+        family,
+        parameters,
+        confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
+        channel: "returns",
+        covariate: covariate.into(),
+        held_out_gains,
+        says,
+        separate_by: None,
+        curve: curve(context, kind, estimate),
+    }
+}
+
+/// Share of such returns by range.
+fn curve(context: &Context, kind: Odd, frames: &[usize]) -> Curve {
+    const BINS: usize = 12;
+    let bin = |r: &Ray| ((r.own_range_m() / 10.0) as usize).min(BINS - 1);
+    let mut counts = [[0.0f64; BINS]; 4];
+    for &f in frames {
+        for (side, rays) in [&context.frames[f].measured, &context.frames[f].simulated].into_iter().enumerate() {
+            for ray in rays {
+                counts[2 * side][bin(ray)] += 1.0;
+                if crate::channels::returns::odd(ray) == Some(kind) {
+                    counts[2 * side + 1][bin(ray)] += 1.0;
+                }
+            }
+        }
+    }
+    let total: [f64; 2] = [0, 2].map(|k: usize| counts[k].iter().sum::<f64>().max(1.0));
+    let points = (0..BINS).map(|b| CurvePoint {
+        x: 10.0 * b as f64 + 5.0,
+        measured: counts[1][b] / total[0],
+        before: counts[3][b] / total[1],
+        after: counts[1][b] / total[0],
+        error: counts[1][b].sqrt() / total[0],
+    });
+    Curve { x: "range, m".into(), y: "share of all returns".into(), points: points.collect() }
+}

@@ -1,0 +1,49 @@
+//! A small blind set with fixed seeds: what is hidden must be named, nothing else, and nothing where nothing is hidden.
+//!
+//! A few cases of the large set, `cargo xtask bench blind`: what a change of the diagnosis must not lose.
+
+use data::Dataset;
+use diagnose::{Options, SensorRig, diagnose};
+use lidarshift_blind::score::{Outcome, score};
+use lidarshift_blind::{CAUSES, CaseSize, Kind, draw_case, write_case};
+use rayon::prelude::*;
+
+fn outcome(seed: u64, kind: Kind) -> Outcome {
+    let folder = tempfile::tempdir().unwrap();
+    let truth = write_case(&draw_case(seed, kind, CaseSize::USUAL), folder.path()).unwrap();
+    let open = |side: &str| Dataset::open(&folder.path().join(side)).unwrap();
+    let rig = SensorRig::read(&folder.path().join("sensor.toml")).unwrap();
+    let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ()).unwrap();
+    score(&truth, &serde_json::to_value(&found.diagnosis).unwrap(), 0.0)
+}
+
+fn single(cause: &str) -> Kind {
+    Kind::Single(CAUSES.iter().position(|c| *c == cause).unwrap())
+}
+
+#[test]
+fn what_is_hidden_is_named() {
+    let cases = [
+        (1, Kind::Null, "clean"),
+        (2, Kind::Null, "clean"),
+        (3, Kind::Shuffled, "refused"),
+        (220, single("range_noise"), "right"),
+        (221, single("range_bias"), "right"),
+        (226, single("random_dropout"), "right"),
+    ];
+    let wrong: Vec<String> = cases
+        .par_iter()
+        .filter_map(|&(seed, kind, want)| {
+            let o = outcome(seed, kind);
+            let told = format!(
+                "{seed}: {:?} gives {} ({:?} {:?}), not {want}",
+                o.truth.hidden,
+                o.word(),
+                o.named,
+                o.ambiguous
+            );
+            (o.word() != want).then_some(told)
+        })
+        .collect();
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
