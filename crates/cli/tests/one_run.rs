@@ -10,6 +10,8 @@ use std::process::Stdio;
 use std::time::Duration;
 
 const TRAIN: &str = "train --dataset . --detector tiny.toml --epochs 4 --set run.checkpoint_every_steps=2";
+const TRAIN_POINTRCNN: &str =
+    "train --dataset . --detector tiny_pointrcnn.toml --epochs 4 --set run.checkpoint_every_steps=2";
 
 fn weights(folder: &Path, run: &str) -> Vec<u8> {
     fs::read(folder.join(run).join("checkpoint/last.safetensors")).unwrap()
@@ -22,12 +24,21 @@ fn steps(folder: &Path, run: &str) -> usize {
 
 #[test]
 fn killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
+    kill_and_resume(TRAIN);
+}
+
+#[test]
+fn pointrcnn_killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
+    kill_and_resume(TRAIN_POINTRCNN);
+}
+
+fn kill_and_resume(train: &str) {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
-    must(dir.path(), &format!("{TRAIN} --seed 1 --out whole"));
+    must(dir.path(), &format!("{train} --seed 1 --out whole"));
     let mut kills = 0;
     for patience_ms in [0, 15, 40, 90, 150, 300] {
-        let words = format!("{TRAIN} --seed 1 --out killed --resume");
+        let words = format!("{train} --seed 1 --out killed --resume");
         let mut child = program(dir.path(), &words).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
         let before = steps(dir.path(), "killed");
         while steps(dir.path(), "killed") == before && child.try_wait().unwrap().is_none() {
@@ -39,7 +50,7 @@ fn killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
         child.wait().unwrap();
     }
     assert!(kills >= 2, "only {kills} runs were killed before their end");
-    must(dir.path(), &format!("{TRAIN} --seed 1 --out killed --resume"));
+    must(dir.path(), &format!("{train} --seed 1 --out killed --resume"));
     assert!(weights(dir.path(), "killed") == weights(dir.path(), "whole"), "the weights differ");
 }
 

@@ -38,7 +38,37 @@ epochs = 3
 batch_size = 2
 "#;
 
-/// Seven frames with a car or two on a flat ground in KITTI's layout with labels in the LiDAR frame, and `tiny.toml` beside them.
+/// The same for PointRCNN.
+pub const TINY_POINTRCNN: &str = r#"
+name = "tiny_pointrcnn"
+classes = ["Car"]
+channels = 4
+range_m = [0.0, -5.12, -3.0, 10.24, 5.12, 1.0]
+[network]
+kind = "pointrcnn"
+sampling = { points = 256 }
+levels = [
+    { centers = 64, scales = [{ radius_m = 0.5, samples = 8, filters = [8, 8] }] },
+    { centers = 16, scales = [{ radius_m = 1.5, samples = 8, filters = [12, 16] }] },
+]
+propagation = [[16], [16]]
+point_head = { mean_sizes = [{ class = "Car", size_m = [3.9, 1.6, 1.56] }], class_filters = [8, 8], box_filters = [8, 8] }
+proposals = { train = { iou = 0.8, pre = 256, post = 32 }, test = { iou = 0.85, pre = 256, post = 16 } }
+roi_sampling = { regions = 16 }
+[network.roi_head]
+points = 32
+xyz_filters = [8, 8]
+levels = [{ centers = 8, radius_m = 0.4, samples = 8, filters = [8, 8] }]
+global_filters = [8, 16]
+class_filters = [8, 8]
+box_filters = [8, 8]
+[optimization]
+epochs = 3
+batch_size = 2
+"#;
+
+/// Seven frames with a car or two on a flat ground in KITTI's layout with labels in the LiDAR frame, and `tiny.toml` and
+/// `tiny_pointrcnn.toml` beside them.
 pub fn data_set(folder: &Path) {
     let mut ids = Vec::new();
     for i in 0..7u64 {
@@ -66,6 +96,7 @@ pub fn data_set(folder: &Path) {
     write_split(&folder.join("ImageSets/train.txt"), &ids[..5]).unwrap();
     write_split(&folder.join("ImageSets/val.txt"), &ids[5..]).unwrap();
     std::fs::write(folder.join("tiny.toml"), TINY_DETECTOR).unwrap();
+    std::fs::write(folder.join("tiny_pointrcnn.toml"), TINY_POINTRCNN).unwrap();
 }
 
 /// The program with these words, in `folder`, in which relative paths are looked up.
