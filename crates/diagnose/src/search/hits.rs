@@ -213,7 +213,7 @@ pub(super) fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
 /// Laws that tell the same story are not put on top of each other: a second one mends the form of the first.
 fn may_join(law: Law, chosen: &[Law]) -> bool {
     let smooth = |l: &Law| matches!(l, Law::Range | Law::Incidence | Law::Signal);
-    !chosen.contains(&law) && !(smooth(&law) && chosen.iter().any(smooth))
+    !(chosen.contains(&law) || smooth(&law) && chosen.iter().any(smooth))
 }
 
 /// Numbers of a law as people read them.
