@@ -120,7 +120,7 @@ mod tests {
         // Offsets of groups, and what the surfaces of one part are wrong by.
         let mut made = |size: f64, of_a_part: f64| -> Vec<PartedFrame> {
             let mut group = |k: u32, part: usize| {
-                let own = if k % 2 == 0 { size } else { -size };
+                let own = if k.is_multiple_of(2) { size } else { -size };
                 let truth = own + if part == 1 && k > 9 { of_a_part } else { 0.0 };
                 let noise: f64 = StandardNormal.sample(&mut rng);
                 let w = 100.0;
