@@ -18,24 +18,38 @@ pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]
     rows.sort_by(|a, b| a.0.total_cmp(&b.0));
     let per = (rows.iter().map(|r| r.1).sum::<f64>() / 14.0).max(1.0);
     let mut points = Vec::new();
-    let mut sum = [0.0f64; 5];
-    for (i, (x, n, va, vb, vc)) in rows.iter().enumerate() {
-        for (s, v) in sum.iter_mut().zip([1.0, *x, *va, *vb, *vc]) {
-            *s += n * v;
-        }
-        if sum[0] >= per || i + 1 == rows.len() && sum[0] > 0.2 * per {
-            let [n, x, va, vb, vc] = sum;
-            let sd = |v: f64| (v / n).sqrt();
+    let mut cells: Vec<(f64, f64, f64, f64, f64)> = Vec::new();
+    for (i, row) in rows.iter().enumerate() {
+        cells.push(*row);
+        let n: f64 = cells.iter().map(|c| c.1).sum();
+        if n >= per || i + 1 == rows.len() && n > 0.2 * per {
+            // Cells that hold an edge are rough on both sides and would hide the others in a mean.
+            let sd = |of: fn(&(f64, f64, f64, f64, f64)) -> f64| {
+                weighted_median(cells.iter().map(|c| (of(c), c.1)).collect()).sqrt()
+            };
+            let measured = sd(|c| c.2);
             points.push(CurvePoint {
-                x: x / n,
-                measured: sd(va),
-                before: sd(vb),
-                after: sd(vc),
-                error: sd(va) / n.sqrt(),
+                x: cells.iter().map(|c| c.0 * c.1).sum::<f64>() / n,
+                measured,
+                before: sd(|c| c.3),
+                after: sd(|c| c.4),
+                error: measured / n.sqrt(),
             });
-            sum = [0.0; 5];
+            cells.clear();
         }
     }
     let x = if angular { "range x tan(incidence), m" } else { "range, m" };
     Curve { x: x.into(), y: "standard deviation along the ray, m".into(), points }
+}
+
+/// The value below which half of the weight lies, of `(value, weight)`.
+fn weighted_median(mut values: Vec<(f64, f64)>) -> f64 {
+    values.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let half = values.iter().map(|v| v.1).sum::<f64>() / 2.0;
+    let mut below = 0.0;
+    let found = values.iter().find(|(_, weight)| {
+        below += weight;
+        below >= half
+    });
+    found.map_or(0.0, |v| v.0)
 }
