@@ -301,19 +301,12 @@ mod tests {
         }
     }
 
-    #[test]
-    fn effects_stand_in_the_order_in_which_light_meets_them() {
-        let diagnosis = Diagnosis {
+    fn diagnosis(findings: Vec<Finding>) -> Diagnosis {
+        Diagnosis {
             schema: SCHEMA.into(),
             verdict: Verdict::Explained,
             frames: Default::default(),
-            findings: vec![
-                finding("label_offset", &[("forward_m", 0.3)]),
-                finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
-                finding("random_dropout", &[("share", 0.2)]),
-                finding("random_dropout", &[("share", -0.2)]),
-                finding("wrong_shape", &[("longer_m", 0.2)]),
-            ],
+            findings,
             minimum_detectable: Default::default(),
             gain: Gain {
                 metric: "nats_per_ray".into(),
@@ -325,7 +318,18 @@ mod tests {
             },
             considered: vec![],
             notes: vec![],
-        };
+        }
+    }
+
+    #[test]
+    fn effects_stand_in_the_order_in_which_light_meets_them() {
+        let diagnosis = diagnosis(vec![
+            finding("label_offset", &[("forward_m", 0.3)]),
+            finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
+            finding("random_dropout", &[("share", 0.2)]),
+            finding("random_dropout", &[("share", -0.2)]),
+            finding("wrong_shape", &[("longer_m", 0.2)]),
+        ]);
         let text = extended_toml(&diagnosis, &SensorRig::single(), &[]);
         let table: toml::Table = toml::from_str(&text).unwrap();
         let kinds: Vec<&str> =
@@ -390,23 +394,7 @@ mod tests {
         ];
         for f in findings {
             let what = f.cause.clone().unwrap_or_else(|| f.channel.clone());
-            let diagnosis = Diagnosis {
-                schema: SCHEMA.into(),
-                verdict: Verdict::Explained,
-                frames: Default::default(),
-                findings: vec![f],
-                minimum_detectable: Default::default(),
-                gain: Gain {
-                    metric: "nats_per_ray".into(),
-                    before: 1.0,
-                    after: 0.1,
-                    floor: 0.0,
-                    closed: Some(0.9),
-                    ci95: None,
-                },
-                considered: vec![],
-                notes: vec![],
-            };
+            let diagnosis = diagnosis(vec![f]);
             let text = extended_toml(&diagnosis, &SensorRig::single(), &[vec![-5.0, -4.0]]);
             let read = simulate::effects::EffectList::parse(&text, std::path::Path::new("extended.toml"));
             let effects = read.unwrap_or_else(|e| panic!("{what}: {e}\n{text}")).effects;

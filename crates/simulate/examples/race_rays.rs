@@ -1,8 +1,8 @@
 //! Rays of the race against its triangles, timed, and beside Embree where Open3D is there.
 //!
 //! ```sh
-//! python3 -m venv /tmp/open3d && /tmp/open3d/bin/pip install open3d numpy
-//! cargo run --release -p lidarshift-simulate --example race_rays -- bench/raycast /tmp/open3d/bin/python
+//! python3 -m venv .venv && .venv/bin/pip install open3d numpy
+//! cargo run --release -p lidarshift-simulate --example race_rays -- bench/raycast .venv/bin/python
 //! ```
 //!
 //! Writes triangles and rays of 20 frames to the folder, casts them with each instruction set on one and on two threads, lets

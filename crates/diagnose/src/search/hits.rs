@@ -1,8 +1,9 @@
 //! Lost returns: which simulated returns has the measured side not, and on what does it depend?
 
+use super::unnamed::{Unnamed, word};
 use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
 use crate::channels::cells::ZONE_NAMES;
-use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
+use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
@@ -171,38 +172,19 @@ fn unnamed_found(
     confidence: f64,
 ) -> Found {
     let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
-    let offsets = grouped::offsets(&all, GROUPED);
     let (spread, _) = grouped::spread(&all, GROUPED, trimmed(grouping));
-    let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
-    let points = offsets.iter().map(|(k, lost)| {
-        let (sensor, place) = place_of(*k as usize, grouping);
-        let place = if grouping == Grouping::Row { place } else { place.to_degrees() };
-        let error = 1.0 / (all[k].gram[0] + GROUPED.precision).sqrt();
-        CurvePoint { x: place + 1000.0 * sensor as f64, measured: 1.0 - lost, before: 1.0, after: 1.0 - lost, error }
-    });
-    Found {
-        status: Status::Unexplained,
-        causes: vec![],
-        family: "unknown",
-        parameters: vec![],
-        confidence,
+    let told = Unnamed {
         channel: "hits",
-        covariate: word.into(),
-        held_out_gains: hold_out
-            .iter()
-            .map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum())
-            .collect(),
+        confidence,
+        parameters: vec![],
         says: format!(
-            "the share of lost returns depends on the {word}, by {:.1} % from one to the next; no cause of the catalogue does that",
+            "the share of lost returns depends on the {}, by {:.1} % from one to the next; no cause of the catalogue does that",
+            word(grouping),
             100.0 * spread
         ),
-        separate_by: None,
-        curve: Curve {
-            x: format!("{word} (1000 a sensor)"),
-            y: "share of simulated returns that are measured".into(),
-            points: points.collect(),
-        },
-    }
+        y: "share of simulated returns that are measured",
+    };
+    told.found(&all, GROUPED, grouping, hold_out.iter().map(|&i| &groups[i]), |lost, std| [1.0 - lost, std])
 }
 
 /// Fits laws one on top of the other.

@@ -7,6 +7,7 @@ pub mod mask;
 pub mod noise;
 pub mod quantisation;
 pub mod returns;
+mod unnamed;
 
 use crate::channels::groups::Grouping;
 use crate::diagnosis::{Considered, Curve, FindingGain, Minimum, Parameter, Status};

@@ -2,11 +2,12 @@
 
 mod curve;
 
+use super::unnamed::{Unnamed, word};
 use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed};
-use crate::channels::groups::{Grouping, PartedFrame, place_of, total as group_total};
+use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::mean::usual_noise_m;
 use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
-use crate::diagnosis::{Curve, CurvePoint, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
@@ -210,37 +211,20 @@ fn unnamed_found(
     usual_m: f64,
 ) -> Found {
     let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
-    let offsets = grouped::offsets(&all, GROUPED);
-    let word = if grouping == Grouping::Row { "row" } else { "azimuth" };
-    let points = offsets.iter().map(|(k, added)| {
-        let (sensor, place) = place_of(*k as usize, grouping);
-        let place = if grouping == Grouping::Row { place } else { place.to_degrees() };
-        let measured = (1.0 + added).max(0.0).sqrt();
-        let error = 0.5 / (all[k].gram[0] + GROUPED.precision).sqrt() / measured.max(0.1);
-        CurvePoint { x: place + 1000.0 * sensor as f64, measured, before: 1.0, after: measured, error }
-    });
-    Found {
-        status: Status::Unexplained,
-        causes: vec![],
-        family: "unknown",
-        parameters: vec![parameter("simulated_std_m", usual_m, 0.05 * usual_m, "m")],
-        confidence: 1.0,
+    let told = Unnamed {
         channel: "roughness",
-        covariate: word.into(),
-        held_out_gains: hold_out
-            .iter()
-            .map(|&i| groups[i].iter().map(|part| grouped::gain(part, 0, &offsets)).sum())
-            .collect(),
+        confidence: 1.0,
+        parameters: vec![parameter("simulated_std_m", usual_m, 0.05 * usual_m, "m")],
         says: format!(
-            "measured ranges scatter more in some directions than in others: it depends on the {word}, and no cause of the catalogue does that"
+            "measured ranges scatter more in some directions than in others: it depends on the {}, and no cause of the catalogue does that",
+            word(grouping)
         ),
-        separate_by: None,
-        curve: Curve {
-            x: format!("{word} (1000 a sensor)"),
-            y: "standard deviation in units of the simulated one".into(),
-            points: points.collect(),
-        },
-    }
+        y: "standard deviation in units of the simulated one",
+    };
+    told.found(&all, GROUPED, grouping, hold_out.iter().map(|&i| &groups[i]), |added, std| {
+        let measured = (1.0 + added).max(0.0).sqrt();
+        [measured, 0.5 * std / measured.max(0.1)]
+    })
 }
 
 /// Sums of a frame after the variance that is explained already.
