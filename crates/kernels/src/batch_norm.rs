@@ -29,7 +29,10 @@ pub struct Statistics {
     pub variance: Vec<f64>,
 }
 
-/// Values in a group of columns that a task takes where channels lie side by side.
+/// Rows that a task takes where an image is a row of its channels' values.
+const ROWS: usize = 128;
+
+/// Columns of such a row that are worked on together.
 const COLUMNS: usize = 32;
 
 /// Below this many pixels an image is a row of its channels' values instead of one run for each of them.
@@ -97,19 +100,27 @@ impl BatchNorm {
     pub fn forward(&self, x: &[f32], gamma: &[f32], beta: &[f32], statistics: &Statistics, y: &mut Vec<f32>) {
         self.check(x, gamma, beta);
         let affine = self.affine(gamma, beta, statistics);
-        // SAFETY: every run of a channel is written.
+        let normalised = |x: f32, a: &Affine| {
+            let z = a.of(x);
+            if self.relu && z < 0.0 { 0.0 } else { z }
+        };
+        let row = self.channels * self.pixels;
+        let rows = Affines::of_row(if self.pixels < SHORT { row } else { 0 }, |c| affine[c / self.pixels]);
+        // SAFETY: every row, or every run of a channel, is written.
         unsafe {
             fill(y, self.len(), |y| {
-                let runs = y.par_chunks_mut(self.pixels.max(1)).zip(x.par_chunks(self.pixels.max(1)));
-                runs.with_min_len(1 + 4096 / self.pixels.max(1)).enumerate().for_each(|(run, (y, x))| {
-                    let a = &affine[run % self.channels];
-                    vectorized(|| {
-                        for (y, &x) in y.iter_mut().zip(x) {
-                            let z = a.of(x);
-                            y.write(if self.relu && z < 0.0 { 0.0 } else { z });
-                        }
+                if self.is_empty() {
+                } else if self.pixels < SHORT {
+                    y.par_chunks_mut(ROWS * row).zip(x.par_chunks(ROWS * row)).for_each(|(y, x)| {
+                        apply_to_rows(y, (x, x), row, &rows, &|x, _, a| normalised(x, a));
                     });
-                });
+                } else {
+                    let runs = y.par_chunks_mut(self.pixels).zip(x.par_chunks(self.pixels));
+                    runs.with_min_len(1 + 4096 / self.pixels).enumerate().for_each(|(run, (y, x))| {
+                        let a = &affine[run % self.channels];
+                        vectorized(|| y.iter_mut().zip(x).for_each(|(y, &x)| _ = y.write(normalised(x, a))));
+                    });
+                }
             });
         }
     }
@@ -128,7 +139,8 @@ impl BatchNorm {
         self.check(x, gamma, beta);
         assert_eq!(dy.len(), self.len(), "elements of dy of {self:?}");
         let before = self.affine(gamma, beta, statistics);
-        let gradient = |x: f32, dy: f32, a: &Affine| if self.relu && !(a.of(x) > 0.0) { 0.0 } else { dy };
+        let linear = !self.relu;
+        let gradient = |x: f32, dy: f32, a: &Affine| if linear | (a.of(x) > 0.0) { dy } else { 0.0 };
         // Sums of g and of g (x - mean).
         let moments = |x: f32, dy: f32, a: &Affine| {
             let g = gradient(x, dy, a) as f64;
@@ -175,10 +187,10 @@ impl BatchNorm {
         if out.is_empty() {
             return vec![[0.0; 2]; self.channels];
         }
-        let out = Shared::new(out);
         if self.pixels < SHORT {
             return self.short_passes(x, other, out, before, moments, affine, apply);
         }
+        let out = Shared::new(out);
         let channel = |channel: usize| {
             let run = |n: usize| (n * self.channels + channel) * self.pixels;
             let before = before(channel);
@@ -214,59 +226,89 @@ impl BatchNorm {
         (0..self.channels).into_par_iter().map(channel).collect()
     }
 
-    /// [`BatchNorm::two_passes`] where an image has few pixels: a row of `channels * pixels` columns, some of which a task takes.
+    /// [`BatchNorm::two_passes`] where an image has few pixels: some rows of `channels * pixels` columns a task.
+    /// The sums of the tasks are added in order, so that the number of threads changes nothing.
     #[allow(clippy::too_many_arguments)]
     fn short_passes(
         &self,
         x: &[f32],
         other: &[f32],
-        out: Shared<'_>,
+        out: &mut [MaybeUninit<f32>],
         before: impl Fn(usize) -> Affine + Sync,
         moments: impl Fn(f32, f32, &Affine) -> [f64; 2] + Sync,
         affine: impl Fn(usize, [f64; 2]) -> (Affine, [f64; 2]) + Sync,
         apply: impl Fn(f32, f32, &Affine) -> f32 + Sync,
     ) -> Vec<[f64; 2]> {
         let row = self.channels * self.pixels;
-        let starts: Vec<usize> = (0..row).step_by(COLUMNS).collect();
-        let columns = |start: usize| start..row.min(start + COLUMNS);
-        let column_sums = |&start: &usize| {
-            let parameters: Vec<Affine> = columns(start).map(|column| before(column / self.pixels)).collect();
-            let mut sums = vec![[0.0; 2]; parameters.len()];
+        let parameters = Affines::of_row(row, |column| before(column / self.pixels));
+        let sums_of_rows = |(x, other): (&[f32], &[f32])| {
+            let mut sums = vec![[[0.0; COLUMNS]; 2]; parameters.len()];
             vectorized(|| {
-                for n in 0..self.batch {
-                    let run = n * row + start..n * row + columns(start).end;
-                    for (((sum, &x), &other), a) in
-                        sums.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters)
-                    {
-                        let [first, second] = moments(x, other, a);
-                        sum[0] += first;
-                        sum[1] += second;
+                for (x, other) in x.chunks_exact(row).zip(other.chunks_exact(row)) {
+                    let groups = x.chunks(COLUMNS).zip(other.chunks(COLUMNS));
+                    for ((x, other), (sums, parameters)) in groups.zip(sums.iter_mut().zip(&parameters)) {
+                        let (x, other, [mut firsts, mut seconds]) = (filled_up(x), filled_up(other), *sums);
+                        for c in 0..COLUMNS {
+                            let [first, second] = moments(x[c], other[c], &parameters.get(c));
+                            firsts[c] += first;
+                            seconds[c] += second;
+                        }
+                        *sums = [firsts, seconds];
                     }
                 }
             });
             sums
         };
-        let sums: Vec<[f64; 2]> = starts.par_iter().map(column_sums).collect::<Vec<_>>().concat();
-        let channel_sum = |columns: &[[f64; 2]]| columns.iter().fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
-        let of_channels: Vec<(Affine, [f64; 2])> =
-            sums.chunks_exact(self.pixels).enumerate().map(|(c, columns)| affine(c, channel_sum(columns))).collect();
-        starts.par_iter().for_each(|&start| {
-            let parameters: Vec<Affine> = columns(start).map(|column| of_channels[column / self.pixels].0).collect();
-            for n in 0..self.batch {
-                let run = n * row + start..n * row + columns(start).end;
-                // SAFETY: no other task has these columns.
-                let out = unsafe { out.part(run.start, run.len()) };
-                vectorized(|| {
-                    for (((out, &x), &other), a) in
-                        out.iter_mut().zip(&x[run.clone()]).zip(&other[run]).zip(&parameters)
-                    {
-                        out.write(apply(x, other, a));
-                    }
-                });
+        let rows = x.par_chunks(ROWS * row).zip(other.par_chunks(ROWS * row));
+        let mut sums = vec![[0.0; 2]; self.channels];
+        for groups in rows.clone().map(sums_of_rows).collect::<Vec<_>>() {
+            for column in 0..row {
+                for (sum, of_group) in sums[column / self.pixels].iter_mut().zip(&groups[column / COLUMNS]) {
+                    *sum += of_group[column % COLUMNS];
+                }
             }
+        }
+        let of_channels: Vec<(Affine, [f64; 2])> =
+            sums.into_iter().enumerate().map(|(c, sum)| affine(c, sum)).collect();
+        let parameters = Affines::of_row(row, |column| of_channels[column / self.pixels].0);
+        out.par_chunks_mut(ROWS * row).zip(rows).for_each(|(out, (x, other))| {
+            apply_to_rows(out, (x, other), row, &parameters, &apply);
         });
         of_channels.into_iter().map(|(_, result)| result).collect()
     }
+}
+
+/// Writes a function of each element of some rows.
+#[inline(always)]
+fn apply_to_rows(
+    out: &mut [MaybeUninit<f32>],
+    (x, other): (&[f32], &[f32]),
+    row: usize,
+    parameters: &[Affines],
+    apply: &impl Fn(f32, f32, &Affine) -> f32,
+) {
+    vectorized(|| {
+        for ((out, x), other) in out.chunks_exact_mut(row).zip(x.chunks_exact(row)).zip(other.chunks_exact(row)) {
+            let groups = out.chunks_mut(COLUMNS).zip(x.chunks(COLUMNS)).zip(other.chunks(COLUMNS));
+            for (((out, x), other), parameters) in groups.zip(parameters) {
+                let (x, other, mut values) = (filled_up(x), filled_up(other), [0.0; COLUMNS]);
+                for c in 0..COLUMNS {
+                    values[c] = apply(x[c], other[c], &parameters.get(c));
+                }
+                out.write_copy_of_slice(&values[..out.len()]);
+            }
+        }
+    });
+}
+
+/// A copy of a group of columns, the last one with zeros behind.
+#[inline(always)]
+fn filled_up(columns: &[f32]) -> [f32; COLUMNS] {
+    columns.try_into().unwrap_or_else(|_| {
+        let mut all = [0.0; COLUMNS];
+        all[..columns.len()].copy_from_slice(columns);
+        all
+    })
 }
 
 /// What is done to each value of a channel: `(x - mean) scale + beta`, and in the gradient `(x - mean) slope + offset` besides.
@@ -290,6 +332,33 @@ impl Affine {
     #[inline(always)]
     fn of(&self, x: f32) -> f32 {
         (x - self.mean) * self.scale + self.beta
+    }
+}
+
+/// Those of a group of columns, side by side as registers want them.
+#[derive(Clone, Copy)]
+struct Affines([[f32; COLUMNS]; 5]);
+
+impl Affines {
+    /// For a row of so many columns, the last group filled up.
+    fn of_row(row: usize, of_column: impl Fn(usize) -> Affine) -> Vec<Self> {
+        let group = |first: usize| {
+            let mut all = Affines([[0.0; COLUMNS]; 5]);
+            for c in first..row.min(first + COLUMNS) {
+                let Affine { mean, scale, beta, slope, offset } = of_column(c);
+                for (all, value) in all.0.iter_mut().zip([mean, scale, beta, slope, offset]) {
+                    all[c - first] = value;
+                }
+            }
+            all
+        };
+        (0..row).step_by(COLUMNS).map(group).collect()
+    }
+
+    #[inline(always)]
+    fn get(&self, c: usize) -> Affine {
+        let [mean, scale, beta, slope, offset] = &self.0;
+        Affine { mean: mean[c], scale: scale[c], beta: beta[c], slope: slope[c], offset: offset[c] }
     }
 }
 
