@@ -1,4 +1,4 @@
-"""A training step of PointPillars (Lang et al. 2019), in two forms.
+"""PointPillars (Lang et al. 2019): a training step, an inference, and the costliest layers, in two forms.
 
 As OpenPCDet runs it: pillars padded to their full number of points, images NCHW, box losses over all anchors. `best`: the points alone with
 the padding's exact share in the statistics, images channels-last, box losses over the positive anchors, a fused optimiser.
@@ -109,22 +109,96 @@ def box_loss(said, truth):
     return torch.where(n < 1 / 9, 4.5 * n.square(), n - 0.5 / 9)
 
 
-def make_step(config, batch, points, pillars, best):
-    """One step on `points` points in `pillars` pillars, of `batch` frames together."""
-    network = Network(config)
+def make_points(config, points, pillars):
+    """As many points in each pillar as the total allows, at least one: padded pillars, points alone, the pillar of each."""
     max_points = config["network"]["pillars"]["max_points"]
     inputs = config["channels"] + INPUTS_BESIDE_CHANNELS
-    # As many points in each pillar as the total allows, at least one.
     num_points = torch.ones(pillars, dtype=torch.long)
     share = torch.rand(pillars).pow(4)
     num_points += (share / share.sum() * (points - pillars)).long().clamp(max=max_points - 1)
     is_point = torch.arange(max_points)[None] < num_points[:, None]
     padded = torch.randn(pillars, max_points, inputs) * is_point[..., None]
-    rows, pillar = padded[is_point], torch.repeat_interleave(torch.arange(pillars), num_points)
+    return padded, padded[is_point], torch.repeat_interleave(torch.arange(pillars), num_points)
+
+
+def make_cells(batch, pillars, area):
+    """Cells of the pillars, about as many in each frame, in the canvases laid end to end."""
     each = pillars // batch
     sizes = [each] * (batch - 1) + [pillars - each * (batch - 1)]
-    area = network.ny * network.nx
-    cells = torch.cat([torch.randperm(area)[:n] + frame * area for frame, n in enumerate(sizes)])
+    return torch.cat([torch.randperm(area)[:n] + frame * area for frame, n in enumerate(sizes)])
+
+
+def make_inference(config, batch, points, pillars, best):
+    """From decorated points to decoded boxes of the best anchors; batch norm not folded, boxes not suppressed."""
+    network = Network(config).eval()
+    padded, rows, pillar = make_points(config, points, pillars)
+    cells = make_cells(batch, pillars, network.ny * network.nx)
+    if best:
+        network = network.to(memory_format=torch.channels_last)
+    keep = config["network"]["detection"]["nms_pre"]
+    anchors = {}
+
+    def pillar_features():
+        net = network.vfe
+        if not best:
+            return net.padded(padded)
+        y = F.relu(F.batch_norm(net.linear(rows), net.norm.running_mean, net.norm.running_var, net.norm.weight, net.norm.bias, False, 0, 1e-3))
+        out = y.new_zeros(pillars, y.shape[1])
+        return out.scatter_reduce(0, pillar[:, None].expand(-1, y.shape[1]), y, "amax", include_self=True)
+
+    @torch.inference_mode()
+    def inference():
+        cls, boxes, bins = network.heads(network.canvas(pillar_features(), cells, batch, best))
+        if not anchors:
+            anchors["all"] = torch.rand(cls.shape[1], 7) + 1
+        scores, at = torch.sigmoid(cls).max(dim=-1)[0].topk(min(keep, cls.shape[1]), dim=1)
+        pick = lambda tensor: tensor.gather(1, at[..., None].expand(-1, -1, tensor.shape[2]))
+        code, anchor = pick(boxes), anchors["all"][at]
+        diagonal = anchor[..., 3:5].norm(dim=-1, keepdim=True)
+        centre = code[..., :3] * torch.cat([diagonal, diagonal, anchor[..., 5:6]], -1) + anchor[..., :3]
+        heading = code[..., 6:] + anchor[..., 6:] + torch.pi * pick(bins).argmax(-1, keepdim=True)
+        return torch.cat([centre, anchor[..., 3:6] * code[..., 3:6].exp(), heading], -1), scores
+
+    return inference
+
+
+def make_convolutions(config, batch, points, pillars, best):
+    """Each of the backbone's 3x3 convolutions of stride 1, forward and backward; `best`: channels-last."""
+    network = Network(config)
+    layout = torch.channels_last if best else torch.contiguous_format
+    work, height, width = [], network.ny, network.nx
+    for filters, stride, count in zip(*(config["network"]["backbone"][key] for key in ("filters", "strides", "layers"))):
+        height, width = -(-height // stride), -(-width // stride)
+        conv = nn.Conv2d(filters, filters, 3, 1, 1, bias=False).to(memory_format=layout)
+        x, dy = (torch.randn(batch, filters, height, width).contiguous(memory_format=layout) for _ in range(2))
+        work += [(conv, x.requires_grad_(), dy)] * count
+
+    def convolutions():
+        for conv, x, dy in work:
+            x.grad = conv.weight.grad = None
+            conv(x).backward(dy)
+
+    return convolutions
+
+
+def make_pillar_net(config, batch, points, pillars, best):
+    """The pillar feature net, forward and backward; `best`: valid points only."""
+    net = Network(config).vfe
+    padded, rows, pillar = make_points(config, points, pillars)
+    dy = torch.randn(pillars, net.linear.out_features)
+
+    def pillar_net():
+        net.zero_grad()
+        (net.of_points(rows, pillar, pillars) if best else net.padded(padded)).backward(dy)
+
+    return pillar_net
+
+
+def make_step(config, batch, points, pillars, best):
+    """One step on `points` points in `pillars` pillars, of `batch` frames together."""
+    network = Network(config)
+    padded, rows, pillar = make_points(config, points, pillars)
+    cells = make_cells(batch, pillars, network.ny * network.nx)
     if best:
         network = network.to(memory_format=torch.channels_last)
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-4, betas=(0.9, 0.99), fused=best or None)

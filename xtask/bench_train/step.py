@@ -1,10 +1,10 @@
-"""Times training steps of the two networks in PyTorch on the CPU, on made-up inputs of given sizes.
+"""Times training steps of the two networks, inference and the costliest layers in PyTorch on the CPU, on made-up inputs of given sizes.
 
 Reads the report of `lidarshift bench-step --json` and builds the same network from the configuration in it, so that both sides have the
 same layers, the same number of points and the same number of pillars. Prints one line of JSON.
 
 What the reference is spared: reading and augmenting, making pillars, anchors and targets, proposals and their suppression. The times here
-begin with tensors in memory and end with updated weights.
+begin with tensors in memory and end with updated weights; those of an inference end with decoded boxes, not yet suppressed.
 """
 
 import argparse
@@ -33,7 +33,14 @@ def main():
         import pointpillars
 
         points, pillars = report["read"]
-        step = pointpillars.make_step(config, report["batch"], points, pillars, arguments.form == "best")
+        best = arguments.form == "best"
+        make = {
+            "step": pointpillars.make_step,
+            "inference": pointpillars.make_inference,
+            "convolutions": pointpillars.make_convolutions,
+            "pillar-net": pointpillars.make_pillar_net,
+        }[report["work"]]
+        step = make(config, report["batch"], points, pillars, best)
     else:
         import pointrcnn
 

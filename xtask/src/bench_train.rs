@@ -1,4 +1,5 @@
-//! `cargo xtask bench train [WORDS]`: whole training steps here and of the same networks in PyTorch, in turns.
+//! `cargo xtask bench train [WORDS]`: whole training steps, inference and the costliest layers here and of the same networks in PyTorch,
+//! in turns.
 
 use crate::program;
 use anyhow::{Context, Result, bail, ensure};
@@ -26,10 +27,22 @@ const DETECTORS: [[&str; 3]; 4] = [
     ["pointrcnn", "small", "pointrcnn_small"],
 ];
 
-/// A step here beside one of the reference.
+/// What is timed of a network, as ids and as `bench-step --work` spell it, and beside what: name and form.
+type Work = (&'static str, &'static str, &'static [[&'static str; 2]]);
+
+const OF_POINTPILLARS: [Work; 4] = [
+    ("step", "step", &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]]),
+    ("inference", "inference", &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]]),
+    ("convolutions", "convolutions", &[["torch_nchw", "openpcdet"], ["torch_channels_last", "best"]]),
+    ("pillar_net", "pillar-net", &[["torch_padded", "openpcdet"], ["torch_valid_points", "best"]]),
+];
+
+const OF_POINTRCNN: [Work; 1] = [("step", "step", &[["torch", "openpcdet"]])];
+
+/// Work here beside that of the reference.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Row {
-    /// `network/size/step/batchB/threadsT/reference`.
+    /// `network/size/work/batchB/threadsT/reference`.
     id: String,
     /// Median, ms.
     ours_ms: f64,
@@ -59,9 +72,10 @@ struct Turn {
     median_ms: Vec<(String, f64)>,
 }
 
-/// One network at one size, batch and number of threads, beside some references.
+/// Some work of one network at one size, batch and number of threads, beside some references.
 struct Case {
     detector: &'static str,
+    work: &'static str,
     batch: usize,
     threads: usize,
     /// Id and form.
@@ -94,16 +108,15 @@ fn example() -> String {
 fn cases(words: &[String]) -> Vec<Case> {
     let mut cases = Vec::new();
     for [network, size, detector] in DETECTORS {
-        let references: &[[&str; 2]] = match network {
-            "pointpillars" => &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]],
-            _ => &[["torch", "openpcdet"]],
-        };
-        for (batch, threads) in [(1, 2), (1, 1), (4, 2), (4, 1)] {
-            let id = |name: &str| format!("{network}/{size}/step/batch{batch}/threads{threads}/{name}");
-            let all = references.iter().map(|&[name, form]| (id(name), form));
-            let references: Vec<_> = all.filter(|(id, _)| words.iter().all(|word| id.contains(word))).collect();
-            if !references.is_empty() {
-                cases.push(Case { detector, batch, threads, references });
+        let works: &[Work] = if network == "pointpillars" { &OF_POINTPILLARS } else { &OF_POINTRCNN };
+        for &(name, work, references) in works {
+            for (batch, threads) in [(1, 2), (1, 1), (4, 2), (4, 1)] {
+                let id = |reference: &str| format!("{network}/{size}/{name}/batch{batch}/threads{threads}/{reference}");
+                let all = references.iter().map(|&[reference, form]| (id(reference), form));
+                let references: Vec<_> = all.filter(|(id, _)| words.iter().all(|word| id.contains(word))).collect();
+                if !references.is_empty() {
+                    cases.push(Case { detector, work, batch, threads, references });
+                }
             }
         }
     }
@@ -112,13 +125,13 @@ fn cases(words: &[String]) -> Vec<Case> {
 
 impl Case {
     fn measure(&self, root: &Path, program: &Path, python: &Path) -> Result<Vec<Row>> {
-        let Case { detector, batch, threads, references } = self;
-        eprintln!("{detector}, batch {batch}, {threads} threads");
+        let Case { detector, work, batch, threads, references } = self;
+        eprintln!("{detector}, {work}, batch {batch}, {threads} threads");
         let report = std::env::temp_dir().join(format!("lidarshift-bench-{}.json", std::process::id()));
         let (mut ours, mut theirs) = (Vec::new(), vec![Vec::new(); references.len()]);
         for _ in 0..ROUNDS {
             let mut step = Command::new(program);
-            step.args(["bench-step", "--detector", detector, "--batch", &batch.to_string()]);
+            step.args(["bench-step", "--work", work, "--detector", detector, "--batch", &batch.to_string()]);
             step.args(["--steps", &STEPS.to_string(), "--json"]).arg(&report);
             step.env("RAYON_NUM_THREADS", threads.to_string()).current_dir(root);
             output(&mut step)?;
@@ -173,7 +186,7 @@ fn merged(known: Vec<Row>, measured: Vec<Row>) -> Vec<Row> {
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn print_table(rows: &[Row]) {
     println!(
-        "| step | here, ms | reference, ms | ratio | memory here, MiB | reference, MiB |\n|---|---|---|---|---|---|"
+        "| work | here, ms | reference, ms | ratio | memory here, MiB | reference, MiB |\n|---|---|---|---|---|---|"
     );
     for Row { id, ours_ms, reference_ms, ratio, ours_peak_mib, reference_peak_mib } in rows {
         let [ours, theirs] =
@@ -227,7 +240,7 @@ mod tests {
             let words: Vec<String> = words.iter().map(|&w| w.into()).collect();
             cases(&words).into_iter().flat_map(|case| case.references).map(|(id, _)| id).collect()
         };
-        assert_eq!(ids(&[]).len(), 24);
+        assert_eq!(ids(&[]).len(), 72);
         assert_eq!(
             ids(&["pointrcnn/published", "batch1/threads2"]),
             ["pointrcnn/published/step/batch1/threads2/torch"]
@@ -237,6 +250,7 @@ mod tests {
             ["torch_as_openpcdet", "torch_best"]
                 .map(|name| format!("pointpillars/published/step/batch1/threads2/{name}"))
         );
+        assert_eq!(ids(&["small/pillar_net", "batch4/threads1"]).len(), 2);
         assert!(ids(&["batch7"]).is_empty());
     }
 

@@ -1,14 +1,17 @@
-//! `lidarshift bench-step`: where the time of one training step goes, and how much memory it takes.
+//! `lidarshift bench-step`: where the time of one training step goes, and how much memory it takes; and the same of an inference, and of the
+//! layers that cost most.
+
+mod layers;
 
 use crate::detectors::find_detector;
 use crate::device::DeviceArgs;
-use anyhow::Result;
+use anyhow::{Result, bail};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Frame, stream};
-use models::config::{DetectorConfig, NetworkConfig};
+use models::config::{DetectorConfig, NetworkConfig, PointPillarsConfig};
 use models::layers::Mode;
 use models::pointpillars::pillars::{PillarGrid, pillarise};
 use models::pointpillars::{losses, scatter::scatter};
@@ -32,6 +35,9 @@ pub struct BenchStepArgs {
     /// Timed steps; two before them warm up
     #[arg(long, default_value_t = 7)]
     steps: usize,
+    /// What is timed
+    #[arg(long, value_enum, default_value_t)]
+    work: Work,
     #[command(flatten)]
     device: DeviceArgs,
     /// Also write the medians as JSON
@@ -39,9 +45,25 @@ pub struct BenchStepArgs {
     json: Option<PathBuf>,
 }
 
+/// What is timed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Work {
+    /// A whole training step
+    #[default]
+    Step,
+    /// From clouds in memory to final boxes
+    Inference,
+    /// The backbone's 3x3 convolutions of stride 1, forward and both gradients (PointPillars, on the CPU)
+    Convolutions,
+    /// The pillar feature net, forward and gradients (PointPillars, on the CPU)
+    PillarNet,
+}
+
 #[derive(Serialize)]
 struct Report {
     schema: &'static str,
+    work: Work,
     detector: String,
     device: String,
     batch: usize,
@@ -65,43 +87,18 @@ impl BenchStepArgs {
         let device = self.device.open()?.autodiff();
         let road = RoadConfig::default();
         let frames: Vec<Frame> = (0..self.batch).map(|i| make_road_frame(&road, "train", i)).collect();
-        let mut detector = Detector::new(&config, 0, &device);
-        let mut adam = Adam::new(config.optimization.weight_decay, reference_name);
-        let preparer = Preparer::new(&config);
-        let mut read = [0, 0];
-        let mut times: Vec<(&'static str, Vec<f64>)> = Vec::new();
-        for step in 0..self.steps + 2 {
-            let mut clock = Clock { device: &device, marks: vec![("", Instant::now())] };
-            let mut batch = Vec::with_capacity(frames.len());
-            for (i, frame) in frames.iter().enumerate() {
-                let mut random = stream(0, "bench", step as u64, i as u64);
-                let augmented = augment(frame.clone(), &AugmentConfig::default(), None, &mut random);
-                let cropped = crop_to_range(augmented, &config.range_m.map(f64::from));
-                batch.push(preparer.training(&cropped, &mut random)?);
-            }
-            read = batch.iter().map(read_of).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]));
-            clock.mark("data")?;
-            let total = forward(&detector, &batch, &mut clock)?;
-            let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
-            let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
-            clock.mark("backward")?;
-            let clip = norm.clip_scale(config.optimization.clip_norm);
-            detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-4, 0.9));
-            clock.mark("optimizer")?;
-            if step >= 2 {
-                for (i, (stage, ms)) in clock.stages().into_iter().enumerate() {
-                    if times.len() == i {
-                        times.push((stage, Vec::new()));
-                    }
-                    times[i].1.push(ms);
-                }
-            }
-        }
+        let timed = match self.work {
+            Work::Step => self.training_steps(&config, &device, &frames)?,
+            Work::Inference => self.inferences(&config, &device, &frames)?,
+            Work::Convolutions => layers::convolutions(pointpillars(&config)?, &config, self.batch, self.steps),
+            Work::PillarNet => layers::pillar_net(pointpillars(&config)?, &samples(&config, &frames, 0)?, self.steps)?,
+        };
         let report = Report {
-            schema: "lidarshift/bench-step/2",
-            read,
-            whole_ms: times.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
-            median_ms: times.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
+            schema: "lidarshift/bench-step/3",
+            work: self.work,
+            read: timed.read,
+            whole_ms: timed.stages.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
+            median_ms: timed.stages.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
             peak_mib: crate::memory::peak_mib(),
             detector: config.name.clone(),
             device: self.device.describe(),
@@ -109,8 +106,13 @@ impl BenchStepArgs {
             steps: self.steps,
             config,
         };
-        println!("pillars of 120,000 points, cells of 0.16 m: {:.1} ms", median(pillarise_ms()));
-        println!("{}, batch {}, {}: medians of {} steps", report.detector, report.batch, report.device, report.steps);
+        if self.work == Work::Step {
+            println!("pillars of 120,000 points, cells of 0.16 m: {:.1} ms", median(pillarise_ms()));
+        }
+        println!(
+            "{}, batch {}, {}: medians of {} times in ms",
+            report.detector, report.batch, report.device, report.steps
+        );
         for (stage, ms) in &report.median_ms {
             println!("  {stage:<11} {ms:>9.1} ms");
         }
@@ -124,15 +126,100 @@ impl BenchStepArgs {
     }
 }
 
-/// Points and pillars of a sample.
-fn read_of(sample: &Sample) -> [usize; 2] {
-    match sample {
+impl BenchStepArgs {
+    fn training_steps(&self, config: &DetectorConfig, device: &Device, frames: &[Frame]) -> Result<Timed> {
+        let mut detector = Detector::new(config, 0, device);
+        let mut adam = Adam::new(config.optimization.weight_decay, reference_name);
+        let mut timed = Timed::default();
+        for step in 0..self.steps + WARM_UP {
+            let mut clock = Clock::start(device);
+            let batch = samples(config, frames, step)?;
+            timed.read = read_of(&batch);
+            clock.mark("data")?;
+            let total = forward(&detector, &batch, &mut clock)?;
+            let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
+            let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
+            clock.mark("backward")?;
+            let clip = norm.clip_scale(config.optimization.clip_norm);
+            detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-4, 0.9));
+            clock.mark("optimizer")?;
+            timed.add(step, clock.stages());
+        }
+        Ok(timed)
+    }
+
+    fn inferences(&self, config: &DetectorConfig, device: &Device, frames: &[Frame]) -> Result<Timed> {
+        let detector = Detector::new(config, 0, device);
+        let preparer = Preparer::new(config);
+        let mut timed = Timed::default();
+        for step in 0..self.steps + WARM_UP {
+            let mut clock = Clock::start(device);
+            let batch = frames.iter().map(|frame| preparer.inference(frame)).collect::<Result<Vec<_>, _>>()?;
+            timed.read = read_of(&batch);
+            clock.mark("data")?;
+            std::hint::black_box(detector.predict(&batch)?);
+            clock.mark("network")?;
+            timed.add(step, clock.stages());
+        }
+        Ok(timed)
+    }
+}
+
+/// Steps that are not timed.
+const WARM_UP: usize = 2;
+
+/// What was timed.
+#[derive(Default)]
+struct Timed {
+    /// Points and pillars of the last batch.
+    read: [usize; 2],
+    /// ms of each timed step, stage by stage, the whole last.
+    stages: Vec<(&'static str, Vec<f64>)>,
+}
+
+impl Timed {
+    fn add(&mut self, step: usize, stages: Vec<(&'static str, f64)>) {
+        if step < WARM_UP {
+            return;
+        }
+        for (i, (stage, ms)) in stages.into_iter().enumerate() {
+            if self.stages.len() == i {
+                self.stages.push((stage, Vec::new()));
+            }
+            self.stages[i].1.push(ms);
+        }
+    }
+}
+
+fn pointpillars(config: &DetectorConfig) -> Result<&PointPillarsConfig> {
+    match &config.network {
+        NetworkConfig::PointPillars(network) => Ok(network),
+        NetworkConfig::PointRcnn(_) => bail!("{} is no PointPillars: --work step or inference", config.name),
+    }
+}
+
+/// The batch of a step, augmented anew.
+fn samples(config: &DetectorConfig, frames: &[Frame], step: usize) -> Result<Vec<Sample>> {
+    let preparer = Preparer::new(config);
+    let sample = |(i, frame): (usize, &Frame)| {
+        let mut random = stream(0, "bench", step as u64, i as u64);
+        let augmented = augment(frame.clone(), &AugmentConfig::default(), None, &mut random);
+        let cropped = crop_to_range(augmented, &config.range_m.map(f64::from));
+        Ok(preparer.training(&cropped, &mut random)?)
+    };
+    frames.iter().enumerate().map(sample).collect()
+}
+
+/// Points and pillars of a batch.
+fn read_of(batch: &[Sample]) -> [usize; 2] {
+    let of_sample = |sample: &Sample| match sample {
         Sample::PointPillars(sample) => {
             let num_points = &sample.pillars.num_points;
             [num_points.iter().map(|&n| n as usize).sum(), num_points.len()]
         }
         Sample::PointRcnn(sample) => [sample.points.len(), 0],
-    }
+    };
+    batch.iter().map(of_sample).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]))
 }
 
 /// The losses of a batch, stage by stage where the network has stages that stand alone.
@@ -171,7 +258,11 @@ struct Clock<'a> {
     marks: Vec<(&'static str, Instant)>,
 }
 
-impl Clock<'_> {
+impl<'a> Clock<'a> {
+    fn start(device: &'a Device) -> Self {
+        Clock { device, marks: vec![("", Instant::now())] }
+    }
+
     fn mark(&mut self, stage: &'static str) -> Result<()> {
         self.device.sync()?;
         self.marks.push((stage, Instant::now()));
@@ -183,7 +274,7 @@ impl Clock<'_> {
         let ms = |from: Instant, to: Instant| 1e3 * (to - from).as_secs_f64();
         let (begin, end) = (self.marks[0].1, self.marks[self.marks.len() - 1].1);
         let stages = self.marks.windows(2).map(|pair| (pair[1].0, ms(pair[0].1, pair[1].1)));
-        stages.chain([("whole step", ms(begin, end))]).collect()
+        stages.chain([("whole", ms(begin, end))]).collect()
     }
 }
 

@@ -1,17 +1,21 @@
-//! The same small suite on every device that this build has and this machine offers: reference numbers, training, detection.
+//! The same small suite on every device that this build has and this machine offers, and on the CPU with every set of instructions:
+//! reference numbers, training, detection.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, run, said};
-use std::path::Path;
+use program::{data_set, must, program, run, said};
+use std::path::{Path, PathBuf};
+
+fn golden(network: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/synthetic").join(network)
+}
 
 /// Devices that answer; of the others, why not.
 fn present() -> Vec<&'static str> {
-    let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/synthetic/pointpillars_tiny");
     let mut found = Vec::new();
     for device in ["flex", "ndarray", "wgpu", "cuda"] {
-        let output = run(&golden, &format!("parity . --device {device}"));
+        let output = run(&golden("pointpillars_tiny"), &format!("parity . --device {device}"));
         let text = said(&output);
         if output.status.success() {
             found.push(device);
@@ -30,18 +34,42 @@ fn reference_numbers_training_and_detection() {
     assert!(devices.starts_with(&["flex", "ndarray"]), "{devices:?}");
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
-    let mut losses = Vec::new();
-    for device in devices {
-        let words = format!("train --dataset . --detector tiny.toml --epochs 1 --device {device} --out {device}");
-        must(dir.path(), &format!("{words} --set run.log_every_steps=1"));
-        let metrics = std::fs::read_to_string(dir.path().join(device).join("metrics.jsonl")).unwrap();
-        let first: serde_json::Value = serde_json::from_str(metrics.lines().next().unwrap()).unwrap();
-        losses.push((device, first["loss"].as_f64().unwrap()));
-        let checkpoint = format!("{device}/checkpoint/last.safetensors");
-        must(dir.path(), &format!("detect velodyne/000005.bin --checkpoint {checkpoint} --device {device}"));
+    for &device in &devices {
+        must(&golden("pointrcnn_tiny"), &format!("parity . --device {device}"));
     }
-    let (_, first) = losses[0];
-    for (device, loss) in losses {
-        assert!((loss / first - 1.0).abs() < 1e-4, "the first loss on {device} is {loss}, on flex {first}");
+    for detector in ["tiny", "tiny_pointrcnn"] {
+        let mut losses = Vec::new();
+        for device in &devices {
+            let out = format!("{detector}-{device}");
+            let words =
+                format!("train --dataset . --detector {detector}.toml --epochs 1 --device {device} --out {out}");
+            must(dir.path(), &format!("{words} --set run.log_every_steps=1"));
+            let metrics = std::fs::read_to_string(dir.path().join(&out).join("metrics.jsonl")).unwrap();
+            let first: serde_json::Value = serde_json::from_str(metrics.lines().next().unwrap()).unwrap();
+            losses.push((device, first["loss"].as_f64().unwrap()));
+            let checkpoint = format!("{out}/checkpoint/last.safetensors");
+            must(dir.path(), &format!("detect velodyne/000005.bin --checkpoint {checkpoint} --device {device}"));
+        }
+        let (_, first) = losses[0];
+        for (device, loss) in losses {
+            assert!(
+                (loss / first - 1.0).abs() < 1e-4,
+                "{detector}: the first loss on {device} is {loss}, on flex {first}"
+            );
+        }
     }
+}
+
+/// Processors without newer instructions, as far as a test can make this one such.
+#[test]
+fn reference_numbers_with_fewer_instructions() {
+    for set in ["portable", "avx2"] {
+        for network in ["pointpillars_tiny", "pointrcnn_tiny"] {
+            let output = program(&golden(network), "parity .").env("LIDARSHIFT_SIMD", set).output().unwrap();
+            assert!(output.status.success(), "{set}, {network}: {}", said(&output));
+        }
+    }
+    let unknown = program(&golden("pointpillars_tiny"), "parity .").env("LIDARSHIFT_SIMD", "avx9").output().unwrap();
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(said(&unknown).contains("portable, neon, avx2 or avx512"), "{}", said(&unknown));
 }

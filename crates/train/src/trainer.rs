@@ -1,5 +1,6 @@
 //! The training loop, read top to bottom in [`train`].
 
+use crate::error::without_panic;
 use crate::provenance::record_session;
 use crate::validation::loss_values;
 use crate::{
@@ -92,7 +93,7 @@ pub fn train(
         while run.state.position < frames.ids().len() {
             let wanted = batch_size.min(frames.ids().len() - run.state.position);
             let batch = clock.wait(|| samples.by_ref().take(wanted).collect::<Result<Vec<Sample>, _>>())?;
-            let step = run.learn(&batch, &mut clock)?;
+            let step = without_panic(run.state.step, || run.learn(&batch, &mut clock))?;
 
             run.state.step += 1;
             run.state.position += batch.len();
