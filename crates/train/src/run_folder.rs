@@ -2,7 +2,7 @@
 //!
 //! A checkpoint is two files, weights and moments of the optimiser, which appear whole and are never changed; then `state.json`, which
 //! names them, takes the place of the one before. Whatever is not named there does not count. `last.safetensors` and `best.safetensors` are
-//! further names of such weights.
+//! further names of such weights, given before the state says so: whoever reads of a step there finds its weights under them.
 
 use crate::TrainError;
 use crate::run_config::hex;
@@ -153,8 +153,8 @@ impl RunFolder {
         }
         let file = StateFile { schema: STATE_SCHEMA.into(), state: state.clone(), sha256 };
         let text = serde_json::to_string_pretty(&file).expect("a state is plain JSON");
-        write_atomic(&self.state_path(), text.as_bytes())?;
         self.name_last_and_best(state)?;
+        write_atomic(&self.state_path(), text.as_bytes())?;
         self.remove_all_but(state, keep)
     }
 
@@ -178,7 +178,7 @@ impl RunFolder {
         Ok(Some((file.state, weights?, moments?)))
     }
 
-    /// Gives the weights of the state's step their further names. Done again on loading: a kill may have come between.
+    /// Gives the weights of the state's step their further names. Done again on loading: they may be those of a step whose state was never written.
     fn name_last_and_best(&self, state: &RunState) -> Result<(), TrainError> {
         let weights = self.checkpoints().join(&names(state.step)[0]);
         link(&weights, &self.last_weights())?;
@@ -364,6 +364,15 @@ mod tests {
             "{:?}",
             files(&folder)
         );
+    }
+
+    #[test]
+    fn the_last_weights_are_never_behind_the_state() {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = RunFolder::open(dir.path()).unwrap();
+        std::fs::create_dir(folder.state_path()).unwrap(); // stands for a kill when the state is written
+        assert!(folder.save(&state(10, None), &tensors(10.0), &BTreeMap::new(), &tensors(1.0), 2).is_err());
+        assert_eq!(read_safetensors(&folder.last_weights()).unwrap(), tensors(10.0));
     }
 
     #[test]
