@@ -3,7 +3,7 @@
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, program};
+use program::{data_set, must, program, said};
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
@@ -52,6 +52,22 @@ fn kill_and_resume(train: &str) {
     assert!(kills >= 2, "only {kills} runs were killed before their end");
     must(dir.path(), &format!("{train} --seed 1 --out killed --resume"));
     assert!(weights(dir.path(), "killed") == weights(dir.path(), "whole"), "the weights differ");
+}
+
+#[test]
+fn the_number_of_threads_changes_no_bit() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    for (train, network) in [(TRAIN, "pointpillars"), (TRAIN_POINTRCNN, "pointrcnn")] {
+        let [one, two, three] = ["1", "2", "3"].map(|threads| {
+            let out = format!("{network}-{threads}");
+            let mut child = program(dir.path(), &format!("{train} --out {out}"));
+            let output = child.env("RAYON_NUM_THREADS", threads).output().unwrap();
+            assert!(output.status.success(), "{}", said(&output));
+            weights(dir.path(), &out)
+        });
+        assert!(one == two && two == three, "{network}: the weights depend on the number of threads");
+    }
 }
 
 #[test]
