@@ -1,12 +1,14 @@
 //! `lidarshift diagnose`: what does the simulation get wrong, why, and what is gained by mending it.
 
+mod detectors;
 mod pictures;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, KittiLine, write_atomic};
-use diagnose::{Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, extended_toml};
+use detectors::gain_of_detectors;
+use diagnose::{DetectorGain, Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, extended_toml};
 use indicatif::{ProgressBar, ProgressStyle};
 use simulate::race::RaceConfig;
 use std::path::{Path, PathBuf};
@@ -41,6 +43,10 @@ pub struct DiagnoseArgs {
     /// Folder for diagnosis.json, extended.toml, a picture of each finding and, where labels are at fault, label_2/
     #[arg(long, value_name = "DIR", default_value = "runs/diagnosis")]
     out: PathBuf,
+    /// Train the detectors of this study, with its seeds and epochs, on measured, simulated and extended data, and test them on measured
+    /// frames; `gain` is one for it
+    #[arg(long, value_name = "STUDY")]
+    detectors: Option<String>,
     /// Write diagnosis.json here as well
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -66,13 +72,9 @@ impl DiagnoseArgs {
             bar.set_length(of as u64);
             bar.set_position(done as u64);
         };
-        let outcome = diagnose(&measured, &simulated, &rig, &Options { split: self.split.clone() }, &told)?;
+        let mut outcome = diagnose(&measured, &simulated, &rig, &Options { split: self.split.clone() }, &told)?;
         bar.finish_and_clear();
-        let json = serde_json::to_vec_pretty(&outcome.diagnosis)?;
-        write_atomic(&self.out.join("diagnosis.json"), &json)?;
-        if let Some(path) = &self.json {
-            write_atomic(path, &json)?;
-        }
+        self.write_json(&outcome.diagnosis)?;
         write_atomic(
             &self.out.join("extended.toml"),
             extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg).as_bytes(),
@@ -82,7 +84,25 @@ impl DiagnoseArgs {
             write_labels(&self.out, &measured, id, boxes)?;
         }
         say(&outcome.diagnosis, &self.out, outcome.corrected.len());
+        if let Some(study) = &self.detectors
+            && !outcome.diagnosis.findings.is_empty()
+        {
+            let extended = self.out.join("extended.toml");
+            let gains = gain_of_detectors(study, &self.measured, &self.simulated, &extended, &self.out)?;
+            say_gains(&gains);
+            outcome.diagnosis.detectors = gains;
+            self.write_json(&outcome.diagnosis)?;
+        }
         Ok(outcome.diagnosis.verdict != Verdict::NotScenarioIdentical)
+    }
+
+    fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {
+        let json = serde_json::to_vec_pretty(diagnosis)?;
+        write_atomic(&self.out.join("diagnosis.json"), &json)?;
+        if let Some(path) = &self.json {
+            write_atomic(path, &json)?;
+        }
+        Ok(())
     }
 
     fn rig(&self) -> Result<SensorRig> {
@@ -140,4 +160,16 @@ fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
         println!("corrected labels of {corrected} frames in {}", out.join("label_2").display());
     }
     eprintln!("diagnosis.json and extended.toml in {}", out.display());
+}
+
+#[expect(clippy::print_stdout, reason = "results go to stdout")]
+fn say_gains(gains: &[DetectorGain]) {
+    for g in gains {
+        let interval = g.ci95.map_or(String::new(), |[low, high]| format!(" ({low:.1} to {high:.1})"));
+        println!(
+            "{}, {} at {}: AP on measured frames {:.1} when trained on the simulation, {:.1} on the extended one, {:.1} on measured data; \
+             gain {:+.1}{interval} over {} runs each",
+            g.detector, g.class, g.overlap, g.before, g.after, g.ceiling, g.gain, g.runs
+        );
+    }
 }

@@ -22,6 +22,9 @@ pub struct Diagnosis {
     pub minimum_detectable: BTreeMap<String, Minimum>,
     /// Distance of the measured held-out frames from the simulation, before and after it is extended.
     pub gain: Gain,
+    /// What detectors gain on measured data, where it was asked for (`--detectors`).
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub detectors: Vec<DetectorGain>,
     /// Candidates that were weighed and what became of them.
     pub considered: Vec<Considered>,
     /// What could not be looked at or must be known to read the rest, in words.
@@ -144,6 +147,31 @@ pub struct Gain {
     /// (before - after) / (before - floor); null where before is not above the floor.
     pub closed: Option<f64>,
     /// Interval of `closed`, from a bootstrap over blocks of held-out frames.
+    pub ci95: Option<[f64; 2]>,
+}
+
+/// Average precision on the measured test frames of a detector trained on each kind of data, percent.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct DetectorGain {
+    /// The detector.
+    pub detector: String,
+    /// Class name.
+    pub class: String,
+    /// 3D overlap that has to be exceeded.
+    pub overlap: f64,
+    /// Measured test frames.
+    pub frames: usize,
+    /// Runs of each, one a seed.
+    pub runs: usize,
+    /// Trained on the simulation as it is, mean over the runs.
+    pub before: f64,
+    /// Trained on the extended simulation.
+    pub after: f64,
+    /// Trained on measured data: the ceiling.
+    pub ceiling: f64,
+    /// `after` - `before`, points of percent.
+    pub gain: f64,
+    /// Its interval: the same measured frames drawn for both, seeds for each.
     pub ci95: Option<[f64; 2]>,
 }
 

@@ -192,6 +192,7 @@ fn refused(notes: Vec<String>) -> Diagnosis {
         findings: vec![],
         minimum_detectable: Default::default(),
         gain: Gain { metric: "nats_per_ray".into(), before: 0.0, after: 0.0, floor: 0.0, closed: None, ci95: None },
+        detectors: Vec::new(),
         considered: vec![],
         notes,
     }
@@ -259,6 +260,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
         gain: gain(&distance, &blocks, returns, findings.is_empty()),
         findings,
         minimum_detectable,
+        detectors: Vec::new(),
         considered,
         notes,
     }

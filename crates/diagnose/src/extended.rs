@@ -316,6 +316,7 @@ mod tests {
                 closed: Some(0.9),
                 ci95: None,
             },
+            detectors: vec![],
             considered: vec![],
             notes: vec![],
         }

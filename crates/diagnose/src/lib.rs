@@ -13,7 +13,7 @@ pub mod pairing;
 mod rig;
 pub mod search;
 
-pub use diagnosis::{Curve, CurvePoint, Diagnosis, Finding, FindingGain, SCHEMA, Status, Verdict};
+pub use diagnosis::{Curve, CurvePoint, DetectorGain, Diagnosis, Finding, FindingGain, SCHEMA, Status, Verdict};
 pub use engine::{Options, Outcome, Progress, Stage, diagnose};
 pub use error::DiagnoseError;
 pub use extended::extended_toml;

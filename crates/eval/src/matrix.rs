@@ -249,10 +249,12 @@ impl Cell {
 pub struct Gap {
     /// [`Place::name`] of the network.
     pub network: String,
-    /// [`Place::name`] of the test set, and of the train set that it is compared to.
+    /// [`Place::name`] of the test set.
     pub test_set: String,
-    /// [`Place::name`] of the other train set.
+    /// [`Place::name`] of the train set whose number is taken off.
     pub train_set: String,
+    /// [`Place::name`] of the train set that it is compared to: the test set's own, or a later one of the study.
+    pub compared_to: String,
     /// Class name.
     pub class: String,
     /// Section of distance; `None`: the whole.

@@ -10,9 +10,10 @@ use toml::{Table, Value};
 use train::{RunConfig, set_key};
 
 /// Studies that come with the program.
-const BUILT_IN: [(&str, &str); 3] = [
+const BUILT_IN: [(&str, &str); 4] = [
     ("quick", include_str!("../../../../configs/studies/quick.toml")),
     ("cpu", include_str!("../../../../configs/studies/cpu.toml")),
+    ("gain", include_str!("../../../../configs/studies/gain.toml")),
     ("paper", include_str!("../../../../configs/studies/paper.toml")),
 ];
 

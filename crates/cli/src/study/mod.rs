@@ -45,7 +45,7 @@ use work::RunPart;
 pub struct StudyArgs {
     #[command(subcommand)]
     command: Option<StudyCommand>,
-    /// A name (quick, cpu, paper), a TOML, or the folder of a study
+    /// A name (quick, cpu, gain, paper), a TOML, or the folder of a study
     #[arg(value_name = "STUDY")]
     study: Option<String>,
     /// Folder of the study [default: runs/NAME]
@@ -69,7 +69,7 @@ enum StudyCommand {
 /// Which study.
 #[derive(Args, Clone, Debug)]
 pub struct StudyPlace {
-    /// A name (quick, cpu, paper), a TOML, or the folder of a study
+    /// A name (quick, cpu, gain, paper), a TOML, or the folder of a study
     #[arg(value_name = "STUDY")]
     study: String,
     /// Folder of the study [default: runs/NAME]
@@ -105,6 +105,13 @@ pub struct HowToRun {
     /// Words for sbatch, behind --
     #[arg(last = true, value_name = "SBATCH", requires = "study")]
     sbatch: Vec<String>,
+}
+
+impl HowToRun {
+    /// On this machine, as many at once as fit.
+    pub fn here() -> Self {
+        HowToRun { launcher: Launcher::Local, dry_run: false, jobs: None, replace: true, sbatch: Vec::new() }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

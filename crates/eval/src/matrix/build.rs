@@ -179,23 +179,32 @@ fn gaps(plan: &MatrixPlan, drawn: &[Drawn], options: &MatrixOptions) -> Vec<Gap>
     };
     for planned in &plan.networks {
         let network = &planned.network.name;
-        for test_set in &plan.test_sets {
-            let Some(own) = find(network, &test_set.name, &test_set.name) else { continue };
-            for train_set in planned.train_sets.iter().filter(|train| train.name != test_set.name) {
-                let Some(other) = find(network, &train_set.name, &test_set.name) else { continue };
-                let numbers = own.cell.numbers.iter().zip(&other.cell.numbers);
+        let names: Vec<&str> = planned.train_sets.iter().map(|train| train.name.as_str()).collect();
+        for test_set in plan.test_sets.iter().map(|test| test.name.as_str()) {
+            let own = names.iter().filter(|train| **train != test_set).map(|train| (test_set, *train));
+            let others: Vec<&str> = names.iter().copied().filter(|train| *train != test_set).collect();
+            let later = (0..others.len()).flat_map(|i| others[i + 1..].iter().map(move |later| (*later, i)));
+            let later = later.map(|(later, i)| (later, others[i]));
+            for (compared_to, train_set) in own.chain(later) {
+                let (Some(one), Some(other)) =
+                    (find(network, compared_to, test_set), find(network, train_set, test_set))
+                else {
+                    continue;
+                };
+                let numbers = one.cell.numbers.iter().zip(&other.cell.numbers);
                 for (i, (a, b)) in numbers.enumerate() {
-                    let (Some(own_mean), Some(other_mean)) = (a.mean, b.mean) else { continue };
-                    let draws = own.draws[i].iter().zip(&other.draws[i]).map(|(a, b)| a - b).collect();
+                    let (Some(one_mean), Some(other_mean)) = (a.mean, b.mean) else { continue };
+                    let draws = one.draws[i].iter().zip(&other.draws[i]).map(|(a, b)| a - b).collect();
                     gaps.push(Gap {
                         network: network.clone(),
-                        test_set: test_set.name.clone(),
-                        train_set: train_set.name.clone(),
+                        test_set: test_set.into(),
+                        train_set: train_set.into(),
+                        compared_to: compared_to.into(),
                         class: a.class.clone(),
                         section: a.section,
                         quantity: a.quantity,
                         overlap: a.overlap,
-                        gap: own_mean - other_mean,
+                        gap: one_mean - other_mean,
                         interval: options.bootstrap.interval(draws),
                     });
                 }

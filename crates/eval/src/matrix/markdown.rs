@@ -105,6 +105,7 @@ impl Matrix {
             .gaps
             .iter()
             .filter(|g| g.class == class && g.section.is_none() && g.quantity == Quantity::Ap40)
+            .filter(|g| g.compared_to == g.test_set)
             .collect();
         if gaps.is_empty() {
             return;

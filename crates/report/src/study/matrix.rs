@@ -67,7 +67,8 @@ pub(super) fn matrix_section(m: &Matrix) -> Section {
 }
 
 fn gaps(m: &Matrix, class: &str) -> Option<Item> {
-    let of_class = m.gaps.iter().filter(|g| g.class == class && g.section.is_none() && g.quantity == Quantity::Ap40);
+    let own = m.gaps.iter().filter(|g| g.compared_to == g.test_set);
+    let of_class = own.filter(|g| g.class == class && g.section.is_none() && g.quantity == Quantity::Ap40);
     let (mut rows, mut last) = (Vec::new(), None);
     for g in of_class {
         let begins = last.replace((&g.network, &g.test_set)) != Some((&g.network, &g.test_set));

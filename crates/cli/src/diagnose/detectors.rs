@@ -1,0 +1,121 @@
+//! `lidarshift diagnose --detectors STUDY`: are detectors trained on the extended simulation better on measured data?
+
+use crate::device::DeviceArgs;
+use crate::study::folder::Study;
+use crate::study::numbers::{Found, matrix};
+use crate::study::{HowToRun, Step, run_study};
+use anyhow::{Context, Result, bail};
+use data::write_atomic;
+use diagnose::DetectorGain;
+use eval::matrix::{Matrix, Quantity};
+use eval::study::{Source, StudyConfig, StudyDataset};
+use std::path::Path;
+
+const MEASURED: &str = "measured";
+const BEFORE: &str = "simulated";
+const AFTER: &str = "extended";
+
+/// Trains the detectors of the study `named`, with its seeds and epochs, on the measured data, on the simulation and on the extended one,
+/// and tests all of them on measured frames. The study of it lies in `out`, and goes on where it was stopped.
+///
+/// # Errors
+/// A study that is wrong, a simulation that cannot be simulated again, runs that failed.
+pub(super) fn gain_of_detectors(
+    named: &str,
+    measured: &Path,
+    simulated: &Path,
+    extended: &Path,
+    out: &Path,
+) -> Result<Vec<DetectorGain>> {
+    let template = Study::open(named, None)?.config;
+    let path = out.join("detectors.toml");
+    let text = toml::to_string(&study_of(template, measured, simulated, extended)?)?;
+    write_atomic(&path, text.as_bytes())?;
+    let study = Study::open(&path.to_string_lossy(), Some(&out.join("detectors")))?;
+    run_study(
+        &study,
+        &[Step::Data, Step::Train, Step::Detect, Step::Report],
+        &HowToRun::here(),
+        &DeviceArgs::default(),
+    )?;
+    gains(&matrix(&study, &Found::look(&study)?)?)
+}
+
+/// The template with the data sets of a diagnosis in the place of its own.
+fn study_of(template: StudyConfig, measured: &Path, simulated: &Path, extended: &Path) -> Result<StudyConfig> {
+    let absolute = |path: &Path| std::path::absolute(path).map(Source::Path);
+    let set =
+        |name: &str, title: &str, source| StudyDataset { name: name.into(), title: title.into(), paper: None, source };
+    let mut study = template;
+    study.name = "detectors".into();
+    study.datasets = vec![
+        set(MEASURED, "Measured", absolute(measured)?),
+        set(BEFORE, "Simulated", absolute(simulated)?),
+        set(AFTER, "Extended", Source::Resim { of: BEFORE.into(), effects: std::path::absolute(extended)? }),
+    ];
+    study.evaluation.tsne_dataset = None;
+    for detector in &mut study.detectors {
+        (detector.train, detector.paper) = (None, None);
+        if let Some(config) = &detector.config {
+            bail!(
+                "--detectors: {} has a file of its own ({}); only detectors of configs/detectors are known here",
+                detector.name,
+                config.display()
+            );
+        }
+    }
+    Ok(study)
+}
+
+/// The area under the curve on measured frames, after and before, for every detector, class and overlap.
+fn gains(matrix: &Matrix) -> Result<Vec<DetectorGain>> {
+    let found = matrix.gaps.iter().filter(|gap| {
+        (&*gap.test_set, &*gap.compared_to, &*gap.train_set) == (MEASURED, AFTER, BEFORE)
+            && gap.section.is_none()
+            && gap.quantity == Quantity::ApArea
+    });
+    let gains = found.map(|gap| {
+        let mean = |train_set: &str| {
+            let cell = matrix
+                .cells
+                .iter()
+                .find(|cell| (&cell.network, &*cell.train_set, &*cell.test_set) == (&gap.network, train_set, MEASURED));
+            let number = cell.and_then(|cell| cell.number(&gap.class, None, Quantity::ApArea, gap.overlap));
+            let (cell, number) = cell.zip(number).with_context(|| format!("no run trained on {train_set}"))?;
+            Ok::<_, anyhow::Error>((cell.frames.unwrap_or(0), cell.n_done(), number.mean.unwrap_or(f64::NAN)))
+        };
+        let ((_, _, before), (frames, runs, after), (_, _, ceiling)) = (mean(BEFORE)?, mean(AFTER)?, mean(MEASURED)?);
+        Ok(DetectorGain {
+            detector: gap.network.clone(),
+            class: gap.class.clone(),
+            overlap: gap.overlap,
+            frames,
+            runs,
+            before,
+            after,
+            ceiling,
+            gain: gap.gap,
+            ci95: gap.interval.map(|interval| [interval.low, interval.high]),
+        })
+    });
+    gains.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_template_gets_the_data_sets_of_the_diagnosis() {
+        let template = Study::open("gain", None).unwrap().config;
+        assert_eq!(template.seeds.len(), 5);
+        let study =
+            study_of(template, Path::new("/a/real"), Path::new("/a/sim"), Path::new("/a/extended.toml")).unwrap();
+        let text = toml::to_string(&study).unwrap();
+        let again = StudyConfig::parse(&text, Path::new("detectors.toml")).unwrap();
+        assert_eq!(again, study);
+        assert_eq!(again.datasets[0].source, Source::Path("/a/real".into()));
+        let of_the_simulation = Source::Resim { of: BEFORE.into(), effects: "/a/extended.toml".into() };
+        assert_eq!(again.datasets[2].source, of_the_simulation);
+    }
+}
