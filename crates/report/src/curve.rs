@@ -45,17 +45,43 @@ pub(crate) fn curve_page(series: &[Series], options: &CurveOptions) -> Page {
 
     let mut page = Page::new(SIZE, [255; 3], false);
     axes(&mut page, &x_axis, &y_axis, options);
-    for (s, color) in series.iter().zip(COLORS.into_iter().cycle()) {
+    for (i, s) in series.iter().enumerate() {
+        let color = COLORS[i % COLORS.len()];
         for part in s.points.split(|p| !drawable(*p)).filter(|part| !part.is_empty()) {
             let line: Vec<[f64; 2]> = part.iter().map(|[x, y]| [x_axis.px(*x), y_axis.px(height(*y))]).collect();
             if let [[x, y]] = line[..] {
                 page.marks.push(Mark::Squares { corners: vec![[x - 2.0, y - 2.0]], side: 4.0, color });
             }
-            page.line(line, color, 1.8);
+            strokes(line, i).into_iter().for_each(|stroke| page.line(stroke, color, 1.8));
         }
     }
     legend(&mut page, series);
     page
+}
+
+/// The line of the i-th series, in dashes where a series before has its color.
+fn strokes(line: Vec<[f64; 2]>, i: usize) -> Vec<Vec<[f64; 2]>> {
+    const DASH: f64 = 6.0; // as long as the gap behind it, px
+    if i < COLORS.len() {
+        return vec![line];
+    }
+    let mut strokes = Vec::new();
+    let mut walked = 0.0; // dashes and gaps so far
+    for ends in line.windows(2) {
+        let ([x, y], [to_x, to_y]) = (ends[0], ends[1]);
+        let length = (to_x - x).hypot(to_y - y) / DASH;
+        let at = |t: f64| [x + (to_x - x) * t / length, y + (to_y - y) * t / length];
+        let mut t = 0.0;
+        while t < length {
+            let end = (t + 1.0 - (walked + t).fract()).min(length);
+            if (walked + 0.5 * (t + end)).rem_euclid(2.0) < 1.0 {
+                strokes.push(vec![at(t), at(end)]);
+            }
+            t = end.max(t + 1e-6);
+        }
+        walked += length;
+    }
+    strokes
 }
 
 fn axes(page: &mut Page, x_axis: &Axis, y_axis: &Axis, options: &CurveOptions) {
@@ -78,9 +104,10 @@ fn axes(page: &mut Page, x_axis: &Axis, y_axis: &Axis, options: &CurveOptions) {
 
 fn legend(page: &mut Page, series: &[Series]) {
     let right = FRAME[1] - 8.0;
-    for (i, (s, color)) in series.iter().zip(COLORS.into_iter().cycle()).enumerate() {
-        let y = FRAME[2] + 16.0 + 18.0 * i as f64;
-        page.line(vec![[right - 22.0, y - 4.0], [right, y - 4.0]], color, 2.5);
+    for (i, s) in series.iter().enumerate() {
+        let (color, y) = (COLORS[i % COLORS.len()], FRAME[2] + 16.0 + 18.0 * i as f64);
+        let sample = vec![[right - 22.0, y - 4.0], [right, y - 4.0]];
+        strokes(sample, i).into_iter().for_each(|stroke| page.line(stroke, color, 2.5));
         page.text([right - 28.0, y], &s.name, 12.0, INK, Anchor::End);
     }
 }

@@ -258,7 +258,9 @@ pub(super) fn cell_warnings(cell: &Cell, results: &BTreeMap<(RunId, String), Run
     let zero: Vec<String> = cell
         .numbers
         .iter()
+        // Recalls are counts: those of two runs may well agree by chance.
         .filter(|n| n.section.is_none() && n.deviation == Some(0.0))
+        .filter(|n| matches!(n.quantity, Quantity::Ap40 | Quantity::ApArea) || n.of_runs.len() > 2)
         .map(|n| format!("{} ({})", n.quantity, n.overlap))
         .collect();
     if !zero.is_empty() {

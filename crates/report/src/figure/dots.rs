@@ -32,6 +32,8 @@ pub struct DotPanel {
 
 const ROW: f64 = 300.0;
 const WIDTH: f64 = 980.0;
+/// Left of the first axis, at least.
+const MARGIN: f64 = 56.0;
 
 /// Panels of dots on a common vertical axis from 0 to 100; `series` are the names of the legend.
 pub fn dots(panels: &[DotPanel], series: &[&str], y_label: &str) -> Figure {
@@ -45,9 +47,14 @@ pub fn dots(panels: &[DotPanel], series: &[&str], y_label: &str) -> Figure {
     .min(panels.len().max(1));
     let rows = panels.len().div_ceil(columns);
     // Labels stand upright where they have the room, else they lean.
-    let panel_width = (WIDTH - 60.0) / columns as f64;
-    let step = (panel_width - 24.0) / most.max(1) as f64;
-    let leaning = longest as f64 * 6.4 > step;
+    let width_beside = |margin: f64| (WIDTH - 4.0 - margin) / columns as f64;
+    let step_within = |panel_width: f64| (panel_width - 24.0) / most.max(1) as f64;
+    let leaning = longest as f64 * 6.4 > step_within(width_beside(MARGIN));
+    // A leaning label reaches to the left of its group.
+    let reach = longest as f64 * 5.4 - step_within(width_beside(MARGIN)) / 2.0;
+    let margin = if leaning { MARGIN.max(reach) } else { MARGIN };
+    let panel_width = width_beside(margin);
+    let step = step_within(panel_width);
     let below = if leaning { 24.0 + longest as f64 * 4.6 } else { 30.0 };
     let row_height = ROW + below;
     let mut page = Page::new([WIDTH, 16.0 + rows as f64 * row_height + 60.0], [255; 3], false);
@@ -55,7 +62,7 @@ pub fn dots(panels: &[DotPanel], series: &[&str], y_label: &str) -> Figure {
     page.size[1] = used + 10.0 + rows as f64 * row_height;
     for (i, panel) in panels.iter().enumerate() {
         let (row, column) = (i / columns, i % columns);
-        let (left, top) = (56.0 + column as f64 * panel_width, used + 26.0 + row as f64 * row_height);
+        let (left, top) = (margin + column as f64 * panel_width, used + 26.0 + row as f64 * row_height);
         let (right, bottom) = (left + panel_width - 24.0, top + ROW - 50.0);
         let axis = Axis::new([0.0, 100.0].into_iter(), [bottom, top], false);
         for (value, name) in axis.ticks() {
