@@ -135,9 +135,10 @@ impl RunScores {
         RunScores { frames: frames.len(), curves: keys.into_par_iter().map(curve).collect() }
     }
 
-    /// Whether a run does the same on every frame as another: two seeds that do were one.
+    /// Whether a run does the same on every frame as another: two seeds that do were one, unless they find nothing.
     pub(super) fn is_same_as(&self, other: &RunScores) -> bool {
-        self.curves.iter().zip(&other.curves).all(|(a, b)| a.evidence == b.evidence && a.covered == b.covered)
+        let finds = self.curves.iter().any(|curve| curve.covered.iter().any(|[_, hits]| *hits > 0));
+        finds && self.curves.iter().zip(&other.curves).all(|(a, b)| a.evidence == b.evidence && a.covered == b.covered)
     }
 }
 
