@@ -5,7 +5,7 @@ mod pictures;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
-use data::{Dataset, KittiLine, write_atomic};
+use data::{Dataset, KittiLine, write_atomic, write_json};
 use diagnose::{Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, extended_toml};
 use indicatif::{ProgressBar, ProgressStyle};
 use simulate::race::RaceConfig;
@@ -68,10 +68,9 @@ impl DiagnoseArgs {
         };
         let outcome = diagnose(&measured, &simulated, &rig, &Options { split: self.split.clone() }, &told)?;
         bar.finish_and_clear();
-        let json = serde_json::to_vec_pretty(&outcome.diagnosis)?;
-        write_atomic(&self.out.join("diagnosis.json"), &json)?;
+        write_json(&self.out.join("diagnosis.json"), &outcome.diagnosis)?;
         if let Some(path) = &self.json {
-            write_atomic(path, &json)?;
+            write_json(path, &outcome.diagnosis)?;
         }
         write_atomic(
             &self.out.join("extended.toml"),
