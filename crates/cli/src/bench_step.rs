@@ -120,7 +120,7 @@ impl BenchStepArgs {
             println!("  peak memory {mib:>9} MiB");
         }
         if let Some(path) = &self.json {
-            data::write_atomic(path, &serde_json::to_vec_pretty(&report)?)?;
+            data::write_json(path, &report)?;
         }
         Ok(())
     }

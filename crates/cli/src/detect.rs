@@ -5,7 +5,7 @@ use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use data::kitti_text::{KittiLine, KittiText, parse_kitti_text};
-use data::{Cloud, Dataset, Detection, Frame, PointColumns, read_cloud, write_atomic};
+use data::{Cloud, Dataset, Detection, Frame, PointColumns, read_cloud, write_atomic, write_json};
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
@@ -113,7 +113,7 @@ impl DetectArgs {
         }
         if let Some(path) = &self.json {
             let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
-            write_atomic(path, &serde_json::to_vec_pretty(&found)?)?;
+            write_json(path, &found)?;
         }
         let truth = match &self.labels {
             Some(path) => parse_kitti_text(&fs_err::read_to_string(path)?, path, KittiText::Labels)?,

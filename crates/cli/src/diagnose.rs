@@ -6,7 +6,7 @@ mod pictures;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
-use data::{Dataset, KittiLine, write_atomic};
+use data::{Dataset, KittiLine, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{DetectorGain, Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, extended_toml};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -97,10 +97,9 @@ impl DiagnoseArgs {
     }
 
     fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {
-        let json = serde_json::to_vec_pretty(diagnosis)?;
-        write_atomic(&self.out.join("diagnosis.json"), &json)?;
+        write_json(&self.out.join("diagnosis.json"), diagnosis)?;
         if let Some(path) = &self.json {
-            write_atomic(path, &json)?;
+            write_json(path, diagnosis)?;
         }
         Ok(())
     }

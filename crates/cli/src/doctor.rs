@@ -37,7 +37,7 @@ impl DoctorArgs {
         let dataset = Dataset::open(&self.dataset)?;
         let report = doctor(&dataset, detector.as_ref().map(facts).as_ref())?;
         if let Some(path) = &self.json {
-            data::write_atomic(path, &serde_json::to_vec_pretty(&report)?)?;
+            data::write_json(path, &report)?;
         }
         println!("{report}");
         Ok(report.sound)

@@ -2,7 +2,7 @@
 
 use anyhow::{Result, bail};
 use clap::Args;
-use data::{Dataset, LabelFrame, write_atomic};
+use data::{Dataset, LabelFrame, write_json};
 use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_frames, read_ids};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -69,9 +69,7 @@ impl EvalApArgs {
         }
         let report = evaluate(&frames, &options);
         if let Some(path) = &self.json {
-            let mut json = serde_json::to_string_pretty(&report)?;
-            json.push('\n');
-            write_atomic(path, json.as_bytes())?;
+            write_json(path, &report)?;
         }
         print!("{report}");
         Ok(())

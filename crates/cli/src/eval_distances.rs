@@ -4,7 +4,7 @@ use crate::detectors::find_detector;
 use crate::study::clouds::{Loader, distances_of};
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
-use data::{Dataset, write_atomic};
+use data::{Dataset, write_json};
 use eval::distance::{Compared, DistanceOptions, Distances};
 use std::path::PathBuf;
 
@@ -72,7 +72,7 @@ impl EvalDistancesArgs {
         let names = [a.config.name.as_str(), &b.config.name];
         let found = distances_of(names, [&a, &b], &self.split, self.frames, loader.as_ref(), &options)?;
         if let Some(path) = &self.json {
-            write_atomic(path, &serde_json::to_vec_pretty(&found)?)?;
+            write_json(path, &found)?;
         }
         print!("{}", table(&found));
         Ok(())

@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use clap::Args;
-use data::{Dataset, write_atomic};
+use data::{Dataset, write_json};
 use eval::compare_statistics;
 use std::path::PathBuf;
 
@@ -38,9 +38,7 @@ impl EvalStatisticsArgs {
         let [a, b] = [Dataset::open(&self.a)?, Dataset::open(&self.b)?];
         let report = compare_statistics(&a, &b, &self.split, self.max_range)?;
         if let Some(path) = &self.json {
-            let mut json = serde_json::to_string_pretty(&report)?;
-            json.push('\n');
-            write_atomic(path, json.as_bytes())?;
+            write_json(path, &report)?;
         }
         print!("{report}");
         Ok(())

@@ -2,7 +2,7 @@
 
 use anyhow::{Result, bail};
 use clap::Args;
-use data::{Dataset, write_atomic};
+use data::{Dataset, write_json};
 use eval::targets::{Spread, TargetOptions, Targets, targets};
 use report::StudyReport;
 use std::path::PathBuf;
@@ -51,7 +51,7 @@ impl EvalTargetsArgs {
             bail!("no frame of the split {} has a {} within {} m", self.split, self.class, options.max_range_m);
         }
         if let Some(path) = &self.json {
-            write_atomic(path, &serde_json::to_vec_pretty(&all)?)?;
+            write_json(path, &all)?;
         }
         all.iter().for_each(|found| print!("{}", table(found)));
         if let Some(out) = &self.out {

@@ -4,7 +4,7 @@ use crate::study::StudyPlace;
 use crate::study::features::features;
 use anyhow::{Result, bail};
 use clap::Args;
-use data::write_atomic;
+use data::write_json;
 use report::StudyReport;
 use std::path::PathBuf;
 
@@ -40,7 +40,7 @@ impl EvalTsneArgs {
             bail!("no run of the study has been tested yet: `lidarshift study {}` does it", study.named);
         }
         if let Some(path) = &self.json {
-            write_atomic(path, &serde_json::to_vec_pretty(&found)?)?;
+            write_json(path, &found)?;
         }
         for e in &found.embeddings {
             let (n, kl) = (e.points.len(), e.kl_divergence);

@@ -128,6 +128,32 @@ fn a_study_is_made_and_gone_on_with_after_kills() {
 }
 
 #[test]
+fn two_stages_leave_their_regions_and_curves_for_tensorboard() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    let two_stage = STUDY.replace("seeds = [1, 2]", "seeds = [1]").replace(
+        "[[detector]]\nname = \"tiny\"\nconfig = \"tiny.toml\"",
+        "[[detector]]\nname = \"tiny\"\nconfig = \"tiny_pointrcnn.toml\"\ntrain = [\"plain\"]",
+    );
+    fs::write(dir.path().join("tiny-study.toml"), two_stage).unwrap();
+    must(dir.path(), "study tiny-study.toml");
+    let run = dir.path().join("runs/tiny/tiny/plain/seed-1");
+    let lines = |folder: &str| fs::read_to_string(run.join(folder).join("noisy/000005.txt")).unwrap().lines().count();
+    assert!(lines("regions") >= lines("detections").max(1));
+    let matrix = fs::read_to_string(dir.path().join("runs/tiny/matrix.json")).unwrap();
+    assert!(matrix.contains("recall_final_boxes"), "{matrix}");
+
+    let text = said(&must(dir.path(), "report tiny-study.toml --tensorboard curves"));
+    assert!(text.contains("curves of 1 runs: tensorboard --logdir curves"), "{text}");
+    let events = fs::read(dir.path().join("curves/tiny/plain/seed-1/events.out.tfevents.0.lidarshift")).unwrap();
+    assert!(events.windows(10).any(|w| w == b"train/loss"));
+    let text = said(&must(dir.path(), "report runs/tiny/tiny/plain/seed-1 --tensorboard alone"));
+    assert!(!text.contains("report.html") && dir.path().join("alone/events.out.tfevents.0.lidarshift").is_file());
+    let output = program(dir.path(), "report runs/tiny/data --tensorboard none").output().unwrap();
+    assert!(!output.status.success() && said(&output).contains("no metrics.jsonl below it"), "{}", said(&output));
+}
+
+#[test]
 fn a_failed_run_and_a_changed_file_are_told() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
@@ -154,8 +180,16 @@ fn a_failed_run_and_a_changed_file_are_told() {
     let status = said(&must(dir.path(), "study status tiny-study.toml"));
     assert!(status.contains("2 trained") && status.contains("to be tested on plain, noisy"), "{status}");
 
-    // Weights of another configuration in a run folder.
+    // A detection that was lost is made again.
     must(dir.path(), "study tiny-study.toml --only detect");
+    let lost = dir.path().join("runs/tiny/tiny/plain/seed-1/detections/noisy/000005.txt");
+    fs::remove_file(&lost).unwrap();
+    let status = said(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("1 done, 1 trained") && status.contains("to be tested on noisy"), "{status}");
+    must(dir.path(), "study tiny-study.toml --only detect");
+    assert!(lost.is_file());
+
+    // Weights of another configuration in a run folder.
     let state = dir.path().join("runs/tiny/tiny/plain/seed-1/checkpoint/state.json");
     let other = dir.path().join("runs/tiny/tiny/noisy/seed-1/checkpoint/state.json");
     fs::copy(other, state).unwrap();
@@ -187,6 +221,14 @@ fn bad_studies_are_refused_in_words() {
         program(dir.path(), "study tiny-study.toml --launcher slurm").env("PATH", dir.path()).output().unwrap();
     let text = said(&output);
     assert!(!output.status.success() && text.contains("there is no squeue on this machine"), "{text}");
+    // A test frame that is missing.
+    let val = dir.path().join("ImageSets/val.txt");
+    let ids = fs::read_to_string(&val).unwrap();
+    fs::write(&val, format!("{ids}000099\n")).unwrap();
+    let output = run(dir.path(), "study tiny-study.toml");
+    let text = said(&output);
+    assert!(!output.status.success() && text.contains("000099"), "{text}");
+    fs::write(&val, ids).unwrap();
     // Frames that the other data set does not have.
     let other = dir.path().join("other");
     fs::create_dir(&other).unwrap();
@@ -200,39 +242,100 @@ fn bad_studies_are_refused_in_words() {
     assert!(!output.status.success() && text.contains("do not pair") && text.contains("000000"), "{text}");
 }
 
-/// Whether `condition` comes true within two minutes.
+/// Whether `condition` comes true within ten minutes.
 fn waits_for(mut condition: impl FnMut() -> bool) -> bool {
-    (0..600).any(|_| {
+    (0..3000).any(|_| {
         std::thread::sleep(Duration::from_millis(200));
         condition()
     })
 }
 
+/// What a command of Slurm says; `None` when it fails or is not there.
+fn slurm(words: &[&str]) -> Option<String> {
+    let output = std::process::Command::new(words[0]).args(&words[1..]).output().ok()?;
+    output.status.success().then(|| said(&output))
+}
+
+/// A node that takes no new task; it goes on with those that run, and takes new ones again when this is dropped.
+struct Drained(String);
+
+impl Drained {
+    fn drain(node: &str) -> Option<Drained> {
+        let name = format!("nodename={node}");
+        slurm(&["scontrol", "update", &name, "state=drain", "reason=test"])?;
+        Some(Drained(name))
+    }
+}
+
+impl Drop for Drained {
+    fn drop(&mut self) {
+        slurm(&["scontrol", "update", &self.0, "state=resume"]);
+    }
+}
+
+/// The number of the job of training that a submission names.
+fn training_job(text: &str) -> String {
+    text.lines().find_map(|line| line.strip_prefix("train: job ")?.split(',').next()).unwrap().to_string()
+}
+
 #[test]
 fn on_slurm_the_numbers_are_the_same() {
-    let there = std::process::Command::new("sinfo").output().is_ok_and(|output| output.status.success());
-    if !there {
+    let Some(nodes) = slurm(&["sinfo", "--noheader", "--format=%n"]) else {
         eprintln!("skipped: there is no Slurm");
         return;
-    }
+    };
     let local = tempfile::tempdir().unwrap();
     study(local.path());
     must(local.path(), "study tiny-study.toml");
-
-    let dir = tempfile::tempdir().unwrap();
-    study(dir.path());
-    let text = said(&must(dir.path(), "study tiny-study.toml --launcher slurm"));
-    assert!(text.contains("train: job") && text.contains("4 tasks") && text.contains("report: job"), "{text}");
-    let job = text.lines().find_map(|line| line.strip_prefix("train: job ")?.split(',').next()).unwrap().to_string();
-    // One task is killed; what depends on it is dropped, and the report shows the gap.
-    assert!(std::process::Command::new("scancel").arg(format!("{job}_3")).status().unwrap().success());
-    assert!(waits_for(|| dir.path().join("runs/tiny/report.html").is_file()), "no report");
-    let status = said(&must(dir.path(), "study status tiny-study.toml"));
-    assert!(status.contains("3 done"), "{status}");
-    // A second submission fills the gap alone.
-    let text = said(&must(dir.path(), "study tiny-study.toml --launcher slurm"));
-    assert!(text.contains("1 tasks"), "{text}");
     let matrix = |folder: &Path| fs::read_to_string(folder.join("runs/tiny/matrix.json")).unwrap();
-    assert!(waits_for(|| matrix(dir.path()) == matrix(local.path())), "the numbers differ");
-    assert!(waits_for(|| page(dir.path()) == page(local.path())), "the report differs");
+    let status = |folder: &Path| said(&must(folder, "study status tiny-study.toml"));
+
+    // One task is killed; what depends on it is dropped, and the report shows the gap.
+    let killed = tempfile::tempdir().unwrap();
+    study(killed.path());
+    let text = said(&must(killed.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(text.contains("train: job") && text.contains("4 tasks") && text.contains("report: job"), "{text}");
+    slurm(&["scancel", &format!("{}_3", training_job(&text))]).unwrap();
+    assert!(waits_for(|| killed.path().join("runs/tiny/report.html").is_file()), "no report");
+    assert!(status(killed.path()).contains("3 done"), "{}", status(killed.path()));
+    // A second submission fills the gap alone.
+    let text = said(&must(killed.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(text.contains("1 tasks"), "{text}");
+    assert!(waits_for(|| matrix(killed.path()) == matrix(local.path())), "the numbers differ");
+    assert!(waits_for(|| page(killed.path()) == page(local.path())), "the report differs");
+
+    // The whole array is killed: nothing is lost but time.
+    let array = tempfile::tempdir().unwrap();
+    study(array.path());
+    let text = said(&must(array.path(), "study tiny-study.toml --launcher slurm --only data,train"));
+    slurm(&["scancel", &training_job(&text)]).unwrap();
+    assert!(waits_for(
+        || slurm(&["squeue", "--noheader", "--jobs", &training_job(&text)]).is_none_or(|q| q.trim().is_empty())
+    ));
+    let text = said(&must(array.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(!text.contains("queue already"), "{text}");
+    assert!(waits_for(|| array.path().join("runs/tiny/report.html").is_file()), "no report");
+    assert!(matrix(array.path()) == matrix(local.path()), "the numbers differ");
+
+    // The node is drained when the first task is at work, and comes back: what waits is not submitted twice.
+    let node = nodes.lines().next().unwrap_or_default();
+    let drained = tempfile::tempdir().unwrap();
+    study(drained.path());
+    must(drained.path(), "study tiny-study.toml --launcher slurm");
+    assert!(waits_for(|| steps_done(drained.path()) > 0), "no task begins");
+    let Some(guard) = Drained::drain(node) else {
+        eprintln!("skipped: only Slurm's administrator may drain a node");
+        return;
+    };
+    // Tasks that are at work go on to their end.
+    let is_idle =
+        || slurm(&["squeue", "--noheader", "--states=running", "--nodelist", node]).unwrap().trim().is_empty();
+    assert!(waits_for(is_idle), "tasks go on for ever");
+    assert!(!status(drained.path()).contains("4 done"), "{}", status(drained.path()));
+    let text = said(&must(drained.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(text.contains("queue already"), "{text}");
+    drop(guard);
+    assert!(waits_for(|| drained.path().join("runs/tiny/report.html").is_file()), "no report");
+    assert!(waits_for(|| matrix(drained.path()) == matrix(local.path())), "the numbers differ");
+    assert!(waits_for(|| page(drained.path()) == page(local.path())), "the report differs");
 }

@@ -33,4 +33,4 @@ pub use pcd_columns::{PcdColumn, encode_pcd_columns, parse_pcd_columns, write_pc
 pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
 pub use prefetch::{Prefetch, prefetch};
 pub use stream::{Stream, stream};
-pub use write::write_atomic;
+pub use write::{write_atomic, write_json};

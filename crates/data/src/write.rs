@@ -3,6 +3,7 @@
 use crate::dataset_config::{DatasetConfig, Layout};
 use crate::kitti_text::to_kitti_text;
 use crate::{Cloud, DataError, Frame, KittiLine, PcdEncoding, encode_pcd};
+use serde::Serialize;
 use std::io::Write as _;
 use std::path::Path;
 
@@ -41,6 +42,13 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     file.as_file().sync_all().map_err(failed)?;
     file.persist(path).map_err(|e| failed(e.error))?;
     Ok(())
+}
+
+/// JSON that people can read, with an end of line.
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), DataError> {
+    let mut text = serde_json::to_vec_pretty(value).map_err(|e| DataError::file(path, format!("is no JSON: {e}")))?;
+    text.push(b'\n');
+    write_atomic(path, &text)
 }
 
 /// KITTI's `.bin`: the cloud's values as little-endian f32, point after point.
@@ -115,6 +123,17 @@ mod tests {
         write_split(&path, &["000003"]).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "000003\n");
         assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn json_ends_its_line_and_what_is_no_json_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.json");
+        write_json(&path, &[1, 2]).unwrap();
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), "[\n  1,\n  2\n]\n");
+        let no_text = std::collections::BTreeMap::from([([1u8, 2], 3)]);
+        let error = write_json(&path, &no_text).unwrap_err().to_string();
+        assert!(error.contains("a.json") && error.contains("is no JSON"), "{error}");
     }
 
     #[test]

@@ -1,7 +1,7 @@
 """Times of other implementations on the inputs of the benchmark `study`.
 
     cargo bench -p lidarshift-eval --bench study -- FOLDER
-    python study.py FOLDER        # with numpy, scipy and scikit-learn; openTSNE and open3d where they are installed
+    python study.py FOLDER        # with numpy, scipy and scikit-learn; openTSNE, open3d and POT where they are installed
 
 Both on the same threads, as `taskset -c 0,1` gives them.
 """
@@ -41,7 +41,7 @@ def chamfer_scipy():
     return (forth**2).sum() + (back**2).sum()
 
 
-timed("Chamfer, SciPy", 15, chamfer_scipy)
+print(f"  sum {timed('Chamfer, SciPy', 15, chamfer_scipy):.4f} m2")
 try:
     import open3d
 
@@ -51,7 +51,7 @@ try:
         distances = [clouds[i].compute_point_cloud_distance(clouds[1 - i]) for i in (0, 1)]
         return sum((np.asarray(d) ** 2).sum() for d in distances)
 
-    timed("Chamfer, Open3D", 15, chamfer_open3d)
+    print(f"  sum {timed('Chamfer, Open3D', 15, chamfer_open3d):.4f} m2")
 except ImportError:
     print("Open3D is not installed")
 
@@ -62,7 +62,17 @@ def emd_scipy():
     return cost[rows, columns].mean()
 
 
-timed("EMD, SciPy", 7, emd_scipy)
+print(f"  {timed('EMD, SciPy', 7, emd_scipy):.6f} m")
+try:
+    import ot
+
+    def emd_pot():
+        cost = cdist(a[:1024].astype(np.float64), b[:1024].astype(np.float64))
+        return ot.emd2([], [], cost)
+
+    print(f"  {timed('EMD, POT', 7, emd_pot):.6f} m")
+except ImportError:
+    print("POT is not installed")
 
 from sklearn.manifold import TSNE
 

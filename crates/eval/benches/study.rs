@@ -1,7 +1,7 @@
 //! What a study computes beside its trainings: t-SNE, Chamfer and earth mover's distance, and a matrix of 16 cells.
 //!
 //! `cargo bench -p lidarshift-eval --bench study [-- FOLDER]`: with a folder the inputs are written there, for `study.py`, which times
-//! scikit-learn, openTSNE, SciPy and Open3D on the same numbers.
+//! scikit-learn, openTSNE, SciPy, POT and Open3D on the same numbers.
 
 #![expect(clippy::print_stdout, reason = "times go to stdout")]
 
@@ -9,7 +9,7 @@ use data::{KittiLine, LabelFrame, stream};
 use geometry::Box3;
 use lidarshift_eval::EvalFrame;
 use lidarshift_eval::distance::{Point, chamfer, emd};
-use lidarshift_eval::features::{Features, TsneOptions, tsne};
+use lidarshift_eval::features::{Features, TsneMethod, TsneOptions, tsne};
 use lidarshift_eval::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId, RunScores, build};
 use rand::RngExt;
 use std::collections::BTreeMap;
@@ -34,14 +34,20 @@ fn main() {
     let [a, b] = [0, 1].map(|seed| cloud(seed, CLOUD_POINTS));
     keep("a.f32", a.as_flattened());
     keep("b.f32", b.as_flattened());
-    time("Chamfer, 75,000 points, trees included", 15, || chamfer(&a, &b).expect("finite"));
-    time("EMD, 1,024 points", 7, || emd(&a[..EMD_POINTS], &b[..EMD_POINTS]).expect("finite"));
+    let found = time("Chamfer, 75,000 points, trees included", 15, || chamfer(&a, &b).expect("finite"));
+    println!("  sum {:.4} m2", found.sum_m2);
+    let found = time("EMD, 1,024 points", 7, || emd(&a[..EMD_POINTS], &b[..EMD_POINTS]).expect("finite"));
+    println!("  {found:.6} m");
     time("matrix of 16 cells, 1,000 frames each, 1,000 draws", 1, matrix);
     let vectors = vectors();
     keep("vectors.f32", &vectors);
     let features = Features::new(DIM, vectors).expect("whole vectors");
-    let (_, divergence) = time("t-SNE, 10,000 x 128", 1, || tsne(&features, &TsneOptions::default()).expect("fits"));
-    println!("  Kullback-Leibler divergence {divergence:.4}");
+    for method in [TsneOptions::default().method, TsneMethod::Interpolated] {
+        let options = TsneOptions { method, ..TsneOptions::default() };
+        let what = format!("t-SNE, 10,000 x 128, {method:?}");
+        let (_, divergence) = time(&what, 1, || tsne(&features, &options).expect("fits"));
+        println!("  Kullback-Leibler divergence {divergence:.4}");
+    }
 }
 
 /// Prints the median and returns the last result.

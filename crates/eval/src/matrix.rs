@@ -108,18 +108,22 @@ pub enum Quantity {
     Ap40,
     /// Area under the curve with a point at every score, in space; has no ceiling for few ground truths.
     ApArea,
-    /// OpenPCDet's recall: ground truths whose highest overlap with any box is over the limit.
+    /// OpenPCDet's recall: ground truths whose highest overlap with any box is over the limit. Of a two-stage network all refined regions
+    /// count, before the score limit and the last suppression.
     RecallAnyBox,
     /// Hits of KITTI's matching over ground truths.
     RecallMatched,
+    /// As [`Quantity::RecallAnyBox`], but of the final boxes, whatever the network.
+    RecallFinalBoxes,
 }
 
 impl Quantity {
     /// In the order of [`RunScores`].
-    pub const ALL: [Quantity; 4] = [Quantity::Ap40, Quantity::ApArea, Quantity::RecallAnyBox, Quantity::RecallMatched];
+    pub const ALL: [Quantity; 5] =
+        [Quantity::Ap40, Quantity::ApArea, Quantity::RecallAnyBox, Quantity::RecallMatched, Quantity::RecallFinalBoxes];
     /// Its name in files.
     pub fn key(self) -> &'static str {
-        ["ap40", "ap_area", "recall_any_box", "recall_matched"][self as usize]
+        ["ap40", "ap_area", "recall_any_box", "recall_matched", "recall_final_boxes"][self as usize]
     }
 
     /// Those of the paper's table.
@@ -133,6 +137,7 @@ impl fmt::Display for Quantity {
             Quantity::ApArea => "3D AP, exact area",
             Quantity::RecallAnyBox => "Recall",
             Quantity::RecallMatched => "Recall, matched",
+            Quantity::RecallFinalBoxes => "Recall, final boxes",
         })
     }
 }
@@ -309,8 +314,22 @@ impl Matrix {
         text
     }
 
-    /// Class and columns of the paper's table: AP at each overlap, then recall at each.
-    pub(crate) fn paper_columns(&self) -> Vec<(Quantity, f64)> {
+    /// Columns of the tables: those of the paper's, and the recall of the final boxes where a network has another one besides.
+    pub fn columns(&self) -> Vec<(Quantity, f64)> {
+        let mean = |cell: &Cell, class: &str, quantity, overlap| cell.number(class, None, quantity, overlap)?.mean;
+        let differs = |cell: &Cell, class: &str, overlap: f64| {
+            let of_final = mean(cell, class, Quantity::RecallFinalBoxes, overlap);
+            of_final.is_some() && of_final != mean(cell, class, Quantity::RecallAnyBox, overlap)
+        };
+        let (classes, overlaps) = (&self.options.classes, &self.options.overlaps);
+        let two_stage =
+            self.cells.iter().any(|cell| classes.iter().any(|class| overlaps.iter().any(|o| differs(cell, class, *o))));
+        let of_final = overlaps.iter().filter(|_| two_stage).map(|overlap| (Quantity::RecallFinalBoxes, *overlap));
+        self.paper_columns().into_iter().chain(of_final).collect()
+    }
+
+    /// Columns of the paper's table: AP at each overlap, then recall at each.
+    fn paper_columns(&self) -> Vec<(Quantity, f64)> {
         Quantity::PAPER.iter().flat_map(|q| self.options.overlaps.iter().map(|overlap| (*q, *overlap))).collect()
     }
 }

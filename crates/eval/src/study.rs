@@ -210,6 +210,11 @@ impl StudyRun {
     pub fn detections(&self, study: &Path, test_set: &str) -> PathBuf {
         self.folder(study).join("detections").join(test_set)
     }
+
+    /// Where all refined regions of a two-stage network on a test set lie, likewise.
+    pub fn regions(&self, study: &Path, test_set: &str) -> PathBuf {
+        self.folder(study).join("regions").join(test_set)
+    }
 }
 
 impl StudyConfig {

@@ -238,6 +238,29 @@ fn numbers_of_a_run_are_those_of_eval_ap() {
 }
 
 #[test]
+fn recall_of_regions_stands_beside_that_of_final_boxes() {
+    let found = frames(3, 1.2, 80);
+    let mut regions = frames(3, 0.1, 80);
+    for (regions, found) in regions.iter_mut().zip(&found) {
+        regions.detections.extend(found.detections.iter().cloned());
+    }
+    let matrix_of = |regions: Option<&[EvalFrame]>| {
+        let scores = RunScores::new(&found, regions, LabelFrame::Lidar, &options());
+        build(&plan(&[1]), &BTreeMap::from([(key("sim", 1, "real"), Ok(scores))]), &options())
+    };
+    let (one_stage, two_stage) = (matrix_of(None), matrix_of(Some(&regions)));
+    let mean = |m: &Matrix, q| m.cell("pp", "sim", "real").unwrap().number("Car", None, q, 0.7).unwrap().mean.unwrap();
+    let of_final = mean(&one_stage, Quantity::RecallFinalBoxes);
+    assert_eq!(mean(&one_stage, Quantity::RecallAnyBox), of_final);
+    assert_eq!(mean(&two_stage, Quantity::RecallFinalBoxes), of_final);
+    assert!(mean(&two_stage, Quantity::RecallAnyBox) > of_final + 10.0);
+    assert_eq!(mean(&two_stage, Quantity::Ap40), mean(&one_stage, Quantity::Ap40));
+    assert_eq!((one_stage.columns().len(), two_stage.columns().len()), (4, 6));
+    assert!(two_stage.to_markdown().contains("Recall, final boxes (0.7)"));
+    assert!(!two_stage.to_latex().contains("final boxes"), "the paper's table has its own columns");
+}
+
+#[test]
 fn sections_share_out_the_ground_truths() {
     let mut results = BTreeMap::new();
     results.insert(key("sim", 1, "real"), Ok(scores(&frames(5, 0.4, 60))));

@@ -106,6 +106,16 @@ pub enum Network {
     PointRcnn(PointRcnn),
 }
 
+/// What is found in a frame.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Prediction {
+    /// Boxes by falling score.
+    pub detections: Vec<Detection>,
+    /// Of a two-stage network every refined region with its score, before the score limit and the last suppression: what OpenPCDet's recall
+    /// looks at. Empty otherwise.
+    pub regions: Vec<Detection>,
+}
+
 /// A network with the configuration it was built from.
 #[derive(Clone, Debug)]
 pub struct Detector {
@@ -169,10 +179,19 @@ impl Detector {
     /// # Errors
     /// Scores that are not numbers, or samples of another kind of network.
     pub fn predict(&self, batch: &[Sample]) -> Result<Vec<Vec<Detection>>, ModelError> {
+        Ok(self.predict_with_regions(batch)?.into_iter().map(|found| found.detections).collect())
+    }
+
+    /// The same, with all refined regions of a two-stage network beside it.
+    ///
+    /// # Errors
+    /// As [`Detector::predict`].
+    pub fn predict_with_regions(&self, batch: &[Sample]) -> Result<Vec<Prediction>, ModelError> {
         match (self.network.valid(), &self.preparation) {
             (Network::PointPillars(network), Preparation::PointPillars(preparation)) => {
                 let batch = of_pillars(batch)?;
-                preparation.detections(network.forward(&batch, Mode::Eval).predictions, &batch)
+                let found = preparation.detections(network.forward(&batch, Mode::Eval).predictions, &batch)?;
+                Ok(found.into_iter().map(|detections| Prediction { detections, regions: Vec::new() }).collect())
             }
             (Network::PointRcnn(network), Preparation::PointRcnn(preparation)) => {
                 pointrcnn::detections(&network, &of_points(batch)?, preparation, &self.config.classes)

@@ -14,7 +14,7 @@ mod detector;
 mod error;
 mod layer_features;
 
-pub use detector::{Detector, Losses, Network, Preparer, Sample, parameter_count};
+pub use detector::{Detector, Losses, Network, Prediction, Preparer, Sample, parameter_count};
 pub use error::ModelError;
 pub use layer_features::LayerFeatures;
 pub use named::reference_name;

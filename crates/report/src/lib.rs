@@ -13,12 +13,14 @@ mod scene;
 mod stroke_font;
 mod study;
 mod svg;
+mod tensorboard;
 
 pub use birds_eye::{BirdsEyeOptions, Style, birds_eye_png, birds_eye_svg};
 pub use curve::{CurveOptions, Series, curve_svg};
 pub use figure::*;
 pub use scene::{Layer, LayerContent, Scene};
 pub use study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
+pub use tensorboard::write_event_files;
 
 /// Why a picture could not be made.
 #[derive(Debug, thiserror::Error)]

@@ -6,6 +6,7 @@ mod features;
 mod matrix;
 mod training;
 
+pub(crate) use training::metrics_lines;
 pub use training::{TrainingRun, read_training_run};
 
 use crate::ReportError;

@@ -9,7 +9,7 @@ use crate::mesh::{MaterialId, MaterialTable};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
 use crate::track::{FIRST_CAR, Group};
-use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_atomic};
+use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_json};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
@@ -76,8 +76,7 @@ pub fn write_names(root: &Path, rig: &Rig, materials: &MaterialTable) -> Result<
     let sensors: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
     let names =
         json!({ "sensors": sensors, "materials": materials.names(), "objects": objects, "first_car": FIRST_CAR });
-    let text = serde_json::to_string_pretty(&names).expect("names are plain data") + "\n";
-    write_atomic(&root.join(FOLDER).join("names.json"), text.as_bytes())
+    write_json(&root.join(FOLDER).join("names.json"), &names)
 }
 
 /// The materials of a data set by the numbers in its attributes.
@@ -124,6 +123,7 @@ pub fn read(path: &Path, rig: &Rig) -> Result<Scan, DataError> {
 mod tests {
     use super::*;
     use crate::effects::testing::{rig, scene};
+    use data::write_atomic;
 
     #[test]
     fn what_is_written_reads_back() {

@@ -12,6 +12,7 @@ use crate::scenario::FRAME_S;
 use data::write::{label_lines, write_bin, write_dataset_toml, write_kitti_text, write_pcd, write_split};
 use data::{
     DataError, Dataset, DatasetConfig, Frame, KittiLine, LabelFrame, Layout, PcdEncoding, PointColumns, write_atomic,
+    write_json,
 };
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -85,7 +86,7 @@ impl Resim<'_> {
         };
         let manifest_path = out.join("manifest.json");
         check_folder(out, &manifest_path, &manifest)?;
-        write_manifest(&manifest_path, &manifest)?;
+        write_json(&manifest_path, &manifest)?;
         self.write_descriptions(out, &rig)?;
         if described {
             attributes::write_names(out, &rig, &materials)?;
@@ -102,7 +103,7 @@ impl Resim<'_> {
             manifest.points[1] += after;
         }
         manifest.complete = true;
-        write_manifest(&manifest_path, &manifest)?;
+        write_json(&manifest_path, &manifest)?;
         Ok(manifest)
     }
 
@@ -323,12 +324,6 @@ fn check_folder(out: &Path, manifest_path: &Path, wanted: &ResimManifest) -> Res
         return Err(DataError::file(out, "is not empty and has no manifest.json; choose another folder").into());
     }
     Ok(())
-}
-
-fn write_manifest(path: &Path, manifest: &ResimManifest) -> Result<(), SimulateError> {
-    let mut text = serde_json::to_string_pretty(manifest).expect("a manifest is plain data");
-    text.push('\n');
-    Ok(write_atomic(path, text.as_bytes())?)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 
 use crate::run_config::hex;
 use crate::{RunConfig, TrainError};
-use data::write_atomic;
+use data::write_json;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::path::Path;
@@ -112,6 +112,5 @@ pub(crate) fn record_session(
         Err(e) => return Err(e.into()),
     };
     provenance.sessions.push(session);
-    let text = serde_json::to_string_pretty(&provenance).expect("provenance is plain JSON");
-    Ok(write_atomic(path, text.as_bytes())?)
+    Ok(write_json(path, &provenance)?)
 }

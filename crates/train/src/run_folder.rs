@@ -7,7 +7,7 @@
 use crate::TrainError;
 use crate::run_config::hex;
 use data::write::remove_unfinished;
-use data::write_atomic;
+use data::{write_atomic, write_json};
 use models::checkpoint::{NamedTensors, read_safetensors, write_safetensors};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -152,9 +152,8 @@ impl RunFolder {
             sha256.insert(name, hex(&Sha256::digest(bytes)));
         }
         let file = StateFile { schema: STATE_SCHEMA.into(), state: state.clone(), sha256 };
-        let text = serde_json::to_string_pretty(&file).expect("a state is plain JSON");
         self.name_last_and_best(state)?;
-        write_atomic(&self.state_path(), text.as_bytes())?;
+        write_json(&self.state_path(), &file)?;
         self.remove_all_but(state, keep)
     }
 

@@ -56,7 +56,7 @@ impl ParityArgs {
         };
         if let Some(path) = &self.json {
             let parity = Parity { schema: "lidarshift/parity/1", rows: &rows };
-            data::write_atomic(path, &serde_json::to_vec_pretty(&parity)?)?;
+            data::write_json(path, &parity)?;
         }
         println!("{:<24} {:<44} {:>10} {:>10}  ", "file", "tensor", "error", "tolerance");
         for row in rows.iter().filter(|r| self.all || !r.pass || is_largest(r, &rows)) {

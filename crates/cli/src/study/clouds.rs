@@ -7,7 +7,9 @@ use super::folder::Study;
 use anyhow::{Context, Result};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Dataset, Frame, stream};
-use eval::distance::{Compared, DistanceError, DistanceOptions, Distances, Regions, compare, paired_ids};
+use eval::distance::{
+    Compared, DISTANCES_SCHEMA, DistanceError, DistanceOptions, Distances, Regions, compare, paired_ids,
+};
 use eval::targets::{Targets, targets};
 use models::config::DetectorConfig;
 
@@ -84,6 +86,7 @@ pub fn all_distances(study: &Study) -> Result<(Vec<Distances>, Vec<String>)> {
         }
         eprintln!("distances between {} and {}", first.name, other.name);
         let key = (
+            DISTANCES_SCHEMA,
             [&a_key, &labelled_sha256(&b, &b_ids)?],
             &evaluation.distances,
             evaluation.distance_frames,

@@ -7,7 +7,7 @@ use crate::memory::peak_mib;
 use anyhow::{Context, Result};
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
-use data::{Dataset, Frame, write_atomic};
+use data::{Dataset, Frame, write_json};
 use eval::study::StudyRun;
 use models::{Detector, Preparer, reference_name};
 use serde::{Deserialize, Serialize};
@@ -128,7 +128,7 @@ pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]
             serde_json::from_slice(&output.stdout).with_context(|| format!("{network}: no measurement"))?;
         cost.device = device.join(" ");
         costs.insert(network.clone(), cost);
-        write_atomic(&study.folder.join("costs.json"), &serde_json::to_vec_pretty(&costs)?)?;
+        write_json(&study.folder.join("costs.json"), &costs)?;
     }
     Ok(costs)
 }

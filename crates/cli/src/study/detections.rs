@@ -4,9 +4,9 @@ use super::data_sets::{file_sha256, frames_sha256, open};
 use super::folder::Study;
 use anyhow::{Context, Result};
 use data::write::write_kitti_text;
-use data::{Dataset, Frame, prefetch, write_atomic};
+use data::{Dataset, Frame, prefetch, write_atomic, write_json};
 use eval::study::StudyRun;
-use models::{Detector, LayerFeatures, Preparer, Sample};
+use models::{Detector, LayerFeatures, Network, Prediction, Preparer, Sample};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -62,7 +62,7 @@ fn wanted(
     let dataset = open(study, test_set)?;
     let ids = dataset.ids(&study.config.splits.test)?;
     let cell = DetectionCell {
-        schema: "lidarshift/detection-cell/1".into(),
+        schema: "lidarshift/detection-cell/2".into(),
         run: run.to_string(),
         test_set: test_set.into(),
         split: study.config.splits.test.clone(),
@@ -73,7 +73,7 @@ fn wanted(
     Ok((dataset, ids, cell))
 }
 
-/// Whether the detections of a run on a test set are there, made of these weights and of the frames as they are.
+/// Whether the detections of a run on a test set are there, all of them, made of these weights and of the frames as they are.
 ///
 /// # Errors
 /// A test set that is not there.
@@ -84,7 +84,9 @@ pub fn is_done(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> 
         return Ok(false);
     }
     let feature_is_there = test_set != study.feature_set() || features_path(study, run).is_file();
-    Ok(feature_is_there && found == wanted(study, run, test_set, weights)?.2)
+    let (_, ids, cell) = wanted(study, run, test_set, weights)?;
+    let folder = run.detections(&study.folder, test_set);
+    Ok(feature_is_there && found == cell && ids.iter().all(|id| folder.join(format!("{id}.txt")).is_file()))
 }
 
 /// Detects every test set that is not done, and keeps the features of one of them. `say` hears what is being done.
@@ -108,15 +110,17 @@ pub fn detect_all(
         if dataset.name == study.feature_set() {
             keep_features(study, run, detector, &set, &ids, &weights)?;
         }
-        let folder = run.detections(&study.folder, &dataset.name);
-        detect(detector, &set, &ids, &folder, workers).with_context(|| format!("test set {}", dataset.name))?;
-        write_atomic(&cell_path(study, run, &dataset.name), &serde_json::to_vec_pretty(&cell)?)?;
+        let folders = [run.detections(&study.folder, &dataset.name), run.regions(&study.folder, &dataset.name)];
+        detect(detector, &set, &ids, &folders, workers).with_context(|| format!("test set {}", dataset.name))?;
+        write_json(&cell_path(study, run, &dataset.name), &cell)?;
     }
     Ok(())
 }
 
-/// The detections of a run on frames, a text a frame.
-fn detect(detector: &Detector, set: &Dataset, ids: &[String], folder: &Path, workers: usize) -> Result<()> {
+/// The detections of a run on frames, a text a frame, and the regions of a two-stage network likewise.
+fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf; 2], workers: usize) -> Result<()> {
+    let [of_detections, of_regions] = folders;
+    let two_stage = matches!(detector.network, Network::PointRcnn(_));
     let mut samples = samples(detector, set, ids, workers);
     let mut at = ids.iter();
     let batch_size = detector.config().optimization.batch_size;
@@ -126,11 +130,15 @@ fn detect(detector: &Detector, set: &Dataset, ids: &[String], folder: &Path, wor
             return Ok(());
         }
         let seen: Vec<Sample> = batch.iter().filter(|sample| !sample.is_empty()).cloned().collect();
-        let found = if seen.is_empty() { Vec::new() } else { detector.predict(&seen)? };
+        let found = if seen.is_empty() { Vec::new() } else { detector.predict_with_regions(&seen)? };
         let mut found = found.into_iter();
         for (sample, id) in batch.iter().zip(at.by_ref()) {
-            let detections = if sample.is_empty() { Vec::new() } else { found.next().unwrap_or_default() };
-            write_kitti_text(&folder.join(format!("{id}.txt")), &set.detection_lines(id, &detections)?)?;
+            let found = if sample.is_empty() { Prediction::default() } else { found.next().unwrap_or_default() };
+            let name = format!("{id}.txt");
+            write_kitti_text(&of_detections.join(&name), &set.detection_lines(id, &found.detections)?)?;
+            if two_stage {
+                write_kitti_text(&of_regions.join(&name), &set.detection_lines(id, &found.regions)?)?;
+            }
         }
     }
 }

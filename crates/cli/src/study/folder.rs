@@ -2,7 +2,7 @@
 
 use crate::detectors::detector_text;
 use anyhow::{Context, Result, bail};
-use data::write_atomic;
+use data::{write_atomic, write_json};
 use eval::study::{Source, StudyConfig, StudyDataset, StudyRun};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ const BUILT_IN: [(&str, &str); 4] = [
 ];
 
 /// The copy of a study's file in its folder, as it was when the folder was last worked on; and where the file came from.
-const COPY: &str = "study.toml";
+pub(super) const COPY: &str = "study.toml";
 const ORIGIN: &str = "origin.json";
 
 #[derive(Serialize, Deserialize)]
@@ -198,7 +198,7 @@ impl Study {
             said.extend(changes.removed.iter().map(removed));
         }
         let origin = Origin { named: self.named.clone(), base: self.base.clone() };
-        write_atomic(&self.folder.join(ORIGIN), &serde_json::to_vec_pretty(&origin)?)?;
+        write_json(&self.folder.join(ORIGIN), &origin)?;
         write_atomic(&copy, self.text.as_bytes())?;
         Ok(said)
     }

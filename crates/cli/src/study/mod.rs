@@ -25,7 +25,7 @@ use eval::study::StudyRun;
 use folder::Study;
 use local::{LocalJobs, work_on};
 use standing::{AtWork, Standing, standing};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use work::RunPart;
 
 /// A whole study: makes the data sets that are missing, trains the runs that are missing, detects every test set, compares, and writes one
@@ -84,6 +84,12 @@ impl StudyPlace {
     /// Neither a name nor a file, or a file that is wrong.
     pub fn open(&self) -> Result<Study> {
         Study::open(&self.study, self.out.as_deref())
+    }
+
+    /// The folder that was named, if it is one and no study's.
+    pub fn runs_alone(&self) -> Option<&Path> {
+        let folder = Path::new(&self.study);
+        (folder.is_dir() && !folder.join(folder::COPY).is_file()).then_some(folder)
     }
 }
 

@@ -6,13 +6,14 @@ use super::detections::{spread, weights_sha256};
 use super::folder::Study;
 use super::standing::{Standing, standing};
 use anyhow::Result;
-use data::{Dataset, KittiLine};
+use data::{DataError, Dataset, KittiLine};
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
-use eval::matrix::{Matrix, RunId, RunResult, RunScores, TestSet, build};
+use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
 use eval::study::StudyRun;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::path::PathBuf;
 
 /// The runs of a study that have detections on a test set, by their names; and why others have none.
 pub struct Found {
@@ -81,8 +82,8 @@ pub fn matrix(study: &Study, found: &Found) -> Result<Matrix> {
             let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
             let of_run = |(run, standing): &(StudyRun, Standing)| {
                 let result = if Found::has(standing, test_set) {
-                    let frames = labels.with_detections(&run.detections(&study.folder, test_set));
-                    frames.map_err(|e| e.to_string()).map(|f| RunScores::new(&f, None, labels.label_frame, options))
+                    let folders = [run.detections(&study.folder, test_set), run.regions(&study.folder, test_set)];
+                    scores(&labels, &folders, options).map_err(|e| e.to_string())
                 } else {
                     Err(reason(standing)?)
                 };
@@ -92,6 +93,14 @@ pub fn matrix(study: &Study, found: &Found) -> Result<Matrix> {
         }
         Ok(build(&study.config.plan(), &results, options))
     })
+}
+
+/// Of the detections of a run, and of the regions of one with two stages.
+fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> Result<RunScores, DataError> {
+    let [detections, regions] = folders;
+    let frames = labels.with_detections(detections)?;
+    let regions = if regions.is_dir() { Some(labels.with_detections(regions)?) } else { None };
+    Ok(RunScores::new(&frames, regions.as_deref(), labels.label_frame, options))
 }
 
 /// Why a run has no detections; `None`: it is only missing.

@@ -91,7 +91,7 @@ fn facts(study: &Study) -> Result<Vec<(String, String)>> {
         }
         fact(&format!("network {}", planned.network.title), text);
     }
-    let recall = "of the final boxes for every network; OpenPCDet takes all refined regions of two-stage networks";
+    let recall = "OpenPCDet's: of all refined regions of a two-stage network, of the final boxes otherwise";
     fact("recall", recall.into());
     Ok(facts)
 }

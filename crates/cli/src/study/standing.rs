@@ -2,7 +2,7 @@
 
 use super::folder::Study;
 use anyhow::Result;
-use data::write_atomic;
+use data::write_json;
 use eval::study::StudyRun;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, TryLockError};
@@ -41,7 +41,7 @@ const FAILURE: &str = "failed.json";
 /// Says that a run has failed.
 pub fn write_failure(folder: &Path, reason: &str) -> Result<()> {
     let failure = Failure { schema: "lidarshift/failed-run/1".into(), reason: reason.into() };
-    Ok(write_atomic(&folder.join(FAILURE), &serde_json::to_vec_pretty(&failure)?)?)
+    Ok(write_json(&folder.join(FAILURE), &failure)?)
 }
 
 /// Forgets a failure: the run is tried again.

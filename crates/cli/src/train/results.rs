@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use data::write::write_kitti_text;
-use data::{Dataset, write_atomic};
+use data::{Dataset, write_atomic, write_json};
 use eval::{Difficulty, Metric};
 use report::{BirdsEyeOptions, CurveOptions, Series, Style, birds_eye_png, curve_svg};
 use std::path::Path;
@@ -34,7 +34,7 @@ pub(super) fn show(found: &Evaluation, what: &str) -> Result<()> {
 
 /// `eval.json`, `detections/`, `pictures/` and `curve.svg` in the run folder.
 pub(super) fn write(found: &Evaluation, set: &Dataset, out: &Path) -> Result<()> {
-    write_atomic(&out.join("eval.json"), &serde_json::to_vec_pretty(&found.report)?)?;
+    write_json(&out.join("eval.json"), &found.report)?;
     for frame in &found.frames {
         write_kitti_text(&out.join(format!("detections/{}.txt", frame.id)), &frame.detections)?;
     }

@@ -18,17 +18,24 @@ pub struct Regions<'a> {
 
 /// So far over the lowest point of its square metre a point still counts as ground, m.
 const GROUND_M: f32 = 0.4;
-/// From here on scenery counts as far, m on the ground.
-const FAR_M: f32 = 33.3;
+/// Directions in which a wall is looked for.
+const DIRECTIONS: usize = 360;
+/// As many points that rise over the ground, within [`WALL_M`] of range, are a wall; fewer may be stray returns.
+const WALL_POINTS: usize = 3;
+/// How far behind its nearest point a wall reaches, m.
+const WALL_M: f32 = 2.0;
 
 impl Regions<'static> {
-    /// What any labelled cloud can be divided into: targets, ground, and what rises over it, near and far.
+    /// What any labelled cloud can be divided into: targets, ground, and what rises over it, up to the first wall in each direction and
+    /// behind it. Every point belongs to one of them.
+    ///
+    /// A wall is whatever rises over the ground first in a direction of one degree, targets aside, by at least three points within 2 m.
     pub fn of_scenery() -> Self {
         let names = [
             "targets".to_string(),
             format!("ground (lowest {GROUND_M} m of a m²)"),
-            format!("scenery up to {FAR_M} m"),
-            format!("scenery beyond {FAR_M} m"),
+            format!("scenery up to the wall (the first that rises in a direction, and {WALL_M} m)"),
+            "scenery behind the wall".to_string(),
         ];
         Regions { names: names.into(), of: Box::new(scenery) }
     }
@@ -43,20 +50,41 @@ fn scenery(frame: &Frame, points: &[Point]) -> Vec<usize> {
     }
     let boxes: Vec<_> = frame.objects.iter().map(|object| object.bbox).collect();
     let flat: Vec<f32> = points.iter().flatten().copied().collect();
-    let mut regions: Vec<usize> = points
-        .iter()
-        .map(|p| match p {
-            p if p[2] <= lowest[&cell(p)] + GROUND_M => 1,
-            p if p[0].hypot(p[1]) <= FAR_M => 2,
-            _ => 3,
-        })
-        .collect();
+    let rises = |p: &Point| p[2] > lowest[&cell(p)] + GROUND_M;
+    let mut regions: Vec<usize> = points.iter().map(|p| if rises(p) { 2 } else { 1 }).collect();
     points_in_boxes(&flat, 3, &boxes, 0.0).into_iter().flatten().for_each(|i| regions[i as usize] = 0);
+
+    let risen = || points.iter().zip(&regions).filter(|(_, region)| **region == 2).map(|(p, _)| p);
+    let walls_m = walls_m(risen());
+    for (region, p) in regions.iter_mut().zip(points).filter(|(region, _)| **region == 2) {
+        *region += usize::from(range_m(p) > walls_m[direction(p)] + WALL_M);
+    }
     regions
 }
 
+/// Range of the wall in each direction; infinite without one.
+fn walls_m<'a>(risen: impl Iterator<Item = &'a Point>) -> Vec<f32> {
+    let mut ranges_m = vec![Vec::new(); DIRECTIONS];
+    risen.for_each(|p| ranges_m[direction(p)].push(range_m(p)));
+    let nearest = |ranges_m: &mut Vec<f32>| {
+        ranges_m.sort_unstable_by(f32::total_cmp);
+        let wall = ranges_m.windows(WALL_POINTS).find(|near| near[WALL_POINTS - 1] - near[0] <= WALL_M);
+        wall.map_or(f32::INFINITY, |near| near[0])
+    };
+    ranges_m.iter_mut().map(nearest).collect()
+}
+
+fn direction(p: &Point) -> usize {
+    let turn = p[1].atan2(p[0]) / std::f32::consts::TAU + 0.5;
+    ((turn * DIRECTIONS as f32) as usize).min(DIRECTIONS - 1)
+}
+
+fn range_m(p: &Point) -> f32 {
+    p[0].hypot(p[1])
+}
+
 /// What one region contributes to the Chamfer sum, over all frames.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RegionRow {
     /// Its name.
     pub region: String,
@@ -68,7 +96,7 @@ pub struct RegionRow {
     pub a_to_b_m2: f64,
     /// Of B's points in it to the nearest of A, m2.
     pub b_to_a_m2: f64,
-    /// Its share of the Chamfer sum, 0 to 1.
+    /// Its share of the Chamfer sum, 0 to 1. The shares of all regions add up to 1.
     pub share: f64,
 }
 
@@ -110,5 +138,32 @@ impl RegionSums {
             share: if all > 0.0 { (a.1 + b.1) / all } else { 0.0 },
         };
         names.iter().zip(&self.0).map(row).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use data::{Cloud, Object};
+    use geometry::Box3;
+
+    #[test]
+    fn every_point_has_its_region() {
+        let car = Box3::from_array([10.0, 4.0, 0.75, 4.5, 1.9, 1.1, 0.0]);
+        let object = Object { class: "Car".into(), bbox: car, truncation: None, occlusion: None, image_box: None };
+        let frame = Frame { id: "0".into(), cloud: Cloud::new(3), objects: vec![object] };
+        let mut points: Vec<(Point, usize)> = vec![([5.0, 0.5, 0.0], 1), ([10.0, 4.0, 0.8], 0), ([5.5, 0.5, 0.3], 1)];
+        for i in 0..100 {
+            let y = -4.95 + 0.1 * i as f32;
+            // A wall at 20 m with ground before it, a fence on it that leans back, and a stand behind it.
+            points.extend([([20.2, y, 0.0], 1), ([20.4, y, 0.9], 2), ([21.4, y, 0.0], 1), ([21.4, y, 2.5], 2)]);
+            points.extend([([50.5, y, 1.0], 1), ([50.5, y, 6.0], 3)]);
+        }
+        // One stray return in the air is no wall, and where nothing rises nothing is behind it.
+        points.extend([([8.5, -1.5, 0.0], 1), ([8.5, -1.5, 1.5], 2), ([-60.5, 0.5, 0.0], 1), ([-60.5, 0.5, 3.0], 2)]);
+        let positions: Vec<Point> = points.iter().map(|(p, _)| *p).collect();
+        for ((p, want), found) in points.iter().zip(scenery(&frame, &positions)) {
+            assert_eq!(found, *want, "{p:?}");
+        }
     }
 }

@@ -105,12 +105,12 @@ fn draw(
     for k in 0..n_curves {
         let curves: Vec<_> = done.iter().map(|(_, scores)| &scores.curves[k]).collect();
         let whole: Vec<_> = curves.iter().map(|curve| curve.numbers(None)).collect();
-        let draws: Vec<[f64; 4]> = weights
+        let draws: Vec<[f64; Quantity::ALL.len()]> = weights
             .par_iter()
             .zip(&seeds)
             .map(|(weights, seeds)| {
-                let mut known: Vec<Option<[f64; 4]>> = vec![None; curves.len()];
-                let mut sum = [0.0; 4];
+                let mut known: Vec<Option<[f64; Quantity::ALL.len()]>> = vec![None; curves.len()];
+                let mut sum = [0.0; Quantity::ALL.len()];
                 for &i in seeds {
                     let numbers = known[i].get_or_insert_with(|| curves[i].numbers(Some(weights)).0);
                     sum.iter_mut().zip(numbers).for_each(|(sum, v)| *sum += *v);

@@ -43,14 +43,15 @@ impl Matrix {
         format!(
             "Values are the mean over the runs in percent, in round brackets their standard deviation with divisor n. {interval}. \
              3D AP is KITTI's over 40 recalls, difficulty {}, {range}. Recall is OpenPCDet's: ground truths whose highest overlap with \
-             any box is over the limit. Ground truth outside a range is ignored, and so is a detection outside it that finds nothing; \
+             any box is over the limit; of two-stage networks all refined regions count, before the score limit and the last \
+             suppression, and the recall of the final boxes stands beside it. Ground truth outside a range is ignored, and so is a detection outside it that finds nothing; \
              one that finds an ignored ground truth is no false alarm.",
             o.difficulty
         )
     }
 
     fn table_of_class(&self, out: &mut String, class: &str) {
-        let columns = self.paper_columns();
+        let columns = self.columns();
         let paper = self.cells.iter().flat_map(|cell| &cell.numbers).any(|n| n.published.is_some());
         let _ = write!(out, "| {class} | trained on | tested on | runs |");
         for (quantity, overlap) in &columns {

@@ -81,25 +81,25 @@ pub(super) struct RunCurve {
     pub section: Option<RangeSection>,
     pub overlap: f64,
     evidence: Evidence,
-    /// Of each frame: ground truths, and those that any box covers.
-    covered: Vec<[u32; 2]>,
+    /// Of each frame: ground truths, those that any box covers, and those that any detection covers.
+    covered: Vec<[u32; 3]>,
 }
 
 impl RunScores {
     /// The scores of a run's detections. Every overlap is computed once.
     ///
-    /// `proposals` are the boxes that OpenPCDet's recall looks at where they are not the detections: of two-stage networks it
+    /// `regions` are the boxes that OpenPCDet's recall looks at where they are not the detections: of two-stage networks it
     /// takes all refined RoIs, before the score limit and the last NMS. Their frames are those of `frames`, in that order.
     pub fn new(
         frames: &[EvalFrame],
-        proposals: Option<&[EvalFrame]>,
+        regions: Option<&[EvalFrame]>,
         label_frame: LabelFrame,
         options: &MatrixOptions,
     ) -> Self {
         let overlaps: Vec<FrameOverlaps> = frames.par_iter().map(|f| FrameOverlaps::new(f, label_frame)).collect();
-        let of_proposals: Option<Vec<FrameOverlaps>> =
-            proposals.map(|p| p.par_iter().map(|f| FrameOverlaps::new(f, label_frame)).collect());
-        let recall_overlaps = of_proposals.as_ref().unwrap_or(&overlaps);
+        let of_regions: Option<Vec<FrameOverlaps>> =
+            regions.map(|r| r.par_iter().map(|f| FrameOverlaps::new(f, label_frame)).collect());
+        let recall_overlaps = of_regions.as_ref().unwrap_or(&overlaps);
         let mut keys = Vec::new();
         for class in &options.classes {
             for section in std::iter::once(None).chain(options.sections.iter().copied().map(Some)) {
@@ -119,15 +119,15 @@ impl RunScores {
             }));
             let covered = frames
                 .iter()
-                .zip(recall_overlaps)
-                .map(|(frame, overlaps)| {
-                    let mut best = vec![0.0f64; frame.labels.len()];
-                    for pair in &overlaps.three_d {
-                        best[pair.label] = best[pair.label].max(pair.overlap);
-                    }
-                    let counts = frame.labels.iter().zip(best);
-                    let counts = counts.filter(|(line, _)| line.class.eq_ignore_ascii_case(&class) && inside(line));
-                    counts.fold([0, 0], |[n, hits], (_, best)| [n + 1, hits + u32::from(best > overlap)])
+                .zip(recall_overlaps.iter().zip(&overlaps))
+                .map(|(frame, (of_any, of_detections))| {
+                    let best = [of_any, of_detections].map(|overlaps| highest(overlaps, frame.labels.len()));
+                    let counts =
+                        |i: &usize| frame.labels[*i].class.eq_ignore_ascii_case(&class) && inside(&frame.labels[*i]);
+                    (0..frame.labels.len()).filter(counts).fold([0; 3], |[n, any, found], i| {
+                        let hit = |best: &[f64]| u32::from(best[i] > overlap);
+                        [n + 1, any + hit(&best[0]), found + hit(&best[1])]
+                    })
                 })
                 .collect();
             RunCurve { class, section, overlap, evidence, covered }
@@ -137,27 +137,38 @@ impl RunScores {
 
     /// Whether a run does the same on every frame as another: two seeds that do were one, unless they find nothing.
     pub(super) fn is_same_as(&self, other: &RunScores) -> bool {
-        let finds = self.curves.iter().any(|curve| curve.covered.iter().any(|[_, hits]| *hits > 0));
+        let finds = self.curves.iter().any(|curve| curve.covered.iter().any(|[_, hits, _]| *hits > 0));
         finds && self.curves.iter().zip(&other.curves).all(|(a, b)| a.evidence == b.evidence && a.covered == b.covered)
     }
+}
+
+/// The highest overlap of each label with any box.
+fn highest(overlaps: &FrameOverlaps, n_labels: usize) -> Vec<f64> {
+    let mut best = vec![0.0f64; n_labels];
+    for pair in &overlaps.three_d {
+        best[pair.label] = best[pair.label].max(pair.overlap);
+    }
+    best
 }
 
 impl RunCurve {
     /// The numbers in the order of [`Quantity::ALL`], percent, NaN where undefined; and the ground truths that count.
     pub(super) fn numbers(&self, weights: Option<&[u32]>) -> ([f64; Quantity::ALL.len()], i64) {
         let p = self.evidence.precisions(weights);
-        let (mut n, mut covered) = (0u64, 0u64);
-        for (i, [gt, hits]) in self.covered.iter().enumerate() {
+        let mut covered = [0u64; 3];
+        for (i, of_frame) in self.covered.iter().enumerate() {
             let weight = weights.map_or(1, |w| u64::from(w[i]));
-            (n, covered) = (n + weight * u64::from(*gt), covered + weight * u64::from(*hits));
+            covered.iter_mut().zip(of_frame).for_each(|(sum, n)| *sum += weight * u64::from(*n));
         }
+        let [n, any, found] = covered.map(|n| n as f64);
         let share = |part: f64, of: f64| 100.0 * part / of; // NaN for 0/0
         let or_undefined = |v: f64| if p.n_gt == 0 { f64::NAN } else { v };
         let numbers = [
             or_undefined(p.ap40),
             or_undefined(p.ap_area),
-            share(covered as f64, n as f64),
+            share(any, n),
             share(p.n_tp as f64, p.n_gt as f64),
+            share(found, n),
         ];
         (numbers, p.n_gt)
     }

@@ -5,14 +5,14 @@ use super::proposals::{point_boxes, proposals};
 use super::roi_input::{RoiInput, Scene};
 use super::sample::{Preparation, Sample};
 use super::training::point_scores;
-use crate::ModelError;
 use crate::config::RcnnDetectionConfig;
 use crate::layers::{Mode, host};
 use crate::pointpillars::box_coder::decode;
+use crate::{ModelError, Prediction};
 use data::Detection;
 use geometry::{Box3, rotated_nms_first};
 
-/// Boxes of each sample, by falling score. `names` are those of the classes.
+/// Boxes of each sample, by falling score, and all refined regions. `names` are those of the classes.
 ///
 /// # Errors
 /// Scores or boxes that are not numbers.
@@ -21,10 +21,10 @@ pub fn detections(
     batch: &[&Sample],
     preparation: &Preparation,
     names: &[String],
-) -> Result<Vec<Vec<Detection>>, ModelError> {
+) -> Result<Vec<Prediction>, ModelError> {
     let seen: Vec<&Sample> = batch.iter().copied().filter(|s| !s.points.is_empty()).collect();
     if seen.is_empty() {
-        return Ok(vec![Vec::new(); batch.len()]);
+        return Ok(vec![Prediction::default(); batch.len()]);
     }
     let (net, classes) = (&preparation.net, preparation.mean_sizes.len());
     let stages = network.points(&seen, Mode::Eval);
@@ -65,11 +65,16 @@ pub fn detections(
         };
         // A size is an exponential: early in a training one can be beyond all numbers. No object is that large.
         let is_number = |&(i, _): &(usize, f32)| boxes[i].iter().all(|v| v.is_finite());
-        let kept = suppress(&boxes, cls, &net.detection).into_iter().filter(is_number);
-        found.push(kept.map(|kept| of(&kept)).collect());
+        let kept = suppress(&boxes, cls, &net.detection);
+        let all = cls.iter().map(|&logit| sigmoid(logit)).enumerate();
+        found.push(Prediction {
+            detections: kept.iter().filter(|kept| is_number(kept)).map(of).collect(),
+            regions: all.filter(is_number).map(|region| of(&region)).collect(),
+        });
     }
     let mut found = found.into_iter();
-    let of_sample = |s: &&Sample| if s.points.is_empty() { Vec::new() } else { found.next().unwrap_or_default() };
+    let of_sample =
+        |s: &&Sample| if s.points.is_empty() { Prediction::default() } else { found.next().unwrap_or_default() };
     Ok(batch.iter().map(of_sample).collect())
 }
 
@@ -77,6 +82,10 @@ fn not_finite(id: &str) -> ModelError {
     ModelError::NonFinite(format!(
         "frame {id}: the network gives scores or boxes that are not numbers; its weights are damaged or its training diverged"
     ))
+}
+
+fn sigmoid(logit: f32) -> f32 {
+    1.0 / (1.0 + (-logit).exp())
 }
 
 /// The refined box of each region.
@@ -97,7 +106,7 @@ pub fn final_boxes(rois: &[[f32; 7]], reg: &[f32]) -> Vec<[f32; 7]> {
 /// Regions that stay and their scores, by falling score: sigmoid, threshold, the `pre` best, rotated suppression whatever the class, the first
 /// `post` of what stays.
 pub fn suppress(boxes: &[[f32; 7]], logits: &[f32], config: &RcnnDetectionConfig) -> Vec<(usize, f32)> {
-    let scores = logits.iter().map(|&logit| 1.0 / (1.0 + (-logit).exp()));
+    let scores = logits.iter().map(|&logit| sigmoid(logit));
     let mut best: Vec<(usize, f32)> = scores.enumerate().filter(|(_, s)| *s >= config.score_threshold).collect();
     best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay by region
     best.truncate(config.suppression.pre);

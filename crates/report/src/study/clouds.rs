@@ -3,37 +3,71 @@
 use super::{csv_number, number, slug};
 use crate::figure::{Bar, LocatedTargets, TargetCloud, aggregated_targets, bars, locations, target_views};
 use crate::html::{Item, Section, TableCell, TableRow};
-use eval::distance::{Distances, Measure};
+use eval::csv_text;
+use eval::distance::{Distances, Measure, RegionRow};
 use eval::targets::{Spread, Targets};
 
 /// Chamfer, EMD and the others, with their floors, and where the Chamfer sum comes from.
 pub(super) fn distance_section(all: &[Distances]) -> Section {
     let mut items: Vec<Item> = all.iter().map(table).collect();
     for d in all.iter().filter(|d| !d.regions.is_empty()) {
-        let bar = |r: &eval::distance::RegionRow| Bar {
-            name: r.region.clone(),
-            value: Some(100.0 * r.share),
-            text: format!("{:.1} %", 100.0 * r.share),
-            series: 0,
-        };
-        let lines: Vec<Vec<String>> = d
-            .regions
-            .iter()
-            .map(|r| {
-                let counts = [r.points_a.to_string(), r.points_b.to_string()];
-                let sums = [r.a_to_b_m2, r.b_to_a_m2, r.share].map(|v| v.to_string());
-                std::iter::once(r.region.clone()).chain(counts).chain(sums).collect()
-            })
-            .collect();
-        let caption = format!(
-            "Which part of the Chamfer sum of {} and {} ({}) comes from which region: squared distances of the points of both in a region.",
-            d.a, d.b, d.options.compared
-        );
-        let columns = ["region", "points_a", "points_b", "a_to_b_m2", "b_to_a_m2", "share"];
-        let figure = bars(&d.regions.iter().map(bar).collect::<Vec<_>>(), "share of the Chamfer sum (%)");
-        items.push(Item::figure(format!("regions-{}-{}", slug(&d.a), slug(&d.b)), caption, figure, (&columns, &lines)));
+        items.extend([region_bars(d), region_table(d)]);
     }
     Section { id: "distances", title: "Distances between the clouds", text: Vec::new(), items }
+}
+
+fn region_bars(d: &Distances) -> Item {
+    let bar = |r: &RegionRow| Bar {
+        name: r.region.clone(),
+        value: Some(100.0 * r.share),
+        text: format!("{:.1} %", 100.0 * r.share),
+        series: 0,
+    };
+    let caption = format!(
+        "Which part of the Chamfer sum of {} and {} ({}) comes from which region: squared distances of the points of both in a region.",
+        d.a, d.b, d.options.compared
+    );
+    let figure = bars(&d.regions.iter().map(bar).collect::<Vec<_>>(), "share of the Chamfer sum (%)");
+    Item::figure(format!("regions-{}-{}", slug(&d.a), slug(&d.b)), caption, figure, (&[], &[]))
+}
+
+/// The numbers behind the bars, and the whole, which they add up to.
+fn region_table(d: &Distances) -> Item {
+    let mut whole = RegionRow { region: "whole cloud".into(), ..RegionRow::default() };
+    for r in &d.regions {
+        whole.points_a += r.points_a;
+        whole.points_b += r.points_b;
+        whole.a_to_b_m2 += r.a_to_b_m2;
+        whole.b_to_a_m2 += r.b_to_a_m2;
+        whole.share += r.share;
+    }
+    let frames = d.frames.max(1) as f64;
+    let row = |(i, r): (usize, &RegionRow)| {
+        let points = [r.points_a, r.points_b].map(|n| number(Some(n as f64 / frames), 0));
+        let sums = [r.a_to_b_m2, r.b_to_a_m2, r.a_to_b_m2 + r.b_to_a_m2].map(|v| number(Some(v / frames), 1));
+        let share = format!("{:.1} %", 100.0 * r.share);
+        let cells = std::iter::once(r.region.clone()).chain(points).chain(sums).chain([share]);
+        TableRow::new(i == d.regions.len(), cells.map(TableCell::new))
+    };
+    let rows: Vec<TableRow> = d.regions.iter().chain([&whole]).enumerate().map(row).collect();
+    let lines: Vec<Vec<String>> = d
+        .regions
+        .iter()
+        .chain([&whole])
+        .map(|r| {
+            let counts = [r.points_a.to_string(), r.points_b.to_string()];
+            let sums = [r.a_to_b_m2, r.b_to_a_m2, r.share].map(|v| v.to_string());
+            std::iter::once(r.region.clone()).chain(counts).chain(sums).collect()
+        })
+        .collect();
+    let caption = format!(
+        "The Chamfer sum of A, {}, and B, {} ({}), by region, a frame: points of each, and the squared distances from them to the nearest \
+         point of the other. The regions add up to the whole. The CSV has the sums over all {} frames.",
+        d.a, d.b, d.options.compared, d.frames
+    );
+    let columns = ["region", "points of A", "points of B", "A to B (m²)", "B to A (m²)", "sum (m²)", "share"];
+    let csv = csv_text(&["region", "points_a", "points_b", "a_to_b_m2", "b_to_a_m2", "share"], &lines);
+    Item::table(format!("region-sums-{}-{}", slug(&d.a), slug(&d.b)), caption, (&columns, 1), rows, Some(csv))
 }
 
 fn digits(measure: Measure) -> usize {

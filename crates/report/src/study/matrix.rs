@@ -21,8 +21,7 @@ pub(super) fn matrix_section(m: &Matrix) -> Section {
     let mut items = Vec::new();
     for class in &m.options.classes {
         let paper = m.cells.iter().flat_map(|cell| &cell.numbers).any(|n| n.published.is_some());
-        let quantities = Quantity::PAPER.iter().flat_map(|q| m.options.overlaps.iter().map(move |o| (*q, *o)));
-        let quantities: Vec<(Quantity, f64)> = quantities.collect();
+        let quantities = m.columns();
         let mut columns: Vec<String> = ["network", "trained on", "tested on", "runs"].map(String::from).into();
         for (quantity, overlap) in &quantities {
             columns.push(format!("{quantity} ({overlap})"));

@@ -3,6 +3,8 @@
 use crate::figure::Figure;
 use crate::html::{Item, Section};
 use crate::{CurveOptions, ReportError, Series};
+use data::DataError;
+use serde_json::Value;
 use std::path::Path;
 
 /// The curves of one run.
@@ -16,19 +18,29 @@ pub struct TrainingRun {
     pub validation_ap: Vec<[f64; 2]>,
 }
 
-/// Reads the `metrics.jsonl` of a run folder. A line that was cut off at the end of the file is left out: the run is being written.
+/// The lines of a `metrics.jsonl`. One that was cut off at the end of the file is left out: the run is being written.
+///
+/// # Errors
+/// A file that cannot be read, or a line in it that is no JSON.
+pub(crate) fn metrics_lines(path: &Path) -> Result<Vec<Value>, ReportError> {
+    let text = fs_err::read_to_string(path).map_err(DataError::from)?;
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    let parse = |(i, line): (usize, &str)| {
+        let failed = |e| DataError::line(path, i + 1, format!("is not a line of metrics: {e}")).into();
+        serde_json::from_str(line).map_err(failed)
+    };
+    text[..whole].lines().enumerate().map(parse).collect()
+}
+
+/// Reads the `metrics.jsonl` of a run folder. A line that was cut off at the end of the file is left out.
 ///
 /// # Errors
 /// A file that cannot be read, or a line in it that is no JSON.
 pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportError> {
-    let text = fs_err::read_to_string(path).map_err(data::DataError::from)?;
     let (mut of_steps, mut of_epochs) = (Vec::<[f64; 2]>::new(), Vec::new());
     let mut epoch_begins = 0;
     let mut run = TrainingRun { name: name.into(), ..TrainingRun::default() };
-    let whole = text.rfind('\n').map_or(0, |end| end + 1);
-    for (i, line) in text[..whole].lines().enumerate() {
-        let value: serde_json::Value = serde_json::from_str(line)
-            .map_err(|e| data::DataError::line(path, i + 1, format!("is not a line of metrics: {e}")))?;
+    for value in metrics_lines(path)? {
         let at = |key: &str| value[key].as_f64();
         match (value["kind"].as_str(), at("step")) {
             (Some("step"), Some(step)) => of_steps.extend(at("loss").map(|loss| [step, loss])),

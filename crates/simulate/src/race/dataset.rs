@@ -13,6 +13,7 @@ use crate::street::SplitCounts;
 use data::write::{remove_unfinished, write_dataset_toml, write_frame, write_split};
 use data::{
     DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Layout, PointColumns, read_kitti_text, write_atomic,
+    write_json,
 };
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -310,12 +311,6 @@ fn check_free(folder: &Path, needed: u64, what: &str) -> Result<(), SimulateErro
         return Err(DataError::file(existing, message).into());
     }
     Ok(())
-}
-
-fn write_json<T: Serialize>(path: &Path, value: &T) -> Result<(), SimulateError> {
-    let mut text = serde_json::to_string_pretty(value).map_err(|e| DataError::file(path, e.to_string()))?;
-    text.push('\n');
-    Ok(write_atomic(path, text.as_bytes())?)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use crate::street::config::RoadConfig;
 use crate::street::scene::Scene;
 use crate::street::sensor::scan;
 use data::write::{remove_unfinished, write_dataset_toml, write_kitti_frame, write_split};
-use data::{DataError, DatasetConfig, Frame, LabelFrame, Object, PointColumns, stream, write_atomic};
+use data::{DataError, DatasetConfig, Frame, LabelFrame, Object, PointColumns, stream, write_json};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -91,7 +91,7 @@ pub fn make_road_dataset(
     for inside in ["", "velodyne", "label_2", "ImageSets"] {
         remove_unfinished(&out.join(inside))?;
     }
-    write_manifest(&manifest_path, &manifest)?;
+    write_json(&manifest_path, &manifest)?;
 
     let jobs: Vec<(&str, usize)> =
         config.frames.splits().into_iter().flat_map(|(split, n)| (0..n).map(move |i| (split, i))).collect();
@@ -115,7 +115,7 @@ pub fn make_road_dataset(
     }
     write_dataset_toml(&out.join("dataset.toml"), &dataset_config(config))?;
     manifest.complete = true;
-    write_manifest(&manifest_path, &manifest)?;
+    write_json(&manifest_path, &manifest)?;
     Ok(manifest)
 }
 
@@ -145,12 +145,6 @@ fn check_folder(out: &Path, manifest_path: &Path, wanted: &Manifest) -> Result<(
         return Err(DataError::file(out, "is not empty and has no manifest.json; choose another folder").into());
     }
     Ok(())
-}
-
-fn write_manifest(path: &Path, manifest: &Manifest) -> Result<(), SimulateError> {
-    let mut text = serde_json::to_string_pretty(manifest).expect("a manifest is plain data");
-    text.push('\n');
-    Ok(write_atomic(path, text.as_bytes())?)
 }
 
 fn config_sha256(config: &RoadConfig) -> String {
