@@ -203,7 +203,7 @@ fn bad_studies_are_refused_in_words() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
     for (from, to, words, want) in [
-        ("", "", "study none", "no study \"none\": neither a file nor one of quick, cpu, paper"),
+        ("", "", "study none", "no study \"none\": neither a file nor one of quick, cpu, gain, paper"),
         ("", "", "study", "which study?"),
         ("", "", "report tiny-study.toml", "is not there: `lidarshift study tiny-study.toml --only data` makes it"),
         ("config = \"tiny.toml\"", "config = \"no.toml\"", "study tiny-study.toml", "no.toml"),

@@ -58,14 +58,6 @@ pub enum DistanceError {
         /// Points of the second.
         b: usize,
     },
-    /// The assignment failed.
-    #[error("the assignment of {n} points failed: {message}")]
-    Assignment {
-        /// Number of points.
-        n: usize,
-        /// What the library says.
-        message: String,
-    },
     /// Two data sets do not show the same frames.
     #[error("the two data sets do not pair: {0}")]
     Pairing(String),
