@@ -5,7 +5,7 @@ use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Ver
 use crate::error::DiagnoseError;
 use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
-use crate::pairing::{FramePair, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all};
+use crate::pairing::{FramePair, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all, with_points};
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
@@ -54,6 +54,8 @@ pub fn diagnose(
 ) -> Result<Outcome, DiagnoseError> {
     let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
     progress(Stage::Comparing, 0, 2);
+    let (ids, empty) = with_points(measured, simulated, ids)?;
+    notes.extend(empty);
     let sensors = find_sensors(measured, simulated, &ids, rig)?;
     for (mount, pattern) in rig.sensors.iter().zip(&sensors.patterns) {
         if pattern.rows_rad.is_empty() {
@@ -74,9 +76,8 @@ pub fn diagnose(
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let (frames, more) =
+    let frames =
         pair_all(measured, simulated, &ids, &sensors, None, &|done| progress(Stage::Pairing, done, ids.len()))?;
-    notes.extend(more);
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
@@ -92,6 +93,7 @@ pub fn diagnose(
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
     notes.extend(limits(&frames));
+    notes.extend(times.as_deref().and_then(|t| one_speed(&frames, t)));
     let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
     let searches = 7;
     let mut results: Vec<ChannelResult> = Vec::new();
@@ -118,7 +120,7 @@ pub fn diagnose(
         Some(_) => {
             let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
             let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
-            Some(pair_all(measured, simulated, &used, &sensors, Some(&off), &|_| ())?.0)
+            Some(pair_all(measured, simulated, &used, &sensors, Some(&off), &|_| ())?)
         }
         None => None,
     };
@@ -136,6 +138,21 @@ pub fn diagnose(
     let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
     let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
+}
+
+/// Speeds that differ by less do not tell a late clock from a constant offset, m/s.
+const ONE_SPEED_M_S: f64 = 0.5;
+
+/// Says so where all objects move alike.
+fn one_speed(frames: &[FramePair], times: &[f64]) -> Option<String> {
+    let shifts = crate::channels::labels::object_shifts(frames, Some(times));
+    let speeds: Vec<f64> = shifts.iter().filter_map(|s| Some(s.seen_velocity_m_s?[0])).collect();
+    let n = speeds.len() as f64;
+    let mean = speeds.iter().sum::<f64>() / n.max(1.0);
+    let spread = (speeds.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n.max(1.0)).sqrt();
+    (!speeds.is_empty() && spread < ONE_SPEED_M_S).then(|| {
+        format!("all labelled objects move at one speed against the sensors (within {spread:.1} m/s): a late clock cannot be told from a constant offset of labels")
+    })
 }
 
 /// What the pairs themselves do not let be judged: labels that do not meet, and a simulation that ends earlier.

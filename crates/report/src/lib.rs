@@ -6,6 +6,7 @@ mod axis;
 mod birds_eye;
 mod curve;
 mod figure;
+mod findings;
 mod html;
 mod page;
 mod png;
@@ -17,6 +18,7 @@ mod svg;
 pub use birds_eye::{BirdsEyeOptions, Style, birds_eye_png, birds_eye_svg};
 pub use curve::{CurveOptions, Series, curve_svg};
 pub use figure::*;
+pub use findings::{finding_name, write_finding_pictures};
 pub use scene::{Layer, LayerContent, Scene};
 pub use study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
 
