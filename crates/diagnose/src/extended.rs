@@ -91,7 +91,11 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
         ),
         "range_bias" => with("range_bias", key("offset_m", "offset_m") + &key("scale", "scale")),
         "beam_range_offset" => with("beam_range_offset", row_table(f, rig)),
-        "beam_elevation_offset" => with("beam_angle_error", key("elevation_std_deg", "std_deg")),
+        "beam_elevation_offset" => {
+            let none = if f.parameters.contains_key("std_deg") { "" } else { "elevation_std_deg = 0.0\n" };
+            let lines = key("elevation_deg", "mean_deg") + &key("elevation_std_deg", "std_deg") + none;
+            with("beam_angle_error", lines + "azimuth_std_deg = 0.0\n")
+        }
         "quantisation" => with("range_quantisation", key("step_m", "step_m")),
         "angular_jitter" => positive(
             f,

@@ -42,9 +42,11 @@ const WALL_RANGE_M: [f64; 2] = [3.0, 45.0];
 const WALL_ABOVE_M: f64 = 0.4;
 const WALL_BEAMS: usize = 8;
 const WALL_POINTS: usize = 80;
-/// Farther from the plane a point is not of it, m; flat is where the median is below that, m.
+/// Farther from the plane a point is not of it, m; flat is where the median is below that, m. What is farther than so many medians is
+/// not of the wall either.
 const OFF_WALL_M: f64 = 0.09;
 const FLAT_M: f64 = 0.022;
+const MEDIANS: f64 = 5.0;
 /// Height that a wall must have, m.
 const WALL_HEIGHT_M: f64 = 1.2;
 /// Ground: so far away, m, so near to its plane, m.
@@ -157,16 +159,18 @@ fn wall(all: Points, ground: &Plane, rng: &mut Stream) -> Option<(Option<Patch>,
         let on: Vec<Vector3<f64>> = points.iter().filter(|p| plane.off(p).abs() < OFF_WALL_M).copied().collect();
         plane = Plane::through(&on)?;
     }
-    let (on, rest): (Points, Points) = all.into_iter().partition(|s| plane.off(&s.1).abs() < OFF_WALL_M);
+    let (mut on, rest): (Points, Points) = all.into_iter().partition(|s| plane.off(&s.1).abs() < OFF_WALL_M);
     let mut beams: Vec<usize> = on.iter().map(|s| s.0.beam).collect();
     beams.sort_unstable();
     beams.dedup();
     let mut offs: Vec<f64> = on.iter().map(|s| plane.off(&s.1).abs()).collect();
     offs.sort_by(f64::total_cmp);
+    let median = *offs.get(offs.len() / 2)?;
+    on.retain(|s| plane.off(&s.1).abs() < MEDIANS * median);
     let heights = on.iter().map(|s| ground.off(&s.1)).fold([f64::MAX, f64::MIN], |[l, h], v| [l.min(v), h.max(v)]);
     let good = on.len() >= WALL_POINTS
         && beams.len() >= WALL_BEAMS
-        && offs[offs.len() / 2] < FLAT_M
+        && median < FLAT_M
         && heights[1] - heights[0] > WALL_HEIGHT_M
         && upright(&plane);
     let patch = good.then(|| Patch { plane, shots: on.iter().map(|s| s.0).collect() });

@@ -10,6 +10,9 @@ use std::collections::BTreeMap;
 pub(super) const LEAST_OFFSET_M: f64 = 0.002;
 pub(super) const LEAST_INTENSITY: f64 = 0.004;
 
+/// Offsets with larger standard errors do not count in their spread, m.
+const SURE_M: f64 = 0.006;
+
 /// Name of a laser in findings: rows count from the lowest.
 fn row_name(seen: &Seen, beam: usize) -> String {
     format!("{}/{}", seen.name, seen.beams.len() - 1 - beam)
@@ -58,36 +61,37 @@ pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Find
     }
     let drawn: Vec<offsets::Offsets> = draws(n).par_iter().map(|d| fit(d)).collect();
     let cis: Vec<[f64; 2]> = (0..told.len()).map(|b| interval(drawn.iter().filter_map(|d| d[b]).collect())).collect();
-    // What chance adds to the spread is taken out.
-    let noise =
-        (0..told.len()).filter(|b| told[*b].is_some()).map(|b| ((cis[b][1] - cis[b][0]) / 3.92).powi(2)).sum::<f64>()
-            / known as f64;
-    let beyond = |o: &offsets::Offsets| (spread(o.iter().flatten().copied()).powi(2) - noise).max(0.0).sqrt();
-    let std = beyond(&told);
-    let std_ci = interval(
-        drawn.iter().map(|d| (spread(d.iter().flatten().copied()).powi(2) - 2.0 * noise).max(0.0).sqrt()).collect(),
-    );
+    // What chance adds to the spread is taken out; lasers that few walls show are left out of it.
+    let error = |b: usize| (cis[b][1] - cis[b][0]) / 3.92;
+    let sure: Vec<usize> = (0..told.len()).filter(|&b| told[b].is_some() && error(b) < SURE_M).collect();
+    let noise = sure.iter().map(|&b| error(b).powi(2)).sum::<f64>() / sure.len().max(1) as f64;
+    let beyond = |o: &offsets::Offsets, times: f64| {
+        (spread(sure.iter().filter_map(|&b| o[b])).powi(2) - times * noise).max(0.0).sqrt()
+    };
+    let std = beyond(&told, 1.0);
+    // A draw adds as much chance again.
+    let std_ci = interval(drawn.iter().map(|d| beyond(d, 2.0)).collect());
+    let none = vec![None; told.len()];
     let gains: Vec<[f64; 2]> = every
         .par_iter()
         .map(|&s| {
-            let train: Vec<usize> = others(n, s).collect();
-            let offsets = fit(&train);
-            let none = vec![None; offsets.len()];
-            let sums = |which: &mut dyn Iterator<Item = usize>, o: &offsets::Offsets| {
-                which.flat_map(|s| &walls[s]).map(|w| w.squares(o)).fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]])
-            };
-            let [v0, v1] = [&none, &offsets].map(|o| {
-                let [ss, n] = sums(&mut train.iter().copied(), o);
-                ss / n.max(1.0)
-            });
-            let ([s0, n], [s1, _]) = (sums(&mut std::iter::once(s), &none), sums(&mut std::iter::once(s), &offsets));
-            [0.5 * (s0 / v0 - s1 / v1) + 0.5 * n * (v0 / v1).ln(), n]
+            let offsets = fit(&others(n, s).collect::<Vec<_>>());
+            // Each wall with a plane and a scatter of its own.
+            walls[s].iter().fold([0.0; 2], |sum, w| {
+                let ([before, points], [after, _]) = (w.squares(&none), w.squares(&offsets));
+                [sum[0] + 0.5 * points * (before / after.max(1e-9)).ln(), sum[1] + points]
+            })
         })
         .collect();
     let gain = gain_of(&gains);
     let [odd, even] = halves(n).map(|h| fit(&h));
     let repeats = agreement(&odd, &even);
     if std < LEAST_OFFSET_M || gain.ci95[0] <= 0.0 {
+        notes.push(format!(
+            "range offsets of single lasers: {:.1} mm from one to the next, {:.4} nats a return on flat walls of other scans: nothing to speak of",
+            1000.0 * std,
+            gain.nats_per_ray
+        ));
         return None;
     }
     let mut parameters = BTreeMap::from([("std_m".to_owned(), parameter(std, "m", std_ci))]);
