@@ -14,5 +14,5 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     write_atomic(&out.join("diagnosis.json"), &serde_json::to_vec_pretty(&outcome.diagnosis)?)?;
     let extended = extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg);
     write_atomic(&out.join("extended.toml"), extended.as_bytes())?;
-    Ok(report::write_finding_pictures(&outcome.diagnosis, out)?)
+    Ok(lidarshift_report::write_finding_pictures(&outcome.diagnosis, out)?)
 }

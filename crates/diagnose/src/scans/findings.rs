@@ -15,7 +15,7 @@ type Told = (Vec<Finding>, BTreeMap<String, Minimum>, Vec<Considered>);
 pub(super) fn all(seen: &Seen, notes: &mut Vec<String>) -> Told {
     let step = comb::find(&seen.scans.iter().collect::<Vec<_>>());
     let mut found: Vec<Option<Finding>> = vec![rows::offsets_found(seen, notes), rows::intensity_found(seen)];
-    let (noise, considered) = noise::noise_found(seen, step.map_or(0.002, |c| c.step_m));
+    let (noise, considered) = noise::noise_found(seen, step.map_or(0.002, |c| c.step_m), notes);
     found.extend(noise.into_iter().map(Some));
     found.push(step.map(|s| comb_found(seen, s)));
     found.push(elevation::elevation_found(seen, notes));

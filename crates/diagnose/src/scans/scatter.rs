@@ -25,8 +25,9 @@ const CAP: f64 = 4.0;
 /// Neighbours farther apart than that are none, rad.
 const NEIGHBOUR_RAD: f64 = 0.0065;
 
-/// Fewer samples say nothing of a bin.
+/// Fewer samples say nothing of a bin; more than that count as so many: what a surface has by itself is not noise.
 const FEWEST: f64 = 30.0;
+const MOST: f64 = 300.0;
 
 /// Adds the samples of a plane.
 pub fn add(sums: &mut ScatterSums, patch: &Patch, beams: &[Beam]) {
@@ -103,7 +104,7 @@ pub fn pooled(scans: &[&ScatterSums]) -> BTreeMap<(i32, i32), [f64; 4]> {
         .collect()
 }
 
-/// Fits a law to bins. Bins count by the logarithm of their number: what flat walls share does not weigh by its points.
+/// Fits a law to bins.
 pub fn fit(bins: &BTreeMap<(i32, i32), [f64; 4]>, free: Free) -> NoiseFit {
     let law = |p: &[f64]| {
         let mut p = p.iter().map(|v| v.exp());
@@ -117,7 +118,7 @@ pub fn fit(bins: &BTreeMap<(i32, i32), [f64; 4]>, free: Free) -> NoiseFit {
         bins.values()
             .map(|[r, l, n, sd]| {
                 let v = law.variance(*r, *l);
-                n.min(3000.0) * 0.5 * (v.ln() + sd * sd / v)
+                n.min(MOST) * 0.5 * (v.ln() + sd * sd / v)
             })
             .sum::<f64>()
     };
@@ -127,15 +128,16 @@ pub fn fit(bins: &BTreeMap<(i32, i32), [f64; 4]>, free: Free) -> NoiseFit {
     law(&minimise(&start, &vec![0.7; start.len()], value).0)
 }
 
-/// Logarithm of the likelihood of a scan under a law, nats, and its samples.
+/// Logarithm of the likelihood of a scan under a law, nats, and the samples that count.
 pub fn likelihood(scan: &ScatterSums, law: &NoiseFit) -> [f64; 2] {
     let mut sum = [0.0; 2];
     for bin in scan.values() {
         let v = law.variance(bin.place[0] / bin.n, bin.place[1] / bin.n);
         let squares: f64 = bin.values.iter().map(|x| f64::from(*x).powi(2).min(CAP * CAP * v)).sum();
+        let n = bin.n.min(MOST);
         // Neighbouring second differences share ranges: two count as one.
-        sum[0] -= 0.25 * (bin.n * v.ln() + squares / v);
-        sum[1] += bin.n;
+        sum[0] -= 0.25 * n * (v.ln() + squares / bin.n / v);
+        sum[1] += n;
     }
     sum
 }

@@ -6,7 +6,7 @@ use crate::scans::{Seen, draws, gain_of, interval, scatter};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-pub(super) fn noise_found(seen: &Seen, step_m: f64) -> (Vec<Finding>, Vec<Considered>) {
+pub(super) fn noise_found(seen: &Seen, step_m: f64, notes: &mut Vec<String>) -> (Vec<Finding>, Vec<Considered>) {
     use scatter::{Free, NoiseFit};
     let n = seen.scans.len();
     let sums: Vec<scatter::ScatterSums> = (0..n)
@@ -43,11 +43,18 @@ pub(super) fn noise_found(seen: &Seen, step_m: f64) -> (Vec<Finding>, Vec<Consid
         (0..n).map(|s| [likelihoods[a][s][0] - likelihoods[b][s][0], likelihoods[a][s][1]]).collect()
     };
     let total = |k: usize| likelihoods[k].iter().map(|l| l[0]).sum::<f64>();
+    let gains = |k: usize, from: usize| gain_of(&over(k, from)).ci95[0] > 0.0;
     let mut chosen = 0;
     for (k, from) in [(1, 0), (2, 0), (3, 1), (3, 2)] {
-        if (from == chosen || from == 0) && gain_of(&over(k, from)).ci95[0] > 0.0 && total(k) > total(chosen) {
+        // The footprint of a beam makes noise at an angle whatever else there is: range must do better.
+        if (from == chosen || from == 0) && gains(k, from) && (chosen == 0 || gains(k, chosen)) {
             chosen = k;
         }
+    }
+    if gains(1, 0) && gains(2, 0) && !gains(1, 2) && !gains(2, 1) {
+        notes.push(
+            "whether noise grows with range or with the angle of incidence these scans do not tell: far surfaces are met at an angle".into(),
+        );
     }
     let samples: f64 = likelihoods[0].iter().map(|l| l[1]).sum();
     let words = ["the same everywhere", "with incidence", "with range", "with range and incidence"];
