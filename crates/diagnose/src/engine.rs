@@ -5,12 +5,15 @@ use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Ver
 use crate::error::DiagnoseError;
 use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
-use crate::pairing::{FramePair, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all, with_points};
+use crate::pairing::{
+    FramePair, Mending, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all, with_points,
+};
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
 use geometry::Box3;
+use nalgebra::Vector3;
 
 /// What to look at.
 #[derive(Clone, Debug, Default)]
@@ -76,8 +79,9 @@ pub fn diagnose(
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let frames =
-        pair_all(measured, simulated, &ids, &sensors, None, &|done| progress(Stage::Pairing, done, ids.len()))?;
+    let frames = pair_all(measured, simulated, &ids, &sensors, Mending::default(), &|done| {
+        progress(Stage::Pairing, done, ids.len())
+    })?;
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
@@ -105,31 +109,35 @@ pub fn diagnose(
     let known: Vec<_> = added.map(|v| (NoiseLaw::Constant, v)).into_iter().collect();
     results.push(rounding);
     progress(Stage::Weighing, 2, searches);
+    // What stands elsewhere is moved back before silhouettes and single returns are looked at.
+    let origins = crate::channels::mean::origins(rig);
+    let shift = |p: &Vector3<f64>, sensor: usize| displaced.of_point(p, sensor, &origins[sensor]);
+    let moved = Mending { shift_m: displaced.moves().then_some(&shift), ..Mending::default() };
+    let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
+    let upright = if displaced.moves() { Some(again(moved)?) } else { None };
+    context.frames = upright.as_deref().unwrap_or(&frames);
     let (hidden, mask) = search::mask::search(&context);
     results.push(hidden);
     results.push(search::hits::search(&context, &mask, displaced.moves()));
     progress(Stage::Weighing, 3, searches);
-    results.push(search::labels::search(&context, Side::Labels, &displaced));
-    results.push(search::labels::search(&context, Side::Objects, &displaced));
-    progress(Stage::Weighing, 4, searches);
     results.push(search::returns::search(&context));
-    progress(Stage::Weighing, 5, searches);
+    progress(Stage::Weighing, 4, searches);
     // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
-    let mended = match &displaced.groups {
-        Some(_) => {
-            let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
-            let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
-            Some(pair_all(measured, simulated, &used, &sensors, Some(&off), &|_| ())?)
-        }
+    let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
+    let even = match &displaced.groups {
+        Some(_) => Some(again(Mending { range_m: Some(&off), ..moved })?),
         None => None,
     };
-    if let Some(mended) = &mended {
-        context.frames = mended;
+    if let Some(even) = &even {
+        context.frames = even;
     }
-    let least_cos = if mended.is_some() { 0.12 } else { 0.0 };
+    let least_cos = if even.is_some() { 0.12 } else { 0.0 };
     results.push(search::noise::search(&context, &known, least_cos));
     context.frames = &frames;
+    progress(Stage::Weighing, 5, searches);
+    results.push(search::labels::search(&context, Side::Labels, &displaced));
+    results.push(search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, searches, searches);
     if let Some(note) = search::set_aside(&mut results) {
         notes.push(note);

@@ -10,7 +10,7 @@ mod scan;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, ObjectPair, RangeCorrection, Sensors, pair_frame};
+pub use frame::{FramePair, Mending, ObjectPair, Sensors, pair_frame};
 pub use identical::{Identity, check_identity};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;
@@ -138,7 +138,7 @@ pub fn pair_all(
     simulated: &Dataset,
     ids: &[String],
     sensors: &Sensors,
-    correction: Option<RangeCorrection>,
+    mending: Mending,
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<Vec<FramePair>, DiagnoseError> {
     let kept = (KEPT / ids.len().max(1)).max(500);
@@ -147,7 +147,7 @@ pub fn pair_all(
         .enumerate()
         .map(|(i, id)| {
             let (a, b) = (load(measured, id)?, load(simulated, id)?);
-            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors, correction);
+            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
             for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
                 thin(rays, kept, i as u64, k as u64);
             }
