@@ -139,6 +139,7 @@ pub fn diagnose(
     results.push(search::labels::search(&context, Side::Labels, &displaced));
     results.push(search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, searches, searches);
+    search::without_leftovers(&mut results);
     if let Some(note) = search::set_aside(&mut results) {
         notes.push(note);
     }

@@ -140,7 +140,8 @@ fn points_that_are_no_numbers_are_an_error_that_names_the_file() {
 fn labels_in_another_frame_are_told() {
     let pair = Pair::new(7, 14);
     for file in pair.files("measured/label_2") {
-        let turned = fs_err::read_to_string(&file).unwrap().lines().map(|line| {
+        let text = fs_err::read_to_string(&file).unwrap();
+        let turned = text.lines().map(|line| {
             let mut words: Vec<&str> = line.split_whitespace().collect();
             words.swap(11, 12);
             words.join(" ") + "\n"

@@ -60,13 +60,16 @@ impl Sensors {
     }
 }
 
+/// How far a point of a sensor is shown from where it is, both in the cloud's frame, m.
+pub type ShownShift<'a> = &'a (dyn Fn(&Vector3<f64>, usize) -> Vector3<f64> + Sync);
+
 /// What is known to be wrong with the measured side and is taken out before the frames are paired.
 #[derive(Clone, Copy, Default)]
 pub struct Mending<'a> {
     /// What is to be taken off the range of a ray, m.
     pub range_m: Option<&'a (dyn Fn(&Ray) -> f64 + Sync)>,
-    /// How far a point of a sensor is shown from where it is, in the cloud's frame, m.
-    pub shift_m: Option<&'a (dyn Fn(&Vector3<f64>, usize) -> Vector3<f64> + Sync)>,
+    /// How far points are shown from where they are.
+    pub shift_m: Option<ShownShift<'a>>,
 }
 
 /// Pairs a frame, return by return.
