@@ -1,7 +1,7 @@
 //! What is put on a simulated data set by `resim` is found again, and what is written as an extension mends it.
 
 use data::Dataset;
-use diagnose::{Diagnosis, Options, Outcome, SensorRig, Status, diagnose, extended_toml};
+use lidarshift_diagnose::{Diagnosis, Options, Outcome, SensorRig, Status, diagnose, extended_toml};
 use simulate::effects::EffectList;
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
