@@ -79,9 +79,14 @@ pub fn diagnose(
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let frames = pair_all(measured, simulated, &ids, &sensors, Mending::default(), &|done| {
+    let mut frames = pair_all(measured, simulated, &ids, &sensors, Mending::default(), &|done| {
         progress(Stage::Pairing, done, ids.len())
     })?;
+    let before = frames.len();
+    leave_out_copies(&mut frames);
+    if frames.len() < before {
+        notes.push(format!("{} frames are copies of others: each scene counts once", before - frames.len()));
+    }
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
@@ -147,6 +152,16 @@ pub fn diagnose(
     let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
     let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
+}
+
+/// Keeps the first of frames that show the same to the bit: they say nothing twice.
+fn leave_out_copies(frames: &mut Vec<FramePair>) {
+    let mut seen = std::collections::BTreeSet::new();
+    let sum = |rays: &[Ray]| rays.iter().map(|r| u64::from(r.range_m.to_bits())).fold(0u64, u64::wrapping_add);
+    frames.retain(|f| {
+        let counts = [f.measured.len(), f.simulated.len()];
+        counts == [0; 2] || seen.insert((counts, sum(&f.measured), sum(&f.simulated)))
+    });
 }
 
 /// Speeds that differ by less do not tell a late clock from a constant offset, m/s.
