@@ -1,20 +1,20 @@
 //! `lidarshift diagnose`: what does the simulation get wrong, why, and what is gained by mending it.
 
 mod detectors;
-mod pictures;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, KittiLine, write_atomic, write_json};
 use detectors::gain_of_detectors;
-use diagnose::{DetectorGain, Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, extended_toml};
+use diagnose::{DetectorGain, Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, diagnose_scans, extended_toml};
 use indicatif::{ProgressBar, ProgressStyle};
+use report::{finding_name, write_finding_pictures};
 use simulate::race::RaceConfig;
 use std::path::{Path, PathBuf};
 
 /// Compare measured data with their scenario-identical simulation: name what differs, with parameters and intervals, and measure what is
-/// gained by mending it.
+/// gained by mending it. Or, with --scans, compare the scans of one spinning sensor with an ideal one where their scene is known: ground and walls.
 ///
 /// Exit codes: 0 when the diagnosis could be made, whatever it says; 3 when the two do not show the same scenes (diagnosis.json says so); 1 when
 /// it could not be made; 2 when the words could not be understood.
@@ -22,15 +22,19 @@ use std::path::{Path, PathBuf};
 /// Examples:
 ///   lidarshift diagnose --measured datasets/measured --simulated datasets/sim --sensor configs/sensors/av21.toml
 ///   lidarshift diagnose --measured real --simulated sim --sensor rig.toml --split test --out runs/diagnosis
+///   lidarshift diagnose --scans datasets/kitti.toml --sensor configs/sensors/hdl64e.toml --out runs/scans
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct DiagnoseArgs {
     /// Measured data set: its folder or its TOML
-    #[arg(long, value_name = "DATASET")]
-    measured: PathBuf,
+    #[arg(long, value_name = "DATASET", required_unless_present = "scans", requires = "simulated")]
+    measured: Option<PathBuf>,
     /// Simulated data set with the same frame ids
-    #[arg(long, value_name = "DATASET")]
-    simulated: PathBuf,
+    #[arg(long, value_name = "DATASET", requires = "measured")]
+    simulated: Option<PathBuf>,
+    /// Scans of one spinning sensor, as its files have them, to be diagnosed against an ideal sensor without a simulation of the scenes
+    #[arg(long, value_name = "DATASET", conflicts_with_all = ["measured", "simulated", "simulator"])]
+    scans: Option<PathBuf>,
     /// Places and directions of the sensors; without it one sensor at the origin of the clouds is assumed
     #[arg(long, value_name = "TOML")]
     sensor: Option<PathBuf>,
@@ -45,7 +49,7 @@ pub struct DiagnoseArgs {
     out: PathBuf,
     /// Train the detectors of this study, with its seeds and epochs, on measured, simulated and extended data, and test them on measured
     /// frames; `gain` is one for it
-    #[arg(long, value_name = "STUDY")]
+    #[arg(long, value_name = "STUDY", requires = "measured")]
     detectors: Option<String>,
     /// Write diagnosis.json here as well
     #[arg(long, value_name = "FILE")]
@@ -55,7 +59,6 @@ pub struct DiagnoseArgs {
 impl DiagnoseArgs {
     /// Diagnoses, writes the files and says what was found; `false` when the two do not show the same scenes.
     pub fn run(self) -> Result<bool> {
-        let (measured, simulated) = (Dataset::open(&self.measured)?, Dataset::open(&self.simulated)?);
         let rig = self.rig()?;
         if self.out.is_file() {
             bail!("--out {}: is a file; a folder is wanted", self.out.display());
@@ -72,23 +75,36 @@ impl DiagnoseArgs {
             bar.set_length(of as u64);
             bar.set_position(done as u64);
         };
-        let mut outcome = diagnose(&measured, &simulated, &rig, &Options { split: self.split.clone() }, &told)?;
+        let options = Options { split: self.split.clone() };
+        let (measured, mut outcome) = match (&self.scans, &self.measured, &self.simulated) {
+            (Some(scans), ..) => {
+                let scans = Dataset::open(scans)?;
+                let outcome = diagnose_scans(&scans, &rig, &options, &told)?;
+                (scans, outcome)
+            }
+            (None, Some(measured), Some(simulated)) => {
+                let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
+                let outcome = diagnose(&measured, &simulated, &rig, &options, &told)?;
+                (measured, outcome)
+            }
+            _ => bail!("--measured and --simulated, or --scans, are wanted"),
+        };
         bar.finish_and_clear();
         self.write_json(&outcome.diagnosis)?;
         write_atomic(
             &self.out.join("extended.toml"),
             extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg).as_bytes(),
         )?;
-        pictures::write(&outcome.diagnosis, &self.out)?;
+        write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {
             write_labels(&self.out, &measured, id, boxes)?;
         }
         say(&outcome.diagnosis, &self.out, outcome.corrected.len());
-        if let Some(study) = &self.detectors
+        if let (Some(study), Some(measured), Some(simulated)) = (&self.detectors, &self.measured, &self.simulated)
             && !outcome.diagnosis.findings.is_empty()
         {
             let extended = self.out.join("extended.toml");
-            let gains = gain_of_detectors(study, &self.measured, &self.simulated, &extended, &self.out)?;
+            let gains = gain_of_detectors(study, measured, simulated, &extended, &self.out)?;
             say_gains(&gains);
             outcome.diagnosis.detectors = gains;
             self.write_json(&outcome.diagnosis)?;
@@ -140,7 +156,7 @@ fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
         _ => {}
     }
     for f in &diagnosis.findings {
-        let name = pictures::name(f);
+        let name = finding_name(f);
         println!("{name}: {}", f.says);
         for (parameter, p) in f.parameters.iter().filter(|(n, _)| !n.contains('/')) {
             println!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);

@@ -14,7 +14,7 @@ pub struct Diagnosis {
     pub schema: String,
     /// What is said of the whole.
     pub verdict: Verdict,
-    /// Ids of the frames by what they were used for; no frame is used twice.
+    /// Ids of the frames by what they were used for; no frame is used twice, but of scans alone each is held out in turn.
     pub frames: FrameRoles,
     /// What was found, the largest gain first.
     pub findings: Vec<Finding>,
@@ -75,7 +75,7 @@ pub struct Finding {
     pub parameters: BTreeMap<String, Parameter>,
     /// Share of block-bootstrap repetitions that choose the same name.
     pub confidence: f64,
-    /// `residuals`, `roughness`, `hits`, `returns`, `objects`, `labels` or `ranges`.
+    /// `residuals`, `roughness`, `hits`, `returns`, `objects`, `labels`, `ranges` or `intensity`.
     pub channel: String,
     /// On what it depends.
     pub covariate: String,

@@ -5,12 +5,15 @@ use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Ver
 use crate::error::DiagnoseError;
 use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
-use crate::pairing::{FramePair, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all};
+use crate::pairing::{
+    FramePair, Mending, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all, with_points,
+};
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
 use geometry::Box3;
+use nalgebra::Vector3;
 
 /// What to look at.
 #[derive(Clone, Debug, Default)]
@@ -54,6 +57,8 @@ pub fn diagnose(
 ) -> Result<Outcome, DiagnoseError> {
     let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
     progress(Stage::Comparing, 0, 2);
+    let (ids, empty) = with_points(measured, simulated, ids)?;
+    notes.extend(empty);
     let sensors = find_sensors(measured, simulated, &ids, rig)?;
     for (mount, pattern) in rig.sensors.iter().zip(&sensors.patterns) {
         if pattern.rows_rad.is_empty() {
@@ -74,9 +79,14 @@ pub fn diagnose(
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
     let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let (frames, more) =
-        pair_all(measured, simulated, &ids, &sensors, None, &|done| progress(Stage::Pairing, done, ids.len()))?;
-    notes.extend(more);
+    let mut frames = pair_all(measured, simulated, &ids, &sensors, Mending::default(), &|done| {
+        progress(Stage::Pairing, done, ids.len())
+    })?;
+    let before = frames.len();
+    leave_out_copies(&mut frames);
+    if frames.len() < before {
+        notes.push(format!("{} frames are copies of others: each scene counts once", before - frames.len()));
+    }
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
@@ -92,6 +102,7 @@ pub fn diagnose(
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
     notes.extend(limits(&frames));
+    notes.extend(times.as_deref().and_then(|t| one_speed(&frames, t)));
     let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
     let searches = 7;
     let mut results: Vec<ChannelResult> = Vec::new();
@@ -103,32 +114,37 @@ pub fn diagnose(
     let known: Vec<_> = added.map(|v| (NoiseLaw::Constant, v)).into_iter().collect();
     results.push(rounding);
     progress(Stage::Weighing, 2, searches);
+    // What stands elsewhere is moved back before silhouettes and single returns are looked at.
+    let origins = crate::channels::mean::origins(rig);
+    let shift = |p: &Vector3<f64>, sensor: usize| displaced.of_point(p, sensor, &origins[sensor]);
+    let moved = Mending { shift_m: displaced.moves().then_some(&shift), ..Mending::default() };
+    let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
+    let upright = if displaced.moves() { Some(again(moved)?) } else { None };
+    context.frames = upright.as_deref().unwrap_or(&frames);
     let (hidden, mask) = search::mask::search(&context);
     results.push(hidden);
     results.push(search::hits::search(&context, &mask, displaced.moves()));
     progress(Stage::Weighing, 3, searches);
-    results.push(search::labels::search(&context, Side::Labels, &displaced));
-    results.push(search::labels::search(&context, Side::Objects, &displaced));
-    progress(Stage::Weighing, 4, searches);
     results.push(search::returns::search(&context));
-    progress(Stage::Weighing, 5, searches);
+    progress(Stage::Weighing, 4, searches);
     // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
-    let mended = match &displaced.groups {
-        Some(_) => {
-            let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
-            let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
-            Some(pair_all(measured, simulated, &used, &sensors, Some(&off), &|_| ())?.0)
-        }
+    let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
+    let even = match &displaced.groups {
+        Some(_) => Some(again(Mending { range_m: Some(&off), ..moved })?),
         None => None,
     };
-    if let Some(mended) = &mended {
-        context.frames = mended;
+    if let Some(even) = &even {
+        context.frames = even;
     }
-    let least_cos = if mended.is_some() { 0.12 } else { 0.0 };
+    let least_cos = if even.is_some() { 0.12 } else { 0.0 };
     results.push(search::noise::search(&context, &known, least_cos));
     context.frames = &frames;
+    progress(Stage::Weighing, 5, searches);
+    results.push(search::labels::search(&context, Side::Labels, &displaced));
+    results.push(search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, searches, searches);
+    search::without_leftovers(&mut results);
     if let Some(note) = search::set_aside(&mut results) {
         notes.push(note);
     }
@@ -136,6 +152,31 @@ pub fn diagnose(
     let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
     let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
+}
+
+/// Keeps the first of frames that show the same to the bit: they say nothing twice.
+fn leave_out_copies(frames: &mut Vec<FramePair>) {
+    let mut seen = std::collections::BTreeSet::new();
+    let sum = |rays: &[Ray]| rays.iter().map(|r| u64::from(r.range_m.to_bits())).fold(0u64, u64::wrapping_add);
+    frames.retain(|f| {
+        let counts = [f.measured.len(), f.simulated.len()];
+        counts == [0; 2] || seen.insert((counts, sum(&f.measured), sum(&f.simulated)))
+    });
+}
+
+/// Speeds that differ by less do not tell a late clock from a constant offset, m/s.
+const ONE_SPEED_M_S: f64 = 0.5;
+
+/// Says so where all objects move alike.
+fn one_speed(frames: &[FramePair], times: &[f64]) -> Option<String> {
+    let shifts = crate::channels::labels::object_shifts(frames, Some(times));
+    let speeds: Vec<f64> = shifts.iter().filter_map(|s| Some(s.seen_velocity_m_s?[0])).collect();
+    let n = speeds.len() as f64;
+    let mean = speeds.iter().sum::<f64>() / n.max(1.0);
+    let spread = (speeds.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n.max(1.0)).sqrt();
+    (!speeds.is_empty() && spread < ONE_SPEED_M_S).then(|| {
+        format!("all labelled objects move at one speed against the sensors (within {spread:.1} m/s): a late clock cannot be told from a constant offset of labels")
+    })
 }
 
 /// What the pairs themselves do not let be judged: labels that do not meet, and a simulation that ends earlier.

@@ -1,5 +1,5 @@
 //! The file `extended.toml`: what was found as a list of effects for the simulator, with intervals as comments. What the simulator has no
-//! effect for is listed in comments.
+//! effect for is listed in comments; what has no name is written as tables.
 
 use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::rig::SensorRig;
@@ -85,9 +85,17 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
                 + &key("exponent", "exponent")
                 + &format!("signal = {:?}\n", crate::inference::noise::USUAL_SIGNAL),
         ),
+        "incidence_noise" => with(
+            "range_noise_by_incidence",
+            format!("divergence_rad = {}\nsamples = 1.0\n", toml_number(2.0 * value("angle_rad"))),
+        ),
         "range_bias" => with("range_bias", key("offset_m", "offset_m") + &key("scale", "scale")),
         "beam_range_offset" => with("beam_range_offset", row_table(f, rig)),
-        "beam_elevation_offset" => with("beam_angle_error", key("elevation_std_deg", "std_deg")),
+        "beam_elevation_offset" => {
+            let none = if f.parameters.contains_key("std_deg") { "" } else { "elevation_std_deg = 0.0\n" };
+            let lines = key("elevation_deg", "mean_deg") + &key("elevation_std_deg", "std_deg") + none;
+            with("beam_angle_error", lines + "azimuth_std_deg = 0.0\n")
+        }
         "quantisation" => with("range_quantisation", key("step_m", "step_m")),
         "angular_jitter" => positive(
             f,
@@ -223,47 +231,46 @@ fn blocked_box(f: &Finding, rig: &SensorRig) -> String {
     format!("[[effect]]\nkind = \"ego_body_mask\"\nboxes = [[{}]]\n", numbers.join(", "))
 }
 
-/// What has no name: a table along its covariate for each sensor, as comments.
+/// What has no name: for each sensor a table along its covariate.
 fn empirical(f: &Finding, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
     let usual = f.parameters.get("simulated_std_m").map_or(0.0, |p| p.estimate);
-    let mut text = String::from("# The simulator has no effect without a cause; as a table this is what was seen.\n");
+    let of_rows = f.covariate == "row";
+    let mut text = String::new();
     for (sensor, mount) in rig.sensors.iter().enumerate() {
         // Curves of sensors stand a thousand apart.
         let own = f.curve.points.iter().filter(|p| (p.x / 1000.0).round() == sensor as f64);
-        let mut table: Vec<(f64, f64)> = own
+        let mut table: Vec<[f64; 3]> = own
             .filter_map(|p| {
                 let x = p.x - 1000.0 * sensor as f64;
-                let at = if f.covariate == "row" {
-                    *rows_deg.get(sensor)?.get(x as usize)?
-                } else {
-                    crate::rig::wrapped((x + mount.yaw_deg).to_radians()).to_degrees()
+                let at = if of_rows { *rows_deg.get(sensor)?.get(x as usize)? } else { x };
+                let [value, error] = match f.channel.as_str() {
+                    "hits" => [(1.0 - p.after).clamp(0.0, 1.0), p.error],
+                    "roughness" => [usual * (p.after * p.after - 1.0).max(0.0).sqrt(), usual * p.error],
+                    _ => [p.after, p.error],
                 };
-                let value = match f.channel.as_str() {
-                    "hits" => p.after.clamp(0.0, 1.0),
-                    "roughness" => usual * (p.after * p.after - 1.0).max(0.0).sqrt(),
-                    _ => p.after,
-                };
-                Some((at, value))
+                Some([at, value, error])
             })
             .collect();
-        table.sort_by(|a, b| a.0.total_cmp(&b.0));
-        table.dedup_by(|a, b| a.0 - b.0 < 1e-3);
+        table.sort_by(|a, b| a[0].total_cmp(&b[0]));
+        table.dedup_by(|a, b| a[0] - b[0] < 1e-3);
         if table.is_empty() {
             continue;
         }
         let list =
-            |g: fn(&(f64, f64)) -> f64| table.iter().map(|p| format!("{:.4}", g(p))).collect::<Vec<_>>().join(", ");
-        let what = match f.channel.as_str() {
-            "hits" => "kept",
+            |k: usize| table.iter().map(|p| format!("{:?}", (p[k] * 1e4).round() / 1e4)).collect::<Vec<_>>().join(", ");
+        let key = match f.channel.as_str() {
+            "hits" => "loss",
             "roughness" => "std_m",
-            _ => "offset_m",
+            _ => "mean_m",
         };
-        let covariate = if f.covariate == "row" { "elevation_deg" } else { "azimuth_deg" };
+        let covariate = if of_rows { "elevation_deg" } else { "azimuth_deg" };
         let _ = write!(
             text,
-            "# sensor {sensor}, along {covariate}:\n# at = [{}]\n# {what} = [{}]\n",
-            list(|p| p.0),
-            list(|p| p.1)
+            "[[effect]]\nkind = \"empirical\"\nsensor = \"{}\"\ncovariate = \"{covariate}\"\nat = [{}]\n{key} = [{}]\n# standard errors: {}\n",
+            mount.name,
+            list(0),
+            list(1),
+            list(2)
         );
     }
     text
@@ -399,8 +406,7 @@ mod tests {
             let text = extended_toml(&diagnosis, &SensorRig::single(), &[vec![-5.0, -4.0]]);
             let read = simulate::effects::EffectList::parse(&text, std::path::Path::new("extended.toml"));
             let effects = read.unwrap_or_else(|e| panic!("{what}: {e}\n{text}")).effects;
-            let of_the_world =
-                matches!(what.as_str(), "wrong_shape" | "missing_object" | "hits" | "roughness" | "residuals");
+            let of_the_world = matches!(what.as_str(), "wrong_shape" | "missing_object");
             assert_eq!(effects.is_empty(), of_the_world, "{what}: {text}");
         }
     }

@@ -11,6 +11,7 @@ mod extended;
 pub mod inference;
 pub mod pairing;
 mod rig;
+mod scans;
 pub mod search;
 
 pub use diagnosis::{Curve, CurvePoint, DetectorGain, Diagnosis, Finding, FindingGain, SCHEMA, Status, Verdict};
@@ -18,3 +19,4 @@ pub use engine::{Options, Outcome, Progress, Stage, diagnose};
 pub use error::DiagnoseError;
 pub use extended::extended_toml;
 pub use rig::{SensorMount, SensorRig, wrapped};
+pub use scans::diagnose_scans;

@@ -20,9 +20,9 @@ pub struct Mask {
 pub type DirectionCell = (u8, i32, i32);
 
 /// Size of a cell, rad.
-pub const AZIMUTH_RAD: f64 = 0.0436;
+pub const AZIMUTH_RAD: f64 = 0.0262;
 /// Size of a cell, rad.
-pub const ELEVATION_RAD: f64 = 0.0262;
+pub const ELEVATION_RAD: f64 = 0.0175;
 
 /// The cell of a ray.
 pub fn direction_cell(ray: &Ray) -> DirectionCell {
@@ -73,23 +73,41 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
 }
 
 /// Simulated returns that a cell needs to be judged.
-const FEWEST: f64 = 25.0;
+const FEWEST: f64 = 15.0;
+
+/// Cells that what stands in the way covers at least.
+const FEWEST_CELLS: usize = 4;
 
 /// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
-/// in a cell.
+/// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not.
 pub fn blocked_cells(counts: &DirectionCounts, expected: impl Fn(&DirectionCell) -> f64) -> BTreeSet<DirectionCell> {
-    let dark: BTreeSet<DirectionCell> = counts
-        .iter()
-        .filter(|(cell, [n, seen, _])| *n >= FEWEST && seen / n < 0.1 && expected(cell) > 0.5)
-        .map(|(cell, _)| *cell)
-        .collect();
-    // Single cells are chance; what stands in the way has neighbours.
-    dark.iter()
-        .filter(|(s, az, el)| {
-            [(1, 0), (-1, 0), (0, 1), (0, -1)].iter().any(|(da, de)| dark.contains(&(*s, az + da, el + de)))
-        })
+    let judged = |cell: &DirectionCell| counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, _]| seen / n);
+    let mut dark: BTreeSet<DirectionCell> = counts
+        .keys()
+        .filter(|cell| judged(cell).is_some_and(|seen| seen < 0.12 && expected(cell) > 0.5))
         .copied()
-        .collect()
+        .collect();
+    let mut blocked = BTreeSet::new();
+    while let Some(first) = dark.pop_first() {
+        let mut together = vec![first];
+        let mut at = 0;
+        while at < together.len() {
+            let (s, az, el) = together[at];
+            at += 1;
+            let around = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| (s, az + a, el + e));
+            together.extend(around.into_iter().filter(|c| dark.remove(c)));
+        }
+        // Two cells on: the next one may be blocked in part.
+        let open = |(s, az, el): DirectionCell, a: i32, e: i32| {
+            (2..4).any(|k| judged(&(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
+        };
+        let sides = [(1, 0), (-1, 0), (0, 1), (0, -1)]
+            .map(|(a, e)| together.iter().filter(|c| open(**c, a, e)).count() * 8 >= together.len());
+        if together.len() >= FEWEST_CELLS && (sides[0] && sides[1] || sides[2] && sides[3]) {
+            blocked.extend(together);
+        }
+    }
+    blocked
 }
 
 /// A set of cells and those around them.
@@ -169,15 +187,16 @@ mod tests {
     #[test]
     fn a_hole_in_all_frames_is_found_and_a_single_dark_cell_is_not() {
         let mut counts = DirectionCounts::new();
-        for az in -10..10 {
+        for az in -20..10 {
             for el in -5..5 {
                 let hole = (2..5).contains(&az) && (-3..-1).contains(&el) || (az, el) == (-8, 0);
-                counts.insert((0, az, el), [100.0, if hole { 2.0 } else { 97.0 }, 0.0]);
+                let end = az < -12 && el > 2;
+                counts.insert((0, az, el), [100.0, if hole || end { 2.0 } else { 97.0 }, 0.0]);
             }
         }
         let blocked = blocked_cells(&counts, |_| 1.0);
         assert_eq!(blocked.len(), 6);
-        assert!(!blocked.contains(&(0, -8, 0)));
+        assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
         assert!(blocked_cells(&counts, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
     }

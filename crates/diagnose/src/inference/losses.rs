@@ -15,13 +15,30 @@ pub enum Law {
     Incidence,
     /// Falls with the signal cos / R^2; surfaces may be brighter than the ground.
     Signal,
-    /// One kind of surface loses a share.
+    /// One kind of surface loses a share; [`WHOLE_OBJECT`]: bodies of objects with their corners.
     Zone(usize),
 }
 
+/// Bodies of objects with their lower corners, as a zone.
+pub const WHOLE_OBJECT: usize = ZONES;
+
+/// Whether a zone belongs to that of a law.
+pub fn in_zone(of_law: usize, zone: usize) -> bool {
+    zone == of_law || of_law == WHOLE_OBJECT && zone >= 2
+}
+
 /// All laws, in the order of how much they assume.
-pub const LAWS: [Law; 8] =
-    [Law::Random, Law::Zone(0), Law::Zone(1), Law::Zone(2), Law::Zone(3), Law::Range, Law::Incidence, Law::Signal];
+pub const LAWS: [Law; 9] = [
+    Law::Random,
+    Law::Zone(0),
+    Law::Zone(1),
+    Law::Zone(2),
+    Law::Zone(3),
+    Law::Zone(WHOLE_OBJECT),
+    Law::Range,
+    Law::Incidence,
+    Law::Signal,
+];
 
 /// Rows of a table: what the laws need to know of a cell.
 #[derive(Clone, Copy, Debug)]
@@ -185,6 +202,17 @@ impl LossTable {
         lost / n.max(1.0)
     }
 
+    /// The kind of standing surface or object on which nine tenths of what the laws lose lie.
+    pub fn confined_to(&self, laws: &[FittedLaw]) -> Option<usize> {
+        let mut lost = [0.0f64; ZONES];
+        for &i in &self.used {
+            lost[self.places[i].zone] += self.cells[i].simulated.n * (1.0 - self.kept(laws, i)).max(0.0);
+        }
+        let all: f64 = lost.iter().sum();
+        let of = |z: usize| (0..ZONES).filter(|k| in_zone(z, *k)).map(|k| lost[k]).sum::<f64>();
+        (1..=WHOLE_OBJECT).find(|&z| of(z) > 0.9 * all)
+    }
+
     /// Cells with enough returns: ln range, ln cos, zone, returns, share found over share expected without losses.
     pub fn shares(&self) -> Vec<([f64; 2], usize, f64, f64)> {
         self.used
@@ -315,7 +343,7 @@ impl FittedLaw {
         match self.law {
             Law::Random => (1.0 - a).clamp(1e-3, 1.5),
             Law::Zone(zone) => {
-                if at.zone == zone {
+                if in_zone(zone, at.zone) {
                     (1.0 - a).clamp(1e-3, 1.5)
                 } else {
                     1.0

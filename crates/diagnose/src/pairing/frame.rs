@@ -60,8 +60,17 @@ impl Sensors {
     }
 }
 
-/// What is to be taken off the range of a measured ray, m.
-pub type RangeCorrection<'a> = &'a (dyn Fn(&Ray) -> f64 + Sync);
+/// How far a point of a sensor is shown from where it is, both in the cloud's frame, m.
+pub type ShownShift<'a> = &'a (dyn Fn(&Vector3<f64>, usize) -> Vector3<f64> + Sync);
+
+/// What is known to be wrong with the measured side and is taken out before the frames are paired.
+#[derive(Clone, Copy, Default)]
+pub struct Mending<'a> {
+    /// What is to be taken off the range of a ray, m.
+    pub range_m: Option<&'a (dyn Fn(&Ray) -> f64 + Sync)>,
+    /// How far points are shown from where they are.
+    pub shift_m: Option<ShownShift<'a>>,
+}
 
 /// Pairs a frame, return by return.
 pub fn pair_frame(
@@ -69,11 +78,20 @@ pub fn pair_frame(
     measured: (&Cloud, &[Object]),
     simulated: (&Cloud, &[Object]),
     sensors: &Sensors,
-    correction: Option<RangeCorrection>,
+    mending: Mending,
 ) -> FramePair {
     let mut objects = pair_labels(measured.1, simulated.1);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
     let mut scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
+    if let Some(shift_m) = mending.shift_m {
+        for (sensor, scan) in scans[0].iter_mut().enumerate() {
+            let pose = sensors.rig.sensors[sensor].pose();
+            scan.move_points(|p| {
+                let at = pose * p;
+                pose.inverse() * (at - shift_m(&at.coords, sensor))
+            });
+        }
+    }
     let mut frame = FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
     for sensor in 0..sensors.rig.sensors.len() {
         let (measured_scans, simulated_scans) = scans.split_at_mut(1);
@@ -89,7 +107,7 @@ pub fn pair_frame(
                 if ray.smooth { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
         }
         let mut measured: Vec<Ray> = (0..a.len()).map(|i| sight.ray(a, i, false)).collect();
-        if let Some(correction) = correction {
+        if let Some(correction) = mending.range_m {
             for (i, ray) in measured.iter_mut().enumerate().filter(|(_, r)| r.smooth) {
                 let off = correction(ray) as f32;
                 ray.residual_m -= off;

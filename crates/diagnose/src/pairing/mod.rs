@@ -10,7 +10,7 @@ mod scan;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, ObjectPair, RangeCorrection, Sensors, pair_frame};
+pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, pair_frame};
 pub use identical::{Identity, check_identity};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;
@@ -24,19 +24,8 @@ use data::{Cloud, Dataset, Object};
 use rand::RngExt;
 use rayon::prelude::*;
 use std::collections::BTreeSet;
-
-/// Both data sets, paired.
-#[derive(Debug)]
-pub struct Pairs {
-    /// Sensors.
-    pub rig: SensorRig,
-    /// Their scan patterns.
-    pub patterns: Vec<ScanPattern>,
-    /// Frames in the order of their ids.
-    pub frames: Vec<FramePair>,
-    /// What could not be paired, in words.
-    pub notes: Vec<String>,
-}
+use std::io::Read;
+use std::path::Path;
 
 /// Returns kept of each side over all frames: enough for every finding, and memory stays bounded.
 const KEPT: usize = 3_000_000;
@@ -44,11 +33,45 @@ const KEPT: usize = 3_000_000;
 /// Frames looked at for the scan patterns.
 const PATTERN_FRAMES: usize = 10;
 
-/// Cloud and objects of a frame; a file without a single point is an empty cloud.
+/// Whether a cloud's file holds no point: no byte, or a PCD that says so.
+fn has_no_point(path: &Path) -> Result<bool, DiagnoseError> {
+    let mut head = Vec::new();
+    fs_err::File::open(path)?.take(2000).read_to_end(&mut head)?;
+    let pcd = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pcd"));
+    let says_so = |line: &str| line.split_whitespace().eq(["POINTS", "0"]);
+    Ok(head.is_empty() || pcd && String::from_utf8_lossy(&head).lines().any(says_so))
+}
+
+/// Those of the frames of which both sides have points, and what is to be said of the others.
+pub fn with_points(
+    measured: &Dataset,
+    simulated: &Dataset,
+    ids: Vec<String>,
+) -> Result<(Vec<String>, Vec<String>), DiagnoseError> {
+    let (mut kept, mut notes) = (Vec::new(), Vec::new());
+    for id in ids {
+        let empty = [("measured", measured), ("simulated", simulated)]
+            .into_iter()
+            .map(|(name, side)| Ok((name, has_no_point(&side.cloud_path(&id))?)))
+            .collect::<Result<Vec<_>, DiagnoseError>>()?;
+        match empty.iter().find(|e| e.1) {
+            Some((name, _)) => notes.push(format!("frame {id}: the {name} cloud has no point; left out")),
+            None => kept.push(id),
+        }
+    }
+    // A side without a point is said once.
+    const LISTED: usize = 8;
+    if notes.len() > LISTED {
+        let more = notes.len() - LISTED;
+        notes.truncate(LISTED);
+        notes.push(format!("and {more} more frames without a point on one side"));
+    }
+    Ok((kept, notes))
+}
+
+/// Cloud and objects of a frame.
 pub(crate) fn load(dataset: &Dataset, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError> {
-    let path = dataset.cloud_path(id);
-    let empty = fs_err::metadata(&path)?.len() == 0;
-    let cloud = if empty { Cloud::new(dataset.config.points.channels()) } else { dataset.load_cloud(id)? };
+    let cloud = dataset.load_cloud(id)?;
     let lines = if dataset.has_labels() { dataset.labels(id)? } else { Vec::new() };
     Ok((cloud, dataset.objects(id, &lines)?))
 }
@@ -115,36 +138,23 @@ pub fn pair_all(
     simulated: &Dataset,
     ids: &[String],
     sensors: &Sensors,
-    correction: Option<RangeCorrection>,
+    mending: Mending,
     done: &(dyn Fn(usize) + Sync),
-) -> Result<(Vec<FramePair>, Vec<String>), DiagnoseError> {
-    let kept = (KEPT / ids.len()).max(500);
+) -> Result<Vec<FramePair>, DiagnoseError> {
+    let kept = (KEPT / ids.len().max(1)).max(500);
     let finished = std::sync::atomic::AtomicUsize::new(0);
-    let frames: Vec<(FramePair, [usize; 2])> = ids
-        .par_iter()
+    ids.par_iter()
         .enumerate()
         .map(|(i, id)| {
             let (a, b) = (load(measured, id)?, load(simulated, id)?);
-            let counts = [a.0.len(), b.0.len()];
-            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors, correction);
+            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
             for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
                 thin(rays, kept, i as u64, k as u64);
             }
             done(finished.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
-            Ok((frame, counts))
+            Ok(frame)
         })
-        .collect::<Result<_, DiagnoseError>>()?;
-    let mut notes = Vec::new();
-    let mut used = Vec::new();
-    for (frame, counts) in frames {
-        if counts.contains(&0) {
-            let side = if counts[0] == 0 { "measured" } else { "simulated" };
-            notes.push(format!("frame {}: the {side} cloud has no point; left out", frame.id));
-        } else {
-            used.push(frame);
-        }
-    }
-    Ok((used, notes))
+        .collect()
 }
 
 /// Keeps about `kept` of the rays, by chance.

@@ -10,7 +10,7 @@ use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
-use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable};
+use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable, in_zone};
 use crate::inference::roles::Role;
 use rayon::prelude::*;
 
@@ -19,6 +19,9 @@ const FLOOR: f64 = 0.005;
 
 /// Of one kind of surface, this share of its own returns.
 const ZONE_FLOOR: f64 = 0.03;
+
+/// A share lost on one kind of surface that gains this share of a law of the signal is the material's.
+const A_MATERIAL: f64 = 0.75;
 
 /// Repetitions of the bootstrap of fits.
 const REFITS: usize = 40;
@@ -49,7 +52,7 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
             .collect();
         let before: Vec<Vec<FittedLaw>> = tables.iter().map(|t| refit(t, &chosen)).collect();
         let candidates: Vec<Law> = LAWS.into_iter().filter(|l| step == 0 || may_join(*l, &chosen)).collect();
-        let mut trials: Vec<Trial> = candidates
+        let (mut trials, confined): (Vec<Trial>, Vec<Option<usize>>) = candidates
             .par_iter()
             .enumerate()
             .map(|(k, &law)| {
@@ -67,9 +70,18 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
                     Law::Random => own > FLOOR + 0.02 * joins + 0.01 * displaced,
                     _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * displaced,
                 };
-                Trial { candidate: k, name: law.name().into(), parameters: law.parameters(), gains, above_floor }
+                let trial =
+                    Trial { candidate: k, name: law.name().into(), parameters: law.parameters(), gains, above_floor };
+                (trial, if law == Law::Signal { table.confined_to(&whole[whole.len() - 1..]) } else { None })
             })
-            .collect();
+            .unzip();
+        // A signal that falls on one kind of surface alone is a material.
+        for (k, zone) in confined.into_iter().enumerate().filter_map(|(k, zone)| Some((k, zone?))) {
+            let total = |k: usize| total_and_z(&trials[k].gains).0;
+            let of_zone = candidates.iter().position(|l| *l == Law::Zone(zone));
+            let material = of_zone.is_some_and(|z| trials[z].above_floor && total(z) > A_MATERIAL * total(k));
+            trials[k].above_floor &= !material;
+        }
         // What depends on the direction has no name.
         let laws = refit(&table, &chosen);
         for grouping in [Grouping::Row, Grouping::Azimuth] {
@@ -266,7 +278,7 @@ fn found(
     };
     let covariate = match law.law {
         Law::Random => "none".to_owned(),
-        Law::Zone(z) => format!("surface: {}", ZONE_NAMES[z]),
+        Law::Zone(z) => format!("surface: {}", ZONE_NAMES.get(z).unwrap_or(&"whole_object")),
         Law::Range => "range_m".into(),
         Law::Incidence => "cos_incidence".into(),
         Law::Signal => "signal".into(),
@@ -291,8 +303,13 @@ fn found(
 }
 
 fn zone_words(zone: usize) -> &'static str {
-    ["the ground", "standing surfaces", "bodies of labelled objects", "the lower corners of labelled objects (wheels)"]
-        [zone]
+    [
+        "the ground",
+        "standing surfaces",
+        "bodies of labelled objects",
+        "the lower corners of labelled objects (wheels)",
+        "labelled objects",
+    ][zone]
 }
 
 /// Share of a number by which a fit of another form may be off.
@@ -312,7 +329,7 @@ fn curve(table: &LossTable, law: Law, all: &[FittedLaw]) -> Curve {
         _ => ln_range.exp(),
     };
     let only = |zone: usize| match law {
-        Law::Zone(z) => z == zone,
+        Law::Zone(z) => in_zone(z, zone),
         _ => true,
     };
     let mut rows: Vec<(f64, f64, f64, f64)> = table

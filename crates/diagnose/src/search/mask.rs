@@ -18,11 +18,13 @@ use std::collections::BTreeMap;
 pub fn search(context: &Context) -> (ChannelResult, Mask) {
     let select = context.of(Role::Select);
     let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
-    // Laws are fitted first with everything in, to know which dark directions they explain.
-    let hits = hit_frames(context.frames, &mask);
+    let counts = direction_counts(context.frames, &select);
+    // Laws are fitted first without the dark directions, to know which of them they explain.
+    let dark = blocked_cells(&counts, |_| 1.0);
+    let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
+    let hits = hit_frames(context.frames, &without);
     let table = LossTable::new(total(select.iter().map(|&i| &hits[i])));
     let laws = refit(&table, &[Law::Random, Law::Signal]);
-    let counts = direction_counts(context.frames, &select);
     let expected = expected_shares(context, &select, &mask, &table, &laws);
     mask.blocked = blocked_cells(&counts, |cell| expected.get(cell).copied().unwrap_or(0.0));
     mask.around = with_neighbours(&mask.blocked);

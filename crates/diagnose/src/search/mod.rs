@@ -151,6 +151,23 @@ pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
     })
 }
 
+/// Share of a pose's gain below which a finding of another channel is what moving the scene back leaves.
+const LEFT_BY_A_POSE: f64 = 0.005;
+
+/// Drops what a pose that was moved back leaves in channels that look at single returns.
+pub fn without_leftovers(results: &mut [ChannelResult]) {
+    let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
+    let poses = results.iter().flat_map(|r| &r.found).filter(|f| {
+        f.channel == "residuals" && f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"))
+    });
+    let pose = poses.map(gain).fold(0.0, f64::max);
+    for result in results {
+        result
+            .found
+            .retain(|f| !matches!(f.channel, "hits" | "roughness" | "returns") || gain(f) >= LEFT_BY_A_POSE * pose);
+    }
+}
+
 /// Number of bootstrap repetitions.
 pub const REPETITIONS: usize = 400;
 

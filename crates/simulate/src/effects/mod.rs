@@ -17,6 +17,7 @@
 mod context;
 mod local_plane;
 mod shot_grid;
+mod table;
 #[cfg(test)]
 pub(crate) mod testing;
 
@@ -148,6 +149,7 @@ effects! {
     encoder_ripple::EncoderRipple "E1",
     mount_vibration::MountVibration "E2",
     point_order::PointOrder "E3",
+    empirical::Empirical "E4",
 }
 
 /// An ordered list of effects, as a TOML of `[[effect]]` tables.

@@ -1,9 +1,9 @@
 //! B3: returns lost by their range alone, along a table.
 
 use super::random_dropout::drop_some;
+use super::table::{check_table, interpolated};
 use super::{Draws, FrameContext, SensorEffect};
 use crate::SimulateError;
-use crate::error::{within, wrong};
 use crate::scan::Scan;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -31,30 +31,13 @@ impl Default for RangeDropout {
 impl RangeDropout {
     /// The probability of a loss at a range.
     pub fn share_at(&self, range_m: f64) -> f64 {
-        let after = self.range_m.partition_point(|r| *r <= range_m);
-        if after == 0 || after == self.range_m.len() {
-            return self.share[after.min(self.share.len() - 1)];
-        }
-        let (r0, r1) = (self.range_m[after - 1], self.range_m[after]);
-        let t = (range_m - r0) / (r1 - r0);
-        self.share[after - 1] + t * (self.share[after] - self.share[after - 1])
+        interpolated(&self.range_m, &self.share, range_m)
     }
 }
 
 impl SensorEffect for RangeDropout {
     fn check(&self) -> Result<(), SimulateError> {
-        if self.range_m.is_empty() || self.range_m.len() != self.share.len() {
-            let (ranges, shares) = (self.range_m.len(), self.share.len());
-            return Err(wrong("share", format!("{ranges} ranges and {shares} shares make no table")));
-        }
-        for (i, share) in self.share.iter().enumerate() {
-            within(&format!("share[{i}]"), *share, 0.0, 1.0)?;
-            within(&format!("range_m[{i}]"), self.range_m[i], 0.0, 1e4)?;
-        }
-        match self.range_m.windows(2).position(|w| w[0] >= w[1]) {
-            Some(i) => Err(wrong(format!("range_m[{}]", i + 1), "is not larger than the one before")),
-            None => Ok(()),
-        }
+        check_table(("range_m", &self.range_m, [0.0, 1e4]), ("share", &self.share, [0.0, 1.0]))
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

@@ -3,7 +3,7 @@
 mod suspects;
 mod words;
 
-use self::suspects::{Suspect, UNNAMED, may_join, suspects};
+use self::suspects::{Suspect, UNNAMED, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, confidence, first_demands, record};
 use crate::channels::groups::{
     GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole,
@@ -27,6 +27,9 @@ const FLOOR_TURN_RAD: f64 = 3.5e-4;
 const FLOOR_SHIFT_M: f64 = 0.04;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
+
+/// Share of a pose's gain that a second pose must bring.
+const A_SECOND_POSE: f64 = 0.3;
 
 /// Everything that candidates are weighed on.
 struct Sums {
@@ -128,12 +131,14 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
                 let with: Vec<Suspect> = chosen.iter().cloned().chain([(*suspect).clone()]).collect();
                 let mut g = gains(&sums, &select, &blocks, &with);
                 g.iter_mut().zip(&before).for_each(|(g, b)| *g -= b);
+                let again = is_pose(suspect) && chosen.iter().any(is_pose);
+                let enough = !again || total_and_z(&g).0 > A_SECOND_POSE * first_gain;
                 Trial {
                     candidate: k,
                     name: suspect.name().into(),
                     parameters: suspect.parameters(),
                     gains: g,
-                    above_floor: above_floor(&sums, &select, &blocks, &with),
+                    above_floor: enough && above_floor(&sums, &select, &blocks, &with),
                 }
             })
             .collect();

@@ -69,6 +69,11 @@ pub(super) fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
 /// Name among the trials of what depends on azimuth: no cause of the catalogue.
 pub(super) const UNNAMED: &str = "unexplained";
 
+/// Whether a suspect is a pose: on top of another one it mends what a turn leaves that is not small.
+pub(super) fn is_pose(suspect: &Suspect) -> bool {
+    matches!(suspect.name(), "pitch_roll" | "sensor_extrinsics")
+}
+
 /// Whether a suspect tells another story than those chosen.
 pub(super) fn may_join(suspect: &Suspect, chosen: &[Suspect]) -> bool {
     chosen.iter().all(|c| {

@@ -1,9 +1,8 @@
 //! One picture of each finding: what was measured along its covariate, what the simulation shows, and what it shows with the finding.
 
-use anyhow::Result;
+use crate::{CurveOptions, Figure, ReportError, Series};
 use data::write_atomic;
 use diagnose::{Diagnosis, Finding, Status};
-use report::{CurveOptions, Figure, Series};
 use std::path::Path;
 
 /// Curves of several sensors lie this far apart along the covariate.
@@ -12,19 +11,22 @@ const A_SENSOR: f64 = 1000.0;
 /// Pixels of a PNG for each of the SVG's.
 const SCALE: f32 = 2.0;
 
-/// Writes `finding-N-NAME.svg` and `.png` into `out`.
-pub fn write(diagnosis: &Diagnosis, out: &Path) -> Result<()> {
+/// Writes `finding-N-NAME.svg` and `.png` of every finding of a diagnosis into `out`.
+///
+/// # Errors
+/// A file that cannot be written; the message names it.
+pub fn write_finding_pictures(diagnosis: &Diagnosis, out: &Path) -> Result<(), ReportError> {
     for (i, finding) in diagnosis.findings.iter().enumerate().filter(|(_, f)| !f.curve.points.is_empty()) {
         let figure = figure(finding);
-        let name = format!("finding-{}-{}", i + 1, name(finding).replace(' ', "-"));
+        let name = format!("finding-{}-{}", i + 1, finding_name(finding).replace(' ', "-"));
         write_atomic(&out.join(format!("{name}.svg")), figure.svg().as_bytes())?;
         write_atomic(&out.join(format!("{name}.png")), &figure.png(SCALE)?)?;
     }
     Ok(())
 }
 
-/// The cause, the candidates, or that there is none.
-pub fn name(finding: &Finding) -> String {
+/// The cause of a finding, its candidates, or that there is none.
+pub fn finding_name(finding: &Finding) -> String {
     match finding.status {
         Status::Named => finding.cause.clone().unwrap_or_default(),
         Status::Ambiguous => finding.candidates.clone().unwrap_or_default().join(" or "),
@@ -54,7 +56,7 @@ fn figure(finding: &Finding) -> Figure {
         }
     }
     let options = CurveOptions {
-        title: name(finding),
+        title: finding_name(finding),
         x_label: curve.x.replace(" (1000 a sensor)", ""),
         y_label: curve.y.clone(),
         log_y: false,
