@@ -72,13 +72,14 @@ fn what_has_no_name_is_mended_by_a_table() {
     let measured = with_effects(&sim, stripes, &folder.path().join("measured"), 11);
     let (outcome, rig) = diagnosed(&measured, &sim, folder.path());
     let d = &outcome.diagnosis;
-    let found: Vec<_> = d.findings.iter().map(|f| (f.status, f.channel.as_str(), f.covariate.as_str())).collect();
-    assert_eq!(found, [(Status::Unexplained, "hits", "azimuth")], "{:?}", d.findings);
-    let gain = &d.findings[0].gain;
-    assert!(gain.ci95[0] > 0.0, "{gain:?}");
+    // The mean of the stripes may be called a random loss; what is left over the azimuth has no name.
+    let unnamed = d.findings.iter().find(|f| f.status == Status::Unexplained).unwrap();
+    assert_eq!((unnamed.channel.as_str(), unnamed.covariate.as_str()), ("hits", "azimuth"), "{:?}", d.findings);
+    assert!(unnamed.gain.ci95[0] > 0.0 && d.findings.iter().all(|f| f.channel == "hits"), "{:?}", d.findings);
+    let found: f64 = d.findings.iter().map(|f| f.gain.nats_per_ray).sum();
     let extended = extended_toml(d, &rig, &outcome.rows_deg);
     let again = with_effects(&sim, &extended, &folder.path().join("extended"), 12);
     let (outcome, _) = diagnosed(&measured, &again, folder.path());
     let left: f64 = outcome.diagnosis.findings.iter().map(|f| f.gain.nats_per_ray).sum();
-    assert!(left < 0.1 * gain.nats_per_ray, "{left} of {}", gain.nats_per_ray);
+    assert!(left < 0.1 * found, "{left} of {found}");
 }

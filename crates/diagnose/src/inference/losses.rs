@@ -378,7 +378,7 @@ mod tests {
     /// Counts without noise: ground where cos = 1 / R, walls of all angles.
     fn table(keep: impl Fn(f64, f64, usize) -> f64) -> LossTable {
         let mut cells = vec![HitCell::default(); CELLS];
-        for zone in 0..3 {
+        for zone in 0..ZONES {
             for r in 4..18 {
                 for c in 0..12 {
                     let (range, cos) = ((0.25f64 * (r as f64 + 0.5)).exp(), (-0.4 * (c as f64 + 0.5)).exp());

@@ -188,7 +188,7 @@ mod tests {
         let mut cloud = Cloud::new(4);
         for beam in &beams {
             for i in 0..900 {
-                let azimuth = (0.4 * f64::from(i)).to_radians();
+                let azimuth = (0.1 + 0.4 * f64::from(i)).to_radians();
                 let p = beam.point(azimuth, 8.0 + 5.0 * (3.0 * azimuth).sin()).map(|v| (v * 1000.0).round() / 1000.0);
                 cloud.values.extend([p.x as f32, p.y as f32, p.z as f32, 0.3]);
             }
@@ -196,7 +196,10 @@ mod tests {
         let (found, scans) = rings(&[("a".into(), cloud)]).unwrap();
         assert_eq!((found.len(), scans[0].rings.len()), (16, 16));
         for (a, b) in found.iter().zip(&beams) {
-            assert!((a.elevation_rad - b.elevation_rad).abs() < 1e-5 && (a.height_m - b.height_m).abs() < 2e-4);
+            assert!(
+                (a.elevation_rad - b.elevation_rad).abs() < 1e-5 && (a.height_m - b.height_m).abs() < 2e-4,
+                "{a:?} {b:?}"
+            );
         }
         assert!(scans[0].rings.iter().all(|r| r.len() > 850));
     }
