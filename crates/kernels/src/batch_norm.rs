@@ -82,10 +82,7 @@ impl BatchNorm {
             let variance = non_negative(squares / self.count() - mean * mean);
             (Affine::new(gamma[channel], beta[channel], mean, variance, self.epsilon), [mean, variance])
         };
-        let apply = |x: f32, _: f32, a: &Affine| {
-            let z = a.of(x);
-            if self.relu && z < 0.0 { 0.0 } else { z }
-        };
+        let apply = |x: f32, _: f32, a: &Affine| self.activated(a.of(x));
         // SAFETY: `two_passes` writes all of y.
         let statistics =
             unsafe { fill(y, self.len(), |y| self.two_passes(x, x, y, |_| Affine::NONE, moments, affine, apply)) };
@@ -100,10 +97,7 @@ impl BatchNorm {
     pub fn forward(&self, x: &[f32], gamma: &[f32], beta: &[f32], statistics: &Statistics, y: &mut Vec<f32>) {
         self.check(x, gamma, beta);
         let affine = self.affine(gamma, beta, statistics);
-        let normalised = |x: f32, a: &Affine| {
-            let z = a.of(x);
-            if self.relu && z < 0.0 { 0.0 } else { z }
-        };
+        let normalised = |x: f32, _: f32, a: &Affine| self.activated(a.of(x));
         let row = self.channels * self.pixels;
         let rows = Affines::of_row(if self.pixels < SHORT { row } else { 0 }, |c| affine[c / self.pixels]);
         // SAFETY: every row, or every run of a channel, is written.
@@ -112,13 +106,13 @@ impl BatchNorm {
                 if self.is_empty() {
                 } else if self.pixels < SHORT {
                     y.par_chunks_mut(ROWS * row).zip(x.par_chunks(ROWS * row)).for_each(|(y, x)| {
-                        apply_to_rows(y, (x, x), row, &rows, &|x, _, a| normalised(x, a));
+                        apply_to_rows(y, (x, x), row, &rows, &normalised);
                     });
                 } else {
                     let runs = y.par_chunks_mut(self.pixels).zip(x.par_chunks(self.pixels));
                     runs.with_min_len(1 + 4096 / self.pixels).enumerate().for_each(|(run, (y, x))| {
                         let a = &affine[run % self.channels];
-                        vectorized(|| y.iter_mut().zip(x).for_each(|(y, &x)| _ = y.write(normalised(x, a))));
+                        vectorized(|| y.iter_mut().zip(x).for_each(|(y, &x)| _ = y.write(normalised(x, x, a))));
                     });
                 }
             });
@@ -159,6 +153,11 @@ impl BatchNorm {
         let sums =
             unsafe { fill(dx, self.len(), |dx| self.two_passes(x, dy, dx, |c| before[c], moments, affine, apply)) };
         sums.into_iter().map(|[dgamma, dbeta]| (dgamma as f32, dbeta as f32)).unzip()
+    }
+
+    #[inline(always)]
+    fn activated(&self, z: f32) -> f32 {
+        if self.relu && z < 0.0 { 0.0 } else { z }
     }
 
     fn check(&self, x: &[f32], gamma: &[f32], beta: &[f32]) {
