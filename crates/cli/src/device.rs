@@ -5,6 +5,7 @@ use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use kernels::InstructionSet;
 use models::kernel_ops::{Kernels, choose_kernels};
+use models::layers::{Precision, choose_precision};
 
 /// Where the network computes, and how.
 #[derive(Args, Clone, Debug)]
@@ -15,6 +16,18 @@ pub struct DeviceArgs {
     /// What computes on flex
     #[arg(long, value_enum, default_value = "auto")]
     pub kernels: KernelChoice,
+    /// What convolutions and linear layers multiply
+    #[arg(long, value_enum, default_value = "f32")]
+    pub precision: PrecisionChoice,
+}
+
+/// The floats of the hot operations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum PrecisionChoice {
+    /// Single precision
+    F32,
+    /// Half precision, on wgpu and cuda; batch norms, losses, weights and optimiser stay f32
+    F16,
 }
 
 /// The forms of the hot operations.
@@ -30,7 +43,7 @@ pub enum KernelChoice {
 
 impl Default for DeviceArgs {
     fn default() -> Self {
-        DeviceArgs { device: "flex".into(), kernels: KernelChoice::Auto }
+        DeviceArgs { device: "flex".into(), kernels: KernelChoice::Auto, precision: PrecisionChoice::F32 }
     }
 }
 
@@ -38,7 +51,7 @@ impl DeviceArgs {
     /// The device; the choice of kernels holds for this process from now on.
     ///
     /// # Errors
-    /// As [`parse_device`]; an instruction set named in the environment that does not exist.
+    /// As [`parse_device`]; an instruction set named in the environment that does not exist; half precision where it does not run.
     pub fn open(&self) -> Result<Device> {
         choose_kernels(match self.kernels {
             KernelChoice::Auto => Kernels::Auto,
@@ -46,13 +59,29 @@ impl DeviceArgs {
             KernelChoice::Burn => Kernels::Burn,
         });
         InstructionSet::in_use()?;
-        parse_device(&self.device)
+        let device = parse_device(&self.device)?;
+        let precision = match self.precision {
+            PrecisionChoice::F32 => Precision::F32,
+            PrecisionChoice::F16 => Precision::F16,
+        };
+        if precision == Precision::F16 && matches!(self.device.as_str(), "flex" | "ndarray") {
+            bail!("--precision f16 is for GPUs (--device wgpu or cuda): on the CPU it would only be slower");
+        }
+        if !precision.runs_on(&device) {
+            bail!("device {} does not compute in half precision: leave out --precision f16", self.device);
+        }
+        choose_precision(precision);
+        Ok(device)
     }
 
     /// The words that say the same to another process.
     pub fn words(&self) -> Vec<String> {
         let kernels = self.kernels.to_possible_value().map_or(String::new(), |value| value.get_name().to_string());
-        ["--device", &self.device, "--kernels", &kernels].map(String::from).to_vec()
+        let mut words = ["--device", &self.device, "--kernels", &kernels].map(String::from).to_vec();
+        if self.precision == PrecisionChoice::F16 {
+            words.extend(["--precision", "f16"].map(String::from));
+        }
+        words
     }
 
     /// Device and kernels in words.
@@ -64,6 +93,7 @@ impl DeviceArgs {
                 let instructions = InstructionSet::in_use().map_or("best", InstructionSet::name);
                 format!("flex, own kernels, {instructions}, {transform}")
             }
+            (device, _) if self.precision == PrecisionChoice::F16 => format!("{device}, half precision"),
             (device, _) => device.into(),
         }
     }

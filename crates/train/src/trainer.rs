@@ -12,6 +12,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use data::{Dataset, write_atomic};
 use models::checkpoint::read_checkpoint;
+use models::layers::Precision;
 use models::{Detector, ModelError, Sample, reference_name};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -209,9 +210,12 @@ impl<'a> Run<'a> {
         if let Some((name, _)) = values[1..].iter().chain(&values[..1]).find(|(_, value)| !value.is_finite()) {
             return Err(self.not_finite(format!("the loss {name}"), batch));
         }
+        let scale = Precision::chosen().loss_scale();
         let (gradients, norm) = clock.backward(|| {
-            let gradients = GradientsParams::from_grads(losses.total.backward(), &self.detector.network);
-            let norm = GradientNorm::of(&self.detector.network, &gradients, reference_name);
+            let loss = if scale == 1.0 { losses.total } else { losses.total * scale };
+            let gradients = GradientsParams::from_grads(loss.backward(), &self.detector.network);
+            let mut norm = GradientNorm::of(&self.detector.network, &gradients, reference_name);
+            norm.total /= scale;
             (gradients, norm)
         });
         if let Some(parameter) = norm.not_finite {
@@ -220,7 +224,7 @@ impl<'a> Run<'a> {
         let (lr, beta1) = self.schedule.at(self.state.step);
         let clip = norm.clip_scale(self.config.detector.optimization.clip_norm);
         clock.optimizer(|| {
-            self.detector.network = self.adam.step(self.detector.network.clone(), gradients, clip, (lr, beta1));
+            self.detector.network = self.adam.step(self.detector.network.clone(), gradients, clip / scale, (lr, beta1));
         });
         Ok(Step { losses: values, gradient_norm: norm.total, lr, beta1 })
     }

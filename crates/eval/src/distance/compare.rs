@@ -16,6 +16,9 @@ use std::fmt;
 /// Version of [`Distances`] as JSON.
 pub const DISTANCES_SCHEMA: &str = "lidarshift.distances/2";
 
+/// Edge of the cells in which a cloud is halved for its floor, m.
+pub const FLOOR_CELL_M: f64 = 4.0;
+
 /// What is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
@@ -176,9 +179,9 @@ pub struct MeasureRow {
     pub deviation: Option<f64>,
     /// Bootstrap interval of the mean over the pairs.
     pub interval: Option<Interval>,
-    /// What two draws of A's own cloud give: its two halves by chance, or for [`Measure::EmdM`] and [`Measure::SinkhornM`] two
-    /// sub-samples without a point in common. Nearer than that is no difference. Halves are thinner than the cloud, so that for the
-    /// Chamfer distances this is an upper bound.
+    /// What two draws of A's own cloud give: its two halves by chance, cell of [`FLOOR_CELL_M`] by cell, so that no half loses an object
+    /// whole; the odd point of a cell is in both. For [`Measure::EmdM`] and [`Measure::SinkhornM`] sub-samples of the two. Nearer than that is
+    /// no difference. Halves are thinner than the cloud, so that for the Chamfer distances of dense clouds this is an upper bound.
     pub floor: Option<f64>,
 }
 
@@ -359,10 +362,24 @@ fn floor(cloud: &[Point], sample: usize, options: &DistanceOptions) -> Result<Op
     if cloud.len() < 2 {
         return Ok(None);
     }
-    let all = shuffled(cloud, cloud.len(), "distances floor", sample, options);
-    let (a, b) = all.split_at(cloud.len() / 2);
-    let chamfer = Chamfer::of_nearest(&nearest(a, b)?, &nearest(b, a)?);
-    measures(&chamfer, a, b, sample, options).map(Some)
+    let [a, b] = halves(cloud, sample, options);
+    let chamfer = Chamfer::of_nearest(&nearest(&a, &b)?, &nearest(&b, &a)?);
+    measures(&chamfer, &a, &b, sample, options).map(Some)
+}
+
+/// Two halves by chance, cell by cell; the odd point of a cell is in both.
+fn halves(cloud: &[Point], sample: usize, options: &DistanceOptions) -> [Vec<Point>; 2] {
+    let cell = |p: &Point| p.map(|v| (f64::from(v) / FLOOR_CELL_M).floor() as i32);
+    let mut all = shuffled(cloud, cloud.len(), "distances floor", sample, options);
+    all.sort_by_key(cell);
+    let mut halves = [vec![], vec![]];
+    for of_cell in all.chunk_by(|p, q| cell(p) == cell(q)) {
+        for pair in of_cell.chunks(2) {
+            halves[0].push(pair[0]);
+            halves[1].push(pair[pair.len() - 1]);
+        }
+    }
+    halves
 }
 
 /// The first `n` of the points in a drawn order; all of a smaller cloud.
@@ -446,6 +463,20 @@ mod tests {
         // A has nothing in the middle section: no pair, and that is said.
         let mid = row(Part::Section(RangeSection::PAPER[1]), Measure::EmdM);
         assert_eq!((mid.frames, mid.left_out, mid.mean), (0, 30, None));
+    }
+
+    #[test]
+    fn halves_lose_no_object() {
+        let mut cloud: Vec<Point> = (0..9).map(|i| [10.0 + 0.01 * i as f32, 1.0, 1.0]).collect();
+        cloud.extend([[90.0, 1.0, 1.0], [91.0, 1.0, 1.0], [-50.0, 1.0, 1.0]]);
+        let [a, b] = halves(&cloud, 0, &options());
+        let far = |half: &[Point], from: f32, to: f32| half.iter().filter(|p| p[0] >= from && p[0] < to).count();
+        for half in [&a, &b] {
+            assert_eq!((far(half, 0.0, 20.0), far(half, 88.0, 92.0), far(half, -60.0, 0.0)), (5, 1, 1), "{half:?}");
+        }
+        assert!(far(&a, 90.5, 92.0) != far(&b, 90.5, 92.0));
+        let sum = floor(&cloud, 0, &options()).unwrap().unwrap()[0];
+        assert!(sum < 2.5, "{sum}: no point is farther from the other half than its neighbour");
     }
 
     #[test]

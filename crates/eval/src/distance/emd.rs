@@ -16,7 +16,7 @@ pub fn emd(a: &[Point], b: &[Point]) -> Result<f64, DistanceError> {
     }
     let n = a.len();
     let costs: Vec<f64> = a.iter().flat_map(|p| b.iter().map(|q| apart_m(p, q))).collect();
-    let row_of = cheapest_assignment(&costs, n);
+    let row_of = pulp::Arch::new().dispatch(|| cheapest_assignment(&costs, n)); // with the widest instructions there are
     Ok(row_of.iter().enumerate().map(|(column, row)| costs[row * n + column]).sum::<f64>() / n as f64)
 }
 
@@ -24,6 +24,7 @@ pub fn emd(a: &[Point], b: &[Point]) -> Result<f64, DistanceError> {
 const NONE: usize = usize::MAX;
 
 /// The row of each column of `costs`, `[n, n]` and finite, so that the sum is least.
+#[inline(always)]
 fn cheapest_assignment(costs: &[f64], n: usize) -> Vec<usize> {
     // Prices u of rows and v of columns: u + v is nowhere above the cost, and equals it where row and column are assigned.
     let mut v = vec![f64::INFINITY; n];
@@ -89,6 +90,7 @@ fn cheapest_assignment(costs: &[f64], n: usize) -> Vec<usize> {
 }
 
 /// The first place of the least value, and that value.
+#[inline(always)]
 fn least(values: &[f64]) -> (usize, f64) {
     let min = |a: f64, b: f64| if b < a { b } else { a };
     let (chunks, rest) = values.as_chunks::<8>();

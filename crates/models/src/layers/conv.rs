@@ -1,5 +1,6 @@
 //! Convolutions with what follows them.
 
+use super::precision::multiply;
 use super::{BatchNorm, Init, Mode, host};
 use crate::kernel_ops::{conv3x3, folded_conv3x3, folded_transposed, pixel_heads, transposed};
 use burn::module::{Module, Param};
@@ -34,8 +35,10 @@ impl ConvBnRelu {
         {
             return y;
         }
-        let y = conv3x3(&x, &weight, stride)
-            .unwrap_or_else(|| conv2d(x, weight, None, ConvOptions::new([stride; 2], [1, 1], [1, 1], 1)));
+        let y = conv3x3(&x, &weight, stride).unwrap_or_else(|| {
+            let options = ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
+            multiply(x, weight, |x, weight| conv2d(x, weight, None, options))
+        });
         norm_relu(&self.norm, y, mode)
     }
 }
@@ -69,7 +72,8 @@ impl DeconvBnRelu {
             return y;
         }
         let y = transposed(&x, &weight, stride).unwrap_or_else(|| {
-            conv_transpose2d(x, weight, None, ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1))
+            let options = ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1);
+            multiply(x, weight, |x, weight| conv_transpose2d(x, weight, None, options))
         });
         norm_relu(&self.norm, y, mode)
     }

@@ -4,12 +4,14 @@ mod batch_norm;
 mod conv;
 mod host;
 mod init;
+mod precision;
 mod rows;
 
 pub use batch_norm::{BatchNorm, Moments};
 pub use conv::{ConvBnRelu, DeconvBnRelu, PointwiseConv};
 pub use host::host;
 pub use init::Init;
+pub use precision::{Precision, choose_precision};
 pub use rows::{RowCounts, RowsBnRelu, RowsLinear, rows_kernel};
 
 /// Whether a pass learns (batch statistics, running ones updated) or only looks (running statistics).

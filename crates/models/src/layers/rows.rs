@@ -1,5 +1,6 @@
 //! Layers over rows: each row is a point, or a point of a group. What PyTorch writes as linear layers and 1x1 convolutions.
 
+use super::precision::multiply;
 use super::{BatchNorm, Init, Mode};
 use crate::kernel_ops::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
 use crate::point_ops::Groups;
@@ -207,7 +208,7 @@ fn matrix<const D: usize>(weight: &Param<Tensor<D>>) -> Tensor<2> {
 fn project<const D: usize>(weight: &Param<Tensor<D>>, x: Tensor<2>, first: usize) -> Tensor<2> {
     let (matrix, columns) = (matrix(weight), x.dims()[1]);
     let matrix = if columns == matrix.dims()[1] { matrix } else { matrix.narrow(1, first, columns) };
-    x.matmul(matrix.transpose())
+    multiply(x, matrix.transpose(), Tensor::matmul)
 }
 
 #[cfg(test)]
