@@ -3,7 +3,6 @@
 use crate::channels::returns;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
 use crate::error::DiagnoseError;
-use crate::inference::noise::NoiseLaw;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     FramePair, Mending, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all, with_points,
@@ -110,8 +109,7 @@ pub fn diagnose(
     let (geometry, displaced) = search::geometry::search(&context);
     results.push(geometry);
     progress(Stage::Weighing, 1, searches);
-    let (rounding, added) = search::quantisation::search(&context);
-    let known: Vec<_> = added.map(|v| (NoiseLaw::Constant, v)).into_iter().collect();
+    let (rounding, step_m) = search::quantisation::search(&context);
     results.push(rounding);
     progress(Stage::Weighing, 2, searches);
     // What stands elsewhere is moved back before silhouettes and single returns are looked at.
@@ -121,24 +119,27 @@ pub fn diagnose(
     let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
     let upright = if displaced.moves() { Some(again(moved)?) } else { None };
     context.frames = upright.as_deref().unwrap_or(&frames);
-    let (hidden, mask) = search::mask::search(&context);
+    let elsewhere = displaced.moves() || displaced.aims();
+    let (hidden, mask) = search::mask::search(&context, elsewhere);
     results.push(hidden);
-    results.push(search::hits::search(&context, &mask, displaced.moves()));
+    results.push(search::hits::search(&context, &mask, elsewhere));
     progress(Stage::Weighing, 3, searches);
     results.push(search::returns::search(&context));
     progress(Stage::Weighing, 4, searches);
     // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
-    let even = match &displaced.groups {
-        Some(_) => Some(again(Mending { range_m: Some(&off), ..moved })?),
-        None => None,
+    let uneven = displaced.groups.is_some();
+    let even = match (uneven, step_m) {
+        (false, None) => None,
+        // Rounding steps are no noise: the simulated side is rounded alike.
+        _ => Some(again(Mending { range_m: uneven.then_some(&off), step_m, ..moved })?),
     };
     if let Some(even) = &even {
         context.frames = even;
     }
-    let least_cos = if even.is_some() { 0.12 } else { 0.0 };
-    results.push(search::noise::search(&context, &known, least_cos));
+    let least_cos = if uneven { 0.12 } else { 0.0 };
+    results.push(search::noise::search(&context, &[], least_cos));
     context.frames = &frames;
     progress(Stage::Weighing, 5, searches);
     results.push(search::labels::search(&context, Side::Labels, &displaced));

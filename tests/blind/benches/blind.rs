@@ -2,12 +2,14 @@
 //! run goes on.
 //!
 //! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N] [--shots N]
-//! [--out DIR] [--keep DIR]`
+//! [--out DIR] [--keep DIR] [--draw-only]`
+//!
+//! `--keep` leaves the drawn pairs in a folder and takes from there what is drawn already; `--draw-only` draws and diagnoses nothing.
 
 use data::Dataset;
 use diagnose::{Options, SensorRig, diagnose};
 use lidarshift_blind::score::{Outcome, score, summarise};
-use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
+use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, Truth, draw_case, write_case};
 use rand::RngExt;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -19,6 +21,7 @@ struct Arguments {
     size: CaseSize,
     out: PathBuf,
     keep: Option<PathBuf>,
+    draw_only: bool,
 }
 
 fn arguments() -> Arguments {
@@ -29,6 +32,7 @@ fn arguments() -> Arguments {
         size: CaseSize::USUAL,
         out: PathBuf::from("bench/blind"),
         keep: None,
+        draw_only: false,
     };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
@@ -41,6 +45,7 @@ fn arguments() -> Arguments {
             "--shots" => out.size.shots = value().parse().expect("a number of shots"),
             "--out" => out.out = value().into(),
             "--keep" => out.keep = Some(value().into()),
+            "--draw-only" => out.draw_only = true,
             "--bench" => {}
             other => panic!("unknown word {other}"),
         }
@@ -74,9 +79,19 @@ fn kind_of(seed: u64, kinds: &[String]) -> Kind {
     }
 }
 
-fn run(seed: u64, arguments: &Arguments, folder: &Path) -> (Outcome, serde_json::Value) {
-    let case = draw_case(seed, kind_of(seed, &arguments.kinds), arguments.size);
-    let truth = write_case(&case, folder).expect("a case can be written");
+/// Draws the pair of a seed into `folder`, unless it lies there; the truth lies beside the folder, not in it.
+fn draw(seed: u64, arguments: &Arguments, folder: &Path) -> Truth {
+    let told = folder.with_extension("truth.json");
+    let drawn = std::fs::read(&told).ok().and_then(|bytes| serde_json::from_slice::<Truth>(&bytes).ok());
+    drawn.unwrap_or_else(|| {
+        let case = draw_case(seed, kind_of(seed, &arguments.kinds), arguments.size);
+        let truth = write_case(&case, folder).expect("a case can be written");
+        data::write_atomic(&told, &serde_json::to_vec_pretty(&truth).expect("JSON")).expect("the truth");
+        truth
+    })
+}
+
+fn run(truth: &Truth, folder: &Path) -> (Outcome, serde_json::Value) {
     let begin = Instant::now();
     let open = |side: &str| Dataset::open(&folder.join(side)).expect("a data set");
     let rig = SensorRig::read(&folder.join("sensor.toml")).expect("a rig");
@@ -85,7 +100,7 @@ fn run(seed: u64, arguments: &Arguments, folder: &Path) -> (Outcome, serde_json:
         Ok(o) => serde_json::to_value(&o.diagnosis).expect("JSON"),
         Err(e) => serde_json::json!({ "verdict": format!("error: {e}") }),
     };
-    (score(&truth, &value, begin.elapsed().as_secs_f64()), value)
+    (score(truth, &value, begin.elapsed().as_secs_f64()), value)
 }
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
@@ -96,11 +111,15 @@ fn main() {
     for seed in arguments.first..arguments.first + arguments.cases {
         let path = arguments.out.join(format!("case-{seed}.json"));
         let done = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice::<Outcome>(&bytes).ok());
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let place = arguments.keep.as_deref().unwrap_or(folder.path()).join(seed.to_string());
+        if arguments.draw_only {
+            draw(seed, &arguments, &place);
+            continue;
+        }
         let outcome = done.unwrap_or_else(|| {
-            let folder = tempfile::tempdir().expect("a temporary folder");
-            let place =
-                arguments.keep.as_deref().map_or_else(|| folder.path().to_owned(), |k| k.join(seed.to_string()));
-            let (outcome, value) = run(seed, &arguments, &place);
+            let truth = draw(seed, &arguments, &place);
+            let (outcome, value) = run(&truth, &place);
             let told = arguments.out.join(format!("diagnosis-{seed}.json"));
             data::write_atomic(&told, &serde_json::to_vec_pretty(&value).expect("JSON")).expect("a diagnosis");
             data::write_atomic(&path, &serde_json::to_vec_pretty(&outcome).expect("JSON")).expect("a result");
@@ -120,6 +139,9 @@ fn main() {
             outcome.seconds
         );
         outcomes.push(outcome);
+    }
+    if arguments.draw_only {
+        return;
     }
     let summary = summarise(&outcomes);
     let text = serde_json::to_vec_pretty(&summary).expect("JSON");

@@ -67,6 +67,8 @@ pub struct Sums {
     pub returns: f64,
     /// Sum of (R tan(incidence))^2 where it is below 100 m^2.
     pub lever: f64,
+    /// Returns that what is hidden takes away, adds, or puts elsewhere by more than 0.35 m.
+    pub touched: f64,
     /// Boxes with five points or more, and the sum of their squared speeds.
     pub boxes: [f64; 2],
 }
@@ -126,6 +128,7 @@ impl Side<'_> {
             _ => None,
         });
         let mut scan = Scan { points: Vec::new(), boxes: Vec::new(), sums: Sums::default() };
+        let reshaped = self.effects.iter().any(|e| matches!(e, Effect::WrongShape { .. }));
         let mut on_car = vec![0usize; self.world.drivers.len()];
         for (k, mount) in self.rig.iter().enumerate() {
             let believed_pose = mount.pose();
@@ -154,7 +157,10 @@ impl Side<'_> {
                             Effect::AngularJitter { sigma_rad } => {
                                 let radius = 2.0 * sigma_rad * rng.random::<f64>().sqrt();
                                 let angle = rng.random::<f64>() * std::f64::consts::TAU;
-                                shot = small_turn([0.0, -radius * angle.sin(), radius * angle.cos()]) * shot;
+                                // Across the shot, not about the sensor's axes: a turn about y leaves a shot along y where it is.
+                                let side = Vector3::new(-az.sin(), az.cos(), 0.0);
+                                let up = shot.cross(&side);
+                                shot = (shot + (side * angle.cos() + up * angle.sin()) * radius.tan()).normalize();
                             }
                             Effect::MixedPixels { divergence_rad } => divergence = *divergence_rad,
                             _ => {}
@@ -169,12 +175,15 @@ impl Side<'_> {
                         stuff: Stuff::Carbon,
                         car: None,
                     });
+                    scan.sums.touched += f64::from(u8::from(met.is_some()));
                     let met = met.or_else(|| moment.cast(&origin, &ray));
                     let hit = met.map(|mut hit| {
                         if divergence > 0.0 && hit.range_m > 1.0 {
+                            let sharp = hit.range_m;
                             hit.range_m = blurred(&hit, divergence, &shot, |d| {
                                 moment.cast(&origin, &(true_pose.rotation * d)).map(|h| h.range_m)
                             });
+                            scan.sums.touched += f64::from(u8::from((hit.range_m - sharp).abs() > 0.35));
                         }
                         hit
                     });
@@ -185,9 +194,12 @@ impl Side<'_> {
                         if let Some(car) = hit.car {
                             on_car[car] += 1;
                         }
+                        let other = hit.stuff == Stuff::Container || hit.car.is_some() && reshaped;
+                        scan.sums.touched += f64::from(u8::from(other));
                     }
                     let angles = [az, el];
-                    if let Some(range) = self.returned(hit, &ray, k, row, angles, mount, rng) {
+                    let lost = &mut scan.sums.touched;
+                    if let Some(range) = self.returned(hit, &ray, k, row, angles, mount, lost, rng) {
                         let p = believed_pose * Point3::from(said * range);
                         scan.points.push([p.x as f32, p.y as f32, p.z as f32]);
                     }
@@ -211,6 +223,7 @@ impl Side<'_> {
         row: usize,
         [az, el]: [f64; 2],
         mount: &Mount,
+        touched: &mut f64,
         rng: &mut Stream,
     ) -> Option<f64> {
         let false_share = self.effects.iter().find_map(|e| match e {
@@ -218,6 +231,7 @@ impl Side<'_> {
             _ => None,
         });
         if rng.random::<f64>() < self.nuisances.false_returns + false_share.unwrap_or(0.0) {
+            *touched += f64::from(u8::from(false_share.is_some()));
             return Some(rng.random_range(0.8..REACH_M));
         }
         let hit = hit?;
@@ -254,6 +268,7 @@ impl Side<'_> {
                 _ => 1.0,
             };
             if rng.random::<f64>() >= kept {
+                *touched += 1.0;
                 return None;
             }
             match effect {

@@ -17,6 +17,8 @@ pub enum Stuff {
     Carbon,
     /// Tyres.
     Rubber,
+    /// Things that only one side has.
+    Container,
 }
 
 /// Where a ray meets a surface, in the frame of the ray.

@@ -10,8 +10,8 @@ pub struct Track {
     pub straight_m: f64,
     /// Radius of the centre line in the turns, m.
     pub radius_m: f64,
-    /// Banking on the straights and in the turns, rad.
-    pub bank_rad: [f64; 2],
+    /// Slope across the road on the straights and in the turns: tangents of the banking.
+    pub slope: [f64; 2],
     /// Half of the road's width, m.
     pub half_width_m: f64,
     /// Amplitude of long waves of the surface, m.
@@ -64,8 +64,8 @@ impl Track {
         }
     }
 
-    /// Banking at a position along the centre line, rad; 0 at the left edge's side down.
-    fn bank_rad(&self, s: f64) -> f64 {
+    /// Slope across the road at a position along the centre line; positive: the left edge is down.
+    fn slope_at(&self, s: f64) -> f64 {
         let turn = PI * self.radius_m;
         let ramp = 50.0;
         let soft = |d: f64| {
@@ -76,15 +76,25 @@ impl Track {
         let one = |begin: f64| soft(s - begin) * (1.0 - soft(s - begin - turn));
         let lap = self.lap_m();
         let inside = one(self.straight_m) + one(2.0 * self.straight_m + turn) + one(2.0 * self.straight_m + turn - lap);
-        self.bank_rad[0] + (self.bank_rad[1] - self.bank_rad[0]) * inside.min(1.0)
+        self.slope[0] + (self.slope[1] - self.slope[0]) * inside.min(1.0)
     }
 
     /// Height of the road and of the apron beside it, m.
     pub fn height_m(&self, x: f64, y: f64) -> f64 {
         let (s, left) = self.curve_coordinates(x, y);
-        let across = left.clamp(-1.3 * self.half_width_m, 1.6 * self.half_width_m);
         let waves = self.waves_m * ((s * 0.11).sin() + 0.6 * (s * 0.043 + left * 0.2).cos());
-        -across * self.bank_rad(s).tan() + waves
+        self.plain_m(s, left) + waves
+    }
+
+    /// Height that the road does not reach beyond, waves included, m.
+    pub fn at_most_m(&self, x: f64, y: f64) -> f64 {
+        let (s, left) = self.curve_coordinates(x, y);
+        self.plain_m(s, left) + 1.6 * self.waves_m
+    }
+
+    /// Height without waves, m.
+    fn plain_m(&self, s: f64, left: f64) -> f64 {
+        -left.clamp(-1.3 * self.half_width_m, 1.6 * self.half_width_m) * self.slope_at(s)
     }
 
     /// Pose of a car whose reference stands `above_m` over the road: x along the curve, z along the surface's normal.
@@ -111,7 +121,7 @@ mod tests {
 
     #[test]
     fn coordinates_go_round() {
-        let track = Track { straight_m: 300.0, radius_m: 120.0, bank_rad: [0.1, 0.3], half_width_m: 7.0, waves_m: 0.0 };
+        let track = Track { straight_m: 300.0, radius_m: 120.0, slope: [0.1, 0.31], half_width_m: 7.0, waves_m: 0.0 };
         let mut before = track.height_m(track.at(0.0, -5.0).0[0], track.at(0.0, -5.0).0[1]);
         for i in 0..2000 {
             let (s, left) = (track.lap_m() * i as f64 / 2000.0, -5.0 + (i % 11) as f64);

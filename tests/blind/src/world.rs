@@ -80,7 +80,7 @@ pub fn draw_world(rng: &mut Stream, ego_above_m: f64) -> World {
     let track = Track {
         straight_m: rng.random_range(120.0..420.0),
         radius_m: rng.random_range(70.0..220.0),
-        bank_rad: [rng.random_range(0.0..0.12), rng.random_range(0.1..0.33)],
+        slope: [rng.random_range(0.0..0.12f64).tan(), rng.random_range(0.1..0.33f64).tan()],
         half_width_m: rng.random_range(5.5..8.0),
         waves_m: rng.random_range(0.0..0.02),
     };
@@ -160,7 +160,7 @@ impl World {
         match hit.stuff {
             Stuff::Asphalt => self.reflectivity[0],
             Stuff::Concrete => self.reflectivity[1],
-            Stuff::Metal => 0.5,
+            Stuff::Metal | Stuff::Container => 0.5,
             Stuff::Paint => hit.car.map_or(0.4, |car| self.drivers[car].paint),
             Stuff::Carbon => 0.07,
             Stuff::Rubber => 0.04,
@@ -281,15 +281,29 @@ impl World {
         })
     }
 
-    /// Marches with steps that cannot pass the surface, then halves the last one.
+    /// Marches with steps that cannot pass the surface, then closes in on it by chords.
     fn cast_road(&self, o: &Point3<f64>, d: &Vector3<f64>, before_m: f64) -> Option<(f64, Vector3<f64>)> {
+        let track = &self.track;
         let gap = |t: f64| {
             let p = o + d * t;
-            p.z - self.track.height_m(p.x, p.y)
+            p.z - track.height_m(p.x, p.y)
         };
-        let steepest = (self.track.bank_rad[1].max(self.track.bank_rad[0])).tan() + 0.02;
+        let steepest = track.slope[1].max(track.slope[0]) + 0.02;
         let fall = (steepest * d.xy().norm() - d.z).max(1e-3);
-        let (mut t, mut g) = (0.0, gap(0.0));
+        // Above the highest waves their phase does not matter.
+        let (mut t, mut above) = (0.0, f64::INFINITY);
+        while above > 0.15 {
+            let p = o + d * t;
+            above = p.z - track.at_most_m(p.x, p.y);
+            if t > before_m || t > REACH_M {
+                return None;
+            }
+            t += (above / fall).max(0.0);
+        }
+        let mut g = gap(t);
+        if g <= 0.0 {
+            (t, g) = (0.0, gap(0.0));
+        }
         while g > 0.0 {
             let next = t + (g / fall).max(0.25);
             if t > before_m || next > REACH_M {
@@ -297,18 +311,14 @@ impl World {
             }
             let after = gap(next);
             if after <= 0.0 {
-                let (mut low, mut high) = (t, next);
-                for _ in 0..40 {
-                    let middle = 0.5 * (low + high);
-                    if gap(middle) > 0.0 { low = middle } else { high = middle }
-                }
+                let high = crossing((t, g), (next, after), gap);
                 if high >= before_m {
                     return None;
                 }
                 let p = o + d * high;
                 let h = 0.05;
                 let slope = |dx: f64, dy: f64| {
-                    (self.track.height_m(p.x + dx, p.y + dy) - self.track.height_m(p.x - dx, p.y - dy)) / (2.0 * h)
+                    (track.height_m(p.x + dx, p.y + dy) - track.height_m(p.x - dx, p.y - dy)) / (2.0 * h)
                 };
                 return Some((high, Vector3::new(-slope(h, 0.0), -slope(0.0, h), 1.0).normalize()));
             }
@@ -316,6 +326,25 @@ impl World {
         }
         None
     }
+}
+
+/// Where a function falls through zero between two places: chords, the end that stays counted half.
+fn crossing(mut above: (f64, f64), mut below: (f64, f64), gap: impl Fn(f64) -> f64) -> f64 {
+    for _ in 0..40 {
+        let t = (above.0 * below.1 - below.0 * above.1) / (below.1 - above.1);
+        let g = gap(t);
+        if g.abs() < 1e-9 || below.0 - above.0 < 1e-9 {
+            return t;
+        }
+        if g > 0.0 {
+            above = (t, g);
+            below.1 *= 0.5;
+        } else {
+            below = (t, g);
+            above.1 *= 0.5;
+        }
+    }
+    below.0
 }
 
 #[cfg(test)]

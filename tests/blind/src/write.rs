@@ -81,6 +81,7 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
         let s = s?;
         total.returns += s.returns;
         total.lever += s.lever;
+        total.touched += s.touched;
         total.boxes = [total.boxes[0] + s.boxes[0], total.boxes[1] + s.boxes[1]];
     }
     Ok(truth(case, &nuisances, &own, &total))
@@ -118,7 +119,7 @@ fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
         let z = world.track.height_m(x, y) + size.z / 2.0;
         let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading);
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), turn);
-        world.things.push(Solid { pose, form: Form::Cuboid(size / 2.0), stuff: Stuff::Metal });
+        world.things.push(Solid { pose, form: Form::Cuboid(size / 2.0), stuff: Stuff::Container });
     }
 }
 
@@ -151,6 +152,7 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, sums: &Sums) -> Tr
         in_catalogue: effect.cause().is_some(),
         parameters: effect.parameters(),
         bound: bound(effect),
+        touched: sums.touched,
     });
     let kind = match case.kind {
         Kind::Null => "null",

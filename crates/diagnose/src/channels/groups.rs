@@ -64,6 +64,11 @@ impl GroupSums {
         self.n += other.n;
     }
 
+    /// Takes a level off the offset of one of the columns.
+    pub fn lower(&mut self, column: usize, level: f64) {
+        self.right[column] -= level * self.gram[2 * column];
+    }
+
     /// Best offset of one of the columns with a prior precision.
     pub fn offset(&self, column: usize, precision: f64) -> f64 {
         self.right[column] / (self.gram[2 * column] + precision)
@@ -101,7 +106,8 @@ pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
 pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -> f64 {
     let (az, el) = (f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
     let up = sensor_turn * Vector3::new(-el.sin() * az.cos(), -el.sin() * az.sin(), el.cos());
-    // The light went up by this angle: the surface met stands where the ray says less.
+    // The light went up by this angle: the surface met stands where the ray says less. The predicted range: at grazing angles the measured
+    // one has the very distance in it that is to be explained.
     -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
 }
 

@@ -48,6 +48,9 @@ impl Mask {
 /// Returns of a cell of directions: simulated, measured beyond the own car, measured on it.
 pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 3]>;
 
+/// Nearer than this share of the simulated range, a near return is from the own car and not from the ground close by.
+const HALF_WAY: f64 = 0.6;
+
 /// Counts over some frames.
 pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCounts {
     let one = |i: &usize| {
@@ -57,8 +60,12 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
             counts.entry(direction_cell(ray)).or_default()[0] += 1.0;
         }
         for ray in &frame.measured {
-            let k = if ray.own_range_m() > OWN_CAR_M { 1 } else { 2 };
-            counts.entry(direction_cell(ray)).or_default()[k] += 1.0;
+            if ray.own_range_m() > OWN_CAR_M {
+                counts.entry(direction_cell(ray)).or_default()[1] += 1.0;
+            } else if ray.own_range_m() < HALF_WAY * f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] })
+            {
+                counts.entry(direction_cell(ray)).or_default()[2] += 1.0;
+            }
         }
         counts
     };
@@ -78,13 +85,22 @@ const FEWEST: f64 = 15.0;
 /// Cells that what stands in the way covers at least.
 const FEWEST_CELLS: usize = 4;
 
+/// Measured returns from the own car, of the simulated ones from beyond it: from this share on the own car hides a cell.
+const ON_OWN_CAR: f64 = 0.4;
+
 /// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
-/// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not.
-pub fn blocked_cells(counts: &DirectionCounts, expected: impl Fn(&DirectionCell) -> f64) -> BTreeSet<DirectionCell> {
+/// in a cell. They lie together, and either returns come from the own car instead, or on two opposite sides of them returns come back: where
+/// a scene ends or only stands elsewhere they do not. Where the scene is `displaced`, returns from the own car alone are believed.
+pub fn blocked_cells(
+    counts: &DirectionCounts,
+    displaced: bool,
+    expected: impl Fn(&DirectionCell) -> f64,
+) -> BTreeSet<DirectionCell> {
     let judged = |cell: &DirectionCell| counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, _]| seen / n);
+    let covered = |cell: &DirectionCell| counts.get(cell).is_some_and(|c| c[0] >= FEWEST && c[2] > ON_OWN_CAR * c[0]);
     let mut dark: BTreeSet<DirectionCell> = counts
         .keys()
-        .filter(|cell| judged(cell).is_some_and(|seen| seen < 0.12 && expected(cell) > 0.5))
+        .filter(|cell| covered(cell) || judged(cell).is_some_and(|seen| seen < 0.12 && expected(cell) > 0.5))
         .copied()
         .collect();
     let mut blocked = BTreeSet::new();
@@ -103,7 +119,13 @@ pub fn blocked_cells(counts: &DirectionCounts, expected: impl Fn(&DirectionCell)
         };
         let sides = [(1, 0), (-1, 0), (0, 1), (0, -1)]
             .map(|(a, e)| together.iter().filter(|c| open(**c, a, e)).count() * 8 >= together.len());
-        if together.len() >= FEWEST_CELLS && (sides[0] && sides[1] || sides[2] && sides[3]) {
+        let on_own_car = together.iter().filter(|c| covered(c)).count();
+        let stands_out = together.len() >= FEWEST_CELLS && (sides[0] && sides[1] || sides[2] && sides[3]);
+        if on_own_car >= 2 {
+            // What lies around and is dark for another reason does not belong to it.
+            let own = |c: &DirectionCell| covered(c) || stands_out && !displaced;
+            blocked.extend(together.into_iter().filter(own));
+        } else if stands_out && !displaced {
             blocked.extend(together);
         }
     }
@@ -142,10 +164,10 @@ pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     let between = |v: &[f64], low: f64, high: f64| above(v, low) - above(v, high);
     // The farthest measured return, but for one in two thousand.
     let farthest = a[a.len() - 1 - a.len() / 2000];
-    let lost = above(&b, farthest);
+    let lost = above(&b, 1.01 * farthest);
     let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
     let beyond = above(&a, 1.01 * farthest) / above(&b, 1.01 * farthest).max(1.0);
-    let step = lost > 60.0 && lost > 0.0005 * b.len() as f64 && beyond < 0.05;
+    let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
     (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
 }
 
@@ -194,10 +216,14 @@ mod tests {
                 counts.insert((0, az, el), [100.0, if hole || end { 2.0 } else { 97.0 }, 0.0]);
             }
         }
-        let blocked = blocked_cells(&counts, |_| 1.0);
+        let blocked = blocked_cells(&counts, false, |_| 1.0);
         assert_eq!(blocked.len(), 6);
+        assert!(blocked_cells(&counts, true, |_| 1.0).is_empty(), "a scene that stands elsewhere makes holes");
+        let mut plate = counts.clone();
+        plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| c[2] = 90.0);
+        assert_eq!(blocked_cells(&plate, true, |_| 1.0).len(), 6);
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
-        assert!(blocked_cells(&counts, |_| 0.2).is_empty(), "other losses explain it");
+        assert!(blocked_cells(&counts, false, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
     }
 }

@@ -101,7 +101,8 @@ pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
 /// Derivatives of the distance across the surface by a movement of the scene about `center`.
 pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVector<f64, 6> {
     let n = ray.normal_vector();
-    let lever = (ray.predicted_point(origin) - center).cross(&n);
+    // The lever is that of the place that was measured: at grazing angles a turn moves the predicted one along the surface by metres.
+    let lever = (origin + ray.direction_vector() * ray.own_range_m() - center).cross(&n);
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
 }
 
@@ -188,8 +189,10 @@ pub fn mean_frames(
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |(frame, pose): (&FramePair, &OwnPoses)| {
         let p = columns.len();
-        let mut out = MeanFrame { gram: DMatrix::zeros(p, p), right: DVector::zeros(p), rays: 0.0, squares: 0.0 };
-        let mut x = vec![0.0; p];
+        let (mut gram, mut right) = (vec![0.0; p * p], DVector::zeros(p));
+        let (mut rays, mut squares) = (0.0, 0.0);
+        // Most columns belong to other sensors and surfaces: only those that say something are multiplied.
+        let mut x: Vec<(usize, f64)> = Vec::with_capacity(p);
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
             let row = pose_row(ray, origin, &Point3::origin());
@@ -201,41 +204,31 @@ pub fn mean_frames(
             let phase = f64::from(ray.azimuth_rad) / (2.0 * half_fov[ray.sensor as usize]);
             let c = f64::from(ray.cos_incidence);
             let kind = kind_of(ray);
-            for (v, column) in x.iter_mut().zip(columns) {
-                *v = match *column {
+            x.clear();
+            for (k, column) in columns.iter().enumerate() {
+                let v = match *column {
                     Column::RangeOffset => -c,
                     Column::RangeScale => -c * f64::from(ray.range_m),
                     Column::Pose(k) => row[k],
-                    Column::SensorPose(s, k) => {
-                        if s == ray.sensor as usize {
-                            own[k]
-                        } else {
-                            0.0
-                        }
-                    }
+                    Column::SensorPose(s, k) if s == ray.sensor as usize => own[k],
                     Column::Sweep(k) => phase * [row[3], row[4], row[2]][k],
-                    Column::Structure(k) => f64::from(u8::from(k == kind)),
+                    Column::Structure(k) if k == kind => 1.0,
+                    Column::SensorPose(..) | Column::Structure(_) => continue,
                 };
+                x.push((k, v));
             }
             let w = weight(ray, noise_m) / design;
-            for i in 0..p {
-                let wx = w * x[i];
-                if wx != 0.0 {
-                    out.right[i] += wx * y;
-                    for j in 0..=i {
-                        out.gram[(i, j)] += wx * x[j];
-                    }
-                }
+            for (i, &(k, v)) in x.iter().enumerate() {
+                let wx = w * v;
+                right[k] += wx * y;
+                let line = &mut gram[k * p..(k + 1) * p];
+                x[..=i].iter().for_each(|&(j, u)| line[j] += wx * u);
             }
-            out.rays += 1.0;
-            out.squares += w * y * y;
+            rays += 1.0;
+            squares += w * y * y;
         }
-        for i in 0..p {
-            for j in 0..i {
-                out.gram[(j, i)] = out.gram[(i, j)];
-            }
-        }
-        out
+        let gram = DMatrix::from_fn(p, p, |i, j| gram[i.max(j) * p + i.min(j)]);
+        MeanFrame { gram, right, rays, squares }
     };
     frames.par_iter().zip(poses).map(one).collect()
 }

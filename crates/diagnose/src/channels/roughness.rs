@@ -126,7 +126,7 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a RoughFrame>) -> Vec<RoughCell>
     sum
 }
 
-/// By how much the measured returns of groups of directions are rougher than `expected` tells, in units of the simulated variance, as sums
+/// By how much the measured returns of groups of directions are rougher than `expected` tells, in units of the expected variance, as sums
 /// of every frame. `variances` gives the two sides' variances of a cell, `expected` the measured one in units of the simulated one.
 pub fn rough_groups(
     frames: &[FramePair],
@@ -147,12 +147,12 @@ pub fn rough_groups(
                 };
                 let Some([va, vb]) = variances(c) else { continue };
                 let square = v.abs().min(CAP * scales[c]).powi(2) / vb;
-                let (mean, spread) = if side == 0 { (expected(c, ray), va / vb) } else { (1.0, 1.0) };
+                let (mean, spread) = if side == 0 { (expected(c, ray).max(0.1), va / vb) } else { (1.0, 1.0) };
                 let sum =
                     &mut sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default()[side];
                 sum[0] += 1.0;
-                sum[1] += square - mean;
-                sum[2] += 2.0 * spread * spread;
+                sum[1] += square / mean - 1.0;
+                sum[2] += 2.0 * (spread / mean).powi(2);
             }
         }
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];

@@ -48,6 +48,24 @@ pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
     (total, mean / error)
 }
 
+/// Whether gains are there though few frames have most of them: what only some scenes show (a turn, a thing beside the road) gains much
+/// on some frames and loses next to nothing on the others.
+fn consistent(gains: &[f64]) -> bool {
+    let won: f64 = gains.iter().filter(|g| **g > 0.0).sum();
+    let lost: f64 = -gains.iter().filter(|g| **g < 0.0).sum::<f64>();
+    let plenty = gains.iter().filter(|g| **g > PLENTY).count();
+    plenty >= 3 && lost < 0.15 * won
+}
+
+/// Gain of a single frame that chance does not make, nats.
+const PLENTY: f64 = 8.0;
+
+/// Whether gains are significant.
+pub fn significant(gains: &[f64], z_least: f64) -> bool {
+    let (_, z) = total_and_z(gains);
+    z > z_least || z > 1.5 && consistent(gains)
+}
+
 /// Chooses, or finds nothing worth choosing.
 pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let eligible: Vec<usize> = (0..trials.len())
@@ -68,7 +86,7 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let chosen = simpler
         .min_by(|a, b| trials[*a].parameters.cmp(&trials[*b].parameters).then(total(*b).total_cmp(&total(*a))))
         .unwrap_or(best);
-    let equals = eligible
+    let mut equals: Vec<usize> = eligible
         .iter()
         .copied()
         .filter(|&i| trials[i].name != trials[chosen].name && trials[i].parameters <= trials[chosen].parameters)
@@ -78,6 +96,12 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
             z < 2.0 && deficit < 0.1 * total(chosen)
         })
         .collect();
+    // What brings far more on the whole, though not on enough frames to be sure of it, forbids to be sure of another name.
+    let far_better = |t: &Trial| {
+        let (gain, z) = total_and_z(&t.gains);
+        t.above_floor && t.name != trials[chosen].name && gain > 2.0 * total(chosen) && z > 1.5
+    };
+    equals.extend((0..trials.len()).filter(|i| !eligible.contains(i) && far_better(&trials[*i])));
     Some(Choice { chosen, equals })
 }
 
@@ -102,10 +126,20 @@ mod tests {
     }
 
     #[test]
+    fn what_only_some_frames_show_counts_and_what_hurts_others_does_not() {
+        let some = [0.0, 900.0, -1.0, 20.0, 0.0, 1500.0, -2.0, 30.0];
+        assert!(total_and_z(&some).1 < 3.0 && significant(&some, 3.0));
+        assert!(!significant(&some.map(|g| if g < 1.0 { g - 100.0 } else { g }), 3.0));
+        assert!(!significant(&[0.0, 900.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 3.0), "one frame is chance");
+    }
+
+    #[test]
     fn equals_are_told_and_noise_is_not_chosen() {
         let a = trial("a", 1, &[10.0, 11.0, 9.0, 10.0]);
         let b = trial("b", 1, &[10.4, 10.5, 9.6, 9.3]);
         assert_eq!(choose(&[a.clone(), b], &DEMANDS).unwrap().equals.len(), 1);
+        let scattered = trial("seldom", 2, &[90.0, 5.0, -10.0, 80.0]);
+        assert_eq!(choose(&[a.clone(), scattered], &DEMANDS).unwrap().equals, [1], "far more, though not for sure");
         assert!(choose(&[trial("noise", 1, &[30.0, -20.0, 25.0, -10.0])], &DEMANDS).is_none());
         assert!(choose(&[Trial { above_floor: false, ..a }], &DEMANDS).is_none());
     }

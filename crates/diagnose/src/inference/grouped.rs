@@ -52,8 +52,15 @@ pub fn smooth(sums: &BTreeMap<u32, GroupSums>, offsets: &BTreeMap<u32, f64>, how
     sums.keys().map(|k| (*k, near(*k))).collect()
 }
 
+/// Mean offset of all groups.
+fn level(sums: &BTreeMap<u32, GroupSums>, column: usize) -> f64 {
+    let (right, gram) = sums.values().fold((0.0, 0.0), |(r, g), s| (r + s.right[column], g + s.gram[2 * column]));
+    if gram > 0.0 { right / gram } else { 0.0 }
+}
+
 /// Gains of frames by offsets that were fitted on other folds and on other parts of each group: what surfaces of one part are wrong by does
-/// not tell the other parts. With `rough` over what a smooth law would gain.
+/// not tell the other parts. With `rough` over what a smooth law would gain. Where what groups have in common is taken out, it is taken out of
+/// each part by itself.
 pub fn cross_part_gains(
     frames: &[PartedFrame],
     select: &[usize],
@@ -65,7 +72,12 @@ pub fn cross_part_gains(
     let mut out = vec![0.0; select.len()];
     for fold in 0..FOLDS {
         let train: Vec<_> = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &frames[select[i]]).collect();
-        let parts: [_; PARTS] = std::array::from_fn(|part| total(train.iter().map(|f| &f[part])));
+        let mut parts: [_; PARTS] = std::array::from_fn(|part| total(train.iter().map(|f| &f[part])));
+        let levels = parts.each_mut().map(|sums| {
+            let level = if how.centred && !rough { level(sums, how.column) } else { 0.0 };
+            sums.values_mut().for_each(|s| s.lower(how.column, level));
+            level
+        });
         for part in 0..PARTS {
             let mut others = BTreeMap::<u32, GroupSums>::new();
             for (_, sums) in parts.iter().enumerate().filter(|(p, _)| *p != part) {
@@ -74,7 +86,9 @@ pub fn cross_part_gains(
             let told = offsets(&others, how);
             let smooth = if rough { smooth(&others, &told, how) } else { BTreeMap::new() };
             for i in (0..select.len()).filter(|&i| folds[i] == fold) {
-                let frame = &frames[select[i]][part];
+                let mut frame = frames[select[i]][part].clone();
+                frame.iter_mut().for_each(|(_, s)| s.lower(how.column, levels[part]));
+                let frame = &frame;
                 out[i] += gain(frame, how.column, &told) - gain(frame, how.column, &smooth);
             }
         }

@@ -50,6 +50,9 @@ pub struct Sensors {
 /// Half widths of the window of neighbours, in steps.
 const WINDOW: [f32; 2] = [2.2, 1.4];
 
+/// Returns with no more than that in company are not of a surface.
+const LONE: u8 = 1;
+
 /// A measured return farther than that from the surface says nothing of its neighbours, m across.
 const STRAY_M: f64 = 0.5;
 
@@ -70,6 +73,8 @@ pub struct Mending<'a> {
     pub range_m: Option<&'a (dyn Fn(&Ray) -> f64 + Sync)>,
     /// How far points are shown from where they are.
     pub shift_m: Option<ShownShift<'a>>,
+    /// Step to which simulated ranges are to be rounded as the measured ones are, m.
+    pub step_m: Option<f64>,
 }
 
 /// Pairs a frame, return by return.
@@ -92,6 +97,10 @@ pub fn pair_frame(
             });
         }
     }
+    if let Some(step) = mending.step_m {
+        let round = |r: &mut f32| *r = ((f64::from(*r) / step).round() * step).max(0.05) as f32;
+        scans[1].iter_mut().flat_map(|s| &mut s.range_m).for_each(round);
+    }
     let mut frame = FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
     for sensor in 0..sensors.rig.sensors.len() {
         let (measured_scans, simulated_scans) = scans.split_at_mut(1);
@@ -104,7 +113,7 @@ pub fn pair_frame(
             ray.matched = matched;
             ray.company = company(&sight.index, b, i);
             (ray.roughness_m, ray.roughness_leverage) =
-                if ray.smooth { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
+                if ray.smooth && ray.company > LONE { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
         }
         let mut measured: Vec<Ray> = (0..a.len()).map(|i| sight.ray(a, i, false)).collect();
         if let Some(correction) = mending.range_m {
@@ -115,10 +124,14 @@ pub fn pair_frame(
             }
         }
         let own = DirectionIndex::new(a, sensors.window(sensor), closes);
-        let stray: Vec<bool> = measured.iter().map(|r| r.smooth && r.across_m().abs() > STRAY_M).collect();
         for (i, (ray, matched)) in measured.iter_mut().zip(of_a).enumerate() {
             ray.matched = matched;
             ray.company = company(&own, a, i);
+        }
+        // A return without any other at its range is no surface: false alarms would make all around them rough.
+        let stray: Vec<bool> =
+            measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
+        for (i, ray) in measured.iter_mut().enumerate() {
             if ray.smooth && !stray[i] {
                 let others = |e: &super::scan::Entry| e.index != i as u32 && !stray[e.index as usize];
                 if let Some(s) = fit_surface(&own, sight.window, a.azimuth_rad[i], a.elevation_rad[i], others) {

@@ -2,8 +2,8 @@
 
 use super::unnamed::{Unnamed, word};
 use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
-use crate::channels::cells::ZONE_NAMES;
-use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
+use crate::channels::cells::{ZONE_NAMES, cell};
+use crate::channels::groups::{Grouping, PartedFrame, group_of, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
@@ -12,6 +12,7 @@ use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable, in_zone};
 use crate::inference::roles::Role;
+use crate::pairing::Ray;
 use rayon::prelude::*;
 
 /// Smaller shares of lost returns are not spoken of.
@@ -86,13 +87,14 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
         let laws = refit(&table, &chosen);
         for grouping in [Grouping::Row, Grouping::Azimuth] {
             let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table.kept(&laws, c));
+            let how = GroupFit { centred: step > 0, ..GROUPED };
             let (spread, _) =
-                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED, trimmed(grouping));
+                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), how, trimmed(grouping));
             trials.push(Trial {
                 candidate: LAWS.len() + grouping as usize,
                 name: UNNAMED.into(),
                 parameters: 12,
-                gains: grouped::cross_part_gains(&groups, &select, &blocks, GROUPED, false),
+                gains: grouped::cross_part_gains(&groups, &select, &blocks, how, false),
                 above_floor: spread > GROUP_FLOOR,
             });
         }
@@ -105,6 +107,8 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
         if trial.name == UNNAMED {
             let grouping = if trial.candidate == LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
             unnamed = Some((grouping, confidence(&trials, &blocks, UNNAMED, &demands)));
+            // A law that leaves losses that depend on the direction is a form, not a name.
+            stories.clear();
             break;
         }
         chosen.push(candidates[trial.candidate]);
@@ -160,10 +164,16 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
         .collect();
     if let Some((grouping, confidence)) = unnamed {
         let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table_e.kept(&fitted, c));
-        let found = unnamed_found(&groups, grouping, &estimate, &hold_out, confidence);
+        let kept = |ray: &Ray| cell(ray).filter(|_| !mask.hides(ray)).map(|c| table_e.kept(&fitted, c));
+        let shares = mean_by_group(context, grouping, &kept);
+        let mut found = unnamed_found(&groups, &shares, grouping, &estimate, &hold_out, confidence);
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
             d[1] += g;
             d[2] += g.max(0.0);
+        }
+        // The forms below the table are part of it: they have no name of their own.
+        for (g, &i) in found.held_out_gains.iter_mut().zip(&hold_out) {
+            *g += table_h.gain(&hits[i], &fitted, &[]);
         }
         result.found.push(found);
     }
@@ -176,8 +186,25 @@ const UNNAMED: &str = "unexplained";
 /// Shares lost by groups of directions: prior spread of a fifth.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false };
 
+/// Mean of a value over the simulated returns of each group.
+fn mean_by_group(
+    context: &Context,
+    grouping: Grouping,
+    value: &dyn Fn(&Ray) -> Option<f64>,
+) -> std::collections::BTreeMap<u32, f64> {
+    let mut sums = std::collections::BTreeMap::<u32, [f64; 2]>::new();
+    for ray in context.of(Role::Estimate).iter().flat_map(|&i| &context.frames[i].simulated) {
+        if let (Some(v), Some(g)) = (value(ray), group_of(ray, grouping)) {
+            let sum = sums.entry(g as u32).or_default();
+            (sum[0], sum[1]) = (sum[0] + v, sum[1] + 1.0);
+        }
+    }
+    sums.into_iter().map(|(g, s)| (g, s[0] / s[1])).collect()
+}
+
 fn unnamed_found(
     groups: &[PartedFrame],
+    shares: &std::collections::BTreeMap<u32, f64>,
     grouping: Grouping,
     estimate: &[usize],
     hold_out: &[usize],
@@ -196,7 +223,9 @@ fn unnamed_found(
         ),
         y: "share of simulated returns that are measured",
     };
-    told.found(&all, GROUPED, grouping, hold_out.iter().map(|&i| &groups[i]), |lost, std| [1.0 - lost, std])
+    told.found(&all, GROUPED, grouping, hold_out.iter().map(|&i| &groups[i]), |group, lost, std| {
+        [shares.get(&group).copied().unwrap_or(1.0) - lost, std]
+    })
 }
 
 /// Fits laws one on top of the other.

@@ -14,19 +14,19 @@ use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
 use std::collections::BTreeMap;
 
-/// The search; also what is to be left out by the others.
-pub fn search(context: &Context) -> (ChannelResult, Mask) {
+/// The search; also what is to be left out by the others. `displaced` tells that the measured scene stands elsewhere, or rows aim elsewhere.
+pub fn search(context: &Context, displaced: bool) -> (ChannelResult, Mask) {
     let select = context.of(Role::Select);
     let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
     // Laws are fitted first without the dark directions, to know which of them they explain.
-    let dark = blocked_cells(&counts, |_| 1.0);
+    let dark = blocked_cells(&counts, displaced, |_| 1.0);
     let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
     let hits = hit_frames(context.frames, &without);
     let table = LossTable::new(total(select.iter().map(|&i| &hits[i])));
     let laws = refit(&table, &[Law::Random, Law::Signal]);
     let expected = expected_shares(context, &select, &mask, &table, &laws);
-    mask.blocked = blocked_cells(&counts, |cell| expected.get(cell).copied().unwrap_or(0.0));
+    mask.blocked = blocked_cells(&counts, displaced, |cell| expected.get(cell).copied().unwrap_or(0.0));
     mask.around = with_neighbours(&mask.blocked);
     let mut result =
         ChannelResult { distance: vec![[0.0; 3]; context.of(Role::HoldOut).len()], ..ChannelResult::default() };

@@ -4,7 +4,8 @@ mod curve;
 
 use super::unnamed::{Unnamed, word};
 use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed};
-use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
+use crate::channels::cells::cell;
+use crate::channels::groups::{Grouping, PartedFrame, group_of, total as group_total};
 use crate::channels::mean::usual_noise_m;
 use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
 use crate::diagnosis::{Minimum, Status};
@@ -22,7 +23,7 @@ const FLOOR_M: f64 = 0.003;
 const FLOOR_RAD: f64 = 1.7e-4;
 
 /// Nor variances that grow by less than this share over the places that matter.
-const FLOOR_SHARE: f64 = 0.04;
+const FLOOR_SHARE: f64 = 0.1;
 
 /// The search; `known` lists variances that other findings explain already (a step of rounding).
 /// Surfaces met at less than `least_cos` are left out.
@@ -50,37 +51,35 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
             name: law.name().into(),
             parameters: law.parameters(),
             gains,
-            above_floor: above_floor(&table, law, fitted.theta[last]),
+            // On top of another law a negative one only mends the form of that.
+            above_floor: (last == 0 || fitted.theta[last] > 0.0) && above_floor(&table, law, fitted.theta[last]),
         }
     };
     let demands = first_demands();
     // What depends on the direction has no name.
-    let directions = |terms: &[(NoiseLaw, f64)]| -> Vec<Trial> {
+    let directions = |terms: &[(NoiseLaw, f64)], how: GroupFit| -> Vec<Trial> {
         let expected = |c: usize, ray: &Ray| expected(&table, c, ray, terms);
         let one = |grouping: Grouping| {
             let groups =
                 rough_groups(context.frames, context.rig, &scales, grouping, &|c| table.variances(c), &expected);
             let (spread, _) =
-                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), GROUPED, trimmed(grouping));
+                grouped::spread(&group_total(select.iter().flat_map(|&i| &groups[i])), how, trimmed(grouping));
             Trial {
                 candidate: NOISE_LAWS.len() + grouping as usize,
                 name: UNNAMED.into(),
                 parameters: 12,
-                gains: grouped::cross_part_gains(&groups, &select, &blocks, GROUPED, false),
-                above_floor: spread > GROUP_FLOOR,
+                gains: grouped::cross_part_gains(&groups, &select, &blocks, how, false),
+                above_floor: spread > GROUP_FLOORS[grouping as usize],
             }
         };
         vec![one(Grouping::Row), one(Grouping::Azimuth)]
     };
     let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| trial(&[k], None)).collect();
-    trials.extend(directions(known));
-    // A table of directions follows the range and the incidence of each: a cause that explains most of it is preferred.
-    let best_named = total_of_best(&trials, &demands);
-    trials
-        .iter_mut()
-        .filter(|t| t.name == UNNAMED)
-        .for_each(|t| t.above_floor &= best_named < PREFERRED * total_and_z(&t.gains).0);
-    let choice = choose(&trials, &demands);
+    let mut choice = choose(&trials, &demands);
+    if choice.is_none() {
+        trials.extend(directions(known, GROUPED));
+        choice = choose(&trials, &demands);
+    }
     let returns = context.returns(&select);
     result.considered = record(&trials, choice.as_ref(), "roughness", returns, &demands);
     let constant = whole(&[0]);
@@ -112,26 +111,28 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
         // A second one must be of another kind and bring a good part of what the first brought.
         let (first_gain, _) = total_and_z(&t.gains);
         let second_demands = Demands { nats: (0.05 * first_gain).max(8.0), ..demands };
-        let mut rivals: Vec<Trial> = (0..NOISE_LAWS.len())
+        let rivals: Vec<Trial> = (0..NOISE_LAWS.len())
             .filter(|&k| NOISE_LAWS[k].name() != NOISE_LAWS[t.candidate].name())
             .map(|k| trial(&[t.candidate, k], Some(&t.gains)))
             .collect();
-        let alone = whole(&[t.candidate]);
-        let so_far: Vec<_> = known.iter().copied().chain([(NOISE_LAWS[t.candidate], alone.theta[0])]).collect();
-        let mut tables = directions(&so_far);
-        tables.iter_mut().for_each(|t| t.above_floor &= total_and_z(&t.gains).0 > REMAINING * first_gain);
-        rivals.extend(tables);
         let second = choose(&rivals, &second_demands);
         result.considered.extend(record(&rivals, second.as_ref(), "roughness", returns, &second_demands));
         if let Some(second) = second {
             let t = &rivals[second.chosen];
-            if t.name == UNNAMED {
-                unnamed = Some(t.candidate);
-            } else {
-                chosen.push(t.candidate);
-                let equals = unique(second.equals.iter().map(|&i| rivals[i].name.clone()));
-                stories.push((equals, confidence(&rivals, &blocks, &t.name, &second_demands)));
-            }
+            chosen.push(t.candidate);
+            let equals = unique(second.equals.iter().map(|&i| rivals[i].name.clone()));
+            stories.push((equals, confidence(&rivals, &blocks, &t.name, &second_demands)));
+        }
+        // A law that leaves much that depends on the direction is a form, not a name.
+        let so_far = whole(&chosen);
+        let told = chosen.iter().zip(so_far.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t));
+        let beside = GroupFit { centred: true, ..GROUPED };
+        let tables = directions(&known.iter().copied().chain(told).collect::<Vec<_>>(), beside);
+        let remains = choose(&tables, &demands);
+        result.considered.extend(record(&tables, remains.as_ref(), "roughness", returns, &demands));
+        if let Some(remains) = remains {
+            unnamed = Some(tables[remains.chosen].candidate);
+            stories.clear();
         }
     }
     // Parameters from other frames.
@@ -165,36 +166,29 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
         let grouping = if candidate == NOISE_LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
         let expected = |c: usize, ray: &Ray| expected(&table_e, c, ray, &terms);
         let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table_e.variances(c), &expected);
-        let found = unnamed_found(&groups, grouping, &estimate, &hold_out, usual_noise_m(context.frames));
+        let shares = expected_by_group(context, grouping, &expected);
+        let mut found = unnamed_found(&groups, &shares, grouping, &estimate, &hold_out, usual_noise_m(context.frames));
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
             d[1] += g;
             d[2] += g.max(0.0);
+        }
+        // The forms below the table are part of it: they have no name of their own.
+        for (g, &i) in found.held_out_gains.iter_mut().zip(&hold_out) {
+            *g += table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &terms[..known.len()]);
         }
         result.found.push(found);
     }
     result
 }
 
-/// Share of the gain of a table of directions from which on a named cause is preferred.
-const PREFERRED: f64 = 0.75;
-
-/// Share of a named cause's gain that a table of directions must bring on top of it.
-const REMAINING: f64 = 0.3;
-
-/// Gain of the best trial with a name.
-fn total_of_best(trials: &[Trial], demands: &Demands) -> f64 {
-    let named: Vec<Trial> = trials.iter().filter(|t| t.name != UNNAMED).cloned().collect();
-    choose(&named, demands).map_or(0.0, |c| total_and_z(&named[c.chosen].gains).0)
-}
-
 /// Name among the trials of what is in no catalogue.
 const UNNAMED: &str = "unexplained";
 
-/// Added variances of groups of directions in units of the simulated one: prior spread of three.
+/// Added variances of groups of directions in units of the expected one: prior spread of three.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false };
 
-/// Spread of them below which nothing is said.
-const GROUP_FLOOR: f64 = 0.25;
+/// Spread of them below which nothing is said: rows, which meet ranges and angles of their own, where laws may have another form; azimuths.
+const GROUP_FLOORS: [f64; 2] = [0.6, 0.25];
 
 /// Measured variance that laws tell of a ray, in units of the simulated one.
 fn expected(table: &NoiseTable, cell: usize, ray: &Ray, terms: &[(NoiseLaw, f64)]) -> f64 {
@@ -203,8 +197,25 @@ fn expected(table: &NoiseTable, cell: usize, ray: &Ray, terms: &[(NoiseLaw, f64)
     1.0 + terms.iter().map(|(l, t)| t * l.variance(range, cos)).sum::<f64>() / vb
 }
 
+/// Mean of what laws tell of the measured returns of each group, in units of the simulated variance.
+fn expected_by_group(
+    context: &Context,
+    grouping: Grouping,
+    expected: &dyn Fn(usize, &Ray) -> f64,
+) -> std::collections::BTreeMap<u32, f64> {
+    let mut sums = std::collections::BTreeMap::<u32, [f64; 2]>::new();
+    for ray in context.of(Role::Estimate).iter().flat_map(|&i| &context.frames[i].measured) {
+        if let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) {
+            let sum = sums.entry(g as u32).or_default();
+            (sum[0], sum[1]) = (sum[0] + expected(c, ray), sum[1] + 1.0);
+        }
+    }
+    sums.into_iter().map(|(g, s)| (g, s[0] / s[1])).collect()
+}
+
 fn unnamed_found(
     groups: &[PartedFrame],
+    shares: &std::collections::BTreeMap<u32, f64>,
     grouping: Grouping,
     estimate: &[usize],
     hold_out: &[usize],
@@ -221,9 +232,10 @@ fn unnamed_found(
         ),
         y: "standard deviation in units of the simulated one",
     };
-    told.found(&all, GROUPED, grouping, hold_out.iter().map(|&i| &groups[i]), |added, std| {
+    told.found(&all, GROUPED, grouping, hold_out.iter().map(|&i| &groups[i]), |group, added, std| {
+        let share = shares.get(&group).copied().unwrap_or(1.0).sqrt();
         let measured = (1.0 + added).max(0.0).sqrt();
-        [measured, 0.5 * std / measured.max(0.1)]
+        [share * measured, share * 0.5 * std / measured.max(0.1)]
     })
 }
 

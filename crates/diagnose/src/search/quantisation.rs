@@ -18,7 +18,7 @@ const COHERENT: f64 = 0.3;
 /// Largest step that is looked for, m: longer ones are structures of the scene.
 const LARGEST_M: f64 = 0.4;
 
-/// The search; also the variance that rounding adds, m2.
+/// The search; also the step, m.
 pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
@@ -43,9 +43,8 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     let spectrum = [&a, &b].map(|r| spectrum(r));
     let from = (BIN_M * BINS as f64 / LARGEST_M) as usize;
     let first = (from..BINS / 2).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
-    // The flank of a peak comes before its top.
-    let peak =
-        first.and_then(|k| (k..(k + 6).min(BINS / 2)).max_by(|&i, &j| spectrum[0][i].total_cmp(&spectrum[0][j])));
+    // The flank of a peak comes before its top; near scenes make wide ones.
+    let peak = first.map(|k| top(&spectrum[0], k));
     let strongest = (from..BINS / 2).map(|k| spectrum[0][k]).fold(0.0, f64::max);
     result.considered.push(Considered {
         cause: "quantisation".into(),
@@ -104,7 +103,20 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
         separate_by: None,
         curve: Curve { x: "range / step, fraction".into(), y: "share of the returns".into(), points: points.collect() },
     });
-    (result, Some(step * step / 12.0 * on_comb))
+    (result, Some(step))
+}
+
+/// The top of the peak on whose flank a bin lies: up to where the spectrum has fallen to two thirds again.
+fn top(spectrum: &[f64], flank: usize) -> usize {
+    let mut best = flank;
+    for k in flank..spectrum.len() {
+        if spectrum[k] > spectrum[best] {
+            best = k;
+        } else if spectrum[k] < 0.67 * spectrum[best] {
+            break;
+        }
+    }
+    best
 }
 
 /// |sum of exp(2 pi i R k)| / n for frequencies up to one in two bins.

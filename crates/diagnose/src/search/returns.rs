@@ -3,7 +3,7 @@
 use super::{ChannelResult, Context, Found, Z_STAR, parameter};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Status};
-use crate::inference::choice::total_and_z;
+use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
@@ -33,7 +33,7 @@ pub fn search(context: &Context) -> ChannelResult {
         let error = base.max(more.abs() / 30.0) / z_difference.abs().max(1e-9);
         let floor = FLOORS[k].max(0.3 * base);
         let mut outcome = "no more of them than on the simulated side";
-        let seen = total > 8.0 && z > Z_STAR && z_difference > Z_STAR;
+        let seen = total > 8.0 && significant(&gains, Z_STAR) && z_difference > 1.5;
         // Surfaces that only stand elsewhere are missed in one place and found in another.
         let one_sided = match kind {
             Odd::GroupInFront => more > 3.0 * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
@@ -141,9 +141,9 @@ fn found(
     let mut parameters = vec![];
     let (covariate, says) = match kind {
         Odd::Alone => {
-            // Those that fall onto a surface by chance are not seen.
+            // Those that fall onto a surface or an edge by chance are not seen, and directions without a return count as well as others.
             let share = share / 0.97;
-            parameters.push(parameter("rate", share, error.hypot(0.05 * share), "1"));
+            parameters.push(parameter("rate", share, error.hypot(0.08 * share), "1"));
             (
                 "none",
                 format!(

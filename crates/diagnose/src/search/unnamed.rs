@@ -21,7 +21,7 @@ pub(super) fn word(grouping: Grouping) -> &'static str {
 }
 
 impl Unnamed {
-    /// The finding. `all` are the sums over the estimating frames, `hold_out` the frames held out; `shown` turns a group's offset and its standard
+    /// The finding. `all` are the sums over the estimating frames, `hold_out` the frames held out; `shown` turns a group's number, offset and standard
     /// error into what is shown: the measured value and its error, where the simulated one is 1.
     pub(super) fn found<'a>(
         self,
@@ -29,13 +29,13 @@ impl Unnamed {
         how: GroupFit,
         grouping: Grouping,
         hold_out: impl Iterator<Item = &'a PartedFrame>,
-        shown: impl Fn(f64, f64) -> [f64; 2],
+        shown: impl Fn(u32, f64, f64) -> [f64; 2],
     ) -> Found {
         let offsets = grouped::offsets(all, how);
         let points = offsets.iter().map(|(k, offset)| {
             let (sensor, place) = place_of(*k as usize, grouping);
             let place = if grouping == Grouping::Row { place } else { place.to_degrees() };
-            let [measured, error] = shown(*offset, 1.0 / (all[k].gram[0] + how.precision).sqrt());
+            let [measured, error] = shown(*k, *offset, 1.0 / (all[k].gram[0] + how.precision).sqrt());
             CurvePoint { x: place + 1000.0 * sensor as f64, measured, before: 1.0, after: measured, error }
         });
         let gain = |frame: &PartedFrame| frame.iter().map(|part| grouped::gain(part, how.column, &offsets)).sum();

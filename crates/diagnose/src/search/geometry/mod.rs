@@ -1,13 +1,15 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
+mod displacement;
 mod suspects;
 mod words;
 
+pub use self::displacement::Displacement;
+
+use self::displacement::displacement;
 use self::suspects::{Suspect, UNNAMED, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, confidence, first_demands, record};
-use crate::channels::groups::{
-    GroupFrame, Grouping, PartedFrame, elevation_lever, group_frames, group_of, total, whole,
-};
+use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
@@ -15,11 +17,8 @@ use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
-use crate::pairing::Ray;
-use crate::rig::SensorRig;
-use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
+use nalgebra::SVector;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 
 /// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
 const FLOOR_OFFSET_M: f64 = 0.012;
@@ -45,68 +44,6 @@ struct Sums {
 struct Groups {
     parted: Vec<PartedFrame>,
     whole: Vec<GroupFrame>,
-}
-
-/// What was found of the geometry, to be taken out before other channels are looked at.
-#[derive(Clone, Debug, Default)]
-pub struct Displacement {
-    /// The scene's turn and shift in the cloud's frame, rad and m.
-    pub scene: SVector<f64, 6>,
-    /// The same for what single sensors see, about their origins.
-    pub sensors: Vec<SVector<f64, 6>>,
-    /// Offset of range, m, and share of it.
-    pub bias: [f64; 2],
-    /// Offsets of groups of rays: which, of range or elevation, by group.
-    pub groups: Option<(Grouping, usize, BTreeMap<u32, f64>)>,
-}
-
-impl Displacement {
-    /// Whether the scene as a whole is turned or moved.
-    pub fn moves(&self) -> bool {
-        self.scene.norm() > 0.0 || self.sensors.iter().any(|s| s.norm() > 0.0)
-    }
-
-    /// How far a thing at `point` seen by a sensor is shown from where it is, m.
-    pub fn of_point(&self, point: &Vector3<f64>, sensor: usize, origin: &Point3<f64>) -> Vector3<f64> {
-        let turned = |p: &SVector<f64, 6>, about: Vector3<f64>| {
-            Vector3::new(p[0], p[1], p[2]).cross(&(point - about)) + Vector3::new(p[3], p[4], p[5])
-        };
-        let to = point - origin.coords;
-        let own = self.sensors.get(sensor).map_or_else(Vector3::zeros, |p| turned(p, origin.coords));
-        turned(&self.scene, Vector3::zeros()) + own + to.normalize() * (self.bias[0] + self.bias[1] * to.norm())
-    }
-
-    /// What is to be taken off the range of a measured ray of a row or strip that measures or aims wrongly, m.
-    pub fn of_range(&self, ray: &Ray, turn: &UnitQuaternion<f64>) -> f64 {
-        let Some((grouping, column, offsets)) = &self.groups else { return 0.0 };
-        let Some(offset) = group_of(ray, *grouping).and_then(|g| offsets.get(&(g as u32))) else { return 0.0 };
-        if *column == 0 {
-            *offset
-        } else {
-            -offset * elevation_lever(ray, turn) / f64::from(ray.cos_incidence.max(0.01))
-        }
-    }
-}
-
-fn displacement(rig: &SensorRig, sums: &Sums, select: &[usize], blocks: &[usize], chosen: &[Suspect]) -> Displacement {
-    let mut out = Displacement { sensors: vec![SVector::zeros(); rig.sensors.len()], ..Displacement::default() };
-    let (columns, groups) = split(chosen);
-    let fitted = fit_all(sums, select, blocks, chosen);
-    for (c, theta) in fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c)) {
-        match sums.columns[*c] {
-            Column::Pose(k) => out.scene[k] += theta,
-            Column::SensorPose(s, k) => out.sensors[s][k] += theta,
-            Column::RangeOffset => out.bias[0] = *theta,
-            Column::RangeScale => out.bias[1] = *theta,
-            Column::Sweep(_) | Column::Structure(_) => {}
-        }
-    }
-    if let Some((grouping, column)) = groups.first() {
-        let frames = groups_of(sums, *grouping);
-        let offsets = grouped::offsets(&total(select.iter().map(|&i| &frames[i])), how(*column));
-        out.groups = Some((*grouping, *column, offsets));
-    }
-    out
 }
 
 /// The search; also what is to be taken out for the others.

@@ -42,6 +42,7 @@ pub(super) fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
         linear("pitch_roll", &[Column::Pose(0)]),
         linear("pitch_roll", &[Column::Pose(0), Column::Pose(1)]),
         linear("rolling_shutter", &[Column::Sweep(0)]),
+        linear("rolling_shutter", &[Column::Sweep(2)]),
         linear("rolling_shutter", &[Column::Sweep(0), Column::Sweep(2)]),
     ];
     if context.rig.sensors.len() > 1 {

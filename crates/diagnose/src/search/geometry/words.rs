@@ -180,7 +180,7 @@ fn linear_parameters(
     for (k, label) in ["roll_deg", "pitch_deg", "yaw_deg"].into_iter().enumerate() {
         if turn[k].abs() > 1e-9 {
             let value = deg(turn[k]);
-            parameters.push(parameter(label, value, deg(turn_error[k]).hypot(0.002).hypot(0.02 * value), "deg"));
+            parameters.push(parameter(label, value, deg(turn_error[k]).hypot(0.002).hypot(0.03 * value), "deg"));
         }
     }
     for (k, label) in ["forward_m", "left_m", "up_m"].into_iter().enumerate() {
