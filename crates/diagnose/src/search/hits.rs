@@ -7,7 +7,7 @@ use crate::channels::groups::{Grouping, PartedFrame, group_of, total as group_to
 use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::{Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable, in_zone};
@@ -23,6 +23,10 @@ const ZONE_FLOOR: f64 = 0.03;
 
 /// A share lost on one kind of surface that gains this share of a law of the signal is the material's.
 const A_MATERIAL: f64 = 0.75;
+
+/// What a second law brings at least, and what a table of directions: as shares of what the first law brings.
+const JOINING_SHARE: f64 = 0.04;
+const UNNAMED_SHARE: f64 = 0.02;
 
 /// Repetitions of the bootstrap of fits.
 const REFITS: usize = 40;
@@ -98,7 +102,11 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
                 above_floor: spread > GROUP_FLOOR,
             });
         }
-        let demands = if step == 0 { demands } else { Demands { nats: (0.04 * first_gain).max(8.0), ..demands } };
+        // On top of a law another one has to bring more than the mending of its form; what depends on the direction tells against the law.
+        for trial in trials.iter_mut().filter(|_| step > 0) {
+            let share = if trial.name == UNNAMED { UNNAMED_SHARE } else { JOINING_SHARE };
+            trial.above_floor &= total_and_z(&trial.gains).0 > share * first_gain;
+        }
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "hits", returns, &demands));
         let Some(choice) = choice else { break };
