@@ -3,7 +3,7 @@
 use burn::tensor::{Device, FloatDType, Tensor};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// What convolutions and linear layers multiply. Weights, batch norms, losses, gradients by weights and the optimiser are f32 in both.
+/// What convolutions and linear layers multiply, forward and backward. Weights, batch norms, losses and the optimiser are f32 in both.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Precision {
     /// 24 bits of mantissa.
