@@ -148,6 +148,9 @@ pub struct Gain {
     pub closed: Option<f64>,
     /// Interval of `closed`, from a bootstrap over blocks of held-out frames.
     pub ci95: Option<[f64; 2]>,
+    /// `before`, `after` and `floor` channel by channel: where the simulation is off, and what is left.
+    #[serde(default)]
+    pub channels: BTreeMap<String, [f64; 3]>,
 }
 
 /// Average precision on the measured test frames of a detector trained on each kind of data, percent.

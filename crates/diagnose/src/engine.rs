@@ -13,6 +13,7 @@ use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_bl
 use data::Dataset;
 use geometry::Box3;
 use nalgebra::Vector3;
+use std::collections::BTreeMap;
 
 /// What to look at.
 #[derive(Clone, Debug, Default)]
@@ -102,30 +103,48 @@ pub fn diagnose(
     }
     notes.extend(limits(&frames));
     notes.extend(times.as_deref().and_then(|t| one_speed(&frames, t)));
-    let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times };
-    let searches = 7;
+    let origins = crate::channels::mean::origins(rig);
+    let motion = times.as_deref().map(|t| crate::channels::motion::own_motion(&frames, t, &origins));
+    let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times, motion };
+    let searches = CHANNELS.len();
     let mut results: Vec<ChannelResult> = Vec::new();
     progress(Stage::Weighing, 0, searches);
+    let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
+    // What slides over a scan is moved back before anything else is looked at.
+    let (sliding, slide) = search::shutter::search(&context);
+    results.push(sliding);
+    let slid = |frame: usize, p: &Vector3<f64>, sensor: usize| match &slide {
+        Some(slide) => slide.shift_m(frame, p, search::shutter::phase(p, sensor, rig)),
+        None => Vector3::zeros(),
+    };
+    let standing = match &slide {
+        Some(_) => Some(again(Mending { shift_m: Some(&slid), ..Mending::default() })?),
+        None => None,
+    };
+    let frames = standing.as_deref().unwrap_or(&frames);
+    context.frames = frames;
+    progress(Stage::Weighing, 1, searches);
     let (geometry, displaced) = search::geometry::search(&context);
     results.push(geometry);
-    progress(Stage::Weighing, 1, searches);
+    progress(Stage::Weighing, 2, searches);
     let (rounding, step_m) = search::quantisation::search(&context);
     results.push(rounding);
-    progress(Stage::Weighing, 2, searches);
+    progress(Stage::Weighing, 3, searches);
     // What stands elsewhere is moved back before silhouettes and single returns are looked at.
-    let origins = crate::channels::mean::origins(rig);
-    let shift = |p: &Vector3<f64>, sensor: usize| displaced.of_point(p, sensor, &origins[sensor]);
-    let moved = Mending { shift_m: displaced.moves().then_some(&shift), ..Mending::default() };
-    let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
+    let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
+        slid(frame, p, sensor) + displaced.of_point(p, sensor, &origins[sensor])
+    };
+    let moves = slide.is_some() || displaced.moves();
+    let moved = Mending { shift_m: moves.then_some(&shift), ..Mending::default() };
     let upright = if displaced.moves() { Some(again(moved)?) } else { None };
-    context.frames = upright.as_deref().unwrap_or(&frames);
+    context.frames = upright.as_deref().unwrap_or(frames);
     let elsewhere = displaced.moves() || displaced.aims();
     let (hidden, mask) = search::mask::search(&context, elsewhere);
     results.push(hidden);
     results.push(search::hits::search(&context, &mask, elsewhere));
-    progress(Stage::Weighing, 3, searches);
+    progress(Stage::Weighing, 5, searches);
     results.push(search::returns::search(&context));
-    progress(Stage::Weighing, 4, searches);
+    progress(Stage::Weighing, 6, searches);
     // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
@@ -139,9 +158,9 @@ pub fn diagnose(
         context.frames = even;
     }
     let least_cos = if uneven { 0.12 } else { 0.0 };
-    results.push(search::noise::search(&context, &[], least_cos));
-    context.frames = &frames;
-    progress(Stage::Weighing, 5, searches);
+    results.push(search::noise::search(&context, least_cos));
+    context.frames = frames;
+    progress(Stage::Weighing, 7, searches);
     results.push(search::labels::search(&context, Side::Labels, &displaced));
     results.push(search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, searches, searches);
@@ -154,6 +173,10 @@ pub fn diagnose(
     let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
 }
+
+/// Channels in the order in which they are searched; what hides rays altogether and the laws of losses both look at hits.
+const CHANNELS: [&str; 9] =
+    ["slide", "residuals", "ranges", "hits", "hits", "returns", "roughness", "labels", "objects"];
 
 /// Keeps the first of frames that show the same to the bit: they say nothing twice.
 fn leave_out_copies(frames: &mut Vec<FramePair>) {
@@ -233,7 +256,15 @@ fn refused(notes: Vec<String>) -> Diagnosis {
         frames: FrameRoles::default(),
         findings: vec![],
         minimum_detectable: Default::default(),
-        gain: Gain { metric: "nats_per_ray".into(), before: 0.0, after: 0.0, floor: 0.0, closed: None, ci95: None },
+        gain: Gain {
+            metric: "nats_per_ray".into(),
+            before: 0.0,
+            after: 0.0,
+            floor: 0.0,
+            closed: None,
+            ci95: None,
+            channels: BTreeMap::new(),
+        },
         detectors: Vec::new(),
         considered: vec![],
         notes,
@@ -247,9 +278,15 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
     let returns = context.returns(&hold_out).max(1.0);
     let mut findings: Vec<Finding> = Vec::new();
     let mut considered = Vec::new();
-    let mut minimum_detectable = std::collections::BTreeMap::new();
+    let mut minimum_detectable = BTreeMap::new();
     let mut distance = vec![[0.0; 3]; hold_out.len()];
-    for result in results {
+    let mut channels = BTreeMap::<String, [f64; 3]>::new();
+    for (channel, result) in CHANNELS.into_iter().zip(results) {
+        let of_channel = channels.entry(channel.into()).or_default();
+        for [before, gained, best] in &result.distance {
+            let left = [*before, before - gained, before - gained.max(*best)];
+            (0..3).for_each(|k| of_channel[k] += left[k] / returns);
+        }
         considered.extend(result.considered);
         minimum_detectable.extend(result.minimum);
         for (sum, d) in distance.iter_mut().zip(&result.distance) {
@@ -299,7 +336,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
         schema: SCHEMA.into(),
         verdict,
         frames: FrameRoles { select: ids(Role::Select), estimate: ids(Role::Estimate), hold_out: ids(Role::HoldOut) },
-        gain: gain(&distance, &blocks, returns, findings.is_empty()),
+        gain: Gain { channels, ..gain(&distance, &blocks, returns, findings.is_empty()) },
         findings,
         minimum_detectable,
         detectors: Vec::new(),
@@ -333,5 +370,6 @@ fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gai
         floor: (before - least) / returns,
         closed: closed(all),
         ci95: closed(all).and_then(|_| Some([at(0.025)?, at(0.975)?])),
+        channels: BTreeMap::new(),
     }
 }

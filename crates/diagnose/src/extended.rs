@@ -64,6 +64,11 @@ pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig, rows_deg: &[Vec<f64
     text
 }
 
+/// Share that a law loses where nothing of it is felt.
+fn lost_anyway(f: &Finding) -> f64 {
+    f.parameters.get("most").map_or(0.0, |most| (1.0 - most.estimate).max(0.0))
+}
+
 /// One effect as the simulator reads it.
 fn named(f: &Finding, rig: &SensorRig) -> String {
     let value = |name: &str| f.parameters.get(name).map_or(0.0, |p| p.estimate);
@@ -103,12 +108,26 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
             with("angular_jitter", key("azimuth_std_deg", "std_deg") + &key("elevation_std_deg", "std_deg")),
         ),
         "random_dropout" => positive(f, "share", with("random_dropout", key("share", "share"))),
-        "signal_dropout" => with("signal_dropout", key("threshold", "threshold") + &key("steepness", "steepness")),
-        "incidence_dropout" => with("incidence_dropout", key("cos_half", "cos_half") + &key("steepness", "steepness")),
+        "signal_dropout" => with(
+            "signal_dropout",
+            key("threshold", "threshold") + &key("steepness", "steepness") + &key("most", "most"),
+        ),
+        "incidence_dropout" => {
+            // The simulator's step is one over the cosine, the finding's one over its logarithm: as steep at one half.
+            let steepness = toml_number(value("steepness") / value("cos_half").max(1e-3));
+            let mut text =
+                with("incidence_dropout", key("cos_half", "cos_half") + &format!("steepness = {steepness}\n"));
+            if lost_anyway(f) > 0.0 {
+                text += &with("random_dropout", format!("share = {}\n", toml_number(lost_anyway(f))));
+            }
+            text
+        }
         "range_dropout" => {
             let (half, steepness) = (value("half_at_m").max(1e-3), value("steepness"));
             let ranges: Vec<f64> = (0..=24).map(|i| 5.0 * f64::from(i)).collect();
-            let lost = ranges.iter().map(|r| if *r > 0.0 { 1.0 / (1.0 + (r / half).powf(-steepness)) } else { 0.0 });
+            let most = 1.0 - lost_anyway(f);
+            let kept = |r: f64| if r > 0.0 { most / (1.0 + (r / half).powf(steepness)) } else { most };
+            let lost = ranges.iter().map(|r| 1.0 - kept(*r));
             let lost: Vec<String> = lost.map(|v| format!("{v:.4}")).collect();
             let ranges: Vec<String> = ranges.iter().map(|r| format!("{r:.1}")).collect();
             with("range_dropout", format!("range_m = [{}]\nshare = [{}]\n", ranges.join(", "), lost.join(", ")))
@@ -322,6 +341,7 @@ mod tests {
                 floor: 0.0,
                 closed: Some(0.9),
                 ci95: None,
+                channels: BTreeMap::new(),
             },
             detectors: vec![],
             considered: vec![],

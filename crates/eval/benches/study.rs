@@ -45,7 +45,9 @@ fn main() {
     for method in [TsneOptions::default().method, TsneMethod::Interpolated] {
         let options = TsneOptions { method, ..TsneOptions::default() };
         let what = format!("t-SNE, 10,000 x 128, {method:?}");
-        let (_, divergence) = time(&what, 1, || tsne(&features, &options).expect("fits"));
+        let (places, divergence) = time(&what, 1, || tsne(&features, &options).expect("fits"));
+        let places: Vec<f32> = places.as_flattened().iter().map(|v| *v as f32).collect();
+        keep(if method == TsneMethod::Interpolated { "interpolated.f32" } else { "barnes_hut.f32" }, &places);
         println!("  Kullback-Leibler divergence {divergence:.4}");
     }
 }

@@ -344,8 +344,9 @@ fn blurred(hit: &Hit, divergence: f64, shot: &Vector3<f64>, cast: impl Fn(Vector
     }
     let near = ranges.iter().copied().fold(f64::INFINITY, f64::min);
     let far = ranges.iter().copied().fold(0.0, f64::max);
-    // Smooth surfaces do not mix: a tilted plane spreads evenly and its mean is its middle.
-    if far - near < 0.25 + 0.1 * near * 0.2 {
+    // Smooth surfaces do not mix: the inverse ranges of a tilted plane spread evenly about that of its middle.
+    let uneven = (1.0 / near + 1.0 / far - 2.0 / hit.range_m).abs() > 0.2 * (1.0 / near - 1.0 / far);
+    if far - near < 0.25 + 0.1 * near * 0.2 || !uneven {
         return hit.range_m;
     }
     let middle = 0.5 * (near + far);

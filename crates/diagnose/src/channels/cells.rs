@@ -17,14 +17,25 @@ const COS_STEP: f64 = 0.4;
 /// Zones by name, for findings.
 pub const ZONE_NAMES: [&str; ZONES] = ["ground", "standing", "object", "object_corner"];
 
+/// Cosine at which the edges and curves of objects are taken to be met: they are too small for a surface of their own, wheels above all.
+const ROUND_COS: f64 = 0.6;
+
+/// Cosine of incidence of a ray that falls on a surface, or on an object whatever its form.
+fn cos_of(ray: &Ray) -> Option<f64> {
+    match ray.smooth {
+        true => (ray.cos_incidence > 0.0).then_some(f64::from(ray.cos_incidence)),
+        false => (ray.surface == Surface::Object).then_some(ROUND_COS),
+    }
+}
+
 /// Where a ray falls.
 pub fn cell(ray: &Ray) -> Option<usize> {
-    let zone = zone(ray)?;
-    if !ray.smooth || !(ray.range_m > 0.5) || !(ray.cos_incidence > 0.0) {
+    let (zone, cos) = (zone(ray)?, cos_of(ray)?);
+    if !(ray.range_m > 0.5) {
         return None;
     }
     let r = (f64::from(ray.range_m).ln() / RANGE_STEP).floor().clamp(0.0, RANGE_BINS as f64 - 1.0) as usize;
-    let c = (-f64::from(ray.cos_incidence).ln() / COS_STEP).floor().clamp(0.0, COS_BINS as f64 - 1.0) as usize;
+    let c = (-cos.ln() / COS_STEP).floor().clamp(0.0, COS_BINS as f64 - 1.0) as usize;
     Some((zone * COS_BINS + c) * RANGE_BINS + r)
 }
 
@@ -59,7 +70,7 @@ impl Place {
     pub fn add(&mut self, ray: &Ray) {
         self.n += 1.0;
         self.ln_range += f64::from(ray.range_m).ln();
-        self.ln_cos += f64::from(ray.cos_incidence).max(1e-4).ln();
+        self.ln_cos += cos_of(ray).unwrap_or(1.0).max(1e-4).ln();
     }
 
     /// Adds another sum.

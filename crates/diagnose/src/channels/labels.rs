@@ -56,13 +56,15 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectS
         for (k, object) in frame.objects.iter().enumerate() {
             let (Some(simulated), Some(measured)) = (object.simulated, object.measured) else { continue };
             let center = Vector3::from(simulated.center);
+            let (sin, cos) = simulated.yaw_rad.sin_cos();
+            let along = |v: Vector3<f64>| [v.x * cos + v.y * sin, -v.x * sin + v.y * cos, v.z];
             shifts.push(ObjectShift {
                 frame: f,
                 object: k,
                 label_m: simulated.to_local(measured.center),
                 label_yaw_rad: limit_period(measured.yaw_rad - simulated.yaw_rad, 0.5, PI),
                 cloud_m: object.shift.map(|s| (s.shift_m, s.error_m)),
-                seen_velocity_m_s: times.and_then(|t| velocity(frames, t, f, &simulated)),
+                seen_velocity_m_s: times.and_then(|t| seen_velocity(frames, t, f, &simulated)).map(along),
                 distance_m: center.xy().norm(),
                 azimuth_rad: center.y.atan2(center.x),
                 points: object.points[0],
@@ -72,8 +74,8 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectS
     shifts
 }
 
-/// Velocity of a box by the nearest boxes of the frames before and after, along its own axes.
-fn velocity(frames: &[FramePair], times: &[f64], f: usize, bbox: &Box3) -> Option<[f64; 3]> {
+/// Velocity of a simulated box of frame `f` by the nearest boxes of the frames before and after, m/s, as the own car sees it, in the cloud's frame.
+pub fn seen_velocity(frames: &[FramePair], times: &[f64], f: usize, bbox: &Box3) -> Option<Vector3<f64>> {
     let neighbour = |g: usize| -> Option<(f64, Vector3<f64>)> {
         let dt = times[g] - times[f];
         if dt.abs() > LONGEST_S {
@@ -95,8 +97,7 @@ fn velocity(frames: &[FramePair], times: &[f64], f: usize, bbox: &Box3) -> Optio
         (Some((t, d)), None) | (None, Some((t, d))) => d / t,
         (None, None) => return None,
     };
-    let (s, c) = bbox.yaw_rad.sin_cos();
-    Some([v.x * c + v.y * s, -v.x * s + v.y * c, v.z])
+    Some(v)
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! Directions and ranges from which nothing comes back whatever is there: parts of the own car in the way, an end of the range.
 
 use super::returns::OWN_CAR_M;
-use crate::pairing::{FramePair, Ray};
+use crate::pairing::{FramePair, Lies, Ray};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -45,8 +45,8 @@ impl Mask {
     }
 }
 
-/// Returns of a cell of directions: simulated, measured beyond the own car, measured on it.
-pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 3]>;
+/// Returns of a cell of directions: simulated, measured beyond the own car, measured on it; and the share of the frames with some on it.
+pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 4]>;
 
 /// Nearer than this share of the simulated range, a near return is from the own car and not from the ground close by.
 const HALF_WAY: f64 = 0.6;
@@ -62,9 +62,17 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
         for ray in &frame.measured {
             if ray.own_range_m() > OWN_CAR_M {
                 counts.entry(direction_cell(ray)).or_default()[1] += 1.0;
-            } else if ray.own_range_m() < HALF_WAY * f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] })
-            {
-                counts.entry(direction_cell(ray)).or_default()[2] += 1.0;
+                continue;
+            }
+            // In the open the simulation has nothing at all there.
+            let predicted = match ray.lies() {
+                Lies::Open => f64::INFINITY,
+                _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
+            };
+            if ray.own_range_m() < HALF_WAY * predicted {
+                let count = counts.entry(direction_cell(ray)).or_default();
+                count[2] += 1.0;
+                count[3] = 1.0 / which.len() as f64;
             }
         }
         counts
@@ -72,7 +80,7 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
     let merge = |mut a: DirectionCounts, b: DirectionCounts| {
         for (k, v) in b {
             let sum = a.entry(k).or_default();
-            (0..3).for_each(|j| sum[j] += v[j]);
+            (0..4).for_each(|j| sum[j] += v[j]);
         }
         a
     };
@@ -96,8 +104,10 @@ pub fn blocked_cells(
     displaced: bool,
     expected: impl Fn(&DirectionCell) -> f64,
 ) -> BTreeSet<DirectionCell> {
-    let judged = |cell: &DirectionCell| counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, _]| seen / n);
-    let covered = |cell: &DirectionCell| counts.get(cell).is_some_and(|c| c[0] >= FEWEST && c[2] > ON_OWN_CAR * c[0]);
+    let judged = |cell: &DirectionCell| counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, ..]| seen / n);
+    // Another car may come as near, though not in most frames.
+    let stays = |c: &[f64; 4]| c[0].max(c[2]) >= FEWEST && c[2] > ON_OWN_CAR * c[0] && c[3] > 0.5;
+    let covered = |cell: &DirectionCell| counts.get(cell).is_some_and(stays);
     let mut dark: BTreeSet<DirectionCell> = counts
         .keys()
         .filter(|cell| covered(cell) || judged(cell).is_some_and(|seen| seen < 0.12 && expected(cell) > 0.5))
@@ -213,14 +223,16 @@ mod tests {
             for el in -5..5 {
                 let hole = (2..5).contains(&az) && (-3..-1).contains(&el) || (az, el) == (-8, 0);
                 let end = az < -12 && el > 2;
-                counts.insert((0, az, el), [100.0, if hole || end { 2.0 } else { 97.0 }, 0.0]);
+                counts.insert((0, az, el), [100.0, if hole || end { 2.0 } else { 97.0 }, 0.0, 0.0]);
             }
         }
         let blocked = blocked_cells(&counts, false, |_| 1.0);
         assert_eq!(blocked.len(), 6);
         assert!(blocked_cells(&counts, true, |_| 1.0).is_empty(), "a scene that stands elsewhere makes holes");
         let mut plate = counts.clone();
-        plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| c[2] = 90.0);
+        plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| (c[2], c[3]) = (90.0, 0.2));
+        assert!(blocked_cells(&plate, true, |_| 1.0).is_empty(), "another car came near in some frames");
+        plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| c[3] = 1.0);
         assert_eq!(blocked_cells(&plate, true, |_| 1.0).len(), 6);
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
         assert!(blocked_cells(&counts, false, |_| 0.2).is_empty(), "other losses explain it");

@@ -176,6 +176,45 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
     if sum[2] < 1.0 { 1.0 } else { (sum[0] / sum[2]).max(1.0) }
 }
 
+/// Derivatives of the distance of a ray's return across its surface by every column.
+pub struct Levers {
+    sensor: usize,
+    kind: usize,
+    range_m: f64,
+    cos_incidence: f64,
+    phase: f64,
+    pose: SVector<f64, 6>,
+    sensor_pose: SVector<f64, 6>,
+}
+
+impl Levers {
+    /// Of a measured ray of a sensor at `origin`.
+    pub fn new(ray: &Ray, origin: &Point3<f64>, half_fov_rad: f64) -> Self {
+        Levers {
+            sensor: ray.sensor as usize,
+            kind: kind_of(ray),
+            range_m: f64::from(ray.range_m),
+            cos_incidence: f64::from(ray.cos_incidence),
+            phase: f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad),
+            pose: pose_row(ray, origin, &Point3::origin()),
+            sensor_pose: pose_row(ray, origin, origin),
+        }
+    }
+
+    /// By one column; `None` of columns of other sensors and surfaces.
+    pub fn of(&self, column: Column) -> Option<f64> {
+        Some(match column {
+            Column::RangeOffset => -self.cos_incidence,
+            Column::RangeScale => -self.cos_incidence * self.range_m,
+            Column::Pose(k) => self.pose[k],
+            Column::SensorPose(s, k) if s == self.sensor => self.sensor_pose[k],
+            Column::Sweep(k) => self.phase * [self.pose[3], self.pose[4], self.pose[2]][k],
+            Column::Structure(k) if k == self.kind => 1.0,
+            Column::SensorPose(..) | Column::Structure(_) => return None,
+        })
+    }
+}
+
 /// Sums of all frames.
 pub fn mean_frames(
     frames: &[FramePair],
@@ -200,23 +239,9 @@ pub fn mean_frames(
             if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
             }
-            let own = pose_row(ray, origin, origin);
-            let phase = f64::from(ray.azimuth_rad) / (2.0 * half_fov[ray.sensor as usize]);
-            let c = f64::from(ray.cos_incidence);
-            let kind = kind_of(ray);
+            let levers = Levers::new(ray, origin, half_fov[ray.sensor as usize]);
             x.clear();
-            for (k, column) in columns.iter().enumerate() {
-                let v = match *column {
-                    Column::RangeOffset => -c,
-                    Column::RangeScale => -c * f64::from(ray.range_m),
-                    Column::Pose(k) => row[k],
-                    Column::SensorPose(s, k) if s == ray.sensor as usize => own[k],
-                    Column::Sweep(k) => phase * [row[3], row[4], row[2]][k],
-                    Column::Structure(k) if k == kind => 1.0,
-                    Column::SensorPose(..) | Column::Structure(_) => continue,
-                };
-                x.push((k, v));
-            }
+            x.extend(columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
             let w = weight(ray, noise_m) / design;
             for (i, &(k, v)) in x.iter().enumerate() {
                 let wx = w * v;

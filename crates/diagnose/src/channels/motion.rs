@@ -14,8 +14,8 @@ pub struct OwnMotion {
     pub yaw_rate_rad_s: f64,
 }
 
-/// Edges of a frame seen from above, cells of this size, m.
-const CELL_M: f64 = 0.35;
+/// Side of a cell of a frame seen from above, m.
+pub const CELL_M: f64 = 0.35;
 
 /// Fastest that is looked for, m/s.
 const FASTEST_M_S: f64 = 95.0;
@@ -95,12 +95,40 @@ fn cell(p: &Vector2<f64>) -> (i32, i32) {
     ((p.x / CELL_M).floor() as i32, (p.y / CELL_M).floor() as i32)
 }
 
+/// A square about the own car in cells, seen from above.
+pub struct Cells {
+    taken: Vec<bool>,
+}
+
+impl Cells {
+    /// Cells of a side; edges lie within 70 m, and what is moved farther away lies beyond.
+    const SIDE: i32 = 432;
+
+    /// Those with a point.
+    pub fn new<'a>(points: impl IntoIterator<Item = &'a Vector2<f64>>) -> Self {
+        let mut taken = vec![false; (Self::SIDE * Self::SIDE) as usize];
+        points.into_iter().filter_map(Self::place).for_each(|i| taken[i] = true);
+        Cells { taken }
+    }
+
+    fn place(p: &Vector2<f64>) -> Option<usize> {
+        let (x, y) = cell(p);
+        let [x, y] = [x, y].map(|v| v + Self::SIDE / 2);
+        ((0..Self::SIDE).contains(&x) && (0..Self::SIDE).contains(&y)).then_some((x * Self::SIDE + y) as usize)
+    }
+
+    /// Whether a point lies in one of them.
+    pub fn contains(&self, p: &Vector2<f64>) -> bool {
+        Self::place(p).is_some_and(|i| self.taken[i])
+    }
+}
+
 /// The motion under which most edges of the first frame come to lie on edges of the second.
 fn between(first: &[Vector2<f64>], second: &[Vector2<f64>], dt: f64) -> Option<OwnMotion> {
     if first.len() < FEWEST || second.len() < FEWEST || dt <= 0.0 || dt > 0.6 {
         return None;
     }
-    let taken: BTreeSet<(i32, i32)> = second.iter().map(cell).collect();
+    let taken = Cells::new(second);
     let stride = (first.len() / 400).max(1);
     let some: Vec<Vector2<f64>> = first.iter().step_by(stride).copied().collect();
     let hits = |d: f64, yaw: f64| {
@@ -109,7 +137,7 @@ fn between(first: &[Vector2<f64>], second: &[Vector2<f64>], dt: f64) -> Option<O
         let (ms, mc) = (0.5 * yaw).sin_cos();
         let count = some.iter().filter(|p| {
             let q = Vector2::new(p.x - d * mc, p.y - d * ms);
-            taken.contains(&cell(&Vector2::new(c * q.x + s * q.y, -s * q.x + c * q.y)))
+            taken.contains(&Vector2::new(c * q.x + s * q.y, -s * q.x + c * q.y))
         });
         count.count()
     };

@@ -243,9 +243,9 @@ fn with_numbers(laws: &[FittedLaw], numbers: &[f64]) -> Vec<FittedLaw> {
 pub struct FittedLaw {
     /// Which.
     pub law: Law,
-    /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew; signal: then by how
-    /// much standing surfaces and objects are brighter, in ln.
-    pub numbers: [f64; 5],
+    /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew, share lost anyway; signal:
+    /// then by how much standing surfaces and objects are brighter, in ln.
+    pub numbers: [f64; 6],
 }
 
 /// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. Real laws have other tails than the logistic one; the skew lets both differ.
@@ -285,21 +285,21 @@ impl Law {
     fn count(self) -> usize {
         match self {
             Law::Random | Law::Zone(_) => 1,
-            Law::Range | Law::Incidence => 3,
-            Law::Signal => 5,
+            Law::Range | Law::Incidence => 4,
+            Law::Signal => 6,
         }
     }
 
     fn steps(self) -> Vec<f64> {
         match self {
             Law::Random | Law::Zone(_) => vec![0.05],
-            Law::Range | Law::Incidence => vec![0.3, 0.4, 0.3],
-            Law::Signal => vec![0.5, 0.4, 0.3, 0.4, 0.4],
+            Law::Range | Law::Incidence => vec![0.3, 0.4, 0.3, 0.005],
+            Law::Signal => vec![0.5, 0.4, 0.3, 0.005, 0.4, 0.4],
         }
     }
 
     fn starts(self, table: &LossTable) -> Vec<FittedLaw> {
-        let with = |numbers: [f64; 5]| FittedLaw { law: self, numbers };
+        let with = |numbers: [f64; 6]| FittedLaw { law: self, numbers };
         let value = |i: usize| match self {
             Law::Incidence => table.places[i].ln_cos,
             Law::Signal => table.places[i].ln_cos - 2.0 * table.places[i].ln_range,
@@ -309,16 +309,20 @@ impl Law {
         values.sort_by(f64::total_cmp);
         let quantile = |q: f64| values.get(((values.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(0.0);
         match self {
-            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0, 0.0])],
-            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0, 0.0])).to_vec(),
-            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0, 0.0])).to_vec(),
+            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])],
+            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0, 0.0, 0.0])).to_vec(),
+            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0, 0.0, 0.0])).to_vec(),
         }
     }
 }
 
-/// Steepness and skew are not expected to be extreme.
-fn shape_penalty(ln_k: f64, ln_skew: f64) -> f64 {
-    0.5 * ln_k.powi(2) + 0.5 * (ln_skew / 0.7).powi(2)
+/// Of what comes back with plenty of light a sensor may lose this share; what is more is a cause of its own, a random loss.
+pub const MOST_ANYWAY: f64 = 0.025;
+
+/// Steepness and skew are not expected to be extreme, nor is much expected to be lost anyway.
+fn shape_penalty(ln_k: f64, ln_skew: f64, anyway: f64) -> f64 {
+    let beyond = (anyway - anyway.clamp(0.0, MOST_ANYWAY)) / 1e-3;
+    0.5 * ln_k.powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2) + beyond * beyond
 }
 
 impl FittedLaw {
@@ -338,8 +342,14 @@ impl FittedLaw {
         2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
     }
 
+    /// Share kept where nothing of the law is felt.
+    pub fn most(&self) -> f64 {
+        1.0 - self.numbers[3].clamp(0.0, MOST_ANYWAY)
+    }
+
     fn kept(&self, at: &Where) -> f64 {
-        let [a, b, s, c, d] = self.numbers;
+        let [a, b, s, _, c, d] = self.numbers;
+        let most = self.most();
         match self.law {
             Law::Random => (1.0 - a).clamp(1e-3, 1.5),
             Law::Zone(zone) => {
@@ -349,11 +359,11 @@ impl FittedLaw {
                     1.0
                 }
             }
-            Law::Range => step(-at.ln_range, [-a, b, s]),
-            Law::Incidence => step(at.ln_cos, [a, b, s]),
+            Law::Range => most * step(-at.ln_range, [-a, b, s]),
+            Law::Incidence => most * step(at.ln_cos, [a, b, s]),
             Law::Signal => {
                 let brighter = [0.0, c, d, d][at.zone];
-                step(at.ln_cos - 2.0 * at.ln_range + brighter, [a, b, s])
+                most * step(at.ln_cos - 2.0 * at.ln_range + brighter, [a, b, s])
             }
         }
     }
@@ -361,10 +371,13 @@ impl FittedLaw {
     fn penalty(&self) -> f64 {
         match self.law {
             Law::Signal => {
-                let [_, steep, skew, c, d] = self.numbers;
-                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS) + shape_penalty(steep - 0.8, skew)
+                let [_, steep, skew, anyway, c, d] = self.numbers;
+                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS) + shape_penalty(steep - 0.8, skew, anyway)
             }
-            Law::Range | Law::Incidence => shape_penalty(self.numbers[1] - 1.0, self.numbers[2]),
+            Law::Range | Law::Incidence => {
+                let [_, steep, skew, anyway, ..] = self.numbers;
+                shape_penalty(steep - 1.0, skew, anyway)
+            }
             _ => 0.0,
         }
     }
@@ -418,10 +431,11 @@ mod tests {
         assert_eq!(best(&table(|_, c, _| c * c / (c * c + 0.01))).0, Law::Incidence);
         let (law, fit) = best(&table(|r, c, z| {
             let u = (c / (r * r)).ln() + if z > 0 { 1.0 } else { 0.0 };
-            0.5 * (1.0 + (2.0 * (u + 10.5)).tanh())
+            0.985 * 0.5 * (1.0 + (2.0 * (u + 10.5)).tanh())
         }));
         assert_eq!(law, Law::Signal);
-        assert!((fit.half() + 10.5).abs() < 0.3 && (fit.numbers[3] - 1.0).abs() < 0.3, "{fit:?}");
+        assert!((fit.half() + 10.5).abs() < 0.3 && (fit.numbers[4] - 1.0).abs() < 0.3, "{fit:?}");
+        assert!((fit.most() - 0.985).abs() < 4e-3, "{fit:?}");
         let (law, fit) = best(&table(|_, _, z| if z == 2 { 0.4 } else { 1.0 }));
         assert_eq!(law, Law::Zone(2));
         assert!((fit.numbers[0] - 0.6).abs() < 0.02);

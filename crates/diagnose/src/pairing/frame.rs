@@ -57,14 +57,19 @@ const LONE: u8 = 1;
 const STRAY_M: f64 = 0.5;
 
 impl Sensors {
+    /// Row of a shot; `u16::MAX` where rows are not known.
+    fn row(&self, sensor: usize, elevation_rad: f32) -> u16 {
+        self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
+    }
+
     fn window(&self, sensor: usize) -> Steps {
         let steps = self.patterns[sensor].steps;
         Steps { azimuth_rad: WINDOW[0] * steps.azimuth_rad, elevation_rad: WINDOW[1] * steps.elevation_rad }
     }
 }
 
-/// How far a point of a sensor is shown from where it is, both in the cloud's frame, m.
-pub type ShownShift<'a> = &'a (dyn Fn(&Vector3<f64>, usize) -> Vector3<f64> + Sync);
+/// How far a point of a frame and a sensor, each by its number, is shown from where it is, both in the cloud's frame, m.
+pub type ShownShift<'a> = &'a (dyn Fn(usize, &Vector3<f64>, usize) -> Vector3<f64> + Sync);
 
 /// What is known to be wrong with the measured side and is taken out before the frames are paired.
 #[derive(Clone, Copy, Default)]
@@ -77,9 +82,9 @@ pub struct Mending<'a> {
     pub step_m: Option<f64>,
 }
 
-/// Pairs a frame, return by return.
+/// Pairs a frame, return by return; `number` is its place among all.
 pub fn pair_frame(
-    id: &str,
+    (number, id): (usize, &str),
     measured: (&Cloud, &[Object]),
     simulated: (&Cloud, &[Object]),
     sensors: &Sensors,
@@ -88,12 +93,20 @@ pub fn pair_frame(
     let mut objects = pair_labels(measured.1, simulated.1);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
     let mut scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
+    // Whether a shot came back is asked by the direction in which it was sent, wherever what it met is moved to.
+    let mut matched: Vec<_> = (0..sensors.rig.sensors.len())
+        .map(|k| {
+            let closes = sensors.rig.sensors[k].closes();
+            match_directions(&scans[0][k], &scans[1][k], &sensors.patterns[k], closes)
+        })
+        .collect();
+    let rows: Vec<Vec<f32>> = scans[0].iter().map(|scan| scan.elevation_rad.clone()).collect();
     if let Some(shift_m) = mending.shift_m {
         for (sensor, scan) in scans[0].iter_mut().enumerate() {
             let pose = sensors.rig.sensors[sensor].pose();
             scan.move_points(|p| {
                 let at = pose * p;
-                pose.inverse() * (at - shift_m(&at.coords, sensor))
+                pose.inverse() * (at - shift_m(number, &at.coords, sensor))
             });
         }
     }
@@ -106,7 +119,7 @@ pub fn pair_frame(
         let (measured_scans, simulated_scans) = scans.split_at_mut(1);
         let (a, b) = (&mut measured_scans[0][sensor], &simulated_scans[0][sensor]);
         let closes = sensors.rig.sensors[sensor].closes();
-        let (of_a, of_b) = match_directions(a, b, &sensors.patterns[sensor], closes);
+        let (of_a, of_b) = std::mem::take(&mut matched[sensor]);
         let sight = Sight::new(sensors, sensor, b, &boxes);
         let mut simulated: Vec<Ray> = (0..b.len()).map(|i| sight.ray(b, i, true)).collect();
         for (i, (ray, matched)) in simulated.iter_mut().zip(of_b).enumerate() {
@@ -126,6 +139,7 @@ pub fn pair_frame(
         let own = DirectionIndex::new(a, sensors.window(sensor), closes);
         for (i, (ray, matched)) in measured.iter_mut().zip(of_a).enumerate() {
             ray.matched = matched;
+            ray.row = sensors.row(sensor, rows[sensor][i]);
             ray.company = company(&own, a, i);
         }
         // A return without any other at its range is no surface: false alarms would make all around them rough.
@@ -187,7 +201,7 @@ impl<'a> Sight<'a> {
     fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
         let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
         let direction = unit(&self.cloud_from_sensor.rotation, az, el);
-        let row = self.sensors.patterns[self.sensor].row(el).map_or(u16::MAX, |r| r as u16);
+        let row = self.sensors.row(self.sensor, el);
         let mut ray = Ray {
             sensor: self.sensor as u8,
             surface: Surface::Open,

@@ -147,7 +147,7 @@ pub fn pair_all(
         .enumerate()
         .map(|(i, id)| {
             let (a, b) = (load(measured, id)?, load(simulated, id)?);
-            let mut frame = pair_frame(id, (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
+            let mut frame = pair_frame((i, id), (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
             for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
                 thin(rays, kept, i as u64, k as u64);
             }

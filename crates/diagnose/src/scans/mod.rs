@@ -140,6 +140,7 @@ pub fn diagnose_scans(
             floor: 0.0,
             closed: None,
             ci95: None,
+            channels: Default::default(),
         },
         detectors: Vec::new(),
         considered,

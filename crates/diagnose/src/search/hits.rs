@@ -1,9 +1,9 @@
 //! Lost returns: which simulated returns has the measured side not, and on what does it depend?
 
-use super::unnamed::{Unnamed, word};
+use super::unnamed::{Unnamed, mean_by_group, word};
 use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
 use crate::channels::cells::{ZONE_NAMES, cell};
-use crate::channels::groups::{Grouping, PartedFrame, group_of, total as group_total};
+use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
@@ -173,7 +173,7 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     if let Some((grouping, confidence)) = unnamed {
         let groups = loss_groups(context.frames, context.rig, mask, grouping, &|c| table_e.kept(&fitted, c));
         let kept = |ray: &Ray| cell(ray).filter(|_| !mask.hides(ray)).map(|c| table_e.kept(&fitted, c));
-        let shares = mean_by_group(context, grouping, &kept);
+        let shares = mean_by_group(estimate.iter().flat_map(|&i| &context.frames[i].simulated), grouping, kept);
         let mut found = unnamed_found(&groups, &shares, grouping, &estimate, &hold_out, confidence);
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
             d[1] += g;
@@ -193,22 +193,6 @@ const UNNAMED: &str = "unexplained";
 
 /// Shares lost by groups of directions: prior spread of a fifth.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false };
-
-/// Mean of a value over the simulated returns of each group.
-fn mean_by_group(
-    context: &Context,
-    grouping: Grouping,
-    value: &dyn Fn(&Ray) -> Option<f64>,
-) -> std::collections::BTreeMap<u32, f64> {
-    let mut sums = std::collections::BTreeMap::<u32, [f64; 2]>::new();
-    for ray in context.of(Role::Estimate).iter().flat_map(|&i| &context.frames[i].simulated) {
-        if let (Some(v), Some(g)) = (value(ray), group_of(ray, grouping)) {
-            let sum = sums.entry(g as u32).or_default();
-            (sum[0], sum[1]) = (sum[0] + v, sum[1] + 1.0);
-        }
-    }
-    sums.into_iter().map(|(g, s)| (g, s[0] / s[1])).collect()
-}
 
 fn unnamed_found(
     groups: &[PartedFrame],
@@ -251,14 +235,19 @@ fn may_join(law: Law, chosen: &[Law]) -> bool {
 fn reading(law: &FittedLaw) -> Vec<(&'static str, f64, &'static str)> {
     match law.law {
         Law::Random | Law::Zone(_) => vec![("share", law.numbers[0], "1")],
-        Law::Range => vec![("half_at_m", law.half().exp(), "m"), ("steepness", law.steepness(), "1")],
-        Law::Incidence => vec![("cos_half", law.half().exp(), "1"), ("steepness", law.steepness(), "1")],
+        Law::Range => {
+            vec![("half_at_m", law.half().exp(), "m"), ("steepness", law.steepness(), "1"), ("most", law.most(), "1")]
+        }
+        Law::Incidence => {
+            vec![("cos_half", law.half().exp(), "1"), ("steepness", law.steepness(), "1"), ("most", law.most(), "1")]
+        }
         // u: ln(0.1 cos / R^2) - ln(0.1 / 250^2).
         Law::Signal => vec![
             ("threshold", law.half() + 2.0 * 250f64.ln(), "1"),
             ("steepness", law.steepness(), "1"),
-            ("brighter_standing", law.numbers[3], "1"),
-            ("brighter_objects", law.numbers[4], "1"),
+            ("most", law.most(), "1"),
+            ("brighter_standing", law.numbers[4], "1"),
+            ("brighter_objects", law.numbers[5], "1"),
         ],
     }
 }
@@ -283,7 +272,8 @@ fn found(
                 (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
             // The form of the truth may differ, the more so beyond the returns that there are.
             let beyond = if *name == "half_at_m" { (estimate - table.farthest_m()).max(0.0) } else { 0.0 };
-            let half = 2.1 * sd.hypot(form_error(law.law) * estimate.abs()) + beyond;
+            let form = if *name == "most" { 0.002 } else { form_error(law.law) * estimate.abs() };
+            let half = 2.1 * sd.hypot(form) + beyond;
             let parameter =
                 Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
             ((*name).to_owned(), parameter)

@@ -6,7 +6,7 @@ use super::geometry::Displacement;
 use super::{ChannelResult, Context, Repair, Z_STAR, confidence, first_demands, record};
 use crate::channels::labels::{ObjectShift, object_shifts};
 use crate::channels::mean::origins;
-use crate::channels::motion::{OwnMotion, own_motion};
+use crate::channels::motion::OwnMotion;
 use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
@@ -93,7 +93,7 @@ const LEAST_MOVED_M: [f64; 2] = [0.02, 0.04];
 
 /// The search on one side; `displaced` tells how far things are shown from where they are for reasons of the geometry.
 pub fn search(context: &Context, side: Side, displaced: &Displacement) -> ChannelResult {
-    let motion = context.times.as_ref().map(|t| own_motion(context.frames, t, &origins(context.rig)));
+    let motion = &context.motion;
     let shifts = object_shifts(context.frames, context.times.as_deref());
     let mut rows: Vec<Row> =
         shifts.iter().filter_map(|s| row(context, s, side, motion.as_deref(), displaced)).collect();

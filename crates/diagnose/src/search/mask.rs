@@ -8,6 +8,7 @@ use crate::channels::mask::{
     AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, blocked_cells, direction_cell, direction_counts, range_cut,
     with_neighbours,
 };
+use crate::channels::returns::OWN_CAR_M;
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::losses::{FittedLaw, Law, LossTable};
 use crate::inference::roles::Role;
@@ -119,10 +120,14 @@ fn cut_found(context: &Context, on_select: f64) -> Found {
 fn blocked_found(context: &Context, mask: &Mask) -> Found {
     let hold_out = context.of(Role::HoldOut);
     let inside = |r: &Ray| mask.blocked.contains(&direction_cell(r));
-    let held: Vec<f64> = hold_out
-        .iter()
-        .map(|&i| context.frames[i].simulated.iter().filter(|r| inside(r)).count() as f64 * 20f64.ln())
-        .collect();
+    // Returns that do not come, or that come from the own car where the simulation has nothing.
+    let surprises = |i: usize| {
+        let frame = &context.frames[i];
+        let hidden = frame.simulated.iter().filter(|r| inside(r)).count();
+        let near = frame.measured.iter().filter(|r| r.own_range_m() < OWN_CAR_M && inside(r)).count();
+        hidden.max(near) as f64
+    };
+    let held: Vec<f64> = hold_out.iter().map(|&i| surprises(i) * 20f64.ln()).collect();
     // The sensor with the most blocked cells is described.
     let sensor = (0..context.rig.sensors.len() as u8)
         .max_by_key(|s| mask.blocked.iter().filter(|c| c.0 == *s).count())
@@ -141,7 +146,7 @@ fn blocked_found(context: &Context, mask: &Mask) -> Found {
     let counts = direction_counts(context.frames, &estimate);
     let points =
         counts.iter().filter(|(c, _)| c.0 == sensor && (el[0]..el[1]).contains(&((f64::from(c.2) + 0.5) * el_step)));
-    let points = points.map(|(c, [n, seen, _])| CurvePoint {
+    let points = points.map(|(c, [n, seen, ..])| CurvePoint {
         x: (f64::from(c.1) + 0.5) * az_step,
         measured: seen / n.max(1.0),
         before: 1.0,

@@ -7,9 +7,11 @@ pub mod mask;
 pub mod noise;
 pub mod quantisation;
 pub mod returns;
+pub mod shutter;
 mod unnamed;
 
 use crate::channels::groups::Grouping;
+use crate::channels::motion::OwnMotion;
 use crate::diagnosis::{Considered, Curve, FindingGain, Minimum, Parameter, Status};
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::roles::Role;
@@ -27,6 +29,8 @@ pub struct Context<'a> {
     pub roles: Vec<(Role, usize)>,
     /// Times of the frames, s, where their ids tell.
     pub times: Option<Vec<f64>>,
+    /// How the own car moves at each frame, where the scenes tell.
+    pub motion: Option<Vec<Option<OwnMotion>>>,
 }
 
 impl Context<'_> {

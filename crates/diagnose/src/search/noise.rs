@@ -2,10 +2,10 @@
 
 mod curve;
 
-use super::unnamed::{Unnamed, word};
+use super::unnamed::{Unnamed, mean_by_group, word};
 use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed};
 use crate::channels::cells::cell;
-use crate::channels::groups::{Grouping, PartedFrame, group_of, total as group_total};
+use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::mean::usual_noise_m;
 use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
 use crate::diagnosis::{Minimum, Status};
@@ -25,16 +25,15 @@ const FLOOR_RAD: f64 = 1.7e-4;
 /// Nor variances that grow by less than this share over the places that matter.
 const FLOOR_SHARE: f64 = 0.1;
 
-/// The search; `known` lists variances that other findings explain already (a step of rounding).
-/// Surfaces met at less than `least_cos` are left out.
-pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> ChannelResult {
+/// The search; surfaces met at less than `least_cos` are left out.
+pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
     let scales = scales(context.frames);
     let rough = rough_frames(context.frames, &scales);
     let mut result = ChannelResult::default();
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let blocks = context.blocks(&select);
     let table = NoiseTable::new(total(select.iter().map(|&i| &rough[i])), least_cos);
-    let linear: Vec<LinearFrame> = select.iter().map(|&i| explained(&table, &rough[i], known)).collect();
+    let linear: Vec<LinearFrame> = select.iter().map(|&i| table.linear(&rough[i], &NOISE_LAWS)).collect();
     let frames: Vec<&LinearFrame> = linear.iter().collect();
     let precision = vec![0.0; NOISE_LAWS.len()];
     let whole = |columns: &[usize]| fit(&frames, &blocks, columns, &precision);
@@ -77,7 +76,7 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
     let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| trial(&[k], None)).collect();
     let mut choice = choose(&trials, &demands);
     if choice.is_none() {
-        trials.extend(directions(known, GROUPED));
+        trials.extend(directions(&[], GROUPED));
         choice = choose(&trials, &demands);
     }
     let returns = context.returns(&select);
@@ -102,7 +101,11 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
     ));
     let mut chosen = Vec::new();
     let mut stories = Vec::new();
-    let mut unnamed = choice.as_ref().map(|c| &trials[c.chosen]).filter(|t| t.name == UNNAMED).map(|t| t.candidate);
+    let mut unnamed = choice
+        .as_ref()
+        .map(|c| &trials[c.chosen])
+        .filter(|t| t.name == UNNAMED)
+        .map(|t| (t.candidate, confidence(&trials, &blocks, UNNAMED, &demands)));
     if let Some(first) = choice.as_ref().filter(|_| unnamed.is_none()) {
         let t = &trials[first.chosen];
         chosen.push(t.candidate);
@@ -125,29 +128,25 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
         }
         // A law that leaves much that depends on the direction is a form, not a name.
         let so_far = whole(&chosen);
-        let told = chosen.iter().zip(so_far.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t));
+        let told: Vec<_> = chosen.iter().zip(so_far.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)).collect();
         let beside = GroupFit { centred: true, ..GROUPED };
-        let tables = directions(&known.iter().copied().chain(told).collect::<Vec<_>>(), beside);
+        let tables = directions(&told, beside);
         let remains = choose(&tables, &demands);
         result.considered.extend(record(&tables, remains.as_ref(), "roughness", returns, &demands));
         if let Some(remains) = remains {
-            unnamed = Some(tables[remains.chosen].candidate);
+            unnamed = Some((tables[remains.chosen].candidate, confidence(&tables, &blocks, UNNAMED, &demands)));
             stories.clear();
         }
     }
     // Parameters from other frames.
     let table_e = NoiseTable::new(total(estimate.iter().map(|&i| &rough[i])), least_cos);
-    let linear_e: Vec<LinearFrame> = estimate.iter().map(|&i| explained(&table_e, &rough[i], known)).collect();
+    let linear_e: Vec<LinearFrame> = estimate.iter().map(|&i| table_e.linear(&rough[i], &NOISE_LAWS)).collect();
     let fitted = fit(&linear_e.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &chosen, &precision);
     let table_h = NoiseTable::new(total(hold_out.iter().map(|&i| &rough[i])), least_cos);
-    let terms: Vec<(NoiseLaw, f64)> = known
-        .iter()
-        .copied()
-        .chain(chosen.iter().zip(fitted.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)))
-        .collect();
+    let terms: Vec<(NoiseLaw, f64)> =
+        chosen.iter().zip(fitted.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)).collect();
     for (k, (equals, confidence)) in stories.into_iter().enumerate() {
-        let without: Vec<_> =
-            terms.iter().enumerate().filter(|(i, _)| *i != known.len() + k).map(|(_, t)| *t).collect();
+        let without: Vec<_> = terms.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, t)| *t).collect();
         let gains =
             hold_out.iter().map(|&i| table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &without));
         result.found.push(found(
@@ -162,19 +161,21 @@ pub fn search(context: &Context, known: &[(NoiseLaw, f64)], least_cos: f64) -> C
         ));
     }
     result.distance = hold_out.iter().map(|&i| distance(&table_h, &table_e, &rough[i], &terms)).collect();
-    if let Some(candidate) = unnamed {
+    if let Some((candidate, confidence)) = unnamed {
         let grouping = if candidate == NOISE_LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
         let expected = |c: usize, ray: &Ray| expected(&table_e, c, ray, &terms);
         let groups = rough_groups(context.frames, context.rig, &scales, grouping, &|c| table_e.variances(c), &expected);
-        let shares = expected_by_group(context, grouping, &expected);
-        let mut found = unnamed_found(&groups, &shares, grouping, &estimate, &hold_out, usual_noise_m(context.frames));
+        let share = |ray: &Ray| Some(expected(cell(ray)?, ray));
+        let shares = mean_by_group(estimate.iter().flat_map(|&i| &context.frames[i].measured), grouping, share);
+        let roles = [&estimate[..], &hold_out];
+        let mut found = unnamed_found(&groups, &shares, grouping, roles, confidence, usual_noise_m(context.frames));
         for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
             d[1] += g;
             d[2] += g.max(0.0);
         }
         // The forms below the table are part of it: they have no name of their own.
         for (g, &i) in found.held_out_gains.iter_mut().zip(&hold_out) {
-            *g += table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &terms[..known.len()]);
+            *g += table_h.likelihood(&rough[i], &terms) - table_h.likelihood(&rough[i], &[]);
         }
         result.found.push(found);
     }
@@ -197,34 +198,18 @@ fn expected(table: &NoiseTable, cell: usize, ray: &Ray, terms: &[(NoiseLaw, f64)
     1.0 + terms.iter().map(|(l, t)| t * l.variance(range, cos)).sum::<f64>() / vb
 }
 
-/// Mean of what laws tell of the measured returns of each group, in units of the simulated variance.
-fn expected_by_group(
-    context: &Context,
-    grouping: Grouping,
-    expected: &dyn Fn(usize, &Ray) -> f64,
-) -> std::collections::BTreeMap<u32, f64> {
-    let mut sums = std::collections::BTreeMap::<u32, [f64; 2]>::new();
-    for ray in context.of(Role::Estimate).iter().flat_map(|&i| &context.frames[i].measured) {
-        if let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) {
-            let sum = sums.entry(g as u32).or_default();
-            (sum[0], sum[1]) = (sum[0] + expected(c, ray), sum[1] + 1.0);
-        }
-    }
-    sums.into_iter().map(|(g, s)| (g, s[0] / s[1])).collect()
-}
-
 fn unnamed_found(
     groups: &[PartedFrame],
     shares: &std::collections::BTreeMap<u32, f64>,
     grouping: Grouping,
-    estimate: &[usize],
-    hold_out: &[usize],
+    [estimate, hold_out]: [&[usize]; 2],
+    confidence: f64,
     usual_m: f64,
 ) -> Found {
     let all = group_total(estimate.iter().flat_map(|&i| &groups[i]));
     let told = Unnamed {
         channel: "roughness",
-        confidence: 1.0,
+        confidence,
         parameters: vec![parameter("simulated_std_m", usual_m, 0.05 * usual_m, "m")],
         says: format!(
             "measured ranges scatter more in some directions than in others: it depends on the {}, and no cause of the catalogue does that",
@@ -237,19 +222,6 @@ fn unnamed_found(
         let measured = (1.0 + added).max(0.0).sqrt();
         [share * measured, share * 0.5 * std / measured.max(0.1)]
     })
-}
-
-/// Sums of a frame after the variance that is explained already.
-fn explained(table: &NoiseTable, frame: &RoughFrame, known: &[(NoiseLaw, f64)]) -> LinearFrame {
-    let mut laws = NOISE_LAWS.to_vec();
-    laws.extend(known.iter().map(|k| k.0));
-    let all = table.linear(frame, &laws);
-    let n = NOISE_LAWS.len();
-    let mut right = all.right.rows(0, n).into_owned();
-    for (j, (_, theta)) in known.iter().enumerate() {
-        right -= all.gram.view((0, n + j), (n, 1)) * *theta;
-    }
-    LinearFrame { gram: all.gram.view((0, 0), (n, n)).into_owned(), right }
 }
 
 fn above_floor(table: &NoiseTable, law: NoiseLaw, theta: f64) -> bool {

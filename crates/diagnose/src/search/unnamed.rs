@@ -1,9 +1,10 @@
 //! What depends on rows or azimuths and has no name in the catalogue.
 
 use super::Found;
-use crate::channels::groups::{GroupSums, Grouping, PartedFrame, place_of};
+use crate::channels::groups::{GroupSums, Grouping, PartedFrame, group_of, place_of};
 use crate::diagnosis::{Curve, CurvePoint, Parameter, Status};
 use crate::inference::grouped::{self, GroupFit};
+use crate::pairing::Ray;
 use std::collections::BTreeMap;
 
 /// What a channel says of such a finding.
@@ -18,6 +19,22 @@ pub(super) struct Unnamed {
 /// What directions are grouped by, as findings call it.
 pub(super) fn word(grouping: Grouping) -> &'static str {
     if grouping == Grouping::Row { "row" } else { "azimuth" }
+}
+
+/// Mean of a value over the rays of each group.
+pub(super) fn mean_by_group<'a>(
+    rays: impl Iterator<Item = &'a Ray>,
+    grouping: Grouping,
+    value: impl Fn(&Ray) -> Option<f64>,
+) -> BTreeMap<u32, f64> {
+    let mut sums = BTreeMap::<u32, [f64; 2]>::new();
+    for ray in rays {
+        if let (Some(v), Some(g)) = (value(ray), group_of(ray, grouping)) {
+            let sum = sums.entry(g as u32).or_default();
+            (sum[0], sum[1]) = (sum[0] + v, sum[1] + 1.0);
+        }
+    }
+    sums.into_iter().map(|(g, s)| (g, s[0] / s[1])).collect()
 }
 
 impl Unnamed {

@@ -1,5 +1,6 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
+mod curve;
 mod displacement;
 mod suspects;
 mod words;

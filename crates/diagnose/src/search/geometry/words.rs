@@ -1,5 +1,6 @@
 //! What the search of geometry found, in words and numbers.
 
+use super::curve::linear_curve;
 use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, UNNAMED, fit_all, groups_of, how};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
@@ -44,7 +45,8 @@ pub(super) fn found(
                 "pitch_roll" => "range_m",
                 _ => "sensor",
             };
-            (covariate.to_owned(), format!("{what}: {}", list.join(", ")), Curve::default())
+            let curve = linear_curve(context, sums, estimate, &fitted, columns, name);
+            (covariate.to_owned(), format!("{what}: {}", list.join(", ")), curve)
         }
         Suspect::Groups { grouping, column, .. } => {
             let frames = groups_of(sums, *grouping);

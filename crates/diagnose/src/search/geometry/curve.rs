@@ -1,0 +1,60 @@
+//! Pictures of linear causes: how far surfaces stand off, against what that depends on.
+
+use super::Sums;
+use crate::channels::mean::{Column, Levers, origins, usable};
+use crate::diagnosis::{Curve, CurvePoint};
+use crate::inference::linear::LinearFit;
+use crate::pairing::Ray;
+use crate::search::Context;
+
+/// Bins of a picture.
+const BINS: usize = 16;
+
+/// Fewer rays make no point.
+const FEWEST: f64 = 30.0;
+
+/// Farther than that a return is not of the surface, m.
+const STRAY_M: f64 = 0.5;
+
+/// What a picture's axis shows of a ray.
+type Axis = (&'static str, fn(&Ray, f64) -> f64);
+
+/// How far surfaces stand off in the direction in which `columns` of a fit move them, by what the cause depends on: range for a bias,
+/// distance along the car for a tilt, phase for a shutter, azimuth for a sensor. Rays that the cause does not move are left out.
+pub(super) fn linear_curve(
+    context: &Context,
+    sums: &Sums,
+    frames: &[usize],
+    fitted: &LinearFit,
+    columns: &[usize],
+    name: &str,
+) -> Curve {
+    let (x, value): Axis = match name {
+        "range_bias" => ("range, m", |r, _| f64::from(r.range_m)),
+        "pitch_roll" => ("distance along the car, m", |r, _| f64::from(r.direction[0] * r.range_m)),
+        "rolling_shutter" => ("phase of the scan", |r, half_fov| f64::from(r.azimuth_rad) / (2.0 * half_fov)),
+        _ => ("azimuth of the sensor, degrees", |r, _| f64::from(r.azimuth_rad).to_degrees()),
+    };
+    let theta = |c: usize| fitted.columns.iter().position(|x| *x == c).map_or(0.0, |i| fitted.theta[i]);
+    let moving: Vec<(Column, f64)> = columns.iter().map(|&c| (sums.columns[c], theta(c))).collect();
+    let origins = origins(context.rig);
+    let half_fov: Vec<f64> = context.rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let mut places: Vec<[f64; 3]> = Vec::new();
+    for ray in frames.iter().flat_map(|&f| &context.frames[f].measured).filter(|r| usable(r)) {
+        let sensor = ray.sensor as usize;
+        let levers = Levers::new(ray, &origins[sensor], half_fov[sensor]);
+        let told: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
+        let y = ray.across_nearest_m();
+        if told != 0.0 && (y - told).abs() < STRAY_M {
+            places.push([value(ray, half_fov[sensor]), y * told.signum(), told.abs()]);
+        }
+    }
+    places.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let points = places.chunks(places.len().div_ceil(BINS).max(1)).filter(|c| c.len() as f64 >= FEWEST).map(|chunk| {
+        let n = chunk.len() as f64;
+        let [x, measured, after] = [0, 1, 2].map(|k: usize| chunk.iter().map(|p| p[k]).sum::<f64>() / n);
+        let variance = chunk.iter().map(|p| (p[1] - measured).powi(2)).sum::<f64>() / n;
+        CurvePoint { x, measured, before: 0.0, after, error: (variance / n).sqrt() }
+    });
+    Curve { x: x.into(), y: "surfaces stand off by, m".into(), points: points.collect() }
+}
