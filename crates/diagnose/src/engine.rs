@@ -5,7 +5,7 @@ use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Ver
 use crate::error::DiagnoseError;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
-    FramePair, Mending, ObjectPair, Ray, check_identity, common_ids, find_sensors, pair_all, with_points,
+    FramePair, Mending, ObjectPair, Ray, ShownShift, check_identity, common_ids, find_sensors, pair_all, with_points,
 };
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
@@ -110,35 +110,39 @@ pub fn diagnose(
     let mut results: Vec<ChannelResult> = Vec::new();
     progress(Stage::Weighing, 0, searches);
     let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
-    // What slides over a scan is moved back before anything else is looked at.
+    // What slides over a scan is moved back before anything else is looked at, but for the ranges as they were measured.
     let (sliding, slide) = search::shutter::search(&context);
     results.push(sliding);
+    let (rounding, step_m) = search::quantisation::search(&context);
+    results.push(rounding);
     let slid = |frame: usize, p: &Vector3<f64>, sensor: usize| match &slide {
         Some(slide) => slide.shift_m(frame, p, search::shutter::phase(p, sensor, rig)),
         None => Vector3::zeros(),
     };
-    let standing = match &slide {
-        Some(_) => Some(again(Mending { shift_m: Some(&slid), ..Mending::default() })?),
-        None => None,
+    // Coarse steps put level ground off by a whole row's width: the simulated side is rounded alike.
+    let coarse_m = step_m.filter(|step| *step > COARSE_M);
+    let standing = match (&slide, coarse_m) {
+        (None, None) => None,
+        _ => {
+            let shift: ShownShift = &slid;
+            Some(again(Mending { shift_m: slide.as_ref().map(|_| shift), step_m: coarse_m, ..Mending::default() })?)
+        }
     };
     let frames = standing.as_deref().unwrap_or(&frames);
     context.frames = frames;
-    progress(Stage::Weighing, 1, searches);
+    progress(Stage::Weighing, 2, searches);
     let (geometry, displaced) = search::geometry::search(&context);
     results.push(geometry);
-    progress(Stage::Weighing, 2, searches);
-    let (rounding, step_m) = search::quantisation::search(&context);
-    results.push(rounding);
     progress(Stage::Weighing, 3, searches);
     // What stands elsewhere is moved back before silhouettes and single returns are looked at.
     let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
         slid(frame, p, sensor) + displaced.of_point(p, sensor, &origins[sensor])
     };
     let moves = slide.is_some() || displaced.moves();
-    let moved = Mending { shift_m: moves.then_some(&shift), ..Mending::default() };
+    let moved = Mending { shift_m: moves.then_some(&shift), step_m: coarse_m, ..Mending::default() };
     let upright = if displaced.moves() { Some(again(moved)?) } else { None };
     context.frames = upright.as_deref().unwrap_or(frames);
-    let elsewhere = displaced.moves() || displaced.aims();
+    let elsewhere = slide.is_some() || displaced.moves() || displaced.aims();
     let (hidden, mask) = search::mask::search(&context, elsewhere);
     results.push(hidden);
     results.push(search::hits::search(&context, &mask, elsewhere));
@@ -176,7 +180,10 @@ pub fn diagnose(
 
 /// Channels in the order in which they are searched; what hides rays altogether and the laws of losses both look at hits.
 const CHANNELS: [&str; 9] =
-    ["slide", "residuals", "ranges", "hits", "hits", "returns", "roughness", "labels", "objects"];
+    ["slide", "ranges", "residuals", "hits", "hits", "returns", "roughness", "labels", "objects"];
+
+/// Larger steps of the ranges matter to where surfaces lie, m.
+const COARSE_M: f64 = 0.02;
 
 /// Keeps the first of frames that show the same to the bit: they say nothing twice.
 fn leave_out_copies(frames: &mut Vec<FramePair>) {

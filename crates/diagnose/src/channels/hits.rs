@@ -74,27 +74,28 @@ pub fn loss_groups(
 ) -> Vec<PartedFrame> {
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |frame: &FramePair| -> PartedFrame {
-        // Simulated returns, measured ones, those expected to be lost, those without a counterpart.
-        let mut sums = std::collections::BTreeMap::<(usize, usize), [f64; 4]>::new();
+        // Of the simulated side and of the measured one: returns, and those without a counterpart; then those expected to be lost.
+        let mut sums = std::collections::BTreeMap::<(usize, usize), ([[f64; 2]; 2], f64)>::new();
         for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
             for ray in rays {
                 let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
                 if mask.hides(ray) {
                     continue;
                 }
-                let sum = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
-                sum[side] += 1.0;
-                sum[3] += f64::from(u8::from(!ray.matched));
+                let (count, lost) = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
+                count[side][0] += 1.0;
+                count[side][1] += f64::from(u8::from(!ray.matched));
                 if side == 0 {
-                    sum[2] += 1.0 - kept(c);
+                    *lost += 1.0 - kept(c);
                 }
             }
         }
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];
-        for ((g, part), [n, seen, lost, odd]) in sums.into_iter().filter(|(_, s)| s[0] >= 5.0) {
+        for ((g, part), ([[n, alone], [seen, odd]], lost)) in sums.into_iter().filter(|(_, (c, _))| c[0][0] >= 5.0) {
             // Twice the count of odd ones: neighbours are lost together.
-            let w = n * n / (2.0 * (odd + 2.0));
-            let y = (n - seen - lost) / n;
+            let w = n * n / (2.0 * (alone + odd + 2.0));
+            // Matching one to one leaves as many without a counterpart on both sides.
+            let y = (alone - lost) / n - odd / f64::max(seen, 1.0);
             out[part].push((g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
         }
         out

@@ -60,19 +60,24 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
             counts.entry(direction_cell(ray)).or_default()[0] += 1.0;
         }
         for ray in &frame.measured {
-            if ray.own_range_m() > OWN_CAR_M {
-                counts.entry(direction_cell(ray)).or_default()[1] += 1.0;
-                continue;
-            }
-            // In the open the simulation has nothing at all there.
+            // In the open the simulation has nothing at all there; what was moved out of sight has a counterpart.
             let predicted = match ray.lies() {
-                Lies::Open => f64::INFINITY,
+                Lies::Open => {
+                    if ray.matched {
+                        0.0
+                    } else {
+                        f64::INFINITY
+                    }
+                }
                 _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
             };
-            if ray.own_range_m() < HALF_WAY * predicted {
-                let count = counts.entry(direction_cell(ray)).or_default();
+            let count = counts.entry(direction_cell(ray)).or_default();
+            if ray.own_range_m() < OWN_CAR_M.min(HALF_WAY * predicted) {
                 count[2] += 1.0;
                 count[3] = 1.0 / which.len() as f64;
+            } else {
+                // What lies about as near as it should counts as seen, on whichever side of the bound it comes to lie.
+                count[1] += 1.0;
             }
         }
         counts

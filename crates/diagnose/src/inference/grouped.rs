@@ -13,6 +13,8 @@ pub struct GroupFit {
     pub precision: f64,
     /// Whether what all groups have in common is taken out: it belongs to other causes.
     pub centred: bool,
+    /// Share of what other parts of a group tell that is believed of a part, 1 for all: less where parts agree in sign rather than in size.
+    pub trust: f64,
 }
 
 /// Offset of each group.
@@ -83,7 +85,8 @@ pub fn cross_part_gains(
             for (_, sums) in parts.iter().enumerate().filter(|(p, _)| *p != part) {
                 sums.iter().for_each(|(k, s)| others.entry(*k).or_default().merge(s));
             }
-            let told = offsets(&others, how);
+            let mut told = offsets(&others, how);
+            told.values_mut().for_each(|v| *v *= how.trust);
             let smooth = if rough { smooth(&others, &told, how) } else { BTreeMap::new() };
             for i in (0..select.len()).filter(|&i| folds[i] == fold) {
                 let mut frame = frames[select[i]][part].clone();
@@ -142,7 +145,7 @@ mod tests {
             };
             (0..16).map(|_| std::array::from_fn(|part| (0..20).map(|k| group(k, part)).collect())).collect()
         };
-        let how = GroupFit { column: 0, precision: 1.0, centred: true };
+        let how = GroupFit { column: 0, precision: 1.0, centred: true, trust: 1.0 };
         let select: Vec<usize> = (0..16).collect();
         let all = |frames: &[PartedFrame]| total(frames.iter().flatten());
         for rough in [false, true] {

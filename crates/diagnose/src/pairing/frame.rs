@@ -100,7 +100,8 @@ pub fn pair_frame(
             match_directions(&scans[0][k], &scans[1][k], &sensors.patterns[k], closes)
         })
         .collect();
-    let rows: Vec<Vec<f32>> = scans[0].iter().map(|scan| scan.elevation_rad.clone()).collect();
+    let sent: Vec<[Vec<f32>; 2]> =
+        scans[0].iter().map(|scan| [scan.azimuth_rad.clone(), scan.elevation_rad.clone()]).collect();
     if let Some(shift_m) = mending.shift_m {
         for (sensor, scan) in scans[0].iter_mut().enumerate() {
             let pose = sensors.rig.sensors[sensor].pose();
@@ -139,7 +140,8 @@ pub fn pair_frame(
         let own = DirectionIndex::new(a, sensors.window(sensor), closes);
         for (i, (ray, matched)) in measured.iter_mut().zip(of_a).enumerate() {
             ray.matched = matched;
-            ray.row = sensors.row(sensor, rows[sensor][i]);
+            (ray.azimuth_rad, ray.elevation_rad) = (sent[sensor][0][i], sent[sensor][1][i]);
+            ray.row = sensors.row(sensor, ray.elevation_rad);
             ray.company = company(&own, a, i);
         }
         // A return without any other at its range is no surface: false alarms would make all around them rough.

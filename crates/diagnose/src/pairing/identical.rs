@@ -29,6 +29,9 @@ const RETURNS: usize = 1_500;
 /// Mean distance at which two frames show the same, whatever strangers do, m.
 const SAME_M: f64 = 0.05;
 
+/// Labels that lie no farther from those of the other side, in units of 4 m, may be late by a few hundredths of a second.
+const LATE: f64 = 0.35;
+
 /// Compares some measured frames with their own simulated frame, its neighbours and frames far away.
 pub fn check_identity(
     measured: &Dataset,
@@ -48,15 +51,17 @@ pub fn check_identity(
     let rows: Vec<FrameScores> = chosen
         .par_iter()
         .map(|&i| {
-            let score = |j: usize| distance(measured, &ids[i], simulated, &ids[j], sensors);
-            let own = score(i)?;
+            let parts = |j: usize| distance(measured, &ids[i], simulated, &ids[j], sensors);
+            let score = |j: usize| parts(j).map(|[cloud, labels]| cloud + LABELS_COUNT * labels);
+            let [cloud, labels] = parts(i)?;
+            let own = cloud + LABELS_COUNT * labels;
             let mut near = Vec::new();
             for lag in &lags {
                 let j = i as i64 + lag;
                 near.push(if (0..n as i64).contains(&j) { Some(score(j as usize)?) } else { None });
             }
             let strangers = far.iter().map(|k| score((i + k) % n)).collect::<Result<Vec<_>, _>>()?;
-            Ok(FrameScores { frame: i, own, near, strangers })
+            Ok(FrameScores { frame: i, own, same: cloud < SAME_M && labels < LATE, near, strangers })
         })
         .collect::<Result<_, DiagnoseError>>()?;
     Ok(judge(&rows, &lags, ids))
@@ -65,12 +70,14 @@ pub fn check_identity(
 struct FrameScores {
     frame: usize,
     own: f64,
+    /// Whether the own frame fits so well that strangers do not matter.
+    same: bool,
     near: Vec<Option<f64>>,
     strangers: Vec<f64>,
 }
 
 fn judge(rows: &[FrameScores], lags: &[i64], ids: &[String]) -> Identity {
-    let beaten = |r: &FrameScores| r.own > SAME_M && r.strangers.iter().any(|s| *s <= r.own);
+    let beaten = |r: &FrameScores| !r.same && r.strangers.iter().any(|s| *s <= r.own);
     let fits = rows.iter().filter(|r| !beaten(r)).count();
     let strangers: Vec<String> = rows.iter().filter(|r| beaten(r)).map(|r| ids[r.frame].clone()).collect();
     let own_mean = rows.iter().map(|r| r.own).sum::<f64>() / rows.len() as f64;
@@ -104,14 +111,17 @@ fn judge(rows: &[FrameScores], lags: &[i64], ids: &[String]) -> Identity {
     Identity { identical: true, reason: String::new(), strangers }
 }
 
-/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each; labels count like returns.
+/// What distances of labels count beside those of returns.
+const LABELS_COUNT: f64 = 0.5;
+
+/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each; and that of the labels, see [`label_distance`].
 fn distance(
     measured: &Dataset,
     measured_id: &str,
     simulated: &Dataset,
     simulated_id: &str,
     sensors: &Sensors,
-) -> Result<f64, DiagnoseError> {
+) -> Result<[f64; 2], DiagnoseError> {
     let ((a, labels_a), (b, labels_b)) = (load(measured, measured_id)?, load(simulated, simulated_id)?);
     let scans_a = split_by_sensor(&a, &sensors.rig);
     let scans_b = split_by_sensor(&b, &sensors.rig);
@@ -133,7 +143,7 @@ fn distance(
         }
     }
     let cloud = if count > 0.0 { sum / count } else { 1.0 };
-    Ok(cloud + 0.5 * label_distance(&labels_a, &labels_b))
+    Ok([cloud, label_distance(&labels_a, &labels_b)])
 }
 
 /// Mean distance of each label from the nearest one of the other side, at most 4 m, in units of that.

@@ -50,9 +50,9 @@ pub struct Ray {
     pub row: u16,
     /// Number of the labelled object in the frame; `u16::MAX` for none.
     pub object: u16,
-    /// In the sensor's frame, rad.
+    /// In which it was sent, in the sensor's frame, rad.
     pub azimuth_rad: f32,
-    /// In the sensor's frame, rad.
+    /// In which it was sent, in the sensor's frame, rad.
     pub elevation_rad: f32,
     /// Predicted range, m; of a direction without a smooth surface the return's own.
     pub range_m: f32,

@@ -1,7 +1,10 @@
 //! Lost returns: which simulated returns has the measured side not, and on what does it depend?
 
 use super::unnamed::{Unnamed, mean_by_group, word};
-use super::{ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed};
+use super::{
+    ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed,
+    unless_unsure,
+};
 use crate::channels::cells::{ZONE_NAMES, cell};
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
@@ -124,7 +127,7 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
             choice.equals.iter().map(|&i| trials[i].name.clone()).filter(|n| n != UNNAMED).collect();
         equals.sort();
         equals.dedup();
-        stories.push((equals, confidence(&trials, &blocks, &trial.name, &demands)));
+        stories.push(unless_unsure(equals, &trials, &blocks, &trial.name, &demands));
     }
     let mismatches: f64 = select
         .iter()
@@ -192,7 +195,7 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
 const UNNAMED: &str = "unexplained";
 
 /// Shares lost by groups of directions: prior spread of a fifth.
-const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false };
+const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false, trust: 1.0 };
 
 fn unnamed_found(
     groups: &[PartedFrame],

@@ -158,9 +158,27 @@ pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
 /// Share of a pose's gain below which a finding of another channel is what moving the scene back leaves.
 const LEFT_BY_A_POSE: f64 = 0.005;
 
-/// Drops what a pose that was moved back leaves in channels that look at single returns.
+/// Share of the gain of offsets of rows below which a law of noise is what mending them leaves.
+const LEFT_BY_ROWS: f64 = 0.15;
+
+/// Share of the gain of missing things below which mixed ranges are their returns.
+const LEFT_BY_THINGS: f64 = 0.05;
+
+/// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns.
 pub fn without_leftovers(results: &mut [ChannelResult]) {
     let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
+    let of_rows = |f: &&Found| f.causes.first().is_some_and(|c| c.starts_with("beam_"));
+    let rows = results.iter().flat_map(|r| &r.found).filter(of_rows).map(gain).fold(0.0, f64::max);
+    let of_things = |f: &&Found| f.causes == ["missing_object"];
+    let things = results.iter().flat_map(|r| &r.found).filter(of_things).map(gain).fold(0.0, f64::max);
+    let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
+    for result in results.iter_mut() {
+        result.found.retain(|f| f.channel != "roughness" || gain(f) >= LEFT_BY_ROWS * rows);
+        // Things that stand before edges lie between what these show.
+        result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= LEFT_BY_THINGS * things);
+        // Things that move by themselves slide otherwise than what stands.
+        result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
+    }
     let poses = results.iter().flat_map(|r| &r.found).filter(|f| {
         f.channel == "residuals" && f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"))
     });
@@ -217,6 +235,26 @@ pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: &str, demands: &De
         })
         .count();
     same as f64 / f64::from(repetitions)
+}
+
+/// Below this share of bootstraps the runner-up is told as well.
+const SURE: f64 = 0.8;
+
+/// What explains as much as the chosen one, and the confidence: where many bootstraps choose another name, that one as well.
+pub fn unless_unsure(
+    mut equals: Vec<String>,
+    trials: &[Trial],
+    blocks: &[usize],
+    chosen: &str,
+    demands: &Demands,
+) -> (Vec<String>, f64) {
+    let confidence = confidence(trials, blocks, chosen, demands);
+    if equals.is_empty() && confidence < SURE {
+        let others = trials.iter().filter(|t| t.name != chosen && t.above_floor);
+        let rival = others.max_by(|a, b| total_and_z(&a.gains).0.total_cmp(&total_and_z(&b.gains).0));
+        equals.extend(rival.map(|t| t.name.clone()));
+    }
+    (equals, confidence)
 }
 
 /// Interval of the mean of per-frame values by a bootstrap over blocks, divided by `per`.

@@ -3,7 +3,9 @@
 mod curve;
 
 use super::unnamed::{Unnamed, mean_by_group, word};
-use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed};
+use super::{
+    ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed, unless_unsure,
+};
 use crate::channels::cells::cell;
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::mean::usual_noise_m;
@@ -110,7 +112,8 @@ pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
         let t = &trials[first.chosen];
         chosen.push(t.candidate);
         let equals: Vec<String> = unique(first.equals.iter().map(|&i| trials[i].name.clone()));
-        stories.push((equals, confidence(&trials, &blocks, &t.name, &demands)));
+        stories.push(unless_unsure(equals, &trials, &blocks, &t.name, &demands));
+        let mut gains = t.gains.clone();
         // A second one must be of another kind and bring a good part of what the first brought.
         let (first_gain, _) = total_and_z(&t.gains);
         let second_demands = Demands { nats: (0.05 * first_gain).max(8.0), ..demands };
@@ -124,7 +127,24 @@ pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
             let t = &rivals[second.chosen];
             chosen.push(t.candidate);
             let equals = unique(second.equals.iter().map(|&i| rivals[i].name.clone()));
-            stories.push((equals, confidence(&rivals, &blocks, &t.name, &second_demands)));
+            stories.push(unless_unsure(equals, &rivals, &blocks, &t.name, &second_demands));
+            gains.iter_mut().zip(&t.gains).for_each(|(g, more)| *g += more);
+        }
+        // Noise along the ray and of its direction together look like one that grows as the signal falls: as a pair they may tell more.
+        let along = (0..NOISE_LAWS.len()).filter(|&k| NOISE_LAWS[k].name() == NoiseLaw::Constant.name());
+        let pairs = along.map(|k| (k, trial(&[k, ANGULAR], None))).filter(|(k, t)| {
+            t.above_floor && above_floor(&table, NOISE_LAWS[*k], whole(&[*k, ANGULAR]).theta[0].max(0.0))
+        });
+        let best = pairs.max_by(|a, b| total_and_z(&a.1.gains).0.total_cmp(&total_and_z(&b.1.gains).0));
+        if let Some((k, pair)) = best.filter(|_| chosen.iter().any(|&c| matches!(NOISE_LAWS[c], NoiseLaw::Signal(_)))) {
+            let (more, z) = total_and_z(&pair.gains.iter().zip(&gains).map(|(a, b)| a - b).collect::<Vec<_>>());
+            if more > (A_PAIR_SHARE * first_gain).max(demands.nats) && z > 2.0 {
+                let both = [pair, Trial { name: NoiseLaw::Signal(1.0).name().into(), gains, ..t.clone() }];
+                let confidence = confidence(&both, &blocks, &both[0].name, &demands);
+                chosen = vec![k, ANGULAR];
+                stories = vec![(vec![], confidence); 2];
+                result.considered.extend(record(&both, None, "roughness", returns, &demands));
+            }
         }
         // A law that leaves much that depends on the direction is a form, not a name.
         let so_far = whole(&chosen);
@@ -182,11 +202,17 @@ pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
     result
 }
 
+/// Place of [`NoiseLaw::Angular`] in the list.
+const ANGULAR: usize = 1;
+
+/// Share of the first law's gain by which a pair of laws has to be better.
+const A_PAIR_SHARE: f64 = 0.003;
+
 /// Name among the trials of what is in no catalogue.
 const UNNAMED: &str = "unexplained";
 
 /// Added variances of groups of directions in units of the expected one: prior spread of three.
-const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false };
+const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false, trust: 0.5 };
 
 /// Spread of them below which nothing is said: rows, which meet ranges and angles of their own, where laws may have another form; azimuths.
 const GROUP_FLOORS: [f64; 2] = [0.6, 0.25];

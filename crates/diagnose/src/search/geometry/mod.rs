@@ -9,7 +9,7 @@ pub use self::displacement::Displacement;
 
 use self::displacement::displacement;
 use self::suspects::{Suspect, UNNAMED, is_pose, may_join, suspects};
-use super::{ChannelResult, Context, confidence, first_demands, record};
+use super::{ChannelResult, Context, first_demands, record, unless_unsure};
 use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
@@ -23,7 +23,7 @@ use rayon::prelude::*;
 
 /// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
 const FLOOR_OFFSET_M: f64 = 0.012;
-const FLOOR_TURN_RAD: f64 = 3.5e-4;
+const FLOOR_TURN_RAD: f64 = 5.2e-4;
 const FLOOR_SHIFT_M: f64 = 0.04;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
@@ -62,7 +62,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     for step in 0..2 {
         let candidates: Vec<&Suspect> = all.iter().filter(|s| may_join(s, &chosen)).collect();
         let before = gains(&sums, &select, &blocks, &chosen);
-        let trials: Vec<Trial> = candidates
+        let mut trials: Vec<Trial> = candidates
             .par_iter()
             .enumerate()
             .map(|(k, suspect)| {
@@ -80,6 +80,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
                 }
             })
             .collect();
+        rows_by_most_frames(&mut trials, &candidates);
         let demands = if step == 0 { demands } else { Demands { nats: (0.1 * first_gain).max(8.0), ..demands } };
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "residuals", returns, &demands));
@@ -92,7 +93,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
         let mut equals: Vec<String> = choice.equals.iter().map(|&i| trials[i].name.clone()).collect();
         equals.sort();
         equals.dedup();
-        stories.push((equals, confidence(&trials, &blocks, &t.name, &demands)));
+        stories.push(unless_unsure(equals, &trials, &blocks, &t.name, &demands));
         chosen.push(candidates[t.candidate].clone());
     }
     let estimate_blocks = context.blocks(&estimate);
@@ -126,6 +127,19 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     }
     let out = displacement(context.rig, &sums, &select, &blocks, &chosen);
     (result, out)
+}
+
+/// Of offsets of rows in range and in elevation, whose gain is a matter of few far rays on some frames, the one that gains more on most frames is
+/// kept.
+fn rows_by_most_frames(trials: &mut [Trial], candidates: &[&Suspect]) {
+    let median = |t: &Trial| {
+        let mut gains = t.gains.clone();
+        gains.sort_by(f64::total_cmp);
+        gains.get(gains.len() / 2).copied().unwrap_or(0.0)
+    };
+    let of_rows = |t: &Trial| matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
+    let best = trials.iter().filter(|t| of_rows(t)).map(median).fold(0.0, f64::max);
+    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= median(t) >= best);
 }
 
 fn sums(context: &Context, select: &[usize]) -> Sums {
@@ -240,7 +254,7 @@ fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
 
 /// Prior spread of offsets: 10 cm, 0.3 degrees.
 fn how(column: usize) -> GroupFit {
-    GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true }
+    GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true, trust: 1.0 }
 }
 
 fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
@@ -265,7 +279,7 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
                 })
                 .sum()
             };
-            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 2.5 * FLOOR_OFFSET_M;
+            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 3.2 * FLOOR_OFFSET_M;
             biased
                 || fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
                     columns.contains(c)

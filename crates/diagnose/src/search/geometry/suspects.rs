@@ -79,6 +79,8 @@ pub(super) fn is_pose(suspect: &Suspect) -> bool {
 pub(super) fn may_join(suspect: &Suspect, chosen: &[Suspect]) -> bool {
     chosen.iter().all(|c| {
         let grouped = |s: &Suspect| matches!(s, Suspect::Groups { .. });
-        c.name() != suspect.name() && !(grouped(c) && grouped(suspect))
+        // A shear that is not small leaves every sensor with a turn and a shift of its own.
+        let sheared = c.name() == "rolling_shutter";
+        c.name() != suspect.name() && !sheared && !(grouped(c) && grouped(suspect))
     })
 }
