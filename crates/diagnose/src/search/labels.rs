@@ -1,7 +1,9 @@
 //! Labels and objects: do measured labels stand where the measured returns are, and do the objects stand where the simulation has them?
 
+mod clock;
 mod words;
 
+use self::clock::{forward, late, own_speeds, within_frames};
 use super::geometry::Displacement;
 use super::{ChannelResult, Context, Repair, Z_STAR, confidence, first_demands, record};
 use crate::channels::labels::{ObjectShift, object_shifts};
@@ -117,12 +119,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let precision = [0.0; 8];
     let floor = FLOOR_M[usize::from(side == Side::Objects)];
     let speeds = own_speeds(motion.as_deref());
-    // What slopes over the seen velocity say is asked of objects that drive as the own car does: in a turn the velocity along their own axes
-    // is another one.
-    let straight: Vec<LinearFrame> =
-        select.iter().map(|&f| sums_of(rows.iter().filter(|r| drives_along(r)), f)).collect();
-    let straight: Vec<&LinearFrame> = straight.iter().collect();
-    let kept = kept_slope(&rows.iter().filter(|r| drives_along(r)).collect::<Vec<_>>());
+    let line = within_frames(&rows, &select, &blocks);
     let trial = |k: usize, columns: &[usize], before: Option<&[f64]>| {
         let fitted = fit(&frames, &blocks, columns, &precision);
         let own = CANDIDATES[k].1;
@@ -130,9 +127,8 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         let size = theta.iter().map(|t| t.abs()).fold(0.0, f64::max);
         let moved = moved_m(&rows, own, &theta);
         let plausible = own != [0, 3] || {
-            let line = fit(&straight, &blocks, own, &precision);
-            line.theta[1].abs() > 3.0 * line.error(1)
-                && (speeds[0]..speeds[1]).contains(&(kept * line.theta[0] / line.theta[1]))
+            let [slope, error] = line;
+            slope.abs() > 3.0 * error && (speeds[0]..speeds[1]).contains(&(forward(&rows, slope) / slope))
         };
         let mut gains = cross_gains(&frames, &blocks, columns, &precision);
         if let Some(before) = before {
@@ -183,7 +179,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     let (name, own) = CANDIDATES[chosen[0]];
-    if name == "label_offset" && own.contains(&0) && usable[3] && late(&straight, &blocks, own, speeds, kept) {
+    if name == "label_offset" && own.contains(&0) && usable[3] && late(forward(&rows, line[0]), line, speeds) {
         stories[0].0.push("time_offset".into());
         stories[0].0.dedup();
     }
@@ -346,19 +342,8 @@ fn set_noise(rows: &mut [Row], select: &[usize], side: Side) {
 }
 
 fn sums(rows: &[Row], frame: usize) -> LinearFrame {
-    sums_of(rows.iter(), frame)
-}
-
-/// Objects turned by less against the own car drive as it does, rad.
-const ALONG_RAD: f64 = 0.12;
-
-fn drives_along(r: &Row) -> bool {
-    r.yaw_rad.abs() < ALONG_RAD
-}
-
-fn sums_of<'a>(rows: impl Iterator<Item = &'a Row>, frame: usize) -> LinearFrame {
     let mut out = LinearFrame { gram: DMatrix::zeros(8, 8), right: DVector::zeros(8) };
-    for r in rows.filter(|r| r.frame == frame) {
+    for r in rows.iter().filter(|r| r.frame == frame) {
         for axis in 0..3 {
             let x = DVector::from_row_slice(&r.x[axis]);
             let w = robust(r, axis) / r.variance[axis];
@@ -373,50 +358,6 @@ fn sums_of<'a>(rows: impl Iterator<Item = &'a Row>, frame: usize) -> LinearFrame
 fn robust(r: &Row, axis: usize) -> f64 {
     let u = r.shift[axis].abs() / (2.0 + 6.0 * r.variance[axis].sqrt());
     if u < 1.0 { 1.0 } else { 1.0 / u }
-}
-
-/// The same object comes to lie no farther from where it was in the next frame, m.
-const NEXT_M: f64 = 2.5;
-
-/// Fewer objects that are followed tell nothing of the errors of velocities.
-const FEWEST_FOLLOWED: usize = 12;
-
-/// Share of a slope over the seen velocity that the errors of that leave, at least a twentieth: velocities come from labels, which are not exact.
-/// Velocities stay the same from frame to frame, their errors do not.
-fn kept_slope(rows: &[&Row]) -> f64 {
-    let apart = |a: &Row, b: &Row| (0..3).map(|k| (a.center[k] - b.center[k]).powi(2)).sum::<f64>().sqrt();
-    let mean = rows.iter().map(|r| r.x[0][3]).sum::<f64>() / rows.len().max(1) as f64;
-    let followed = rows.iter().filter_map(|r| {
-        let next = rows.iter().filter(|q| q.frame == r.frame + 1);
-        let same = next.min_by(|p, q| apart(r, p).total_cmp(&apart(r, q)))?;
-        (apart(r, same) < NEXT_M).then_some([r.x[0][3] - mean, same.x[0][3] - mean])
-    });
-    let followed: Vec<[f64; 2]> = followed.collect();
-    let squares: f64 = followed.iter().map(|[a, b]| 0.5 * (a * a + b * b)).sum();
-    let together: f64 = followed.iter().map(|[a, b]| a * b).sum();
-    if followed.len() < FEWEST_FOLLOWED { 0.05 } else { (together / squares.max(1e-9)).clamp(0.05, 1.0) }
-}
-
-/// What the own speed may be, m/s: from the scene, or anything that a car does.
-fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
-    let mut known: Vec<f64> = motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect();
-    known.sort_by(f64::total_cmp);
-    match known.get(known.len() / 2) {
-        Some(&v) if v > 5.0 => [0.7 * v, 1.4 * v],
-        _ => [4.0, 90.0],
-    }
-}
-
-/// Whether an offset that is the same for all could as well be a late clock: the dependence on the seen velocity that this would make is
-/// not excluded.
-fn late(frames: &[&LinearFrame], blocks: &[usize], own: &[usize], speeds: [f64; 2], kept: f64) -> bool {
-    let columns: Vec<usize> = own.iter().copied().chain([3]).collect();
-    let fitted = fit(frames, blocks, &columns, &[0.0; 8]);
-    let slope = fitted.theta[columns.len() - 1] / kept;
-    let reach = 2.5 * fitted.error(columns.len() - 1) / kept;
-    let forward = own.iter().position(|c| *c == 0).map_or(0.0, |i| fitted.theta[i]);
-    let ends = speeds.map(|v| forward / v);
-    slope + reach > ends[0].min(ends[1]) && slope - reach < ends[0].max(ends[1])
 }
 
 /// Root mean square of what columns with coefficients move objects by, m.
