@@ -16,10 +16,10 @@ use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, 
 const SCENES: usize = 3;
 /// Data sets whose clouds are in it.
 const SCENE_SETS: usize = 2;
-/// Colours of the layers: clouds, labels, detections.
+/// Colours of the layers: clouds, labels, detections; of these as many as the paper's grid has networks and data sets.
 const CLOUDS: [&str; SCENE_SETS] = ["#0072b2", "#d55e00"];
 const LABELS: &str = "#009e73";
-const DETECTIONS: [&str; 3] = ["#cc79a7", "#e69f00", "#56b4e9"];
+const DETECTIONS: [&str; 8] = ["#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#882255", "#44aa99", "#999933", "#8c6bb1"];
 
 /// Evaluates what there is and writes `report.html` with its figures and tables into the study's folder; and the matrix.
 ///
