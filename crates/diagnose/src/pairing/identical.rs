@@ -170,7 +170,13 @@ mod tests {
 
     fn rows(own: f64, near: f64, far: f64) -> Vec<FrameScores> {
         (0..10)
-            .map(|i| FrameScores { frame: i, own, near: vec![Some(near)], strangers: vec![far, far * 1.1] })
+            .map(|i| FrameScores {
+                frame: i,
+                own,
+                same: own < SAME_M,
+                near: vec![Some(near)],
+                strangers: vec![far, far * 1.1],
+            })
             .collect()
     }
 

@@ -1,11 +1,13 @@
 //! Pictures of linear causes: how far surfaces stand off, against what that depends on.
 
 use super::Sums;
-use crate::channels::mean::{Column, Levers, origins, usable};
+use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable, usual_noise_m};
 use crate::diagnosis::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
 use crate::search::Context;
+use nalgebra::{Point3, SVector};
+use rayon::prelude::*;
 
 /// Bins of a picture.
 const BINS: usize = 16;
@@ -39,16 +41,28 @@ pub(super) fn linear_curve(
     let moving: Vec<(Column, f64)> = columns.iter().map(|&c| (sums.columns[c], theta(c))).collect();
     let origins = origins(context.rig);
     let half_fov: Vec<f64> = context.rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
-    let mut places: Vec<[f64; 3]> = Vec::new();
-    for ray in frames.iter().flat_map(|&f| &context.frames[f].measured).filter(|r| usable(r)) {
-        let sensor = ray.sensor as usize;
-        let levers = Levers::new(ray, &origins[sensor], half_fov[sensor]);
-        let told: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
-        let y = ray.across_nearest_m();
-        if told != 0.0 && (y - told).abs() < STRAY_M {
-            places.push([value(ray, half_fov[sensor]), y * told.signum(), told.abs()]);
+    let displaced = moving.iter().find_map(|(c, _)| if let Column::SensorPose(s, _) = c { Some(*s) } else { None });
+    let noise_m = usual_noise_m(context.frames);
+    let of_frame = |&f: &usize| {
+        let frame = &context.frames[f];
+        // How the frame as a whole lies off is told by the other sensors.
+        let mut pose = SVector::<f64, 6>::zeros();
+        if let Some(s) = displaced {
+            let own = own_poses(frame, &origins, noise_m);
+            let others: Vec<_> = (0..own.len()).filter(|k| *k != s).map(|k| own[k]).collect();
+            pose = others.iter().sum::<SVector<f64, 6>>() / others.len().max(1) as f64;
         }
-    }
+        let place = |ray: &Ray| {
+            let sensor = ray.sensor as usize;
+            let levers = Levers::new(ray, &origins[sensor], half_fov[sensor]);
+            let told: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
+            let y = ray.across_nearest_m() - pose_row(ray, &origins[sensor], &Point3::origin()).dot(&pose);
+            (told != 0.0 && (y - told).abs() < STRAY_M)
+                .then(|| [value(ray, half_fov[sensor]), y * told.signum(), told.abs()])
+        };
+        frame.measured.iter().filter(|r| usable(r)).filter_map(place).collect::<Vec<[f64; 3]>>()
+    };
+    let mut places: Vec<[f64; 3]> = frames.par_iter().flat_map_iter(of_frame).collect();
     places.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let points = places.chunks(places.len().div_ceil(BINS).max(1)).filter(|c| c.len() as f64 >= FEWEST).map(|chunk| {
         let n = chunk.len() as f64;

@@ -29,15 +29,18 @@ pub(super) fn found(
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, estimate, blocks, chosen);
             linear_parameters(context, sums, &fitted, columns, name, &mut parameters);
-            let list: Vec<String> =
-                parameters.iter().map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
+            let sensor = parameters.iter().find(|(n, _)| n == "sensor").map(|(_, p)| p.estimate as usize);
+            let numbers = parameters.iter().filter(|(n, _)| n != "sensor");
+            let list: Vec<String> = numbers.map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
+            let seen_by = sensor.map_or("lidar", |s| context.rig.sensors[s].name.as_str());
+            let displaced = format!("sensor {seen_by} sees the scene displaced: it is mounted otherwise than believed");
             let what = match name {
                 "range_bias" => "all ranges are measured longer (shorter where negative) than they are",
                 "pitch_roll" => "the whole scene is tilted: the car leans otherwise than the simulation believes",
                 "rolling_shutter" => {
                     "the scene shears over a scan: points of a moving car are put where the car is at one moment"
                 }
-                _ => "one sensor sees the scene displaced: it is mounted otherwise than believed",
+                _ => displaced.as_str(),
             };
             let covariate = match name {
                 "range_bias" => "cos_incidence",
