@@ -106,17 +106,18 @@ pub fn diagnose(
     let origins = crate::channels::mean::origins(rig);
     let motion = times.as_deref().map(|t| crate::channels::motion::own_motion(&frames, t, &origins));
     let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times, motion };
-    let searches = CHANNELS.len();
+    let searches = SEARCHES;
     let mut results: Vec<ChannelResult> = Vec::new();
+    let mut keep = |channel, result| results.push(ChannelResult { channel, ..result });
     progress(Stage::Weighing, 0, searches);
     let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
     // What slides over a scan is moved back before anything else is looked at, but for the ranges as they were measured.
     let (sliding, slide) = search::shutter::search(&context);
-    results.push(sliding);
+    keep("slide", sliding);
     let (rounding, step_m) = search::quantisation::search(&context);
-    results.push(rounding);
+    keep("ranges", rounding);
     let slid = |frame: usize, p: &Vector3<f64>, sensor: usize| match &slide {
-        Some(slide) => slide.shift_m(frame, p, search::shutter::phase(p, sensor, rig)),
+        Some(slide) => slide.shift_m(frame, p, sensor),
         None => Vector3::zeros(),
     };
     // Coarse steps put level ground off by a whole row's width: the simulated side is rounded alike.
@@ -132,7 +133,7 @@ pub fn diagnose(
     context.frames = frames;
     progress(Stage::Weighing, 2, searches);
     let (geometry, displaced) = search::geometry::search(&context);
-    results.push(geometry);
+    keep("residuals", geometry);
     progress(Stage::Weighing, 3, searches);
     // What stands elsewhere is moved back before silhouettes and single returns are looked at.
     let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
@@ -144,10 +145,10 @@ pub fn diagnose(
     context.frames = upright.as_deref().unwrap_or(frames);
     let elsewhere = slide.is_some() || displaced.moves() || displaced.aims();
     let (hidden, mask) = search::mask::search(&context, elsewhere);
-    results.push(hidden);
-    results.push(search::hits::search(&context, &mask, elsewhere));
+    keep("hits", hidden);
+    keep("hits", search::hits::search(&context, &mask, elsewhere));
     progress(Stage::Weighing, 5, searches);
-    results.push(search::returns::search(&context));
+    keep("returns", search::returns::search(&context));
     progress(Stage::Weighing, 6, searches);
     // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
@@ -162,11 +163,11 @@ pub fn diagnose(
         context.frames = even;
     }
     let least_cos = if uneven { 0.12 } else { 0.0 };
-    results.push(search::noise::search(&context, least_cos));
+    keep("roughness", search::noise::search(&context, least_cos));
     context.frames = frames;
     progress(Stage::Weighing, 7, searches);
-    results.push(search::labels::search(&context, Side::Labels, &displaced));
-    results.push(search::labels::search(&context, Side::Objects, &displaced));
+    keep("labels", search::labels::search(&context, Side::Labels, &displaced));
+    keep("objects", search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, searches, searches);
     search::without_leftovers(&mut results);
     if let Some(note) = search::set_aside(&mut results) {
@@ -178,9 +179,8 @@ pub fn diagnose(
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
 }
 
-/// Channels in the order in which they are searched; what hides rays altogether and the laws of losses both look at hits.
-const CHANNELS: [&str; 9] =
-    ["slide", "ranges", "residuals", "hits", "hits", "returns", "roughness", "labels", "objects"];
+/// Searches, one a call.
+const SEARCHES: usize = 9;
 
 /// Larger steps of the ranges matter to where surfaces lie, m.
 const COARSE_M: f64 = 0.02;
@@ -288,8 +288,8 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
     let mut minimum_detectable = BTreeMap::new();
     let mut distance = vec![[0.0; 3]; hold_out.len()];
     let mut channels = BTreeMap::<String, [f64; 3]>::new();
-    for (channel, result) in CHANNELS.into_iter().zip(results) {
-        let of_channel = channels.entry(channel.into()).or_default();
+    for result in results {
+        let of_channel = channels.entry(result.channel.into()).or_default();
         for [before, gained, best] in &result.distance {
             let left = [*before, before - gained, before - gained.max(*best)];
             (0..3).for_each(|k| of_channel[k] += left[k] / returns);

@@ -98,6 +98,11 @@ impl SensorRig {
     }
 }
 
+/// Place in the scan of an azimuth of a sensor, -1/2 to +1/2, counter-clockwise.
+pub fn scan_phase(azimuth_rad: f64, half_fov_rad: f64) -> f64 {
+    azimuth_rad / (2.0 * half_fov_rad)
+}
+
 impl SensorMount {
     /// `cloud_from_sensor`: roll about x, then pitch about y, then yaw about z, then the position.
     pub fn pose(&self) -> Isometry3<f64> {

@@ -62,13 +62,8 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
         for ray in &frame.measured {
             // In the open the simulation has nothing at all there; what was moved out of sight has a counterpart.
             let predicted = match ray.lies() {
-                Lies::Open => {
-                    if ray.matched {
-                        0.0
-                    } else {
-                        f64::INFINITY
-                    }
-                }
+                Lies::Open if ray.matched => 0.0,
+                Lies::Open => f64::INFINITY,
                 _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
             };
             let count = counts.entry(direction_cell(ray)).or_default();

@@ -195,7 +195,7 @@ impl Levers {
             kind: kind_of(ray),
             range_m: f64::from(ray.range_m),
             cos_incidence: f64::from(ray.cos_incidence),
-            phase: f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad),
+            phase: crate::rig::scan_phase(f64::from(ray.azimuth_rad), half_fov_rad),
             pose: pose_row(ray, origin, &Point3::origin()),
             sensor_pose: pose_row(ray, origin, origin),
         }

@@ -1,5 +1,6 @@
 //! How the own car moves from frame to frame, from posts, ends of walls and other edges of the simulated side that stand still.
 
+use crate::inference::median;
 use crate::pairing::{FramePair, Surface};
 use nalgebra::{Point3, Vector2};
 use rayon::prelude::*;
@@ -55,10 +56,6 @@ fn smooth(raw: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
     if (known as f64) < KNOWN * raw.len() as f64 || known < 3 {
         return vec![None; raw.len()];
     }
-    let median = |mut v: Vec<f64>| {
-        v.sort_by(f64::total_cmp);
-        v[v.len() / 2]
-    };
     (0..raw.len())
         .map(|i| {
             let near: Vec<OwnMotion> =

@@ -122,9 +122,12 @@ pub fn find_sensors(
 ) -> Result<Sensors, DiagnoseError> {
     let step = ids.len().div_ceil(PATTERN_FRAMES).max(1);
     let some: Vec<&String> = ids.iter().step_by(step).collect();
+    // All are read before the first damaged one, in order, is named.
     let scans: Vec<Vec<SensorScan>> = some
         .par_iter()
         .flat_map_iter(|id| [measured, simulated].map(|d| load(d, id).map(|(cloud, _)| split_by_sensor(&cloud, rig))))
+        .collect::<Vec<_>>()
+        .into_iter()
         .collect::<Result<_, _>>()?;
     let patterns = (0..rig.sensors.len())
         .map(|k| ScanPattern::of_scans(&scans.iter().map(|s| &s[k]).collect::<Vec<_>>()))
@@ -154,6 +157,8 @@ pub fn pair_all(
             done(finished.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
             Ok(frame)
         })
+        .collect::<Vec<_>>()
+        .into_iter()
         .collect()
 }
 

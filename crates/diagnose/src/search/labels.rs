@@ -284,7 +284,10 @@ fn row(
         Some(seen) => {
             (0..3).for_each(|k| x[k][3] = seen[k]);
             let mount = &context.rig.sensors[sensor];
-            let phase = crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()) / (2.0 * mount.half_fov_rad());
+            let phase = crate::rig::scan_phase(
+                crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()),
+                mount.half_fov_rad(),
+            );
             (0..3).for_each(|k| x[k][7] = seen[k] * phase);
             match motion.and_then(|m| m[s.frame]) {
                 Some(own) => {

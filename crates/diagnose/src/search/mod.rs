@@ -80,6 +80,8 @@ pub struct Found {
 /// What a channel's search hands back.
 #[derive(Clone, Debug, Default)]
 pub struct ChannelResult {
+    /// Channel.
+    pub channel: &'static str,
     /// Findings.
     pub found: Vec<Found>,
     /// Candidates and what became of them.

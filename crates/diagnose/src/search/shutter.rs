@@ -10,11 +10,12 @@ use crate::channels::mean::origins;
 use crate::channels::motion::{CELL_M, Cells, OwnMotion};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
+use crate::inference::median;
 use crate::inference::roles::Role;
-use crate::pairing::{FramePair, Surface};
-use crate::rig::SensorRig;
+use crate::pairing::{FramePair, Ray, Surface};
+use crate::rig::{SensorMount, SensorRig, scan_phase};
 use geometry::Box3;
-use nalgebra::{Point3, Vector2, Vector3};
+use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
 /// How the scene slides over a scan.
@@ -23,6 +24,8 @@ pub struct Slide {
     scan_s: f64,
     /// Of every frame: the own motion and the objects with what the own car sees of their motion, m/s.
     motions: Vec<Motion>,
+    /// Of every sensor: its frame from the cloud's, and half its field of view, rad.
+    sensors: Vec<(Isometry3<f64>, f64)>,
 }
 
 /// What moves in one frame.
@@ -51,17 +54,12 @@ impl Motion {
 }
 
 impl Slide {
-    /// How far a point of a frame is shown from where it was in the middle of the scan, m, cloud's frame.
-    pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, phase: f64) -> Vector3<f64> {
-        self.motions[frame].at(point, self.scan_s.abs()) * (phase * self.scan_s)
+    /// How far a point of a frame that a sensor shows is from where it was in the middle of the scan, m, cloud's frame.
+    pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
+        let (sensor_from_cloud, half_fov_rad) = &self.sensors[sensor];
+        let [azimuth_rad, ..] = SensorMount::spherical(&(sensor_from_cloud * Point3::from(*point)));
+        self.motions[frame].at(point, self.scan_s.abs()) * (scan_phase(azimuth_rad, *half_fov_rad) * self.scan_s)
     }
-}
-
-/// Phase of the scan of a point, -1/2 to +1/2, counter-clockwise.
-pub fn phase(point: &Vector3<f64>, sensor: usize, rig: &SensorRig) -> f64 {
-    let mount = &rig.sensors[sensor];
-    let [azimuth_rad, ..] = crate::rig::SensorMount::spherical(&(mount.pose().inverse() * Point3::from(*point)));
-    azimuth_rad / (2.0 * mount.half_fov_rad())
 }
 
 /// Returns of a frame that are moved.
@@ -92,22 +90,23 @@ struct Sliders {
 
 impl Sliders {
     fn new(frame: &FramePair, motion: &Motion, rig: &SensorRig, origins: &[Point3<f64>], longest: f64) -> Self {
-        let at = |r: &crate::pairing::Ray| origins[r.sensor as usize] + r.direction_vector() * r.own_range_m();
-        let near = |r: &&crate::pairing::Ray| (3.0..REACH_M).contains(&r.own_range_m());
-        let stands = |r: &&crate::pairing::Ray| r.surface != Surface::Ground || !r.smooth || r.across_m() > 0.25;
+        let at = |r: &Ray| origins[r.sensor as usize] + r.direction_vector() * r.own_range_m();
+        let near = |r: &&Ray| (3.0..REACH_M).contains(&r.own_range_m());
+        let stands = |r: &&Ray| r.surface != Surface::Ground || !r.smooth || r.across_m() > 0.25;
         let simulated = frame.simulated.iter().filter(near).filter(|r| r.surface != Surface::Ground);
         let occupied = Cells::new(&simulated.map(|r| at(r).coords.xy()).collect::<Vec<_>>());
         let measured: Vec<_> = frame.measured.iter().filter(near).filter(stands).collect();
         let stride = measured.len().div_ceil(POINTS).max(1);
         let points = measured.iter().step_by(stride).map(|r| {
             let p = at(r).coords;
-            let slides = motion.at(&p, longest) * phase(&p, r.sensor as usize, rig);
+            let half_fov_rad = rig.sensors[r.sensor as usize].half_fov_rad();
+            let slides = motion.at(&p, longest) * scan_phase(f64::from(r.azimuth_rad), half_fov_rad);
             (p.xy(), slides.xy())
         });
         Sliders { occupied, points: points.collect(), each: stride as f64 }
     }
 
-    /// Share of the points that lie where the simulation has something if a scan takes `scan_s`, and their number.
+    /// Number of the points that lie where the simulation has something if a scan takes `scan_s`.
     fn on(&self, scan_s: f64) -> f64 {
         let on = self.points.iter().filter(|(p, slides)| self.occupied.contains(&(p - slides * scan_s)));
         on.count() as f64
@@ -121,14 +120,13 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
     // Where the scenes tell the own motion, and where they do not: then all frames slide alike.
     let mut ways = vec![Way::unknown(context)];
     ways.extend(Way::known(context));
-    let tried = ways.iter().map(|way| way.gains(&select)).collect::<Vec<_>>();
-    let total = |k: usize| total_and_z(&tried[k].1).0;
+    let tried = ways.iter().map(|way| way.tried(&select)).collect::<Vec<_>>();
+    let total = |k: usize| total_and_z(&tried[k].gains).0;
     let Some(k) = (0..ways.len()).max_by(|&a, &b| total(a).total_cmp(&total(b))) else { return (result, None) };
-    let (best, gains) = &tried[k];
+    let Tried { best, gains, least, most } = &tried[k];
     let way = ways.swap_remove(k);
-    let on = |frames: &[usize], at: f64| frames.iter().map(|&f| way.sliders[f].on(at)).sum::<f64>();
     let (gain, z) = total_and_z(gains);
-    let seen = significant(gains, Z_STAR) && gain > LEAST_SHARE * on(&select, 0.0);
+    let seen = significant(gains, Z_STAR) && gain > LEAST_SHARE * (most - gain);
     let far_enough = best.abs() * way.fastest > LEAST_M;
     let outcome = match (seen, far_enough) {
         (true, true) => "chosen",
@@ -162,8 +160,7 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
     // Chance puts some of the points onto the simulation whatever is done: what one more is worth follows from both shares.
     let points = |frames: &[usize]| frames.iter().map(|&f| way.sliders[f].points.len() as f64).sum::<f64>();
     let share = |on: f64| ((on + 1.0) / (points(&select) + 2.0)).clamp(0.01, 0.99);
-    let chance = share(way.grid().iter().map(|at| on(&select, *at)).fold(f64::INFINITY, f64::min));
-    let there = share(on(&select, *best));
+    let [chance, there] = [*least, *most].map(share);
     let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
     let held = hold_out.iter().map(|&f| {
         let sliders = &way.sliders[f];
@@ -177,9 +174,12 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
         unit: unit.into(),
         ci95: [estimate - 2.0 * error, estimate + 2.0 * error],
     };
-    let share = |at: f64| on(&estimate, at) / points(&estimate).max(1.0);
-    let [before, after] = [0.0, scan_s].map(share);
-    let curve = fine.iter().map(|s| CurvePoint { x: -s, measured: share(*s), before, after, error: 0.0 });
+    let share = |on: f64| on / points(&estimate).max(1.0);
+    let [before, after] = [0.0, scan_s].map(|at| share(estimate.iter().map(|&f| way.sliders[f].on(at)).sum()));
+    let curve = fine.iter().enumerate().map(|(k, s)| {
+        let measured = share(on_estimate.iter().map(|counts| counts[k]).sum());
+        CurvePoint { x: -s, measured, before, after, error: 0.0 }
+    });
     let shear = ("shear_x_m".to_owned(), parameter(-middle * scan_s, middle * error, "m"));
     let times = way.speed_known.then(|| ("scan_s".to_owned(), parameter(-scan_s, error, "s"))).into_iter();
     let speed = if way.speed_known {
@@ -208,7 +208,8 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
             points: curve.collect(),
         },
     });
-    (result, Some(Slide { scan_s, motions: way.motions }))
+    let sensors = context.rig.sensors.iter().map(|s| (s.pose().inverse(), s.half_fov_rad())).collect();
+    (result, Some(Slide { scan_s, motions: way.motions, sensors }))
 }
 
 /// One way to tell how things slide.
@@ -253,27 +254,39 @@ impl Way {
         Way { motions, sliders, fastest, step, speed_known }
     }
 
-    fn grid(&self) -> Vec<f64> {
-        (-STEPS..=STEPS).map(|k| self.step * f64::from(k)).collect()
-    }
-
     /// Of every frame the numbers that come to lie on the simulation, one by one of what is tried.
     fn counts(&self, frames: &[usize], tried: &[f64]) -> Vec<Vec<f64>> {
         frames.par_iter().map(|&f| tried.iter().map(|&s| self.sliders[f].on(s)).collect()).collect()
     }
 
-    /// What is best on these frames, and how many more come to lie on the simulation on each.
-    fn gains(&self, frames: &[usize]) -> (f64, Vec<f64>) {
-        let grid = self.grid();
+    /// Tries all on these frames.
+    fn tried(&self, frames: &[usize]) -> Tried {
+        let grid: Vec<f64> = (-STEPS..=STEPS).map(|k| self.step * f64::from(k)).collect();
         let on = self.counts(frames, &grid);
-        let sum = |k: usize| on.iter().map(|c| c[k]).sum::<f64>();
+        let sums: Vec<f64> = (0..grid.len()).map(|k| on.iter().map(|c| c[k]).sum()).collect();
         let still = STEPS as usize;
-        let best = (0..grid.len()).max_by(|&a, &b| sum(a).total_cmp(&sum(b))).unwrap_or(still);
-        (grid[best], on.iter().map(|c| c[best] - c[still]).collect())
+        let best = (0..grid.len()).max_by(|&a, &b| sums[a].total_cmp(&sums[b])).unwrap_or(still);
+        Tried {
+            best: grid[best],
+            gains: on.iter().map(|c| c[best] - c[still]).collect(),
+            least: sums.iter().copied().fold(f64::INFINITY, f64::min),
+            most: sums[best],
+        }
     }
 }
 
-/// The time at which most come to lie on the simulation: the mean of the best tenth.
+/// What came of trying.
+struct Tried {
+    /// What is best.
+    best: f64,
+    /// How many more come to lie on the simulation on each frame.
+    gains: Vec<f64>,
+    /// How many come to lie there at least, whatever is tried, and how many at most.
+    least: f64,
+    most: f64,
+}
+
+/// The time at which most come to lie on the simulation: the mean of those within 15 % of the best, of what is between the worst and it.
 fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
     let sums: Vec<f64> = (0..times.len()).map(|k| which.iter().map(|&i| counts[i][k]).sum()).collect();
     let [low, high] = [sums.iter().copied().fold(f64::INFINITY, f64::min), sums.iter().copied().fold(0.0, f64::max)];
@@ -282,16 +295,10 @@ fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
     sums.iter().zip(times).map(|(s, t)| weight(*s) * t).sum::<f64>() / total.max(1e-9)
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::inference::roles::roles;
-    use crate::pairing::Ray;
     use rand::RngExt;
 
     /// A return of something that stands.
@@ -329,7 +336,8 @@ mod tests {
                 let mut rng = data::stream(f, "posts", 0, 0);
                 let mut place = || rng.random_range(-45.0..45.0f64);
                 let posts: Vec<Vector3<f64>> = (0..150).map(|_| Vector3::new(place(), place(), 0.0)).collect();
-                let shown = |p: &Vector3<f64>| p + velocity * (phase(p, 0, &rig) * scan_s);
+                let shown =
+                    |p: &Vector3<f64>| p + velocity * (scan_phase(p.y.atan2(p.x), std::f64::consts::PI) * scan_s);
                 FramePair {
                     id: f.to_string(),
                     measured: posts.iter().map(|p| standing(&shown(p))).collect(),
@@ -350,7 +358,7 @@ mod tests {
         assert_eq!(result.found.len(), usize::from(slide.is_some()));
         let p = Vector3::new(0.0, 20.0, 0.0);
         if let Some(slide) = slide {
-            let shift = slide.shift_m(3, &p, phase(&p, 0, &rig));
+            let shift = slide.shift_m(3, &p, 0);
             assert!((shift - velocity * (0.25 * slide.scan_s)).norm() < 1e-9, "{shift}");
         }
         let scan_s = &result.found.first()?.parameters[0].1;

@@ -5,6 +5,7 @@ use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable
 use crate::diagnosis::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
+use crate::rig::scan_phase;
 use crate::search::Context;
 use nalgebra::{Point3, SVector};
 use rayon::prelude::*;
@@ -34,7 +35,7 @@ pub(super) fn linear_curve(
     let (x, value): Axis = match name {
         "range_bias" => ("range, m", |r, _| f64::from(r.range_m)),
         "pitch_roll" => ("distance along the car, m", |r, _| f64::from(r.direction[0] * r.range_m)),
-        "rolling_shutter" => ("phase of the scan", |r, half_fov| f64::from(r.azimuth_rad) / (2.0 * half_fov)),
+        "rolling_shutter" => ("phase of the scan", |r, half_fov| scan_phase(f64::from(r.azimuth_rad), half_fov)),
         _ => ("azimuth of the sensor, degrees", |r, _| f64::from(r.azimuth_rad).to_degrees()),
     };
     let theta = |c: usize| fitted.columns.iter().position(|x| *x == c).map_or(0.0, |i| fitted.theta[i]);

@@ -17,6 +17,7 @@ use crate::channels::mean::{
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
+use crate::inference::median;
 use crate::inference::roles::Role;
 use nalgebra::SVector;
 use rayon::prelude::*;
@@ -132,11 +133,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
 /// Of offsets of rows in range and in elevation, whose gain is a matter of few far rays on some frames, the one that gains more on most frames is
 /// kept.
 fn rows_by_most_frames(trials: &mut [Trial], candidates: &[&Suspect]) {
-    let median = |t: &Trial| {
-        let mut gains = t.gains.clone();
-        gains.sort_by(f64::total_cmp);
-        gains.get(gains.len() / 2).copied().unwrap_or(0.0)
-    };
+    let median = |t: &Trial| median(t.gains.clone());
     let of_rows = |t: &Trial| matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
     let best = trials.iter().filter(|t| of_rows(t)).map(median).fold(0.0, f64::max);
     trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= median(t) >= best);
