@@ -96,9 +96,13 @@ const FEWEST_CELLS: usize = 4;
 /// Measured returns from the own car, of the simulated ones from beyond it: from this share on the own car hides a cell.
 const ON_OWN_CAR: f64 = 0.4;
 
+/// Nothing at all, as a share of the simulated returns.
+const NONE: f64 = 0.02;
+
 /// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
-/// in a cell. They lie together, and either returns come from the own car instead, or on two opposite sides of them returns come back: where
-/// a scene ends or only stands elsewhere they do not. Where the scene is `displaced`, returns from the own car alone are believed.
+/// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not.
+/// Where returns come from the own car beside them the field of view may end there as well, but not above, where the scene ends. Where the
+/// scene is `displaced`, returns from the own car are believed, and beside them cells from which nothing at all comes back.
 pub fn blocked_cells(
     counts: &DirectionCounts,
     displaced: bool,
@@ -127,13 +131,20 @@ pub fn blocked_cells(
         let open = |(s, az, el): DirectionCell, a: i32, e: i32| {
             (2..4).any(|k| judged(&(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
         };
-        let sides = [(1, 0), (-1, 0), (0, 1), (0, -1)]
-            .map(|(a, e)| together.iter().filter(|c| open(**c, a, e)).count() * 8 >= together.len());
-        let on_own_car = together.iter().filter(|c| covered(c)).count();
-        let stands_out = together.len() >= FEWEST_CELLS && (sides[0] && sides[1] || sides[2] && sides[3]);
-        if on_own_car >= 2 {
+        let ends = |(s, az, el): DirectionCell, a: i32, e: i32| {
+            e <= 0 && (1..4).any(|k| !counts.contains_key(&(s, az + k * a, el + k * e)))
+        };
+        let sides = |bounds: &dyn Fn(DirectionCell, i32, i32) -> bool| {
+            let on = |a, e| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len();
+            on(1, 0) && on(-1, 0) || on(0, 1) && on(0, -1)
+        };
+        let on_own_car = together.iter().filter(|c| covered(c)).count() >= 2;
+        let stands_out = together.len() >= FEWEST_CELLS
+            && (sides(&open) || on_own_car && sides(&|c, a, e| open(c, a, e) || ends(c, a, e)));
+        if on_own_car {
             // What lies around and is dark for another reason does not belong to it.
-            let own = |c: &DirectionCell| covered(c) || stands_out && !displaced;
+            let own =
+                |c: &DirectionCell| covered(c) || stands_out && (!displaced || judged(c).is_some_and(|s| s < NONE));
             blocked.extend(together.into_iter().filter(own));
         } else if stands_out && !displaced {
             blocked.extend(together);
@@ -237,5 +248,20 @@ mod tests {
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
         assert!(blocked_cells(&counts, false, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
+        // A plate that reaches below the field of view and gives returns along its upper edge alone.
+        let mut low = DirectionCounts::new();
+        for (az, el) in (-20..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
+            let hidden = (-6..3).contains(&az) && el < -2;
+            let near = if hidden && el == -3 { 90.0 } else { 0.0 };
+            low.insert((0, az, el), [100.0, if hidden { 0.0 } else { 97.0 }, near, near / 90.0]);
+        }
+        assert_eq!(blocked_cells(&low, false, |_| 1.0).len(), 27);
+        assert_eq!(blocked_cells(&low, true, |_| 1.0).len(), 27);
+        low.values_mut().filter(|c| c[1] == 0.0 && c[2] == 0.0).for_each(|c| c[1] = 5.0);
+        assert_eq!(
+            blocked_cells(&low, true, |_| 1.0).len(),
+            9,
+            "a scene that stands elsewhere makes holes beside the plate"
+        );
     }
 }

@@ -143,7 +143,9 @@ pub fn pair_frame(
             (ray.azimuth_rad, ray.elevation_rad) = (sent[sensor][0][i], sent[sensor][1][i]);
             ray.row = sensors.row(sensor, ray.elevation_rad);
             ray.company = company(&own, a, i);
+            ray.in_gap = in_gap(&sight.index, a, i);
         }
+        simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));
         // A return without any other at its range is no surface: false alarms would make all around them rough.
         let stray: Vec<bool> =
             measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
@@ -174,6 +176,35 @@ fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
         }
     });
     n
+}
+
+/// Jumps in range over which a beam mixes, m.
+const GAP_M: [f64; 2] = [1.2, 12.0];
+
+/// Whether a jump in range is one over which beams mix.
+pub fn gap_mixes(near_m: f64, far_m: f64) -> bool {
+    (GAP_M[0]..GAP_M[1]).contains(&(far_m - near_m))
+}
+
+/// Closer than that to the nearer surface, or to the farther one, a return lies on it, m.
+pub fn gap_margin_m(near_m: f64) -> f64 {
+    0.35 + 0.015 * near_m
+}
+
+/// Whether a return lies between two surfaces of the other side, off both of them.
+fn in_gap(other: &DirectionIndex, scan: &SensorScan, i: usize) -> bool {
+    let range = scan.range_m[i];
+    let [mut near, mut far] = [0.0f32, f32::INFINITY];
+    other.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
+        if e.range_m < range {
+            near = near.max(e.range_m);
+        } else {
+            far = far.min(e.range_m);
+        }
+    });
+    let [range, near, far] = [range, near, far].map(f64::from);
+    let margin = gap_margin_m(near);
+    near > 0.0 && gap_mixes(near, far) && range > near + margin && range < far - margin
 }
 
 /// The simulated side of one sensor, to be looked at from any direction.
@@ -211,6 +242,7 @@ impl<'a> Sight<'a> {
             corner: false,
             matched: false,
             company: 0,
+            in_gap: false,
             row,
             object: u16::MAX,
             azimuth_rad: az,

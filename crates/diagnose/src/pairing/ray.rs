@@ -46,6 +46,8 @@ pub struct Ray {
     pub matched: bool,
     /// Returns of its own side around it at about its range.
     pub company: u8,
+    /// Around it the *other* side has something nearer and something farther, a jump that beams mix, and nothing at its range.
+    pub in_gap: bool,
     /// Row of the sensor; `u16::MAX` where rows are not known.
     pub row: u16,
     /// Number of the labelled object in the frame; `u16::MAX` for none.
@@ -122,7 +124,7 @@ impl Ray {
             };
         }
         let [near, far] = self.near_far_m.map(f64::from);
-        let margin = 0.35 + 0.015 * near;
+        let margin = super::gap_margin_m(near);
         match own {
             r if r < near - margin => Lies::InFront,
             r if r > far + margin => Lies::Behind,

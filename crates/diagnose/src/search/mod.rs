@@ -172,11 +172,18 @@ fn slight_bias(f: &Found) -> bool {
     f.causes == ["range_bias"] && (value("offset_m") + 30.0 * value("scale")).abs() < 0.04
 }
 
+/// Nats a return below which a law of noise beside surfaces that stand elsewhere, slide or mix is what these leave.
+const LEFT_OF_NOISE: f64 = 0.015;
+
+/// Share of what the own car hides below which a sensor's pose is a matter of which surfaces it still sees.
+const LEFT_BY_OWN_CAR: f64 = 0.05;
+
 /// Share of the gain of missing things below which mixed ranges are their returns.
 const LEFT_BY_THINGS: f64 = 0.05;
 
-/// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns.
-pub fn without_leftovers(results: &mut [ChannelResult]) {
+/// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
+/// the frames that were held out.
+pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
     let of_rows = |f: &&Found| f.causes.first().is_some_and(|c| c.starts_with("beam_"));
     let rows = results.iter().flat_map(|r| &r.found).filter(of_rows).map(gain).fold(0.0, f64::max);
@@ -184,7 +191,13 @@ pub fn without_leftovers(results: &mut [ChannelResult]) {
     let things = results.iter().flat_map(|r| &r.found).filter(of_things).map(gain).fold(0.0, f64::max);
     let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
     let losses = results.iter().flat_map(|r| &r.found).filter(|f| f.channel == "hits").map(gain).fold(0.0, f64::max);
+    let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
+    let disturbed = results.iter().flat_map(|r| &r.found).any(disturbs);
+    let own_car = |f: &&Found| f.causes == ["ego_occlusion"];
+    let hidden = results.iter().flat_map(|r| &r.found).filter(own_car).map(gain).fold(0.0, f64::max);
     for result in results.iter_mut() {
+        result.found.retain(|f| f.channel != "roughness" || !disturbed || gain(f) >= LEFT_OF_NOISE * returns);
+        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= LEFT_BY_OWN_CAR * hidden);
         // Where far returns are lost, those that come back are the nearer ones.
         result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
         result.found.retain(|f| f.channel != "roughness" || gain(f) >= LEFT_BY_ROWS * rows);

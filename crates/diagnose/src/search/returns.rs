@@ -2,7 +2,7 @@
 
 use super::{ChannelResult, Context, Found, Z_STAR, parameter};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
-use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Status};
+use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::roles::Role;
@@ -10,6 +10,9 @@ use crate::pairing::Ray;
 
 /// Share of returns below which nothing is said, by kind.
 const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.003, 0.003];
+
+/// A beam's width, which follows from what a disc of even light would mix, is known within this factor.
+const WIDTH_FACTOR: f64 = 2.5;
 
 /// The search.
 pub fn search(context: &Context) -> ChannelResult {
@@ -38,12 +41,14 @@ pub fn search(context: &Context) -> ChannelResult {
         let one_sided = match kind {
             Odd::GroupInFront => more > 3.0 * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
             Odd::GroupBehind => more > 3.0 * excess_of(&select, Odd::GroupInFront as usize)[1].max(0.0),
-            _ => true,
+            // Thin things that the simulation has not got, or loses, lie between what it has there, too.
+            Odd::Between => more > 0.5 * base,
+            Odd::Alone => true,
         };
         if seen && more <= floor {
             outcome = "too small to speak of";
         } else if seen && !one_sided {
-            outcome = "as many are missing elsewhere: surfaces stand elsewhere, nothing was added";
+            outcome = "the other way round they are nearly as many: surfaces stand elsewhere";
         } else if seen {
             outcome = "chosen";
             let [base_e, more_e] = excess_of(&estimate, k);
@@ -155,18 +160,20 @@ fn found(
         Odd::Between => {
             parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
             let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
-            let of_edges = share * sum(|f| f.all[0]) / sum(|f| f.at_edges).max(1.0);
-            parameters.push(parameter(
-                "share_at_edges",
-                of_edges,
-                (error / share.max(1e-9) * of_edges).hypot(0.05 * of_edges),
-                "1",
-            ));
+            let width = share * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
+            // How a sensor weighs what a beam meets is not known.
+            let so_wide = if width.is_finite() {
+                let ci95 = [width / WIDTH_FACTOR, width * WIDTH_FACTOR];
+                parameters.push(("divergence_rad".into(), Parameter { estimate: width, unit: "rad".into(), ci95 }));
+                format!(", about {:.1} mrad", 1e3 * width)
+            } else {
+                String::new()
+            };
             (
                 "edge",
                 format!(
-                    "{:.2} % of the returns at edges lie between the two surfaces: beams have a width, your simulator's are lines",
-                    100.0 * of_edges
+                    "{:.2} % of the measured returns lie between the two surfaces of an edge: beams have a width{so_wide}, your simulator's are lines",
+                    100.0 * share
                 ),
             )
         }

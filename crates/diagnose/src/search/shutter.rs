@@ -310,6 +310,7 @@ mod tests {
             corner: false,
             matched: true,
             company: 5,
+            in_gap: false,
             row: 0,
             object: u16::MAX,
             azimuth_rad: at.y.atan2(at.x) as f32,
