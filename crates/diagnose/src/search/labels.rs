@@ -3,7 +3,7 @@
 mod clock;
 mod words;
 
-use self::clock::{forward, late, own_speeds, within_frames};
+use self::clock::{forward, late, own_speeds, surely_late, within_frames};
 use super::geometry::Displacement;
 use super::{ChannelResult, Context, Repair, Z_STAR, confidence, first_demands, record};
 use crate::channels::labels::{ObjectShift, object_shifts};
@@ -69,8 +69,11 @@ const CANDIDATES: [(&str, &[usize]); 14] = [
     ("wrong_shape", &[5, 2]),
     ("rolling_shutter", &[7]),
     // The targets' clock where the own speed is not known: the constant is the own speed's share of it.
-    ("time_offset", &[0, 3]),
+    ("time_offset", TARGETS_CLOCK),
 ];
+
+/// Columns of the targets' clock where the own speed is not known.
+const TARGETS_CLOCK: &[usize] = &[0, 3];
 
 /// Smaller constant shifts of labels and of objects are not spoken of, m.
 const FLOOR_M: [f64; 2] = [0.03, 0.07];
@@ -120,21 +123,19 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let floor = FLOOR_M[usize::from(side == Side::Objects)];
     let speeds = own_speeds(motion.as_deref());
     let line = within_frames(&rows, &select, &blocks);
+    let clock = surely_late(forward(&rows, line[0]), line, speeds);
     let trial = |k: usize, columns: &[usize], before: Option<&[f64]>| {
         let fitted = fit(&frames, &blocks, columns, &precision);
         let own = CANDIDATES[k].1;
         let theta: Vec<f64> = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i]).collect();
         let size = theta.iter().map(|t| t.abs()).fold(0.0, f64::max);
         let moved = moved_m(&rows, own, &theta);
-        let plausible = own != [0, 3] || {
-            let [slope, error] = line;
-            slope.abs() > 3.0 * error && (speeds[0]..speeds[1]).contains(&(forward(&rows, slope) / slope))
-        };
+        let plausible = own != TARGETS_CLOCK || clock;
         let mut gains = cross_gains(&frames, &blocks, columns, &precision);
         if let Some(before) = before {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
         }
-        let least = if own == [0, 3] {
+        let least = if own == TARGETS_CLOCK {
             floor
         } else if CANDIDATES[k].0 == "time_offset" {
             FLOOR_S
@@ -179,9 +180,15 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     let (name, own) = CANDIDATES[chosen[0]];
-    if name == "label_offset" && own.contains(&0) && usable[3] && late(forward(&rows, line[0]), line, speeds) {
-        stories[0].0.push("time_offset".into());
-        stories[0].0.dedup();
+    if name == "label_offset" && own.contains(&0) && usable[3] {
+        if clock && own == [0] {
+            // Objects of the same frame tell, whatever the own speed does from frame to frame.
+            chosen[0] = CANDIDATES.iter().position(|c| c.1 == TARGETS_CLOCK).unwrap_or(chosen[0]);
+            stories[0] = (Vec::new(), 1.0);
+        } else if late(forward(&rows, line[0]), line, speeds) {
+            stories[0].0.push("time_offset".into());
+            stories[0].0.dedup();
+        }
     }
     let (first_gain, _) = total_and_z(&trials[first.chosen].gains);
     let second_demands = Demands { nats: (0.1 * first_gain).max(8.0), ..demands };
@@ -202,6 +209,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let on_estimate = linear(&estimate);
     let fitted = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &columns, &precision);
     let on_hold_out = linear(&hold_out);
+    let late_by = within_frames(&rows, &estimate, &context.blocks(&estimate));
     let mut at = 0;
     for (k, (equals, confidence)) in chosen.iter().zip(stories) {
         let own = at..at + CANDIDATES[*k].1.len();
@@ -209,7 +217,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         let mut without = fitted.clone();
         own.clone().for_each(|i| without.theta[i] = 0.0);
         let gains = on_hold_out.iter().map(|f| fitted.gain(f) - without.gain(f)).collect();
-        result.found.push(words::found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable));
+        result.found.push(words::found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable, late_by));
     }
     let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
     let best = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &known, &[1e-3; 8]);

@@ -1,6 +1,6 @@
 //! What the search of labels and objects found, in words and numbers.
 
-use super::{CANDIDATES, CAUSES, Cause, Row, Side};
+use super::{CANDIDATES, CAUSES, Cause, Row, Side, TARGETS_CLOCK};
 use crate::diagnosis::{Curve, CurvePoint, Status};
 use crate::inference::linear::LinearFit;
 use crate::search::{Found, parameter};
@@ -16,6 +16,7 @@ pub(super) fn found(
     side: Side,
     rows: &[Row],
     usable: &[bool],
+    late_by: [f64; 2],
 ) -> Found {
     let (name, columns) = CANDIDATES[candidate];
     // Labels that stand ahead of the returns are the same as returns that stand behind the labels.
@@ -23,7 +24,11 @@ pub(super) fn found(
     let mut parameters = Vec::new();
     let mut words = Vec::new();
     for (i, &c) in own.clone().zip(columns) {
-        let (theta, error) = (fitted.theta[i], fitted.error(i));
+        let (mut theta, mut error) = (fitted.theta[i], fitted.error(i));
+        if columns == TARGETS_CLOCK && c == 3 {
+            // From frame to frame the own speed changes as well; among the objects of a frame it does not.
+            [theta, error] = late_by;
+        }
         match CAUSES[c] {
             Cause::Forward if name == "time_offset" => continue,
             Cause::Forward => parameters.push(parameter("forward_m", sign * theta, error, "m")),
@@ -51,14 +56,14 @@ pub(super) fn found(
     };
     let clock = match columns {
         [3] => "; they move with the velocity that the sensor sees: all positions against the cloud",
-        [4] | [0, 3] => "; they move with the targets' velocity over the ground: the targets' clock",
+        [4] | TARGETS_CLOCK => "; they move with the targets' velocity over the ground: the targets' clock",
         _ => "",
     };
     let says = format!("{what}: {}{clock}", words.join(", "));
     let (covariate, x_column) = match columns {
         [3] => ("seen_velocity_m_s", 3),
         [4] => ("velocity_m_s", 4),
-        [0, 3] => ("velocity_m_s", 3),
+        TARGETS_CLOCK => ("velocity_m_s", 3),
         [7] => ("scan_phase * velocity", 7),
         [5, ..] | [6] => ("side_seen", columns[0]),
         _ => ("none", if usable[4] { 4 } else { 3 }),
