@@ -24,6 +24,8 @@ pub struct Demands {
     pub nats: f64,
     /// Share of the best gain by which a simpler candidate may fall behind.
     pub slack: f64,
+    /// Share of the gain from which on a richer candidate of another name, better for sure, is told beside the simpler one.
+    pub told: f64,
 }
 
 /// The outcome of a step.
@@ -86,6 +88,15 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let chosen = simpler
         .min_by(|a, b| trials[*a].parameters.cmp(&trials[*b].parameters).then(total(*b).total_cmp(&total(*a))))
         .unwrap_or(best);
+    // A slightly wrong form of the right cause is worth a little to a richer law; where it is worth more, and for sure, both are told.
+    let worth_more = |&i: &usize| {
+        let differences: Vec<f64> = trials[i].gains.iter().zip(&trials[chosen].gains).map(|(a, b)| a - b).collect();
+        let (more, z) = total_and_z(&differences);
+        trials[i].name != trials[chosen].name && more > demands.told * total(i) && z > 3.0
+    };
+    if let Some(richer) = eligible.iter().copied().filter(worth_more).max_by(|&a, &b| total(a).total_cmp(&total(b))) {
+        return Some(Choice { chosen: richer, equals: vec![chosen] });
+    }
     let mut equals: Vec<usize> = eligible
         .iter()
         .copied()
@@ -113,7 +124,7 @@ mod tests {
         Trial { candidate: 0, name: name.into(), parameters, gains: gains.to_vec(), above_floor: true }
     }
 
-    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02 };
+    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02, told: 0.02 };
 
     #[test]
     fn the_simplest_of_equals_wins() {
@@ -121,6 +132,10 @@ mod tests {
         let complex = trial("complex", 3, &[10.1, 11.2, 9.0, 10.2]);
         let choice = choose(&[complex.clone(), simple.clone()], &DEMANDS).unwrap();
         assert_eq!((choice.chosen, choice.equals.len()), (1, 0));
+        let told = Demands { told: 0.005, ..DEMANDS };
+        let richer = trial("richer", 3, &[10.1, 11.1, 9.2, 10.2]);
+        let choice = choose(&[richer, simple.clone()], &told).unwrap();
+        assert_eq!((choice.chosen, choice.equals), (0, vec![1]), "better for sure, and by more than a wrong form");
         let better = trial("better", 3, &[20.0, 21.0, 19.0, 20.0]);
         assert_eq!(choose(&[better, simple], &DEMANDS).unwrap().chosen, 0);
     }

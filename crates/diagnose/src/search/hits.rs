@@ -10,7 +10,7 @@ use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
-use crate::inference::choice::{Trial, choose, total_and_z};
+use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable, in_zone};
@@ -47,7 +47,8 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     let folds = fold_of(&blocks);
     let returns = context.returns(&select);
     let table = of(&select);
-    let demands = first_demands();
+    // The form of a law is never quite that of the sensor.
+    let demands = Demands { told: 0.01, ..first_demands() };
     let mut result = ChannelResult::default();
     let mut chosen: Vec<Law> = Vec::new();
     let mut stories = Vec::new();

@@ -111,7 +111,7 @@ pub const Z_STAR: f64 = 3.2;
 
 /// The demands of a first step.
 pub fn first_demands() -> Demands {
-    Demands { z: Z_STAR, nats: 8.0, slack: 0.02 }
+    Demands { z: Z_STAR, nats: 8.0, slack: 0.02, told: 0.02 }
 }
 
 /// Share of rows whose offsets do not count in their spread: a row may follow the upper edge of a wall, which every shift of the wall
