@@ -123,7 +123,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let floor = FLOOR_M[usize::from(side == Side::Objects)];
     let speeds = own_speeds(motion.as_deref());
     let line = within_frames(&rows, &select, &blocks);
-    let clock = surely_late(forward(&rows, line[0]), line, speeds);
+    let clock = usable[3] && surely_late(forward(&rows, line[0]), line, speeds);
     let trial = |k: usize, columns: &[usize], before: Option<&[f64]>| {
         let fitted = fit(&frames, &blocks, columns, &precision);
         let own = CANDIDATES[k].1;
@@ -180,12 +180,13 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     let (name, own) = CANDIDATES[chosen[0]];
-    if name == "label_offset" && own.contains(&0) && usable[3] {
+    if name == "label_offset" && own.contains(&0) {
         if clock && own == [0] {
             // Objects of the same frame tell, whatever the own speed does from frame to frame.
             chosen[0] = CANDIDATES.iter().position(|c| c.1 == TARGETS_CLOCK).unwrap_or(chosen[0]);
             stories[0] = (Vec::new(), 1.0);
-        } else if late(forward(&rows, line[0]), line, speeds) {
+        } else if !usable[3] || late(forward(&rows, line[0]), line, speeds) {
+            // Where no speeds are known nothing speaks against a late clock.
             stories[0].0.push("time_offset".into());
             stories[0].0.dedup();
         }

@@ -70,7 +70,8 @@ pub(super) fn found(
     };
     let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
     let separate_by = (!equals.is_empty()).then(|| {
-        "targets at very different speeds: a constant offset does not change with speed, a late clock's does".to_owned()
+        let frames = if usable[3] { "" } else { "frames that follow one another, so that speeds are known, and " };
+        format!("{frames}targets at very different speeds: a constant offset does not change with speed, a late clock's does")
     });
     let axis = match columns {
         [1] | [6] => 1,
