@@ -278,9 +278,10 @@ fn found(
             let beyond = if *name == "half_at_m" { (estimate - table.farthest_m()).max(0.0) } else { 0.0 };
             let form = if *name == "most" { 0.002 } else { form_error(law.law) * estimate.abs() };
             let half = 2.1 * sd.hypot(form) + beyond;
-            let parameter =
-                Parameter { estimate: *estimate, unit: (*unit).into(), ci95: [estimate - half, estimate + half] };
-            ((*name).to_owned(), parameter)
+            // Which of an object's surfaces are of the material is not known: where few are, each of them loses more.
+            let few = matches!(law.law, Law::Zone(_)) && *estimate > 0.0;
+            let ci95 = [estimate - half, if few { 1.0 } else { estimate + half }];
+            ((*name).to_owned(), Parameter { estimate: *estimate, unit: (*unit).into(), ci95 })
         })
         .collect();
     let name = law.law.name().to_owned();

@@ -182,10 +182,12 @@ fn linear_parameters(
         (turn, shift) = (turn_of.inverse_transform_vector(&turn), turn_of.inverse_transform_vector(&shift));
         (turn_error, shift_error) = (error_of(turn_error), error_of(shift_error));
     }
+    // What one of several sensors sees, the pose of the frame and the surfaces' own offsets take a part of.
+    let form = if sensor.is_some() { 0.07 } else { 0.03 };
     for (k, label) in ["roll_deg", "pitch_deg", "yaw_deg"].into_iter().enumerate() {
         if turn[k].abs() > 1e-9 {
             let value = deg(turn[k]);
-            parameters.push(parameter(label, value, deg(turn_error[k]).hypot(0.002).hypot(0.03 * value), "deg"));
+            parameters.push(parameter(label, value, deg(turn_error[k]).hypot(0.002).hypot(form * value), "deg"));
         }
     }
     for (k, label) in ["forward_m", "left_m", "up_m"].into_iter().enumerate() {
