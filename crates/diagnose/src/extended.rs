@@ -2,6 +2,7 @@
 //! effect for is listed in comments; what has no name is written as tables.
 
 use crate::diagnosis::{Diagnosis, Finding, Status};
+use crate::pairing::GAP_M;
 use crate::rig::SensorRig;
 use std::fmt::Write;
 
@@ -179,7 +180,10 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
         }
         "rolling_shutter" => with("rolling_shutter", "deskewed = false\n".into()),
         "outliers" => with("false_alarms", key("rate", "rate")),
-        "mixed_pixels" => with("beam_divergence", key("divergence_rad", "divergence_rad")),
+        // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
+        "mixed_pixels" => {
+            with("beam_divergence", key("divergence_rad", "divergence_rad") + &format!("pulse_m = {:?}\n", GAP_M[1]))
+        }
         "label_offset" => {
             with("label_offset", key("forward_m", "forward_m") + &key("left_m", "left_m") + &key("up_m", "up_m"))
         }
@@ -411,7 +415,7 @@ mod tests {
             finding("pitch_roll", &[("pitch_deg", 0.2)]),
             finding("rolling_shutter", &[("scan_s", 0.1)]),
             finding("outliers", &[("rate", 0.01)]),
-            finding("mixed_pixels", &[("share", 0.01)]),
+            finding("mixed_pixels", &[("share", 0.01), ("divergence_rad", 0.004)]),
             finding("label_offset", &[("forward_m", 0.2)]),
             finding("time_offset", &[("offset_s", 0.02)]),
             finding("wrong_shape", &[("longer_m", 0.2)]),

@@ -179,7 +179,7 @@ fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
 }
 
 /// Jumps in range over which a beam mixes, m.
-const GAP_M: [f64; 2] = [1.2, 12.0];
+pub const GAP_M: [f64; 2] = [1.2, 12.0];
 
 /// Whether a jump in range is one over which beams mix.
 pub fn gap_mixes(near_m: f64, far_m: f64) -> bool {

@@ -10,7 +10,7 @@ mod scan;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, gap_margin_m, gap_mixes, pair_frame};
+pub use frame::{FramePair, GAP_M, Mending, ObjectPair, Sensors, ShownShift, gap_margin_m, gap_mixes, pair_frame};
 pub use identical::{Identity, check_identity};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;
