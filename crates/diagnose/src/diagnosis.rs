@@ -66,7 +66,7 @@ pub struct Finding {
     /// Name of the cause, where it is named.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub cause: Option<String>,
-    /// Names of the causes that explain it equally well, where it is ambiguous.
+    /// Names of the causes that explain it as well or nearly so, where it is ambiguous; parameters are those of the first.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub candidates: Option<Vec<String>>,
     /// `range_error`, `detection`, `geometry`, `timing`, `labels`, `returns` or `unknown`.

@@ -179,7 +179,7 @@ pub fn diagnose(
     Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
 }
 
-/// Searches, one a call.
+/// Number of searches, for the progress that is shown.
 const SEARCHES: usize = 9;
 
 /// Larger steps of the ranges matter to where surfaces lie, m.

@@ -53,7 +53,7 @@ pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig, rows_deg: &[Vec<f64
                 let names = f.candidates.clone().unwrap_or_default();
                 let _ = writeln!(
                     text,
-                    "# These data do not tell {} apart; the first of them stands here.",
+                    "# These data do not tell {} apart for sure; the first of them stands here.",
                     names.join(" and ")
                 );
                 let first = Finding { cause: names.first().cloned(), ..f.clone() };
@@ -181,6 +181,9 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
         "rolling_shutter" => with("rolling_shutter", "deskewed = false\n".into()),
         "outliers" => with("false_alarms", key("rate", "rate")),
         // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
+        "mixed_pixels" if !f.parameters.contains_key("divergence_rad") => {
+            "# beam_divergence: how wide the beams are these data do not tell.\n".into()
+        }
         "mixed_pixels" => {
             with("beam_divergence", key("divergence_rad", "divergence_rad") + &format!("pulse_m = {:?}\n", GAP_M[1]))
         }

@@ -14,6 +14,9 @@ pub const CELLS: usize = RANGE_BINS * COS_BINS * ZONES;
 const RANGE_STEP: f64 = 0.25;
 const COS_STEP: f64 = 0.4;
 
+/// Number of the first zone of objects.
+pub const OBJECT: usize = 2;
+
 /// Zones by name, for findings.
 pub const ZONE_NAMES: [&str; ZONES] = ["ground", "standing", "object", "object_corner"];
 

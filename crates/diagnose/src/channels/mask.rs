@@ -132,7 +132,9 @@ pub fn blocked_cells(
             (2..4).any(|k| judged(&(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
         };
         let ends = |(s, az, el): DirectionCell, a: i32, e: i32| {
-            e <= 0 && (1..4).any(|k| !counts.contains_key(&(s, az + k * a, el + k * e)))
+            // Rows may be farther apart than cells are high.
+            let nothing = |k: i32| !counts.contains_key(&(s, az + k * a, el + k * e));
+            e <= 0 && (1..4).any(|k| (k..k + 3).all(nothing))
         };
         let sides = |bounds: &dyn Fn(DirectionCell, i32, i32) -> bool| {
             let on = |a, e| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len();

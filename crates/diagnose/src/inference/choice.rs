@@ -1,5 +1,8 @@
 //! One step of forward selection: which candidate explains frames that it was not fitted on, and which others could as well.
 
+/// Name of a trial of what is in no catalogue.
+pub const UNNAMED: &str = "unexplained";
+
 /// What a candidate brought on each frame, when it was fitted on other blocks.
 #[derive(Clone, Debug)]
 pub struct Trial {
@@ -33,7 +36,7 @@ pub struct Demands {
 pub struct Choice {
     /// The chosen trial.
     pub chosen: usize,
-    /// Other names that explain as much, as far as these frames tell.
+    /// Other names that explain as much, as far as these frames tell, or next to as much with fewer parameters.
     pub equals: Vec<usize>,
 }
 
@@ -92,11 +95,11 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let worth_more = |&i: &usize| {
         let differences: Vec<f64> = trials[i].gains.iter().zip(&trials[chosen].gains).map(|(a, b)| a - b).collect();
         let (more, z) = total_and_z(&differences);
-        trials[i].name != trials[chosen].name && more > demands.told * total(i) && z > 3.0
+        let richer = trials[i].parameters > trials[chosen].parameters;
+        let other = trials[i].name != trials[chosen].name && trials[i].name != UNNAMED;
+        richer && other && more > demands.told * total(i) && z > 3.0
     };
-    if let Some(richer) = eligible.iter().copied().filter(worth_more).max_by(|&a, &b| total(a).total_cmp(&total(b))) {
-        return Some(Choice { chosen: richer, equals: vec![chosen] });
-    }
+    let richer = eligible.iter().copied().filter(worth_more).max_by(|&a, &b| total(a).total_cmp(&total(b)));
     let mut equals: Vec<usize> = eligible
         .iter()
         .copied()
@@ -113,7 +116,14 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
         t.above_floor && t.name != trials[chosen].name && gain > 2.0 * total(chosen) && z > 1.5
     };
     equals.extend((0..trials.len()).filter(|i| !eligible.contains(i) && far_better(&trials[*i])));
-    Some(Choice { chosen, equals })
+    match richer {
+        Some(richer) => {
+            equals.retain(|&i| trials[i].name != trials[richer].name);
+            equals.insert(0, chosen);
+            Some(Choice { chosen: richer, equals })
+        }
+        None => Some(Choice { chosen, equals }),
+    }
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! One frame of both sides, return by return.
 
 use super::boxes::{BoxShift, SurfacePoint, fit_shift};
+use super::gaps::{in_gap, mixed_per_rad};
 use super::matching::match_directions;
 use super::pattern::ScanPattern;
 use super::ray::{Ray, Surface};
@@ -20,6 +21,8 @@ pub struct FramePair {
     pub measured: Vec<Ray>,
     /// Returns of the simulated side.
     pub simulated: Vec<Ray>,
+    /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
+    pub mixed_per_rad: f64,
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
 }
@@ -115,7 +118,13 @@ pub fn pair_frame(
         let round = |r: &mut f32| *r = ((f64::from(*r) / step).round() * step).max(0.05) as f32;
         scans[1].iter_mut().flat_map(|s| &mut s.range_m).for_each(round);
     }
-    let mut frame = FramePair { id: id.into(), measured: Vec::new(), simulated: Vec::new(), objects: Vec::new() };
+    let mut frame = FramePair {
+        id: id.into(),
+        measured: Vec::new(),
+        simulated: Vec::new(),
+        mixed_per_rad: 0.0,
+        objects: Vec::new(),
+    };
     for sensor in 0..sensors.rig.sensors.len() {
         let (measured_scans, simulated_scans) = scans.split_at_mut(1);
         let (a, b) = (&mut measured_scans[0][sensor], &simulated_scans[0][sensor]);
@@ -161,6 +170,7 @@ pub fn pair_frame(
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }
+    frame.mixed_per_rad = mixed_per_rad(&frame.simulated);
     fit_objects(&mut objects, &frame, sensors);
     frame.objects = objects;
     frame
@@ -176,35 +186,6 @@ fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
         }
     });
     n
-}
-
-/// Jumps in range over which a beam mixes, m.
-pub const GAP_M: [f64; 2] = [1.2, 12.0];
-
-/// Whether a jump in range is one over which beams mix.
-pub fn gap_mixes(near_m: f64, far_m: f64) -> bool {
-    (GAP_M[0]..GAP_M[1]).contains(&(far_m - near_m))
-}
-
-/// Closer than that to the nearer surface, or to the farther one, a return lies on it, m.
-pub fn gap_margin_m(near_m: f64) -> f64 {
-    0.35 + 0.015 * near_m
-}
-
-/// Whether a return lies between two surfaces of the other side, off both of them.
-fn in_gap(other: &DirectionIndex, scan: &SensorScan, i: usize) -> bool {
-    let range = scan.range_m[i];
-    let [mut near, mut far] = [0.0f32, f32::INFINITY];
-    other.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
-        if e.range_m < range {
-            near = near.max(e.range_m);
-        } else {
-            far = far.min(e.range_m);
-        }
-    });
-    let [range, near, far] = [range, near, far].map(f64::from);
-    let margin = gap_margin_m(near);
-    near > 0.0 && gap_mixes(near, far) && range > near + margin && range < far - margin
 }
 
 /// The simulated side of one sensor, to be looked at from any direction.

@@ -63,6 +63,8 @@ pub fn check_identity(
             let strangers = far.iter().map(|k| score((i + k) % n)).collect::<Result<Vec<_>, _>>()?;
             Ok(FrameScores { frame: i, own, same: cloud < SAME_M && labels < LATE, near, strangers })
         })
+        .collect::<Vec<_>>()
+        .into_iter()
         .collect::<Result<_, DiagnoseError>>()?;
     Ok(judge(&rows, &lags, ids))
 }

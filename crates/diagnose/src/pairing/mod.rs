@@ -2,6 +2,7 @@
 
 mod boxes;
 mod frame;
+mod gaps;
 mod identical;
 mod matching;
 mod pattern;
@@ -10,7 +11,8 @@ mod scan;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, GAP_M, Mending, ObjectPair, Sensors, ShownShift, gap_margin_m, gap_mixes, pair_frame};
+pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, pair_frame};
+pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;

@@ -18,14 +18,12 @@ pub enum Surface {
 /// Where a return lies against the simulated returns around its direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Lies {
-    /// On their surface, or on one of two at an edge.
+    /// On their surface, or at an edge on one of the two or between them.
     On,
     /// Nearer.
     InFront,
     /// Farther.
     Behind,
-    /// Between the two surfaces of an edge.
-    Between,
     /// There are none.
     Open,
 }
@@ -128,7 +126,6 @@ impl Ray {
         match own {
             r if r < near - margin => Lies::InFront,
             r if r > far + margin => Lies::Behind,
-            r if r > near + margin && r < far - margin => Lies::Between,
             _ => Lies::On,
         }
     }

@@ -5,12 +5,12 @@ use super::{
     ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed,
     unless_unsure,
 };
-use crate::channels::cells::{ZONE_NAMES, cell};
+use crate::channels::cells::{OBJECT, ZONE_NAMES, cell};
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::{Demands, Trial, UNNAMED, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::{FittedLaw, LAWS, Law, LossTable, in_zone};
@@ -192,9 +192,6 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     result
 }
 
-/// Name among the trials of what is in no catalogue.
-const UNNAMED: &str = "unexplained";
-
 /// Shares lost by groups of directions: prior spread of a fifth.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false, trust: 1.0 };
 
@@ -279,7 +276,7 @@ fn found(
             let form = if *name == "most" { 0.002 } else { form_error(law.law) * estimate.abs() };
             let half = 2.1 * sd.hypot(form) + beyond;
             // Which of an object's surfaces are of the material is not known: where few are, each of them loses more.
-            let few = matches!(law.law, Law::Zone(_)) && *estimate > 0.0;
+            let few = matches!(law.law, Law::Zone(z) if z >= OBJECT) && *estimate > 0.0;
             let ci95 = [estimate - half, if few { 1.0 } else { estimate + half }];
             ((*name).to_owned(), Parameter { estimate: *estimate, unit: (*unit).into(), ci95 })
         })

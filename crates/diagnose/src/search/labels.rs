@@ -130,7 +130,11 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         let theta: Vec<f64> = (0..own.len()).map(|i| fitted.theta[columns.len() - own.len() + i]).collect();
         let size = theta.iter().map(|t| t.abs()).fold(0.0, f64::max);
         let moved = moved_m(&rows, own, &theta);
-        let plausible = own != TARGETS_CLOCK || clock;
+        let plausible = match CANDIDATES[k] {
+            (_, TARGETS_CLOCK) => clock,
+            ("label_offset", own) => !(clock && own.contains(&0)),
+            _ => true,
+        };
         let mut gains = cross_gains(&frames, &blocks, columns, &precision);
         if let Some(before) = before {
             gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
@@ -157,11 +161,16 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         columns.iter().all(|&c| usable[c])
             && (side == Side::Objects || !matches!(name, "wrong_shape" | "rolling_shutter"))
     };
-    let demands = Demands { nats: 6.0, slack: 0.03, ..first_demands() };
+    let demands = Demands { nats: 6.0, slack: 0.03, told: 0.03, ..first_demands() };
     let trials: Vec<Trial> = (0..CANDIDATES.len()).filter(allowed).map(|k| trial(k, CANDIDATES[k].1, None)).collect();
     let choice = choose(&trials, &demands);
     let returns = context.returns(&select);
     result.considered = record(&trials, choice.as_ref(), channel, returns, &demands);
+    for (considered, t) in result.considered.iter_mut().zip(&trials).filter(|_| clock) {
+        if t.name == "label_offset" && CANDIDATES[t.candidate].1.contains(&0) {
+            considered.outcome = "objects of the same frame are shifted by their speeds, not all alike".into();
+        }
+    }
     if side == Side::Labels {
         let error = |k: usize| fit(&frames, &blocks, &[k], &precision).error(0);
         let least = |name: &str, parameter: &str, value: f64, unit: &str| {
@@ -181,11 +190,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     let (name, own) = CANDIDATES[chosen[0]];
     if name == "label_offset" && own.contains(&0) {
-        if clock && own == [0] {
-            // Objects of the same frame tell, whatever the own speed does from frame to frame.
-            chosen[0] = CANDIDATES.iter().position(|c| c.1 == TARGETS_CLOCK).unwrap_or(chosen[0]);
-            stories[0] = (Vec::new(), 1.0);
-        } else if !usable[3] || late(forward(&rows, line[0]), line, speeds) {
+        if !usable[3] || late(forward(&rows, line[0]), line, speeds) {
             // Where no speeds are known nothing speaks against a late clock.
             stories[0].0.push("time_offset".into());
             stories[0].0.dedup();
@@ -211,6 +216,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let fitted = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &columns, &precision);
     let on_hold_out = linear(&hold_out);
     let late_by = within_frames(&rows, &estimate, &context.blocks(&estimate));
+    let late_by = if late_by[1].is_finite() { late_by } else { line };
     let mut at = 0;
     for (k, (equals, confidence)) in chosen.iter().zip(stories) {
         let own = at..at + CANDIDATES[*k].1.len();

@@ -55,7 +55,7 @@ impl Context<'_> {
 pub struct Found {
     /// Status.
     pub status: Status,
-    /// The cause, or the candidates with the simplest first.
+    /// The cause, or the candidates with the one whose parameters stand here first.
     pub causes: Vec<String>,
     /// Family of causes.
     pub family: &'static str,
@@ -63,7 +63,7 @@ pub struct Found {
     pub parameters: Vec<(String, Parameter)>,
     /// Share of repetitions with the same choice.
     pub confidence: f64,
-    /// Channel.
+    /// Channel in which it searched; the engine, which runs the searches, writes it down.
     pub channel: &'static str,
     /// Covariate.
     pub covariate: String,
@@ -80,7 +80,7 @@ pub struct Found {
 /// What a channel's search hands back.
 #[derive(Clone, Debug, Default)]
 pub struct ChannelResult {
-    /// Channel.
+    /// Channel in which it searched; the engine, which runs the searches, writes it down.
     pub channel: &'static str,
     /// Findings.
     pub found: Vec<Found>,
@@ -173,7 +173,13 @@ fn slight_bias(f: &Found) -> bool {
 }
 
 /// Nats a return below which a law of noise beside surfaces that stand elsewhere, slide or mix is what these leave.
-const LEFT_OF_NOISE: f64 = 0.015;
+const LEFT_OF_NOISE: f64 = 0.03;
+
+/// Times the gain of rows that aim elsewhere below which a law of noise is what is left of the jumps between rows on the ground.
+const LEFT_BY_AIMS: f64 = 2.5;
+
+/// Share of the gain of rows that aim elsewhere below which the pose of a sensor is what their mean leaves.
+const LEFT_BY_ROWS_OF_A_POSE: f64 = 0.25;
 
 /// Share of what the own car hides below which a sensor's pose is a matter of which surfaces it still sees.
 const LEFT_BY_OWN_CAR: f64 = 0.05;
@@ -187,20 +193,20 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
     let of_rows = |f: &&Found| f.causes.first().is_some_and(|c| c.starts_with("beam_"));
     let rows = results.iter().flat_map(|r| &r.found).filter(of_rows).map(gain).fold(0.0, f64::max);
+    let of_aims = |f: &&Found| f.causes == ["beam_elevation_offset"];
+    let aims = results.iter().flat_map(|r| &r.found).filter(of_aims).map(gain).fold(0.0, f64::max);
     let of_things = |f: &&Found| f.causes == ["missing_object"];
     let things = results.iter().flat_map(|r| &r.found).filter(of_things).map(gain).fold(0.0, f64::max);
     let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
     let losses = results.iter().flat_map(|r| &r.found).filter(|f| f.channel == "hits").map(gain).fold(0.0, f64::max);
-    let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
-    let disturbed = results.iter().flat_map(|r| &r.found).any(disturbs);
     let own_car = |f: &&Found| f.causes == ["ego_occlusion"];
     let hidden = results.iter().flat_map(|r| &r.found).filter(own_car).map(gain).fold(0.0, f64::max);
     for result in results.iter_mut() {
-        result.found.retain(|f| f.channel != "roughness" || !disturbed || gain(f) >= LEFT_OF_NOISE * returns);
         result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= LEFT_BY_OWN_CAR * hidden);
         // Where far returns are lost, those that come back are the nearer ones.
         result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
-        result.found.retain(|f| f.channel != "roughness" || gain(f) >= LEFT_BY_ROWS * rows);
+        result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
+        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= LEFT_BY_ROWS_OF_A_POSE * aims);
         // Things that stand before edges lie between what these show.
         result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= LEFT_BY_THINGS * things);
         // Things that move by themselves slide otherwise than what stands.
@@ -210,10 +216,19 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         f.channel == "residuals" && f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"))
     });
     let pose = poses.map(gain).fold(0.0, f64::max);
-    for result in results {
+    for result in results.iter_mut() {
         result
             .found
             .retain(|f| !matches!(f.channel, "hits" | "roughness" | "returns") || gain(f) >= LEFT_BY_A_POSE * pose);
+    }
+    let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
+    if results.iter().flat_map(|r| &r.found).any(disturbs) {
+        let rough = |f: &Found| f.channel == "roughness" && gain(f) < LEFT_OF_NOISE * returns;
+        results.iter_mut().for_each(|r| r.found.retain(|f| !rough(f)));
+    }
+    // What is not spoken of explains nothing.
+    for result in results.iter_mut().filter(|r| r.found.is_empty()) {
+        result.distance.iter_mut().for_each(|d| d[1] = 0.0);
     }
 }
 
@@ -311,7 +326,7 @@ pub fn record(
         let (total, z) = total_and_z(&t.gains);
         let outcome = match choice {
             Some(c) if c.chosen == i => "chosen".to_owned(),
-            Some(c) if c.equals.contains(&i) => "explains as much, as far as these frames tell".into(),
+            Some(c) if c.equals.contains(&i) => "explains as much, or nearly so, as far as these frames tell".into(),
             _ if total <= demands.nats || z <= demands.z => "no gain on frames that it was not fitted on".into(),
             _ if !t.above_floor => "too small to speak of".into(),
             Some(c) => {

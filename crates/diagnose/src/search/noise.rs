@@ -11,7 +11,7 @@ use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::mean::usual_noise_m;
 use crate::channels::roughness::{RoughFrame, rough_frames, rough_groups, scales, total};
 use crate::diagnosis::{Minimum, Status};
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::{Demands, Trial, UNNAMED, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::noise::{NOISE_LAWS, NoiseLaw, NoiseTable};
@@ -207,9 +207,6 @@ const ANGULAR: usize = 1;
 
 /// Share of the first law's gain by which a pair of laws has to be better.
 const A_PAIR_SHARE: f64 = 0.003;
-
-/// Name among the trials of what is in no catalogue.
-const UNNAMED: &str = "unexplained";
 
 /// Added variances of groups of directions in units of the expected one: prior spread of three.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false, trust: 0.5 };

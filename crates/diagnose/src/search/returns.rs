@@ -14,6 +14,9 @@ const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.003, 0.003];
 /// A beam's width, which follows from what a disc of even light would mix, is known within this factor.
 const WIDTH_FACTOR: f64 = 2.5;
 
+/// Widths that beams have, rad.
+const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
+
 /// The search.
 pub fn search(context: &Context) -> ChannelResult {
     let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
@@ -34,21 +37,20 @@ pub fn search(context: &Context) -> ChannelResult {
             .collect();
         let (_, z_difference) = total_and_z(&differences);
         let error = base.max(more.abs() / 30.0) / z_difference.abs().max(1e-9);
-        let floor = FLOORS[k].max(0.3 * base);
+        // Thin things that the simulation has not got, or loses, lie between what it has there, too.
+        let floor = FLOORS[k].max(if kind == Odd::Between { 0.5 } else { 0.3 } * base);
         let mut outcome = "no more of them than on the simulated side";
         let seen = total > 8.0 && significant(&gains, Z_STAR) && z_difference > 1.5;
         // Surfaces that only stand elsewhere are missed in one place and found in another.
         let one_sided = match kind {
             Odd::GroupInFront => more > 3.0 * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
             Odd::GroupBehind => more > 3.0 * excess_of(&select, Odd::GroupInFront as usize)[1].max(0.0),
-            // Thin things that the simulation has not got, or loses, lie between what it has there, too.
-            Odd::Between => more > 0.5 * base,
-            Odd::Alone => true,
+            _ => true,
         };
         if seen && more <= floor {
             outcome = "too small to speak of";
         } else if seen && !one_sided {
-            outcome = "the other way round they are nearly as many: surfaces stand elsewhere";
+            outcome = "as many are missing elsewhere: surfaces stand elsewhere, nothing was added";
         } else if seen {
             outcome = "chosen";
             let [base_e, more_e] = excess_of(&estimate, k);
@@ -162,7 +164,7 @@ fn found(
             let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
             let width = share * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
             // How a sensor weighs what a beam meets is not known.
-            let so_wide = if width.is_finite() {
+            let so_wide = if WIDTHS_RAD.contains(&width) {
                 let ci95 = [width / WIDTH_FACTOR, width * WIDTH_FACTOR];
                 parameters.push(("divergence_rad".into(), Parameter { estimate: width, unit: "rad".into(), ci95 }));
                 format!(", about {:.1} mrad", 1e3 * width)

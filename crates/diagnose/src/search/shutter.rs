@@ -340,6 +340,7 @@ mod tests {
                 let shown =
                     |p: &Vector3<f64>| p + velocity * (scan_phase(p.y.atan2(p.x), std::f64::consts::PI) * scan_s);
                 FramePair {
+                    mixed_per_rad: 0.0,
                     id: f.to_string(),
                     measured: posts.iter().map(|p| standing(&shown(p))).collect(),
                     simulated: posts.iter().map(standing).collect(),

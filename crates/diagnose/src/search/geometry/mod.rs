@@ -8,7 +8,7 @@ mod words;
 pub use self::displacement::Displacement;
 
 use self::displacement::displacement;
-use self::suspects::{Suspect, UNNAMED, is_pose, may_join, suspects};
+use self::suspects::{Suspect, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, first_demands, record, unless_unsure};
 use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{

@@ -2,6 +2,7 @@
 
 use crate::channels::groups::Grouping;
 use crate::channels::mean::Column;
+use crate::inference::choice::UNNAMED;
 use crate::search::Context;
 
 /// What may be wrong.
@@ -66,9 +67,6 @@ pub(super) fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
     all.push(Suspect::Groups { name: UNNAMED, grouping: Grouping::Azimuth, column: 0 });
     all
 }
-
-/// Name among the trials of what depends on azimuth: no cause of the catalogue.
-pub(super) const UNNAMED: &str = "unexplained";
 
 /// Whether a suspect is a pose: on top of another one it mends what a turn leaves that is not small.
 pub(super) fn is_pose(suspect: &Suspect) -> bool {

@@ -1,10 +1,11 @@
 //! What the search of geometry found, in words and numbers.
 
 use super::curve::linear_curve;
-use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, UNNAMED, fit_all, groups_of, how};
+use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, fit_all, groups_of, how};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
+use crate::inference::choice::UNNAMED;
 use crate::inference::grouped;
 use crate::inference::linear::{LinearFit, LinearFrame, fit};
 use crate::search::{Context, Found, Z_STAR, parameter};
@@ -182,7 +183,7 @@ fn linear_parameters(
         (turn, shift) = (turn_of.inverse_transform_vector(&turn), turn_of.inverse_transform_vector(&shift));
         (turn_error, shift_error) = (error_of(turn_error), error_of(shift_error));
     }
-    // What one of several sensors sees, the pose of the frame and the surfaces' own offsets take a part of.
+    // The free pose of every frame and the free offsets of its surfaces take a part of what a single sensor's turn does.
     let form = if sensor.is_some() { 0.07 } else { 0.03 };
     for (k, label) in ["roll_deg", "pitch_deg", "yaw_deg"].into_iter().enumerate() {
         if turn[k].abs() > 1e-9 {

@@ -28,10 +28,10 @@ pub(super) fn surely_late(forward_m: f64, [slope, error]: [f64; 2], speeds: [f64
     slope.abs() > 3.2 * error && (speeds[0]..speeds[1]).contains(&(forward_m / slope))
 }
 
-/// Mean shift forward at no seen velocity, m.
+/// Shift forward at no seen velocity of an object that heads as the own car does, m; of one that comes towards it a late clock makes the opposite.
 pub(super) fn forward(rows: &[Row], slope: f64) -> f64 {
-    let sum = |f: &dyn Fn(&Row) -> f64| rows.iter().map(|r| f(r) / r.variance[0]).sum::<f64>();
-    sum(&|r| r.shift[0] - slope * r.x[0][3]) / sum(&|_| 1.0).max(1e-9)
+    let sum = |f: &dyn Fn(&Row, f64) -> f64| rows.iter().map(|r| f(r, r.yaw_rad.cos()) / r.variance[0]).sum::<f64>();
+    sum(&|r, cos| cos * (r.shift[0] - slope * r.x[0][3])) / sum(&|_, cos| cos * cos).max(1e-9)
 }
 
 /// The same object comes to lie no farther from where it was in the next frame, m.
@@ -57,7 +57,8 @@ struct Contrast<'a> {
 /// Slope of the shift forward over the seen velocity among the objects of a frame, s, and its standard error, beside a constant. A late clock shifts an
 /// object by its velocity over the ground: the seen one, the own speed times the cosine of its heading, and the own turn times its lever. The last
 /// two have one unknown factor a frame each, and are taken out. Velocities come from labels, which are not exact: the share of the slope that their
-/// errors leave, at least a twentieth, is known from objects that are followed, whose velocities stay the same from frame to frame and whose errors do not.
+/// errors leave is known from objects that are followed, whose velocities stay the same from frame to frame and whose errors do not; where too few are,
+/// the error is infinite.
 pub(super) fn within_frames(rows: &[Row], which: &[usize], blocks: &[usize]) -> [f64; 2] {
     let mut contrasts: Vec<Contrast> = Vec::new();
     for frame in rows.chunk_by(|a, b| a.frame == b.frame).filter(|f| f.len() >= FEWEST_OF_FRAME) {
@@ -85,7 +86,12 @@ pub(super) fn within_frames(rows: &[Row], which: &[usize], blocks: &[usize]) -> 
     let followed: Vec<[f64; 2]> = followed.collect();
     let squares: f64 = followed.iter().map(|[a, b]| 0.5 * (a * a + b * b)).sum();
     let together: f64 = followed.iter().map(|[a, b]| a * b).sum();
-    let kept = if followed.len() < FEWEST_FOLLOWED { 0.05 } else { (together / squares.max(1e-9)).clamp(0.05, 1.0) };
+    if followed.len() < FEWEST_FOLLOWED {
+        return [0.0, f64::INFINITY];
+    }
+    let kept = (together / squares.max(1e-9)).clamp(0.05, 1.0);
+    // Standard error of a correlation.
+    let kept_error = (1.0 - kept * kept) / (followed.len() as f64).sqrt();
     let of_frame = |f: &usize| {
         let mut out = LinearFrame { gram: DMatrix::zeros(2, 2), right: DVector::zeros(2) };
         for c in contrasts.iter().filter(|c| c.row.frame == *f) {
@@ -97,5 +103,6 @@ pub(super) fn within_frames(rows: &[Row], which: &[usize], blocks: &[usize]) -> 
     };
     let frames: Vec<LinearFrame> = which.iter().map(of_frame).collect();
     let fitted = fit(&frames.iter().collect::<Vec<_>>(), blocks, &[0, 1], &[1.0, 1.0]);
-    [fitted.theta[0] / kept, fitted.error(0) / kept]
+    let slope = fitted.theta[0] / kept;
+    [slope, (fitted.error(0) / kept).hypot(slope * kept_error / kept)]
 }

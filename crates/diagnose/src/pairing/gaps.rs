@@ -1,0 +1,85 @@
+//! Jumps in range over which a beam mixes: returns that lie in them, and how many a beam of some width would put there.
+
+use super::ray::Ray;
+use super::scan::{DirectionIndex, SensorScan};
+use crate::inference::median;
+use std::collections::BTreeMap;
+
+/// Jumps in range over which a beam mixes, m.
+pub const GAP_M: [f64; 2] = [1.2, 12.0];
+
+/// Whether a jump in range is one over which beams mix.
+fn gap_mixes(near_m: f64, far_m: f64) -> bool {
+    (GAP_M[0]..GAP_M[1]).contains(&(far_m - near_m))
+}
+
+/// Closer than that to the nearer surface, or to the farther one, a return lies on it, m.
+pub fn gap_margin_m(near_m: f64) -> f64 {
+    0.35 + 0.015 * near_m
+}
+
+/// Whether a return lies between two surfaces of the other side, off both of them.
+pub(super) fn in_gap(other: &DirectionIndex, scan: &SensorScan, i: usize) -> bool {
+    let range = scan.range_m[i];
+    let [mut near, mut far] = [0.0f32, f32::INFINITY];
+    other.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
+        if e.range_m < range {
+            near = near.max(e.range_m);
+        } else {
+            far = far.min(e.range_m);
+        }
+    });
+    let [range, near, far] = [range, near, far].map(f64::from);
+    let margin = gap_margin_m(near);
+    near > 0.0 && gap_mixes(near, far) && range > near + margin && range < far - margin
+}
+
+/// What share of the returns a beam would mix over the jumps of a scan, for each radian of its width: an edge between two neighbours that are an angle apart is
+/// met by as large a share of the shots as the beam is wide against that angle. Two returns of one shot are no neighbours. 0 where rows are not known.
+pub(super) fn mixed_per_rad(rays: &[Ray]) -> f64 {
+    let mut rows = BTreeMap::<(u8, u16), Vec<&Ray>>::new();
+    for ray in rays.iter().filter(|r| r.row != u16::MAX) {
+        rows.entry((ray.sensor, ray.row)).or_default().push(ray);
+    }
+    rows.values_mut().for_each(|row| row.sort_by(|a, b| a.azimuth_rad.total_cmp(&b.azimuth_rad)));
+    let of_pair = |a: &Ray, b: &Ray, apart_rad: f64| {
+        let mixes = if a.smooth || b.smooth { 0.0 } else { mixing_share(a.own_range_m(), b.own_range_m()) };
+        mixes / apart_rad.max(1e-5)
+    };
+    let mut sum = 0.0;
+    for (&(sensor, number), row) in &rows {
+        let gaps = row.windows(2).map(|w| f64::from(w[1].azimuth_rad - w[0].azimuth_rad));
+        let step = median(gaps.clone().collect());
+        for (pair, gap) in row.windows(2).zip(gaps).filter(|(_, gap)| (0.3 * step..1.7 * step).contains(gap)) {
+            sum += of_pair(pair[0], pair[1], gap * f64::from(pair[0].elevation_rad).cos());
+        }
+        let Some(above) = rows.get(&(sensor, number + 1)) else { continue };
+        for ray in row {
+            let at = above.partition_point(|r| r.azimuth_rad < ray.azimuth_rad);
+            let apart = |r: &Ray| f64::from((r.azimuth_rad - ray.azimuth_rad).abs());
+            let beside = above[at.saturating_sub(1)..above.len().min(at + 1)].iter();
+            let nearest = beside.min_by(|a, b| apart(a).total_cmp(&apart(b))).filter(|r| apart(r) < step);
+            if let Some(over) = nearest {
+                sum += of_pair(ray, over, f64::from((over.elevation_rad - ray.elevation_rad).abs()));
+            }
+        }
+    }
+    sum / rays.len().max(1) as f64
+}
+
+/// Share of the places of an edge in a beam at which the mean of the two ranges is seen to lie between them.
+fn mixing_share(a_m: f64, b_m: f64) -> f64 {
+    let [near, far] = [a_m.min(b_m), a_m.max(b_m)];
+    if !gap_mixes(near, far) {
+        return 0.0;
+    }
+    // A disc at whose distance d from its middle (radius 1) an edge lies has this much on the nearer side.
+    let margin = gap_margin_m(near) / (far - near);
+    let covered = |d: f64| 0.5 - (d * (1.0 - d * d).sqrt() + d.asin()) / std::f64::consts::PI;
+    let [mut low, mut high] = [0.0, 1.0];
+    for _ in 0..30 {
+        let middle = 0.5 * (low + high);
+        *(if covered(middle) > margin { &mut low } else { &mut high }) = middle;
+    }
+    low
+}
