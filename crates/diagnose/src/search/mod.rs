@@ -191,6 +191,7 @@ const LEFT_BY_THINGS: f64 = 0.05;
 /// the frames that were held out.
 pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
+    let spoke: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
     let of_rows = |f: &&Found| f.causes.first().is_some_and(|c| c.starts_with("beam_"));
     let rows = results.iter().flat_map(|r| &r.found).filter(of_rows).map(gain).fold(0.0, f64::max);
     let of_aims = |f: &&Found| f.causes == ["beam_elevation_offset"];
@@ -226,9 +227,11 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         let rough = |f: &Found| f.channel == "roughness" && gain(f) < LEFT_OF_NOISE * returns;
         results.iter_mut().for_each(|r| r.found.retain(|f| !rough(f)));
     }
-    // What is not spoken of explains nothing.
-    for result in results.iter_mut().filter(|r| r.found.is_empty()) {
-        result.distance.iter_mut().for_each(|d| d[1] = 0.0);
+    // What mending leaves explains nothing, and no sensor model could close it.
+    for (result, spoke) in results.iter_mut().zip(spoke) {
+        if spoke && result.found.is_empty() {
+            result.distance.iter_mut().for_each(|d| (d[1], d[2]) = (0.0, 0.0));
+        }
     }
 }
 
