@@ -12,7 +12,7 @@ use crate::pairing::Ray;
 const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.003, 0.003];
 
 /// A beam's width, which follows from what a disc of even light would mix, is known within this factor.
-const WIDTH_FACTOR: f64 = 2.5;
+const WIDTH_FACTOR: f64 = 5.0;
 
 /// Widths that beams have, rad.
 const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
