@@ -106,10 +106,9 @@ pub fn diagnose(
     let origins = crate::channels::mean::origins(rig);
     let motion = times.as_deref().map(|t| crate::channels::motion::own_motion(&frames, t, &origins));
     let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times, motion };
-    let searches = SEARCHES;
     let mut results: Vec<ChannelResult> = Vec::new();
     let mut keep = |channel, result| results.push(ChannelResult { channel, ..result });
-    progress(Stage::Weighing, 0, searches);
+    progress(Stage::Weighing, 0, SEARCHES);
     let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
     // What slides over a scan is moved back before anything else is looked at, but for the ranges as they were measured.
     let (sliding, slide) = search::shutter::search(&context);
@@ -131,10 +130,10 @@ pub fn diagnose(
     };
     let frames = standing.as_deref().unwrap_or(&frames);
     context.frames = frames;
-    progress(Stage::Weighing, 2, searches);
+    progress(Stage::Weighing, 2, SEARCHES);
     let (geometry, displaced) = search::geometry::search(&context);
     keep("residuals", geometry);
-    progress(Stage::Weighing, 3, searches);
+    progress(Stage::Weighing, 3, SEARCHES);
     // What stands elsewhere is moved back before silhouettes and single returns are looked at.
     let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
         slid(frame, p, sensor) + displaced.of_point(p, sensor, &origins[sensor])
@@ -147,9 +146,9 @@ pub fn diagnose(
     let (hidden, mask) = search::mask::search(&context, elsewhere);
     keep("hits", hidden);
     keep("hits", search::hits::search(&context, &mask, elsewhere));
-    progress(Stage::Weighing, 5, searches);
+    progress(Stage::Weighing, 5, SEARCHES);
     keep("returns", search::returns::search(&context));
-    progress(Stage::Weighing, 6, searches);
+    progress(Stage::Weighing, 6, SEARCHES);
     // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
@@ -165,10 +164,10 @@ pub fn diagnose(
     let least_cos = if uneven { 0.12 } else { 0.0 };
     keep("roughness", search::noise::search(&context, least_cos));
     context.frames = frames;
-    progress(Stage::Weighing, 7, searches);
+    progress(Stage::Weighing, 7, SEARCHES);
     keep("labels", search::labels::search(&context, Side::Labels, &displaced));
     keep("objects", search::labels::search(&context, Side::Objects, &displaced));
-    progress(Stage::Weighing, searches, searches);
+    progress(Stage::Weighing, SEARCHES, SEARCHES);
     search::without_leftovers(&mut results, context.returns(&context.of(Role::HoldOut)));
     if let Some(note) = search::set_aside(&mut results) {
         notes.push(note);

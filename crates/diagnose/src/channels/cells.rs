@@ -47,7 +47,7 @@ pub fn zone(ray: &Ray) -> Option<usize> {
     match ray.surface {
         Surface::Ground => Some(0),
         Surface::Standing => Some(1),
-        Surface::Object => Some(if ray.corner { 3 } else { 2 }),
+        Surface::Object => Some(if ray.corner { OBJECT + 1 } else { OBJECT }),
         Surface::Open => None,
     }
 }

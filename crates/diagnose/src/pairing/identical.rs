@@ -48,25 +48,20 @@ pub fn check_identity(
     let lags: Vec<i64> = [-2i64, -1, 1, 2].into_iter().filter(|l| l.unsigned_abs() < n as u64 / 4).collect();
     let mut far: Vec<usize> = (1..6).map(|k| k * n / 6).filter(|&k| k > 2 || n < 18 && k > 0).collect();
     far.dedup();
-    let rows: Vec<FrameScores> = chosen
-        .par_iter()
-        .map(|&i| {
-            let parts = |j: usize| distance(measured, &ids[i], simulated, &ids[j], sensors);
-            let score = |j: usize| parts(j).map(|[cloud, labels]| cloud + LABELS_COUNT * labels);
-            let [cloud, labels] = parts(i)?;
-            let own = cloud + LABELS_COUNT * labels;
-            let mut near = Vec::new();
-            for lag in &lags {
-                let j = i as i64 + lag;
-                near.push(if (0..n as i64).contains(&j) { Some(score(j as usize)?) } else { None });
-            }
-            let strangers = far.iter().map(|k| score((i + k) % n)).collect::<Result<Vec<_>, _>>()?;
-            Ok(FrameScores { frame: i, own, same: cloud < SAME_M && labels < LATE, near, strangers })
-        })
-        .collect::<Vec<_>>()
-        .into_iter()
-        .collect::<Result<_, DiagnoseError>>()?;
-    Ok(judge(&rows, &lags, ids))
+    let rows = chosen.par_iter().map(|&i| {
+        let parts = |j: usize| distance(measured, &ids[i], simulated, &ids[j], sensors);
+        let score = |j: usize| parts(j).map(|[cloud, labels]| cloud + LABELS_COUNT * labels);
+        let [cloud, labels] = parts(i)?;
+        let own = cloud + LABELS_COUNT * labels;
+        let mut near = Vec::new();
+        for lag in &lags {
+            let j = i as i64 + lag;
+            near.push(if (0..n as i64).contains(&j) { Some(score(j as usize)?) } else { None });
+        }
+        let strangers = far.iter().map(|k| score((i + k) % n)).collect::<Result<Vec<_>, _>>()?;
+        Ok(FrameScores { frame: i, own, same: cloud < SAME_M && labels < LATE, near, strangers })
+    });
+    Ok(judge(&super::in_order(rows)?, &lags, ids))
 }
 
 struct FrameScores {

@@ -124,13 +124,10 @@ pub fn find_sensors(
 ) -> Result<Sensors, DiagnoseError> {
     let step = ids.len().div_ceil(PATTERN_FRAMES).max(1);
     let some: Vec<&String> = ids.iter().step_by(step).collect();
-    // All are read before the first damaged one, in order, is named.
-    let scans: Vec<Vec<SensorScan>> = some
+    let scans = some
         .par_iter()
-        .flat_map_iter(|id| [measured, simulated].map(|d| load(d, id).map(|(cloud, _)| split_by_sensor(&cloud, rig))))
-        .collect::<Vec<_>>()
-        .into_iter()
-        .collect::<Result<_, _>>()?;
+        .flat_map_iter(|id| [measured, simulated].map(|d| load(d, id).map(|(cloud, _)| split_by_sensor(&cloud, rig))));
+    let scans: Vec<Vec<SensorScan>> = in_order(scans)?;
     let patterns = (0..rig.sensors.len())
         .map(|k| ScanPattern::of_scans(&scans.iter().map(|s| &s[k]).collect::<Vec<_>>()))
         .collect();
@@ -148,20 +145,20 @@ pub fn pair_all(
 ) -> Result<Vec<FramePair>, DiagnoseError> {
     let kept = (KEPT / ids.len().max(1)).max(500);
     let finished = std::sync::atomic::AtomicUsize::new(0);
-    ids.par_iter()
-        .enumerate()
-        .map(|(i, id)| {
-            let (a, b) = (load(measured, id)?, load(simulated, id)?);
-            let mut frame = pair_frame((i, id), (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
-            for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
-                thin(rays, kept, i as u64, k as u64);
-            }
-            done(finished.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
-            Ok(frame)
-        })
-        .collect::<Vec<_>>()
-        .into_iter()
-        .collect()
+    in_order(ids.par_iter().enumerate().map(|(i, id)| {
+        let (a, b) = (load(measured, id)?, load(simulated, id)?);
+        let mut frame = pair_frame((i, id), (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
+        for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
+            thin(rays, kept, i as u64, k as u64);
+        }
+        done(finished.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
+        Ok(frame)
+    }))
+}
+
+/// Results in order: all are there before the first damaged one is named, whatever the threads.
+fn in_order<T: Send>(results: impl ParallelIterator<Item = Result<T, DiagnoseError>>) -> Result<Vec<T>, DiagnoseError> {
+    results.collect::<Vec<_>>().into_iter().collect()
 }
 
 /// Keeps about `kept` of the rays, by chance.

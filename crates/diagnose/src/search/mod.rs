@@ -63,7 +63,7 @@ pub struct Found {
     pub parameters: Vec<(String, Parameter)>,
     /// Share of repetitions with the same choice.
     pub confidence: f64,
-    /// Channel in which it searched; the engine, which runs the searches, writes it down.
+    /// Channel.
     pub channel: &'static str,
     /// Covariate.
     pub covariate: String,
@@ -191,32 +191,29 @@ const LEFT_BY_THINGS: f64 = 0.05;
 /// the frames that were held out.
 pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
+    let most = |results: &[ChannelResult], of: &dyn Fn(&Found) -> bool| {
+        results.iter().flat_map(|r| &r.found).filter(|f| of(f)).map(gain).fold(0.0, f64::max)
+    };
     let spoke: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
-    let of_rows = |f: &&Found| f.causes.first().is_some_and(|c| c.starts_with("beam_"));
-    let rows = results.iter().flat_map(|r| &r.found).filter(of_rows).map(gain).fold(0.0, f64::max);
-    let of_aims = |f: &&Found| f.causes == ["beam_elevation_offset"];
-    let aims = results.iter().flat_map(|r| &r.found).filter(of_aims).map(gain).fold(0.0, f64::max);
-    let of_things = |f: &&Found| f.causes == ["missing_object"];
-    let things = results.iter().flat_map(|r| &r.found).filter(of_things).map(gain).fold(0.0, f64::max);
+    let rows = most(results, &|f| f.causes.first().is_some_and(|c| c.starts_with("beam_")));
+    let aims = most(results, &|f| f.causes == ["beam_elevation_offset"]);
+    let things = most(results, &|f| f.causes == ["missing_object"]);
+    let losses = most(results, &|f| f.channel == "hits");
+    let hidden = most(results, &|f| f.causes == ["ego_occlusion"]);
     let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
-    let losses = results.iter().flat_map(|r| &r.found).filter(|f| f.channel == "hits").map(gain).fold(0.0, f64::max);
-    let own_car = |f: &&Found| f.causes == ["ego_occlusion"];
-    let hidden = results.iter().flat_map(|r| &r.found).filter(own_car).map(gain).fold(0.0, f64::max);
     for result in results.iter_mut() {
-        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= LEFT_BY_OWN_CAR * hidden);
+        let least = (LEFT_BY_OWN_CAR * hidden).max(LEFT_BY_ROWS_OF_A_POSE * aims);
+        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= least);
         // Where far returns are lost, those that come back are the nearer ones.
         result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
         result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
-        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= LEFT_BY_ROWS_OF_A_POSE * aims);
         // Things that stand before edges lie between what these show.
         result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= LEFT_BY_THINGS * things);
         // Things that move by themselves slide otherwise than what stands.
         result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
     }
-    let poses = results.iter().flat_map(|r| &r.found).filter(|f| {
-        f.channel == "residuals" && f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"))
-    });
-    let pose = poses.map(gain).fold(0.0, f64::max);
+    let posed = |f: &Found| f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"));
+    let pose = most(results, &|f| f.channel == "residuals" && posed(f));
     for result in results.iter_mut() {
         result
             .found

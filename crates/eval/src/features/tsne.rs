@@ -138,7 +138,7 @@ pub fn tsne(features: &Features, options: &TsneOptions) -> Result<(Vec<[f64; 2]>
 const EXAGGERATED_STEPS: usize = 250;
 const EXAGGERATION: f32 = 12.0;
 
-/// Learning rate after that, for each sample: of 1 to 6 tried on 10,000 x 128 and on 400 x 128, what left the least divergence.
+/// Learning rate after that, for each sample: from 2 to 4 the divergence hardly changes, on 10,000 x 128 and on 400 x 128; with 1 it is larger.
 const LATE_RATE: f32 = 3.0;
 
 /// Learning rate of few samples.

@@ -3,14 +3,13 @@
 use super::Row;
 use crate::channels::motion::OwnMotion;
 use crate::inference::linear::{LinearFrame, fit};
+use crate::inference::median;
 use nalgebra::{DMatrix, DVector};
 
 /// What the own speed may be, m/s: from the scene, or anything that a car does.
 pub(super) fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
-    let mut known: Vec<f64> = motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect();
-    known.sort_by(f64::total_cmp);
-    match known.get(known.len() / 2) {
-        Some(&v) if v > 5.0 => [0.7 * v, 1.4 * v],
+    match median(motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect()) {
+        v if v > 5.0 => [0.7 * v, 1.4 * v],
         _ => [4.0, 90.0],
     }
 }
