@@ -81,10 +81,13 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
         .collect();
     let total = |i: usize| total_and_z(&trials[i].gains).0;
     let best = eligible.iter().copied().max_by(|a, b| total(*a).total_cmp(&total(*b)))?;
-    // How much of the gain a rival leaves, and whether these frames can tell.
+    // How much of its gain a rival leaves, and whether these frames can tell.
+    let ahead = |of: usize, rival: usize| {
+        let differences: Vec<f64> = trials[of].gains.iter().zip(&trials[rival].gains).map(|(a, b)| a - b).collect();
+        total_and_z(&differences)
+    };
     let near = |i: usize, than: usize| {
-        let differences: Vec<f64> = trials[than].gains.iter().zip(&trials[i].gains).map(|(a, b)| a - b).collect();
-        let (deficit, z) = total_and_z(&differences);
+        let (deficit, z) = ahead(than, i);
         deficit < demands.slack * total(than) || z < 2.0
     };
     let simpler = eligible.iter().copied().filter(|&i| near(i, best));
@@ -93,8 +96,7 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
         .unwrap_or(best);
     // A slightly wrong form of the right cause is worth a little to a richer law; where it is worth more, and for sure, both are told.
     let worth_more = |&i: &usize| {
-        let differences: Vec<f64> = trials[i].gains.iter().zip(&trials[chosen].gains).map(|(a, b)| a - b).collect();
-        let (more, z) = total_and_z(&differences);
+        let (more, z) = ahead(i, chosen);
         let richer = trials[i].parameters > trials[chosen].parameters;
         let other = trials[i].name != trials[chosen].name && trials[i].name != UNNAMED;
         richer && other && more > demands.told * total(i) && z > 3.0
@@ -105,8 +107,7 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
         .copied()
         .filter(|&i| trials[i].name != trials[chosen].name && trials[i].parameters <= trials[chosen].parameters)
         .filter(|&i| {
-            let differences: Vec<f64> = trials[chosen].gains.iter().zip(&trials[i].gains).map(|(a, b)| a - b).collect();
-            let (deficit, z) = total_and_z(&differences);
+            let (deficit, z) = ahead(chosen, i);
             z < 2.0 && deficit < 0.1 * total(chosen)
         })
         .collect();

@@ -197,13 +197,11 @@ fn pose_scatter(poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 6> {
     SVector::from_fn(|k, _| {
         let mut deviations = Vec::new();
         for sensor in 0..poses.first().map_or(0, Vec::len) {
-            let mut values: Vec<f64> = select.iter().map(|&f| poses[f][sensor][k]).collect();
-            values.sort_by(f64::total_cmp);
-            let middle = values[values.len() / 2];
+            let values: Vec<f64> = select.iter().map(|&f| poses[f][sensor][k]).collect();
+            let middle = median(values.clone());
             deviations.extend(values.iter().map(|v| (v - middle).abs()));
         }
-        deviations.sort_by(f64::total_cmp);
-        let sd = deviations.get(deviations.len() / 2).copied().unwrap_or(0.0) / 0.6745;
+        let sd = median(deviations) / 0.6745;
         (sd * sd).max(least[k] * least[k])
     })
 }
