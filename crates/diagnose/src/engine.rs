@@ -1,5 +1,6 @@
 //! The whole way from two data sets to a diagnosis.
 
+use crate::channels::mask::Shown;
 use crate::channels::returns;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
 use crate::error::DiagnoseError;
@@ -143,7 +144,12 @@ pub fn diagnose(
     let upright = if displaced.moves() { Some(again(moved)?) } else { None };
     context.frames = upright.as_deref().unwrap_or(frames);
     let elsewhere = slide.is_some() || displaced.moves() || displaced.aims();
-    let (hidden, mask) = search::mask::search(&context, elsewhere);
+    let shown = match (slide.is_some() || displaced.aims(), displaced.moves()) {
+        (true, _) => Shown::Elsewhere,
+        (false, true) => Shown::MovedBack,
+        (false, false) => Shown::InPlace,
+    };
+    let (hidden, mask) = search::mask::search(&context, shown);
     keep("hits", hidden);
     keep("hits", search::hits::search(&context, &mask, elsewhere));
     progress(Stage::Weighing, 5, SEARCHES);

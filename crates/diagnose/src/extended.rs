@@ -257,8 +257,30 @@ fn blocked_box(f: &Finding, rig: &SensorRig) -> String {
     format!("[[effect]]\nkind = \"ego_body_mask\"\nboxes = [[{}]]\n", numbers.join(", "))
 }
 
+/// A patch of directions that loses more than others: the table over directions is a spot.
+fn dirty_window(f: &Finding, rig: &SensorRig) -> String {
+    let value = |name: &str| f.parameters.get(name).map_or(0.0, |p| p.estimate);
+    let Some(mount) = rig.sensors.get(value("sensor") as usize) else { return String::new() };
+    // Half of the light, one way: three quarters of `loss` in the middle.
+    let loss = (value("share") / 0.75).clamp(0.0, 1.0);
+    let line = |key: &str| {
+        let interval = f.parameters.get(key).map(|p| format!(" # {} to {}", short(p.ci95[0]), short(p.ci95[1])));
+        format!("{key} = {}{}\n", toml_number(value(key)), interval.unwrap_or_default())
+    };
+    let place = ["azimuth_deg", "elevation_deg", "radius_deg"].map(line).concat();
+    let window = format!(
+        "sensor = \"{}\"\n{place}transmission = 0.5\nloss = {}\nnoise_m = 0.0\n",
+        mount.name,
+        toml_number(loss)
+    );
+    format!("[[effect]]\nkind = \"dirty_window\"\n{window}")
+}
+
 /// What has no name: for each sensor a table along its covariate.
 fn empirical(f: &Finding, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
+    if f.covariate == "direction" {
+        return dirty_window(f, rig);
+    }
     let usual = f.parameters.get("simulated_std_m").map_or(0.0, |p| p.estimate);
     let of_rows = f.covariate == "row";
     let mut text = String::new();
@@ -426,6 +448,20 @@ mod tests {
             unexplained("hits", "azimuth", &[-30.0, 10.0, 50.0]),
             unexplained("roughness", "row", &[0.0, 1.0]),
             unexplained("residuals", "azimuth", &[-30.0, 10.0]),
+            Finding {
+                parameters: finding(
+                    "",
+                    &[
+                        ("sensor", 0.0),
+                        ("azimuth_deg", -20.0),
+                        ("elevation_deg", -4.0),
+                        ("radius_deg", 5.0),
+                        ("share", 0.4),
+                    ],
+                )
+                .parameters,
+                ..unexplained("hits", "direction", &[-20.0])
+            },
         ];
         for f in findings {
             let what = f.cause.clone().unwrap_or_else(|| f.channel.clone());

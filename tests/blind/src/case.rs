@@ -77,7 +77,7 @@ pub const CAUSES: [&str; 22] = [
 ];
 
 /// Number of effects that are in no catalogue.
-pub const OFF_CATALOGUE: usize = 3;
+pub const OFF_CATALOGUE: usize = 4;
 
 /// The case of a seed.
 pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
@@ -166,9 +166,15 @@ fn draw_effect(i: usize, rng: &mut Stream) -> Effect {
 }
 
 fn draw_off_catalogue(i: usize, rng: &mut Stream) -> Effect {
+    let deg = f64::to_radians;
     match i % OFF_CATALOGUE {
         0 => Effect::AzimuthRipple { amplitude_m: log_uniform(rng, 0.04, 0.15), waves: rng.random_range(6..14) as f64 },
         1 => Effect::StripedLoss { share: rng.random_range(0.15..0.5), stripes: rng.random_range(3..7) as f64 },
-        _ => Effect::SidedNoise { sigma_m: log_uniform(rng, 0.04, 0.12) },
+        2 => Effect::SidedNoise { sigma_m: log_uniform(rng, 0.04, 0.12) },
+        _ => Effect::Smear {
+            share: rng.random_range(0.3..0.9),
+            middle: [rng.random_range(-0.35..0.35), rng.random_range(0.2..0.6)],
+            half_rad: [deg(rng.random_range(4.0..10.0)), deg(rng.random_range(2.0..5.0))],
+        },
     }
 }

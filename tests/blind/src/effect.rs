@@ -66,6 +66,9 @@ pub enum Effect {
     StripedLoss { share: f64, stripes: f64 },
     /// Not of the catalogue: noise that grows towards one side of the field of view.
     SidedNoise { sigma_m: f64 },
+    /// Not of the catalogue: losses within an ellipse of directions of the first sensor, with a soft edge. Its middle is told as a share of the
+    /// field of view, from -1/2 to 1/2 across and from 0 at the lowest row to 1.
+    Smear { share: f64, middle: [f64; 2], half_rad: [f64; 2] },
 }
 
 impl Effect {
@@ -94,7 +97,10 @@ impl Effect {
             Effect::MixedPixels { .. } => "mixed_pixels",
             Effect::MissingObject { .. } => "missing_object",
             Effect::WrongShape { .. } => "wrong_shape",
-            Effect::AzimuthRipple { .. } | Effect::StripedLoss { .. } | Effect::SidedNoise { .. } => return None,
+            Effect::AzimuthRipple { .. }
+            | Effect::StripedLoss { .. }
+            | Effect::SidedNoise { .. }
+            | Effect::Smear { .. } => return None,
         })
     }
 }
@@ -171,6 +177,13 @@ impl Effect {
             Effect::AzimuthRipple { amplitude_m, waves } => vec![("amplitude_m", *amplitude_m), ("waves", *waves)],
             Effect::StripedLoss { share, stripes } => vec![("share", *share), ("stripes", *stripes)],
             Effect::SidedNoise { sigma_m } => vec![("sigma_m", *sigma_m)],
+            Effect::Smear { share, middle, half_rad } => vec![
+                ("share", *share),
+                ("across", middle[0]),
+                ("up", middle[1]),
+                ("half_width_deg", deg(half_rad[0])),
+                ("half_height_deg", deg(half_rad[1])),
+            ],
         };
         list.into_iter().map(|(k, v)| (k.to_owned(), v)).collect()
     }

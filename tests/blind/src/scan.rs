@@ -265,6 +265,12 @@ impl Side<'_> {
                         / (mount.rows_rad[0] - mount.rows_rad[mount.rows_rad.len() - 1]);
                     1.0 - share * (1.0 + (std::f64::consts::TAU * stripes * u).sin()) / 2.0
                 }
+                Effect::Smear { share, middle, half_rad } if sensor == 0 => {
+                    let (high, low) = (mount.rows_rad[0], mount.rows_rad[mount.rows_rad.len() - 1]);
+                    let off = [az - middle[0] * mount.fov_rad, el - (low + middle[1] * (high - low))];
+                    let from_middle = (off[0] / half_rad[0]).hypot(off[1] / half_rad[1]);
+                    1.0 - share * ((1.25 - from_middle) / 0.5).clamp(0.0, 1.0)
+                }
                 _ => 1.0,
             };
             if rng.random::<f64>() >= kept {

@@ -41,6 +41,20 @@ pub struct Judged {
     pub bound: Option<f64>,
 }
 
+impl Judged {
+    /// Whether the interval holds the true value.
+    pub fn inside(&self) -> bool {
+        self.ci95[0] <= self.truth && self.truth <= self.ci95[1]
+    }
+
+    /// Whether it is as close as wished: within 1.5 times the bound or 5 % of the true value, 10 % of mixed pixels, jitter and laws of the signal.
+    pub fn close(&self) -> bool {
+        let coarse = ["mixed_pixels", "angular_jitter", "signal_dropout"].iter().any(|c| self.name.starts_with(c));
+        let share = if coarse { 0.1 } else { 0.05 };
+        (self.estimate - self.truth).abs() <= (1.5 * self.bound.unwrap_or(0.0)).max(share * self.truth.abs())
+    }
+}
+
 /// Compares a diagnosis with the truth.
 pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
     let findings = diagnosis["findings"].as_array().cloned().unwrap_or_default();
@@ -124,8 +138,9 @@ pub struct Summary {
     pub words: BTreeMap<String, BTreeMap<String, usize>>,
     /// By hidden cause (of single cases) what was said: `confusion[hidden][said]`.
     pub confusion: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By parameter: cases, share inside the interval, median of |error| / |truth|, root mean square of error over bound where it is known.
-    pub parameters: BTreeMap<String, [f64; 4]>,
+    /// By parameter: cases, share inside the interval, median of |error| / |truth|, root mean square of error over bound where it is known, share
+    /// as close as wished.
+    pub parameters: BTreeMap<String, [f64; 5]>,
     /// Median of what was closed where something was named rightly.
     pub closed: Option<f64>,
     /// Median and largest time of a diagnosis, s.
@@ -160,12 +175,13 @@ pub fn summarise(outcomes: &[Outcome]) -> Summary {
     };
     for (name, list) in judged {
         let n = list.len() as f64;
-        let inside = list.iter().filter(|p| p.ci95[0] <= p.truth && p.truth <= p.ci95[1]).count() as f64 / n;
+        let inside = list.iter().filter(|p| p.inside()).count() as f64 / n;
+        let close = list.iter().filter(|p| p.close()).count() as f64 / n;
         let relative = median(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
         let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
         let rms =
             if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
-        summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms]);
+        summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms, close]);
     }
     summary.closed = median(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());
     let times: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();

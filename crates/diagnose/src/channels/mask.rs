@@ -99,13 +99,25 @@ const ON_OWN_CAR: f64 = 0.4;
 /// Nothing at all, as a share of the simulated returns.
 const NONE: f64 = 0.02;
 
+/// Where the measured scene is shown.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Shown {
+    /// Where it is.
+    InPlace,
+    /// It was turned or shifted and has been moved back.
+    MovedBack,
+    /// It slides over a scan, or rows aim elsewhere.
+    Elsewhere,
+}
+
 /// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
-/// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not.
-/// Where returns come from the own car beside them the field of view may end there as well, but not above, where the scene ends. Where the
-/// scene is `displaced`, returns from the own car are believed, and beside them cells from which nothing at all comes back.
+/// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not;
+/// where it was moved back, on all sides but one, where the field of view ends. Where returns come from the own car beside them the field of view
+/// may end there as well, but not above, where the scene ends. Where the scene is not shown in its place, returns from the own car are
+/// believed, and beside them cells from which nothing at all comes back.
 pub fn blocked_cells(
     counts: &DirectionCounts,
-    displaced: bool,
+    shown: Shown,
     expected: impl Fn(&DirectionCell) -> f64,
 ) -> BTreeSet<DirectionCell> {
     let judged = |cell: &DirectionCell| counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, ..]| seen / n);
@@ -143,12 +155,28 @@ pub fn blocked_cells(
         let on_own_car = together.iter().filter(|c| covered(c)).count() >= 2;
         let stands_out = together.len() >= FEWEST_CELLS
             && (sides(&open) || on_own_car && sides(&|c, a, e| open(c, a, e) || ends(c, a, e)));
+        let all_around = || {
+            let [left, right, up, down] = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| {
+                let on = |bounds: &dyn Fn(&DirectionCell) -> bool| {
+                    together.iter().filter(|c| bounds(c)).count() * 8 >= together.len()
+                };
+                [on(&|c| open(*c, a, e)), on(&|c| ends(*c, a, e))]
+            });
+            let sides = [left, right, up, down];
+            sides.iter().filter(|s| s[0]).count() >= 3 && sides.iter().all(|s| s[0] || s[1])
+        };
+        let believed = match shown {
+            Shown::InPlace => true,
+            Shown::MovedBack => all_around(),
+            Shown::Elsewhere => false,
+        };
         if on_own_car {
             // What lies around and is dark for another reason does not belong to it.
-            let own =
-                |c: &DirectionCell| covered(c) || stands_out && (!displaced || judged(c).is_some_and(|s| s < NONE));
+            let own = |c: &DirectionCell| {
+                covered(c) || stands_out && (shown == Shown::InPlace || judged(c).is_some_and(|s| s < NONE))
+            };
             blocked.extend(together.into_iter().filter(own));
-        } else if stands_out && !displaced {
+        } else if stands_out && believed {
             blocked.extend(together);
         }
     }
@@ -239,16 +267,23 @@ mod tests {
                 counts.insert((0, az, el), [100.0, if hole || end { 2.0 } else { 97.0 }, 0.0, 0.0]);
             }
         }
-        let blocked = blocked_cells(&counts, false, |_| 1.0);
+        let blocked = blocked_cells(&counts, Shown::InPlace, |_| 1.0);
         assert_eq!(blocked.len(), 6);
-        assert!(blocked_cells(&counts, true, |_| 1.0).is_empty(), "a scene that stands elsewhere makes holes");
+        assert!(
+            blocked_cells(&counts, Shown::Elsewhere, |_| 1.0).is_empty(),
+            "a scene that stands elsewhere makes holes"
+        );
+        assert_eq!(blocked_cells(&counts, Shown::MovedBack, |_| 1.0).len(), 6, "returns come back on all sides of it");
+        let mut beside_the_end = counts.clone();
+        beside_the_end.retain(|(_, az, _), _| *az < 5);
+        assert_eq!(blocked_cells(&beside_the_end, Shown::MovedBack, |_| 1.0).len(), 6, "the field of view ends there");
         let mut plate = counts.clone();
         plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| (c[2], c[3]) = (90.0, 0.2));
-        assert!(blocked_cells(&plate, true, |_| 1.0).is_empty(), "another car came near in some frames");
+        assert!(blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).is_empty(), "another car came near in some frames");
         plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| c[3] = 1.0);
-        assert_eq!(blocked_cells(&plate, true, |_| 1.0).len(), 6);
+        assert_eq!(blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).len(), 6);
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
-        assert!(blocked_cells(&counts, false, |_| 0.2).is_empty(), "other losses explain it");
+        assert!(blocked_cells(&counts, Shown::InPlace, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
         // A plate that reaches below the field of view and gives returns along its upper edge alone.
         let mut low = DirectionCounts::new();
@@ -257,11 +292,11 @@ mod tests {
             let near = if hidden && el == -3 { 90.0 } else { 0.0 };
             low.insert((0, az, el), [100.0, if hidden { 0.0 } else { 97.0 }, near, near / 90.0]);
         }
-        assert_eq!(blocked_cells(&low, false, |_| 1.0).len(), 27);
-        assert_eq!(blocked_cells(&low, true, |_| 1.0).len(), 27);
+        assert_eq!(blocked_cells(&low, Shown::InPlace, |_| 1.0).len(), 27);
+        assert_eq!(blocked_cells(&low, Shown::Elsewhere, |_| 1.0).len(), 27);
         low.values_mut().filter(|c| c[1] == 0.0 && c[2] == 0.0).for_each(|c| c[1] = 5.0);
         assert_eq!(
-            blocked_cells(&low, true, |_| 1.0).len(),
+            blocked_cells(&low, Shown::Elsewhere, |_| 1.0).len(),
             9,
             "a scene that stands elsewhere makes holes beside the plate"
         );

@@ -7,5 +7,6 @@ pub mod labels;
 pub mod mask;
 pub mod mean;
 pub mod motion;
+pub mod patch;
 pub mod returns;
 pub mod roughness;

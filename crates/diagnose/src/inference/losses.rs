@@ -150,6 +150,11 @@ impl LossTable {
         self.cells.iter().enumerate().map(share).collect()
     }
 
+    /// Shares of the simulated and of the measured returns of each cell that have no counterpart.
+    pub fn unmatched(&self, laws: &[FittedLaw]) -> Vec<[f64; 2]> {
+        self.told(laws).into_iter().enumerate().map(|(i, told)| [1.0 - told, 1.0 - self.matched(&[], i)]).collect()
+    }
+
     /// Gain of a frame by a table of matched shares, nats.
     pub fn gain_by_table(&self, frame: &HitFrame, told: &[f64]) -> f64 {
         let used = frame.iter().filter(|(i, _)| self.cells[*i as usize].simulated.n >= FEWEST);

@@ -167,10 +167,11 @@ pub fn pair_frame(
                 }
             }
         }
+        frame.mixed_per_rad += mixed_per_rad(&simulated, &sight.index);
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }
-    frame.mixed_per_rad = mixed_per_rad(&frame.simulated);
+    frame.mixed_per_rad /= frame.simulated.len().max(1) as f64;
     fit_objects(&mut objects, &frame, sensors);
     frame.objects = objects;
     frame

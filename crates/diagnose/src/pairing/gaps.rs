@@ -30,30 +30,36 @@ pub(super) fn in_gap(other: &DirectionIndex, scan: &SensorScan, i: usize) -> boo
         }
     });
     let [range, near, far] = [range, near, far].map(f64::from);
-    let margin = gap_margin_m(near);
-    near > 0.0 && gap_mixes(near, far) && range > near + margin && range < far - margin
+    near > 0.0 && is_between(range, near, far)
 }
 
-/// What share of the returns a beam would mix over the jumps of a scan, for each radian of its width: an edge between two neighbours that are an angle apart is
-/// met by as large a share of the shots as the beam is wide against that angle. Two returns of one shot are no neighbours. 0 where rows are not known.
-pub(super) fn mixed_per_rad(rays: &[Ray]) -> f64 {
-    let mut rows = BTreeMap::<(u8, u16), Vec<&Ray>>::new();
+/// Whether a range lies in a jump over which beams mix, off both surfaces.
+fn is_between(range_m: f64, near_m: f64, far_m: f64) -> bool {
+    let margin = gap_margin_m(near_m);
+    gap_mixes(near_m, far_m) && range_m > near_m + margin && range_m < far_m - margin
+}
+
+/// How many returns a beam would mix over the jumps of a sensor's scan, for each radian of its width: an edge between two neighbours that are an angle apart is
+/// met by as large a share of the shots as the beam is wide against that angle. `index` holds the scan. Two returns of one shot are no neighbours. 0 where
+/// rows are not known.
+pub(super) fn mixed_per_rad(rays: &[Ray], index: &DirectionIndex) -> f64 {
+    let mut rows = BTreeMap::<u16, Vec<&Ray>>::new();
     for ray in rays.iter().filter(|r| r.row != u16::MAX) {
-        rows.entry((ray.sensor, ray.row)).or_default().push(ray);
+        rows.entry(ray.row).or_default().push(ray);
     }
     rows.values_mut().for_each(|row| row.sort_by(|a, b| a.azimuth_rad.total_cmp(&b.azimuth_rad)));
     let of_pair = |a: &Ray, b: &Ray, apart_rad: f64| {
-        let mixes = if a.smooth || b.smooth { 0.0 } else { mixing_share(a.own_range_m(), b.own_range_m()) };
+        let mixes = if a.smooth || b.smooth { 0.0 } else { mixing_share(a, b, index) };
         mixes / apart_rad.max(1e-5)
     };
     let mut sum = 0.0;
-    for (&(sensor, number), row) in &rows {
+    for (number, row) in &rows {
         let gaps = row.windows(2).map(|w| f64::from(w[1].azimuth_rad - w[0].azimuth_rad));
         let step = median(gaps.clone().collect());
         for (pair, gap) in row.windows(2).zip(gaps).filter(|(_, gap)| (0.3 * step..1.7 * step).contains(gap)) {
             sum += of_pair(pair[0], pair[1], gap * f64::from(pair[0].elevation_rad).cos());
         }
-        let Some(above) = rows.get(&(sensor, number + 1)) else { continue };
+        let Some(above) = rows.get(&(number + 1)) else { continue };
         for ray in row {
             let at = above.partition_point(|r| r.azimuth_rad < ray.azimuth_rad);
             let apart = |r: &Ray| f64::from((r.azimuth_rad - ray.azimuth_rad).abs());
@@ -64,22 +70,32 @@ pub(super) fn mixed_per_rad(rays: &[Ray]) -> f64 {
             }
         }
     }
-    sum / rays.len().max(1) as f64
+    sum
 }
 
-/// Share of the places of an edge in a beam at which the mean of the two ranges is seen to lie between them.
-fn mixing_share(a_m: f64, b_m: f64) -> f64 {
-    let [near, far] = [a_m.min(b_m), a_m.max(b_m)];
+/// Places of an edge in a beam that are tried.
+const PLACES: u32 = 24;
+
+/// Share of the places of an edge in a beam at which the mean of the two ranges is seen to lie between them, and between all else that is shown around.
+fn mixing_share(a: &Ray, b: &Ray, index: &DirectionIndex) -> f64 {
+    let [near, far] = [a.own_range_m().min(b.own_range_m()), a.own_range_m().max(b.own_range_m())];
     if !gap_mixes(near, far) {
         return 0.0;
     }
-    // A disc at whose distance d from its middle (radius 1) an edge lies has this much on the nearer side.
-    let margin = gap_margin_m(near) / (far - near);
+    let mut around = Vec::new();
+    let [azimuth, elevation] = [a.azimuth_rad + b.azimuth_rad, a.elevation_rad + b.elevation_rad].map(|s| 0.5 * s);
+    index.around(azimuth, elevation, |e, _, _| around.push(f64::from(e.range_m)));
+    around.sort_by(f64::total_cmp);
+    // A disc at whose distance d from its middle (radius 1) an edge lies has this much beyond the edge.
     let covered = |d: f64| 0.5 - (d * (1.0 - d * d).sqrt() + d.asin()) / std::f64::consts::PI;
-    let [mut low, mut high] = [0.0, 1.0];
-    for _ in 0..30 {
-        let middle = 0.5 * (low + high);
-        *(if covered(middle) > margin { &mut low } else { &mut high }) = middle;
-    }
-    low
+    let seen = (0..PLACES).filter(|k| {
+        let share = covered(2.0 * (f64::from(*k) + 0.5) / f64::from(PLACES) - 1.0);
+        let range = share * near + (1.0 - share) * far;
+        let at = around.partition_point(|r| *r < range);
+        let (Some(&below), Some(&above)) = (at.checked_sub(1).and_then(|i| around.get(i)), around.get(at)) else {
+            return false;
+        };
+        is_between(range, below, above)
+    });
+    seen.count() as f64 / f64::from(PLACES)
 }

@@ -1,11 +1,11 @@
 //! What hides rays altogether: an end of the range, parts of the own car. Looked for before laws of losses are weighed.
 
 use super::hits::refit;
-use super::{ChannelResult, Context, Found, parameter};
+use super::{ChannelResult, Context, Found, parameter, patch};
 use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
-    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, blocked_cells, direction_cell, direction_counts, range_cut,
+    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, blocked_cells, direction_cell, direction_counts, range_cut,
     with_neighbours,
 };
 use crate::channels::returns::OWN_CAR_M;
@@ -15,20 +15,21 @@ use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
 use std::collections::BTreeMap;
 
-/// The search; also what is to be left out by the others. `displaced` tells that the measured scene stands elsewhere, or rows aim elsewhere.
-pub fn search(context: &Context, displaced: bool) -> (ChannelResult, Mask) {
+/// The search; also what is to be left out by the others.
+pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let select = context.of(Role::Select);
     let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
     // Laws are fitted first without the dark directions, to know which of them they explain.
-    let dark = blocked_cells(&counts, displaced, |_| 1.0);
+    let dark = blocked_cells(&counts, shown, |_| 1.0);
     let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
     let hits = hit_frames(context.frames, &without);
     let table = LossTable::new(total(select.iter().map(|&i| &hits[i])));
     let laws = refit(&table, &[Law::Random, Law::Signal]);
     let expected = expected_shares(context, &select, &mask, &table, &laws);
-    mask.blocked = blocked_cells(&counts, displaced, |cell| expected.get(cell).copied().unwrap_or(0.0));
+    mask.blocked = blocked_cells(&counts, shown, |cell| expected.get(cell).copied().unwrap_or(0.0));
     mask.around = with_neighbours(&mask.blocked);
+    let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
     let mut result =
         ChannelResult { distance: vec![[0.0; 3]; context.of(Role::HoldOut).len()], ..ChannelResult::default() };
     if let Some(cut) = mask.cut_m {
@@ -37,6 +38,7 @@ pub fn search(context: &Context, displaced: bool) -> (ChannelResult, Mask) {
     if !mask.blocked.is_empty() {
         result.found.push(blocked_found(context, &mask));
     }
+    result.found.extend(spots);
     let outcome = |found: bool| if found { "chosen" } else { "no such place" };
     for (cause, found) in [("range_cut", mask.cut_m.is_some()), ("ego_occlusion", !mask.blocked.is_empty())] {
         let outcome = outcome(found).into();

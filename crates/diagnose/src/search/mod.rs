@@ -5,6 +5,7 @@ pub mod hits;
 pub mod labels;
 pub mod mask;
 pub mod noise;
+mod patch;
 pub mod quantisation;
 pub mod returns;
 pub mod shutter;

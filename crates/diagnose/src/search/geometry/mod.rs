@@ -1,5 +1,6 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
+mod agreed;
 mod curve;
 mod displacement;
 mod suspects;
@@ -7,6 +8,7 @@ mod words;
 
 pub use self::displacement::Displacement;
 
+use self::agreed::agreed_turns;
 use self::displacement::displacement;
 use self::suspects::{Suspect, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, first_demands, record, unless_unsure};
@@ -14,6 +16,7 @@ use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, t
 use crate::channels::mean::{
     Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
 };
+use crate::diagnosis::Considered;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
@@ -40,6 +43,7 @@ struct Sums {
     linear: Vec<LinearFrame>,
     rows: Groups,
     strips: Groups,
+    poses: Vec<OwnPoses>,
 }
 
 /// Groups of every frame, by part and whole.
@@ -97,7 +101,34 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
         stories.push(unless_unsure(equals, &trials, &blocks, &t.name, &demands));
         chosen.push(candidates[t.candidate].clone());
     }
+    if let Some(suspect) = agreed_turns(&sums, &select, &blocks, &chosen) {
+        let with: Vec<Suspect> = chosen.iter().cloned().chain([suspect.clone()]).collect();
+        let before = gains(&sums, &select, &blocks, &chosen);
+        let more: Vec<f64> = gains(&sums, &select, &blocks, &with).iter().zip(&before).map(|(g, b)| g - b).collect();
+        let (total, z) = total_and_z(&more);
+        if total > demands.nats && z > demands.z && above_floor(&sums, &select, &blocks, &with) {
+            result.considered.push(Considered {
+                cause: suspect.name().into(),
+                channel: "residuals".into(),
+                nats_per_ray: total / returns,
+                z,
+                outcome: "chosen: all other sensors see it alike".into(),
+            });
+            chosen.push(suspect);
+            stories.push((vec![], 1.0));
+        }
+    }
     let estimate_blocks = context.blocks(&estimate);
+    // What is chosen must be worth speaking of on the frames that say how large it is.
+    let spoken: Vec<bool> = (0..chosen.len())
+        .map(|k| {
+            let last: Vec<Suspect> =
+                (0..chosen.len()).filter(|i| *i != k).chain([k]).map(|i| chosen[i].clone()).collect();
+            matches!(chosen[k], Suspect::Groups { .. }) || above_floor(&sums, &estimate, &estimate_blocks, &last)
+        })
+        .collect();
+    let kept = chosen.into_iter().zip(stories).zip(spoken).filter(|(_, spoken)| *spoken).map(|(both, _)| both);
+    let (chosen, stories): (Vec<Suspect>, Vec<_>) = kept.unzip();
     for (k, (equals, confidence)) in stories.into_iter().enumerate() {
         let alone = &chosen[k];
         let held: Vec<f64> =
@@ -188,7 +219,7 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
         let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
-    Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear }
+    Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear, poses }
 }
 
 /// Variances of the frames' own poses, robust, about the mean of each sensor.

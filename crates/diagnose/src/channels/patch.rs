@@ -1,0 +1,230 @@
+//! Patches of directions of a sensor from which less comes back than from surfaces like these elsewhere: dirt on a window.
+
+use super::cells::cell;
+use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, direction_cell};
+use crate::pairing::FramePair;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Returns in a direction: simulated and measured ones, and those of them without a counterpart beyond what is usual for surfaces like theirs.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Losses {
+    simulated: f64,
+    alone: f64,
+    measured: f64,
+    odd: f64,
+}
+
+impl Losses {
+    /// Adds another sum.
+    pub fn add(&mut self, other: &Losses) {
+        self.simulated += other.simulated;
+        self.alone += other.alone;
+        self.measured += other.measured;
+        self.odd += other.odd;
+    }
+
+    /// Simulated returns.
+    pub fn simulated(&self) -> f64 {
+        self.simulated
+    }
+
+    /// Returns lost beyond what is usual. Matching one to one leaves as many without a counterpart on both sides.
+    pub fn lost(&self) -> f64 {
+        self.alone - self.odd * self.simulated / self.measured.max(1.0)
+    }
+
+    /// The same as a share of the simulated ones.
+    pub fn share(&self) -> f64 {
+        self.lost() / self.simulated.max(1.0)
+    }
+}
+
+/// Losses by direction.
+pub type DirectionLosses = BTreeMap<DirectionCell, Losses>;
+
+/// Sums over some frames; `usual` holds of each cell of covariates the shares of simulated and of measured returns that have no counterpart. Objects
+/// do not count: they are met in some directions more than in others.
+pub fn direction_losses(frames: &[FramePair], which: &[usize], mask: &Mask, usual: &[[f64; 2]]) -> DirectionLosses {
+    let one = |i: &usize| {
+        let mut sums = DirectionLosses::new();
+        for (side, rays) in [&frames[*i].simulated, &frames[*i].measured].into_iter().enumerate() {
+            for ray in rays.iter().filter(|r| r.object == u16::MAX && !mask.hides(r)) {
+                let Some(c) = cell(ray) else { continue };
+                let sum = sums.entry(direction_cell(ray)).or_default();
+                let alone = f64::from(u8::from(!ray.matched)) - usual[c][side];
+                if side == 0 {
+                    sum.simulated += 1.0;
+                    sum.alone += alone;
+                } else {
+                    sum.measured += 1.0;
+                    sum.odd += alone;
+                }
+            }
+        }
+        sums
+    };
+    let merge = |mut a: DirectionLosses, b: DirectionLosses| {
+        b.iter().for_each(|(k, v)| a.entry(*k).or_default().add(v));
+        a
+    };
+    which.par_iter().map(one).reduce(DirectionLosses::new, merge)
+}
+
+/// Sum over some cells.
+pub fn sum<'a>(losses: &DirectionLosses, cells: impl IntoIterator<Item = &'a DirectionCell>) -> Losses {
+    cells.into_iter().filter_map(|c| losses.get(c)).fold(Losses::default(), |mut all, l| {
+        all.add(l);
+        all
+    })
+}
+
+/// A patch is looked for where cells with those around them lose more than one of these shares beyond what is usual, the lowest first.
+const SHARES: [f64; 6] = [0.06, 0.09, 0.13, 0.19, 0.27, 0.4];
+
+/// Returns that a share needs.
+const FEWEST: f64 = 40.0;
+
+/// Cells of a patch, and its largest width and height, rad: what is larger is no spot.
+const FEWEST_CELLS: usize = 4;
+const LARGEST_RAD: [f64; 2] = [1.0, 0.35];
+
+/// Around a patch that share of its own is lost at most.
+const AROUND: f64 = 0.35;
+
+/// Most of its cells lose by themselves that share of what it loses.
+const ALIKE: f64 = 0.3;
+const MOST: f64 = 0.85;
+
+/// Directions that lose more than those around them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Patch {
+    /// Where more than `share` is lost, half of what is lost in the middle.
+    pub cells: BTreeSet<DirectionCell>,
+    /// The share.
+    pub share: f64,
+}
+
+/// Patches, the one that loses most first.
+pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
+    let around = |&(s, az, el): &DirectionCell| {
+        let cells: Vec<_> = (-1..=1).flat_map(|a| (-1..=1).map(move |e| (s, az + a, el + e))).collect();
+        sum(losses, &cells)
+    };
+    let known = losses.keys().map(|c| (*c, around(c))).filter(|(_, l)| l.simulated >= FEWEST);
+    let shares: BTreeMap<DirectionCell, f64> = known.map(|(c, l)| (c, l.share())).collect();
+    let mut found: Vec<Patch> = Vec::new();
+    for share in SHARES {
+        let mut high: BTreeSet<DirectionCell> = shares.iter().filter(|(_, s)| **s > share).map(|(c, _)| *c).collect();
+        while let Some(first) = high.first().copied() {
+            let cells = together(&mut high, first);
+            let Some(middle) = cells.iter().max_by(|a, b| shares[a].total_cmp(&shares[b])) else { continue };
+            let new = found.iter().all(|f| f.cells.is_disjoint(&cells));
+            if new && shares[middle] > 1.5 * share && stands_alone(losses, &cells) {
+                // What lies beside it and loses a little is not of it.
+                let half = 0.5 * shares[middle];
+                let mut more: BTreeSet<DirectionCell> = cells.iter().filter(|c| shares[c] > half).copied().collect();
+                let cells = together(&mut more, *middle);
+                if cells.len() >= FEWEST_CELLS {
+                    found.push(Patch { cells, share: half });
+                }
+            }
+        }
+    }
+    found.sort_by(|a, b| sum(losses, &b.cells).lost().total_cmp(&sum(losses, &a.cells).lost()));
+    found
+}
+
+/// Takes out of `cells` those that lie together with `first`.
+fn together(cells: &mut BTreeSet<DirectionCell>, first: DirectionCell) -> BTreeSet<DirectionCell> {
+    cells.remove(&first);
+    let mut all = vec![first];
+    let mut at = 0;
+    while at < all.len() {
+        let (s, az, el) = all[at];
+        at += 1;
+        let beside = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| (s, az + a, el + e));
+        all.extend(beside.into_iter().filter(|c| cells.remove(c)));
+    }
+    all.into_iter().collect()
+}
+
+/// Whether returns come back on all sides of a patch; below the field of view may end, not above, where scenes end.
+fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bool {
+    let span = |f: fn(&DirectionCell) -> i32, step: f64| {
+        let [low, high] = [patch.iter().map(f).min(), patch.iter().map(f).max()].map(Option::unwrap_or_default);
+        f64::from(high - low + 1) * step
+    };
+    let small = span(|c| c.1, AZIMUTH_RAD) <= LARGEST_RAD[0] && span(|c| c.2, ELEVATION_RAD) <= LARGEST_RAD[1];
+    if patch.len() < FEWEST_CELLS || !small {
+        return false;
+    }
+    let own = sum(losses, patch).share();
+    let alike = patch.iter().filter(|c| losses.get(c).is_some_and(|l| l.share() > ALIKE * own)).count();
+    if (alike as f64) < MOST * patch.len() as f64 {
+        return false;
+    }
+    // Two cells on: the next one may belong to it in part.
+    let beside = |a: i32, e: i32| {
+        let ring: BTreeSet<DirectionCell> = patch
+            .iter()
+            .flat_map(|&(s, az, el)| (2..4).map(move |k| (s, az + k * a, el + k * e)))
+            .filter(|c| !patch.contains(c))
+            .collect();
+        sum(losses, &ring)
+    };
+    let open = |l: &Losses| l.simulated >= FEWEST && l.share() < AROUND * own;
+    let [left, right, up, down] = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| beside(a, e));
+    open(&left) && open(&right) && open(&up) && (open(&down) || down.simulated < 1.0)
+}
+
+/// Middle and radius of a spot from which a share `most * exp(-(angle / radius)^4)` does not come back: azimuth, elevation, radius, rad, and `most`.
+pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
+    let place = |c: &DirectionCell| [(f64::from(c.1) + 0.5) * AZIMUTH_RAD, (f64::from(c.2) + 0.5) * ELEVATION_RAD];
+    let mut cells: Vec<([f64; 2], Losses)> =
+        patch.cells.iter().filter_map(|c| Some((place(c), *losses.get(c)?))).collect();
+    let weight = |l: &Losses| l.share().max(0.0);
+    let total: f64 = cells.iter().map(|(_, l)| weight(l)).sum::<f64>().max(1e-12);
+    let [azimuth, elevation] = [0, 1].map(|k| cells.iter().map(|(p, l)| weight(l) * p[k]).sum::<f64>() / total);
+    // What the best third of its cells lose is lost in its middle.
+    cells.sort_by(|a, b| b.1.share().total_cmp(&a.1.share()));
+    let middle = cells.iter().take(cells.len().div_ceil(3)).fold(Losses::default(), |mut all, (_, l)| {
+        all.add(l);
+        all
+    });
+    let most = middle.share().clamp(1.2 * patch.share, 1.0);
+    // The share is passed within an angle of r ln(most / share)^(1/4).
+    let area = patch.cells.len() as f64 * AZIMUTH_RAD * elevation.cos() * ELEVATION_RAD;
+    [azimuth, elevation, (area / std::f64::consts::PI).sqrt() / (most / patch.share).ln().powf(0.25), most]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A field of view in which `lost` tells the share lost at each cell.
+    fn field(lost: impl Fn(f64, f64) -> f64) -> DirectionLosses {
+        let cells = (-30..30).flat_map(|az| (-12..6).map(move |el| (0, az, el)));
+        cells
+            .map(|c: DirectionCell| {
+                let share = lost((f64::from(c.1) + 0.5) * AZIMUTH_RAD, (f64::from(c.2) + 0.5) * ELEVATION_RAD);
+                let alone = 100.0 * share;
+                (c, Losses { simulated: 100.0, alone, measured: 100.0 - alone, odd: 0.0 })
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_spot_is_found_and_a_band_a_side_and_nothing_are_not() {
+        let spot_of = |az: f64, el: f64| 0.4 * (-((az + 0.3).hypot(el + 0.05) / 0.09).powi(4)).exp();
+        let losses = field(spot_of);
+        let found = patches(&losses);
+        assert_eq!(found.len(), 1);
+        let [azimuth, elevation, radius, most] = spot(&losses, &found[0]);
+        assert!((azimuth + 0.3).abs() < 0.01 && (elevation + 0.05).abs() < 0.01, "{azimuth} {elevation}");
+        assert!((radius / 0.09 - 1.0).abs() < 0.15 && (most / 0.4 - 1.0).abs() < 0.1, "{radius} {most}");
+        assert!(patches(&field(|_, el| if el.abs() < 0.04 { 0.4 } else { 0.0 })).is_empty(), "a band");
+        assert!(patches(&field(|az, _| if az < -0.6 { 0.4 } else { 0.0 })).is_empty(), "a side");
+        assert!(patches(&field(|_, _| 0.02)).is_empty(), "nothing");
+    }
+}
