@@ -104,9 +104,10 @@ impl DiagnoseArgs {
             && !outcome.diagnosis.findings.is_empty()
         {
             let extended = self.out.join("extended.toml");
-            let gains = gain_of_detectors(study, measured, simulated, &extended, &self.out)?;
-            say_gains(&gains);
+            let (gains, left_out) = gain_of_detectors(study, measured, simulated, &extended, &self.out)?;
+            say_gains(&gains, &left_out);
             outcome.diagnosis.detectors = gains;
+            outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis)?;
         }
         Ok(outcome.diagnosis.verdict != Verdict::NotScenarioIdentical)
@@ -178,7 +179,8 @@ fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
 }
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
-fn say_gains(gains: &[DetectorGain]) {
+fn say_gains(gains: &[DetectorGain], left_out: &[String]) {
+    left_out.iter().for_each(|note| println!("note: {note}"));
     for g in gains {
         let interval = g.ci95.map_or(String::new(), |[low, high]| format!(" ({low:.1} to {high:.1})"));
         println!(

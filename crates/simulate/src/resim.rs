@@ -64,16 +64,13 @@ impl Resim<'_> {
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
         let source = &self.dataset.config;
-        let rig = match (&self.rig, &source.rig) {
-            (Some(rig), _) => rig.clone(),
-            (None, Some(path)) => Rig::read(path)?,
-            (None, None) => Rig::single(),
-        };
-        rig.check()?;
+        let rig = self.rig()?;
         let ids = self.dataset.all_ids()?;
         let described = attributes::path(&source.root, &ids[0]).is_file();
         let materials = if described { attributes::read_materials(&source.root)? } else { MaterialTable::default() };
-        self.check_needs(&known_of(self.dataset, &rig, &ids[0], described)?)?;
+        if let Some((i, why)) = self.refusals(&known_of(self.dataset, &rig, &ids[0], described)?).into_iter().next() {
+            return Err(wrong(format!("effect[{i}]"), why));
+        }
 
         let mut manifest = ResimManifest {
             schema: RESIM_MANIFEST_SCHEMA.into(),
@@ -105,6 +102,23 @@ impl Resim<'_> {
         manifest.complete = true;
         write_json(&manifest_path, &manifest)?;
         Ok(manifest)
+    }
+
+    fn rig(&self) -> Result<Rig, SimulateError> {
+        let rig = match (&self.rig, &self.dataset.config.rig) {
+            (Some(rig), _) => rig.clone(),
+            (None, Some(path)) => Rig::read(path)?,
+            (None, None) => Rig::single(),
+        };
+        rig.check()?;
+        Ok(rig)
+    }
+
+    /// Which effects of the list cannot act on this finished data set, by their place, and why.
+    pub fn refused(&self) -> Result<Vec<(usize, String)>, SimulateError> {
+        let ids = self.dataset.all_ids()?;
+        let described = attributes::path(&self.dataset.config.root, &ids[0]).is_file();
+        Ok(self.refusals(&known_of(self.dataset, &self.rig()?, &ids[0], described)?))
     }
 
     /// One frame with the effects on it; `index` is its place in the order of names. Its points, and what is known of them.
@@ -163,28 +177,28 @@ impl Resim<'_> {
         Ok((frame, scan))
     }
 
-    fn check_needs(&self, known: &BTreeSet<Need>) -> Result<(), SimulateError> {
+    fn refusals(&self, known: &BTreeSet<Need>) -> Vec<(usize, String)> {
+        let mut refused = Vec::new();
         for (i, effect) in self.effects.effects.iter().enumerate() {
-            let refuse = |why: String| Err(wrong(format!("effect[{i}]"), format!("{} {why}", effect.kind())));
-            match effect.model().needs() {
+            let why = match effect.model().needs() {
                 None => {
-                    return refuse(
-                        "changes what rays meet, which a finished cloud does not tell: use it with `simulate`".into(),
-                    );
+                    "changes what rays meet, which a finished cloud does not tell: use it with `simulate`".to_owned()
                 }
                 Some(needs) => {
                     let missing: Vec<&str> = needs.iter().filter(|n| !known.contains(n)).map(|n| n.words()).collect();
-                    if !missing.is_empty() {
-                        return refuse(format!(
-                            "needs {}, of which this data set says nothing; name its sensors with their patterns (`rig` in its TOML), or write \
-                             attributes with `simulate`",
-                            missing.join(" and ")
-                        ));
+                    if missing.is_empty() {
+                        continue;
                     }
+                    format!(
+                        "needs {}, of which this data set says nothing; name its sensors with their patterns (`rig` in its TOML), or write \
+                         attributes with `simulate`",
+                        missing.join(" and ")
+                    )
                 }
-            }
+            };
+            refused.push((i, format!("{} {why}", effect.kind())));
         }
-        Ok(())
+        refused
     }
 
     /// Writes one frame, unless it is there; its points before and after.

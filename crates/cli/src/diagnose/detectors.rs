@@ -5,18 +5,21 @@ use crate::study::folder::Study;
 use crate::study::numbers::{Found, matrix};
 use crate::study::{HowToRun, Step, run_study};
 use anyhow::{Context, Result, bail};
-use data::write_atomic;
+use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
 use eval::study::{Source, StudyConfig, StudyDataset};
-use std::path::Path;
+use simulate::effects::EffectList;
+use simulate::resim::Resim;
+use std::path::{Path, PathBuf};
 
 const MEASURED: &str = "measured";
 const BEFORE: &str = "simulated";
 const AFTER: &str = "extended";
 
 /// Trains the detectors of the study `named`, with its seeds and epochs, on the measured data, on the simulation and on the extended one,
-/// and tests all of them on measured frames. The study of it lies in `out`, and goes on where it was stopped.
+/// and tests all of them on measured frames. The study of it lies in `out`, and goes on where it was stopped. Also says which effects of the
+/// extended simulation are left out, since they cannot act on the finished clouds of the simulation.
 ///
 /// # Errors
 /// A study that is wrong, a simulation that cannot be simulated again, runs that failed.
@@ -26,10 +29,11 @@ pub(super) fn gain_of_detectors(
     simulated: &Path,
     extended: &Path,
     out: &Path,
-) -> Result<Vec<DetectorGain>> {
+) -> Result<(Vec<DetectorGain>, Vec<String>)> {
     let template = Study::open(named, None)?.config;
+    let (effects, left_out) = applicable(simulated, extended, out)?;
     let path = out.join("detectors.toml");
-    let text = toml::to_string(&study_of(template, measured, simulated, extended)?)?;
+    let text = toml::to_string(&study_of(template, measured, simulated, &effects)?)?;
     write_atomic(&path, text.as_bytes())?;
     let study = Study::open(&path.to_string_lossy(), Some(&out.join("detectors")))?;
     run_study(
@@ -38,7 +42,23 @@ pub(super) fn gain_of_detectors(
         &HowToRun::here(),
         &DeviceArgs::default(),
     )?;
-    gains(&matrix(&study, &Found::look(&study)?)?)
+    Ok((gains(&matrix(&study, &Found::look(&study)?)?)?, left_out))
+}
+
+/// The file of effects that can act on the finished simulation, and what is left out: `extended` itself where nothing is.
+fn applicable(simulated: &Path, extended: &Path, out: &Path) -> Result<(PathBuf, Vec<String>)> {
+    let (dataset, mut effects) = (Dataset::open(simulated)?, EffectList::read(extended)?);
+    let refused = Resim { dataset: &dataset, effects: &effects, rig: None, seed: 0 }.refused()?;
+    if refused.is_empty() {
+        return Ok((extended.to_path_buf(), vec![]));
+    }
+    let mut place = 0..;
+    effects.effects.retain(|_| place.next().is_some_and(|i| refused.iter().all(|(r, _)| *r != i)));
+    let path = out.join("extended_detectors.toml");
+    write_atomic(&path, toml::to_string(&effects)?.as_bytes())?;
+    let say =
+        |(_, why): (usize, String)| format!("the detectors are trained without an effect of extended.toml: {why}");
+    Ok((path, refused.into_iter().map(say).collect()))
 }
 
 /// The template with the data sets of a diagnosis in the place of its own.

@@ -1,10 +1,11 @@
 //! C8: the own car stands otherwise on the road than it is believed to.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::SimulateError;
 use crate::beams::Beams;
 use crate::error::within;
-use nalgebra::UnitQuaternion;
+use crate::scan::Scan;
+use nalgebra::{UnitQuaternion, Vector3};
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -58,18 +59,36 @@ impl SensorEffect for EgoAttitude {
         within("heave_std_m", self.heave_std_m, 0.0, 1.0)
     }
 
-    fn needs(&self) -> Option<&'static [super::Need]> {
-        None
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(if self.pitch_at_70mps_deg == 0.0 { &[] } else { &[Need::Motion] })
     }
 
     fn on_beams(&self, beams: &mut Beams, frame: &FrameContext, draws: &Draws) {
+        let (tilt, heave_m) = self.of_frame(frame, draws);
+        beams.ego_tilt *= tilt;
+        beams.ego_heave_m += heave_m;
+    }
+
+    /// The cloud moves as a whole, by what its sensors see unchanged.
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let (tilt, heave_m) = self.of_frame(frame, draws);
+        for echo in scan.returns_mut() {
+            let lowered = Vector3::from(echo.point().map(f64::from)) - Vector3::z() * heave_m;
+            echo.move_point((tilt.inverse() * lowered).map(|v| v as f32).into());
+        }
+    }
+}
+
+impl EgoAttitude {
+    /// How the car is turned in a frame, and lifted, m.
+    fn of_frame(&self, frame: &FrameContext, draws: &Draws) -> (UnitQuaternion<f64>, f64) {
         let mut random = draws.of_frame();
         let [roll, pitch, heave]: [f64; 3] = std::array::from_fn(|_| StandardNormal.sample(&mut random));
         let speed = frame.ego_velocity.iter().map(|v| v * v).sum::<f64>().sqrt();
         let roll_deg = self.roll_deg + self.roll_std_deg * roll;
         let pitch_deg = self.pitch_deg + self.pitch_at_70mps_deg * (speed / 70.0).powi(2) + self.pitch_std_deg * pitch;
-        beams.ego_tilt *= UnitQuaternion::from_euler_angles(roll_deg.to_radians(), pitch_deg.to_radians(), 0.0);
-        beams.ego_heave_m += self.heave_std_m * heave;
+        let tilt = UnitQuaternion::from_euler_angles(roll_deg.to_radians(), pitch_deg.to_radians(), 0.0);
+        (tilt, self.heave_std_m * heave)
     }
 }
 
@@ -77,6 +96,22 @@ impl SensorEffect for EgoAttitude {
 mod tests {
     use super::super::testing::*;
     use super::*;
+
+    #[test]
+    fn a_nose_that_goes_down_lifts_what_lies_ahead() {
+        let still = EgoAttitude { pitch_deg: 0.5, roll_std_deg: 0.0, pitch_std_deg: 0.0, ..EgoAttitude::default() };
+        let before = scene();
+        let mut after = before.clone();
+        with_frame(0, |frame, draws| still.on_cloud(&mut after, frame, draws));
+        let mut ahead = 0;
+        for (a, b) in before.returns().zip(after.returns()) {
+            let (p, q) = (a.point().map(f64::from), b.point().map(f64::from));
+            let lifted = 0.5f64.to_radians() * p[0];
+            assert!((q[2] - p[2] - lifted).abs() < 0.01 * lifted.abs() + 2e-3, "{p:?} {q:?}");
+            ahead += usize::from(p[0] > 1.0);
+        }
+        assert!(ahead > 10);
+    }
 
     #[test]
     fn the_car_is_tilted_by_that_much() {
