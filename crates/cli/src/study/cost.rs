@@ -2,6 +2,7 @@
 
 use super::data_sets::open;
 use super::folder::Study;
+use super::local::own_program;
 use super::standing::{Standing, standing};
 use crate::memory::peak_mib;
 use anyhow::{Context, Result};
@@ -111,7 +112,7 @@ pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]
             continue;
         }
         eprintln!("measuring a step of {network}");
-        let output = Command::new(std::env::current_exe()?)
+        let output = Command::new(own_program()?)
             .arg("study-run")
             .arg(&study.folder)
             .args(["--run", &run.to_string(), "--parts", "measure"])

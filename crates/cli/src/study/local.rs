@@ -7,7 +7,7 @@ use super::work::RunPart;
 use anyhow::{Context, Result};
 use clap::ValueEnum;
 use eval::study::StudyRun;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 use train::read_run_state;
@@ -109,12 +109,19 @@ fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> 
     let folder = run.folder(&study.folder);
     fs_err::create_dir_all(&folder)?;
     let log = || fs_err::OpenOptions::new().create(true).append(true).open(folder.join("log.txt"));
-    let mut command = Command::new(std::env::current_exe()?);
+    let mut command = Command::new(own_program()?);
     command.arg("study-run").arg(&study.folder).args(["--attached", "--run", &run.to_string()]);
     command.args(["--parts", &words(parts)]).args(&jobs.device);
     command.env("RAYON_NUM_THREADS", jobs.threads.to_string());
     command.stdin(Stdio::piped()).stdout(log()?.into_file()).stderr(log()?.into_file());
     command.spawn().with_context(|| format!("{run} could not be started"))
+}
+
+/// The program that is running, also where its file was replaced meanwhile: who builds while a study runs must not lose it.
+pub fn own_program() -> std::io::Result<PathBuf> {
+    let path = std::env::current_exe()?;
+    let running = Path::new("/proc/self/exe");
+    Ok(if !path.is_file() && running.exists() { running.to_path_buf() } else { path })
 }
 
 /// As the command line takes them.

@@ -156,14 +156,13 @@ pub fn blocked_cells(
         let stands_out = together.len() >= FEWEST_CELLS
             && (sides(&open) || on_own_car && sides(&|c, a, e| open(c, a, e) || ends(c, a, e)));
         let all_around = || {
-            let [left, right, up, down] = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| {
-                let on = |bounds: &dyn Fn(&DirectionCell) -> bool| {
-                    together.iter().filter(|c| bounds(c)).count() * 8 >= together.len()
-                };
-                [on(&|c| open(*c, a, e)), on(&|c| ends(*c, a, e))]
-            });
-            let sides = [left, right, up, down];
-            sides.iter().filter(|s| s[0]).count() >= 3 && sides.iter().all(|s| s[0] || s[1])
+            let on = |bounds: &dyn Fn(&DirectionCell) -> bool| {
+                together.iter().filter(|c| bounds(c)).count() * 8 >= together.len()
+            };
+            let sides = [(1, 0), (-1, 0), (0, 1), (0, -1)];
+            let opens = sides.map(|(a, e)| on(&|c| open(*c, a, e)));
+            let closes = sides.map(|(a, e)| on(&|c| ends(*c, a, e)));
+            opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k])
         };
         let believed = match shown {
             Shown::InPlace => true,

@@ -10,6 +10,7 @@ use crate::channels::mask::{
 };
 use crate::channels::returns::OWN_CAR_M;
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
+use crate::inference::choice::UNNAMED;
 use crate::inference::losses::{FittedLaw, Law, LossTable};
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
@@ -38,9 +39,12 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     if !mask.blocked.is_empty() {
         result.found.push(blocked_found(context, &mask));
     }
+    let patched = !spots.is_empty();
     result.found.extend(spots);
     let outcome = |found: bool| if found { "chosen" } else { "no such place" };
-    for (cause, found) in [("range_cut", mask.cut_m.is_some()), ("ego_occlusion", !mask.blocked.is_empty())] {
+    let looked_for =
+        [("range_cut", mask.cut_m.is_some()), ("ego_occlusion", !mask.blocked.is_empty()), (UNNAMED, patched)];
+    for (cause, found) in looked_for {
         let outcome = outcome(found).into();
         result.considered.push(Considered {
             cause: cause.into(),

@@ -188,6 +188,9 @@ const LEFT_BY_OWN_CAR: f64 = 0.05;
 /// Share of the gain of missing things below which mixed ranges are their returns.
 const LEFT_BY_THINGS: f64 = 0.05;
 
+/// Share of the gain of jitter below which mixed ranges are returns that it carried across edges.
+const LEFT_BY_JITTER: f64 = 0.001;
+
 /// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
 /// the frames that were held out.
 pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
@@ -199,6 +202,7 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let rows = most(results, &|f| f.causes.first().is_some_and(|c| c.starts_with("beam_")));
     let aims = most(results, &|f| f.causes == ["beam_elevation_offset"]);
     let things = most(results, &|f| f.causes == ["missing_object"]);
+    let jitter = most(results, &|f| f.causes == ["angular_jitter"]);
     let losses = most(results, &|f| f.channel == "hits");
     let hidden = most(results, &|f| f.causes == ["ego_occlusion"]);
     let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
@@ -209,7 +213,8 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
         result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
         // Things that stand before edges lie between what these show.
-        result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= LEFT_BY_THINGS * things);
+        let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter);
+        result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= least);
         // Things that move by themselves slide otherwise than what stands.
         result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
     }
