@@ -178,9 +178,19 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
     open(&left) && open(&right) && open(&up) && (open(&down) || down.simulated < 1.0)
 }
 
+fn place(cell: &DirectionCell) -> [f64; 2] {
+    [(f64::from(cell.1) + 0.5) * AZIMUTH_RAD, (f64::from(cell.2) + 0.5) * ELEVATION_RAD]
+}
+
+/// What a spot (see [`spot`]) loses in a cell.
+pub fn share_of_spot([azimuth, elevation, radius, most]: &[f64; 4], cell: &DirectionCell) -> f64 {
+    let [a, e] = place(cell);
+    let angle = ((a - azimuth) * elevation.cos()).hypot(e - elevation);
+    most * (-(angle / radius).powi(4)).exp()
+}
+
 /// Middle and radius of a spot from which a share `most * exp(-(angle / radius)^4)` does not come back: azimuth, elevation, radius, rad, and `most`.
 pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
-    let place = |c: &DirectionCell| [(f64::from(c.1) + 0.5) * AZIMUTH_RAD, (f64::from(c.2) + 0.5) * ELEVATION_RAD];
     let mut cells: Vec<([f64; 2], Losses)> =
         patch.cells.iter().filter_map(|c| Some((place(c), *losses.get(c)?))).collect();
     let weight = |l: &Losses| l.share().max(0.0);

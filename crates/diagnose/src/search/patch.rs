@@ -3,14 +3,14 @@
 use super::{Context, Found, Z_STAR, by_block, draw_blocks, parameter};
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{AZIMUTH_RAD, ELEVATION_RAD, Mask, with_neighbours};
-use crate::channels::patch::{DirectionLosses, Losses, Patch, direction_losses, patches, spot, sum};
+use crate::channels::patch::{DirectionLosses, Losses, Patch, direction_losses, patches, share_of_spot, spot, sum};
 use crate::diagnosis::{Curve, CurvePoint, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::losses::{Law, LossTable};
 use crate::inference::roles::Role;
 use crate::search::hits::refit;
 use rayon::prelude::*;
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// At most so many are spoken of.
 const MOST: usize = 3;
@@ -99,21 +99,20 @@ fn put(
     };
     let number = parameter("sensor", f64::from(sensor), 0.0, "number");
     let rows: BTreeSet<i32> = patch.cells.iter().map(|c| c.2).collect();
-    let whole = {
-        let mut all = DirectionLosses::new();
-        of_estimate.iter().flatten().filter(|(c, _)| c.0 == sensor && rows.contains(&c.2)).for_each(|(c, l)| {
-            all.entry((c.0, c.1, 0)).or_default().add(l);
-        });
-        all
-    };
-    let in_patch: BTreeSet<i32> = patch.cells.iter().map(|c| c.1).collect();
-    let points = whole.iter().filter(|(_, l)| l.simulated() >= 20.0).map(|(c, l)| {
+    // By azimuth, over the rows of the patch: what is lost, and what the spot would lose.
+    let mut columns = BTreeMap::<i32, (Losses, f64)>::new();
+    for (cell, losses) in of_estimate.iter().flatten().filter(|(c, _)| c.0 == sensor && rows.contains(&c.2)) {
+        let (all, told) = columns.entry(cell.1).or_default();
+        all.add(losses);
+        *told += losses.simulated() * share_of_spot(&estimates, cell);
+    }
+    let points = columns.iter().filter(|(_, (l, _))| l.simulated() >= 20.0).map(|(azimuth, (l, told))| {
         let lost = l.share().clamp(0.0, 1.0);
         CurvePoint {
-            x: ((f64::from(c.1) + 0.5) * AZIMUTH_RAD).to_degrees(),
+            x: ((f64::from(*azimuth) + 0.5) * AZIMUTH_RAD).to_degrees(),
             measured: 1.0 - lost,
             before: 1.0,
-            after: if in_patch.contains(&c.1) { 1.0 - lost } else { 1.0 },
+            after: 1.0 - told / l.simulated(),
             error: ((lost + 0.02) / l.simulated()).sqrt(),
         }
     });
