@@ -130,15 +130,8 @@ pub fn blocked_cells(
         .copied()
         .collect();
     let mut blocked = BTreeSet::new();
-    while let Some(first) = dark.pop_first() {
-        let mut together = vec![first];
-        let mut at = 0;
-        while at < together.len() {
-            let (s, az, el) = together[at];
-            at += 1;
-            let around = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| (s, az + a, el + e));
-            together.extend(around.into_iter().filter(|c| dark.remove(c)));
-        }
+    while let Some(first) = dark.first().copied() {
+        let together = take_together(&mut dark, first);
         // Two cells on: the next one may be blocked in part.
         let open = |(s, az, el): DirectionCell, a: i32, e: i32| {
             (2..4).any(|k| judged(&(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
@@ -148,20 +141,16 @@ pub fn blocked_cells(
             let nothing = |k: i32| !counts.contains_key(&(s, az + k * a, el + k * e));
             e <= 0 && (1..4).any(|k| (k..k + 3).all(nothing))
         };
-        let sides = |bounds: &dyn Fn(DirectionCell, i32, i32) -> bool| {
-            let on = |a, e| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len();
-            on(1, 0) && on(-1, 0) || on(0, 1) && on(0, -1)
+        // Left, right, above, below.
+        let on = |bounds: &dyn Fn(DirectionCell, i32, i32) -> bool| {
+            SIDES.map(|(a, e)| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len())
         };
+        let opposite = |[left, right, above, below]: [bool; 4]| left && right || above && below;
         let on_own_car = together.iter().filter(|c| covered(c)).count() >= 2;
         let stands_out = together.len() >= FEWEST_CELLS
-            && (sides(&open) || on_own_car && sides(&|c, a, e| open(c, a, e) || ends(c, a, e)));
+            && (opposite(on(&open)) || on_own_car && opposite(on(&|c, a, e| open(c, a, e) || ends(c, a, e))));
         let all_around = || {
-            let on = |bounds: &dyn Fn(&DirectionCell) -> bool| {
-                together.iter().filter(|c| bounds(c)).count() * 8 >= together.len()
-            };
-            let sides = [(1, 0), (-1, 0), (0, 1), (0, -1)];
-            let opens = sides.map(|(a, e)| on(&|c| open(*c, a, e)));
-            let closes = sides.map(|(a, e)| on(&|c| ends(*c, a, e)));
+            let (opens, closes) = (on(&open), on(&ends));
             opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k])
         };
         let believed = match shown {
@@ -182,15 +171,30 @@ pub fn blocked_cells(
     blocked
 }
 
+/// Steps to the cells beside one: left, right, above, below.
+pub(super) const SIDES: [(i32, i32); 4] = [(1, 0), (-1, 0), (0, 1), (0, -1)];
+
+/// Takes out of `cells` those that lie together with `first`, which is one of them.
+pub(super) fn take_together(cells: &mut BTreeSet<DirectionCell>, first: DirectionCell) -> BTreeSet<DirectionCell> {
+    cells.remove(&first);
+    let mut all = vec![first];
+    let mut at = 0;
+    while at < all.len() {
+        let (s, az, el) = all[at];
+        at += 1;
+        all.extend(SIDES.map(|(a, e)| (s, az + a, el + e)).into_iter().filter(|c| cells.remove(c)));
+    }
+    all.into_iter().collect()
+}
+
+/// A cell and those around it.
+pub(super) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = DirectionCell> {
+    (-1..=1).flat_map(move |a| (-1..=1).map(move |e| (s, az + a, el + e)))
+}
+
 /// A set of cells and those around them.
 pub fn with_neighbours(cells: &BTreeSet<DirectionCell>) -> BTreeSet<DirectionCell> {
-    let mut all = BTreeSet::new();
-    for (s, az, el) in cells {
-        for da in -1..=1 {
-            all.extend((-1..=1).map(|de| (*s, az + da, el + de)));
-        }
-    }
-    all
+    cells.iter().flat_map(|c| neighbours(*c)).collect()
 }
 
 /// The end of the range, m: beyond it the simulation has returns and the measured side none, before it both have.

@@ -1,7 +1,7 @@
 //! Patches of directions of a sensor from which less comes back than from surfaces like these elsewhere: dirt on a window.
 
 use super::cells::cell;
-use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, direction_cell};
+use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, SIDES, direction_cell, neighbours, take_together};
 use crate::pairing::FramePair;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -72,8 +72,12 @@ pub fn direction_losses(frames: &[FramePair], which: &[usize], mask: &Mask, usua
 }
 
 /// Sum over some cells.
-pub fn sum<'a>(losses: &DirectionLosses, cells: impl IntoIterator<Item = &'a DirectionCell>) -> Losses {
-    cells.into_iter().filter_map(|c| losses.get(c)).fold(Losses::default(), |mut all, l| {
+fn sum(losses: &DirectionLosses, cells: impl IntoIterator<Item = DirectionCell>) -> Losses {
+    total(cells.into_iter().filter_map(|c| losses.get(&c)))
+}
+
+fn total<'a>(losses: impl Iterator<Item = &'a Losses>) -> Losses {
+    losses.fold(Losses::default(), |mut all, l| {
         all.add(l);
         all
     })
@@ -105,48 +109,37 @@ pub struct Patch {
     pub share: f64,
 }
 
+impl Patch {
+    /// Sum over its cells.
+    pub fn sum(&self, losses: &DirectionLosses) -> Losses {
+        sum(losses, self.cells.iter().copied())
+    }
+}
+
 /// Patches, the one that loses most first.
 pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
-    let around = |&(s, az, el): &DirectionCell| {
-        let cells: Vec<_> = (-1..=1).flat_map(|a| (-1..=1).map(move |e| (s, az + a, el + e))).collect();
-        sum(losses, &cells)
-    };
-    let known = losses.keys().map(|c| (*c, around(c))).filter(|(_, l)| l.simulated >= FEWEST);
+    let known = losses.keys().map(|c| (*c, sum(losses, neighbours(*c)))).filter(|(_, l)| l.simulated >= FEWEST);
     let shares: BTreeMap<DirectionCell, f64> = known.map(|(c, l)| (c, l.share())).collect();
     let mut found: Vec<Patch> = Vec::new();
     for share in SHARES {
         let mut high: BTreeSet<DirectionCell> = shares.iter().filter(|(_, s)| **s > share).map(|(c, _)| *c).collect();
         while let Some(first) = high.first().copied() {
-            let cells = together(&mut high, first);
+            let cells = take_together(&mut high, first);
             let Some(middle) = cells.iter().max_by(|a, b| shares[a].total_cmp(&shares[b])) else { continue };
             let new = found.iter().all(|f| f.cells.is_disjoint(&cells));
             if new && shares[middle] > 1.5 * share && stands_alone(losses, &cells) {
                 // What lies beside it and loses a little is not of it.
                 let half = 0.5 * shares[middle];
                 let mut more: BTreeSet<DirectionCell> = cells.iter().filter(|c| shares[c] > half).copied().collect();
-                let cells = together(&mut more, *middle);
+                let cells = take_together(&mut more, *middle);
                 if cells.len() >= FEWEST_CELLS {
                     found.push(Patch { cells, share: half });
                 }
             }
         }
     }
-    found.sort_by(|a, b| sum(losses, &b.cells).lost().total_cmp(&sum(losses, &a.cells).lost()));
+    found.sort_by(|a, b| b.sum(losses).lost().total_cmp(&a.sum(losses).lost()));
     found
-}
-
-/// Takes out of `cells` those that lie together with `first`.
-fn together(cells: &mut BTreeSet<DirectionCell>, first: DirectionCell) -> BTreeSet<DirectionCell> {
-    cells.remove(&first);
-    let mut all = vec![first];
-    let mut at = 0;
-    while at < all.len() {
-        let (s, az, el) = all[at];
-        at += 1;
-        let beside = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| (s, az + a, el + e));
-        all.extend(beside.into_iter().filter(|c| cells.remove(c)));
-    }
-    all.into_iter().collect()
 }
 
 /// Whether returns come back on all sides of a patch; below the field of view may end, not above, where scenes end.
@@ -159,7 +152,7 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
     if patch.len() < FEWEST_CELLS || !small {
         return false;
     }
-    let own = sum(losses, patch).share();
+    let own = sum(losses, patch.iter().copied()).share();
     let alike = patch.iter().filter(|c| losses.get(c).is_some_and(|l| l.share() > ALIKE * own)).count();
     if (alike as f64) < MOST * patch.len() as f64 {
         return false;
@@ -171,10 +164,10 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
             .flat_map(|&(s, az, el)| (2..4).map(move |k| (s, az + k * a, el + k * e)))
             .filter(|c| !patch.contains(c))
             .collect();
-        sum(losses, &ring)
+        sum(losses, ring)
     };
     let open = |l: &Losses| l.simulated >= FEWEST && l.share() < AROUND * own;
-    let [left, right, up, down] = [(1, 0), (-1, 0), (0, 1), (0, -1)].map(|(a, e)| beside(a, e));
+    let [left, right, up, down] = SIDES.map(|(a, e)| beside(a, e));
     open(&left) && open(&right) && open(&up) && (open(&down) || down.simulated < 1.0)
 }
 
@@ -194,14 +187,11 @@ pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
     let mut cells: Vec<([f64; 2], Losses)> =
         patch.cells.iter().filter_map(|c| Some((place(c), *losses.get(c)?))).collect();
     let weight = |l: &Losses| l.share().max(0.0);
-    let total: f64 = cells.iter().map(|(_, l)| weight(l)).sum::<f64>().max(1e-12);
-    let [azimuth, elevation] = [0, 1].map(|k| cells.iter().map(|(p, l)| weight(l) * p[k]).sum::<f64>() / total);
+    let weights: f64 = cells.iter().map(|(_, l)| weight(l)).sum::<f64>().max(1e-12);
+    let [azimuth, elevation] = [0, 1].map(|k| cells.iter().map(|(p, l)| weight(l) * p[k]).sum::<f64>() / weights);
     // What the best third of its cells lose is lost in its middle.
     cells.sort_by(|a, b| b.1.share().total_cmp(&a.1.share()));
-    let middle = cells.iter().take(cells.len().div_ceil(3)).fold(Losses::default(), |mut all, (_, l)| {
-        all.add(l);
-        all
-    });
+    let middle = total(cells.iter().take(cells.len().div_ceil(3)).map(|(_, l)| l));
     let most = middle.share().clamp(1.2 * patch.share, 1.0);
     // The share is passed within an angle of r ln(most / share)^(1/4).
     let area = patch.cells.len() as f64 * AZIMUTH_RAD * elevation.cos() * ELEVATION_RAD;
@@ -217,7 +207,8 @@ mod tests {
         let cells = (-30..30).flat_map(|az| (-12..6).map(move |el| (0, az, el)));
         cells
             .map(|c: DirectionCell| {
-                let share = lost((f64::from(c.1) + 0.5) * AZIMUTH_RAD, (f64::from(c.2) + 0.5) * ELEVATION_RAD);
+                let [azimuth, elevation] = place(&c);
+                let share = lost(azimuth, elevation);
                 let alone = 100.0 * share;
                 (c, Losses { simulated: 100.0, alone, measured: 100.0 - alone, odd: 0.0 })
             })

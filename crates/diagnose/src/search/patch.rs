@@ -3,7 +3,7 @@
 use super::{Context, Found, Z_STAR, by_block, draw_blocks, parameter};
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{AZIMUTH_RAD, ELEVATION_RAD, Mask, with_neighbours};
-use crate::channels::patch::{DirectionLosses, Losses, Patch, direction_losses, patches, share_of_spot, spot, sum};
+use crate::channels::patch::{DirectionLosses, Losses, Patch, direction_losses, patches, share_of_spot, spot};
 use crate::diagnosis::{Curve, CurvePoint, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::losses::{Law, LossTable};
@@ -28,21 +28,26 @@ pub(super) fn search(context: &Context, mask: &mut Mask) -> Vec<Found> {
     let table = LossTable::new(total(select.iter().map(|&i| &hits[i])));
     let usual = table.unmatched(&refit(&table, &[Law::Random, Law::Signal]));
     let losses = |which: &[usize]| direction_losses(context.frames, which, mask, &usual);
-    let of_estimate: Vec<DirectionLosses> = estimate.par_iter().map(|&f| losses(&[f])).collect();
+    let candidates = patches(&losses(&select));
+    if candidates.is_empty() {
+        return vec![];
+    }
+    let each = |frames: &[usize]| frames.par_iter().map(|&f| losses(&[f])).collect::<Vec<DirectionLosses>>();
+    let (of_estimate, of_hold_out) = (each(&estimate), each(&hold_out));
     let blocks = context.blocks(&estimate);
     let returns = context.returns(&estimate);
     let mut found = Vec::new();
     let mut hidden = BTreeSet::new();
-    for patch in patches(&losses(&select)).into_iter().take(MOST) {
+    for patch in candidates.into_iter().take(MOST) {
         // Other frames decide whether it is there.
-        let each: Vec<Losses> = of_estimate.iter().map(|l| sum(l, &patch.cells)).collect();
+        let each: Vec<Losses> = of_estimate.iter().map(|l| patch.sum(l)).collect();
         let lost: Vec<f64> = each.iter().map(Losses::lost).collect();
         let (all, z) = total_and_z(&lost);
         let share = all / each.iter().map(Losses::simulated).sum::<f64>().max(1.0);
         if z < Z_STAR || all < FLOOR[0] * returns || share < FLOOR[1] {
             continue;
         }
-        let held = hold_out.iter().map(|&f| gain(&sum(&losses(&[f]), &patch.cells), share));
+        let held = of_hold_out.iter().map(|l| gain(&patch.sum(l), share));
         found.push(put(context, &patch, &estimate, &blocks, &of_estimate, held.collect()));
         hidden.extend(with_neighbours(&patch.cells));
     }
