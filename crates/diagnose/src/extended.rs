@@ -179,7 +179,7 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
             with("ego_attitude", lines)
         }
         "rolling_shutter" => with("rolling_shutter", "deskewed = false\n".into()),
-        "outliers" => with("false_alarms", key("rate", "rate")),
+        "outliers" => with("false_alarms", key("rate", "rate") + &key("reach_m", "reach_m")),
         // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
         "mixed_pixels" if !f.parameters.contains_key("divergence_rad") => {
             "# beam_divergence: how wide the beams are these data do not tell.\n".into()
@@ -439,7 +439,7 @@ mod tests {
             finding("sensor_extrinsics", &[("sensor", 0.0), ("yaw_deg", 0.2)]),
             finding("pitch_roll", &[("pitch_deg", 0.2)]),
             finding("rolling_shutter", &[("scan_s", 0.1)]),
-            finding("outliers", &[("rate", 0.01)]),
+            finding("outliers", &[("rate", 0.01), ("reach_m", 90.0)]),
             finding("mixed_pixels", &[("share", 0.01), ("divergence_rad", 0.004)]),
             finding("label_offset", &[("forward_m", 0.2)]),
             finding("time_offset", &[("offset_s", 0.02)]),

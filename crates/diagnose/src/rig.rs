@@ -2,11 +2,11 @@
 
 use data::DataError;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer};
 use std::f64::consts::{PI, TAU};
 use std::path::Path;
 
-/// The sensors of a rig, in the cloud's frame. Keys that only a simulation needs (patterns, rates, limits) are not looked at.
+/// The sensors of a rig, in the cloud's frame. Keys that only a simulation needs (columns, limits) are not looked at.
 #[derive(Clone, Debug, Deserialize)]
 pub struct SensorRig {
     /// In the order of the file; their order is their number in findings.
@@ -37,6 +37,32 @@ pub struct SensorMount {
     /// Scans a second.
     #[serde(default = "twenty")]
     pub rate_hz: f64,
+    /// Blocks of rows that a scan finishes one after the other, from the top; empty where time runs along azimuth, as in sensors that spin.
+    #[serde(default, rename = "pattern", deserialize_with = "rows_in_turn")]
+    pub rows_in_turn: Vec<RowBlock>,
+}
+
+/// Rows of a sensor at equal angles.
+#[derive(Clone, Copy, Debug, Deserialize)]
+pub struct RowBlock {
+    /// Number of rows.
+    pub rows: f64,
+    /// Elevation of the first, degrees.
+    pub top_deg: f64,
+    /// Elevation of the last, degrees.
+    pub bottom_deg: f64,
+}
+
+/// Reads the pattern of a simulated sensor (`blocks`, `sweep`); what other tools call a pattern says nothing.
+fn rows_in_turn<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<RowBlock>, D::Error> {
+    #[derive(Deserialize)]
+    struct Pattern {
+        blocks: Vec<RowBlock>,
+        #[serde(default)]
+        sweep: Option<String>,
+    }
+    let pattern: Option<Pattern> = toml::Value::deserialize(deserializer)?.try_into().ok();
+    Ok(pattern.filter(|p| p.sweep.as_deref() != Some("columns")).map_or(vec![], |p| p.blocks))
 }
 
 fn all_around() -> f64 {
@@ -93,14 +119,10 @@ impl SensorRig {
             roll_deg: 0.0,
             horizontal_fov_deg: 360.0,
             rate_hz: 20.0,
+            rows_in_turn: vec![],
         };
         SensorRig { sensors: vec![mount] }
     }
-}
-
-/// Place in the scan of an azimuth of a sensor, -1/2 to +1/2, counter-clockwise.
-pub fn scan_phase(azimuth_rad: f64, half_fov_rad: f64) -> f64 {
-    azimuth_rad / (2.0 * half_fov_rad)
 }
 
 impl SensorMount {
@@ -113,6 +135,19 @@ impl SensorMount {
     /// Half of its field of view, rad.
     pub fn half_fov_rad(&self) -> f64 {
         (self.horizontal_fov_deg.to_radians() / 2.0).min(PI)
+    }
+
+    /// Place in the scan of a direction in its own frame, from +1/2 where a scan begins, on the left or at the top, to -1/2.
+    pub fn scan_phase(&self, azimuth_rad: f64, elevation_rad: f64) -> f64 {
+        let all: f64 = self.rows_in_turn.iter().map(|b| b.rows).sum();
+        if all == 0.0 {
+            return azimuth_rad / (2.0 * self.half_fov_rad());
+        }
+        let done = |b: &RowBlock| {
+            let below_top_deg = b.top_deg - elevation_rad.to_degrees();
+            b.rows * (below_top_deg / (b.top_deg - b.bottom_deg).max(1e-9)).clamp(0.0, 1.0)
+        };
+        0.5 - self.rows_in_turn.iter().map(done).sum::<f64>() / all
     }
 
     /// Whether it sees all around, so that its azimuth closes.
@@ -136,6 +171,27 @@ pub fn wrapped(angle: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn time_runs_along_azimuth_or_row_after_row() {
+        let rig = |pattern: &str| {
+            let text = format!("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 120\n{pattern}");
+            SensorRig::parse(&text, Path::new("rig.toml")).unwrap().sensors.remove(0)
+        };
+        let spins = rig("pattern = { blocks = [{ rows = 64, top_deg = 6, bottom_deg = -19 }], sweep = \"columns\" }\n");
+        for mount in [rig(""), rig("pattern = \"spiral\"\n"), spins] {
+            assert!((mount.scan_phase(1f64.to_radians() * 30.0, 0.3) - 0.25).abs() < 1e-12);
+        }
+        // Three quarters of the rows lie above the horizon.
+        let blocks =
+            "[{ rows = 30, top_deg = 10, bottom_deg = 0.0 }, { rows = 10, top_deg = -0.5, bottom_deg = -20.5 }]";
+        let rows = rig(&format!("pattern = {{ blocks = {blocks}, columns = 400 }}\n"));
+        for (elevation_deg, phase) in
+            [(12.0, 0.5), (10.0, 0.5), (5.0, 0.125), (-0.2, -0.25), (-10.5, -0.375), (-30.0, -0.5)]
+        {
+            assert!((rows.scan_phase(0.7, f64::to_radians(elevation_deg)) - phase).abs() < 1e-12, "{elevation_deg}");
+        }
+    }
 
     #[test]
     fn a_rig_needs_only_places() {

@@ -84,7 +84,7 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
         total.touched += s.touched;
         total.boxes = [total.boxes[0] + s.boxes[0], total.boxes[1] + s.boxes[1]];
     }
-    Ok(truth(case, &nuisances, &own, &total))
+    Ok(truth(case, &nuisances, &own, beams.iter().flatten().count(), &total))
 }
 
 fn write_scan(root: &Path, id: usize, scan: Scan) -> Result<(), DataError> {
@@ -123,15 +123,19 @@ fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
     }
 }
 
-/// The truth with standard errors of estimators that know the form: Fisher information of the frames' returns.
-fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, sums: &Sums) -> Truth {
+/// The truth with standard errors of estimators that know the form: Fisher information of the frames' returns. Of rows that are drawn, the offsets
+/// of every one may be known; the standard deviation that they were drawn with (uniform) is not known better than so few tell.
+fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, rows: usize, sums: &Sums) -> Truth {
     let bound = |effect: &Effect| -> BTreeMap<String, f64> {
         let own_variance = 2.0 * nuisances.noise_m.powi(2);
         let n = sums.returns.max(1.0);
+        let of_rows = (0.2 / rows as f64).sqrt();
         let list: Vec<(&str, f64)> = match effect {
             Effect::RangeNoise { sigma_m, .. } => {
                 vec![("std_m", (sigma_m.powi(2) + own_variance) / sigma_m / (2.0 * n).sqrt())]
             }
+            Effect::BeamRangeOffset { std_m } => vec![("std_m", std_m * of_rows)],
+            Effect::BeamElevationOffset { std_rad } => vec![("std_deg", std_rad.to_degrees() * of_rows)],
             Effect::RandomDropout { share } => vec![("share", (share * (1.0 - share) / n).sqrt())],
             Effect::Outliers { share } => vec![("rate", (share / n).sqrt())],
             Effect::AngularJitter { sigma_rad } => {

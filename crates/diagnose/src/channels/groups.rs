@@ -92,7 +92,7 @@ pub type PartedFrame = [GroupFrame; PARTS];
 /// Part of a ray within its group.
 pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
     let at = match grouping {
-        Grouping::Row => crate::rig::scan_phase(f64::from(ray.azimuth_rad), half_fov_rad) + 0.5,
+        Grouping::Row => f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad) + 0.5,
         // Bands that hold about as many rays of a car's sensor each: edges at -10, -5 and -1 degrees.
         Grouping::Azimuth => {
             let below = [-0.175, -0.087, -0.017].iter().filter(|edge| f64::from(ray.elevation_rad) > **edge).count();

@@ -4,7 +4,7 @@
 //! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
 
 use crate::pairing::{FramePair, Ray, Surface};
-use crate::rig::SensorRig;
+use crate::rig::{SensorMount, SensorRig};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
 
@@ -25,11 +25,14 @@ pub enum Column {
     Structure(usize),
 }
 
-/// All columns for a rig, the six of the frames' own poses first.
+/// Number of columns, the first ones, that every frame may have of its own: its pose, and how it slides over a scan.
+pub const OWN: usize = 9;
+
+/// All columns for a rig, those of the frames' own first.
 pub fn columns(rig: &SensorRig) -> Vec<Column> {
     let mut all: Vec<Column> = (0..6).map(Column::Pose).collect();
-    all.extend([Column::RangeOffset, Column::RangeScale]);
     all.extend((0..3).map(Column::Sweep));
+    all.extend([Column::RangeOffset, Column::RangeScale]);
     all.extend((0..KINDS).map(Column::Structure));
     if rig.sensors.len() > 1 {
         all.extend((0..rig.sensors.len()).flat_map(|s| (0..6).map(move |k| Column::SensorPose(s, k))));
@@ -189,13 +192,13 @@ pub struct Levers {
 
 impl Levers {
     /// Of a measured ray of a sensor at `origin`.
-    pub fn new(ray: &Ray, origin: &Point3<f64>, half_fov_rad: f64) -> Self {
+    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &SensorMount) -> Self {
         Levers {
             sensor: ray.sensor as usize,
             kind: kind_of(ray),
             range_m: f64::from(ray.range_m),
             cos_incidence: f64::from(ray.cos_incidence),
-            phase: crate::rig::scan_phase(f64::from(ray.azimuth_rad), half_fov_rad),
+            phase: mount.scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad)),
             pose: pose_row(ray, origin, &Point3::origin()),
             sensor_pose: pose_row(ray, origin, origin),
         }
@@ -225,7 +228,6 @@ pub fn mean_frames(
     design: f64,
 ) -> Vec<MeanFrame> {
     let origins = origins(rig);
-    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |(frame, pose): (&FramePair, &OwnPoses)| {
         let p = columns.len();
         let (mut gram, mut right) = (vec![0.0; p * p], DVector::zeros(p));
@@ -239,7 +241,7 @@ pub fn mean_frames(
             if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
             }
-            let levers = Levers::new(ray, origin, half_fov[ray.sensor as usize]);
+            let levers = Levers::new(ray, origin, &rig.sensors[ray.sensor as usize]);
             x.clear();
             x.extend(columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
             let w = weight(ray, noise_m) / design;
@@ -264,18 +266,18 @@ pub fn origins(rig: &SensorRig) -> Vec<Point3<f64>> {
 }
 
 impl MeanFrame {
-    /// The same sums with the frame's own pose integrated out; `prior` holds the variances of its six numbers.
-    pub fn without_own_pose(&self, prior: &SVector<f64, 6>) -> (DMatrix<f64>, DVector<f64>) {
+    /// The same sums with the frame's own pose and slide integrated out; `prior` holds the variances of their numbers.
+    pub fn without_own(&self, prior: &SVector<f64, OWN>) -> (DMatrix<f64>, DVector<f64>) {
         let p = self.gram.nrows();
-        let mut own = self.gram.view((0, 0), (6, 6)).into_owned();
-        for k in 0..6 {
+        let mut own = self.gram.view((0, 0), (OWN, OWN)).into_owned();
+        for k in 0..OWN {
             own[(k, k)] += 1.0 / prior[k].max(1e-16);
         }
         let Some(inverse) = own.try_inverse() else { return (self.gram.clone(), self.right.clone()) };
-        let across = self.gram.view((0, 0), (p, 6)).into_owned();
+        let across = self.gram.view((0, 0), (p, OWN)).into_owned();
         let part = &across * inverse;
         let gram = &self.gram - &part * across.transpose();
-        let right = &self.right - &part * self.right.rows(0, 6);
+        let right = &self.right - &part * self.right.rows(0, OWN);
         (gram, right)
     }
 }

@@ -23,6 +23,8 @@ pub struct FramePair {
     pub simulated: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
+    /// Shots of the scan; of sensors whose rows are not known, returns of the measured side.
+    pub shots: f64,
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
 }
@@ -63,6 +65,13 @@ impl Sensors {
     /// Row of a shot; `u16::MAX` where rows are not known.
     fn row(&self, sensor: usize, elevation_rad: f32) -> u16 {
         self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
+    }
+
+    /// Shots of a scan; `None` where rows are not known.
+    fn shots(&self, sensor: usize) -> Option<f64> {
+        let pattern = &self.patterns[sensor];
+        let columns = 2.0 * self.rig.sensors[sensor].half_fov_rad() / f64::from(pattern.steps.azimuth_rad);
+        (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.len() as f64 * columns.round())
     }
 
     fn window(&self, sensor: usize) -> Steps {
@@ -123,6 +132,7 @@ pub fn pair_frame(
         measured: Vec::new(),
         simulated: Vec::new(),
         mixed_per_rad: 0.0,
+        shots: 0.0,
         objects: Vec::new(),
     };
     for sensor in 0..sensors.rig.sensors.len() {
@@ -168,6 +178,7 @@ pub fn pair_frame(
             }
         }
         frame.mixed_per_rad += mixed_per_rad(&simulated, &sight.index);
+        frame.shots += sensors.shots(sensor).unwrap_or(measured.len() as f64);
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }

@@ -13,6 +13,7 @@ use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
+use crate::rig::SensorMount;
 use nalgebra::{DMatrix, DVector, Vector3};
 
 /// What is compared.
@@ -298,10 +299,9 @@ fn row(
         Some(seen) => {
             (0..3).for_each(|k| x[k][3] = seen[k]);
             let mount = &context.rig.sensors[sensor];
-            let phase = crate::rig::scan_phase(
-                crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()),
-                mount.half_fov_rad(),
-            );
+            let [azimuth_rad, elevation_rad, _] =
+                SensorMount::spherical(&mount.pose().inverse_transform_point(&center.into()));
+            let phase = mount.scan_phase(azimuth_rad, elevation_rad);
             (0..3).for_each(|k| x[k][7] = seen[k] * phase);
             match motion.and_then(|m| m[s.frame]) {
                 Some(own) => {

@@ -188,6 +188,9 @@ const LEFT_BY_OWN_CAR: f64 = 0.05;
 /// Share of the gain of missing things below which mixed ranges are their returns.
 const LEFT_BY_THINGS: f64 = 0.05;
 
+/// Share of the gain of rows that aim elsewhere below which mixed ranges are returns of rows that see past edges.
+const LEFT_BY_AIMS_OF_MIXED: f64 = 0.1;
+
 /// Share of the gain of jitter below which mixed ranges are returns that it carried across edges.
 const LEFT_BY_JITTER: f64 = 0.001;
 
@@ -213,7 +216,7 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
         result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
         // Things that stand before edges lie between what these show.
-        let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter);
+        let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter).max(LEFT_BY_AIMS_OF_MIXED * aims);
         result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= least);
         // Things that move by themselves slide otherwise than what stands.
         result.found.retain(|f| !(slides && f.causes == ["missing_object"]));

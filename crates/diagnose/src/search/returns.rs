@@ -1,7 +1,7 @@
 //! Returns too many: false alarms, mixed ranges at edges, things that the simulation has not got.
 
 use super::{ChannelResult, Context, Found, Z_STAR, parameter};
-use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
+use crate::channels::returns::{self, ODD, OWN_CAR_M, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::{FOLDS, fold_of};
@@ -19,7 +19,8 @@ const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
 
 /// The search.
 pub fn search(context: &Context) -> ChannelResult {
-    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
+    let end_m = 0.98 * end_m(context.frames);
+    let odd = odd_frames(context.frames, end_m);
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let blocks = context.blocks(&select);
     let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
@@ -61,7 +62,7 @@ pub fn search(context: &Context) -> ChannelResult {
             let (_, z_e) = total_and_z(&values);
             let share_error = more_e.abs() / z_e.abs().max(1e-9);
             let held: Vec<f64> = hold_out.iter().map(|&i| gain(&odd[i], k, base_e, more_e)).collect();
-            result.found.push(found(context, kind, more_e, share_error, held, &odd, &estimate, z));
+            result.found.push(found(context, kind, more_e, share_error, held, &odd, &estimate, z, end_m));
             for (d, &i) in result.distance.iter_mut().zip(&hold_out) {
                 let (before, after) = distance(&odd[i], k, base_e, more_e);
                 *d = [d[0] + before, d[1] + before - after, d[2] + before - after];
@@ -143,25 +144,31 @@ fn found(
     odd: &[OddFrame],
     estimate: &[usize],
     z: f64,
+    end_m: f64,
 ) -> Found {
     let name = name(kind);
     let mut parameters = vec![];
+    let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
     let (covariate, says) = match kind {
         Odd::Alone => {
-            // Those that fall onto a surface or an edge by chance are not seen, and directions without a return count as well as others.
-            let share = share / 0.97;
-            parameters.push(parameter("rate", share, error.hypot(0.08 * share), "1"));
+            let reach_m = reach_m(context, estimate);
+            // They are counted between these ranges; those that fall onto a surface by chance are not seen.
+            let counted = ((end_m - OWN_CAR_M) / reach_m).clamp(0.05, 1.0) * 0.97;
+            let a_shot = sum(|f| f.all[0]) / sum(|f| f.plain_shots).max(1.0) / counted;
+            let rate = share * a_shot;
+            parameters.push(parameter("rate", rate, (error * a_shot).hypot(0.08 * rate), "1"));
+            parameters.push(parameter("reach_m", reach_m, 0.05 * reach_m, "m"));
             (
                 "none",
                 format!(
-                    "{:.2} % of the measured returns stand alone where nothing is: false alarms that your simulator does not make",
-                    100.0 * share
+                    "{:.2} % of the measured returns stand alone where nothing is: false alarms, of {:.2} % of the shots, that your simulator does not make",
+                    100.0 * share,
+                    100.0 * rate
                 ),
             )
         }
         Odd::Between => {
             parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
-            let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
             let width = share * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
             // How a sensor weighs what a beam meets is not known.
             let so_wide = if WIDTHS_RAD.contains(&width) {
@@ -216,6 +223,16 @@ fn found(
     }
 }
 
+/// Range up to which returns stand alone where nothing is, m: 99 of 100 are nearer than 0.99 of it.
+fn reach_m(context: &Context, frames: &[usize]) -> f64 {
+    let alone = |r: &&Ray| returns::odd(r) == Some(Odd::Alone);
+    let mut ranges: Vec<f64> =
+        frames.iter().flat_map(|&f| context.frames[f].measured.iter().filter(alone)).map(Ray::own_range_m).collect();
+    ranges.sort_by(f64::total_cmp);
+    let most = (0.99 * ranges.len().saturating_sub(1) as f64).round() as usize;
+    ranges.get(most).map_or(OWN_CAR_M, |r| r / 0.99)
+}
+
 /// Share of such returns by range.
 fn curve(context: &Context, kind: Odd, frames: &[usize]) -> Curve {
     const BINS: usize = 12;
@@ -225,7 +242,7 @@ fn curve(context: &Context, kind: Odd, frames: &[usize]) -> Curve {
         for (side, rays) in [&context.frames[f].measured, &context.frames[f].simulated].into_iter().enumerate() {
             for ray in rays {
                 counts[2 * side][bin(ray)] += 1.0;
-                if crate::channels::returns::odd(ray) == Some(kind) {
+                if returns::odd(ray) == Some(kind) {
                     counts[2 * side + 1][bin(ray)] += 1.0;
                 }
             }

@@ -13,19 +13,19 @@ use crate::inference::choice::{significant, total_and_z};
 use crate::inference::median;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray, Surface};
-use crate::rig::{SensorMount, SensorRig, scan_phase};
+use crate::rig::{SensorMount, SensorRig};
 use geometry::Box3;
 use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
 /// How the scene slides over a scan.
 pub struct Slide {
-    /// What a scan takes from azimuth -1/2 to +1/2 of the field of view, s.
+    /// What a scan takes from phase -1/2 to +1/2, s.
     scan_s: f64,
     /// Of every frame: the own motion and the objects with what the own car sees of their motion, m/s.
     motions: Vec<Motion>,
-    /// Of every sensor: its frame from the cloud's, and half its field of view, rad.
-    sensors: Vec<(Isometry3<f64>, f64)>,
+    /// Every sensor, and its frame from the cloud's.
+    sensors: Vec<(SensorMount, Isometry3<f64>)>,
 }
 
 /// What moves in one frame.
@@ -56,9 +56,10 @@ impl Motion {
 impl Slide {
     /// How far a point of a frame that a sensor shows is from where it was in the middle of the scan, m, cloud's frame.
     pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
-        let (sensor_from_cloud, half_fov_rad) = &self.sensors[sensor];
-        let [azimuth_rad, ..] = SensorMount::spherical(&(sensor_from_cloud * Point3::from(*point)));
-        self.motions[frame].at(point, self.scan_s.abs()) * (scan_phase(azimuth_rad, *half_fov_rad) * self.scan_s)
+        let (mount, sensor_from_cloud) = &self.sensors[sensor];
+        let [azimuth_rad, elevation_rad, _] = SensorMount::spherical(&(sensor_from_cloud * Point3::from(*point)));
+        let phase = mount.scan_phase(azimuth_rad, elevation_rad);
+        self.motions[frame].at(point, self.scan_s.abs()) * (phase * self.scan_s)
     }
 }
 
@@ -99,8 +100,9 @@ impl Sliders {
         let stride = measured.len().div_ceil(POINTS).max(1);
         let points = measured.iter().step_by(stride).map(|r| {
             let p = at(r).coords;
-            let half_fov_rad = rig.sensors[r.sensor as usize].half_fov_rad();
-            let slides = motion.at(&p, longest) * scan_phase(f64::from(r.azimuth_rad), half_fov_rad);
+            let mount = &rig.sensors[r.sensor as usize];
+            let phase = mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad));
+            let slides = motion.at(&p, longest) * phase;
             (p.xy(), slides.xy())
         });
         Sliders { occupied, points: points.collect(), each: stride as f64 }
@@ -208,7 +210,7 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
             points: curve.collect(),
         },
     });
-    let sensors = context.rig.sensors.iter().map(|s| (s.pose().inverse(), s.half_fov_rad())).collect();
+    let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
     (result, Some(Slide { scan_s, motions: way.motions, sensors }))
 }
 
@@ -337,10 +339,10 @@ mod tests {
                 let mut rng = data::stream(f, "posts", 0, 0);
                 let mut place = || rng.random_range(-45.0..45.0f64);
                 let posts: Vec<Vector3<f64>> = (0..150).map(|_| Vector3::new(place(), place(), 0.0)).collect();
-                let shown =
-                    |p: &Vector3<f64>| p + velocity * (scan_phase(p.y.atan2(p.x), std::f64::consts::PI) * scan_s);
+                let shown = |p: &Vector3<f64>| p + velocity * (p.y.atan2(p.x) / std::f64::consts::TAU * scan_s);
                 FramePair {
                     mixed_per_rad: 0.0,
+                    shots: 0.0,
                     id: f.to_string(),
                     measured: posts.iter().map(|p| standing(&shown(p))).collect(),
                     simulated: posts.iter().map(standing).collect(),

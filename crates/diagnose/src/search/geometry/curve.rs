@@ -5,7 +5,7 @@ use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable
 use crate::diagnosis::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
-use crate::rig::scan_phase;
+use crate::rig::SensorMount;
 use crate::search::Context;
 use nalgebra::{Point3, SVector};
 use rayon::prelude::*;
@@ -20,7 +20,7 @@ const FEWEST: f64 = 30.0;
 const STRAY_M: f64 = 0.5;
 
 /// What a picture's axis shows of a ray.
-type Axis = (&'static str, fn(&Ray, f64) -> f64);
+type Axis = (&'static str, fn(&Ray, &SensorMount) -> f64);
 
 /// How far surfaces stand off in the direction in which `columns` of a fit move them, by what the cause depends on: range for a bias,
 /// distance along the car for a tilt, phase for a shutter, azimuth for a sensor. Rays that the cause does not move are left out.
@@ -35,13 +35,14 @@ pub(super) fn linear_curve(
     let (x, value): Axis = match name {
         "range_bias" => ("range, m", |r, _| f64::from(r.range_m)),
         "pitch_roll" => ("distance along the car, m", |r, _| f64::from(r.direction[0] * r.range_m)),
-        "rolling_shutter" => ("phase of the scan", |r, half_fov| scan_phase(f64::from(r.azimuth_rad), half_fov)),
+        "rolling_shutter" => {
+            ("phase of the scan", |r, mount| mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad)))
+        }
         _ => ("azimuth of the sensor, degrees", |r, _| f64::from(r.azimuth_rad).to_degrees()),
     };
     let theta = |c: usize| fitted.columns.iter().position(|x| *x == c).map_or(0.0, |i| fitted.theta[i]);
     let moving: Vec<(Column, f64)> = columns.iter().map(|&c| (sums.columns[c], theta(c))).collect();
     let origins = origins(context.rig);
-    let half_fov: Vec<f64> = context.rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let displaced = moving.iter().find_map(|(c, _)| if let Column::SensorPose(s, _) = c { Some(*s) } else { None });
     let noise_m = usual_noise_m(context.frames);
     let of_frame = |&f: &usize| {
@@ -55,11 +56,11 @@ pub(super) fn linear_curve(
         }
         let place = |ray: &Ray| {
             let sensor = ray.sensor as usize;
-            let levers = Levers::new(ray, &origins[sensor], half_fov[sensor]);
+            let mount = &context.rig.sensors[sensor];
+            let levers = Levers::new(ray, &origins[sensor], mount);
             let told: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
             let y = ray.across_nearest_m() - pose_row(ray, &origins[sensor], &Point3::origin()).dot(&pose);
-            (told != 0.0 && (y - told).abs() < STRAY_M)
-                .then(|| [value(ray, half_fov[sensor]), y * told.signum(), told.abs()])
+            (told != 0.0 && (y - told).abs() < STRAY_M).then(|| [value(ray, mount), y * told.signum(), told.abs()])
         };
         frame.measured.iter().filter(|r| usable(r)).filter_map(place).collect::<Vec<[f64; 3]>>()
     };

@@ -14,7 +14,8 @@ use self::suspects::{Suspect, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, first_demands, record, unless_unsure};
 use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
-    Column, MeanFrame, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses, usual_noise_m,
+    Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
+    usual_noise_m,
 };
 use crate::diagnosis::Considered;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
@@ -22,6 +23,7 @@ use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::median;
 use crate::inference::roles::Role;
+use crate::rig::SensorRig;
 use nalgebra::SVector;
 use rayon::prelude::*;
 
@@ -178,11 +180,11 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
     let design = design_effect(frames, &origins, &poses, noise_m);
     let columns = columns(rig);
     let means: Vec<MeanFrame> = mean_frames(frames, rig, &columns, &poses, noise_m, design);
-    let prior = pose_scatter(&poses, select);
+    let prior = own_scatter(rig, &poses, select);
     let linear: Vec<LinearFrame> = means
         .iter()
         .map(|m| {
-            let (gram, right) = m.without_own_pose(&prior);
+            let (gram, right) = m.without_own(&prior);
             LinearFrame { gram, right }
         })
         .collect();
@@ -222,20 +224,26 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
     Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear, poses }
 }
 
-/// Variances of the frames' own poses, robust, about the mean of each sensor.
-fn pose_scatter(poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 6> {
-    let least = SVector::<f64, 6>::from([2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4]);
-    SVector::from_fn(|k, _| {
+/// Variances of what every frame may have of its own: of its pose as they scatter, robust, about the mean of each sensor; of its slide as cars drive,
+/// where a scan takes row after row: what stands slides along columns then, unlike anything else but a little like a sensor's pose.
+fn own_scatter(rig: &SensorRig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
+    let least = [2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4];
+    let scatter = |k: usize| {
         let mut deviations = Vec::new();
         for sensor in 0..poses.first().map_or(0, Vec::len) {
             let values: Vec<f64> = select.iter().map(|&f| poses[f][sensor][k]).collect();
             let middle = median(values.clone());
             deviations.extend(values.iter().map(|v| (v - middle).abs()));
         }
-        let sd = median(deviations) / 0.6745;
-        (sd * sd).max(least[k] * least[k])
-    })
+        (median(deviations) / 0.6745).max(least[k])
+    };
+    let by_rows = rig.sensors.iter().find(|s| !s.rows_in_turn.is_empty());
+    let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);
+    SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide(k - 6) }.powi(2))
 }
+
+/// How cars drive: along, across (m/s), turns (rad/s).
+const OWN_MOTION: [f64; 3] = [40.0, 3.0, 0.3];
 
 fn split(suspects: &[Suspect]) -> (Vec<usize>, Vec<(Grouping, usize)>) {
     let mut columns: Vec<usize> = Vec::new();

@@ -1,7 +1,7 @@
 //! What the search of geometry found, in words and numbers.
 
 use super::curve::linear_curve;
-use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, fit_all, groups_of, how};
+use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, fit_all, groups_of, how, split};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
@@ -29,7 +29,8 @@ pub(super) fn found(
     let (covariate, says, curve) = match suspect {
         Suspect::Linear { columns, .. } => {
             let fitted = fit_all(sums, estimate, blocks, chosen);
-            linear_parameters(context, sums, &fitted, columns, name, &mut parameters);
+            let others = others_see(sums, estimate, blocks, columns, chosen);
+            linear_parameters(context, sums, &fitted, columns, others, name, &mut parameters);
             let sensor = parameters.iter().find(|(n, _)| n == "sensor").map(|(_, p)| p.estimate as usize);
             let numbers = parameters.iter().filter(|(n, _)| n != "sensor");
             let list: Vec<String> = numbers.map(|(n, p)| format!("{n} {:.4} {}", p.estimate, p.unit)).collect();
@@ -128,11 +129,38 @@ pub(super) fn found(
     }
 }
 
+/// By how much sensors that are mounted well would be said to be mounted otherwise, beyond chance: what the form of a sensor's pose is wrong by
+/// (turns, then shifts). Nothing where fewer than two others are there.
+fn others_see(sums: &Sums, estimate: &[usize], blocks: &[usize], columns: &[usize], chosen: &[Suspect]) -> [f64; 6] {
+    let pose = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
+    let spoken = split(chosen).0;
+    let others: Vec<usize> = (0..sums.poses.first().map_or(0, Vec::len))
+        .filter(|s| spoken.iter().filter_map(pose).all(|chosen| chosen != *s))
+        .collect();
+    if others.len() < 2 || !columns.iter().any(|c| pose(c).is_some()) {
+        return [0.0; 6];
+    }
+    let frames: Vec<&LinearFrame> = estimate.iter().map(|&i| &sums.linear[i]).collect();
+    let mut squares = [0.0; 6];
+    for other in &others {
+        let own: Vec<usize> = (0..sums.columns.len()).filter(|c| pose(c) == Some(*other)).collect();
+        let with: Vec<usize> = sums.base.iter().chain(&spoken).chain(&own).copied().collect();
+        let fitted = fit(&frames, blocks, &with, &sums.precision);
+        for (k, square) in squares.iter_mut().enumerate() {
+            let i = with.len() - 6 + k;
+            *square += (fitted.theta[i].powi(2) - fitted.error(i).powi(2)).max(0.0);
+        }
+    }
+    // One is held against the mean of the others: of two against each other by their difference.
+    squares.map(|s| (0.75 * s / others.len() as f64).sqrt())
+}
+
 fn linear_parameters(
     context: &Context,
     sums: &Sums,
     fitted: &LinearFit,
     columns: &[usize],
+    others_see: [f64; 6],
     name: &str,
     parameters: &mut Vec<(String, Parameter)>,
 ) {
@@ -158,6 +186,7 @@ fn linear_parameters(
                 if let Column::SensorPose(s, _) = sums.columns[c] {
                     sensor = Some(s);
                 }
+                let error = error.hypot(others_see[k]);
                 if k < 3 {
                     (turn[k], turn_error[k]) = (-theta, error);
                 } else {
