@@ -194,6 +194,23 @@ const LEFT_BY_AIMS_OF_MIXED: f64 = 0.1;
 /// Share of the gain of jitter below which mixed ranges are returns that it carried across edges.
 const LEFT_BY_JITTER: f64 = 0.001;
 
+/// Share of the gain of a sensor's pose below which things that only the simulation has are what this sensor looks over.
+const LEFT_BY_A_POSE_OF_THINGS: f64 = 0.1;
+
+/// Nats a return below which a law of noise beside surfaces that are off in a way without a name is a part of that.
+const LEFT_BY_THE_UNNAMED: f64 = 0.1;
+
+/// Whether a finding is more than chance on the frames that say how large it is: intervals of some number exclude 0, where it has any.
+fn speaks(f: &Found) -> bool {
+    let mut sizes = f.parameters.iter().filter(|(_, p)| p.unit != "number").map(|(_, p)| p.ci95).peekable();
+    sizes.peek().is_none() || sizes.any(|[low, high]| low > 0.0 || high < 0.0)
+}
+
+/// Whether things are said to be in the simulation alone.
+fn things_too_many(f: &Found) -> bool {
+    f.causes == ["missing_object"] && f.parameters.iter().any(|(_, p)| p.estimate < 0.0)
+}
+
 /// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
 /// the frames that were held out.
 pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
@@ -202,6 +219,7 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         results.iter().flat_map(|r| &r.found).filter(|f| of(f)).map(gain).fold(0.0, f64::max)
     };
     let spoke: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
+    results.iter_mut().for_each(|r| r.found.retain(speaks));
     let rows = most(results, &|f| f.causes.first().is_some_and(|c| c.starts_with("beam_")));
     let aims = most(results, &|f| f.causes == ["beam_elevation_offset"]);
     let things = most(results, &|f| f.causes == ["missing_object"]);
@@ -227,6 +245,12 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         result
             .found
             .retain(|f| !matches!(f.channel, "hits" | "roughness" | "returns") || gain(f) >= LEFT_BY_A_POSE * pose);
+        result.found.retain(|f| !things_too_many(f) || gain(f) >= LEFT_BY_A_POSE_OF_THINGS * pose);
+    }
+    let unnamed = |f: &Found| f.channel == "residuals" && f.status == Status::Unexplained;
+    if results.iter().flat_map(|r| &r.found).any(unnamed) {
+        let rough = |f: &Found| f.channel == "roughness" && gain(f) < LEFT_BY_THE_UNNAMED * returns;
+        results.iter_mut().for_each(|r| r.found.retain(|f| !rough(f)));
     }
     let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
     if results.iter().flat_map(|r| &r.found).any(disturbs) {
@@ -353,4 +377,62 @@ pub fn record(
 pub fn parameter(name: &str, estimate: f64, error: f64, unit: &str) -> (String, Parameter) {
     let half = 1.96 * error;
     (name.into(), Parameter { estimate, unit: unit.into(), ci95: [estimate - half, estimate + half] })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn found(cause: &str, channel: &'static str, gain: f64, parameters: Vec<(String, Parameter)>) -> Found {
+        Found {
+            status: if cause.is_empty() { Status::Unexplained } else { Status::Named },
+            causes: if cause.is_empty() { vec![] } else { vec![cause.into()] },
+            family: "",
+            parameters,
+            confidence: 1.0,
+            channel,
+            covariate: String::new(),
+            held_out_gains: vec![gain; 10],
+            says: String::new(),
+            separate_by: None,
+            curve: Curve { x: String::new(), y: String::new(), points: vec![] },
+        }
+    }
+
+    /// What is left of findings beside the first, on 1,000 returns held out.
+    fn left(all: Vec<Found>) -> Vec<String> {
+        let mut results: Vec<ChannelResult> =
+            all.into_iter().map(|f| ChannelResult { found: vec![f], ..ChannelResult::default() }).collect();
+        without_leftovers(&mut results, 1000.0);
+        results.into_iter().skip(1).flat_map(|r| r.found).flat_map(|f| f.causes).collect()
+    }
+
+    #[test]
+    fn what_others_leave_is_dropped_and_what_stands_for_itself_is_kept() {
+        let number = |name: &str, value: f64| vec![parameter(name, value, 0.1 * value.abs(), "1")];
+        let cases = [
+            // (first, its gain), (second, its channel, its size, gain that is left over, gain that stands for itself)
+            (("beam_elevation_offset", "residuals", 3.0), ("mixed_pixels", "returns", 0.003, 0.2, 0.4)),
+            (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", -0.005, 3.0, 5.0)),
+            (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", 0.005, 0.1, 3.0)),
+            (("", "residuals", 1.0), ("range_noise", "roughness", 0.02, 9.0, 11.0)),
+        ];
+        for ((first, channel, gain), (second, of, size, left_over, itself)) in cases {
+            let beside =
+                |g| left(vec![found(first, channel, gain, number("a", 1.0)), found(second, of, g, number("b", size))]);
+            assert!(beside(left_over).is_empty(), "{second} {left_over}");
+            assert_eq!(beside(itself), [second]);
+        }
+    }
+
+    #[test]
+    fn an_interval_about_nothing_is_no_finding() {
+        let sensor = || ("sensor".to_owned(), Parameter { estimate: 2.0, unit: "number".into(), ci95: [2.0, 2.0] });
+        let about =
+            |value: f64| found("time_offset", "objects", 1.0, vec![sensor(), parameter("offset_s", value, 0.003, "s")]);
+        let first = || found("range_bias", "residuals", 1.0, vec![]);
+        assert!(left(vec![first(), about(-0.0006)]).is_empty());
+        assert_eq!(left(vec![first(), about(-0.02)]), ["time_offset"]);
+        assert_eq!(left(vec![first(), found("missing_object", "returns", 1.0, vec![])]), ["missing_object"]);
+    }
 }

@@ -18,7 +18,7 @@ use crate::channels::mean::{
     usual_noise_m,
 };
 use crate::diagnosis::Considered;
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::{Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::median;
@@ -65,7 +65,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     let all = suspects(context, &sums.columns);
     let mut chosen: Vec<Suspect> = Vec::new();
     let mut stories = Vec::new();
-    let mut first_gain = 0.0f64;
+    let mut first_gains: Vec<f64> = Vec::new();
     for step in 0..2 {
         let candidates: Vec<&Suspect> = all.iter().filter(|s| may_join(s, &chosen)).collect();
         let before = gains(&sums, &select, &blocks, &chosen);
@@ -77,7 +77,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
                 let mut g = gains(&sums, &select, &blocks, &with);
                 g.iter_mut().zip(&before).for_each(|(g, b)| *g -= b);
                 let again = is_pose(suspect) && chosen.iter().any(is_pose);
-                let enough = !again || total_and_z(&g).0 > A_SECOND_POSE * first_gain;
+                let enough = !again || total_and_z(&g).0 > A_SECOND_POSE * first_gains.iter().sum::<f64>();
                 Trial {
                     candidate: k,
                     name: suspect.name().into(),
@@ -87,8 +87,15 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
                 }
             })
             .collect();
-        rows_by_most_frames(&mut trials, &candidates);
-        let demands = if step == 0 { demands } else { Demands { nats: (0.1 * first_gain).max(8.0), ..demands } };
+        surer_rows(&mut trials, &candidates);
+        if step > 0 {
+            // What is left of the first gains little; what is surer than the first by itself is none of it.
+            let first = total_and_z(&first_gains);
+            trials.iter_mut().for_each(|t| {
+                let (total, z) = total_and_z(&t.gains);
+                t.above_floor &= total > 0.1 * first.0 || z > first.1 && total > 0.02 * first.0;
+            });
+        }
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "residuals", returns, &demands));
         if step == 0 {
@@ -96,7 +103,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
         }
         let Some(choice) = choice else { break };
         let t = &trials[choice.chosen];
-        first_gain = total_and_z(&t.gains).0;
+        first_gains.clone_from(&t.gains);
         let mut equals: Vec<String> = choice.equals.iter().map(|&i| trials[i].name.clone()).collect();
         equals.sort();
         equals.dedup();
@@ -163,13 +170,12 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     (result, out)
 }
 
-/// Of offsets of rows in range and in elevation, whose gain is a matter of few far rays on some frames, the one that gains more on most frames is
-/// kept.
-fn rows_by_most_frames(trials: &mut [Trial], candidates: &[&Suspect]) {
-    let median = |t: &Trial| median(t.gains.clone());
+/// Of offsets of rows in range and in elevation the one that is surer over frames is kept: the other one fits few rays at grazing angles, by much, on some.
+fn surer_rows(trials: &mut [Trial], candidates: &[&Suspect]) {
+    let z = |t: &Trial| total_and_z(&t.gains).1;
     let of_rows = |t: &Trial| matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
-    let best = trials.iter().filter(|t| of_rows(t)).map(median).fold(0.0, f64::max);
-    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= median(t) >= best);
+    let best = trials.iter().filter(|t| of_rows(t)).map(z).fold(0.0, f64::max);
+    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= z(t) >= best);
 }
 
 fn sums(context: &Context, select: &[usize]) -> Sums {
@@ -374,4 +380,31 @@ fn everything(sums: &Sums, frames: &[usize], blocks: &[usize]) -> (LinearFit, Li
     let frames: Vec<&LinearFrame> = frames.iter().map(|&i| &sums.linear[i]).collect();
     let all: Vec<usize> = (0..sums.columns.len()).collect();
     (fit(&frames, blocks, &all, &sums.precision), fit(&frames, blocks, &sums.base, &sums.precision))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_two_offsets_of_rows_the_surer_one_is_kept() {
+        let rows = |name, column| Suspect::Groups { name, grouping: Grouping::Row, column };
+        let suspects = [
+            rows("beam_range_offset", 0),
+            rows("beam_elevation_offset", 1),
+            Suspect::Linear { name: "range_bias", columns: vec![0] },
+        ];
+        let trial = |candidate: usize, gains: Vec<f64>| Trial {
+            candidate,
+            name: suspects[candidate].name().into(),
+            parameters: 1,
+            gains,
+            above_floor: true,
+        };
+        // More on the whole, by some frames, and a little less on every frame.
+        let some = (0..20).map(|f| if f % 4 == 0 { 90.0 } else { 2.0 }).collect();
+        let mut trials = vec![trial(0, vec![20.0; 20]), trial(1, some), trial(2, vec![1.0; 20])];
+        surer_rows(&mut trials, &suspects.iter().collect::<Vec<_>>());
+        assert_eq!(trials.iter().map(|t| t.above_floor).collect::<Vec<_>>(), [true, false, true]);
+    }
 }
