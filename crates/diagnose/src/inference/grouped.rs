@@ -1,6 +1,7 @@
 //! Offsets of groups, one number each, shrunk by a prior; weighed on frames that they were not fitted on.
 
 use super::linear::{FOLDS, fold_of};
+use super::median;
 use crate::channels::groups::{GroupFrame, GroupSums, PARTS, PartedFrame, total};
 use std::collections::BTreeMap;
 
@@ -113,12 +114,17 @@ pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
     differences[differences.len() / 2] / 0.6745 / 1.5f64.sqrt()
 }
 
-/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well. The largest `trimmed` share of
-/// them does not count.
+/// Times the usual variance of a group's offset from which on it says nothing of the others.
+const WORSE: f64 = 16.0;
+
+/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well: not much worse than most. The
+/// largest `trimmed` share of them does not count.
 pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
     let offsets = offsets(sums, how);
     let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
     let mut squares: Vec<(f64, f64)> = known.map(|(k, s)| (offsets[k].powi(2), 1.0 / s.gram[2 * how.column])).collect();
+    let usual = median(squares.iter().map(|(_, noise)| *noise).collect());
+    squares.retain(|(_, noise)| *noise <= WORSE * usual);
     squares.sort_by(|a, b| a.0.total_cmp(&b.0));
     squares.truncate(((1.0 - trimmed) * squares.len() as f64).ceil() as usize);
     let n = squares.len() as f64;

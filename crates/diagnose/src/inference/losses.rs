@@ -183,16 +183,26 @@ impl LossTable {
 
     /// Range beyond which one simulated return in fifty lies, m.
     pub fn farthest_m(&self) -> f64 {
-        let mut ranges: Vec<(f64, f64)> =
-            self.used.iter().map(|&i| (self.places[i].ln_range, self.cells[i].simulated.n)).collect();
-        ranges.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let all: f64 = ranges.iter().map(|r| r.1).sum();
+        self.last(|p| p.ln_range).exp()
+    }
+
+    /// Cosine of incidence below which one simulated return in fifty is met.
+    pub fn most_grazing(&self) -> f64 {
+        (-self.last(|p| -p.ln_cos)).exp()
+    }
+
+    /// The value that one return in fifty exceeds.
+    fn last(&self, value: impl Fn(&Where) -> f64) -> f64 {
+        let mut values: Vec<(f64, f64)> =
+            self.used.iter().map(|&i| (value(&self.places[i]), self.cells[i].simulated.n)).collect();
+        values.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let all: f64 = values.iter().map(|v| v.1).sum();
         let mut beyond = 0.0;
-        let at = ranges.iter().find(|(_, n)| {
+        let at = values.iter().find(|(_, n)| {
             beyond += n;
             beyond > 0.02 * all
         });
-        at.map_or(0.0, |r| r.0.exp())
+        at.map_or(f64::NEG_INFINITY, |v| v.0)
     }
 
     /// Share that laws keep, in the order of [`LossTable::shares`].
@@ -345,6 +355,11 @@ impl FittedLaw {
         let [_, b, s, ..] = self.numbers;
         // d ln(kept) / dx at one half, over that of a logistic step.
         2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
+    }
+
+    /// Share that a law of range or of incidence keeps there.
+    pub fn kept_there(&self, range_m: f64, cos_incidence: f64) -> f64 {
+        self.kept(&Where { ln_range: range_m.ln(), ln_cos: cos_incidence.ln(), zone: 0 })
     }
 
     /// Share kept where nothing of the law is felt.

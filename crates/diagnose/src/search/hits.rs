@@ -272,7 +272,11 @@ fn found(
             let sd =
                 (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
             // The form of the truth may differ, the more so beyond the returns that there are.
-            let beyond = if *name == "half_at_m" { (estimate - table.farthest_m()).max(0.0) } else { 0.0 };
+            let beyond = match *name {
+                "half_at_m" => (estimate - table.farthest_m()).max(0.0),
+                "cos_half" => (table.most_grazing() - estimate).max(0.0),
+                _ => 0.0,
+            };
             let form = if *name == "most" { 0.002 } else { form_error(law.law) * estimate.abs() };
             let half = 2.1 * sd.hypot(form) + beyond;
             // Which of an object's surfaces are of the material is not known: where few are, each of them loses more.
@@ -293,12 +297,19 @@ fn found(
             100.0 * law.numbers[0]
         ),
         Law::Range => {
-            format!("returns are lost with range: 50 % at {:.0} m; your simulator keeps them all", law.half().exp())
+            // Not what no return shows.
+            let at_m = law.half().exp().min(table.farthest_m());
+            let lost = 100.0 * (1.0 - law.kept_there(at_m, 1.0));
+            format!("returns are lost with range: {lost:.0} % at {at_m:.0} m; your simulator keeps them all")
         }
-        Law::Incidence => format!(
-            "returns are lost at grazing angles: 50 % at {:.1} degrees from the surface; your simulator keeps them all",
-            law.half().exp().min(1.0).asin().to_degrees()
-        ),
+        Law::Incidence => {
+            let cos = law.half().exp().clamp(table.most_grazing(), 1.0);
+            format!(
+                "returns are lost at grazing angles: {:.0} % at {:.1} degrees from the surface; your simulator keeps them all",
+                100.0 * (1.0 - law.kept_there(1.0, cos)),
+                cos.asin().to_degrees()
+            )
+        }
         Law::Signal => format!(
             "returns are lost as the signal falls: 50 % at u = {:.1}, on the road at {:.0} m if it is met at 2 degrees; your simulator keeps them all",
             values[0].1,

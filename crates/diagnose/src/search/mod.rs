@@ -197,13 +197,19 @@ const LEFT_BY_JITTER: f64 = 0.001;
 /// Share of the gain of a sensor's pose below which things that only the simulation has are what this sensor looks over.
 const LEFT_BY_A_POSE_OF_THINGS: f64 = 0.1;
 
-/// Nats a return below which a law of noise beside surfaces that are off in a way without a name is a part of that.
-const LEFT_BY_THE_UNNAMED: f64 = 0.1;
+/// Nats a return below which a law of noise beside surfaces that are off in a way without a name is a part of that, and share of what this
+/// gains below which poses and shifts of objects are.
+const LEFT_BY_THE_UNNAMED: [f64; 2] = [0.1, 0.25];
+
+/// Standard errors by which a sensor's pose must be off in one number: its six take up what is wrong with the few surfaces that it alone sees.
+const SURE_OF_A_SENSOR: f64 = 4.5;
 
 /// Whether a finding is more than chance on the frames that say how large it is: intervals of some number exclude 0, where it has any.
 fn speaks(f: &Found) -> bool {
-    let mut sizes = f.parameters.iter().filter(|(_, p)| p.unit != "number").map(|(_, p)| p.ci95).peekable();
-    sizes.peek().is_none() || sizes.any(|[low, high]| low > 0.0 || high < 0.0)
+    let of_sensor = f.causes == ["sensor_extrinsics"];
+    let mut sizes = f.parameters.iter().map(|(_, p)| p).filter(|p| p.unit != "number").peekable();
+    let sure = |p: &Parameter| p.estimate.abs() > SURE_OF_A_SENSOR / 1.96 * (p.ci95[1] - p.ci95[0]) / 2.0;
+    sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0 && (!of_sensor || sure(p)))
 }
 
 /// Whether things are said to be in the simulation alone.
@@ -248,9 +254,14 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         result.found.retain(|f| !things_too_many(f) || gain(f) >= LEFT_BY_A_POSE_OF_THINGS * pose);
     }
     let unnamed = |f: &Found| f.channel == "residuals" && f.status == Status::Unexplained;
-    if results.iter().flat_map(|r| &r.found).any(unnamed) {
-        let rough = |f: &Found| f.channel == "roughness" && gain(f) < LEFT_BY_THE_UNNAMED * returns;
-        results.iter_mut().for_each(|r| r.found.retain(|f| !rough(f)));
+    let without_a_name = most(results, &unnamed);
+    if without_a_name > 0.0 {
+        let left = |f: &Found| match f.channel {
+            "roughness" => gain(f) < LEFT_BY_THE_UNNAMED[0] * returns,
+            "residuals" | "objects" => gain(f) < LEFT_BY_THE_UNNAMED[1] * without_a_name,
+            _ => false,
+        };
+        results.iter_mut().for_each(|r| r.found.retain(|f| !left(f)));
     }
     let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
     if results.iter().flat_map(|r| &r.found).any(disturbs) {

@@ -31,6 +31,8 @@ use rayon::prelude::*;
 const FLOOR_OFFSET_M: f64 = 0.012;
 const FLOOR_TURN_RAD: f64 = 5.2e-4;
 const FLOOR_SHIFT_M: f64 = 0.04;
+/// Smaller turns of one sensor are not spoken of, rad: 4 cm at 50 m.
+const FLOOR_SENSOR_RAD: f64 = 8e-4;
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
 
@@ -326,13 +328,9 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
                         && t.abs()
                             > match sums.columns[*c] {
                                 Column::RangeOffset | Column::RangeScale => f64::INFINITY,
-                                Column::Pose(k) | Column::SensorPose(_, k) => {
-                                    if k < 3 {
-                                        FLOOR_TURN_RAD
-                                    } else {
-                                        FLOOR_SHIFT_M
-                                    }
-                                }
+                                Column::Pose(0..3) => FLOOR_TURN_RAD,
+                                Column::SensorPose(_, 0..3) => FLOOR_SENSOR_RAD,
+                                Column::Pose(_) | Column::SensorPose(..) => FLOOR_SHIFT_M,
                                 Column::Sweep(k) => {
                                     if k < 2 {
                                         0.3

@@ -1,12 +1,14 @@
 //! What the search of geometry found, in words and numbers.
 
 use super::curve::linear_curve;
-use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, fit_all, groups_of, how, split};
+use super::{
+    FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SENSOR_RAD, FLOOR_TURN_RAD, Sums, Suspect, fit_all, groups_of, how, split,
+};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::UNNAMED;
-use crate::inference::grouped;
+use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, fit};
 use crate::search::{Context, Found, Z_STAR, parameter};
 use nalgebra::Vector3;
@@ -63,11 +65,14 @@ pub(super) fn found(
                 let label = if *column == 0 { "std_m" } else { "std_deg" };
                 parameters.push(parameter(label, std * unit.0, (error.hypot(0.05 * std)) * unit.0, unit.1));
             }
-            let offsets = grouped::offsets(&all, how(*column));
+            // Rows that are hardly known are as far off as the others are.
+            let own = if std > 0.0 { 1.0 / (std * std) } else { 0.0 };
+            let fit = GroupFit { precision: own.max(how(*column).precision), ..how(*column) };
+            let offsets = grouped::offsets(&all, fit);
             if name != UNNAMED {
                 for (k, v) in &offsets {
                     let (sensor, row) = place_of(*k as usize, *grouping);
-                    let e = 1.0 / (all[k].gram[2 * column] + how(*column).precision).sqrt();
+                    let e = 1.0 / (all[k].gram[2 * column] + fit.precision).sqrt();
                     let label = format!("{}/{}", context.rig.sensors[sensor].name, row as usize);
                     parameters.push(parameter(&label, v * unit.0, e * unit.0, unit.1));
                 }
@@ -269,7 +274,8 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(S
     push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
     push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
     let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
-    push("sensor_extrinsics", "yaw_deg", error(one), FLOOR_TURN_RAD, "deg", deg);
+    let floor = if one == Column::Pose(2) { FLOOR_TURN_RAD } else { FLOOR_SENSOR_RAD };
+    push("sensor_extrinsics", "yaw_deg", error(one), floor, "deg", deg);
     push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
     push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
     all
