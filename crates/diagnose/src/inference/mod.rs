@@ -2,6 +2,7 @@
 
 pub mod choice;
 pub mod grouped;
+pub mod law;
 pub mod linear;
 pub mod losses;
 pub mod noise;

@@ -11,7 +11,8 @@ use crate::channels::mask::{
 use crate::channels::returns::OWN_CAR_M;
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::UNNAMED;
-use crate::inference::losses::{FittedLaw, Law, LossTable};
+use crate::inference::law::{FittedLaw, Law};
+use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
 use std::collections::BTreeMap;

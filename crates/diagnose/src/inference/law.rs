@@ -1,0 +1,198 @@
+//! The forms that laws of lost returns have, and their numbers.
+
+use crate::channels::cells::ZONES;
+
+/// A law of losses; several multiply.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Law {
+    /// The same share everywhere.
+    Random,
+    /// Falls with range: half of the returns at a range, and how fast.
+    Range,
+    /// Falls with the angle of incidence.
+    Incidence,
+    /// Falls with the signal cos / R^2; surfaces may be brighter than the ground.
+    Signal,
+    /// One kind of surface loses a share; [`WHOLE_OBJECT`]: bodies of objects with their corners.
+    Zone(usize),
+}
+
+/// Bodies of objects with their lower corners, as a zone.
+pub const WHOLE_OBJECT: usize = ZONES;
+
+/// Whether a zone belongs to that of a law.
+pub fn in_zone(of_law: usize, zone: usize) -> bool {
+    zone == of_law || of_law == WHOLE_OBJECT && zone >= 2
+}
+
+/// All laws, in the order of how much they assume.
+pub const LAWS: [Law; 9] = [
+    Law::Random,
+    Law::Zone(0),
+    Law::Zone(1),
+    Law::Zone(2),
+    Law::Zone(3),
+    Law::Zone(WHOLE_OBJECT),
+    Law::Range,
+    Law::Incidence,
+    Law::Signal,
+];
+
+/// What the laws need to know of a cell.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Where {
+    pub(super) ln_range: f64,
+    pub(super) ln_cos: f64,
+    pub(super) zone: usize,
+}
+
+/// A law with its numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FittedLaw {
+    /// Which.
+    pub law: Law,
+    /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew, share lost anyway; signal:
+    /// then by how much standing surfaces and objects are brighter, in ln.
+    pub numbers: [f64; 6],
+}
+
+/// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. Real laws have other tails than the logistic one; the skew lets both differ.
+fn step(x: f64, [a, ln_k, ln_skew]: [f64; 3]) -> f64 {
+    (1.0 + (-ln_k.exp() * (x - a)).exp()).powf(-ln_skew.exp())
+}
+
+/// Where the step is at one half.
+fn half([a, ln_k, ln_skew]: [f64; 3]) -> f64 {
+    a - ((0.5f64.powf(-(-ln_skew).exp()) - 1.0).max(1e-12)).ln() / ln_k.exp()
+}
+
+/// Reflectivities of unlike surfaces differ by about this factor, as a logarithm.
+const BRIGHTNESS: f64 = 1.2;
+
+impl Law {
+    /// The cause's name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Law::Random => "random_dropout",
+            Law::Range => "range_dropout",
+            Law::Incidence => "incidence_dropout",
+            Law::Signal => "signal_dropout",
+            Law::Zone(_) => "material_dropout",
+        }
+    }
+
+    /// Free parameters.
+    pub fn parameters(self) -> usize {
+        match self {
+            Law::Random | Law::Zone(_) => 1,
+            Law::Range | Law::Incidence => 2,
+            Law::Signal => 4,
+        }
+    }
+
+    pub(super) fn count(self) -> usize {
+        match self {
+            Law::Random | Law::Zone(_) => 1,
+            Law::Range | Law::Incidence => 4,
+            Law::Signal => 6,
+        }
+    }
+
+    pub(super) fn steps(self) -> Vec<f64> {
+        match self {
+            Law::Random | Law::Zone(_) => vec![0.05],
+            Law::Range | Law::Incidence => vec![0.3, 0.4, 0.3, 0.005],
+            Law::Signal => vec![0.5, 0.4, 0.3, 0.005, 0.4, 0.4],
+        }
+    }
+
+    /// Where a fit begins, by the cells that have returns.
+    pub(super) fn starts(self, cells: &[Where]) -> Vec<FittedLaw> {
+        let with = |numbers: [f64; 6]| FittedLaw { law: self, numbers };
+        let value = |at: &Where| match self {
+            Law::Incidence => at.ln_cos,
+            Law::Signal => at.ln_cos - 2.0 * at.ln_range,
+            _ => at.ln_range,
+        };
+        let mut values: Vec<f64> = cells.iter().map(value).collect();
+        values.sort_by(f64::total_cmp);
+        let quantile = |q: f64| values.get(((values.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(0.0);
+        match self {
+            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])],
+            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0, 0.0, 0.0])).to_vec(),
+            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0, 0.0, 0.0])).to_vec(),
+        }
+    }
+}
+
+/// Of what comes back with plenty of light a sensor may lose this share; what is more is a cause of its own, a random loss.
+pub const MOST_ANYWAY: f64 = 0.025;
+
+/// Steepness and skew are not expected to be extreme, nor is much expected to be lost anyway.
+fn shape_penalty(ln_k: f64, ln_skew: f64, anyway: f64) -> f64 {
+    let beyond = (anyway - anyway.clamp(0.0, MOST_ANYWAY)) / 1e-3;
+    0.5 * ln_k.powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2) + beyond * beyond
+}
+
+impl FittedLaw {
+    /// Where one half is kept: of range ln(m), of incidence ln(cos), of signal ln(cos / R^2) on the ground.
+    pub fn half(&self) -> f64 {
+        let [a, b, s, ..] = self.numbers;
+        match self.law {
+            Law::Range => -half([-a, b, s]),
+            _ => half([a, b, s]),
+        }
+    }
+
+    /// Steepness of a step without skew that falls as fast at one half.
+    pub fn steepness(&self) -> f64 {
+        let [_, b, s, ..] = self.numbers;
+        // d ln(kept) / dx at one half, over that of a logistic step.
+        2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
+    }
+
+    /// Share that a law of range or of incidence keeps there.
+    pub fn kept_there(&self, range_m: f64, cos_incidence: f64) -> f64 {
+        self.kept(&Where { ln_range: range_m.ln(), ln_cos: cos_incidence.ln(), zone: 0 })
+    }
+
+    /// Share kept where nothing of the law is felt.
+    pub fn most(&self) -> f64 {
+        1.0 - self.numbers[3].clamp(0.0, MOST_ANYWAY)
+    }
+
+    pub(super) fn kept(&self, at: &Where) -> f64 {
+        let [a, b, s, _, c, d] = self.numbers;
+        let most = self.most();
+        match self.law {
+            Law::Random => (1.0 - a).clamp(1e-3, 1.5),
+            Law::Zone(zone) => {
+                if in_zone(zone, at.zone) {
+                    (1.0 - a).clamp(1e-3, 1.5)
+                } else {
+                    1.0
+                }
+            }
+            Law::Range => most * step(-at.ln_range, [-a, b, s]),
+            Law::Incidence => most * step(at.ln_cos, [a, b, s]),
+            Law::Signal => {
+                let brighter = [0.0, c, d, d][at.zone];
+                most * step(at.ln_cos - 2.0 * at.ln_range + brighter, [a, b, s])
+            }
+        }
+    }
+
+    pub(super) fn penalty(&self) -> f64 {
+        match self.law {
+            Law::Signal => {
+                let [_, steep, skew, anyway, c, d] = self.numbers;
+                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS) + shape_penalty(steep - 0.8, skew, anyway)
+            }
+            Law::Range | Law::Incidence => {
+                let [_, steep, skew, anyway, ..] = self.numbers;
+                shape_penalty(steep - 1.0, skew, anyway)
+            }
+            _ => 0.0,
+        }
+    }
+}
