@@ -1,6 +1,7 @@
 //! `cargo xtask WORD ...`: the program `lidarshift`, built in release and run with the same words; and the chores of who works on it.
 
 mod bench;
+mod bench_mutants;
 mod bench_train;
 mod ci;
 mod program;
@@ -35,9 +36,10 @@ enum Word {
     Tidy,
     /// Write configs/schema.json and docs/configuration.md from the Rust types.
     Schema,
-    /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's.
+    /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's;
+    /// `bench mutants` breaks the diagnosis in many ways and sees whether the blind cases notice.
     Bench {
-        /// A benchmark (`crates/*/benches/NAME.rs`), the folder of a crate, or `train`; all but `train` when left out.
+        /// A benchmark (`crates/*/benches/NAME.rs`), the folder of a crate, `train` or `mutants`; all but these two when left out.
         name: Option<String>,
         /// For Criterion, as `--quick` or a filter; for `train` parts of the ids of the wanted rows.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
