@@ -174,7 +174,7 @@ pub fn diagnose(
     keep("labels", search::labels::search(&context, Side::Labels, &displaced));
     keep("objects", search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, SEARCHES, SEARCHES);
-    search::without_leftovers(&mut results, context.returns(&context.of(Role::HoldOut)));
+    search::leftovers::without_leftovers(&mut results, context.returns(&context.of(Role::HoldOut)));
     if let Some(note) = search::set_aside(&mut results) {
         notes.push(note);
     }

@@ -62,7 +62,8 @@ fn rows_in_turn<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<RowBlo
         sweep: Option<String>,
     }
     let pattern: Option<Pattern> = toml::Value::deserialize(deserializer)?.try_into().ok();
-    Ok(pattern.filter(|p| p.sweep.as_deref() != Some("columns")).map_or(vec![], |p| p.blocks))
+    let in_turn = pattern.filter(|p| p.sweep.as_deref().is_none_or(|s| s == "rows"));
+    Ok(in_turn.map_or(vec![], |p| p.blocks))
 }
 
 fn all_around() -> f64 {
@@ -97,6 +98,15 @@ impl SensorRig {
                 return Err(DataError::file(
                     path,
                     format!("sensor[{i}]: position within 100 m and finite angles are wanted"),
+                ));
+            }
+            let level = |b: &RowBlock| {
+                (1.0..=4096.0).contains(&b.rows) && b.top_deg.abs() <= 90.0 && b.bottom_deg.abs() <= 90.0
+            };
+            if !s.rows_in_turn.iter().all(level) {
+                return Err(DataError::file(
+                    path,
+                    format!("sensor[{i}]: pattern.blocks want rows from 1 to 4096 and angles within 90 degrees"),
                 ));
             }
             if !(s.horizontal_fov_deg > 0.0 && s.horizontal_fov_deg <= 360.0 && s.rate_hz > 0.0) {
@@ -144,8 +154,8 @@ impl SensorMount {
             return azimuth_rad / (2.0 * self.half_fov_rad());
         }
         let done = |b: &RowBlock| {
-            let below_top_deg = b.top_deg - elevation_rad.to_degrees();
-            b.rows * (below_top_deg / (b.top_deg - b.bottom_deg).max(1e-9)).clamp(0.0, 1.0)
+            let step_deg = ((b.top_deg - b.bottom_deg) / (b.rows - 1.0).max(1.0)).max(1e-9);
+            ((b.top_deg - elevation_rad.to_degrees()) / step_deg + 0.5).clamp(0.0, b.rows)
         };
         0.5 - self.rows_in_turn.iter().map(done).sum::<f64>() / all
     }
@@ -187,7 +197,7 @@ mod tests {
             "[{ rows = 30, top_deg = 10, bottom_deg = 0.0 }, { rows = 10, top_deg = -0.5, bottom_deg = -20.5 }]";
         let rows = rig(&format!("pattern = {{ blocks = {blocks}, columns = 400 }}\n"));
         for (elevation_deg, phase) in
-            [(12.0, 0.5), (10.0, 0.5), (5.0, 0.125), (-0.2, -0.25), (-10.5, -0.375), (-30.0, -0.5)]
+            [(12.0, 0.5), (10.0, 0.4875), (5.0, 0.125), (-0.5, -0.2625), (-10.5, -0.375), (-30.0, -0.5)]
         {
             assert!((rows.scan_phase(0.7, f64::to_radians(elevation_deg)) - phase).abs() < 1e-12, "{elevation_deg}");
         }

@@ -55,8 +55,6 @@ pub struct OddFrame {
     pub all: [f64; 2],
     /// Returns that beams would mix over the jumps of the simulated side, for each radian of their width.
     pub mixed_per_rad: f64,
-    /// Shots in directions in which a false return stands out: on smooth surfaces and in the open.
-    pub plain_shots: f64,
 }
 
 /// Where the simulation ends, m: but for a few, no return lies farther. Beyond it the measured side cannot be judged.
@@ -83,8 +81,6 @@ pub fn odd_frames(frames: &[FramePair], end_m: f64) -> Vec<OddFrame> {
                 }
             }
             out.mixed_per_rad = frame.mixed_per_rad * out.all[1];
-            let edges = frame.simulated.iter().filter(|r| !r.smooth).count();
-            out.plain_shots = (frame.shots - edges as f64).max(0.2 * frame.shots);
             out
         })
         .collect()

@@ -139,14 +139,14 @@ impl LossTable {
         sum
     }
 
-    /// Range beyond which one simulated return in fifty lies, m.
+    /// Range beyond which one simulated return in fifty lies, m; 0 where there are none.
     pub fn farthest_m(&self) -> f64 {
         self.last(|p| p.ln_range).exp()
     }
 
-    /// Cosine of incidence below which one simulated return in fifty is met.
+    /// Cosine of incidence below which one simulated return in fifty is met; 1 where there are none.
     pub fn most_grazing(&self) -> f64 {
-        (-self.last(|p| -p.ln_cos)).exp()
+        (-self.last(|p| -p.ln_cos)).exp().min(1.0)
     }
 
     /// The value that one return in fifty exceeds.

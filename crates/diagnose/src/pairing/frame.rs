@@ -67,10 +67,12 @@ impl Sensors {
         self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
     }
 
-    /// Shots of a scan; `None` where rows are not known.
-    fn shots(&self, sensor: usize) -> Option<f64> {
+    /// Shots of a scan over the azimuths that its returns span; `None` where rows are not known.
+    fn shots(&self, sensor: usize, scans: [&SensorScan; 2]) -> Option<f64> {
         let pattern = &self.patterns[sensor];
-        let columns = 2.0 * self.rig.sensors[sensor].half_fov_rad() / f64::from(pattern.steps.azimuth_rad);
+        let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
+        let [least, most] = [azimuths().fold(f32::MAX, f32::min), azimuths().fold(f32::MIN, f32::max)];
+        let columns = 1.0 + f64::from((most - least).max(0.0) / pattern.steps.azimuth_rad);
         (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.len() as f64 * columns.round())
     }
 
@@ -178,7 +180,7 @@ pub fn pair_frame(
             }
         }
         frame.mixed_per_rad += mixed_per_rad(&simulated, &sight.index);
-        frame.shots += sensors.shots(sensor).unwrap_or(measured.len() as f64);
+        frame.shots += sensors.shots(sensor, [a, b]).unwrap_or(measured.len() as f64);
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }

@@ -3,6 +3,7 @@
 pub mod geometry;
 pub mod hits;
 pub mod labels;
+pub mod leftovers;
 pub mod mask;
 pub mod noise;
 mod patch;
@@ -158,124 +159,6 @@ pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
     })
 }
 
-/// Share of a pose's gain below which a finding of another channel is what moving the scene back leaves.
-const LEFT_BY_A_POSE: f64 = 0.005;
-
-/// Share of the gain of offsets of rows below which a law of noise is what mending them leaves.
-const LEFT_BY_ROWS: f64 = 0.15;
-
-/// Share of the gain of losses below which a slight bias of range is a matter of which returns are left.
-const LEFT_BY_LOSSES: f64 = 0.04;
-
-/// Whether a finding is a bias of range of less than 4 cm at 30 m.
-fn slight_bias(f: &Found) -> bool {
-    let value = |name: &str| f.parameters.iter().find(|(n, _)| n == name).map_or(0.0, |(_, p)| p.estimate);
-    f.causes == ["range_bias"] && (value("offset_m") + 30.0 * value("scale")).abs() < 0.04
-}
-
-/// Nats a return below which a law of noise beside surfaces that stand elsewhere, slide or mix is what these leave.
-const LEFT_OF_NOISE: f64 = 0.03;
-
-/// Times the gain of rows that aim elsewhere below which a law of noise is what is left of the jumps between rows on the ground.
-const LEFT_BY_AIMS: f64 = 2.5;
-
-/// Share of the gain of rows that aim elsewhere below which the pose of a sensor is what their mean leaves.
-const LEFT_BY_ROWS_OF_A_POSE: f64 = 0.25;
-
-/// Share of what the own car hides below which a sensor's pose is a matter of which surfaces it still sees.
-const LEFT_BY_OWN_CAR: f64 = 0.05;
-
-/// Share of the gain of missing things below which mixed ranges are their returns.
-const LEFT_BY_THINGS: f64 = 0.05;
-
-/// Share of the gain of rows that aim elsewhere below which mixed ranges are returns of rows that see past edges.
-const LEFT_BY_AIMS_OF_MIXED: f64 = 0.1;
-
-/// Share of the gain of jitter below which mixed ranges are returns that it carried across edges.
-const LEFT_BY_JITTER: f64 = 0.001;
-
-/// Share of the gain of a sensor's pose below which things that only the simulation has are what this sensor looks over.
-const LEFT_BY_A_POSE_OF_THINGS: f64 = 0.1;
-
-/// Nats a return below which a law of noise beside surfaces that are off in a way without a name is a part of that, and share of what this
-/// gains below which poses and shifts of objects are.
-const LEFT_BY_THE_UNNAMED: [f64; 2] = [0.1, 0.25];
-
-/// Standard errors by which a sensor's pose must be off in one number: its six take up what is wrong with the few surfaces that it alone sees.
-const SURE_OF_A_SENSOR: f64 = 4.5;
-
-/// Whether a finding is more than chance on the frames that say how large it is: intervals of some number exclude 0, where it has any.
-fn speaks(f: &Found) -> bool {
-    let of_sensor = f.causes == ["sensor_extrinsics"];
-    let mut sizes = f.parameters.iter().map(|(_, p)| p).filter(|p| p.unit != "number").peekable();
-    let sure = |p: &Parameter| p.estimate.abs() > SURE_OF_A_SENSOR / 1.96 * (p.ci95[1] - p.ci95[0]) / 2.0;
-    sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0 && (!of_sensor || sure(p)))
-}
-
-/// Whether things are said to be in the simulation alone.
-fn things_too_many(f: &Found) -> bool {
-    f.causes == ["missing_object"] && f.parameters.iter().any(|(_, p)| p.estimate < 0.0)
-}
-
-/// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
-/// the frames that were held out.
-pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
-    let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
-    let most = |results: &[ChannelResult], of: &dyn Fn(&Found) -> bool| {
-        results.iter().flat_map(|r| &r.found).filter(|f| of(f)).map(gain).fold(0.0, f64::max)
-    };
-    let spoke: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
-    results.iter_mut().for_each(|r| r.found.retain(speaks));
-    let rows = most(results, &|f| f.causes.first().is_some_and(|c| c.starts_with("beam_")));
-    let aims = most(results, &|f| f.causes == ["beam_elevation_offset"]);
-    let things = most(results, &|f| f.causes == ["missing_object"]);
-    let jitter = most(results, &|f| f.causes == ["angular_jitter"]);
-    let losses = most(results, &|f| f.channel == "hits");
-    let hidden = most(results, &|f| f.causes == ["ego_occlusion"]);
-    let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
-    for result in results.iter_mut() {
-        let least = (LEFT_BY_OWN_CAR * hidden).max(LEFT_BY_ROWS_OF_A_POSE * aims);
-        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= least);
-        // Where far returns are lost, those that come back are the nearer ones.
-        result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
-        result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
-        // Things that stand before edges lie between what these show.
-        let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter).max(LEFT_BY_AIMS_OF_MIXED * aims);
-        result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= least);
-        // Things that move by themselves slide otherwise than what stands.
-        result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
-    }
-    let posed = |f: &Found| f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"));
-    let pose = most(results, &|f| f.channel == "residuals" && posed(f));
-    for result in results.iter_mut() {
-        result
-            .found
-            .retain(|f| !matches!(f.channel, "hits" | "roughness" | "returns") || gain(f) >= LEFT_BY_A_POSE * pose);
-        result.found.retain(|f| !things_too_many(f) || gain(f) >= LEFT_BY_A_POSE_OF_THINGS * pose);
-    }
-    let unnamed = |f: &Found| f.channel == "residuals" && f.status == Status::Unexplained;
-    let without_a_name = most(results, &unnamed);
-    if without_a_name > 0.0 {
-        let left = |f: &Found| match f.channel {
-            "roughness" => gain(f) < LEFT_BY_THE_UNNAMED[0] * returns,
-            "residuals" | "objects" => gain(f) < LEFT_BY_THE_UNNAMED[1] * without_a_name,
-            _ => false,
-        };
-        results.iter_mut().for_each(|r| r.found.retain(|f| !left(f)));
-    }
-    let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
-    if results.iter().flat_map(|r| &r.found).any(disturbs) {
-        let rough = |f: &Found| f.channel == "roughness" && gain(f) < LEFT_OF_NOISE * returns;
-        results.iter_mut().for_each(|r| r.found.retain(|f| !rough(f)));
-    }
-    // What mending leaves explains nothing, and no sensor model could close it.
-    for (result, spoke) in results.iter_mut().zip(spoke) {
-        if spoke && result.found.is_empty() {
-            result.distance.iter_mut().for_each(|d| (d[1], d[2]) = (0.0, 0.0));
-        }
-    }
-}
-
 /// Number of bootstrap repetitions.
 pub const REPETITIONS: usize = 400;
 
@@ -388,62 +271,4 @@ pub fn record(
 pub fn parameter(name: &str, estimate: f64, error: f64, unit: &str) -> (String, Parameter) {
     let half = 1.96 * error;
     (name.into(), Parameter { estimate, unit: unit.into(), ci95: [estimate - half, estimate + half] })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn found(cause: &str, channel: &'static str, gain: f64, parameters: Vec<(String, Parameter)>) -> Found {
-        Found {
-            status: if cause.is_empty() { Status::Unexplained } else { Status::Named },
-            causes: if cause.is_empty() { vec![] } else { vec![cause.into()] },
-            family: "",
-            parameters,
-            confidence: 1.0,
-            channel,
-            covariate: String::new(),
-            held_out_gains: vec![gain; 10],
-            says: String::new(),
-            separate_by: None,
-            curve: Curve { x: String::new(), y: String::new(), points: vec![] },
-        }
-    }
-
-    /// What is left of findings beside the first, on 1,000 returns held out.
-    fn left(all: Vec<Found>) -> Vec<String> {
-        let mut results: Vec<ChannelResult> =
-            all.into_iter().map(|f| ChannelResult { found: vec![f], ..ChannelResult::default() }).collect();
-        without_leftovers(&mut results, 1000.0);
-        results.into_iter().skip(1).flat_map(|r| r.found).flat_map(|f| f.causes).collect()
-    }
-
-    #[test]
-    fn what_others_leave_is_dropped_and_what_stands_for_itself_is_kept() {
-        let number = |name: &str, value: f64| vec![parameter(name, value, 0.1 * value.abs(), "1")];
-        let cases = [
-            // (first, its gain), (second, its channel, its size, gain that is left over, gain that stands for itself)
-            (("beam_elevation_offset", "residuals", 3.0), ("mixed_pixels", "returns", 0.003, 0.2, 0.4)),
-            (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", -0.005, 3.0, 5.0)),
-            (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", 0.005, 0.1, 3.0)),
-            (("", "residuals", 1.0), ("range_noise", "roughness", 0.02, 9.0, 11.0)),
-        ];
-        for ((first, channel, gain), (second, of, size, left_over, itself)) in cases {
-            let beside =
-                |g| left(vec![found(first, channel, gain, number("a", 1.0)), found(second, of, g, number("b", size))]);
-            assert!(beside(left_over).is_empty(), "{second} {left_over}");
-            assert_eq!(beside(itself), [second]);
-        }
-    }
-
-    #[test]
-    fn an_interval_about_nothing_is_no_finding() {
-        let sensor = || ("sensor".to_owned(), Parameter { estimate: 2.0, unit: "number".into(), ci95: [2.0, 2.0] });
-        let about =
-            |value: f64| found("time_offset", "objects", 1.0, vec![sensor(), parameter("offset_s", value, 0.003, "s")]);
-        let first = || found("range_bias", "residuals", 1.0, vec![]);
-        assert!(left(vec![first(), about(-0.0006)]).is_empty());
-        assert_eq!(left(vec![first(), about(-0.02)]), ["time_offset"]);
-        assert_eq!(left(vec![first(), found("missing_object", "returns", 1.0, vec![])]), ["missing_object"]);
-    }
 }

@@ -1,7 +1,10 @@
 //! Returns too many: false alarms, mixed ranges at edges, things that the simulation has not got.
 
+mod alarms;
+
+use self::alarms::{Alarms, alarms};
 use super::{ChannelResult, Context, Found, Z_STAR, parameter};
-use crate::channels::returns::{self, ODD, OWN_CAR_M, Odd, OddFrame, end_m, odd_frames};
+use crate::channels::returns::{self, ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::{FOLDS, fold_of};
@@ -151,12 +154,9 @@ fn found(
     let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
     let (covariate, says) = match kind {
         Odd::Alone => {
-            let reach_m = reach_m(context, estimate);
-            // They are counted between these ranges; those that fall onto a surface by chance are not seen.
-            let counted = ((end_m - OWN_CAR_M) / reach_m).clamp(0.05, 1.0) * 0.97;
-            let a_shot = sum(|f| f.all[0]) / sum(|f| f.plain_shots).max(1.0) / counted;
-            let rate = share * a_shot;
-            parameters.push(parameter("rate", rate, (error * a_shot).hypot(0.08 * rate), "1"));
+            let Alarms { rate, reach_m } = alarms(context, estimate, end_m);
+            let form = (error / share.abs().max(1e-9)).hypot(0.08);
+            parameters.push(parameter("rate", rate, form * rate, "1"));
             parameters.push(parameter("reach_m", reach_m, 0.05 * reach_m, "m"));
             (
                 "none",
@@ -221,16 +221,6 @@ fn found(
         separate_by: None,
         curve: curve(context, kind, estimate),
     }
-}
-
-/// Range up to which returns stand alone where nothing is, m: 99 of 100 are nearer than 0.99 of it.
-fn reach_m(context: &Context, frames: &[usize]) -> f64 {
-    let alone = |r: &&Ray| returns::odd(r) == Some(Odd::Alone);
-    let mut ranges: Vec<f64> =
-        frames.iter().flat_map(|&f| context.frames[f].measured.iter().filter(alone)).map(Ray::own_range_m).collect();
-    ranges.sort_by(f64::total_cmp);
-    let most = (0.99 * ranges.len().saturating_sub(1) as f64).round() as usize;
-    ranges.get(most).map_or(OWN_CAR_M, |r| r / 0.99)
 }
 
 /// Share of such returns by range.

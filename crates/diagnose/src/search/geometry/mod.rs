@@ -175,7 +175,8 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
 /// Of offsets of rows in range and in elevation the one that is surer over frames is kept: the other one fits few rays at grazing angles, by much, on some.
 fn surer_rows(trials: &mut [Trial], candidates: &[&Suspect]) {
     let z = |t: &Trial| total_and_z(&t.gains).1;
-    let of_rows = |t: &Trial| matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
+    let of_rows =
+        |t: &Trial| t.above_floor && matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
     let best = trials.iter().filter(|t| of_rows(t)).map(z).fold(0.0, f64::max);
     trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= z(t) >= best);
 }

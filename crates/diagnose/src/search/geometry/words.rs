@@ -66,8 +66,9 @@ pub(super) fn found(
                 parameters.push(parameter(label, std * unit.0, (error.hypot(0.05 * std)) * unit.0, unit.1));
             }
             // Rows that are hardly known are as far off as the others are.
-            let own = if std > 0.0 { 1.0 / (std * std) } else { 0.0 };
-            let fit = GroupFit { precision: own.max(how(*column).precision), ..how(*column) };
+            let least = FLOOR_GROUPS[if *grouping == Grouping::Row { *column } else { 2 }];
+            let precision = std.max(least).powi(-2).max(how(*column).precision);
+            let fit = GroupFit { precision, ..how(*column) };
             let offsets = grouped::offsets(&all, fit);
             if name != UNNAMED {
                 for (k, v) in &offsets {
@@ -77,7 +78,7 @@ pub(super) fn found(
                     parameters.push(parameter(&label, v * unit.0, e * unit.0, unit.1));
                 }
             }
-            let curve = group_curve(&all, &offsets, *grouping, *column, unit.0);
+            let curve = group_curve(&all, &offsets, *grouping, fit, unit.0);
             match (grouping, column) {
                 (Grouping::Row, 0) => (
                     "row".to_owned(),
@@ -138,6 +139,7 @@ pub(super) fn found(
 /// (turns, then shifts). Nothing where fewer than two others are there.
 fn others_see(sums: &Sums, estimate: &[usize], blocks: &[usize], columns: &[usize], chosen: &[Suspect]) -> [f64; 6] {
     let pose = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
+    let number = |c: usize| if let Column::SensorPose(_, k) = sums.columns[c] { Some(k) } else { None };
     let spoken = split(chosen).0;
     let others: Vec<usize> = (0..sums.poses.first().map_or(0, Vec::len))
         .filter(|s| spoken.iter().filter_map(pose).all(|chosen| chosen != *s))
@@ -148,16 +150,23 @@ fn others_see(sums: &Sums, estimate: &[usize], blocks: &[usize], columns: &[usiz
     let frames: Vec<&LinearFrame> = estimate.iter().map(|&i| &sums.linear[i]).collect();
     let mut squares = [0.0; 6];
     for other in &others {
-        let own: Vec<usize> = (0..sums.columns.len()).filter(|c| pose(c) == Some(*other)).collect();
+        // In the numbers that the finding has.
+        let like = |c: &&usize| matches!(sums.columns[**c], Column::SensorPose(..));
+        let numbers: Vec<usize> = columns.iter().filter(like).filter_map(|c| number(*c)).collect();
+        let own: Vec<usize> = (0..sums.columns.len())
+            .filter(|c| pose(c) == Some(*other) && number(*c).is_some_and(|k| numbers.contains(&k)))
+            .collect();
         let with: Vec<usize> = sums.base.iter().chain(&spoken).chain(&own).copied().collect();
         let fitted = fit(&frames, blocks, &with, &sums.precision);
-        for (k, square) in squares.iter_mut().enumerate() {
-            let i = with.len() - 6 + k;
-            *square += (fitted.theta[i].powi(2) - fitted.error(i).powi(2)).max(0.0);
+        for (i, c) in own.iter().enumerate() {
+            let at = with.len() - own.len() + i;
+            let Some(k) = number(*c) else { continue };
+            squares[k] += (fitted.theta[at].powi(2) - fitted.error(at).powi(2)).max(0.0);
         }
     }
-    // One is held against the mean of the others: of two against each other by their difference.
-    squares.map(|s| (0.75 * s / others.len() as f64).sqrt())
+    // One of them is held against the other others, the finding against all of them.
+    let n = others.len() as f64;
+    squares.map(|s| ((n * n - 1.0) / (n * n) * s / n).sqrt())
 }
 
 fn linear_parameters(
@@ -236,7 +245,7 @@ fn group_curve(
     sums: &BTreeMap<u32, GroupSums>,
     offsets: &BTreeMap<u32, f64>,
     grouping: Grouping,
-    column: usize,
+    fit: GroupFit,
     unit: f64,
 ) -> Curve {
     let points = offsets.iter().map(|(k, v)| {
@@ -246,11 +255,11 @@ fn group_curve(
         } else {
             place.to_degrees() + 1000.0 * sensor as f64
         };
-        let error = 1.0 / (sums[k].gram[2 * column] + how(column).precision).sqrt();
+        let error = 1.0 / (sums[k].gram[2 * fit.column] + fit.precision).sqrt();
         CurvePoint { x, measured: v * unit, before: 0.0, after: v * unit, error: error * unit }
     });
     let x = if grouping == Grouping::Row { "row (1000 a sensor)" } else { "azimuth, degrees (1000 a sensor)" };
-    let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
+    let y = if fit.column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
     Curve { x: x.into(), y: y.into(), points: points.collect() }
 }
 
