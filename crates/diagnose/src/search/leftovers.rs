@@ -107,15 +107,16 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     if without_a_name > 0.0 {
         let curves = results.iter().flat_map(|r| &r.found).filter(|f| unnamed(f)).flat_map(|f| &f.curve.points);
         let off_m = curves.map(|p| p.measured.abs()).fold(0.0, f64::max);
-        let largest_m = |f: &Found| {
-            let lengths = f.parameters.iter().filter(|(_, p)| p.unit == "m");
-            lengths.map(|(_, p)| p.estimate.abs()).fold(0.0, f64::max)
+        let shifts_by_less = |f: &Found, m: f64| {
+            let mut lengths =
+                f.parameters.iter().filter(|(_, p)| p.unit == "m").map(|(_, p)| p.estimate.abs()).peekable();
+            lengths.peek().is_some() && lengths.all(|l| l < m)
         };
         let left = |f: &Found| match f.channel {
             "roughness" => gain(f) < LEFT_BY_THE_UNNAMED[0] * returns,
             "residuals" => posed(f) && gain(f) < LEFT_BY_THE_UNNAMED[1] * without_a_name,
             // A scan that shears the scene makes such surfaces itself.
-            "objects" => f.causes != ["rolling_shutter"] && largest_m(f) < LEFT_BY_THE_UNNAMED[2] * off_m,
+            "objects" => f.causes != ["rolling_shutter"] && shifts_by_less(f, LEFT_BY_THE_UNNAMED[2] * off_m),
             _ => false,
         };
         results.iter_mut().for_each(|r| r.found.retain(|f| !left(f)));
