@@ -150,7 +150,7 @@ fn run(tree: &Path, folder: &Path, list: &List) -> Result<Score> {
         fs_err::remove_dir_all(&out)?;
     }
     let mut command = cargo(tree);
-    command.env("CARGO_TARGET_DIR", folder.join("target"));
+    command.env("CARGO_TARGET_DIR", folder.join("target")).env("CARGO_PROFILE_BENCH_INCREMENTAL", "true");
     command.args(["bench", "--quiet", "--package", "lidarshift-blind", "--bench", "blind", "--"]);
     for kind in &list.kinds {
         command.args(["--kind", kind]);
