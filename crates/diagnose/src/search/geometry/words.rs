@@ -138,29 +138,23 @@ pub(super) fn found(
 /// By how much sensors that are mounted well would be said to be mounted otherwise, beyond chance: what the form of a sensor's pose is wrong by
 /// (turns, then shifts). Nothing where fewer than two others are there.
 fn others_see(sums: &Sums, estimate: &[usize], blocks: &[usize], columns: &[usize], chosen: &[Suspect]) -> [f64; 6] {
-    let pose = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
-    let number = |c: usize| if let Column::SensorPose(_, k) = sums.columns[c] { Some(k) } else { None };
+    let pose = |c: usize| if let Column::SensorPose(s, k) = sums.columns[c] { Some((s, k)) } else { None };
     let spoken = split(chosen).0;
-    let others: Vec<usize> = (0..sums.poses.first().map_or(0, Vec::len))
-        .filter(|s| spoken.iter().filter_map(pose).all(|chosen| chosen != *s))
-        .collect();
-    if others.len() < 2 || !columns.iter().any(|c| pose(c).is_some()) {
+    let displaced: Vec<usize> = spoken.iter().filter_map(|c| Some(pose(*c)?.0)).collect();
+    let others: Vec<usize> = (0..sums.poses.first().map_or(0, Vec::len)).filter(|s| !displaced.contains(s)).collect();
+    // The numbers that the finding has.
+    let numbers: Vec<usize> = columns.iter().filter_map(|c| Some(pose(*c)?.1)).collect();
+    if others.len() < 2 || numbers.is_empty() {
         return [0.0; 6];
     }
     let frames: Vec<&LinearFrame> = estimate.iter().map(|&i| &sums.linear[i]).collect();
     let mut squares = [0.0; 6];
     for other in &others {
-        // In the numbers that the finding has.
-        let like = |c: &&usize| matches!(sums.columns[**c], Column::SensorPose(..));
-        let numbers: Vec<usize> = columns.iter().filter(like).filter_map(|c| number(*c)).collect();
-        let own: Vec<usize> = (0..sums.columns.len())
-            .filter(|c| pose(c) == Some(*other) && number(*c).is_some_and(|k| numbers.contains(&k)))
-            .collect();
-        let with: Vec<usize> = sums.base.iter().chain(&spoken).chain(&own).copied().collect();
+        let of_other = |c: usize| pose(c).filter(|(s, k)| s == other && numbers.contains(k));
+        let own = (0..sums.columns.len()).filter(|c| of_other(*c).is_some());
+        let with: Vec<usize> = sums.base.iter().chain(&spoken).copied().chain(own).collect();
         let fitted = fit(&frames, blocks, &with, &sums.precision);
-        for (i, c) in own.iter().enumerate() {
-            let at = with.len() - own.len() + i;
-            let Some(k) = number(*c) else { continue };
+        for (at, (_, k)) in with.iter().enumerate().filter_map(|(at, c)| Some((at, of_other(*c)?))) {
             squares[k] += (fitted.theta[at].powi(2) - fitted.error(at).powi(2)).max(0.0);
         }
     }
