@@ -268,7 +268,7 @@ impl<'a> Sight<'a> {
             return ray;
         };
         ray.near_far_m = surface.near_far_m.map(|v| v as f32);
-        ray.smooth = surface.misfit_m < self.sensors.edge_m;
+        ray.smooth = surface.smooth(self.sensors.edge_m);
         if !ray.smooth {
             ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
             return ray;

@@ -135,7 +135,7 @@ fn distance(
             // Far ground is the same in every frame; what stands is not.
             let weight = if s.cos_incidence > 0.15 { 1.0 } else { 0.2 };
             let off = ((f64::from(a.range_m[i]) - s.range_m) * s.cos_incidence).abs();
-            sum += weight * if s.misfit_m < sensors.edge_m { off.min(1.0) } else { (off - s.misfit_m).clamp(0.0, 1.0) };
+            sum += weight * if s.smooth(sensors.edge_m) { off.min(1.0) } else { (off - s.misfit_m).clamp(0.0, 1.0) };
             count += weight;
         }
     }

@@ -18,6 +18,8 @@ pub struct LocalSurface {
     pub leverage: f64,
     /// Largest distance of a neighbour from the plane, across it, m.
     pub misfit_m: f64,
+    /// Largest distance of a neighbour from the plane along its ray, m.
+    pub misfit_along_m: f64,
     /// Nearest and farthest neighbour, m.
     pub near_far_m: [f64; 2],
     /// Range of the neighbour closest in direction minus what the plane says of it, m: by how much the surface is not flat there.
@@ -26,6 +28,10 @@ pub struct LocalSurface {
 
 /// At least that many neighbours make a surface.
 const FEWEST: usize = 5;
+
+/// Share of the way from the nearest to the farthest neighbour, and m, that one may lie off a plane along its ray: between the top of a wall and the road
+/// behind it a plane fits that is met at a grazing angle, and nothing is far from it across.
+const ALONG: (f64, f64) = (0.15, 0.5);
 
 /// Fits the surface around a direction; `keep` chooses the neighbours. `None` where there are too few, or they lie on a line.
 pub fn fit_surface(
@@ -71,7 +77,7 @@ pub fn fit_surface(
     }
     let range = 1.0 / q0;
     // Effective weights: derivative of q0 by each q.
-    let (mut leverage, mut misfit) = (0.0f64, 0.0f64);
+    let (mut leverage, mut misfit, mut along) = (0.0f64, 0.0f64, 0.0f64);
     let mut near_far = [f64::INFINITY, 0.0f64];
     let (mut closest, mut bulge) = (f64::INFINITY, 0.0);
     let (gx, gy) = (bx / window[0] / f64::from(el.cos()), by / window[1]);
@@ -84,6 +90,7 @@ pub fn fit_surface(
         leverage += (share * (q / q0).powi(2)).powi(2);
         let predicted = q0 + bx * x + by * y;
         let off = if predicted > 1e-4 { (1.0 / q - 1.0 / predicted).abs() } else { f64::INFINITY };
+        along = along.max(off);
         misfit = misfit.max(off * cos * (1.0 / predicted.max(1e-4)).min(range) / range.max(1.0 / predicted.max(1e-4)));
         near_far = [near_far[0].min(1.0 / q), near_far[1].max(1.0 / q)];
         let distance = x * x + y * y;
@@ -97,12 +104,19 @@ pub fn fit_surface(
         cos_incidence: cos,
         leverage,
         misfit_m: misfit,
+        misfit_along_m: along,
         near_far_m: near_far,
         bulge_m: bulge,
     })
 }
 
 impl LocalSurface {
+    /// Whether the neighbours lie on one surface: within `edge_m` of the plane across it, and no farther along their rays than on a plane met like this one.
+    pub fn smooth(&self, edge_m: f64) -> bool {
+        let [near, far] = self.near_far_m;
+        self.misfit_m < edge_m && self.misfit_along_m < (ALONG.0 * (far - near)).max(ALONG.1)
+    }
+
     /// Unit normal towards the sensor, in the basis (along the ray, along growing azimuth, along growing elevation).
     pub fn normal(&self) -> [f64; 3] {
         let c = self.cos_incidence;
@@ -149,13 +163,34 @@ mod tests {
             let range = h / normal.dot(&u);
             assert!((s.range_m - range).abs() < 2e-3, "{} {range}", s.range_m);
             assert!((s.cos_incidence / normal.dot(&u).abs() - 1.0).abs() < 0.01);
-            assert!(s.misfit_m < 1e-2 && s.leverage < 0.5, "{s:?}");
+            assert!(s.misfit_m < 1e-2 && s.smooth(0.12) && s.leverage < 0.5, "{s:?}");
             let side = Vector3::new(-az.sin(), az.cos(), 0.0);
             let up = u.cross(&side);
             let [a, b, c] = s.normal();
             let n = u * a + side * b + up * c;
             assert!((n + normal).norm() < 0.02, "{n} {normal}");
         }
+    }
+
+    #[test]
+    fn the_top_of_a_wall_and_the_road_behind_it_are_no_grazing_plane() {
+        let (mut scan, step) = (SensorScan::default(), 0.01);
+        for row in -3..4 {
+            for i in -10..10 {
+                let (az, el) = (0.1 * step * f64::from(i), -0.04 + step * f64::from(row));
+                let road = 1.5 / -el.sin();
+                scan.azimuth_rad.push(az as f32);
+                scan.elevation_rad.push(el as f32);
+                scan.range_m.push(if row < 0 { 0.4 * road } else { road } as f32);
+            }
+        }
+        let window = [0.22 * step, 1.4 * step];
+        let index =
+            DirectionIndex::new(&scan, Steps { azimuth_rad: window[0] as f32, elevation_rad: window[1] as f32 }, false);
+        let at = |el: f64| fit_surface(&index, window, 1e-4, el as f32, |_| true).unwrap();
+        let (edge, road) = (at(-0.05), at(-0.03));
+        assert!(road.smooth(0.12) && (road.cos_incidence / 0.03 - 1.0).abs() < 0.02, "{road:?}");
+        assert!(!edge.smooth(0.12), "{edge:?}");
     }
 
     #[test]
