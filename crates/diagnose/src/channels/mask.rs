@@ -93,6 +93,9 @@ const FEWEST: f64 = 15.0;
 /// Cells that what stands in the way covers at least.
 const FEWEST_CELLS: usize = 4;
 
+/// Cells of what stands so near that it reaches over an end of the field of view.
+const REACHES_OVER: usize = 100;
+
 /// Measured returns from the own car, of the simulated ones from beyond it: from this share on the own car hides a cell.
 const ON_OWN_CAR: f64 = 0.4;
 
@@ -113,7 +116,8 @@ pub enum Shown {
 /// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
 /// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not;
 /// where it was moved back, on all sides but one, where the field of view ends. Where returns come from the own car beside them the field of view
-/// may end there as well, but not above, where the scene ends. Where the scene is not shown in its place, returns from the own car are
+/// may end there as well, but not above, where the scene ends. What hides a whole side of the field of view ends upright: laws of losses do not,
+/// and sensors that aim elsewhere lose less at their ends. Where the scene is not shown in its place, returns from the own car are
 /// believed, and beside them cells from which nothing at all comes back.
 pub fn blocked_cells(
     counts: &DirectionCounts,
@@ -146,9 +150,16 @@ pub fn blocked_cells(
             SIDES.map(|(a, e)| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len())
         };
         let opposite = |[left, right, above, below]: [bool; 4]| left && right || above && below;
+        let rows_of =
+            |cells: &mut dyn Iterator<Item = &DirectionCell>| cells.map(|c| c.2).collect::<BTreeSet<_>>().len();
+        let upright =
+            |a: i32| 4 * rows_of(&mut together.iter().filter(|c| open(**c, a, 0))) >= 3 * rows_of(&mut together.iter());
+        let reaches_over = shown == Shown::InPlace && together.len() >= REACHES_OVER && (upright(1) || upright(-1));
         let on_own_car = together.iter().filter(|c| covered(c)).count() >= 2;
         let stands_out = together.len() >= FEWEST_CELLS
-            && (opposite(on(&open)) || on_own_car && opposite(on(&|c, a, e| open(c, a, e) || ends(c, a, e))));
+            && (opposite(on(&open))
+                || reaches_over
+                || on_own_car && opposite(on(&|c, a, e| open(c, a, e) || ends(c, a, e))));
         let all_around = || {
             let (opens, closes) = (on(&open), on(&ends));
             opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k])
@@ -288,6 +299,14 @@ mod tests {
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
         assert!(blocked_cells(&counts, Shown::InPlace, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
+        // A plate close to the sensor that hides one side of the field of view, and the sky above it; a shorter side is one that aims elsewhere.
+        for (from, found) in [(-20, 130), (-13, 0)] {
+            let mut side = DirectionCounts::new();
+            for (az, el) in (from..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
+                side.insert((0, az, el), [100.0, if az < -7 { 0.0 } else { 97.0 }, 0.0, 0.0]);
+            }
+            assert_eq!(blocked_cells(&side, Shown::InPlace, |_| 1.0).len(), found);
+        }
         // A plate that reaches below the field of view and gives returns along its upper edge alone.
         let mut low = DirectionCounts::new();
         for (az, el) in (-20..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
