@@ -31,8 +31,8 @@ use rayon::prelude::*;
 const FLOOR_OFFSET_M: f64 = 0.012;
 const FLOOR_TURN_RAD: f64 = 5.2e-4;
 const FLOOR_SHIFT_M: f64 = 0.04;
-/// Smaller turns of one sensor are not spoken of, rad: 4 cm at 50 m.
-const FLOOR_SENSOR_RAD: f64 = 8e-4;
+/// Smaller turns of one sensor are not spoken of, rad: 4 cm at 50 m; and where fewer than two others tell what the form of a pose is wrong by.
+const FLOOR_SENSOR_RAD: [f64; 2] = [8e-4, 1.2e-3];
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
 
@@ -172,13 +172,17 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     (result, out)
 }
 
-/// Of offsets of rows in range and in elevation the one that is surer over frames is kept: the other one fits few rays at grazing angles, by much, on some.
+/// Share of the z of the surer of two offsets of rows from which on the other one is as sure.
+const AS_SURE: f64 = 0.75;
+
+/// Offsets of rows in range or in elevation that are less sure over frames than the other ones are dropped: they fit few rays at grazing angles, by much, on
+/// some frames.
 fn surer_rows(trials: &mut [Trial], candidates: &[&Suspect]) {
     let z = |t: &Trial| total_and_z(&t.gains).1;
     let of_rows =
         |t: &Trial| t.above_floor && matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
     let best = trials.iter().filter(|t| of_rows(t)).map(z).fold(0.0, f64::max);
-    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= z(t) >= best);
+    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= z(t) >= AS_SURE * best);
 }
 
 fn sums(context: &Context, select: &[usize]) -> Sums {
@@ -291,6 +295,12 @@ fn gains(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) 
     out
 }
 
+impl Sums {
+    fn floor_sensor_rad(&self) -> f64 {
+        FLOOR_SENSOR_RAD[usize::from(self.poses.first().is_none_or(|p| p.len() < 3))]
+    }
+}
+
 fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
     if grouping == Grouping::Row { &sums.rows.whole } else { &sums.strips.whole }
 }
@@ -330,7 +340,7 @@ fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Susp
                             > match sums.columns[*c] {
                                 Column::RangeOffset | Column::RangeScale => f64::INFINITY,
                                 Column::Pose(0..3) => FLOOR_TURN_RAD,
-                                Column::SensorPose(_, 0..3) => FLOOR_SENSOR_RAD,
+                                Column::SensorPose(_, 0..3) => sums.floor_sensor_rad(),
                                 Column::Pose(_) | Column::SensorPose(..) => FLOOR_SHIFT_M,
                                 Column::Sweep(k) => {
                                     if k < 2 {
@@ -405,5 +415,9 @@ mod tests {
         let mut trials = vec![trial(0, vec![20.0; 20]), trial(1, some), trial(2, vec![1.0; 20])];
         surer_rows(&mut trials, &suspects.iter().collect::<Vec<_>>());
         assert_eq!(trials.iter().map(|t| t.above_floor).collect::<Vec<_>>(), [true, false, true]);
+        // As sure, next to: the gain decides.
+        let mut trials = vec![trial(0, vec![18.0, 22.0, 20.0]), trial(1, vec![9.2, 10.8, 10.0])];
+        surer_rows(&mut trials, &suspects.iter().collect::<Vec<_>>());
+        assert!(trials.iter().all(|t| t.above_floor));
     }
 }
