@@ -71,6 +71,14 @@ pub fn significant(gains: &[f64], z_least: f64) -> bool {
     z > z_least || z > 1.5 && consistent(gains)
 }
 
+/// Whether differences point the same way on so many frames that chance does not, by `z_least` standard errors, however unlike their sizes are (the sign test;
+/// frames without a difference do not count).
+pub fn significant_by_signs(differences: &[f64], z_least: f64) -> bool {
+    let more = differences.iter().filter(|d| **d > 0.0).count() as f64;
+    let less = differences.iter().filter(|d| **d < 0.0).count() as f64;
+    more - less > z_least * (more + less).sqrt()
+}
+
 /// Chooses, or finds nothing worth choosing.
 pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let eligible: Vec<usize> = (0..trials.len())
@@ -157,6 +165,15 @@ mod tests {
         assert!(total_and_z(&some).1 < 3.0 && significant(&some, 3.0));
         assert!(!significant(&some.map(|g| if g < 1.0 { g - 100.0 } else { g }), 3.0));
         assert!(!significant(&[0.0, 900.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], 3.0), "one frame is chance");
+    }
+
+    #[test]
+    fn many_frames_that_point_the_same_way_are_no_chance() {
+        let seldom = [28.0, 11.0, 9.0, 0.0, 18.0, 23.0, 313.0, 462.0, 15.0, 4.0, 1.0, 0.0];
+        assert!(total_and_z(&seldom).1 < 2.0 && significant_by_signs(&seldom, 3.0));
+        let half = |i: usize| if i.is_multiple_of(3) { -1.0 } else { 1.0 };
+        assert!(!significant_by_signs(&(0..30).map(half).collect::<Vec<_>>(), 3.0));
+        assert!(!significant_by_signs(&[9.0; 9], 3.0) && !significant_by_signs(&[], 3.0));
     }
 
     #[test]

@@ -36,6 +36,9 @@ const LEFT_BY_THINGS: f64 = 0.05;
 /// Share of the gain of rows that aim elsewhere below which mixed ranges are returns of rows that see past edges.
 const LEFT_BY_AIMS_OF_MIXED: f64 = 0.1;
 
+/// Share of returns below which things beside objects of another shape are parts of these.
+const LEFT_BY_SHAPES: f64 = 0.004;
+
 /// Share of the gain of jitter below which mixed ranges are returns that it carried across edges.
 const LEFT_BY_JITTER: f64 = 0.001;
 
@@ -49,8 +52,21 @@ const LEFT_BY_THE_UNNAMED: [f64; 3] = [0.1, 0.25, 1.5];
 /// Standard errors by which a sensor's pose must be off in one number: its six take up what is wrong with the few surfaces that it alone sees.
 const SURE_OF_A_SENSOR: f64 = 4.5;
 
-/// Numbers that say what form an effect has, not how large it is.
-const FORM: [&str; 6] = ["reach_m", "divergence_rad", "most", "steepness", "share_on_comb", "simulated_std_m"];
+/// Numbers that say what form an effect has and where it begins, not how large it is.
+const FORM: [&str; 11] = [
+    "reach_m",
+    "divergence_rad",
+    "share_on_comb",
+    "simulated_std_m",
+    // Of laws of losses.
+    "most",
+    "steepness",
+    "half_at_m",
+    "cos_half",
+    "threshold",
+    "brighter_standing",
+    "brighter_objects",
+];
 
 /// Whether a finding is more than chance on the frames that say how large it is: intervals of some number exclude 0, where it has any.
 fn speaks(f: &Found) -> bool {
@@ -61,9 +77,14 @@ fn speaks(f: &Found) -> bool {
     sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0 && (!of_sensor || sure(p)))
 }
 
+/// The share of returns that a finding tells of.
+fn share_of(f: &Found) -> f64 {
+    f.parameters.iter().find(|(name, _)| name == "share").map_or(0.0, |(_, p)| p.estimate)
+}
+
 /// Whether things are said to be in the simulation alone.
 fn things_too_many(f: &Found) -> bool {
-    f.causes == ["missing_object"] && f.parameters.iter().any(|(_, p)| p.estimate < 0.0)
+    f.causes == ["missing_object"] && share_of(f) < 0.0
 }
 
 /// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
@@ -81,6 +102,7 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let jitter = most(results, &|f| f.causes == ["angular_jitter"]);
     let losses = most(results, &|f| f.channel == "hits");
     let hidden = most(results, &|f| f.causes == ["ego_occlusion"]);
+    let shapes = results.iter().flat_map(|r| &r.found).any(|f| f.causes.iter().any(|c| c == "wrong_shape"));
     let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
     for result in results.iter_mut() {
         let least = (LEFT_BY_OWN_CAR * hidden).max(LEFT_BY_ROWS_OF_A_POSE * aims);
@@ -91,6 +113,7 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
         // Things that stand before edges lie between what these show.
         let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter).max(LEFT_BY_AIMS_OF_MIXED * aims);
         result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= least);
+        result.found.retain(|f| !(shapes && f.causes == ["missing_object"] && share_of(f) < LEFT_BY_SHAPES));
         // Things that move by themselves slide otherwise than what stands.
         result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
     }
@@ -176,8 +199,9 @@ mod tests {
             (("", "residuals", 1.0), ("range_noise", "roughness", 0.02, 9.0, 11.0)),
         ];
         for ((first, channel, gain), (second, of, size, left_over, itself)) in cases {
-            let beside =
-                |g| left(vec![found(first, channel, gain, number("a", 1.0)), found(second, of, g, number("b", size))]);
+            let beside = |g| {
+                left(vec![found(first, channel, gain, number("a", 1.0)), found(second, of, g, number("share", size))])
+            };
             assert!(beside(left_over).is_empty(), "{second} {left_over}");
             assert_eq!(beside(itself), [second]);
         }
@@ -192,5 +216,12 @@ mod tests {
         assert!(left(vec![first(), about(-0.0006)]).is_empty());
         assert_eq!(left(vec![first(), about(-0.02)]), ["time_offset"]);
         assert_eq!(left(vec![first(), found("missing_object", "returns", 1.0, vec![])]), ["missing_object"]);
+        let things = |share: f64| found("missing_object", "returns", 1.0, vec![parameter("share", share, 0.0003, "1")]);
+        let shapes = || found("wrong_shape", "objects", 1.0, vec![]);
+        assert!(left(vec![shapes(), things(0.002)]).is_empty(), "parts of larger objects");
+        assert_eq!(left(vec![first(), things(0.002)]), ["missing_object"]);
+        // Half of such a law may lie at no angle that there is.
+        let grazing = vec![parameter("cos_half", 0.001, 0.01, "1"), parameter("steepness", 0.3, 0.02, "1")];
+        assert_eq!(left(vec![first(), found("incidence_dropout", "hits", 1.0, grazing)]), ["incidence_dropout"]);
     }
 }

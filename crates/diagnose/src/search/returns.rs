@@ -6,13 +6,19 @@ use self::alarms::{Alarms, alarms};
 use super::{ChannelResult, Context, Found, Z_STAR, parameter};
 use crate::channels::returns::{self, ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
-use crate::inference::choice::{significant, total_and_z};
+use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
 
 /// Share of returns below which nothing is said, by kind.
-const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.003, 0.003];
+const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.0025];
+
+/// Times as many returns on one side of surfaces as on the other, from which on something was added, or is missing.
+const ONE_SIDED: f64 = 2.0;
+
+/// Standard errors, by the signs of frames (ten of ten have more of it), from which on something is seen, and from which on other frames show it again.
+const SURE_BY_SIGNS: [f64; 2] = [3.0, 2.0];
 
 /// A beam's width, which follows from what a disc of even light would mix, is known within this factor.
 const WIDTH_FACTOR: f64 = 5.0;
@@ -35,20 +41,24 @@ pub fn search(context: &Context) -> ChannelResult {
         let (total, z) = total_and_z(&gains);
         let [base, more] = excess_of(&select, k);
         // How much more there is on each frame by itself.
-        let differences: Vec<f64> = select
-            .iter()
-            .map(|&i| odd[i].counts[k][0] / odd[i].all[0].max(1.0) - odd[i].counts[k][1] / odd[i].all[1].max(1.0))
-            .collect();
+        let more_on_each = |frames: &[usize]| -> Vec<f64> {
+            let share = |i: usize, side: usize| odd[i].counts[k][side] / odd[i].all[side].max(1.0);
+            frames.iter().map(|&i| share(i, 0) - share(i, 1)).collect()
+        };
+        let differences = more_on_each(&select);
         let (_, z_difference) = total_and_z(&differences);
         let error = base.max(more.abs() / 30.0) / z_difference.abs().max(1e-9);
         // Thin things that the simulation has not got, or loses, lie between what it has there, too.
         let floor = FLOORS[k].max(if kind == Odd::Between { 0.5 } else { 0.3 } * base);
         let mut outcome = "no more of them than on the simulated side";
-        let seen = total > 8.0 && significant(&gains, Z_STAR) && z_difference > 1.5;
+        // Things stand in few places: what is far more on few frames is not surer by its mean.
+        let of_things = matches!(kind, Odd::GroupInFront | Odd::GroupBehind);
+        let by_signs = of_things && significant_by_signs(&differences, SURE_BY_SIGNS[0]);
+        let seen = total > 8.0 && (significant(&gains, Z_STAR) && z_difference > 1.5 || by_signs);
         // Surfaces that only stand elsewhere are missed in one place and found in another.
         let one_sided = match kind {
-            Odd::GroupInFront => more > 3.0 * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
-            Odd::GroupBehind => more > 3.0 * excess_of(&select, Odd::GroupInFront as usize)[1].max(0.0),
+            Odd::GroupInFront => more > ONE_SIDED * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
+            Odd::GroupBehind => more > ONE_SIDED * excess_of(&select, Odd::GroupInFront as usize)[1].max(0.0),
             _ => true,
         };
         if seen && more <= floor {
@@ -58,14 +68,9 @@ pub fn search(context: &Context) -> ChannelResult {
         } else if seen {
             outcome = "chosen";
             let [base_e, more_e] = excess_of(&estimate, k);
-            let values: Vec<f64> = estimate
-                .iter()
-                .map(|&i| odd[i].counts[k][0] / odd[i].all[0].max(1.0) - odd[i].counts[k][1] / odd[i].all[1].max(1.0))
-                .collect();
-            let (_, z_e) = total_and_z(&values);
-            let share_error = more_e.abs() / z_e.abs().max(1e-9);
+            let share = share_of(more_e, &more_on_each(&estimate));
             let held: Vec<f64> = hold_out.iter().map(|&i| gain(&odd[i], k, base_e, more_e)).collect();
-            result.found.push(found(context, kind, more_e, share_error, held, &odd, &estimate, z, end_m));
+            result.found.push(found(context, kind, share, held, &odd, &estimate, z, end_m));
             for (d, &i) in result.distance.iter_mut().zip(&hold_out) {
                 let (before, after) = distance(&odd[i], k, base_e, more_e);
                 *d = [d[0] + before, d[1] + before - after, d[2] + before - after];
@@ -108,6 +113,18 @@ fn excess<'a>(frames: impl Iterator<Item = &'a OddFrame>, k: usize) -> [f64; 2] 
     [base, sum[0] / sum[2].max(1.0) - base]
 }
 
+/// How much more there is, with its interval, from how much more there is on each frame; in logarithms where few frames have most of it.
+fn share_of(more: f64, each: &[f64]) -> Parameter {
+    let (_, z) = total_and_z(each);
+    let error = (more.abs() / z.abs().max(1e-9)).hypot(0.05 * more);
+    let mut share = parameter("share", more, error, "1").1;
+    if share.ci95[0] * share.ci95[1] <= 0.0 && more > 0.0 && significant_by_signs(each, SURE_BY_SIGNS[1]) {
+        let factor = (1.96 * error / more).exp();
+        share.ci95 = [more / factor, more * factor];
+    }
+    share
+}
+
 /// Gain of a frame's count, nats.
 fn gain(frame: &OddFrame, k: usize, base: f64, more: f64) -> f64 {
     let rate = (base + more).max(0.05 * base);
@@ -141,8 +158,7 @@ fn cross_gains(odd: &[OddFrame], select: &[usize], blocks: &[usize], k: usize) -
 fn found(
     context: &Context,
     kind: Odd,
-    share: f64,
-    error: f64,
+    share: Parameter,
     held_out_gains: Vec<f64>,
     odd: &[OddFrame],
     estimate: &[usize],
@@ -150,26 +166,27 @@ fn found(
     end_m: f64,
 ) -> Found {
     let name = name(kind);
+    let (more, error) = (share.estimate, (share.ci95[1] - share.ci95[0]) / 2.0 / 1.96);
     let mut parameters = vec![];
     let sum = |f: fn(&OddFrame) -> f64| estimate.iter().map(|&i| f(&odd[i])).sum::<f64>();
     let (covariate, says) = match kind {
         Odd::Alone => {
             let Alarms { rate, reach_m } = alarms(context, estimate, end_m);
-            let form = (error / share.abs().max(1e-9)).hypot(0.08);
+            let form = (error / more.abs().max(1e-9)).hypot(0.06);
             parameters.push(parameter("rate", rate, form * rate, "1"));
             parameters.push(parameter("reach_m", reach_m, 0.05 * reach_m, "m"));
             (
                 "none",
                 format!(
                     "{:.2} % of the measured returns stand alone where nothing is: false alarms, of {:.2} % of the shots, that your simulator does not make",
-                    100.0 * share,
+                    100.0 * more,
                     100.0 * rate
                 ),
             )
         }
         Odd::Between => {
-            parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
-            let width = share * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
+            parameters.push(("share".into(), share));
+            let width = more * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
             // How a sensor weighs what a beam meets is not known.
             let so_wide = if WIDTHS_RAD.contains(&width) {
                 let ci95 = [width / WIDTH_FACTOR, width * WIDTH_FACTOR];
@@ -182,27 +199,28 @@ fn found(
                 "edge",
                 format!(
                     "{:.2} % of the measured returns lie between the two surfaces of an edge: beams have a width{so_wide}, your simulator's are lines",
-                    100.0 * share
+                    100.0 * more
                 ),
             )
         }
         Odd::GroupInFront => {
-            parameters.push(parameter("share", share, error.hypot(0.05 * share), "1"));
+            parameters.push(("share".into(), share));
             (
                 "place",
                 format!(
                     "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
-                    100.0 * share
+                    100.0 * more
                 ),
             )
         }
         Odd::GroupBehind => {
-            parameters.push(parameter("share", -share, error.hypot(0.05 * share), "1"));
+            let [low, high] = share.ci95;
+            parameters.push(("share".into(), Parameter { estimate: -more, ci95: [-high, -low], ..share }));
             (
                 "place",
                 format!(
                     "{:.2} % of the measured returns lie together behind what the simulation has there: it has things that are not on the road",
-                    100.0 * share
+                    100.0 * more
                 ),
             )
         }
