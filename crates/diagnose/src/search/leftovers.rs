@@ -14,8 +14,7 @@ const LEFT_BY_LOSSES: f64 = 0.04;
 
 /// Whether a finding is a bias of range of less than 4 cm at 30 m.
 fn slight_bias(f: &Found) -> bool {
-    let value = |name: &str| f.parameters.iter().find(|(n, _)| n == name).map_or(0.0, |(_, p)| p.estimate);
-    f.causes == ["range_bias"] && (value("offset_m") + 30.0 * value("scale")).abs() < 0.04
+    f.causes == ["range_bias"] && (number(f, "offset_m") + 30.0 * number(f, "scale")).abs() < 0.04
 }
 
 /// Nats a return below which a law of noise beside surfaces that stand elsewhere, slide or mix is what these leave.
@@ -25,7 +24,7 @@ const LEFT_OF_NOISE: f64 = 0.03;
 const LEFT_BY_AIMS: f64 = 2.5;
 
 /// Share of the gain of rows that aim elsewhere below which the pose of a sensor is what their mean leaves.
-const LEFT_BY_ROWS_OF_A_POSE: f64 = 0.25;
+const LEFT_BY_ROWS_OF_A_POSE: f64 = 0.35;
 
 /// Share of what the own car hides below which a sensor's pose is a matter of which surfaces it still sees.
 const LEFT_BY_OWN_CAR: f64 = 0.05;
@@ -43,11 +42,17 @@ const LEFT_BY_SHAPES: f64 = 0.004;
 const LEFT_BY_JITTER: f64 = 0.001;
 
 /// Share of a pose's gain below which things that only the simulation has are what is looked over from there.
-const LEFT_BY_A_POSE_OF_THINGS: f64 = 0.1;
+const LEFT_BY_A_POSE_OF_THINGS: f64 = 0.3;
+
+/// Share of the gain of a scene that slides below which false alarms are returns that it left alone.
+const LEFT_BY_A_SLIDE: f64 = 0.5;
+
+/// Share of the spread of the rows' offsets in range below which noise, at 20 m, is what mending them leaves.
+const LEFT_BY_ROWS_OF_NOISE: f64 = 0.25;
 
 /// Nats a return below which a law of noise beside surfaces that are off in a way without a name is a part of that, share of what this gains
-/// below which poses are, and times what surfaces are off by up to which shifts of objects are.
-const LEFT_BY_THE_UNNAMED: [f64; 3] = [0.1, 0.25, 1.5];
+/// below which poses are, times what surfaces are off by up to which shifts of objects are, and share of its gain below which anything that objects show is.
+const LEFT_BY_THE_UNNAMED: [f64; 4] = [0.1, 0.25, 1.5, 0.05];
 
 /// Standard errors by which a sensor's pose must be off in one number: its six take up what is wrong with the few surfaces that it alone sees.
 const SURE_OF_A_SENSOR: f64 = 4.5;
@@ -74,17 +79,20 @@ fn speaks(f: &Found) -> bool {
     let sized = |(name, p): &&(String, Parameter)| p.unit != "number" && !FORM.contains(&name.as_str());
     let mut sizes = f.parameters.iter().filter(sized).map(|(_, p)| p).peekable();
     let sure = |p: &Parameter| p.estimate.abs() > SURE_OF_A_SENSOR / 1.96 * (p.ci95[1] - p.ci95[0]) / 2.0;
-    sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0 && (!of_sensor || sure(p)))
+    // That labels differ from labels is no chance, whatever of it is known.
+    f.channel == "labels"
+        || sizes.peek().is_none()
+        || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0 && (!of_sensor || sure(p)))
 }
 
-/// The share of returns that a finding tells of.
-fn share_of(f: &Found) -> f64 {
-    f.parameters.iter().find(|(name, _)| name == "share").map_or(0.0, |(_, p)| p.estimate)
+/// A number of a finding, 0 where it has not got it.
+fn number(f: &Found, name: &str) -> f64 {
+    f.parameters.iter().find(|(n, _)| n == name).map_or(0.0, |(_, p)| p.estimate)
 }
 
 /// Whether things are said to be in the simulation alone.
 fn things_too_many(f: &Found) -> bool {
-    f.causes == ["missing_object"] && share_of(f) < 0.0
+    f.causes == ["missing_object"] && number(f, "share") < 0.0
 }
 
 /// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
@@ -104,16 +112,22 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
     let hidden = most(results, &|f| f.causes == ["ego_occlusion"]);
     let shapes = results.iter().flat_map(|r| &r.found).any(|f| f.causes.iter().any(|c| c == "wrong_shape"));
     let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
+    let slide = most(results, &|f| f.channel == "slide");
+    let rows_m = results.iter().flat_map(|r| &r.found).filter(|f| f.causes == ["beam_range_offset"]);
+    let rows_m = rows_m.map(|f| number(f, "std_m")).fold(0.0, f64::max);
     for result in results.iter_mut() {
         let least = (LEFT_BY_OWN_CAR * hidden).max(LEFT_BY_ROWS_OF_A_POSE * aims);
         result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= least);
         // Where far returns are lost, those that come back are the nearer ones.
         result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
         result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
+        let noise_m = |f: &Found| number(f, "std_m") + 20.0 * number(f, "per_m");
+        result.found.retain(|f| f.causes != ["range_noise"] || noise_m(f) >= LEFT_BY_ROWS_OF_NOISE * rows_m);
+        result.found.retain(|f| f.causes != ["outliers"] || gain(f) >= LEFT_BY_A_SLIDE * slide);
         // Things that stand before edges lie between what these show.
         let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter).max(LEFT_BY_AIMS_OF_MIXED * aims);
         result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= least);
-        result.found.retain(|f| !(shapes && f.causes == ["missing_object"] && share_of(f) < LEFT_BY_SHAPES));
+        result.found.retain(|f| !(shapes && f.causes == ["missing_object"] && number(f, "share") < LEFT_BY_SHAPES));
         // Things that move by themselves slide otherwise than what stands.
         result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
     }
@@ -139,7 +153,10 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
             "roughness" => gain(f) < LEFT_BY_THE_UNNAMED[0] * returns,
             "residuals" => posed(f) && gain(f) < LEFT_BY_THE_UNNAMED[1] * without_a_name,
             // A scan that shears the scene makes such surfaces itself.
-            "objects" => f.causes != ["rolling_shutter"] && shifts_by_less(f, LEFT_BY_THE_UNNAMED[2] * off_m),
+            "objects" => {
+                let little = gain(f) < LEFT_BY_THE_UNNAMED[3] * without_a_name;
+                f.causes != ["rolling_shutter"] && (little || shifts_by_less(f, LEFT_BY_THE_UNNAMED[2] * off_m))
+            }
             _ => false,
         };
         results.iter_mut().for_each(|r| r.found.retain(|f| !left(f)));
@@ -194,8 +211,10 @@ mod tests {
         let cases = [
             // (first, its gain), (second, its channel, its size, gain that is left over, gain that stands for itself)
             (("beam_elevation_offset", "residuals", 3.0), ("mixed_pixels", "returns", 0.003, 0.2, 0.4)),
-            (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", -0.005, 3.0, 5.0)),
+            (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", -0.005, 11.0, 13.0)),
             (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", 0.005, 0.1, 3.0)),
+            (("rolling_shutter", "slide", 4.0), ("outliers", "returns", 0.004, 1.9, 2.1)),
+            (("", "residuals", 1.0), ("time_offset", "objects", 0.002, 0.04, 0.06)),
             (("", "residuals", 1.0), ("range_noise", "roughness", 0.02, 9.0, 11.0)),
         ];
         for ((first, channel, gain), (second, of, size, left_over, itself)) in cases {
@@ -215,11 +234,17 @@ mod tests {
         let first = || found("range_bias", "residuals", 1.0, vec![]);
         assert!(left(vec![first(), about(-0.0006)]).is_empty());
         assert_eq!(left(vec![first(), about(-0.02)]), ["time_offset"]);
+        let of_labels = Found { channel: "labels", ..about(-0.0006) };
+        assert_eq!(left(vec![first(), of_labels]), ["time_offset"], "how large is not known, that it is there is");
         assert_eq!(left(vec![first(), found("missing_object", "returns", 1.0, vec![])]), ["missing_object"]);
         let things = |share: f64| found("missing_object", "returns", 1.0, vec![parameter("share", share, 0.0003, "1")]);
         let shapes = || found("wrong_shape", "objects", 1.0, vec![]);
         assert!(left(vec![shapes(), things(0.002)]).is_empty(), "parts of larger objects");
         assert_eq!(left(vec![first(), things(0.002)]), ["missing_object"]);
+        let rows = || found("beam_range_offset", "residuals", 1.0, vec![parameter("std_m", 0.07, 0.001, "m")]);
+        let noise = |std_m: f64| found("range_noise", "roughness", 9.0, vec![parameter("std_m", std_m, 0.0002, "m")]);
+        assert!(left(vec![rows(), noise(0.007)]).is_empty(), "what mending rows leaves");
+        assert_eq!(left(vec![rows(), noise(0.02)]), ["range_noise"]);
         // Half of such a law may lie at no angle that there is.
         let grazing = vec![parameter("cos_half", 0.001, 0.01, "1"), parameter("steepness", 0.3, 0.02, "1")];
         assert_eq!(left(vec![first(), found("incidence_dropout", "hits", 1.0, grazing)]), ["incidence_dropout"]);

@@ -12,10 +12,10 @@ use crate::inference::roles::Role;
 use crate::pairing::Ray;
 
 /// Share of returns below which nothing is said, by kind.
-const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.0025];
+const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.003];
 
 /// Times as many returns on one side of surfaces as on the other, from which on something was added, or is missing.
-const ONE_SIDED: f64 = 2.0;
+const ONE_SIDED: f64 = 3.0;
 
 /// Standard errors, by the signs of frames (ten of ten have more of it), from which on something is seen, and from which on other frames show it again.
 const SURE_BY_SIGNS: [f64; 2] = [3.0, 2.0];

@@ -32,7 +32,7 @@ const FLOOR_OFFSET_M: f64 = 0.012;
 const FLOOR_TURN_RAD: f64 = 5.2e-4;
 const FLOOR_SHIFT_M: f64 = 0.04;
 /// Smaller turns of one sensor are not spoken of, rad: 4 cm at 50 m; and where fewer than two others tell what the form of a pose is wrong by.
-const FLOOR_SENSOR_RAD: [f64; 2] = [8e-4, 1.2e-3];
+const FLOOR_SENSOR_RAD: [f64; 2] = [8e-4, 1.6e-3];
 /// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
 const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
 
@@ -172,17 +172,26 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     (result, out)
 }
 
-/// Share of the z of the surer of two offsets of rows from which on the other one is as sure.
+/// Of two offsets of rows: the z that is sure, the share of the surer one's z from which on the other one is as sure, and how many times as much it gains where
+/// it needs not to be.
+const SURE_OF_ROWS: f64 = 30.0;
 const AS_SURE: f64 = 0.75;
+const FAR_BETTER: f64 = 2.0;
 
-/// Offsets of rows in range or in elevation that are less sure over frames than the other ones are dropped: they fit few rays at grazing angles, by much, on
-/// some frames.
+/// Offsets of rows in range or in elevation that are less sure over frames than the other ones, and do not gain far more, are dropped: they fit few rays at
+/// grazing angles, by much, on some frames.
 fn surer_rows(trials: &mut [Trial], candidates: &[&Suspect]) {
-    let z = |t: &Trial| total_and_z(&t.gains).1;
+    let sure = |t: &Trial| {
+        let (gain, z) = total_and_z(&t.gains);
+        (gain, z.min(SURE_OF_ROWS))
+    };
     let of_rows =
         |t: &Trial| t.above_floor && matches!(candidates[t.candidate], Suspect::Groups { grouping: Grouping::Row, .. });
-    let best = trials.iter().filter(|t| of_rows(t)).map(z).fold(0.0, f64::max);
-    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= z(t) >= AS_SURE * best);
+    let all: Vec<(f64, f64)> = trials.iter().filter(|t| of_rows(t)).map(sure).collect();
+    let surer =
+        |(gain, z): (f64, f64), (other, other_z): (f64, f64)| AS_SURE * other_z > z && gain < FAR_BETTER * other;
+    let dropped = |t: &Trial| all.iter().any(|&other| surer(sure(t), other));
+    trials.iter_mut().filter(|t| of_rows(t)).for_each(|t| t.above_floor &= !dropped(t));
 }
 
 fn sums(context: &Context, select: &[usize]) -> Sums {
@@ -411,13 +420,15 @@ mod tests {
             above_floor: true,
         };
         // More on the whole, by some frames, and a little less on every frame.
-        let some = (0..20).map(|f| if f % 4 == 0 { 90.0 } else { 2.0 }).collect();
-        let mut trials = vec![trial(0, vec![20.0; 20]), trial(1, some), trial(2, vec![1.0; 20])];
+        let some: Vec<f64> = (0..20).map(|f| if f % 4 == 0 { 90.0 } else { 2.0 }).collect();
+        let mut trials = vec![trial(0, vec![20.0; 20]), trial(1, some.clone()), trial(2, vec![1.0; 20])];
         surer_rows(&mut trials, &suspects.iter().collect::<Vec<_>>());
         assert_eq!(trials.iter().map(|t| t.above_floor).collect::<Vec<_>>(), [true, false, true]);
-        // As sure, next to: the gain decides.
-        let mut trials = vec![trial(0, vec![18.0, 22.0, 20.0]), trial(1, vec![9.2, 10.8, 10.0])];
-        surer_rows(&mut trials, &suspects.iter().collect::<Vec<_>>());
-        assert!(trials.iter().all(|t| t.above_floor));
+        // As sure, next to, or far better: the gain decides.
+        for other in [(0..20).map(|f| 9.0 + 0.2 * f64::from(f % 2)).collect(), vec![2.0; 20]] {
+            let mut trials = vec![trial(0, some.clone()), trial(1, other)];
+            surer_rows(&mut trials, &suspects.iter().collect::<Vec<_>>());
+            assert!(trials[0].above_floor);
+        }
     }
 }
