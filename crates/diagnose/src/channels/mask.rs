@@ -162,7 +162,9 @@ pub fn blocked_cells(
                 || on_own_car && opposite(on(&|c, a, e| open(c, a, e) || ends(c, a, e))));
         let all_around = || {
             let (opens, closes) = (on(&open), on(&ends));
-            opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k])
+            let sides = opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k]);
+            // A single row is the top of a wall that was moved.
+            sides && rows_of(&mut together.iter()) > 1
         };
         let believed = match shown {
             Shown::InPlace => true,
