@@ -210,6 +210,9 @@ pub fn with_neighbours(cells: &BTreeSet<DirectionCell>) -> BTreeSet<DirectionCel
     cells.iter().flat_map(|c| neighbours(*c)).collect()
 }
 
+/// Measured returns of which one may lie beyond the end of the range.
+const BUT_ONE_IN: [usize; 2] = [2_000, 20_000];
+
 /// The end of the range, m: beyond it the simulation has returns and the measured side none, before it both have.
 pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     // Returns in company only: false alarms come from everywhere.
@@ -229,13 +232,15 @@ pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     }
     let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
     let between = |v: &[f64], low: f64, high: f64| above(v, low) - above(v, high);
-    // The farthest measured return, but for one in two thousand.
-    let farthest = a[a.len() - 1 - a.len() / 2000];
-    let lost = above(&b, 1.01 * farthest);
-    let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
-    let beyond = above(&a, 1.01 * farthest) / above(&b, 1.01 * farthest).max(1.0);
-    let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
-    (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
+    // The farthest measured return, but for a few false alarms; where few lie near the end, for next to none.
+    BUT_ONE_IN.into_iter().find_map(|one_in| {
+        let farthest = a[a.len() - 1 - a.len() / one_in];
+        let lost = above(&b, 1.01 * farthest);
+        let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
+        let beyond = above(&a, 1.01 * farthest) / lost.max(1.0);
+        let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
+        (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
+    })
 }
 
 /// Where the share of measured returns among all falls, beyond `from_m`, m: the most likely single step.
