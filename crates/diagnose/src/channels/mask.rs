@@ -150,10 +150,11 @@ pub fn blocked_cells(
             SIDES.map(|(a, e)| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len())
         };
         let opposite = |[left, right, above, below]: [bool; 4]| left && right || above && below;
-        let rows_of =
-            |cells: &mut dyn Iterator<Item = &DirectionCell>| cells.map(|c| c.2).collect::<BTreeSet<_>>().len();
-        let upright =
-            |a: i32| 4 * rows_of(&mut together.iter().filter(|c| open(**c, a, 0))) >= 3 * rows_of(&mut together.iter());
+        let rows = |which: &dyn Fn(&DirectionCell) -> bool| {
+            together.iter().filter(|c| which(c)).map(|c| c.2).collect::<BTreeSet<_>>().len()
+        };
+        let height = rows(&|_| true);
+        let upright = |a: i32| 4 * rows(&|c| open(*c, a, 0)) >= 3 * height;
         let reaches_over = shown == Shown::InPlace && together.len() >= REACHES_OVER && (upright(1) || upright(-1));
         let on_own_car = together.iter().filter(|c| covered(c)).count() >= 2;
         let stands_out = together.len() >= FEWEST_CELLS
@@ -164,7 +165,7 @@ pub fn blocked_cells(
             let (opens, closes) = (on(&open), on(&ends));
             let sides = opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k]);
             // A single row is the top of a wall that was moved.
-            sides && rows_of(&mut together.iter()) > 1
+            sides && height > 1
         };
         let believed = match shown {
             Shown::InPlace => true,

@@ -51,16 +51,17 @@ pub fn search(context: &Context) -> ChannelResult {
         // Thin things that the simulation has not got, or loses, lie between what it has there, too.
         let floor = FLOORS[k].max(if kind == Odd::Between { 0.5 } else { 0.3 } * base);
         let mut outcome = "no more of them than on the simulated side";
+        // What things that are missing on the other side would be.
+        let opposite = match kind {
+            Odd::GroupInFront => Some(Odd::GroupBehind),
+            Odd::GroupBehind => Some(Odd::GroupInFront),
+            Odd::Alone | Odd::Between => None,
+        };
         // Things stand in few places: what is far more on few frames is not surer by its mean.
-        let of_things = matches!(kind, Odd::GroupInFront | Odd::GroupBehind);
-        let by_signs = of_things && significant_by_signs(&differences, SURE_BY_SIGNS[0]);
+        let by_signs = opposite.is_some() && significant_by_signs(&differences, SURE_BY_SIGNS[0]);
         let seen = total > 8.0 && (significant(&gains, Z_STAR) && z_difference > 1.5 || by_signs);
         // Surfaces that only stand elsewhere are missed in one place and found in another.
-        let one_sided = match kind {
-            Odd::GroupInFront => more > ONE_SIDED * excess_of(&select, Odd::GroupBehind as usize)[1].max(0.0),
-            Odd::GroupBehind => more > ONE_SIDED * excess_of(&select, Odd::GroupInFront as usize)[1].max(0.0),
-            _ => true,
-        };
+        let one_sided = opposite.is_none_or(|other| more > ONE_SIDED * excess_of(&select, other as usize)[1].max(0.0));
         if seen && more <= floor {
             outcome = "too small to speak of";
         } else if seen && !one_sided {
