@@ -1,61 +1,198 @@
-//! What findings leave in channels that look at something else: dropped.
+//! What findings leave in channels that look at something else: dropped, and said among the candidates.
 
 use super::{ChannelResult, Found};
 use crate::diagnosis::{Parameter, Status};
+use crate::inference::choice::UNNAMED;
 
-/// Share of a pose's gain below which a finding of another channel is what moving the scene back leaves.
-const LEFT_BY_A_POSE: f64 = 0.005;
+/// What one finding leaves of another kind.
+struct Leftover {
+    /// What is left.
+    what: fn(&Found) -> bool,
+    /// By what.
+    by: fn(&Found) -> bool,
+    /// Share of the gain of that below which it is no finding of its own.
+    share: f64,
+    /// Why.
+    because: &'static str,
+}
 
-/// Share of the gain of offsets of rows below which a law of noise is what mending them leaves.
-const LEFT_BY_ROWS: f64 = 0.15;
+/// In the order in which they are dropped: what is dropped leaves nothing itself.
+const LEFTOVERS: [Leftover; 17] = [
+    Leftover {
+        what: |f| names(f, "sensor_extrinsics"),
+        by: |f| names(f, "ego_occlusion"),
+        share: 0.05,
+        because: "the own car decides which surfaces the sensor still sees",
+    },
+    Leftover {
+        what: |f| names(f, "sensor_extrinsics"),
+        by: aims,
+        share: 0.35,
+        because: "the mean of what rows aim elsewhere by",
+    },
+    Leftover {
+        what: slight_bias,
+        by: |f| f.channel == "hits",
+        share: 0.04,
+        because: "where far returns are lost, those that come back are the nearer ones",
+    },
+    Leftover {
+        what: |f| f.channel == "roughness",
+        by: |f| f.causes.first().is_some_and(|c| c.starts_with("beam_")),
+        share: 0.15,
+        because: "offsets of rows are mended but for their errors",
+    },
+    Leftover {
+        what: |f| f.channel == "roughness",
+        by: aims,
+        share: 2.5,
+        because: "on the ground the range jumps from row to row where rows aim elsewhere",
+    },
+    Leftover {
+        what: |f| names(f, "outliers"),
+        by: slide,
+        share: 0.5,
+        because: "returns that a scene that slides left alone",
+    },
+    Leftover {
+        what: |f| names(f, "mixed_pixels"),
+        by: |f| names(f, "missing_object"),
+        share: 0.05,
+        because: "things that stand before edges lie between what these show",
+    },
+    Leftover {
+        what: |f| names(f, "mixed_pixels"),
+        by: |f| names(f, "angular_jitter"),
+        share: 0.001,
+        because: "returns that jitter carried across edges",
+    },
+    Leftover {
+        what: |f| names(f, "mixed_pixels"),
+        by: aims,
+        share: 0.1,
+        because: "rows that aim elsewhere see past edges",
+    },
+    Leftover {
+        what: |f| names(f, "missing_object") && number(f, "share") < FEW_THINGS,
+        by: shapes,
+        share: f64::INFINITY,
+        because: "parts of objects of another shape",
+    },
+    Leftover {
+        what: |f| names(f, "material_dropout") && number(f, "share") < 0.0,
+        by: shapes,
+        share: f64::INFINITY,
+        because: "larger objects have more returns, none of which were lost before",
+    },
+    Leftover {
+        what: |f| names(f, "missing_object"),
+        by: slide,
+        share: f64::INFINITY,
+        because: "things that move by themselves slide otherwise than what stands",
+    },
+    Leftover {
+        what: |f| f.channel == "hits",
+        by: |f| f.channel == "residuals" && names(f, "rolling_shutter"),
+        share: 0.2,
+        because: "the scene shears, and rays pass the edges of what they met",
+    },
+    Leftover {
+        what: |f| matches!(f.channel, "hits" | "roughness" | "returns"),
+        by: pose,
+        share: 0.005,
+        because: "the scene was moved back, but for an error",
+    },
+    Leftover {
+        what: |f| names(f, "missing_object") && number(f, "share") < 0.0,
+        by: pose,
+        share: 0.3,
+        because: "from where the sensor is, other things are looked over",
+    },
+    Leftover { what: pose, by: unnamed, share: 0.25, because: "a part of what is off in a way without a name" },
+    Leftover {
+        // A scan that shears the scene makes surfaces without a name itself.
+        what: |f| f.channel == "objects" && !names(f, "rolling_shutter"),
+        by: unnamed,
+        share: 0.05,
+        because: "a part of what is off in a way without a name",
+    },
+];
 
-/// Share of the gain of losses below which a slight bias of range is a matter of which returns are left.
-const LEFT_BY_LOSSES: f64 = 0.04;
+/// Share of returns below which things beside objects of another shape are parts of these.
+const FEW_THINGS: f64 = 0.004;
+
+/// Share of the spread of the rows' offsets in range below which noise, at 20 m, is what mending them leaves.
+const NOISE_OF_ROWS: f64 = 0.25;
+
+/// Nats a return below which a law of noise is left by surfaces that stand elsewhere, slide or mix, and by surfaces that are off in a way without a name.
+const NOISE_OF_SURFACES: [f64; 2] = [0.03, 0.1];
+
+/// Times what surfaces are off by in a way without a name up to which shifts of objects are a part of that.
+const SHIFTS_OF_SURFACES: f64 = 1.5;
+
+/// Whether a finding has this cause, and no other.
+fn names(f: &Found, cause: &str) -> bool {
+    f.causes == [cause]
+}
+
+/// Whether rows aim elsewhere.
+fn aims(f: &Found) -> bool {
+    names(f, "beam_elevation_offset")
+}
+
+/// Whether the scene slides over a scan.
+fn slide(f: &Found) -> bool {
+    f.channel == "slide"
+}
+
+/// Whether objects may have another shape.
+fn shapes(f: &Found) -> bool {
+    f.causes.iter().any(|c| c == "wrong_shape")
+}
+
+/// Whether the car leans or a sensor is mounted otherwise.
+fn pose(f: &Found) -> bool {
+    f.channel == "residuals" && f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"))
+}
+
+/// Whether surfaces are off in a way without a name.
+fn unnamed(f: &Found) -> bool {
+    f.channel == "residuals" && f.status == Status::Unexplained
+}
 
 /// Whether a finding is a bias of range of less than 4 cm at 30 m.
 fn slight_bias(f: &Found) -> bool {
-    f.causes == ["range_bias"] && (number(f, "offset_m") + 30.0 * number(f, "scale")).abs() < 0.04
+    names(f, "range_bias") && (number(f, "offset_m") + 30.0 * number(f, "scale")).abs() < 0.04
 }
 
-/// Nats a return below which a law of noise beside surfaces that stand elsewhere, slide or mix is what these leave.
-const LEFT_OF_NOISE: f64 = 0.03;
+/// A number of a finding, 0 where it has not got it.
+fn number(f: &Found, name: &str) -> f64 {
+    f.parameters.iter().find(|(n, _)| n == name).map_or(0.0, |(_, p)| p.estimate)
+}
 
-/// Times the gain of rows that aim elsewhere below which a law of noise is what is left of the jumps between rows on the ground.
-const LEFT_BY_AIMS: f64 = 2.5;
+/// Gain on the frames held out, nats.
+fn gain(f: &Found) -> f64 {
+    f.held_out_gains.iter().sum()
+}
 
-/// Share of the gain of rows that aim elsewhere below which the pose of a sensor is what their mean leaves.
-const LEFT_BY_ROWS_OF_A_POSE: f64 = 0.35;
+/// The largest of numbers of findings.
+fn most(results: &[ChannelResult], of: impl Fn(&Found) -> Option<f64>) -> Option<f64> {
+    results.iter().flat_map(|r| &r.found).filter_map(of).reduce(f64::max)
+}
 
-/// Share of what the own car hides below which a sensor's pose is a matter of which surfaces it still sees.
-const LEFT_BY_OWN_CAR: f64 = 0.05;
-
-/// Share of the gain of missing things below which mixed ranges are their returns.
-const LEFT_BY_THINGS: f64 = 0.05;
-
-/// Share of the gain of rows that aim elsewhere below which mixed ranges are returns of rows that see past edges.
-const LEFT_BY_AIMS_OF_MIXED: f64 = 0.1;
-
-/// Share of returns below which things beside objects of another shape are parts of these.
-const LEFT_BY_SHAPES: f64 = 0.004;
-
-/// Share of the gain of jitter below which mixed ranges are returns that it carried across edges.
-const LEFT_BY_JITTER: f64 = 0.001;
-
-/// Share of a pose's gain below which things that only the simulation has are what is looked over from there.
-const LEFT_BY_A_POSE_OF_THINGS: f64 = 0.3;
-
-/// Share of the gain of a scene that slides below which false alarms are returns that it left alone.
-const LEFT_BY_A_SLIDE: f64 = 0.5;
-
-/// Share of the spread of the rows' offsets in range below which noise, at 20 m, is what mending them leaves.
-const LEFT_BY_ROWS_OF_NOISE: f64 = 0.25;
-
-/// Nats a return below which a law of noise beside surfaces that are off in a way without a name is a part of that, share of what this gains
-/// below which poses are, times what surfaces are off by up to which shifts of objects are, and share of its gain below which anything that objects show is.
-const LEFT_BY_THE_UNNAMED: [f64; 4] = [0.1, 0.25, 1.5, 0.05];
-
-/// Standard errors by which a sensor's pose must be off in one number: its six take up what is wrong with the few surfaces that it alone sees.
-const SURE_OF_A_SENSOR: f64 = 4.5;
+/// Drops findings, and says why among the candidates.
+fn drop_all(results: &mut [ChannelResult], because: &str, what: impl Fn(&Found) -> bool) {
+    for result in results {
+        let (dropped, kept) = std::mem::take(&mut result.found).into_iter().partition(&what);
+        result.found = kept;
+        let dropped: Vec<Found> = dropped;
+        for f in dropped {
+            let cause = f.causes.first().map_or(UNNAMED, String::as_str);
+            let of_it = result.considered.iter_mut().filter(|c| c.cause == cause && c.channel == f.channel);
+            of_it.filter(|c| c.outcome.starts_with("chosen")).for_each(|c| c.outcome = format!("left over: {because}"));
+        }
+    }
+}
 
 /// Numbers that say what form an effect has and where it begins, not how large it is.
 const FORM: [&str; 11] = [
@@ -75,99 +212,44 @@ const FORM: [&str; 11] = [
 
 /// Whether a finding is more than chance on the frames that say how large it is: intervals of some number exclude 0, where it has any.
 fn speaks(f: &Found) -> bool {
-    let of_sensor = f.causes == ["sensor_extrinsics"];
     let sized = |(name, p): &&(String, Parameter)| p.unit != "number" && !FORM.contains(&name.as_str());
     let mut sizes = f.parameters.iter().filter(sized).map(|(_, p)| p).peekable();
-    let sure = |p: &Parameter| p.estimate.abs() > SURE_OF_A_SENSOR / 1.96 * (p.ci95[1] - p.ci95[0]) / 2.0;
     // That labels differ from labels is no chance, whatever of it is known.
-    f.channel == "labels"
-        || sizes.peek().is_none()
-        || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0 && (!of_sensor || sure(p)))
-}
-
-/// A number of a finding, 0 where it has not got it.
-fn number(f: &Found, name: &str) -> f64 {
-    f.parameters.iter().find(|(n, _)| n == name).map_or(0.0, |(_, p)| p.estimate)
-}
-
-/// Whether things are said to be in the simulation alone.
-fn things_too_many(f: &Found) -> bool {
-    f.causes == ["missing_object"] && number(f, "share") < 0.0
+    f.channel == "labels" || sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0)
 }
 
 /// Drops what a pose that was moved back, rows that were mended, and a scene that slid leave in channels that look at single returns. `returns` are those of
 /// the frames that were held out.
 pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
-    let gain = |f: &Found| f.held_out_gains.iter().sum::<f64>();
-    let most = |results: &[ChannelResult], of: &dyn Fn(&Found) -> bool| {
-        results.iter().flat_map(|r| &r.found).filter(|f| of(f)).map(gain).fold(0.0, f64::max)
-    };
     let spoke: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
-    results.iter_mut().for_each(|r| r.found.retain(speaks));
-    let rows = most(results, &|f| f.causes.first().is_some_and(|c| c.starts_with("beam_")));
-    let aims = most(results, &|f| f.causes == ["beam_elevation_offset"]);
-    let things = most(results, &|f| f.causes == ["missing_object"]);
-    let jitter = most(results, &|f| f.causes == ["angular_jitter"]);
-    let losses = most(results, &|f| f.channel == "hits");
-    let hidden = most(results, &|f| f.causes == ["ego_occlusion"]);
-    let shapes = results.iter().flat_map(|r| &r.found).any(|f| f.causes.iter().any(|c| c == "wrong_shape"));
-    let slides = results.iter().flat_map(|r| &r.found).any(|f| f.channel == "slide");
-    let slide = most(results, &|f| f.channel == "slide");
-    let rows_m = results.iter().flat_map(|r| &r.found).filter(|f| f.causes == ["beam_range_offset"]);
-    let rows_m = rows_m.map(|f| number(f, "std_m")).fold(0.0, f64::max);
-    for result in results.iter_mut() {
-        let least = (LEFT_BY_OWN_CAR * hidden).max(LEFT_BY_ROWS_OF_A_POSE * aims);
-        result.found.retain(|f| f.causes != ["sensor_extrinsics"] || gain(f) >= least);
-        // Where far returns are lost, those that come back are the nearer ones.
-        result.found.retain(|f| !(slight_bias(f) && gain(f) < LEFT_BY_LOSSES * losses));
-        result.found.retain(|f| f.channel != "roughness" || gain(f) >= (LEFT_BY_ROWS * rows).max(LEFT_BY_AIMS * aims));
-        let noise_m = |f: &Found| number(f, "std_m") + 20.0 * number(f, "per_m");
-        result.found.retain(|f| f.causes != ["range_noise"] || noise_m(f) >= LEFT_BY_ROWS_OF_NOISE * rows_m);
-        result.found.retain(|f| f.causes != ["outliers"] || gain(f) >= LEFT_BY_A_SLIDE * slide);
-        // Things that stand before edges lie between what these show.
-        let least = (LEFT_BY_THINGS * things).max(LEFT_BY_JITTER * jitter).max(LEFT_BY_AIMS_OF_MIXED * aims);
-        result.found.retain(|f| f.causes != ["mixed_pixels"] || gain(f) >= least);
-        result.found.retain(|f| !(shapes && f.causes == ["missing_object"] && number(f, "share") < LEFT_BY_SHAPES));
-        // Larger objects have more returns, none of which were lost before.
-        let gained = |f: &Found| f.causes == ["material_dropout"] && number(f, "share") < 0.0;
-        result.found.retain(|f| !(shapes && gained(f)));
-        // Things that move by themselves slide otherwise than what stands.
-        result.found.retain(|f| !(slides && f.causes == ["missing_object"]));
+    drop_all(results, "the frames that say how large it is do not tell it from nothing", |f| !speaks(f));
+    let rows_m = most(results, |f| names(f, "beam_range_offset").then(|| number(f, "std_m"))).unwrap_or(0.0);
+    let noise_m = |f: &Found| number(f, "std_m") + 20.0 * number(f, "per_m");
+    drop_all(results, "offsets of rows are mended but for their errors", |f| {
+        names(f, "range_noise") && noise_m(f) < NOISE_OF_ROWS * rows_m
+    });
+    for Leftover { what, by, share, because } in LEFTOVERS {
+        if let Some(most) = most(results, |f| by(f).then(|| gain(f))) {
+            let least = share * most.max(f64::MIN_POSITIVE);
+            drop_all(results, because, |f| what(f) && gain(f) < least);
+        }
     }
-    let posed = |f: &Found| f.causes.iter().any(|c| matches!(c.as_str(), "pitch_roll" | "sensor_extrinsics"));
-    let pose = most(results, &|f| f.channel == "residuals" && posed(f));
-    for result in results.iter_mut() {
-        result
-            .found
-            .retain(|f| !matches!(f.channel, "hits" | "roughness" | "returns") || gain(f) >= LEFT_BY_A_POSE * pose);
-        result.found.retain(|f| !things_too_many(f) || gain(f) >= LEFT_BY_A_POSE_OF_THINGS * pose);
-    }
-    let unnamed = |f: &Found| f.channel == "residuals" && f.status == Status::Unexplained;
-    let without_a_name = most(results, &unnamed);
-    if without_a_name > 0.0 {
-        let curves = results.iter().flat_map(|r| &r.found).filter(|f| unnamed(f)).flat_map(|f| &f.curve.points);
-        let off_m = curves.map(|p| p.measured.abs()).fold(0.0, f64::max);
-        let shifts_by_less = |f: &Found, m: f64| {
-            let mut lengths =
-                f.parameters.iter().filter(|(_, p)| p.unit == "m").map(|(_, p)| p.estimate.abs()).peekable();
-            lengths.peek().is_some() && lengths.all(|l| l < m)
-        };
-        let left = |f: &Found| match f.channel {
-            "roughness" => gain(f) < LEFT_BY_THE_UNNAMED[0] * returns,
-            "residuals" => posed(f) && gain(f) < LEFT_BY_THE_UNNAMED[1] * without_a_name,
-            // A scan that shears the scene makes such surfaces itself.
-            "objects" => {
-                let little = gain(f) < LEFT_BY_THE_UNNAMED[3] * without_a_name;
-                f.causes != ["rolling_shutter"] && (little || shifts_by_less(f, LEFT_BY_THE_UNNAMED[2] * off_m))
-            }
-            _ => false,
-        };
-        results.iter_mut().for_each(|r| r.found.retain(|f| !left(f)));
-    }
-    let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || f.causes == ["mixed_pixels"];
-    if results.iter().flat_map(|r| &r.found).any(disturbs) {
-        let rough = |f: &Found| f.channel == "roughness" && gain(f) < LEFT_OF_NOISE * returns;
-        results.iter_mut().for_each(|r| r.found.retain(|f| !rough(f)));
+    let off_m = |f: &Found| f.curve.points.iter().map(|p| p.measured.abs()).reduce(f64::max);
+    let off_m = most(results, |f| if unnamed(f) { off_m(f) } else { None });
+    let shifts_by_less = |f: &Found, m: f64| {
+        let mut lengths = f.parameters.iter().filter(|(_, p)| p.unit == "m").map(|(_, p)| p.estimate.abs()).peekable();
+        lengths.peek().is_some() && lengths.all(|l| l < m)
+    };
+    drop_all(results, "a part of what is off in a way without a name", |f| {
+        let shifts_m = SHIFTS_OF_SURFACES * off_m.unwrap_or(0.0);
+        f.channel == "objects" && !names(f, "rolling_shutter") && shifts_by_less(f, shifts_m)
+    });
+    let disturbs = |f: &Found| matches!(f.channel, "residuals" | "slide") || names(f, "mixed_pixels");
+    for (nats, by) in NOISE_OF_SURFACES.into_iter().zip([&disturbs as &dyn Fn(&Found) -> bool, &unnamed]) {
+        if results.iter().flat_map(|r| &r.found).any(by) {
+            let least = nats * returns;
+            drop_all(results, "surfaces stand elsewhere", |f| f.channel == "roughness" && gain(f) < least);
+        }
     }
     // What mending leaves explains nothing, and no sensor model could close it; nor are labels mended for it.
     for (result, spoke) in results.iter_mut().zip(spoke) {
@@ -181,7 +263,7 @@ pub fn without_leftovers(results: &mut [ChannelResult], returns: f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnosis::Curve;
+    use crate::diagnosis::{Considered, Curve};
     use crate::search::parameter;
 
     fn found(cause: &str, channel: &'static str, gain: f64, parameters: Vec<(String, Parameter)>) -> Found {
@@ -216,6 +298,7 @@ mod tests {
             (("beam_elevation_offset", "residuals", 3.0), ("mixed_pixels", "returns", 0.003, 0.2, 0.4)),
             (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", -0.005, 11.0, 13.0)),
             (("sensor_extrinsics", "residuals", 40.0), ("missing_object", "returns", 0.005, 0.1, 3.0)),
+            (("rolling_shutter", "residuals", 4.0), ("random_dropout", "hits", 0.005, 0.7, 0.9)),
             (("rolling_shutter", "slide", 4.0), ("outliers", "returns", 0.004, 1.9, 2.1)),
             (("", "residuals", 1.0), ("time_offset", "objects", 0.002, 0.04, 0.06)),
             (("", "residuals", 1.0), ("range_noise", "roughness", 0.02, 9.0, 11.0)),
@@ -227,6 +310,31 @@ mod tests {
             assert!(beside(left_over).is_empty(), "{second} {left_over}");
             assert_eq!(beside(itself), [second]);
         }
+    }
+
+    #[test]
+    fn what_is_dropped_is_said_among_the_candidates() {
+        let considered = |cause: &str, outcome: &str| Considered {
+            cause: cause.into(),
+            channel: "returns".into(),
+            nats_per_ray: 0.1,
+            z: 5.0,
+            outcome: outcome.into(),
+        };
+        let of_returns = ChannelResult {
+            found: vec![found("mixed_pixels", "returns", 0.2, vec![]), found("range_cut", "returns", 0.2, vec![])],
+            considered: vec![
+                considered("mixed_pixels", "chosen"),
+                considered("mixed_pixels", "gains less"),
+                considered("range_cut", "chosen"),
+            ],
+            ..ChannelResult::default()
+        };
+        let aims = found("beam_elevation_offset", "residuals", 3.0, vec![]);
+        let mut results = [of_returns, ChannelResult { found: vec![aims], ..ChannelResult::default() }];
+        without_leftovers(&mut results, 1000.0);
+        let outcomes: Vec<&str> = results[0].considered.iter().map(|c| c.outcome.as_str()).collect();
+        assert_eq!(outcomes, ["left over: rows that aim elsewhere see past edges", "gains less", "chosen"]);
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! A lean of the car beside one sensor that is mounted otherwise than believed: what every other sensor sees by itself.
 
+use super::Sums;
+use super::floor::FLOOR_TURN_RAD;
 use super::suspects::Suspect;
-use super::{FLOOR_TURN_RAD, Sums};
 use crate::channels::mean::{Column, OwnPoses};
 use crate::search::{Z_STAR, by_block};
 

@@ -3,6 +3,7 @@
 mod agreed;
 mod curve;
 mod displacement;
+mod floor;
 mod rows;
 mod suspects;
 mod words;
@@ -11,6 +12,7 @@ pub use self::displacement::Displacement;
 
 use self::agreed::agreed_turns;
 use self::displacement::displacement;
+use self::floor::above_floor;
 use self::rows::surer_rows;
 use self::suspects::{Suspect, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, first_demands, record, unless_unsure};
@@ -29,15 +31,6 @@ use crate::rig::SensorRig;
 use nalgebra::SVector;
 use rayon::prelude::*;
 
-/// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
-const FLOOR_OFFSET_M: f64 = 0.012;
-const FLOOR_TURN_RAD: f64 = 5.2e-4;
-const FLOOR_SHIFT_M: f64 = 0.04;
-/// Smaller turns of one sensor are not spoken of, rad: 4 cm at 50 m; and where fewer than two others tell what the form of a pose is wrong by.
-const FLOOR_SENSOR_RAD: [f64; 2] = [8e-4, 1.6e-3];
-/// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
-const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
-
 /// Share of a pose's gain that a second pose must bring.
 const A_SECOND_POSE: f64 = 0.3;
 
@@ -50,6 +43,8 @@ struct Sums {
     rows: Groups,
     strips: Groups,
     poses: Vec<OwnPoses>,
+    /// Weights of all returns of each sensor, by frame.
+    of_sensors: Vec<Vec<f64>>,
 }
 
 /// Groups of every frame, by part and whole.
@@ -183,6 +178,13 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
     let columns = columns(rig);
     let means: Vec<MeanFrame> = mean_frames(frames, rig, &columns, &poses, noise_m, design);
     let prior = own_scatter(rig, &poses, select);
+    // The normals of surfaces have the length 1: squares of levers of shifts make the weights.
+    let shift_of = |c: &Column, s: usize| matches!(c, Column::SensorPose(of, 3..6) if *of == s);
+    let of_sensor = |m: &MeanFrame, s: usize| {
+        let shifts = (0..columns.len()).filter(|&c| shift_of(&columns[c], s));
+        shifts.map(|c| m.gram[(c, c)]).sum::<f64>()
+    };
+    let of_sensors = means.iter().map(|m| (0..rig.sensors.len()).map(|s| of_sensor(m, s)).collect()).collect();
     let linear: Vec<LinearFrame> = means
         .iter()
         .map(|m| {
@@ -223,7 +225,16 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
         let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
-    Sums { rows: groups(Grouping::Row), strips: groups(Grouping::Azimuth), columns, precision, base, linear, poses }
+    Sums {
+        rows: groups(Grouping::Row),
+        strips: groups(Grouping::Azimuth),
+        columns,
+        precision,
+        base,
+        linear,
+        poses,
+        of_sensors,
+    }
 }
 
 /// Variances of what every frame may have of its own: of its pose as they scatter, robust, about the mean of each sensor; of its slide as cars drive,
@@ -284,12 +295,6 @@ fn gains(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) 
     out
 }
 
-impl Sums {
-    fn floor_sensor_rad(&self) -> f64 {
-        FLOOR_SENSOR_RAD[usize::from(self.poses.first().is_none_or(|p| p.len() < 3))]
-    }
-}
-
 fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
     if grouping == Grouping::Row { &sums.rows.whole } else { &sums.strips.whole }
 }
@@ -297,52 +302,6 @@ fn groups_of(sums: &Sums, grouping: Grouping) -> &[GroupFrame] {
 /// Prior spread of offsets: 10 cm, 0.3 degrees.
 fn how(column: usize) -> GroupFit {
     GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true, trust: 1.0 }
-}
-
-fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
-    let Some(last) = suspects.last() else { return false };
-    match last {
-        Suspect::Groups { grouping, column, .. } => {
-            let frames = groups_of(sums, *grouping);
-            let all = total(select.iter().map(|&i| &frames[i]));
-            match grouping {
-                Grouping::Row => grouped::rough_spread(&all, how(*column)) > FLOOR_GROUPS[*column],
-                Grouping::Azimuth => grouped::spread(&all, how(*column), 0.0).0 > FLOOR_GROUPS[2],
-            }
-        }
-        Suspect::Linear { columns, .. } => {
-            let fitted = fit_all(sums, select, blocks, suspects);
-            let bias = |range_m: f64| -> f64 {
-                let told = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
-                told.map(|(c, t)| match sums.columns[*c] {
-                    Column::RangeOffset => *t,
-                    Column::RangeScale => t * range_m,
-                    _ => 0.0,
-                })
-                .sum()
-            };
-            let biased = bias(10.0).abs() > FLOOR_OFFSET_M || bias(40.0).abs() > 3.2 * FLOOR_OFFSET_M;
-            biased
-                || fitted.columns.iter().zip(fitted.theta.iter()).any(|(c, t)| {
-                    columns.contains(c)
-                        && t.abs()
-                            > match sums.columns[*c] {
-                                Column::RangeOffset | Column::RangeScale => f64::INFINITY,
-                                Column::Pose(0..3) => FLOOR_TURN_RAD,
-                                Column::SensorPose(_, 0..3) => sums.floor_sensor_rad(),
-                                Column::Pose(_) | Column::SensorPose(..) => FLOOR_SHIFT_M,
-                                Column::Sweep(k) => {
-                                    if k < 2 {
-                                        0.3
-                                    } else {
-                                        0.01
-                                    }
-                                }
-                                Column::Structure(_) => f64::INFINITY,
-                            }
-                })
-        }
-    }
 }
 
 fn fit_all(sums: &Sums, frames: &[usize], blocks: &[usize], suspects: &[Suspect]) -> LinearFit {

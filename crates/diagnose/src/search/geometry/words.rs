@@ -1,7 +1,8 @@
 //! What the search of geometry found, in words and numbers.
 
 use super::curve::linear_curve;
-use super::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD, Sums, Suspect, fit_all, groups_of, how, split};
+use super::floor::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SENSOR_M, FLOOR_TURN_RAD};
+use super::{Sums, Suspect, fit_all, groups_of, how, split};
 use crate::channels::groups::{GroupSums, Grouping, place_of, total};
 use crate::channels::mean::Column;
 use crate::diagnosis::{Curve, CurvePoint, Minimum, Parameter, Status};
@@ -275,7 +276,9 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(S
     push("range_bias", "offset_m", error(Column::RangeOffset), FLOOR_OFFSET_M, "m", 1.0);
     push("pitch_roll", "pitch_deg", error(Column::Pose(1)), FLOOR_TURN_RAD, "deg", deg);
     let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
-    let floor = if one == Column::Pose(2) { FLOOR_TURN_RAD } else { sums.floor_sensor_rad() };
+    let of_one = sums.columns.iter().position(|x| *x == one).filter(|_| one != Column::Pose(2));
+    let displaced_m = of_one.map(|k| sums.displaced_m(select, 0, &[(k, 1.0)]));
+    let floor = displaced_m.map_or(FLOOR_TURN_RAD, |by_one_rad| FLOOR_SENSOR_M / by_one_rad.max(1e-3));
     push("sensor_extrinsics", "yaw_deg", error(one), floor, "deg", deg);
     push("beam_range_offset", "std_m", Some(0.0), FLOOR_GROUPS[0], "m", 1.0);
     push("beam_elevation_offset", "std_deg", Some(0.0), FLOOR_GROUPS[1], "deg", deg);
