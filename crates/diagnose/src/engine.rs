@@ -10,6 +10,7 @@ use crate::pairing::{
 };
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
+use crate::search::shutter::Sliding;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
 use geometry::Box3;
@@ -112,7 +113,16 @@ pub fn diagnose(
     progress(Stage::Weighing, 0, SEARCHES);
     let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
     // What slides over a scan is moved back before anything else is looked at, but for the ranges as they were measured.
-    let (sliding, slide) = search::shutter::search(&context);
+    let (sliding, slide) = match search::shutter::search(&context) {
+        Sliding::No(result) => (result, None),
+        Sliding::Yes(result, slide) => (result, Some(slide)),
+        Sliding::Perhaps(result, slide, none) => {
+            let shift: ShownShift = &|frame, p, sensor| slide.shift_m(frame, p, sensor);
+            let moved_back = again(Mending { shift_m: Some(shift), ..Mending::default() })?;
+            let moved_back = Context { frames: &moved_back, ..context.clone() };
+            if search::returns::comes_to_lie(&context, &moved_back) { (result, Some(slide)) } else { (none, None) }
+        }
+    };
     keep("slide", sliding);
     let (rounding, step_m) = search::quantisation::search(&context);
     keep("ranges", rounding);

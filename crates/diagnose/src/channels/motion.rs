@@ -18,19 +18,50 @@ pub struct OwnMotion {
 /// Side of a cell of a frame seen from above, m.
 pub const CELL_M: f64 = 0.35;
 
-/// Fastest that is looked for, m/s.
-const FASTEST_M_S: f64 = 95.0;
+/// Speeds that are looked for: their number, and the step, m/s.
+const SPEEDS: usize = 160;
+const SPEED_M_S: f64 = 0.6;
+
+/// Hardest that cars brake, m/s2.
+const HARDEST_M_S2: f64 = 15.0;
+
+/// Frames farther apart in time show other things, s.
+const LONGEST_S: f64 = 0.6;
 
 /// Fewer edges than that say nothing.
 const FEWEST: usize = 40;
 
+/// Frames that are held against one for what edges have in common wherever the car is, are at least so far from it in time, s.
+const ELSEWHERE_S: f64 = 0.5;
+
+/// Edges of a frame that are moved, at most.
+const SOME: usize = 250;
+
+/// Times what the best path through chance gains that the speeds must gain.
+const STANDS_OUT: f64 = 1.25;
+
+/// Number of the slowest speed that is looked for: the sensors' pattern stands still in the car's frame.
+const SLOWEST: usize = 8;
+
 /// The motion at each frame; `None` where the scene does not tell.
 pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) -> Vec<Option<OwnMotion>> {
-    let edges: Vec<Vec<Vector2<f64>>> = frames.par_iter().map(|f| edges(f, origins)).collect();
-    let steps: Vec<Option<OwnMotion>> = (0..frames.len().saturating_sub(1))
-        .into_par_iter()
-        .map(|i| between(&edges[i], &edges[i + 1], times[i + 1] - times[i]))
-        .collect();
+    let seen = |f: &FramePair| {
+        let edges = edges(f, origins);
+        Seen { taken: Cells::new(&edges), edges }
+    };
+    let seen: Vec<Seen> = frames.par_iter().map(seen).collect();
+    let pair = |i: usize| {
+        // Of the frames in which nothing of this one stands where it stood, those that look most like it.
+        let far = (0..frames.len()).filter(|&j| (times[j] - times[i]).abs() > ELSEWHERE_S);
+        let mut far: Vec<&Seen> = far.map(|j| &seen[j]).collect();
+        far.sort_by_cached_key(|other| std::cmp::Reverse(hits(&seen[i].edges, other, 0.0, 0.0) as usize));
+        let [one, other, ..] = far[..] else { return None };
+        Some(Pair::new(&seen[i], &seen[i + 1], [one, other], times[i + 1] - times[i]))
+    };
+    let pairs: Option<Vec<Pair>> = (0..frames.len().saturating_sub(1)).into_par_iter().map(pair).collect();
+    let told = pairs.and_then(|pairs| speeds(&pairs).map(|speeds| (pairs, speeds)));
+    let Some((pairs, speeds)) = told else { return vec![None; frames.len()] };
+    let steps: Vec<Option<OwnMotion>> = pairs.par_iter().zip(speeds).map(|(pair, k)| pair.motion(k)).collect();
     let raw: Vec<Option<OwnMotion>> = (0..frames.len())
         .map(|i| {
             let before = i.checked_sub(1).and_then(|j| steps[j]);
@@ -120,63 +151,121 @@ impl Cells {
     }
 }
 
-/// The motion under which most edges of the first frame come to lie on edges of the second.
-fn between(first: &[Vector2<f64>], second: &[Vector2<f64>], dt: f64) -> Option<OwnMotion> {
-    if first.len() < FEWEST || second.len() < FEWEST || dt <= 0.0 || dt > 0.6 {
-        return None;
+/// Edges seen from above, and the cells that they take.
+struct Seen {
+    edges: Vec<Vector2<f64>>,
+    taken: Cells,
+}
+
+/// How many of some edges come to lie on edges of another frame if the car moves ahead by `d` and turns by `yaw` along its mean heading.
+fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
+    let (s, c) = yaw.sin_cos();
+    let (ms, mc) = (0.5 * yaw).sin_cos();
+    let on = some.iter().filter(|p| {
+        let q = Vector2::new(p.x - d * mc, p.y - d * ms);
+        other.taken.contains(&Vector2::new(c * q.x + s * q.y, -s * q.x + c * q.y))
+    });
+    on.count() as f64
+}
+
+/// Two frames that follow one another, and others from elsewhere: the sensors' pattern stays where it is in the car's frame, and a wall looks like itself
+/// wherever one is along it.
+struct Pair<'a> {
+    some: Vec<Vector2<f64>>,
+    second: &'a Seen,
+    elsewhere: [&'a Seen; 2],
+    dt: f64,
+    /// By speed: how many more edges of the first frame come to lie on those of the second than on those from elsewhere, at the best turn, and that turn; and
+    /// how many more on those of one frame from elsewhere than on those of the other, which is chance.
+    scores: Vec<[f64; 3]>,
+}
+
+impl<'a> Pair<'a> {
+    fn new(first: &Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
+        let stride = first.edges.len().div_ceil(SOME);
+        let some = first.edges.iter().step_by(stride.max(1)).copied().collect();
+        let mut pair = Pair { some, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
+        if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt < LONGEST_S {
+            let yaw_steps = (0.6 * dt / 0.009).ceil() as i32;
+            let yaws = (-yaw_steps..=yaw_steps).map(|k| 0.6 * dt * f64::from(k) / f64::from(yaw_steps.max(1)));
+            let at = |k: usize| {
+                let mut best = [f64::NEG_INFINITY, 0.0, f64::NEG_INFINITY];
+                for yaw in yaws.clone() {
+                    let [more, chance] = pair.more(SPEED_M_S * k as f64 * dt, yaw);
+                    if more > best[0] {
+                        (best[0], best[1]) = (more, yaw);
+                    }
+                    best[2] = best[2].max(chance);
+                }
+                best
+            };
+            pair.scores = (0..SPEEDS).map(at).collect();
+        }
+        pair
     }
-    let taken = Cells::new(second);
-    let stride = (first.len() / 400).max(1);
-    let some: Vec<Vector2<f64>> = first.iter().step_by(stride).copied().collect();
-    let hits = |d: f64, yaw: f64| {
-        let (s, c) = yaw.sin_cos();
-        // The car moves along its mean heading.
-        let (ms, mc) = (0.5 * yaw).sin_cos();
-        let count = some.iter().filter(|p| {
-            let q = Vector2::new(p.x - d * mc, p.y - d * ms);
-            taken.contains(&Vector2::new(c * q.x + s * q.y, -s * q.x + c * q.y))
-        });
-        count.count()
-    };
-    let far = FASTEST_M_S * dt;
-    let turn = 0.6 * dt;
-    let yaw_steps = 1 + 2 * ((turn / 0.006).ceil() as i32);
-    let mut scores = Vec::new();
-    let mut best = (0usize, 0.0, 0.0);
-    let mut d = 0.0;
-    while d <= far {
-        let mut top = 0;
-        for k in 0..yaw_steps {
-            let yaw = turn * (2.0 * f64::from(k) / f64::from(yaw_steps - 1).max(1.0) - 1.0);
-            let n = hits(d, yaw);
-            top = top.max(n);
-            if n > best.0 {
-                best = (n, d, yaw);
+
+    fn more(&self, d: f64, yaw: f64) -> [f64; 2] {
+        let [on, one, other] = [self.second, self.elsewhere[0], self.elsewhere[1]].map(|s| hits(&self.some, s, d, yaw));
+        [on - 0.5 * (one + other), one - other]
+    }
+
+    /// The motion about the speed number `k`; `None` where no edges tell.
+    fn motion(&self, k: usize) -> Option<OwnMotion> {
+        let [best, yaw, _] = self.scores[k];
+        let mut sum = [0.0; 3];
+        for i in -6..=6 {
+            for j in -4..=4 {
+                let (d, yaw) = (SPEED_M_S * k as f64 * self.dt + 0.05 * f64::from(i), yaw + 0.0015 * f64::from(j));
+                let weight = (self.more(d, yaw)[0] - 0.7 * best).max(0.0).powi(2);
+                sum = [sum[0] + weight, sum[1] + weight * d, sum[2] + weight * yaw];
             }
         }
-        scores.push(top);
-        d += 0.15;
+        (best > 0.0 && sum[0] > 0.0)
+            .then(|| OwnMotion { speed_m_s: sum[1] / sum[0] / self.dt, yaw_rate_rad_s: sum[2] / sum[0] / self.dt })
     }
-    scores.sort_unstable();
-    let usual = scores[scores.len() / 2];
-    // The right place must stand out from wrong ones.
-    if best.0 < 12 || (best.0 as f64) < 1.35 * usual as f64 + 4.0 {
-        return None;
+}
+
+/// Of every pair the number of the speed, so that the most edges come to lie on others and the car neither brakes nor accelerates harder than cars do. `None`
+/// where chance finds such speeds as well, or all lie at the lower end: what moves with the car seems to stand.
+fn speeds(pairs: &[Pair]) -> Option<Vec<usize>> {
+    let (speeds, sum) = path(pairs, 0)?;
+    let (_, by_chance) = path(pairs, 2)?;
+    let usual = median(speeds.iter().map(|k| *k as f64).collect());
+    (sum > STANDS_OUT * by_chance.max(1.0) && usual > 2.0 * SLOWEST as f64).then_some(speeds)
+}
+
+/// The path of speeds on which one of the scores has the largest sum, and that sum.
+fn path(pairs: &[Pair], score: usize) -> Option<(Vec<usize>, f64)> {
+    // Best sum that ends at each speed, and from where.
+    let mut best: Vec<f64> = vec![0.0; SPEEDS];
+    let mut from: Vec<Vec<usize>> = Vec::new();
+    for pair in pairs {
+        let reach = (HARDEST_M_S2 * pair.dt.abs() / SPEED_M_S).ceil().min(SPEEDS as f64) as usize;
+        let before = |k: usize| {
+            let near = k.saturating_sub(reach).max(SLOWEST)..(k + reach + 1).min(SPEEDS);
+            near.max_by(|&a, &b| best[a].total_cmp(&best[b])).unwrap_or(SLOWEST)
+        };
+        let came: Vec<usize> = (0..SPEEDS).map(before).collect();
+        // What all speeds have in common tells nothing.
+        let middle = median(pair.scores[SLOWEST..].iter().map(|s| s[score]).collect());
+        best = came.iter().zip(&pair.scores).map(|(&k, s)| best[k] + s[score] - middle).collect();
+        from.push(came);
     }
-    let mut sum = [0.0; 3];
-    for i in -4..=4 {
-        for k in -4..=4 {
-            let (d, yaw) = (best.1 + 0.05 * f64::from(i), best.2 + 0.0015 * f64::from(k));
-            let weight = (hits(d, yaw) as f64 - 0.7 * best.0 as f64).max(0.0).powi(2);
-            sum = [sum[0] + weight, sum[1] + weight * d, sum[2] + weight * yaw];
-        }
-    }
-    Some(OwnMotion { speed_m_s: sum[1] / sum[0] / dt, yaw_rate_rad_s: sum[2] / sum[0] / dt })
+    let last = (SLOWEST..SPEEDS).max_by(|&a, &b| best[a].total_cmp(&best[b]))?;
+    let back = from.iter().rev().scan(last, |k, came| {
+        let here = *k;
+        *k = came[here];
+        Some(here)
+    });
+    let mut speeds: Vec<usize> = back.collect();
+    speeds.reverse();
+    Some((speeds, best[last]))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rand::RngExt;
 
     #[test]
     fn posts_tell_the_motion_and_walls_do_not() {
@@ -194,12 +283,20 @@ mod tests {
                 Vector2::new(yaw.cos() * q.x + yaw.sin() * q.y, -yaw.sin() * q.x + yaw.cos() * q.y)
             })
             .collect();
-        let motion = between(&posts, &moved, 0.05).unwrap();
+        let seen = |edges: Vec<Vector2<f64>>| Seen { taken: Cells::new(&edges), edges };
+        let mut rng = data::stream(0, "elsewhere", 0, 0);
+        let mut scattered = |n: usize, across_m: f64| {
+            let mut at = |half: f64| if half > 0.0 { rng.random_range(-half..half) } else { 8.0 };
+            seen((0..n).map(|_| Vector2::new(at(70.0), at(across_m))).collect())
+        };
+        let (first, second) = (seen(posts), seen(moved));
+        let [one, other] = [scattered(60, 10.0), scattered(60, 10.0)];
+        let pair = Pair::new(&first, &second, [&one, &other], 0.05);
+        let motion = pair.motion(speeds(std::slice::from_ref(&pair)).unwrap()[0]).unwrap();
         assert!((motion.speed_m_s - 48.0).abs() < 3.0 && (motion.yaw_rate_rad_s - 0.24).abs() < 0.1, "{motion:?}");
         // Each scan meets a wall at other places of it.
-        let wall = |jitter: i32| -> Vec<Vector2<f64>> {
-            (0..400).map(|i| Vector2::new(0.35 * f64::from(i) + 0.05 * f64::from(i * i % jitter) - 70.0, 8.0)).collect()
-        };
-        assert_eq!(between(&wall(7), &wall(5), 0.05), None);
+        let walls: Vec<Seen> = (0..12).map(|_| scattered(400, 0.0)).collect();
+        let pair = |i: usize| Pair::new(&walls[i], &walls[i + 1], [&walls[(i + 5) % 12], &walls[(i + 7) % 12]], 0.25);
+        assert_eq!(speeds(&(0..11).map(pair).collect::<Vec<_>>()), None);
     }
 }

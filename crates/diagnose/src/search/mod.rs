@@ -22,6 +22,7 @@ use crate::rig::SensorRig;
 use rand::RngExt;
 
 /// What all searches share.
+#[derive(Clone)]
 pub struct Context<'a> {
     /// Sensors.
     pub rig: &'a SensorRig,

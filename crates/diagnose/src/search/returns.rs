@@ -94,6 +94,24 @@ pub fn search(context: &Context) -> ChannelResult {
     result
 }
 
+/// Nats a return that groups of returns gain where surfaces stand elsewhere, and the share of it that is left at most where they were moved to their place.
+const ELSEWHERE: [f64; 2] = [0.01, 0.5];
+
+/// Whether a scene that was moved comes to lie where the simulation has something.
+pub fn comes_to_lie(before: &Context, moved: &Context) -> bool {
+    let [before, after] = [before, moved].map(elsewhere);
+    before > ELSEWHERE[0] && after < ELSEWHERE[1] * before
+}
+
+/// What returns gain that lie together where the other side has nothing, nats a return: things that only one side has, or surfaces that stand elsewhere.
+fn elsewhere(context: &Context) -> f64 {
+    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
+    let select = context.of(Role::Select);
+    let blocks = context.blocks(&select);
+    let gain = |kind: Odd| cross_gains(&odd, &select, &blocks, kind as usize).iter().sum::<f64>().max(0.0);
+    (gain(Odd::GroupInFront) + gain(Odd::GroupBehind)) / context.returns(&select).max(1.0)
+}
+
 fn name(kind: Odd) -> &'static str {
     match kind {
         Odd::Alone => "outliers",

@@ -115,8 +115,21 @@ impl Sliders {
     }
 }
 
-/// The search; also how the scene slides, if it does.
-pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
+/// Mean gain over its standard error from which on a slide may be one: whether the scene then comes to lie on the simulation is asked elsewhere.
+const DOUBTFUL: f64 = 1.5;
+
+/// What the search of a slide says.
+pub enum Sliding {
+    /// Nothing slides.
+    No(ChannelResult),
+    /// Everything slides.
+    Yes(ChannelResult, Slide),
+    /// So little is seen from above that the whole scene must be moved back to tell: what to say if it slides, and if not.
+    Perhaps(ChannelResult, Slide, ChannelResult),
+}
+
+/// The search.
+pub fn search(context: &Context) -> Sliding {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
     // Where the scenes tell the own motion, and where they do not: then all frames slide alike.
@@ -124,29 +137,28 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
     ways.extend(Way::known(context));
     let tried = ways.iter().map(|way| way.tried(&select)).collect::<Vec<_>>();
     let total = |k: usize| total_and_z(&tried[k].gains).0;
-    let Some(k) = (0..ways.len()).max_by(|&a, &b| total(a).total_cmp(&total(b))) else { return (result, None) };
+    let Some(k) = (0..ways.len()).max_by(|&a, &b| total(a).total_cmp(&total(b))) else { return Sliding::No(result) };
     let Tried { best, gains, least, most } = &tried[k];
     let way = ways.swap_remove(k);
     let (gain, z) = total_and_z(gains);
     let seen = significant(gains, Z_STAR) && gain > LEAST_SHARE * (most - gain);
     let far_enough = best.abs() * way.fastest > LEAST_M;
-    let outcome = match (seen, far_enough) {
-        (true, true) => "chosen",
-        (true, false) => "too small to be seen from above",
-        _ => "no more returns come to lie on the simulation",
-    };
-    result.considered.push(Considered {
+    let considered = |outcome: &str| Considered {
         cause: "rolling_shutter".into(),
         channel: "slide".into(),
         nats_per_ray: 0.0,
         z,
         outcome: outcome.into(),
-    });
+    };
     let minimum = Minimum { parameter: "shear_x_m".into(), value: LEAST_M, unit: "m".into() };
     result.minimum.push(("rolling_shutter".into(), minimum));
-    if !(seen && far_enough) {
-        return (result, None);
+    let outcome =
+        if seen { "too small to be seen from above" } else { "no more returns come to lie on the simulation" };
+    let none = ChannelResult { considered: vec![considered(outcome)], ..result.clone() };
+    if !far_enough || !seen && z < DOUBTFUL {
+        return Sliding::No(none);
     }
+    result.considered.push(considered("chosen"));
     // Finer on other frames, with blocks drawn for the interval.
     let fine: Vec<f64> = (-20..=20).map(|k| best + 0.2 * way.step * f64::from(k)).collect();
     let on_estimate = way.counts(&estimate, &fine);
@@ -211,7 +223,8 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Slide>) {
         },
     });
     let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
-    (result, Some(Slide { scan_s, motions: way.motions, sensors }))
+    let slide = Slide { scan_s, motions: way.motions, sensors };
+    if seen { Sliding::Yes(result, slide) } else { Sliding::Perhaps(result, slide, none) }
 }
 
 /// One way to tell how things slide.
@@ -358,7 +371,10 @@ mod tests {
             times: Some((0..20).map(|f| 0.05 * f64::from(f)).collect()),
             motion: Some(vec![Some(own); 20]),
         };
-        let (result, slide) = search(&context);
+        let (result, slide) = match search(&context) {
+            Sliding::Yes(result, slide) => (result, Some(slide)),
+            Sliding::No(result) | Sliding::Perhaps(_, _, result) => (result, None),
+        };
         assert_eq!(result.found.len(), usize::from(slide.is_some()));
         let p = Vector3::new(0.0, 20.0, 0.0);
         if let Some(slide) = slide {
