@@ -231,7 +231,7 @@ fn speeds(pairs: &[Pair]) -> Option<Vec<usize>> {
     let (speeds, sum) = path(pairs, 0)?;
     let (_, by_chance) = path(pairs, 2)?;
     let usual = median(speeds.iter().map(|k| *k as f64).collect());
-    (sum > STANDS_OUT * by_chance.max(1.0) && usual > 2.0 * SLOWEST as f64).then_some(speeds)
+    (sum > STANDS_OUT * by_chance.max(1.0) && usual > SLOWEST as f64 + 2.0).then_some(speeds)
 }
 
 /// The path of speeds on which one of the scores has the largest sum, and that sum.
