@@ -67,7 +67,8 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
                 _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
             };
             let count = counts.entry(direction_cell(ray)).or_default();
-            if ray.own_range_m() < OWN_CAR_M.min(HALF_WAY * predicted) {
+            // Another car may drive as near all along.
+            if ray.own_range_m() < OWN_CAR_M.min(HALF_WAY * predicted) && !ray.at_object {
                 count[2] += 1.0;
                 count[3] = 1.0 / which.len() as f64;
             } else {

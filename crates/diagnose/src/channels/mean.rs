@@ -79,7 +79,8 @@ pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
 
 /// Whether a measured ray says where a surface lies.
 pub fn usable(ray: &Ray) -> bool {
-    ray.smooth && matches!(ray.surface, Surface::Ground | Surface::Standing) && ray.cos_incidence > 0.003
+    let stands = matches!(ray.surface, Surface::Ground | Surface::Standing) && !ray.at_object;
+    ray.smooth && stands && ray.cos_incidence > 0.003
 }
 
 /// Kinds of surfaces.

@@ -3,7 +3,7 @@
 
 use super::cells::{CELLS, Place, cell};
 use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
-use crate::pairing::{FramePair, Ray};
+use crate::pairing::{FramePair, Ray, Surface};
 use crate::rig::SensorRig;
 use rayon::prelude::*;
 
@@ -48,8 +48,11 @@ fn log_bin(v: f64) -> usize {
     ((v.max(1e-9).log2() + 20.0) * 2.0).clamp(0.0, LOG_BINS as f64 - 1.0) as usize
 }
 
-/// Roughness in units of what one range would have by itself, m.
+/// Roughness in units of what one range would have by itself, m. Where an object is of which the simulation knows nothing, nothing is alike.
 pub fn own_roughness_m(ray: &Ray) -> Option<f64> {
+    if ray.at_object && ray.surface != Surface::Object {
+        return None;
+    }
     let value = f64::from(ray.roughness_m) / (1.0 + f64::from(ray.roughness_leverage)).sqrt();
     value.is_finite().then_some(value)
 }

@@ -6,11 +6,12 @@ use super::matching::match_directions;
 use super::pattern::ScanPattern;
 use super::ray::{Ray, Surface};
 use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
-use super::surface::{LocalSurface, fit_surface};
+use super::sight::Sight;
+use super::surface::fit_surface;
 use crate::rig::SensorRig;
 use data::{Cloud, Object};
 use geometry::Box3;
-use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
+use nalgebra::{Point3, Vector3};
 
 /// One frame of both sides.
 #[derive(Clone, Debug)]
@@ -63,7 +64,7 @@ const STRAY_M: f64 = 0.5;
 
 impl Sensors {
     /// Row of a shot; `u16::MAX` where rows are not known.
-    fn row(&self, sensor: usize, elevation_rad: f32) -> u16 {
+    pub(super) fn row(&self, sensor: usize, elevation_rad: f32) -> u16 {
         self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
     }
 
@@ -76,7 +77,7 @@ impl Sensors {
         (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.len() as f64 * columns.round())
     }
 
-    fn window(&self, sensor: usize) -> Steps {
+    pub(super) fn window(&self, sensor: usize) -> Steps {
         let steps = self.patterns[sensor].steps;
         Steps { azimuth_rad: WINDOW[0] * steps.azimuth_rad, elevation_rad: WINDOW[1] * steps.elevation_rad }
     }
@@ -200,125 +201,6 @@ fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
         }
     });
     n
-}
-
-/// The simulated side of one sensor, to be looked at from any direction.
-struct Sight<'a> {
-    sensor: usize,
-    sensors: &'a Sensors,
-    cloud_from_sensor: Isometry3<f64>,
-    index: DirectionIndex,
-    window: [f64; 2],
-    boxes: &'a [Box3],
-}
-
-impl<'a> Sight<'a> {
-    fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
-        let mount = &sensors.rig.sensors[sensor];
-        let window = sensors.window(sensor);
-        Sight {
-            sensor,
-            sensors,
-            cloud_from_sensor: mount.pose(),
-            index: DirectionIndex::new(simulated, window, mount.closes()),
-            window: [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)],
-            boxes,
-        }
-    }
-
-    fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
-        let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
-        let direction = unit(&self.cloud_from_sensor.rotation, az, el);
-        let row = self.sensors.row(self.sensor, el);
-        let mut ray = Ray {
-            sensor: self.sensor as u8,
-            surface: Surface::Open,
-            smooth: false,
-            corner: false,
-            matched: false,
-            company: 0,
-            in_gap: false,
-            row,
-            object: u16::MAX,
-            azimuth_rad: az,
-            elevation_rad: el,
-            range_m: range,
-            cos_incidence: 0.0,
-            direction: direction.cast::<f32>().into(),
-            normal: [0.0; 3],
-            residual_m: 0.0,
-            bulge_m: 0.0,
-            leverage: 0.0,
-            roughness_m: f32::NAN,
-            roughness_leverage: 0.0,
-            near_far_m: [0.0; 2],
-        };
-        let others = |e: &super::scan::Entry| !without_itself || e.index != i as u32;
-        let Some(surface) = fit_surface(&self.index, self.window, az, el, others) else {
-            let mut near_far = [f32::INFINITY, 0.0f32];
-            self.index.around(az, el, |e, _, _| {
-                if others(e) {
-                    near_far = [near_far[0].min(e.range_m), near_far[1].max(e.range_m)];
-                }
-            });
-            if near_far[1] > 0.0 {
-                ray.near_far_m = near_far;
-                ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
-            }
-            return ray;
-        };
-        ray.near_far_m = surface.near_far_m.map(|v| v as f32);
-        ray.smooth = surface.smooth(self.sensors.edge_m);
-        if !ray.smooth {
-            ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
-            return ray;
-        }
-        let normal = self.normal(&surface, az, el);
-        ray.range_m = surface.range_m as f32;
-        ray.residual_m = (f64::from(range) - surface.range_m) as f32;
-        ray.cos_incidence = surface.cos_incidence as f32;
-        ray.leverage = surface.leverage as f32;
-        ray.bulge_m = surface.bulge_m as f32;
-        ray.normal = normal.cast::<f32>().into();
-        ray.surface = self.surface_at(&direction, surface.range_m, Some(&normal), &mut ray);
-        ray
-    }
-
-    fn normal(&self, surface: &LocalSurface, az: f32, el: f32) -> Vector3<f64> {
-        let (az, el) = (f64::from(az), f64::from(el));
-        let [along, side, up] = surface.normal();
-        let u = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin());
-        let left = Vector3::new(-az.sin(), az.cos(), 0.0);
-        let n = u * along + left * side + u.cross(&left) * up;
-        self.cloud_from_sensor.rotation * n
-    }
-
-    fn surface_at(
-        &self,
-        direction: &Vector3<f64>,
-        range: f64,
-        normal: Option<&Vector3<f64>>,
-        ray: &mut Ray,
-    ) -> Surface {
-        let p: [f64; 3] = (self.cloud_from_sensor.translation.vector + direction * range).into();
-        for (k, b) in self.boxes.iter().enumerate() {
-            let local = b.to_local(p);
-            let inside = |axis: usize, margin: f64| local[axis].abs() < b.size[axis] / 2.0 + margin;
-            let on_the_floor = local[2] < -b.size[2] / 2.0 + 0.12;
-            if inside(0, 0.2) && inside(1, 0.2) && inside(2, 0.2) && !on_the_floor {
-                ray.object = k as u16;
-                let beyond = |axis: usize, share: f64| local[axis].abs() > share * b.size[axis];
-                ray.corner = beyond(0, 0.18) && beyond(1, 0.3) && local[2] < 0.06 * b.size[2];
-                return Surface::Object;
-            }
-        }
-        if normal.is_some_and(|n| n.z > 0.85) { Surface::Ground } else { Surface::Standing }
-    }
-}
-
-fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
-    let (az, el) = (f64::from(az), f64::from(el));
-    turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
 }
 
 /// Labels farther apart than that are not of the same object, m.

@@ -8,6 +8,7 @@ mod matching;
 mod pattern;
 mod ray;
 mod scan;
+mod sight;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};

@@ -40,6 +40,8 @@ pub struct Ray {
     pub smooth: bool,
     /// In a lower corner of the labelled object's box, where cars have wheels.
     pub corner: bool,
+    /// It lies in the box of a labelled object or so near to it that it is the object's, if that is larger than its label.
+    pub at_object: bool,
     /// The other side has a return in this direction, at whatever range.
     pub matched: bool,
     /// Returns of its own side around it at about its range.

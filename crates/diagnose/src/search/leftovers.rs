@@ -39,7 +39,7 @@ const LEFTOVERS: [Leftover; 18] = [
     Leftover {
         what: slight_bias,
         by: |f| f.channel == "hits",
-        share: 0.04,
+        share: 0.1,
         because: "where far returns are lost, those that come back are the nearer ones",
     },
     Leftover {

@@ -11,7 +11,7 @@ use crate::channels::mask::{
 use crate::channels::returns::OWN_CAR_M;
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::UNNAMED;
-use crate::inference::law::{FittedLaw, Law};
+use crate::inference::law::Law;
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
@@ -22,14 +22,12 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let select = context.of(Role::Select);
     let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
-    // Laws are fitted first without the dark directions, to know which of them they explain.
+    // What laws explain is none of it, be they fitted without the dark directions or with them: far ground may be dark all along.
     let dark = blocked_cells(&counts, shown, |_| 1.0);
     let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
-    let hits = hit_frames(context.frames, &without);
-    let table = LossTable::new(total(select.iter().map(|&i| &hits[i])));
-    let laws = refit(&table, &[Law::Random, Law::Signal]);
-    let expected = expected_shares(context, &select, &mask, &table, &laws);
-    mask.blocked = blocked_cells(&counts, shown, |cell| expected.get(cell).copied().unwrap_or(0.0));
+    let [without, with] = [&without, &mask].map(|m| expected_shares(context, &select, &mask, m));
+    let expected = |cell: &DirectionCell| Some(without.get(cell)?.min(*with.get(cell)?));
+    mask.blocked = blocked_cells(&counts, shown, |cell| expected(cell).unwrap_or(0.0));
     mask.around = with_neighbours(&mask.blocked);
     let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
     let mut result =
@@ -64,19 +62,21 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     (result, mask)
 }
 
-/// Share that laws keep in each cell of directions.
+/// Share that laws keep in each cell of directions, fitted on what `fitted_without` leaves.
 fn expected_shares(
     context: &Context,
     frames: &[usize],
     mask: &Mask,
-    table: &LossTable,
-    laws: &[FittedLaw],
+    fitted_without: &Mask,
 ) -> BTreeMap<DirectionCell, f64> {
+    let hits = hit_frames(context.frames, fitted_without);
+    let table = LossTable::new(total(frames.iter().map(|&i| &hits[i])));
+    let laws = refit(&table, &[Law::Random, Law::Signal]);
     let mut sums = BTreeMap::<DirectionCell, [f64; 2]>::new();
     for ray in frames.iter().flat_map(|&i| &context.frames[i].simulated) {
         let kept = match cell(ray) {
             _ if mask.hides(ray) => 0.0,
-            Some(c) => table.kept(laws, c),
+            Some(c) => table.kept(&laws, c),
             // Edges tell nothing of their incidence; whatever lies around them decides.
             None => continue,
         };

@@ -323,6 +323,7 @@ mod tests {
             surface: Surface::Standing,
             smooth: true,
             corner: false,
+            at_object: false,
             matched: true,
             company: 5,
             in_gap: false,

@@ -1,0 +1,149 @@
+//! What the simulation has in a direction: the surface around it, what is to be expected there, and of what it is.
+
+use super::frame::Sensors;
+use super::ray::{Ray, Surface};
+use super::scan::{DirectionIndex, SensorScan};
+use super::surface::{LocalSurface, fit_surface};
+use geometry::Box3;
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+
+/// A return so near to a labelled object is the object's, though it be larger than its label, m.
+const BESIDE_M: f64 = 0.5;
+
+/// Lower than that above the bottom of its box a return is of what an object stands on, m.
+const FLOOR_M: f64 = 0.12;
+
+/// The simulated side of one sensor, to be looked at from any direction.
+pub(super) struct Sight<'a> {
+    sensor: usize,
+    sensors: &'a Sensors,
+    cloud_from_sensor: Isometry3<f64>,
+    /// Simulated returns by direction.
+    pub(super) index: DirectionIndex,
+    /// Half widths of the window of neighbours, rad.
+    pub(super) window: [f64; 2],
+    boxes: &'a [Box3],
+}
+
+impl<'a> Sight<'a> {
+    /// Of a sensor by its number, its simulated returns, and the simulation's labels.
+    pub(super) fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
+        let mount = &sensors.rig.sensors[sensor];
+        let window = sensors.window(sensor);
+        Sight {
+            sensor,
+            sensors,
+            cloud_from_sensor: mount.pose(),
+            index: DirectionIndex::new(simulated, window, mount.closes()),
+            window: [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)],
+            boxes,
+        }
+    }
+
+    /// A return of a scan of that sensor with all that the simulation says of its direction.
+    pub(super) fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
+        let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
+        let direction = unit(&self.cloud_from_sensor.rotation, az, el);
+        let row = self.sensors.row(self.sensor, el);
+        let mut ray = Ray {
+            sensor: self.sensor as u8,
+            surface: Surface::Open,
+            smooth: false,
+            corner: false,
+            at_object: self.at_object(&direction, f64::from(range)),
+            matched: false,
+            company: 0,
+            in_gap: false,
+            row,
+            object: u16::MAX,
+            azimuth_rad: az,
+            elevation_rad: el,
+            range_m: range,
+            cos_incidence: 0.0,
+            direction: direction.cast::<f32>().into(),
+            normal: [0.0; 3],
+            residual_m: 0.0,
+            bulge_m: 0.0,
+            leverage: 0.0,
+            roughness_m: f32::NAN,
+            roughness_leverage: 0.0,
+            near_far_m: [0.0; 2],
+        };
+        let others = |e: &super::scan::Entry| !without_itself || e.index != i as u32;
+        let Some(surface) = fit_surface(&self.index, self.window, az, el, others) else {
+            let mut near_far = [f32::INFINITY, 0.0f32];
+            self.index.around(az, el, |e, _, _| {
+                if others(e) {
+                    near_far = [near_far[0].min(e.range_m), near_far[1].max(e.range_m)];
+                }
+            });
+            if near_far[1] > 0.0 {
+                ray.near_far_m = near_far;
+                ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
+            }
+            return ray;
+        };
+        ray.near_far_m = surface.near_far_m.map(|v| v as f32);
+        ray.smooth = surface.smooth(self.sensors.edge_m);
+        if !ray.smooth {
+            ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
+            return ray;
+        }
+        let normal = self.normal(&surface, az, el);
+        ray.range_m = surface.range_m as f32;
+        ray.residual_m = (f64::from(range) - surface.range_m) as f32;
+        ray.cos_incidence = surface.cos_incidence as f32;
+        ray.leverage = surface.leverage as f32;
+        ray.bulge_m = surface.bulge_m as f32;
+        ray.normal = normal.cast::<f32>().into();
+        ray.surface = self.surface_at(&direction, surface.range_m, Some(&normal), &mut ray);
+        ray
+    }
+
+    /// Whether a place lies in a labelled object or just beside it, above what it stands on. A box with the sensor in it is the own car's.
+    fn at_object(&self, direction: &Vector3<f64>, range_m: f64) -> bool {
+        let origin = self.cloud_from_sensor.translation.vector;
+        let within = |b: &Box3, p: Vector3<f64>| {
+            let local = b.to_local(p.into());
+            let above = local[2] > -b.size[2] / 2.0 + FLOOR_M;
+            above && (0..3).all(|k| local[k].abs() < b.size[k] / 2.0 + BESIDE_M)
+        };
+        self.boxes.iter().any(|b| within(b, origin + direction * range_m) && !within(b, origin))
+    }
+
+    fn normal(&self, surface: &LocalSurface, az: f32, el: f32) -> Vector3<f64> {
+        let (az, el) = (f64::from(az), f64::from(el));
+        let [along, side, up] = surface.normal();
+        let u = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin());
+        let left = Vector3::new(-az.sin(), az.cos(), 0.0);
+        let n = u * along + left * side + u.cross(&left) * up;
+        self.cloud_from_sensor.rotation * n
+    }
+
+    fn surface_at(
+        &self,
+        direction: &Vector3<f64>,
+        range: f64,
+        normal: Option<&Vector3<f64>>,
+        ray: &mut Ray,
+    ) -> Surface {
+        let p: [f64; 3] = (self.cloud_from_sensor.translation.vector + direction * range).into();
+        for (k, b) in self.boxes.iter().enumerate() {
+            let local = b.to_local(p);
+            let inside = |axis: usize, margin: f64| local[axis].abs() < b.size[axis] / 2.0 + margin;
+            let on_the_floor = local[2] < -b.size[2] / 2.0 + FLOOR_M;
+            if inside(0, 0.2) && inside(1, 0.2) && inside(2, 0.2) && !on_the_floor {
+                ray.object = k as u16;
+                let beyond = |axis: usize, share: f64| local[axis].abs() > share * b.size[axis];
+                ray.corner = beyond(0, 0.18) && beyond(1, 0.3) && local[2] < 0.06 * b.size[2];
+                return Surface::Object;
+            }
+        }
+        if normal.is_some_and(|n| n.z > 0.85) { Surface::Ground } else { Surface::Standing }
+    }
+}
+
+fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
+    let (az, el) = (f64::from(az), f64::from(el));
+    turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
+}
