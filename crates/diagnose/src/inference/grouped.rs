@@ -117,19 +117,45 @@ pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
 /// Times the usual variance of a group's offset from which on it says nothing of the others.
 const WORSE: f64 = 16.0;
 
-/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well: not much worse than most. The
-/// largest `trimmed` share of them does not count.
-pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
+/// Offsets, with variances, of the groups that are known well: not much worse than most.
+fn known(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, (f64, f64)> {
     let offsets = offsets(sums, how);
     let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
-    let mut squares: Vec<(f64, f64)> = known.map(|(k, s)| (offsets[k].powi(2), 1.0 / s.gram[2 * how.column])).collect();
-    let usual = median(squares.iter().map(|(_, noise)| *noise).collect());
-    squares.retain(|(_, noise)| *noise <= WORSE * usual);
+    let mut known: BTreeMap<u32, (f64, f64)> =
+        known.map(|(k, s)| (*k, (offsets[k], 1.0 / s.gram[2 * how.column]))).collect();
+    let usual = median(known.values().map(|(_, noise)| *noise).collect());
+    known.retain(|_, (_, noise)| *noise <= WORSE * usual);
+    known
+}
+
+/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well. The
+/// largest `trimmed` share of them does not count.
+pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
+    let mut squares: Vec<(f64, f64)> = known(sums, how).into_values().map(|(o, noise)| (o.powi(2), noise)).collect();
     squares.sort_by(|a, b| a.0.total_cmp(&b.0));
     squares.truncate(((1.0 - trimmed) * squares.len() as f64).ceil() as usize);
     let n = squares.len() as f64;
     let excess: f64 = squares.iter().map(|(square, noise)| square - noise).sum();
     if n < 4.0 { (0.0, 0.0) } else { ((excess / n).max(0.0).sqrt(), n) }
+}
+
+/// Times the spread about their neighbours beyond which rows are shifted together.
+const TOGETHER: f64 = 1.12;
+
+/// The same of rows. Walls that lie a little elsewhere shift many rows together: where the spread about the mean of their neighbours is less by more than
+/// rows that know nothing of each other make it, it is that.
+pub fn spread_of_rows(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> (f64, f64) {
+    let known = known(sums, how);
+    let about = |(k, (offset, noise)): (&u32, &(f64, f64))| {
+        let around = known.range(k.saturating_sub(NEIGHBOURS)..=k + NEIGHBOURS).filter(|(g, _)| *g != k);
+        let (n, sum, of_mean) = around.fold((0.0, 0.0, 0.0), |(n, sum, v), (_, (o, e))| (n + 1.0, sum + o, v + e));
+        (n > 1.0).then(|| ((offset - sum / n).powi(2) - noise - of_mean / (n * n)) / (1.0 + 1.0 / n))
+    };
+    let squares: Vec<f64> = known.iter().filter_map(about).collect();
+    let n = squares.len() as f64;
+    let about_neighbours = (squares.iter().sum::<f64>() / n.max(1.0)).max(0.0).sqrt();
+    let whole = spread(sums, how, 0.0);
+    if n >= 4.0 && whole.0 > TOGETHER * about_neighbours { (about_neighbours, n) } else { whole }
 }
 
 #[cfg(test)]
@@ -165,6 +191,7 @@ mod tests {
             let surface = made(0.0, 0.2);
             assert!(cross_part_gains(&surface, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
             assert!(rough_spread(&all(&surface), how) < 0.02);
+            assert!(spread(&all(&surface), how, 0.0).0 > 0.08 && spread_of_rows(&all(&surface), how).0 < 0.06);
         }
     }
 }

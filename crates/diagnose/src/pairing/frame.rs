@@ -24,8 +24,8 @@ pub struct FramePair {
     pub simulated: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
-    /// Shots of the scan; of sensors whose rows are not known, returns of the measured side.
-    pub shots: f64,
+    /// Shots around whose direction the simulation has nothing; of sensors whose rows are not known, returns that it has fewer.
+    pub open: f64,
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
 }
@@ -56,6 +56,9 @@ pub struct Sensors {
 /// Half widths of the window of neighbours, in steps.
 const WINDOW: [f32; 2] = [2.2, 1.4];
 
+/// Of so many shots of a row one is looked at, to count those that meet nothing.
+const EVERY: usize = 3;
+
 /// Returns with no more than that in company are not of a surface.
 const LONE: u8 = 1;
 
@@ -68,13 +71,22 @@ impl Sensors {
         self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
     }
 
-    /// Shots of a scan over the azimuths that its returns span; `None` where rows are not known.
-    fn shots(&self, sensor: usize, scans: [&SensorScan; 2]) -> Option<f64> {
+    /// Shots of a scan, over the azimuths that its returns span, around which a side has nothing; `None` where rows are not known.
+    fn open(&self, sensor: usize, scans: [&SensorScan; 2], side: &DirectionIndex) -> Option<f64> {
         let pattern = &self.patterns[sensor];
         let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
         let [least, most] = [azimuths().fold(f32::MAX, f32::min), azimuths().fold(f32::MIN, f32::max)];
-        let columns = 1.0 + f64::from((most - least).max(0.0) / pattern.steps.azimuth_rad);
-        (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.len() as f64 * columns.round())
+        let columns = 1 + ((most - least).max(0.0) / pattern.steps.azimuth_rad).round() as usize;
+        let empty = |azimuth_rad: f32, elevation_rad: f32| {
+            let mut n = 0u32;
+            side.around(azimuth_rad, elevation_rad, |_, _, _| n += 1);
+            n == 0
+        };
+        let in_row = |el: &f32| {
+            let places = (0..columns).step_by(EVERY).map(|k| least + k as f32 * pattern.steps.azimuth_rad);
+            places.filter(|az| empty(*az, *el)).count() * EVERY
+        };
+        (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.iter().map(in_row).sum::<usize>() as f64)
     }
 
     pub(super) fn window(&self, sensor: usize) -> Steps {
@@ -135,7 +147,7 @@ pub fn pair_frame(
         measured: Vec::new(),
         simulated: Vec::new(),
         mixed_per_rad: 0.0,
-        shots: 0.0,
+        open: 0.0,
         objects: Vec::new(),
     };
     for sensor in 0..sensors.rig.sensors.len() {
@@ -181,7 +193,8 @@ pub fn pair_frame(
             }
         }
         frame.mixed_per_rad += mixed_per_rad(&simulated, &sight.index);
-        frame.shots += sensors.shots(sensor, [a, b]).unwrap_or(measured.len() as f64);
+        let missing = measured.len() as f64 - simulated.len() as f64;
+        frame.open += sensors.open(sensor, [a, b], &sight.index).unwrap_or(missing.max(0.0));
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }
@@ -191,12 +204,17 @@ pub fn pair_frame(
     frame
 }
 
+/// Returns nearer to each other than that are in company, m.
+pub fn company_m(range_m: f64) -> f64 {
+    0.3 + 0.03 * range_m
+}
+
 /// Number of returns of a scan around one of its own that lie at about its range.
 fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
     let range = scan.range_m[i];
     let mut n = 0u8;
     index.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
-        if e.index != i as u32 && (e.range_m - range).abs() < 0.3 + 0.03 * range {
+        if e.index != i as u32 && f64::from((e.range_m - range).abs()) < company_m(f64::from(range)) {
             n = n.saturating_add(1);
         }
     });

@@ -12,7 +12,7 @@ mod sight;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, pair_frame};
+pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, company_m, pair_frame};
 pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity};
 pub use matching::match_directions;

@@ -299,8 +299,8 @@ fn found(
 ) -> Found {
     let (theta, error) = (fitted.theta[k], fitted.error(k));
     let sigma = theta.signum() * theta.abs().sqrt();
-    // The form of the truth may differ: two per cent of the value on top.
-    let sigma_error = (error / (2.0 * theta.abs().sqrt()).max(1e-9)).hypot(0.02 * sigma);
+    // The form of the truth may differ: three per cent of the value on top.
+    let sigma_error = (error / (2.0 * theta.abs().sqrt()).max(1e-9)).hypot(0.03 * sigma);
     let mut parameters = Vec::new();
     let (covariate, says) = match law {
         NoiseLaw::Constant => {

@@ -106,17 +106,11 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     (result, Some(step))
 }
 
-/// The top of the peak on whose flank a bin lies: up to where the spectrum has fallen to two thirds again.
+/// The top of the peak on whose flank, or on a smaller one before it, a bin lies: scenes that end sharply make several. Multiples of the comb's
+/// frequency lie beyond.
 fn top(spectrum: &[f64], flank: usize) -> usize {
-    let mut best = flank;
-    for k in flank..spectrum.len() {
-        if spectrum[k] > spectrum[best] {
-            best = k;
-        } else if spectrum[k] < 0.67 * spectrum[best] {
-            break;
-        }
-    }
-    best
+    let end = (flank + flank / 2).min(spectrum.len() - 1);
+    (flank..=end).max_by(|a, b| spectrum[*a].total_cmp(&spectrum[*b])).unwrap_or(flank)
 }
 
 /// |sum of exp(2 pi i R k)| / n for frequencies up to one in two bins.
@@ -164,5 +158,13 @@ mod tests {
         let k = (0.0437f64.recip() * BIN_M * BINS as f64).round() as usize;
         assert!(spectrum(&rounded)[k] > 0.5 && spectrum(&smooth)[k] < 0.1);
         assert!((refine(&rounded, BIN_M * BINS as f64 / k as f64, 1e-3) - 0.0437).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_smaller_peak_before_that_of_the_comb_is_not_taken_for_it() {
+        let mut values = vec![0.01; 1000];
+        (values[380], values[400], values[800]) = (0.33, 0.95, 0.9);
+        assert_eq!(top(&values, 380), 400);
+        assert_eq!(top(&values, 400), 400);
     }
 }

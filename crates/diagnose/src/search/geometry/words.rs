@@ -57,7 +57,10 @@ pub(super) fn found(
         Suspect::Groups { grouping, column, .. } => {
             let frames = groups_of(sums, *grouping);
             let all = total(estimate.iter().map(|&i| &frames[i]));
-            let (std, n) = grouped::spread(&all, how(*column), 0.0);
+            let (std, n) = match grouping {
+                Grouping::Row => grouped::spread_of_rows(&all, how(*column)),
+                Grouping::Azimuth => grouped::spread(&all, how(*column), 0.0),
+            };
             let error = std / (2.0 * n.max(1.0)).sqrt();
             let unit = if *column == 0 { (1.0, "m") } else { (1f64.to_degrees(), "deg") };
             if name != UNNAMED {

@@ -1,7 +1,7 @@
 //! How often a sensor reports a range at which nothing is, and how far such ranges reach.
 
 use crate::channels::returns::{OWN_CAR_M, Odd, odd};
-use crate::pairing::{FramePair, Lies, Ray};
+use crate::pairing::{FramePair, Lies, Ray, company_m};
 use crate::search::Context;
 
 /// Nearer to a surface than that a return lies on it, m: along the ray, or across the surface.
@@ -85,11 +85,10 @@ fn seen(frames: &[&FramePair], [from, to]: [f64; 2]) -> Seen {
             }
         }
         // Shots of which nothing comes back show all of it; at edges nothing stands alone.
-        let open = (frame.shots - frame.simulated.len() as f64).max(0.0);
-        seen.lengths_m[0] += open * (to - from).max(0.0);
+        seen.lengths_m[0] += frame.open * (to - from).max(0.0);
         for ray in frame.simulated.iter().filter(|r| r.smooth) {
-            let margin = (ON_M[1] / f64::from(ray.cos_incidence).max(1e-3)).max(ON_M[0]);
             let range = ray.own_range_m();
+            let margin = (ON_M[1] / f64::from(ray.cos_incidence).max(1e-3)).max(ON_M[0]).max(company_m(range));
             seen.lengths_m[0] += (to.min(range - margin) - from).max(0.0);
             seen.lengths_m[1] += (to - from.max(range + margin)).max(0.0);
         }
