@@ -189,6 +189,12 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let mut chosen = vec![trials[first.chosen].candidate];
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
+    if side == Side::Objects {
+        let also = as_good(&trials, first.chosen);
+        stories[0].0.extend(also);
+        stories[0].0.sort();
+        stories[0].0.dedup();
+    }
     let (name, own) = CANDIDATES[chosen[0]];
     // Where no speeds are known nothing speaks against a late clock.
     let forward_alike = name == "label_offset" && own.contains(&0);
@@ -246,6 +252,20 @@ fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
     let (s, c) = r.yaw_rad.sin_cos();
     let shift = Vector3::new(told[0] * c - told[1] * s, told[0] * s + told[1] * c, told[2]) * sign;
     Repair { frame: r.frame, object: r.object, shift_m: shift.into() }
+}
+
+/// What surfaces are fitted wrongly by does not tell causes apart whose gains differ by less than that, however sure the difference is.
+const AS_GOOD: f64 = 0.02;
+
+/// Names of other causes, no richer, that explain the shifts of objects as well as the chosen one.
+fn as_good(trials: &[Trial], chosen: usize) -> Vec<String> {
+    let total = |t: &Trial| total_and_z(&t.gains).0;
+    let c = &trials[chosen];
+    let as_good = |t: &&Trial| {
+        let other = t.above_floor && t.name != c.name && t.parameters <= c.parameters;
+        other && total(t) > (1.0 - AS_GOOD) * total(c)
+    };
+    trials.iter().filter(as_good).map(|t| t.name.clone()).collect()
 }
 
 fn equals(trials: &[Trial], which: &[usize]) -> Vec<String> {
