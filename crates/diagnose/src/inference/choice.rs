@@ -135,6 +135,14 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     }
 }
 
+/// Names of other causes, no richer, that gain as much as the chosen one but for a share, be that sure or not.
+pub fn as_good(trials: &[Trial], chosen: usize, but_for: f64) -> Vec<String> {
+    let c = &trials[chosen];
+    let least = (1.0 - but_for) * total_and_z(&c.gains).0;
+    let others = trials.iter().filter(|t| t.above_floor && t.name != c.name && t.parameters <= c.parameters);
+    others.filter(|t| total_and_z(&t.gains).0 > least).map(|t| t.name.clone()).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -184,6 +192,9 @@ mod tests {
         let scattered = trial("seldom", 2, &[90.0, 5.0, -10.0, 80.0]);
         assert_eq!(choose(&[a.clone(), scattered], &DEMANDS).unwrap().equals, [1], "far more, though not for sure");
         assert!(choose(&[trial("noise", 1, &[30.0, -20.0, 25.0, -10.0])], &DEMANDS).is_none());
-        assert!(choose(&[Trial { above_floor: false, ..a }], &DEMANDS).is_none());
+        assert!(choose(&[Trial { above_floor: false, ..a.clone() }], &DEMANDS).is_none());
+        let nearly = trial("nearly", 1, &[9.9, 10.9, 8.9, 9.9]);
+        let [richer, less] = [trial("richer", 2, &[10.0; 4]), trial("less", 1, &[9.0; 4])];
+        assert_eq!(as_good(&[a, nearly, richer, less], 0, 0.02), ["nearly"]);
     }
 }

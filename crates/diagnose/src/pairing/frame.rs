@@ -293,3 +293,31 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
         object.shift = fit_shift(&boxes[k], &measured[k], &simulated[k]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shots_that_meet_nothing_are_counted_but_for_those_beside_what_others_meet() {
+        let (rows, step) = ([-0.06f32, -0.04, -0.02, 0.0], 0.01f32);
+        let steps = Steps { azimuth_rad: step, elevation_rad: 0.02 };
+        let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
+        let sensors = Sensors { rig: SensorRig::single(), patterns: vec![pattern], edge_m: 0.1 };
+        let scan_up_to = |columns: usize| {
+            let shots: Vec<_> = rows.iter().flat_map(|el| (0..columns).map(move |k| (k as f32 * step, *el))).collect();
+            SensorScan {
+                azimuth_rad: shots.iter().map(|s| s.0).collect(),
+                elevation_rad: shots.iter().map(|s| s.1).collect(),
+                range_m: vec![10.0; shots.len()],
+            }
+        };
+        let (measured, simulated) = (scan_up_to(300), scan_up_to(100));
+        let index = DirectionIndex::new(&simulated, sensors.window(0), false);
+        let open = sensors.open(0, [&measured, &simulated], &index).unwrap();
+        // Two columns beside the last return are seen together with it.
+        assert!((open - 4.0 * 198.0).abs() < 4.0 * EVERY as f64, "{open}");
+        let whole = DirectionIndex::new(&measured, sensors.window(0), false);
+        assert_eq!(sensors.open(0, [&measured, &simulated], &whole), Some(0.0));
+    }
+}

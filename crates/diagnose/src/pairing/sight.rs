@@ -50,7 +50,7 @@ impl<'a> Sight<'a> {
             surface: Surface::Open,
             smooth: false,
             corner: false,
-            at_object: self.at_object(&direction, f64::from(range)),
+            at_object: at_object(self.boxes, &self.cloud_from_sensor.translation.vector, &direction, f64::from(range)),
             matched: false,
             company: 0,
             in_gap: false,
@@ -100,17 +100,6 @@ impl<'a> Sight<'a> {
         ray
     }
 
-    /// Whether a place lies in a labelled object or just beside it, above what it stands on. A box with the sensor in it is the own car's.
-    fn at_object(&self, direction: &Vector3<f64>, range_m: f64) -> bool {
-        let origin = self.cloud_from_sensor.translation.vector;
-        let within = |b: &Box3, p: Vector3<f64>| {
-            let local = b.to_local(p.into());
-            let above = local[2] > -b.size[2] / 2.0 + FLOOR_M;
-            above && (0..3).all(|k| local[k].abs() < b.size[k] / 2.0 + BESIDE_M)
-        };
-        self.boxes.iter().any(|b| within(b, origin + direction * range_m) && !within(b, origin))
-    }
-
     fn normal(&self, surface: &LocalSurface, az: f32, el: f32) -> Vector3<f64> {
         let (az, el) = (f64::from(az), f64::from(el));
         let [along, side, up] = surface.normal();
@@ -146,4 +135,33 @@ impl<'a> Sight<'a> {
 fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
     let (az, el) = (f64::from(az), f64::from(el));
     turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
+}
+
+/// Whether what lies in a direction from a sensor is a labelled object's or just beside it, above what it stands on. A box with the sensor in it is the own
+/// car's.
+fn at_object(boxes: &[Box3], origin: &Vector3<f64>, direction: &Vector3<f64>, range_m: f64) -> bool {
+    let within = |b: &Box3, p: Vector3<f64>| {
+        let local = b.to_local(p.into());
+        let above = local[2] > -b.size[2] / 2.0 + FLOOR_M;
+        above && (0..3).all(|k| local[k].abs() < b.size[k] / 2.0 + BESIDE_M)
+    };
+    boxes.iter().any(|b| within(b, origin + direction * range_m) && !within(b, *origin))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_beside_a_label_is_the_objects_and_the_own_car_is_none() {
+        let origin = Vector3::new(0.0, 0.0, 1.0);
+        let ahead = |elevation_rad: f64| Vector3::new(elevation_rad.cos(), 0.0, elevation_rad.sin());
+        let car = Box3::from_array([20.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]);
+        let own = Box3::from_array([0.0, 0.0, 0.8, 5.0, 2.0, 1.6, 0.0]);
+        let at = |b: Box3, range_m: f64, elevation_rad: f64| at_object(&[b], &origin, &ahead(elevation_rad), range_m);
+        assert!(at(car, 18.0, 0.0) && at(car, 17.7, 0.0), "a car may be longer than its label");
+        assert!(!at(car, 17.0, 0.0));
+        assert!(!at(car, 20.0, -0.048), "the road below it");
+        assert!(!at(own, 1.0, 0.0), "the sensor stands in it");
+    }
 }

@@ -10,7 +10,7 @@ use crate::channels::labels::{ObjectShift, object_shifts};
 use crate::channels::mean::origins;
 use crate::channels::motion::OwnMotion;
 use crate::diagnosis::Minimum;
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::{Demands, Trial, as_good, choose, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
 use crate::rig::SensorMount;
@@ -78,6 +78,9 @@ const TARGETS_CLOCK: &[usize] = &[0, 3];
 
 /// Smaller constant shifts of labels and of objects are not spoken of, m.
 const FLOOR_M: [f64; 2] = [0.03, 0.07];
+
+/// What surfaces are fitted wrongly by does not tell causes of shifts of objects apart whose gains differ by a smaller share, however sure that is.
+const AS_GOOD: f64 = 0.02;
 
 /// Nor times below this, s.
 const FLOOR_S: f64 = 0.001;
@@ -190,8 +193,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let mut stories =
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     if side == Side::Objects {
-        let also = as_good(&trials, first.chosen);
-        stories[0].0.extend(also);
+        stories[0].0.extend(as_good(&trials, first.chosen, AS_GOOD));
         stories[0].0.sort();
         stories[0].0.dedup();
     }
@@ -252,20 +254,6 @@ fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
     let (s, c) = r.yaw_rad.sin_cos();
     let shift = Vector3::new(told[0] * c - told[1] * s, told[0] * s + told[1] * c, told[2]) * sign;
     Repair { frame: r.frame, object: r.object, shift_m: shift.into() }
-}
-
-/// What surfaces are fitted wrongly by does not tell causes apart whose gains differ by less than that, however sure the difference is.
-const AS_GOOD: f64 = 0.02;
-
-/// Names of other causes, no richer, that explain the shifts of objects as well as the chosen one.
-fn as_good(trials: &[Trial], chosen: usize) -> Vec<String> {
-    let total = |t: &Trial| total_and_z(&t.gains).0;
-    let c = &trials[chosen];
-    let as_good = |t: &&Trial| {
-        let other = t.above_floor && t.name != c.name && t.parameters <= c.parameters;
-        other && total(t) > (1.0 - AS_GOOD) * total(c)
-    };
-    trials.iter().filter(as_good).map(|t| t.name.clone()).collect()
 }
 
 fn equals(trials: &[Trial], which: &[usize]) -> Vec<String> {

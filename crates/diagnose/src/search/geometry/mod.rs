@@ -219,10 +219,7 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
         .collect();
     let base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
-    // Groups look at what every sensor's own pose leaves: so does what surfaces are off by for them.
-    let posed = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Pose(_) | Column::SensorPose(..)));
-    let with_poses: Vec<usize> = base.iter().copied().chain(posed).collect();
-    let structure = fit(&selected, &context.blocks(select), &with_poses, &precision);
+    let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
     let groups = |g| {
         let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
