@@ -4,6 +4,7 @@ use super::returns::OWN_CAR_M;
 use crate::pairing::{FramePair, Lies, Ray};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
+use std::f64::consts::FRAC_PI_2;
 
 /// What hides a ray before any law of losses applies.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -207,6 +208,40 @@ pub(super) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = Dir
     (-1..=1).flat_map(move |a| (-1..=1).map(move |e| (s, az + a, el + e)))
 }
 
+/// A cell of which less than this share of what is expected is seen is hidden in part.
+const IN_PART: f64 = 0.85;
+
+/// Cells at the edge of what hides others: beside a blocked one, or beside another one at the edge, and hidden in part. None where they would be more than the
+/// blocked ones: something else is lost there as well.
+pub fn edge_cells(
+    blocked: &BTreeSet<DirectionCell>,
+    counts: &DirectionCounts,
+    expected: impl Fn(&DirectionCell) -> f64,
+) -> BTreeSet<DirectionCell> {
+    let in_part = |cell: &DirectionCell| {
+        let judged = counts.get(cell).filter(|c| c[0] >= FEWEST);
+        judged.is_some_and(|[n, seen, ..]| *seen < IN_PART * expected(cell) * n)
+    };
+    let mut edge = BTreeSet::new();
+    let mut from: Vec<DirectionCell> = blocked.iter().copied().collect();
+    while let Some(cell) = from.pop() {
+        for next in neighbours(cell).filter(|c| !blocked.contains(c) && in_part(c)) {
+            if edge.insert(next) {
+                from.push(next);
+            }
+        }
+    }
+    if edge.len() > blocked.len() { BTreeSet::new() } else { edge }
+}
+
+/// Cells below others in which the simulation has next to nothing beyond the own car: what stands in the way of the ones above is in theirs as well.
+pub fn below(cells: &BTreeSet<DirectionCell>, counts: &DirectionCounts) -> BTreeSet<DirectionCell> {
+    let near = |c: &DirectionCell| counts.get(c).is_none_or(|[n, ..]| *n < FEWEST);
+    let lowest = (-FRAC_PI_2 / ELEVATION_RAD) as i32;
+    let under = |&(s, az, el): &DirectionCell| (lowest..el).rev().map(move |e| (s, az, e)).take_while(near);
+    cells.iter().flat_map(under).collect()
+}
+
 /// A set of cells and those around them.
 pub fn with_neighbours(cells: &BTreeSet<DirectionCell>) -> BTreeSet<DirectionCell> {
     cells.iter().flat_map(|c| neighbours(*c)).collect()
@@ -308,6 +343,20 @@ mod tests {
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
         assert!(blocked_cells(&counts, Shown::InPlace, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
+        // Cells along its edge that are hidden in part; one like them that does not lie beside it.
+        let mut edges = counts.clone();
+        for c in [(0, 5, -3), (0, 6, -3), (0, 7, -2), (0, 9, 4)] {
+            edges.insert(c, [100.0, 60.0, 0.0, 0.0]);
+        }
+        let at_edge = edge_cells(&blocked, &edges, |_| 1.0);
+        assert_eq!(at_edge.into_iter().collect::<Vec<_>>(), [(0, 5, -3), (0, 6, -3), (0, 7, -2)]);
+        edges.values_mut().for_each(|c| c[1] = c[1].min(60.0));
+        assert!(edge_cells(&blocked, &edges, |_| 1.0).is_empty(), "all around is lost in part");
+        assert!(edge_cells(&blocked, &edges, |_| 0.6).is_empty(), "other losses explain it");
+        let under = below(&blocked, &counts);
+        assert!(under.is_empty(), "the simulation has something there");
+        let under = below(&[(0, 3, -5)].into(), &counts);
+        assert!(under.contains(&(0, 3, -6)) && under.contains(&(0, 3, -80)) && under.iter().all(|c| c.1 == 3));
         // A plate close to the sensor that hides one side of the field of view, and the sky above it; a shorter side is one that aims elsewhere.
         for (from, found) in [(-20, 130), (-13, 0)] {
             let mut side = DirectionCounts::new();

@@ -5,8 +5,8 @@ use super::{ChannelResult, Context, Found, parameter, patch};
 use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
-    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, blocked_cells, direction_cell, direction_counts, range_cut,
-    with_neighbours,
+    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, below, blocked_cells, direction_cell, direction_counts,
+    edge_cells, range_cut, with_neighbours,
 };
 use crate::channels::returns::OWN_CAR_M;
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
@@ -15,7 +15,7 @@ use crate::inference::law::Law;
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// The search; also what is to be left out by the others.
 pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
@@ -28,7 +28,9 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let [without, with] = [&without, &mask].map(|m| expected_shares(context, &select, &mask, m));
     let expected = |cell: &DirectionCell| Some(without.get(cell)?.min(*with.get(cell)?));
     mask.blocked = blocked_cells(&counts, shown, |cell| expected(cell).unwrap_or(0.0));
-    mask.around = with_neighbours(&mask.blocked);
+    let edge = edge_cells(&mask.blocked, &counts, |cell| expected(cell).unwrap_or(0.0));
+    let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
+    mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
     let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
     let mut result =
         ChannelResult { distance: vec![[0.0; 3]; context.of(Role::HoldOut).len()], ..ChannelResult::default() };
