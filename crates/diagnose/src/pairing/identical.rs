@@ -5,6 +5,7 @@ use super::load;
 use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
 use super::surface::fit_surface;
 use crate::error::DiagnoseError;
+use crate::inference::median;
 use data::{Dataset, Object};
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -111,10 +112,13 @@ fn judge(rows: &[FrameScores], lags: &[i64], ids: &[String]) -> Identity {
     Identity { identical: true, reason: String::new(), strangers }
 }
 
+/// Cosine of incidence from which on a surface stands rather than being ground far away.
+const SQUARELY: f64 = 0.15;
+
 /// What distances of labels count beside those of returns.
 const LABELS_COUNT: f64 = 0.5;
 
-/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each; and that of the labels, see [`label_distance`].
+/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each, but for what all ranges are off by; and that of the labels, see [`label_distance`].
 fn distance(
     measured: &Dataset,
     measured_id: &str,
@@ -127,7 +131,7 @@ fn distance(
     let scans_b = split_by_sensor(&b, &sensors.rig);
     let total: usize = scans_a.iter().map(SensorScan::len).sum();
     let stride = (total / RETURNS).max(1);
-    let (mut sum, mut count) = (0.0, 0.0);
+    let mut met = Vec::new();
     for (k, (a, b)) in scans_a.iter().zip(&scans_b).enumerate() {
         let steps = sensors.patterns[k].steps;
         let window = Steps { azimuth_rad: 2.2 * steps.azimuth_rad, elevation_rad: 1.4 * steps.elevation_rad };
@@ -135,12 +139,19 @@ fn distance(
         let size = [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)];
         for i in (0..a.len()).step_by(stride) {
             let Some(s) = fit_surface(&index, size, a.azimuth_rad[i], a.elevation_rad[i], |_| true) else { continue };
-            // Far ground is the same in every frame; what stands is not.
-            let weight = if s.cos_incidence > 0.15 { 1.0 } else { 0.2 };
-            let off = ((f64::from(a.range_m[i]) - s.range_m) * s.cos_incidence).abs();
-            sum += weight * if s.smooth(sensors.edge_m) { off.min(1.0) } else { (off - s.misfit_m).clamp(0.0, 1.0) };
-            count += weight;
+            let off_m = f64::from(a.range_m[i]) - s.range_m;
+            met.push((off_m, s.cos_incidence, if s.smooth(sensors.edge_m) { 0.0 } else { s.misfit_m }));
         }
+    }
+    // What all ranges are off by is no other scene.
+    let squarely = met.iter().filter(|(off_m, cos, _)| *cos > SQUARELY && off_m.abs() < 1.0).map(|m| m.0);
+    let bias_m = median(squarely.collect());
+    let (mut sum, mut count) = (0.0, 0.0);
+    for (off_m, cos, misfit_m) in met {
+        // Far ground is the same in every frame; what stands is not.
+        let weight = if cos > SQUARELY { 1.0 } else { 0.2 };
+        sum += weight * (((off_m - bias_m) * cos).abs() - misfit_m).clamp(0.0, 1.0);
+        count += weight;
     }
     let cloud = if count > 0.0 { sum / count } else { 1.0 };
     Ok([cloud, label_distance(&labels_a, &labels_b)])

@@ -6,7 +6,7 @@
 
 use super::{ChannelResult, Context, Found, REPETITIONS, Z_STAR, by_block, draw_blocks};
 use crate::channels::labels::seen_velocity;
-use crate::channels::mean::origins;
+use crate::channels::mean::{common_bias_m, origins};
 use crate::channels::motion::{CELL_M, Cells, OwnMotion};
 use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
@@ -91,15 +91,17 @@ struct Sliders {
 
 impl Sliders {
     fn new(frame: &FramePair, motion: &Motion, rig: &SensorRig, origins: &[Point3<f64>], longest: f64) -> Self {
-        let at = |r: &Ray| origins[r.sensor as usize] + r.direction_vector() * r.own_range_m();
+        let at = |r: &Ray, off_m: f64| origins[r.sensor as usize] + r.direction_vector() * (r.own_range_m() - off_m);
         let near = |r: &&Ray| (3.0..REACH_M).contains(&r.own_range_m());
         let stands = |r: &&Ray| r.surface != Surface::Ground || !r.smooth || r.across_m() > 0.25;
         let simulated = frame.simulated.iter().filter(near).filter(|r| r.surface != Surface::Ground);
-        let occupied = Cells::new(&simulated.map(|r| at(r).coords.xy()).collect::<Vec<_>>());
+        let occupied = Cells::new(&simulated.map(|r| at(r, 0.0).coords.xy()).collect::<Vec<_>>());
         let measured: Vec<_> = frame.measured.iter().filter(near).filter(stands).collect();
         let stride = measured.len().div_ceil(POINTS).max(1);
+        // Walls that are all seen nearer or farther slide nowhere.
+        let bias_m = common_bias_m(frame);
         let points = measured.iter().step_by(stride).map(|r| {
-            let p = at(r).coords;
+            let p = at(r, bias_m).coords;
             let mount = &rig.sensors[r.sensor as usize];
             let phase = mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad));
             let slides = motion.at(&p, longest) * phase;
