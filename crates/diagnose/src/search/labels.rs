@@ -194,16 +194,15 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         vec![(equals(&trials, &first.equals), confidence(&trials, &blocks, &trials[first.chosen].name, &demands))];
     if side == Side::Objects {
         stories[0].0.extend(as_good(&trials, first.chosen, AS_GOOD));
-        stories[0].0.sort();
-        stories[0].0.dedup();
     }
     let (name, own) = CANDIDATES[chosen[0]];
     // Where no speeds are known nothing speaks against a late clock.
     let forward_alike = name == "label_offset" && own.contains(&0);
     if forward_alike && (!usable[3] || late(forward(&rows, line[0]), line, speeds)) {
         stories[0].0.push("time_offset".into());
-        stories[0].0.dedup();
     }
+    stories[0].0.sort();
+    stories[0].0.dedup();
     let (first_gain, _) = total_and_z(&trials[first.chosen].gains);
     let second_demands = Demands { nats: (0.1 * first_gain).max(8.0), ..demands };
     let first_columns = CANDIDATES[chosen[0]].1;
