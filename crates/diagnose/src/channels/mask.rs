@@ -92,6 +92,11 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
 /// Simulated returns that a cell needs to be judged.
 const FEWEST: f64 = 15.0;
 
+/// Share of the simulated returns of a cell that is seen; `None` of one with too few.
+fn share_seen(counts: &DirectionCounts, cell: &DirectionCell) -> Option<f64> {
+    counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, ..]| seen / n)
+}
+
 /// Cells that what stands in the way covers at least.
 const FEWEST_CELLS: usize = 4;
 
@@ -126,7 +131,7 @@ pub fn blocked_cells(
     shown: Shown,
     expected: impl Fn(&DirectionCell) -> f64,
 ) -> BTreeSet<DirectionCell> {
-    let judged = |cell: &DirectionCell| counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, ..]| seen / n);
+    let judged = |cell: &DirectionCell| share_seen(counts, cell);
     // Another car may come as near, though not in most frames.
     let stays = |c: &[f64; 4]| c[0].max(c[2]) >= FEWEST && c[2] > ON_OWN_CAR * c[0] && c[3] > 0.5;
     let covered = |cell: &DirectionCell| counts.get(cell).is_some_and(stays);
@@ -218,10 +223,7 @@ pub fn edge_cells(
     counts: &DirectionCounts,
     expected: impl Fn(&DirectionCell) -> f64,
 ) -> BTreeSet<DirectionCell> {
-    let in_part = |cell: &DirectionCell| {
-        let judged = counts.get(cell).filter(|c| c[0] >= FEWEST);
-        judged.is_some_and(|[n, seen, ..]| *seen < IN_PART * expected(cell) * n)
-    };
+    let in_part = |cell: &DirectionCell| share_seen(counts, cell).is_some_and(|seen| seen < IN_PART * expected(cell));
     let mut edge = BTreeSet::new();
     let mut from: Vec<DirectionCell> = blocked.iter().copied().collect();
     while let Some(cell) = from.pop() {

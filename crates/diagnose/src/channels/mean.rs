@@ -4,7 +4,7 @@
 //! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
 
 use crate::inference::median;
-use crate::pairing::{FramePair, Ray, Surface};
+use crate::pairing::{FramePair, Ray, Surface, met_squarely};
 use crate::rig::{SensorMount, SensorRig};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
@@ -86,7 +86,7 @@ pub fn usable(ray: &Ray) -> bool {
 
 /// What all ranges of a frame are off by, m; 0 where they are not off alike, but for half of it.
 pub fn common_bias_m(frame: &FramePair) -> f64 {
-    let squarely = |r: &&Ray| usable(r) && r.cos_incidence > 0.15 && r.residual_m.abs() < 1.0;
+    let squarely = |r: &&Ray| usable(r) && met_squarely(f64::from(r.residual_m), f64::from(r.cos_incidence));
     let off_m: Vec<f64> = frame.measured.iter().filter(squarely).map(|r| f64::from(r.residual_m)).collect();
     let bias_m = median(off_m.clone());
     let others_m = median(off_m.into_iter().map(|m| (m - bias_m).abs()).collect());

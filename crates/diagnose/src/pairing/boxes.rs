@@ -24,6 +24,16 @@ pub struct BoxShift {
     pub points: usize,
 }
 
+/// Lower than that above the bottom of its box a return is of what an object stands on, m.
+const FLOOR_M: f64 = 0.12;
+
+/// Whether a point lies in a box, or beside it by less than a margin, above what it stands on.
+pub(super) fn in_or_beside(bbox: &Box3, point: [f64; 3], margin_m: f64) -> bool {
+    let local = bbox.to_local(point);
+    let near = (0..3).all(|k| local[k].abs() < bbox.size[k] / 2.0 + margin_m);
+    near && local[2] > -bbox.size[2] / 2.0 + FLOOR_M
+}
+
 /// Standard deviation of what is known of a shift beforehand, m.
 const PRIOR_M: f64 = 1.0;
 

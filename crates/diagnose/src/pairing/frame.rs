@@ -1,6 +1,6 @@
 //! One frame of both sides, return by return.
 
-use super::boxes::{BoxShift, SurfacePoint, fit_shift};
+use super::boxes::{BoxShift, SurfacePoint, fit_shift, in_or_beside};
 use super::gaps::{in_gap, mixed_per_rad};
 use super::matching::match_directions;
 use super::pattern::ScanPattern;
@@ -265,10 +265,6 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
     let origins: Vec<Point3<f64>> =
         sensors.rig.sensors.iter().map(|s| Point3::from(Vector3::from(s.position))).collect();
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
-    let near = |p: &Point3<f64>, b: &Box3| {
-        let local = b.to_local((*p).into());
-        (0..3).all(|k| local[k].abs() < b.size[k] / 2.0 + AROUND_M) && local[2] > -b.size[2] / 2.0 + 0.12
-    };
     let mut measured = vec![Vec::new(); boxes.len()];
     let mut simulated = vec![Vec::new(); boxes.len()];
     for ray in &frame.measured {
@@ -276,7 +272,7 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
         // What the simulation says is ground, and lies on it, is ground.
         let ground = ray.surface == Surface::Ground && ray.across_m().abs() < 0.15;
         for (k, b) in boxes.iter().enumerate() {
-            if !ground && near(&p, b) {
+            if !ground && in_or_beside(b, p.into(), AROUND_M) {
                 measured[k].push(p);
             }
         }

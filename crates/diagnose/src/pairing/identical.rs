@@ -115,6 +115,11 @@ fn judge(rows: &[FrameScores], lags: &[i64], ids: &[String]) -> Identity {
 /// Cosine of incidence from which on a surface stands rather than being ground far away.
 const SQUARELY: f64 = 0.15;
 
+/// Whether a return tells what all ranges are off by: on a surface that stands, and no farther from it than a metre.
+pub fn met_squarely(off_m: f64, cos_incidence: f64) -> bool {
+    cos_incidence > SQUARELY && off_m.abs() < 1.0
+}
+
 /// What distances of labels count beside those of returns.
 const LABELS_COUNT: f64 = 0.5;
 
@@ -144,7 +149,7 @@ fn distance(
         }
     }
     // What all ranges are off by is no other scene.
-    let squarely = met.iter().filter(|(off_m, cos, _)| *cos > SQUARELY && off_m.abs() < 1.0).map(|m| m.0);
+    let squarely = met.iter().filter(|(off_m, cos, _)| met_squarely(*off_m, *cos)).map(|m| m.0);
     let bias_m = median(squarely.collect());
     let (mut sum, mut count) = (0.0, 0.0);
     for (off_m, cos, misfit_m) in met {

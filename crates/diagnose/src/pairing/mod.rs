@@ -14,7 +14,7 @@ mod surface;
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
 pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, company_m, pair_frame};
 pub use gaps::{GAP_M, gap_margin_m};
-pub use identical::{Identity, check_identity};
+pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;
 pub use ray::{Lies, Ray, Surface};

@@ -1,5 +1,6 @@
 //! What the simulation has in a direction: the surface around it, what is to be expected there, and of what it is.
 
+use super::boxes::in_or_beside;
 use super::frame::Sensors;
 use super::ray::{Ray, Surface};
 use super::scan::{DirectionIndex, SensorScan};
@@ -10,8 +11,8 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 /// A return so near to a labelled object is the object's, though it be larger than its label, m.
 const BESIDE_M: f64 = 0.5;
 
-/// Lower than that above the bottom of its box a return is of what an object stands on, m.
-const FLOOR_M: f64 = 0.12;
+/// A surface so near to a labelled object is the object's, m.
+const OF_OBJECT_M: f64 = 0.2;
 
 /// The simulated side of one sensor, to be looked at from any direction.
 pub(super) struct Sight<'a> {
@@ -23,6 +24,7 @@ pub(super) struct Sight<'a> {
     /// Half widths of the window of neighbours, rad.
     pub(super) window: [f64; 2],
     boxes: &'a [Box3],
+    others: Vec<Box3>,
 }
 
 impl<'a> Sight<'a> {
@@ -33,6 +35,7 @@ impl<'a> Sight<'a> {
         Sight {
             sensor,
             sensors,
+            others: others(boxes, mount.pose().translation.vector.into()),
             cloud_from_sensor: mount.pose(),
             index: DirectionIndex::new(simulated, window, mount.closes()),
             window: [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)],
@@ -50,7 +53,7 @@ impl<'a> Sight<'a> {
             surface: Surface::Open,
             smooth: false,
             corner: false,
-            at_object: at_object(self.boxes, &self.cloud_from_sensor.translation.vector, &direction, f64::from(range)),
+            at_object: at_object(&self.others, self.place(&direction, f64::from(range))),
             matched: false,
             company: 0,
             in_gap: false,
@@ -100,6 +103,11 @@ impl<'a> Sight<'a> {
         ray
     }
 
+    /// The place in a direction at a range, in the cloud's frame, m.
+    fn place(&self, direction: &Vector3<f64>, range_m: f64) -> [f64; 3] {
+        (self.cloud_from_sensor.translation.vector + direction * range_m).into()
+    }
+
     fn normal(&self, surface: &LocalSurface, az: f32, el: f32) -> Vector3<f64> {
         let (az, el) = (f64::from(az), f64::from(el));
         let [along, side, up] = surface.normal();
@@ -116,13 +124,11 @@ impl<'a> Sight<'a> {
         normal: Option<&Vector3<f64>>,
         ray: &mut Ray,
     ) -> Surface {
-        let p: [f64; 3] = (self.cloud_from_sensor.translation.vector + direction * range).into();
+        let p = self.place(direction, range);
         for (k, b) in self.boxes.iter().enumerate() {
-            let local = b.to_local(p);
-            let inside = |axis: usize, margin: f64| local[axis].abs() < b.size[axis] / 2.0 + margin;
-            let on_the_floor = local[2] < -b.size[2] / 2.0 + FLOOR_M;
-            if inside(0, 0.2) && inside(1, 0.2) && inside(2, 0.2) && !on_the_floor {
+            if in_or_beside(b, p, OF_OBJECT_M) {
                 ray.object = k as u16;
+                let local = b.to_local(p);
                 let beyond = |axis: usize, share: f64| local[axis].abs() > share * b.size[axis];
                 ray.corner = beyond(0, 0.18) && beyond(1, 0.3) && local[2] < 0.06 * b.size[2];
                 return Surface::Object;
@@ -137,15 +143,14 @@ fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
     turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
 }
 
-/// Whether what lies in a direction from a sensor is a labelled object's or just beside it, above what it stands on. A box with the sensor in it is the own
-/// car's.
-fn at_object(boxes: &[Box3], origin: &Vector3<f64>, direction: &Vector3<f64>, range_m: f64) -> bool {
-    let within = |b: &Box3, p: Vector3<f64>| {
-        let local = b.to_local(p.into());
-        let above = local[2] > -b.size[2] / 2.0 + FLOOR_M;
-        above && (0..3).all(|k| local[k].abs() < b.size[k] / 2.0 + BESIDE_M)
-    };
-    boxes.iter().any(|b| within(b, origin + direction * range_m) && !within(b, *origin))
+/// The labelled objects but for the own car: its box has the sensor in it.
+fn others(boxes: &[Box3], origin: [f64; 3]) -> Vec<Box3> {
+    boxes.iter().filter(|b| !in_or_beside(b, origin, BESIDE_M)).copied().collect()
+}
+
+/// Whether a place is that of a labelled object or just beside it.
+fn at_object(others: &[Box3], place: [f64; 3]) -> bool {
+    others.iter().any(|b| in_or_beside(b, place, BESIDE_M))
 }
 
 #[cfg(test)]
@@ -158,7 +163,9 @@ mod tests {
         let ahead = |elevation_rad: f64| Vector3::new(elevation_rad.cos(), 0.0, elevation_rad.sin());
         let car = Box3::from_array([20.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]);
         let own = Box3::from_array([0.0, 0.0, 0.8, 5.0, 2.0, 1.6, 0.0]);
-        let at = |b: Box3, range_m: f64, elevation_rad: f64| at_object(&[b], &origin, &ahead(elevation_rad), range_m);
+        let at = |b: Box3, range_m: f64, elevation_rad: f64| {
+            at_object(&others(&[b], origin.into()), (origin + ahead(elevation_rad) * range_m).into())
+        };
         assert!(at(car, 18.0, 0.0) && at(car, 17.7, 0.0), "a car may be longer than its label");
         assert!(!at(car, 17.0, 0.0));
         assert!(!at(car, 20.0, -0.048), "the road below it");

@@ -79,11 +79,11 @@ const TARGETS_CLOCK: &[usize] = &[0, 3];
 /// Smaller constant shifts of labels and of objects are not spoken of, m.
 const FLOOR_M: [f64; 2] = [0.03, 0.07];
 
-/// What surfaces are fitted wrongly by does not tell causes of shifts of objects apart whose gains differ by a smaller share, however sure that is.
-const AS_GOOD: f64 = 0.02;
-
 /// Nor times below this, s.
 const FLOOR_S: f64 = 0.001;
+
+/// What surfaces are fitted wrongly by does not tell causes of shifts of objects apart whose gains differ by a smaller share, however sure that is.
+const AS_GOOD: f64 = 0.02;
 
 /// One object's shift with its covariates.
 struct Row {

@@ -24,11 +24,17 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let counts = direction_counts(context.frames, &select);
     // What laws explain is none of it, be they fitted without the dark directions or with them: far ground may be dark all along.
     let dark = blocked_cells(&counts, shown, |_| 1.0);
-    let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
-    let [without, with] = [&without, &mask].map(|m| expected_shares(context, &select, &mask, m));
-    let expected = |cell: &DirectionCell| Some(without.get(cell)?.min(*with.get(cell)?));
-    mask.blocked = blocked_cells(&counts, shown, |cell| expected(cell).unwrap_or(0.0));
-    let edge = edge_cells(&mask.blocked, &counts, |cell| expected(cell).unwrap_or(0.0));
+    let mut fits = vec![expected_shares(context, &select, &mask, &mask)];
+    if !dark.is_empty() {
+        let without = Mask { around: with_neighbours(&dark), blocked: dark, ..mask.clone() };
+        fits.push(expected_shares(context, &select, &mask, &without));
+    }
+    let expected = |cell: &DirectionCell| {
+        let of_fit = |fit: &BTreeMap<DirectionCell, f64>| fit.get(cell).copied().unwrap_or(0.0);
+        fits.iter().map(of_fit).fold(f64::INFINITY, f64::min)
+    };
+    mask.blocked = blocked_cells(&counts, shown, expected);
+    let edge = edge_cells(&mask.blocked, &counts, expected);
     let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
     mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
     let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
