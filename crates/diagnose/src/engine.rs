@@ -10,7 +10,7 @@ use crate::pairing::{
 };
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
-use crate::search::shutter::Sliding;
+use crate::search::rolling_shutter::Sliding;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
 use geometry::Box3;
@@ -113,7 +113,7 @@ pub fn diagnose(
     progress(Stage::Weighing, 0, SEARCHES);
     let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
     // What slides over a scan is moved back before anything else is looked at, but for the ranges as they were measured.
-    let (sliding, slide) = match search::shutter::search(&context) {
+    let (sliding, slide) = match search::rolling_shutter::search(&context) {
         Sliding::No(result) => (result, None),
         Sliding::Yes(result, slide) => (result, Some(slide)),
         Sliding::Perhaps(result, slide, none) => {
@@ -184,7 +184,7 @@ pub fn diagnose(
     keep("labels", search::labels::search(&context, Side::Labels, &displaced));
     keep("objects", search::labels::search(&context, Side::Objects, &displaced));
     progress(Stage::Weighing, SEARCHES, SEARCHES);
-    search::leftovers::without_leftovers(&mut results, context.returns(&context.of(Role::HoldOut)));
+    search::confounders::without_leftovers(&mut results, context.returns(&context.of(Role::HoldOut)));
     if let Some(note) = search::set_aside(&mut results) {
         notes.push(note);
     }

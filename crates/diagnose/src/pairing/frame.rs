@@ -6,7 +6,7 @@ use super::matching::match_directions;
 use super::pattern::ScanPattern;
 use super::ray::{Ray, Surface};
 use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
-use super::sight::Sight;
+use super::prediction::Sight;
 use super::surface::fit_surface;
 use crate::rig::SensorRig;
 use data::{Cloud, Object};

@@ -8,7 +8,7 @@ mod matching;
 mod pattern;
 mod ray;
 mod scan;
-mod sight;
+mod prediction;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};

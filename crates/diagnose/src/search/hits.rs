@@ -1,9 +1,9 @@
 //! Lost returns: which simulated returns has the measured side not, and on what does it depend?
 
-mod words;
+mod describe;
 
-use self::words::found;
-use super::unnamed::{Unnamed, mean_by_group, word};
+use self::describe::found;
+use super::unexplained::{Unnamed, mean_by_group, word};
 use super::{
     ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed,
     unless_unsure,

@@ -1,7 +1,7 @@
 //! Labels and objects: do measured labels stand where the measured returns are, and do the objects stand where the simulation has them?
 
 mod clock;
-mod words;
+mod describe;
 
 use self::clock::{forward, late, own_speeds, surely_late, within_frames};
 use super::geometry::Displacement;
@@ -231,7 +231,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
         let mut without = fitted.clone();
         own.clone().for_each(|i| without.theta[i] = 0.0);
         let gains = on_hold_out.iter().map(|f| fitted.gain(f) - without.gain(f)).collect();
-        result.found.push(words::found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable, late_by));
+        result.found.push(describe::found(*k, &fitted, own, equals, confidence, gains, side, &rows, &usable, late_by));
     }
     let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
     let best = fit(&on_estimate.iter().collect::<Vec<_>>(), &context.blocks(&estimate), &known, &[1e-3; 8]);

@@ -3,14 +3,14 @@
 pub mod geometry;
 pub mod hits;
 pub mod labels;
-pub mod leftovers;
+pub mod confounders;
 pub mod mask;
 pub mod noise;
 mod patch;
 pub mod quantisation;
 pub mod returns;
-pub mod shutter;
-mod unnamed;
+pub mod rolling_shutter;
+mod unexplained;
 
 use crate::channels::groups::Grouping;
 use crate::channels::motion::OwnMotion;

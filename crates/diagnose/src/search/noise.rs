@@ -2,7 +2,7 @@
 
 mod curve;
 
-use super::unnamed::{Unnamed, mean_by_group, word};
+use super::unexplained::{Unnamed, mean_by_group, word};
 use super::{
     ChannelResult, Context, Found, Z_STAR, confidence, first_demands, parameter, record, trimmed, unless_unsure,
 };

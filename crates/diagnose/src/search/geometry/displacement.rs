@@ -1,6 +1,6 @@
 //! What the geometry is off by, so that other channels can be looked at without it.
 
-use super::suspects::Suspect;
+use super::hypotheses::Suspect;
 use super::{Sums, fit_all, groups_of, how, split};
 use crate::channels::groups::{Grouping, STRIP_RAD, elevation_lever, group_of, place_of, total};
 use crate::channels::mean::Column;

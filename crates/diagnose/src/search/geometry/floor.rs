@@ -1,6 +1,6 @@
 //! What is too small to speak of.
 
-use super::suspects::Suspect;
+use super::hypotheses::Suspect;
 use super::{Sums, fit_all, groups_of, how};
 use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;

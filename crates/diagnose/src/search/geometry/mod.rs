@@ -1,20 +1,20 @@
 //! Where surfaces lie: biases of range, poses of sensors and car, rows that aim or measure wrongly, and what has no name.
 
-mod agreed;
+mod common_turns;
 mod curve;
 mod displacement;
 mod floor;
 mod rows;
-mod suspects;
-mod words;
+mod hypotheses;
+mod describe;
 
 pub use self::displacement::Displacement;
 
-use self::agreed::agreed_turns;
+use self::common_turns::agreed_turns;
 use self::displacement::displacement;
 use self::floor::above_floor;
 use self::rows::surer_rows;
-use self::suspects::{Suspect, is_pose, may_join, suspects};
+use self::hypotheses::{Suspect, is_pose, may_join, suspects};
 use super::{ChannelResult, Context, first_demands, record, unless_unsure};
 use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
@@ -98,7 +98,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
         let choice = choose(&trials, &demands);
         result.considered.extend(record(&trials, choice.as_ref(), "residuals", returns, &demands));
         if step == 0 {
-            result.minimum = words::minimum(&sums, &select, &blocks);
+            result.minimum = describe::minimum(&sums, &select, &blocks);
         }
         let Some(choice) = choice else { break };
         let t = &trials[choice.chosen];
@@ -141,7 +141,7 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
         let alone = &chosen[k];
         let held: Vec<f64> =
             hold_out.iter().map(|&f| told(&sums, &estimate, &estimate_blocks, alone, &chosen, f)).collect();
-        result.found.push(words::found(
+        result.found.push(describe::found(
             context,
             &sums,
             &estimate,

@@ -2,7 +2,7 @@
 
 use super::Sums;
 use super::floor::FLOOR_TURN_RAD;
-use super::suspects::Suspect;
+use super::hypotheses::Suspect;
 use crate::channels::mean::{Column, OwnPoses};
 use crate::search::{Z_STAR, by_block};
 
