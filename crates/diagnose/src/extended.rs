@@ -1,45 +1,18 @@
 //! The file `extended.toml`: what was found as a list of effects for the simulator, with intervals as comments. What the simulator has no
 //! effect for is listed in comments; what has no name is written as tables.
 
+use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity};
 use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::pairing::GAP_M;
 use crate::rig::SensorRig;
 use std::fmt::Write;
-
-/// Order in which light meets the effects: the world, the shots, the returns, the numbers, the labels.
-const ORDER: [&str; 23] = [
-    "missing_object",
-    "wrong_shape",
-    "pitch_roll",
-    "sensor_extrinsics",
-    "beam_elevation_offset",
-    "angular_jitter",
-    "rolling_shutter",
-    "mixed_pixels",
-    "ego_occlusion",
-    "material_dropout",
-    "signal_dropout",
-    "incidence_dropout",
-    "range_dropout",
-    "random_dropout",
-    "outliers",
-    "range_bias",
-    "beam_range_offset",
-    "range_noise",
-    "signal_noise",
-    "range_cut",
-    "quantisation",
-    "label_offset",
-    "time_offset",
-];
 
 /// The text of `extended.toml`. `rows_deg` holds the elevations of the rows of every sensor.
 pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
     let mut text = String::from(
         "# What the diagnosis adds to the simulation's sensor model: a list of effects. Intervals (95 %) stand behind the values.\n",
     );
-    let place =
-        |f: &Finding| f.cause.as_deref().and_then(|c| ORDER.iter().position(|o| *o == c)).unwrap_or(ORDER.len());
+    let place = |f: &Finding| f.cause.map_or(u16::MAX, Cause::place);
     let mut findings: Vec<&Finding> = diagnosis.findings.iter().collect();
     findings.sort_by_key(|f| place(f));
     if findings.is_empty() {
@@ -54,9 +27,9 @@ pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig, rows_deg: &[Vec<f64
                 let _ = writeln!(
                     text,
                     "# These data do not tell {} apart for sure; the first of them stands here.",
-                    names.join(" and ")
+                    names.iter().map(|c| c.name()).collect::<Vec<_>>().join(" and ")
                 );
-                let first = Finding { cause: names.first().cloned(), ..f.clone() };
+                let first = Finding { cause: names.first().copied(), ..f.clone() };
                 text.push_str(&named(&first, rig));
             }
             Status::Unexplained => text.push_str(&empirical(f, rig, rows_deg)),
@@ -67,64 +40,70 @@ pub fn extended_toml(diagnosis: &Diagnosis, rig: &SensorRig, rows_deg: &[Vec<f64
 
 /// Share that a law loses where nothing of it is felt.
 fn lost_anyway(f: &Finding) -> f64 {
-    f.parameters.get("most").map_or(0.0, |most| (1.0 - most.estimate).max(0.0))
+    f.parameter(Quantity::Most).map_or(0.0, |most| (1.0 - most.estimate).max(0.0))
 }
 
 /// One effect as the simulator reads it.
 fn named(f: &Finding, rig: &SensorRig) -> String {
-    let value = |name: &str| f.parameters.get(name).map_or(0.0, |p| p.estimate);
-    let key = |key: &str, name: &str| -> String {
-        f.parameters.get(name).map_or_else(String::new, |p| {
+    let value = |quantity: Quantity| f.parameter(quantity).map_or(0.0, |p| p.estimate);
+    let key = |key: &str, quantity: Quantity| -> String {
+        f.parameter(quantity).map_or_else(String::new, |p| {
             let [low, high] = p.ci95.map(short);
             format!("{key} = {} # {low} to {high}\n", toml_number(p.estimate))
         })
     };
     let with = |kind: &str, lines: String| format!("[[effect]]\nkind = \"{kind}\"\n{lines}");
-    match f.cause.as_deref().unwrap_or_default() {
-        "range_noise" if value("per_m") > 0.0 => {
-            with("range_noise_by_range", key("base_m", "std_m") + &key("per_m", "per_m"))
+    let Some(cause) = f.cause else { return String::new() };
+    match cause {
+        Cause::RangeNoise if value(Quantity::PerM) > 0.0 => {
+            with("range_noise_by_range", key("base_m", Quantity::StdM) + &key("per_m", Quantity::PerM))
         }
-        "range_noise" => positive(f, "std_m", with("range_noise", key("std_m", "std_m"))),
-        "signal_noise" => with(
+        Cause::RangeNoise => positive(f, Quantity::StdM, with("range_noise", key("std_m", Quantity::StdM))),
+        Cause::SignalNoise => with(
             "range_noise_by_signal",
-            key("std_m", "std_m")
-                + &key("exponent", "exponent")
+            key("std_m", Quantity::StdM)
+                + &key("exponent", Quantity::Exponent)
                 + &format!("signal = {:?}\n", crate::inference::noise::USUAL_SIGNAL),
         ),
-        "incidence_noise" => with(
+        Cause::IncidenceNoise => with(
             "range_noise_by_incidence",
-            format!("divergence_rad = {}\nsamples = 1.0\n", toml_number(2.0 * value("angle_rad"))),
+            format!("divergence_rad = {}\nsamples = 1.0\n", toml_number(2.0 * value(Quantity::AngleRad))),
         ),
-        "range_bias" => with("range_bias", key("offset_m", "offset_m") + &key("scale", "scale")),
-        "beam_range_offset" => with("beam_range_offset", row_table(f, rig)),
-        "beam_elevation_offset" => {
-            let none = if f.parameters.contains_key("std_deg") { "" } else { "elevation_std_deg = 0.0\n" };
-            let lines = key("elevation_deg", "mean_deg") + &key("elevation_std_deg", "std_deg") + none;
+        Cause::RangeBias => with("range_bias", key("offset_m", Quantity::OffsetM) + &key("scale", Quantity::Scale)),
+        Cause::BeamRangeOffset => with("beam_range_offset", row_table(f, rig)),
+        Cause::BeamElevationOffset => {
+            let none = if f.parameter(Quantity::StdDeg).is_some() { "" } else { "elevation_std_deg = 0.0\n" };
+            let lines = key("elevation_deg", Quantity::MeanDeg) + &key("elevation_std_deg", Quantity::StdDeg) + none;
             with("beam_angle_error", lines + "azimuth_std_deg = 0.0\n")
         }
-        "quantisation" => with("range_quantisation", key("step_m", "step_m")),
-        "angular_jitter" => positive(
+        Cause::Quantisation => with("range_quantisation", key("step_m", Quantity::StepM)),
+        Cause::AngularJitter => positive(
             f,
-            "std_deg",
-            with("angular_jitter", key("azimuth_std_deg", "std_deg") + &key("elevation_std_deg", "std_deg")),
+            Quantity::StdDeg,
+            with(
+                "angular_jitter",
+                key("azimuth_std_deg", Quantity::StdDeg) + &key("elevation_std_deg", Quantity::StdDeg),
+            ),
         ),
-        "random_dropout" => positive(f, "share", with("random_dropout", key("share", "share"))),
-        "signal_dropout" => with(
+        Cause::RandomDropout => positive(f, Quantity::Share, with("random_dropout", key("share", Quantity::Share))),
+        Cause::SignalDropout => with(
             "signal_dropout",
-            key("threshold", "threshold") + &key("steepness", "steepness") + &key("most", "most"),
+            key("threshold", Quantity::Threshold)
+                + &key("steepness", Quantity::Steepness)
+                + &key("most", Quantity::Most),
         ),
-        "incidence_dropout" => {
+        Cause::IncidenceDropout => {
             // The simulator's step is one over the cosine, the finding's one over its logarithm: as steep at one half.
-            let steepness = toml_number(value("steepness") / value("cos_half").max(1e-3));
+            let steepness = toml_number(value(Quantity::Steepness) / value(Quantity::CosHalf).max(1e-3));
             let mut text =
-                with("incidence_dropout", key("cos_half", "cos_half") + &format!("steepness = {steepness}\n"));
+                with("incidence_dropout", key("cos_half", Quantity::CosHalf) + &format!("steepness = {steepness}\n"));
             if lost_anyway(f) > 0.0 {
                 text += &with("random_dropout", format!("share = {}\n", toml_number(lost_anyway(f))));
             }
             text
         }
-        "range_dropout" => {
-            let (half, steepness) = (value("half_at_m").max(1e-3), value("steepness"));
+        Cause::RangeDropout => {
+            let (half, steepness) = (value(Quantity::HalfAtM).max(1e-3), value(Quantity::Steepness));
             let ranges: Vec<f64> = (0..=24).map(|i| 5.0 * f64::from(i)).collect();
             let most = 1.0 - lost_anyway(f);
             let kept = |r: f64| if r > 0.0 { most / (1.0 + (r / half).powf(steepness)) } else { most };
@@ -133,80 +112,82 @@ fn named(f: &Finding, rig: &SensorRig) -> String {
             let ranges: Vec<String> = ranges.iter().map(|r| format!("{r:.1}")).collect();
             with("range_dropout", format!("range_m = [{}]\nshare = [{}]\n", ranges.join(", "), lost.join(", ")))
         }
-        "material_dropout" => {
-            let materials = match f.covariate.as_str() {
-                "surface: ground" => "\"asphalt\"",
-                "surface: standing" => "\"concrete\"",
-                "surface: object_corner" => "\"rubber\"",
+        Cause::MaterialDropout => {
+            let materials = match f.covariate {
+                Covariate::SurfaceGround => "\"asphalt\"",
+                Covariate::SurfaceStanding => "\"concrete\"",
+                Covariate::SurfaceObjectCorner => "\"rubber\"",
                 _ => "\"paint\"",
             };
             positive(
                 f,
-                "share",
-                with("material_dropout", format!("materials = [{materials}]\n") + &key("share", "share")),
+                Quantity::Share,
+                with("material_dropout", format!("materials = [{materials}]\n") + &key("share", Quantity::Share)),
             )
         }
-        "range_cut" => with("range_limits", key("max_m", "max_m")),
-        "ego_occlusion" => blocked_box(f, rig),
-        "sensor_extrinsics" => {
-            let sensor = &rig.sensors[(value("sensor") as usize).min(rig.sensors.len() - 1)].name;
-            let three = |names: [&str; 3]| names.map(|n| toml_number(value(n))).join(", ");
+        Cause::RangeCut => with("range_limits", key("max_m", Quantity::MaxM)),
+        Cause::EgoOcclusion => blocked_box(f, rig),
+        Cause::SensorExtrinsics => {
+            let sensor = &rig.sensors[(value(Quantity::Sensor) as usize).min(rig.sensors.len() - 1)].name;
+            let three = |names: [Quantity; 3]| names.map(|n| toml_number(value(n))).join(", ");
             let intervals: Vec<String> = f
                 .parameters
                 .iter()
-                .filter(|(n, _)| *n != "sensor")
+                .filter(|(n, _)| **n != ParameterId::Of(Quantity::Sensor))
                 .map(|(n, p)| format!("# {n}: {} to {}\n", short(p.ci95[0]), short(p.ci95[1])))
                 .collect();
             with(
                 "sensor_pose_error",
                 format!(
                     "sensor = \"{sensor}\"\ntranslation_m = [{}]\nrotation_deg = [{}]\n{}",
-                    three(["forward_m", "left_m", "up_m"]),
-                    three(["roll_deg", "pitch_deg", "yaw_deg"]),
+                    three([Quantity::ForwardM, Quantity::LeftM, Quantity::UpM]),
+                    three([Quantity::RollDeg, Quantity::PitchDeg, Quantity::YawDeg]),
                     intervals.concat()
                 ),
             )
         }
-        "pitch_roll" => {
-            let steady = |key: &str, name: &str| {
-                if f.parameters.contains_key(name) { String::new() } else { format!("{key} = 0.0\n") }
+        Cause::PitchRoll => {
+            let steady = |key: &str, quantity: Quantity| {
+                if f.parameter(quantity).is_some() { String::new() } else { format!("{key} = 0.0\n") }
             };
-            let lines = key("roll_deg", "roll_deg")
-                + &key("pitch_deg", "pitch_deg")
-                + &steady("roll_deg", "roll_deg")
-                + &steady("pitch_deg", "pitch_deg")
+            let lines = key("roll_deg", Quantity::RollDeg)
+                + &key("pitch_deg", Quantity::PitchDeg)
+                + &steady("roll_deg", Quantity::RollDeg)
+                + &steady("pitch_deg", Quantity::PitchDeg)
                 + "roll_std_deg = 0.0\npitch_std_deg = 0.0\n";
             with("ego_attitude", lines)
         }
-        "rolling_shutter" => with("rolling_shutter", "deskewed = false\n".into()),
-        "outliers" => with("false_alarms", key("rate", "rate") + &key("reach_m", "reach_m")),
+        Cause::RollingShutter => with("rolling_shutter", "deskewed = false\n".into()),
+        Cause::Outliers => with("false_alarms", key("rate", Quantity::Rate) + &key("reach_m", Quantity::ReachM)),
         // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
-        "mixed_pixels" if !f.parameters.contains_key("divergence_rad") => {
+        Cause::MixedPixels if f.parameter(Quantity::DivergenceRad).is_none() => {
             "# beam_divergence: how wide the beams are these data do not tell.\n".into()
         }
-        "mixed_pixels" => {
-            with("beam_divergence", key("divergence_rad", "divergence_rad") + &format!("pulse_m = {:?}\n", GAP_M[1]))
-        }
-        "label_offset" => {
-            with("label_offset", key("forward_m", "forward_m") + &key("left_m", "left_m") + &key("up_m", "up_m"))
-        }
-        "time_offset" => {
-            let clock = if f.covariate == "seen_velocity_m_s" { "cloud" } else { "cars" };
-            with("label_time_offset", key("offset_s", "offset_s") + &format!("clock = \"{clock}\"\n"))
+        Cause::MixedPixels => with(
+            "beam_divergence",
+            key("divergence_rad", Quantity::DivergenceRad) + &format!("pulse_m = {:?}\n", GAP_M[1]),
+        ),
+        Cause::LabelOffset => with(
+            "label_offset",
+            key("forward_m", Quantity::ForwardM) + &key("left_m", Quantity::LeftM) + &key("up_m", Quantity::UpM),
+        ),
+        Cause::TimeOffset => {
+            let clock = if f.covariate == Covariate::SeenVelocity { "cloud" } else { "cars" };
+            with("label_time_offset", key("offset_s", Quantity::OffsetS) + &format!("clock = \"{clock}\"\n"))
         }
         other => format!("# The simulator has no effect that does this by itself ({other}): mend its world.\n"),
     }
 }
 
 /// A simulation that has too much of something is mended by taking it out, not by an effect.
-fn positive(f: &Finding, name: &str, text: String) -> String {
-    if f.parameters.get(name).is_some_and(|p| p.estimate < 0.0) {
-        return format!(
-            "# The simulation has more of it than the measurement: take it out there ({name} by {}).\n",
-            short(f.parameters[name].estimate)
-        );
+fn positive(f: &Finding, quantity: Quantity, text: String) -> String {
+    match f.parameter(quantity).filter(|p| p.estimate < 0.0) {
+        Some(p) => format!(
+            "# The simulation has more of it than the measurement: take it out there ({quantity} by {}).\n",
+            short(p.estimate)
+        ),
+        None => text,
     }
-    text
 }
 
 /// Offsets of rows from the top, the mean of all sensors.
@@ -214,9 +195,9 @@ fn row_table(f: &Finding, rig: &SensorRig) -> String {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sensor in &rig.sensors {
         for (name, p) in &f.parameters {
-            let Some(row) = name.strip_prefix(&format!("{}/", sensor.name)).and_then(|r| r.parse::<usize>().ok())
-            else {
-                continue;
+            let row = match name {
+                ParameterId::Row { sensor: of, row } if *of == sensor.name => *row,
+                _ => continue,
             };
             if rows.len() <= row {
                 rows.resize(row + 1, Vec::new());
@@ -232,12 +213,12 @@ fn row_table(f: &Finding, rig: &SensorRig) -> String {
 
 /// A thin box a metre before the sensor that fills the blocked directions.
 fn blocked_box(f: &Finding, rig: &SensorRig) -> String {
-    let value = |name: &str| f.parameters.get(name).map_or(0.0, |p| p.estimate);
-    let sensor = &rig.sensors[(value("sensor") as usize).min(rig.sensors.len() - 1)];
+    let value = |quantity: Quantity| f.parameter(quantity).map_or(0.0, |p| p.estimate);
+    let sensor = &rig.sensors[(value(Quantity::Sensor) as usize).min(rig.sensors.len() - 1)];
     let pose = sensor.pose();
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    for az in ["azimuth_from_deg", "azimuth_to_deg"] {
-        for el in ["elevation_from_deg", "elevation_to_deg"] {
+    for az in [Quantity::AzimuthFromDeg, Quantity::AzimuthToDeg] {
+        for el in [Quantity::ElevationFromDeg, Quantity::ElevationToDeg] {
             for distance in [1.0, 1.05] {
                 let (a, e) = (value(az).to_radians(), value(el).to_radians());
                 let p = pose
@@ -259,15 +240,15 @@ fn blocked_box(f: &Finding, rig: &SensorRig) -> String {
 
 /// A patch of directions that loses more than others: the table over directions is a spot.
 fn dirty_window(f: &Finding, rig: &SensorRig) -> String {
-    let value = |name: &str| f.parameters.get(name).map_or(0.0, |p| p.estimate);
-    let Some(mount) = rig.sensors.get(value("sensor") as usize) else { return String::new() };
+    let value = |quantity: Quantity| f.parameter(quantity).map_or(0.0, |p| p.estimate);
+    let Some(mount) = rig.sensors.get(value(Quantity::Sensor) as usize) else { return String::new() };
     // Half of the light, one way: three quarters of `loss` in the middle.
-    let loss = (value("share") / 0.75).clamp(0.0, 1.0);
-    let line = |key: &str| {
-        let interval = f.parameters.get(key).map(|p| format!(" # {} to {}", short(p.ci95[0]), short(p.ci95[1])));
+    let loss = (value(Quantity::Share) / 0.75).clamp(0.0, 1.0);
+    let line = |key: Quantity| {
+        let interval = f.parameter(key).map(|p| format!(" # {} to {}", short(p.ci95[0]), short(p.ci95[1])));
         format!("{key} = {}{}\n", toml_number(value(key)), interval.unwrap_or_default())
     };
-    let place = ["azimuth_deg", "elevation_deg", "radius_deg"].map(line).concat();
+    let place = [Quantity::AzimuthDeg, Quantity::ElevationDeg, Quantity::RadiusDeg].map(line).concat();
     let window = format!(
         "sensor = \"{}\"\n{place}transmission = 0.5\nloss = {}\nnoise_m = 0.0\n",
         mount.name,
@@ -278,22 +259,20 @@ fn dirty_window(f: &Finding, rig: &SensorRig) -> String {
 
 /// What has no name: for each sensor a table along its covariate.
 fn empirical(f: &Finding, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
-    if f.covariate == "direction" {
+    if f.covariate == Covariate::Direction {
         return dirty_window(f, rig);
     }
-    let usual = f.parameters.get("simulated_std_m").map_or(0.0, |p| p.estimate);
-    let of_rows = f.covariate == "row";
+    let usual = f.parameter(Quantity::SimulatedStdM).map_or(0.0, |p| p.estimate);
+    let of_rows = f.covariate == Covariate::Row;
     let mut text = String::new();
     for (sensor, mount) in rig.sensors.iter().enumerate() {
-        // Curves of sensors stand a thousand apart.
-        let own = f.curve.points.iter().filter(|p| (p.x / 1000.0).round() == sensor as f64);
+        let own = f.curve.points.iter().filter(|p| p.sensor == sensor);
         let mut table: Vec<[f64; 3]> = own
             .filter_map(|p| {
-                let x = p.x - 1000.0 * sensor as f64;
-                let at = if of_rows { *rows_deg.get(sensor)?.get(x as usize)? } else { x };
-                let [value, error] = match f.channel.as_str() {
-                    "hits" => [(1.0 - p.after).clamp(0.0, 1.0), p.error],
-                    "roughness" => [usual * (p.after * p.after - 1.0).max(0.0).sqrt(), usual * p.error],
+                let at = if of_rows { *rows_deg.get(sensor)?.get(p.x as usize)? } else { p.x };
+                let [value, error] = match f.channel {
+                    Channel::Hits => [(1.0 - p.after).clamp(0.0, 1.0), p.error],
+                    Channel::Roughness => [usual * (p.after * p.after - 1.0).max(0.0).sqrt(), usual * p.error],
                     _ => [p.after, p.error],
                 };
                 Some([at, value, error])
@@ -306,9 +285,9 @@ fn empirical(f: &Finding, rig: &SensorRig, rows_deg: &[Vec<f64>]) -> String {
         }
         let list =
             |k: usize| table.iter().map(|p| format!("{:?}", (p[k] * 1e4).round() / 1e4)).collect::<Vec<_>>().join(", ");
-        let key = match f.channel.as_str() {
-            "hits" => "loss",
-            "roughness" => "std_m",
+        let key = match f.channel {
+            Channel::Hits => "loss",
+            Channel::Roughness => "std_m",
             _ => "mean_m",
         };
         let covariate = if of_rows { "elevation_deg" } else { "azimuth_deg" };
@@ -335,25 +314,36 @@ fn toml_number(v: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnosis::{Curve, CurvePoint, FindingGain, Gain, Parameter, SCHEMA, Verdict};
+    use crate::catalogue::Unit;
+    use crate::curve::{Curve, CurvePoint};
+    use crate::diagnosis::{FindingGain, Gain, Parameter, SCHEMA, Verdict};
     use std::collections::BTreeMap;
 
-    fn finding(cause: &str, parameters: &[(&str, f64)]) -> Finding {
-        let parameter = |v: f64| Parameter { estimate: v, unit: "m".into(), ci95: [0.9 * v, 1.1 * v] };
+    fn finding(cause: Cause, parameters: &[(Quantity, f64)]) -> Finding {
+        let parameter =
+            |q: Quantity, v: f64| (q.into(), Parameter { estimate: v, unit: q.unit(), ci95: [0.9 * v, 1.1 * v] });
         Finding {
             status: Status::Named,
-            cause: Some(cause.into()),
+            cause: Some(cause),
             candidates: None,
-            family: "range_error".into(),
-            parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), parameter(*v))).collect::<BTreeMap<_, _>>(),
+            family: cause.family(),
+            parameters: parameters.iter().map(|(q, v)| parameter(*q, *v)).collect(),
             confidence: 1.0,
-            channel: "roughness".into(),
-            covariate: "none".into(),
+            channel: Channel::Roughness,
+            covariate: Covariate::None,
             gain: FindingGain::default(),
             says: format!("says {cause}"),
             separate_by: None,
             curve: Curve::default(),
         }
+    }
+
+    fn with_rows(mut finding: Finding, offsets: [f64; 2]) -> Finding {
+        for (row, v) in offsets.into_iter().enumerate() {
+            let id = ParameterId::Row { sensor: "lidar".into(), row };
+            finding.parameters.insert(id, Parameter { estimate: v, unit: Unit::Metre, ci95: [v - 0.001, v + 0.001] });
+        }
+        finding
     }
 
     fn diagnosis(findings: Vec<Finding>) -> Diagnosis {
@@ -381,11 +371,11 @@ mod tests {
     #[test]
     fn effects_stand_in_the_order_in_which_light_meets_them() {
         let diagnosis = diagnosis(vec![
-            finding("label_offset", &[("forward_m", 0.3)]),
-            finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
-            finding("random_dropout", &[("share", 0.2)]),
-            finding("random_dropout", &[("share", -0.2)]),
-            finding("wrong_shape", &[("longer_m", 0.2)]),
+            finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.3)]),
+            finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 0.0)]),
+            finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)]),
+            finding(Cause::RandomDropout, &[(Quantity::Share, -0.2)]),
+            finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
         ]);
         let text = extended_toml(&diagnosis, &SensorRig::single(), &[]);
         let table: toml::Table = toml::from_str(&text).unwrap();
@@ -398,78 +388,78 @@ mod tests {
 
     #[test]
     fn the_simulator_reads_every_cause() {
-        let unexplained = |channel: &str, covariate: &str, at: &[f64]| Finding {
+        let unexplained = |channel: Channel, covariate: Covariate, at: &[f64]| Finding {
             status: Status::Unexplained,
             cause: None,
-            channel: channel.into(),
-            covariate: covariate.into(),
+            channel,
+            covariate,
             curve: Curve {
                 points: at
                     .iter()
-                    .map(|x| CurvePoint { x: *x, measured: 0.9, before: 1.0, after: 0.9, error: 0.1 })
+                    .map(|x| CurvePoint { sensor: 0, x: *x, measured: 0.9, before: 1.0, after: 0.9, error: 0.1 })
                     .collect(),
                 ..Curve::default()
             },
-            ..finding("", &[("simulated_std_m", 0.01)])
+            ..finding(Cause::Unexplained, &[(Quantity::SimulatedStdM, 0.01)])
         };
         let findings = vec![
-            finding("range_noise", &[("std_m", 0.02), ("per_m", 1e-4)]),
-            finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
-            finding("signal_noise", &[("std_m", 0.02), ("exponent", 0.5)]),
-            finding("range_bias", &[("offset_m", -0.02), ("scale", 1e-3)]),
-            finding("beam_range_offset", &[("std_m", 0.02), ("lidar/0", 0.01), ("lidar/1", -0.01)]),
-            finding("beam_elevation_offset", &[("std_deg", 0.1)]),
-            finding("quantisation", &[("step_m", 0.02)]),
-            finding("angular_jitter", &[("std_deg", 0.05)]),
-            finding("random_dropout", &[("share", 0.2)]),
-            finding("signal_dropout", &[("threshold", 1.0), ("steepness", 3.0)]),
-            finding("incidence_dropout", &[("cos_half", 0.1), ("steepness", 3.0)]),
-            finding("range_dropout", &[("half_at_m", 50.0), ("steepness", 6.0)]),
-            finding("material_dropout", &[("share", 0.5)]),
-            finding("range_cut", &[("max_m", 80.0)]),
+            finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 1e-4)]),
+            finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 0.0)]),
+            finding(Cause::SignalNoise, &[(Quantity::StdM, 0.02), (Quantity::Exponent, 0.5)]),
+            finding(Cause::RangeBias, &[(Quantity::OffsetM, -0.02), (Quantity::Scale, 1e-3)]),
+            with_rows(finding(Cause::BeamRangeOffset, &[(Quantity::StdM, 0.02)]), [0.01, -0.01]),
+            finding(Cause::BeamElevationOffset, &[(Quantity::StdDeg, 0.1)]),
+            finding(Cause::Quantisation, &[(Quantity::StepM, 0.02)]),
+            finding(Cause::AngularJitter, &[(Quantity::StdDeg, 0.05)]),
+            finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)]),
+            finding(Cause::SignalDropout, &[(Quantity::Threshold, 1.0), (Quantity::Steepness, 3.0)]),
+            finding(Cause::IncidenceDropout, &[(Quantity::CosHalf, 0.1), (Quantity::Steepness, 3.0)]),
+            finding(Cause::RangeDropout, &[(Quantity::HalfAtM, 50.0), (Quantity::Steepness, 6.0)]),
+            finding(Cause::MaterialDropout, &[(Quantity::Share, 0.5)]),
+            finding(Cause::RangeCut, &[(Quantity::MaxM, 80.0)]),
             finding(
-                "ego_occlusion",
+                Cause::EgoOcclusion,
                 &[
-                    ("azimuth_from_deg", -10.0),
-                    ("azimuth_to_deg", 10.0),
-                    ("elevation_from_deg", -4.0),
-                    ("elevation_to_deg", 1.0),
+                    (Quantity::AzimuthFromDeg, -10.0),
+                    (Quantity::AzimuthToDeg, 10.0),
+                    (Quantity::ElevationFromDeg, -4.0),
+                    (Quantity::ElevationToDeg, 1.0),
                 ],
             ),
-            finding("sensor_extrinsics", &[("sensor", 0.0), ("yaw_deg", 0.2)]),
-            finding("pitch_roll", &[("pitch_deg", 0.2)]),
-            finding("rolling_shutter", &[("scan_s", 0.1)]),
-            finding("outliers", &[("rate", 0.01), ("reach_m", 90.0)]),
-            finding("mixed_pixels", &[("share", 0.01), ("divergence_rad", 0.004)]),
-            finding("label_offset", &[("forward_m", 0.2)]),
-            finding("time_offset", &[("offset_s", 0.02)]),
-            finding("wrong_shape", &[("longer_m", 0.2)]),
-            finding("missing_object", &[("share", 0.02)]),
-            unexplained("hits", "azimuth", &[-30.0, 10.0, 50.0]),
-            unexplained("roughness", "row", &[0.0, 1.0]),
-            unexplained("residuals", "azimuth", &[-30.0, 10.0]),
+            finding(Cause::SensorExtrinsics, &[(Quantity::Sensor, 0.0), (Quantity::YawDeg, 0.2)]),
+            finding(Cause::PitchRoll, &[(Quantity::PitchDeg, 0.2)]),
+            finding(Cause::RollingShutter, &[(Quantity::ScanS, 0.1)]),
+            finding(Cause::Outliers, &[(Quantity::Rate, 0.01), (Quantity::ReachM, 90.0)]),
+            finding(Cause::MixedPixels, &[(Quantity::Share, 0.01), (Quantity::DivergenceRad, 0.004)]),
+            finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.2)]),
+            finding(Cause::TimeOffset, &[(Quantity::OffsetS, 0.02)]),
+            finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
+            finding(Cause::MissingObject, &[(Quantity::Share, 0.02)]),
+            unexplained(Channel::Hits, Covariate::Azimuth, &[-30.0, 10.0, 50.0]),
+            unexplained(Channel::Roughness, Covariate::Row, &[0.0, 1.0]),
+            unexplained(Channel::Residuals, Covariate::Azimuth, &[-30.0, 10.0]),
             Finding {
                 parameters: finding(
-                    "",
+                    Cause::Unexplained,
                     &[
-                        ("sensor", 0.0),
-                        ("azimuth_deg", -20.0),
-                        ("elevation_deg", -4.0),
-                        ("radius_deg", 5.0),
-                        ("share", 0.4),
+                        (Quantity::Sensor, 0.0),
+                        (Quantity::AzimuthDeg, -20.0),
+                        (Quantity::ElevationDeg, -4.0),
+                        (Quantity::RadiusDeg, 5.0),
+                        (Quantity::Share, 0.4),
                     ],
                 )
                 .parameters,
-                ..unexplained("hits", "direction", &[-20.0])
+                ..unexplained(Channel::Hits, Covariate::Direction, &[-20.0])
             },
         ];
         for f in findings {
-            let what = f.cause.clone().unwrap_or_else(|| f.channel.clone());
+            let what = f.cause.map_or(f.channel.name(), Cause::name);
             let diagnosis = diagnosis(vec![f]);
             let text = extended_toml(&diagnosis, &SensorRig::single(), &[vec![-5.0, -4.0]]);
             let read = simulate::effects::EffectList::parse(&text, std::path::Path::new("extended.toml"));
             let effects = read.unwrap_or_else(|e| panic!("{what}: {e}\n{text}")).effects;
-            let of_the_world = matches!(what.as_str(), "wrong_shape" | "missing_object");
+            let of_the_world = matches!(what, "wrong_shape" | "missing_object");
             assert_eq!(effects.is_empty(), of_the_world, "{what}: {text}");
         }
     }

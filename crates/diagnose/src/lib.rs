@@ -3,7 +3,9 @@
 //! `pairing` brings two data sets together return by return, `channels` sums up what is looked at, `inference` weighs causes, `search`
 //! goes through the channels, `engine` is the whole way. Nothing here knows a simulator: clouds, labels and the places of the sensors do.
 
+pub mod catalogue;
 pub mod channels;
+mod curve;
 pub mod diagnosis;
 mod engine;
 mod error;
@@ -14,7 +16,9 @@ mod rig;
 mod scans;
 pub mod search;
 
-pub use diagnosis::{Curve, CurvePoint, DetectorGain, Diagnosis, Finding, FindingGain, SCHEMA, Status, Verdict};
+pub use catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
+pub use curve::{Curve, CurvePoint};
+pub use diagnosis::{DetectorGain, Diagnosis, Finding, FindingGain, SCHEMA, Status, Verdict};
 pub use engine::{Options, Outcome, Progress, Stage, diagnose};
 pub use error::DiagnoseError;
 pub use extended::extended_toml;

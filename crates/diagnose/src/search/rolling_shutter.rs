@@ -1,14 +1,16 @@
-//! A scan that takes its time: what stands still slides along the scan as the own car drives, by metres at speed. Looked for before all else,
-//! since it shears whole scenes, and taken out for the other channels.
+//! Motion distortion: static objects are displaced along the scan as the ego vehicle drives, by metres at speed. Searched first, since it
+//! shears whole scenes, and undone for the other channels.
 //!
-//! For each time that a scan may take, measured returns are moved back to where they would be in the middle of the scan; counted are those that
-//! then come to lie where the simulation has something, seen from above. No pairing of rays is needed, so that metres do not matter.
+//! For each duration of a scan, measured returns are moved back to their place in the middle of the scan. The duration is that with the most
+//! returns in occupied cells of the simulation, in bird's-eye view. Rays need not be paired, so that displacements of metres are found.
 
-use super::{ChannelResult, Context, Found, REPETITIONS, Z_STAR, by_block, draw_blocks};
+use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR, by_block, draw_blocks};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::labels::seen_velocity;
 use crate::channels::mean::{common_bias_m, origins};
 use crate::channels::motion::{CELL_M, Cells, OwnMotion};
-use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::median;
 use crate::inference::roles::Role;
@@ -18,24 +20,24 @@ use geometry::Box3;
 use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
 
-/// How the scene slides over a scan.
+/// Displacement of the scene over a scan.
 pub struct Slide {
-    /// What a scan takes from phase -1/2 to +1/2, s.
+    /// Duration of a scan from phase -1/2 to +1/2, s.
     scan_s: f64,
-    /// Of every frame: the own motion and the objects with what the own car sees of their motion, m/s.
+    /// Motion in every frame.
     motions: Vec<Motion>,
-    /// Every sensor, and its frame from the cloud's.
+    /// Every sensor with `sensor_from_cloud`.
     sensors: Vec<(SensorMount, Isometry3<f64>)>,
 }
 
-/// What moves in one frame.
+/// Motion in one frame: of the ego vehicle, and of the labelled objects relative to it, m/s.
 struct Motion {
     own: OwnMotion,
     objects: Vec<(Box3, Vector3<f64>)>,
 }
 
 impl Motion {
-    /// Velocity of what is at a point, as the own car sees it, m/s.
+    /// Velocity of what is at a point relative to the ego vehicle, m/s.
     fn at(&self, point: &Vector3<f64>, longest_s: f64) -> Vector3<f64> {
         let on = |(b, v): &&(Box3, Vector3<f64>)| {
             let local = b.to_local((*point).into());
@@ -54,7 +56,7 @@ impl Motion {
 }
 
 impl Slide {
-    /// How far a point of a frame that a sensor shows is from where it was in the middle of the scan, m, cloud's frame.
+    /// Displacement of a point of a frame and a sensor from its place in the middle of the scan, m, cloud's frame.
     pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
         let (mount, sensor_from_cloud) = &self.sensors[sensor];
         let [azimuth_rad, elevation_rad, _] = SensorMount::spherical(&(sensor_from_cloud * Point3::from(*point)));
@@ -63,33 +65,38 @@ impl Slide {
     }
 }
 
-/// Returns of a frame that are moved.
+/// Returns of a frame that are moved, at most.
 const POINTS: usize = 2500;
 
-/// Farther returns lie too thin, m.
+/// Largest range of returns that are used, m: farther ones are too sparse.
 const REACH_M: f64 = 60.0;
 
-/// Steps to either side of what is tried: 5 ms, or 25 cm where the own speed is not known.
+/// Steps of the grid to either side of zero.
 const STEPS: i32 = 28;
+
+/// Step of the duration of a scan, s.
 const STEP_S: f64 = 0.005;
+
+/// Step of the displacement over a scan where the ego speed is not known, m.
 const STEP_M: f64 = 0.25;
 
-/// Slides of the whole scene by less than that are seen better by the surfaces, m.
+/// Smallest displacement that is searched for, m: smaller ones are found by surfaces.
 const LEAST_M: f64 = 0.3;
 
-/// What comes to lie on the simulation must be more by this share.
+/// Smallest relative increase of the number of returns on the simulation.
 const LEAST_SHARE: f64 = 0.015;
 
-/// Returns of one frame that may slide.
-struct Sliders {
+/// Returns of one frame in bird's-eye view.
+struct TopView {
+    /// Cells that the simulation occupies.
     occupied: Cells,
-    /// Place, and how far it slides a second of scan, seen from above.
+    /// Place of a measured return, m, and its displacement for each second of scan, m/s.
     points: Vec<(Vector2<f64>, Vector2<f64>)>,
-    /// Measured returns that each of the points stands for.
+    /// Measured returns for each of the points.
     each: f64,
 }
 
-impl Sliders {
+impl TopView {
     fn new(frame: &FramePair, motion: &Motion, rig: &SensorRig, origins: &[Point3<f64>], longest: f64) -> Self {
         let at = |r: &Ray, off_m: f64| origins[r.sensor as usize] + r.direction_vector() * (r.own_range_m() - off_m);
         let near = |r: &&Ray| (3.0..REACH_M).contains(&r.own_range_m());
@@ -98,150 +105,177 @@ impl Sliders {
         let occupied = Cells::new(&simulated.map(|r| at(r, 0.0).coords.xy()).collect::<Vec<_>>());
         let measured: Vec<_> = frame.measured.iter().filter(near).filter(stands).collect();
         let stride = measured.len().div_ceil(POINTS).max(1);
-        // Walls that are all seen nearer or farther slide nowhere.
+        // A common range bias is no displacement along the scan.
         let bias_m = common_bias_m(frame);
         let points = measured.iter().step_by(stride).map(|r| {
             let p = at(r, bias_m).coords;
             let mount = &rig.sensors[r.sensor as usize];
             let phase = mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad));
-            let slides = motion.at(&p, longest) * phase;
-            (p.xy(), slides.xy())
+            let displacement = motion.at(&p, longest) * phase;
+            (p.xy(), displacement.xy())
         });
-        Sliders { occupied, points: points.collect(), each: stride as f64 }
+        TopView { occupied, points: points.collect(), each: stride as f64 }
     }
 
-    /// Number of the points that lie where the simulation has something if a scan takes `scan_s`.
+    /// Number of the points in occupied cells if a scan takes `scan_s`.
     fn on(&self, scan_s: f64) -> f64 {
-        let on = self.points.iter().filter(|(p, slides)| self.occupied.contains(&(p - slides * scan_s)));
+        let on = self.points.iter().filter(|(p, per_s)| self.occupied.contains(&(p - per_s * scan_s)));
         on.count() as f64
     }
 }
 
-/// Mean gain over its standard error from which on a slide may be one: whether the scene then comes to lie on the simulation is asked elsewhere.
-const DOUBTFUL: f64 = 1.5;
+/// Mean gain over its standard error from which on an insignificant displacement is tested further, by moving the scene back.
+const DOUBTFUL_Z: f64 = 1.5;
 
-/// What the search of a slide says.
-pub enum Sliding {
-    /// Nothing slides.
-    No(ChannelResult),
-    /// Everything slides.
-    Yes(ChannelResult, Slide),
-    /// So little is seen from above that the whole scene must be moved back to tell: what to say if it slides, and if not.
-    Perhaps(ChannelResult, Slide, ChannelResult),
+/// Result of the search.
+pub enum Search {
+    /// No displacement along the scan.
+    NotFound(ChannelResult),
+    /// A significant displacement.
+    Found(ChannelResult, Slide),
+    /// A displacement that is not significant from above. Whether it is one is decided after the whole scene was moved back by it.
+    Undecided {
+        /// Result if it is one.
+        found: ChannelResult,
+        /// The displacement.
+        slide: Slide,
+        /// Result if it is none.
+        not_found: ChannelResult,
+    },
 }
 
 /// The search.
-pub fn search(context: &Context) -> Sliding {
+pub fn search(context: &Context) -> Search {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
-    let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
-    // Where the scenes tell the own motion, and where they do not: then all frames slide alike.
-    let mut ways = vec![Way::unknown(context)];
-    ways.extend(Way::known(context));
-    let tried = ways.iter().map(|way| way.tried(&select)).collect::<Vec<_>>();
-    let total = |k: usize| total_and_z(&tried[k].gains).0;
-    let Some(k) = (0..ways.len()).max_by(|&a, &b| total(a).total_cmp(&total(b))) else { return Sliding::No(result) };
-    let Tried { best, gains, least, most } = &tried[k];
-    let way = ways.swap_remove(k);
-    let (gain, z) = total_and_z(gains);
-    let seen = significant(gains, Z_STAR) && gain > LEAST_SHARE * (most - gain);
-    let far_enough = best.abs() * way.fastest > LEAST_M;
+    let mut result = ChannelResult::new(Channel::Slide, hold_out.len());
+    let mut models = vec![Model::without_speed(context)];
+    models.extend(Model::with_speed(context));
+    let grids = models.iter().map(|model| model.grid(&select)).collect::<Vec<_>>();
+    let total = |k: usize| total_and_z(&grids[k].gains).0;
+    let best = (0..models.len()).max_by(|&a, &b| total(a).total_cmp(&total(b)));
+    let Some(k) = best else { return Search::NotFound(result) };
+    let (grid, model) = (&grids[k], models.swap_remove(k));
+    let (gain, z) = total_and_z(&grid.gains);
+    let significant = significant(&grid.gains, Z_STAR) && gain > LEAST_SHARE * (grid.most - gain);
+    let far_enough = grid.best.abs() * model.fastest > LEAST_M;
     let considered = |outcome: &str| Considered {
-        cause: "rolling_shutter".into(),
-        channel: "slide".into(),
+        cause: Cause::RollingShutter.into(),
+        channel: Channel::Slide,
         nats_per_ray: 0.0,
         z,
         outcome: outcome.into(),
     };
-    let minimum = Minimum { parameter: "shear_x_m".into(), value: LEAST_M, unit: "m".into() };
-    result.minimum.push(("rolling_shutter".into(), minimum));
+    result.minimum.push((Cause::RollingShutter, Minimum::new(Quantity::ShearXM, LEAST_M)));
     let outcome =
-        if seen { "too small to be seen from above" } else { "no more returns come to lie on the simulation" };
-    let none = ChannelResult { considered: vec![considered(outcome)], ..result.clone() };
-    if !far_enough || !seen && z < DOUBTFUL {
-        return Sliding::No(none);
+        if significant { "too small to be seen from above" } else { "no more returns come to lie on the simulation" };
+    let not_found = ChannelResult { considered: vec![considered(outcome)], ..result.clone() };
+    if !far_enough || !significant && z < DOUBTFUL_Z {
+        return Search::NotFound(not_found);
     }
     result.considered.push(considered("chosen"));
-    // Finer on other frames, with blocks drawn for the interval.
-    let fine: Vec<f64> = (-20..=20).map(|k| best + 0.2 * way.step * f64::from(k)).collect();
-    let on_estimate = way.counts(&estimate, &fine);
-    let members = by_block(&context.blocks(&estimate));
-    let mut rng = data::stream(0, "diagnose shutter", 0, 0);
-    let all: Vec<usize> = (0..estimate.len()).collect();
-    let scan_s = peak(&fine, &on_estimate, &all);
-    let draws: Vec<f64> =
-        (0..REPETITIONS).map(|_| peak(&fine, &on_estimate, &draw_blocks(&members, &mut rng))).collect();
-    let spread = (draws.iter().map(|d| (d - scan_s).powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
-    // Cells have a size, and the own speed is not known better than by a few per cent.
-    let error = spread.hypot(0.03 * scan_s).hypot(0.1 * CELL_M / way.fastest.max(1.0));
-    // Chance puts some of the points onto the simulation whatever is done: what one more is worth follows from both shares.
-    let points = |frames: &[usize]| frames.iter().map(|&f| way.sliders[f].points.len() as f64).sum::<f64>();
-    let share = |on: f64| ((on + 1.0) / (points(&select) + 2.0)).clamp(0.01, 0.99);
-    let [chance, there] = [*least, *most].map(share);
-    let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
-    let held = hold_out.iter().map(|&f| {
-        let sliders = &way.sliders[f];
-        (sliders.on(scan_s) - sliders.on(0.0)) * sliders.each * worth
-    });
-    let held: Vec<f64> = held.collect();
+    let fitted = Fitted::new(context, &model, grid.best, &estimate);
+    let held = model.held_out_gains(grid, &fitted, &select, &hold_out);
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [g.max(0.0), *g, g.max(0.0)]);
-    let middle = median(way.motions.iter().map(|m| m.own.speed_m_s).collect());
-    let parameter = |estimate: f64, error: f64, unit: &str| Parameter {
-        estimate,
-        unit: unit.into(),
-        ci95: [estimate - 2.0 * error, estimate + 2.0 * error],
-    };
-    let share = |on: f64| on / points(&estimate).max(1.0);
-    let [before, after] = [0.0, scan_s].map(|at| share(estimate.iter().map(|&f| way.sliders[f].on(at)).sum()));
-    let curve = fine.iter().enumerate().map(|(k, s)| {
-        let measured = share(on_estimate.iter().map(|counts| counts[k]).sum());
-        CurvePoint { x: -s, measured, before, after, error: 0.0 }
-    });
-    let shear = ("shear_x_m".to_owned(), parameter(-middle * scan_s, middle * error, "m"));
-    let times = way.speed_known.then(|| ("scan_s".to_owned(), parameter(-scan_s, error, "s"))).into_iter();
-    let speed = if way.speed_known {
-        format!(" at {middle:.0} m/s: a scan takes {:.0} ms", 1e3 * scan_s.abs())
-    } else {
-        String::new()
-    };
-    result.found.push(Found {
-        status: Status::Named,
-        causes: vec!["rolling_shutter".into()],
-        family: "timing",
-        // Scanners of this kind turn clockwise: positive.
-        parameters: times.chain([shear]).collect(),
-        confidence: draws.iter().filter(|d| d.signum() == scan_s.signum()).count() as f64 / draws.len() as f64,
-        channel: "slide",
-        covariate: "scan_phase".into(),
-        held_out_gains: held,
-        says: format!(
-            "what stands still slides by {:.2} m over a scan{speed}, and nobody moves its points back; your simulator shoots all at once",
-            (middle * scan_s).abs()
-        ),
-        separate_by: None,
-        curve: Curve {
-            x: if way.speed_known { "time that a scan takes, s" } else { "slide over a scan, m" }.into(),
-            y: "share of standing returns on the simulation".into(),
-            points: curve.collect(),
-        },
-    });
+    result.found.push(fitted.found(&model, &estimate, held));
     let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
-    let slide = Slide { scan_s, motions: way.motions, sensors };
-    if seen { Sliding::Yes(result, slide) } else { Sliding::Perhaps(result, slide, none) }
+    let slide = Slide { scan_s: fitted.scan_s, motions: model.motions, sensors };
+    if significant { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
 }
 
-/// One way to tell how things slide.
-struct Way {
+/// The duration of a scan, fitted on the estimating frames.
+struct Fitted {
+    /// Durations of a finer grid about the best of the selecting frames, and the counts of every frame.
+    fine: Vec<f64>,
+    counts: Vec<Vec<f64>>,
+    scan_s: f64,
+    /// Standard error, s.
+    error: f64,
+    /// Share of bootstrap repetitions with the same sign.
+    confidence: f64,
+}
+
+impl Fitted {
+    fn new(context: &Context, model: &Model, best: f64, estimate: &[usize]) -> Self {
+        let fine: Vec<f64> = (-20..=20).map(|k| best + 0.2 * model.step * f64::from(k)).collect();
+        let counts = model.counts(estimate, &fine);
+        let members = by_block(&context.blocks(estimate));
+        let mut rng = data::stream(0, "diagnose shutter", 0, 0);
+        let all: Vec<usize> = (0..estimate.len()).collect();
+        let scan_s = peak(&fine, &counts, &all);
+        let draws: Vec<f64> =
+            (0..REPETITIONS).map(|_| peak(&fine, &counts, &draw_blocks(&members, &mut rng))).collect();
+        let spread = (draws.iter().map(|d| (d - scan_s).powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
+        // The size of a cell, and an error of 3 % of the ego speed.
+        let error = spread.hypot(0.03 * scan_s).hypot(0.1 * CELL_M / model.fastest.max(1.0));
+        let confidence = draws.iter().filter(|d| d.signum() == scan_s.signum()).count() as f64 / draws.len() as f64;
+        Fitted { fine, counts, scan_s, error, confidence }
+    }
+
+    /// The finding. Scans that turn clockwise have a positive duration.
+    fn found(&self, model: &Model, estimate: &[usize], held_out_gains: Vec<f64>) -> Found {
+        let Fitted { scan_s, error, .. } = *self;
+        let middle = median(model.motions.iter().map(|m| m.own.speed_m_s).collect());
+        let parameter = |quantity: Quantity, estimate: f64, error: f64| -> NamedParameter {
+            let ci95 = [estimate - 2.0 * error, estimate + 2.0 * error];
+            (quantity.into(), Parameter { estimate, unit: quantity.unit(), ci95 })
+        };
+        let duration = model.speed_known.then(|| parameter(Quantity::ScanS, -scan_s, error));
+        let shear = parameter(Quantity::ShearXM, -middle * scan_s, middle * error);
+        let speed = if model.speed_known {
+            format!(" at {middle:.0} m/s: a scan takes {:.0} ms", 1e3 * scan_s.abs())
+        } else {
+            String::new()
+        };
+        Found {
+            status: Status::Named,
+            causes: vec![Cause::RollingShutter],
+            parameters: duration.into_iter().chain([shear]).collect(),
+            confidence: self.confidence,
+            channel: Channel::Slide,
+            covariate: Covariate::ScanPhase,
+            held_out_gains,
+            says: format!(
+                "what stands still slides by {:.2} m over a scan{speed}, and nobody moves its points back; your simulator shoots all at once",
+                (middle * scan_s).abs()
+            ),
+            separate_by: None,
+            curve: self.curve(model, estimate),
+        }
+    }
+
+    /// Share of the static returns that lie on the simulation, by the duration of a scan.
+    fn curve(&self, model: &Model, estimate: &[usize]) -> Curve {
+        let points = model.points(estimate);
+        let share = |on: f64| on / points.max(1.0);
+        let on = |at: f64| estimate.iter().map(|&f| model.frames[f].on(at)).sum();
+        let [before, after] = [0.0, self.scan_s].map(|at| share(on(at)));
+        let points = self.fine.iter().enumerate().map(|(k, s)| {
+            let measured = share(self.counts.iter().map(|counts| counts[k]).sum());
+            CurvePoint { sensor: 0, x: -s, measured, before, after, error: 0.0 }
+        });
+        Curve {
+            x: if model.speed_known { "time that a scan takes, s" } else { "slide over a scan, m" }.into(),
+            y: "share of standing returns on the simulation".into(),
+            by_sensor: false,
+            points: points.collect(),
+        }
+    }
+}
+
+/// A model of the motion in all frames.
+struct Model {
     motions: Vec<Motion>,
-    sliders: Vec<Sliders>,
-    /// Fastest own speed, m/s; 1 where it is not known: what is tried are then metres of slide.
+    frames: Vec<TopView>,
+    /// Largest ego speed, m/s. Where it is not known it is 1, and durations are displacements in m.
     fastest: f64,
+    /// Step of the grid, s or m.
     step: f64,
     speed_known: bool,
 }
 
-impl Way {
-    /// From the own motion and that of the objects, where the scenes tell both.
-    fn known(context: &Context) -> Option<Way> {
+impl Model {
+    /// With the motion of the ego vehicle and of the objects, where both are known.
+    fn with_speed(context: &Context) -> Option<Model> {
         let (times, own) = (context.times.as_ref()?, context.motion.as_ref()?);
         let motion = |f: usize| {
             let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
@@ -251,39 +285,58 @@ impl Way {
         };
         let motions: Vec<Motion> = (0..context.frames.len()).map(motion).collect();
         let fastest = motions.iter().map(|m| m.own.speed_m_s.abs()).fold(0.0, f64::max);
-        (fastest > 1.0).then(|| Way::new(context, motions, fastest, STEP_S, true))
+        (fastest > 1.0).then(|| Model::new(context, motions, fastest, STEP_S, true))
     }
 
-    /// All frames alike; objects stay where they are.
-    fn unknown(context: &Context) -> Way {
+    /// With the same displacement in all frames; objects are not displaced.
+    fn without_speed(context: &Context) -> Model {
         let motion = |frame: &FramePair| Motion {
             own: OwnMotion { speed_m_s: 1.0, yaw_rate_rad_s: 0.0 },
             objects: frame.objects.iter().filter_map(|o| Some((o.simulated?, Vector3::zeros()))).collect(),
         };
-        Way::new(context, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
+        Model::new(context, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
     }
 
-    fn new(context: &Context, motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Way {
+    fn new(context: &Context, motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model {
         let origins = origins(context.rig);
         let longest = step * f64::from(STEPS);
-        let of_frame = |(frame, motion)| Sliders::new(frame, motion, context.rig, &origins, longest);
-        let sliders = context.frames.par_iter().zip(&motions).map(of_frame).collect();
-        Way { motions, sliders, fastest, step, speed_known }
+        let of_frame = |(frame, motion)| TopView::new(frame, motion, context.rig, &origins, longest);
+        let frames = context.frames.par_iter().zip(&motions).map(of_frame).collect();
+        Model { motions, frames, fastest, step, speed_known }
     }
 
-    /// Of every frame the numbers that come to lie on the simulation, one by one of what is tried.
-    fn counts(&self, frames: &[usize], tried: &[f64]) -> Vec<Vec<f64>> {
-        frames.par_iter().map(|&f| tried.iter().map(|&s| self.sliders[f].on(s)).collect()).collect()
+    /// Of every frame the numbers of points in occupied cells, for each duration.
+    fn counts(&self, frames: &[usize], durations: &[f64]) -> Vec<Vec<f64>> {
+        frames.par_iter().map(|&f| durations.iter().map(|&s| self.frames[f].on(s)).collect()).collect()
     }
 
-    /// Tries all on these frames.
-    fn tried(&self, frames: &[usize]) -> Tried {
+    /// Number of points of some frames.
+    fn points(&self, frames: &[usize]) -> f64 {
+        frames.iter().map(|&f| self.frames[f].points.len() as f64).sum::<f64>()
+    }
+
+    /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the best and the worst share is
+    /// the gain of one more point.
+    fn held_out_gains(&self, grid: &Grid, fitted: &Fitted, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
+        let points = self.points(select);
+        let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
+        let [chance, there] = [grid.least, grid.most].map(share);
+        let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
+        let gain = |&f: &usize| {
+            let view = &self.frames[f];
+            (view.on(fitted.scan_s) - view.on(0.0)) * view.each * worth
+        };
+        hold_out.iter().map(gain).collect()
+    }
+
+    /// Counts on a grid of durations.
+    fn grid(&self, frames: &[usize]) -> Grid {
         let grid: Vec<f64> = (-STEPS..=STEPS).map(|k| self.step * f64::from(k)).collect();
         let on = self.counts(frames, &grid);
         let sums: Vec<f64> = (0..grid.len()).map(|k| on.iter().map(|c| c[k]).sum()).collect();
         let still = STEPS as usize;
         let best = (0..grid.len()).max_by(|&a, &b| sums[a].total_cmp(&sums[b])).unwrap_or(still);
-        Tried {
+        Grid {
             best: grid[best],
             gains: on.iter().map(|c| c[best] - c[still]).collect(),
             least: sums.iter().copied().fold(f64::INFINITY, f64::min),
@@ -292,18 +345,19 @@ impl Way {
     }
 }
 
-/// What came of trying.
-struct Tried {
-    /// What is best.
+/// Counts on a grid of durations.
+struct Grid {
+    /// The duration with the most points in occupied cells.
     best: f64,
-    /// How many more come to lie on the simulation on each frame.
+    /// Increase of that number on each frame over no displacement.
     gains: Vec<f64>,
-    /// How many come to lie there at least, whatever is tried, and how many at most.
+    /// Smallest and largest number over all durations.
     least: f64,
     most: f64,
 }
 
-/// The time at which most come to lie on the simulation: the mean of those within 15 % of the best, of what is between the worst and it.
+/// The duration with the most points in occupied cells: the mean of the durations whose counts are within 15 % of the best, in units of the
+/// difference between best and worst, weighted by what exceeds that.
 fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
     let sums: Vec<f64> = (0..times.len()).map(|k| which.iter().map(|&i| counts[i][k]).sum()).collect();
     let [low, high] = [sums.iter().copied().fold(f64::INFINITY, f64::min), sums.iter().copied().fold(0.0, f64::max)];
@@ -318,7 +372,7 @@ mod tests {
     use crate::inference::roles::roles;
     use rand::RngExt;
 
-    /// A return of something that stands.
+    /// A return of a static surface.
     fn standing(at: &Vector3<f64>) -> Ray {
         Ray {
             sensor: 0,
@@ -375,8 +429,8 @@ mod tests {
             motion: Some(vec![Some(own); 20]),
         };
         let (result, slide) = match search(&context) {
-            Sliding::Yes(result, slide) => (result, Some(slide)),
-            Sliding::No(result) | Sliding::Perhaps(_, _, result) => (result, None),
+            Search::Found(result, slide) => (result, Some(slide)),
+            Search::NotFound(result) | Search::Undecided { not_found: result, .. } => (result, None),
         };
         assert_eq!(result.found.len(), usize::from(slide.is_some()));
         let p = Vector3::new(0.0, 20.0, 0.0);
@@ -390,7 +444,7 @@ mod tests {
     }
 
     #[test]
-    fn the_time_that_a_scan_takes_is_found_and_nothing_where_it_takes_none() {
+    fn the_duration_of_a_scan_is_found_and_none_where_it_is_zero() {
         for truth in [-0.08, 0.05] {
             let estimate = found(truth).unwrap();
             assert!((estimate - truth).abs() < 0.003, "{estimate} {truth}");

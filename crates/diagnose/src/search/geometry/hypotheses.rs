@@ -1,84 +1,85 @@
-//! What may be wrong with where surfaces lie.
+//! Hypotheses about where surfaces lie.
 
+use crate::catalogue::Cause;
 use crate::channels::groups::Grouping;
 use crate::channels::mean::Column;
-use crate::inference::choice::UNNAMED;
 use crate::search::Context;
 
-/// What may be wrong.
+/// A hypothesis: some columns of the linear fit, or one offset for each group of rays.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Suspect {
-    Linear { name: &'static str, columns: Vec<usize> },
-    Groups { name: &'static str, grouping: Grouping, column: usize },
+pub(super) enum Hypothesis {
+    Linear { cause: Cause, columns: Vec<usize> },
+    Groups { cause: Cause, grouping: Grouping, column: usize },
 }
 
-impl Suspect {
-    /// The cause's name.
-    pub(super) fn name(&self) -> &'static str {
+impl Hypothesis {
+    /// Its cause.
+    pub(super) fn cause(&self) -> Cause {
         match self {
-            Suspect::Linear { name, .. } | Suspect::Groups { name, .. } => name,
+            Hypothesis::Linear { cause, .. } | Hypothesis::Groups { cause, .. } => *cause,
         }
     }
 
-    /// Free parameters; of groups as many as they are worth.
+    /// Number of free parameters. Offsets of groups are shrunk by their prior: 12 for rows and 14 for strips of azimuth are what they count.
     pub(super) fn parameters(&self) -> usize {
         match self {
-            Suspect::Linear { columns, .. } => columns.len(),
-            Suspect::Groups { grouping: Grouping::Row, .. } => 12,
-            Suspect::Groups { .. } => 14,
+            Hypothesis::Linear { columns, .. } => columns.len(),
+            Hypothesis::Groups { grouping: Grouping::Row, .. } => 12,
+            Hypothesis::Groups { .. } => 14,
         }
     }
 }
 
-/// All suspects of a rig.
-pub(super) fn suspects(context: &Context, columns: &[Column]) -> Vec<Suspect> {
+/// All hypotheses of a rig. With a single sensor its pose and that of the scene are the same columns.
+pub(super) fn hypotheses(context: &Context, columns: &[Column]) -> Vec<Hypothesis> {
     let at = |c: Column| columns.iter().position(|x| *x == c);
     let pick = |list: &[Column]| list.iter().filter_map(|c| at(*c)).collect::<Vec<_>>();
-    let linear = |name, list: &[Column]| Suspect::Linear { name, columns: pick(list) };
+    let linear = |cause, list: &[Column]| Hypothesis::Linear { cause, columns: pick(list) };
     let mut all = vec![
-        linear("range_bias", &[Column::RangeOffset]),
-        linear("range_bias", &[Column::RangeScale]),
-        linear("range_bias", &[Column::RangeOffset, Column::RangeScale]),
-        linear("pitch_roll", &[Column::Pose(1)]),
-        linear("pitch_roll", &[Column::Pose(0)]),
-        linear("pitch_roll", &[Column::Pose(0), Column::Pose(1)]),
-        linear("rolling_shutter", &[Column::Sweep(0)]),
-        linear("rolling_shutter", &[Column::Sweep(2)]),
-        linear("rolling_shutter", &[Column::Sweep(0), Column::Sweep(2)]),
+        linear(Cause::RangeBias, &[Column::RangeOffset]),
+        linear(Cause::RangeBias, &[Column::RangeScale]),
+        linear(Cause::RangeBias, &[Column::RangeOffset, Column::RangeScale]),
+        linear(Cause::PitchRoll, &[Column::Pose(1)]),
+        linear(Cause::PitchRoll, &[Column::Pose(0)]),
+        linear(Cause::PitchRoll, &[Column::Pose(0), Column::Pose(1)]),
+        linear(Cause::RollingShutter, &[Column::Sweep(0)]),
+        linear(Cause::RollingShutter, &[Column::Sweep(2)]),
+        linear(Cause::RollingShutter, &[Column::Sweep(0), Column::Sweep(2)]),
     ];
+    let mount = |list: &[Column]| linear(Cause::SensorExtrinsics, list);
     if context.rig.sensors.len() > 1 {
         for s in 0..context.rig.sensors.len() {
             for k in 0..3 {
-                all.push(linear("sensor_extrinsics", &[Column::SensorPose(s, k)]));
+                all.push(mount(&[Column::SensorPose(s, k)]));
             }
-            all.push(linear("sensor_extrinsics", &[0, 1, 2].map(|k| Column::SensorPose(s, k))));
-            all.push(linear("sensor_extrinsics", &[3, 4, 5].map(|k| Column::SensorPose(s, k))));
-            all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(|k| Column::SensorPose(s, k))));
+            all.push(mount(&[0, 1, 2].map(|k| Column::SensorPose(s, k))));
+            all.push(mount(&[3, 4, 5].map(|k| Column::SensorPose(s, k))));
+            all.push(mount(&[0, 1, 2, 3, 4, 5].map(|k| Column::SensorPose(s, k))));
         }
     } else {
         for k in 0..3 {
-            all.push(linear("sensor_extrinsics", &[Column::Pose(k)]));
+            all.push(mount(&[Column::Pose(k)]));
         }
-        all.push(linear("sensor_extrinsics", &[0, 1, 2].map(Column::Pose)));
-        all.push(linear("sensor_extrinsics", &[0, 1, 2, 3, 4, 5].map(Column::Pose)));
+        all.push(mount(&[0, 1, 2].map(Column::Pose)));
+        all.push(mount(&[0, 1, 2, 3, 4, 5].map(Column::Pose)));
     }
-    all.push(Suspect::Groups { name: "beam_range_offset", grouping: Grouping::Row, column: 0 });
-    all.push(Suspect::Groups { name: "beam_elevation_offset", grouping: Grouping::Row, column: 1 });
-    all.push(Suspect::Groups { name: UNNAMED, grouping: Grouping::Azimuth, column: 0 });
+    all.push(Hypothesis::Groups { cause: Cause::BeamRangeOffset, grouping: Grouping::Row, column: 0 });
+    all.push(Hypothesis::Groups { cause: Cause::BeamElevationOffset, grouping: Grouping::Row, column: 1 });
+    all.push(Hypothesis::Groups { cause: Cause::Unexplained, grouping: Grouping::Azimuth, column: 0 });
     all
 }
 
-/// Whether a suspect is a pose: on top of another one it mends what a turn leaves that is not small.
-pub(super) fn is_pose(suspect: &Suspect) -> bool {
-    matches!(suspect.name(), "pitch_roll" | "sensor_extrinsics")
+/// Whether a hypothesis is a pose. A second pose may only compensate the non-linear part of a large first one.
+pub(super) fn is_pose(hypothesis: &Hypothesis) -> bool {
+    matches!(hypothesis.cause(), Cause::PitchRoll | Cause::SensorExtrinsics)
 }
 
-/// Whether a suspect tells another story than those chosen.
-pub(super) fn may_join(suspect: &Suspect, chosen: &[Suspect]) -> bool {
+/// Whether a hypothesis may be added to those chosen: another cause, at most one grouping, and nothing after motion distortion. A strong
+/// shear leaves every sensor with an apparent turn and shift of its own.
+pub(super) fn may_join(hypothesis: &Hypothesis, chosen: &[Hypothesis]) -> bool {
     chosen.iter().all(|c| {
-        let grouped = |s: &Suspect| matches!(s, Suspect::Groups { .. });
-        // A shear that is not small leaves every sensor with a turn and a shift of its own.
-        let sheared = c.name() == "rolling_shutter";
-        c.name() != suspect.name() && !sheared && !(grouped(c) && grouped(suspect))
+        let grouped = |h: &Hypothesis| matches!(h, Hypothesis::Groups { .. });
+        let sheared = c.cause() == Cause::RollingShutter;
+        c.cause() != hypothesis.cause() && !sheared && !(grouped(c) && grouped(hypothesis))
     })
 }

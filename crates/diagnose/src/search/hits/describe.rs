@@ -1,66 +1,83 @@
-//! What the search of losses found, in words and numbers.
+//! Findings of lost returns: parameters, sentences and plots.
 
-use crate::channels::cells::{OBJECT, ZONE_NAMES};
-use crate::diagnosis::{Curve, CurvePoint, Parameter, Status};
+use crate::catalogue::{Channel, Covariate, Quantity};
+use crate::channels::cells::OBJECT;
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::Parameter;
 use crate::inference::law::{FittedLaw, Law, in_zone};
 use crate::inference::losses::LossTable;
-use crate::search::Found;
+use crate::search::{Found, NamedParameter, Selected};
 
-/// Numbers of a law as people read them.
-fn reading(law: &FittedLaw) -> Vec<(&'static str, f64, &'static str)> {
+/// Parameters of a law, as a finding has them.
+fn values(law: &FittedLaw) -> Vec<(Quantity, f64)> {
+    let steepness = (Quantity::Steepness, law.steepness());
+    let most = (Quantity::Most, law.most());
     match law.law {
-        Law::Random | Law::Zone(_) => vec![("share", law.numbers[0], "1")],
-        Law::Range => {
-            vec![("half_at_m", law.half().exp(), "m"), ("steepness", law.steepness(), "1"), ("most", law.most(), "1")]
-        }
-        Law::Incidence => {
-            vec![("cos_half", law.half().exp(), "1"), ("steepness", law.steepness(), "1"), ("most", law.most(), "1")]
-        }
-        // u: ln(0.1 cos / R^2) - ln(0.1 / 250^2).
+        Law::Random | Law::Zone(_) => vec![(Quantity::Share, law.numbers[0])],
+        Law::Range => vec![(Quantity::HalfAtM, law.half().exp()), steepness, most],
+        Law::Incidence => vec![(Quantity::CosHalf, law.half().exp()), steepness, most],
+        // Signal index: ln(0.1 cos / R^2) - ln(0.1 / 250^2).
         Law::Signal => vec![
-            ("threshold", law.half() + 2.0 * 250f64.ln(), "1"),
-            ("steepness", law.steepness(), "1"),
-            ("most", law.most(), "1"),
-            ("brighter_standing", law.numbers[4], "1"),
-            ("brighter_objects", law.numbers[5], "1"),
+            (Quantity::Threshold, law.half() + 2.0 * 250f64.ln()),
+            steepness,
+            most,
+            (Quantity::BrighterStanding, law.numbers[4]),
+            (Quantity::BrighterObjects, law.numbers[5]),
         ],
     }
 }
 
+/// The finding of one law. `draws` are its bootstrap fits, `all` are all laws that were fitted together.
 pub(super) fn found(
     law: &FittedLaw,
     draws: &[FittedLaw],
-    equals: Vec<String>,
-    confidence: f64,
+    selected: Selected,
     held_out_gains: Vec<f64>,
     table: &LossTable,
     all: &[FittedLaw],
 ) -> Found {
-    let values = reading(law);
-    let parameters = values
-        .iter()
-        .enumerate()
-        .map(|(k, (name, estimate, unit))| {
-            let drawn: Vec<f64> = draws.iter().map(|d| reading(d)[k].1).collect();
-            let mean = drawn.iter().sum::<f64>() / drawn.len().max(1) as f64;
-            let sd =
-                (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
-            // The form of the truth may differ, the more so beyond the returns that there are.
-            let beyond = match *name {
-                "half_at_m" => (estimate - table.farthest_m()).max(0.0),
-                "cos_half" => (table.most_grazing() - estimate).max(0.0),
-                _ => 0.0,
-            };
-            let form = if *name == "most" { 0.002 } else { form_error(law.law) * estimate.abs() };
-            let half = 2.1 * sd.hypot(form) + beyond;
-            // Which of an object's surfaces are of the material is not known: where few are, each of them loses more.
-            let few = matches!(law.law, Law::Zone(z) if z >= OBJECT) && *estimate > 0.0;
-            let ci95 = [estimate - half, if few { 1.0 } else { estimate + half }];
-            ((*name).to_owned(), Parameter { estimate: *estimate, unit: (*unit).into(), ci95 })
-        })
-        .collect();
-    let name = law.law.name().to_owned();
-    let says = match law.law {
+    let separate_by = (!selected.rivals.is_empty()).then(|| {
+        "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
+    });
+    Found {
+        status: selected.status(),
+        confidence: selected.confidence,
+        causes: selected.causes(law.law.cause()),
+        parameters: parameters(law, draws, table),
+        channel: Channel::Hits,
+        covariate: covariate(law.law),
+        held_out_gains,
+        says: says(law, table),
+        separate_by,
+        curve: curve(table, law.law, all),
+    }
+}
+
+/// Parameters of a law with intervals: 2.1 times the standard deviation of the bootstrap fits and the error of the law's form.
+fn parameters(law: &FittedLaw, draws: &[FittedLaw], table: &LossTable) -> Vec<NamedParameter> {
+    let parameter = |(k, (quantity, estimate)): (usize, (Quantity, f64))| {
+        let drawn: Vec<f64> = draws.iter().map(|d| values(d)[k].1).collect();
+        let mean = drawn.iter().sum::<f64>() / drawn.len().max(1) as f64;
+        let sd = (drawn.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (drawn.len() as f64 - 1.0).max(1.0)).sqrt();
+        // Beyond the ranges and angles of the returns the law is extrapolated.
+        let beyond = match quantity {
+            Quantity::HalfAtM => (estimate - table.farthest_m()).max(0.0),
+            Quantity::CosHalf => (table.most_grazing() - estimate).max(0.0),
+            _ => 0.0,
+        };
+        let form = if quantity == Quantity::Most { 0.002 } else { form_error(law.law) * estimate.abs() };
+        let half = 2.1 * sd.hypot(form) + beyond;
+        // Which part of an object has the material is not known: where the part is small, it loses more.
+        let part = matches!(law.law, Law::Zone(z) if z >= OBJECT) && estimate > 0.0;
+        let ci95 = [estimate - half, if part { 1.0 } else { estimate + half }];
+        (quantity.into(), Parameter { estimate, unit: quantity.unit(), ci95 })
+    };
+    values(law).into_iter().enumerate().map(parameter).collect()
+}
+
+/// The finding in a sentence.
+fn says(law: &FittedLaw, table: &LossTable) -> String {
+    match law.law {
         Law::Random => format!(
             "{:.1} % of the returns are lost wherever they come from; your simulator keeps them",
             100.0 * law.numbers[0]
@@ -71,7 +88,7 @@ pub(super) fn found(
             100.0 * law.numbers[0]
         ),
         Law::Range => {
-            // Not what no return shows.
+            // No farther than returns are.
             let at_m = law.half().exp().min(table.farthest_m());
             let lost = 100.0 * (1.0 - law.kept_there(at_m, 1.0));
             format!("returns are lost with range: {lost:.0} % at {at_m:.0} m; your simulator keeps them all")
@@ -86,36 +103,28 @@ pub(super) fn found(
         }
         Law::Signal => format!(
             "returns are lost as the signal falls: 50 % at u = {:.1}, on the road at {:.0} m if it is met at 2 degrees; your simulator keeps them all",
-            values[0].1,
+            values(law)[0].1,
             (0.5 * (2f64.to_radians().sin().ln() - law.half())).exp()
         ),
-    };
-    let covariate = match law.law {
-        Law::Random => "none".to_owned(),
-        Law::Zone(z) => format!("surface: {}", ZONE_NAMES.get(z).unwrap_or(&"whole_object")),
-        Law::Range => "range_m".into(),
-        Law::Incidence => "cos_incidence".into(),
-        Law::Signal => "signal".into(),
-    };
-    let status = if equals.is_empty() { Status::Named } else { Status::Ambiguous };
-    let separate_by = (!equals.is_empty()).then(|| {
-        "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
-    });
-    Found {
-        status,
-        causes: std::iter::once(name).chain(equals).collect(),
-        family: "detection",
-        parameters,
-        confidence,
-        channel: "hits",
-        covariate,
-        held_out_gains,
-        says,
-        separate_by,
-        curve: curve(table, law.law, all),
     }
 }
 
+/// What a law depends on.
+fn covariate(law: Law) -> Covariate {
+    match law {
+        Law::Random => Covariate::None,
+        Law::Zone(0) => Covariate::SurfaceGround,
+        Law::Zone(1) => Covariate::SurfaceStanding,
+        Law::Zone(2) => Covariate::SurfaceObject,
+        Law::Zone(3) => Covariate::SurfaceObjectCorner,
+        Law::Zone(_) => Covariate::SurfaceWholeObject,
+        Law::Range => Covariate::Range,
+        Law::Incidence => Covariate::CosIncidence,
+        Law::Signal => Covariate::Signal,
+    }
+}
+
+/// Kinds of surfaces as sentences name them.
 fn zone_words(zone: usize) -> &'static str {
     [
         "the ground",
@@ -126,7 +135,7 @@ fn zone_words(zone: usize) -> &'static str {
     ][zone]
 }
 
-/// Share of a number by which a fit of another form may be off.
+/// Relative error of the parameters if the sensor has another law than the fitted one.
 fn form_error(law: Law) -> f64 {
     match law {
         Law::Random => 0.01,
@@ -136,6 +145,7 @@ fn form_error(law: Law) -> f64 {
     }
 }
 
+/// Share of the simulated returns that are measured, along the covariate of a law.
 fn curve(table: &LossTable, law: Law, all: &[FittedLaw]) -> Curve {
     let x_of = |[ln_range, ln_cos]: [f64; 2]| match law {
         Law::Incidence => ln_cos.exp().min(1.0).asin().to_degrees(),
@@ -164,7 +174,7 @@ fn curve(table: &LossTable, law: Law, all: &[FittedLaw]) -> Curve {
         if sum[0] >= per || i + 1 == rows.len() && sum[0] > 0.2 * per {
             let [_, x, share, kept] = sum.map(|s| s / sum[0].max(1.0));
             let share_error = (share.clamp(0.0, 1.0) * (1.0 - share.clamp(0.0, 1.0)) / sum[0]).sqrt();
-            points.push(CurvePoint { x, measured: share, before: 1.0, after: kept, error: share_error });
+            points.push(CurvePoint { sensor: 0, x, measured: share, before: 1.0, after: kept, error: share_error });
             sum = [0.0; 4];
         }
     }
@@ -173,5 +183,5 @@ fn curve(table: &LossTable, law: Law, all: &[FittedLaw]) -> Curve {
         Law::Signal => "u = ln(cos / R^2) - ln(1 / 250^2)",
         _ => "range, m",
     };
-    Curve { x: x.into(), y: "share of simulated returns that are measured".into(), points }
+    Curve { x: x.into(), y: "share of simulated returns that are measured".into(), by_sensor: false, points }
 }
