@@ -3,6 +3,8 @@
 //! `pairing` brings two data sets together return by return, `channels` sums up what is looked at, `inference` weighs causes, `search`
 //! goes through the channels, `engine` is the whole way. Nothing here knows a simulator: clouds, labels and the places of the sensors do.
 
+#![warn(clippy::too_many_lines)]
+
 pub mod catalogue;
 pub mod channels;
 mod curve;
