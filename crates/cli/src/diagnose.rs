@@ -93,7 +93,7 @@ impl DiagnoseArgs {
         self.write_json(&outcome.diagnosis)?;
         write_atomic(
             &self.out.join("extended.toml"),
-            extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg).as_bytes(),
+            extended_toml(&outcome.diagnosis).as_bytes(),
         )?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {

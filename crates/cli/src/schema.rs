@@ -7,9 +7,9 @@ use eval::study::StudyConfig;
 use models::config::DetectorConfig;
 use schemars::{JsonSchema, Schema, schema_for};
 use serde_json::{Map, Value, json};
-use simulate::effects::EffectList;
+use sensor::{EffectList, Rig};
 use simulate::race::RaceConfig;
-use simulate::{Rig, RoadConfig};
+use simulate::RoadConfig;
 use std::fmt::Write;
 use std::path::PathBuf;
 

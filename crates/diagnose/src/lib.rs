@@ -6,6 +6,7 @@
 pub mod channels;
 pub mod diagnosis;
 mod engine;
+mod effects;
 mod error;
 mod extended;
 pub mod inference;

@@ -12,7 +12,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let rig = SensorRig::read(sensor)?;
     let outcome = diagnose_scans(&Dataset::open(dataset)?, &rig, &Options::default(), &|_, _, _| ())?;
     write_atomic(&out.join("diagnosis.json"), &serde_json::to_vec_pretty(&outcome.diagnosis)?)?;
-    let extended = extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg);
+    let extended = extended_toml(&outcome.diagnosis);
     write_atomic(&out.join("extended.toml"), extended.as_bytes())?;
     Ok(lidarshift_report::write_finding_pictures(&outcome.diagnosis, out)?)
 }

@@ -5,10 +5,10 @@
 //! the scan), `object` (groups of the track from 1, cars from 100, 0 unknown), `row`, `column` (65535 unknown), `sensor` (number in the rig),
 //! `material` (number in `names.json` beside it), `echo` (0 first return, 1 second).
 
-use crate::mesh::{MaterialId, MaterialTable};
+use crate::material::{MaterialId, MaterialTable};
+use crate::object::{FIRST_CAR, Group};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
-use crate::track::{FIRST_CAR, Group};
 use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_json};
 use serde_json::json;
 use std::path::{Path, PathBuf};

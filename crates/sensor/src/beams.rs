@@ -120,7 +120,7 @@ impl Beams {
 }
 
 /// Turns a unit vector by small angles: to the left about the vertical, and up, rad.
-pub(crate) fn turned(direction: [f32; 3], left_rad: f32, up_rad: f32) -> [f32; 3] {
+pub fn turned(direction: [f32; 3], left_rad: f32, up_rad: f32) -> [f32; 3] {
     let [x, y, z] = direction;
     let flat = x.hypot(y).max(1e-6);
     let d = Vector3::new(x, y, z);

@@ -1,15 +1,15 @@
 //! A finished cloud as a scan: which sensor saw each point, where in its pattern, and under which angle of incidence.
 
+use crate::assignment::Assignment;
 use crate::effects::Need;
 use crate::rig::{Rig, Sensor};
 use crate::scan::{Echo, Scan, dot};
+use crate::signal::CLOUD_REFLECTIVITY;
 use data::Cloud;
 use geometry::Pose;
 use nalgebra::{Matrix3, Point3, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A surface of which nothing is known is taken to reflect that part of the light.
-pub const ASSUMED_REFLECTIVITY: f32 = 0.2;
 /// Side of the cells, seen from the sensor, in which a point looks for its neighbours, rad.
 const CELL_RAD: f32 = 0.01;
 /// Neighbours are at most this part of the range away.
@@ -19,18 +19,19 @@ const FEWEST: usize = 5;
 
 /// The cloud as a scan, and what is known of it.
 ///
-/// A point belongs to the sensor in whose field of view it lies; of several, to the one whose middle it is nearest to. Rows and columns are
-/// the nearest of the sensor's pattern, where it has one. Incidence comes from the plane through the neighbours of a point, seen from the
-/// sensor. Reflectivity is [`ASSUMED_REFLECTIVITY`] everywhere; intensities, where there are, scale it.
+/// [`Assignment`] says which sensor a point belongs to. Rows and columns are the nearest of the sensor's pattern, where it has one.
+/// Incidence comes from the plane through the neighbours of a point, seen from the sensor. Reflectivity is [`CLOUD_REFLECTIVITY`] everywhere; intensities, where there are, scale it.
 pub fn scan_of_cloud(cloud: &Cloud, rig: &Rig) -> (Scan, BTreeSet<Need>) {
+    let assignment = Assignment::new(rig);
     let poses: Vec<Pose> = rig.sensors.iter().map(Sensor::pose).collect();
     let intensity = |p: &[f32]| p.get(3).copied();
     let echo = |p: &[f32]| {
-        let number = sensor_of(rig, &poses, [p[0], p[1], p[2]]);
+        let point = Point3::new(p[0], p[1], p[2]).cast();
+        let number = assignment.of_point(point).map_or(0, |assigned| assigned.sensor);
         let mut echo = Echo {
             sensor: number as u8,
             range_m: 1.0,
-            reflectivity: ASSUMED_REFLECTIVITY,
+            reflectivity: CLOUD_REFLECTIVITY,
             intensity: intensity(p).unwrap_or(0.0),
             ..Echo::nothing(rig.sensors[number].position.map(|v| v as f32), [1.0, 0.0, 0.0])
         };
@@ -50,15 +51,6 @@ pub fn scan_of_cloud(cloud: &Cloud, rig: &Rig) -> (Scan, BTreeSet<Need>) {
         known.extend([Need::Row, Need::Grid, Need::Time]);
     }
     (scan, known)
-}
-
-fn sensor_of(rig: &Rig, poses: &[Pose], point: [f32; 3]) -> usize {
-    let off_middle = |i: &usize| {
-        let local = poses[*i].inverse() * Point3::from(point.map(f64::from));
-        local.y.atan2(local.x).abs() - rig.sensors[*i].horizontal_fov_deg.to_radians() / 2.0
-    };
-    // The one whose edge is farthest: inside of its field that is negative.
-    (0..rig.sensors.len()).min_by(|a, b| off_middle(a).total_cmp(&off_middle(b))).unwrap_or(0)
 }
 
 fn place_in_pattern(echo: &mut Echo, sensor: &Sensor, pose: &Pose) {

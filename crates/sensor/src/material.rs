@@ -1,7 +1,7 @@
 //! What surfaces are made of, and how much light they send back.
 
-use crate::SimulateError;
-use crate::error::{within, wrong};
+use data::KeyError;
+use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -40,7 +40,7 @@ impl Material {
         self.reflectivity * ((1.0 - self.lobe) * c + self.lobe * c.powf(self.exponent))
     }
 
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("reflectivity", self.reflectivity, 0.0, 1000.0)?;
         within("lobe", self.lobe, 0.0, 1.0)?;
         within("exponent", self.exponent, 1.0, 1000.0)
@@ -90,7 +90,7 @@ impl Default for MaterialTable {
 
 impl MaterialTable {
     /// The built-in materials, with some replaced and others added.
-    pub fn with(changes: &BTreeMap<String, Material>) -> Result<Self, SimulateError> {
+    pub fn with(changes: &BTreeMap<String, Material>) -> Result<Self, KeyError> {
         let mut table = MaterialTable::default();
         for (name, material) in changes {
             material.check().map_err(|e| e.below(name))?;
@@ -118,8 +118,8 @@ impl MaterialTable {
         self.names.iter().position(|n| n == name).map(|i| MaterialId(i as u8))
     }
 
-    /// The number of a built-in name.
-    pub(crate) fn built_in(name: &str) -> MaterialId {
+    /// The number of a built-in name; a name that is not built in is a mistake of the program.
+    pub fn built_in(name: &str) -> MaterialId {
         let place = BUILT_IN.iter().position(|m| m.0 == name);
         MaterialId(place.unwrap_or_else(|| panic!("{name} is in the list of built-in materials")) as u8)
     }

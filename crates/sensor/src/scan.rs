@@ -1,11 +1,9 @@
 //! What comes back of one scan: a list of echoes, one a shot, that the sensor model works on.
 
-use crate::mesh::MaterialId;
-use crate::track::FIRST_CAR;
+use crate::material::MaterialId;
+use crate::object::FIRST_CAR;
+use crate::signal::returned_light_index;
 use data::Cloud;
-
-/// The signal at the reach of the data sheet, 250 m at a reflectivity of 10 %, is index 0.
-const REFERENCE: (f32, f32) = (0.1, 250.0);
 
 /// One shot and what came back of it. Positions and directions are what the sensor believes, in the cloud's frame; the true ray may
 /// have been another.
@@ -90,8 +88,7 @@ impl Echo {
 
     /// Index of the signal, the logarithm of the light that comes back: `ln(returned / R^2) - ln(0.1 / 250^2)`.
     pub fn signal(&self) -> f32 {
-        let (reflectivity, range_m) = REFERENCE;
-        (self.returned.max(1e-9) / (self.range_m * self.range_m)).ln() - (reflectivity / (range_m * range_m)).ln()
+        returned_light_index(self.returned, self.range_m)
     }
 
     /// Moves the measured point; the shot then points at it.
@@ -106,7 +103,7 @@ impl Echo {
 }
 
 /// Scalar product.
-pub(crate) fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+pub fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 

@@ -9,7 +9,7 @@ use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
 use eval::study::{Source, StudyConfig, StudyDataset};
-use simulate::effects::EffectList;
+use sensor::EffectList;
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
 

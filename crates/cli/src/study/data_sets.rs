@@ -7,7 +7,7 @@ use data::Dataset;
 use eval::study::{Source, StudyDataset};
 use indicatif::{ProgressBar, ProgressStyle};
 use sha2::{Digest, Sha256};
-use simulate::effects::EffectList;
+use sensor::EffectList;
 use simulate::make_road_dataset;
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;

@@ -3,6 +3,7 @@
 use crate::rig::{SensorMount, SensorRig};
 use data::Cloud;
 use nalgebra::Point3;
+use sensor::assignment::{Assigned, Assignment};
 use std::f64::consts::TAU;
 
 /// The returns of one sensor in one frame, in its own frame.
@@ -41,27 +42,18 @@ impl SensorScan {
 /// Nearer than this there is no direction worth the name, m.
 const NEAREST_M: f64 = 0.05;
 
-/// Gives each point of an unordered cloud to a sensor: the one in whose field of view it lies most centrally. Two clouds of the same
-/// scene are split alike.
+/// Gives each point of an unordered cloud to a sensor, as [`Assignment`] says. Two clouds of the same scene are split alike.
 pub fn split_by_sensor(cloud: &Cloud, rig: &SensorRig) -> Vec<SensorScan> {
-    let sensors: Vec<_> = rig.sensors.iter().map(|s| (s.pose().inverse(), s.half_fov_rad())).collect();
-    let mut scans = vec![SensorScan::default(); sensors.len()];
+    let assignment = Assignment::new(rig);
+    let mut scans = vec![SensorScan::default(); rig.sensors.len()];
     for point in cloud.points() {
         let p = Point3::new(f64::from(point[0]), f64::from(point[1]), f64::from(point[2]));
-        let mut best: Option<(f64, usize, [f64; 3])> = None;
-        for (k, (sensor_from_cloud, half_fov)) in sensors.iter().enumerate() {
-            let spherical = SensorMount::spherical(&(sensor_from_cloud * p));
-            let outside = spherical[0].abs() / half_fov;
-            if best.is_none_or(|(least, ..)| outside < least) {
-                best = Some((outside, k, spherical));
-            }
-        }
-        if let Some((_, k, [az, el, range])) = best
+        if let Some(Assigned { sensor, spherical: [az, el, range] }) = assignment.of_point(p)
             && range > NEAREST_M
         {
-            scans[k].azimuth_rad.push(az as f32);
-            scans[k].elevation_rad.push(el as f32);
-            scans[k].range_m.push(range as f32);
+            scans[sensor].azimuth_rad.push(az as f32);
+            scans[sensor].elevation_rad.push(el as f32);
+            scans[sensor].range_m.push(range as f32);
         }
     }
     scans

@@ -17,6 +17,7 @@ use crate::diagnosis::{Diagnosis, FindingGain, FrameRoles, Gain, SCHEMA, Status,
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
+use crate::effects::fill_effects;
 use crate::rig::SensorRig;
 use crate::search::REPETITIONS;
 use data::Dataset;
@@ -127,7 +128,7 @@ pub fn diagnose_scans(
     let used: Vec<String> = seen.scans.iter().map(|s| s.id.clone()).collect();
     let together: f64 = found.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
     let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
-    let diagnosis = Diagnosis {
+    let mut diagnosis = Diagnosis {
         schema: SCHEMA.into(),
         verdict,
         frames: FrameRoles { select: vec![], estimate: used.clone(), hold_out: used },
@@ -146,7 +147,8 @@ pub fn diagnose_scans(
         considered,
         notes,
     };
-    Ok(Outcome { diagnosis, corrected: vec![], rows_deg: vec![rows_deg] })
+    fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
+    Ok(Outcome { diagnosis, corrected: vec![] })
 }
 
 /// Draws of scans with replacement, the same for every finding.

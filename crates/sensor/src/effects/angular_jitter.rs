@@ -1,12 +1,12 @@
 //! C1: shots that do not go quite where they should.
 
-use super::local_plane::measure_along;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
+use super::local_plane::measure_along;
 use crate::beams::{Beams, turned};
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
 use data::Stream;
+use data::toml_text::within;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -40,7 +40,7 @@ impl AngularJitter {
 }
 
 impl SensorEffect for AngularJitter {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("azimuth_std_deg", self.azimuth_std_deg, 0.0, 5.0)?;
         within("elevation_std_deg", self.elevation_std_deg, 0.0, 5.0)
     }

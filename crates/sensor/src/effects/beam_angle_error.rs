@@ -1,11 +1,11 @@
 //! C3: every beam has an error of its own in its angles.
 
-use super::local_plane::measure_along;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
+use super::local_plane::measure_along;
 use crate::beams::{Beams, turned};
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -41,7 +41,7 @@ impl BeamAngleError {
 }
 
 impl SensorEffect for BeamAngleError {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("elevation_deg", self.elevation_deg, -5.0, 5.0)?;
         within("elevation_std_deg", self.elevation_std_deg, 0.0, 5.0)?;
         within("azimuth_std_deg", self.azimuth_std_deg, 0.0, 5.0)

@@ -1,9 +1,9 @@
 //! D1: beams have a width, and at edges a range between near and far.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
 use crate::beams::{BeamWidth, Beams, Pick};
-use crate::error::{within, wrong};
+use data::KeyError;
+use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -31,7 +31,7 @@ impl Default for BeamDivergence {
 }
 
 impl SensorEffect for BeamDivergence {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("divergence_rad", self.divergence_rad, 1e-6, 0.1)?;
         within("pulse_m", self.pulse_m, 0.0, 100.0)?;
         if [7, 19].contains(&self.rays) {

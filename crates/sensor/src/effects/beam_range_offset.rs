@@ -1,9 +1,9 @@
 //! A7: every beam has an offset of its own.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -38,7 +38,7 @@ impl BeamRangeOffset {
 }
 
 impl SensorEffect for BeamRangeOffset {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("std_m", self.std_m, 0.0, 10.0)?;
         self.offsets_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("offsets_m[{i}]"), *v, -10.0, 10.0))
     }

@@ -1,10 +1,10 @@
 //! D3: a bright target shines into its neighbours.
 
-use super::shot_grid::{ShotGrid, reach};
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::shot_grid::{ShotGrid, reach};
 use crate::scan::{Scan, dot};
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -31,7 +31,7 @@ impl Default for Blooming {
 }
 
 impl SensorEffect for Blooming {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("returned_above", self.returned_above, 0.0, 1e4)?;
         within("halo_deg", self.halo_deg, 1e-3, 5.0)?;
         within("strength", self.strength, 0.0, 1.0)

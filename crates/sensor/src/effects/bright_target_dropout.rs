@@ -1,10 +1,10 @@
 //! B10: a bright target blinds the receiver for its neighbours.
 
-use super::shot_grid::{ShotGrid, reach};
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::shot_grid::{ShotGrid, reach};
 use crate::scan::{Scan, dot};
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -31,7 +31,7 @@ impl Default for BrightTargetDropout {
 }
 
 impl SensorEffect for BrightTargetDropout {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("returned_above", self.returned_above, 0.0, 1e4)?;
         within("radius_deg", self.radius_deg, 0.0, 10.0)?;
         within("share", self.share, 0.0, 1.0)

@@ -1,9 +1,9 @@
 //! What effects are told of a frame, and where their random numbers come from.
 
-use crate::frame_scene::FrameScene;
-use crate::mesh::MaterialTable;
+use crate::material::MaterialTable;
+use crate::object::Group;
+use crate::ray_caster::RayCaster;
 use crate::rig::Rig;
-use crate::track::{Group, Undulation};
 use data::{Stream, stream};
 use geometry::Box3;
 use std::collections::BTreeSet;
@@ -80,7 +80,7 @@ pub struct FrameContext<'a> {
     /// The other cars.
     pub cars: &'a [LabelledCar],
     /// To ask what further rays meet; `None` for a finished cloud.
-    pub scene: Option<&'a FrameScene<'a>>,
+    pub scene: Option<&'a dyn RayCaster>,
     /// Direction of the world's +x axis in the cloud's frame, rad, counter-clockwise from +x.
     pub world_x_rad: f64,
 }
@@ -108,6 +108,18 @@ impl Draws {
     pub fn of_set(&self, number: u64) -> Stream {
         stream(self.seed, &self.purpose, 0, number)
     }
+}
+
+/// A waviness of the ground that is not in the plans: `h(way) = amplitude * sin(2 pi way / length + phase)`, m, of the surface and all that
+/// stands on it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Undulation {
+    /// Greatest height, m.
+    pub amplitude_m: f64,
+    /// Length of a wave along the centre line, m; rounded so that whole waves fit into a lap.
+    pub length_m: f64,
+    /// Where it begins, rad.
+    pub phase_rad: f64,
 }
 
 /// What stands where.

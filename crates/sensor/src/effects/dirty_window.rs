@@ -1,9 +1,9 @@
 //! B8: a dirty spot on a sensor's window.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use nalgebra::Vector3;
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -49,7 +49,7 @@ impl Default for DirtyWindow {
 }
 
 impl SensorEffect for DirtyWindow {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("azimuth_deg", self.azimuth_deg, -180.0, 180.0)?;
         within("elevation_deg", self.elevation_deg, -90.0, 90.0)?;
         within("radius_deg", self.radius_deg, 0.01, 180.0)?;

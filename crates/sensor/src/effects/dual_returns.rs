@@ -1,8 +1,8 @@
 //! D6: two returns a shot.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
 use crate::beams::Beams;
+use data::KeyError;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 pub struct DualReturns {}
 
 impl SensorEffect for DualReturns {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         Ok(())
     }
 

@@ -1,10 +1,10 @@
 //! C8: the own car stands otherwise on the road than it is believed to.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
 use crate::beams::Beams;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use nalgebra::{UnitQuaternion, Vector3};
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
@@ -46,7 +46,7 @@ impl Default for EgoAttitude {
 }
 
 impl SensorEffect for EgoAttitude {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for (key, value) in [
             ("roll_deg", self.roll_deg),
             ("pitch_deg", self.pitch_deg),

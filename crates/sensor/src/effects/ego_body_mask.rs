@@ -1,10 +1,10 @@
 //! B7: parts of the own car in the way.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::{within, wrong};
-use crate::race_car::{CAR_SIZE_M, car_box};
+use crate::car::{CAR_SIZE_M, car_box};
 use crate::scan::{Echo, Scan};
+use data::KeyError;
+use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -35,7 +35,7 @@ impl Default for EgoBodyMask {
 }
 
 impl SensorEffect for EgoBodyMask {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for (i, b) in self.boxes.iter().enumerate() {
             for (k, v) in b.iter().enumerate() {
                 within(&format!("boxes[{i}][{k}]"), *v, -100.0, 100.0)?;

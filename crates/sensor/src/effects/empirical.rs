@@ -1,9 +1,9 @@
 //! E4: what was seen of a sensor and has no cause: losses, offsets and noise as tables over one covariate.
 
-use super::table::{check_table, interpolated};
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
+use super::table::{check_table, interpolated};
 use crate::scan::{Echo, Scan, dot};
+use data::KeyError;
 use nalgebra::Vector3;
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -77,7 +77,7 @@ impl Empirical {
 }
 
 impl SensorEffect for Empirical {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         let tables = self.tables().into_iter().filter(|(_, values, _)| !values.is_empty());
         for (name, values, [low, high]) in tables {
             check_table(("at", &self.at, [-1e4, 1e4]), (name, values, [low, high]))?;

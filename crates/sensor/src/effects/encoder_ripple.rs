@@ -1,9 +1,9 @@
 //! E1: ranges that swing with azimuth.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ impl Default for EncoderRipple {
 }
 
 impl SensorEffect for EncoderRipple {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("amplitude_m", self.amplitude_m, -5.0, 5.0)?;
         within("periods", self.periods, 0.0, 1e4)?;
         within("phase_rad", self.phase_rad, -100.0, 100.0)

@@ -1,9 +1,9 @@
 //! C10: a world with what another one lacks.
 
 use super::{Need, SensorEffect, WorldPlan};
-use crate::SimulateError;
-use crate::error::wrong;
-use crate::track::Group;
+use crate::object::Group;
+use data::KeyError;
+use data::toml_text::wrong;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -22,7 +22,7 @@ impl Default for ExtraObjects {
 }
 
 impl SensorEffect for ExtraObjects {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         if self.groups.is_empty() { Err(wrong("groups", "names none")) } else { Ok(()) }
     }
 

@@ -1,9 +1,9 @@
 //! D5: returns of nothing: noise of the receiver, more of it towards the sun.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -34,7 +34,7 @@ impl Default for FalseAlarms {
 }
 
 impl SensorEffect for FalseAlarms {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("rate", self.rate, 0.0, 1.0)?;
         within("sun_rate", self.sun_rate, 0.0, 1.0)?;
         within("sun_azimuth_deg", self.sun_azimuth_deg, -360.0, 360.0)?;

@@ -1,9 +1,9 @@
 //! D4: fog takes light and sends some back.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -32,7 +32,7 @@ impl Default for Fog {
 }
 
 impl SensorEffect for Fog {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("visibility_m", self.visibility_m, 1.0, 1e6)?;
         within("backscatter", self.backscatter, 0.0, 1.0)?;
         within("reach_m", self.reach_m, 1.0, 1000.0)

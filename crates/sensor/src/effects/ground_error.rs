@@ -1,9 +1,8 @@
 //! C9: the ground is not as level as in the plans.
 
-use super::{Need, SensorEffect, WorldPlan};
-use crate::SimulateError;
-use crate::error::within;
-use crate::track::Undulation;
+use super::{Need, SensorEffect, Undulation, WorldPlan};
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -29,7 +28,7 @@ impl Default for GroundError {
 }
 
 impl SensorEffect for GroundError {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("amplitude_m", self.amplitude_m, -2.0, 2.0)?;
         within("length_m", self.length_m, 5.0, 1e4)?;
         within("phase_rad", self.phase_rad, -100.0, 100.0)

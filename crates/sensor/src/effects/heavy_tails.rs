@@ -1,9 +1,9 @@
 //! A5: a few ranges that are off by much more than the rest.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
@@ -28,7 +28,7 @@ impl Default for HeavyTails {
 }
 
 impl SensorEffect for HeavyTails {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("probability", self.probability, 0.0, 1.0)?;
         within("std_m", self.std_m, 0.0, 10.0)
     }

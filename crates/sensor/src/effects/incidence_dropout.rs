@@ -1,10 +1,10 @@
 //! B4: returns lost where a surface is met at a grazing angle.
 
-use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::random_dropout::drop_some;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ impl Default for IncidenceDropout {
 }
 
 impl SensorEffect for IncidenceDropout {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("cos_half", self.cos_half, -1.0, 1.0)?;
         within("steepness", self.steepness, 0.1, 1e4)
     }

@@ -1,9 +1,9 @@
 //! D7: what the sensor reports as intensity.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +32,7 @@ impl Default for IntensityLaw {
 }
 
 impl SensorEffect for IntensityLaw {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("gain", self.gain, 0.0, 1e6)?;
         within("reference_m", self.reference_m, 0.1, 1000.0)?;
         within("range_exponent", self.range_exponent, 0.0, 4.0)?;

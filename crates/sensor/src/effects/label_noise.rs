@@ -1,8 +1,8 @@
 //! C7: labels that are off by another amount in every frame.
 
 use super::{Draws, FrameContext, LabelledCar, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
@@ -43,7 +43,7 @@ impl Default for LabelNoise {
 }
 
 impl SensorEffect for LabelNoise {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for (key, value) in [
             ("longitudinal_std_m", self.longitudinal_std_m),
             ("lateral_std_m", self.lateral_std_m),

@@ -1,8 +1,8 @@
 //! C6: labels that are off by the same amount in every car.
 
 use super::{Draws, FrameContext, LabelledCar, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -29,7 +29,7 @@ impl Default for LabelOffset {
 }
 
 impl SensorEffect for LabelOffset {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for (key, value) in [("forward_m", self.forward_m), ("left_m", self.left_m), ("up_m", self.up_m)] {
             within(key, value, -20.0, 20.0)?;
         }

@@ -1,8 +1,8 @@
 //! C5: labels and cloud are of different times.
 
 use super::{Draws, FrameContext, LabelledCar, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -38,7 +38,7 @@ impl Default for LabelTimeOffset {
 }
 
 impl SensorEffect for LabelTimeOffset {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("offset_s", self.offset_s, -1.0, 1.0)
     }
 

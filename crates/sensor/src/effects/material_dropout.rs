@@ -1,11 +1,11 @@
 //! B5: returns lost on some materials.
 
-use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::{within, wrong};
-use crate::mesh::MaterialId;
+use super::random_dropout::drop_some;
+use crate::material::MaterialId;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -28,7 +28,7 @@ impl Default for MaterialDropout {
 }
 
 impl SensorEffect for MaterialDropout {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         if self.materials.is_empty() {
             return Err(wrong("materials", "names none"));
         }
@@ -49,7 +49,7 @@ impl SensorEffect for MaterialDropout {
 mod tests {
     use super::super::testing::*;
     use super::*;
-    use crate::mesh::MaterialTable;
+    use crate::material::MaterialTable;
 
     #[test]
     fn the_others_stay() {

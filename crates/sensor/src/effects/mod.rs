@@ -21,12 +21,14 @@ mod table;
 #[cfg(test)]
 pub(crate) mod testing;
 
-pub use context::{Draws, FrameContext, LabelledCar, Need, WorldPlan};
+pub use context::{Draws, FrameContext, LabelledCar, Need, Undulation, WorldPlan};
+pub use empirical::Covariate;
+pub use label_time_offset::Clock;
 
-use crate::SimulateError;
 use crate::beams::Beams;
-use crate::config_text::{parse_toml, read_toml};
 use crate::scan::Scan;
+use data::toml_text::{parse_toml, read_toml, wrong};
+use data::{DataError, KeyError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -34,7 +36,7 @@ use std::path::Path;
 /// One physical effect. What it does not touch it leaves as it is.
 pub trait SensorEffect {
     /// Refuses parameters that cannot be, naming the key.
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         Ok(())
     }
 
@@ -163,17 +165,17 @@ pub struct EffectList {
 
 impl EffectList {
     /// Reads a list.
-    pub fn read(path: &Path) -> Result<EffectList, SimulateError> {
+    pub fn read(path: &Path) -> Result<EffectList, DataError> {
         read_toml(path, EffectList::check)
     }
 
     /// A list in memory; `path` is for messages.
-    pub fn parse(text: &str, path: &Path) -> Result<EffectList, SimulateError> {
+    pub fn parse(text: &str, path: &Path) -> Result<EffectList, DataError> {
         parse_toml(text, path, EffectList::check)
     }
 
     /// Refuses parameters that cannot be, naming the key.
-    pub fn check(&self) -> Result<(), SimulateError> {
+    pub fn check(&self) -> Result<(), KeyError> {
         for (i, effect) in self.effects.iter().enumerate() {
             effect.model().check().map_err(|e| e.below(&format!("effect[{i}]")))?;
         }
@@ -181,10 +183,7 @@ impl EffectList {
             matches!(e, Effect::DualReturns(_))
                 && !self.effects[..i].iter().any(|e| matches!(e, Effect::BeamDivergence(_)))
         }) {
-            return Err(crate::error::wrong(
-                "effect",
-                "dual_returns needs a beam_divergence before it: a line has one return",
-            ));
+            return Err(wrong("effect", "dual_returns needs a beam_divergence before it: a line has one return"));
         }
         Ok(())
     }

@@ -1,9 +1,9 @@
 //! E2: the mounts of the sensors swing.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
 use crate::beams::Beams;
-use crate::error::within;
+use data::KeyError;
+use data::toml_text::within;
 use nalgebra::UnitQuaternion;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -28,7 +28,7 @@ impl Default for MountVibration {
 }
 
 impl SensorEffect for MountVibration {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("amplitude_deg", self.amplitude_deg, 0.0, 10.0)?;
         within("frequency_hz", self.frequency_hz, 0.0, 1e4)
     }

@@ -1,9 +1,9 @@
 //! B9: packets, and now and then a whole sensor, lost on the way.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -33,7 +33,7 @@ impl Default for PacketLoss {
 }
 
 impl SensorEffect for PacketLoss {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("packet_ms", self.packet_ms, 1e-3, 1000.0)?;
         within("loss", self.loss, 0.0, 1.0)?;
         within("burst", self.burst, 0.0, 1.0)?;

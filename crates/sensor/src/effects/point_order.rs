@@ -1,8 +1,8 @@
 //! E3: the order of the points.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
 use crate::scan::Scan;
+use data::KeyError;
 use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 pub struct PointOrder {}
 
 impl SensorEffect for PointOrder {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         Ok(())
     }
 

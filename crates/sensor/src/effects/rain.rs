@@ -1,9 +1,9 @@
 //! D4: rain takes some light, and single drops near the sensor send it back.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -31,7 +31,7 @@ impl Default for Rain {
 const DROP_RANGE_M: f32 = 2.0;
 
 impl SensorEffect for Rain {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("rate_mm_per_h", self.rate_mm_per_h, 0.0, 300.0)?;
         within("drops", self.drops, 0.0, 1.0)
     }

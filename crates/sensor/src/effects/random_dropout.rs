@@ -1,9 +1,9 @@
 //! B1: returns lost at random.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::{Echo, Scan};
+use data::KeyError;
+use data::toml_text::within;
 use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -25,7 +25,7 @@ impl Default for RandomDropout {
 }
 
 impl SensorEffect for RandomDropout {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("share", self.share, 0.0, 1.0)
     }
 

@@ -1,9 +1,9 @@
 //! A6: all ranges off by the same amount and the same part.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ impl Default for RangeBias {
 }
 
 impl SensorEffect for RangeBias {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("offset_m", self.offset_m, -10.0, 10.0)?;
         within("scale", self.scale, -0.5, 0.5)
     }

@@ -1,9 +1,9 @@
 //! A10: ranges that drift with time, as the sensor warms up.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ impl Default for RangeDrift {
 }
 
 impl SensorEffect for RangeDrift {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("drift_m", self.drift_m, -10.0, 10.0)?;
         within("time_constant_s", self.time_constant_s, 0.01, 1e6)
     }

@@ -1,10 +1,10 @@
 //! B3: returns lost by their range alone, along a table.
 
+use super::{Draws, FrameContext, SensorEffect};
 use super::random_dropout::drop_some;
 use super::table::{check_table, interpolated};
-use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
 use crate::scan::Scan;
+use data::KeyError;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -36,7 +36,7 @@ impl RangeDropout {
 }
 
 impl SensorEffect for RangeDropout {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         check_table(("range_m", &self.range_m, [0.0, 1e4]), ("share", &self.share, [0.0, 1.0]))
     }
 

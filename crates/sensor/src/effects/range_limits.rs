@@ -1,9 +1,9 @@
 //! B6: nothing nearer, nothing farther.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ impl Default for RangeLimits {
 }
 
 impl SensorEffect for RangeLimits {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("max_m", self.max_m, 0.0, 1e4)?;
         within("min_m", self.min_m, 0.0, self.max_m)
     }

@@ -1,10 +1,10 @@
 //! A4: noise from the footprint of a beam that meets a surface at an angle.
 
-use super::range_noise::add_noise;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::range_noise::add_noise;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ impl Default for RangeNoiseByIncidence {
 }
 
 impl SensorEffect for RangeNoiseByIncidence {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("divergence_rad", self.divergence_rad, 0.0, 0.1)?;
         within("samples", self.samples, 1.0, 1e6)?;
         within("most_m", self.most_m, 0.0, 10.0)

@@ -1,10 +1,10 @@
 //! A2: noise that grows with range.
 
-use super::range_noise::add_noise;
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::range_noise::add_noise;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -29,7 +29,7 @@ impl Default for RangeNoiseByRange {
 }
 
 impl SensorEffect for RangeNoiseByRange {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("base_m", self.base_m, 0.0, 10.0)?;
         within("per_m", self.per_m, 0.0, 0.1)
     }

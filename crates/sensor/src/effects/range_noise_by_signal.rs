@@ -1,10 +1,10 @@
 //! A3: noise that grows where little light comes back.
 
-use super::range_noise::add_noise;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::range_noise::add_noise;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +32,7 @@ impl Default for RangeNoiseBySignal {
 }
 
 impl SensorEffect for RangeNoiseBySignal {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("std_m", self.std_m, 0.0, 10.0)?;
         within("exponent", self.exponent, 0.0, 5.0)?;
         within("signal", self.signal, -20.0, 20.0)?;

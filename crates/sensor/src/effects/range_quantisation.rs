@@ -1,9 +1,9 @@
 //! A9: ranges in steps.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -24,7 +24,7 @@ impl Default for RangeQuantisation {
 }
 
 impl SensorEffect for RangeQuantisation {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("step_m", self.step_m, 1e-6, 10.0)
     }
 

@@ -1,9 +1,9 @@
 //! A8: ranges that depend on how bright a surface is.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -27,7 +27,7 @@ impl Default for ReflectivityWalk {
 }
 
 impl SensorEffect for ReflectivityWalk {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("walk_m", self.walk_m, -1.0, 1.0)?;
         within("reference", self.reference, 1e-3, 1000.0)
     }

@@ -1,9 +1,9 @@
 //! C4: a scan takes time, in which everything moves.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
 use crate::beams::{Beams, Shutter};
 use crate::scan::Scan;
+use data::KeyError;
 use nalgebra::Vector3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -27,7 +27,7 @@ impl Default for RollingShutter {
 }
 
 impl SensorEffect for RollingShutter {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         Ok(())
     }
 

@@ -1,10 +1,10 @@
 //! C2: a sensor that is not mounted where it is said to be.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::SimulateError;
 use crate::beams::Beams;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use geometry::Pose;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use schemars::JsonSchema;
@@ -40,7 +40,7 @@ impl SensorPoseError {
 }
 
 impl SensorEffect for SensorPoseError {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for k in 0..3 {
             within(&format!("translation_m[{k}]"), self.translation_m[k], -5.0, 5.0)?;
             within(&format!("rotation_deg[{k}]"), self.rotation_deg[k], -45.0, 45.0)?;

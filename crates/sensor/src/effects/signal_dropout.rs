@@ -1,10 +1,10 @@
 //! B2: returns lost where too little light comes back: the lidar equation.
 
-use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
+use super::random_dropout::drop_some;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +32,7 @@ impl Default for SignalDropout {
 }
 
 impl SensorEffect for SignalDropout {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("most", self.most, 0.0, 1.0)?;
         within("threshold", self.threshold, -20.0, 20.0)?;
         within("steepness", self.steepness, 0.01, 100.0)?;

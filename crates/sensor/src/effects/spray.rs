@@ -1,9 +1,9 @@
 //! D4: the plume of water or dust behind a car.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::SimulateError;
-use crate::error::within;
 use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
 use geometry::Box3;
 use rand::RngExt;
 use schemars::JsonSchema;
@@ -32,7 +32,7 @@ impl Default for Spray {
 }
 
 impl SensorEffect for Spray {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("density_per_m", self.density_per_m, 1e-6, 100.0)?;
         within("length_m", self.length_m, 0.01, 200.0)?;
         within("height_m", self.height_m, 0.01, 20.0)

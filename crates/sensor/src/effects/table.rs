@@ -1,7 +1,7 @@
 //! Tables: values at ascending places, and what lies between them.
 
-use crate::SimulateError;
-use crate::error::{within, wrong};
+use data::KeyError;
+use data::toml_text::{within, wrong};
 
 /// The value at `x` on the lines through the points (`at`, `values`); beyond both ends that of the end. The table must have been checked.
 pub(super) fn interpolated(at: &[f64], values: &[f64], x: f64) -> f64 {
@@ -17,7 +17,7 @@ pub(super) fn interpolated(at: &[f64], values: &[f64], x: f64) -> f64 {
 pub(super) type Column<'a> = (&'a str, &'a [f64], [f64; 2]);
 
 /// Refuses what is no table: places that do not ascend, another number of values, numbers out of bounds.
-pub(super) fn check_table(at: Column, values: Column) -> Result<(), SimulateError> {
+pub(super) fn check_table(at: Column, values: Column) -> Result<(), KeyError> {
     if at.1.is_empty() || at.1.len() != values.1.len() {
         let (places, numbers) = (at.1.len(), values.1.len());
         return Err(wrong(

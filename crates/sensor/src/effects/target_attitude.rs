@@ -1,8 +1,8 @@
 //! C8: the other cars stand otherwise on the road than they are believed to.
 
 use super::{Need, SensorEffect, WorldPlan};
-use crate::SimulateError;
-use crate::error::within;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +30,7 @@ impl Default for TargetAttitude {
 }
 
 impl SensorEffect for TargetAttitude {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         within("roll_deg", self.roll_deg, -20.0, 20.0)?;
         within("pitch_deg", self.pitch_deg, -20.0, 20.0)?;
         within("roll_std_deg", self.roll_std_deg, 0.0, 10.0)?;

@@ -1,8 +1,8 @@
 //! C11: the cars are not quite as they are modelled.
 
 use super::{Need, SensorEffect, WorldPlan};
-use crate::SimulateError;
-use crate::error::within;
+use data::KeyError;
+use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -26,7 +26,7 @@ impl Default for TargetShape {
 }
 
 impl SensorEffect for TargetShape {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for k in 0..3 {
             within(&format!("scale[{k}]"), self.scale[k], 0.2, 5.0)?;
             within(&format!("shift_m[{k}]"), self.shift_m[k], -5.0, 5.0)?;

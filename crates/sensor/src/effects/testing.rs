@@ -1,7 +1,7 @@
 //! Scans and figures for the tests of effects.
 
 use super::{Draws, FrameContext, LabelledCar, SensorEffect};
-use crate::mesh::{MaterialId, MaterialTable};
+use crate::material::{MaterialId, MaterialTable};
 use crate::rig::{Pattern, Rig, RowBlock};
 use crate::scan::{Echo, Scan};
 use geometry::Box3;

@@ -2,16 +2,15 @@
 
 mod pattern;
 
-pub(crate) use pattern::direction;
-pub use pattern::{Pattern, RowBlock, Shot, Sweep};
+pub use pattern::{Pattern, RowBlock, Shot, Sweep, direction};
 
-use crate::SimulateError;
-use crate::config_text::{parse_toml, read_toml};
-use crate::error::{within, wrong};
+use data::toml_text::{parse_toml, read_toml, within, wrong};
+use data::{DataError, KeyError};
 use geometry::Pose;
-use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::f64::consts::PI;
 use std::path::Path;
 
 /// The sensors of a car; the frame of its clouds is the car's.
@@ -76,14 +75,14 @@ fn far() -> f64 {
 
 impl Rig {
     /// Reads a rig; the paths of patterns in CSV become relative to the working folder.
-    pub fn read(path: &Path) -> Result<Rig, SimulateError> {
+    pub fn read(path: &Path) -> Result<Rig, DataError> {
         let mut rig: Rig = read_toml(path, Rig::check)?;
         rig.resolve(path)?;
         Ok(rig)
     }
 
     /// A rig in memory; `path` is where it lies, for messages and for patterns in CSV.
-    pub fn parse(text: &str, path: &Path) -> Result<Rig, SimulateError> {
+    pub fn parse(text: &str, path: &Path) -> Result<Rig, DataError> {
         let mut rig: Rig = parse_toml(text, path, Rig::check)?;
         rig.resolve(path)?;
         Ok(rig)
@@ -95,7 +94,7 @@ impl Rig {
         Rig { sensors: vec![sensor] }
     }
 
-    fn resolve(&mut self, path: &Path) -> Result<(), SimulateError> {
+    fn resolve(&mut self, path: &Path) -> Result<(), DataError> {
         let folder = path.parent().unwrap_or(Path::new(""));
         for sensor in &mut self.sensors {
             let (fov, rate) = (sensor.horizontal_fov_deg, sensor.rate_hz);
@@ -107,7 +106,7 @@ impl Rig {
     }
 
     /// Refuses what cannot be, naming the key.
-    pub fn check(&self) -> Result<(), SimulateError> {
+    pub fn check(&self) -> Result<(), KeyError> {
         if self.sensors.is_empty() {
             return Err(wrong("sensor", "there is none; a rig has at least one [[sensor]]"));
         }
@@ -142,9 +141,9 @@ impl Rig {
 }
 
 impl Sensor {
-    fn check(&self) -> Result<(), SimulateError> {
+    fn check(&self) -> Result<(), KeyError> {
         for (k, v) in self.position.iter().enumerate() {
-            within(&format!("position[{k}]"), *v, -50.0, 50.0)?;
+            within(&format!("position[{k}]"), *v, -100.0, 100.0)?;
         }
         within("yaw_deg", self.yaw_deg, -360.0, 360.0)?;
         within("pitch_deg", self.pitch_deg, -90.0, 90.0)?;
@@ -160,6 +159,43 @@ impl Sensor {
     pub fn pose(&self) -> Pose {
         let [roll, pitch, yaw] = [self.roll_deg, self.pitch_deg, self.yaw_deg].map(f64::to_radians);
         Isometry3::from_parts(Translation3::from(self.position), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
+    }
+
+    /// Half of its field of view, rad.
+    pub fn half_fov_rad(&self) -> f64 {
+        (self.horizontal_fov_deg.to_radians() / 2.0).min(PI)
+    }
+
+    /// Whether it sees all around, so that its azimuth closes.
+    pub fn closes(&self) -> bool {
+        self.half_fov_rad() > 0.98 * PI
+    }
+
+    /// Rows that a scan finishes one after the other, from the top; empty where time runs along azimuth, as in sensors that spin.
+    pub fn rows_in_turn(&self) -> &[RowBlock] {
+        self.pattern.as_ref().filter(|p| p.sweep == Sweep::Rows).map_or(&[], |p| &p.blocks)
+    }
+
+    /// Place in the scan of a direction in its own frame, from +1/2 where a scan begins, on the left or at the top, to -1/2.
+    pub fn scan_phase(&self, azimuth_rad: f64, elevation_rad: f64) -> f64 {
+        let blocks = self.rows_in_turn();
+        let all: f64 = blocks.iter().map(|b| f64::from(b.rows)).sum();
+        if all == 0.0 {
+            return azimuth_rad / (2.0 * self.half_fov_rad());
+        }
+        let done = |b: &RowBlock| {
+            let rows = f64::from(b.rows);
+            let step_deg = ((b.top_deg - b.bottom_deg) / (rows - 1.0).max(1.0)).max(1e-9);
+            ((b.top_deg - elevation_rad.to_degrees()) / step_deg + 0.5).clamp(0.0, rows)
+        };
+        0.5 - blocks.iter().map(done).sum::<f64>() / all
+    }
+
+    /// Azimuth (counter-clockwise from the middle), elevation, range of a point in a sensor's own frame: rad, rad, m.
+    pub fn spherical(sensor_point: &Point3<f64>) -> [f64; 3] {
+        let p = sensor_point.coords;
+        let across = p.x.hypot(p.y);
+        [p.y.atan2(p.x), p.z.atan2(across), p.norm()]
     }
 
     /// Whether a direction of the sensor's own frame lies in its field of view, seen from above, with a margin in rad.
@@ -211,6 +247,55 @@ mod tests {
     }
 
     #[test]
+    fn time_runs_along_azimuth_or_row_after_row() {
+        let sensor = |pattern: &str| {
+            let text = format!("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 120\n{pattern}");
+            Rig::parse(&text, Path::new("rig.toml")).unwrap().sensors.remove(0)
+        };
+        let spins =
+            "pattern = { blocks = [{ rows = 64, top_deg = 6, bottom_deg = -19 }], columns = 9, sweep = \"columns\" }\n";
+        for sensor in [sensor(""), sensor(spins)] {
+            assert!((sensor.scan_phase(30f64.to_radians(), 0.3) - 0.25).abs() < 1e-12);
+        }
+        // Three quarters of the rows lie above the horizon.
+        let blocks =
+            "[{ rows = 30, top_deg = 10, bottom_deg = 0.0 }, { rows = 10, top_deg = -0.5, bottom_deg = -20.5 }]";
+        let rows = sensor(&format!("pattern = {{ blocks = {blocks}, columns = 400 }}\n"));
+        for (elevation_deg, phase) in
+            [(12.0, 0.5), (10.0, 0.4875), (5.0, 0.125), (-0.5, -0.2625), (-10.5, -0.375), (-30.0, -0.5)]
+        {
+            assert!((rows.scan_phase(0.7, f64::to_radians(elevation_deg)) - phase).abs() < 1e-12, "{elevation_deg}");
+        }
+    }
+
+    #[test]
+    fn a_rig_on_disk_needs_only_places() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("rig.toml");
+        std::fs::write(&path, "[[sensor]]\nname = \"a\"\nposition = [1, 0, 2.5]\nyaw_deg = 90\n").unwrap();
+        let rig = Rig::read(&path).unwrap();
+        let at = rig.sensors[0].pose() * Point3::new(2.0, 0.0, 0.0);
+        assert!((at - Point3::new(1.0, 2.0, 2.5)).norm() < 1e-12 && rig.sensors[0].closes());
+    }
+
+    #[test]
+    fn keys_without_their_unit_are_answered_with_the_right_one() {
+        for (line, want) in [
+            ("yaw = 3", "unknown field `yaw`: did you mean `yaw_deg`?"),
+            ("pitch = 3", "unknown field `pitch`: did you mean `pitch_deg`?"),
+            ("roll = 3", "unknown field `roll`: did you mean `roll_deg`?"),
+            ("horizontal_fov = 90", "unknown field `horizontal_fov`: did you mean `horizontal_fov_deg`?"),
+            ("position_m = [0, 0, 1]", "unknown field `position_m`: did you mean `position`?"),
+            ("rate = 10", "unknown field `rate`: did you mean `rate_hz`?"),
+            ("max_range = 100", "unknown field `max_range`: did you mean `max_range_m`?"),
+        ] {
+            let text = format!("[[sensor]]\nname = \"a\"\n{line}\n");
+            let error = Rig::parse(&text, Path::new("r.toml")).unwrap_err().to_string();
+            assert_eq!(error, format!("r.toml:3: {want}"));
+        }
+    }
+
+    #[test]
     fn bad_rigs_are_refused_by_line() {
         let pattern = |text: &str| format!("[[sensor]]\nname = \"a\"\n[sensor.pattern]\n{text}\n");
         for (text, want) in [
@@ -225,6 +310,10 @@ mod tests {
                 "r.toml:3: sensor[0].horizontal_fov_deg: NaN",
             ),
             ("[[sensor]]\nname = \"a\"\nmin_range_m = 300\n".into(), "r.toml:3: sensor[0].min_range_m"),
+            ("[[sensor]]\nposition = [0, 0, 0]\n".into(), "r.toml:1: missing field `name`"),
+            ("[[sensor]]\nname = \"a\"\nposition = [nan, 0, 0]\n".into(), "r.toml:3: sensor[0].position[0]: NaN"),
+            ("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 0\n".into(), "sensor[0].horizontal_fov_deg: 0"),
+            ("[[sensor]]\nname = \"a\"\npattern = \"spiral\"\n".into(), "r.toml:3: invalid type"),
             (pattern("blocks = []\ncolumns = 10"), "r.toml:4: sensor[0].pattern.blocks: there is no row"),
             (
                 pattern("blocks = [{ rows = 0, top_deg = 1, bottom_deg = 0 }]\ncolumns = 10"),

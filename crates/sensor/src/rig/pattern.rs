@@ -1,8 +1,7 @@
 //! In which directions a sensor shoots, and when.
 
-use crate::SimulateError;
-use crate::error::{within, wrong};
-use data::DataError;
+use data::toml_text::{within, wrong};
+use data::{DataError, KeyError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -76,7 +75,7 @@ impl Shot {
 }
 
 /// The unit vector of an azimuth and an elevation.
-pub(crate) fn direction(azimuth_rad: f64, elevation_rad: f64) -> [f64; 3] {
+pub fn direction(azimuth_rad: f64, elevation_rad: f64) -> [f64; 3] {
     let ((sa, ca), (se, ce)) = (azimuth_rad.sin_cos(), elevation_rad.sin_cos());
     [ca * ce, sa * ce, se]
 }
@@ -115,7 +114,7 @@ impl Pattern {
         self.blocks.iter().flat_map(of_block).collect()
     }
 
-    pub(super) fn check(&self) -> Result<(), SimulateError> {
+    pub(super) fn check(&self) -> Result<(), KeyError> {
         if self.file.is_some() {
             if self.blocks.is_empty() && self.columns == 0 {
                 return Ok(());
@@ -139,7 +138,7 @@ impl Pattern {
         within("columns", shots, 1.0, 16e6).map_err(|_| wrong("columns", format!("{shots} shots a scan are too many")))
     }
 
-    pub(super) fn load_shots(&mut self, folder: &Path, fov_deg: f64, rate_hz: f64) -> Result<(), SimulateError> {
+    pub(super) fn load_shots(&mut self, folder: &Path, fov_deg: f64, rate_hz: f64) -> Result<(), DataError> {
         if let Some(file) = &self.file {
             let path = folder.join(file);
             self.shots = read_shots(&path)?;
