@@ -6,10 +6,10 @@ use data::{DatasetConfig, write_atomic};
 use eval::study::StudyConfig;
 use models::config::DetectorConfig;
 use schemars::{JsonSchema, Schema, schema_for};
-use serde_json::{Map, Value, json};
 use sensor::{EffectList, Rig};
-use simulate::race::RaceConfig;
+use serde_json::{Map, Value, json};
 use simulate::RoadConfig;
+use simulate::race::RaceConfig;
 use std::fmt::Write;
 use std::path::PathBuf;
 

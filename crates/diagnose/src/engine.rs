@@ -3,19 +3,19 @@
 use crate::channels::mask::Shown;
 use crate::channels::returns;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     FramePair, Mending, ObjectPair, Ray, ShownShift, check_identity, common_ids, find_sensors, pair_all, with_points,
 };
-use crate::effects::fill_effects;
-use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::shutter::Sliding;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
 use geometry::Box3;
 use nalgebra::Vector3;
+use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// What to look at.
@@ -52,7 +52,7 @@ pub struct Outcome {
 pub fn diagnose(
     measured: &Dataset,
     simulated: &Dataset,
-    rig: &SensorRig,
+    rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {

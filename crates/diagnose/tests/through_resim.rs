@@ -1,7 +1,7 @@
 //! What is put on a simulated data set by `resim` is found again, and what is written as an extension mends it.
 
 use data::Dataset;
-use lidarshift_diagnose::{Diagnosis, Options, Outcome, SensorRig, Status, diagnose, extended_toml};
+use lidarshift_diagnose::{Diagnosis, Options, Outcome, Rig, Status, diagnose, extended_toml};
 use sensor::EffectList;
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
@@ -27,7 +27,7 @@ fn with_effects(dataset: &Dataset, effects: &str, out: &Path, seed: u64) -> Data
 }
 
 fn diagnosed(measured: &Dataset, simulated: &Dataset, folder: &Path) -> Outcome {
-    let rig = SensorRig::read(&folder.join("rig.toml")).unwrap();
+    let rig = Rig::read(&folder.join("rig.toml")).unwrap();
     diagnose(measured, simulated, &rig, &Options::default(), &|_, _, _| ()).unwrap()
 }
 

@@ -1,9 +1,9 @@
 //! The points of one sensor by direction, and an index to find the neighbours of a direction.
 
-use crate::rig::{SensorMount, SensorRig};
 use data::Cloud;
 use nalgebra::Point3;
 use sensor::assignment::{Assigned, Assignment};
+use sensor::{Rig, Sensor};
 use std::f64::consts::TAU;
 
 /// The returns of one sensor in one frame, in its own frame.
@@ -28,7 +28,7 @@ impl SensorScan {
         for i in 0..self.len() {
             let [az, el, range] = [self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]].map(f64::from);
             let p = Point3::new(range * el.cos() * az.cos(), range * el.cos() * az.sin(), range * el.sin());
-            let [az, el, range] = SensorMount::spherical(&moved(&p)).map(|v| v as f32);
+            let [az, el, range] = Sensor::spherical(&moved(&p)).map(|v| v as f32);
             (self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]) = (az, el, range.max(NEAREST_M as f32));
         }
     }
@@ -43,7 +43,7 @@ impl SensorScan {
 const NEAREST_M: f64 = 0.05;
 
 /// Gives each point of an unordered cloud to a sensor, as [`Assignment`] says. Two clouds of the same scene are split alike.
-pub fn split_by_sensor(cloud: &Cloud, rig: &SensorRig) -> Vec<SensorScan> {
+pub fn split_by_sensor(cloud: &Cloud, rig: &Rig) -> Vec<SensorScan> {
     let assignment = Assignment::new(rig);
     let mut scans = vec![SensorScan::default(); rig.sensors.len()];
     for point in cloud.points() {
@@ -210,7 +210,7 @@ mod tests {
 
     #[test]
     fn points_go_to_the_sensor_that_sees_them() {
-        let mut rig = SensorRig::single();
+        let mut rig = Rig::single();
         rig.sensors[0].horizontal_fov_deg = 120.0;
         let mut left = rig.sensors[0].clone();
         left.yaw_deg = 120.0;

@@ -14,17 +14,17 @@ mod scatter;
 mod tilt;
 
 use crate::diagnosis::{Diagnosis, FindingGain, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::effects::fill_effects;
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
-use crate::effects::fill_effects;
-use crate::rig::SensorRig;
 use crate::search::REPETITIONS;
 use data::Dataset;
 use planes::Patch;
 use rand::RngExt;
 use rayon::prelude::*;
 use rings::{Beam, RingScan};
+use sensor::Rig;
 
 /// Fewer scans do not let one be held out.
 const FEWEST_SCANS: usize = 3;
@@ -44,7 +44,7 @@ struct Seen {
 /// Diagnoses the scans of one spinning sensor at the clouds' origin, against an ideal one.
 pub fn diagnose_scans(
     dataset: &Dataset,
-    rig: &SensorRig,
+    rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
