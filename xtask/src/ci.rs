@@ -12,7 +12,7 @@ use std::time::Instant;
 pub fn ci(root: &Path) -> Result<()> {
     const FEATURES: [&str; 2] = ["--features", "lidarshift/wgpu"];
     let start = Instant::now();
-    step("format", || component(root, "fmt", &["--all", "--check"]))?;
+    step("format", || crate::format::format(root, true))?;
     step("tidy", crate::tidy)?;
     step("clippy", || {
         let words = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];

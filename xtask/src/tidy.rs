@@ -16,13 +16,15 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("train", &["kernels", "models", "eval"]),
     ("diagnose", &["simulate", "data", "eval"]),
     ("report", &["eval", "diagnose"]),
-    ("cli", &["simulate", "train", "report"]),
-    ("tests", &["cli"]),
+    ("study", &["simulate", "train", "report"]),
+    ("cli", &["study"]),
+    ("checks", &["cli"]),
+    ("tests", &["checks"]),
     ("xtask", &[]),
 ];
 
 /// The crates that may know tensors.
-const KNOWS_BURN: &[&str] = &["models", "train", "cli", "tests"];
+const KNOWS_BURN: &[&str] = &["models", "train", "study", "cli", "checks", "tests"];
 
 /// File names that say nothing.
 const EMPTY_NAMES: &[&str] = &["utils", "util", "common", "base", "helper", "helpers", "manager"];
@@ -199,7 +201,7 @@ fn lines_before_tests(text: &str) -> usize {
 }
 
 /// Everything a person wrote in the repository, by path: sources, manifests, scripts, documents; not what a run made.
-fn texts(root: &Path) -> Result<Vec<PathBuf>> {
+pub fn texts(root: &Path) -> Result<Vec<PathBuf>> {
     let (mut open, mut files) = (vec![root.to_owned()], Vec::new());
     while let Some(folder) = open.pop() {
         for entry in fs::read_dir(&folder)? {
@@ -251,6 +253,11 @@ mod tests {
             ("report", "simulate", true),
             ("report", "train", false),
             ("cli", "geometry", true),
+            ("study", "report", true),
+            ("eval", "study", false),
+            ("study", "lidarshift", false),
+            ("checks", "lidarshift", true),
+            ("lidarshift", "checks", false),
             ("tests", "lidarshift", true),
             ("train", "lidarshift", false),
             ("xtask", "geometry", false),

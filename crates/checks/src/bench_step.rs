@@ -1,17 +1,17 @@
-//! `lidarshift bench-step`: where the time of one training step goes, and how much memory it takes; and the same of an inference, and of the
+//! `lidarshift-checks bench-step`: where the time of one training step goes, and how much memory it takes; and the same of an inference, and of the
 //! layers that cost most.
 
 mod layers;
 
-use crate::detectors::find_detector;
-use crate::device::DeviceArgs;
 use anyhow::{Result, bail};
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use clap::{Args, ValueEnum};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Frame, stream};
+use lidarshift::device::DeviceArgs;
 use models::config::{DetectorConfig, NetworkConfig, PointPillarsConfig};
+use models::find_detector;
 use models::layers::Mode;
 use models::pointpillars::pillars::{PillarGrid, pillarise};
 use models::pointpillars::{losses, scatter::scatter};
@@ -99,7 +99,7 @@ impl BenchStepArgs {
             read: timed.read,
             whole_ms: timed.stages.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
             median_ms: timed.stages.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
-            peak_mib: crate::memory::peak_mib(),
+            peak_mib: train::memory::peak_mib(),
             detector: config.name.clone(),
             device: self.device.describe(),
             batch: self.batch,

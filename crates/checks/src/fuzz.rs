@@ -1,9 +1,8 @@
-//! `lidarshift fuzz`: damaged files for every reader. A reader answers with data that keeps its promises or with an error; it never
+//! `cargo xtask fuzz`: damaged files for every reader. A reader answers with data that keeps its promises or with an error; it never
 //! panics, hangs, or takes memory that the file cannot fill.
 
 mod targets;
 
-use crate::memory::{peak_mib, reset_peak_mib};
 use anyhow::{Result, bail};
 use clap::Args;
 use data::stream;
@@ -14,6 +13,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 use targets::{Target, targets};
+use train::memory::{peak_mib, reset_peak_mib};
 
 /// The files are of a few kilobytes; a reader that takes this much more memory believes a size that it should have checked.
 const MEMORY_BOUND_MIB: u64 = 64;

@@ -1,9 +1,8 @@
-//! `lidarshift schema`: the JSON schema of the configuration files, and their reference in Markdown.
+//! `cargo xtask schema`: the JSON schema of the configuration files, and their reference in Markdown.
 
 use anyhow::Result;
 use clap::Args;
 use data::{DatasetConfig, write_atomic};
-use eval::study::StudyConfig;
 use models::config::DetectorConfig;
 use schemars::{JsonSchema, Schema, schema_for};
 use serde_json::{Map, Value, json};
@@ -12,6 +11,7 @@ use simulate::race::RaceConfig;
 use simulate::{Rig, RoadConfig};
 use std::fmt::Write;
 use std::path::PathBuf;
+use study::StudyConfig;
 
 /// Writes configs/schema.json and docs/configuration.md from the Rust types.
 #[derive(Args, Debug)]

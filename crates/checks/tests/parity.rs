@@ -1,15 +1,10 @@
-//! `lidarshift parity` on the reference numbers that may be part of the repository, sound and spoiled.
+//! `parity` on the reference numbers that may be part of the repository, sound and spoiled.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{must, run, said};
+use program::{golden, must, run, said};
 use std::fs;
-use std::path::{Path, PathBuf};
-
-fn golden(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden").join(name)
-}
 
 #[test]
 fn equals_the_reference() {

@@ -1,6 +1,6 @@
 //! Results that are kept with a hash of what they were made of, so that a second call makes only what changed.
 
-use anyhow::Result;
+use crate::error::Result;
 use data::write_atomic;
 use serde::Serialize;
 use serde::de::DeserializeOwned;

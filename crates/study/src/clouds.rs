@@ -1,10 +1,12 @@
 //! What the data sets of a study have in common and what not: distances and targets.
 
-use super::cache::cached;
-use super::data_sets::{labelled_sha256, open};
-use super::detections::spread;
-use super::folder::Study;
-use anyhow::{Context, Result};
+use crate::cache::cached;
+use crate::config::StudyDataset;
+use crate::data_sets::{labelled_sha256, open};
+use crate::detections::spread;
+use crate::error::{Result, refused};
+use crate::folder::Study;
+use crate::{Event, Listener};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Dataset, Frame, stream};
 use eval::distance::{
@@ -64,7 +66,7 @@ pub fn distances_of(
 ///
 /// # Errors
 /// Frames that cannot be read.
-pub fn all_distances(study: &Study) -> Result<(Vec<Distances>, Vec<String>)> {
+pub(crate) fn all_distances(study: &Study, listener: Listener<'_>) -> Result<(Vec<Distances>, Vec<String>)> {
     let evaluation = &study.config.evaluation;
     let split = &study.config.splits.train;
     let loader = match study.config.runs().first() {
@@ -73,7 +75,7 @@ pub fn all_distances(study: &Study) -> Result<(Vec<Distances>, Vec<String>)> {
         }
         _ => None,
     };
-    let (first, others) = study.config.datasets.split_first().context("a study has data sets")?;
+    let (first, others) = study.config.datasets.split_first().ok_or_else(|| refused("a study has data sets"))?;
     let a = open(study, &first.name)?;
     let a_key = labelled_sha256(&a, &a.ids(split)?)?;
     let (mut out, mut warnings) = (Vec::new(), Vec::new());
@@ -84,7 +86,7 @@ pub fn all_distances(study: &Study) -> Result<(Vec<Distances>, Vec<String>)> {
             warnings.push(format!("no distances between {} and {}: {problem}", first.title, other.title));
             continue;
         }
-        eprintln!("distances between {} and {}", first.name, other.name);
+        listener(Event::Note(&format!("distances between {} and {}", first.name, other.name)));
         let key = (
             DISTANCES_SCHEMA,
             [&a_key, &labelled_sha256(&b, &b_ids)?],
@@ -105,9 +107,9 @@ pub fn all_distances(study: &Study) -> Result<(Vec<Distances>, Vec<String>)> {
 ///
 /// # Errors
 /// Frames that cannot be read.
-pub fn all_targets(study: &Study) -> Result<Vec<Targets>> {
+pub(crate) fn all_targets(study: &Study) -> Result<Vec<Targets>> {
     let (split, options) = (&study.config.splits.train, &study.config.evaluation.targets);
-    let of_set = |dataset: &eval::study::StudyDataset| {
+    let of_set = |dataset: &StudyDataset| {
         let set = open(study, &dataset.name)?;
         let ids = set.ids(split)?;
         let path = study.folder.join(format!("targets/{}.json", dataset.name));

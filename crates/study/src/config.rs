@@ -6,12 +6,12 @@ mod problem;
 
 pub use changes::StudyChanges;
 
-use crate::analysis::AnalysisOptions;
-use crate::distance::DistanceOptions;
-use crate::features::TsneOptions;
-use crate::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId};
-use crate::targets::TargetOptions;
 use data::DataError;
+use eval::analysis::AnalysisOptions;
+use eval::distance::DistanceOptions;
+use eval::features::TsneOptions;
+use eval::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId};
+use eval::targets::TargetOptions;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

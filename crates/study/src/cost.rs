@@ -1,20 +1,21 @@
 //! What a study will cost: the steps that are left, times a step measured on this machine.
 
-use super::data_sets::open;
-use super::folder::Study;
-use super::local::own_program;
-use super::standing::{Standing, standing};
-use crate::memory::peak_mib;
-use anyhow::{Context, Result};
+use crate::config::StudyRun;
+use crate::data_sets::open;
+use crate::error::{InPart, Result, refused};
+use crate::folder::Study;
+use crate::local::own_program;
+use crate::standing::{Standing, standing};
+use crate::{Event, Listener};
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use data::{Dataset, Frame, write_json};
-use eval::study::StudyRun;
-use models::{Detector, Preparer, reference_name};
+use models::{Detector, Preparer, predict_samples, reference_name};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::process::{Command, Stdio};
 use std::time::Instant;
+use train::memory::peak_mib;
 use train::{Adam, GradientNorm, TrainingFrames};
 
 /// Steps that are measured, behind one that warms up.
@@ -40,9 +41,11 @@ pub struct NetworkCost {
 /// What all networks of a study cost, by name: `costs.json`.
 pub type Costs = BTreeMap<String, NetworkCost>;
 
-/// Measures a run's network in this process and prints [`NetworkCost`] as JSON.
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
-pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<()> {
+/// Measures a run's network in this process. The words for the device are left empty.
+///
+/// # Errors
+/// Frames that cannot be read, a step that fails.
+pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<NetworkCost> {
     let config = study.run_config(run)?;
     let set = Dataset::open(&config.dataset)?;
     let frames = TrainingFrames::new(&config, &set, &run.folder(&study.folder).join("cache"))?;
@@ -60,7 +63,7 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<()> {
         let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
         let clip = norm.clip_scale(config.detector.optimization.clip_norm);
         detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-5, 0.9));
-        device.sync()?;
+        device.sync().map_err(|e| refused(e.to_string()))?;
         seconds.push(begin.elapsed().as_secs_f64());
     }
     let test = open(study, study.feature_set())?;
@@ -69,20 +72,16 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<()> {
     for id in test.ids(&study.config.splits.test)?.iter().take(MEASURED_FRAMES) {
         let begin = Instant::now();
         let sample = preparer.inference(&Frame { id: id.clone(), cloud: test.load_cloud(id)?, objects: Vec::new() })?;
-        if !sample.is_empty() {
-            detector.predict(&[sample])?;
-        }
+        predict_samples(&detector, &[sample])?;
         detection.push(begin.elapsed().as_secs_f64());
     }
-    let cost = NetworkCost {
+    Ok(NetworkCost {
         step_s: median(seconds.split_off(1)),
         detection_s: median(detection),
         peak_mib: peak_mib().unwrap_or(0),
         threads: rayon::current_num_threads(),
         device: String::new(),
-    };
-    println!("{}", serde_json::to_string(&cost)?);
-    Ok(())
+    })
 }
 
 /// A machine that pauses for a moment does not change it.
@@ -102,7 +101,13 @@ pub fn known(study: &Study) -> Costs {
 ///
 /// # Errors
 /// A process that cannot be started, a file that cannot be written.
-pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]) -> Result<Costs> {
+pub fn costs(
+    study: &Study,
+    runs: &[StudyRun],
+    threads: usize,
+    device: &[String],
+    listener: Listener<'_>,
+) -> Result<Costs> {
     let mut costs = known(study);
     let mut tried = BTreeSet::new();
     for run in runs {
@@ -111,7 +116,7 @@ pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]
         if !tried.insert(network) || costs.get(network).is_some_and(is_same) {
             continue;
         }
-        eprintln!("measuring a step of {network}");
+        listener(Event::Note(&format!("measuring a step of {network}")));
         let output = Command::new(own_program()?)
             .arg("study-run")
             .arg(&study.folder)
@@ -122,11 +127,12 @@ pub fn costs(study: &Study, runs: &[StudyRun], threads: usize, device: &[String]
             .output()?;
         if !output.status.success() {
             let said = String::from_utf8_lossy(&output.stderr);
-            eprintln!("{network} could not be measured: {}", said.trim().trim_start_matches("error: "));
+            let reason = said.trim().trim_start_matches("error: ");
+            listener(Event::Note(&format!("{network} could not be measured: {reason}")));
             continue;
         }
         let mut cost: NetworkCost =
-            serde_json::from_slice(&output.stdout).with_context(|| format!("{network}: no measurement"))?;
+            serde_json::from_slice(&output.stdout).in_part(|| format!("{network}: no measurement"))?;
         cost.device = device.join(" ");
         costs.insert(network.clone(), cost);
         write_json(&study.folder.join("costs.json"), &costs)?;

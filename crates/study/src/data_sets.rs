@@ -1,51 +1,37 @@
 //! The data sets of a study: made where they are not there, opened, and told apart by what is in them.
 
-use super::folder::Study;
-use crate::simulate::{Scenery, SimulateArgs};
-use anyhow::{Context, Result, bail};
+use crate::config::{Source, StudyDataset};
+use crate::error::{InPart, Result, refused};
+use crate::folder::Study;
+use crate::{Event, Listener};
 use data::Dataset;
-use eval::study::{Source, StudyDataset};
-use indicatif::{ProgressBar, ProgressStyle};
 use sha2::{Digest, Sha256};
 use simulate::effects::EffectList;
-use simulate::make_road_dataset;
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
+use simulate::{Scenery, make_road_dataset};
 use std::path::Path;
 
 /// Makes what is missing of the data sets, in their order. What an earlier process began is gone on with.
 ///
 /// # Errors
 /// A source that does not exist or cannot be made.
-pub fn make_datasets(study: &Study) -> Result<()> {
+pub fn make_datasets(study: &Study, listener: Listener<'_>) -> Result<()> {
     for dataset in &study.config.datasets {
-        make(study, dataset).with_context(|| format!("data set {}", dataset.name))?;
+        make(study, dataset, listener).in_part(|| format!("data set {}", dataset.name))?;
     }
     Ok(())
 }
 
-fn make(study: &Study, dataset: &StudyDataset) -> Result<()> {
-    let bar =
-        ProgressBar::new(0).with_style(ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} frames, {eta} left")?);
-    bar.set_message(dataset.name.clone());
-    let show = |done: usize, total: usize| {
-        bar.set_length(total as u64);
-        bar.set_position(done as u64);
-    };
+fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result<()> {
+    let show = |done: usize, total: usize| listener(Event::Frames { dataset: &dataset.name, done, total });
     let path = study.dataset_path(dataset);
     match &dataset.source {
         Source::Path(_) => {
             Dataset::open(&path)?;
         }
         Source::Simulate { config, dataset: name, frames, seed } => {
-            let scenery = SimulateArgs {
-                config: study.scenes_config(config),
-                out: None,
-                frames: Some(*frames),
-                seed: Some(*seed),
-                dataset: Vec::new(),
-            };
-            match (scenery.scenery()?, name) {
+            match (Scenery::find(&study.scenes_config(config), Some(*frames), Some(*seed))?, name) {
                 (Scenery::Street(config), None) => {
                     make_road_dataset(&config, &path, &show)?;
                 }
@@ -55,11 +41,15 @@ fn make(study: &Study, dataset: &StudyDataset) -> Result<()> {
                     make_race_datasets(&race.0, &race.1, &out, &only, &|_, done, total| show(done, total))?;
                 }
                 (Scenery::Street(_), Some(name)) => {
-                    bail!("a street has but one data set: leave dataset = {name:?} out")
+                    return Err(refused(format!("a street has but one data set: leave dataset = {name:?} out")));
                 }
                 (Scenery::Race(race), None) => {
                     let names: Vec<&str> = race.0.datasets.iter().map(|set| set.name.as_str()).collect();
-                    bail!("{} makes several data sets: say dataset = one of {}", config.display(), names.join(", "));
+                    return Err(refused(format!(
+                        "{} makes several data sets: say dataset = one of {}",
+                        config.display(),
+                        names.join(", ")
+                    )));
                 }
             }
         }
@@ -69,7 +59,7 @@ fn make(study: &Study, dataset: &StudyDataset) -> Result<()> {
             Resim { dataset: &source, effects: &effects, rig: None, seed: 0 }.make(&path, &show)?;
         }
     }
-    bar.finish_and_clear();
+    listener(Event::DatasetMade);
     Ok(())
 }
 
@@ -90,7 +80,7 @@ fn with_sources(race: &RaceConfig, name: &str) -> Vec<String> {
 pub fn open(study: &Study, name: &str) -> Result<Dataset> {
     let dataset = study.dataset(name)?;
     let path = study.dataset_path(dataset);
-    Dataset::open(&path).with_context(|| match dataset.source {
+    Dataset::open(&path).in_part(|| match dataset.source {
         Source::Path(_) => format!("data set {name}"),
         _ => format!("data set {name} is not there: `lidarshift study {} --only data` makes it", study.named),
     })

@@ -1,12 +1,12 @@
 //! What a trained run finds on the test sets, and what its layers make of them: texts and numbers in the run's folder.
 
-use super::data_sets::{file_sha256, frames_sha256, open};
-use super::folder::Study;
-use anyhow::{Context, Result};
+use crate::config::StudyRun;
+use crate::data_sets::{file_sha256, frames_sha256, open};
+use crate::error::{InPart, Result};
+use crate::folder::Study;
 use data::write::write_kitti_text;
-use data::{Dataset, Frame, prefetch, write_atomic, write_json};
-use eval::study::StudyRun;
-use models::{Detector, LayerFeatures, Network, Prediction, Preparer, Sample};
+use data::{Dataset, write_atomic, write_json};
+use models::{Detector, LayerFeatures, Network, inference_samples, predict_frames};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -111,7 +111,7 @@ pub fn detect_all(
             keep_features(study, run, detector, &set, &ids, &weights)?;
         }
         let folders = [run.detections(&study.folder, &dataset.name), run.regions(&study.folder, &dataset.name)];
-        detect(detector, &set, &ids, &folders, workers).with_context(|| format!("test set {}", dataset.name))?;
+        detect(detector, &set, &ids, &folders, workers).in_part(|| format!("test set {}", dataset.name))?;
         write_json(&cell_path(study, run, &dataset.name), &cell)?;
     }
     Ok(())
@@ -121,34 +121,16 @@ pub fn detect_all(
 fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf; 2], workers: usize) -> Result<()> {
     let [of_detections, of_regions] = folders;
     let two_stage = matches!(detector.network, Network::PointRcnn(_));
-    let mut samples = samples(detector, set, ids, workers);
-    let mut at = ids.iter();
-    let batch_size = detector.config().optimization.batch_size;
-    loop {
-        let batch: Vec<Sample> = samples.by_ref().take(batch_size).collect::<Result<_>>()?;
-        if batch.is_empty() {
-            return Ok(());
-        }
-        let seen: Vec<Sample> = batch.iter().filter(|sample| !sample.is_empty()).cloned().collect();
-        let found = if seen.is_empty() { Vec::new() } else { detector.predict_with_regions(&seen)? };
-        let mut found = found.into_iter();
-        for (sample, id) in batch.iter().zip(at.by_ref()) {
-            let found = if sample.is_empty() { Prediction::default() } else { found.next().unwrap_or_default() };
+    let samples = inference_samples(detector, set, ids, workers).zip(ids).map(|(sample, id)| Ok((sample?, id)));
+    predict_frames(detector, detector.config().optimization.batch_size, samples, |batch| {
+        for (id, found) in batch {
             let name = format!("{id}.txt");
             write_kitti_text(&of_detections.join(&name), &set.detection_lines(id, &found.detections)?)?;
             if two_stage {
                 write_kitti_text(&of_regions.join(&name), &set.detection_lines(id, &found.regions)?)?;
             }
         }
-    }
-}
-
-/// What the network reads of frames, made ahead.
-fn samples(detector: &Detector, set: &Dataset, ids: &[String], workers: usize) -> data::Prefetch<Result<Sample>> {
-    let (preparer, set) = (Preparer::new(detector.config()), set.clone());
-    prefetch(ids.to_vec(), workers, 2 * detector.config().optimization.batch_size, move |id: &String| {
-        let frame = Frame { id: id.clone(), cloud: set.load_cloud(id)?, objects: Vec::new() };
-        Ok(preparer.inference(&frame)?)
+        Ok(())
     })
 }
 
@@ -170,7 +152,7 @@ fn keep_features(
         layers: Vec::new(),
         values: Vec::new(),
     };
-    for (sample, id) in samples(detector, set, &ids, 1).zip(&ids) {
+    for (sample, id) in inference_samples(detector, set, &ids, 1).zip(&ids) {
         let layers = detector.layer_features(&sample?)?;
         // A frame without points has no features; it is left out.
         if layers.is_empty() {
@@ -204,7 +186,7 @@ pub fn read_features(study: &Study, run: &StudyRun) -> Result<Option<RunFeatures
         return Ok(None);
     }
     let features: RunFeatures = serde_json::from_slice(&fs_err::read(&path)?)
-        .with_context(|| format!("{}: is damaged; remove it and run the study again", path.display()))?;
+        .in_part(|| format!("{}: is damaged; remove it and run the study again", path.display()))?;
     let weights = weights_sha256(&run.folder(&study.folder))?;
     Ok((features.weights_sha256 == weights && !features.frames.is_empty()).then_some(features))
 }

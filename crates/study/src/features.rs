@@ -1,12 +1,12 @@
 //! What the networks of a study see: t-SNE, CKA and Fréchet distances of their features.
 
-use super::cache::cached;
-use super::detections::{RunFeatures, read_features};
-use super::folder::Study;
-use super::numbers::network_title;
-use anyhow::{Context, Result};
+use crate::cache::cached;
+use crate::config::StudyRun;
+use crate::detections::{RunFeatures, read_features};
+use crate::error::{Result, refused};
+use crate::folder::Study;
+use crate::numbers::network_title;
 use eval::features::{CkaTable, Embedded, Embedding, Features, TSNE_SCHEMA, cka_table, frechet_distance, tsne};
-use eval::study::StudyRun;
 use report::FrechetRow;
 use serde::{Deserialize, Serialize};
 
@@ -49,11 +49,11 @@ pub fn features(study: &Study) -> Result<FeatureResults> {
             }
             match embedding(study, &of_network) {
                 Ok(picture) => out.embeddings.push(picture),
-                Err(e) => out.warnings.push(format!("no t-SNE of {}: {e:#}", planned.network.title)),
+                Err(e) => out.warnings.push(format!("no t-SNE of {}: {e}", planned.network.title)),
             }
             let compared = similarities(study, &of_network, &mut out);
             if let Err(e) = compared {
-                out.warnings.push(format!("no similarities of {}: {e:#}", planned.network.title));
+                out.warnings.push(format!("no similarities of {}: {e}", planned.network.title));
             }
         }
         Ok(out)
@@ -83,7 +83,7 @@ fn embedding(study: &Study, runs: &[&Seen]) -> Result<Embedding> {
     }
     let (places, kl_divergence) = tsne(&Features::new(dim, values)?, options)?;
     let point = |((train_set, seed, frame), at)| Embedded { train_set, seed, frame, at };
-    let layer = runs[0].1.layers.last().context("features have layers")?;
+    let layer = runs[0].1.layers.last().ok_or_else(|| refused("features have layers"))?;
     Ok(Embedding {
         schema: TSNE_SCHEMA.into(),
         network: network_title(study, &runs[0].0.id.network),

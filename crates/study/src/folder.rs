@@ -1,9 +1,9 @@
 //! A study and its folder: what its file says, resolved to data sets, runs and files.
 
-use crate::detectors::detector_text;
-use anyhow::{Context, Result, bail};
+use crate::config::{Source, StudyConfig, StudyDataset, StudyRun};
+use crate::error::{InPart, Result, refused};
 use data::{write_atomic, write_json};
-use eval::study::{Source, StudyConfig, StudyDataset, StudyRun};
+use models::detector_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
@@ -11,14 +11,14 @@ use train::{RunConfig, set_key};
 
 /// Studies that come with the program.
 const BUILT_IN: [(&str, &str); 4] = [
-    ("quick", include_str!("../../../../configs/studies/quick.toml")),
-    ("cpu", include_str!("../../../../configs/studies/cpu.toml")),
-    ("gain", include_str!("../../../../configs/studies/gain.toml")),
-    ("paper", include_str!("../../../../configs/studies/paper.toml")),
+    ("quick", include_str!("../../../configs/studies/quick.toml")),
+    ("cpu", include_str!("../../../configs/studies/cpu.toml")),
+    ("gain", include_str!("../../../configs/studies/gain.toml")),
+    ("paper", include_str!("../../../configs/studies/paper.toml")),
 ];
 
 /// The copy of a study's file in its folder, as it was when the folder was last worked on; and where the file came from.
-pub(super) const COPY: &str = "study.toml";
+const COPY: &str = "study.toml";
 const ORIGIN: &str = "origin.json";
 
 #[derive(Serialize, Deserialize)]
@@ -49,7 +49,7 @@ impl Study {
     /// # Errors
     /// Neither a file nor a name, or a file that is wrong.
     pub fn open(named: &str, out: Option<&Path>) -> Result<Study> {
-        if Path::new(named).join(COPY).is_file() {
+        if Self::is_folder(Path::new(named)) {
             return Self::of_folder(Path::new(named));
         }
         let below = PathBuf::from(format!("configs/studies/{named}.toml"));
@@ -60,7 +60,7 @@ impl Study {
             (None, Some((_, text))) => ((*text).to_string(), below),
             (None, None) => {
                 let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
-                bail!("no study {named:?}: neither a file nor one of {}", names.join(", "));
+                return Err(refused(format!("no study {named:?}: neither a file nor one of {}", names.join(", "))));
             }
         };
         let config = StudyConfig::parse(&text, &path)?;
@@ -69,13 +69,18 @@ impl Study {
         Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
     }
 
+    /// Whether a folder is that of a study.
+    pub fn is_folder(folder: &Path) -> bool {
+        folder.join(COPY).is_file()
+    }
+
     /// The study that made a folder, by the copy of its file.
     fn of_folder(folder: &Path) -> Result<Study> {
         let path = folder.join(COPY);
         let text = fs_err::read_to_string(&path)?;
         let config = StudyConfig::parse(&text, &path)?;
         let origin: Origin = serde_json::from_slice(&fs_err::read(folder.join(ORIGIN))?)
-            .with_context(|| format!("{}: is damaged", folder.join(ORIGIN).display()))?;
+            .in_part(|| format!("{}: is damaged", folder.join(ORIGIN).display()))?;
         Ok(Study { config, named: origin.named, text, base: origin.base, folder: std::path::absolute(folder)? })
     }
 
@@ -102,7 +107,7 @@ impl Study {
             .datasets
             .iter()
             .find(|d| d.name == name)
-            .with_context(|| format!("the study has no data set {name:?}"))
+            .ok_or_else(|| refused(format!("the study has no data set {name:?}")))
     }
 
     /// The title of a data set.
@@ -141,11 +146,16 @@ impl Study {
     pub fn run_config(&self, run: &StudyRun) -> Result<RunConfig> {
         let named = run.config.as_ref().map_or(run.detector.clone(), |file| self.path(file).display().to_string());
         let mut table = Table::new();
-        let detector: Table = detector_text(&named)?.parse().with_context(|| named.clone())?;
+        let detector: Table = detector_text(&named)?.parse().in_part(|| named.clone())?;
         table.insert("detector".into(), Value::Table(detector));
-        table.insert("seed".into(), Value::Integer(i64::try_from(run.id.seed).context("a seed is too large")?));
+        table.insert(
+            "seed".into(),
+            Value::Integer(i64::try_from(run.id.seed).map_err(|_| refused("a seed is too large"))?),
+        );
         let dataset = self.dataset_path(self.dataset(&run.id.train_set)?);
-        let Some(dataset) = dataset.to_str() else { bail!("{}: its name is not UTF-8", dataset.display()) };
+        let Some(dataset) = dataset.to_str() else {
+            return Err(refused(format!("{}: its name is not UTF-8", dataset.display())));
+        };
         table.insert("dataset".into(), Value::String(dataset.into()));
         let splits = &self.config.splits;
         let mut set = vec![format!("run.train_split={:?}", splits.train), format!("run.val_split={:?}", splits.val)];
@@ -153,7 +163,7 @@ impl Study {
         for assignment in set.iter().chain(&run.set) {
             set_key(&mut table, assignment)?;
         }
-        RunConfig::from_table(table).with_context(|| format!("run {run}"))
+        RunConfig::from_table(table).in_part(|| format!("run {run}"))
     }
 
     /// A run by its folder's name below that of the study.
@@ -163,7 +173,7 @@ impl Study {
     pub fn run(&self, name: &str) -> Result<StudyRun> {
         let runs = self.config.runs();
         let found = runs.into_iter().find(|run| run.to_string() == name);
-        found.with_context(|| format!("the study has no run {name:?}; `lidarshift study status` lists them"))
+        found.ok_or_else(|| refused(format!("the study has no run {name:?}; `lidarshift study status` lists them")))
     }
 
     /// The data set whose test clouds show what the networks see.

@@ -1,12 +1,12 @@
 //! The runs of a study on this machine: a process each, as many at once as cores and memory allow.
 
-use super::cost::{Costs, duration, left};
-use super::folder::Study;
-use super::standing::{AtWork, read_failure, write_failure};
-use super::work::RunPart;
-use anyhow::{Context, Result};
-use clap::ValueEnum;
-use eval::study::StudyRun;
+use crate::config::StudyRun;
+use crate::cost::{Costs, duration, left};
+use crate::error::{InPart, Result};
+use crate::folder::Study;
+use crate::standing::{AtWork, read_failure, write_failure};
+use crate::work::RunPart;
+use crate::{Event, Listener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
@@ -70,7 +70,9 @@ pub fn work_on(
     parts: &[RunPart],
     jobs: &LocalJobs,
     costs: &Costs,
+    listener: Listener<'_>,
 ) -> Result<Vec<(String, String)>> {
+    let note = |text: String| listener(Event::Note(&text));
     let mut waiting: Vec<&StudyRun> = runs.iter().rev().collect();
     let (mut at_work, mut failed, mut done) = (Vec::<Job>::new(), Vec::new(), 0);
     let mut progress = Progress::new(study, runs, costs, jobs.at_once)?;
@@ -80,7 +82,7 @@ pub fn work_on(
             let free = waiting.iter().rposition(|run| !AtWork::is_taken(&run.folder(&study.folder)));
             let Some(free) = free else { break };
             let run = waiting.remove(free);
-            eprintln!("{run} begins");
+            note(format!("{run} begins"));
             at_work.push(Job { run, child: start(study, run, parts, jobs)? });
         }
         std::thread::sleep(Duration::from_millis(100));
@@ -93,14 +95,15 @@ pub fn work_on(
             done += 1;
             match failure(study, job.run, status)? {
                 Some(reason) => {
-                    eprintln!("{} failed: {reason}", job.run);
+                    note(format!("{} failed: {reason}", job.run));
                     failed.push((job.run.to_string(), reason));
                 }
-                None => eprintln!("{} is done ({done} of {})", job.run, runs.len()),
+                None => note(format!("{} is done ({done} of {})", job.run, runs.len())),
             }
         }
         at_work = still;
-        progress.show(study, &at_work.iter().map(|job| job.run).collect::<Vec<_>>(), &waiting, costs)?;
+        let at_work: Vec<&StudyRun> = at_work.iter().map(|job| job.run).collect();
+        progress.line(study, &at_work, &waiting, costs)?.into_iter().for_each(&note);
     }
     Ok(failed)
 }
@@ -114,7 +117,7 @@ fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> 
     command.args(["--parts", &words(parts)]).args(&jobs.device);
     command.env("RAYON_NUM_THREADS", jobs.threads.to_string());
     command.stdin(Stdio::piped()).stdout(log()?.into_file()).stderr(log()?.into_file());
-    command.spawn().with_context(|| format!("{run} could not be started"))
+    command.spawn().in_part(|| format!("{run} could not be started"))
 }
 
 /// The program that is running, also where its file was replaced meanwhile: who builds while a study runs must not lose it.
@@ -126,9 +129,7 @@ pub fn own_program() -> std::io::Result<PathBuf> {
 
 /// As the command line takes them.
 pub fn words(parts: &[RunPart]) -> String {
-    let names: Vec<String> =
-        parts.iter().filter_map(|part| part.to_possible_value()).map(|value| value.get_name().to_string()).collect();
-    names.join(",")
+    parts.iter().map(|part| part.word()).collect::<Vec<_>>().join(",")
 }
 
 /// Why a run failed; a process that could not say so itself leaves it to us.
@@ -153,7 +154,7 @@ fn last_line(path: &Path) -> Option<String> {
     String::from_utf8_lossy(&bytes).lines().rev().find(|line| !line.trim().is_empty()).map(String::from)
 }
 
-/// Says how far all runs are, now and then.
+/// How far all runs are, every half minute.
 struct Progress {
     began: Instant,
     last: Instant,
@@ -170,9 +171,15 @@ impl Progress {
         Ok(Progress { began: now, last: now, every: Duration::from_secs(30), at_once, whole_s })
     }
 
-    fn show(&mut self, study: &Study, at_work: &[&StudyRun], waiting: &[&StudyRun], costs: &Costs) -> Result<()> {
+    fn line(
+        &mut self,
+        study: &Study,
+        at_work: &[&StudyRun],
+        waiting: &[&StudyRun],
+        costs: &Costs,
+    ) -> Result<Option<String>> {
         if self.last.elapsed() < self.every || at_work.is_empty() {
-            return Ok(());
+            return Ok(None);
         }
         self.last = Instant::now();
         let mut left_s = 0.0;
@@ -193,15 +200,15 @@ impl Progress {
                 state.map_or(format!("{run} begins"), |s| format!("{run} step {} of {}", s.step, s.total_steps))
             })
             .collect();
-        eprintln!("{}; {} waiting; about {} left", stands.join(", "), waiting.len(), duration(left_s * pace));
-        Ok(())
+        let left = duration(left_s * pace);
+        Ok(Some(format!("{}; {} waiting; about {left} left", stands.join(", "), waiting.len())))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::study::cost::NetworkCost;
+    use crate::cost::NetworkCost;
 
     #[test]
     fn memory_limits_how_many_run_at_once() {

@@ -1,15 +1,15 @@
 //! What the detections of a study say: the matrix, and what is behind the average precision of single runs.
 
-use super::cache::cached;
-use super::data_sets::{labelled_sha256, open};
-use super::detections::{spread, weights_sha256};
-use super::folder::Study;
-use super::standing::{Standing, standing};
-use anyhow::Result;
+use crate::cache::cached;
+use crate::config::StudyRun;
+use crate::data_sets::{labelled_sha256, open};
+use crate::detections::{spread, weights_sha256};
+use crate::error::Result;
+use crate::folder::Study;
+use crate::standing::{Standing, standing};
 use data::{DataError, Dataset, KittiLine};
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
 use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
-use eval::study::StudyRun;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -1,14 +1,15 @@
 //! The report of a study from what its folder holds.
 
-use super::clouds::{all_distances, all_targets};
-use super::data_sets::open;
-use super::features::features;
-use super::folder::Study;
-use super::numbers::{Found, analyses, matrix, network_title, some_test_frames};
-use anyhow::Result;
+use crate::clouds::{all_distances, all_targets};
+use crate::config::{Source, StudyDataset, StudyRun};
+use crate::data_sets::open;
+use crate::error::Result;
+use crate::features::features;
+use crate::folder::Study;
+use crate::numbers::{Found, analyses, matrix, network_title, some_test_frames};
+use crate::{Event, Listener};
 use data::{KittiText, read_kitti_text};
 use eval::matrix::Matrix;
-use eval::study::StudyRun;
 use geometry::Box3;
 use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
 
@@ -25,16 +26,16 @@ const DETECTIONS: [&str; 8] = ["#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#882
 ///
 /// # Errors
 /// Data sets that are not there, files that are damaged.
-pub fn write_report(study: &Study) -> Result<(Matrix, ReportFiles)> {
+pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, ReportFiles)> {
     let found = Found::look(study)?;
-    eprintln!("matrix");
+    listener(Event::Note("matrix"));
     let matrix = matrix(study, &found)?;
-    eprintln!("analyses");
+    listener(Event::Note("analyses"));
     let analyses = analyses(study, &found)?;
-    eprintln!("features");
+    listener(Event::Note("features"));
     let features = features(study)?;
-    let (distances, mut warnings) = all_distances(study)?;
-    eprintln!("targets");
+    let (distances, mut warnings) = all_distances(study, listener)?;
+    listener(Event::Note("targets"));
     let targets = all_targets(study)?;
     warnings.extend(features.warnings);
     let report = StudyReport {
@@ -96,8 +97,7 @@ fn facts(study: &Study) -> Result<Vec<(String, String)>> {
     Ok(facts)
 }
 
-fn source(study: &Study, dataset: &eval::study::StudyDataset) -> String {
-    use eval::study::Source;
+fn source(study: &Study, dataset: &StudyDataset) -> String {
     match &dataset.source {
         Source::Path(path) => path.display().to_string(),
         Source::Simulate { config, dataset, frames, seed } => {

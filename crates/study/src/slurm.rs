@@ -1,10 +1,11 @@
 //! The runs of a study on a Slurm cluster: a job array to train, one to detect, and the report behind both.
 
-use super::Step;
-use super::folder::Study;
-use anyhow::{Context, Result, bail};
+use crate::config::StudyRun;
+use crate::error::{InPart, Result, refused};
+use crate::folder::Study;
+use crate::steps::{RunOptions, Step};
+use crate::{Event, Listener};
 use data::write_atomic;
-use eval::study::StudyRun;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -14,12 +15,13 @@ use std::process::Command;
 ///
 /// # Errors
 /// No Slurm on this machine, or a submission that it refuses.
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
-pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[String], sbatch: &[String]) -> Result<()> {
+pub fn submit(study: &Study, missing: &[StudyRun], options: &RunOptions, listener: Listener<'_>) -> Result<()> {
+    let RunOptions { steps, device, sbatch, .. } = options;
+    let result = |text: String| listener(Event::Result(&text));
     let waiting = queued(study)?;
     let runs: Vec<&StudyRun> = missing.iter().filter(|run| !waiting.contains(&run.to_string())).collect();
     if runs.len() < missing.len() {
-        println!("{} runs are in Slurm's queue already", missing.len() - runs.len());
+        result(format!("{} runs are in Slurm's queue already", missing.len() - runs.len()));
     }
     let submission = Submission::new(study, device, sbatch)?;
     let mut last = None;
@@ -44,7 +46,7 @@ pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[Str
             let mut words = vec![array.clone()];
             words.extend(last.as_ref().map(|id| format!("--dependency=aftercorr:{id}")));
             let id = submission.submit(word, &task(word), &words)?;
-            println!("{word}: job {id}, {} tasks", names.len());
+            result(format!("{word}: job {id}, {} tasks", names.len()));
             last = Some(id);
         }
         record(study, last.as_deref().unwrap_or_default(), &list)?;
@@ -57,13 +59,13 @@ pub fn submit(study: &Study, missing: &[StudyRun], steps: &[Step], device: &[Str
             false => vec![format!("--dependency=afterany:{}", ids.join(":"))],
         };
         let id = submission.submit("report", &text, &words)?;
-        println!("report: job {id}");
+        result(format!("report: job {id}"));
     }
-    println!(
+    result(format!(
         "`lidarshift study status {}` says where they stand; logs lie in {}",
         study.named,
         submission.folder.display()
-    );
+    ));
     Ok(())
 }
 
@@ -113,13 +115,15 @@ fn answer(command: &mut Command) -> Result<String> {
     let name = command.get_program().to_string_lossy().into_owned();
     let output = match command.output() {
         Ok(output) => output,
-        Err(e) if e.kind() == ErrorKind::NotFound => bail!(
-            "there is no {name} on this machine: --launcher slurm needs Slurm's client programs; --launcher local works without"
-        ),
-        Err(e) => return Err(e).with_context(|| format!("{name} could not be started")),
+        Err(e) if e.kind() == ErrorKind::NotFound => {
+            return Err(refused(format!(
+                "there is no {name} on this machine: --launcher slurm needs Slurm's client programs; --launcher local works without"
+            )));
+        }
+        Err(e) => return Err(e).in_part(|| format!("{name} could not be started")),
     };
     if !output.status.success() {
-        bail!("{name}: {}", String::from_utf8_lossy(&output.stderr).trim());
+        return Err(refused(format!("{name}: {}", String::from_utf8_lossy(&output.stderr).trim())));
     }
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }

@@ -1,9 +1,9 @@
 //! How the runs of a study stand, from their folders alone.
 
-use super::folder::Study;
-use anyhow::Result;
+use crate::config::StudyRun;
+use crate::error::Result;
+use crate::folder::Study;
 use data::write_json;
-use eval::study::StudyRun;
 use serde::{Deserialize, Serialize};
 use std::fs::{File, TryLockError};
 use std::path::Path;
@@ -133,10 +133,10 @@ pub fn standing(study: &Study, run: &StudyRun) -> Result<Standing> {
     if step < total {
         return Ok(Standing::Stopped(step, total));
     }
-    let weights = super::detections::weights_sha256(&folder)?;
+    let weights = crate::detections::weights_sha256(&folder)?;
     let mut missing = Vec::new();
     for dataset in &study.config.datasets {
-        if !super::detections::is_done(study, run, &dataset.name, &weights)? {
+        if !crate::detections::is_done(study, run, &dataset.name, &weights)? {
             missing.push(dataset.name.clone());
         }
     }

@@ -1,4 +1,4 @@
-//! `lidarshift parity DIR`: our numbers against a folder of reference numbers, tensor by tensor.
+//! `cargo xtask parity DIR`: our numbers against a folder of reference numbers, tensor by tensor.
 
 mod manifest;
 mod network;
@@ -11,16 +11,16 @@ mod reference;
 mod rotations;
 mod toy_training;
 
-use crate::device::DeviceArgs;
 use anyhow::{Context, Result};
 use clap::Args;
+use lidarshift::device::DeviceArgs;
 use reference::Row;
 use serde::Serialize;
 use std::path::PathBuf;
 
 /// Compares this program's numbers with a folder of reference numbers of the same network, tensor by tensor.
 ///
-/// Example: lidarshift parity ../shared/golden/pointpillars_tiny
+/// Example: cargo xtask parity ../shared/golden/pointpillars_tiny
 #[derive(Args, Debug)]
 pub struct ParityArgs {
     /// Folder with manifest.json and safetensors files of a network, or of single operations

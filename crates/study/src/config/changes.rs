@@ -1,7 +1,7 @@
 //! What a changed study file does to what was made before.
 
 use super::{Source, StudyConfig, StudyRun};
-use crate::matrix::RunId;
+use eval::matrix::RunId;
 use std::collections::BTreeMap;
 
 /// What a changed study file does to runs that were made before.

@@ -1,12 +1,12 @@
 //! `lidarshift eval tsne`: what the networks of a study see.
 
 use crate::study::StudyPlace;
-use crate::study::features::features;
 use anyhow::{Result, bail};
 use clap::Args;
 use data::write_json;
 use report::StudyReport;
 use std::path::PathBuf;
+use study::features::features;
 
 /// Features of every run of a study on the same test clouds: t-SNE of each network, linear CKA layer by layer, and the Fréchet distance
 /// between train sets. With --figures also as figures.

@@ -1,11 +1,11 @@
 //! `lidarshift eval matrix`: train set x test set of a study.
 
 use crate::study::StudyPlace;
-use crate::study::numbers::{Found, matrix};
 use anyhow::Result;
 use clap::Args;
 use data::write_atomic;
 use std::path::{Path, PathBuf};
+use study::numbers::{Found, matrix};
 
 /// Average precision and recall of every run of a study on every test set: means, deviations and intervals, in the layout of the paper's
 /// table. A cell without a run stays in the table and says why. Only what has been detected counts; nothing is trained.

@@ -1,9 +1,10 @@
 //! Detectors by name: the files of `configs/detectors`, built into the program.
 
-use anyhow::{Context, Result, bail};
-use models::config::DetectorConfig;
+use crate::ModelError;
+use crate::config::DetectorConfig;
 use std::path::Path;
 
+/// Name and text of each file.
 const BUILT_IN: [(&str, &str); 8] = [
     ("pointpillars", include_str!("../../../configs/detectors/pointpillars.toml")),
     ("pointpillars_small", include_str!("../../../configs/detectors/pointpillars_small.toml")),
@@ -19,24 +20,26 @@ const BUILT_IN: [(&str, &str); 8] = [
 ///
 /// # Errors
 /// Neither a name nor a file.
-pub fn detector_text(name_or_path: &str) -> Result<String> {
+pub fn detector_text(name_or_path: &str) -> Result<String, ModelError> {
     if let Some((_, text)) = BUILT_IN.iter().find(|(name, _)| *name == name_or_path) {
         return Ok((*text).to_string());
     }
     let path = Path::new(name_or_path);
     if !path.is_file() {
         let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
-        bail!("no detector {name_or_path:?}: neither a file nor one of {}", names.join(", "));
+        let message = format!("there is no such detector: neither a file nor one of {}", names.join(", "));
+        return Err(ModelError::File { path: path.into(), message });
     }
-    Ok(fs_err::read_to_string(path)?)
+    Ok(fs_err::read_to_string(path).map_err(data::DataError::from)?)
 }
 
 /// A detector by its name or its path.
 ///
 /// # Errors
 /// Neither a name nor a file, or a file that is wrong.
-pub fn find_detector(name_or_path: &str) -> Result<DetectorConfig> {
-    DetectorConfig::parse(&detector_text(name_or_path)?).map_err(anyhow::Error::msg).context(name_or_path.to_string())
+pub fn find_detector(name_or_path: &str) -> Result<DetectorConfig, ModelError> {
+    let text = detector_text(name_or_path)?;
+    DetectorConfig::parse(&text).map_err(|message| ModelError::File { path: name_or_path.into(), message })
 }
 
 #[cfg(test)]

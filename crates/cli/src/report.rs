@@ -1,11 +1,11 @@
 //! `lidarshift report`: the page of a study.
 
-use crate::study::StudyPlace;
-use crate::study::present::write_report;
+use crate::study::{StudyPlace, listener};
 use anyhow::Result;
 use clap::Args;
 use report::write_event_files;
 use std::path::PathBuf;
+use study::write_report;
 
 /// Write the report of a study from what its folder holds: one HTML page that needs nothing else, its figures as SVG and PNG, its tables as
 /// CSV. Nothing is trained; cells without a run say so.
@@ -38,7 +38,7 @@ impl ReportArgs {
             Some(runs) => runs.to_path_buf(),
             None => {
                 let study = self.place.open()?;
-                let (_, files) = write_report(&study)?;
+                let (_, files) = write_report(&study, &listener())?;
                 println!("report: {} ({:.1} MB)", files.page.display(), files.page_bytes as f64 / 1e6);
                 study.folder
             }
