@@ -4,6 +4,7 @@ mod bench;
 mod bench_mutants;
 mod bench_train;
 mod ci;
+mod pages;
 mod program;
 mod tidy;
 
@@ -32,9 +33,9 @@ struct Xtask {
 enum Word {
     /// All that has to pass: format, house rules, clippy, tests, a smoke run. The README's test command.
     Ci,
-    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths.
+    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths, links between pages.
     Tidy,
-    /// Write configs/schema.json and docs/configuration.md from the Rust types.
+    /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
     /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's;
     /// `bench mutants` breaks the diagnosis in many ways and sees whether the blind cases notice.
