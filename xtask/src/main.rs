@@ -6,6 +6,7 @@ mod bench_mutants;
 mod bench_train;
 mod ci;
 mod format;
+mod pages;
 mod program;
 mod tidy;
 
@@ -41,9 +42,9 @@ enum Word {
         #[arg(long)]
         check: bool,
     },
-    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths.
+    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths, links between pages.
     Tidy,
-    /// Write configs/schema.json and docs/configuration.md from the Rust types.
+    /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
     /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's;
     /// `bench mutants` breaks the diagnosis in many ways and sees whether the blind cases notice.

@@ -1,5 +1,6 @@
 //! `cargo xtask tidy`: the house rules that a machine can check. ARCHITECTURE.md gives the reason of each.
 
+use crate::pages;
 use anyhow::{Context, Result};
 use fs_err as fs;
 use std::collections::{BTreeMap, BTreeSet};
@@ -96,7 +97,10 @@ pub fn complaints(root: &Path) -> Result<Vec<String>> {
         let path = shown(root, &manifest.path);
         found.extend(manifest_complaints(&manifest).into_iter().map(|c| format!("{path}: {c}")));
     }
-    for file in texts(root)? {
+    let files = texts(root)?;
+    let pages: Vec<PathBuf> = files.iter().filter(|f| f.extension().is_some_and(|e| e == "md")).cloned().collect();
+    found.extend(pages::complaints(root, &pages)?);
+    for file in files {
         let path = shown(root, &file);
         let text = fs::read_to_string(&file)?;
         found.extend(text_complaints(&path, &text).into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));

@@ -13,7 +13,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 use study::StudyConfig;
 
-/// Writes configs/schema.json and docs/configuration.md from the Rust types.
+/// Writes configs/schema.json and docs/src/reference/configuration.md from the Rust types.
 #[derive(Args, Debug)]
 pub struct SchemaArgs {
     /// The project's folder
@@ -27,7 +27,9 @@ pub struct SchemaArgs {
 impl SchemaArgs {
     /// Writes both files, or compares them.
     pub fn run(self) -> Result<()> {
-        for (path, text) in [("configs/schema.json", schema_json()?), ("docs/configuration.md", reference())] {
+        for (path, text) in
+            [("configs/schema.json", schema_json()?), ("docs/src/reference/configuration.md", reference())]
+        {
             let path = self.root.join(path);
             if !self.check {
                 write_atomic(&path, text.as_bytes())?;

@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct SimulateArgs {
-    /// What to make: race, race_small, race_full, street, or a TOML; docs/configuration.md lists the keys
+    /// What to make: race, race_small, race_full, street, or a TOML; docs/src/reference/configuration.md lists the keys
     #[arg(long, value_name = "CONFIG", default_value = "race")]
     config: String,
     /// Folder for the data sets: new, empty, or begun with the same words [default: datasets/NAME]
