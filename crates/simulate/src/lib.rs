@@ -9,9 +9,11 @@ pub mod race_car;
 pub mod raycast;
 pub mod resim;
 pub mod scenario;
+mod scenery;
 pub mod street;
 pub mod track;
 pub mod world;
 
 pub use error::SimulateError;
+pub use scenery::Scenery;
 pub use street::{FrameCounts, MANIFEST_SCHEMA, Manifest, RoadConfig, SplitCounts, make_road_dataset, make_road_frame};
