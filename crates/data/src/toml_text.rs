@@ -1,4 +1,5 @@
-//! TOML files that people write: one typed reading for all of them, and errors that name the file, the line and the key that was meant.
+//! TOML files that people write: one typed reading for all of them, and errors that name the file, the line and the key
+//! that was meant.
 
 use crate::DataError;
 use serde::de::DeserializeOwned;
@@ -75,7 +76,8 @@ pub fn message(error: &toml::de::Error) -> String {
     with_suggestion(error.message())
 }
 
-/// [`message`] and the table that it speaks of, in one line: for a table that was put together in memory and has no lines.
+/// [`message`] and the table that it speaks of, in one line: for a table that was put together in memory and has no
+/// lines.
 pub fn message_with_key(error: &toml::de::Error) -> String {
     let text = error.to_string();
     let place = text.strip_prefix(error.message()).unwrap_or_default().trim().replace('\n', " ");
@@ -98,7 +100,8 @@ fn with_suggestion(message: &str) -> String {
     suggested().unwrap_or_else(|| message.to_owned())
 }
 
-/// Letters to change, add or take away between two keys; a key without its unit (`yaw` for `yaw_deg`), or with one too many, counts as 1.
+/// Letters to change, add or take away between two keys; a key without its unit (`yaw` for `yaw_deg`), or with one too
+/// many, counts as 1.
 fn distance_of_keys(unknown: &str, known: &str) -> usize {
     let without = |long: &str, short: &str| long.strip_prefix(short).is_some_and(|unit| unit.starts_with('_'));
     if !unknown.is_empty() && (without(known, unknown) || without(unknown, known)) {
@@ -117,7 +120,8 @@ fn distance_of_keys(unknown: &str, known: &str) -> usize {
     row[known.len()]
 }
 
-/// The line of a TOML error. Within tagged tables the parser knows the table alone; an unknown key is then looked for by its name.
+/// The line of a TOML error. Within tagged tables the parser knows the table alone; an unknown key is then looked for
+/// by its name.
 fn line_of_error(text: &str, error: &toml::de::Error) -> usize {
     let at = error.span().map_or(0, |span| span.start);
     let unknown = error.message().strip_prefix("unknown field `").and_then(|m| m.split('`').next());
@@ -156,7 +160,8 @@ fn line_of_byte(text: &str, byte: usize) -> usize {
     1 + text.as_bytes()[..byte.min(text.len())].iter().filter(|b| **b == b'\n').count()
 }
 
-/// The line of a key as `effect[2].std_m`, or of the nearest table above it that is written down; `None` when nothing of it is.
+/// The line of a key as `effect[2].std_m`, or of the nearest table above it that is written down; `None` when nothing
+/// of it is.
 fn line_of_key(text: &str, key: &str) -> Option<usize> {
     let root = DeTable::parse(text).ok()?;
     let mut line = None;

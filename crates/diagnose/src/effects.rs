@@ -1,7 +1,7 @@
 //! Findings as effects of the sensor model: what a simulation has to be given to show the same.
 //!
-//! Every parameter of an effect is written: one that the finding does not have takes the value at which it changes nothing, not the
-//! effect's default, which is a typical strength.
+//! Every parameter of an effect is written: one that the finding does not have takes the value at which it changes
+//! nothing, not the effect's default, which is a typical strength.
 
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
@@ -28,7 +28,8 @@ pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<
     }
 }
 
-/// The effects of a finding; none where the sensor model has none for it. Of an ambiguous finding those of its first candidate.
+/// The effects of a finding; none where the sensor model has none for it. Of an ambiguous finding those of its first
+/// candidate.
 pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
     match finding.status {
         Status::Unexplained if finding.covariate == "direction" => dirty_window(finding, rig).into_iter().collect(),

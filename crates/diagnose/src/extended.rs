@@ -1,5 +1,5 @@
-//! The file `extended.toml`: the effects of all findings as a list for the simulator, with what was found and its intervals as comments.
-//! What the simulator has no effect for is a comment alone.
+//! The file `extended.toml`: the effects of all findings as a list for the simulator, with what was found and its
+//! intervals as comments. What the simulator has no effect for is a comment alone.
 
 use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::effects::cause_of;
@@ -37,7 +37,8 @@ const ORDER: [&str; 23] = [
 /// The text of `extended.toml`, for a diagnosis whose findings carry their effects.
 pub fn extended_toml(diagnosis: &Diagnosis) -> String {
     let mut text = String::from(
-        "# What the diagnosis adds to the simulation's sensor model: a list of effects. Intervals (95 %) stand above them.\n",
+        "# What the diagnosis adds to the simulation's sensor model: a list of effects.\n\
+         # Intervals (95 %) stand above each effect.\n",
     );
     let place = |f: &Finding| {
         let cause = if f.status == Status::Named { cause_of(f) } else { "" };

@@ -6,11 +6,11 @@ use nalgebra::Point3;
 
 /// The sensors of a rig as seen from the cloud's frame, ready to be asked for many points.
 ///
-/// A point belongs to the sensor in whose horizontal field of view it lies. Where several fields hold it, it belongs to the narrowest: a
-/// scan spreads its shots over its field, so that the narrower one has more returns a degree and a point is more probably its own. Where
-/// no field holds it, it belongs to the one whose edge is the fewest degrees away: points leave a field by motion or by a mount that is
-/// slightly off, and such angles do not grow with the width of the field. Among equal fields it is the one in which the point lies most
-/// centrally; of equals the first.
+/// A point belongs to the sensor in whose horizontal field of view it lies. Where several fields hold it, it belongs to
+/// the narrowest: a scan spreads its shots over its field, so that the narrower one has more returns a degree and a
+/// point is more probably its own. Where no field holds it, it belongs to the one whose edge is the fewest degrees
+/// away: points leave a field by motion or by a mount that is slightly off, and such angles do not grow with the width
+/// of the field. Among equal fields it is the one in which the point lies most centrally; of equals the first.
 #[derive(Clone, Debug)]
 pub struct Assignment {
     views: Vec<View>,
@@ -27,7 +27,8 @@ struct View {
 pub struct Assigned {
     /// Number of the sensor in its rig.
     pub sensor: usize,
-    /// Azimuth (counter-clockwise from the sensor's middle, rad), elevation (rad) and range (m) in the sensor's own frame.
+    /// Azimuth (counter-clockwise from the sensor's middle, rad), elevation (rad) and range (m) in the sensor's own
+    /// frame.
     pub spherical: [f64; 3],
 }
 
@@ -111,14 +112,15 @@ mod tests {
         let by_margin = |rig: &Rig, p| least(off_and_half(rig, p).iter().map(|(off, half)| off - half));
         let of = |rig: &Rig, p| Assignment::new(rig).of_point(p).unwrap().sensor;
 
-        // In both fields, 1 degree off the middle of the narrow one: 12 times as many returns a degree are the narrow one's. The
-        // distance to the edge gave it to the wide one, as it did with every point that the narrow one sees.
+        // In both fields, 1 degree off the middle of the narrow one: 12 times as many returns a degree are the narrow
+        // one's. The distance to the edge gave it to the wide one, as it did with every point that the narrow one sees.
         let (both, point) = (fields(40.0), at(41.0));
         assert_eq!([by_share(&both, point), by_margin(&both, point), of(&both, point)], [1, 0, 1]);
         // In the middle of both fields the share of the field gave it to the wide one as well.
         let (both, point) = (fields(0.0), at(1.0));
         assert_eq!([by_share(&both, point), by_margin(&both, point), of(&both, point)], [0, 0, 1]);
-        // In neither field, 6 degrees beyond the narrow one's edge, 15 beyond the wide one's: the share of the field gave it to the wide.
+        // In neither field, 6 degrees beyond the narrow one's edge, 15 beyond the wide one's: the share of the field
+        // gave it to the wide.
         let (apart, point) = (fields(86.0), at(75.0));
         assert_eq!([by_share(&apart, point), by_margin(&apart, point), of(&apart, point)], [0, 1, 1]);
         // In one field alone it is that one's, whatever the others are.

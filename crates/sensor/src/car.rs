@@ -1,7 +1,7 @@
 //! Size and place of the racing car, the Dallara AV-21, in its own frame.
 //!
-//! The car's frame is also that of its clouds: origin at the middle of the rear axle, 0.198 m above the ground (the frame of the published
-//! sensor mounts), x forward, y left, z up, m.
+//! The car's frame is also that of its clouds: origin at the middle of the rear axle, 0.198 m above the ground (the
+//! frame of the published sensor mounts), x forward, y left, z up, m.
 
 use geometry::Box3;
 

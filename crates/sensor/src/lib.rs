@@ -1,7 +1,9 @@
-//! LiDAR sensors, whoever made the data: where they are mounted and what they see ([`rig`]), what came back of a scan ([`scan`]), which
-//! sensor a point belongs to ([`assignment`]), how strong a return is ([`signal`]), and the sensor model as a list of [`effects`].
+//! LiDAR sensors, whoever made the data: where they are mounted and what they see ([`rig`]), what came back of a scan
+//! ([`scan`]), which sensor a point belongs to ([`assignment`]), how strong a return is ([`signal`]), and the sensor
+//! model as a list of [`effects`].
 //!
-//! Nothing here casts a ray. An effect that has to ask what another ray would meet asks a [`RayCaster`], which a simulator provides.
+//! Nothing here casts a ray. An effect that has to ask what another ray would meet asks a [`RayCaster`], which a
+//! simulator provides.
 
 pub mod assignment;
 pub mod attributes;
