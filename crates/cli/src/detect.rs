@@ -1,6 +1,5 @@
 //! `lidarshift detect`: boxes in one cloud, or in a whole split of a data set.
 
-use crate::detectors::find_detector;
 use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
@@ -9,7 +8,7 @@ use data::{Cloud, Dataset, Detection, Frame, PointColumns, read_cloud, write_ato
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
-use models::{Detector, Preparer};
+use models::{Detector, Preparer, find_detector};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
 use serde::Serialize;
 use std::path::{Path, PathBuf};

@@ -1,11 +1,11 @@
 //! `lidarshift eval distances`: how far the clouds of two data sets are from each other.
 
-use crate::detectors::find_detector;
 use crate::study::clouds::{Loader, distances_of};
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use data::{Dataset, write_json};
 use eval::distance::{Compared, DistanceOptions, Distances};
+use models::find_detector;
 use std::path::PathBuf;
 
 /// Chamfer, earth mover's and sliced Wasserstein distances of two data sets of the same frames, each with its floor: the whole clouds, the

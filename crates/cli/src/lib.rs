@@ -2,7 +2,6 @@
 
 pub mod bench_step;
 pub mod detect;
-pub mod detectors;
 pub mod device;
 pub mod diagnose;
 pub mod doctor;

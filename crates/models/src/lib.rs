@@ -1,4 +1,4 @@
-//! PointPillars and PointRCNN in burn, faithful to the published networks to the last tensor.
+//! Detectors in burn. The published networks equal OpenPCDet's tensor by tensor; [`Architecture`] is what a new one implements.
 
 pub mod checkpoint;
 pub mod config;
@@ -10,11 +10,17 @@ pub mod point_ops;
 pub mod pointpillars;
 pub mod pointrcnn;
 
+mod architecture;
+mod built_in;
 mod detector;
+mod detectors;
 mod error;
 mod layer_features;
 
-pub use detector::{Detector, Losses, Network, Prediction, Preparer, Sample, parameter_count};
+pub use architecture::{Architecture, NetworkInput};
+pub use built_in::{detector_text, find_detector};
+pub use detector::{Detector, Losses, Prediction, Preparer, parameter_count};
+pub use detectors::{Network, Sample};
 pub use error::ModelError;
 pub use layer_features::LayerFeatures;
 pub use named::reference_name;

@@ -24,7 +24,7 @@ fn shared(path: &str) -> Option<PathBuf> {
     Some(found)
 }
 
-fn network(config: &mut DetectorConfig) -> &mut models::config::PointRcnnConfig {
+fn network(config: &mut DetectorConfig) -> &mut models::pointrcnn::PointRcnnConfig {
     match &mut config.network {
         NetworkConfig::PointRcnn(net) => net,
         other => panic!("{other:?}"),

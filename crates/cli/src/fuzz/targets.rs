@@ -61,7 +61,7 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
     });
     targets.push(Target {
         name: "detector toml",
-        sound: crate::detectors::detector_text("pointpillars_small")?.into_bytes(),
+        sound: models::detector_text("pointpillars_small")?.into_bytes(),
         read: text(|t| DetectorConfig::parse(t).ok().map(|c| c.check().is_ok())),
     });
     let toml = "name = \"track\"\nroot = \".\"\nlayout = \"kitti\"\nclasses = [\"Car\"]\n[splits]\ntrain = \"ImageSets/train.txt\"\n";

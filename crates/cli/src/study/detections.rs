@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use data::write::write_kitti_text;
 use data::{Dataset, Frame, prefetch, write_atomic, write_json};
 use eval::study::StudyRun;
-use models::{Detector, LayerFeatures, Network, Prediction, Preparer, Sample};
+use models::{Detector, LayerFeatures, Prediction, Preparer, Sample};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -120,7 +120,7 @@ pub fn detect_all(
 /// The detections of a run on frames, a text a frame, and the regions of a two-stage network likewise.
 fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf; 2], workers: usize) -> Result<()> {
     let [of_detections, of_regions] = folders;
-    let two_stage = matches!(detector.network, Network::PointRcnn(_));
+    let two_stage = detector.config().network.is_two_stage();
     let mut samples = samples(detector, set, ids, workers);
     let mut at = ids.iter();
     let batch_size = detector.config().optimization.batch_size;

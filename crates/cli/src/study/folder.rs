@@ -1,9 +1,9 @@
 //! A study and its folder: what its file says, resolved to data sets, runs and files.
 
-use crate::detectors::detector_text;
 use anyhow::{Context, Result, bail};
 use data::{write_atomic, write_json};
 use eval::study::{Source, StudyConfig, StudyDataset, StudyRun};
+use models::detector_text;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};

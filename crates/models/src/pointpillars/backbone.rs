@@ -1,6 +1,6 @@
 //! The 2D backbone and neck (OpenPCDet: `BaseBEVBackbone`).
 
-use crate::config::BackboneConfig;
+use super::config::BackboneConfig;
 use crate::layers::{BatchNorm, ConvBnRelu, DeconvBnRelu, Init, Mode};
 use burn::module::Module;
 use burn::tensor::Tensor;

@@ -1,9 +1,9 @@
 //! The three losses of PointPillars (OpenPCDet: `AnchorHeadTemplate.get_loss`).
 
 use super::Sample;
+use super::config::LossConfig;
 use super::head::Predictions;
 use crate::Losses;
-use crate::config::LossConfig;
 use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal_sum, smooth_l1};
 use burn::tensor::{Int, Tensor, TensorData};
 

@@ -2,10 +2,11 @@
 
 use super::Sample;
 use super::backbone::{BackboneStages, BaseBevBackbone};
+use super::config::PointPillarsConfig;
 use super::head::{AnchorHead, Predictions};
 use super::scatter::scatter;
 use super::vfe::{PillarRows, PillarVfe};
-use crate::config::{DetectorConfig, PointPillarsConfig};
+use crate::config::DetectorConfig;
 use crate::layers::{Init, Mode};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};

@@ -1,11 +1,12 @@
 //! From a frame to what the network reads, and from what it says to detections. Runs on the host.
 
 use super::anchors::{AnchorClass, anchors};
+use super::config::{LossConfig, PointPillarsConfig};
 use super::decode::{DecodeOptions, RawBox, decode};
 use super::head::Predictions;
 use super::pillars::{PillarGrid, Pillars, decorate, pillarise};
 use super::target_assigner::{Targets, assign};
-use crate::config::{DetectorConfig, PointPillarsConfig};
+use crate::config::DetectorConfig;
 use crate::{ModelError, layers};
 use data::{Detection, Frame, Object};
 use geometry::Box3;
@@ -34,6 +35,7 @@ pub struct Preparation {
     anchors: Vec<[f32; 7]>,
     map: [usize; 2],
     decode: DecodeOptions,
+    pub(super) loss: LossConfig,
 }
 
 impl Preparation {
@@ -76,6 +78,7 @@ impl Preparation {
                 dir_offset: net.head.dir_offset_rad,
                 dir_limit_offset: net.head.dir_limit_offset,
             },
+            loss: net.loss.clone(),
         }
     }
 

@@ -1,8 +1,8 @@
 //! The backbone (Qi et al. 2017, PointNet++; OpenPCDet: `PointNet2MSG`).
 
+use super::config::PointRcnnConfig;
 use super::hierarchy::Hierarchy;
 use super::set_abstraction::SharedMlp;
-use crate::config::PointRcnnConfig;
 use crate::kernel_ops::MlpRows;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, rows_kernel};
 use crate::point_ops::{Groups, Interpolation, InterpolationTensors, interpolate};

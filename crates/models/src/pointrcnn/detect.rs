@@ -1,18 +1,18 @@
 //! Detections of a batch (OpenPCDet: `generate_predicted_boxes`, `post_processing`).
 
+use super::config::RcnnDetectionConfig;
 use super::network::PointRcnn;
 use super::proposals::{point_boxes, proposals};
 use super::roi_input::{RoiInput, Scene};
 use super::sample::{Preparation, Sample};
 use super::training::point_scores;
-use crate::config::RcnnDetectionConfig;
 use crate::layers::{Mode, host};
 use crate::pointpillars::box_coder::decode;
 use crate::{ModelError, Prediction};
 use data::Detection;
 use geometry::{Box3, rotated_nms_first};
 
-/// Boxes of each sample, by falling score, and all refined regions. `names` are those of the classes.
+/// Boxes of each sample, by falling score, and all refined regions.
 ///
 /// # Errors
 /// Scores or boxes that are not numbers.
@@ -20,7 +20,6 @@ pub fn detections(
     network: &PointRcnn,
     batch: &[&Sample],
     preparation: &Preparation,
-    names: &[String],
 ) -> Result<Vec<Prediction>, ModelError> {
     let seen: Vec<&Sample> = batch.iter().copied().filter(|s| !s.points.is_empty()).collect();
     if seen.is_empty() {
@@ -59,7 +58,7 @@ pub fn detections(
         }
         let boxes = final_boxes(&regions.boxes, reg);
         let of = |&(i, score): &(usize, f32)| Detection {
-            class: names[regions.labels[i] as usize - 1].clone(),
+            class: preparation.classes[regions.labels[i] as usize - 1].clone(),
             bbox: Box3::from_array(boxes[i].map(f64::from)),
             score,
         };

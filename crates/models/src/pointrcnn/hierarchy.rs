@@ -1,6 +1,6 @@
 //! Which points each level of the backbone keeps, and who is whose neighbour. Coordinates alone decide it, so it is found on loader threads.
 
-use crate::config::LevelConfig;
+use super::config::LevelConfig;
 use crate::point_ops::{Groups, Interpolation};
 use geometry::{TieRule, ball_query, farthest_point_sampling};
 
@@ -62,7 +62,7 @@ impl Level {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::ScaleConfig;
+    use crate::pointrcnn::config::ScaleConfig;
 
     #[test]
     fn every_group_counts_as_many_rows_as_the_reference_s() {

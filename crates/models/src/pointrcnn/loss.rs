@@ -1,10 +1,10 @@
 //! The five losses of PointRCNN (OpenPCDet: `PointHeadTemplate`, `RoIHeadTemplate`).
 
 use super::box_coder::{CORNER_SIGNS, corners};
+use super::config::PointRcnnLossConfig;
 use super::point_head::{POINT_CODE, PointPredictions};
 use super::point_targets::PointTargets;
 use super::roi_targets::RoiTargets;
-use crate::config::PointRcnnLossConfig;
 use crate::loss::{sigmoid_focal, smooth_l1};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 

@@ -2,10 +2,11 @@
 
 use super::Sample;
 use super::backbone::{BackboneStages, PointNet2Msg};
+use super::config::PointRcnnConfig;
 use super::hierarchy::Hierarchy;
 use super::point_head::{PointHead, PointPredictions};
 use super::roi_head::RoiHead;
-use crate::config::{DetectorConfig, PointRcnnConfig};
+use crate::config::DetectorConfig;
 use crate::layers::{Init, Mode};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};

@@ -1,6 +1,6 @@
 //! The first stage's head: what single points say (OpenPCDet: `PointHeadBox`).
 
-use crate::config::PointHeadConfig;
+use super::config::PointHeadConfig;
 use crate::kernel_ops::MlpRows;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear, rows_kernel};
 use burn::module::Module;

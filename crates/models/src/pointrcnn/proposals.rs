@@ -1,8 +1,8 @@
 //! From what points say to regions of interest (OpenPCDet: `RoIHeadTemplate.proposal_layer`). Runs on the host.
 
 use super::box_coder::decode;
+use super::config::SuppressionConfig;
 use super::point_head::POINT_CODE;
-use crate::config::SuppressionConfig;
 use geometry::{Box3, rotated_nms_first};
 
 /// Regions of one frame, by falling score. When fewer boxes survive the suppression than are wanted, the rest are boxes without extent, with

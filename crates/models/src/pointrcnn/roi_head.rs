@@ -1,10 +1,10 @@
 //! The second stage's network (Shi et al. 2019, PointRCNN, section 3.3; OpenPCDet: `PointRCNNHead`).
 
 use super::backbone::SetAbstraction;
+use super::config::RoiHeadConfig;
 use super::point_head::HiddenLayers;
 use super::roi_input::{PREFIX, RoiInput};
 use super::set_abstraction::SharedMlp;
-use crate::config::RoiHeadConfig;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear};
 use burn::module::Module;
 use burn::tensor::activation::relu;

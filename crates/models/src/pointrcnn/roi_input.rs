@@ -4,7 +4,7 @@
 //! The reference fills a region up to 512 points by repeating them, and a level up to its number of centres likewise. Repetitions are not
 //! rows here, they are counted (see [`Groups`]).
 
-use crate::config::RoiHeadConfig;
+use super::config::RoiHeadConfig;
 use crate::point_ops::Groups;
 use geometry::{Box3, TieRule, ball_query, farthest_point_sampling, roi_points};
 use rayon::prelude::*;
@@ -163,7 +163,7 @@ impl RoiInput {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::RoiLevelConfig;
+    use crate::pointrcnn::config::RoiLevelConfig;
 
     fn config() -> RoiHeadConfig {
         let level = |centers| RoiLevelConfig { centers, radius_m: 0.5, samples: 4, filters: vec![4] };

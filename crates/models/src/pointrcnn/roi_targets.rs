@@ -1,7 +1,7 @@
 //! Which regions the second stage learns from, and what it should say of them (OpenPCDet: `ProposalTargetLayer`). Runs on the host.
 
+use super::config::RoiSamplingConfig;
 use super::proposals::Proposals;
-use crate::config::RoiSamplingConfig;
 use crate::pointpillars::box_coder::encode;
 use data::Stream;
 use geometry::{Box3, iou_3d};

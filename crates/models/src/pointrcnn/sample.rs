@@ -1,9 +1,10 @@
 //! From a frame to what the network reads. Runs on the host.
 
+use super::config::PointRcnnConfig;
 use super::hierarchy::Hierarchy;
 use super::point_targets::{PointTargets, assign};
 use crate::ModelError;
-use crate::config::{DetectorConfig, PointRcnnConfig};
+use crate::config::DetectorConfig;
 use data::{Cloud, Frame, Object, Stream};
 use rand::RngExt;
 use rand::seq::{SliceRandom, index};
@@ -37,7 +38,8 @@ pub struct SampleTargets {
 /// What [`Sample`]s are made with.
 #[derive(Clone, Debug)]
 pub struct Preparation {
-    classes: Vec<String>,
+    /// Names of the classes.
+    pub classes: Vec<String>,
     channels: usize,
     range_m: [f32; 6],
     /// The network's sizes.

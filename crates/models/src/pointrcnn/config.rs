@@ -1,6 +1,6 @@
 //! Sizes of PointRCNN.
 
-use super::DetectorConfig;
+use crate::config::DetectorConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
