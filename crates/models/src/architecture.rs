@@ -9,7 +9,8 @@ use data::{Frame, Stream};
 
 /// A kind of detector. The type that implements it is the network, a burn module whose field names are OpenPCDet's.
 ///
-/// [`crate::detectors`] lists all of them; trainer, prediction, parity check, doctor and benchmark reach them through that list alone.
+/// [`crate::detectors`] lists all of them; trainer, prediction, parity check, doctor and benchmark reach them through
+/// that list alone.
 pub trait Architecture: Module {
     /// Sizes of the network: the table `[network]` of a detector's TOML without its key `kind`.
     type Config;
@@ -80,7 +81,8 @@ pub trait Architecture: Module {
     /// Tensors that are not f32.
     fn frame_features(&self, batch: &[&Self::Sample]) -> Result<Vec<Vec<f32>>, ModelError>;
 
-    /// The output of each layer for one sample that is not empty, averaged over all places, in the order of the forward pass.
+    /// The output of each layer for one sample that is not empty, averaged over all places, in the order of the forward
+    /// pass.
     ///
     /// # Errors
     /// Tensors that are not f32.

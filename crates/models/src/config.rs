@@ -1,4 +1,4 @@
-//! What a detector is: one TOML file in `configs/detectors`, typed once.
+//! The configuration of a detector: one TOML file in `configs/detectors`.
 
 pub use crate::detectors::NetworkConfig;
 
@@ -8,24 +8,24 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// A detector with everything that decides its numbers: classes, range, network, loss, detections, training.
+/// Configuration of a detector: classes, range, network, loss, detections, training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DetectorConfig {
     /// Name in run folders and tables.
     pub name: String,
-    /// Classes that the network tells apart; the data set must have them all.
+    /// Classes that the network distinguishes; the data set must have all of them.
     pub classes: Vec<String>,
     /// Values of a point that the network reads: 3 (x, y, z) or 4 (and intensity).
     pub channels: usize,
     /// `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame. Points and training boxes outside are dropped.
     pub range_m: [f32; 6],
-    /// The network's own sizes.
+    /// The network and its sizes.
     pub network: NetworkConfig,
     /// How the network is trained.
     #[serde(default)]
     pub optimization: OptimizationConfig,
-    /// How training frames are varied; the default is the reference's.
+    /// Augmentation of training frames; the default is that of OpenPCDet.
     #[serde(default)]
     pub augmentation: AugmentConfig,
 }
@@ -38,14 +38,14 @@ pub struct AnchorConfig {
     pub class: String,
     /// Length, width, height, m.
     pub size_m: [f32; 3],
-    /// Height of the anchor's underside, m, LiDAR frame.
+    /// z of the bottom face, m, LiDAR frame.
     pub bottom_m: f32,
     /// Headings, rad.
     #[serde(default = "default_rotations")]
     pub rotations_rad: Vec<f32>,
     /// Overlap from which an anchor is positive.
     pub matched: f32,
-    /// Overlap below which an anchor is background; between the two it does not count.
+    /// Overlap below which an anchor is background; between the two thresholds it is ignored.
     pub unmatched: f32,
 }
 
@@ -65,11 +65,11 @@ pub struct OptimizationConfig {
     pub lr_max: f64,
     /// Decoupled weight decay, on every parameter.
     pub weight_decay: f64,
-    /// Largest global norm of the gradient.
+    /// Largest global L2 norm of the gradients (clipping).
     pub clip_norm: f64,
-    /// First and last learning rate of the rise: `lr_max / div_factor`.
+    /// The initial learning rate is `lr_max / div_factor`.
     pub div_factor: f64,
-    /// Share of the steps in which the rate rises.
+    /// Fraction of the steps in which the learning rate rises.
     pub pct_start: f64,
     /// Adam's beta1 at the ends of the cycle and at its peak.
     pub momentum: [f64; 2],
@@ -117,7 +117,7 @@ impl DetectorConfig {
             return fail(format!("channels = {}: 3 (xyz) or 4 (xyzi)", self.channels));
         }
         if (0..3).any(|i| !(self.range_m[i] < self.range_m[i + 3]) || !self.range_m[i].is_finite()) {
-            return fail(format!("range_m = {:?}: each minimum must lie below its maximum", self.range_m));
+            return fail(format!("range_m = {:?}: each minimum must be below its maximum", self.range_m));
         }
         let o = &self.optimization;
         if o.epochs == 0 || o.batch_size == 0 || !(o.lr_max > 0.0) || !(o.clip_norm > 0.0) || !(o.div_factor >= 1.0) {

@@ -52,8 +52,8 @@ pub struct Losses {
 pub struct Prediction {
     /// Boxes by falling score.
     pub detections: Vec<Detection>,
-    /// All refined regions of a two-stage network with their scores, before score threshold and NMS: the boxes of OpenPCDet's recall. Empty
-    /// for other networks.
+    /// All refined regions of a two-stage network with their scores, before score threshold and NMS: the boxes of
+    /// OpenPCDet's recall. Empty for other networks.
     pub regions: Vec<Detection>,
 }
 
@@ -67,7 +67,7 @@ pub struct Detector {
 }
 
 impl Detector {
-    /// With fresh weights from `seed`.
+    /// A network with initial weights from `seed`.
     pub fn new(config: &DetectorConfig, seed: u64, device: &Device) -> Self {
         let network = Network::fresh(config, seed, device);
         Detector { network, config: config.clone(), preparation: Preparation::new(config) }
@@ -127,10 +127,11 @@ impl Detector {
         self.network.valid().predictions(&self.preparation, batch)
     }
 
-    /// The feature vector of each frame, for t-SNE and for distances between data sets: the input of the head, averaged over all places.
+    /// The feature vector of each frame, for t-SNE and for distances between data sets: the input of the head, averaged
+    /// over all places.
     ///
-    /// PointPillars: the neck's output, mean over the cells of the BEV map (384 values as published). PointRCNN: the finest feature
-    /// propagation, mean over the sampled points (128 values); zeros for a frame without points.
+    /// PointPillars: the neck's output, mean over the cells of the BEV map (384 values as published). PointRCNN: the
+    /// finest feature propagation, mean over the sampled points (128 values); zeros for a frame without points.
     ///
     /// # Errors
     /// Samples of another kind of network.
@@ -138,10 +139,11 @@ impl Detector {
         self.network.valid().frame_features(batch)
     }
 
-    /// The outputs of all layers for one frame, first to last; the last is the input of the head. Empty for a frame without points.
+    /// The outputs of all layers for one frame, first to last; the last is the input of the head. Empty for a frame
+    /// without points.
     ///
-    /// PointPillars: the pillar feature net (mean over pillars), each block and the neck (mean over cells). PointRCNN: each level of set
-    /// abstraction and of feature propagation (mean over points).
+    /// PointPillars: the pillar feature net (mean over pillars), each block and the neck (mean over cells). PointRCNN:
+    /// each level of set abstraction and of feature propagation (mean over points).
     ///
     /// # Errors
     /// A sample of another kind of network.

@@ -1,7 +1,8 @@
 //! The registry of detectors.
 //!
-//! A new detector is a folder of this crate whose network implements [`Architecture`], its TOML files in `configs/detectors`, and an entry in
-//! the list at the end of this file. Everything else in the program reaches detectors through the types that the list generates.
+//! A new detector is a folder of this crate whose network implements [`Architecture`], its TOML files in
+//! `configs/detectors`, and an entry in the list at the end of this file. Everything else in the program reaches
+//! detectors through the types that the list generates.
 
 use crate::architecture::{Architecture, NetworkInput};
 use crate::config::{AnchorConfig, DetectorConfig};
@@ -13,7 +14,8 @@ use data::{Frame, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Defines the types that hold a detector of any kind, one variant an entry. The variant's name in lower case is the `kind` in a TOML.
+/// Defines the types that hold a detector of any kind, one variant an entry. The variant's name in lower case is the
+/// `kind` in a TOML.
 macro_rules! detectors {
     ($($(#[$doc:meta])* $kind:ident($network:path),)+) => {
         /// Which network, and its sizes.
@@ -154,8 +156,8 @@ macro_rules! detectors {
             }
         }
 
-        /// OpenPCDet's name of the tensor at a path of field names. The first part names the variant of [`Network`]; a path without
-        /// such a part stays as it is.
+        /// OpenPCDet's name of the tensor at a path of field names. The first part names the variant of [`Network`]; a
+        /// path without such a part stays as it is.
         pub(crate) fn tensor_name(path: &[&str]) -> String {
             match path {
                 $([kind, rest @ ..] if *kind == stringify!($kind) => <$network>::tensor_name(rest),)+

@@ -1,4 +1,5 @@
-//! Detectors in burn. The published networks equal OpenPCDet's tensor by tensor; [`Architecture`] is what a new one implements.
+//! Detectors in burn. The published networks equal OpenPCDet's tensor by tensor; [`Architecture`] is what a new one
+//! implements.
 
 pub mod checkpoint;
 pub mod config;

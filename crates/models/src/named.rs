@@ -1,4 +1,4 @@
-//! The tensors of a network under OpenPCDet's names, out and in.
+//! Export and import of the tensors of a network under OpenPCDet's names.
 
 use crate::checkpoint::{HostTensor, HostValues, NamedTensors};
 use crate::{ModelError, detectors, layers};
@@ -11,7 +11,7 @@ pub fn reference_name(path: &str) -> String {
     detectors::tensor_name(&path.split('.').collect::<Vec<_>>())
 }
 
-/// Follows the path of field names on a walk through a network.
+/// The path of field names while visiting a network.
 #[derive(Default)]
 struct Path(Vec<String>);
 
@@ -68,7 +68,7 @@ pub fn to_named<M: Module>(network: &M) -> Result<NamedTensors, ModelError> {
     collect.error.map_or(Ok(collect.tensors), Err)
 }
 
-/// Names and shapes of what is learned; running statistics are not.
+/// Names and shapes of the learned parameters, without running statistics.
 pub fn trainable<M: Module>(network: &M) -> BTreeMap<String, Vec<usize>> {
     #[derive(Default)]
     struct Shapes(Path, BTreeMap<String, Vec<usize>>);
@@ -91,10 +91,10 @@ pub fn trainable<M: Module>(network: &M) -> BTreeMap<String, Vec<usize>> {
     shapes.1
 }
 
-/// The same network with the values of `tensors`. Counters may be missing (files that hold floats only), nothing else.
+/// The same network with the values of `tensors`. Only counters may be missing (files that hold floats only).
 ///
 /// # Errors
-/// A tensor that is missing, has another shape or type, or has no place in this network.
+/// A tensor that is missing, has another shape or type, or does not belong to this network.
 pub fn load_named<M: Module>(network: M, tensors: &NamedTensors) -> Result<M, ModelError> {
     struct Load<'a> {
         path: Path,
@@ -145,12 +145,12 @@ pub fn load_named<M: Module>(network: M, tensors: &NamedTensors) -> Result<M, Mo
         message += &format!("; and {} more", load.wrong.len() - 3);
     }
     if foreign > 0 {
-        message += &format!("; {foreign} tensors of the file have no place here");
+        message += &format!("; {foreign} tensors of the file do not belong to it");
     }
     Err(ModelError::Weights(message))
 }
 
-/// The gradient of every learned tensor by name, zero where none reached it.
+/// The gradient of every learned parameter by name; zero without a gradient.
 ///
 /// # Errors
 /// Tensors that are not f32.

@@ -16,7 +16,7 @@ pub fn read_safetensors(path: &Path) -> Result<NamedTensors, ModelError> {
     parse(&bytes).map_err(|message| file_error(path, message))
 }
 
-/// The texts that a safetensors file carries beside its tensors.
+/// The metadata of a safetensors file.
 ///
 /// # Errors
 /// A file that cannot be read, or whose header is damaged.
@@ -26,7 +26,7 @@ pub fn read_metadata(path: &Path) -> Result<BTreeMap<String, String>, ModelError
     Ok(header.metadata().iter().flatten().map(|(key, text)| (key.clone(), text.clone())).collect())
 }
 
-/// Writes tensors, and texts beside them, whole or not at all. The same content gives the same bytes.
+/// Writes tensors and metadata atomically. The same content gives the same bytes.
 ///
 /// # Errors
 /// A file that cannot be written; a tensor whose values do not fill its shape.
@@ -47,7 +47,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
             Dtype::F32 => NumberType::F32,
             Dtype::F64 => NumberType::F64,
             Dtype::I64 => NumberType::I64,
-            other => return Err(format!("tensor {name} holds {other:?}; only F32, F64 and I64 are read")),
+            other => return Err(format!("tensor {name} holds {other:?}; only F32, F64 and I64 are supported")),
         };
         let values = numbers.values(view.data());
         tensors.insert(name.into(), HostTensor { shape: view.shape().to_vec(), values });
@@ -56,11 +56,11 @@ pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
 }
 
 fn no_safetensors(error: &safetensors::SafeTensorError) -> String {
-    format!("is no safetensors file, or is damaged or truncated: {error}")
+    format!("is not a safetensors file, or is damaged or truncated: {error}")
 }
 
-/// The library would write the texts in the random order of a hash map; hence the header by hand: its length (u64), JSON padded to
-/// 8 bytes, then the values, the widest types first so that all lie aligned.
+/// Writes the header here, because the library writes metadata in the random order of a hash map: its length (u64),
+/// JSON padded to 8 bytes, then the values, widest types first so that all are aligned.
 fn serialize(tensors: &NamedTensors, metadata: &BTreeMap<String, String>) -> Result<Vec<u8>, String> {
     let mut ordered: Vec<(&str, &HostTensor)> = tensors.iter().map(|(name, tensor)| (name.as_str(), tensor)).collect();
     ordered.sort_by_key(|(_, tensor)| matches!(tensor.values, HostValues::F32(_)));

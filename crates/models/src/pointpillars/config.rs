@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PointPillarsConfig {
-    /// Pillars.
+    /// Size and number of the pillars.
     #[serde(default)]
     pub pillars: PillarsConfig,
-    /// Channels of the pillar feature net, one entry a layer; one layer is built.
+    /// Channels of the single layer of the pillar feature net.
     #[serde(default = "default_vfe_filters")]
     pub vfe_filters: usize,
     /// The 2D backbone.
@@ -25,7 +25,7 @@ pub struct PointPillarsConfig {
     /// Weights of the losses.
     #[serde(default)]
     pub loss: LossConfig,
-    /// From head outputs to boxes.
+    /// Score threshold and NMS.
     #[serde(default)]
     pub detection: DetectionConfig,
 }
@@ -40,11 +40,11 @@ fn default_vfe_filters() -> usize {
 pub struct PillarsConfig {
     /// Extent of a pillar along x, y and z, m.
     pub size_m: [f32; 3],
-    /// Points kept in a pillar, first come first kept.
+    /// Largest number of points of a pillar; the first points in the order of the cloud are kept.
     pub max_points: usize,
-    /// Pillars kept in a training frame.
+    /// Largest number of pillars of a training frame.
     pub max_train: usize,
-    /// Pillars kept otherwise.
+    /// Largest number of pillars of other frames.
     pub max_test: usize,
 }
 
@@ -54,7 +54,8 @@ impl Default for PillarsConfig {
     }
 }
 
-/// Blocks that shrink the bird's eye canvas, and transposed convolutions that bring them back to one size.
+/// Blocks of convolutions on the BEV canvas, and transposed convolutions that upsample their outputs to a common
+/// resolution.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BackboneConfig {
@@ -64,9 +65,9 @@ pub struct BackboneConfig {
     pub strides: Vec<usize>,
     /// Channels of a block.
     pub filters: Vec<usize>,
-    /// Stride (and kernel) of the transposed convolution behind each block.
+    /// Stride and kernel size of the transposed convolution after each block.
     pub upsample_strides: Vec<usize>,
-    /// Its channels.
+    /// Channels of the transposed convolutions.
     pub upsample_filters: Vec<usize>,
 }
 
@@ -82,20 +83,20 @@ impl Default for BackboneConfig {
     }
 }
 
-/// The direction classifier's constants.
+/// Constants of the direction classifier.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct HeadConfig {
-    /// Where the first direction bin begins, rad.
+    /// Start of the first direction bin, rad.
     pub dir_offset_rad: f32,
-    /// Offset of the period into which the regressed heading is folded.
+    /// Offset of the period into which the regressed heading is wrapped.
     pub dir_limit_offset: f32,
     /// Number of direction bins.
     pub dir_bins: usize,
 }
 
 impl Default for HeadConfig {
-    #[expect(clippy::approx_constant, reason = "the reference's own digits, not a quarter of pi")]
+    #[expect(clippy::approx_constant, reason = "rounded as in the reference")]
     fn default() -> Self {
         HeadConfig { dir_offset_rad: 0.78539, dir_limit_offset: 0.0, dir_bins: 2 }
     }
@@ -105,13 +106,13 @@ impl Default for HeadConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LossConfig {
-    /// Focal loss of the classes.
+    /// Weight of the focal loss of the classes.
     pub class_weight: f32,
-    /// Smooth L1 of the box residuals.
+    /// Weight of the smooth L1 loss of the box residuals.
     pub box_weight: f32,
-    /// Weights of the seven residuals.
+    /// Weights of the seven box residuals.
     pub code_weights: [f32; 7],
-    /// Cross entropy of the direction bins.
+    /// Weight of the cross entropy of the direction bins.
     pub direction_weight: f32,
 }
 
@@ -121,17 +122,17 @@ impl Default for LossConfig {
     }
 }
 
-/// From scores to final boxes.
+/// Score threshold and NMS.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DetectionConfig {
     /// Lowest score of a detection.
     pub score_threshold: f32,
-    /// BEV overlap above which the weaker of two boxes is dropped, whatever their classes.
+    /// BEV IoU above which the box with the lower score is suppressed, regardless of their classes.
     pub nms_iou: f32,
-    /// Boxes that enter the suppression.
+    /// Boxes with the highest scores that enter the NMS.
     pub nms_pre: usize,
-    /// Boxes that may leave it.
+    /// Largest number of boxes kept.
     pub nms_post: usize,
 }
 
@@ -148,14 +149,14 @@ impl PointPillarsConfig {
         let named: Vec<&String> = net.anchors.iter().map(|a| &a.class).collect();
         if named != detector.classes.iter().collect::<Vec<_>>() {
             return fail(format!(
-                "network.anchors name {named:?}, classes are {:?}: one anchor a class, in order",
+                "network.anchors name {named:?}, classes are {:?}: one entry a class in this order is needed",
                 detector.classes
             ));
         }
         for a in &net.anchors {
             if a.size_m.iter().any(|&s| !(s > 0.0 && s.is_finite())) || a.rotations_rad.is_empty() {
                 return fail(format!(
-                    "network.anchors of {}: sizes must be above 0 and there must be a rotation",
+                    "network.anchors of {}: sizes must be above 0 and at least one rotation is needed",
                     a.class
                 ));
             }
@@ -185,7 +186,9 @@ impl PointPillarsConfig {
             scales.push((scale, *up));
         }
         if scales.iter().any(|(scale, up)| scale % up != 0 || scale / up != scales[0].0 / scales[0].1) {
-            return fail("network.backbone: strides and upsample_strides bring the blocks to different sizes".into());
+            return fail(
+                "network.backbone: strides and upsample_strides give the blocks different output sizes".into(),
+            );
         }
         let p = &net.pillars;
         if p.size_m.iter().any(|&s| !(s > 0.0 && s.is_finite()))
@@ -197,7 +200,9 @@ impl PointPillarsConfig {
         }
         let [nx, ny, nz] = self.grid_size(detector);
         if nz != 1 {
-            return fail(format!("network.pillars.size_m: {nz} pillars above each other; z must span the whole range"));
+            return fail(format!(
+                "network.pillars.size_m: {nz} pillars along z; the pillar must span the whole z range"
+            ));
         }
         if nx % scale != 0 || ny % scale != 0 || nx == 0 || ny == 0 {
             return fail(format!(

@@ -1,4 +1,4 @@
-//! From a frame to what the network reads, and from what it says to detections. Runs on the host.
+//! Network input and targets of a frame, and decoding of the outputs. Runs on the host.
 
 use super::anchors::{AnchorClass, anchors};
 use super::config::{LossConfig, PointPillarsConfig};
@@ -18,13 +18,13 @@ pub struct Sample {
     pub id: String,
     /// Cells and point counts of its pillars.
     pub pillars: Pillars,
-    /// Decorated points, pillar after pillar, `[N, F]`.
+    /// Decorated points, sorted by pillar, `[N, F]`.
     pub features: Vec<f32>,
-    /// What each anchor should say; only in training.
+    /// Targets of the anchors; only in training.
     pub targets: Option<Targets>,
 }
 
-/// What [`Sample`]s are made with: grid, anchors, classes.
+/// Grid, anchors, classes and decoding options.
 #[derive(Clone, Debug)]
 pub struct Preparation {
     classes: Vec<String>,
@@ -39,7 +39,7 @@ pub struct Preparation {
 }
 
 impl Preparation {
-    /// For that detector.
+    /// From the configuration of a detector.
     pub fn new(config: &DetectorConfig, net: &PointPillarsConfig) -> Self {
         let range = config.range_m;
         let stride = net.backbone.strides[0] / net.backbone.upsample_strides[0];
@@ -87,17 +87,17 @@ impl Preparation {
         &self.anchors
     }
 
-    /// Height and width of the feature map that the anchors lie on.
+    /// Height and width of the feature map of the anchors.
     pub fn map(&self) -> [usize; 2] {
         self.map
     }
 
-    /// How detections are taken out of the predictions.
+    /// Options of the decoding.
     pub fn decode_options(&self) -> &DecodeOptions {
         &self.decode
     }
 
-    /// The network's input of a frame, with targets when it is to learn from it.
+    /// The network's input for a frame, with targets if `training`.
     ///
     /// # Errors
     /// A cloud with too few values a point.
@@ -130,7 +130,7 @@ impl Preparation {
         assign(&self.anchors, &self.anchor_classes, self.map, boxes, self.decode.dir_offset)
     }
 
-    /// Boxes of the detector's classes whose centre lies within the range, with their class counted from 1.
+    /// Boxes of the detector's classes whose centre lies within the range, with classes counted from 1.
     pub fn ground_truth(&self, objects: &[Object]) -> Vec<[f32; 8]> {
         let inside = |b: &Box3| {
             (0..3).all(|i| {
@@ -146,10 +146,10 @@ impl Preparation {
         objects.iter().filter_map(with_class).collect()
     }
 
-    /// Final boxes of a batch.
+    /// Detections of a batch.
     ///
     /// # Errors
-    /// Scores that are not numbers.
+    /// Outputs that are not finite.
     pub fn detections(&self, predictions: Predictions, batch: &[&Sample]) -> Result<Vec<Vec<Detection>>, ModelError> {
         let [b, anchors, classes] = predictions.cls.dims();
         let bins = predictions.dir.dims()[2];

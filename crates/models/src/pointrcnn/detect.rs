@@ -15,7 +15,7 @@ use geometry::{Box3, rotated_nms_first};
 /// Boxes of each sample, by falling score, and all refined regions.
 ///
 /// # Errors
-/// Scores or boxes that are not numbers.
+/// Scores or boxes that are not finite.
 pub fn detections(
     network: &PointRcnn,
     batch: &[&Sample],
@@ -62,7 +62,7 @@ pub fn detections(
             bbox: Box3::from_array(boxes[i].map(f64::from)),
             score,
         };
-        // A size is an exponential: early in a training one can be beyond all numbers. No object is that large.
+        // Sizes are exponentials, which may overflow early in training. Such boxes are dropped.
         let is_number = |&(i, _): &(usize, f32)| boxes[i].iter().all(|v| v.is_finite());
         let kept = suppress(&boxes, cls, &net.detection);
         let all = cls.iter().map(|&logit| sigmoid(logit)).enumerate();
@@ -102,12 +102,12 @@ pub fn final_boxes(rois: &[[f32; 7]], reg: &[f32]) -> Vec<[f32; 7]> {
     rois.iter().zip(reg.as_chunks::<7>().0).map(refined).collect()
 }
 
-/// Regions that stay and their scores, by falling score: sigmoid, threshold, the `pre` best, rotated suppression whatever the class, the first
-/// `post` of what stays.
+/// Indices and scores of the regions kept, by falling score: sigmoid, score threshold, the `pre` best, class-agnostic
+/// rotated NMS, the first `post`.
 pub fn suppress(boxes: &[[f32; 7]], logits: &[f32], config: &RcnnDetectionConfig) -> Vec<(usize, f32)> {
     let scores = logits.iter().map(|&logit| sigmoid(logit));
     let mut best: Vec<(usize, f32)> = scores.enumerate().filter(|(_, s)| *s >= config.score_threshold).collect();
-    best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay by region
+    best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay ordered by region
     best.truncate(config.suppression.pre);
     let solid: Vec<Box3> = best.iter().map(|&(i, _)| Box3::from_array(boxes[i].map(f64::from))).collect();
     let scores: Vec<f32> = best.iter().map(|&(_, score)| score).collect();
