@@ -16,6 +16,7 @@ mod built_in;
 mod detector;
 mod detectors;
 mod error;
+mod inference;
 mod layer_features;
 
 pub use architecture::{Architecture, NetworkInput};
@@ -23,5 +24,6 @@ pub use built_in::{detector_text, find_detector};
 pub use detector::{Detector, Losses, Prediction, Preparer, parameter_count};
 pub use detectors::{Network, Sample};
 pub use error::ModelError;
+pub use inference::{inference_samples, predict_frames, predict_samples};
 pub use layer_features::LayerFeatures;
 pub use named::reference_name;
