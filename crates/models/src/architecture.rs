@@ -9,8 +9,8 @@ use data::{Frame, Stream};
 
 /// A kind of detector. The type that implements it is the network, a burn module whose field names are OpenPCDet's.
 ///
-/// [`crate::detectors`] lists all of them; trainer, prediction, parity check, doctor and benchmark reach them through
-/// that list alone.
+/// The list `detectors!` in `lib.rs` has all of them. Trainer, prediction, parity check, doctor and benchmark reach them
+/// through this list only.
 pub trait Architecture: Module {
     /// Sizes of the network: the table `[network]` of a detector's TOML without its key `kind`.
     type Config;

@@ -1,6 +1,6 @@
 //! The configuration of a detector: one TOML file in `configs/detectors`.
 
-pub use crate::detectors::NetworkConfig;
+pub use crate::NetworkConfig;
 
 use crate::ModelError;
 use data::augment::AugmentConfig;

@@ -2,9 +2,8 @@
 
 use crate::checkpoint::NamedTensors;
 use crate::config::DetectorConfig;
-use crate::detectors::{Network, Preparation, Sample};
 use crate::layers::Mode;
-use crate::{LayerFeatures, ModelError, named};
+use crate::{LayerFeatures, ModelError, Network, Preparation, Sample, named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use data::{Detection, Frame, Stream, stream};

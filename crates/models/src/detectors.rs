@@ -1,46 +1,50 @@
-//! The registry of detectors.
-//!
-//! A new detector is a folder of this crate whose network implements [`Architecture`], its TOML files in
-//! `configs/detectors`, and an entry in the list at the end of this file. Everything else in the program reaches
-//! detectors through the types that the list generates.
+//! The registry of detectors: the macro that makes the list of detectors in `lib.rs` into types.
 
-use crate::architecture::{Architecture, NetworkInput};
-use crate::config::{AnchorConfig, DetectorConfig};
-use crate::layers::Mode;
-use crate::{LayerFeatures, Losses, ModelError, Prediction};
-use burn::module::Module;
-use burn::tensor::Device;
-use data::{Frame, Stream};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use crate::{ModelError, Sample};
 
-/// Defines the types that hold a detector of any kind, one variant an entry. The variant's name in lower case is the
-/// `kind` in a TOML.
+/// The samples of one kind in a batch; an error if there is another kind in it.
+macro_rules! of_kind {
+    ($batch:expr, $kind:ident) => {
+        $batch
+            .iter()
+            .map(|sample| match sample {
+                Sample::$kind(sample) => Ok(sample),
+                _ => Err(detectors::other_kind()),
+            })
+            .collect::<Result<Vec<_>, ModelError>>()
+    };
+}
+
+/// Declares the folder of each detector, and the types that hold a detector of any kind with one variant an entry:
+/// `Name(folder::Network),`. The network implements [`crate::Architecture`]. The name in lower case is the `kind` in a
+/// TOML.
 macro_rules! detectors {
-    ($($(#[$doc:meta])* $kind:ident($network:path),)+) => {
+    ($($(#[$doc:meta])* $kind:ident($folder:ident::$network:ident),)+) => {
+        $(pub mod $folder;)+
+
         /// Which network, and its sizes.
-        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+        #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
         #[serde(tag = "kind", rename_all = "lowercase")]
         pub enum NetworkConfig {
-            $($(#[$doc])* $kind(<$network as Architecture>::Config),)+
+            $($(#[$doc])* $kind(<$folder::$network as Architecture>::Config),)+
         }
 
         /// The trainable part of a detector.
-        #[derive(Module, Debug)]
+        #[derive(burn::module::Module, Debug)]
         pub enum Network {
-            $($(#[$doc])* $kind($network),)+
+            $($(#[$doc])* $kind($folder::$network),)+
         }
 
         /// One frame, ready for the network.
         #[derive(Clone, Debug)]
         pub enum Sample {
-            $($(#[$doc])* $kind(<$network as Architecture>::Sample),)+
+            $($(#[$doc])* $kind(<$folder::$network as Architecture>::Sample),)+
         }
 
         /// What samples are made with.
         #[derive(Clone, Debug)]
         pub(crate) enum Preparation {
-            $($kind(Box<<$network as Architecture>::Preparation>),)+
+            $($kind(Box<<$folder::$network as Architecture>::Preparation>),)+
         }
 
         impl NetworkConfig {
@@ -48,36 +52,36 @@ macro_rules! detectors {
             ///
             /// # Errors
             /// A message that names the key.
-            pub fn check(&self, detector: &DetectorConfig) -> Result<(), String> {
+            pub fn check(&self, detector: &config::DetectorConfig) -> Result<(), String> {
                 match self {
-                    $(NetworkConfig::$kind(net) => <$network>::check(net, detector),)+
+                    $(NetworkConfig::$kind(net) => $folder::$network::check(net, detector),)+
                 }
             }
 
             /// The anchors, one entry a class; none where boxes do not start from anchors.
-            pub fn anchors(&self) -> &[AnchorConfig] {
+            pub fn anchors(&self) -> &[config::AnchorConfig] {
                 match self {
-                    $(NetworkConfig::$kind(net) => <$network>::anchors(net),)+
+                    $(NetworkConfig::$kind(net) => $folder::$network::anchors(net),)+
                 }
             }
 
             /// Whether a second stage refines regions of interest. Only then [`Prediction::regions`] is filled.
             pub fn is_two_stage(&self) -> bool {
                 match self {
-                    $(NetworkConfig::$kind(_) => <$network>::TWO_STAGE,)+
+                    $(NetworkConfig::$kind(_) => $folder::$network::TWO_STAGE,)+
                 }
             }
 
             /// Training steps after which the network has overfitted a few frames.
             pub fn overfit_steps(&self) -> usize {
                 match self {
-                    $(NetworkConfig::$kind(_) => <$network>::OVERFIT_STEPS,)+
+                    $(NetworkConfig::$kind(_) => $folder::$network::OVERFIT_STEPS,)+
                 }
             }
         }
 
         impl Sample {
-            fn input(&self) -> &dyn NetworkInput {
+            pub(crate) fn input(&self) -> &dyn NetworkInput {
                 match self {
                     $(Sample::$kind(sample) => sample,)+
                 }
@@ -85,32 +89,38 @@ macro_rules! detectors {
         }
 
         impl Preparation {
-            pub(crate) fn new(detector: &DetectorConfig) -> Self {
+            pub(crate) fn new(detector: &config::DetectorConfig) -> Self {
                 match &detector.network {
                     $(NetworkConfig::$kind(net) => {
-                        Preparation::$kind(Box::new(<$network>::preparation(detector, net)))
+                        Preparation::$kind(Box::new($folder::$network::preparation(detector, net)))
                     })+
                 }
             }
 
             pub(crate) fn sample(
                 &self,
-                frame: &Frame,
+                frame: &data::Frame,
                 training: bool,
-                stream: &mut Stream,
+                stream: &mut data::Stream,
             ) -> Result<Sample, ModelError> {
                 Ok(match self {
                     $(Preparation::$kind(preparation) => {
-                        Sample::$kind(<$network>::sample(preparation, frame, training, stream)?)
+                        Sample::$kind($folder::$network::sample(preparation, frame, training, stream)?)
                     })+
                 })
             }
         }
 
         impl Network {
-            pub(crate) fn fresh(detector: &DetectorConfig, seed: u64, device: &Device) -> Self {
+            pub(crate) fn fresh(
+                detector: &config::DetectorConfig,
+                seed: u64,
+                device: &burn::tensor::Device,
+            ) -> Self {
                 match &detector.network {
-                    $(NetworkConfig::$kind(net) => Network::$kind(<$network>::fresh(detector, net, seed, device)),)+
+                    $(NetworkConfig::$kind(net) => {
+                        Network::$kind($folder::$network::fresh(detector, net, seed, device))
+                    })+
                 }
             }
 
@@ -118,14 +128,14 @@ macro_rules! detectors {
                 &self,
                 preparation: &Preparation,
                 batch: &[Sample],
-                mode: Mode,
+                mode: layers::Mode,
                 on_stage: &mut dyn FnMut(&'static str),
             ) -> Result<Losses, ModelError> {
                 match (self, preparation) {
                     $((Network::$kind(network), Preparation::$kind(preparation)) => {
                         network.losses(preparation, &of_kind!(batch, $kind)?, mode, on_stage)
                     })+
-                    _ => Err(other_kind()),
+                    _ => Err(detectors::other_kind()),
                 }
             }
 
@@ -138,7 +148,7 @@ macro_rules! detectors {
                     $((Network::$kind(network), Preparation::$kind(preparation)) => {
                         network.predictions(preparation, &of_kind!(batch, $kind)?)
                     })+
-                    _ => Err(other_kind()),
+                    _ => Err(detectors::other_kind()),
                 }
             }
 
@@ -151,7 +161,7 @@ macro_rules! detectors {
             pub(crate) fn layer_features(&self, sample: &Sample) -> Result<Vec<LayerFeatures>, ModelError> {
                 match (self, sample) {
                     $((Network::$kind(network), Sample::$kind(sample)) => network.layer_features(sample),)+
-                    _ => Err(other_kind()),
+                    _ => Err(detectors::other_kind()),
                 }
             }
         }
@@ -160,27 +170,15 @@ macro_rules! detectors {
         /// path without such a part stays as it is.
         pub(crate) fn tensor_name(path: &[&str]) -> String {
             match path {
-                $([kind, rest @ ..] if *kind == stringify!($kind) => <$network>::tensor_name(rest),)+
+                $([kind, rest @ ..] if *kind == stringify!($kind) => $folder::$network::tensor_name(rest),)+
                 _ => path.join("."),
             }
         }
     };
 }
 
-/// The samples of one kind in a batch; an error if there is another kind in it.
-macro_rules! of_kind {
-    ($batch:expr, $kind:ident) => {
-        $batch
-            .iter()
-            .map(|sample| match sample {
-                Sample::$kind(sample) => Ok(sample),
-                _ => Err(other_kind()),
-            })
-            .collect::<Result<Vec<_>, ModelError>>()
-    };
-}
-
-fn other_kind() -> ModelError {
+/// The error of samples or networks of different kinds.
+pub(crate) fn other_kind() -> ModelError {
     ModelError::Tensor("the samples were prepared for another kind of network".into())
 }
 
@@ -199,11 +197,4 @@ impl Sample {
     pub fn size(&self) -> [usize; 2] {
         self.input().size()
     }
-}
-
-detectors! {
-    /// PointPillars (Lang et al. 2019) as OpenPCDet builds it.
-    PointPillars(crate::pointpillars::PointPillars),
-    /// PointRCNN (Shi et al. 2019) as OpenPCDet builds it.
-    PointRcnn(crate::pointrcnn::PointRcnn),
 }

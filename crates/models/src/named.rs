@@ -1,14 +1,14 @@
 //! Export and import of the tensors of a network under OpenPCDet's names.
 
 use crate::checkpoint::{HostTensor, HostValues, NamedTensors};
-use crate::{ModelError, detectors, layers};
+use crate::{ModelError, layers};
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 use std::collections::BTreeMap;
 
 /// OpenPCDet's name of the tensor at a path of field names, `PointPillars.vfe.weight`.
 pub fn reference_name(path: &str) -> String {
-    detectors::tensor_name(&path.split('.').collect::<Vec<_>>())
+    crate::tensor_name(&path.split('.').collect::<Vec<_>>())
 }
 
 /// The path of field names while visiting a network.

@@ -1,6 +1,7 @@
 //! The manifest of a folder of reference numbers, and the detector that it describes.
 
-use super::network::{DETECTORS, DetectorChecks};
+use super::DETECTORS;
+use super::network::DetectorChecks;
 use anyhow::{Context, Result};
 use models::config::DetectorConfig;
 use serde::Deserialize;

@@ -1,8 +1,8 @@
 //! A network against a folder of reference numbers: what all networks have in common. Their stages are in files of their own.
 
 use super::manifest::Manifest;
+use super::recipe;
 use super::reference::{ReferenceFile, Row, numbers};
-use super::{pointpillars, pointrcnn, recipe};
 use anyhow::{Context, Result};
 use burn::tensor::{Device, Tensor};
 use data::{Cloud, Frame};
@@ -32,9 +32,6 @@ pub struct DetectorChecks {
     /// Every stage of a forward pass in training mode; the losses still have their graph.
     pub train: fn(&mut Case, &Detector) -> Result<Losses>,
 }
-
-/// All detectors that reference numbers are compared for.
-pub const DETECTORS: &[DetectorChecks] = &[pointpillars::CHECKS, pointrcnn::CHECKS];
 
 /// Compares every file of the folder.
 pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
