@@ -9,12 +9,12 @@ use data::{Frame, Stream};
 
 /// A kind of detector. The type that implements it is the network, a burn module whose field names are OpenPCDet's.
 ///
-/// The list `detectors!` in `lib.rs` has all of them. Trainer, prediction, parity check, doctor and benchmark reach them
-/// through this list only.
+/// The list `detectors!` in `lib.rs` has all of them. Trainer, prediction, parity check, doctor and benchmark reach
+/// them through this list only.
 pub trait Architecture: Module {
     /// Sizes of the network: the table `[network]` of a detector's TOML without its key `kind`.
     type Config;
-    /// What is computed once from the configuration, to make samples and to decode predictions.
+    /// Data computed once from the configuration, for making samples and decoding predictions.
     type Preparation;
     /// One frame, ready for the network.
     type Sample: NetworkInput;
@@ -94,7 +94,7 @@ pub trait Architecture: Module {
     fn tensor_name(path: &[&str]) -> String;
 }
 
-/// What every kind of sample knows of its frame.
+/// Properties that every kind of sample has.
 pub trait NetworkInput {
     /// Id of the frame.
     fn id(&self) -> &str;

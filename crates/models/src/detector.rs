@@ -15,7 +15,7 @@ pub struct Preparer {
 }
 
 impl Preparer {
-    /// For that detector.
+    /// For a detector's configuration.
     pub fn new(config: &DetectorConfig) -> Self {
         Preparer { preparation: Preparation::new(config) }
     }
@@ -40,13 +40,13 @@ impl Preparer {
 /// The losses of a batch, weighted.
 #[derive(Clone, Debug)]
 pub struct Losses {
-    /// What is minimised, `[1]`.
+    /// The total loss, `[1]`.
     pub total: Tensor<1>,
-    /// Its summands by name, `[1]` each.
+    /// Its terms by name, `[1]` each.
     pub parts: Vec<(&'static str, Tensor<1>)>,
 }
 
-/// What is found in a frame.
+/// Detections of a frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Prediction {
     /// Boxes by falling score.
@@ -72,7 +72,7 @@ impl Detector {
         Detector { network, config: config.clone(), preparation: Preparation::new(config) }
     }
 
-    /// What it was built from.
+    /// The configuration it was built from.
     pub fn config(&self) -> &DetectorConfig {
         &self.config
     }
@@ -113,7 +113,7 @@ impl Detector {
     /// Boxes of each sample, by falling score, in the LiDAR frame.
     ///
     /// # Errors
-    /// Scores that are not numbers, or samples of another kind of network.
+    /// Scores that are not finite, or samples of another kind of network.
     pub fn predict(&self, batch: &[Sample]) -> Result<Vec<Vec<Detection>>, ModelError> {
         Ok(self.predict_with_regions(batch)?.into_iter().map(|found| found.detections).collect())
     }
@@ -170,7 +170,7 @@ impl Detector {
     }
 }
 
-/// Number of learned values.
+/// Number of learned parameters.
 pub fn parameter_count<M: Module>(network: &M) -> usize {
     named::trainable(network).values().map(|shape| shape.iter().product::<usize>()).sum()
 }

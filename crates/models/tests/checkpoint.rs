@@ -161,7 +161,7 @@ fn sizes_that_the_file_does_not_have() {
 }
 
 #[test]
-fn what_is_no_checkpoint_of_weights() {
+fn files_without_weights_are_refused() {
     let tensor = |kind| Script::default().text("w").tensor(kind, "0", 2, 0, &[2], &[1]);
     assert!(parse(&legacy(tensor("FloatStorage"), &[("0", &[0; 8], 2)])).is_ok());
     assert_refused(&legacy(tensor("HalfStorage"), &[("0", &[0; 4], 2)]), "tensor w lies in a HalfStorage");

@@ -341,7 +341,7 @@ fn decoding_is_the_inverse_of_the_targets() {
 }
 
 #[test]
-fn the_reference_tensors_are_what_they_say() {
+fn reference_tensors_have_the_expected_types() {
     let tensor: &HostTensor = &read(&own("operators/pillars.safetensors"))["points"];
     assert_eq!(tensor.shape, [600, 4]);
 }

@@ -11,7 +11,7 @@ pub enum TrainError {
     /// A file of the data set, or any file that cannot be read or written.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// The network, its weights or a frame that it cannot take.
+    /// The network, its weights or a frame that it cannot read.
     #[error(transparent)]
     Model(#[from] ModelError),
     /// A file of the run folder, or the folder as a whole.
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lost_device_ends_a_run_with_a_message() {
+    fn a_lost_device_ends_a_run_with_an_error() {
         let lost = without_panic::<()>(7, || panic!("device {} was lost", 0)).unwrap_err().to_string();
         assert!(
             lost.starts_with("step 7: the computation failed: device 0 was lost. The run's last checkpoint"),

@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_and_hashes_alike() {
+    fn a_written_configuration_is_read_with_the_same_hash() {
         let config = RunConfig::from_table(tiny_table(Path::new("/data"))).unwrap();
         let again = RunConfig::from_table(config.to_table()).unwrap();
         assert_eq!((&config, config.sha256()), (&again, again.sha256()));

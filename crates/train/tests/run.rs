@@ -220,7 +220,7 @@ fn the_folder_records_provenance_and_metadata() {
 }
 
 #[test]
-fn a_run_begins_with_the_weights_it_is_given_and_refuses_those_of_another_network() {
+fn initial_weights_are_loaded_and_must_fit_the_network() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let first = dir.path().join("first");

@@ -130,7 +130,7 @@ fn the_result_is_bit_equal_for_any_number_of_threads() {
 }
 
 #[test]
-fn without_pillars_nothing_comes_out() {
+fn no_pillars_give_an_empty_output() {
     let case = Case::new(10, 64, 32, vec![]);
     let ([out, dw, dgamma, dbeta], state) = case.run();
     assert!(out.is_empty());

@@ -10,7 +10,7 @@ const PLACES: usize = 64;
 /// For each of `places` destinations the sum of the rows with that `source`, in their order. `out`, `[places,
 /// channels]`, is overwritten.
 pub(super) fn add_up(rows: &[f32], source: &[u32], places: usize, channels: usize, out: &mut Vec<f32>) {
-    // The rows sorted by place.
+    // The rows sorted by destination.
     let mut begin = vec![0usize; places + 1];
     for &place in source {
         begin[place as usize + 1] += 1;

@@ -22,7 +22,7 @@ pub fn read_safetensors(path: &Path) -> Result<NamedTensors, ModelError> {
 /// A file that cannot be read, or whose header is damaged.
 pub fn read_metadata(path: &Path) -> Result<BTreeMap<String, String>, ModelError> {
     let bytes = fs_err::read(path).map_err(data::DataError::from)?;
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| file_error(path, no_safetensors(&e)))?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| file_error(path, not_safetensors(&e)))?;
     Ok(header.metadata().iter().flatten().map(|(key, text)| (key.clone(), text.clone())).collect())
 }
 
@@ -40,7 +40,7 @@ pub fn write_safetensors(
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
-    let file = SafeTensors::deserialize(bytes).map_err(|e| no_safetensors(&e))?;
+    let file = SafeTensors::deserialize(bytes).map_err(|e| not_safetensors(&e))?;
     let mut tensors = NamedTensors::new();
     for (name, view) in file.iter() {
         let numbers = match view.dtype() {
@@ -55,7 +55,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
     Ok(tensors)
 }
 
-fn no_safetensors(error: &safetensors::SafeTensorError) -> String {
+fn not_safetensors(error: &safetensors::SafeTensorError) -> String {
     format!("is not a safetensors file, or is damaged or truncated: {error}")
 }
 
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
+    fn written_files_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("last.safetensors");
         let texts: BTreeMap<String, String> =

@@ -261,7 +261,7 @@ fn focal_loss_of_all_anchors() {
 }
 
 #[test]
-fn what_is_no_number_comes_out() {
+fn nan_propagates() {
     let mut x = values(2 * 3 * 4 * 4, 13);
     x[20] = f32::NAN;
     let x = Tensor::<4>::from_data(TensorData::new(x, [2, 3, 4, 4]), &device());

@@ -239,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_that_counts_three_times_is_three_rows() {
+    fn multiplicity_3_equals_three_rows() {
         let device = Device::flex().autodiff();
         let rows: Vec<f32> = (0..12).map(|i| ((i * 29 % 17) as f32 - 8.0) / 4.0).collect();
         let counts = [1usize, 3, 2, 1];

@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_size_beyond_all_numbers_is_no_object() {
+    fn boxes_of_infinite_size_are_dropped() {
         let (mut boxes, dir, anchors) = outputs(2);
         boxes[7 + 3] = 200.0; // its exponential overflows
         let found = decode(&[2.0, 3.0], &boxes, &dir, &anchors, &options()).unwrap();
@@ -180,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_an_error() {
+    fn outputs_that_are_not_finite_are_an_error() {
         let (boxes, dir, anchors) = outputs(2);
         let of = |cls: [f32; 2], boxes: &[f32], dir: &[f32]| decode(&cls, boxes, dir, &anchors, &options());
         assert_eq!(of([-5.0, f32::NAN], &boxes, &dir), Err(NonFinite { anchor: 1, output: "class score" }));

@@ -268,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_out_of_reach_takes_no_anchor() {
+    fn a_box_outside_the_map_matches_no_anchor() {
         let far = [100.0, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0, 1.0];
         let flat = [4.0, 0.0, -1.0, 0.0, 1.6, 1.5, 0.0, 1.0];
         let broken = [f32::NAN, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0, 1.0];

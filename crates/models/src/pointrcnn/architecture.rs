@@ -16,7 +16,7 @@ impl Architecture for PointRcnn {
 
     const TWO_STAGE: bool = true;
 
-    /// The second stage learns from a few dozen regions a frame, and each step reads other points of it.
+    /// The second stage is trained on a few dozen regions a frame, and each step samples different points.
     const OVERFIT_STEPS: usize = 3600;
 
     fn check(net: &PointRcnnConfig, detector: &DetectorConfig) -> Result<(), String> {

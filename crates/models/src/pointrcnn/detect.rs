@@ -120,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_region_s_residual_is_in_its_own_frame() {
+    fn residuals_are_in_the_region_frame() {
         let roi = [10.0, 5.0, -1.0, 4.0, 3.0, 1.5, std::f32::consts::FRAC_PI_2];
         let found = final_boxes(&[roi], &[0.2, 0.0, 0.1, 0.0, 0.0, 0.0, 0.1]);
         let want = [10.0, 6.0, -0.85, 4.0, 3.0, 1.5, std::f32::consts::FRAC_PI_2 + 0.1];

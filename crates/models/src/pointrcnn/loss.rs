@@ -164,7 +164,7 @@ mod tests {
     use crate::layers::host;
 
     #[test]
-    fn no_positive_and_no_region_that_counts() {
+    fn no_positive_point_and_only_ignored_regions() {
         let device = Device::flex().autodiff();
         let predictions =
             PointPredictions { cls: Tensor::zeros([4, 2], &device), boxes: Tensor::zeros([4, POINT_CODE], &device) };
