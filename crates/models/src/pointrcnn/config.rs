@@ -1,6 +1,6 @@
 //! Sizes of PointRCNN.
 
-use super::DetectorConfig;
+use crate::config::DetectorConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -8,42 +8,42 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PointRcnnConfig {
-    /// How many points the network reads, and which.
+    /// Number and selection of the input points.
     #[serde(default)]
     pub sampling: SamplingConfig,
     /// Set abstraction, finest level first.
     #[serde(default = "default_levels")]
     pub levels: Vec<LevelConfig>,
-    /// Channels of the feature propagation, one list a level, finest first.
+    /// Channels of the feature propagation layers, one list a level, finest first.
     #[serde(default = "default_propagation")]
     pub propagation: Vec<Vec<usize>>,
-    /// Classes and boxes of single points.
+    /// The head of the first stage.
     pub point_head: PointHeadConfig,
-    /// From points to regions of interest.
+    /// From point predictions to regions of interest.
     #[serde(default)]
     pub proposals: ProposalsConfig,
     /// The second stage.
     #[serde(default)]
     pub roi_head: RoiHeadConfig,
-    /// Which regions the second stage learns from.
+    /// Sampling of the regions that the second stage is trained on.
     #[serde(default)]
     pub roi_sampling: RoiSamplingConfig,
     /// Weights of the losses.
     #[serde(default)]
     pub loss: PointRcnnLossConfig,
-    /// From scores to final boxes.
+    /// Score threshold and NMS of the second stage.
     #[serde(default)]
     pub detection: RcnnDetectionConfig,
 }
 
-/// Points that are read of a cloud.
+/// Selection of the input points.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SamplingConfig {
-    /// Number of points; a smaller cloud is filled up with repetitions.
+    /// Number of points; points of a smaller cloud are repeated.
     pub points: usize,
-    /// Points at least this far from the sensor are all kept, near ones drawn at random, m. When there are too many far ones, all are drawn
-    /// alike.
+    /// All points at least this far from the sensor are kept and nearer ones are sampled, m. If there are too many far
+    /// points, all points are sampled.
     pub far_m: f32,
 }
 
@@ -59,7 +59,7 @@ impl Default for SamplingConfig {
 pub struct LevelConfig {
     /// Points kept by farthest point sampling.
     pub centers: usize,
-    /// Groupings around each of them.
+    /// Groupings around each of these centres.
     pub scales: Vec<ScaleConfig>,
 }
 
@@ -67,9 +67,9 @@ pub struct LevelConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ScaleConfig {
-    /// Neighbours are nearer than this, m.
+    /// Radius of the ball query, m.
     pub radius_m: f32,
-    /// Neighbours at most.
+    /// Largest number of neighbours.
     pub samples: usize,
     /// Channels of the layers.
     pub filters: Vec<usize>,
@@ -97,19 +97,19 @@ fn default_propagation() -> Vec<Vec<usize>> {
     vec![vec![128, 128], vec![256, 256], vec![512, 512], vec![512, 512]]
 }
 
-/// The first stage's head.
+/// The head of the first stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PointHeadConfig {
     /// Mean sizes, one entry a class, in the order of `classes`.
     pub mean_sizes: Vec<MeanSizeConfig>,
-    /// Channels of the hidden layers that lead to classes.
+    /// Channels of the hidden layers of the class branch.
     #[serde(default = "default_hidden")]
     pub class_filters: [usize; 2],
-    /// Channels of the hidden layers that lead to boxes.
+    /// Channels of the hidden layers of the box branch.
     #[serde(default = "default_hidden")]
     pub box_filters: [usize; 2],
-    /// Points outside of a box but inside of one that is larger by this in total do not count, m.
+    /// Points outside a box but inside the box enlarged by this in total are ignored, m.
     #[serde(default = "default_extra_width")]
     pub extra_width_m: [f32; 3],
 }
@@ -132,13 +132,13 @@ pub struct MeanSizeConfig {
     pub size_m: [f32; 3],
 }
 
-/// Regions of interest out of the boxes of single points.
+/// NMS of the boxes of the first stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ProposalsConfig {
-    /// In training.
+    /// NMS in training.
     pub train: SuppressionConfig,
-    /// Otherwise.
+    /// NMS otherwise.
     pub test: SuppressionConfig,
 }
 
@@ -151,37 +151,37 @@ impl Default for ProposalsConfig {
     }
 }
 
-/// Suppression of overlapping boxes.
+/// Rotated NMS.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SuppressionConfig {
-    /// BEV overlap above which the weaker of two boxes is dropped, whatever their classes.
+    /// BEV IoU above which the box with the lower score is suppressed, regardless of their classes.
     pub iou: f32,
-    /// Boxes with the highest scores that enter.
+    /// Boxes with the highest scores that enter the NMS.
     pub pre: usize,
-    /// Boxes that may leave.
+    /// Largest number of boxes kept.
     pub post: usize,
 }
 
-/// The second stage: points of a region, refined.
+/// The second stage, which refines regions of interest.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RoiHeadConfig {
-    /// Points of a region; fewer are repeated.
+    /// Number of points sampled in a region; fewer points are repeated.
     pub points: usize,
-    /// Regions are larger by this in total when their points are taken, m.
+    /// Regions are enlarged by this in total when their points are sampled, m.
     pub extra_width_m: [f32; 3],
     /// Distances from the sensor are divided by this, m.
     pub depth_normalizer_m: f32,
-    /// Channels of the layers that read a point's position, score and distance.
+    /// Channels of the layers on position, score and distance of a point.
     pub xyz_filters: [usize; 2],
     /// Set abstraction inside a region, finest level first.
     pub levels: Vec<RoiLevelConfig>,
-    /// Channels of the layers over all that is left of a region.
+    /// Channels of the set abstraction over the whole region.
     pub global_filters: Vec<usize>,
-    /// Channels of the hidden layers that lead to the score.
+    /// Channels of the hidden layers of the score branch.
     pub class_filters: [usize; 2],
-    /// Channels of the hidden layers that lead to the box.
+    /// Channels of the hidden layers of the box branch.
     pub box_filters: [usize; 2],
 }
 
@@ -209,31 +209,31 @@ impl Default for RoiHeadConfig {
 pub struct RoiLevelConfig {
     /// Points kept by farthest point sampling.
     pub centers: usize,
-    /// Neighbours are nearer than this, m.
+    /// Radius of the ball query, m.
     pub radius_m: f32,
-    /// Neighbours at most.
+    /// Largest number of neighbours.
     pub samples: usize,
     /// Channels of the layers.
     pub filters: Vec<usize>,
 }
 
-/// How regions are drawn and labelled in training. Overlaps are 3D, with the ground truth of the region's class.
+/// Sampling and labels of regions in training. Overlaps are 3D IoU with the ground truth of the region's class.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RoiSamplingConfig {
-    /// Regions of a frame.
+    /// Number of regions a frame.
     pub regions: usize,
-    /// Share that may be foreground.
+    /// Largest fraction of foreground regions.
     pub foreground_share: f32,
-    /// Overlap above which a region is an object.
+    /// Overlap above which a region is labelled foreground.
     pub class_foreground: f32,
-    /// Overlap up to which it is background; between the two it does not count.
+    /// Overlap up to which it is labelled background; between the two thresholds it is ignored.
     pub class_background: f32,
-    /// Overlap above which its box is learned.
+    /// Overlap above which its box is regressed.
     pub box_foreground: f32,
-    /// Overlap below which background is easy.
+    /// Overlap below which background is called easy.
     pub easy_background: f32,
-    /// Share of the background that is hard.
+    /// Fraction of hard regions in the background.
     pub hard_share: f32,
 }
 
@@ -255,19 +255,19 @@ impl Default for RoiSamplingConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PointRcnnLossConfig {
-    /// Focal loss of the points' classes.
+    /// Weight of the focal loss of the points' classes.
     pub point_class_weight: f32,
-    /// Smooth L1 of the points' boxes.
+    /// Weight of the smooth L1 loss of the points' boxes.
     pub point_box_weight: f32,
-    /// Weights of their eight codes.
+    /// Weights of the eight codes of a point.
     pub point_code_weights: [f32; 8],
-    /// Cross entropy of the regions.
+    /// Weight of the cross entropy of the regions.
     pub roi_class_weight: f32,
-    /// Smooth L1 of the regions' boxes.
+    /// Weight of the smooth L1 loss of the regions' boxes.
     pub roi_box_weight: f32,
-    /// Weights of their seven residuals.
+    /// Weights of the seven residuals of a region.
     pub roi_code_weights: [f32; 7],
-    /// Smooth L1 of the corners' distances; 0 leaves it out.
+    /// Weight of the corner loss; 0 disables it.
     pub corner_weight: f32,
 }
 
@@ -285,13 +285,13 @@ impl Default for PointRcnnLossConfig {
     }
 }
 
-/// From the second stage's scores to final boxes.
+/// Score threshold and NMS of the second stage.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RcnnDetectionConfig {
     /// Lowest score of a detection.
     pub score_threshold: f32,
-    /// Suppression of the refined boxes.
+    /// NMS of the refined boxes.
     pub suppression: SuppressionConfig,
 }
 
@@ -308,7 +308,7 @@ impl PointRcnnConfig {
         let named: Vec<&String> = self.point_head.mean_sizes.iter().map(|m| &m.class).collect();
         if named != detector.classes.iter().collect::<Vec<_>>() {
             return Err(format!(
-                "network.point_head.mean_sizes name {named:?}, classes are {:?}: one size a class, in order",
+                "network.point_head.mean_sizes name {named:?}, classes are {:?}: one entry a class in this order is needed",
                 detector.classes
             ));
         }
@@ -322,7 +322,7 @@ impl PointRcnnConfig {
         for (i, level) in levels.iter().enumerate() {
             if level.centers == 0 || level.centers > above {
                 return Err(format!(
-                    "network.levels[{i}].centers must be above 0 and at most {above}, the points above it"
+                    "network.levels[{i}].centers must be above 0 and at most {above}, the number of points of the level before"
                 ));
             }
             above = level.centers;
@@ -359,7 +359,7 @@ impl PointRcnnConfig {
             ),
             (some(&head.global_filters), "roi_head.global_filters must be above 0"),
             (sampler.regions > 0, "roi_sampling.regions must be above 0"),
-            (shares.iter().all(|s| (0.0..=1.0).contains(s)), "roi_sampling: shares lie between 0 and 1"),
+            (shares.iter().all(|s| (0.0..=1.0).contains(s)), "roi_sampling: fractions must be between 0 and 1"),
         ];
         sound.into_iter().find(|(sound, _)| !sound).map_or(Ok(()), |(_, message)| Err(format!("network.{message}")))
     }
