@@ -2,13 +2,14 @@
 
 mod detectors;
 
+use crate::commands::End;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, KittiLine, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
-    DetectorGain, Diagnosis, Options, ParameterId, SensorRig, Stage, Verdict, diagnose, diagnose_scans, extended_toml,
+    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Verdict, diagnose, diagnose_scans, extended_toml,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{finding_name, write_finding_pictures};
@@ -59,8 +60,8 @@ pub struct DiagnoseArgs {
 }
 
 impl DiagnoseArgs {
-    /// Diagnoses, writes the files and says what was found; `false` when the two do not show the same scenes.
-    pub fn run(self) -> Result<bool> {
+    /// Diagnoses, writes the files and says what was found.
+    pub fn run(self) -> Result<End> {
         let rig = self.rig()?;
         if self.out.is_file() {
             bail!("--out {}: is a file; a folder is wanted", self.out.display());
@@ -93,10 +94,7 @@ impl DiagnoseArgs {
         };
         bar.finish_and_clear();
         self.write_json(&outcome.diagnosis)?;
-        write_atomic(
-            &self.out.join("extended.toml"),
-            extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg).as_bytes(),
-        )?;
+        write_atomic(&self.out.join("extended.toml"), extended_toml(&outcome.diagnosis).as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {
             write_labels(&self.out, &measured, id, boxes)?;
@@ -112,7 +110,10 @@ impl DiagnoseArgs {
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis)?;
         }
-        Ok(outcome.diagnosis.verdict != Verdict::NotScenarioIdentical)
+        Ok(match outcome.diagnosis.verdict {
+            Verdict::NotScenarioIdentical => End::NotTheSameScenes,
+            _ => End::Done,
+        })
     }
 
     fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {
@@ -123,15 +124,15 @@ impl DiagnoseArgs {
         Ok(())
     }
 
-    fn rig(&self) -> Result<SensorRig> {
+    fn rig(&self) -> Result<Rig> {
         match (&self.sensor, &self.simulator) {
-            (Some(path), _) => Ok(SensorRig::read(path)?),
+            (Some(path), _) => Ok(Rig::read(path)?),
             (None, Some(config)) => {
                 let (race, files) = RaceConfig::find(config).with_context(|| format!("--simulator {config}"))?;
                 let (text, path) = files.text(&race.rig)?;
-                Ok(SensorRig::parse(&text, &path)?)
+                Ok(Rig::parse(&text, &path)?)
             }
-            (None, None) => Ok(SensorRig::single()),
+            (None, None) => Ok(Rig::single()),
         }
     }
 }

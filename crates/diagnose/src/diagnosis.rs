@@ -90,6 +90,9 @@ pub struct Finding {
     pub separate_by: Option<String>,
     /// The picture: what is measured along the covariate, before and after.
     pub curve: Curve,
+    /// What a simulation has to be given to show the same: the entries of `extended.toml`. Not in the file.
+    #[serde(skip)]
+    pub effects: Vec<sensor::Effect>,
 }
 
 impl Finding {
@@ -222,7 +225,7 @@ impl Verdict {
     }
 }
 
-/// The JSON schema of the file, as docs/diagnosis.schema.json has it.
+/// The JSON schema of the file, as docs/src/reference/diagnosis.schema.json has it.
 pub fn schema_json() -> String {
     format!("{:#}\n", schemars::schema_for!(Diagnosis).to_value())
 }
@@ -233,10 +236,11 @@ mod tests {
 
     #[test]
     fn the_schema_in_the_docs_is_up_to_date() {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/diagnosis.schema.json");
+        let path =
+            std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/reference/diagnosis.schema.json");
         let text = fs_err::read_to_string(path).unwrap();
-        let how = "run `cargo run -p lidarshift-diagnose --example schema > docs/diagnosis.schema.json`";
-        assert!(text == schema_json(), "docs/diagnosis.schema.json is stale: {how}");
+        let how = "run `cargo run -p lidarshift-diagnose --example schema > docs/src/reference/diagnosis.schema.json`";
+        assert!(text == schema_json(), "docs/src/reference/diagnosis.schema.json is stale: {how}");
     }
 
     #[test]

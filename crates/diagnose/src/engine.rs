@@ -7,13 +7,13 @@ use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::{labels, motion, returns};
 use crate::diagnosis::{Diagnosis, Verdict};
+use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     Corrections, FramePair, ObjectPair, Ray, Recordings, Sensors, ShownShift, check_identity, common_ids, find_sensors,
     pair_all, with_points,
 };
-use crate::rig::SensorRig;
 use crate::search::geometry::Displacement;
 use crate::search::labels::Side;
 use crate::search::rolling_shutter::{self, Slide};
@@ -21,6 +21,7 @@ use crate::search::{self, ChannelResult, Context};
 use data::Dataset;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
+use sensor::Rig;
 use std::collections::BTreeSet;
 
 /// What to diagnose.
@@ -51,14 +52,12 @@ pub struct Outcome {
     pub diagnosis: Diagnosis,
     /// Corrected boxes of the measured labels, by frame id; empty where the labels are correct.
     pub corrected: Vec<(String, Vec<Box3>)>,
-    /// Elevations of the rows of every sensor, from the lowest, degrees; empty where none stand out.
-    pub rows_deg: Vec<Vec<f64>>,
 }
 
 impl Outcome {
     /// A diagnosis without findings.
     fn without_findings(diagnosis: Diagnosis) -> Self {
-        Outcome { diagnosis, corrected: vec![], rows_deg: vec![] }
+        Outcome { diagnosis, corrected: vec![] }
     }
 }
 
@@ -69,7 +68,7 @@ impl Outcome {
 pub fn diagnose(
     measured: &Dataset,
     simulated: &Dataset,
-    rig: &SensorRig,
+    rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
@@ -119,7 +118,7 @@ fn without_rows(sensors: &Sensors) -> Vec<String> {
 }
 
 /// What all searches share: roles, times and ego motion of the frames; with notes about what is not known.
-fn context<'a>(rig: &'a SensorRig, frames: &'a [FramePair], notes: &mut Vec<String>) -> Context<'a> {
+fn context<'a>(rig: &'a Rig, frames: &'a [FramePair], notes: &mut Vec<String>) -> Context<'a> {
     let ids: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
     let times = labels::times_s(&ids, rate_hz);
@@ -214,8 +213,10 @@ impl Engine<'_> {
         notes.extend(search::set_aside(&mut results));
         let corrected = corrected(&context, &results);
         let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
-        let rows_deg = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
-        Ok(Outcome { diagnosis: report(&context, results, notes), corrected, rows_deg })
+        let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
+        let mut diagnosis = report(&context, results, notes);
+        fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
+        Ok(Outcome { diagnosis, corrected })
     }
 
     /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on the simulation.

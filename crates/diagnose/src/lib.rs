@@ -5,16 +5,17 @@
 
 #![warn(clippy::too_many_lines)]
 
+mod angle;
 pub mod catalogue;
 pub mod channels;
 mod curve;
 pub mod diagnosis;
+mod effects;
 mod engine;
 mod error;
 mod extended;
 pub mod inference;
 pub mod pairing;
-mod rig;
 mod scans;
 pub mod search;
 
@@ -24,5 +25,5 @@ pub use diagnosis::{DetectorGain, Diagnosis, Finding, FindingGain, SCHEMA, Statu
 pub use engine::{Options, Outcome, Progress, Stage, diagnose};
 pub use error::DiagnoseError;
 pub use extended::extended_toml;
-pub use rig::{SensorMount, SensorRig, wrapped};
 pub use scans::diagnose_scans;
+pub use sensor::Rig;

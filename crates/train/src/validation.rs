@@ -4,11 +4,11 @@ use crate::{TrainError, ValidationMetrics};
 use burn::tensor::Tensor;
 use data::{Dataset, Detection, KittiLine, prefetch, stream};
 use eval::{Difficulty, EvalFrame, EvalOptions, EvalReport, Metric, evaluate, reference_overlaps};
-use models::{Detector, Losses, ModelError, Preparer, Sample};
+use models::{Detector, Losses, ModelError, Prediction, Preparer, Sample, predict_frames};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// What a detector finds on labelled frames.
+/// The detections of a detector on labelled frames, and their evaluation.
 #[derive(Clone, Debug)]
 pub struct Evaluation {
     /// Labels and detections as texts, in the frame of the data set's labels.
@@ -19,11 +19,11 @@ pub struct Evaluation {
     pub report: EvalReport,
     /// Mean total loss over the batches, with the running statistics.
     pub loss: f64,
-    /// How long it took, s.
+    /// Duration, s.
     pub seconds: f64,
 }
 
-/// Runs the detector over frames of a data set with labels. `progress` hears how many are done.
+/// Runs the detector over frames of a data set with labels. `progress` is called with the number of frames done.
 ///
 /// # Errors
 /// A frame that cannot be read, or scores that are not numbers.
@@ -47,13 +47,13 @@ pub fn evaluate_detector(
     });
     let mut detections = Vec::with_capacity(ids.len());
     let mut losses = Vec::new();
-    while detections.len() < ids.len() {
-        let batch: Vec<(Sample, Sample)> = samples.by_ref().take(batch_size).collect::<Result<_, _>>()?;
-        let (inference, training): (Vec<Sample>, Vec<Sample>) = batch.into_iter().unzip();
+    predict_frames(detector, batch_size, &mut samples, |batch: Vec<(Sample, Prediction)>| {
+        let (training, found): (Vec<Sample>, Vec<Prediction>) = batch.into_iter().unzip();
         losses.push(loss_values(&detector.validation_loss(&training)?)?[0].1);
-        detections.extend(detector.predict(&inference)?);
+        detections.extend(found.into_iter().map(|found| found.detections));
         progress(detections.len());
-    }
+        Ok::<(), TrainError>(())
+    })?;
     let frames = ids
         .iter()
         .zip(&detections)
@@ -73,7 +73,7 @@ pub fn evaluate_detector(
 }
 
 impl Evaluation {
-    /// The numbers for `metrics.jsonl`.
+    /// The metrics for `metrics.jsonl`.
     pub fn metrics(&self, classes: &[String]) -> ValidationMetrics {
         let of_set = |set: usize| -> BTreeMap<String, Option<f64>> {
             let of_class = |class: &String| {

@@ -25,10 +25,10 @@ pub use scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
 pub use surface::{LocalSurface, fit_surface};
 
 use crate::error::DiagnoseError;
-use crate::rig::SensorRig;
 use data::Dataset;
 use rand::RngExt;
 use rayon::prelude::*;
+use sensor::Rig;
 use std::collections::BTreeSet;
 use std::io::Read;
 use std::path::Path;
@@ -116,7 +116,7 @@ pub fn common_ids(
 }
 
 /// Scan patterns from some frames of both sides.
-pub fn find_sensors(recordings: &Recordings, rig: &SensorRig) -> Result<Sensors, DiagnoseError> {
+pub fn find_sensors(recordings: &Recordings, rig: &Rig) -> Result<Sensors, DiagnoseError> {
     let step = recordings.len().div_ceil(PATTERN_FRAMES).max(1);
     let some: Vec<usize> = (0..recordings.len()).step_by(step).collect();
     let sides = some

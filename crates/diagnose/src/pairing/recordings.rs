@@ -4,8 +4,8 @@ use super::frame::Sensors;
 use super::matching::match_directions;
 use super::scan::{SensorScan, split_by_sensor};
 use crate::error::DiagnoseError;
-use crate::rig::SensorRig;
 use data::{Cloud, Dataset, Object};
+use sensor::Rig;
 use std::sync::OnceLock;
 
 /// One side of a frame: its returns by sensor (12 bytes a return) and its labelled objects.
@@ -32,7 +32,7 @@ pub type Matched = (Vec<bool>, Vec<bool>);
 /// The frames that both data sets have.
 pub struct Recordings<'a> {
     datasets: [&'a Dataset; 2],
-    rig: &'a SensorRig,
+    rig: &'a Rig,
     frames: Vec<Held>,
 }
 
@@ -45,7 +45,7 @@ struct Held {
 
 impl<'a> Recordings<'a> {
     /// Frames by their ids; nothing is read yet.
-    pub fn new(measured: &'a Dataset, simulated: &'a Dataset, rig: &'a SensorRig, ids: Vec<String>) -> Self {
+    pub fn new(measured: &'a Dataset, simulated: &'a Dataset, rig: &'a Rig, ids: Vec<String>) -> Self {
         let held = |id| Held { id, sides: Default::default(), matched: OnceLock::new() };
         Recordings { datasets: [measured, simulated], rig, frames: ids.into_iter().map(held).collect() }
     }

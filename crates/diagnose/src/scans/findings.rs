@@ -62,6 +62,7 @@ impl From<Named> for Finding {
             says: named.says,
             separate_by: None,
             curve: named.curve,
+            effects: vec![],
         }
     }
 }

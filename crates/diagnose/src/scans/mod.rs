@@ -15,16 +15,17 @@ mod tilt;
 
 use crate::catalogue::Cause;
 use crate::diagnosis::{Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, SCHEMA, Verdict};
+use crate::effects::fill_effects;
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
-use crate::rig::{SensorMount, SensorRig};
 use crate::search::REPETITIONS;
 use data::{Cloud, Dataset, Object};
 use planes::Patch;
 use rand::RngExt;
 use rayon::prelude::*;
 use rings::{Beam, RingScan};
+use sensor::{Rig, Sensor};
 use std::collections::BTreeMap;
 
 /// Fewest scans: one is held out in turn.
@@ -48,7 +49,7 @@ struct Seen {
 /// A rig with another mount, fewer than three scans, clouds that are not in the order of lasers, files that cannot be read.
 pub fn diagnose_scans(
     dataset: &Dataset,
-    rig: &SensorRig,
+    rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
@@ -80,13 +81,14 @@ pub fn diagnose_scans(
     progress(Stage::Weighing, 0, 1);
     let (found, minimum_detectable, considered) = findings::all(&seen, &mut notes);
     progress(Stage::Weighing, 1, 1);
-    let diagnosis = report(&seen, found, minimum_detectable, considered, notes);
+    let mut diagnosis = report(&seen, found, minimum_detectable, considered, notes);
     let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
-    Ok(Outcome { diagnosis, corrected: vec![], rows_deg: vec![rows_deg] })
+    fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
+    Ok(Outcome { diagnosis, corrected: vec![] })
 }
 
 /// The one sensor of a rig that stands at the origin of its clouds, unturned.
-fn only_mount(rig: &SensorRig) -> Result<&SensorMount, DiagnoseError> {
+fn only_mount(rig: &Rig) -> Result<&Sensor, DiagnoseError> {
     match rig.sensors.as_slice() {
         [one] if one.position == [0.0; 3] && [one.yaw_deg, one.pitch_deg, one.roll_deg] == [0.0; 3] => Ok(one),
         _ => Err(DiagnoseError::Pair(

@@ -80,6 +80,7 @@ pub(super) fn elevation_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Fi
         separate_by: (!named)
             .then(|| "a level hall or a survey of the road under the car, and plumb walls on all sides".into()),
         curve: curve(&grounds, mean),
+        effects: vec![],
     })
 }
 

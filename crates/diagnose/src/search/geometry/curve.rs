@@ -6,9 +6,9 @@ use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
-use crate::rig::SensorMount;
 use nalgebra::{Point3, SVector};
 use rayon::prelude::*;
+use sensor::Sensor;
 
 /// Points of a plot.
 const BINS: usize = 16;
@@ -20,7 +20,7 @@ const FEWEST: f64 = 30.0;
 const STRAY_M: f64 = 0.5;
 
 /// Name of the horizontal axis, and its value for a ray.
-type Axis = (&'static str, fn(&Ray, &SensorMount) -> f64);
+type Axis = (&'static str, fn(&Ray, &Sensor) -> f64);
 
 /// The horizontal axis of a cause: range for a bias, distance along the vehicle for a tilt, phase for motion distortion, azimuth for a sensor.
 fn axis(cause: Cause) -> Axis {

@@ -12,9 +12,9 @@ use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, fit};
-use crate::rig::SensorRig;
 use crate::search::{Found, NamedParameter, Z_STAR, parameter, sensor_number, with_error};
 use nalgebra::Vector3;
+use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// What is said of one hypothesis.
@@ -181,7 +181,7 @@ struct Pose {
 /// Parameters of a linear hypothesis.
 fn linear_parameters(
     sums: &Sums,
-    rig: &SensorRig,
+    rig: &Rig,
     fitted: &LinearFit,
     columns: &[usize],
     spurious: [f64; 6],
@@ -224,7 +224,7 @@ fn linear_parameters(
 }
 
 /// Parameters of a pose; none where it has no turn and no shift.
-fn pose_parameters(rig: &SensorRig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
+fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
     let Pose { mut turn, mut turn_error, mut shift, mut shift_error, sensor } = pose;
     let mut parameters = Vec::new();
     if turn == Vector3::zeros() && shift == Vector3::zeros() {

@@ -6,8 +6,8 @@ use crate::channels::groups::{Group, Grouping, STRIP_RAD, elevation_lever, group
 use crate::channels::mean::Column;
 use crate::inference::grouped;
 use crate::pairing::Ray;
-use crate::rig::SensorRig;
 use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
+use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// Displacements of the measured side against the simulation.
@@ -66,7 +66,7 @@ impl Displacement {
 
 /// The displacement by the chosen hypotheses, fitted on the selecting frames.
 pub(super) fn displacement(
-    rig: &SensorRig,
+    rig: &Rig,
     sums: &Sums,
     select: &[usize],
     blocks: &[usize],

@@ -9,10 +9,10 @@ use crate::channels::mean::{
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::median;
-use crate::rig::SensorRig;
 use crate::search::Context;
 use nalgebra::SVector;
 use rayon::prelude::*;
+use sensor::Rig;
 
 /// Sums of all frames.
 pub(super) struct Sums {
@@ -105,7 +105,7 @@ fn precision(column: Column) -> f64 {
 /// Prior variances of what every frame may have of its own. Pose: the robust scatter of the frames' poses about the median of each sensor.
 /// Displacement over a scan: that of a driving vehicle where a sensor scans row after row, since static surfaces are then displaced along
 /// columns, which resembles a pose error of a sensor; zero otherwise.
-fn own_scatter(rig: &SensorRig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
+fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
     let least = [2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4];
     let scatter = |k: usize| {
         let mut deviations = Vec::new();
@@ -116,7 +116,7 @@ fn own_scatter(rig: &SensorRig, poses: &[OwnPoses], select: &[usize]) -> SVector
         }
         (median(deviations) / 0.6745).max(least[k])
     };
-    let by_rows = rig.sensors.iter().find(|s| !s.rows_in_turn.is_empty());
+    let by_rows = rig.sensors.iter().find(|s| !s.rows_in_turn().is_empty());
     let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);
     SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide(k - 6) }.powi(2))
 }

@@ -7,6 +7,7 @@ use crate::diagnosis::Parameter;
 use crate::inference::law::{FittedLaw, Law, in_zone};
 use crate::inference::losses::LossTable;
 use crate::search::{Found, NamedParameter, Selected};
+use sensor::signal::index_offset;
 
 /// Parameters of a law, as a finding has them.
 fn values(law: &FittedLaw) -> Vec<(Quantity, f64)> {
@@ -16,9 +17,9 @@ fn values(law: &FittedLaw) -> Vec<(Quantity, f64)> {
         Law::Random | Law::Zone(_) => vec![(Quantity::Share, law.numbers[0])],
         Law::Range => vec![(Quantity::HalfAtM, law.half().exp()), steepness, most],
         Law::Incidence => vec![(Quantity::CosHalf, law.half().exp()), steepness, most],
-        // Signal index: ln(0.1 cos / R^2) - ln(0.1 / 250^2).
+        // As the signal index at the reflectivity that the diagnosis assumes.
         Law::Signal => vec![
-            (Quantity::Threshold, law.half() + 2.0 * 250f64.ln()),
+            (Quantity::Threshold, law.half() + index_offset()),
             steepness,
             most,
             (Quantity::BrighterStanding, law.numbers[4]),
@@ -149,7 +150,7 @@ fn form_error(law: Law) -> f64 {
 fn curve(table: &LossTable, law: Law, all: &[FittedLaw]) -> Curve {
     let x_of = |[ln_range, ln_cos]: [f64; 2]| match law {
         Law::Incidence => ln_cos.exp().min(1.0).asin().to_degrees(),
-        Law::Signal => ln_cos - 2.0 * ln_range + 2.0 * 250f64.ln(),
+        Law::Signal => ln_cos - 2.0 * ln_range + index_offset(),
         _ => ln_range.exp(),
     };
     let only = |zone: usize| match law {

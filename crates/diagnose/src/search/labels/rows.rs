@@ -1,14 +1,15 @@
 //! Objects with their shifts and the covariates that may explain them.
 
 use super::Side;
+use crate::angle::wrapped;
 use crate::channels::labels::ObjectShift;
 use crate::channels::mean::origins;
 use crate::channels::motion::OwnMotion;
 use crate::inference::linear::LinearFrame;
-use crate::rig::{SensorMount, wrapped};
 use crate::search::Context;
 use crate::search::geometry::Displacement;
 use nalgebra::{DMatrix, DVector, Vector3};
+use sensor::Sensor;
 
 /// A linear effect on the shift of an object, in the object's own frame: one column of the fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -143,7 +144,7 @@ fn velocity_columns(
     x: &mut [[f64; 8]; 3],
     seen: Option<[f64; 3]>,
     center: &Vector3<f64>,
-    mount: &SensorMount,
+    mount: &Sensor,
     motion: Option<OwnMotion>,
     axes: impl Fn(Vector3<f64>) -> [f64; 3],
 ) -> (Option<f64>, [bool; 8]) {
@@ -153,8 +154,7 @@ fn velocity_columns(
         return (None, known);
     };
     (0..3).for_each(|k| x[k][3] = seen[k]);
-    let [azimuth_rad, elevation_rad, _] =
-        SensorMount::spherical(&mount.pose().inverse_transform_point(&(*center).into()));
+    let [azimuth_rad, elevation_rad, _] = Sensor::spherical(&mount.pose().inverse_transform_point(&(*center).into()));
     let phase = mount.scan_phase(azimuth_rad, elevation_rad);
     (0..3).for_each(|k| x[k][7] = seen[k] * phase);
     let Some(own) = motion else {

