@@ -41,7 +41,7 @@ const SENSOR_SPACING: f64 = 1000.0;
 /// Ends the name of the horizontal axis where each sensor has a curve of its own.
 const BY_SENSOR: &str = " (1000 a sensor)";
 
-/// Points of a picture.
+/// Points of a plot.
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[schemars(rename = "Curve")]
 struct CurveFile {
@@ -53,7 +53,7 @@ struct CurveFile {
     points: Vec<CurvePointFile>,
 }
 
-/// A point of a picture.
+/// A point of a plot.
 #[derive(Serialize, Deserialize, JsonSchema)]
 #[schemars(rename = "CurvePoint")]
 struct CurvePointFile {

@@ -1,4 +1,4 @@
-//! What a diagnosis says: the file `diagnosis.json`.
+//! The result of a diagnosis: the file `diagnosis.json`.
 
 use crate::catalogue::{Cause, Channel, Covariate, Family, Hypothesis, ParameterId, Quantity, Unit};
 use crate::curve::Curve;
@@ -14,45 +14,45 @@ pub const SCHEMA: &str = "lidarshift/diagnosis/1";
 pub struct Diagnosis {
     /// [`SCHEMA`].
     pub schema: String,
-    /// What is said of the whole.
+    /// The overall result.
     pub verdict: Verdict,
-    /// Ids of the frames by what they were used for; no frame is used twice, but of scans alone each is held out in turn.
+    /// Ids of the frames by role; no frame has two roles, except that of scans alone each is held out in turn.
     pub frames: FrameRoles,
     /// What was found, the largest gain first.
     pub findings: Vec<Finding>,
-    /// For each cause the smallest effect that would have been seen, as far as these data tell.
+    /// Detectable effect size of each cause in these data.
     pub minimum_detectable: BTreeMap<Cause, Minimum>,
     /// Distance of the measured held-out frames from the simulation, before and after it is extended.
     pub gain: Gain,
     /// What detectors gain on measured data, where it was asked for (`--detectors`).
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub detectors: Vec<DetectorGain>,
-    /// Candidates that were weighed and what became of them.
+    /// Hypotheses that were considered and what became of them.
     pub considered: Vec<Considered>,
-    /// What could not be looked at or must be known to read the rest, in words.
+    /// Limits of the data, and what else is needed to read the result.
     pub notes: Vec<String>,
 }
 
-/// What is said of the whole.
+/// The overall result.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
-    /// Nothing differs by more than the smallest effects that would have been seen.
+    /// No difference above the detectable effect sizes.
     NothingFound,
-    /// Everything found has a name.
+    /// All findings have a named cause.
     Explained,
-    /// Some of what was found has a name.
+    /// Some findings have a named cause.
     PartlyExplained,
-    /// Nothing of what was found has a name.
+    /// No finding has a named cause.
     Unexplained,
-    /// The two sides do not show the same scenes; nothing else is said.
+    /// The two sides do not show the same scenes; there is no other result.
     NotScenarioIdentical,
 }
 
-/// Ids of the frames by what they were used for.
+/// Ids of the frames by role.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct FrameRoles {
-    /// To find and to name.
+    /// To select hypotheses.
     pub select: Vec<String>,
     /// To fit parameters and intervals.
     pub estimate: Vec<String>,
@@ -63,32 +63,32 @@ pub struct FrameRoles {
 /// One difference between measured and simulated data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Finding {
-    /// Whether it has a name.
+    /// Whether its cause is named.
     pub status: Status,
-    /// Name of the cause, where it is named.
+    /// The cause, where it is named.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub cause: Option<Cause>,
-    /// Names of the causes that explain it as well or nearly so, where it is ambiguous; parameters are those of the first.
+    /// The causes that explain it about equally well, where it is ambiguous; parameters are those of the first.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub candidates: Option<Vec<Cause>>,
     /// Family of its cause.
     pub family: Family,
     /// Fitted parameters; docs/diagnosis.md has names, units and signs.
     pub parameters: BTreeMap<ParameterId, Parameter>,
-    /// Share of block-bootstrap repetitions that choose the same name.
+    /// Share of block-bootstrap repetitions that choose the same cause.
     pub confidence: f64,
     /// What it was found in.
     pub channel: Channel,
     /// On what it depends.
     pub covariate: Covariate,
-    /// What it brings on frames held out.
+    /// Its gain on held-out frames.
     pub gain: FindingGain,
     /// The finding in a sentence.
     pub says: String,
     /// What to record to tell the candidates apart.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub separate_by: Option<String>,
-    /// The picture: what is measured along the covariate, before and after.
+    /// The plot: what is measured along the covariate, before and after.
     pub curve: Curve,
     /// What a simulation has to be given to show the same: the entries of `extended.toml`. Not in the file.
     #[serde(skip)]
@@ -102,7 +102,7 @@ impl Finding {
     }
 }
 
-/// Whether a finding has a name.
+/// Whether the cause of a finding is named.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Status {
@@ -141,7 +141,7 @@ impl Minimum {
     }
 }
 
-/// The smallest effect that would have been seen.
+/// A detectable effect size.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Minimum {
     /// Which number.
@@ -161,13 +161,14 @@ pub struct Gain {
     pub before: f64,
     /// With the extended simulation.
     pub after: f64,
-    /// What would be left with tables without any form, fitted on the same frames as the findings: what no sensor model can close.
+    /// With unconstrained lookup tables fitted on the same frames as the findings: the best any sensor model could
+    /// reach.
     pub floor: f64,
     /// (before - after) / (before - floor); null where before is not above the floor.
     pub closed: Option<f64>,
     /// Interval of `closed`, from a bootstrap over blocks of held-out frames.
     pub ci95: Option<[f64; 2]>,
-    /// `before`, `after` and `floor` channel by channel: where the simulation is off, and what is left.
+    /// `before`, `after` and `floor` by channel.
     #[serde(default)]
     pub channels: BTreeMap<Channel, [f64; 3]>,
 }
@@ -197,18 +198,18 @@ pub struct DetectorGain {
     pub ci95: Option<[f64; 2]>,
 }
 
-/// A candidate that was weighed.
+/// A hypothesis that was considered.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Considered {
     /// Cause.
     pub cause: Hypothesis,
     /// Channel.
     pub channel: Channel,
-    /// Gain on blocks of the selecting frames that it was not fitted on, nats per ray.
+    /// Cross-validated gain on the selecting frames, nats per ray.
     pub nats_per_ray: f64,
     /// That over its standard error.
     pub z: f64,
-    /// `chosen`, or why not.
+    /// `chosen`, or the reason why not.
     pub outcome: String,
 }
 

@@ -73,6 +73,8 @@ fn positive(strength: f64, effect: impl Into<Option<Effect>>) -> Vec<Effect> {
     if strength < 0.0 { Vec::new() } else { effect.into().into_iter().collect() }
 }
 
+/// The effects of a named cause.
+#[expect(clippy::too_many_lines, reason = "a table: one arm for each cause")]
 fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
     let value = |quantity: Quantity| value(f, quantity);
     let effect = match cause_of(f) {

@@ -31,14 +31,14 @@ pub struct Options {
     pub split: Option<String>,
 }
 
-/// What is being done, for whoever shows progress.
+/// Stages, for the display of progress.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
-    /// Looking for scan patterns and whether the scenes are the same.
+    /// Estimating scan patterns and comparing scenes.
     Comparing,
     /// Pairing frames.
     Pairing,
-    /// Weighing causes.
+    /// Comparing hypotheses.
     Weighing,
 }
 
@@ -134,14 +134,15 @@ fn context<'a>(rig: &'a Rig, frames: &'a [FramePair], notes: &mut Vec<String>) -
 /// Number of searches, for the progress that is shown.
 const SEARCHES: usize = 9;
 
-/// Quantisation step from which on the simulated side is rounded for all searches, m: coarse steps displace level ground by the distance of
-/// rows.
+/// Quantisation step from which on the simulated side is rounded for all searches, m: coarse steps displace level
+/// ground by the distance of rows.
 const COARSE_M: f64 = 0.02;
 
 /// Smallest cosine of incidence for roughness where offsets of rows were corrected.
 const LEAST_COS: f64 = 0.12;
 
-/// Runs the searches one after the other, on frames that are paired anew where an earlier search found something to correct.
+/// Runs the searches one after the other, on frames that are paired anew where an earlier search found something to
+/// correct.
 struct Engine<'a> {
     recordings: &'a Recordings<'a>,
     sensors: &'a Sensors,
@@ -191,7 +192,8 @@ impl Engine<'_> {
         (self.progress)(Stage::Weighing, searches, SEARCHES);
     }
 
-    /// All searches in turn. Motion distortion is undone before anything else is compared, except for the ranges as they were measured.
+    /// All searches in turn. Motion distortion is undone before anything else is compared, except for the ranges as
+    /// they were measured.
     fn diagnose(&self, context: Context, mut notes: Vec<String>) -> Result<Outcome, DiagnoseError> {
         self.finished(0);
         let (sliding, slide) = self.rolling_shutter(&context)?;
@@ -219,7 +221,8 @@ impl Engine<'_> {
         Ok(Outcome { diagnosis, corrected })
     }
 
-    /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on the simulation.
+    /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on
+    /// the simulation.
     fn rolling_shutter(&self, context: &Context) -> Result<(ChannelResult, Option<Slide>), DiagnoseError> {
         Ok(match rolling_shutter::search(context) {
             rolling_shutter::Search::NotFound(result) => (result, None),
@@ -247,8 +250,9 @@ impl Engine<'_> {
         self.pair(Corrections { shift_m, step_m: known.coarse_m(), ..Corrections::default() }).map(Some)
     }
 
-    /// Searches of silhouettes and single returns, on frames with the displacement of the scene undone; then of noise, with offsets of rows and
-    /// quantisation corrected as well: they look like noise between neighbouring rows.
+    /// Searches of silhouettes and single returns, on frames with the displacement of the scene undone; then of
+    /// noise, with offsets of rows and quantisation corrected as well: they look like noise between neighbouring
+    /// rows.
     fn single_returns(&self, context: &Context, known: &Known) -> Result<Vec<ChannelResult>, DiagnoseError> {
         let displaced = &known.displaced;
         let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
@@ -278,7 +282,8 @@ impl Engine<'_> {
     }
 }
 
-/// Keeps the first of frames that are identical to the bit; each scene counts once. Returns a note where there are some.
+/// Keeps the first of frames that are identical to the bit; each scene counts once. Returns a note where there are
+/// some.
 fn leave_out_copies(frames: &mut Vec<FramePair>) -> Option<String> {
     let before = frames.len();
     let mut seen = BTreeSet::new();

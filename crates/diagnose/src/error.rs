@@ -1,17 +1,17 @@
-//! Why nothing could be diagnosed.
+//! Errors of a diagnosis.
 
 use data::DataError;
 
-/// A pair that cannot be looked at as it is.
+/// A pair that cannot be diagnosed.
 #[derive(Debug, thiserror::Error)]
 pub enum DiagnoseError {
-    /// A file could not be read or written, or says something that cannot be.
+    /// A file could not be read or written, or has invalid content.
     #[error(transparent)]
     Data(#[from] DataError),
     /// The file system refused; the message names the path.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// The two sides do not fit each other.
+    /// The two sides do not match, or scans cannot be used.
     #[error("{0}")]
     Pair(String),
 }

@@ -1,7 +1,9 @@
-//! Measured against simulated: what differs, why, and what is gained by mending it.
+//! Diagnosis of measured against simulated data: differences, their causes with intervals, and the gain of an
+//! extended sensor model.
 //!
-//! `pairing` brings two data sets together return by return, `channels` sums up what is looked at, `inference` weighs causes, `search`
-//! goes through the channels, `engine` is the whole way. Nothing here knows a simulator: clouds, labels and the places of the sensors do.
+//! `pairing` pairs two data sets return by return, `channels` sums covariates and residuals, `inference` fits and
+//! chooses causes, `search` searches each channel, `engine` runs all of it. `catalogue` holds the identifiers of
+//! causes, channels, covariates and parameters.
 
 #![warn(clippy::too_many_lines)]
 

@@ -65,8 +65,8 @@ identifiers! {
 }
 
 impl Cause {
-    /// Its family, and its place in the extended sensor model: the world first, then shots, returns, range values and labels. Places have
-    /// gaps for new causes; causes without an effect of the simulator come last.
+    /// Its family, and its place in the extended sensor model: the world first, then shots, returns, range values and
+    /// labels. Places have gaps for new causes; causes without an effect of the simulator come last.
     const fn entry(self) -> (Family, u16) {
         match self {
             Cause::MissingObject => (Family::Geometry, 10),
@@ -127,7 +127,8 @@ identifiers! {
     }
 }
 
-/// A hypothesis as the list of what was considered has it: a cause, or a form of it; written as `CAUSE` or `CAUSE, FORM`.
+/// A hypothesis as the list of what was considered has it: a cause, or a form of it; written as `CAUSE` or `CAUSE,
+/// FORM`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, JsonSchema)]
 #[schemars(with = "String")]
 pub struct Hypothesis {

@@ -1,5 +1,5 @@
-//! The catalogue: causes, channels, covariates, parameters and units of a diagnosis. Each identifier is an enum with one table that holds
-//! its name in `diagnosis.json` and what else is fixed for it.
+//! The catalogue: causes, channels, covariates, parameters and units of a diagnosis. Each identifier is an enum with
+//! one table that holds its name in `diagnosis.json` and what else is fixed for it.
 
 mod causes;
 mod covariates;
@@ -9,8 +9,8 @@ pub use causes::{Cause, Hypothesis, NoiseForm};
 pub use covariates::Covariate;
 pub use parameters::{ParameterId, Quantity, Unit};
 
-/// Defines an enum of identifiers with their names in `diagnosis.json`. Variants are listed in the order of their names, so that maps by
-/// identifier are written in the order of the names; a test holds every table to that.
+/// Defines an enum of identifiers with their names in `diagnosis.json`. Variants are listed in the order of their
+/// names, so that maps by identifier are written in the order of the names; a test holds every table to that.
 macro_rules! identifiers {
     ($(#[$about:meta])* $id:ident { $($(#[$doc:meta])* $variant:ident = $name:literal,)* }) => {
         $(#[$about])*

@@ -1,26 +1,30 @@
-//! Cells of range, incidence and surface: what the channels of hits and of roughness are summed up in.
+//! Cells of range, incidence and surface, in which the channels of hits and of roughness are summed.
 
 use crate::pairing::{Ray, Surface};
 
-/// Bins of the logarithm of range, from 1 m.
+/// Number of bins of the logarithm of range, from 1 m.
 pub const RANGE_BINS: usize = 22;
-/// Bins of the logarithm of the cosine of incidence, from 1 down.
+/// Number of bins of the logarithm of the cosine of incidence, from 1 down.
 pub const COS_BINS: usize = 14;
-/// Surfaces: ground, standing, objects, and the lower corners of objects, where cars have wheels.
+/// Number of zones: ground, standing surfaces, objects, and the lower corners of objects, where vehicles have wheels.
 pub const ZONES: usize = 4;
-/// All cells.
+/// Number of all cells.
 pub const CELLS: usize = RANGE_BINS * COS_BINS * ZONES;
 
+/// Width of a bin of ln(range).
 const RANGE_STEP: f64 = 0.25;
+
+/// Width of a bin of ln(cosine).
 const COS_STEP: f64 = 0.4;
 
-/// Number of the first zone of objects.
+/// The first zone of objects.
 pub const OBJECT: usize = 2;
 
-/// Cosine at which the edges and curves of objects are taken to be met: they are too small for a surface of their own, wheels above all.
+/// Cosine of incidence that is assumed on edges and curved parts of objects, such as wheels: no surface can be fitted
+/// to them.
 const ROUND_COS: f64 = 0.6;
 
-/// Cosine of incidence of a ray that falls on a surface, or on an object whatever its form.
+/// Cosine of incidence of a ray on a smooth surface, or on an object; `None` on other edges.
 fn cos_of(ray: &Ray) -> Option<f64> {
     match ray.smooth {
         true => (ray.cos_incidence > 0.0).then_some(f64::from(ray.cos_incidence)),
@@ -28,7 +32,7 @@ fn cos_of(ray: &Ray) -> Option<f64> {
     }
 }
 
-/// Where a ray falls.
+/// The cell of a ray; `None` where its incidence is not known.
 pub fn cell(ray: &Ray) -> Option<usize> {
     let (zone, cos) = (zone(ray)?, cos_of(ray)?);
     if !(ray.range_m > 0.5) {
@@ -39,7 +43,7 @@ pub fn cell(ray: &Ray) -> Option<usize> {
     Some((zone * COS_BINS + c) * RANGE_BINS + r)
 }
 
-/// Zone of a ray's surface.
+/// Zone of a ray's surface; `None` without one.
 pub fn zone(ray: &Ray) -> Option<usize> {
     match ray.surface {
         Surface::Ground => Some(0),
@@ -54,7 +58,7 @@ pub fn zone_of(cell: usize) -> usize {
     cell / (COS_BINS * RANGE_BINS)
 }
 
-/// Sum, sum of logarithms and so on, to know where within its cell the mass lies.
+/// Sums over the rays of a cell, for its mean range and incidence.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Place {
     /// Number of rays.

@@ -1,5 +1,5 @@
-//! Offsets of groups of rays: rows of a sensor, or strips of azimuth. Each group has one range offset, and rows have one elevation offset as
-//! well. The pose error of each frame is subtracted before.
+//! Offsets of groups of rays: rows of a sensor, or strips of azimuth. Each group has one range offset, and rows have
+//! one elevation offset as well. The pose error of each frame is subtracted before.
 
 use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
 use crate::catalogue::Covariate;
@@ -24,7 +24,7 @@ impl Grouping {
     }
 }
 
-/// Width of a strip of azimuth, rad.
+/// Width of a strip of azimuth, rad: 5 degrees.
 pub const STRIP_RAD: f64 = 0.0873;
 
 /// Strips of a full turn.
@@ -99,17 +99,17 @@ impl GroupSums {
         self.n += other.n;
     }
 
-    /// Takes a level off the offset of one of the columns.
+    /// Subtracts a common level from the offset of one of the columns.
     pub fn lower(&mut self, column: usize, level: f64) {
         self.right[column] -= level * self.gram[2 * column];
     }
 
-    /// Best offset of one of the columns with a prior precision.
+    /// Estimated offset of one of the columns, with a prior precision.
     pub fn offset(&self, column: usize, precision: f64) -> f64 {
         self.right[column] / (self.gram[2 * column] + precision)
     }
 
-    /// Gain of a frame's group by an offset, nats.
+    /// Gain of a group by an offset, nats.
     pub fn gain(&self, column: usize, offset: f64) -> f64 {
         offset * self.right[column] - 0.5 * offset * offset * self.gram[2 * column]
     }
@@ -118,7 +118,7 @@ impl GroupSums {
 /// Groups of one frame, in their order.
 pub type GroupFrame = Vec<(Group, GroupSums)>;
 
-/// Parts that the rays of a group are cut into.
+/// Number of parts of a group.
 pub const PARTS: usize = 4;
 
 /// Groups of one frame by part: rows by quarters of the field of view, strips of azimuth by bands of elevation.
@@ -128,7 +128,7 @@ pub type PartedFrame = [GroupFrame; PARTS];
 pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
     let at = match grouping {
         Grouping::Row => f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad) + 0.5,
-        // Bands that hold about as many rays of a car's sensor each: edges at -10, -5 and -1 degrees.
+        // Bands with about as many rays each for a sensor on a vehicle: edges at -10, -5 and -1 degrees.
         Grouping::Azimuth => {
             let below = [-0.175, -0.087, -0.017].iter().filter(|edge| f64::from(ray.elevation_rad) > **edge).count();
             (below as f64 + 0.5) / PARTS as f64
@@ -141,12 +141,12 @@ pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
 pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -> f64 {
     let (az, el) = (f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
     let up = sensor_turn * Vector3::new(-el.sin() * az.cos(), -el.sin() * az.sin(), el.cos());
-    // The light went up by this angle: the surface met stands where the ray says less. The predicted range: at grazing angles the measured
-    // one has the very distance in it that is to be explained.
+    // The beam was sent higher by this angle. The predicted range is used: at grazing incidence the measured one
+    // contains the distance that is to be explained.
     -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
 }
 
-/// Sums of all frames. `structure` is what each kind of surface is off by, m.
+/// Sums of all frames. `structure` is the offset of each kind of surface, m.
 pub fn group_frames(
     frames: &[FramePair],
     rig: &Rig,
@@ -191,7 +191,7 @@ pub fn group_frames(
     frames.par_iter().zip(poses).map(one).collect()
 }
 
-/// The parts of a frame together.
+/// Sums over the parts of a frame.
 pub fn whole(frame: &PartedFrame) -> GroupFrame {
     total(frame.iter()).into_iter().collect()
 }

@@ -1,4 +1,4 @@
-//! Which returns have a counterpart on the other side, by direction.
+//! Counts of returns with and without a counterpart on the other side, by direction.
 
 use super::cells::{CELLS, Place, cell};
 use super::groups::{Group, GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
@@ -64,7 +64,8 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a HitFrame>) -> Vec<HitCell> {
     sum
 }
 
-/// Shares of returns that groups of directions lose beyond what `kept` tells of each cell, as sums of every frame.
+/// Shares of returns that groups of directions lose beyond the share that `kept` gives for each cell, as sums of
+/// every frame.
 pub fn loss_groups(
     frames: &[FramePair],
     rig: &Rig,
@@ -74,7 +75,8 @@ pub fn loss_groups(
 ) -> Vec<PartedFrame> {
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |frame: &FramePair| -> PartedFrame {
-        // Of the simulated side and of the measured one: returns, and those without a counterpart; then those expected to be lost.
+        // Of the simulated and of the measured side: returns, and those without a counterpart; then the expected
+        // losses.
         let mut sums = std::collections::BTreeMap::<(Group, usize), ([[f64; 2]; 2], f64)>::new();
         for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
             for ray in rays {
@@ -92,9 +94,9 @@ pub fn loss_groups(
         }
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];
         for ((g, part), ([[n, alone], [seen, odd]], lost)) in sums.into_iter().filter(|(_, (c, _))| c[0][0] >= 5.0) {
-            // Twice the count of odd ones: neighbours are lost together.
+            // Twice the variance of a count: neighbours are lost together.
             let w = n * n / (2.0 * (alone + odd + 2.0));
-            // Matching one to one leaves as many without a counterpart on both sides.
+            // One-to-one matching leaves as many returns without a counterpart on both sides.
             let y = (alone - lost) / n - odd / f64::max(seen, 1.0);
             out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
         }

@@ -1,5 +1,5 @@
-//! Labels against clouds, and objects against objects: per labelled object the shift of the measured label from the simulated one, and
-//! that of the measured returns from the simulated returns, in the object's own frame (forward, left, up).
+//! Shifts of labelled objects in the object's own frame (forward, left, up): of the measured label against the
+//! simulated one, and of the measured returns against the simulated ones.
 
 use crate::pairing::FramePair;
 use geometry::{Box3, limit_period};
@@ -19,8 +19,8 @@ pub struct ObjectShift {
     pub label_yaw_rad: f64,
     /// Measured returns against simulated returns, m, with standard errors; `None` where there are too few.
     pub cloud_m: Option<([f64; 3], [f64; 3])>,
-    /// Velocity of the simulated label in the cloud's frame, along the object's own axes, m/s: what the ego car sees of it. `None` where
-    /// neighbouring frames do not tell.
+    /// Velocity of the simulated label relative to the ego vehicle, along the object's own axes, m/s. `None` where
+    /// neighbouring frames do not show the object.
     pub seen_velocity_m_s: Option<[f64; 3]>,
     /// Distance, m.
     pub distance_m: f64,
@@ -30,7 +30,8 @@ pub struct ObjectShift {
     pub points: usize,
 }
 
-/// Times of the frames from their ids: whole numbers count scans, very large ones nanoseconds. `None` where ids are no numbers.
+/// Times of the frames from their ids: numbers of scans, or nanoseconds where neighbours differ by 1e6 or more.
+/// `None` unless ids are rising numbers.
 pub fn times_s(ids: &[String], rate_hz: f64) -> Option<Vec<f64>> {
     let numbers: Vec<f64> = ids.iter().map(|id| id.parse::<f64>().ok()).collect::<Option<_>>()?;
     if numbers.windows(2).any(|w| w[1] <= w[0]) {
@@ -43,10 +44,10 @@ pub fn times_s(ids: &[String], rate_hz: f64) -> Option<Vec<f64>> {
     Some(numbers.iter().map(|n| (n - numbers[0]) * unit).collect())
 }
 
-/// Frames farther apart than that say nothing of a velocity, s.
+/// Longest time between frames from which a velocity is estimated, s.
 const LONGEST_S: f64 = 0.6;
 
-/// Fastest change of place that is believed, m/s.
+/// Largest relative speed of an object, m/s.
 const FASTEST_M_S: f64 = 60.0;
 
 /// Shifts of all objects.
@@ -74,7 +75,8 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectS
     shifts
 }
 
-/// Velocity of a simulated box of frame `f` by the nearest boxes of the frames before and after, m/s, as the own car sees it, in the cloud's frame.
+/// Velocity of a simulated box of frame `f` relative to the ego vehicle, from the nearest boxes of the frames before
+/// and after, m/s, cloud's frame.
 pub fn seen_velocity(frames: &[FramePair], times: &[f64], f: usize, bbox: &Box3) -> Option<Vector3<f64>> {
     let neighbour = |g: usize| -> Option<(f64, Vector3<f64>)> {
         let dt = times[g] - times[f];

@@ -1,4 +1,5 @@
-//! Directions and ranges from which nothing comes back whatever is there: parts of the own car in the way, an end of the range.
+//! Directions and ranges without returns whatever the scene: parts of the ego vehicle in the field of view, and the
+//! largest range.
 
 use super::returns::OWN_CAR_M;
 use crate::pairing::{FramePair, Lies, Ray};
@@ -6,23 +7,23 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::f64::consts::FRAC_PI_2;
 
-/// What hides a ray before any law of losses applies.
+/// Rays that are hidden, whatever the laws of losses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mask {
     /// Nothing is measured beyond this, m.
     pub cut_m: Option<f64>,
-    /// Cells of directions with nothing behind.
+    /// Hidden cells of directions.
     pub blocked: BTreeSet<DirectionCell>,
-    /// Those and the cells around them, which may be blocked in part.
+    /// Those and the cells around them, which may be hidden in part.
     pub around: BTreeSet<DirectionCell>,
 }
 
 /// Sensor and cell of azimuth and elevation.
 pub type DirectionCell = (u8, i32, i32);
 
-/// Size of a cell, rad.
+/// Width of a cell, rad: 1.5 degrees.
 pub const AZIMUTH_RAD: f64 = 0.0262;
-/// Size of a cell, rad.
+/// Height of a cell, rad: 1 degree.
 pub const ELEVATION_RAD: f64 = 0.0175;
 
 /// The cell of a ray.
@@ -35,7 +36,7 @@ pub fn direction_cell(ray: &Ray) -> DirectionCell {
 impl Mask {
     /// Whether a ray is hidden, or may be.
     pub fn hides(&self, ray: &Ray) -> bool {
-        // Just before the end noise moves returns across it.
+        // Range noise moves returns near the largest range across it.
         self.cut_m.is_some_and(|cut| f64::from(ray.range_m) > 0.985 * cut)
             || !self.around.is_empty() && self.around.contains(&direction_cell(ray))
     }
@@ -46,10 +47,11 @@ impl Mask {
     }
 }
 
-/// Returns of a cell of directions: simulated, measured beyond the own car, measured on it; and the share of the frames with some on it.
+/// Returns of a cell of directions: simulated, measured beyond the ego vehicle, measured on it; and the share of the
+/// frames with some on it.
 pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 4]>;
 
-/// Nearer than this share of the simulated range, a near return is from the own car and not from the ground close by.
+/// A near return below this share of the simulated range is from the ego vehicle and not from the ground.
 const HALF_WAY: f64 = 0.6;
 
 /// Counts over some frames.
@@ -61,19 +63,20 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
             counts.entry(direction_cell(ray)).or_default()[0] += 1.0;
         }
         for ray in &frame.measured {
-            // In the open the simulation has nothing at all there; what was moved out of sight has a counterpart.
+            // Without a simulated return nothing is predicted; but a return with a counterpart was moved out of the
+            // field of view.
             let predicted = match ray.lies() {
                 Lies::Open if ray.matched => 0.0,
                 Lies::Open => f64::INFINITY,
                 _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
             };
             let count = counts.entry(direction_cell(ray)).or_default();
-            // Another car may drive as near all along.
+            // Another vehicle may drive as near in all frames.
             if ray.own_range_m() < OWN_CAR_M.min(HALF_WAY * predicted) && !ray.at_object {
                 count[2] += 1.0;
                 count[3] = 1.0 / which.len() as f64;
             } else {
-                // What lies about as near as it should counts as seen, on whichever side of the bound it comes to lie.
+                // Returns at about the predicted range are seen, on either side of the bound.
                 count[1] += 1.0;
             }
         }
@@ -89,113 +92,146 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
     which.par_iter().map(one).reduce(DirectionCounts::new, merge)
 }
 
-/// Simulated returns that a cell needs to be judged.
+/// Fewest simulated returns of a cell that is judged.
 const FEWEST: f64 = 15.0;
 
-/// Share of the simulated returns of a cell that is seen; `None` of one with too few.
+/// Share of the simulated returns of a cell that are measured; `None` with too few.
 fn share_seen(counts: &DirectionCounts, cell: &DirectionCell) -> Option<f64> {
     counts.get(cell).filter(|c| c[0] >= FEWEST).map(|[n, seen, ..]| seen / n)
 }
 
-/// Cells that what stands in the way covers at least.
+/// Fewest cells of an occlusion.
 const FEWEST_CELLS: usize = 4;
 
-/// Cells of what stands so near that it reaches over an end of the field of view.
-const REACHES_OVER: usize = 100;
+/// Fewest cells of an occlusion that covers a whole side of the field of view.
+const WHOLE_SIDE_CELLS: usize = 100;
 
-/// Measured returns from the own car, of the simulated ones from beyond it: from this share on the own car hides a cell.
-const ON_OWN_CAR: f64 = 0.4;
+/// Ratio of measured returns from the ego vehicle to simulated returns beyond it from which on the ego vehicle hides
+/// a cell.
+const ON_EGO_VEHICLE: f64 = 0.4;
 
-/// Nothing at all, as a share of the simulated returns.
-const NONE: f64 = 0.02;
+/// Share of the simulated returns below which a cell is empty.
+const EMPTY: f64 = 0.02;
 
-/// Where the measured scene is shown.
+/// Share of the simulated returns below which a cell is dark.
+const DARK: f64 = 0.12;
+
+/// How the measured scene lies against the simulated one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Shown {
-    /// Where it is.
+    /// In its place.
     InPlace,
-    /// It was turned or shifted and has been moved back.
+    /// It was turned or shifted, and this was undone.
     MovedBack,
-    /// It slides over a scan, or rows aim elsewhere.
+    /// It has motion distortion, or rows aim elsewhere.
     Elsewhere,
 }
 
-/// Cells from which next to nothing comes back though `expected` says that it should; `expected` gives the share that other losses keep
-/// in a cell. They lie together, and on two opposite sides of them returns come back: where a scene ends or only stands elsewhere they do not;
-/// where it was moved back, on all sides but one, where the field of view ends. Where returns come from the own car beside them the field of view
-/// may end there as well, but not above, where the scene ends. What hides a whole side of the field of view ends upright: laws of losses do not,
-/// and sensors that aim elsewhere lose less at their ends. Where the scene is not shown in its place, returns from the own car are
-/// believed, and beside them cells from which nothing at all comes back.
+/// Hidden cells: almost no simulated return is measured although `expected`, the share that other losses keep in a
+/// cell, says that it should.
+///
+/// Cells are judged in connected regions. A region counts if it stands out, see [`Region::stands_out`]. Where the
+/// measured scene is displaced, only regions with returns from the ego vehicle are believed, or regions that are
+/// surrounded on all sides, see [`Region::surrounded`].
 pub fn blocked_cells(
     counts: &DirectionCounts,
     shown: Shown,
     expected: impl Fn(&DirectionCell) -> f64,
 ) -> BTreeSet<DirectionCell> {
-    let judged = |cell: &DirectionCell| share_seen(counts, cell);
-    // Another car may come as near, though not in most frames.
-    let stays = |c: &[f64; 4]| c[0].max(c[2]) >= FEWEST && c[2] > ON_OWN_CAR * c[0] && c[3] > 0.5;
-    let covered = |cell: &DirectionCell| counts.get(cell).is_some_and(stays);
-    let mut dark: BTreeSet<DirectionCell> = counts
-        .keys()
-        .filter(|cell| covered(cell) || judged(cell).is_some_and(|seen| seen < 0.12 && expected(cell) > 0.5))
-        .copied()
-        .collect();
+    let is_dark =
+        |cell: &DirectionCell| share_seen(counts, cell).is_some_and(|seen| seen < DARK && expected(cell) > 0.5);
+    let mut dark: BTreeSet<DirectionCell> =
+        counts.keys().filter(|cell| covered(counts, cell) || is_dark(cell)).copied().collect();
     let mut blocked = BTreeSet::new();
     while let Some(first) = dark.first().copied() {
-        let together = take_together(&mut dark, first);
-        // Two cells on: the next one may be blocked in part.
-        let open = |(s, az, el): DirectionCell, a: i32, e: i32| {
-            (2..4).any(|k| judged(&(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
-        };
-        let ends = |(s, az, el): DirectionCell, a: i32, e: i32| {
-            // Rows may be farther apart than cells are high.
-            let nothing = |k: i32| !counts.contains_key(&(s, az + k * a, el + k * e));
-            e <= 0 && (1..4).any(|k| (k..k + 3).all(nothing))
-        };
-        // Left, right, above, below.
-        let on = |bounds: &dyn Fn(DirectionCell, i32, i32) -> bool| {
-            SIDES.map(|(a, e)| together.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= together.len())
-        };
-        let opposite = |[left, right, above, below]: [bool; 4]| left && right || above && below;
-        let rows = |which: &dyn Fn(&DirectionCell) -> bool| {
-            together.iter().filter(|c| which(c)).map(|c| c.2).collect::<BTreeSet<_>>().len()
-        };
-        let height = rows(&|_| true);
-        let upright = |a: i32| 4 * rows(&|c| open(*c, a, 0)) >= 3 * height;
-        let reaches_over = shown == Shown::InPlace && together.len() >= REACHES_OVER && (upright(1) || upright(-1));
-        let on_own_car = together.iter().filter(|c| covered(c)).count() >= 2;
-        let stands_out = together.len() >= FEWEST_CELLS
-            && (opposite(on(&open))
-                || reaches_over
-                || on_own_car && opposite(on(&|c, a, e| open(c, a, e) || ends(c, a, e))));
-        let all_around = || {
-            let (opens, closes) = (on(&open), on(&ends));
-            let sides = opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k]);
-            // A single row is the top of a wall that was moved.
-            sides && height > 1
-        };
+        let region = Region { counts, cells: take_together(&mut dark, first) };
+        let stands_out = region.stands_out(shown);
         let believed = match shown {
             Shown::InPlace => true,
-            Shown::MovedBack => all_around(),
+            Shown::MovedBack => region.surrounded(),
             Shown::Elsewhere => false,
         };
-        if on_own_car {
-            // What lies around and is dark for another reason does not belong to it.
-            let own = |c: &DirectionCell| {
-                covered(c) || stands_out && (shown == Shown::InPlace || judged(c).is_some_and(|s| s < NONE))
-            };
-            blocked.extend(together.into_iter().filter(own));
+        if region.on_ego_vehicle() {
+            // Cells of the region that are dark for another reason do not belong to the ego vehicle.
+            let empty = |c: &DirectionCell| share_seen(counts, c).is_some_and(|s| s < EMPTY);
+            let own = |c: &DirectionCell| covered(counts, c) || stands_out && (shown == Shown::InPlace || empty(c));
+            blocked.extend(region.cells.iter().filter(|c| own(c)));
         } else if stands_out && believed {
-            blocked.extend(together);
+            blocked.extend(region.cells);
         }
     }
     blocked
 }
 
+/// Whether most frames have returns from the ego vehicle in a cell. Another vehicle may come as near, though not in
+/// most frames.
+fn covered(counts: &DirectionCounts, cell: &DirectionCell) -> bool {
+    let stays = |c: &[f64; 4]| c[0].max(c[2]) >= FEWEST && c[2] > ON_EGO_VEHICLE * c[0] && c[3] > 0.5;
+    counts.get(cell).is_some_and(stays)
+}
+
+/// Connected dark cells of one sensor.
+struct Region<'a> {
+    counts: &'a DirectionCounts,
+    cells: BTreeSet<DirectionCell>,
+}
+
+impl Region<'_> {
+    /// Whether returns come back beside a cell on one side. The next cell may be hidden in part; the two after it
+    /// count.
+    fn open(&self, (s, az, el): DirectionCell, a: i32, e: i32) -> bool {
+        (2..4).any(|k| share_seen(self.counts, &(s, az + k * a, el + k * e)).is_some_and(|seen| seen > 0.5))
+    }
+
+    /// Whether the field of view ends beside a cell on one side, but not above, where the scene ends. Three cells
+    /// without any return are an end: rows may be farther apart than cells are high.
+    fn ends(&self, (s, az, el): DirectionCell, a: i32, e: i32) -> bool {
+        let nothing = |k: i32| !self.counts.contains_key(&(s, az + k * a, el + k * e));
+        e <= 0 && (1..4).any(|k| (k..k + 3).all(nothing))
+    }
+
+    /// For each side (left, right, above, below) whether an eighth of the cells are bounded there.
+    fn bounded(&self, bounds: impl Fn(DirectionCell, i32, i32) -> bool) -> [bool; 4] {
+        SIDES.map(|(a, e)| self.cells.iter().filter(|c| bounds(**c, a, e)).count() * 8 >= self.cells.len())
+    }
+
+    /// Number of rows of cells.
+    fn height(&self, which: impl Fn(&DirectionCell) -> bool) -> usize {
+        self.cells.iter().filter(|c| which(c)).map(|c| c.2).collect::<BTreeSet<_>>().len()
+    }
+
+    /// Whether returns come from the ego vehicle.
+    fn on_ego_vehicle(&self) -> bool {
+        self.cells.iter().filter(|c| covered(self.counts, c)).count() >= 2
+    }
+
+    /// Whether the region differs from the end of a scene: returns come back on two opposite sides; or it hides a
+    /// whole side of the field of view with an upright edge, which laws of losses do not; or returns come from the
+    /// ego vehicle and the field of view ends on the other side.
+    fn stands_out(&self, shown: Shown) -> bool {
+        let opposite = |[left, right, above, below]: [bool; 4]| left && right || above && below;
+        let open = |c, a, e| self.open(c, a, e);
+        let upright = |a: i32| 4 * self.height(|c| self.open(*c, a, 0)) >= 3 * self.height(|_| true);
+        let whole_side = shown == Shown::InPlace && self.cells.len() >= WHOLE_SIDE_CELLS && (upright(1) || upright(-1));
+        self.cells.len() >= FEWEST_CELLS
+            && (opposite(self.bounded(open))
+                || whole_side
+                || self.on_ego_vehicle() && opposite(self.bounded(|c, a, e| open(c, a, e) || self.ends(c, a, e))))
+    }
+
+    /// Whether returns come back on at least three sides, and on the fourth or the field of view ends there. A single
+    /// row does not count: it is the upper edge of a wall that was moved.
+    fn surrounded(&self) -> bool {
+        let (opens, closes) = (self.bounded(|c, a, e| self.open(c, a, e)), self.bounded(|c, a, e| self.ends(c, a, e)));
+        let sides = opens.iter().filter(|o| **o).count() >= 3 && (0..4).all(|k| opens[k] || closes[k]);
+        sides && self.height(|_| true) > 1
+    }
+}
+
 /// Steps to the cells beside one: left, right, above, below.
 pub(super) const SIDES: [(i32, i32); 4] = [(1, 0), (-1, 0), (0, 1), (0, -1)];
 
-/// Takes out of `cells` those that lie together with `first`, which is one of them.
+/// Removes the connected region of `first` from `cells`.
 pub(super) fn take_together(cells: &mut BTreeSet<DirectionCell>, first: DirectionCell) -> BTreeSet<DirectionCell> {
     cells.remove(&first);
     let mut all = vec![first];
@@ -213,11 +249,11 @@ pub(super) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = Dir
     (-1..=1).flat_map(move |a| (-1..=1).map(move |e| (s, az + a, el + e)))
 }
 
-/// A cell of which less than this share of what is expected is seen is hidden in part.
+/// Share of the expected returns below which a cell is hidden in part.
 const IN_PART: f64 = 0.85;
 
-/// Cells at the edge of what hides others: beside a blocked one, or beside another one at the edge, and hidden in part. None where they would be more than the
-/// blocked ones: something else is lost there as well.
+/// Cells at the edge of hidden ones: connected to them and hidden in part. None where they outnumber the hidden ones:
+/// then returns are lost for another reason as well.
 pub fn edge_cells(
     blocked: &BTreeSet<DirectionCell>,
     counts: &DirectionCounts,
@@ -236,7 +272,8 @@ pub fn edge_cells(
     if edge.len() > blocked.len() { BTreeSet::new() } else { edge }
 }
 
-/// Cells below others in which the simulation has next to nothing beyond the own car: what stands in the way of the ones above is in theirs as well.
+/// Cells below others in which the simulation has almost no returns beyond the ego vehicle: the occlusion continues
+/// into them.
 pub fn below(cells: &BTreeSet<DirectionCell>, counts: &DirectionCounts) -> BTreeSet<DirectionCell> {
     let near = |c: &DirectionCell| counts.get(c).is_none_or(|[n, ..]| *n < FEWEST);
     let lowest = (-FRAC_PI_2 / ELEVATION_RAD) as i32;
@@ -249,12 +286,13 @@ pub fn with_neighbours(cells: &BTreeSet<DirectionCell>) -> BTreeSet<DirectionCel
     cells.iter().flat_map(|c| neighbours(*c)).collect()
 }
 
-/// Measured returns of which one may lie beyond the end of the range.
-const BUT_ONE_IN: [usize; 2] = [2_000, 20_000];
+/// One of so many measured returns may lie beyond the largest range: false alarms. The second value is for scenes
+/// with few returns near it.
+const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
 
-/// The end of the range, m: beyond it the simulation has returns and the measured side none, before it both have.
+/// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.
 pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
-    // Returns in company only: false alarms come from everywhere.
+    // Returns with neighbours at their range only: false alarms occur at all ranges.
     let ranges = |measured: bool| {
         let mut all: Vec<f64> = which
             .iter()
@@ -271,8 +309,7 @@ pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     }
     let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
     let between = |v: &[f64], low: f64, high: f64| above(v, low) - above(v, high);
-    // The farthest measured return, but for a few false alarms; where few lie near the end, for next to none.
-    BUT_ONE_IN.into_iter().find_map(|one_in| {
+    OUTLIER_ONE_IN.into_iter().find_map(|one_in| {
         let farthest = a[a.len() - 1 - a.len() / one_in];
         let lost = above(&b, 1.01 * farthest);
         let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
@@ -282,7 +319,7 @@ pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     })
 }
 
-/// Where the share of measured returns among all falls, beyond `from_m`, m: the most likely single step.
+/// The most likely single step of the share of measured returns among all, beyond `from_m`, m.
 fn change(measured: &[f64], simulated: &[f64], from_m: f64) -> f64 {
     let mut all: Vec<(f64, f64)> =
         measured.iter().map(|r| (*r, 1.0)).chain(simulated.iter().map(|r| (*r, 0.0))).collect();
@@ -329,23 +366,23 @@ mod tests {
         }
         let blocked = blocked_cells(&counts, Shown::InPlace, |_| 1.0);
         assert_eq!(blocked.len(), 6);
-        assert!(
-            blocked_cells(&counts, Shown::Elsewhere, |_| 1.0).is_empty(),
-            "a scene that stands elsewhere makes holes"
-        );
-        assert_eq!(blocked_cells(&counts, Shown::MovedBack, |_| 1.0).len(), 6, "returns come back on all sides of it");
+        assert!(blocked_cells(&counts, Shown::Elsewhere, |_| 1.0).is_empty(), "a displaced scene has dark regions");
+        assert_eq!(blocked_cells(&counts, Shown::MovedBack, |_| 1.0).len(), 6, "returns come back on all sides");
         let mut beside_the_end = counts.clone();
         beside_the_end.retain(|(_, az, _), _| *az < 5);
         assert_eq!(blocked_cells(&beside_the_end, Shown::MovedBack, |_| 1.0).len(), 6, "the field of view ends there");
         let mut plate = counts.clone();
         plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| (c[2], c[3]) = (90.0, 0.2));
-        assert!(blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).is_empty(), "another car came near in some frames");
+        assert!(
+            blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).is_empty(),
+            "another vehicle came near in some frames"
+        );
         plate.iter_mut().filter(|(c, _)| blocked.contains(c)).for_each(|(_, c)| c[3] = 1.0);
         assert_eq!(blocked_cells(&plate, Shown::Elsewhere, |_| 1.0).len(), 6);
         assert!(!blocked.contains(&(0, -8, 0)) && !blocked.contains(&(0, -15, 4)));
         assert!(blocked_cells(&counts, Shown::InPlace, |_| 0.2).is_empty(), "other losses explain it");
         assert_eq!(with_neighbours(&blocked).len(), 20);
-        // Cells along its edge that are hidden in part; one like them that does not lie beside it.
+        // Cells along its edge that are hidden in part; one that is not connected.
         let mut edges = counts.clone();
         for c in [(0, 5, -3), (0, 6, -3), (0, 7, -2), (0, 9, 4)] {
             edges.insert(c, [100.0, 60.0, 0.0, 0.0]);
@@ -359,7 +396,8 @@ mod tests {
         assert!(under.is_empty(), "the simulation has something there");
         let under = below(&[(0, 3, -5)].into(), &counts);
         assert!(under.contains(&(0, 3, -6)) && under.contains(&(0, 3, -80)) && under.iter().all(|c| c.1 == 3));
-        // A plate close to the sensor that hides one side of the field of view, and the sky above it; a shorter side is one that aims elsewhere.
+        // A plate close to the sensor that hides one side of the field of view; a shorter side is a sensor that aims
+        // elsewhere.
         for (from, found) in [(-20, 130), (-13, 0)] {
             let mut side = DirectionCounts::new();
             for (az, el) in (from..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
@@ -367,7 +405,7 @@ mod tests {
             }
             assert_eq!(blocked_cells(&side, Shown::InPlace, |_| 1.0).len(), found);
         }
-        // A plate that reaches below the field of view and gives returns along its upper edge alone.
+        // A plate that extends below the field of view, with returns along its upper edge alone.
         let mut low = DirectionCounts::new();
         for (az, el) in (-20..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
             let hidden = (-6..3).contains(&az) && el < -2;
@@ -380,7 +418,7 @@ mod tests {
         assert_eq!(
             blocked_cells(&low, Shown::Elsewhere, |_| 1.0).len(),
             9,
-            "a scene that stands elsewhere makes holes beside the plate"
+            "a displaced scene has dark regions beside the plate"
         );
     }
 }

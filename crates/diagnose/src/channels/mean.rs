@@ -1,5 +1,5 @@
-//! Where the surfaces lie: distances of measured returns from the simulated surfaces, across them, as sums that every linear cause can
-//! be fitted from. Each frame has a small pose error of its own, which is integrated out.
+//! Distances of measured returns from the simulated surfaces, across them, as sums from which every linear cause is
+//! fitted. Each frame has a small pose error of its own, which is integrated out.
 //!
 //! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
 
@@ -22,11 +22,11 @@ pub enum Column {
     SensorPose(usize, usize),
     /// A shift along x, y or a turn about z that grows over a scan from -1/2 to +1/2.
     Sweep(usize),
-    /// Offset across one kind of surface, m: see [`kind_of`]. No cause: what simulated surfaces are wrong by.
+    /// Offset across one kind of surface, m: see [`kind_of`]. No cause: an error of the simulated surfaces.
     Structure(usize),
 }
 
-/// Number of columns, the first ones, that every frame may have of its own: its pose, and how it slides over a scan.
+/// Number of columns, the first ones, that every frame has of its own: its pose, and its displacement over a scan.
 pub const OWN: usize = 9;
 
 /// All columns for a rig, those of the frames' own first.
@@ -41,13 +41,13 @@ pub fn columns(rig: &Rig) -> Vec<Column> {
     all
 }
 
-/// What a structure may be wrong by, m: standard deviation.
+/// Standard deviation of the offset of a kind of surface, m.
 pub const STRUCTURE_M: f64 = 0.02;
 
-/// Farther than that from the surface after the frame's own pose is taken out, a return is not of this surface, m.
+/// Distance from the surface, after the frame's own pose is subtracted, from which on a return is not of it, m.
 pub const STRAY_M: f64 = 0.30;
 
-/// Surfaces are not flatter than that, m.
+/// Standard deviation of real surfaces from a plane, m.
 const RIPPLE_M: f64 = 0.006;
 
 /// Sums of one frame, in units of its noise.
@@ -78,13 +78,13 @@ pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
     values.get(values.len() / 2).map_or(0.01, |v| f64::from(*v) / 0.6745).max(0.002)
 }
 
-/// Whether a measured ray says where a surface lies.
+/// Whether a measured ray is used for the place of a surface.
 pub fn usable(ray: &Ray) -> bool {
     let stands = matches!(ray.surface, Surface::Ground | Surface::Standing) && !ray.at_object;
     ray.smooth && stands && ray.cos_incidence > 0.003
 }
 
-/// What all ranges of a frame are off by, m; 0 where they are not off alike, but for half of it.
+/// Common range bias of a frame, m: the median residual; 0 unless the median deviation from it is below half of it.
 pub fn common_bias_m(frame: &FramePair) -> f64 {
     let squarely = |r: &&Ray| usable(r) && met_squarely(f64::from(r.residual_m), f64::from(r.cos_incidence));
     let off_m: Vec<f64> = frame.measured.iter().filter(squarely).map(|r| f64::from(r.residual_m)).collect();
@@ -93,10 +93,10 @@ pub fn common_bias_m(frame: &FramePair) -> f64 {
     if others_m < 0.5 * bias_m.abs() { bias_m } else { 0.0 }
 }
 
-/// Kinds of surfaces.
+/// Number of kinds of surfaces.
 pub const KINDS: usize = 4;
 
-/// Kind of its surface: ground; standing and facing right, facing left, or facing along the car. A wall that follows a turn keeps its kind.
+/// Kind of a ray's surface: ground; standing and facing right, facing left, or facing along the vehicle.
 pub fn kind_of(ray: &Ray) -> usize {
     match ray.surface {
         Surface::Ground => 0,
@@ -115,7 +115,8 @@ pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
 /// Derivatives of the distance across the surface by a movement of the scene about `center`.
 pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVector<f64, 6> {
     let n = ray.normal_vector();
-    // The lever is that of the place that was measured: at grazing angles a turn moves the predicted one along the surface by metres.
+    // The lever of the measured place: at grazing incidence a turn moves the predicted one along the surface by
+    // metres.
     let lever = (origin + ray.direction_vector() * ray.own_range_m() - center).cross(&n);
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
 }
@@ -125,7 +126,7 @@ fn loose_prior() -> SVector<f64, 6> {
     SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
 }
 
-/// The pose error of one frame by itself, seen by each sensor, with redescending weights.
+/// The pose error of one frame as each sensor sees it, fitted with redescending weights.
 pub fn own_poses(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> OwnPoses {
     (0..origins.len()).map(|sensor| own_pose(frame, sensor, origins, noise_m)).collect()
 }
@@ -147,7 +148,7 @@ fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: 
         for (row, y, w) in &rows {
             let u = (y - row.dot(&pose)) / (4.0 * scale);
             if u.abs() < 1.0 {
-                // Neighbours err alike; a fiftieth keeps the prior meaningful.
+                // Errors of neighbours are correlated: a fiftieth of the weight keeps the prior meaningful.
                 let w = w * (1.0 - u * u).powi(2) / 50.0;
                 system += row * row.transpose() * w;
                 right += row * (w * y);
@@ -161,7 +162,7 @@ fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: 
     pose
 }
 
-/// How many neighbouring residuals count as one: variance of means over patches of directions, against that of independent ones.
+/// Design effect: the variance of means over patches of directions, in units of that of independent residuals.
 pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[OwnPoses], noise_m: f64) -> f64 {
     let sums: Vec<[f64; 3]> = frames
         .par_iter()
@@ -243,7 +244,7 @@ pub fn mean_frames(
         let p = columns.len();
         let (mut gram, mut right) = (vec![0.0; p * p], DVector::zeros(p));
         let (mut rays, mut squares) = (0.0, 0.0);
-        // Most columns belong to other sensors and surfaces: only those that say something are multiplied.
+        // Most columns belong to other sensors and surfaces: only non-zero ones are multiplied.
         let mut x: Vec<(usize, f64)> = Vec::with_capacity(p);
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
@@ -277,7 +278,8 @@ pub fn origins(rig: &Rig) -> Vec<Point3<f64>> {
 }
 
 impl MeanFrame {
-    /// The same sums with the frame's own pose and slide integrated out; `prior` holds the variances of their numbers.
+    /// The same sums with the frame's own pose and displacement over a scan integrated out; `prior` holds the
+    /// variances of their parameters.
     pub fn without_own(&self, prior: &SVector<f64, OWN>) -> (DMatrix<f64>, DVector<f64>) {
         let p = self.gram.nrows();
         let mut own = self.gram.view((0, 0), (OWN, OWN)).into_owned();

@@ -1,4 +1,4 @@
-//! What is looked at: each channel sums a pair of data sets up so that causes can be weighed.
+//! Channels: sums over a pair of data sets from which causes are fitted.
 
 pub mod cells;
 pub mod groups;

@@ -1,4 +1,4 @@
-//! How the own car moves from frame to frame, from posts, ends of walls and other edges of the simulated side that stand still.
+//! Ego motion from frame to frame, from posts, ends of walls and other static edges of the simulated side.
 
 use crate::inference::median;
 use crate::pairing::{FramePair, Surface};
@@ -6,7 +6,7 @@ use nalgebra::{Point3, Vector2};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
 
-/// Motion of the own car between two frames.
+/// Ego motion between two frames.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OwnMotion {
     /// Along its heading, m/s.
@@ -15,35 +15,38 @@ pub struct OwnMotion {
     pub yaw_rate_rad_s: f64,
 }
 
-/// Side of a cell of a frame seen from above, m.
+/// Side of a cell in bird's-eye view, m.
 pub const CELL_M: f64 = 0.35;
 
-/// Speeds that are looked for: their number, and the step, m/s.
+/// Number of speeds of the grid.
 const SPEEDS: usize = 160;
+
+/// Step of the grid of speeds, m/s.
 const SPEED_M_S: f64 = 0.6;
 
-/// Hardest that cars brake, m/s2.
+/// Largest acceleration of a vehicle, m/s2.
 const HARDEST_M_S2: f64 = 15.0;
 
-/// Frames farther apart in time show other things, s.
+/// Longest time between two frames that are compared, s.
 const LONGEST_S: f64 = 0.6;
 
-/// Fewer edges than that say nothing.
+/// Fewest edges of a frame.
 const FEWEST: usize = 40;
 
-/// Frames that are held against one for what edges have in common wherever the car is, are at least so far from it in time, s.
+/// Shortest time between a frame and the reference frames that show matches by chance, s.
 const ELSEWHERE_S: f64 = 0.5;
 
-/// Edges of a frame that are moved, at most.
+/// Edges of a frame that are compared, at most.
 const SOME: usize = 250;
 
-/// Times what the best path through chance gains that the speeds must gain.
+/// Ratio of the score of the best path of speeds to that of the best path by chance from which on it is significant.
 const STANDS_OUT: f64 = 1.25;
 
-/// Number of the slowest speed that is looked for: the sensors' pattern stands still in the car's frame.
+/// Index of the smallest speed of the search, 4.8 m/s: the scan pattern is static in the frame of the vehicle and
+/// resembles standstill.
 const SLOWEST: usize = 8;
 
-/// The motion at each frame; `None` where the scene does not tell.
+/// The motion at each frame; `None` where it cannot be estimated.
 pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) -> Vec<Option<OwnMotion>> {
     let seen = |f: &FramePair| {
         let edges = edges(f, origins);
@@ -51,7 +54,7 @@ pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) 
     };
     let seen: Vec<Seen> = frames.par_iter().map(seen).collect();
     let pair = |i: usize| {
-        // Of the frames in which nothing of this one stands where it stood, those that look most like it.
+        // References: of the frames far in time, those with the most edges at the same places.
         let far = (0..frames.len()).filter(|&j| (times[j] - times[i]).abs() > ELSEWHERE_S);
         let mut far: Vec<&Seen> = far.map(|j| &seen[j]).collect();
         far.sort_by_cached_key(|other| std::cmp::Reverse(hits(&seen[i].edges, other, 0.0, 0.0) as usize));
@@ -59,8 +62,8 @@ pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) 
         Some(Pair::new(&seen[i], &seen[i + 1], [one, other], times[i + 1] - times[i]))
     };
     let pairs: Option<Vec<Pair>> = (0..frames.len().saturating_sub(1)).into_par_iter().map(pair).collect();
-    let told = pairs.and_then(|pairs| speeds(&pairs).map(|speeds| (pairs, speeds)));
-    let Some((pairs, speeds)) = told else { return vec![None; frames.len()] };
+    let known = pairs.and_then(|pairs| speeds(&pairs).map(|speeds| (pairs, speeds)));
+    let Some((pairs, speeds)) = known else { return vec![None; frames.len()] };
     let steps: Vec<Option<OwnMotion>> = pairs.par_iter().zip(speeds).map(|(pair, k)| pair.motion(k)).collect();
     let raw: Vec<Option<OwnMotion>> = (0..frames.len())
         .map(|i| {
@@ -78,10 +81,10 @@ pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) 
     smooth(&raw, times)
 }
 
-/// Fewer frames with a motion than this share: nothing is known.
+/// Smallest share of frames with a known motion.
 const KNOWN: f64 = 0.4;
 
-/// Speeds change slowly: the median of the motions within a second, where there are enough.
+/// Median of the motions within 0.8 s, where at least two are known: speeds change slowly.
 fn smooth(raw: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
     let known = raw.iter().flatten().count();
     if (known as f64) < KNOWN * raw.len() as f64 || known < 3 {
@@ -99,7 +102,7 @@ fn smooth(raw: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
         .collect()
 }
 
-/// Places of edges that stand: not of the ground, not of objects, not of smooth walls.
+/// Places of static edges: not of the ground, not of objects, not of smooth walls.
 fn edges(frame: &FramePair, origins: &[Point3<f64>]) -> Vec<Vector2<f64>> {
     let mut cells = BTreeSet::new();
     let mut points = Vec::new();
@@ -123,16 +126,16 @@ fn cell(p: &Vector2<f64>) -> (i32, i32) {
     ((p.x / CELL_M).floor() as i32, (p.y / CELL_M).floor() as i32)
 }
 
-/// A square about the own car in cells, seen from above.
+/// Cells of a square about the ego vehicle, in bird's-eye view.
 pub struct Cells {
     taken: Vec<bool>,
 }
 
 impl Cells {
-    /// Cells of a side; edges lie within 70 m, and what is moved farther away lies beyond.
+    /// Cells along a side: 151 m. Edges lie within 70 m.
     const SIDE: i32 = 432;
 
-    /// Those with a point.
+    /// The cells that hold a point.
     pub fn new<'a>(points: impl IntoIterator<Item = &'a Vector2<f64>>) -> Self {
         let mut taken = vec![false; (Self::SIDE * Self::SIDE) as usize];
         points.into_iter().filter_map(Self::place).for_each(|i| taken[i] = true);
@@ -145,19 +148,20 @@ impl Cells {
         ((0..Self::SIDE).contains(&x) && (0..Self::SIDE).contains(&y)).then_some((x * Self::SIDE + y) as usize)
     }
 
-    /// Whether a point lies in one of them.
+    /// Whether a point lies in a cell that holds one.
     pub fn contains(&self, p: &Vector2<f64>) -> bool {
         Self::place(p).is_some_and(|i| self.taken[i])
     }
 }
 
-/// Edges seen from above, and the cells that they take.
+/// Edges in bird's-eye view, and the cells that they occupy.
 struct Seen {
     edges: Vec<Vector2<f64>>,
     taken: Cells,
 }
 
-/// How many of some edges come to lie on edges of another frame if the car moves ahead by `d` and turns by `yaw` along its mean heading.
+/// Number of edges that match edges of another frame if the vehicle moves ahead by `d` and turns by `yaw`, along its
+/// mean heading.
 fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
     let (s, c) = yaw.sin_cos();
     let (ms, mc) = (0.5 * yaw).sin_cos();
@@ -168,15 +172,15 @@ fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
     on.count() as f64
 }
 
-/// Two frames that follow one another, and others from elsewhere: the sensors' pattern stays where it is in the car's frame, and a wall looks like itself
-/// wherever one is along it.
+/// Two consecutive frames, and two reference frames from elsewhere. Matches with the references are due to the scan
+/// pattern, which is static in the frame of the vehicle, and to walls, which look alike along their length.
 struct Pair<'a> {
     some: Vec<Vector2<f64>>,
     second: &'a Seen,
     elsewhere: [&'a Seen; 2],
     dt: f64,
-    /// By speed: how many more edges of the first frame come to lie on those of the second than on those from elsewhere, at the best turn, and that turn; and
-    /// how many more on those of one frame from elsewhere than on those of the other, which is chance.
+    /// By speed: excess of matches with the second frame over the references at the best turn, that turn, and the
+    /// excess of one reference over the other, which is chance.
     scores: Vec<[f64; 3]>,
 }
 
@@ -209,7 +213,7 @@ impl<'a> Pair<'a> {
         [on - 0.5 * (one + other), one - other]
     }
 
-    /// The motion about the speed number `k`; `None` where no edges tell.
+    /// The motion about grid speed `k`; `None` without an excess of matches.
     fn motion(&self, k: usize) -> Option<OwnMotion> {
         let [best, yaw, _] = self.scores[k];
         let mut sum = [0.0; 3];
@@ -225,8 +229,9 @@ impl<'a> Pair<'a> {
     }
 }
 
-/// Of every pair the number of the speed, so that the most edges come to lie on others and the car neither brakes nor accelerates harder than cars do. `None`
-/// where chance finds such speeds as well, or all lie at the lower end: what moves with the car seems to stand.
+/// Index of the speed of every pair: the path with the most matches whose accelerations are possible. `None` where a
+/// path by chance scores as well, or where speeds are at the lower end of the grid, which is due to parts that move
+/// with the vehicle.
 fn speeds(pairs: &[Pair]) -> Option<Vec<usize>> {
     let (speeds, sum) = path(pairs, 0)?;
     let (_, by_chance) = path(pairs, 2)?;
@@ -246,7 +251,7 @@ fn path(pairs: &[Pair], score: usize) -> Option<(Vec<usize>, f64)> {
             near.max_by(|&a, &b| best[a].total_cmp(&best[b])).unwrap_or(SLOWEST)
         };
         let came: Vec<usize> = (0..SPEEDS).map(before).collect();
-        // What all speeds have in common tells nothing.
+        // The median over speeds is subtracted: only differences count.
         let middle = median(pair.scores[SLOWEST..].iter().map(|s| s[score]).collect());
         best = came.iter().zip(&pair.scores).map(|(&k, s)| best[k] + s[score] - middle).collect();
         from.push(came);
@@ -268,7 +273,7 @@ mod tests {
     use rand::RngExt;
 
     #[test]
-    fn posts_tell_the_motion_and_walls_do_not() {
+    fn posts_give_the_motion_and_walls_do_not() {
         let posts: Vec<Vector2<f64>> = (0..60)
             .map(|i| {
                 Vector2::new(-60.0 + 2.2 * f64::from(i) + f64::from(i * i % 7) * 0.23, f64::from(i % 5) * 2.1 - 9.3)
@@ -294,7 +299,7 @@ mod tests {
         let pair = Pair::new(&first, &second, [&one, &other], 0.05);
         let motion = pair.motion(speeds(std::slice::from_ref(&pair)).unwrap()[0]).unwrap();
         assert!((motion.speed_m_s - 48.0).abs() < 3.0 && (motion.yaw_rate_rad_s - 0.24).abs() < 0.1, "{motion:?}");
-        // Each scan meets a wall at other places of it.
+        // Each scan samples a wall at other places.
         let walls: Vec<Seen> = (0..12).map(|_| scattered(400, 0.0)).collect();
         let pair = |i: usize| Pair::new(&walls[i], &walls[i + 1], [&walls[(i + 5) % 12], &walls[(i + 7) % 12]], 0.25);
         assert_eq!(speeds(&(0..11).map(pair).collect::<Vec<_>>()), None);

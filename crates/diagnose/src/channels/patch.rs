@@ -1,4 +1,4 @@
-//! Patches of directions of a sensor from which less comes back than from surfaces like these elsewhere: dirt on a window.
+//! Patches of directions of a sensor with more losses than the same surfaces elsewhere, as by dirt on a window.
 
 use super::cells::cell;
 use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, SIDES, direction_cell, neighbours, take_together};
@@ -6,7 +6,8 @@ use crate::pairing::FramePair;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Returns in a direction: simulated and measured ones, and those of them without a counterpart beyond what is usual for surfaces like theirs.
+/// Returns in a direction: simulated and measured ones, and the excess of those without a counterpart over the usual
+/// number for such surfaces.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Losses {
     simulated: f64,
@@ -29,7 +30,7 @@ impl Losses {
         self.simulated
     }
 
-    /// Returns lost beyond what is usual. Matching one to one leaves as many without a counterpart on both sides.
+    /// Losses beyond the usual ones. One-to-one matching leaves as many returns without a counterpart on both sides.
     pub fn lost(&self) -> f64 {
         self.alone - self.odd * self.simulated / self.measured.max(1.0)
     }
@@ -43,8 +44,8 @@ impl Losses {
 /// Losses by direction.
 pub type DirectionLosses = BTreeMap<DirectionCell, Losses>;
 
-/// Sums over some frames; `usual` holds of each cell of covariates the shares of simulated and of measured returns that have no counterpart. Objects
-/// do not count: they are met in some directions more than in others.
+/// Sums over some frames. `usual` holds for each cell of covariates the shares of simulated and of measured returns
+/// without a counterpart. Objects are left out: they are more frequent in some directions.
 pub fn direction_losses(frames: &[FramePair], which: &[usize], mask: &Mask, usual: &[[f64; 2]]) -> DirectionLosses {
     let one = |i: &usize| {
         let mut sums = DirectionLosses::new();
@@ -83,29 +84,33 @@ fn total<'a>(losses: impl Iterator<Item = &'a Losses>) -> Losses {
     })
 }
 
-/// A patch is looked for where cells with those around them lose more than one of these shares beyond what is usual, the lowest first.
+/// Thresholds of the excess loss for connected cells, in the order in which they are tried.
 const SHARES: [f64; 6] = [0.06, 0.09, 0.13, 0.19, 0.27, 0.4];
 
-/// Returns that a share needs.
+/// Fewest simulated returns of a share.
 const FEWEST: f64 = 40.0;
 
-/// Cells of a patch, and its largest width and height, rad: what is larger is no spot.
+/// Fewest cells of a patch.
 const FEWEST_CELLS: usize = 4;
+
+/// Largest width and height of a patch, rad.
 const LARGEST_RAD: [f64; 2] = [1.0, 0.35];
 
-/// Around a patch that share of its own is lost at most.
+/// Largest loss beside a patch, as a share of its own.
 const AROUND: f64 = 0.35;
 
-/// Most of its cells lose by themselves that share of what it loses.
+/// Smallest loss of a cell of a patch, as a share of the loss of the patch; see [`MOST`].
 const ALIKE: f64 = 0.3;
+
+/// Smallest share of the cells of a patch with such a loss.
 const MOST: f64 = 0.85;
 
-/// Directions that lose more than those around them.
+/// Directions with more losses than those around them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Patch {
-    /// Where more than `share` is lost, half of what is lost in the middle.
+    /// Cells with a loss above `share`.
     pub cells: BTreeSet<DirectionCell>,
-    /// The share.
+    /// Half of the loss in the middle.
     pub share: f64,
 }
 
@@ -116,7 +121,7 @@ impl Patch {
     }
 }
 
-/// Patches, the one that loses most first.
+/// Patches, the one with the most losses first.
 pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
     let known = losses.keys().map(|c| (*c, sum(losses, neighbours(*c)))).filter(|(_, l)| l.simulated >= FEWEST);
     let shares: BTreeMap<DirectionCell, f64> = known.map(|(c, l)| (c, l.share())).collect();
@@ -128,7 +133,7 @@ pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
             let Some(middle) = cells.iter().max_by(|a, b| shares[a].total_cmp(&shares[b])) else { continue };
             let new = found.iter().all(|f| f.cells.is_disjoint(&cells));
             if new && shares[middle] > 1.5 * share && stands_alone(losses, &cells) {
-                // What lies beside it and loses a little is not of it.
+                // Cells beside it with small losses do not belong to it.
                 let half = 0.5 * shares[middle];
                 let mut more: BTreeSet<DirectionCell> = cells.iter().filter(|c| shares[c] > half).copied().collect();
                 let cells = take_together(&mut more, *middle);
@@ -142,7 +147,8 @@ pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
     found
 }
 
-/// Whether returns come back on all sides of a patch; below the field of view may end, not above, where scenes end.
+/// Whether losses are small on all sides of a patch. Below it the field of view may end, but not above, where scenes
+/// end.
 fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bool {
     let span = |f: fn(&DirectionCell) -> i32, step: f64| {
         let [low, high] = [patch.iter().map(f).min(), patch.iter().map(f).max()].map(Option::unwrap_or_default);
@@ -157,7 +163,7 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
     if (alike as f64) < MOST * patch.len() as f64 {
         return false;
     }
-    // Two cells on: the next one may belong to it in part.
+    // The next cell may belong to it in part: the two after it count.
     let beside = |a: i32, e: i32| {
         let ring: BTreeSet<DirectionCell> = patch
             .iter()
@@ -175,25 +181,25 @@ fn place(cell: &DirectionCell) -> [f64; 2] {
     [(f64::from(cell.1) + 0.5) * AZIMUTH_RAD, (f64::from(cell.2) + 0.5) * ELEVATION_RAD]
 }
 
-/// What a spot (see [`spot`]) loses in a cell.
+/// Loss of a spot (see [`spot`]) in a cell.
 pub fn share_of_spot([azimuth, elevation, radius, most]: &[f64; 4], cell: &DirectionCell) -> f64 {
     let [a, e] = place(cell);
     let angle = ((a - azimuth) * elevation.cos()).hypot(e - elevation);
     most * (-(angle / radius).powi(4)).exp()
 }
 
-/// Middle and radius of a spot from which a share `most * exp(-(angle / radius)^4)` does not come back: azimuth, elevation, radius, rad, and `most`.
+/// Fits a spot with the loss `most * exp(-(angle / radius)^4)`: azimuth, elevation, radius, rad, and `most`.
 pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
     let mut cells: Vec<([f64; 2], Losses)> =
         patch.cells.iter().filter_map(|c| Some((place(c), *losses.get(c)?))).collect();
     let weight = |l: &Losses| l.share().max(0.0);
     let weights: f64 = cells.iter().map(|(_, l)| weight(l)).sum::<f64>().max(1e-12);
     let [azimuth, elevation] = [0, 1].map(|k| cells.iter().map(|(p, l)| weight(l) * p[k]).sum::<f64>() / weights);
-    // What the best third of its cells lose is lost in its middle.
+    // The loss of its middle is that of the third of its cells with the largest losses.
     cells.sort_by(|a, b| b.1.share().total_cmp(&a.1.share()));
     let middle = total(cells.iter().take(cells.len().div_ceil(3)).map(|(_, l)| l));
     let most = middle.share().clamp(1.2 * patch.share, 1.0);
-    // The share is passed within an angle of r ln(most / share)^(1/4).
+    // The loss exceeds `share` within an angle of r ln(most / share)^(1/4).
     let area = patch.cells.len() as f64 * AZIMUTH_RAD * elevation.cos() * ELEVATION_RAD;
     [azimuth, elevation, (area / std::f64::consts::PI).sqrt() / (most / patch.share).ln().powf(0.25), most]
 }
@@ -202,7 +208,7 @@ pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
 mod tests {
     use super::*;
 
-    /// A field of view in which `lost` tells the share lost at each cell.
+    /// A field of view; `lost` gives the loss of each cell.
     fn field(lost: impl Fn(f64, f64) -> f64) -> DirectionLosses {
         let cells = (-30..30).flat_map(|az| (-12..6).map(move |el| (0, az, el)));
         cells

@@ -1,42 +1,44 @@
-//! Returns where the simulation has none: alone, in groups, in the gap between the two surfaces of an edge. Simulated returns are counted
-//! alike, each against the others, and in gaps of the measured side, so that what both sides have cancels.
+//! Returns off the simulated surfaces: lone ones, groups, and returns between the two surfaces of an edge. Simulated
+//! returns are counted in the same way, each against the others and in gaps of the measured side, so that effects of
+//! both sides cancel.
 
 use crate::pairing::{FramePair, Lies, Ray, Surface};
 use rayon::prelude::*;
 
-/// Kinds of returns that stand out.
+/// Kinds of returns off the surfaces.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Odd {
-    /// Alone, in front of the surface, behind it or in the open; not at an edge.
+    /// Lone, in front of the surface, behind it or without one; not at an edge.
     Alone,
     /// In a gap of the other side, between the two surfaces of an edge.
     Between,
-    /// In company, in front of the surface or in the open; not on objects.
+    /// Grouped, in front of the surface or without one; not on objects.
     GroupInFront,
-    /// In company, behind the surface; not on objects.
+    /// Grouped, behind the surface; not on objects.
     GroupBehind,
 }
 
 /// All kinds.
 pub const ODD: [Odd; 4] = [Odd::Alone, Odd::Between, Odd::GroupInFront, Odd::GroupBehind];
 
-/// Nearer than that it may be the own car, m.
+/// Range below which a return may be from the ego vehicle, m.
 pub const OWN_CAR_M: f64 = 4.0;
 
-/// In the middle of a jump there may be a few in company: a beam wider than the steps mixes several shots beside each other alike.
+/// Neighbours at the same range from which on returns are grouped. Mixed ranges may have a few: a beam wider than the
+/// steps mixes several neighbouring shots alike.
 const FEW: u8 = 4;
 
-/// Nearer to a smooth surface than that, across it, a return lies on it, m.
+/// Distance from a smooth surface, across it, within which a return lies on it, m.
 const FLAT_M: f64 = 0.15;
 
-/// What a return is, if it stands out.
+/// The kind of a return; `None` on a surface.
 pub fn odd(ray: &Ray) -> Option<Odd> {
     let lies = ray.lies();
     if ray.own_range_m() < OWN_CAR_M {
         return None;
     }
     match lies {
-        // On a smooth surface met at a grazing angle neighbouring rows lie apart as well.
+        // On a smooth surface at grazing incidence neighbouring rows lie apart as well.
         _ if ray.in_gap && ray.company < FEW && !(ray.smooth && ray.across_m().abs() < FLAT_M) => Some(Odd::Between),
         Lies::On => None,
         _ if ray.company <= 1 => (ray.smooth || lies == Lies::Open).then_some(Odd::Alone),
@@ -57,7 +59,7 @@ pub struct OddFrame {
     pub mixed_per_rad: f64,
 }
 
-/// Where the simulation ends, m: but for a few, no return lies farther. Beyond it the measured side cannot be judged.
+/// Largest range of the simulation, m: one in 2000 returns lies farther. Beyond it the measured side cannot be judged.
 pub fn end_m(frames: &[FramePair]) -> f64 {
     let mut ranges: Vec<f64> =
         frames.iter().flat_map(|f| f.simulated.iter().step_by(7)).map(Ray::own_range_m).collect();
@@ -66,7 +68,7 @@ pub fn end_m(frames: &[FramePair]) -> f64 {
     ranges.get(last).copied().unwrap_or(f64::INFINITY)
 }
 
-/// Counts of every frame, of returns nearer than `end_m`. The two sides may have been thinned differently: simulated counts are scaled to the measured share.
+/// Counts of every frame, of returns nearer than `end_m`.
 pub fn odd_frames(frames: &[FramePair], end_m: f64) -> Vec<OddFrame> {
     frames
         .par_iter()

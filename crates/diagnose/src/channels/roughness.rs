@@ -1,5 +1,5 @@
-//! How rough the returns of a surface are: each return against the surface of its own side's returns around it. Poses, labels and
-//! slightly wrong walls cancel; noise along the ray and of the direction does not.
+//! Roughness: the distance of each return from the surface through its neighbours of the same side. Poses, labels and
+//! errors of walls cancel; noise of the range and of the direction does not.
 
 use super::cells::{CELLS, Place, cell};
 use super::groups::{Group, GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
@@ -12,7 +12,7 @@ use sensor::Rig;
 pub struct RoughCell {
     /// Measured returns.
     pub measured: Place,
-    /// Sum of their squared roughness, m2, each at most [`CAP`] times the cell's scale.
+    /// Sum of their squared roughness, m2, each at most that of [`CAP`] scales of the cell.
     pub measured_squares: f64,
     /// Simulated returns.
     pub simulated: Place,
@@ -38,17 +38,17 @@ impl RoughCell {
 /// Cells of one frame: those that hold something, by number.
 pub type RoughFrame = Vec<(u32, RoughCell)>;
 
-/// Squares count up to this many standard deviations.
+/// Largest roughness that counts, in standard deviations.
 const CAP: f64 = 4.0;
 
-/// Bins of the logarithm of the roughness, for medians.
+/// Number of bins of the logarithm of the roughness, for medians.
 const LOG_BINS: usize = 56;
 
 fn log_bin(v: f64) -> usize {
     ((v.max(1e-9).log2() + 20.0) * 2.0).clamp(0.0, LOG_BINS as f64 - 1.0) as usize
 }
 
-/// Roughness in units of what one range would have by itself, m. Where an object is of which the simulation knows nothing, nothing is alike.
+/// Roughness in units of the noise of one range, m. `None` at objects that the simulation does not show there.
 pub fn own_roughness_m(ray: &Ray) -> Option<f64> {
     if ray.at_object && ray.surface != Surface::Object {
         return None;
@@ -129,8 +129,9 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a RoughFrame>) -> Vec<RoughCell>
     sum
 }
 
-/// By how much the measured returns of groups of directions are rougher than `expected` tells, in units of the expected variance, as sums
-/// of every frame. `variances` gives the two sides' variances of a cell, `expected` the measured one in units of the simulated one.
+/// Excess variance of the measured returns of groups of directions over `expected`, in units of it, as sums of every
+/// frame. `variances` gives the two sides' variances of a cell, `expected` the measured variance in units of the
+/// simulated one.
 pub fn rough_groups(
     frames: &[FramePair],
     rig: &Rig,
@@ -141,7 +142,7 @@ pub fn rough_groups(
 ) -> Vec<PartedFrame> {
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |frame: &FramePair| -> PartedFrame {
-        // Of each side: returns, sum of squares less what is expected, sum of variances of the squares.
+        // Of each side: returns, sum of the squares minus their expectation, sum of the variances of the squares.
         let mut sums = std::collections::BTreeMap::<(Group, usize), [[f64; 3]; 2]>::new();
         for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
             for ray in rays {
@@ -161,7 +162,7 @@ pub fn rough_groups(
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];
         for ((g, part), [a, b]) in sums.into_iter().filter(|(_, [a, b])| a[0] >= 5.0 && b[0] >= 5.0) {
             let y = a[1] / a[0] - b[1] / b[0];
-            // Neighbours share neighbours.
+            // Neighbouring returns share neighbours: half of the weight.
             let w = 1.0 / (2.0 * (a[2] / (a[0] * a[0]) + b[2] / (b[0] * b[0])));
             out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n: a[0] }));
         }

@@ -70,7 +70,8 @@ struct Report {
     /// Simulated returns of the held-out frames.
     returns: f64,
     findings: Vec<Finding>,
-    /// Of every held-out frame the distance, the gain of the findings, and the gain of unconstrained lookup tables, nats.
+    /// Of every held-out frame the distance, the gain of the findings, and the gain of unconstrained lookup tables,
+    /// nats.
     distance: Vec<[f64; 3]>,
     /// Distance before, after and at the floor, nats a return.
     channels: BTreeMap<Channel, [f64; 3]>,
@@ -119,8 +120,8 @@ impl Report {
     }
 }
 
-/// Distance over all held-out frames, with the interval of the share that is closed. `sums` holds of every frame its distance, the gain of the
-/// findings, and the gain of unconstrained lookup tables.
+/// Distance over all held-out frames, with the interval of the share that is closed. `sums` holds of every frame its
+/// distance, the gain of the findings, and the gain of unconstrained lookup tables.
 fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
     let total = |which: &[usize]| {
         which.iter().fold([0.0; 3], |s, &i| [s[0] + sums[i][0], s[1] + sums[i][1], s[2] + sums[i][2]])

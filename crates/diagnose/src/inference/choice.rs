@@ -26,8 +26,8 @@ pub struct Demands {
     pub nats: f64,
     /// Share of the best gain by which a simpler hypothesis may fall behind.
     pub slack: f64,
-    /// Share of its gain by which a hypothesis with more parameters and another cause must exceed the simpler one, significantly, to be
-    /// reported beside it.
+    /// Share of its gain by which a hypothesis with more parameters and another cause must exceed the simpler one,
+    /// significantly, to be reported beside it.
     pub richer: f64,
 }
 
@@ -36,12 +36,13 @@ pub struct Demands {
 pub struct Choice {
     /// The chosen trial.
     pub chosen: usize,
-    /// Trials of other causes that explain as much as far as these frames tell, or nearly as much with fewer parameters.
+    /// Trials of other causes that explain as much as far as these frames tell, or nearly as much with fewer
+    /// parameters.
     pub equals: Vec<usize>,
 }
 
-/// Sum of the gains, and their mean over its standard error. The relative standard deviation is taken to be at least 1/30, which bounds z by
-/// 30 times the square root of the number of frames.
+/// Sum of the gains, and their mean over its standard error. The relative standard deviation is taken to be at least
+/// 1/30, which bounds z by 30 times the square root of the number of frames.
 pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
     let n = gains.len() as f64;
     let total: f64 = gains.iter().sum();
@@ -54,8 +55,9 @@ pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
     (total, mean / error)
 }
 
-/// Whether gains are consistent although few frames have most of them. An effect that only some scenes show (a bend, an object beside the
-/// road) gains much on at least three frames, and all losses together are below 15 % of all gains.
+/// Whether gains are consistent although few frames have most of them. An effect that only some scenes show (a bend,
+/// an object beside the road) gains much on at least three frames, and all losses together are below 15 % of all
+/// gains.
 fn consistent(gains: &[f64]) -> bool {
     let won: f64 = gains.iter().filter(|g| **g > 0.0).sum();
     let lost: f64 = -gains.iter().filter(|g| **g < 0.0).sum::<f64>();
@@ -72,8 +74,8 @@ pub fn significant(gains: &[f64], z_least: f64) -> bool {
     z > z_least || z > 1.5 && consistent(gains)
 }
 
-/// Sign test: whether positive differences outnumber negative ones by more than `z_least` standard errors. Frames without a difference do
-/// not count.
+/// Sign test: whether positive differences outnumber negative ones by more than `z_least` standard errors. Frames
+/// without a difference do not count.
 pub fn significant_by_signs(differences: &[f64], z_least: f64) -> bool {
     let more = differences.iter().filter(|d| **d > 0.0).count() as f64;
     let less = differences.iter().filter(|d| **d < 0.0).count() as f64;
@@ -103,7 +105,8 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let chosen = simpler
         .min_by(|a, b| trials[*a].parameters.cmp(&trials[*b].parameters).then(total(*b).total_cmp(&total(*a))))
         .unwrap_or(best);
-    // A slightly wrong form of the right cause lets a richer law gain a little. Where it gains more, significantly, both are reported.
+    // A slightly wrong form of the right cause lets a richer law gain a little. Where it gains more, significantly,
+    // both are reported.
     let worth_more = |&i: &usize| {
         let (more, z) = ahead(i, chosen);
         let richer = trials[i].parameters > trials[chosen].parameters;
@@ -136,7 +139,8 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     }
 }
 
-/// Other causes, without more parameters, whose gain falls behind the chosen one's by less than a share, significant or not.
+/// Other causes, without more parameters, whose gain falls behind the chosen one's by less than a share, significant
+/// or not.
 pub fn as_good(trials: &[Trial], chosen: usize, but_for: f64) -> Vec<Cause> {
     let c = &trials[chosen];
     let least = (1.0 - but_for) * total_and_z(&c.gains).0;

@@ -32,12 +32,13 @@ pub fn step_of(frequency: usize) -> f64 {
 /// Spectra of ranges.
 pub struct Spectra(Arc<dyn Fft<f32>>);
 
-impl Spectra {
-    /// Prepares the transform.
-    pub fn new() -> Self {
+impl Default for Spectra {
+    fn default() -> Self {
         Spectra(FftPlanner::new().plan_fft_forward(BINS))
     }
+}
 
+impl Spectra {
     /// Sum of exp(-2 pi i R / step) over ranges, by frequency. Ranges beyond the last bin count in it.
     pub fn of(&self, ranges: impl IntoIterator<Item = f64>) -> Vec<Complex<f32>> {
         let mut values = vec![Complex::new(0.0f32, 0.0); BINS];

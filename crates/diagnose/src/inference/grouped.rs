@@ -1,4 +1,4 @@
-//! Offsets of groups, one number each, shrunk by a prior; weighed on frames that they were not fitted on.
+//! Offsets of groups of rays, shrunk by a prior, and their cross-validated gains.
 
 use super::linear::{FOLDS, fold_of};
 use super::median;
@@ -12,9 +12,10 @@ pub struct GroupFit {
     pub column: usize,
     /// Prior precision of an offset.
     pub precision: f64,
-    /// Whether what all groups have in common is taken out: it belongs to other causes.
+    /// Whether the mean of all groups is subtracted: it belongs to other causes.
     pub centred: bool,
-    /// Share of what other parts of a group tell that is believed of a part, 1 for all: less where parts agree in sign rather than in size.
+    /// Factor on the offset that other parts of a group predict for a part: below 1 where parts agree in sign rather
+    /// than in size.
     pub trust: f64,
 }
 
@@ -39,10 +40,10 @@ pub fn gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<Group, f64>) -
     frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
 }
 
-/// Groups on either side whose offsets a smooth law would tell.
+/// Neighbouring groups to either side that a smooth law is averaged over.
 const NEIGHBOURS: u16 = 3;
 
-/// Mean offset of the neighbours of each group: what a law that is smooth from group to group would say.
+/// Mean offset of the neighbours of each group: the prediction of a smooth law.
 pub fn smooth(
     sums: &BTreeMap<Group, GroupSums>,
     offsets: &BTreeMap<Group, f64>,
@@ -65,9 +66,9 @@ fn level(sums: &BTreeMap<Group, GroupSums>, column: usize) -> f64 {
     if gram > 0.0 { right / gram } else { 0.0 }
 }
 
-/// Gains of frames by offsets that were fitted on other folds and on other parts of each group: what surfaces of one part are wrong by does
-/// not tell the other parts. With `rough` over what a smooth law would gain. Where what groups have in common is taken out, it is taken out of
-/// each part by itself.
+/// Gains of frames by offsets fitted on other folds and on other parts of each group: errors of the surfaces of one
+/// part do not predict the other parts. With `rough`, gains are relative to those of a smooth law. Where the mean of
+/// all groups is subtracted, it is that of each part.
 pub fn cross_part_gains(
     frames: &[PartedFrame],
     select: &[usize],
@@ -90,22 +91,22 @@ pub fn cross_part_gains(
             for (_, sums) in parts.iter().enumerate().filter(|(p, _)| *p != part) {
                 sums.iter().for_each(|(k, s)| others.entry(*k).or_default().merge(s));
             }
-            let mut told = offsets(&others, how);
-            told.values_mut().for_each(|v| *v *= how.trust);
-            let smooth = if rough { smooth(&others, &told, how) } else { BTreeMap::new() };
+            let mut predicted = offsets(&others, how);
+            predicted.values_mut().for_each(|v| *v *= how.trust);
+            let smooth = if rough { smooth(&others, &predicted, how) } else { BTreeMap::new() };
             for i in (0..select.len()).filter(|&i| folds[i] == fold) {
                 let mut frame = frames[select[i]][part].clone();
                 frame.iter_mut().for_each(|(_, s)| s.lower(how.column, levels[part]));
                 let frame = &frame;
-                out[i] += gain(frame, how.column, &told) - gain(frame, how.column, &smooth);
+                out[i] += gain(frame, how.column, &predicted) - gain(frame, how.column, &smooth);
             }
         }
     }
     out
 }
 
-/// Spread of the offsets from row to row: from the median of second differences between neighbouring groups, so that offsets that are
-/// smooth but for a few jumps have none.
+/// Standard deviation of the offsets from row to row, from the median second difference between neighbouring groups:
+/// zero for offsets that are smooth except for a few jumps.
 pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
     let offsets = offsets(sums, how);
     let known = |k: Group| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
@@ -118,10 +119,10 @@ pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
     differences[differences.len() / 2] / 0.6745 / 1.5f64.sqrt()
 }
 
-/// Times the usual variance of a group's offset from which on it says nothing of the others.
+/// Groups with an offset of more than this many times the median variance are left out of spreads.
 const WORSE: f64 = 16.0;
 
-/// Offsets, with variances, of the groups that are known well: not much worse than most.
+/// Offsets with their variances, of the groups that are known well.
 fn known(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> BTreeMap<Group, (f64, f64)> {
     let offsets = offsets(sums, how);
     let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
@@ -132,8 +133,8 @@ fn known(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> BTreeMap<Group, (f
     known
 }
 
-/// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well. The
-/// largest `trimmed` share of them does not count.
+/// Root mean square of the offsets beyond their errors, and the number of groups that are known well. The `trimmed`
+/// share with the largest offsets is left out.
 pub fn spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
     let mut squares: Vec<(f64, f64)> = known(sums, how).into_values().map(|(o, noise)| (o.powi(2), noise)).collect();
     squares.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -143,11 +144,11 @@ pub fn spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit, trimmed: f64) ->
     if n < 4.0 { (0.0, 0.0) } else { ((excess / n).max(0.0).sqrt(), n) }
 }
 
-/// Times the spread about their neighbours beyond which rows are shifted together.
+/// Ratio of the spread to the spread about the neighbours above which rows are shifted together.
 const TOGETHER: f64 = 1.12;
 
-/// The same of rows. Walls that lie a little elsewhere shift many rows together: where the spread about the mean of their neighbours is less by more than
-/// rows that know nothing of each other make it, it is that.
+/// The same for rows. A displaced wall shifts many rows together. Where the spread about the mean of the neighbours
+/// is significantly smaller than for independent rows, it is returned.
 pub fn spread_of_rows(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> (f64, f64) {
     let known = known(sums, how);
     let about = |(k, (offset, noise)): (&Group, &(f64, f64))| {
@@ -174,7 +175,7 @@ mod tests {
     #[test]
     fn offsets_and_their_spread_are_found_and_noise_gains_nothing() {
         let mut rng = data::stream(3, "grouped", 0, 0);
-        // Offsets of groups, and what the surfaces of one part are wrong by.
+        // Offsets of groups, and an error of the surfaces of one part.
         let mut made = |size: f64, of_a_part: f64| -> Vec<PartedFrame> {
             let mut group = |k: u16, part: usize| {
                 let own = if k.is_multiple_of(2) { size } else { -size };
@@ -203,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn what_walls_shift_together_is_no_spread_of_rows() {
+    fn shifts_of_many_rows_by_a_wall_are_no_spread_of_rows() {
         let mut rng = data::stream(5, "rows", 0, 0);
         let offsets: Vec<f64> =
             (0..200).map(|_| 0.05 * Distribution::<f64>::sample(&StandardNormal, &mut rng)).collect();

@@ -1,4 +1,4 @@
-//! The forms that laws of lost returns have, and their numbers.
+//! Laws of lost returns and their parameters.
 
 use crate::catalogue::Cause;
 use crate::channels::cells::ZONES;
@@ -8,13 +8,13 @@ use crate::channels::cells::ZONES;
 pub enum Law {
     /// The same share everywhere.
     Random,
-    /// Falls with range: half of the returns at a range, and how fast.
+    /// Falls with range.
     Range,
     /// Falls with the angle of incidence.
     Incidence,
     /// Falls with the signal cos / R^2; surfaces may be brighter than the ground.
     Signal,
-    /// One kind of surface loses a share; [`WHOLE_OBJECT`]: bodies of objects with their corners.
+    /// One kind of surface loses a share; see [`WHOLE_OBJECT`].
     Zone(usize),
 }
 
@@ -26,7 +26,7 @@ pub fn in_zone(of_law: usize, zone: usize) -> bool {
     zone == of_law || of_law == WHOLE_OBJECT && zone >= 2
 }
 
-/// All laws, in the order of how much they assume.
+/// All laws, from those with the fewest parameters on.
 pub const LAWS: [Law; 9] = [
     Law::Random,
     Law::Zone(0),
@@ -39,7 +39,7 @@ pub const LAWS: [Law; 9] = [
     Law::Signal,
 ];
 
-/// What the laws need to know of a cell.
+/// Covariates of a cell.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Where {
     pub(super) ln_range: f64,
@@ -47,27 +47,29 @@ pub(super) struct Where {
     pub(super) zone: usize,
 }
 
-/// A law with its numbers.
+/// A law with its parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FittedLaw {
     /// Which.
     pub law: Law,
-    /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew, share lost anyway; signal:
-    /// then by how much standing surfaces and objects are brighter, in ln.
+    /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew,
+    /// share lost where the law has no effect. Signal, in addition: ln of the reflectivity of standing surfaces and
+    /// of objects over that of the ground.
     pub numbers: [f64; 6],
 }
 
-/// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. Real laws have other tails than the logistic one; the skew lets both differ.
+/// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. The skew lets the two tails differ, as those of real
+/// sensors do.
 fn step(x: f64, [a, ln_k, ln_skew]: [f64; 3]) -> f64 {
     (1.0 + (-ln_k.exp() * (x - a)).exp()).powf(-ln_skew.exp())
 }
 
-/// Where the step is at one half.
+/// The place at which a step is one half.
 fn half([a, ln_k, ln_skew]: [f64; 3]) -> f64 {
     a - ((0.5f64.powf(-(-ln_skew).exp()) - 1.0).max(1e-12)).ln() / ln_k.exp()
 }
 
-/// Reflectivities of unlike surfaces differ by about this factor, as a logarithm.
+/// Prior standard deviation of the logarithm of a ratio of reflectivities.
 const BRIGHTNESS: f64 = 1.2;
 
 impl Law {
@@ -107,7 +109,7 @@ impl Law {
         }
     }
 
-    /// Where a fit begins, by the cells that have returns.
+    /// Starting points of a fit, from the cells with returns.
     pub(super) fn starts(self, cells: &[Where]) -> Vec<FittedLaw> {
         let with = |numbers: [f64; 6]| FittedLaw { law: self, numbers };
         let value = |at: &Where| match self {
@@ -126,17 +128,17 @@ impl Law {
     }
 }
 
-/// Of what comes back with plenty of light a sensor may lose this share; what is more is a cause of its own, a random loss.
+/// Largest share that a law loses where it has no effect. A larger share is a cause of its own, a random loss.
 pub const MOST_ANYWAY: f64 = 0.025;
 
-/// Steepness and skew are not expected to be extreme, nor is much expected to be lost anyway.
+/// Penalty on extreme steepness and skew, and on losses where the law has no effect.
 fn shape_penalty(ln_k: f64, ln_skew: f64, anyway: f64) -> f64 {
     let beyond = (anyway - anyway.clamp(0.0, MOST_ANYWAY)) / 1e-3;
     0.5 * ln_k.powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2) + beyond * beyond
 }
 
 impl FittedLaw {
-    /// Where one half is kept: of range ln(m), of incidence ln(cos), of signal ln(cos / R^2) on the ground.
+    /// Where one half is kept: for range ln(m), for incidence ln(cos), for signal ln(cos / R^2) on the ground.
     pub fn half(&self) -> f64 {
         let [a, b, s, ..] = self.numbers;
         match self.law {
@@ -145,19 +147,19 @@ impl FittedLaw {
         }
     }
 
-    /// Steepness of a step without skew that falls as fast at one half.
+    /// Steepness of the step without skew that has the same slope at one half.
     pub fn steepness(&self) -> f64 {
         let [_, b, s, ..] = self.numbers;
         // d ln(kept) / dx at one half, over that of a logistic step.
         2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
     }
 
-    /// Share that a law of range or of incidence keeps there.
+    /// Share that a law of range or of incidence keeps at a range and a cosine.
     pub fn kept_there(&self, range_m: f64, cos_incidence: f64) -> f64 {
         self.kept(&Where { ln_range: range_m.ln(), ln_cos: cos_incidence.ln(), zone: 0 })
     }
 
-    /// Share kept where nothing of the law is felt.
+    /// Share kept where the law has no effect.
     pub fn most(&self) -> f64 {
         1.0 - self.numbers[3].clamp(0.0, MOST_ANYWAY)
     }

@@ -18,11 +18,13 @@ pub struct LinearFit {
     pub columns: Vec<usize>,
     /// Their coefficients.
     pub theta: DVector<f64>,
-    /// Covariance: the larger, on the diagonal, of what the noise says and what the scatter of the blocks says.
+    /// Covariance; each variance is the larger of that from the noise and that from the scatter of the blocks
+    /// (sandwich estimate).
     pub covariance: DMatrix<f64>,
 }
 
-/// Fits `columns` on frames; `precision` holds the prior precision of every column (0 for none), `blocks` the block of each frame.
+/// Fits `columns` on frames; `precision` holds the prior precision of every column (0 for none), `blocks` the block
+/// of each frame.
 pub fn fit(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize], precision: &[f64]) -> LinearFit {
     let k = columns.len();
     let part = |f: &LinearFrame| {
@@ -65,7 +67,7 @@ pub fn fit(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize], precisi
 }
 
 impl LinearFit {
-    /// Gain of a frame over no cause at all, nats.
+    /// Gain of a frame over zero coefficients, nats.
     pub fn gain(&self, frame: &LinearFrame) -> f64 {
         let k = self.columns.len();
         let mut gain = 0.0;
@@ -144,7 +146,7 @@ mod tests {
         assert!(fitted.theta[0].abs() < 3.5 * fitted.error(0));
         let gain: f64 = cross_gains(&refs, &blocks, &[1], &[0.0, 0.0]).iter().sum();
         let none: f64 = cross_gains(&refs, &blocks, &[0], &[0.0, 0.0]).iter().sum();
-        // Chance gains less than a choice demands.
+        // A gain by chance is below what a choice demands.
         assert!(gain > 20.0 && none < 8.0, "{gain} {none}");
     }
 }

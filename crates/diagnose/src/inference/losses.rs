@@ -1,24 +1,24 @@
-//! Lost returns, cell by cell: the share of simulated returns that the measured side has too, and the laws that fit it.
+//! Lost returns by cell: the share of simulated returns with a measured counterpart, and fits of laws to it.
 
 use super::law::{FittedLaw, Law, WHOLE_OBJECT, Where, in_zone};
 use super::simplex::minimise;
 use crate::channels::cells::{CELLS, ZONES, zone_of};
 use crate::channels::hits::{HitCell, HitFrame};
 
-/// Cells of a set of frames with the share that would match if nothing were lost.
+/// Counts of some frames, with the share that would match without losses.
 #[derive(Clone, Debug)]
 pub struct LossTable {
     places: Vec<Where>,
-    /// Share of measured returns with a simulated counterpart: the matching itself loses some on both sides.
+    /// Share of measured returns with a simulated counterpart: matching misses some on both sides.
     matches: Vec<f64>,
     cells: Vec<HitCell>,
     used: Vec<usize>,
 }
 
-/// Measured returns without a counterpart that every cell is given beforehand, of the share of all.
+/// Weight of the prior share of matches in a cell, returns.
 const PRIOR_RETURNS: f64 = 60.0;
 
-/// Fewer simulated returns say nothing.
+/// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;
 
 impl LossTable {
@@ -67,7 +67,7 @@ impl LossTable {
             .sum()
     }
 
-    /// Fits a law on top of others; the others' numbers are fitted anew as well.
+    /// Fits a law together with others; parameters of the others are fitted anew.
     pub fn fit(&self, before: &[FittedLaw], law: Law) -> Vec<FittedLaw> {
         let mut best: Option<(Vec<FittedLaw>, f64)> = None;
         let places: Vec<Where> = self.used.iter().map(|&i| self.places[i]).collect();
@@ -88,7 +88,7 @@ impl LossTable {
         best.map(|b| b.0).unwrap_or_default()
     }
 
-    /// Gain of a frame by `laws` over `before`, nats; the matching is that of this table.
+    /// Gain of a frame by `laws` over `before`, nats; match probabilities are those of this table.
     pub fn gain(&self, frame: &HitFrame, laws: &[FittedLaw], before: &[FittedLaw]) -> f64 {
         let counts = || {
             frame
@@ -99,7 +99,7 @@ impl LossTable {
         self.likelihood(laws, counts()) - self.likelihood(before, counts())
     }
 
-    /// Share of matched returns of each cell as these frames have it, drawn a little towards the laws.
+    /// Share of matched returns of each cell in these frames, shrunk towards the laws: an unconstrained lookup table.
     pub fn matched_shares(&self, laws: &[FittedLaw]) -> Vec<f64> {
         let share = |(i, c): (usize, &HitCell)| {
             let towards = self.matched(laws, i);
@@ -114,7 +114,7 @@ impl LossTable {
         self.matched_shares(laws).into_iter().enumerate().map(unmatched).collect()
     }
 
-    /// Gain of a frame by a table of matched shares, nats.
+    /// Gain of a frame by a lookup table of matched shares, nats.
     pub fn gain_by_table(&self, frame: &HitFrame, shares: &[f64]) -> f64 {
         let used = frame.iter().filter(|(i, _)| self.cells[*i as usize].simulated.n >= FEWEST);
         used.map(|(i, c)| {
@@ -125,7 +125,7 @@ impl LossTable {
         .sum()
     }
 
-    /// Kullback-Leibler distance of a frame's counts from a simulation that loses nothing, nats.
+    /// Kullback-Leibler distance of a frame's counts from a simulation without losses, nats.
     pub fn distance(&self, frame: &HitFrame) -> f64 {
         let mut sum = 0.0;
         for (i, c) in frame {
@@ -145,12 +145,12 @@ impl LossTable {
         self.last(|p| p.ln_range).exp()
     }
 
-    /// Cosine of incidence below which one simulated return in fifty is met; 1 where there are none.
+    /// Cosine of incidence below which one simulated return in fifty lies; 1 where there are none.
     pub fn most_grazing(&self) -> f64 {
         (-self.last(|p| -p.ln_cos)).exp().min(1.0)
     }
 
-    /// The value that one return in fifty exceeds.
+    /// The 98 % quantile of a value over simulated returns.
     fn last(&self, value: impl Fn(&Where) -> f64) -> f64 {
         let mut values: Vec<(f64, f64)> =
             self.used.iter().map(|&i| (value(&self.places[i]), self.cells[i].simulated.n)).collect();
@@ -176,7 +176,7 @@ impl LossTable {
         lost / n.max(1.0)
     }
 
-    /// The kind of standing surface or object on which nine tenths of what the laws lose lie.
+    /// The kind of standing surface or object with more than nine tenths of the losses; `None` without one.
     pub fn confined_to(&self, laws: &[FittedLaw]) -> Option<usize> {
         let mut lost = [0.0f64; ZONES];
         for &i in &self.used {
@@ -187,7 +187,7 @@ impl LossTable {
         (1..=WHOLE_OBJECT).find(|&z| of(z) > 0.9 * all)
     }
 
-    /// Cells with enough returns: ln range, ln cos, zone, returns, share found over share expected without losses.
+    /// Cells with enough returns: ln range, ln cos, zone, returns, ratio of the matched share to that without losses.
     pub fn shares(&self) -> Vec<([f64; 2], usize, f64, f64)> {
         self.used
             .iter()
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn each_law_is_told_from_the_others() {
+    fn each_law_is_distinguished_from_the_others() {
         let (law, fit) = best(&table(|_, _, _| 0.8));
         assert_eq!(law, Law::Random);
         assert!((fit.numbers[0] - 0.2).abs() < 5e-3, "{fit:?}");

@@ -1,4 +1,4 @@
-//! How causes are weighed against each other.
+//! Fits of causes and the choice between them.
 
 pub mod choice;
 pub mod comb;

@@ -1,4 +1,4 @@
-//! Laws of noise: how much rougher the measured returns are than the simulated ones, in variance, cell by cell.
+//! Laws of noise: the variance that the measured roughness has beyond the simulated one, by cell.
 
 use super::linear::LinearFrame;
 use crate::catalogue::Cause;
@@ -37,7 +37,7 @@ pub const NOISE_LAWS: [NoiseLaw; 10] = [
 /// Signal at which [`NoiseLaw::Signal`] is one.
 pub const USUAL_SIGNAL: f64 = 4.0;
 
-/// Levers beyond this are cut: tangents of grazing rays are not known well.
+/// Largest lever of the direction on the range, m: tangents at grazing incidence are uncertain.
 const LONGEST_LEVER_M: f64 = 400.0;
 
 impl NoiseLaw {
@@ -74,21 +74,21 @@ impl NoiseLaw {
     }
 }
 
-/// What the variances of the cells are weighed with: those of all frames that select.
+/// Sums of some frames, for the variances and weights of the cells.
 #[derive(Clone, Debug)]
 pub struct NoiseTable {
     cells: Vec<RoughCell>,
     used: Vec<bool>,
 }
 
-/// Fewer returns of either side say nothing.
+/// Fewest returns of either side in a cell.
 const FEWEST: f64 = 40.0;
 
-/// Neighbouring returns share neighbours: this many count as one.
+/// Returns that count as one: neighbouring returns share neighbours.
 const SHARED: f64 = 2.0;
 
 impl NoiseTable {
-    /// From the sums over some frames; cells met at less than `least_cos` are left out.
+    /// From the sums over some frames; cells with a cosine of incidence below `least_cos` are left out.
     pub fn new(cells: Vec<RoughCell>, least_cos: f64) -> Self {
         let enough =
             |c: &RoughCell| c.measured.n >= FEWEST && c.simulated.n >= FEWEST && c.simulated.mean().1 > least_cos;
@@ -101,7 +101,7 @@ impl NoiseTable {
         self.used[cell].then(|| self.cells[cell].variances().map(|v| v.max(1e-8)))
     }
 
-    /// Sums of one frame over its cells: differences of the two sides' mean squares against the laws.
+    /// Linear sums of one frame: differences of the two sides' mean squares over the laws.
     pub fn linear(&self, frame: &RoughFrame, laws: &[NoiseLaw]) -> LinearFrame {
         let k = laws.len();
         let mut out = LinearFrame { gram: DMatrix::zeros(k, k), right: DVector::zeros(k) };
@@ -121,7 +121,7 @@ impl NoiseTable {
         out
     }
 
-    /// Nats of a frame's measured returns under the simulated variance plus laws with coefficients.
+    /// Log likelihood of a frame's measured returns under the simulated variance plus laws with coefficients, nats.
     pub fn likelihood(&self, frame: &RoughFrame, laws: &[(NoiseLaw, f64)]) -> f64 {
         frame
             .iter()
@@ -136,7 +136,7 @@ impl NoiseTable {
             .sum()
     }
 
-    /// The same under the ratios of variances of `other` frames, cell by cell.
+    /// The same under the ratios of variances of `other` frames by cell: an unconstrained lookup table.
     pub fn likelihood_by_table(&self, frame: &RoughFrame, other: &NoiseTable) -> f64 {
         frame
             .iter()

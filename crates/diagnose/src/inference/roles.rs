@@ -1,4 +1,4 @@
-//! Which frames select, which estimate, which are held out: never the same ones.
+//! Roles of frames: to select, to estimate, or held out. No frame has two.
 
 use serde::{Deserialize, Serialize};
 
@@ -13,10 +13,10 @@ pub enum Role {
     HoldOut,
 }
 
-/// Fewer frames than that cannot be divided.
+/// Fewest frames that can be divided into roles.
 pub const FEWEST_FRAMES: usize = 5;
 
-/// Blocks that a recording is cut into, where it has the frames.
+/// Largest number of blocks of a recording.
 const BLOCKS: usize = 20;
 
 /// Roles in the order of blocks.

@@ -1,4 +1,4 @@
-//! Minimum of a function of a few numbers: the simplex of Nelder and Mead (1965), standard coefficients.
+//! Minimum of a function of a few parameters: the simplex method of Nelder and Mead (1965) with standard coefficients.
 
 /// The best point found from `start` with first steps `steps`, and the value there.
 pub fn minimise(start: &[f64], steps: &[f64], f: impl Fn(&[f64]) -> f64) -> (Vec<f64>, f64) {

@@ -1,5 +1,5 @@
-//! How far an object of the measured cloud stands from the same one of the simulation: fitted to the surface, so that lost returns and
-//! other shots do not shift it.
+//! Shift of an object of the measured cloud against the simulated one. It is fitted to the surface, so that lost
+//! returns and other shot directions do not bias it.
 
 use geometry::Box3;
 use nalgebra::{Matrix3, Point3, Vector3};
@@ -9,7 +9,7 @@ use nalgebra::{Matrix3, Point3, Vector3};
 pub struct SurfacePoint {
     /// Place, m.
     pub point: Point3<f64>,
-    /// Unit normal, or zero where it is not known.
+    /// Unit normal; zero where it is not known.
     pub normal: Vector3<f64>,
 }
 
@@ -18,27 +18,27 @@ pub struct SurfacePoint {
 pub struct BoxShift {
     /// Measured minus simulated, m.
     pub shift_m: [f64; 3],
-    /// Its standard errors, m; large where the visible faces do not tell.
+    /// Its standard errors, m; large along directions that the visible faces do not constrain.
     pub error_m: [f64; 3],
     /// Measured returns used.
     pub points: usize,
 }
 
-/// Lower than that above the bottom of its box a return is of what an object stands on, m.
+/// Height above the bottom of a box below which a return is of the ground, m.
 const FLOOR_M: f64 = 0.12;
 
-/// Whether a point lies in a box, or beside it by less than a margin, above what it stands on.
+/// Whether a point lies in a box or within a margin beside it, above the ground.
 pub(super) fn in_or_beside(bbox: &Box3, point: [f64; 3], margin_m: f64) -> bool {
     let local = bbox.to_local(point);
     let near = (0..3).all(|k| local[k].abs() < bbox.size[k] / 2.0 + margin_m);
     near && local[2] > -bbox.size[2] / 2.0 + FLOOR_M
 }
 
-/// Standard deviation of what is known of a shift beforehand, m.
+/// Prior standard deviation of a shift, m.
 const PRIOR_M: f64 = 1.0;
 
-/// Fits the shift that brings the simulated surfaces onto the measured returns: nearest surface point, distance across the surface,
-/// redescending weights, gates that narrow.
+/// Fits the shift that brings the simulated surfaces onto the measured returns: nearest surface point, distance
+/// across the surface, redescending weights, gates that narrow.
 pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoint]) -> Option<BoxShift> {
     if measured.len() < 8 || simulated.len() < 8 {
         return None;
@@ -82,7 +82,7 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
         if used < 8 {
             return None;
         }
-        // Neighbouring returns err alike: a fifth of them counts.
+        // Errors of neighbouring returns are correlated: a fifth of them counts.
         let variance = (squares / used as f64).max(1e-5) * 5.0;
         information += system / variance;
         let inverse = information.try_inverse()?;

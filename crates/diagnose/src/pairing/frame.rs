@@ -25,7 +25,8 @@ pub struct FramePair {
     pub simulated: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
-    /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns it has fewer.
+    /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns
+    /// it has fewer.
     pub open: f64,
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
@@ -63,7 +64,8 @@ const EVERY: usize = 3;
 /// Returns with at most this many neighbours at their range are not of a surface.
 const LONE: u8 = 1;
 
-/// Distance from the predicted surface, across it, from which on a return is not used for the roughness of its neighbours, m.
+/// Distance from the predicted surface, across it, from which on a return is not used for the roughness of its
+/// neighbours, m.
 const STRAY_M: f64 = 0.5;
 
 impl Sensors {
@@ -72,7 +74,8 @@ impl Sensors {
         self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
     }
 
-    /// Shots of a scan, over the azimuths of its returns, around which a side has no return; `None` where rows are not known.
+    /// Shots of a scan, over the azimuths of its returns, around which a side has no return; `None` where rows are
+    /// not known.
     fn open(&self, sensor: usize, scans: [&SensorScan; 2], side: &DirectionIndex) -> Option<f64> {
         let pattern = &self.patterns[sensor];
         let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
@@ -229,7 +232,8 @@ impl SensorPair<'_> {
         rays
     }
 
-    /// Sets what depends on the direction in which measured rays were sent, and on the returns around them. `own` is the index of the scan.
+    /// Sets what depends on the direction in which measured rays were sent, and on the returns around them. `own` is
+    /// the index of the scan.
     fn complete_measured(&self, rays: &mut [Ray], scan: &SensorScan, own: &DirectionIndex, predictor: &Predictor) {
         for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.0).enumerate() {
             ray.matched = *matched;
@@ -241,8 +245,8 @@ impl SensorPair<'_> {
     }
 }
 
-/// Sets the roughness of measured rays. Lone returns and returns off the predicted surface are left out: false alarms would make all returns
-/// around them rough.
+/// Sets the roughness of measured rays. Lone returns and returns off the predicted surface are left out: false alarms
+/// would make all returns around them rough.
 fn set_roughness(measured: &mut [Ray], scan: &SensorScan, own: &DirectionIndex, window: [f64; 2]) {
     let stray: Vec<bool> =
         measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
@@ -277,7 +281,8 @@ fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
 /// Distance from which on labels are not of the same object, m.
 const SAME_OBJECT_M: f64 = 4.0;
 
-/// Labels of the simulation in their order, each with the nearest one of the measured side; then what only the measured side has.
+/// Labels of the simulation in their order, each with the nearest one of the measured side; then what only the
+/// measured side has.
 fn pair_labels(measured: &[Object], simulated: &[Object]) -> Vec<ObjectPair> {
     let mut candidates = Vec::new();
     for (i, s) in simulated.iter().enumerate() {

@@ -1,19 +1,21 @@
-//! Jumps in range over which a beam mixes: returns that lie in them, and how many a beam of some width would put there.
+//! Range discontinuities over which a beam mixes two surfaces: returns between the surfaces, and their expected
+//! number by the width of the beam.
 
 use super::ray::Ray;
 use super::scan::{DirectionIndex, SensorScan};
 use crate::inference::median;
 use std::collections::BTreeMap;
 
-/// Jumps in range over which a beam mixes, m.
+/// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a
+/// pulse.
 pub const GAP_M: [f64; 2] = [1.2, 12.0];
 
-/// Whether a jump in range is one over which beams mix.
+/// Whether beams mix over a range discontinuity.
 fn gap_mixes(near_m: f64, far_m: f64) -> bool {
     (GAP_M[0]..GAP_M[1]).contains(&(far_m - near_m))
 }
 
-/// Closer than that to the nearer surface, or to the farther one, a return lies on it, m.
+/// Distance from either surface within which a return lies on it, m.
 pub fn gap_margin_m(near_m: f64) -> f64 {
     0.35 + 0.015 * near_m
 }
@@ -33,15 +35,15 @@ pub(super) fn in_gap(other: &DirectionIndex, scan: &SensorScan, i: usize) -> boo
     near > 0.0 && is_between(range, near, far)
 }
 
-/// Whether a range lies in a jump over which beams mix, off both surfaces.
+/// Whether a range lies in a discontinuity over which beams mix, off both surfaces.
 fn is_between(range_m: f64, near_m: f64, far_m: f64) -> bool {
     let margin = gap_margin_m(near_m);
     gap_mixes(near_m, far_m) && range_m > near_m + margin && range_m < far_m - margin
 }
 
-/// How many returns a beam would mix over the jumps of a sensor's scan, for each radian of its width: an edge between two neighbours that are an angle apart is
-/// met by as large a share of the shots as the beam is wide against that angle. `index` holds the scan. Two returns of one shot are no neighbours. 0 where
-/// rows are not known.
+/// Expected number of mixed returns of a sensor's scan for each radian of beam width. An edge between two
+/// neighbouring shots is hit with a probability of the beam width over their angle. `index` holds the scan. Two
+/// returns of one shot are no neighbours. 0 where rows are not known.
 pub(super) fn mixed_per_rad(rays: &[Ray], index: &DirectionIndex) -> f64 {
     let mut rows = BTreeMap::<u16, Vec<&Ray>>::new();
     for ray in rays.iter().filter(|r| r.row != u16::MAX) {
@@ -73,10 +75,11 @@ pub(super) fn mixed_per_rad(rays: &[Ray], index: &DirectionIndex) -> f64 {
     sum
 }
 
-/// Places of an edge in a beam that are tried.
+/// Number of places of an edge in a beam that are averaged.
 const PLACES: u32 = 24;
 
-/// Share of the places of an edge in a beam at which the mean of the two ranges is seen to lie between them, and between all else that is shown around.
+/// Share of the places of an edge in a beam at which the weighted mean of the two ranges lies between them, and
+/// between all other ranges around.
 fn mixing_share(a: &Ray, b: &Ray, index: &DirectionIndex) -> f64 {
     let [near, far] = [a.own_range_m().min(b.own_range_m()), a.own_range_m().max(b.own_range_m())];
     if !gap_mixes(near, far) {
@@ -86,7 +89,7 @@ fn mixing_share(a: &Ray, b: &Ray, index: &DirectionIndex) -> f64 {
     let [azimuth, elevation] = [a.azimuth_rad + b.azimuth_rad, a.elevation_rad + b.elevation_rad].map(|s| 0.5 * s);
     index.around(azimuth, elevation, |e, _, _| around.push(f64::from(e.range_m)));
     around.sort_by(f64::total_cmp);
-    // A disc at whose distance d from its middle (radius 1) an edge lies has this much beyond the edge.
+    // Area of a unit disc beyond an edge at distance d from its middle, as a share.
     let covered = |d: f64| 0.5 - (d * (1.0 - d * d).sqrt() + d.asin()) / std::f64::consts::PI;
     let seen = (0..PLACES).filter(|k| {
         let share = covered(2.0 * (f64::from(*k) + 0.5) / f64::from(PLACES) - 1.0);

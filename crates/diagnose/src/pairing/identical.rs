@@ -1,4 +1,4 @@
-//! Do the two sides show the same scenes? Each measured frame must fit its own simulated frame better than others.
+//! Scenario identity: each measured frame must match its own simulated frame better than other frames.
 
 use super::frame::Sensors;
 use super::recordings::{PairSide, Recordings};
@@ -10,34 +10,35 @@ use data::Object;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
-/// What the comparison with other frames says.
+/// Result of the comparison.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Identity {
     /// Whether the two sides show the same scenes.
     pub identical: bool,
-    /// Why not, in words; empty where they do.
+    /// The reason where they do not; empty where they do.
     pub reason: String,
-    /// Frames whose own partner fits no better than strangers though those of the others do.
+    /// Frames that do not match their own simulated frame although most others do.
     pub strangers: Vec<String>,
 }
 
-/// Frames that are compared.
+/// Number of measured frames that are compared.
 const FRAMES: usize = 16;
 
-/// Measured returns of a frame that are looked at.
+/// Measured returns of a frame that are compared, at most.
 const RETURNS: usize = 1_500;
 
-/// Mean distance at which two frames show the same, whatever strangers do, m.
+/// Mean distance below which two frames are identical whatever the distance of other frames, m.
 const SAME_M: f64 = 0.05;
 
-/// Share of the frames that fit their own partner best where the two sides show the same scenes. Among six by chance a sixth does; but on a straight all
-/// frames look alike, and most fit any other.
+/// Smallest share of frames that match their own simulated frame best. By chance a sixth does among six; but on a
+/// straight road frames look alike, and many match any other.
 const FIT: f64 = 0.85;
 
-/// Labels that lie no farther from those of the other side, in units of 4 m, may be late by a few hundredths of a second.
+/// Largest distance of the labels of identical frames, in units of 4 m: labels may be late by a few hundredths of a
+/// second.
 const LATE: f64 = 0.35;
 
-/// Compares some measured frames with their own simulated frame, its neighbours and frames far away.
+/// Compares some measured frames with their own simulated frame, with its neighbours and with distant frames.
 pub fn check_identity(recordings: &Recordings, sensors: &Sensors) -> Result<Identity, DiagnoseError> {
     let n = recordings.len();
     if n < 2 {
@@ -67,7 +68,7 @@ pub fn check_identity(recordings: &Recordings, sensors: &Sensors) -> Result<Iden
 struct FrameScores {
     frame: usize,
     own: f64,
-    /// Whether the own frame fits so well that strangers do not matter.
+    /// Whether the own frame is identical whatever the distance of others.
     same: bool,
     near: Vec<Option<f64>>,
     strangers: Vec<f64>,
@@ -107,18 +108,19 @@ fn judge(rows: &[FrameScores], lags: &[i64], id: &dyn Fn(usize) -> String) -> Id
     Identity { identical: true, reason: String::new(), strangers }
 }
 
-/// Cosine of incidence from which on a surface stands rather than being ground far away.
+/// Cosine of incidence from which on a surface is a standing one rather than distant ground.
 const SQUARELY: f64 = 0.15;
 
-/// Whether a return tells what all ranges are off by: on a surface that stands, and no farther from it than a metre.
+/// Whether a return is used for the common range bias: on a standing surface, and within 1 m of it.
 pub fn met_squarely(off_m: f64, cos_incidence: f64) -> bool {
     cos_incidence > SQUARELY && off_m.abs() < 1.0
 }
 
-/// What distances of labels count beside those of returns.
+/// Weight of the distances of labels beside those of returns.
 const LABELS_COUNT: f64 = 0.5;
 
-/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each, but for what all ranges are off by; and that of the labels, see [`label_distance`].
+/// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each, the common range
+/// bias subtracted; and that of the labels, see [`label_distance`].
 fn distance(
     recordings: &Recordings,
     measured: usize,
@@ -140,12 +142,12 @@ fn distance(
             met.push((off_m, s.cos_incidence, if s.smooth(sensors.edge_m) { 0.0 } else { s.misfit_m }));
         }
     }
-    // What all ranges are off by is no other scene.
+    // A common range bias does not make another scene.
     let squarely = met.iter().filter(|(off_m, cos, _)| met_squarely(*off_m, *cos)).map(|m| m.0);
     let bias_m = median(squarely.collect());
     let (mut sum, mut count) = (0.0, 0.0);
     for (off_m, cos, misfit_m) in met {
-        // Far ground is the same in every frame; what stands is not.
+        // Distant ground is the same in every frame; standing surfaces are not.
         let weight = if cos > SQUARELY { 1.0 } else { 0.2 };
         sum += weight * (((off_m - bias_m) * cos).abs() - misfit_m).clamp(0.0, 1.0);
         count += weight;
@@ -167,7 +169,7 @@ fn label_distance(a: &[Object], b: &[Object]) -> f64 {
             })
             .sum()
     };
-    // Up to 1 m is no other scene.
+    // Up to 1 m does not make another scene.
     let mean = (nearest(a, b) + nearest(b, a)) / (a.len() + b.len()) as f64;
     (mean - 1.0).max(0.0) / 4.0
 }
@@ -192,7 +194,7 @@ mod tests {
     fn own_frames_must_fit_best() {
         let id = |i: usize| i.to_string();
         assert!(judge(&rows(0.1, 0.2, 0.5), &[1], &id).identical);
-        assert!(judge(&rows(0.01, 0.01, 0.01), &[1], &id).identical, "nothing moves");
+        assert!(judge(&rows(0.01, 0.01, 0.01), &[1], &id).identical, "static scene");
         let shuffled = judge(&rows(0.5, 0.4, 0.4), &[1], &id);
         assert!(
             !shuffled.identical && shuffled.reason.contains("not scenario-identical") && shuffled.strangers.len() == 10

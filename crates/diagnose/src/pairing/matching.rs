@@ -1,12 +1,13 @@
-//! Which return of one side stands for which of the other: by direction alone, one to one.
+//! One-to-one matching of the returns of the two sides, by direction alone.
 
 use super::pattern::ScanPattern;
 use super::scan::{DirectionIndex, SensorScan, Steps};
 
 /// For each return of `a` whether it has a counterpart in `b`, and the other way round.
 ///
-/// Shots of the two sides may lie between each other: the common shift in azimuth, of each row where rows are known, is taken out first.
-/// The difference of the two numbers of returns without counterpart is the difference of the numbers of returns, whatever the matching.
+/// Shots of the two sides may be interleaved: the common shift in azimuth, of each row where rows are known, is
+/// subtracted first. The difference of the numbers of returns without a counterpart equals the difference of the
+/// numbers of returns, whatever the matching.
 pub fn match_directions(a: &SensorScan, b: &SensorScan, pattern: &ScanPattern, closes: bool) -> (Vec<bool>, Vec<bool>) {
     let steps = pattern.steps;
     let window = Steps { azimuth_rad: 1.5 * steps.azimuth_rad, elevation_rad: 0.7 * steps.elevation_rad };
@@ -37,10 +38,10 @@ pub fn match_directions(a: &SensorScan, b: &SensorScan, pattern: &ScanPattern, c
     (of_a, of_b)
 }
 
-/// Fewer pairs than that say nothing about a row's shift.
+/// Fewest pairs for the shift of a row.
 const FEWEST: f64 = 20.0;
 
-/// Circular mean of the offset to the nearest shot, in steps: one a row, then one for all.
+/// Circular mean of the offset to the nearest shot, in steps: one for each row, then one for all.
 fn row_shifts(a: &SensorScan, index: &DirectionIndex, pattern: &ScanPattern, window: Steps) -> Vec<f32> {
     let rows = pattern.rows_rad.len();
     let mut sums = vec![[0.0f64; 3]; rows + 1];

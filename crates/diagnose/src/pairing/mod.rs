@@ -1,4 +1,4 @@
-//! Two data sets of the same scenes, return by return.
+//! Pairing of two data sets of the same scenes, return by return.
 
 mod boxes;
 mod frame;

@@ -1,11 +1,11 @@
-//! Rows and steps of a sensor, recovered from where its returns lie.
+//! Rows and angular steps of a sensor, estimated from the directions of its returns.
 
 use super::scan::{SensorScan, Steps};
 
-/// What is known of a sensor's scan pattern.
+/// Scan pattern of a sensor.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ScanPattern {
-    /// Elevation of each row from the lowest, rad; empty where there are no rows to be seen.
+    /// Elevation of each row from the lowest, rad; empty where no rows are found.
     pub rows_rad: Vec<f32>,
     /// Typical angle between neighbouring shots.
     pub steps: Steps,
@@ -15,7 +15,7 @@ pub struct ScanPattern {
 const BIN_RAD: f32 = 3.5e-4;
 
 impl ScanPattern {
-    /// From the scans of several frames, of both sides: their shots go the same way.
+    /// From scans of several frames of both sides, whose shots have the same directions.
     pub fn of_scans(scans: &[&SensorScan]) -> ScanPattern {
         let mut rows_rad = rows(scans);
         let azimuth = azimuth_step(scans, &rows_rad);
@@ -33,7 +33,7 @@ impl ScanPattern {
         ScanPattern { rows_rad, steps }
     }
 
-    /// Row of an elevation; `None` without rows, or far from all of them.
+    /// Row of an elevation; `None` without rows, or farther from the nearest than 0.4 of its distance to the next.
     pub fn row(&self, elevation_rad: f32) -> Option<usize> {
         let rows = &self.rows_rad;
         if rows.is_empty() {
@@ -56,37 +56,63 @@ impl ScanPattern {
     }
 }
 
-/// Clusters of elevations, empty where they do not stand out.
+/// Half width of the window of the local mean of the histogram, bins: 0.9 degrees.
+const REACH: usize = 45;
+
+/// A bin belongs to a cluster if it has at least this share of the local mean.
+const OF_LOCAL_MEAN: f32 = 0.35;
+
+/// A cluster of elevations.
+struct Cluster {
+    /// Mean elevation, rad.
+    centre: f32,
+    /// rad.
+    width: f32,
+    /// Returns.
+    count: f32,
+}
+
+/// Elevations of the rows: clusters of the returns' elevations. Empty where clusters do not stand out: fewer than
+/// four, less than 80 % of the returns in them, or clusters wider than 60 % of their distance.
 fn rows(scans: &[&SensorScan]) -> Vec<f32> {
+    let mut found = clusters(scans);
+    let total: usize = scans.iter().map(|s| s.len()).sum();
+    // False alarms between the rows make small clusters.
+    let mut sizes: Vec<f32> = found.iter().map(|c| c.count).collect();
+    sizes.sort_by(f32::total_cmp);
+    let usual = sizes.get(sizes.len() / 2).copied().unwrap_or(0.0);
+    found.retain(|c| c.count > 0.02 * usual);
+    let inside: f32 = found.iter().map(|c| c.count).sum();
+    let mut widths: Vec<f32> = found.iter().map(|c| c.width).collect();
+    widths.sort_by(f32::total_cmp);
+    let mut gaps: Vec<f32> = found.windows(2).map(|w| w[1].centre - w[0].centre).collect();
+    gaps.sort_by(f32::total_cmp);
+    let (Some(width), Some(gap)) = (widths.get(widths.len() / 2), gaps.get(gaps.len() / 2)) else { return vec![] };
+    if found.len() < 4 || inside < 0.8 * total as f32 || *width > 0.6 * gap {
+        return vec![];
+    }
+    found.into_iter().map(|c| c.centre).collect()
+}
+
+/// Clusters of the histogram of elevations: bins above a share of the local mean, with gaps of at most one bin.
+fn clusters(scans: &[&SensorScan]) -> Vec<Cluster> {
     let low = scans.iter().flat_map(|s| &s.elevation_rad).copied().fold(f32::INFINITY, f32::min);
     let high = scans.iter().flat_map(|s| &s.elevation_rad).copied().fold(f32::NEG_INFINITY, f32::max);
     if !(high > low) {
         return vec![];
     }
     let n = ((high - low) / BIN_RAD) as usize + 1;
-    let mut counts = vec![0.0f32; n];
-    let mut sums = vec![0.0f64; n];
+    let (mut counts, mut sums) = (vec![0.0f32; n], vec![0.0f64; n]);
     for &el in scans.iter().flat_map(|s| &s.elevation_rad) {
         let bin = (((el - low) / BIN_RAD) as usize).min(n - 1);
         counts[bin] += 1.0;
         sums[bin] += f64::from(el);
     }
-    let total: f32 = counts.iter().sum();
-    let cumulative: Vec<f32> = std::iter::once(0.0)
-        .chain(counts.iter().scan(0.0, |sum, c| {
-            *sum += c;
-            Some(*sum)
-        }))
-        .collect();
-    let reach = 45; // 0.9 degrees
-    let local = |i: usize| {
-        let (a, b) = (i.saturating_sub(reach), (i + reach + 1).min(n));
-        (cumulative[b] - cumulative[a]) / (b - a) as f32
-    };
-    let mut found: Vec<(f32, f32, f32)> = Vec::new(); // centre, width, count
+    let dense = dense_bins(&counts);
+    let mut found = Vec::new();
     let mut i = 0;
     while i < n {
-        if counts[i] <= 0.35 * local(i) || counts[i] < 1.0 {
+        if !dense[i] {
             i += 1;
             continue;
         }
@@ -94,30 +120,33 @@ fn rows(scans: &[&SensorScan]) -> Vec<f32> {
         let (mut count, mut sum, mut gap) = (0.0, 0.0, 0);
         let mut end = i;
         while i < n && gap < 2 {
-            if counts[i] > 0.35 * local(i) && counts[i] >= 1.0 {
+            if dense[i] {
                 (count, sum, gap, end) = (count + counts[i], sum + sums[i], 0, i + 1);
             } else {
                 gap += 1;
             }
             i += 1;
         }
-        found.push(((sum / f64::from(count)) as f32, (end - begin) as f32 * BIN_RAD, count));
+        let centre = (sum / f64::from(count)) as f32;
+        found.push(Cluster { centre, width: (end - begin) as f32 * BIN_RAD, count });
     }
-    // False returns between the rows make small clusters.
-    let mut sizes: Vec<f32> = found.iter().map(|f| f.2).collect();
-    sizes.sort_by(f32::total_cmp);
-    let usual = sizes.get(sizes.len() / 2).copied().unwrap_or(0.0);
-    found.retain(|f| f.2 > 0.02 * usual);
-    let inside: f32 = found.iter().map(|f| f.2).sum();
-    let mut widths: Vec<f32> = found.iter().map(|f| f.1).collect();
-    widths.sort_by(f32::total_cmp);
-    let mut gaps: Vec<f32> = found.windows(2).map(|w| w[1].0 - w[0].0).collect();
-    gaps.sort_by(f32::total_cmp);
-    let (Some(width), Some(gap)) = (widths.get(widths.len() / 2), gaps.get(gaps.len() / 2)) else { return vec![] };
-    if found.len() < 4 || inside < 0.8 * total || *width > 0.6 * gap {
-        return vec![];
-    }
-    found.into_iter().map(|f| f.0).collect()
+    found
+}
+
+/// Whether each bin of a histogram exceeds a share of the local mean.
+fn dense_bins(counts: &[f32]) -> Vec<bool> {
+    let n = counts.len();
+    let cumulative: Vec<f32> = std::iter::once(0.0)
+        .chain(counts.iter().scan(0.0, |sum, c| {
+            *sum += c;
+            Some(*sum)
+        }))
+        .collect();
+    let local = |i: usize| {
+        let (a, b) = (i.saturating_sub(REACH), (i + REACH + 1).min(n));
+        (cumulative[b] - cumulative[a]) / (b - a) as f32
+    };
+    (0..n).map(|i| counts[i] > OF_LOCAL_MEAN * local(i) && counts[i] >= 1.0).collect()
 }
 
 /// The usual difference of neighbouring azimuths within a row.

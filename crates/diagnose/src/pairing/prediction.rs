@@ -1,4 +1,4 @@
-//! What the simulation has in a direction: the surface around it, what is to be expected there, and of what it is.
+//! Predictions of the simulation for a direction: the surface around it, its range, incidence and kind.
 
 use super::boxes::in_or_beside;
 use super::frame::Sensors;
@@ -8,13 +8,13 @@ use super::surface::{LocalSurface, fit_surface};
 use geometry::Box3;
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 
-/// A return so near to a labelled object is the object's, though it be larger than its label, m.
+/// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
 const BESIDE_M: f64 = 0.5;
 
-/// A surface so near to a labelled object is the object's, m.
+/// Distance from a labelled object within which a simulated surface belongs to it, m.
 const OF_OBJECT_M: f64 = 0.2;
 
-/// The simulated side of one sensor, to be looked at from any direction.
+/// Predictor of the simulated side of one sensor.
 pub(super) struct Predictor<'a> {
     sensor: usize,
     sensors: &'a Sensors,
@@ -28,7 +28,7 @@ pub(super) struct Predictor<'a> {
 }
 
 impl<'a> Predictor<'a> {
-    /// Of a sensor by its number, its simulated returns, and the simulation's labels.
+    /// For the number of a sensor, its simulated returns, and the simulated labels.
     pub(super) fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
         let mount = &sensors.rig.sensors[sensor];
         let window = sensors.window(sensor);
@@ -43,7 +43,7 @@ impl<'a> Predictor<'a> {
         }
     }
 
-    /// A return of a scan of that sensor with all that the simulation says of its direction.
+    /// A return of a scan of that sensor with the prediction for its direction.
     pub(super) fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
         let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
         let direction = unit(&self.cloud_from_sensor.rotation, az, el);
@@ -103,7 +103,7 @@ impl<'a> Predictor<'a> {
         ray
     }
 
-    /// The place in a direction at a range, in the cloud's frame, m.
+    /// The point in a direction at a range, in the cloud's frame, m.
     fn place(&self, direction: &Vector3<f64>, range_m: f64) -> [f64; 3] {
         (self.cloud_from_sensor.translation.vector + direction * range_m).into()
     }
@@ -143,12 +143,12 @@ fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
     turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
 }
 
-/// The labelled objects but for the own car: its box has the sensor in it.
+/// The labelled objects except the ego vehicle, whose box contains the sensor.
 fn others(boxes: &[Box3], origin: [f64; 3]) -> Vec<Box3> {
     boxes.iter().filter(|b| !in_or_beside(b, origin, BESIDE_M)).copied().collect()
 }
 
-/// Whether a place is that of a labelled object or just beside it.
+/// Whether a point lies on a labelled object or beside it.
 fn at_object(others: &[Box3], place: [f64; 3]) -> bool {
     others.iter().any(|b| in_or_beside(b, place, BESIDE_M))
 }
@@ -158,7 +158,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_beside_a_label_is_the_objects_and_the_own_car_is_none() {
+    fn points_beside_a_label_belong_to_the_object_and_the_ego_vehicle_is_none() {
         let origin = Vector3::new(0.0, 0.0, 1.0);
         let ahead = |elevation_rad: f64| Vector3::new(elevation_rad.cos(), 0.0, elevation_rad.sin());
         let car = Box3::from_array([20.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]);
@@ -166,7 +166,7 @@ mod tests {
         let at = |b: Box3, range_m: f64, elevation_rad: f64| {
             at_object(&others(&[b], origin.into()), (origin + ahead(elevation_rad) * range_m).into())
         };
-        assert!(at(car, 18.0, 0.0) && at(car, 17.7, 0.0), "a car may be longer than its label");
+        assert!(at(car, 18.0, 0.0) && at(car, 17.7, 0.0), "a vehicle may be longer than its label");
         assert!(!at(car, 17.0, 0.0));
         assert!(!at(car, 20.0, -0.048), "the road below it");
         assert!(!at(own, 1.0, 0.0), "the sensor stands in it");

@@ -1,14 +1,14 @@
-//! One return with everything that is known of it.
+//! One return with its covariates.
 
 use nalgebra::{Point3, Vector3};
 use sensor::signal::{DIAGNOSIS_REFLECTIVITY, signal_index};
 
-/// What a ray meets in the simulation.
+/// Kind of the simulated surface in the direction of a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Surface {
     /// A level surface below the sensor.
     Ground,
-    /// Walls, posts, anything else that stands.
+    /// Walls, posts and other standing surfaces.
     Standing,
     /// A labelled object.
     Object,
@@ -16,7 +16,7 @@ pub enum Surface {
     Open,
 }
 
-/// Where a return lies against the simulated returns around its direction.
+/// Place of a return relative to the simulated returns around its direction.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Lies {
     /// On their surface, or at an edge on one of the two or between them.
@@ -29,35 +29,36 @@ pub enum Lies {
     Open,
 }
 
-/// A return of either side. Predictions are those of the simulated side's returns around its direction, for a simulated return without
-/// itself, so that both sides are looked at alike.
+/// A return of either side. Predictions are from the simulated returns around its direction; a simulated return
+/// itself is left out, so that both sides are treated alike.
 #[derive(Clone, Copy, Debug)]
 pub struct Ray {
     /// Number of the sensor.
     pub sensor: u8,
-    /// What the simulation has in this direction.
+    /// Kind of the simulated surface in this direction.
     pub surface: Surface,
-    /// The simulation has one smooth surface around this direction: no edge.
+    /// Whether the simulation has one smooth surface around this direction, without an edge.
     pub smooth: bool,
-    /// In a lower corner of the labelled object's box, where cars have wheels.
+    /// Whether it lies in a lower corner of the labelled object's box, where vehicles have wheels.
     pub corner: bool,
-    /// It lies in the box of a labelled object or so near to it that it is the object's, if that is larger than its label.
+    /// Whether it lies in the box of a labelled object or so near to it that it belongs to the object, if that is
+    /// larger than its label.
     pub at_object: bool,
-    /// The other side has a return in this direction, at whatever range.
+    /// Whether the other side has a return in this direction, at any range.
     pub matched: bool,
-    /// Returns of its own side around it at about its range.
+    /// Number of neighbours of its own side at about its range.
     pub company: u8,
-    /// Around it the *other* side has something nearer and something farther, a jump that beams mix, and nothing at its range.
+    /// Whether it lies between two surfaces of the *other* side, over a range discontinuity that beams mix.
     pub in_gap: bool,
     /// Row of the sensor; `u16::MAX` where rows are not known.
     pub row: u16,
     /// Number of the labelled object in the frame; `u16::MAX` for none.
     pub object: u16,
-    /// In which it was sent, in the sensor's frame, rad.
+    /// Azimuth in which it was sent, in the sensor's frame, rad.
     pub azimuth_rad: f32,
-    /// In which it was sent, in the sensor's frame, rad.
+    /// Elevation in which it was sent, in the sensor's frame, rad.
     pub elevation_rad: f32,
-    /// Predicted range, m; of a direction without a smooth surface the return's own.
+    /// Predicted range, m; the return's own range without a smooth surface.
     pub range_m: f32,
     /// Cosine of the angle of incidence on the predicted surface; 0 without one.
     pub cos_incidence: f32,
@@ -67,11 +68,11 @@ pub struct Ray {
     pub normal: [f32; 3],
     /// Range minus predicted range, m.
     pub residual_m: f32,
-    /// Range of the simulated return closest in direction minus what the plane around says of it, m.
+    /// Range of the simulated return closest in direction minus that of the fitted plane, m.
     pub bulge_m: f32,
     /// Variance of the prediction in units of that of one simulated range.
     pub leverage: f32,
-    /// Range minus what the own side's returns around it predict, m; NaN where they do not.
+    /// Range minus the range predicted from the neighbours of its own side, m; NaN without such a prediction.
     pub roughness_m: f32,
     /// Variance of that prediction in units of that of one range.
     pub roughness_leverage: f32,
@@ -105,13 +106,13 @@ impl Ray {
         -f64::from(self.residual_m) * f64::from(self.cos_incidence)
     }
 
-    /// [`Ray::across_m`] from the simulated return closest in direction, carried along the plane: free of the error that a plane makes on a
-    /// surface that is not flat.
+    /// [`Ray::across_m`] relative to the simulated return closest in direction: without the error of a plane on a
+    /// curved surface.
     pub fn across_nearest_m(&self) -> f64 {
         -f64::from(self.residual_m - self.bulge_m) * f64::from(self.cos_incidence)
     }
 
-    /// Where it lies against the simulated returns around its direction.
+    /// Its place relative to the simulated returns around its direction.
     pub fn lies(&self) -> Lies {
         if self.near_far_m[1] <= 0.0 {
             return Lies::Open;

@@ -82,8 +82,8 @@ impl<'a> Recordings<'a> {
         Ok(cell.get_or_init(|| read))
     }
 
-    /// Which returns of a frame have a counterpart, by sensor. Shots are matched by the directions in which they were sent, whatever is corrected
-    /// later.
+    /// Which returns of a frame have a counterpart, by sensor. Shots are matched by the directions in which they were
+    /// sent, whatever is corrected later.
     pub fn matched(&self, frame: usize, sensors: &Sensors) -> Result<&[Matched], DiagnoseError> {
         let [measured, simulated] = [self.side(frame, PairSide::Measured)?, self.side(frame, PairSide::Simulated)?];
         let of_sensor = |k: usize| {

@@ -39,10 +39,11 @@ impl SensorScan {
     }
 }
 
-/// Nearer than this there is no direction worth the name, m.
+/// Smallest range of a point with a direction, m.
 const NEAREST_M: f64 = 0.05;
 
-/// Gives each point of an unordered cloud to a sensor, as [`Assignment`] says. Two clouds of the same scene are split alike.
+/// Gives each point of an unordered cloud to a sensor, as [`Assignment`] says. Two clouds of the same scene are split
+/// alike.
 pub fn split_by_sensor(cloud: &Cloud, rig: &Rig) -> Vec<SensorScan> {
     let assignment = Assignment::new(rig);
     let mut scans = vec![SensorScan::default(); rig.sensors.len()];
@@ -80,7 +81,7 @@ pub struct DirectionIndex {
 /// A return in the index.
 #[derive(Clone, Copy, Debug)]
 pub struct Entry {
-    /// Azimuth, rad; beyond half a turn for the copies that close the circle.
+    /// Azimuth, rad; beyond half a turn for copies of returns on the other side of the seam.
     pub azimuth_rad: f32,
     /// Elevation, rad.
     pub elevation_rad: f32,

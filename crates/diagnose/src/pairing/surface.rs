@@ -1,7 +1,7 @@
 //! The surface around a direction, from the returns around it.
 //!
-//! A plane n . p = h seen from the origin along the unit direction u has the inverse range q = n . u / h: linear in u, so that a linear
-//! fit of q in the two angles is exact for planes up to second order of the window.
+//! A plane n . p = h seen from the origin along the unit direction u has the inverse range q = n . u / h: linear in
+//! u, so that a linear fit of q in the two angles is exact for planes up to second order of the window.
 
 use super::scan::{DirectionIndex, Entry};
 
@@ -22,18 +22,23 @@ pub struct LocalSurface {
     pub misfit_along_m: f64,
     /// Nearest and farthest neighbour, m.
     pub near_far_m: [f64; 2],
-    /// Range of the neighbour closest in direction minus what the plane says of it, m: by how much the surface is not flat there.
+    /// Range of the neighbour closest in direction minus the range of the plane there, m: the deviation from a plane.
     pub bulge_m: f64,
 }
 
-/// At least that many neighbours make a surface.
+/// Fewest neighbours of a surface.
 const FEWEST: usize = 5;
 
-/// Share of the way from the nearest to the farthest neighbour, and m, that one may lie off a plane along its ray: between the top of a wall and the road
-/// behind it a plane fits that is met at a grazing angle, and nothing is far from it across.
+/// Smallest inverse range, 1/m: surfaces farther than 10 km are none.
+const LEAST_INVERSE_RANGE: f64 = 1e-4;
+
+/// Largest distance of a neighbour from the plane along its ray: as a share of the difference of the nearest and the
+/// farthest range, and in m. Between the top of a wall and the road behind it a plane at grazing incidence fits, from
+/// which no neighbour is far across.
 const ALONG: (f64, f64) = (0.15, 0.5);
 
-/// Fits the surface around a direction; `keep` chooses the neighbours. `None` where there are too few, or they lie on a line.
+/// Fits the surface around a direction to the neighbours that `keep` accepts. `None` where they are too few, or lie
+/// on a line.
 pub fn fit_surface(
     index: &DirectionIndex,
     window: [f64; 2],
@@ -56,62 +61,95 @@ pub fn fit_surface(
         return None;
     }
     let near = &near[..n];
-    let mut s = [0.0f64; 9]; // w, wx, wy, wxx, wxy, wyy, wq, wxq, wyq
-    for [x, y, q, w] in near {
-        for (sum, v) in s.iter_mut().zip([1.0, *x, *y, x * x, x * y, y * y, *q, x * q, y * q]) {
-            *sum += w * v;
+    let plane = Plane::fit(near)?;
+    Some(plane.surface(near, window, el))
+}
+
+/// A weighted linear fit of the inverse range over offsets in windows.
+struct Plane {
+    /// Sum of the weights.
+    weights: f64,
+    /// Weighted means of the offsets.
+    mean: [f64; 2],
+    /// Second central moments of the offsets and their determinant.
+    moments: [f64; 3],
+    determinant: f64,
+    /// Inverse range at the direction, and its slopes.
+    q0: f64,
+    slope: [f64; 2],
+}
+
+impl Plane {
+    /// Fits neighbours (offsets, inverse range, weight); `None` unless they lie on both sides in both angles.
+    fn fit(near: &[[f64; 4]]) -> Option<Plane> {
+        let mut s = [0.0f64; 9]; // w, wx, wy, wxx, wxy, wyy, wq, wxq, wyq
+        for [x, y, q, w] in near {
+            for (sum, v) in s.iter_mut().zip([1.0, *x, *y, x * x, x * y, y * y, *q, x * q, y * q]) {
+                *sum += w * v;
+            }
         }
+        let (mx, my, mq) = (s[1] / s[0], s[2] / s[0], s[6] / s[0]);
+        let (xx, xy, yy) = (s[3] - s[0] * mx * mx, s[4] - s[0] * mx * my, s[5] - s[0] * my * my);
+        let (xq, yq) = (s[7] - s[0] * mx * mq, s[8] - s[0] * my * mq);
+        let det = xx * yy - xy * xy;
+        if xx < 0.02 * s[0] || yy < 0.02 * s[0] || det < 0.1 * xx * yy || mx.abs() > 0.6 || my.abs() > 0.6 {
+            return None;
+        }
+        let (bx, by) = ((yy * xq - xy * yq) / det, (xx * yq - xy * xq) / det);
+        let q0 = mq - bx * mx - by * my;
+        let plane =
+            Plane { weights: s[0], mean: [mx, my], moments: [xx, xy, yy], determinant: det, q0, slope: [bx, by] };
+        (q0 > LEAST_INVERSE_RANGE).then_some(plane)
     }
-    let (mx, my, mq) = (s[1] / s[0], s[2] / s[0], s[6] / s[0]);
-    let (xx, xy, yy) = (s[3] - s[0] * mx * mx, s[4] - s[0] * mx * my, s[5] - s[0] * my * my);
-    let (xq, yq) = (s[7] - s[0] * mx * mq, s[8] - s[0] * my * mq);
-    let det = xx * yy - xy * xy;
-    // Neighbours on both sides in both angles, or the plane is a guess.
-    if xx < 0.02 * s[0] || yy < 0.02 * s[0] || det < 0.1 * xx * yy || mx.abs() > 0.6 || my.abs() > 0.6 {
-        return None;
-    }
-    let (bx, by) = ((yy * xq - xy * yq) / det, (xx * yq - xy * xq) / det);
-    let q0 = mq - bx * mx - by * my;
-    if q0 <= 1e-4 {
-        return None;
-    }
-    let range = 1.0 / q0;
-    // Effective weights: derivative of q0 by each q.
-    let (mut leverage, mut misfit, mut along) = (0.0f64, 0.0f64, 0.0f64);
-    let mut near_far = [f64::INFINITY, 0.0f64];
-    let (mut closest, mut bulge) = (f64::INFINITY, 0.0);
-    let (gx, gy) = (bx / window[0] / f64::from(el.cos()), by / window[1]);
-    let cos = 1.0 / (1.0 + (gx * gx + gy * gy) * range * range).sqrt();
-    for [x, y, q, w] in near {
+
+    /// Weight of a neighbour in the inverse range at the direction: its derivative by the neighbour's inverse range.
+    fn share(&self, [x, y, _, w]: &[f64; 4]) -> f64 {
+        let ([mx, my], [xx, xy, yy]) = (self.mean, self.moments);
         let (cx, cy) = (x - mx, y - my);
-        let from_slope = mx * (yy * cx - xy * cy) / det + my * (xx * cy - xy * cx) / det;
-        let share = w * (1.0 / s[0] - from_slope);
-        // A range's error dR is one of q^2 dR of inverse range.
-        leverage += (share * (q / q0).powi(2)).powi(2);
-        let predicted = q0 + bx * x + by * y;
-        let off = if predicted > 1e-4 { (1.0 / q - 1.0 / predicted).abs() } else { f64::INFINITY };
-        along = along.max(off);
-        misfit = misfit.max(off * cos * (1.0 / predicted.max(1e-4)).min(range) / range.max(1.0 / predicted.max(1e-4)));
-        near_far = [near_far[0].min(1.0 / q), near_far[1].max(1.0 / q)];
-        let distance = x * x + y * y;
-        if distance < closest && predicted > 1e-4 {
-            (closest, bulge) = (distance, 1.0 / q - 1.0 / predicted);
+        let from_slope = mx * (yy * cx - xy * cy) / self.determinant + my * (xx * cy - xy * cx) / self.determinant;
+        w * (1.0 / self.weights - from_slope)
+    }
+
+    /// The surface, with what the neighbours say of its flatness.
+    fn surface(&self, near: &[[f64; 4]], window: [f64; 2], el: f32) -> LocalSurface {
+        let (q0, [bx, by]) = (self.q0, self.slope);
+        let range = 1.0 / q0;
+        let (mut leverage, mut misfit, mut along) = (0.0f64, 0.0f64, 0.0f64);
+        let mut near_far = [f64::INFINITY, 0.0f64];
+        let (mut closest, mut bulge) = (f64::INFINITY, 0.0);
+        let (gx, gy) = (bx / window[0] / f64::from(el.cos()), by / window[1]);
+        let cos = 1.0 / (1.0 + (gx * gx + gy * gy) * range * range).sqrt();
+        for neighbour in near {
+            let [x, y, q, _] = neighbour;
+            // An error dR of a range is one of q^2 dR of the inverse range.
+            leverage += (self.share(neighbour) * (q / q0).powi(2)).powi(2);
+            let predicted = q0 + bx * x + by * y;
+            let off = if predicted > LEAST_INVERSE_RANGE { (1.0 / q - 1.0 / predicted).abs() } else { f64::INFINITY };
+            along = along.max(off);
+            let predicted_m = 1.0 / predicted.max(LEAST_INVERSE_RANGE);
+            misfit = misfit.max(off * cos * predicted_m.min(range) / range.max(predicted_m));
+            near_far = [near_far[0].min(1.0 / q), near_far[1].max(1.0 / q)];
+            let distance = x * x + y * y;
+            if distance < closest && predicted > LEAST_INVERSE_RANGE {
+                (closest, bulge) = (distance, 1.0 / q - 1.0 / predicted);
+            }
+        }
+        LocalSurface {
+            range_m: range,
+            slope_m_per_rad: [-gx * range * range, -gy * range * range],
+            cos_incidence: cos,
+            leverage,
+            misfit_m: misfit,
+            misfit_along_m: along,
+            near_far_m: near_far,
+            bulge_m: bulge,
         }
     }
-    Some(LocalSurface {
-        range_m: range,
-        slope_m_per_rad: [-gx * range * range, -gy * range * range],
-        cos_incidence: cos,
-        leverage,
-        misfit_m: misfit,
-        misfit_along_m: along,
-        near_far_m: near_far,
-        bulge_m: bulge,
-    })
 }
 
 impl LocalSurface {
-    /// Whether the neighbours lie on one surface: within `edge_m` of the plane across it, and no farther along their rays than on a plane met like this one.
+    /// Whether the neighbours lie on one surface: within `edge_m` of the plane across it, and along their rays no
+    /// farther than on a plane at this incidence.
     pub fn smooth(&self, edge_m: f64) -> bool {
         let [near, far] = self.near_far_m;
         self.misfit_m < edge_m && self.misfit_along_m < (ALONG.0 * (far - near)).max(ALONG.1)
@@ -173,7 +211,7 @@ mod tests {
     }
 
     #[test]
-    fn the_top_of_a_wall_and_the_road_behind_it_are_no_grazing_plane() {
+    fn the_top_of_a_wall_and_the_road_behind_it_are_no_plane_at_grazing_incidence() {
         let (mut scan, step) = (SensorScan::default(), 0.01);
         for row in -3..4 {
             for i in -10..10 {

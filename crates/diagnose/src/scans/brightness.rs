@@ -1,4 +1,4 @@
-//! Intensity of single lasers: each against its two neighbours on the same plane at the same azimuth.
+//! Intensity contrast of single lasers: each against its two neighbours on the same plane at the same azimuth.
 
 use super::planes::{OnPlane, Patch};
 use nalgebra::{DMatrix, DVector};
@@ -6,13 +6,13 @@ use nalgebra::{DMatrix, DVector};
 /// Sums of one laser: samples, their sum, their squares.
 pub type ContrastSums = Vec<[f64; 3]>;
 
-/// Neighbours farther than that in azimuth are none, rad.
+/// Largest difference in azimuth of neighbours, rad: 0.2 degrees.
 const NEIGHBOUR_RAD: f64 = 0.0035;
 
-/// Farther from its neighbours in range than this share a shot is elsewhere.
+/// Largest relative difference in range of neighbours.
 const SAME_RANGE: f64 = 0.12;
 
-/// Samples that a laser must have.
+/// Fewest samples of a laser in a scan.
 const FEWEST: f64 = 50.0;
 
 /// Adds the samples of a plane.
@@ -45,7 +45,7 @@ fn nearest(ring: &[&OnPlane], to: &OnPlane) -> Option<f64> {
 /// Mean contrast of each laser; `None` where there are too few samples.
 pub fn contrasts(scans: &[&ContrastSums]) -> Vec<Option<f64>> {
     let beams = scans.first().map_or(0, |s| s.len());
-    // Each scan counts alike: scenes differ more than samples.
+    // Scans have equal weight: scenes differ more than samples.
     let mean = |b: usize| {
         let seen: Vec<f64> = scans.iter().filter(|s| s[b][0] >= FEWEST).map(|s| s[b][1] / s[b][0]).collect();
         (!seen.is_empty()).then(|| seen.iter().sum::<f64>() / seen.len() as f64)
@@ -53,15 +53,15 @@ pub fn contrasts(scans: &[&ContrastSums]) -> Vec<Option<f64>> {
     (0..beams).map(mean).collect()
 }
 
-/// Variance of the samples around what is told of each laser, and their number.
-pub fn squares(scan: &[[f64; 3]], told: &[Option<f64>]) -> [f64; 2] {
-    scan.iter().zip(told).filter(|(_, t)| t.is_some()).fold([0.0; 2], |sum, ([n, s, ss], told)| {
-        let t = told.unwrap_or(0.0);
+/// Sum of squared deviations of the samples from the contrast of each laser, and their number.
+pub fn squares(scan: &[[f64; 3]], contrasts: &[Option<f64>]) -> [f64; 2] {
+    scan.iter().zip(contrasts).filter(|(_, t)| t.is_some()).fold([0.0; 2], |sum, ([n, s, ss], contrast)| {
+        let t = contrast.unwrap_or(0.0);
         [sum[0] + ss - 2.0 * t * s + t * t * n, sum[1] + n]
     })
 }
 
-/// By how much each laser is brighter than the trend of all: the offsets of which neighbours differ by these contrasts, the smallest ones.
+/// Intensity of each laser relative to the trend of all: the smallest offsets that have these contrasts.
 pub fn offsets(contrasts: &[Option<f64>]) -> Vec<f64> {
     let n = contrasts.len();
     let mut gram = DMatrix::<f64>::identity(n, n) * 0.01;

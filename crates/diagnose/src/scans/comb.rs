@@ -39,7 +39,8 @@ pub fn find(scans: &[&RingScan]) -> Option<Comb> {
     if used < 1.0 || power[k] / used < STANDS_OUT {
         return None;
     }
-    // Harmonics of a longer step stand out as well. The longest step with at least half of the power is the fundamental.
+    // Harmonics of a longer step stand out as well. The longest step with at least half of the power is the
+    // fundamental.
     let fundamental = (2..=HARMONICS)
         .rev()
         .map(|m| k / m)
@@ -55,7 +56,7 @@ fn power(scans: &[&RingScan]) -> Option<(Vec<f64>, f64)> {
     let beams = scans.first()?.rings.len();
     let mut power = vec![0.0f64; comb::FREQUENCIES];
     let mut used = 0.0;
-    let spectra = Spectra::new();
+    let spectra = Spectra::default();
     for beam in 0..beams {
         let n = ranges(scans, beam).count() as f64;
         if n < FEWEST {

@@ -1,8 +1,9 @@
-//! Scans of a spinning sensor alone, against an ideal sensor: residuals of ranges and intensities on flat ground and walls, given the sensor's
-//! own table of beams.
+//! Scans of a spinning sensor alone, against an ideal sensor: residuals of ranges and intensities on flat ground and
+//! walls, given the sensor's own table of beams.
 //!
-//! The ideal side is computed on planes of the ground and of walls that are fitted to each scan. Everything else, and labelled objects, are
-//! masked. Each finding is fitted on all scans. Its gain is measured on each scan with a fit of the others.
+//! The ideal side is computed on planes of the ground and of walls that are fitted to each scan. Everything else, and
+//! labelled objects, are masked. Each finding is fitted on all scans. Its gain is measured on each scan with a fit of
+//! the others.
 
 mod brightness;
 mod comb;
@@ -46,7 +47,8 @@ struct Seen {
 /// Diagnoses the scans of one spinning sensor at the origin of the clouds, against an ideal one.
 ///
 /// # Errors
-/// A rig with another mount, fewer than three scans, clouds that are not in the order of lasers, files that cannot be read.
+/// A rig with another mount, fewer than three scans, clouds that are not in the order of lasers, files that cannot be
+/// read.
 pub fn diagnose_scans(
     dataset: &Dataset,
     rig: &Rig,

@@ -1,6 +1,7 @@
-//! Range offsets of single lasers: what each leaves on flat walls, of which every one has a free plane.
+//! Range offsets of single lasers: their mean residuals on flat walls, each with a free plane.
 //!
-//! A wall's plane takes an offset of all lasers and one that grows along the wall with it: offsets are told up to these.
+//! The plane of a wall absorbs an offset of all lasers and one that grows along the wall: offsets are known up to
+//! these.
 
 use super::planes::Patch;
 use super::rings::Beam;
@@ -27,13 +28,13 @@ struct BeamSums {
 /// Offset of each laser, m; `None` where too few walls show it.
 pub type Offsets = Vec<Option<f64>>;
 
-/// Points of a wall by one laser count up to that: they share the wall's own waves.
+/// Largest weight of one laser on a wall, points: errors of its points are correlated by the shape of the wall.
 const MOST_POINTS: f64 = 25.0;
 
-/// Walls that a laser must be seen on.
+/// Fewest walls of a laser with a known offset.
 const FEWEST_WALLS: usize = 5;
 
-/// Rounds between planes and offsets.
+/// Rounds of alternating fits of planes and offsets.
 const ROUNDS: usize = 12;
 
 impl WallSums {
@@ -74,7 +75,7 @@ impl WallSums {
         self.gram.try_inverse().map_or_else(Vector3::zeros, |inverse| inverse * right)
     }
 
-    /// Mean residual of a laser off the plane that fits with `offsets`, and its weight.
+    /// Mean residual of a laser from a plane, and its weight.
     fn left(&self, beam: usize, plane: &Vector3<f64>) -> Option<(f64, f64)> {
         let s = self.beams.get(&beam)?;
         Some(((s.residual - s.columns.dot(plane)) / s.n, s.n.min(MOST_POINTS)))
@@ -90,7 +91,7 @@ impl WallSums {
     }
 }
 
-/// Offsets of all lasers: planes and medians over walls in turn.
+/// Offsets of all lasers: alternating fits of planes and of medians over walls.
 pub fn fit(walls: &[&WallSums], beams: &[Beam]) -> Offsets {
     let mut offsets: Offsets = vec![None; beams.len()];
     for _ in 0..ROUNDS {
@@ -105,7 +106,7 @@ pub fn fit(walls: &[&WallSums], beams: &[Beam]) -> Offsets {
     offsets
 }
 
-/// Takes out what free planes take: the mean, and the slope over the tangent of the elevation.
+/// Subtracts what free planes absorb: the mean, and the slope over the tangent of the elevation.
 fn centre(offsets: &mut [Option<f64>], beams: &[Beam]) {
     let known: Vec<(f64, f64)> =
         offsets.iter().zip(beams).filter_map(|(o, b)| Some((b.elevation_rad.tan(), (*o)?))).collect();

@@ -1,4 +1,4 @@
-//! What an ideal sensor would see of a scan: planes of ground and walls fitted to it; everything else is masked.
+//! Planes of the ground and of walls that are fitted to a scan; everything else is masked.
 
 use super::rings::{Beam, RingScan, Shot};
 use data::{Object, Stream};
@@ -34,27 +34,41 @@ pub struct Patch {
     pub shots: Vec<OnPlane>,
 }
 
-/// Width of the sectors in which walls are looked for, rad.
+/// Width of the sectors in which walls are searched for, rad: 6 degrees.
 const SECTOR_RAD: f64 = 0.105;
 
-/// Walls: so far away, m, so high above the ground, m, so many lasers, so many points.
+/// Ranges of walls, m.
 const WALL_RANGE_M: [f64; 2] = [3.0, 45.0];
+
+/// Smallest height of a point of a wall above the ground, m.
 const WALL_ABOVE_M: f64 = 0.4;
+
+/// Fewest lasers on a wall.
 const WALL_BEAMS: usize = 8;
+
+/// Fewest points of a wall.
 const WALL_POINTS: usize = 80;
-/// Farther from the plane a point is not of it, m; flat is where the median is below that, m. What is farther than so many medians is
-/// not of the wall either.
+
+/// Largest distance of a point from the plane of its wall, m.
 const OFF_WALL_M: f64 = 0.09;
+
+/// Largest median distance of the points of a flat wall, m.
 const FLAT_M: f64 = 0.022;
+
+/// Largest distance of a point of a wall, in medians.
 const MEDIANS: f64 = 5.0;
-/// Height that a wall must have, m.
+
+/// Smallest height of a wall, m.
 const WALL_HEIGHT_M: f64 = 1.2;
-/// Ground: so far away, m, so near to its plane, m.
+
+/// Largest range of the ground, m.
 const GROUND_RANGE_M: f64 = 30.0;
+
+/// Largest distance of a point of the ground from its plane, m.
 const OFF_GROUND_M: f64 = 0.12;
 
 impl Plane {
-    /// Range at which a ray meets it, and the cosine of incidence; `None` where it does not.
+    /// Range at which a ray hits it, and the cosine of incidence; `None` where it does not.
     pub fn meets(&self, beam: &Beam, azimuth_rad: f64) -> Option<[f64; 2]> {
         let along = self.normal.dot(&beam.direction(azimuth_rad));
         let range = (self.offset_m - self.normal.dot(&beam.origin())) / along;
@@ -85,7 +99,7 @@ impl Plane {
     }
 }
 
-/// Most points within `off_m` of a plane through three of them that `allowed` likes.
+/// The plane through three points with the most points within `off_m` (RANSAC), of those that `allowed` accepts.
 fn consensus(
     points: &[Vector3<f64>],
     off_m: f64,
@@ -106,7 +120,7 @@ fn consensus(
     best.1
 }
 
-/// The ground around the car, with its points; `None` where there is none to be seen.
+/// The ground around the vehicle with its points; `None` where none is found.
 pub fn ground(scan: &RingScan, beams: &[Beam], boxes: &[Object], rng: &mut Stream) -> Option<Patch> {
     let all = shots(scan, beams, boxes, |shot, p| p.z < -0.8 && shot.range_m < GROUND_RANGE_M);
     let points: Vec<Vector3<f64>> = all.iter().map(|s| s.1).collect();
@@ -125,7 +139,7 @@ pub fn ground(scan: &RingScan, beams: &[Beam], boxes: &[Object], rng: &mut Strea
     level(&plane).then_some(Patch { plane, shots })
 }
 
-/// Flat walls, at most two a sector of directions.
+/// Flat walls, at most two in each sector.
 pub fn walls(scan: &RingScan, beams: &[Beam], boxes: &[Object], ground: &Plane, rng: &mut Stream) -> Vec<Patch> {
     let near = WALL_RANGE_M[0]..WALL_RANGE_M[1];
     let all = shots(scan, beams, boxes, |shot, p| near.contains(&shot.range_m) && ground.off(p) > WALL_ABOVE_M);
@@ -147,7 +161,7 @@ pub fn walls(scan: &RingScan, beams: &[Beam], boxes: &[Object], ground: &Plane, 
 
 type Points = Vec<(OnPlane, Vector3<f64>)>;
 
-/// The largest wall of a sector if it is flat, and what is not of it.
+/// The largest wall of a sector if it is flat, and the other points.
 fn wall(all: Points, ground: &Plane, rng: &mut Stream) -> Option<(Option<Patch>, Points)> {
     if all.len() < WALL_POINTS {
         return None;
@@ -177,7 +191,7 @@ fn wall(all: Points, ground: &Plane, rng: &mut Stream) -> Option<(Option<Patch>,
     Some((patch, rest))
 }
 
-/// Shots outside of all boxes that `keep` likes, with their points.
+/// Shots outside of all boxes that `keep` accepts, with their points.
 fn shots(
     scan: &RingScan,
     beams: &[Beam],

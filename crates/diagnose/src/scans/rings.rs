@@ -1,15 +1,15 @@
-//! Scans of a spinning sensor as rings: which laser measured each point, and what the sensor believes of that laser.
+//! Scans of a spinning sensor as rings: the laser of each point, and the calibration of that laser.
 //!
-//! Files keep the order in which lasers stand, from the top, each all around counter-clockwise: a new ring begins where the azimuth
-//! passes from below to above 0. In a ring all points lie on a cone, z = tan(elevation) rho + height: the sensor's own table of beams can be
-//! read out of the points.
+//! Files keep the order in which lasers stand, from the top, each all around counter-clockwise: a new ring begins
+//! where the azimuth passes from below to above 0. The points of a ring lie on a cone, z = tan(elevation) rho +
+//! height: the sensor's own table of beams is fitted to the points.
 
 use crate::error::DiagnoseError;
 use data::Cloud;
 use nalgebra::Vector3;
 use std::f64::consts::FRAC_PI_2;
 
-/// What the sensor believes of one laser.
+/// Calibration of one laser, as the sensor applied it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Beam {
     /// Elevation, rad.
@@ -41,16 +41,16 @@ pub struct RingScan {
 /// A ring before its laser is known: cylinder coordinates rho, z (m), azimuth (rad), intensity.
 type RawRing = Vec<[f64; 4]>;
 
-/// Farther than that from the cone of its ring a point belongs to something else, m.
+/// Largest distance of a point from the cone of its ring, m.
 const OFF_CONE_M: f64 = 0.004;
 
-/// Elevations that differ by less are of the same laser, rad.
+/// Largest difference in elevation of rings of the same laser, rad: 0.1 degrees.
 const SAME_LASER_RAD: f64 = 1.7e-3;
 
-/// Lasers that a scan must show.
+/// Fewest rings of a scan.
 const FEWEST_RINGS: usize = 8;
 
-/// Points that a ring must have to tell its cone.
+/// Fewest points of a ring whose cone is fitted.
 const FEWEST_POINTS: usize = 100;
 
 impl Beam {
@@ -71,7 +71,7 @@ impl Beam {
     }
 }
 
-/// Cuts clouds into rings and reads out the table of beams, from the top; both are the same lasers in the same order.
+/// Divides clouds into rings and fits the table of beams, from the top. Both have the same lasers in the same order.
 pub fn rings(clouds: &[(String, Cloud)]) -> Result<(Vec<Beam>, Vec<RingScan>), DiagnoseError> {
     let raw: Vec<Vec<RawRing>> = clouds.iter().map(|(_, cloud)| cut(cloud)).collect();
     // Cones of all rings of all scans: elevation, sums of rho and z.
@@ -121,7 +121,7 @@ fn cut(cloud: &Cloud) -> Vec<RawRing> {
     rings
 }
 
-/// Elevation of a ring, and the sums of its cone, where it is one.
+/// Elevation of a ring and the sums of its cone; `None` where it is no cone.
 fn cone(ring: &[[f64; 4]]) -> Option<(f64, [f64; 5])> {
     let mut near = 0.1f64;
     let mut fitted = line(&sums(ring, |_| true))?;
@@ -159,7 +159,7 @@ fn line([n, r, z, rr, rz]: &[f64; 5]) -> Option<Beam> {
     Some(Beam { elevation_rad: slope.atan(), height_m: (z - slope * r) / n })
 }
 
-/// Gives each ring to the laser on whose cone most of it lies.
+/// Assigns each ring to the laser on whose cone most of its points lie.
 fn assigned(id: &str, raw: Vec<RawRing>, beams: &[Beam]) -> RingScan {
     let mut rings = vec![Vec::new(); beams.len()];
     for ring in raw {
@@ -181,7 +181,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_table_of_beams_is_read_out_of_the_points() {
+    fn the_table_of_beams_is_fitted_to_the_points() {
         let beams: Vec<Beam> = (0..16)
             .map(|b| Beam { elevation_rad: 0.03 - 0.012 * f64::from(b), height_m: if b < 8 { 0.2 } else { 0.12 } })
             .collect();

@@ -1,4 +1,5 @@
-//! Noise of the range: second differences along a ring on planes, in which offsets of lasers and slow errors of the planes cancel.
+//! Range noise: second differences along a ring on planes, in which offsets of lasers and slow errors of the planes
+//! cancel.
 
 use super::planes::Patch;
 use super::rings::Beam;
@@ -15,18 +16,20 @@ pub struct Bin {
     pub n: f64,
     /// Sum of ranges, m, and of R tan(incidence), m.
     pub place: [f64; 2],
-    /// The samples, m: residuals in units of one range's noise.
+    /// The samples, m: residuals, scaled to the noise of one range.
     pub values: Vec<f32>,
 }
 
-/// Samples count up to this many standard deviations.
+/// Largest sample that counts, in standard deviations.
 const CAP: f64 = 4.0;
 
-/// Neighbours farther apart than that are none, rad.
+/// Largest difference in azimuth of neighbours, rad: 0.37 degrees.
 const NEIGHBOUR_RAD: f64 = 0.0065;
 
-/// Fewer samples say nothing of a bin; more than that count as so many: what a surface has by itself is not noise.
+/// Fewest samples of a bin.
 const FEWEST: f64 = 30.0;
+
+/// Largest weight of a bin, samples: the texture of surfaces is not noise.
 const MOST: f64 = 300.0;
 
 /// Adds the samples of a plane.
@@ -68,7 +71,7 @@ pub struct NoiseFit {
     pub angle_rad: f64,
 }
 
-/// Which numbers of a law are free.
+/// Which parameters of a law are free.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Free {
     /// Whether it grows with range.

@@ -1,20 +1,20 @@
-//! An error of all elevations: the ground becomes a cone, upright walls lean outwards on all sides.
+//! A common elevation error: the ground becomes a cone, and vertical walls lean outwards on all sides.
 
 use super::planes::{Patch, Plane};
 use super::rings::{Beam, RingScan};
 use nalgebra::{Matrix3, Matrix4, Vector3, Vector4};
 
-/// Ground that is looked at: distances, m.
+/// Distances of the ground that is used, m.
 const GROUND_M: [f64; 2] = [4.0, 25.0];
 
-/// Farther from the plane a point is not of the road, m.
+/// Largest distance of a point of the road from its plane, m.
 const OFF_ROAD_M: f64 = 0.25;
 
-/// Walls that a scan must have.
+/// Fewest walls of a scan.
 const FEWEST_WALLS: usize = 6;
 
-/// Elevation error of one scan by its ground, rad: the slope over distance of what a free plane leaves. Positive: the light goes higher
-/// than the sensor says. Also the points of the picture: distance, mean residual, number.
+/// Elevation error of one scan from its ground, rad: the slope over distance of the residuals of a free plane.
+/// Positive: beams go higher than the sensor says. Also the points of the plot: distance, mean residual, number.
 pub fn by_ground(scan: &RingScan, beams: &[Beam], ground: &Plane) -> Option<(f64, Vec<[f64; 3]>)> {
     let mut points: Vec<Vector3<f64>> = Vec::new();
     for (ring, beam) in scan.rings.iter().zip(beams) {
@@ -32,7 +32,7 @@ pub fn by_ground(scan: &RingScan, beams: &[Beam], ground: &Plane) -> Option<(f64
             let (x, y) = row(p, ground);
             let u = (y - x.dot(&theta)) / (3.0 * scale);
             if u.abs() < 1.0 {
-                // Distances count alike: near rings have most points.
+                // Equal weight of distances: near rings have most points.
                 let w = (1.0 - u * u).powi(2) * p.xy().norm();
                 gram += x * x.transpose() * w;
                 right += x * (w * y);
@@ -61,16 +61,16 @@ fn row(p: &Vector3<f64>, ground: &Plane) -> (Vector4<f64>, f64) {
     (Vector4::new(1.0, p.x, p.y, p.xy().norm() - 12.0), ground.off(p))
 }
 
-/// Elevation error of one scan by its walls, rad: how far they lean outwards beyond what one tilt of the car makes.
+/// Elevation error of one scan from its walls, rad: their outward lean beyond that of a tilt of the vehicle.
 pub fn by_walls(walls: &[Patch], beams: &[Beam], ground: &Plane) -> Option<f64> {
     let rows: Vec<(Vector3<f64>, f64)> = walls.iter().filter_map(|w| lean(w, beams, ground)).collect();
     if rows.len() < FEWEST_WALLS {
         return None;
     }
-    // Walls are plumb to some tenths of a degree; a few are no walls.
+    // Walls are vertical to some tenths of a degree; a few are no walls.
     let mut theta = Vector3::zeros();
     for scale in [0.03, 0.015, 0.008, 0.008] {
-        // A tilt of up to a degree.
+        // Prior: a tilt of about a degree.
         let mut gram = Matrix3::from_diagonal(&Vector3::new(1e-6, 0.2, 0.2));
         let mut right = Vector3::zeros();
         for (x, y) in &rows {

@@ -138,8 +138,8 @@ const BEAM_CAUSES: [Cause; 3] = [Cause::BeamElevationOffset, Cause::BeamIntensit
 /// Range noise at 20 m below this share of the spread of per-row range offsets is the error of their correction.
 const NOISE_OF_ROWS: f64 = 0.25;
 
-/// Gain below which a noise law is a side effect, nats a return: of displaced surfaces, motion distortion or mixed ranges, and of unexplained
-/// offsets of surfaces.
+/// Gain below which a noise law is a side effect, nats a return: of displaced surfaces, motion distortion or mixed
+/// ranges, and of unexplained offsets of surfaces.
 const NOISE_OF_SURFACES: [f64; 2] = [0.03, 0.1];
 
 /// Shifts of objects below this many times the largest unexplained offset of surfaces are a part of that offset.
@@ -157,7 +157,7 @@ fn slide(f: &Found) -> bool {
 
 /// Whether objects may have another shape.
 fn shapes(f: &Found) -> bool {
-    f.causes.iter().any(|c| *c == Cause::WrongShape)
+    f.causes.contains(&Cause::WrongShape)
 }
 
 /// Whether the ego vehicle is tilted or a sensor is mounted otherwise.
@@ -220,8 +220,8 @@ const FORM: [Quantity; 11] = [
     Quantity::BrighterObjects,
 ];
 
-/// Whether the size of a finding is significant on the estimating frames: the interval of some parameter of size excludes 0, where it has one.
-/// A difference of labels is no chance, even where none of its parameters is known.
+/// Whether the size of a finding is significant on the estimating frames: the interval of some parameter of size
+/// excludes 0, where it has one. A difference of labels is no chance, even where none of its parameters is known.
 fn has_significant_size(f: &Found) -> bool {
     let is_form = |id: &ParameterId| matches!(id, ParameterId::Of(quantity) if FORM.contains(quantity));
     let sized = |(id, p): &&NamedParameter| p.unit != Unit::Number && !is_form(id);
@@ -229,8 +229,9 @@ fn has_significant_size(f: &Found) -> bool {
     f.channel == Channel::Labels || sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0)
 }
 
-/// Drops findings that are side effects of others: remainders of corrections (pose, rows, motion distortion) in channels of single returns, and
-/// findings without a significant size. `returns` is the number of simulated returns of the held-out frames.
+/// Drops findings that are side effects of others: remainders of corrections (pose, rows, motion distortion) in
+/// channels of single returns, and findings without a significant size. `returns` is the number of simulated returns
+/// of the held-out frames.
 pub fn drop_confounded(results: &mut [ChannelResult], returns: f64) {
     let had_findings: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
     drop_all(results, "the frames that say how large it is do not tell it from nothing", |f| !has_significant_size(f));

@@ -30,7 +30,8 @@ const FLOOR: f64 = 0.005;
 /// Smallest share lost on one kind of surface that is reported, of its own returns.
 const ZONE_FLOOR: f64 = 0.03;
 
-/// A loss on one kind of surface with at least this share of the gain of a signal law that is confined to it is reported as a material.
+/// A loss on one kind of surface with at least this share of the gain of a signal law that is confined to it is
+/// reported as a material.
 const MATERIAL_SHARE: f64 = 0.75;
 
 /// Smallest gain of a second law, as a share of the gain of the first.
@@ -39,8 +40,8 @@ const SECOND_LAW_SHARE: f64 = 0.04;
 /// Smallest gain of a table by direction on top of a law, as a share of the gain of the law.
 const UNEXPLAINED_SHARE: f64 = 0.02;
 
-/// Share of its gain by which a richer law must exceed the simpler one to be reported beside it: the form of a law is never exactly that of
-/// the sensor.
+/// Share of its gain by which a richer law must exceed the simpler one to be reported beside it: the form of a law is
+/// never exactly that of the sensor.
 const RICHER_SHARE: f64 = 0.01;
 
 /// Bootstrap repetitions of the fits.
@@ -52,8 +53,8 @@ const GROUP_FLOOR: f64 = 0.02;
 /// Fit of the shares lost by groups of directions: prior standard deviation of a fifth.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false, trust: 1.0 };
 
-/// The search. Rays that the mask hides are left out. `displaced` says that the measured scene is turned or moved as a whole: silhouettes do
-/// not match, and small losses are an effect of that.
+/// The search. Rays that the mask hides are left out. `displaced` says that the measured scene is turned or moved as
+/// a whole: silhouettes do not match, and small losses are an effect of that.
 pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult {
     let search = Search::new(context, mask, displaced);
     let mut result = ChannelResult::new(Channel::Hits, search.hold_out.len());
@@ -121,7 +122,8 @@ impl<'a> Search<'a> {
             let candidates: Vec<Law> = LAWS.into_iter().filter(joins).collect();
             let mut trials = self.law_trials(&candidates, &selection.laws);
             trials.extend(self.direction_trials(&selection.laws));
-            // A second law must gain more than a correction of the form of the first. A table by direction tells against the first law.
+            // A second law must gain more than a correction of the form of the first. A table by direction tells
+            // against the first law.
             for trial in trials.iter_mut().filter(|_| step > 0) {
                 let unexplained = trial.cause == Cause::Unexplained;
                 let share = if unexplained { UNEXPLAINED_SHARE } else { SECOND_LAW_SHARE };
@@ -180,7 +182,8 @@ impl<'a> Search<'a> {
         trials
     }
 
-    /// Whether the last of some laws loses enough to be reported. A second law must lose more than a correction of the form of the first.
+    /// Whether the last of some laws loses enough to be reported. A second law must lose more than a correction of
+    /// the form of the first.
     fn above_floor(&self, law: Law, laws: &[FittedLaw]) -> bool {
         let lost = self.table.lost(laws) - self.table.lost(&laws[..laws.len() - 1]);
         let own = laws.last().map_or(0.0, |l| l.numbers[0].abs());
@@ -312,8 +315,8 @@ pub(super) fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
     laws.iter().fold(Vec::new(), |before, &law| table.fit(&before, law))
 }
 
-/// Whether a law may be added to those chosen: laws of range, incidence and signal exclude each other, since a second one corrects the form of
-/// the first.
+/// Whether a law may be added to those chosen: laws of range, incidence and signal exclude each other, since a second
+/// one corrects the form of the first.
 fn may_join(law: Law, chosen: &[Law]) -> bool {
     let smooth = |l: &Law| matches!(l, Law::Range | Law::Incidence | Law::Signal);
     !(chosen.contains(&law) || smooth(&law) && chosen.iter().any(smooth))

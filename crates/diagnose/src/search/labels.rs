@@ -1,4 +1,5 @@
-//! Labels and objects: shifts of measured labels against simulated ones, and of measured returns on objects against simulated ones.
+//! Labels and objects: shifts of measured labels against simulated ones, and of measured returns on objects against
+//! simulated ones.
 
 mod clock;
 mod describe;
@@ -60,8 +61,8 @@ const FLOOR_S: f64 = 0.001;
 /// Shortest duration of a scan that is reported, s.
 const FLOOR_SCAN_S: f64 = 0.005;
 
-/// Relative difference in gain below which causes of an object shift are reported as ambiguous even if it is significant: surface fitting has
-/// a systematic error of this size.
+/// Relative difference in gain below which causes of an object shift are reported as ambiguous even if it is
+/// significant: surface fitting has a systematic error of this size.
 const AS_GOOD: f64 = 0.02;
 
 /// Fewest objects of the selecting frames.
@@ -129,7 +130,8 @@ impl Search<'_> {
         self.on_select.iter().collect()
     }
 
-    /// A trial of a hypothesis, `k` in the list, beside the columns of others that were chosen with `before` as their gains.
+    /// A trial of a hypothesis, `k` in the list, beside the columns of others that were chosen with `before` as their
+    /// gains.
     fn trial(&self, k: usize, others: &[usize], before: Option<&[f64]>) -> Trial {
         let Hypothesis { cause, columns: own } = HYPOTHESES[k];
         let columns = [others, own].concat();
@@ -160,7 +162,8 @@ impl Search<'_> {
         }
     }
 
-    /// Whether a hypothesis can be tried: its columns are known. Labels have no shape of their own and are not scanned.
+    /// Whether a hypothesis can be tried: its columns are known. Labels have no shape of their own and are not
+    /// scanned.
     fn allowed(&self, k: usize) -> bool {
         let Hypothesis { cause, columns } = HYPOTHESES[k];
         columns.iter().all(|&c| self.usable[c])
@@ -206,8 +209,8 @@ impl Search<'_> {
         Some((chosen, selected))
     }
 
-    /// Rival causes of the first hypothesis. A forward shift that is the same for all objects may be a late clock unless the velocities
-    /// contradict it; without velocities nothing does.
+    /// Rival causes of the first hypothesis. A forward shift that is the same for all objects may be a late clock
+    /// unless the velocities contradict it; without velocities nothing does.
     fn rivals_of_first(&self, trials: &[Trial], chosen: usize, equals: &[usize]) -> Vec<Cause> {
         let mut rivals = causes_of(trials, equals);
         if self.side == Side::Objects {
@@ -274,8 +277,8 @@ impl Search<'_> {
     }
 }
 
-/// The correction of a measured label that places it on its returns: displaced labels are moved back, displaced objects take their labels
-/// along.
+/// The correction of a measured label that places it on its returns: displaced labels are moved back, displaced
+/// objects take their labels along.
 fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
     let shift = [0, 1, 2].map(|axis: usize| r.expected(axis, &fitted.columns, fitted.theta.iter()));
     let sign = if side == Side::Labels { -1.0 } else { 1.0 };

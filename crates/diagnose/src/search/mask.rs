@@ -1,4 +1,5 @@
-//! What hides rays altogether: the largest range, parts of the ego vehicle, patches of directions. Searched before laws of losses.
+//! What hides rays altogether: the largest range, parts of the ego vehicle, patches of directions. Searched before
+//! laws of losses.
 
 use super::hits::refit;
 use super::{ChannelResult, Context, Found, NamedParameter, parameter, patch, sensor_number};
@@ -64,8 +65,8 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let select = context.of(Role::Select);
     let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
-    // Losses that laws explain are no occlusion, whether the laws are fitted with the dark directions or without them. Far ground may be dark in
-    // all directions.
+    // Losses that laws explain are no occlusion, whether the laws are fitted with the dark directions or without
+    // them. Far ground may be dark in all directions.
     let dark = blocked_cells(&counts, shown, |_| 1.0);
     let mut fits = vec![expected_shares(context, &select, &mask, &mask)];
     if !dark.is_empty() {
@@ -84,7 +85,8 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     (mask, spots)
 }
 
-/// Share of the returns that laws keep in each cell of directions. The laws are fitted on the rays that `fitted_without` does not hide.
+/// Share of the returns that laws keep in each cell of directions. The laws are fitted on the rays that
+/// `fitted_without` does not hide.
 fn expected_shares(
     context: &Context,
     frames: &[usize],

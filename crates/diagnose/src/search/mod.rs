@@ -1,5 +1,5 @@
-//! The search of each channel: hypotheses are compared on the selecting frames, fitted on the estimating frames, and their gain is
-//! measured on the held-out frames.
+//! The search of each channel: hypotheses are compared on the selecting frames, fitted on the estimating frames, and
+//! their gain is measured on the held-out frames.
 
 pub mod confounders;
 pub mod geometry;
@@ -109,8 +109,8 @@ pub struct ChannelResult {
     pub considered: Vec<Considered>,
     /// Detectable effect sizes.
     pub minimum: Vec<(Cause, Minimum)>,
-    /// On held-out frames, frame by frame, nats: distance of the simulation, gain of the findings, and gain of unconstrained lookup tables
-    /// fitted on the same frames as the findings.
+    /// On held-out frames, frame by frame, nats: distance of the simulation, gain of the findings, and gain of
+    /// unconstrained lookup tables fitted on the same frames as the findings.
     pub distance: Vec<[f64; 3]>,
     /// Corrections of measured labels.
     pub repairs: Vec<Repair>,
@@ -149,8 +149,8 @@ pub fn first_demands() -> Demands {
     Demands { z: Z_STAR, nats: 8.0, slack: 0.02, richer: 0.02 }
 }
 
-/// Share of groups, those with the largest offsets, that are left out of the spread. Rows: a single row may follow the upper edge of a wall,
-/// which every shift of the wall displaces.
+/// Share of groups, those with the largest offsets, that are left out of the spread. Rows: a single row may follow
+/// the upper edge of a wall, which every shift of the wall displaces.
 pub fn trimmed(grouping: Grouping) -> f64 {
     if grouping == Grouping::Row { 0.12 } else { 0.0 }
 }
@@ -158,8 +158,8 @@ pub fn trimmed(grouping: Grouping) -> f64 {
 /// Displacement of the fastest objects over one scan from which on motion distortion spoils the other channels, m.
 const SWEPT_M: f64 = 0.8;
 
-/// Removes findings of other channels where objects show strong motion distortion: the whole scene is sheared, so that surfaces, silhouettes
-/// and directions do not match. Returns a note about what was removed.
+/// Removes findings of other channels where objects show strong motion distortion: the whole scene is sheared, so
+/// that surfaces, silhouettes and directions do not match. Returns a note about what was removed.
 pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
     let of_objects = |f: &Found| f.channel == Channel::Objects && f.is(Cause::RollingShutter);
     let found = results.iter().flat_map(|r| &r.found).find(|f| of_objects(f))?;
@@ -238,7 +238,8 @@ pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: Cause, demands: &D
 /// Share of bootstrap repetitions below which the runner-up is reported as a candidate.
 const SURE: f64 = 0.8;
 
-/// The rival causes of a chosen one and its confidence. Without rivals the runner-up becomes one where the confidence is low.
+/// The rival causes of a chosen one and its confidence. Without rivals the runner-up becomes one where the confidence
+/// is low.
 pub fn rivals_and_confidence(
     mut rivals: Vec<Cause>,
     trials: &[Trial],

@@ -150,8 +150,8 @@ fn above_floor(table: &NoiseTable, law: NoiseLaw, theta: f64) -> bool {
     enough && share / n.max(1.0) > FLOOR_SHARE
 }
 
-/// Of one frame the Kullback-Leibler distance of its roughness from the simulation, the gain of the laws, and the gain of the variances of
-/// `other` frames cell by cell, nats.
+/// Of one frame the Kullback-Leibler distance of its roughness from the simulation, the gain of the laws, and the
+/// gain of the variances of `other` frames cell by cell, nats.
 fn distance(table: &NoiseTable, other: &NoiseTable, frame: &RoughFrame, terms: &[Term]) -> [f64; 3] {
     let best: f64 = frame
         .iter()

@@ -1,4 +1,5 @@
-//! Patches of directions that lose more than others, as by dirt on a window, a scratch or a reflection. No cause of the catalogue.
+//! Patches of directions that lose more than others, as by dirt on a window, a scratch or a reflection. No cause of
+//! the catalogue.
 
 use super::{Context, Found, NamedParameter, Z_STAR, by_block, draw_blocks, parameter, sensor_number};
 use crate::catalogue::{Channel, Covariate, Quantity};
@@ -112,8 +113,8 @@ fn sum_of(patch: &Patch, of_frames: &[DirectionLosses], which: &[usize]) -> Dire
     all
 }
 
-/// Middle, radius and loss of a spot, with intervals from a bootstrap over blocks of frames. The size of a cell and the unknown profile of the
-/// edge add to the errors.
+/// Middle, radius and loss of a spot, with intervals from a bootstrap over blocks of frames. The size of a cell and
+/// the unknown profile of the edge add to the errors.
 fn parameters(
     patch: &Patch,
     blocks: &[usize],

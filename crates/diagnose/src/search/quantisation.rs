@@ -13,7 +13,8 @@ const RETURNS: usize = 60_000;
 /// Fewest returns of each side.
 const FEWEST: usize = 500;
 
-/// Share of the measured ranges on the comb from which on it is one; the share of the simulated ranges must be below half of it.
+/// Share of the measured ranges on the comb from which on it is one; the share of the simulated ranges must be below
+/// half of it.
 const COHERENT: f64 = 0.3;
 
 /// Largest step that is searched for, m: the structure of the scene causes longer periods.
@@ -72,7 +73,8 @@ fn ranges(context: &Context, frames: &[usize], measured: bool) -> Vec<f64> {
     some.map(|r| r.own_range_m()).filter(|r| *r < LENGTH_M).collect()
 }
 
-/// Gains of held-out frames, nats: a range on the comb gives its place between the steps, for the share of ranges on the comb.
+/// Gains of held-out frames, nats: a range on the comb gives its place between the steps, for the share of ranges on
+/// the comb.
 fn held_out_gains(context: &Context, hold_out: &[usize], step: f64) -> Vec<f64> {
     let gain = |&i: &usize| {
         let own = ranges(context, &[i], true);
@@ -124,8 +126,8 @@ fn found(step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64
     }
 }
 
-/// The top of the peak on whose flank a frequency lies, or on the flank of a smaller peak before it: scenes with sharp ends have side peaks. The
-/// harmonics of the step lie beyond.
+/// The top of the peak on whose flank a frequency lies, or on the flank of a smaller peak before it: scenes with
+/// sharp ends have side peaks. The harmonics of the step lie beyond.
 fn top(spectrum: &[f64], flank: usize) -> usize {
     let end = (flank + flank / 2).min(spectrum.len() - 1);
     (flank..=end).max_by(|a, b| spectrum[*a].total_cmp(&spectrum[*b])).unwrap_or(flank)
@@ -133,7 +135,7 @@ fn top(spectrum: &[f64], flank: usize) -> usize {
 
 /// Share of the ranges on the comb of each frequency.
 fn spectrum(ranges: &[f64]) -> Vec<f64> {
-    let sums = Spectra::new().of(ranges.iter().copied());
+    let sums = Spectra::default().of(ranges.iter().copied());
     sums.iter().map(|v| f64::from(v.norm()) / ranges.len() as f64).collect()
 }
 

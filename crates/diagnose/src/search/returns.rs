@@ -1,4 +1,5 @@
-//! Returns without a simulated surface at their place: false alarms, mixed ranges at edges, objects that the simulation lacks.
+//! Returns without a simulated surface at their place: false alarms, mixed ranges at edges, objects that the
+//! simulation lacks.
 
 mod describe;
 mod false_alarms;
@@ -15,11 +16,12 @@ use crate::inference::roles::Role;
 /// Smallest share of returns that is reported, by kind.
 const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.003];
 
-/// Ratio of the excess in front of surfaces to the excess behind them, or the reverse, from which on objects were added or are missing. Below
-/// it, surfaces stand elsewhere.
+/// Ratio of the excess in front of surfaces to the excess behind them, or the reverse, from which on objects were
+/// added or are missing. Below it, surfaces stand elsewhere.
 const ONE_SIDED: f64 = 3.0;
 
-/// Sign test over frames, standard errors: to detect an excess, and to confirm it on other frames. Three are ten of ten frames.
+/// Sign test over frames, standard errors: to detect an excess, and to confirm it on other frames. Three are ten of
+/// ten frames.
 const Z_BY_SIGNS: [f64; 2] = [3.0, 2.0];
 
 /// Smallest gain of the selecting frames, nats.
@@ -97,7 +99,8 @@ impl Search<'_> {
             Odd::GroupBehind => Some(Odd::GroupInFront),
             Odd::Alone | Odd::Between => None,
         };
-        // Objects stand in few places. Where few frames have most of the excess, signs are more powerful than the mean.
+        // Objects stand in few places. Where few frames have most of the excess, signs are more powerful than the
+        // mean.
         let by_signs = opposite.is_some() && significant_by_signs(&differences, Z_BY_SIGNS[0]);
         let by_mean = significant(&gains, Z_STAR) && z_difference > 1.5;
         let excess_of = |other: Odd| self.excess(&self.select, other)[1].max(0.0);
@@ -156,14 +159,15 @@ const ELSEWHERE_NATS: f64 = 0.01;
 /// Share of that gain that may remain after surfaces were moved to their place.
 const ELSEWHERE_REMAINS: f64 = 0.5;
 
-/// Whether undoing a displacement brings measured returns onto the simulated surfaces: grouped returns off the surfaces are significant before
-/// and at most half as many after.
+/// Whether undoing a displacement brings measured returns onto the simulated surfaces: grouped returns off the
+/// surfaces are significant before and at most half as many after.
 pub fn is_explained_by_displacement(before: &Context, moved: &Context) -> bool {
     let [before, after] = [before, moved].map(grouped_gain);
     before > ELSEWHERE_NATS && after < ELSEWHERE_REMAINS * before
 }
 
-/// Gain by grouped returns off the surfaces, nats a return: objects that only one side has, or surfaces that stand elsewhere.
+/// Gain by grouped returns off the surfaces, nats a return: objects that only one side has, or surfaces that stand
+/// elsewhere.
 fn grouped_gain(context: &Context) -> f64 {
     let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
     let select = context.of(Role::Select);
@@ -193,8 +197,8 @@ fn excess<'a>(frames: impl Iterator<Item = &'a OddFrame>, k: usize) -> [f64; 2] 
     [base, sum[0] / sum[2].max(1.0) - base]
 }
 
-/// The excess with its interval from the scatter of the frames. Where that interval contains zero but the sign test confirms the excess, the
-/// interval is that of its logarithm.
+/// The excess with its interval from the scatter of the frames. Where that interval contains zero but the sign test
+/// confirms the excess, the interval is that of its logarithm.
 fn share_of(more: f64, each: &[f64]) -> Parameter {
     let (_, z) = total_and_z(each);
     let error = (more.abs() / z.abs().max(1e-9)).hypot(0.05 * more);

@@ -1,8 +1,9 @@
-//! Motion distortion: static objects are displaced along the scan as the ego vehicle drives, by metres at speed. Searched first, since it
-//! shears whole scenes, and undone for the other channels.
+//! Motion distortion: static objects are displaced along the scan as the ego vehicle drives, by metres at speed.
+//! Searched first, since it shears whole scenes, and undone for the other channels.
 //!
-//! For each duration of a scan, measured returns are moved back to their place in the middle of the scan. The duration is that with the most
-//! returns in occupied cells of the simulation, in bird's-eye view. Rays need not be paired, so that displacements of metres are found.
+//! For each duration of a scan, measured returns are moved back to their place in the middle of the scan. The
+//! duration is that with the most returns in occupied cells of the simulation, in bird's-eye view. Rays need not be
+//! paired, so that displacements of metres are found.
 
 use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR, by_block, draw_blocks};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
@@ -124,7 +125,8 @@ impl TopView {
     }
 }
 
-/// Mean gain over its standard error from which on an insignificant displacement is tested further, by moving the scene back.
+/// Mean gain over its standard error from which on an insignificant displacement is tested further, by moving the
+/// scene back.
 const DOUBTFUL_Z: f64 = 1.5;
 
 /// Result of the search.
@@ -133,7 +135,8 @@ pub enum Search {
     NotFound(ChannelResult),
     /// A significant displacement.
     Found(ChannelResult, Slide),
-    /// A displacement that is not significant from above. Whether it is one is decided after the whole scene was moved back by it.
+    /// A displacement that is not significant from above. Whether it is one is decided after the whole scene was
+    /// moved back by it.
     Undecided {
         /// Result if it is one.
         found: ChannelResult,
@@ -315,8 +318,8 @@ impl Model {
         frames.iter().map(|&f| self.frames[f].points.len() as f64).sum::<f64>()
     }
 
-    /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the best and the worst share is
-    /// the gain of one more point.
+    /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the
+    /// best and the worst share is the gain of one more point.
     fn held_out_gains(&self, grid: &Grid, fitted: &Fitted, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
         let points = self.points(select);
         let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
@@ -356,8 +359,8 @@ struct Grid {
     most: f64,
 }
 
-/// The duration with the most points in occupied cells: the mean of the durations whose counts are within 15 % of the best, in units of the
-/// difference between best and worst, weighted by what exceeds that.
+/// The duration with the most points in occupied cells: the mean of the durations whose counts are within 15 % of the
+/// best, in units of the difference between best and worst, weighted by what exceeds that.
 fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
     let sums: Vec<f64> = (0..times.len()).map(|k| which.iter().map(|&i| counts[i][k]).sum()).collect();
     let [low, high] = [sums.iter().copied().fold(f64::INFINITY, f64::min), sums.iter().copied().fold(0.0, f64::max)];

@@ -37,8 +37,9 @@ pub(super) fn mean_by_group<'a>(
 }
 
 impl Unexplained {
-    /// The finding. `all` holds the sums over the estimating frames, `hold_out` the held-out frames. `shown` maps a group, its offset and its
-    /// standard error to the measured value of the plot and its error, in units of the simulated value.
+    /// The finding. `all` holds the sums over the estimating frames, `hold_out` the held-out frames. `shown` maps a
+    /// group, its offset and its standard error to the measured value of the plot and its error, in units of the
+    /// simulated value.
     pub(super) fn found<'a>(
         self,
         all: &BTreeMap<Group, GroupSums>,

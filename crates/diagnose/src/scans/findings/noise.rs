@@ -82,8 +82,8 @@ impl Forms {
         gain_of(&self.over(k, from)).ci95[0] > 0.0
     }
 
-    /// The form that gains significantly over all simpler ones. Incidence is tried before range: the footprint of a beam causes noise at grazing
-    /// incidence in any case, and a dependence on range must gain more than that.
+    /// The form that gains significantly over all simpler ones. Incidence is tried before range: the footprint of a
+    /// beam causes noise at grazing incidence in any case, and a dependence on range must gain more than that.
     fn choose(&self, notes: &mut Vec<String>) -> usize {
         let mut chosen = 0;
         for (k, from) in [(1, 0), (2, 0), (3, 1), (3, 2)] {
@@ -168,8 +168,8 @@ impl Forms {
     }
 }
 
-/// Standard deviation along the ray, by the angle of incidence or by range: measured, of an ideal sensor, and fitted. Range is shown on surfaces
-/// that are met squarely, where there are enough.
+/// Standard deviation along the ray, by the angle of incidence or by range: measured, of an ideal sensor, and fitted.
+/// Range is shown on surfaces that are met squarely, where there are enough.
 fn curve(table: &Bins, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
     let row = |[r, l, m, sd]: &[f64; 4]| {
         let x = if by_angle { (l / r).atan().to_degrees() } else { *r };

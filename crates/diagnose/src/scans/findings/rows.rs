@@ -131,7 +131,8 @@ pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Find
     Some(named.into())
 }
 
-/// Standard deviation of the offsets beyond their errors, and its interval. A draw of scans has the variance of the errors twice.
+/// Standard deviation of the offsets beyond their errors, and its interval. A draw of scans has the variance of the
+/// errors twice.
 fn spread_beyond_noise(fitted: &Fitted) -> (f64, [f64; 2]) {
     let lasers = 0..fitted.offsets.len();
     let certain: Vec<usize> = lasers.filter(|&b| fitted.offsets[b].is_some() && fitted.error(b) < CERTAIN_M).collect();

@@ -1,4 +1,5 @@
-//! Pitch and roll of the ego vehicle beside one sensor that is mounted otherwise than the rig says: turns that all other sensors see alike.
+//! Pitch and roll of the ego vehicle beside one sensor that is mounted otherwise than the rig says: turns that all
+//! other sensors see alike.
 
 use super::floor::FLOOR_TURN_RAD;
 use super::hypotheses::Hypothesis;
@@ -10,7 +11,8 @@ use crate::search::{Z_STAR, by_block};
 /// Turns of the other sensors agree if the smallest is at least this share of the largest.
 const ALIKE: f64 = 0.5;
 
-/// Turns of the whole scene as a hypothesis, where a sensor's pose was chosen and at least two other sensors agree on the turns.
+/// Turns of the whole scene as a hypothesis, where a sensor's pose was chosen and at least two other sensors agree on
+/// the turns.
 pub(super) fn common_turns(
     sums: &Sums,
     select: &[usize],

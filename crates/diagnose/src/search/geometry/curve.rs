@@ -22,7 +22,8 @@ const STRAY_M: f64 = 0.5;
 /// Name of the horizontal axis, and its value for a ray.
 type Axis = (&'static str, fn(&Ray, &Sensor) -> f64);
 
-/// The horizontal axis of a cause: range for a bias, distance along the vehicle for a tilt, phase for motion distortion, azimuth for a sensor.
+/// The horizontal axis of a cause: range for a bias, distance along the vehicle for a tilt, phase for motion
+/// distortion, azimuth for a sensor.
 fn axis(cause: Cause) -> Axis {
     match cause {
         Cause::RangeBias => ("range, m", |r, _| f64::from(r.range_m)),
@@ -34,8 +35,8 @@ fn axis(cause: Cause) -> Axis {
     }
 }
 
-/// Displacement of surfaces in the direction in which `columns` of a fit move them, along the covariate of the cause. Rays that the columns do
-/// not move are left out.
+/// Displacement of surfaces in the direction in which `columns` of a fit move them, along the covariate of the cause.
+/// Rays that the columns do not move are left out.
 pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize], cause: Cause) -> Curve {
     let (context, sums) = (search.context, &search.sums);
     let (x, value) = axis(cause);

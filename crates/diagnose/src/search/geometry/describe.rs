@@ -139,8 +139,9 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize) -> D
     }
 }
 
-/// Pose errors that the same fit attributes to sensors that are mounted correctly, beyond chance: three turns, rad, then three shifts, m, root
-/// mean square over the other sensors. They measure the error of the model of a sensor's pose. Zero where fewer than two others are there.
+/// Pose errors that the same fit attributes to sensors that are mounted correctly, beyond chance: three turns, rad,
+/// then three shifts, m, root mean square over the other sensors. They measure the error of the model of a sensor's
+/// pose. Zero where fewer than two others are there.
 fn spurious_poses(search: &Search, columns: &[usize], chosen: &[Hypothesis]) -> [f64; 6] {
     let sums = &search.sums;
     let pose = |c: usize| if let Column::SensorPose(s, k) = sums.columns[c] { Some((s, k)) } else { None };
@@ -243,7 +244,8 @@ fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
         (turn_error, shift_error) = (error_of(turn_error), error_of(shift_error));
     }
     let deg = f64::to_degrees;
-    // Relative error of the model: poses of frames and offsets of surfaces absorb a part of the turn of a single sensor.
+    // Relative error of the model: poses of frames and offsets of surfaces absorb a part of the turn of a single
+    // sensor.
     let form = if sensor.is_some() { 0.07 } else { 0.03 };
     for (k, angle) in [Quantity::RollDeg, Quantity::PitchDeg, Quantity::YawDeg].into_iter().enumerate() {
         if turn[k].abs() > 1e-9 {

@@ -19,7 +19,8 @@ pub struct Displacement {
     pub sensors: Vec<SVector<f64, 6>>,
     /// Constant range offset, m, and relative range error.
     pub bias: [f64; 2],
-    /// Offsets of groups of rays: the grouping, the column (0: range, m; 1: elevation, rad), and the offset of each group.
+    /// Offsets of groups of rays: the grouping, the column (0: range, m; 1: elevation, rad), and the offset of each
+    /// group.
     pub groups: Option<(Grouping, usize, BTreeMap<Group, f64>)>,
 }
 

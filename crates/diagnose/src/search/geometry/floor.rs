@@ -19,11 +19,12 @@ const FLOOR_SHIFT_M: f64 = 0.04;
 /// Smallest displacement over a scan that is reported: along x and y in m, about z in rad.
 const FLOOR_SWEEP: [f64; 3] = [0.3, 0.3, 0.01];
 
-/// Smallest displacement of surfaces by the pose of one sensor that is reported, root mean square, m. The six parameters of a pose absorb
-/// errors of the few surfaces that this sensor alone sees.
+/// Smallest displacement of surfaces by the pose of one sensor that is reported, root mean square, m. The six
+/// parameters of a pose absorb errors of the few surfaces that this sensor alone sees.
 pub(super) const FLOOR_SENSOR_M: f64 = 0.004;
 
-/// Smallest spread of group offsets that is reported: rows in range, m; rows in elevation, rad; strips of azimuth in range, m.
+/// Smallest spread of group offsets that is reported: rows in range, m; rows in elevation, rad; strips of azimuth in
+/// range, m.
 pub(super) const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
 
 /// Whether the effect of the last of some hypotheses, fitted together, is large enough to be reported.
@@ -65,8 +66,8 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
 }
 
 impl Sums {
-    /// Displacement of the surfaces that a sensor sees by some columns, m, root mean square. The part that poses of single frames and offsets of
-    /// the surfaces absorb is subtracted.
+    /// Displacement of the surfaces that a sensor sees by some columns, m, root mean square. The part that poses of
+    /// single frames and offsets of the surfaces absorb is subtracted.
     pub(super) fn displaced_m(&self, frames: &[usize], sensor: usize, coefficients: &[(usize, f64)]) -> f64 {
         let gram: DMatrix<f64> = frames.iter().map(|&f| &self.linear[f].gram).sum();
         let mut by = DVector::zeros(self.columns.len());

@@ -20,7 +20,8 @@ impl Hypothesis {
         }
     }
 
-    /// Number of free parameters. Offsets of groups are shrunk by their prior: 12 for rows and 14 for strips of azimuth are what they count.
+    /// Number of free parameters. Offsets of groups are shrunk by their prior: 12 for rows and 14 for strips of
+    /// azimuth are what they count.
     pub(super) fn parameters(&self) -> usize {
         match self {
             Hypothesis::Linear { columns, .. } => columns.len(),
@@ -74,8 +75,8 @@ pub(super) fn is_pose(hypothesis: &Hypothesis) -> bool {
     matches!(hypothesis.cause(), Cause::PitchRoll | Cause::SensorExtrinsics)
 }
 
-/// Whether a hypothesis may be added to those chosen: another cause, at most one grouping, and nothing after motion distortion. A strong
-/// shear leaves every sensor with an apparent turn and shift of its own.
+/// Whether a hypothesis may be added to those chosen: another cause, at most one grouping, and nothing after motion
+/// distortion. A strong shear leaves every sensor with an apparent turn and shift of its own.
 pub(super) fn may_join(hypothesis: &Hypothesis, chosen: &[Hypothesis]) -> bool {
     chosen.iter().all(|c| {
         let grouped = |h: &Hypothesis| matches!(h, Hypothesis::Groups { .. });

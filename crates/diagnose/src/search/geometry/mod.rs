@@ -1,5 +1,5 @@
-//! Where surfaces lie: range biases, poses of sensors and of the ego vehicle, rows that aim or measure wrongly, and unexplained offsets by
-//! azimuth.
+//! Where surfaces lie: range biases, poses of sensors and of the ego vehicle, rows that aim or measure wrongly, and
+//! unexplained offsets by azimuth.
 
 mod common_turns;
 mod curve;
@@ -168,8 +168,8 @@ impl<'a> Search<'a> {
         chosen.into_iter().zip(selected).zip(large).filter(|(_, large)| *large).map(|(both, _)| both).unzip()
     }
 
-    /// Of each held-out frame its distance, the gain of the chosen hypotheses, and the gain of all columns, nats. The sums have no distance
-    /// of their own: it is taken to be the largest gain.
+    /// Of each held-out frame its distance, the gain of the chosen hypotheses, and the gain of all columns, nats. The
+    /// sums have no distance of their own: it is taken to be the largest gain.
     fn distances(&self, chosen: &[Hypothesis]) -> Vec<[f64; 3]> {
         let (full, base) = self.sums.full_and_base(&self.estimate, &self.estimate_blocks);
         let of_frame = |&f: &usize| {
@@ -184,8 +184,8 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Drops trials of a second step that only fit what the first one left: below 10 % of the first gain, or below 2 % where they are more
-/// significant than the first.
+/// Drops trials of a second step that only fit what the first one left: below 10 % of the first gain, or below 2 %
+/// where they are more significant than the first.
 fn drop_remainders(trials: &mut [Trial], first_gains: &[f64]) {
     let first = total_and_z(first_gains);
     trials.iter_mut().for_each(|t| {

@@ -13,8 +13,8 @@ const Z_SHARE: f64 = 0.75;
 /// Tie-break: a hypothesis with at least this many times the gain of the other is kept whatever its z.
 const GAIN_FACTOR: f64 = 2.0;
 
-/// Rejects the less significant of per-row range offsets and per-row elevation offsets. The wrong one fits few rays at grazing incidence, with
-/// large gains on few frames.
+/// Rejects the less significant of per-row range offsets and per-row elevation offsets. The wrong one fits few rays
+/// at grazing incidence, with large gains on few frames.
 pub(super) fn drop_less_certain_rows(trials: &mut [Trial], candidates: &[&Hypothesis]) {
     let gain_and_z = |t: &Trial| {
         let (gain, z) = total_and_z(&t.gains);

@@ -77,8 +77,8 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
     }
 }
 
-/// Weights of all returns of each sensor, by frame. Surface normals have length 1, so that the squared levers of the shifts sum to the
-/// weights.
+/// Weights of all returns of each sensor, by frame. Surface normals have length 1, so that the squared levers of the
+/// shifts sum to the weights.
 fn sensor_weights(means: &[MeanFrame], columns: &[Column], sensors: usize) -> Vec<Vec<f64>> {
     let shift_of = |c: &Column, s: usize| matches!(c, Column::SensorPose(of, 3..6) if *of == s);
     let of_sensor = |m: &MeanFrame, s: usize| {
@@ -102,9 +102,9 @@ fn precision(column: Column) -> f64 {
     1.0 / (sd * sd)
 }
 
-/// Prior variances of what every frame may have of its own. Pose: the robust scatter of the frames' poses about the median of each sensor.
-/// Displacement over a scan: that of a driving vehicle where a sensor scans row after row, since static surfaces are then displaced along
-/// columns, which resembles a pose error of a sensor; zero otherwise.
+/// Prior variances of what every frame may have of its own. Pose: the robust scatter of the frames' poses about the
+/// median of each sensor. Displacement over a scan: that of a driving vehicle where a sensor scans row after row,
+/// since static surfaces are then displaced along columns, which resembles a pose error of a sensor; zero otherwise.
 fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
     let least = [2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4];
     let scatter = |k: usize| {

@@ -54,7 +54,8 @@ pub(super) fn found(
     }
 }
 
-/// Parameters of a law with intervals: 2.1 times the standard deviation of the bootstrap fits and the error of the law's form.
+/// Parameters of a law with intervals: 2.1 times the standard deviation of the bootstrap fits and the error of the
+/// law's form.
 fn parameters(law: &FittedLaw, draws: &[FittedLaw], table: &LossTable) -> Vec<NamedParameter> {
     let parameter = |(k, (quantity, estimate)): (usize, (Quantity, f64))| {
         let drawn: Vec<f64> = draws.iter().map(|d| values(d)[k].1).collect();

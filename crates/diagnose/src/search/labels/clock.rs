@@ -1,4 +1,4 @@
-//! A constant offset of labels, or a late clock? The dependence on the velocity that the own car sees.
+//! Distinguishes a constant offset of labels from a late clock by the dependence on the relative velocity.
 
 use super::rows::Row;
 use crate::channels::motion::OwnMotion;
@@ -6,7 +6,7 @@ use crate::inference::linear::{LinearFrame, fit};
 use crate::inference::median;
 use nalgebra::{DMatrix, DVector};
 
-/// What the own speed may be, m/s: from the scene, or anything that a car does.
+/// Range of the ego speed, m/s: within 30 to 40 % of the estimate from the scenes, or that of any vehicle.
 pub(super) fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
     match median(motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect()) {
         v if v > 5.0 => [0.7 * v, 1.4 * v],
@@ -14,50 +14,54 @@ pub(super) fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
     }
 }
 
-/// Whether an offset that is the same for all could as well be a late clock: the dependence on the seen velocity that this would make is
+/// Whether a common offset may be a late clock: the dependence on the relative velocity that a late clock causes is
 /// not excluded.
 pub(super) fn late(forward_m: f64, [slope, error]: [f64; 2], speeds: [f64; 2]) -> bool {
     let ends = speeds.map(|v| forward_m / v);
     slope + 2.5 * error > ends[0].min(ends[1]) && slope - 2.5 * error < ends[0].max(ends[1])
 }
 
-/// Whether an offset that is the same for all is a late clock for sure: shifts depend on the seen velocity, and an own speed that a car may have
-/// makes the constant.
+/// Whether a common offset is a late clock: shifts depend significantly on the relative velocity, and a possible ego
+/// speed explains the constant.
 pub(super) fn surely_late(forward_m: f64, [slope, error]: [f64; 2], speeds: [f64; 2]) -> bool {
     slope.abs() > 3.2 * error && (speeds[0]..speeds[1]).contains(&(forward_m / slope))
 }
 
-/// Shift forward at no seen velocity of an object that heads as the own car does, m; of one that comes towards it a late clock makes the opposite.
+/// Forward shift at zero relative velocity of an object with the heading of the ego vehicle, m. For oncoming objects
+/// a late clock has the opposite sign.
 pub(super) fn forward(rows: &[Row], slope: f64) -> f64 {
     let sum = |f: &dyn Fn(&Row, f64) -> f64| rows.iter().map(|r| f(r, r.yaw_rad.cos()) / r.variance[0]).sum::<f64>();
     sum(&|r, cos| cos * (r.shift[0] - slope * r.x[0][3])) / sum(&|_, cos| cos * cos).max(1e-9)
 }
 
-/// The same object comes to lie no farther from where it was in the next frame, m.
+/// Largest relative movement of an object between consecutive frames, m.
 const NEXT_M: f64 = 2.5;
 
-/// Fewer objects that are followed tell nothing of the errors of velocities.
+/// Fewest objects that are tracked to the next frame.
 const FEWEST_FOLLOWED: usize = 12;
 
-/// Fewer objects of a frame tell nothing: two numbers of the frame, the own speed and the own turn, are not known.
+/// Fewest objects of a frame: two parameters of the frame, ego speed and yaw rate, are not known.
 const FEWEST_OF_FRAME: usize = 3;
 
-/// An object against the others of its frame, what the own motion may do to all of them taken out.
+/// An object relative to the others of its frame, the effect of ego motion subtracted.
 struct Contrast<'a> {
     row: &'a Row,
-    /// Seen velocity, m/s.
+    /// Relative velocity, m/s.
     seen: f64,
     /// Shift forward, m.
     shift: f64,
-    /// What is left of a constant.
+    /// Residual of a constant.
     constant: f64,
 }
 
-/// Slope of the shift forward over the seen velocity among the objects of a frame, s, and its standard error, beside a constant. A late clock shifts an
-/// object by its velocity over the ground: the seen one, the own speed times the cosine of its heading, and the own turn times its lever. The last
-/// two have one unknown factor a frame each, and are taken out. Velocities come from labels, which are not exact: the share of the slope that their
-/// errors leave is known from objects that are followed, whose velocities stay the same from frame to frame and whose errors do not; where too few are,
-/// the error is infinite.
+/// Slope of the forward shift over the relative velocity among the objects of a frame, s, and its standard error,
+/// beside a constant.
+///
+/// A late clock shifts an object by its velocity over the ground: the relative one, the ego speed times the cosine of
+/// its heading, and the yaw rate times its lever. The last two have one unknown factor for each frame and are
+/// projected out. Velocities are from labels with errors, which attenuate the slope. The attenuation is estimated
+/// from objects that are tracked: their velocities stay the same from frame to frame, the errors do not. Where too
+/// few are tracked, the standard error is infinite.
 pub(super) fn within_frames(rows: &[Row], which: &[usize], blocks: &[usize]) -> [f64; 2] {
     let mut contrasts: Vec<Contrast> = Vec::new();
     for frame in rows.chunk_by(|a, b| a.frame == b.frame).filter(|f| f.len() >= FEWEST_OF_FRAME) {

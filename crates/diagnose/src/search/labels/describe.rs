@@ -60,8 +60,8 @@ impl Description<'_> {
         }
     }
 
-    /// One parameter for each column; the constant of a late clock is none. Labels ahead of the returns equal returns behind the labels, hence
-    /// the sign.
+    /// One parameter for each column; the constant of a late clock is none. Labels ahead of the returns equal returns
+    /// behind the labels, hence the sign.
     fn parameters(&self) -> Vec<NamedParameter> {
         let Hypothesis { cause, columns } = *self.hypothesis;
         let sign = if self.side == Side::Labels { 1.0 } else { -1.0 };

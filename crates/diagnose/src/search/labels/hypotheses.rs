@@ -31,5 +31,6 @@ pub(super) const HYPOTHESES: [Hypothesis; 14] = [
     of(Cause::TimeOffset, TARGETS_CLOCK),
 ];
 
-/// Columns of a late clock of the objects where the ego speed is not known: the constant is the share of the ego speed.
+/// Columns of a late clock of the objects where the ego speed is not known: the constant is the share of the ego
+/// speed.
 pub(super) const TARGETS_CLOCK: &[usize] = &[0, 3];

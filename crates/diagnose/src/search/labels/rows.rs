@@ -139,7 +139,8 @@ fn nearest_sensor(context: &Context, azimuth_rad: f64) -> usize {
     nearest.unwrap_or(0)
 }
 
-/// Fills the columns of velocities. Returns the velocity over the ground along the heading, and which columns are known.
+/// Fills the columns of velocities. Returns the velocity over the ground along the heading, and which columns are
+/// known.
 fn velocity_columns(
     x: &mut [[f64; 8]; 3],
     seen: Option<[f64; 3]>,
@@ -167,8 +168,8 @@ fn velocity_columns(
     (Some(x[0][4]), known)
 }
 
-/// Leaves columns out that are not known of more than 60 % of the objects, then objects with an unknown column. Returns which columns are
-/// used.
+/// Leaves columns out that are not known of more than 60 % of the objects, then objects with an unknown column.
+/// Returns which columns are used.
 pub(super) fn keep_known(rows: &mut Vec<Row>) -> [bool; 8] {
     let share = |k: usize| rows.iter().filter(|r| r.known[k]).count() as f64 / rows.len() as f64;
     let usable: [bool; 8] = std::array::from_fn(|k| share(k) > 0.6);

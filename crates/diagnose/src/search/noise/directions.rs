@@ -16,8 +16,8 @@ use crate::search::{Found, parameter, trimmed};
 /// Fit of the added variance of groups of directions, in units of the expected one: prior standard deviation of three.
 pub(super) const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false, trust: 0.5 };
 
-/// Smallest spread of the added variance that is reported, by grouping. Rows have ranges and angles of their own, where laws may have another
-/// form; azimuths do not.
+/// Smallest spread of the added variance that is reported, by grouping. Rows have ranges and angles of their own,
+/// where laws may have another form; azimuths do not.
 const GROUP_FLOORS: [f64; 2] = [0.6, 0.25];
 
 impl Search<'_> {

@@ -24,8 +24,8 @@ pub(super) struct Selection {
 }
 
 impl Search<'_> {
-    /// Forward selection: one law and at most a second one of another cause, or a pair that replaces a law of the signal; a table by direction
-    /// where no law is chosen, or where laws leave one.
+    /// Forward selection: one law and at most a second one of another cause, or a pair that replaces a law of the
+    /// signal; a table by direction where no law is chosen, or where laws leave one.
     pub(super) fn select(&self, result: &mut ChannelResult) -> Selection {
         let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| self.trial(&[k], None)).collect();
         let mut choice = choose(&trials, &self.demands);
@@ -85,7 +85,8 @@ impl Search<'_> {
         }
     }
 
-    /// Adds a second law of another cause that brings at least 5 % of the first gain. Returns the gains of the selecting frames.
+    /// Adds a second law of another cause that brings at least 5 % of the first gain. Returns the gains of the
+    /// selecting frames.
     fn add_second(&self, first: &Trial, selection: &mut Selection, result: &mut ChannelResult) -> Vec<f64> {
         let mut gains = first.gains.clone();
         let (first_gain, _) = total_and_z(&first.gains);
@@ -106,8 +107,8 @@ impl Search<'_> {
         gains
     }
 
-    /// Replaces a law of the signal by range noise together with angular jitter, where the pair gains more: the two together resemble noise
-    /// that grows as the signal falls.
+    /// Replaces a law of the signal by range noise together with angular jitter, where the pair gains more: the two
+    /// together resemble noise that grows as the signal falls.
     fn try_pair(&self, first: &Trial, gains: Vec<f64>, selection: &mut Selection, result: &mut ChannelResult) {
         let range_noise = NOISE_LAWS[CONSTANT].cause();
         let along = (0..NOISE_LAWS.len()).filter(|&k| NOISE_LAWS[k].cause() == range_noise);
@@ -129,7 +130,8 @@ impl Search<'_> {
         }
     }
 
-    /// Looks for a dependence on the direction that the chosen laws leave. Where there is one, the laws are forms, not causes.
+    /// Looks for a dependence on the direction that the chosen laws leave. Where there is one, the laws are forms,
+    /// not causes.
     fn try_directions(&self, selection: &mut Selection, result: &mut ChannelResult) {
         let so_far = self.whole(&selection.laws);
         let terms: Vec<Term> =

@@ -22,7 +22,8 @@ struct Description {
     parameters: Vec<NamedParameter>,
 }
 
-/// The finding of an excess of one kind of returns; `share` is the excess, `z` its significance on the selecting frames.
+/// The finding of an excess of one kind of returns; `share` is the excess, `z` its significance on the selecting
+/// frames.
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
     let Description { covariate, says, parameters } = match kind {
         Odd::Alone => of_false_alarms(search, &share),
@@ -70,8 +71,8 @@ fn of_false_alarms(search: &Search, share: &Parameter) -> Description {
     }
 }
 
-/// Describes ranges between the two surfaces of an edge. The width of the beam is reported where it is plausible; how a sensor weights what a
-/// beam meets is not known.
+/// Describes ranges between the two surfaces of an edge. The width of the beam is reported where it is plausible; how
+/// a sensor weights what a beam meets is not known.
 fn mixed(search: &Search, share: Parameter) -> Description {
     let more = share.estimate;
     let mut parameters = vec![(Quantity::Share.into(), share)];
@@ -95,7 +96,8 @@ fn mixed(search: &Search, share: Parameter) -> Description {
     }
 }
 
-/// Describes grouped returns behind simulated surfaces: objects that only the simulation has, a negative share of missing ones.
+/// Describes grouped returns behind simulated surfaces: objects that only the simulation has, a negative share of
+/// missing ones.
 fn behind(share: Parameter) -> Description {
     let [low, high] = share.ci95;
     Description {

@@ -25,8 +25,8 @@ struct Seen {
 }
 
 impl Seen {
-    /// False alarms for each metre of ray. Sensors whose false alarms replace the true return show them behind surfaces as well; others only in
-    /// front of them.
+    /// False alarms for each metre of ray. Sensors whose false alarms replace the true return show them behind
+    /// surfaces as well; others only in front of them.
     fn per_metre(&self) -> f64 {
         let [front, behind] = [0, 1].map(|k| self.returns[k] / self.lengths_m[k].max(1.0));
         if behind > 0.5 * front {
