@@ -170,9 +170,8 @@ impl Row {
     }
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+fn median(values: Vec<f64>) -> f64 {
+    statistics::median_upper(values).unwrap_or(f64::NAN)
 }
 
 /// New rows take the place of those of the same id; in the order of their ids.

@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 const ARROWS: &[(&str, &[&str])] = &[
     ("geometry", &[]),
     ("kernels", &[]),
-    ("data", &["geometry"]),
+    ("statistics", &[]),
+    ("data", &["geometry", "statistics"]),
     ("simulate", &["data"]),
     ("models", &["data", "kernels"]),
     ("eval", &["data"]),
@@ -18,7 +19,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("report", &["eval", "diagnose"]),
     ("cli", &["simulate", "train", "report"]),
     ("tests", &["cli"]),
-    ("xtask", &[]),
+    ("xtask", &["statistics"]),
 ];
 
 /// The crates that may know tensors.

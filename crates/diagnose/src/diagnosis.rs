@@ -47,6 +47,19 @@ pub enum Verdict {
     NotScenarioIdentical,
 }
 
+impl Verdict {
+    /// The verdict of findings on data that could be compared.
+    pub fn of(findings: &[Finding]) -> Self {
+        let named = findings.iter().filter(|f| f.status == Status::Named).count();
+        match (findings.len(), named) {
+            (0, _) => Verdict::NothingFound,
+            (all, named) if all == named => Verdict::Explained,
+            (_, 0) => Verdict::Unexplained,
+            _ => Verdict::PartlyExplained,
+        }
+    }
+}
+
 /// Ids of the frames by what they were used for.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct FrameRoles {

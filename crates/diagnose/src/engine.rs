@@ -11,10 +11,11 @@ use crate::pairing::{
 use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::shutter::Sliding;
-use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
+use crate::search::{self, ChannelResult, Context, REPETITIONS, mean_interval};
 use data::Dataset;
 use geometry::Box3;
 use nalgebra::Vector3;
+use statistics::{blocks_of, draw_blocks, interval_nearest};
 use std::collections::BTreeMap;
 
 /// What to look at.
@@ -346,17 +347,10 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
         }
     }
     findings.sort_by(|a, b| b.gain.nats_per_ray.total_cmp(&a.gain.nats_per_ray));
-    let named = findings.iter().filter(|f| f.status == Status::Named).count();
-    let verdict = match (findings.len(), named) {
-        (0, _) => Verdict::NothingFound,
-        (all, named) if all == named => Verdict::Explained,
-        (_, 0) => Verdict::Unexplained,
-        _ => Verdict::PartlyExplained,
-    };
     let ids = |role| context.of(role).into_iter().map(|i| context.frames[i].id.clone()).collect();
     Diagnosis {
         schema: SCHEMA.into(),
-        verdict,
+        verdict: Verdict::of(&findings),
         frames: FrameRoles { select: ids(Role::Select), estimate: ids(Role::Estimate), hold_out: ids(Role::HoldOut) },
         gain: Gain { channels, ..gain(&distance, &blocks, returns, findings.is_empty()) },
         findings,
@@ -376,12 +370,9 @@ fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gai
     let closed =
         |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0 && !nothing).then(|| gained / gained.max(table));
     let all = total(&(0..sums.len()).collect::<Vec<_>>());
-    let members = by_block(blocks);
+    let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let mut drawn: Vec<f64> =
-        (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
-    drawn.sort_by(f64::total_cmp);
-    let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
+    let drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
     let gained = if nothing { 0.0 } else { all[1] };
     let least = gained.max(if nothing { 0.0 } else { all[2] });
     let before = all[0].max(least);
@@ -391,7 +382,7 @@ fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gai
         after: (before - gained) / returns,
         floor: (before - least) / returns,
         closed: closed(all),
-        ci95: closed(all).and_then(|_| Some([at(0.025)?, at(0.975)?])),
+        ci95: closed(all).and_then(|_| interval_nearest(drawn)),
         channels: BTreeMap::new(),
     }
 }

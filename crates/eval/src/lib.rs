@@ -8,6 +8,7 @@ pub mod analysis;
 mod bootstrap;
 mod csv_text;
 mod curve;
+mod dataset_statistics;
 pub mod distance;
 mod evaluate;
 mod evidence;
@@ -19,19 +20,18 @@ mod overlaps;
 mod read;
 mod recall;
 mod report;
-mod statistics;
 pub mod study;
 pub mod targets;
 
 pub use bootstrap::{BootstrapOptions, Interval};
 pub use csv_text::csv_text;
 pub use curve::{PrecisionCurve, ceiling_ap40};
+pub use dataset_statistics::{
+    Extent, FrameCounts, STATISTICS_SCHEMA, SetStatistics, StatisticsReport, compare_statistics, sum_up,
+};
 pub use evaluate::evaluate;
 pub use matching::Counts;
 pub use options::{Difficulty, EvalFrame, EvalOptions, Metric, RangeSection, default_classes, reference_overlaps};
 pub use read::{ids_of_folder, read_frames, read_ids};
 pub use recall::{RECALL_OVERLAPS, Recall, RecallDefinition};
 pub use report::{EvalReport, OverlapSet, Row, SCHEMA};
-pub use statistics::{
-    Extent, FrameCounts, STATISTICS_SCHEMA, SetStatistics, StatisticsReport, compare_statistics, sum_up,
-};

@@ -2,13 +2,13 @@
 //! the paper's table of data sets.
 
 use crate::RangeSection;
-use crate::bootstrap::mean;
 use data::{DataError, Frame, stream};
 use geometry::points_in_boxes;
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::mean;
 
 /// Version of [`Targets`] as JSON.
 pub const TARGETS_SCHEMA: &str = "lidarshift.targets/1";

@@ -3,6 +3,7 @@
 use crate::effect::Truth;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use statistics::median_upper;
 use std::collections::BTreeMap;
 
 /// What became of one case.
@@ -169,22 +170,19 @@ pub fn summarise(outcomes: &[Outcome]) -> Summary {
             judged.entry(p.name.clone()).or_default().push(p.clone());
         }
     }
-    let median = |mut v: Vec<f64>| {
-        v.sort_by(f64::total_cmp);
-        v.get(v.len() / 2).copied()
-    };
     for (name, list) in judged {
         let n = list.len() as f64;
         let inside = list.iter().filter(|p| p.inside()).count() as f64 / n;
         let close = list.iter().filter(|p| p.close()).count() as f64 / n;
-        let relative = median(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
+        let relative =
+            median_upper(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
         let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
         let rms =
             if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
         summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms, close]);
     }
-    summary.closed = median(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());
+    summary.closed = median_upper(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());
     let times: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
-    summary.seconds = [median(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
+    summary.seconds = [median_upper(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
     summary
 }

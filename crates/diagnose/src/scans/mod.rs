@@ -13,7 +13,7 @@ mod rings;
 mod scatter;
 mod tilt;
 
-use crate::diagnosis::{Diagnosis, FindingGain, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::diagnosis::{Diagnosis, FindingGain, FrameRoles, Gain, SCHEMA, Verdict};
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
@@ -21,7 +21,6 @@ use crate::rig::SensorRig;
 use crate::search::REPETITIONS;
 use data::Dataset;
 use planes::Patch;
-use rand::RngExt;
 use rayon::prelude::*;
 use rings::{Beam, RingScan};
 
@@ -117,19 +116,12 @@ pub fn diagnose_scans(
     let (mut found, minimum_detectable, considered) = findings::all(&seen, &mut notes);
     progress(Stage::Weighing, 1, 1);
     found.sort_by(|a, b| b.gain.nats_per_ray.total_cmp(&a.gain.nats_per_ray));
-    let named = found.iter().filter(|f| f.status == Status::Named).count();
-    let verdict = match (found.len(), named) {
-        (0, _) => Verdict::NothingFound,
-        (all, named) if all == named => Verdict::Explained,
-        (_, 0) => Verdict::Unexplained,
-        _ => Verdict::PartlyExplained,
-    };
     let used: Vec<String> = seen.scans.iter().map(|s| s.id.clone()).collect();
     let together: f64 = found.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
     let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
     let diagnosis = Diagnosis {
         schema: SCHEMA.into(),
-        verdict,
+        verdict: Verdict::of(&found),
         frames: FrameRoles { select: vec![], estimate: used.clone(), hold_out: used },
         findings: found,
         minimum_detectable,
@@ -152,15 +144,13 @@ pub fn diagnose_scans(
 /// Draws of scans with replacement, the same for every finding.
 fn draws(scans: usize) -> Vec<Vec<usize>> {
     let mut rng = data::stream(0, "diagnose scans", 0, 0);
-    (0..REPETITIONS / 2).map(|_| (0..scans).map(|_| rng.random_range(0..scans)).collect()).collect()
+    (0..REPETITIONS / 2).map(|_| statistics::draw(scans, &mut rng)).collect()
 }
 
 /// 95 % interval of drawn values.
 fn interval(mut drawn: Vec<f64>) -> [f64; 2] {
     drawn.retain(|v| v.is_finite());
-    drawn.sort_by(f64::total_cmp);
-    let at = |q: f64| drawn.get(((drawn.len().max(1) - 1) as f64 * q).round() as usize).copied().unwrap_or(0.0);
-    [at(0.025), at(0.975)]
+    statistics::interval_nearest(drawn).unwrap_or_default()
 }
 
 /// Gain in nats a return, of each scan's nats and returns, with an interval over draws of scans.

@@ -4,10 +4,7 @@ mod words;
 
 use self::words::found;
 use super::unnamed::{Unnamed, mean_by_group, word};
-use super::{
-    ChannelResult, Context, Found, Z_STAR, by_block, confidence, draw_blocks, first_demands, record, trimmed,
-    unless_unsure,
-};
+use super::{ChannelResult, Context, Found, Z_STAR, confidence, first_demands, record, trimmed, unless_unsure};
 use crate::channels::cells::cell;
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{hit_frames, loss_groups, total};
@@ -21,6 +18,7 @@ use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
 use rayon::prelude::*;
+use statistics::{blocks_of, draw_blocks};
 
 /// Smaller shares of lost returns are not spoken of.
 const FLOOR: f64 = 0.005;
@@ -151,7 +149,7 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     // Parameters from other frames, intervals from refits of drawn blocks.
     let table_e = of(&estimate);
     let fitted = refit(&table_e, &chosen);
-    let members = by_block(&context.blocks(&estimate));
+    let members = blocks_of(&context.blocks(&estimate));
     let repeated: Vec<Vec<FittedLaw>> = if chosen.is_empty() {
         vec![]
     } else {

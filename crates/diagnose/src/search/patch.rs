@@ -1,6 +1,6 @@
 //! Patches of directions that lose more than others. No cause of the catalogue: dirt on a window, a scratch, a reflection.
 
-use super::{Context, Found, Z_STAR, by_block, draw_blocks, parameter};
+use super::{Context, Found, Z_STAR, parameter};
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{AZIMUTH_RAD, ELEVATION_RAD, Mask, with_neighbours};
 use crate::channels::patch::{DirectionLosses, Losses, Patch, direction_losses, patches, share_of_spot, spot};
@@ -11,6 +11,7 @@ use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::search::hits::refit;
 use rayon::prelude::*;
+use statistics::{blocks_of, draw_blocks};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// At most so many are spoken of.
@@ -81,7 +82,7 @@ fn put(
         }
         all
     };
-    let members = by_block(blocks);
+    let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose patch", 0, 0);
     let everything: Vec<usize> = (0..estimate.len()).collect();
     let estimates = spot(&together(&everything), patch);

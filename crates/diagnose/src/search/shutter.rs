@@ -4,7 +4,7 @@
 //! For each time that a scan may take, measured returns are moved back to where they would be in the middle of the scan; counted are those that
 //! then come to lie where the simulation has something, seen from above. No pairing of rays is needed, so that metres do not matter.
 
-use super::{ChannelResult, Context, Found, REPETITIONS, Z_STAR, by_block, draw_blocks};
+use super::{ChannelResult, Context, Found, REPETITIONS, Z_STAR};
 use crate::channels::labels::seen_velocity;
 use crate::channels::mean::{common_bias_m, origins};
 use crate::channels::motion::{CELL_M, Cells, OwnMotion};
@@ -17,6 +17,7 @@ use crate::rig::{SensorMount, SensorRig};
 use geometry::Box3;
 use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
+use statistics::{blocks_of, draw_blocks};
 
 /// How the scene slides over a scan.
 pub struct Slide {
@@ -164,7 +165,7 @@ pub fn search(context: &Context) -> Sliding {
     // Finer on other frames, with blocks drawn for the interval.
     let fine: Vec<f64> = (-20..=20).map(|k| best + 0.2 * way.step * f64::from(k)).collect();
     let on_estimate = way.counts(&estimate, &fine);
-    let members = by_block(&context.blocks(&estimate));
+    let members = blocks_of(&context.blocks(&estimate));
     let mut rng = data::stream(0, "diagnose shutter", 0, 0);
     let all: Vec<usize> = (0..estimate.len()).collect();
     let scan_s = peak(&fine, &on_estimate, &all);

@@ -2,7 +2,6 @@
 
 use super::regions::RegionSums;
 use super::{Chamfer, DistanceError, Point, RegionRow, Regions, emd, nearest, sinkhorn, sliced_wasserstein};
-use crate::bootstrap::{deviation, mean};
 use crate::{BootstrapOptions, Interval, RangeSection};
 use data::{Frame, stream};
 use geometry::{Box3, points_in_boxes};
@@ -10,6 +9,7 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::{deviation, mean};
 use std::collections::BTreeSet;
 use std::fmt;
 

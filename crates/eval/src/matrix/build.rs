@@ -5,9 +5,9 @@ use super::{
     Cell, CellNumber, CellRun, Gap, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity,
     RunId, RunNumber, RunState, published,
 };
-use crate::bootstrap::{deviation, mean};
 use crate::{RangeSection, ceiling_ap40};
 use rayon::prelude::*;
+use statistics::{deviation, mean};
 use std::collections::BTreeMap;
 
 /// A run on a test set: its scores, or why there are none.

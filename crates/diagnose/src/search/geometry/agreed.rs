@@ -4,7 +4,7 @@ use super::Sums;
 use super::floor::FLOOR_TURN_RAD;
 use super::suspects::Suspect;
 use crate::channels::mean::{Column, OwnPoses};
-use crate::search::{Z_STAR, by_block};
+use crate::search::Z_STAR;
 
 /// The smallest of the others' turns is at least that share of the largest.
 const ALIKE: f64 = 0.5;
@@ -33,7 +33,7 @@ fn alike(poses: &[OwnPoses], select: &[usize], blocks: &[usize], except: usize) 
     if others.len() < 2 {
         return vec![];
     }
-    let members = by_block(blocks);
+    let members = statistics::blocks_of(blocks);
     let mean_and_error = |sensor: usize, turn: usize| {
         let mean =
             |which: &[usize]| which.iter().map(|&i| poses[select[i]][sensor][turn]).sum::<f64>() / which.len() as f64;

@@ -182,8 +182,8 @@ impl fmt::Display for StatisticsReport {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use data::write::{write_kitti_frame, write_split};
-    use data::{Cloud, Object};
+    use data::write::write_split;
+    use data::{Cloud, Layout, Object};
     use geometry::Box3;
 
     fn frame(id: &str, points: &[[f32; 3]], boxes: &[[f64; 2]]) -> Frame {
@@ -230,8 +230,8 @@ mod tests {
         let more =
             frame("000000", &[[10.0, 0.0, 0.5], [11.0, 0.5, 0.0], [9.5, 0.1, 0.0], [10.5, 0.0, 0.1]], &[[10.5, 0.0]]);
         for (root, first) in [(&a, &first), (&b, &more)] {
-            write_kitti_frame(root, first).unwrap();
-            write_kitti_frame(root, &second).unwrap();
+            Layout::Kitti.write_frame(root, first).unwrap();
+            Layout::Kitti.write_frame(root, &second).unwrap();
             write_split(&root.join("ImageSets/train.txt"), &["000000", "000001"]).unwrap();
         }
         let open = |path| Dataset::open(path).unwrap();
