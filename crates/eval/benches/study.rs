@@ -5,7 +5,7 @@
 
 #![expect(clippy::print_stdout, reason = "times go to stdout")]
 
-use data::{KittiLine, LabelFrame, stream};
+use data::{LabelBox, LabelFrame, stream};
 use geometry::Box3;
 use lidarshift_eval::EvalFrame;
 use lidarshift_eval::distance::{Point, chamfer, emd};
@@ -112,11 +112,11 @@ fn frame(k: u64, run: u64) -> EvalFrame {
         let mut places = stream(0, "study bench places", i, k);
         let mut car = [places.random_range(-90.0..90.0), places.random_range(-30.0..30.0), 0.0, 4.9, 1.9, 1.2, 0.1];
         if i < 3 {
-            frame.labels.push(KittiLine::from_box("Car", &Box3::from_array(car), None));
+            frame.labels.push(LabelBox::from_box("Car", &Box3::from_array(car), None));
         }
         car[0] += random.random_range(-0.6..0.6);
         car[1] += random.random_range(-0.2..0.2);
-        frame.detections.push(KittiLine::from_box("Car", &Box3::from_array(car), Some(random.random())));
+        frame.detections.push(LabelBox::from_box("Car", &Box3::from_array(car), Some(random.random())));
     }
     frame
 }

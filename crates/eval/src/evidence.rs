@@ -151,7 +151,7 @@ impl Evidence {
 mod tests {
     use super::*;
     use crate::{Difficulty, Metric};
-    use data::{KittiLine, LabelFrame, stream};
+    use data::{LabelBox, LabelFrame, stream};
     use proptest::prelude::*;
     use rand::RngExt;
 
@@ -161,14 +161,14 @@ mod tests {
         let mut car = |x: f64, score: bool| {
             let bbox = geometry::Box3::from_array([x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]);
             let score = score.then(|| rng.random_range(0..8) as f32 / 8.0);
-            (KittiLine::from_box("Car", &bbox, score), rng.random_range(0.0..1.0))
+            (LabelBox::from_box("Car", &bbox, score), rng.random_range(0.0..1.0))
         };
         (0..12)
             .map(|i| {
                 let mut frame = EvalFrame { id: i.to_string(), labels: vec![], detections: vec![] };
                 for k in 0..3 {
                     let x = 10.0 * f64::from(k);
-                    let (label, chance): (KittiLine, f64) = car(x, false);
+                    let (label, chance): (LabelBox, f64) = car(x, false);
                     if chance < 0.7 {
                         frame.labels.push(label);
                     }

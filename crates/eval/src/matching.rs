@@ -2,7 +2,7 @@
 
 use crate::overlaps::{FrameOverlaps, Pair};
 use crate::{Difficulty, EvalFrame, Metric};
-use data::KittiLine;
+use data::LabelBox;
 use serde::{Deserialize, Serialize};
 use std::ops::{AddAssign, Sub};
 
@@ -227,7 +227,7 @@ fn split_off_pairs<'a>(pairs: &mut &'a [Pair], label: usize) -> &'a [Pair] {
     own
 }
 
-fn label_role(line: &KittiLine, class: &str, difficulty: Difficulty, far: bool) -> Role {
+fn label_role(line: &LabelBox, class: &str, difficulty: Difficulty, far: bool) -> Role {
     let is = |name: &str| line.class.eq_ignore_ascii_case(name);
     let neighbour = difficulty != Difficulty::All
         && ((class.eq_ignore_ascii_case("Car") && is("Van"))
@@ -242,7 +242,7 @@ fn label_role(line: &KittiLine, class: &str, difficulty: Difficulty, far: bool) 
     }
 }
 
-fn detection_role(line: &KittiLine, class: &str, difficulty: Difficulty) -> Role {
+fn detection_role(line: &LabelBox, class: &str, difficulty: Difficulty) -> Role {
     if (line.image_box[3] - line.image_box[1]).abs() < difficulty.least_height_px() {
         Role::Ignored // of whatever class: the reference looks at the height first
     } else if line.class.eq_ignore_ascii_case(class) {

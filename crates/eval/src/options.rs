@@ -1,19 +1,19 @@
 //! What is evaluated and by which rules.
 
-use data::{KittiLine, LabelFrame};
+use data::{LabelBox, LabelFrame};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Ground truth and detections of one frame, as their texts write them.
+/// Ground truth and detections of one frame, both in the frame of the labels.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvalFrame {
     /// The file name without ending.
     pub id: String,
-    /// Label lines, DontCare included.
-    pub labels: Vec<KittiLine>,
-    /// Detection lines; each has a score.
-    pub detections: Vec<KittiLine>,
+    /// Labels, DontCare included.
+    pub labels: Vec<LabelBox>,
+    /// Detections; each has a score.
+    pub detections: Vec<LabelBox>,
 }
 
 /// What to evaluate.
@@ -158,7 +158,7 @@ pub fn reference_overlaps(class: &str, metric: Metric) -> [f64; 2] {
 pub fn default_classes(frames: &[EvalFrame]) -> Vec<String> {
     const LEFT_OUT: [&str; 6] = [data::DONT_CARE, "Van", "Person_sitting", "Truck", "Tram", "Misc"];
     let mut found: Vec<&str> = Vec::new();
-    for class in frames.iter().flat_map(|f| f.labels.iter().chain(&f.detections)).map(|line| line.class.as_str()) {
+    for class in frames.iter().flat_map(|f| f.labels.iter().chain(&f.detections)).map(|b| b.class.as_str()) {
         if !LEFT_OUT.iter().chain(&found).any(|name| name.eq_ignore_ascii_case(class)) {
             found.push(class);
         }

@@ -1,7 +1,7 @@
 //! Overlap of every label with every detection of a frame, in the image, seen from above and in space.
 
 use crate::{EvalFrame, Metric};
-use data::{KittiLine, LabelFrame};
+use data::{LabelBox, LabelFrame};
 use geometry::{Box3, bev_intersection};
 
 /// A label and a detection, by their index, that overlap.
@@ -79,7 +79,7 @@ struct Upright {
 
 /// The box of a line in a frame with z up: its own for [`LabelFrame::Lidar`]; for [`LabelFrame::Camera`] x to the right, y forward
 /// (KITTI's z) and z up (KITTI's -y), which is right-handed.
-pub(crate) fn upright_box(line: &KittiLine, label_frame: LabelFrame) -> Box3 {
+pub(crate) fn upright_box(line: &LabelBox, label_frame: LabelFrame) -> Box3 {
     match label_frame {
         LabelFrame::Lidar => line.lidar_box(),
         LabelFrame::Camera => {
@@ -90,17 +90,17 @@ pub(crate) fn upright_box(line: &KittiLine, label_frame: LabelFrame) -> Box3 {
 }
 
 /// The inverse of [`upright_box`]: the line with another box.
-pub(crate) fn with_upright_box(line: &KittiLine, b: &Box3, label_frame: LabelFrame) -> KittiLine {
+pub(crate) fn with_upright_box(line: &LabelBox, b: &Box3, label_frame: LabelFrame) -> LabelBox {
     let ([x, y, z], [l, w, h]) = (b.center, b.size);
     let (location, rotation_y) = match label_frame {
         LabelFrame::Lidar => (b.center, b.yaw_rad),
         LabelFrame::Camera => ([x, -(z - h / 2.0), y], -b.yaw_rad),
     };
-    KittiLine { location, rotation_y, size_hwl: [h, w, l], ..line.clone() }
+    LabelBox { location, rotation_y, size_hwl: [h, w, l], ..line.clone() }
 }
 
 impl Upright {
-    fn new(line: &KittiLine, label_frame: LabelFrame) -> Self {
+    fn new(line: &LabelBox, label_frame: LabelFrame) -> Self {
         let [h, w, l] = line.size_hwl;
         let base = upright_box(line, label_frame);
         let height = match label_frame {
@@ -127,7 +127,7 @@ impl Upright {
 }
 
 /// Distance of a box on the ground, m.
-pub(crate) fn range_m(line: &KittiLine, label_frame: LabelFrame) -> f64 {
+pub(crate) fn range_m(line: &LabelBox, label_frame: LabelFrame) -> f64 {
     let [x, y, z] = line.location;
     match label_frame {
         LabelFrame::Camera => x.hypot(z),

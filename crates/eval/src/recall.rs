@@ -48,7 +48,7 @@ pub(crate) fn any_box_recall(
         for pair in &overlaps.three_d {
             best[pair.label] = best[pair.label].max(pair.overlap);
         }
-        let counts = |line: &data::KittiLine| {
+        let counts = |line: &data::LabelBox| {
             classes.iter().any(|class| class.eq_ignore_ascii_case(&line.class))
                 && options.max_range_m.is_none_or(|most| range_m(line, options.label_frame) <= most)
         };

@@ -1,6 +1,6 @@
 //! The matrix: the paper's table from per-run values, and cells from detections.
 
-use data::{KittiLine, LabelFrame, stream};
+use data::{LabelBox, LabelFrame, stream};
 use lidarshift_eval::matrix::{
     Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity, RunId, RunResult, RunScores, RunState,
     RunValue, build, from_run_values, published,
@@ -134,8 +134,8 @@ fn the_table_is_laid_out_as_in_the_papers_source() {
     assert_eq!(plain(&paper_matrix().to_latex()), plain(table));
 }
 
-fn car(x: f64, y: f64, yaw: f64, score: Option<f64>) -> KittiLine {
-    KittiLine {
+fn car(x: f64, y: f64, yaw: f64, score: Option<f64>) -> LabelBox {
+    LabelBox {
         class: "Car".into(),
         truncation: 0.0,
         occlusion: 0.0,
@@ -145,6 +145,7 @@ fn car(x: f64, y: f64, yaw: f64, score: Option<f64>) -> KittiLine {
         location: [x, y, 0.5],
         rotation_y: yaw,
         score,
+        track: None,
     }
 }
 

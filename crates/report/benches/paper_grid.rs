@@ -4,7 +4,7 @@
 
 #![expect(clippy::print_stdout, reason = "times go to stdout")]
 
-use data::{Cloud, Frame, KittiLine, LabelFrame, Object, stream};
+use data::{Cloud, Frame, LabelBox, LabelFrame, Object, stream};
 use eval::EvalFrame;
 use eval::analysis::{AnalysisOptions, RunAnalysis, analyse};
 use eval::features::{CkaTable, Embedded, Embedding, TSNE_SCHEMA, TsneOptions};
@@ -95,7 +95,7 @@ fn matrix(scores: &Scores) -> Matrix {
 fn frame(id: u64, run: u64) -> EvalFrame {
     let (mut places, mut random) = (stream(0, "grid places", 0, id), stream(run, "grid detections", 0, id));
     let mut car = [places.random_range(-90.0..90.0), places.random_range(-30.0..30.0), 0.0, 4.9, 1.9, 1.2, 0.1];
-    let line = |at: [f64; 7], score| KittiLine::from_box("Car", &Box3::from_array(at), score);
+    let line = |at: [f64; 7], score| LabelBox::from_box("Car", &Box3::from_array(at), score);
     let labels = vec![line(car, None)];
     car[0] += random.random_range(-0.9..0.9);
     car[1] += random.random_range(-0.3..0.3);

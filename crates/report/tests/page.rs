@@ -1,6 +1,6 @@
 //! The report of a study as a whole: one page that needs nothing else, and its files.
 
-use data::{Cloud, Detection, Frame, KittiLine, LabelFrame, Object, stream};
+use data::{Cloud, Detection, Frame, LabelBox, LabelFrame, Object, stream};
 use eval::analysis::{AnalysisOptions, BoxPoints, analyse};
 use eval::distance::{DistanceOptions, Regions, compare};
 use eval::features::{CkaTable, Embedded, Embedding, TSNE_SCHEMA, TsneOptions};
@@ -62,7 +62,7 @@ fn found(frame: &Frame, seed: u64, noise: f64) -> Vec<Detection> {
 }
 
 fn eval_frames(frames: &[Frame], seed: u64, noise: f64) -> Vec<EvalFrame> {
-    let line = |class: &str, b: &Box3, score| KittiLine::from_box(class, b, score);
+    let line = |class: &str, b: &Box3, score| LabelBox::from_box(class, b, score);
     frames
         .iter()
         .map(|f| EvalFrame {
@@ -111,7 +111,7 @@ fn report() -> StudyReport {
     }
     let analysis = |name: &str, noise: f64| {
         let of_run = eval_frames(&frames, 1, noise);
-        let boxes = |lines: &[KittiLine]| lines.iter().map(KittiLine::lidar_box).collect::<Vec<_>>();
+        let boxes = |lines: &[LabelBox]| lines.iter().map(LabelBox::lidar_box).collect::<Vec<_>>();
         let points: Vec<BoxPoints> = frames
             .iter()
             .zip(&of_run)

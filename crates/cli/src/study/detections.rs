@@ -135,9 +135,9 @@ fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf
         for (sample, id) in batch.iter().zip(at.by_ref()) {
             let found = if sample.is_empty() { Prediction::default() } else { found.next().unwrap_or_default() };
             let name = format!("{id}.txt");
-            write_kitti_text(&of_detections.join(&name), &set.detection_lines(id, &found.detections)?)?;
+            write_kitti_text(&of_detections.join(&name), &set.detection_boxes(id, &found.detections)?)?;
             if two_stage {
-                write_kitti_text(&of_regions.join(&name), &set.detection_lines(id, &found.regions)?)?;
+                write_kitti_text(&of_regions.join(&name), &set.detection_boxes(id, &found.regions)?)?;
             }
         }
     }

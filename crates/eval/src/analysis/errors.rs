@@ -2,12 +2,12 @@
 
 use super::AnalysisOptions;
 use super::pairs::{BoxPair, pairs};
-use crate::bootstrap::{deviation, mean, quantile};
 use crate::{EvalFrame, RangeSection};
 use geometry::limit_period;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::{deviation, mean, quantile_linear};
 use std::f64::consts::{FRAC_PI_2, PI};
 
 /// The error of one component: found less true.
@@ -68,8 +68,8 @@ pub fn box_errors(frames: &[EvalFrame], options: &AnalysisOptions) -> BoxErrors 
                 component: (*name).into(),
                 mean: mean(&values),
                 deviation: deviation(&values),
-                median_abs: quantile(&sizes, 0.5),
-                p90_abs: quantile(&sizes, 0.9),
+                median_abs: quantile_linear(&sizes, 0.5),
+                p90_abs: quantile_linear(&sizes, 0.9),
             }
         };
         let any = !inside.is_empty();
@@ -97,7 +97,7 @@ fn is_turned(pair: &BoxPair) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use data::{KittiLine, LabelFrame};
+    use data::{LabelBox, LabelFrame};
     use geometry::Box3;
 
     /// The error of one box is told in the frame of the true one, whatever the frame of the text.
@@ -110,7 +110,7 @@ mod tests {
         found.yaw_rad = 0.5 + PI + 0.02;
         for label_frame in [LabelFrame::Lidar, LabelFrame::Camera] {
             let line = |b: &Box3, score| {
-                crate::overlaps::with_upright_box(&KittiLine::from_box("Car", b, score), b, label_frame)
+                crate::overlaps::with_upright_box(&LabelBox::from_box("Car", b, score), b, label_frame)
             };
             let frame = EvalFrame {
                 id: "0".into(),

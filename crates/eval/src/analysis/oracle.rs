@@ -93,7 +93,7 @@ fn with_truth(frame: &EvalFrame, component: Component, options: &AnalysisOptions
 mod tests {
     use super::super::analyse;
     use super::*;
-    use data::{KittiLine, stream};
+    use data::{LabelBox, stream};
     use geometry::Box3;
     use rand::RngExt;
 
@@ -112,7 +112,7 @@ mod tests {
                         Component::Yaw => found.yaw_rad += 0.4,
                         _ => found.size = [3.5, 1.4, 1.18],
                     }
-                    let line = |b: &Box3, score| KittiLine::from_box("Car", b, score);
+                    let line = |b: &Box3, score| LabelBox::from_box("Car", b, score);
                     let detections = vec![line(&found, Some(rng.random_range(0.2..1.0)))];
                     EvalFrame { id: format!("{i}"), labels: vec![line(&truth, None)], detections }
                 })

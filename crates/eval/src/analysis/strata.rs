@@ -5,7 +5,7 @@ use crate::evidence::{Evidence, FrameEvidence};
 use crate::matching::{BoxIndex, CurveKey};
 use crate::overlaps::{FrameOverlaps, range_m, upright_box};
 use crate::{Difficulty, EvalFrame, Metric, ceiling_ap40};
-use data::{Cloud, KittiLine};
+use data::{Cloud, LabelBox};
 use geometry::{Box3, limit_period, points_in_boxes};
 use rayon::prelude::*;
 use schemars::JsonSchema;
@@ -61,7 +61,7 @@ pub(super) fn near(frame: &EvalFrame, index: BoxIndex, options: &AnalysisOptions
     range_m(line(frame, index), options.label_frame) <= options.max_range_m
 }
 
-fn line(frame: &EvalFrame, index: BoxIndex) -> &KittiLine {
+fn line(frame: &EvalFrame, index: BoxIndex) -> &LabelBox {
     match index {
         BoxIndex::Label(i) => &frame.labels[i],
         BoxIndex::Detection(j) => &frame.detections[j],
