@@ -6,8 +6,7 @@ use crate::rig::{draw_rig, rig_toml};
 use crate::scan::{Nuisances, OwnErrors, Scan, Side, Sums};
 use crate::solid::{Form, Solid, Stuff};
 use crate::world::{World, draw_world};
-use data::write::write_kitti_frame;
-use data::{Cloud, DataError, Frame, Object, write_atomic};
+use data::{Cloud, DataError, Frame, Layout, Object, write_atomic};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rayon::prelude::*;
@@ -95,7 +94,7 @@ fn write_scan(root: &Path, id: usize, scan: Scan) -> Result<(), DataError> {
         cloud: Cloud { values, channels: 3 },
         objects: scan.boxes.into_iter().map(object).collect(),
     };
-    write_kitti_frame(root, &frame)?;
+    Layout::Kitti.write_frame(root, &frame)?;
     write_atomic(&root.join("dataset.toml"), b"points = \"xyz\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\"]\n")
 }
 

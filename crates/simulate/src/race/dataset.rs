@@ -10,17 +10,12 @@ use crate::auto_label::{LabelError, label_errors};
 use crate::effects::{Effect, EffectList};
 use crate::matched::{RangeHistogram, fit_range_dropout};
 use crate::street::SplitCounts;
-use data::write::{remove_unfinished, write_dataset_toml, write_frame, write_split};
-use data::{
-    DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Layout, PointColumns, read_kitti_text, write_atomic,
-    write_json,
-};
+use data::{DataError, Dataset, DatasetConfig, LabelFrame, Manifest, NewDataset, PointColumns, write_atomic};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::path::Path;
 
 /// Version of the manifest.
 pub const RACE_MANIFEST_SCHEMA: &str = "lidarshift/race-dataset/1";
@@ -47,6 +42,18 @@ pub struct RaceManifest {
     pub splits: BTreeMap<String, SplitCounts>,
     /// How far labels are from the true boxes, for labels made as on the road.
     pub label_errors: Vec<LabelError>,
+}
+
+impl Manifest for RaceManifest {
+    const OTHERWISE: &'static str = "from another configuration or version";
+
+    fn identity(&self) -> [&str; 2] {
+        [&self.schema, &self.config_sha256]
+    }
+
+    fn set_complete(&mut self, complete: bool) {
+        self.complete = complete;
+    }
 }
 
 /// Makes the data sets of a race below `out`, a folder each: clouds, labels, `ImageSets/`, `dataset.toml`, `rig.toml`, `manifest.json`, and
@@ -97,33 +104,17 @@ fn make_set(
         splits: BTreeMap::new(),
         label_errors: Vec::new(),
     };
-    let manifest_path = root.join("manifest.json");
-    check_folder(&root, &manifest_path, &manifest)?;
-    let layout = simulator.config.layout;
-    for inside in ["", layout.cloud_folder(), layout.label_folder(), attributes::FOLDER, "ImageSets"] {
-        remove_unfinished(&root.join(inside))?;
-    }
-    write_json(&manifest_path, &manifest)?;
-    write_descriptions(simulator, &root, set, &prepared)?;
-
-    let (done, total) = (AtomicUsize::new(0), simulator.keys().len());
-    progress(&set.name, 0, total);
-    let made = simulator.keys().par_iter().map(|key| {
-        let counts = make_frame_file(simulator, &prepared, &root, key)?;
-        progress(&set.name, done.fetch_add(1, Ordering::Relaxed) + 1, total);
-        Ok((key.split_name(), counts))
-    });
-    for (split, counts) in made.collect::<Result<Vec<_>, SimulateError>>()? {
-        let sum = manifest.splits.entry(split.into()).or_default();
-        sum.frames += counts.frames;
-        sum.cars += counts.cars;
-        sum.points += counts.points;
-    }
+    let new = NewDataset::begin(&root, simulator.config.layout, &[attributes::FOLDER], &mut manifest)?;
+    write_descriptions(simulator, &new, set, &prepared)?;
+    let progress = |done: usize, all: usize| progress(&set.name, done, all);
+    let counts = new.make_frames(simulator.keys(), &progress, |_, key| {
+        Ok::<_, SimulateError>((key.split_name(), make_frame_file(simulator, &prepared, &new, key)?))
+    })?;
+    manifest.splits = SplitCounts::of_splits(counts);
     if set.auto_label.is_some() {
-        manifest.label_errors = errors_of_labels(simulator, &root)?;
+        manifest.label_errors = errors_of_labels(simulator, &new)?;
     }
-    manifest.complete = true;
-    write_json(&manifest_path, &manifest)?;
+    new.finish(&mut manifest)?;
     Ok(manifest)
 }
 
@@ -131,66 +122,45 @@ fn make_set(
 fn make_frame_file(
     simulator: &Simulator,
     set: &PreparedSet,
-    root: &Path,
+    new: &NewDataset,
     key: &FrameKey,
 ) -> Result<SplitCounts, SimulateError> {
     let (config, id) = (&simulator.config, key.id());
-    let (cloud, label) = frame_paths(config.layout, root, &id);
-    let beside = attributes::path(root, &id);
-    if !(cloud.is_file() && label.is_file() && (!config.attributes || beside.is_file())) {
+    let beside = attributes::path(new.root(), &id);
+    if !(new.has_frame(&id, true) && (!config.attributes || beside.is_file())) {
         let made = simulator.make(set, key)?;
         if made.frame.cloud.is_empty() {
             let message = "would be empty: no shot has a return within the crop; check rig, effects and crop_m";
-            return Err(DataError::file(&cloud, message).into());
+            return Err(DataError::file(&new.layout().cloud_path(new.root(), &id), message).into());
         }
         if config.attributes {
             write_atomic(&beside, &attributes::encode(&made.scan))?;
         }
-        write_frame(root, config.layout, &made.frame)?;
+        new.layout().write_frame(new.root(), &made.frame)?;
     }
-    let cars = fs_err::read_to_string(&label)?.lines().count();
-    let points = match config.layout {
-        Layout::Kitti => (fs_err::metadata(&cloud)?.len() / POINT_BYTES.0) as usize,
-        Layout::S2rDad => data::read_cloud(&cloud, PointColumns::Xyzi)?.len(),
-    };
+    let [points, cars] = new.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
-}
-
-fn frame_paths(layout: Layout, root: &Path, id: &str) -> (PathBuf, PathBuf) {
-    let ending = match layout {
-        Layout::Kitti => "bin",
-        Layout::S2rDad => "pcd",
-    };
-    (
-        root.join(layout.cloud_folder()).join(format!("{id}.{ending}")),
-        root.join(layout.label_folder()).join(format!("{id}.txt")),
-    )
 }
 
 /// Everything about the data set that is no frame.
 fn write_descriptions(
     simulator: &Simulator,
-    root: &Path,
+    new: &NewDataset,
     set: &SetConfig,
     prepared: &PreparedSet,
 ) -> Result<(), SimulateError> {
-    let config = &simulator.config;
-    for (split, (name, _)) in SPLITS.iter().enumerate() {
-        let ids: Vec<String> = simulator.keys().iter().filter(|k| k.split == split).map(FrameKey::id).collect();
-        write_split(&root.join(format!("ImageSets/{name}.txt")), &ids)?;
-    }
-    let splits = SPLITS.map(|(name, _)| (name.to_string(), format!("ImageSets/{name}.txt").into()));
+    let (config, root) = (&simulator.config, new.root());
+    let ids = |split: usize| simulator.keys().iter().filter(move |k| k.split == split).map(FrameKey::id);
+    let splits = SPLITS.iter().enumerate().map(|(split, (name, _))| (*name, ids(split).collect()));
     let dataset = DatasetConfig {
         name: format!("{}-{}", config.name, set.name),
-        layout: config.layout,
         points: PointColumns::Xyzi,
         label_frame: LabelFrame::Lidar,
         classes: vec![config.class.clone()],
-        splits: splits.into(),
         rig: Some("rig.toml".into()),
         ..DatasetConfig::default()
     };
-    write_dataset_toml(&root.join("dataset.toml"), &dataset)?;
+    new.describe(dataset, splits)?;
     write_atomic(&root.join("rig.toml"), to_toml(&simulator.rig)?.as_bytes())?;
     if config.attributes {
         attributes::write_names(root, &simulator.rig, &simulator.materials)?;
@@ -217,13 +187,12 @@ fn matched(target: &Path, from: &Path) -> Result<crate::effects::RangeDropout, S
 }
 
 /// Labels on disk against where the cars really are.
-fn errors_of_labels(simulator: &Simulator, root: &Path) -> Result<Vec<LabelError>, SimulateError> {
+fn errors_of_labels(simulator: &Simulator, new: &NewDataset) -> Result<Vec<LabelError>, SimulateError> {
     let of_frame = |key: &FrameKey| {
-        let (_, path) = frame_paths(simulator.config.layout, root, &key.id());
-        let labels = read_kitti_text(&path, KittiText::Labels)?;
+        let labels = new.layout().read_labels(new.root(), &key.id())?;
         let cars = simulator.cars(key)?.into_iter().zip(simulator.labelled(key)?);
         let truth = cars.filter(|(_, labelled)| *labelled).map(|(car, _)| car.true_box);
-        Ok(labels.iter().map(|line| line.lidar_box()).zip(truth).collect())
+        Ok(labels.iter().map(|label| label.lidar_box()).zip(truth).collect())
     };
     let pairs: Result<Vec<Vec<_>>, SimulateError> = simulator.keys().par_iter().map(of_frame).collect();
     Ok(label_errors(pairs?.into_iter().flatten()))
@@ -262,29 +231,13 @@ fn json<T: Serialize>(value: &T) -> String {
     serde_json::to_string(value).expect("a configuration is plain data")
 }
 
-/// The folder must be empty, or begun with the same configuration.
-fn check_folder(root: &Path, manifest_path: &Path, wanted: &RaceManifest) -> Result<(), SimulateError> {
-    if manifest_path.is_file() {
-        let text = fs_err::read_to_string(manifest_path)?;
-        let found: RaceManifest =
-            serde_json::from_str(&text).map_err(|e| DataError::line(manifest_path, e.line(), e.to_string()))?;
-        if found.config_sha256 != wanted.config_sha256 || found.schema != wanted.schema {
-            let message = "was made from another configuration or version; choose another folder, or remove this one";
-            return Err(DataError::file(root, message).into());
-        }
-    } else if root.is_dir() && fs_err::read_dir(root)?.next().is_some() {
-        return Err(DataError::file(root, "is not empty and has no manifest.json; choose another folder").into());
-    }
-    Ok(())
-}
-
 /// Refuses to begin what the disk cannot hold.
 fn check_space(simulator: &Simulator, out: &Path, sets: &[&SetConfig]) -> Result<(), SimulateError> {
     let point = POINT_BYTES.0 + if simulator.config.attributes { POINT_BYTES.1 } else { 0 };
     let frame = simulator.shots() as u64 * point + 1024;
     let missing = |set: &&SetConfig| {
         let root = out.join(&set.name);
-        let there = |key: &&FrameKey| frame_paths(simulator.config.layout, &root, &key.id()).0.is_file();
+        let there = |key: &&FrameKey| simulator.config.layout.has_cloud(&root, &key.id());
         (simulator.keys().len() - simulator.keys().iter().filter(there).count()) as u64
     };
     let needed = sets.iter().map(missing).sum::<u64>() * frame;
