@@ -1,8 +1,8 @@
 //! The files that people edit, as they lie in the repository.
 
 use data::DatasetConfig;
-use lidarshift::detectors::find_detector;
 use lidarshift_tests::workspace;
+use models::find_detector;
 
 #[test]
 fn data_sets_and_detectors_are_right() {

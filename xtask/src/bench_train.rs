@@ -1,7 +1,7 @@
 //! `cargo xtask bench train [WORDS]`: whole training steps, inference and the costliest layers here and of the same networks in PyTorch,
 //! in turns.
 
-use crate::program;
+use crate::program::{self, Program};
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -87,7 +87,7 @@ pub fn bench_train(root: &Path, words: &[String]) -> Result<()> {
     let cases = cases(words);
     ensure!(!cases.is_empty(), "no row has {} in its id; ids are as {}", words.join(" and "), example());
     let python = python()?;
-    let program = program::build(root, None)?;
+    let program = program::build(root, Program::Checks, None)?;
     let mut measured = Vec::new();
     for case in cases {
         measured.extend(case.measure(root, &program, &python)?);

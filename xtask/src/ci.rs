@@ -6,20 +6,15 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-/// Folders of modules that a macro's list declares; `cargo fmt` does not find those.
-const LISTED_MODULES: &[&str] = &["crates/data/src/layout"];
-
-/// Format, house rules, clippy, tests: doc tests and the smallest default run through the program are among them.
+/// Format, house rules, the book, clippy, tests: doc tests and the smallest default run through the program are among them.
 ///
 /// Everything is built once, with wgpu in it, which compiles without a GPU.
 pub fn ci(root: &Path) -> Result<()> {
     const FEATURES: [&str; 2] = ["--features", "lidarshift/wgpu"];
     let start = Instant::now();
-    step("format", || {
-        component(root, "fmt", &["--all", "--check"])?;
-        LISTED_MODULES.iter().try_for_each(|folder| check_format_of(&root.join(folder)))
-    })?;
+    step("format", || crate::format::format(root, true))?;
     step("tidy", crate::tidy)?;
+    step("book", || book(root))?;
     step("clippy", || {
         let words = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];
         component(root, "clippy", &words)
@@ -27,16 +22,6 @@ pub fn ci(root: &Path) -> Result<()> {
     step("test", || must(cargo(root).args(["test", "--workspace"]).args(FEATURES)))?;
     eprintln!("ci: all passed in {:.0} s", start.elapsed().as_secs_f64());
     Ok(())
-}
-
-/// Checks the format of every module in a folder; where rustfmt is not installed, [`component`] has said so.
-fn check_format_of(folder: &Path) -> Result<()> {
-    let there = Command::new("rustfmt").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
-    if !there.is_ok_and(|status| status.success()) {
-        return Ok(());
-    }
-    let modules = fs_err::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
-    must(Command::new("rustfmt").args(["--check", "--edition", "2024"]).args(modules))
 }
 
 /// A component of the toolchain; where it is not installed, that is said.
@@ -47,6 +32,16 @@ fn component(root: &Path, name: &str, words: &[&str]) -> Result<()> {
         return Ok(());
     }
     must(cargo(root).arg(name).args(words))
+}
+
+/// Builds the book of `docs`; where mdBook is not installed, that is said.
+fn book(root: &Path) -> Result<()> {
+    let there = Command::new("mdbook").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+    if !there.is_ok_and(|status| status.success()) {
+        eprintln!("mdbook is not installed: the book is not built (cargo install mdbook)");
+        return Ok(());
+    }
+    must(Command::new("mdbook").current_dir(root).args(["build", "docs"]))
 }
 
 /// Runs `work` under a heading; an error carries the step's name.

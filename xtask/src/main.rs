@@ -1,19 +1,23 @@
-//! `cargo xtask WORD ...`: the program `lidarshift`, built in release and run with the same words; and the chores of who works on it.
+//! `cargo xtask WORD ...`: the program `lidarshift`, built in release and run with the same words; and the chores of who works on it, some of
+//! which the program `lidarshift-checks` does.
 
 mod bench;
 mod bench_mutants;
 mod bench_train;
 mod ci;
+mod format;
+mod pages;
 mod program;
 mod tidy;
 
 use anyhow::{Result, bail};
 use clap::{Parser, Subcommand};
+use program::Program::{Checks, Lidarshift};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-/// Chores of the workspace; every other word (train, eval, simulate, detect, doctor, parity, ...) goes to the program
+/// Chores of the workspace; every other word (train, eval, simulate, detect, doctor, ...) goes to the program
 /// `lidarshift`, built in release with the backend that `--device` asks for.
 #[derive(Parser)]
 #[command(
@@ -32,9 +36,15 @@ struct Xtask {
 enum Word {
     /// All that has to pass: format, house rules, clippy, tests, a smoke run. The README's test command.
     Ci,
-    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths.
+    /// Format all sources, those that macros name included.
+    Format {
+        /// Only say whether they are formatted.
+        #[arg(long)]
+        check: bool,
+    },
+    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths, links between pages.
     Tidy,
-    /// Write configs/schema.json and docs/configuration.md from the Rust types.
+    /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
     /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's;
     /// `bench mutants` breaks the diagnosis in many ways and sees whether the blind cases notice.
@@ -45,9 +55,24 @@ enum Word {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         words: Vec<String>,
     },
+    /// Compare every tensor with a folder of reference numbers: `parity ../shared/golden/pointpillars_tiny`.
+    #[command(disable_help_flag = true)]
+    Parity {
+        /// For the `parity` of `lidarshift-checks`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        args: Vec<OsString>,
+    },
+    /// Time a training step by stage.
+    #[command(hide = true, disable_help_flag = true)]
+    BenchStep {
+        /// For the `bench-step` of `lidarshift-checks`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        args: Vec<OsString>,
+    },
     /// Face every reader of files with mutated inputs: `fuzz --inputs 1000000`.
+    #[command(disable_help_flag = true)]
     Fuzz {
-        /// For the program's `fuzz`.
+        /// For the `fuzz` of `lidarshift-checks`.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<OsString>,
     },
@@ -59,11 +84,14 @@ enum Word {
 fn main() -> ExitCode {
     let outcome = match Xtask::parse().word {
         Word::Ci => ci::ci(&root()),
+        Word::Format { check } => format::format(&root(), check),
         Word::Tidy => tidy(),
-        Word::Schema => program::run(&root(), &["schema".into()]),
+        Word::Schema => program::run(&root(), Checks, &["schema".into()]),
         Word::Bench { name, words } => bench::bench(&root(), name.as_deref(), &words),
-        Word::Fuzz { args } => program::hand_over(&root(), &[vec!["fuzz".into()], args].concat()),
-        Word::Program(args) => program::hand_over(&root(), &args),
+        Word::Parity { args } => program::hand_over(&root(), Checks, &[vec!["parity".into()], args].concat()),
+        Word::BenchStep { args } => program::hand_over(&root(), Checks, &[vec!["bench-step".into()], args].concat()),
+        Word::Fuzz { args } => program::hand_over(&root(), Checks, &[vec!["fuzz".into()], args].concat()),
+        Word::Program(args) => program::hand_over(&root(), Lidarshift, &args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

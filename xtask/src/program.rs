@@ -1,4 +1,4 @@
-//! The program `lidarshift`: built in release with the wanted backend, then run with the caller's words.
+//! The programs `lidarshift` and `lidarshift-checks`: built in release with the wanted backend, then run with the caller's words.
 
 use crate::cargo;
 use anyhow::{Context, Result, bail};
@@ -12,9 +12,28 @@ use std::time::Duration;
 /// A build that takes longer than this is announced.
 const SILENCE: Duration = Duration::from_millis(1500);
 
-/// Builds the program and becomes it: same folder, same words, its exit code; signals reach it directly.
-pub fn hand_over(root: &Path, args: &[OsString]) -> Result<()> {
-    let mut program = Command::new(build(root, backend_feature(args))?);
+/// A program of the workspace.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Program {
+    /// What users run.
+    Lidarshift,
+    /// What checks it: `parity`, `fuzz`, `bench-step`, `schema`.
+    Checks,
+}
+
+impl Program {
+    /// Its package, and its executable.
+    fn name(self) -> &'static str {
+        match self {
+            Program::Lidarshift => "lidarshift",
+            Program::Checks => "lidarshift-checks",
+        }
+    }
+}
+
+/// Builds a program and becomes it: same folder, same words, its exit code; signals reach it directly.
+pub fn hand_over(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
+    let mut program = Command::new(build(root, program, backend_feature(args))?);
     program.args(args);
     #[cfg(unix)]
     {
@@ -30,19 +49,20 @@ pub fn hand_over(root: &Path, args: &[OsString]) -> Result<()> {
     }
 }
 
-/// Builds the program and runs it in the folder of the workspace; an exit code other than 0 is an error.
-pub fn run(root: &Path, args: &[OsString]) -> Result<()> {
-    let status = Command::new(build(root, backend_feature(args))?).args(args).current_dir(root).status()?;
+/// Builds a program and runs it in the folder of the workspace; an exit code other than 0 is an error.
+pub fn run(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
+    let status = Command::new(build(root, program, backend_feature(args))?).args(args).current_dir(root).status()?;
     if !status.success() {
-        bail!("lidarshift {} ended with {status}", args.join(OsStr::new(" ")).display());
+        bail!("{} {} ended with {status}", program.name(), args.join(OsStr::new(" ")).display());
     }
     Ok(())
 }
 
-/// The path of the program, built in release, with a backend beyond the default ones where wanted.
-pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
+/// The path of a program, built in release, with a backend beyond the default ones where wanted.
+pub fn build(root: &Path, program: Program, feature: Option<&str>) -> Result<PathBuf> {
+    let name = program.name();
     let mut cargo = cargo(root);
-    cargo.args(["build", "--quiet", "--release", "--package", "lidarshift", "--bin", "lidarshift"]);
+    cargo.args(["build", "--quiet", "--release", "--package", name, "--bin", name]);
     cargo.arg("--message-format=json-render-diagnostics");
     if let Some(feature) = feature {
         cargo.args(["--features", feature]);
@@ -50,7 +70,7 @@ pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
     let (done, is_done) = channel::<()>();
     let speaker = std::thread::spawn(move || {
         if is_done.recv_timeout(SILENCE) == Err(RecvTimeoutError::Timeout) {
-            eprintln!("building lidarshift (release)...");
+            eprintln!("building {name} (release)...");
         }
     });
     let mut build = cargo.stdout(Stdio::piped()).spawn().context("could not start cargo")?;
@@ -62,9 +82,9 @@ pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
     drop(done);
     speaker.join().expect("the speaker does not panic");
     if !status.success() {
-        bail!("the program lidarshift could not be built");
+        bail!("the program {name} could not be built");
     }
-    executable.context("cargo names no executable of lidarshift")
+    executable.with_context(|| format!("cargo names no executable of {name}"))
 }
 
 /// The executable that one line of cargo's messages names.

@@ -20,7 +20,6 @@ mod overlaps;
 mod read;
 mod recall;
 mod report;
-pub mod study;
 pub mod targets;
 
 pub use bootstrap::{BootstrapOptions, Interval};
