@@ -5,8 +5,7 @@ use data::{Dataset, stream};
 use lidarshift_tests::shared;
 use models::checkpoint::HostValues;
 use models::config::{DetectorConfig, NetworkConfig};
-use models::find_detector;
-use models::{Detector, Preparer, parameter_count};
+use models::{Detector, Preparer, find_detector, parameter_count};
 use std::collections::BTreeMap;
 
 /// With three classes and intensity, and with cars and coordinates alone.

@@ -19,25 +19,35 @@ const ROUNDS: usize = 3;
 /// Timed steps of a turn.
 const STEPS: usize = 3;
 
-/// Network, size, and the detector that has it.
-const DETECTORS: [[&str; 3]; 4] = [
-    ["pointpillars", "published", "pointpillars"],
-    ["pointpillars", "small", "pointpillars_small"],
-    ["pointrcnn", "published", "pointrcnn"],
-    ["pointrcnn", "small", "pointrcnn_small"],
-];
-
-/// What is timed of a network, as ids and as `bench-step --work` spell it, and beside what: name and form.
+/// A timed piece of work: its name in ids, its name for `bench-step --work`, and the references, each with its name in ids and its `--form`.
 type Work = (&'static str, &'static str, &'static [[&'static str; 2]]);
 
-const OF_POINTPILLARS: [Work; 4] = [
-    ("step", "step", &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]]),
-    ("inference", "inference", &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]]),
-    ("convolutions", "convolutions", &[["torch_nchw", "openpcdet"], ["torch_channels_last", "best"]]),
-    ("pillar_net", "pillar-net", &[["torch_padded", "openpcdet"], ["torch_valid_points", "best"]]),
-];
+/// A kind of detector that is timed.
+struct Network {
+    /// Name in ids.
+    name: &'static str,
+    /// Size in ids, and the detector of that size.
+    detectors: &'static [[&'static str; 2]],
+    works: &'static [Work],
+}
 
-const OF_POINTRCNN: [Work; 1] = [("step", "step", &[["torch", "openpcdet"]])];
+const NETWORKS: &[Network] = &[
+    Network {
+        name: "pointpillars",
+        detectors: &[["published", "pointpillars"], ["small", "pointpillars_small"]],
+        works: &[
+            ("step", "step", &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]]),
+            ("inference", "inference", &[["torch_as_openpcdet", "openpcdet"], ["torch_best", "best"]]),
+            ("convolutions", "convolutions", &[["torch_nchw", "openpcdet"], ["torch_channels_last", "best"]]),
+            ("pillar_net", "pillar-net", &[["torch_padded", "openpcdet"], ["torch_valid_points", "best"]]),
+        ],
+    },
+    Network {
+        name: "pointrcnn",
+        detectors: &[["published", "pointrcnn"], ["small", "pointrcnn_small"]],
+        works: &[("step", "step", &[["torch", "openpcdet"]])],
+    },
+];
 
 /// Work here beside that of the reference.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -107,9 +117,9 @@ fn example() -> String {
 
 fn cases(words: &[String]) -> Vec<Case> {
     let mut cases = Vec::new();
-    for [network, size, detector] in DETECTORS {
-        let works: &[Work] = if network == "pointpillars" { &OF_POINTPILLARS } else { &OF_POINTRCNN };
-        for &(name, work, references) in works {
+    for Network { name: network, detectors, works } in NETWORKS {
+        let pairs = detectors.iter().flat_map(|detector| works.iter().map(move |work| (detector, work)));
+        for (&[size, detector], &(name, work, references)) in pairs {
             for (batch, threads) in [(1, 2), (1, 1), (4, 2), (4, 1)] {
                 let id = |reference: &str| format!("{network}/{size}/{name}/batch{batch}/threads{threads}/{reference}");
                 let all = references.iter().map(|&[reference, form]| (id(reference), form));

@@ -5,17 +5,15 @@ mod layers;
 
 use anyhow::{Result, bail};
 use burn::optim::GradientsParams;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Device;
 use clap::{Args, ValueEnum};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Frame, stream};
 use lidarshift::device::DeviceArgs;
-use models::config::{DetectorConfig, NetworkConfig, PointPillarsConfig};
-use models::find_detector;
-use models::layers::Mode;
+use models::config::{DetectorConfig, NetworkConfig};
+use models::pointpillars::PointPillarsConfig;
 use models::pointpillars::pillars::{PillarGrid, pillarise};
-use models::pointpillars::{losses, scatter::scatter};
-use models::{Detector, Network, Preparer, Sample, reference_name};
+use models::{Detector, Preparer, Sample, find_detector, reference_name};
 use rand::RngExt;
 use serde::Serialize;
 use simulate::{RoadConfig, make_road_frame};
@@ -136,7 +134,15 @@ impl BenchStepArgs {
             let batch = samples(config, frames, step)?;
             timed.read = read_of(&batch);
             clock.mark("data")?;
-            let total = forward(&detector, &batch, &mut clock)?;
+            let mut synced = Ok(());
+            let total = detector
+                .loss_by_stage(&batch, &mut |stage| {
+                    if synced.is_ok() {
+                        synced = clock.mark(stage);
+                    }
+                })?
+                .total;
+            synced?;
             let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
             let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
             clock.mark("backward")?;
@@ -192,10 +198,10 @@ impl Timed {
 }
 
 fn pointpillars(config: &DetectorConfig) -> Result<&PointPillarsConfig> {
-    match &config.network {
-        NetworkConfig::PointPillars(network) => Ok(network),
-        NetworkConfig::PointRcnn(_) => bail!("{} is no PointPillars: --work step or inference", config.name),
-    }
+    let NetworkConfig::PointPillars(network) = &config.network else {
+        bail!("{} is no PointPillars: use --work step or inference", config.name);
+    };
+    Ok(network)
 }
 
 /// The batch of a step, augmented anew.
@@ -212,44 +218,7 @@ fn samples(config: &DetectorConfig, frames: &[Frame], step: usize) -> Result<Vec
 
 /// Points and pillars of a batch.
 fn read_of(batch: &[Sample]) -> [usize; 2] {
-    let of_sample = |sample: &Sample| match sample {
-        Sample::PointPillars(sample) => {
-            let num_points = &sample.pillars.num_points;
-            [num_points.iter().map(|&n| n as usize).sum(), num_points.len()]
-        }
-        Sample::PointRcnn(sample) => [sample.points.len(), 0],
-    };
-    batch.iter().map(of_sample).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]))
-}
-
-/// The losses of a batch, stage by stage where the network has stages that stand alone.
-fn forward(detector: &Detector, batch: &[Sample], clock: &mut Clock<'_>) -> Result<Tensor<1>> {
-    if let (Network::PointPillars(network), NetworkConfig::PointPillars(net)) =
-        (&detector.network, &detector.config().network)
-    {
-        let batch: Vec<_> = batch
-            .iter()
-            .filter_map(|sample| match sample {
-                Sample::PointPillars(sample) => Some(sample),
-                Sample::PointRcnn(_) => None,
-            })
-            .collect();
-        let pillars = network.vfe.forward(network.pillar_rows(&batch), Mode::Train);
-        clock.mark("encoder")?;
-        let (cells, shape) = network.cells(&batch);
-        let canvas = scatter(pillars, &cells, shape);
-        clock.mark("scatter")?;
-        let features = network.backbone_2d.forward(canvas, Mode::Train).spatial_features_2d;
-        clock.mark("backbone")?;
-        let predictions = network.dense_head.forward(features);
-        clock.mark("head")?;
-        let total = losses(&predictions, &batch, &net.loss).total;
-        clock.mark("loss")?;
-        return Ok(total);
-    }
-    let total = detector.loss(batch)?.total;
-    clock.mark("forward")?;
-    Ok(total)
+    batch.iter().map(Sample::size).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]))
 }
 
 /// When each stage of a step ended, the device being done with it.

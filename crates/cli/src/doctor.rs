@@ -4,7 +4,7 @@ use anyhow::Result;
 use clap::Args;
 use data::Dataset;
 use data::doctor::{AnchorFacts, DetectorFacts, doctor};
-use models::config::{DetectorConfig, NetworkConfig};
+use models::config::DetectorConfig;
 use models::find_detector;
 use std::path::PathBuf;
 
@@ -48,11 +48,7 @@ impl DoctorArgs {
 fn facts(detector: &DetectorConfig) -> DetectorFacts {
     // By way of the decimal text, so that an f32 of 3.9 does not print as 3.9000000953674316.
     let number = |v: f32| v.to_string().parse::<f64>().unwrap_or(v.into());
-    let anchors = match &detector.network {
-        NetworkConfig::PointPillars(network) => network.anchors.as_slice(),
-        NetworkConfig::PointRcnn(_) => &[], // its boxes begin at points
-    };
-    let anchors = anchors.iter().map(|anchor| AnchorFacts {
+    let anchors = detector.network.anchors().iter().map(|anchor| AnchorFacts {
         class: anchor.class.clone(),
         size: anchor.size_m.map(number),
         bottom: number(anchor.bottom_m),

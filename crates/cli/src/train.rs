@@ -8,7 +8,6 @@ use crate::study::{HowToRun, run_study};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
-use models::config::NetworkConfig;
 use models::detector_text;
 use progress::Progress;
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
@@ -18,14 +17,6 @@ use toml::{Table, Value};
 use train::{RunConfig, Session, evaluate_detector, set_key, train};
 
 const DEFAULT_DETECTOR: &str = "pointpillars_small";
-/// What a network needs at least to learn a few frames by heart, where nobody says how many epochs. The second stage of PointRCNN learns from a
-/// few dozen regions a frame, and reads other points in each step.
-fn overfit_steps(network: &NetworkConfig) -> usize {
-    match network {
-        NetworkConfig::PointPillars(_) => 400,
-        NetworkConfig::PointRcnn(_) => 3600,
-    }
-}
 
 /// Train a detector. Without a data set one is made on the spot: roads with cars, seen by a spinning LiDAR.
 ///
@@ -67,7 +58,7 @@ pub struct TrainArgs {
     /// Go on where a run was stopped, or begin it; what is not said again stays as it was
     #[arg(long)]
     resume: bool,
-    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default: as many epochs as make 400 steps, for PointRCNN 3600]
+    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default: as many epochs as a network of this kind needs for it]
     #[arg(long)]
     overfit: bool,
     /// Threads that load and augment frames; any number gives the same weights
@@ -148,7 +139,7 @@ impl TrainArgs {
         let mut config = self.changed(table)?;
         if config.overfit && self.epochs.is_none() && !self.set.iter().any(|s| s.contains("optimization.epochs")) {
             let frames = Dataset::open(&config.dataset)?.all_ids()?.len();
-            let least = overfit_steps(&config.detector.network);
+            let least = config.detector.network.overfit_steps();
             let optimization = &mut config.detector.optimization;
             // The statistics of one frame alone are not those of all of them, which evaluation takes.
             optimization.batch_size = optimization.batch_size.max(2);

@@ -19,7 +19,7 @@ fn overlap(c: &mut Criterion) {
     assert!(pairs.iter().all(|(a, b)| iou_3d(a, b) > 0.0), "each pair is clipped");
     let mut group = c.benchmark_group("overlap");
     group.throughput(Throughput::Elements(pairs.len() as u64));
-    group.bench_function("iou_3d of pairs that meet", |bench| {
+    group.bench_function("iou_3d of overlapping pairs", |bench| {
         bench.iter(|| black_box(&pairs).iter().map(|(a, b)| iou_3d(a, b)).sum::<f64>())
     });
     group.finish();
@@ -28,9 +28,9 @@ fn overlap(c: &mut Criterion) {
 fn nms(c: &mut Criterion) {
     let mut rng = ChaCha8Rng::seed_from_u64(2);
     let spread: Vec<Box3> = (0..4096).map(|_| car(&mut rng, 35.0, 0.0, 35.0)).collect();
-    let heaped: Vec<Box3> = (0..4096).map(|i| car(&mut rng, 3.5 * f64::from(i % 20), 0.0, 0.5)).collect();
+    let clustered: Vec<Box3> = (0..4096).map(|i| car(&mut rng, 3.5 * f64::from(i % 20), 0.0, 0.5)).collect();
     let scores: Vec<f32> = (0..4096).map(|_| rng.random_range(0.0..1.0)).collect();
-    for (name, boxes) in [("spread over 70 m", &spread), ("heaped on 20 cars", &heaped)] {
+    for (name, boxes) in [("spread over 70 m", &spread), ("clustered on 20 cars", &clustered)] {
         for threshold in [0.01, 0.8] {
             c.bench_function(&format!("nms of 4096 boxes {name}, threshold {threshold}"), |bench| {
                 bench.iter(|| rotated_nms(black_box(boxes), &scores, threshold))

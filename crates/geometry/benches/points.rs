@@ -1,4 +1,4 @@
-//! Speed of the point operations at the sizes of the published PointRCNN, on a made-up scan of 16,384 points.
+//! Speed of the point operations at the sizes of the published PointRCNN, on a synthetic scan of 16,384 points.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use lidarshift_geometry::{Box3, TieRule, ball_query, farthest_point_sampling, roi_points, three_nearest};
@@ -8,7 +8,7 @@ use std::hint::black_box;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-/// Ground in rings, as a turning LiDAR sees it, and things that stand on it.
+/// Rings on the ground, as of a spinning LiDAR, and objects on it.
 fn scan(points: usize) -> Vec<[f32; 3]> {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let point = |_| {
@@ -53,9 +53,9 @@ fn point_operations(c: &mut Criterion) {
     });
 }
 
-/// The same three operations in PyTorch on the same points, in the same run, where `LIDARSHIFT_PYTHON` names a Python that has it; and how many
-/// of its indices ours equal.
-#[expect(clippy::print_stdout, reason = "it is what it is for")]
+/// The same three operations in PyTorch on the same points, if `LIDARSHIFT_PYTHON` names a Python that has it. Prints
+/// both times and the number of equal indices.
+#[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn beside_torch(_: &mut Criterion) {
     let Ok(python) = std::env::var("LIDARSHIFT_PYTHON") else { return };
     let folder = tempfile::tempdir().unwrap();

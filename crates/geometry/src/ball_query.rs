@@ -3,17 +3,17 @@
 use crate::point_grid::PointGrid;
 use rayon::prelude::*;
 
-/// Centres that one task works on.
+/// Centres a task.
 const TASK: usize = 128;
 
-/// Points in a cell of the grid, on average and at least.
+/// Smallest average number of points in a grid cell.
 const IN_CELL: f64 = 0.25;
 
 /// For each centre the indices of the first `samples` points nearer than `radius_m`, in the order of the points.
 ///
-/// With fewer neighbours the first one fills the places that are left; a centre without any gets index 0 throughout. The distance is
-/// compared squared and in f32, and must be smaller than the radius: equal to the reference index for index. Points that are not finite
-/// are nobody's neighbours.
+/// With fewer neighbours the remaining entries repeat the first one. A centre without neighbours gets index 0 in all
+/// entries. The squared f32 distance must be smaller than the squared radius, as in the reference, so that the indices
+/// are equal. Points that are not finite are never neighbours.
 ///
 /// # Shapes
 /// `points`: `[N]`, `centers`: `[M]`, m; result `[M, samples]`.
@@ -48,7 +48,7 @@ pub fn ball_query(points: &[[f32; 3]], centers: &[[f32; 3]], radius_m: f32, samp
 fn find(grid: &PointGrid, center: [f32; 3], radius_m: f32, hits: &mut Vec<u32>) {
     hits.clear();
     let radius2 = radius_m * radius_m;
-    // Distances are rounded; a little more is looked at, so that rounding never hides a cell.
+    // The search range is slightly larger than the radius, because distances are rounded.
     let cells = |axis: usize| {
         let (v, reach) = (f64::from(center[axis]), f64::from(radius_m) * (1.0 + 1e-6) + 1e-30);
         (grid.cell(axis, v - reach), grid.cell(axis, v + reach))
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_near_and_nothing_finite() {
+    fn no_neighbours_and_no_finite_point() {
         assert_eq!(ball_query(&[[0.0; 3]], &[[5.0; 3]], 1.0, 2), [0, 0]);
         assert_eq!(ball_query(&[], &[[5.0; 3]], 1.0, 2), [0, 0]);
         assert!(ball_query(&[[0.0; 3]], &[], 1.0, 2).is_empty());

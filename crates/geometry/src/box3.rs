@@ -1,4 +1,4 @@
-//! The oriented box that everything in this project speaks of.
+//! The oriented 3D box.
 
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
@@ -66,7 +66,7 @@ impl Box3 {
     }
 }
 
-/// `v` moved by whole periods into `[-offset * period, (1 - offset) * period)`.
+/// `v` shifted by whole periods into `[-offset * period, (1 - offset) * period)`.
 pub fn limit_period(v: f64, offset: f64, period: f64) -> f64 {
     v - (v / period + offset).floor() * period
 }

@@ -1,28 +1,31 @@
-//! Farthest point sampling (Qi et al. 2017, PointNet++, section 3.2), index for index as OpenPCDet's kernel does it.
+//! Farthest point sampling (Qi et al. 2017, PointNet++, section 3.2). The indices equal those of OpenPCDet's CUDA
+//! kernel.
 //!
-//! Each pick is the point whose distance to the nearest earlier pick is largest. The plain form looks at every point for every pick.
-//! Here points lie in small buckets with bounds: a bucket that is farther from the new pick than all its points are from their nearest pick
-//! cannot change and is passed over. Bounds are computed by the same f32 operations in the same order as distances; rounding keeps order,
-//! so that nothing is passed over by mistake and the picks are those of the plain form, ties included.
+//! Each pick is the point whose distance to the nearest earlier pick is largest. The brute-force form visits every
+//! point for every pick. Here points are sorted into small buckets with bounding boxes. A bucket is skipped if its
+//! bounding box is farther from the new pick than each of its points is from its nearest pick. Bounds use the same f32
+//! operations in the same order as distances. f32 rounding is monotone, so no bucket is skipped wrongly and the picks
+//! equal those of the brute-force form, ties included.
 
 /// Points in a bucket, at most.
 const BUCKET: usize = 64;
 
-/// Nearest pick of a point before the first pick, squared, m2: the reference's start value. Larger distances count as this one.
+/// Initial squared distance of each point to its nearest pick, m2, as in the reference. Larger distances are clamped to
+/// it.
 const FIRST_DISTANCE2_M2: f32 = 1e10;
 
-/// Which of several points at the same distance is picked. Clouds on a grid (KITTI's is one of 1 mm) do have such points.
+/// Which of several points at the same distance is picked. Quantised clouds (KITTI: 1 mm) have such points.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TieRule {
-    /// As the reference's CUDA kernel: point k is seen by lane k mod L, L = 2^floor(log2 N) but at most 1024; inside a lane the lower index
-    /// wins, between lanes the one with the smaller bit-reversed number.
+    /// As the reference's CUDA kernel. Thread k mod L handles point k, L = 2^floor(log2 N) but at most 1024. Within a
+    /// thread the lower index wins, between threads the smaller bit-reversed thread number.
     ReferenceKernel,
     /// The lower index.
     LowestIndex,
 }
 
 impl TieRule {
-    /// Key of each index; of equally far points the one with the smallest key is picked.
+    /// The tie-break key of each index: the smallest key is picked.
     fn ranks(self, points: usize) -> impl Fn(usize) -> u32 {
         let bits = match self {
             TieRule::ReferenceKernel => points.max(1).ilog2().min(10),
@@ -37,9 +40,10 @@ impl TieRule {
     }
 }
 
-/// Indices of `count` points: first point 0, then the farthest from all picked so far. With fewer points than `count` some come twice.
+/// Indices of `count` points: first point 0, then the farthest from all picked so far. If there are fewer points than
+/// `count`, some are repeated.
 ///
-/// Coordinates must be finite. No point at all gives no index.
+/// Coordinates must be finite. Without points the result is empty.
 ///
 /// # Shapes
 /// `points`: `[N]`, m; result `[count]`.
@@ -52,14 +56,14 @@ pub fn farthest_point_sampling(points: &[[f32; 3]], count: usize, ties: TieRule)
     let mut pick = 0;
     picks.push(pick as u32);
     while picks.len() < count {
-        cloud.bring_nearer(points[pick]);
+        cloud.update_distances(points[pick]);
         pick = cloud.farthest();
         picks.push(pick as u32);
     }
     picks
 }
 
-/// Points sorted into buckets, coordinate by coordinate. Inside a bucket they are ordered by rank, so that the first of equal ones wins.
+/// Points sorted into buckets, stored by coordinate. A bucket is ordered by rank, so that its first point wins ties.
 struct Buckets {
     xyz: [Vec<f32>; 3],
     /// Distance to the nearest pick, squared, m2.
@@ -70,7 +74,7 @@ struct Buckets {
     starts: Vec<u32>,
     low: [Vec<f32>; 3],
     high: [Vec<f32>; 3],
-    /// Largest distance in each bucket, and the place of its first point at that distance.
+    /// Largest distance in each bucket, and the position of its first point at that distance.
     largest: Vec<f32>,
     place: Vec<u32>,
     /// Buckets that the last pick may change.
@@ -110,13 +114,14 @@ impl Buckets {
         }
     }
 
-    /// Takes a pick into the distances.
-    fn bring_nearer(&mut self, pick: [f32; 3]) {
+    /// Updates the distances after a pick.
+    fn update_distances(&mut self, pick: [f32; 3]) {
         self.touched.clear();
         self.touched.resize(self.largest.len(), 0);
         let mut count = 0;
         for b in 0..self.largest.len() {
-            // In f32 as `distance2` below: subtraction, square and sum are monotone, so no point of the bucket comes out nearer.
+            // The same f32 operations as for `distance2` below. They are monotone, so no point of the bucket is nearer
+            // than this.
             let apart = [0, 1, 2].map(|axis| {
                 let (under, over) = (self.low[axis][b] - pick[axis], pick[axis] - self.high[axis][b]);
                 let outside = if under > over { under } else { over };
@@ -131,7 +136,7 @@ impl Buckets {
             let members = self.starts[b] as usize..self.starts[b + 1] as usize;
             let distance2 = &mut self.distance2[members.clone()];
             let [x, y, z] = &self.xyz;
-            nearer(distance2, [&x[members.clone()], &y[members.clone()], &z[members.clone()]], pick);
+            minimum_with(distance2, [&x[members.clone()], &y[members.clone()], &z[members.clone()]], pick);
             let largest = largest(distance2);
             let first = distance2.iter().position(|&d| d == largest).unwrap_or(0);
             self.largest[b] = largest;
@@ -151,7 +156,8 @@ impl Buckets {
     }
 }
 
-/// Cuts `order` at the middle of the widest axis until a bucket is small enough; appends the ends of the buckets.
+/// Splits `order` at the median of the widest axis until each bucket is small enough, and appends the ends of the
+/// buckets.
 fn split(points: &[[f32; 3]], order: &mut [u32], ends: &mut Vec<u32>) {
     if order.len() <= BUCKET {
         ends.push(ends[ends.len() - 1] + order.len() as u32);
@@ -164,7 +170,7 @@ fn split(points: &[[f32; 3]], order: &mut [u32], ends: &mut Vec<u32>) {
     };
     let widths = [width(0), width(1), width(2)];
     let axis = (0..3).fold(0, |widest, axis| if widths[axis] > widths[widest] { axis } else { widest });
-    // Full buckets but for the last: the middle is rounded to a multiple of the bucket.
+    // The median is rounded up to a multiple of the bucket size, so that all buckets but the last are full.
     let middle = (order.len() / 2).next_multiple_of(BUCKET).min(order.len() - 1);
     order.select_nth_unstable_by(middle, |&a, &b| points[a as usize][axis].total_cmp(&points[b as usize][axis]));
     let (left, right) = order.split_at_mut(middle);
@@ -172,8 +178,8 @@ fn split(points: &[[f32; 3]], order: &mut [u32], ends: &mut Vec<u32>) {
     split(points, right, ends);
 }
 
-/// Each distance, or the one to `pick` where that is smaller.
-fn nearer(distance2: &mut [f32], xyz: [&[f32]; 3], pick: [f32; 3]) {
+/// The minimum of each squared distance and the squared distance to `pick`.
+fn minimum_with(distance2: &mut [f32], xyz: [&[f32]; 3], pick: [f32; 3]) {
     let n = distance2.len();
     let [x, y, z] = xyz.map(|values| &values[..n]);
     for i in 0..n {
@@ -183,7 +189,7 @@ fn nearer(distance2: &mut [f32], xyz: [&[f32]; 3], pick: [f32; 3]) {
     }
 }
 
-/// The largest of values that are not negative; 0 of none.
+/// The maximum of non-negative values; 0 for an empty slice.
 fn largest(values: &[f32]) -> f32 {
     let (chunks, rest) = values.as_chunks::<16>();
     let mut most = [0.0f32; 16];
@@ -200,7 +206,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// The kernel, thread by thread: each lane keeps its first farthest point, then halves of the lanes are compared.
+    /// The CUDA kernel thread by thread: each thread keeps its first farthest point, then a tree reduction over the
+    /// threads.
     fn by_lanes(points: &[[f32; 3]], count: usize) -> Vec<u32> {
         let lanes = (1usize << points.len().ilog2()).min(1024);
         let mut distance2 = vec![FIRST_DISTANCE2_M2; points.len()];
@@ -251,12 +258,12 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(1000))]
         #[test]
-        fn equals_the_plain_form(
+        fn equals_brute_force(
             points in prop::collection::vec(prop::array::uniform3(-40.0f32..40.0), 1..300),
             raster in prop_oneof![Just(0.0f32), Just(0.001), Just(0.5), Just(10.0)],
             share in 0.0f64..1.2,
         ) {
-            // On a raster many points are equally far, or equal.
+            // Quantised coordinates give ties and equal points.
             let on_raster = |v: f32| if raster > 0.0 { (v / raster).round() * raster } else { v };
             let points: Vec<[f32; 3]> = points.iter().map(|p| p.map(on_raster)).collect();
             let count = ((points.len() as f64 * share) as usize).clamp(1, 60);

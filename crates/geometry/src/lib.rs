@@ -1,6 +1,7 @@
 //! Poses, yaw, boxes, rotated overlap, NMS, points in boxes, sampling and neighbours of points.
 //!
-//! Pure functions: no files, no clock, no global random numbers. Frame: x forward, y left, z up; yaw counter-clockwise from +x.
+//! Pure functions: no files, no clock, no global random numbers. Frame: x forward, y left, z up; yaw counter-clockwise
+//! from +x.
 
 mod ball_query;
 mod box3;

@@ -3,15 +3,16 @@
 use crate::{Box3, overlap::BevRectangle};
 use std::{cmp::Ordering, collections::HashMap};
 
-/// Indices of the boxes that stay, by falling score, equal scores by index. A box goes when its BEV IoU with one that stays is
-/// larger than `iou_threshold`. Scores that are NaN come last.
+/// Indices of the boxes kept, by falling score, equal scores by index. A box is suppressed if its BEV IoU with a kept
+/// box is larger than `iou_threshold`. NaN scores come last.
 ///
-/// Only boxes whose bounding circles may meet are compared, found in a grid of cells as large as the largest circle.
+/// Only boxes whose bounding circles can intersect are compared. They are found in a grid whose cells are as large as
+/// the largest circle.
 pub fn rotated_nms(boxes: &[Box3], scores: &[f32], iou_threshold: f64) -> Vec<usize> {
     rotated_nms_first(boxes, scores, iou_threshold, usize::MAX)
 }
 
-/// The first `most` indices of [`rotated_nms`]; the rest is not looked at.
+/// The first `most` indices of [`rotated_nms`]; the search stops there.
 pub fn rotated_nms_first(boxes: &[Box3], scores: &[f32], iou_threshold: f64, most: usize) -> Vec<usize> {
     assert_eq!(boxes.len(), scores.len(), "one score a box");
     let mut order: Vec<usize> = (0..boxes.len()).collect();
@@ -31,7 +32,7 @@ pub fn rotated_nms_first(boxes: &[Box3], scores: &[f32], iou_threshold: f64, mos
             break;
         }
         let [cx, cy] = cell(&boxes[i]);
-        // The own cell first: there the rival is most likely to be.
+        // The box's own cell first: an overlapping box is most likely there.
         let near = [0, -1, 1].into_iter();
         let near =
             near.clone().flat_map(|dx| near.clone().map(move |dy| [cx.saturating_add(dx), cy.saturating_add(dy)]));
@@ -44,10 +45,10 @@ pub fn rotated_nms_first(boxes: &[Box3], scores: &[f32], iou_threshold: f64, mos
     kept
 }
 
-/// Whether the IoU is larger than `threshold`, decided by bounds where they are enough.
+/// Whether the IoU is larger than `threshold`. Cheap bounds are tried before exact clipping.
 fn overlaps(a: &BevRectangle, b: &BevRectangle, threshold: f64) -> bool {
     let both = a.area + b.area;
-    // IoU > t means shared > t * both / (1 + t). The bound is a little lower, so that rounding cannot decide.
+    // IoU > t means intersection > t * (area a + area b) / (1 + t). The bound is slightly lower to allow for rounding.
     let least = (threshold / (1.0 + threshold) * both * (1.0 - 1e-9)).max(0.0);
     if a.area.min(b.area) < least {
         return false;

@@ -1,23 +1,23 @@
 //! Exact overlap of rotated boxes, by convex clipping in f64.
 //!
-//! One box is clipped in the frame of the other, so that neither the distance from the origin nor equal, touching or collinear
-//! edges matter. Boxes without extent, and such with values that are not finite, overlap nothing.
+//! One box is clipped in the frame of the other. This is robust against large distances from the origin and against
+//! equal, touching or collinear edges. Boxes without extent or with values that are not finite have overlap 0.
 
 use crate::Box3;
 use std::f64::consts::PI;
 
-/// The base of a box, seen from above, with what clipping needs of it worked out once.
+/// The BEV rectangle of a box with precomputed quantities for clipping.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BevRectangle {
     center: [f64; 2],
     half: [f64; 2],
     sin: f64,
     cos: f64,
-    /// m2; 0 for a box that overlaps nothing.
+    /// Area, m2; 0 for a box without extent or with values that are not finite.
     pub(crate) area: f64,
-    /// Of the circle around it, m.
+    /// Radius of the circumscribed circle, m.
     radius: f64,
-    /// Of the largest circle inside, m.
+    /// Radius of the inscribed circle, m.
     inner_radius: f64,
 }
 
@@ -38,12 +38,12 @@ impl BevRectangle {
         }
     }
 
-    /// m2.
+    /// Area, m2.
     pub(crate) fn intersection(&self, other: &BevRectangle) -> f64 {
         self.intersection_above(other, 0.0)
     }
 
-    /// m2, or 0 when a cheap bound shows that the intersection is not larger than `least`.
+    /// Area of the intersection, m2; 0 if a cheap bound shows that it is at most `least`.
     pub(crate) fn intersection_above(&self, other: &BevRectangle, least: f64) -> f64 {
         let (a, b) = (self, other);
         if !(a.area > 0.0 && b.area > 0.0) {
@@ -55,7 +55,7 @@ impl BevRectangle {
         if apart_squared >= reach * reach || a.is_too_far(b, apart_squared, least) {
             return 0.0;
         }
-        // b in the frame of a: its centre, and the sine and cosine of its yaw relative to a's.
+        // Centre of b in the frame of a, and the sine and cosine of its yaw relative to a.
         let center = [apart[0] * a.cos + apart[1] * a.sin, apart[1] * a.cos - apart[0] * a.sin];
         let (sin, cos) = (b.sin * a.cos - b.cos * a.sin, b.cos * a.cos + b.sin * a.sin);
         if bound(a.half, b.half, center, sin, cos) <= least {
@@ -78,11 +78,12 @@ impl BevRectangle {
 }
 
 impl BevRectangle {
-    /// Whether the distance of the centres alone keeps the intersection at `least` or below.
+    /// Whether the distance of the centres alone shows that the intersection is at most `least`.
     ///
-    /// The line in the middle between the centres cuts the intersection into a piece of each rectangle: less than half of it, by a
-    /// strip half as wide as the centres are apart. The strip holds at least that of the circle inside, which is at least pi/4 of
-    /// its width times the diameter.
+    /// The perpendicular bisector of the centres splits the intersection. Each part lies in one rectangle beyond a
+    /// strip that starts at its centre and is half the distance of the centres wide, so it is at most half the
+    /// rectangle minus that strip. The strip of the rectangle contains that of the inscribed circle, whose area is at
+    /// least pi/4 of strip width times diameter.
     fn is_too_far(&self, other: &BevRectangle, apart_squared: f64, least: f64) -> bool {
         let spare = (self.area + other.area) / 2.0 - least;
         let strips_by_distance = PI / 4.0 * (self.inner_radius + other.inner_radius);
@@ -91,7 +92,8 @@ impl BevRectangle {
     }
 }
 
-/// Area of the part of a rectangle (half sizes `inner`, at the origin) inside the axis-aligned bounds of another at `center`.
+/// Area of the part of a rectangle (half sizes `inner`, at the origin) inside the axis-aligned bounds of another at
+/// `center`.
 fn bound(inner: [f64; 2], outer: [f64; 2], center: [f64; 2], sin: f64, cos: f64) -> f64 {
     let ex = outer[0] * cos.abs() + outer[1] * sin.abs();
     let ey = outer[0] * sin.abs() + outer[1] * cos.abs();
@@ -100,7 +102,8 @@ fn bound(inner: [f64; 2], outer: [f64; 2], center: [f64; 2], sin: f64, cos: f64)
     width.max(0.0) * height.max(0.0)
 }
 
-/// A convex polygon, counter-clockwise. Four cuts of a quadrilateral leave at most eight corners; rounding may add a few.
+/// A convex polygon, counter-clockwise. Clipping a quadrilateral four times gives at most eight corners; rounding may
+/// add a few.
 #[derive(Clone, Copy, Default)]
 struct Polygon {
     corners: [[f64; 2]; 16],
@@ -152,18 +155,18 @@ impl Polygon {
     }
 }
 
-/// Area that the bases of two boxes share, seen from above, m2.
+/// Area of the BEV intersection of two boxes, m2.
 pub fn bev_intersection(a: &Box3, b: &Box3) -> f64 {
     BevRectangle::new(a).intersection(&BevRectangle::new(b))
 }
 
-/// Intersection over union of the bases of two boxes, seen from above, 0 to 1.
+/// BEV IoU of two boxes, 0 to 1.
 pub fn bev_iou(a: &Box3, b: &Box3) -> f64 {
     let (a, b) = (BevRectangle::new(a), BevRectangle::new(b));
     over_union(a.intersection(&b), a.area, b.area)
 }
 
-/// Intersection over union of the volumes of two upright boxes, 0 to 1.
+/// 3D IoU of two upright boxes, 0 to 1.
 pub fn iou_3d(a: &Box3, b: &Box3) -> f64 {
     let ((a_low, a_high), (b_low, b_high)) = (a.z_range(), b.z_range());
     let height = a_high.min(b_high) - a_low.max(b_low);
@@ -176,7 +179,7 @@ pub fn iou_3d(a: &Box3, b: &Box3) -> f64 {
     }
 }
 
-/// `shared / (a + b - shared)`; 0 where there is no union.
+/// `shared / (a + b - shared)`; 0 if the union is empty.
 pub(crate) fn over_union(shared: f64, a: f64, b: f64) -> f64 {
     let iou = shared / (a + b - shared);
     if iou > 0.0 { iou.min(1.0) } else { 0.0 } // NaN is not > 0
@@ -196,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_boxes_overlap_wholly_everywhere() {
+    fn equal_boxes_have_overlap_1_at_any_distance() {
         for (x, y) in [(0.0, 0.0), (31.7, -88.2), (691_608.0, 5_334_000.0)] {
             for i in 0..100 {
                 let yaw = i as f64 * 0.37 - 15.0;
@@ -213,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn touching_boxes_share_nothing() {
+    fn touching_boxes_have_overlap_0() {
         assert_eq!(bev_intersection(&car(0.0, 0.0, 0.0), &car(4.88, 0.0, 0.0)), 0.0);
         assert_eq!(bev_intersection(&car(0.0, 0.0, 0.0), &car(4.88, 1.9, 0.0)), 0.0);
         let mut above = car(0.0, 0.0, 0.0);
@@ -225,7 +228,7 @@ mod tests {
     fn tiny_and_huge() {
         for scale in [1e-9, 1e-3, 1e6, 1e12] {
             let b = |x: f64| Box3::from_array([x * scale, 0.0, 0.0, 2.0 * scale, scale, scale, 0.4]);
-            let shift = [0.4f64.cos(), 0.4f64.sin()]; // half of the length along the heading: a third of the union is shared
+            let shift = [0.4f64.cos(), 0.4f64.sin()]; // shift by half the length along the heading: IoU 1/3
             let mut moved = b(0.0);
             moved.center = [shift[0] * scale, shift[1] * scale, 0.0];
             assert!(close(bev_iou(&b(0.0), &moved), 1.0 / 3.0), "{scale}");
@@ -264,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn degenerate_boxes_overlap_nothing() {
+    fn degenerate_boxes_have_overlap_0() {
         let good = car(0.0, 0.0, 0.2);
         for i in 0..7 {
             for v in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {

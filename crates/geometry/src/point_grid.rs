@@ -1,6 +1,6 @@
-//! Points in the cells of a grid seen from above, for searches that must find exactly what a search through all points finds.
+//! Points sorted into the cells of a BEV grid, for neighbour searches whose result equals brute force.
 
-/// Cells along one side, at most.
+/// Largest number of cells along one side.
 const MAX_SIDE: usize = 2048;
 
 /// Points sorted by cell; inside a cell by index.
@@ -9,7 +9,8 @@ pub(crate) struct PointGrid {
     cell_m: f64,
     /// Cells along x and y.
     pub(crate) size: [usize; 2],
-    /// Cell (x, y) has the points `starts[x * size[1] + y]..starts[x * size[1] + y + 1]`: cells of a column follow each other.
+    /// Cell (x, y) has the points `starts[x * size[1] + y]..starts[x * size[1] + y + 1]`: the cells of a column are
+    /// contiguous.
     starts: Vec<u32>,
     /// Index of each point in the cloud.
     pub(crate) index: Vec<u32>,
@@ -18,8 +19,8 @@ pub(crate) struct PointGrid {
 }
 
 impl PointGrid {
-    /// Cells of `cell_m`, or larger ones where they would hold fewer than `in_cell` points on average. Points that are not finite are left
-    /// out.
+    /// A grid with cells of `cell_m`, or larger ones if they would hold fewer than `in_cell` points on average. Points
+    /// that are not finite are left out.
     pub(crate) fn new(points: &[[f32; 3]], cell_m: f64, in_cell: f64) -> Self {
         let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
         let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
@@ -66,13 +67,13 @@ impl PointGrid {
         grid
     }
 
-    /// Cell of a coordinate, the nearest one outside the grid. Never falls when `v` grows.
+    /// Cell of a coordinate, clamped to the grid; monotone in `v`.
     pub(crate) fn cell(&self, axis: usize, v: f64) -> usize {
         let cell = (v - self.low[axis]) / self.cell_m;
         (cell.max(0.0) as usize).min(self.size[axis] - 1)
     }
 
-    /// Where cell number `cell` of an axis begins, m; minus infinity for the first and infinity behind the last, where no point is.
+    /// Lower border of cell `cell` along an axis, m; minus infinity for the first cell, infinity after the last.
     pub(crate) fn border_m(&self, axis: usize, cell: usize) -> f64 {
         match cell {
             0 => f64::NEG_INFINITY,
@@ -81,7 +82,7 @@ impl PointGrid {
         }
     }
 
-    /// Places of the points in cells `y_from..=y_to` of the column `x`.
+    /// Positions of the points in cells `y_from..=y_to` of the column `x`.
     pub(crate) fn run(&self, x: usize, y_from: usize, y_to: usize) -> std::ops::Range<usize> {
         self.starts[x * self.size[1] + y_from] as usize..self.starts[x * self.size[1] + y_to + 1] as usize
     }

@@ -7,9 +7,9 @@ const CELLS: usize = 64;
 
 /// For each box the indices of the points inside, ascending. `points` holds `channels` values each, x, y, z first.
 ///
-/// Inside is OpenPCDet's rule, in the box's own frame: |z| <= dz/2, |x| < dx/2 + margin, |y| < dy/2 + margin. Its margin is 1e-5 m
-/// on the GPU and 1e-2 m on the CPU; 0 is the box itself. A point that is not finite is in no box, and nothing is in a box that has
-/// no extent.
+/// A point is inside by OpenPCDet's rule in the box frame: |z| <= dz/2, |x| < dx/2 + margin, |y| < dy/2 + margin.
+/// OpenPCDet's margin is 1e-5 m on the GPU and 1e-2 m on the CPU. Points that are not finite are in no box, and boxes
+/// without extent contain no points.
 ///
 /// # Shapes
 /// `points`: `[N * channels]`; out: one list a box.
@@ -35,7 +35,7 @@ pub fn points_in_boxes(points: &[f32], channels: usize, boxes: &[Box3], margin_m
     inside
 }
 
-/// A box, ready to test points.
+/// A box with precomputed quantities for testing points.
 struct InsideTest {
     index: usize,
     center: [f64; 3],
@@ -105,12 +105,13 @@ impl BoxGrid {
         Some(grid)
     }
 
-    /// Never falls when `v` grows, so that a point between the bounds of a box is in a cell between theirs.
+    /// Monotone in `v`, so that a point within the bounds of a box is in a cell within the cells of these bounds.
     fn index(&self, axis: usize, v: f64) -> usize {
         (((v - self.low[axis]) * self.cells_per_m[axis]) as i32).clamp(0, CELLS as i32 - 1) as usize
     }
 
-    /// Points beyond the grid, and such that are not finite, get the boxes of a cell on its border: no branch to guess wrong.
+    /// Candidate boxes of a point. Points outside the grid or not finite get those of a border cell; this avoids a
+    /// branch.
     fn boxes_near(&self, x: f64, y: f64) -> &[u32] {
         let cell = self.index(0, x) * CELLS + self.index(1, y);
         &self.boxes[self.starts[cell] as usize..self.starts[cell + 1] as usize]
@@ -129,7 +130,7 @@ mod tests {
             [1.0, 2.0, 4.0],      // on the top: inside
             [3.0, 2.0, 3.0],      // on the front: outside without a margin
             [1.0, 2.999, 3.0],    // inside
-            [f32::NAN, 2.0, 3.0], // nowhere
+            [f32::NAN, 2.0, 3.0], // in no box
             [1.0, f32::INFINITY, 3.0],
         ]
         .concat();

@@ -1,4 +1,4 @@
-//! Rigid motions: where a sensor or a vehicle stands. Named `dst_from_src`, so that `map_from_car * p_car` reads right.
+//! Rigid transforms: poses of sensors and vehicles. Values are named `dst_from_src`, as in `map_from_car * p_car`.
 
 use crate::Box3;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -6,18 +6,19 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 /// A rotation followed by a translation, m.
 pub type Pose = Isometry3<f64>;
 
-/// The pose of something that stands at `position` (m) and heads `yaw_rad` counter-clockwise from +x, upright.
+/// An upright pose at `position` (m) with heading `yaw_rad`, counter-clockwise from +x.
 pub fn upright_pose(position: [f64; 3], yaw_rad: f64) -> Pose {
     Pose::from_parts(Translation3::from(position), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw_rad))
 }
 
-/// Heading of the turned x axis, rad, counter-clockwise from +x.
+/// Heading of the rotated x axis, rad, counter-clockwise from +x.
 pub fn yaw_rad(pose: &Pose) -> f64 {
     let x = pose.rotation * Vector3::x();
     x.y.atan2(x.x)
 }
 
-/// An upright box moved to the frame `dst`. It stays upright: a tilt of the pose moves its centre, but does not tilt the box.
+/// An upright box transformed to the frame `dst`. Roll and pitch of the pose move its centre, but the box stays
+/// upright.
 pub fn move_box(dst_from_src: &Pose, box_src: &Box3) -> Box3 {
     let center = dst_from_src * Point3::from(box_src.center);
     let heading = dst_from_src.rotation * Vector3::new(box_src.yaw_rad.cos(), box_src.yaw_rad.sin(), 0.0);

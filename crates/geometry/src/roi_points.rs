@@ -5,16 +5,17 @@ use crate::{Box3, points_in_boxes};
 /// The margin of the reference's kernel, m.
 const MARGIN_M: f64 = 1e-5;
 
-/// Which points lie in which region. R regions with S places each.
+/// The points of each region of interest: R regions with S entries each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RoiPoints {
     /// Indices of points, region after region, `[R, S]`; 0 in a region without points.
     pub index: Vec<u32>,
-    /// Different points in each region, at most S; 0 for an empty one. Length R.
+    /// Number of distinct points in each region, at most S, `[R]`.
     pub count: Vec<u32>,
 }
 
-/// The first `samples` points inside each box, in the order of the points; with fewer they are repeated from the first on.
+/// The first `samples` points inside each box, in the order of the points. If there are fewer, they are repeated in the
+/// same order.
 ///
 /// # Shapes
 /// `points`: `[N * channels]`, x, y, z first, m; `boxes`: `[R]`.

@@ -3,10 +3,10 @@
 use crate::point_grid::PointGrid;
 use rayon::prelude::*;
 
-/// Points that one task works on.
+/// Points a task.
 const TASK: usize = 256;
 
-/// Known points in a cell of the grid, on average and at least.
+/// Smallest average number of known points in a grid cell.
 const IN_CELL: f64 = 2.0;
 
 /// Nearest first.
@@ -14,12 +14,12 @@ const IN_CELL: f64 = 2.0;
 pub struct ThreeNearest {
     /// Indices into the known points.
     pub index: Vec<[u32; 3]>,
-    /// Squared distances, m2; infinite, with index 0, where there are fewer than three known points.
+    /// Squared distances, m2; infinite, with index 0, if there are fewer than three known points.
     pub distance2: Vec<[f32; 3]>,
 }
 
-/// The three nearest of `known` for each of `unknown`; of equally far ones the lower index comes first. Distances in f32, as the reference.
-/// Known points that are not finite are nobody's neighbours.
+/// The three nearest of `known` for each of `unknown`; ties by lower index. Distances are f32, as in the reference.
+/// Known points that are not finite are never neighbours.
 ///
 /// # Shapes
 /// `unknown`: `[N]`, `known`: `[M]`, m; results `[N, 3]`.
@@ -50,7 +50,7 @@ fn nearest(grid: &PointGrid, p: [f32; 3]) -> [(f32, u32); 3] {
             if x.abs_diff(cell[0]) == ring {
                 visit(grid, grid.run(x, from[1], to[1]), p, &mut best);
             } else {
-                // The inner part of this column was seen before.
+                // The inner part of this column was visited before.
                 for y in
                     [cell[1].checked_sub(ring), Some(cell[1] + ring).filter(|y| *y <= last[1])].into_iter().flatten()
                 {
@@ -58,7 +58,7 @@ fn nearest(grid: &PointGrid, p: [f32; 3]) -> [(f32, u32); 3] {
                 }
             }
         }
-        // Everything not yet seen lies beyond these borders.
+        // All points not yet visited lie beyond these borders.
         let beyond = |axis: usize| {
             let (low, high) = (grid.border_m(axis, from[axis]), grid.border_m(axis, to[axis] + 1));
             (at[axis] - low).min(high - at[axis]).max(0.0)
@@ -72,7 +72,7 @@ fn nearest(grid: &PointGrid, p: [f32; 3]) -> [(f32, u32); 3] {
     best
 }
 
-/// Puts the points at these places of the grid where they belong among the best.
+/// Inserts the points at these positions of the grid into the sorted list of the nearest.
 fn visit(grid: &PointGrid, places: std::ops::Range<usize>, p: [f32; 3], best: &mut [(f32, u32); 3]) {
     let [x, y, z] = [0, 1, 2].map(|axis| &grid.xyz[axis][places.clone()]);
     for (k, &i) in grid.index[places].iter().enumerate() {

@@ -1,4 +1,4 @@
-//! The overlap against an independent polygon library, on random boxes and on such that bring clipping routines down.
+//! The overlap against an independent polygon library, on random and on degenerate pairs of boxes.
 
 use i_overlay::{
     core::{fill_rule::FillRule, overlay_rule::OverlayRule},
@@ -9,7 +9,8 @@ use rand::RngExt;
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// Area of the intersection by `i_overlay`, on its 64-bit grid; relative to the centre of `a`, since a grid has only so many steps.
+/// Area of the intersection by `i_overlay`, which rounds to a 64-bit grid; computed relative to the centre of `a` for
+/// precision.
 fn independent_intersection(a: &Box3, b: &Box3) -> f64 {
     let about = |c: &Box3| Box3 { center: std::array::from_fn(|i| c.center[i] - a.center[i]), ..*c }.bev_corners();
     let shapes = FloatOverlay::<[f64; 2], i64>::from_subj_and_clip(&about(a), &about(b))

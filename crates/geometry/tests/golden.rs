@@ -1,4 +1,4 @@
-//! Reference numbers: overlaps clipped with 50 digits, and the golden tensors of the operators.
+//! Reference values: overlaps computed with 50 digits, and the golden tensors of the operators.
 
 use lidarshift_geometry::{Box3, bev_intersection, bev_iou, iou_3d, rotated_nms};
 use safetensors::SafeTensors;
@@ -8,7 +8,7 @@ fn golden(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden").join(path)
 }
 
-/// KITTI order h w l x y z ry (camera frame, bottom centre) as a box that stands upright on the plane of x and z.
+/// A box from KITTI's h w l x y z ry (camera frame, bottom centre), with the camera's x-z plane as the ground plane.
 fn standing(v: &[f64]) -> Box3 {
     let [h, w, l, x, y, z, ry] = v else { panic!("seven numbers") };
     Box3 { center: [*x, *z, -y + h / 2.0], size: [*l, *w, *h], yaw_rad: -ry }

@@ -1,4 +1,4 @@
-//! Sampling, neighbours and regions of points against the reference's numbers, and on real scans against plain searches.
+//! Sampling, neighbours and regions of points against reference values, and on real scans against brute force.
 
 use lidarshift_geometry::{Box3, TieRule, ball_query, farthest_point_sampling, roi_points, three_nearest};
 use safetensors::SafeTensors;

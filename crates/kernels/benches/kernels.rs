@@ -1,6 +1,6 @@
-//! Times of the kernels at the sizes of the published PointPillars, batch 1; the median and the fastest of some runs in ms.
+//! Times of the kernels at the sizes of the published PointPillars, batch 1: median and minimum of several runs, ms.
 //!
-//! Arguments choose what runs by parts of its name: `cargo bench -p lidarshift-kernels -- conv stride2`.
+//! Arguments select benchmarks by parts of their names: `cargo bench -p lidarshift-kernels -- conv stride2`.
 
 #![expect(clippy::print_stdout, reason = "results go to stdout")]
 

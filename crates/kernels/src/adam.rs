@@ -1,36 +1,38 @@
-//! Adam with decoupled weight decay (Loshchilov & Hutter, "Decoupled Weight Decay Regularization", 2019), and clipping by the global norm.
+//! Adam with decoupled weight decay (Loshchilov & Hutter, "Decoupled Weight Decay Regularization", 2019), and clipping
+//! by the global norm.
 
 use crate::simd::vectorized;
 use rayon::prelude::*;
 
-/// Values that a task takes at once.
+/// Values a task.
 const CHUNK: usize = 1 << 14;
 
-/// One step of the optimiser; all parameters share it.
+/// One step of the optimiser, the same for all parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AdamStep {
-    /// Of this step.
+    /// Learning rate of this step.
     pub learning_rate: f64,
-    /// Decay of the running mean of the gradients; may change from step to step, and the bias correction takes the one of this step.
+    /// Decay of the running mean of the gradients (beta1). It may change between steps; the bias correction uses this
+    /// step's value.
     pub beta1: f64,
-    /// Decay of the running mean of their squares.
+    /// Decay of the running mean of the squared gradients (beta2).
     pub beta2: f64,
     /// Added to the denominator.
     pub epsilon: f64,
-    /// Times the learning rate: the share by which each value shrinks before the step.
+    /// Decoupled weight decay: each value is multiplied by 1 - lr * weight decay before the step.
     pub weight_decay: f64,
     /// Number of this step, from 1.
     pub step: u64,
-    /// Multiplies every gradient first; see [`GradientNorm::clip_scale`].
+    /// Factor of every gradient, applied first; see [`GradientNorm::clip_scale`].
     pub gradient_scale: f64,
 }
 
-/// A parameter and what belongs to it, all of one length.
+/// A parameter, its gradient and its moments, all of one length.
 #[derive(Debug)]
 pub struct Parameter<'a> {
     /// The values, changed in place.
     pub value: &'a mut [f32],
-    /// Their gradient. Without one, the values only decay.
+    /// Their gradient. Without one, only the weight decay is applied.
     pub gradient: Option<&'a [f32]>,
     /// Running mean of the gradient, zero before the first step.
     pub exp_avg: &'a mut [f32],
@@ -39,13 +41,16 @@ pub struct Parameter<'a> {
 }
 
 impl AdamStep {
-    /// Moves all parameters.
+    /// Updates all parameters.
     pub fn apply(&self, parameters: Vec<Parameter<'_>>) {
         let mut chunks = Vec::new();
         for Parameter { value, gradient, exp_avg, exp_avg_sq } in parameters {
             let n = value.len();
-            assert!(gradient.is_none_or(|g| g.len() == n), "a gradient for {n} values");
-            assert!(gradient.is_none() || (exp_avg.len(), exp_avg_sq.len()) == (n, n), "moments for {n} values");
+            assert!(gradient.is_none_or(|g| g.len() == n), "length of the gradient of {n} values");
+            assert!(
+                gradient.is_none() || (exp_avg.len(), exp_avg_sq.len()) == (n, n),
+                "length of the moments of {n} values"
+            );
             match gradient {
                 None => chunks.extend(value.chunks_mut(CHUNK).map(Chunk::Decay)),
                 Some(gradient) => {
@@ -56,7 +61,7 @@ impl AdamStep {
             }
         }
         let step = self.step as f64;
-        let numbers = Numbers {
+        let numbers = Coefficients {
             scale: self.gradient_scale as f32,
             decay: (1.0 - self.learning_rate * self.weight_decay) as f32,
             beta1: self.beta1 as f32,
@@ -76,9 +81,9 @@ enum Chunk<'a> {
     Move(&'a mut [f32], &'a [f32], &'a mut [f32], &'a mut [f32]),
 }
 
-/// The numbers of a step in single precision.
+/// The coefficients of a step in single precision.
 #[derive(Clone, Copy)]
-struct Numbers {
+struct Coefficients {
     scale: f32,
     decay: f32,
     beta1: f32,
@@ -90,7 +95,7 @@ struct Numbers {
     rate: f32,
 }
 
-impl Numbers {
+impl Coefficients {
     #[inline(always)]
     fn update(&self, chunk: Chunk<'_>) {
         match chunk {
@@ -108,17 +113,17 @@ impl Numbers {
     }
 }
 
-/// The Euclidean norm over all gradients together.
+/// The global L2 norm of all gradients.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GradientNorm {
-    /// The norm, before any clipping.
+    /// The norm before clipping.
     pub total: f64,
-    /// The first gradient with a NaN or an infinity in it, by its place in the list.
+    /// Index of the first gradient that holds a NaN or an infinity.
     pub not_finite: Option<usize>,
 }
 
 impl GradientNorm {
-    /// Of these gradients, squares and sums in double precision.
+    /// The norm of these gradients; squares and sums are f64.
     pub fn of(gradients: &[&[f32]]) -> Self {
         let squares = |chunk: &[f32]| {
             vectorized(|| {
@@ -139,7 +144,7 @@ impl GradientNorm {
         GradientNorm { total: sums.iter().sum::<f64>().sqrt(), not_finite: sums.iter().position(|s| !s.is_finite()) }
     }
 
-    /// What the gradients are multiplied with so that their norm is at most `max_norm`, as `torch.nn.utils.clip_grad_norm_` computes it.
+    /// Factor of the gradients that limits their norm to `max_norm`, as in `torch.nn.utils.clip_grad_norm_`.
     pub fn clip_scale(&self, max_norm: f64) -> f64 {
         (max_norm / (self.total + 1e-6)).min(1.0)
     }
@@ -187,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_gradient_values_only_decay() {
+    fn without_a_gradient_only_weight_decay_is_applied() {
         let mut value = vec![2.0f32; 3];
         STEP.apply(vec![Parameter { value: &mut value, gradient: None, exp_avg: &mut [], exp_avg_sq: &mut [] }]);
         assert_eq!(value, [2.0 * (1.0 - 3e-5f64) as f32; 3]);
@@ -208,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_threads_changes_no_bit() {
+    fn the_result_is_bit_equal_for_any_number_of_threads() {
         let gradient = random(5 * CHUNK + 9, 3);
         assert_same_for_threads(|| {
             let mut value = random(gradient.len(), 1);
@@ -225,7 +230,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_comes_out() {
+    fn nan_propagates() {
         let (mut value, mut exp_avg, mut exp_avg_sq) = (vec![1.0; 40], vec![0.0; 40], vec![0.0; 40]);
         let mut gradient = vec![1.0; 40];
         gradient[20] = f32::NAN;

@@ -1,11 +1,11 @@
-//! Batch normalisation with the ReLU behind it, and folded into the convolution before it.
+//! Batch normalisation, optionally followed by a ReLU.
 
 use crate::output::{Shared, fill};
 use crate::simd::vectorized;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Normalisation of `[batch, channels, pixels]` over batch and pixels, each channel by itself.
+/// Normalisation of `[batch, channels, pixels]` over batch and pixels, per channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BatchNorm {
     /// Images, or rows.
@@ -29,16 +29,16 @@ pub struct Statistics {
     pub variance: Vec<f64>,
 }
 
-/// Rows that a task takes where an image is a row of its channels' values.
+/// Rows a task if images are processed as rows of `channels * pixels` values.
 const ROWS: usize = 128;
 
-/// Columns of such a row that are worked on together.
+/// Columns of such a row that are processed together.
 const COLUMNS: usize = 32;
 
-/// Below this many pixels an image is a row of its channels' values instead of one run for each of them.
+/// Images with fewer pixels are processed as rows of `channels * pixels` values instead of channel by channel.
 const SHORT: usize = 32;
 
-/// Sums of single precision values, exact as far as double precision goes.
+/// Two sums of f32 values in f64, 16 lanes each.
 #[derive(Clone, Copy)]
 struct Sums([[f64; 16]; 2]);
 
@@ -60,17 +60,17 @@ impl BatchNorm {
         self.batch * self.channels * self.pixels
     }
 
-    /// Whether there are none.
+    /// Whether `x` has no elements.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// Values of a channel.
+    /// Number of values of a channel.
     fn count(&self) -> f64 {
         (self.batch * self.pixels) as f64
     }
 
-    /// Normalises by the statistics of `x`, which are returned; of an empty `x` they are zero. `y` is overwritten, whatever it held.
+    /// Normalises by the statistics of `x` and returns them; they are zero if `x` is empty. `y` is overwritten.
     ///
     /// # Shapes
     /// `x`, `y`: `[batch, channels, pixels]`; `gamma`, `beta`: `[channels]`.
@@ -90,7 +90,7 @@ impl BatchNorm {
         Statistics { mean, variance }
     }
 
-    /// Normalises by given statistics. `y` is overwritten, whatever it held.
+    /// Normalises by given statistics. `y` is overwritten.
     ///
     /// # Shapes
     /// `x`, `y`: `[batch, channels, pixels]`; `gamma`, `beta`: `[channels]`.
@@ -100,7 +100,7 @@ impl BatchNorm {
         let normalised = |x: f32, _: f32, a: &Affine| self.activated(a.of(x));
         let row = self.channels * self.pixels;
         let rows = Affines::of_row(if self.pixels < SHORT { row } else { 0 }, |c| affine[c / self.pixels]);
-        // SAFETY: every row, or every run of a channel, is written.
+        // SAFETY: every row, or every channel of every image, is written.
         unsafe {
             fill(y, self.len(), |y| {
                 if self.is_empty() {
@@ -119,7 +119,8 @@ impl BatchNorm {
         }
     }
 
-    /// Gradients by `x` (`dx`, overwritten), by gamma and by beta, `statistics` those of [`BatchNorm::forward_train`].
+    /// Gradients with respect to `x` (`dx`, overwritten), gamma and beta; `statistics`: those of
+    /// [`BatchNorm::forward_train`].
     ///
     /// # Shapes
     /// `x`, `dy`, `dx`: `[batch, channels, pixels]`; all others: `[channels]`.
@@ -170,9 +171,10 @@ impl BatchNorm {
         (0..self.channels).map(|c| Affine::new(gamma[c], beta[c], mean[c], variance[c], self.epsilon)).collect()
     }
 
-    /// For each channel: sums two values over all of its elements, makes parameters of them, and writes a function of each element. Where an
-    /// image is long, a channel's elements are still in the cache for the second pass.
-    #[allow(clippy::too_many_arguments)] // two tensors in, one out, and the four steps
+    /// For each channel: sums two values over all of its elements, computes coefficients from the sums, and writes a
+    /// function of each element. If images have many pixels, the elements of a channel are still in the cache for the
+    /// second pass.
+    #[allow(clippy::too_many_arguments)] // two inputs, one output and four callbacks
     fn two_passes(
         &self,
         x: &[f32],
@@ -225,8 +227,8 @@ impl BatchNorm {
         (0..self.channels).into_par_iter().map(channel).collect()
     }
 
-    /// [`BatchNorm::two_passes`] where an image has few pixels: some rows of `channels * pixels` columns a task.
-    /// The sums of the tasks are added in order, so that the number of threads changes nothing.
+    /// [`BatchNorm::two_passes`] for images with few pixels: some rows of `channels * pixels` columns a task.
+    /// The sums of the tasks are added in order, so that the result does not depend on the number of threads.
     #[allow(clippy::too_many_arguments)]
     fn short_passes(
         &self,
@@ -246,7 +248,7 @@ impl BatchNorm {
                 for (x, other) in x.chunks_exact(row).zip(other.chunks_exact(row)) {
                     let groups = x.chunks(COLUMNS).zip(other.chunks(COLUMNS));
                     for ((x, other), (sums, parameters)) in groups.zip(sums.iter_mut().zip(&parameters)) {
-                        let (x, other, [mut firsts, mut seconds]) = (filled_up(x), filled_up(other), *sums);
+                        let (x, other, [mut firsts, mut seconds]) = (padded(x), padded(other), *sums);
                         for c in 0..COLUMNS {
                             let [first, second] = moments(x[c], other[c], &parameters.get(c));
                             firsts[c] += first;
@@ -290,7 +292,7 @@ fn apply_to_rows(
         for ((out, x), other) in out.chunks_exact_mut(row).zip(x.chunks_exact(row)).zip(other.chunks_exact(row)) {
             let groups = out.chunks_mut(COLUMNS).zip(x.chunks(COLUMNS)).zip(other.chunks(COLUMNS));
             for (((out, x), other), parameters) in groups.zip(parameters) {
-                let (x, other, mut values) = (filled_up(x), filled_up(other), [0.0; COLUMNS]);
+                let (x, other, mut values) = (padded(x), padded(other), [0.0; COLUMNS]);
                 for c in 0..COLUMNS {
                     values[c] = apply(x[c], other[c], &parameters.get(c));
                 }
@@ -300,9 +302,9 @@ fn apply_to_rows(
     });
 }
 
-/// A copy of a group of columns, the last one with zeros behind.
+/// A copy of a group of columns; the last group is padded with zeros.
 #[inline(always)]
-fn filled_up(columns: &[f32]) -> [f32; COLUMNS] {
+fn padded(columns: &[f32]) -> [f32; COLUMNS] {
     columns.try_into().unwrap_or_else(|_| {
         let mut all = [0.0; COLUMNS];
         all[..columns.len()].copy_from_slice(columns);
@@ -310,7 +312,7 @@ fn filled_up(columns: &[f32]) -> [f32; COLUMNS] {
     })
 }
 
-/// What is done to each value of a channel: `(x - mean) scale + beta`, and in the gradient `(x - mean) slope + offset` besides.
+/// The affine function of a channel: `(x - mean) scale + beta`, and for the gradient `(x - mean) slope + offset`.
 #[derive(Clone, Copy, Debug)]
 struct Affine {
     mean: f32,
@@ -334,12 +336,12 @@ impl Affine {
     }
 }
 
-/// Those of a group of columns, side by side as registers want them.
+/// The coefficients of a group of columns, as arrays for vector registers.
 #[derive(Clone, Copy)]
 struct Affines([[f32; COLUMNS]; 5]);
 
 impl Affines {
-    /// For a row of so many columns, the last group filled up.
+    /// For a row of `row` columns; the last group is padded.
     fn of_row(row: usize, of_column: impl Fn(usize) -> Affine) -> Vec<Self> {
         let group = |first: usize| {
             let mut all = Affines([[0.0; COLUMNS]; 5]);
@@ -361,7 +363,7 @@ impl Affines {
     }
 }
 
-/// A variance may come out a little below zero; NaN stays.
+/// Rounding may give a variance slightly below zero, which becomes zero; NaN propagates.
 pub(crate) fn non_negative(variance: f64) -> f64 {
     if variance < 0.0 { 0.0 } else { variance }
 }

@@ -1,4 +1,4 @@
-//! A batch of images cut into runs of [`PIXELS`] tiles.
+//! A batch of images divided into blocks of [`PIXELS`] tiles.
 
 use crate::tile::PIXELS;
 
@@ -13,7 +13,7 @@ pub(crate) struct TileGrid {
     pub columns: usize,
 }
 
-/// Tiles of a block that lie side by side in a row of an image.
+/// Adjacent tiles of a block in one row of an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Segment {
     /// The image.
@@ -24,7 +24,7 @@ pub(crate) struct Segment {
     pub column: usize,
     /// Number of tiles.
     pub len: usize,
-    /// Place of the first tile in the block.
+    /// Position of the first tile in the block.
     pub at: usize,
 }
 
@@ -35,7 +35,7 @@ pub(crate) struct Segments {
 }
 
 impl Segments {
-    /// In the order of their places.
+    /// In the order of their positions.
     #[inline(always)]
     pub fn list(&self) -> &[Segment] {
         &self.all[..self.count]
@@ -58,7 +58,7 @@ impl TileGrid {
         self.tiles().div_ceil(PIXELS)
     }
 
-    /// The segments of a block; none behind the last.
+    /// The segments of a block; empty after the last block.
     pub fn segments(&self, block: usize) -> Segments {
         let mut segments = Segments { all: [Segment::default(); PIXELS], count: 0 };
         let (from, to) = (block * PIXELS, self.tiles().min((block + 1) * PIXELS));

@@ -1,36 +1,38 @@
-//! Pillars onto the bird's eye canvas (PointPillars' scatter), and back.
+//! Scatter of pillar features to the BEV canvas (OpenPCDet: `PointPillarScatter`), and the gather that is its gradient.
 
 use crate::output::{Shared, fill};
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 use std::ops::Range;
 
-/// Pillars that a task of [`Canvas::gather`] takes.
+/// Pillars a task of [`Canvas::gather`].
 const PILLARS: usize = 256;
 
-/// The canvases of a batch.
+/// The shape of the BEV canvases of a batch.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Canvas {
-    /// Canvases.
+    /// Number of canvases.
     pub batch: usize,
-    /// Values of a pillar.
+    /// Features of a pillar.
     pub channels: usize,
     /// Cells of a canvas: rows times columns.
     pub pixels: usize,
 }
 
 impl Canvas {
-    /// Each pillar's features at its cell, zeros elsewhere; `canvas`, `[batch, channels, pixels]`, is overwritten, whatever it held.
+    /// Writes each pillar's features to its cell and zeros elsewhere. `canvas`, `[batch, channels, pixels]`, is
+    /// overwritten.
     ///
     /// # Shapes
-    /// `features`: `[P, channels]`; `cells`: P places in `[batch, pixels]`, the canvases one after the other; of equal ones the last counts.
+    /// `features`: `[P, channels]`; `cells`: `[P]`, indices into `[batch, pixels]`, sorted by canvas. If cells are
+    /// equal, the last pillar wins.
     pub fn scatter(&self, features: &[f32], cells: &[u32], canvas: &mut Vec<f32>) {
         let Canvas { batch, channels, pixels } = *self;
         assert_eq!(features.len(), cells.len() * channels, "features of {self:?}");
         let pillars: Vec<Range<usize>> = (0..batch).map(|b| self.pillars_of(cells, b)).collect();
         let work = |canvas: Shared<'_>| {
             (0..batch * channels).into_par_iter().for_each(|plane| {
-                // SAFETY: each plane is one task's.
+                // SAFETY: each plane belongs to one task.
                 let values = unsafe { canvas.part(plane * pixels, pixels) };
                 values.fill(MaybeUninit::new(0.0));
                 let (image, channel) = (plane / channels, plane % channels);
@@ -43,8 +45,8 @@ impl Canvas {
         unsafe { fill(canvas, batch * channels * pixels, |canvas| work(Shared::new(canvas))) };
     }
 
-    /// What the canvas holds at the cells of the pillars: the gradient of [`Canvas::scatter`] where all cells differ. `features`,
-    /// `[P, channels]`, is overwritten, whatever it held.
+    /// Reads the canvas at the cells of the pillars: the gradient of [`Canvas::scatter`] if all cells differ.
+    /// `features`, `[P, channels]`, is overwritten.
     pub fn gather(&self, canvas: &[f32], cells: &[u32], features: &mut Vec<f32>) {
         let Canvas { batch, channels, pixels } = *self;
         assert_eq!(canvas.len(), batch * channels * pixels, "elements of {self:?}");
@@ -65,7 +67,7 @@ impl Canvas {
         unsafe { fill(features, cells.len() * channels, |features| work(Shared::new(features))) };
     }
 
-    /// The pillars of an image; a batch has them one image after the other.
+    /// The pillars of an image; those of a batch are sorted by image.
     fn pillars_of(&self, cells: &[u32], image: usize) -> Range<usize> {
         let before = |image: usize| cells.partition_point(|&cell| (cell as usize) < image * self.pixels);
         debug_assert!(cells.windows(2).all(|c| c[0] as usize / self.pixels <= c[1] as usize / self.pixels));
@@ -78,7 +80,7 @@ mod tests {
     use super::*;
     use crate::reference::{assert_same_for_threads, random};
 
-    /// Every third cell of each canvas, in an order of its own.
+    /// Every third cell of each canvas, in a shuffled order.
     fn cells(canvas: &Canvas) -> Vec<u32> {
         let n = canvas.pixels / 3;
         let of_image = |b| (0..n).map(move |p| (b * canvas.pixels + (p * 7 + b) % n * 3) as u32);
@@ -86,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn equals_the_definition_and_comes_back() {
+    fn equals_the_definition_and_gather_inverts_it() {
         for (batch, channels, pixels) in [(1, 1, 3), (2, 3, 30), (3, 20, 1000), (1, 5, 1), (0, 4, 9)] {
             let canvas = Canvas { batch, channels, pixels };
             let cells = cells(&canvas);
@@ -107,7 +109,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_threads_changes_no_bit() {
+    fn the_result_is_bit_equal_for_any_number_of_threads() {
         let canvas = Canvas { batch: 2, channels: 9, pixels: 3000 };
         let cells = cells(&canvas);
         let features = random(cells.len() * 9, 2);
@@ -120,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_comes_out() {
+    fn nan_propagates() {
         let canvas = Canvas { batch: 1, channels: 2, pixels: 4 };
         let mut there = Vec::new();
         canvas.scatter(&[1.0, f32::NAN, 3.0, 4.0], &[2, 0], &mut there);

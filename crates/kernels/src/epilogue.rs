@@ -1,13 +1,13 @@
-//! What follows a convolution at inference.
+//! The epilogue of a convolution at inference: bias and ReLU.
 
 use pulp::Simd;
 
-/// What is done to each output before it is stored: what is left of a batch norm and a ReLU at inference.
+/// What is applied to each output before it is stored: the bias of a folded batch norm, and a ReLU.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Epilogue<'a> {
-    /// Added, `[outputs]`.
+    /// Bias, `[outputs]`.
     pub bias: Option<&'a [f32]>,
-    /// Negative values become zero.
+    /// Whether a ReLU follows.
     pub relu: bool,
 }
 
@@ -22,6 +22,6 @@ impl Epilogue<'_> {
             return values;
         }
         let zero = simd.splat_f32s(0.0);
-        simd.select_f32s(simd.less_than_f32s(values, zero), zero, values) // NaN stays
+        simd.select_f32s(simd.less_than_f32s(values, zero), zero, values) // NaN propagates
     }
 }

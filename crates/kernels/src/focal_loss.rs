@@ -1,23 +1,24 @@
-//! Sigmoid focal loss (Lin et al., "Focal Loss for Dense Object Detection", 2017; OpenPCDet: `SigmoidFocalClassificationLoss`).
+//! Sigmoid focal loss (Lin et al., "Focal Loss for Dense Object Detection", 2017; OpenPCDet:
+//! `SigmoidFocalClassificationLoss`).
 
 use crate::simd::vectorized;
 use rayon::prelude::*;
 
-/// Weight of a positive entry; a negative one has the rest.
+/// Weight of a positive entry; a negative one has 1 - alpha.
 const ALPHA: f32 = 0.25;
 
-/// Logits that a task takes at once.
+/// Logits a task.
 const CHUNK: usize = 1 << 13;
 
-/// Logits that are worked on between looking up their targets.
+/// Logits that are processed after each lookup of their targets.
 const GROUP: usize = 256;
 
-/// The loss with alpha 0.25 and gamma 2, each row weighted and all entries summed up, and its gradient by the logits (overwritten, whatever it
-/// held).
+/// The weighted sum over all entries of the loss with alpha 0.25 and gamma 2, and its gradient with respect to the
+/// logits, which is overwritten.
 ///
 /// # Shapes
-/// `logits`, `gradient`: `[rows, classes]`; `labels`: `[rows]`, 0 for background (no class is the target), k for the class with index k - 1,
-/// anything below 0 as 0; `weights`: `[rows]`.
+/// `logits`, `gradient`: `[rows, classes]`; `labels`: `[rows]`, 0 or less for background, k for the class with index k
+/// - 1; `weights`: `[rows]`.
 pub fn sigmoid_focal_loss(
     logits: &[f32],
     classes: usize,
@@ -74,7 +75,8 @@ fn loss_and_gradient(logits: &[f32], targets: &[f32], scales: &[f32], gradient: 
     losses.iter().map(|&loss| loss as f64).sum()
 }
 
-/// e^x for x <= 0 to about an ulp; below -87 what it is there. Cody and Waite's reduction and a polynomial, in a form that is vectorised.
+/// e^x for x <= 0 to about 1 ulp; x is clamped to -87. Cody and Waite's range reduction and a polynomial, without
+/// branches for vectorisation.
 #[inline(always)]
 fn exp_of_negative(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23: adding it rounds to whole numbers
@@ -88,7 +90,7 @@ fn exp_of_negative(x: f32) -> f32 {
     polynomial * power
 }
 
-/// ln(1 + e) for e in [0, 1], to about two ulp also where e is small: 2 artanh(e / (2 + e)).
+/// ln(1 + e) for e in [0, 1], to about 2 ulp, also for small e: 2 artanh(e / (2 + e)).
 #[inline(always)]
 fn ln_1p_of_unit(e: f32) -> f32 {
     let s = e / (2.0 + e);
@@ -149,7 +151,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_threads_changes_no_bit() {
+    fn the_result_is_bit_equal_for_any_number_of_threads() {
         let (logits, labels, weights) = case(20_000, 3);
         assert_same_for_threads(|| {
             let mut gradient = Vec::new();
@@ -159,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_comes_out() {
+    fn nan_propagates() {
         let (mut logits, labels, weights) = case(20, 2);
         logits[7] = f32::NAN;
         let mut gradient = Vec::new();

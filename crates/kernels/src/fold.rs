@@ -1,36 +1,36 @@
-//! A batch norm with fixed statistics as part of the convolution before it.
+//! Folding of a batch norm with fixed statistics into the preceding convolution.
 
 use crate::batch_norm::Statistics;
 
-/// Weights and bias that give what the convolution and the batch norm behind it give.
+/// Weights and bias of the convolution with the batch norm folded in.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Folded {
-    /// In the form of the weights that were given.
+    /// In the layout of the given weights.
     pub weight: Vec<f32>,
-    /// `[outputs]`.
+    /// Bias, `[outputs]`.
     pub bias: Vec<f32>,
 }
 
-/// Learned and measured parameters of a batch norm.
+/// Parameters and statistics of a batch norm.
 #[derive(Clone, Copy, Debug)]
 pub struct NormParameters<'a> {
     /// Scale, `[channels]`.
     pub gamma: &'a [f32],
     /// Shift, `[channels]`.
     pub beta: &'a [f32],
-    /// Of the past batches.
+    /// Running statistics.
     pub statistics: &'a Statistics,
     /// Added to the variance.
     pub epsilon: f64,
 }
 
 impl NormParameters<'_> {
-    /// The norm behind a convolution with weights `[outputs, ...]` (3x3, 1x1, linear).
+    /// Folds the norm into the preceding convolution with weights `[outputs, ...]` (3x3, 1x1, linear).
     pub fn fold_into_conv(&self, weight: &[f32]) -> Folded {
         self.fold(weight, weight.len() / self.gamma.len().max(1), |at, of_an_output| at / of_an_output)
     }
 
-    /// The norm behind a transposed convolution with weights `[inputs, outputs, stride, stride]`.
+    /// Folds the norm into the preceding transposed convolution with weights `[inputs, outputs, stride, stride]`.
     pub fn fold_into_transposed(&self, weight: &[f32], stride: usize) -> Folded {
         let outputs = self.gamma.len();
         self.fold(weight, stride * stride, |at, of_a_pair| at / of_a_pair % outputs)
@@ -40,7 +40,7 @@ impl NormParameters<'_> {
         let Statistics { mean, variance } = self.statistics;
         assert!(
             group > 0 && weight.len().is_multiple_of(group * self.gamma.len()),
-            "weights of {} outputs",
+            "number of weights for {} outputs",
             self.gamma.len()
         );
         let scale: Vec<f64> =
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn gives_what_both_give() {
+    fn equals_convolution_and_norm() {
         let (gamma, beta, statistics) = norm(5);
         let parameters = NormParameters { gamma: &gamma, beta: &beta, statistics: &statistics, epsilon: 1e-3 };
         let conv =

@@ -1,4 +1,4 @@
-//! Batches of images as the schemes read and write them.
+//! Reading and writing of batches of images in tiles.
 
 use crate::blocks::Segment;
 use crate::epilogue::Epilogue;
@@ -19,7 +19,7 @@ pub(crate) struct ImageShape {
 }
 
 impl ImageShape {
-    /// A row of a channel, if the image has it.
+    /// A row of a channel; none if `y` is outside the image.
     #[inline(always)]
     pub fn row(&self, image: usize, channel: usize, y: isize) -> Option<ImageRow> {
         let inside = y >= 0 && (y as usize) < self.height;
@@ -28,17 +28,18 @@ impl ImageShape {
     }
 }
 
-/// Images that are read.
+/// Images for reading.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Images<'a> {
     /// `[batch, channels, height, width]`.
     pub values: &'a [f32],
-    /// Of one image.
+    /// Shape of one image.
     pub shape: ImageShape,
 }
 
 impl Images<'_> {
-    /// Every M-th pixel of a row, from `first` on, which may be -1: register j has pixels `first + j`, `first + j + M`, ... Zeros outside.
+    /// Every M-th pixel of a row, from `first` on, which may be -1: register j has pixels `first + j`, `first + j + M`,
+    /// ... Pixels outside the row are zero.
     #[inline(always)]
     pub fn every<S: Simd, const M: usize>(&self, simd: S, row: Option<ImageRow>, first: isize) -> [S::f32s; M] {
         let mut pixels = [simd.splat_f32s(0.0); M];
@@ -49,8 +50,8 @@ impl Images<'_> {
         deinterleave(simd, pixels)
     }
 
-    /// Has the processor fetch what a later block reads of a channel: of each tile `rows` rows from `above` over its first on, a tile being
-    /// `size` pixels wide.
+    /// Prefetches the pixels of a channel that a later block reads: `rows` rows of each tile, the first one `above`
+    /// rows above the tile. A tile is `size` pixels wide.
     #[inline(always)]
     pub fn prefetch(&self, segments: &[Segment], channel: usize, size: usize, (above, rows): (usize, usize)) {
         prefetch_tiles(self.values.as_ptr(), &self.shape, segments, channel, size, (above, rows));
@@ -102,25 +103,26 @@ fn prefetch_tiles(
     }
 }
 
-/// Images that are written, by several threads.
+/// Images that several threads write.
 #[derive(Clone, Copy)]
 pub(crate) struct ImagesOut<'a> {
     /// `[batch, channels, height, width]`.
     pub values: Shared<'a>,
-    /// Of one image.
+    /// Shape of one image.
     pub shape: ImageShape,
-    /// What is done to each value first.
+    /// Applied to each value before it is written.
     pub epilogue: Epilogue<'a>,
 }
 
 impl ImagesOut<'_> {
-    /// As [`Images::prefetch`], for tiles of `size` times `size` pixels that are going to be written.
+    /// As [`Images::prefetch`], for tiles of `size` x `size` pixels that will be written.
     #[inline(always)]
     pub fn prefetch(&self, segments: &[Segment], channel: usize, size: usize) {
         prefetch_tiles(self.values.start(), &self.shape, segments, channel, size, (0, size));
     }
 
-    /// Writes the `M x M` pixels of the tiles of a segment from its tile `group` on, a register of tiles for each pixel, in one channel.
+    /// Writes the `M x M` pixels of one channel for the tiles of a segment from tile `group` on, one register of tiles
+    /// per pixel.
     ///
     /// # Safety
     /// No other thread writes these tiles.
@@ -139,7 +141,7 @@ impl ImagesOut<'_> {
                 *pixel = self.epilogue.apply(simd, channel, *pixel);
             }
             for (k, values) in interleave(simd, pixels).into_iter().enumerate() {
-                // SAFETY: passed on to the caller.
+                // SAFETY: required of the caller.
                 unsafe { store(simd, &self.values, row, (begin + k * S::F32_LANES, end), values) };
             }
         }
@@ -163,7 +165,7 @@ impl ImagesOut<'_> {
                 for (k, pixel) in tiles.as_flattened_mut().iter_mut().enumerate() {
                     *pixel = get(simd, rows(k), segment.at + group);
                 }
-                // SAFETY: passed on to the caller.
+                // SAFETY: required of the caller.
                 unsafe { self.write_tiles(simd, (segment, group), channel, tiles) };
             }
         }

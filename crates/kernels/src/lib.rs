@@ -1,10 +1,10 @@
-//! The hot operations of the networks on slices of f32.
+//! CPU kernels of the networks on slices of f32.
 //!
-//! Images are `[batch, channels, height, width]`, row-major, as burn and PyTorch have them. Every result is the same to the bit for any number of
-//! threads: work is cut by its size alone and partial sums are added in a fixed order. Which vector instructions run is found at run time
-//! ([`InstructionSet`]) and may change the last digits.
+//! Images are `[batch, channels, height, width]`, row-major, as in burn and PyTorch. Results are bit-equal for any
+//! number of threads: the division of work depends on its size alone, and partial sums are added in a fixed order. The
+//! vector instructions are chosen at run time ([`InstructionSet`]) and may change the last digits.
 //!
-//! Arguments are checked by assertions: shapes come from code, not from users.
+//! Arguments are checked by assertions, because shapes come from code and not from users.
 
 pub mod adam;
 pub mod batch_norm;

@@ -1,6 +1,6 @@
-//! Products of matrices in slices, by the crate `gemm` on one thread.
+//! Products of matrices in slices, with the crate `gemm` on one thread.
 
-/// A matrix whose elements have fixed distances.
+/// A strided matrix in a slice.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Matrix<'a> {
     values: &'a [f32],
@@ -11,33 +11,33 @@ pub(crate) struct Matrix<'a> {
 }
 
 impl<'a> Matrix<'a> {
-    /// `[rows, columns]`, row-major; `rows` as many as there are values for.
+    /// `[rows, columns]`, row-major; the number of rows follows from the number of values.
     pub fn new(values: &'a [f32], columns: usize) -> Self {
         let rows = values.len() / columns.max(1);
         assert_eq!(rows * columns, values.len(), "whole rows of {columns} values");
         Matrix { values, rows, columns, row_stride: columns, column_stride: 1 }
     }
 
-    /// `[rows, columns]` whose rows begin `row_stride` apart.
+    /// `[rows, columns]` with `row_stride` values from row to row.
     pub fn window(values: &'a [f32], rows: usize, columns: usize, row_stride: usize) -> Self {
         let needed = if rows == 0 { 0 } else { (rows - 1) * row_stride + columns };
         assert!(columns <= row_stride && values.len() >= needed, "{rows} rows of {columns} values");
         Matrix { values, rows, columns, row_stride, column_stride: 1 }
     }
 
-    /// Rows and columns exchanged.
+    /// The transposed matrix.
     pub fn transposed(self) -> Self {
         let Matrix { rows, columns, row_stride, column_stride, .. } = self;
         Matrix { rows: columns, columns: rows, row_stride: column_stride, column_stride: row_stride, ..self }
     }
 }
 
-/// What is done with the product.
+/// Whether the product replaces or is added to the output.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Then {
-    /// It replaces what was there.
+    /// Overwrite the output.
     Store,
-    /// It is added to what was there.
+    /// Add to the output.
     Add,
 }
 
@@ -51,8 +51,8 @@ pub(crate) fn multiply(a: Matrix<'_>, b: Matrix<'_>, out: &mut [f32], then: Then
     if out.is_empty() || a.columns == 0 {
         return;
     }
-    // SAFETY: `Matrix::new`, `window` and `transposed` keep all elements of the factors inside of their slices, `out` has as many as the product and is
-    // row-major, and a mutable slice overlaps nothing.
+    // SAFETY: `Matrix::new`, `window` and `transposed` keep all elements of the factors inside their slices. `out` is
+    // row-major and has the size of the product, and a mutable slice overlaps no other.
     unsafe {
         gemm::gemm(
             a.rows,

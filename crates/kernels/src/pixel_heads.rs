@@ -1,5 +1,5 @@
-//! 1x1 convolutions of the same image side by side, with the outputs of a pixel one behind the other: the heads of a detector, whose outputs
-//! are read anchor by anchor.
+//! Several 1x1 convolutions of the same image whose outputs are stored channels-last: the heads of a detector, whose
+//! outputs are read anchor by anchor.
 
 use crate::matrix::{Matrix, Then, multiply};
 use crate::output::{Shared, fill};
@@ -7,10 +7,10 @@ use crate::scratch;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Pixels that are worked on together.
+/// Pixels that are processed together.
 const PIXELS: usize = 256;
 
-/// Parts of the gradient by the weights, whatever the number of threads.
+/// Number of partial sums of the gradient with respect to the weights, for any number of threads.
 const PARTS: usize = 16;
 
 /// The shape of the heads.
@@ -29,22 +29,22 @@ pub struct PixelHeads {
 /// Gradients of [`PixelHeads`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct PixelHeadGradients {
-    /// By `x`, `[batch, inputs, pixels]`.
+    /// With respect to `x`, `[batch, inputs, pixels]`.
     pub x: Vec<f32>,
-    /// By the weights, `[K, inputs]`.
+    /// With respect to the weights, `[K, inputs]`.
     pub weight: Vec<f32>,
-    /// By the biases, `[K]`.
+    /// With respect to the biases, `[K]`.
     pub bias: Vec<f32>,
 }
 
-/// Some pixels of one image.
+/// A range of pixels of one image.
 struct Block {
     image: usize,
     pixels: Range<usize>,
 }
 
 impl PixelHeads {
-    /// All heads one behind the other, each `[batch, pixels, outputs]`; `y` is overwritten, whatever it held.
+    /// Computes all heads; `y` holds one after the other, each `[batch, pixels, outputs]`, and is overwritten.
     ///
     /// # Shapes
     /// `x`: `[batch, inputs, pixels]`; `weight`: `[K, inputs]`, head after head; `bias`: `[K]`.
@@ -79,7 +79,7 @@ impl PixelHeads {
         unsafe { fill(y, self.batch * self.pixels * all, |y| work(Shared::new(y))) };
     }
 
-    /// Gradients by everything.
+    /// All gradients.
     ///
     /// # Shapes
     /// `dy`: as `y` of [`PixelHeads::forward`].
@@ -153,14 +153,14 @@ impl PixelHeads {
         Matrix::window(&x[first..end], self.inputs, block.pixels.len(), self.pixels).transposed()
     }
 
-    /// Where a block's rows of a head begin in `y`; `head`: its channels among all.
+    /// Offset of a block's rows of a head in `y`; `head`: its range among all channels.
     fn place(&self, block: &Block, head: &Range<usize>) -> usize {
         let pixels = self.batch * self.pixels;
         head.start * pixels + (block.image * self.pixels + block.pixels.start) * head.len()
     }
 }
 
-/// The channels of each head among all.
+/// The range of each head among all channels.
 fn for_heads(outputs: &[usize], mut work: impl FnMut(Range<usize>)) {
     let mut first = 0;
     for &channels in outputs {
@@ -235,14 +235,14 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_threads_changes_no_bit() {
+    fn the_result_is_bit_equal_for_any_number_of_threads() {
         let heads = PixelHeads { batch: 2, inputs: 33, pixels: 1500, outputs: vec![18, 7] };
         let values = inputs(&heads);
         assert_same_for_threads(|| run(&heads, &values));
     }
 
     #[test]
-    fn what_is_not_a_number_comes_out() {
+    fn nan_propagates() {
         let heads = PixelHeads { batch: 1, inputs: 3, pixels: 40, outputs: vec![2, 1] };
         let mut values = inputs(&heads);
         (values[0][40 + 7], values[3][5 * 2]) = (f32::NAN, f32::NAN);

@@ -1,4 +1,4 @@
-//! What the tests of all kernels share: random values, comparison with f64, one thread against several.
+//! Shared by the tests of all kernels: random values, comparison with f64, comparison of thread counts.
 
 /// Values in [-1, 1), the same on every machine (xorshift).
 pub fn random(n: usize, seed: u64) -> Vec<f32> {
@@ -12,7 +12,7 @@ pub fn random(n: usize, seed: u64) -> Vec<f32> {
     (0..n).map(next).collect()
 }
 
-/// The largest difference is at most `tolerance` times the largest value.
+/// Asserts that the largest difference is at most `tolerance` times the largest value.
 pub fn assert_close(got: &[f32], want: &[f64], tolerance: f64, what: &str) {
     assert_eq!(got.len(), want.len(), "elements of {what}");
     let largest = want.iter().fold(0.0f64, |m, v| m.max(v.abs())).max(1e-30);
@@ -22,7 +22,7 @@ pub fn assert_close(got: &[f32], want: &[f64], tolerance: f64, what: &str) {
     }
 }
 
-/// One, two and three threads give the same bits.
+/// Asserts that one, two and three threads give the same bits.
 pub fn assert_same_for_threads<const N: usize>(work: impl Fn() -> [Vec<f32>; N] + Sync) {
     let bits = |threads: usize| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
@@ -31,6 +31,6 @@ pub fn assert_same_for_threads<const N: usize>(work: impl Fn() -> [Vec<f32>; N] 
     let one = bits(1);
     assert!(one.iter().any(|values| !values.is_empty()));
     for threads in [2, 3] {
-        assert!(bits(threads) == one, "{threads} threads give other bits");
+        assert!(bits(threads) == one, "{threads} threads give different bits");
     }
 }

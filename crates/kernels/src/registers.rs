@@ -1,4 +1,4 @@
-//! Registers of pixels: out of and into rows of images and panels, every M-th pixel apart and back together.
+//! Vector registers of pixels: loads, stores and (de)interleaving of rows of images and panels.
 
 use crate::output::Shared;
 use crate::tile::Row;
@@ -9,9 +9,9 @@ use std::any::Any;
 /// A row of one channel of one image within a tensor.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ImageRow {
-    /// Place of its first pixel.
+    /// Index of its first pixel.
     pub start: usize,
-    /// Number of its pixels.
+    /// Number of pixels.
     pub width: usize,
 }
 
@@ -40,7 +40,7 @@ pub(crate) fn load<S: Simd>(simd: S, tensor: &[f32], row: ImageRow, first: isize
     unsafe { simd.mask_load_ptr_f32s(mask, place) }
 }
 
-/// Stores the lanes that are inside of the row and before `end`.
+/// Stores the lanes inside the row and before `end`.
 ///
 /// # Safety
 /// As [`Shared::write`].
@@ -56,17 +56,17 @@ pub(crate) unsafe fn store<S: Simd>(
     if count == 0 {
         return;
     }
-    // SAFETY: passed on to the caller.
+    // SAFETY: required of the caller.
     let place = unsafe { tensor.part(row.start + first, count) };
     let place: *mut f32 = place.as_mut_ptr().cast();
     if count == S::F32_LANES {
-        // SAFETY: the part has as many places as the register, and its type no alignment.
+        // SAFETY: the slice has as many elements as the register, and its type needs no alignment.
         unsafe { place.cast::<S::f32s>().write_unaligned(values) };
         return;
     }
     #[cfg(target_arch = "x86_64")]
     if let Some(v4) = (&simd as &dyn Any).downcast_ref::<pulp::x86::V4>() {
-        // SAFETY: the part's `count` lanes are written, no other.
+        // SAFETY: only the `count` lanes of the slice are written.
         unsafe { v4.avx512f._mm512_mask_storeu_ps(place, (1 << count) - 1, cast(values)) };
         return;
     }
@@ -74,8 +74,8 @@ pub(crate) unsafe fn store<S: Simd>(
     unsafe { simd.mask_store_ptr_f32s(simd.mask_between_m32s(0, count as u32), place, values) };
 }
 
-/// Has the processor fetch a place that will be read or written in a while; any address will do. The rows of an image's channels lie far apart, in more
-/// streams than processors foresee.
+/// Prefetches an address that will be read or written later; any address is valid. The rows of an image's channels are
+/// far apart, in more streams than hardware prefetchers follow.
 #[inline(always)]
 pub(crate) fn prefetch(place: *const f32) {
     #[cfg(target_arch = "x86_64")]
@@ -87,13 +87,13 @@ pub(crate) fn prefetch(place: *const f32) {
     let _ = place;
 }
 
-/// The values of a panel's row from `at` on, zeros behind its end.
+/// The values of a panel's row from `at` on; zeros after its end.
 #[inline(always)]
 pub(crate) fn get<S: Simd>(simd: S, row: &Row, at: usize) -> S::f32s {
     load(simd, row, ImageRow { start: 0, width: row.len() }, at as isize)
 }
 
-/// Puts values into a panel's row from `at` on, as many as it has places for.
+/// Writes values to a panel's row from `at` on, up to its end.
 #[inline(always)]
 pub(crate) fn put<S: Simd>(simd: S, row: &mut Row, at: usize, values: S::f32s) {
     match row.get_mut(at..at + S::F32_LANES) {
@@ -102,7 +102,7 @@ pub(crate) fn put<S: Simd>(simd: S, row: &mut Row, at: usize, values: S::f32s) {
             let rest = &mut row[at..];
             #[cfg(target_arch = "x86_64")]
             if let Some(v4) = (&simd as &dyn Any).downcast_ref::<pulp::x86::V4>() {
-                // SAFETY: `rest` has fewer places than the register has lanes; only these are written.
+                // SAFETY: `rest` has fewer elements than the register has lanes; only these are written.
                 unsafe { v4.avx512f._mm512_mask_storeu_ps(rest.as_mut_ptr(), (1 << rest.len()) - 1, cast(values)) };
                 return;
             }
@@ -111,7 +111,7 @@ pub(crate) fn put<S: Simd>(simd: S, row: &mut Row, at: usize, values: S::f32s) {
     }
 }
 
-/// From `M` registers of neighbouring pixels those of every M-th pixel: the j-th has pixels j, M + j, 2 M + j, ... M is 1, 2 or 4.
+/// Deinterleaves `M` registers of adjacent pixels: the j-th result has pixels j, M + j, 2 M + j, ... M is 1, 2 or 4.
 #[inline(always)]
 pub(crate) fn deinterleave<S: Simd, const M: usize>(simd: S, pixels: [S::f32s; M]) -> [S::f32s; M] {
     let mut apart = pixels;
@@ -145,7 +145,7 @@ pub(crate) fn interleave<S: Simd, const M: usize>(simd: S, apart: [S::f32s; M]) 
     pixels
 }
 
-/// The values at even and at odd places of `a` and `b` one after the other.
+/// The even and the odd elements of the concatenation of `a` and `b`.
 #[inline(always)]
 fn pairs_apart<S: Simd>(simd: S, a: S::f32s, b: S::f32s) -> (S::f32s, S::f32s) {
     #[cfg(target_arch = "x86_64")]

@@ -1,4 +1,4 @@
-//! Convolutions as products of small matrices, block by block in cache.
+//! Convolutions as products of small matrices, in blocks that fit the cache.
 
 use crate::blocks::{Segment, TileGrid};
 use crate::scratch;
@@ -7,30 +7,30 @@ use pulp::Simd;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// What a convolution reads for a block of tiles, which products it takes, and what it makes of them.
+/// A convolution algorithm: what it reads for a block of tiles, its matrix products, and how it writes the result.
 ///
-/// The panel of a block has rows of [`PIXELS`] values, one a tile. A product multiplies weights `[outputs, rows]` with some of
-/// the panel's rows.
+/// The panel of a block has rows of [`PIXELS`] values, one a tile. A product multiplies weights `[outputs, rows]` with
+/// a range of the panel's rows.
 pub(crate) trait Scheme: Sync {
     /// The tiles.
     fn grid(&self) -> TileGrid;
 
-    /// Channels read.
+    /// Input channels.
     fn inputs(&self) -> usize;
 
-    /// Channels written.
+    /// Output channels.
     fn outputs(&self) -> usize;
 
     /// Rows of the panel.
     fn panel_rows(&self) -> usize;
 
-    /// The rows of the panel that each product takes.
+    /// The rows of the panel that each product reads.
     fn products(&self) -> Vec<Range<usize>>;
 
-    /// Has the processor fetch what [`Scheme::read`] will read of another block.
+    /// Prefetches what [`Scheme::read`] will read of another block.
     fn prefetch_input(&self, segments: &[Segment], channel: usize);
 
-    /// Has the processor fetch what [`Scheme::write`] will write.
+    /// Prefetches what [`Scheme::write`] will write.
     fn prefetch_output(&self, segments: &[Segment], channel: usize);
 
     /// Writes the rows of one input channel into the panel.
@@ -65,11 +65,15 @@ impl PackedWeights {
     }
 }
 
-/// Runs a scheme over all its blocks.
+/// Runs a scheme over all blocks.
 pub(crate) fn run<C: Scheme>(scheme: &C, weights: &PackedWeights) {
     let products = scheme.products();
     let rows: usize = products.iter().map(Range::len).sum();
-    assert_eq!((weights.outputs, weights.rows), (scheme.outputs(), rows), "weights packed for another convolution");
+    assert_eq!(
+        (weights.outputs, weights.rows),
+        (scheme.outputs(), rows),
+        "weights were packed for another convolution"
+    );
     let tile_rows = weights.tile_rows;
     (0..scheme.grid().blocks()).into_par_iter().for_each(|block| {
         let lengths = [scheme.panel_rows() * PIXELS, products.len() * tile_rows * PIXELS];

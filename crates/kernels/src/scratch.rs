@@ -1,4 +1,4 @@
-//! Memory for intermediate values that a thread keeps from one piece of work to the next.
+//! Thread-local scratch memory for intermediate values.
 
 use std::cell::RefCell;
 
@@ -9,9 +9,9 @@ thread_local! {
     static KEPT: RefCell<Vec<Vec<f32>>> = const { RefCell::new(Vec::new()) };
 }
 
-/// Lends buffers of these lengths, each beginning at a cache line, with what earlier work left in them.
+/// Lends buffers of these lengths, aligned to cache lines, with undefined contents.
 ///
-/// Work that asks again inside of `work` gets other memory.
+/// Nested calls inside `work` get other memory.
 pub(crate) fn with<const N: usize, R>(lengths: [usize; N], work: impl FnOnce([&mut [f32]; N]) -> R) -> R {
     let mut memory = KEPT.with_borrow_mut(Vec::pop).unwrap_or_default();
     let needed = lengths.iter().map(|n| n.next_multiple_of(LINE)).sum::<usize>() + LINE;

@@ -4,13 +4,13 @@ use pulp::{Scalar128b, Simd, WithSimd};
 use std::ops::{Add, Mul, Sub};
 use std::sync::LazyLock;
 
-/// The environment variable that keeps the kernels from newer instructions: `portable`, `neon`, `avx2` or `avx512`.
+/// The environment variable that limits the instruction set: `portable`, `neon`, `avx2` or `avx512`.
 pub const VARIABLE: &str = "LIDARSHIFT_SIMD";
 
 /// A set of vector instructions. The last digits of a sum depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum InstructionSet {
-    /// Four lanes in plain Rust, which every compiler target has instructions for; no fused multiply-add.
+    /// Four lanes in plain Rust, for every compiler target; no fused multiply-add.
     Portable,
     /// ARM: four lanes, fused multiply-add, 32 registers.
     Neon,
@@ -20,16 +20,16 @@ pub enum InstructionSet {
     Avx512,
 }
 
-/// The variable [`VARIABLE`] holds something else than the name of a set.
+/// The variable [`VARIABLE`] does not hold the name of an instruction set.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{VARIABLE} is \"{0}\"; it may be portable, neon, avx2 or avx512, or not set at all")]
 pub struct UnknownInstructionSet(pub String);
 
 impl InstructionSet {
-    /// The set in use: the best of this processor that is not above the one named in [`VARIABLE`].
+    /// The set in use: the fastest one of this processor, limited by [`VARIABLE`].
     ///
     /// # Errors
-    /// An unknown name in the variable. The kernels use the best set then.
+    /// An unknown name in the variable. The kernels then use the fastest set.
     pub fn in_use() -> Result<Self, UnknownInstructionSet> {
         IN_USE.clone()
     }
@@ -47,7 +47,7 @@ impl InstructionSet {
         sets
     }
 
-    /// As [`VARIABLE`] spells it.
+    /// Its name in [`VARIABLE`].
     pub fn name(self) -> &'static str {
         match self {
             InstructionSet::Portable => "portable",
@@ -70,7 +70,7 @@ static IN_USE: LazyLock<Result<InstructionSet, UnknownInstructionSet>> = LazyLoc
     InstructionSet::not_above(if name.is_empty() { InstructionSet::Avx512.name() } else { &name })
 });
 
-/// Proof that the processor has the instructions, as pulp wants it.
+/// The token of pulp which proves that the processor has the instructions.
 #[derive(Clone, Copy)]
 enum Token {
     Portable,
@@ -96,8 +96,9 @@ static TOKEN: LazyLock<Token> = LazyLock::new(|| {
     token.unwrap_or(Token::Portable)
 });
 
-/// Runs `kernel` with the instructions in use. Everything that it calls has to be `#[inline(always)]` to be compiled with them; registers are
-/// not to be worked on in closures given to the standard library (`array::from_fn`, `map`), which are functions of their own.
+/// Runs `kernel` with the instruction set in use. Every function that it calls must be `#[inline(always)]` to be
+/// compiled with this set. Do not use registers in closures passed to the standard library (`array::from_fn`, `map`):
+/// these are separate functions.
 pub(crate) fn dispatch<K: WithSimd>(kernel: K) -> K::Output {
     match *TOKEN {
         #[cfg(target_arch = "aarch64")]
@@ -110,7 +111,7 @@ pub(crate) fn dispatch<K: WithSimd>(kernel: K) -> K::Output {
     }
 }
 
-/// Runs a closure compiled with the instructions in use: loops over plain `f32` in it are vectorised by the compiler.
+/// Runs a closure compiled with the instruction set in use, so that the compiler vectorises its loops over `f32`.
 pub(crate) fn vectorized<R>(work: impl FnOnce() -> R) -> R {
     struct Work<F>(F);
     impl<R, F: FnOnce() -> R> WithSimd for Work<F> {
@@ -124,7 +125,7 @@ pub(crate) fn vectorized<R>(work: impl FnOnce() -> R) -> R {
     dispatch(Work(work))
 }
 
-/// One register of values with the arithmetic written as usual.
+/// One register of values with overloaded arithmetic operators.
 #[derive(Clone, Copy)]
 pub(crate) struct Lanes<S: Simd> {
     simd: S,
@@ -166,7 +167,7 @@ impl<S: Simd> Mul<f32> for Lanes<S> {
     }
 }
 
-/// `a b + c`, fused where the processor can.
+/// `a b + c`, fused if the instruction set has fused multiply-add.
 #[inline(always)]
 pub(crate) fn multiply_add<S: Simd>(simd: S, a: S::f32s, b: S::f32s, c: S::f32s) -> S::f32s {
     // In pulp's portable set the fused form is a function call for each lane.
@@ -196,7 +197,7 @@ mod tests {
         );
     }
 
-    /// The comparisons with the definitions, each in a process of its own: a set is chosen once.
+    /// Runs the comparisons with the definitions in one process per set, because the set is chosen once per process.
     #[test]
     fn kernels_equal_their_definitions_with_older_instructions() {
         if std::env::var_os(VARIABLE).is_some() {
@@ -207,7 +208,7 @@ mod tests {
         for set in sets {
             let tests = std::env::current_exe().unwrap();
             let run = std::process::Command::new(tests)
-                .args(["equals_the", "comes_out", "the_named_set_is_in_use"])
+                .args(["equals_the", "nan_propagates", "the_named_set_is_in_use"])
                 .env(VARIABLE, set.name())
                 .output()
                 .unwrap();

@@ -3,7 +3,7 @@
 use crate::simd::{dispatch, multiply_add};
 use pulp::{Simd, WithSimd};
 
-/// Pixels (or tiles) that are worked on together: two registers of sixteen lanes, four of eight, eight of four.
+/// Pixels (or tiles) that are processed together: two registers of sixteen lanes, four of eight, eight of four.
 pub(crate) const PIXELS: usize = 32;
 
 /// Values of [`PIXELS`] pixels.
@@ -12,16 +12,16 @@ pub(crate) type Row = [f32; PIXELS];
 /// `R` rows of `V` registers.
 pub(crate) type Tile<S, const R: usize, const V: usize> = [[<S as Simd>::f32s; V]; R];
 
-/// Work in tiles of `R` rows and `V` registers.
+/// A computation in register tiles of `R` rows and `V` registers.
 pub(crate) trait TileWork {
-    /// What comes out.
+    /// Its result.
     type Output;
 
-    /// To be `#[inline(always)]`, as everything that it calls.
+    /// Must be `#[inline(always)]`, like every function that it calls.
     fn run<S: Simd, const R: usize, const V: usize>(self, simd: S) -> Self::Output;
 }
 
-/// Runs `work` with the instructions in use, in tiles that fill their registers.
+/// Runs `work` with the instruction set in use and the largest tiles that fit its registers.
 pub(crate) fn dispatch_tiles<W: TileWork>(work: W) -> W::Output {
     struct Sized<W>(W);
     impl<W: TileWork> WithSimd for Sized<W> {
@@ -29,7 +29,7 @@ pub(crate) fn dispatch_tiles<W: TileWork>(work: W) -> W::Output {
 
         #[inline(always)]
         fn with_simd<S: Simd>(self, simd: S) -> W::Output {
-            // The sums, a row of the right factor, and one value of the left.
+            // Registers: the sums, a row of the right factor, and one value of the left factor.
             if S::REGISTER_COUNT >= 32 { self.0.run::<S, 8, 2>(simd) } else { self.0.run::<S, 6, 2>(simd) }
         }
     }
@@ -50,7 +50,7 @@ pub(crate) fn tile_rows() -> usize {
     dispatch_tiles(Rows)
 }
 
-/// Zeros to begin with.
+/// A tile of zeros.
 #[inline(always)]
 pub(crate) fn zeros<S: Simd, const R: usize, const V: usize>(simd: S) -> Tile<S, R, V> {
     [[simd.splat_f32s(0.0); V]; R]
@@ -77,8 +77,8 @@ pub(crate) fn product<S: Simd, const R: usize, const V: usize>(
     tile
 }
 
-/// `tile[r][c] + sum over k < count of left[r][k] right[k][at + c]`, c: the lanes of `V` registers; `right` has `stride`
-/// values a row.
+/// `tile[r][c] + sum over k < count of left[r][k] right[k][at + c]`, c: the lanes of `V` registers; `right` has
+/// `stride` values a row.
 #[inline(always)]
 pub(crate) fn outer<S: Simd, const R: usize, const V: usize>(
     simd: S,

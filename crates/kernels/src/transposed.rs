@@ -1,4 +1,4 @@
-//! Transposed convolution whose kernel is its stride, without bias: the neck that brings all blocks to one size.
+//! Transposed convolution with kernel size equal to stride and without bias: the upsampling of the 2D backbone.
 
 use crate::epilogue::Epilogue;
 use crate::images::{ImageShape, Images, ImagesOut};
@@ -7,8 +7,8 @@ use crate::scheme::{PackedWeights, run};
 use crate::upsampling::{Expand, Gather, PixelPanels, pack_expand, pack_gather};
 use crate::weight_gradient::weight_gradient;
 
-/// A transposed convolution of images `[batch, inputs, height, width]` with weights `[inputs, outputs, stride, stride]` to images
-/// `[batch, outputs, height * stride, width * stride]`.
+/// A transposed convolution of images `[batch, inputs, height, width]` with weights `[inputs, outputs, stride, stride]`
+/// to images `[batch, outputs, height * stride, width * stride]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TransposedConv {
     /// Images.
@@ -21,7 +21,7 @@ pub struct TransposedConv {
     pub height: usize,
     /// Columns of `x`.
     pub width: usize,
-    /// Rows and columns of `y` for one of `x`; see [`TransposedConv::STRIDES`].
+    /// Upsampling factor; one of [`TransposedConv::STRIDES`].
     pub stride: usize,
 }
 
@@ -41,13 +41,13 @@ macro_rules! with_stride {
                 const $M: usize = 4;
                 $work
             }
-            _ => panic!("a stride of 1, 2 or 4: {:?}", $conv),
+            _ => panic!("the stride must be 1, 2 or 4: {:?}", $conv),
         }
     };
 }
 
 impl TransposedConv {
-    /// Strides that there are kernels for.
+    /// Supported strides.
     pub const STRIDES: [usize; 3] = [1, 2, 4];
 
     fn x_shape(&self) -> ImageShape {
@@ -78,22 +78,23 @@ impl TransposedConv {
         (input * self.outputs + output) * self.stride * self.stride
     }
 
-    /// The weights `[inputs, outputs, stride, stride]` in the form that [`TransposedConv::forward`] reads; it may be kept.
+    /// The weights `[inputs, outputs, stride, stride]` packed for [`TransposedConv::forward`]. The result may be
+    /// reused.
     pub fn pack(&self, weight: &[f32]) -> PackedWeights {
         assert_eq!(weight.len(), self.weight_len(), "elements of the weights of {self:?}");
         let weight = |output, input, pixel| weight[self.weight_at(input, output) + pixel];
         with_stride!(self, M => pack_expand::<M>(self.inputs, self.outputs, weight))
     }
 
-    /// `y`, overwritten, whatever it held.
+    /// Computes `y`, which is overwritten.
     ///
     /// # Shapes
     /// `x`: `[batch, inputs, height, width]`; `y`: `[batch, outputs, height * stride, width * stride]`.
     pub fn forward(&self, x: &[f32], weights: &PackedWeights, epilogue: Epilogue<'_>, y: &mut Vec<f32>) {
         assert_eq!(x.len(), self.x_len(), "elements of x of {self:?}");
-        assert!(epilogue.bias.is_none_or(|b| b.len() == self.outputs), "one bias an output of {self:?}");
+        assert!(epilogue.bias.is_none_or(|b| b.len() == self.outputs), "biases of {self:?}");
         let (batch, x) = (self.batch, Images { values: x, shape: self.x_shape() });
-        // SAFETY: every pixel of x is in one of the blocks, and the pixels that it becomes cover y.
+        // SAFETY: every pixel of x is in one of the blocks, and their output pixels cover y.
         unsafe {
             fill(y, self.y_len(), |y| {
                 let y = ImagesOut { values: Shared::new(y), shape: self.y_shape(), epilogue };
@@ -102,7 +103,7 @@ impl TransposedConv {
         }
     }
 
-    /// Gradient by `x`; `dx` is overwritten, whatever it held.
+    /// Gradient with respect to `x`; `dx` is overwritten.
     ///
     /// # Shapes
     /// `dy`: `[batch, outputs, height * stride, width * stride]`; `dx`: `[batch, inputs, height, width]`.
@@ -124,7 +125,7 @@ impl TransposedConv {
         }
     }
 
-    /// Gradient by the weights, `[inputs, outputs, stride, stride]`.
+    /// Gradient with respect to the weights, `[inputs, outputs, stride, stride]`.
     ///
     /// # Shapes
     /// `x`: `[batch, inputs, height, width]`; `dy`: `[batch, outputs, height * stride, width * stride]`.
@@ -175,7 +176,7 @@ mod tests {
         }
     }
 
-    /// Places of x, y and weight that meet.
+    /// Indices of x, y and weight in each product of the definition.
     fn pairs(conv: &TransposedConv) -> Vec<(usize, usize, usize)> {
         let (s, shape) = (conv.stride, conv.y_shape());
         let mut all = Vec::new();
@@ -194,7 +195,7 @@ mod tests {
     }
 
     #[test]
-    fn the_number_of_threads_changes_no_bit() {
+    fn the_result_is_bit_equal_for_any_number_of_threads() {
         for stride in TransposedConv::STRIDES {
             let conv = TransposedConv { batch: 2, inputs: 10, outputs: 7, height: 30, width: 41, stride };
             let [x, w, dy] = inputs(&conv);
@@ -203,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_number_comes_out() {
+    fn nan_propagates() {
         for stride in TransposedConv::STRIDES {
             let conv = TransposedConv { batch: 1, inputs: 2, outputs: 3, height: 3, width: 35, stride };
             let [mut x, w, mut dy] = inputs(&conv);

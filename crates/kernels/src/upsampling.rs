@@ -1,5 +1,6 @@
-//! Products of the channels of single pixels: one pixel becomes `M x M`, or `M x M` become one. With `M = 1` this is a 1x1 convolution, else a
-//! transposed convolution whose kernel is its stride, and its gradients.
+//! Matrix products over the channels of single pixels: one pixel maps to `M x M` pixels, or `M x M` pixels to one. With
+//! `M = 1` this is a 1x1 convolution, otherwise a transposed convolution with kernel size equal to stride, and its
+//! gradients.
 
 use crate::blocks::{Segment, TileGrid};
 use crate::images::{ImageShape, Images, ImagesOut};
@@ -9,7 +10,7 @@ use crate::weight_gradient::Panels;
 use pulp::Simd;
 use std::ops::Range;
 
-/// From each pixel of `x` `M x M` pixels of `y`. Nothing else may be writing there.
+/// Maps each pixel of `x` to `M x M` pixels of `y`. No other code may write there.
 pub(crate) struct Expand<'a, const M: usize> {
     pub batch: usize,
     pub x: Images<'a>,
@@ -78,7 +79,7 @@ impl<const M: usize> Scheme for Expand<'_, M> {
     }
 }
 
-/// From `M x M` pixels of `dy` one pixel of `dx`. Nothing else may be writing there.
+/// Maps `M x M` pixels of `dy` to one pixel of `dx`. No other code may write there.
 pub(crate) struct Gather<'a, const M: usize> {
     pub batch: usize,
     pub dy: Images<'a>,
@@ -143,12 +144,12 @@ impl<const M: usize> Scheme for Gather<'_, M> {
     }
 }
 
-/// The factors of the gradient by the weights of [`Expand`].
+/// The factors of the gradient with respect to the weights of [`Expand`].
 pub(crate) struct PixelPanels<'a, const M: usize, W> {
     pub batch: usize,
     pub x: Images<'a>,
     pub dy: Images<'a>,
-    /// Place of the first weight of (input, output).
+    /// Index of the first weight of (input, output).
     pub weight_at: W,
 }
 

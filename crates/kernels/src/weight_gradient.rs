@@ -1,7 +1,8 @@
-//! Gradients by weights: for each block of tiles the product of a panel of `x` with one of `dy`, summed over all blocks.
+//! Gradients with respect to weights: for each block of tiles the product of a panel of `x` with one of `dy`, summed
+//! over all blocks.
 //!
-//! The blocks are cut into parts by their number alone, and the sums of the parts are added in order, so the result does not depend on the
-//! number of threads.
+//! The division of the blocks into parts depends on their number alone, and the sums of the parts are added in order.
+//! The result therefore does not depend on the number of threads.
 
 use crate::blocks::{Segment, TileGrid};
 use crate::images::Images;
@@ -12,24 +13,24 @@ use pulp::Simd;
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Blocks that a part has at least, where there are that many: below, adding up the parts takes longer than the products.
+/// Smallest number of blocks in a part; with fewer, adding up the parts takes longer than the products.
 const BLOCKS_A_PART: usize = 12;
 const MOST_PARTS: usize = 16;
 
-/// Outputs that are worked on together.
+/// Outputs that are processed together.
 const OUTPUTS_AT_ONCE: usize = 128;
 
-/// Outputs whose weights are made together.
+/// Outputs whose weights are computed together.
 const OUTPUTS_A_TASK: usize = 16;
 
-/// Positions times rows, and weights of a pair of channels, at most.
+/// Upper limit of positions times rows, and of the weights of a pair of channels.
 const MOST: usize = 36;
 
-/// What is multiplied for a block of tiles, and what becomes of the sums.
+/// The factors of the product for a block of tiles, and the computation of the weights from the sums.
 ///
-/// The sums are those over tiles t of `x[p][input * ROWS + row][t] dy[p][t][output]`, `[POSITIONS, inputs * ROWS, outputs]`.
+/// The sums over tiles t are `x[p][input * ROWS + row][t] dy[p][t][output]`, `[POSITIONS, inputs * ROWS, outputs]`.
 pub(crate) trait Panels: Sync {
-    /// Values that a tile of `dy` becomes.
+    /// Transformed values of a tile of `dy`.
     const POSITIONS: usize;
     /// Whether the panel of `x` is the same for all positions.
     const X_SHARED: bool;
@@ -46,19 +47,20 @@ pub(crate) trait Panels: Sync {
     /// Channels of `x`.
     fn inputs(&self) -> usize;
 
-    /// `dy`, its channels the outputs.
+    /// `dy`; its channels are the outputs.
     fn dy(&self) -> Images<'_>;
 
-    /// Place of the first weight of a pair of channels.
+    /// Index of the first weight of a pair of channels.
     fn weight_at(&self, input: usize, output: usize) -> usize;
 
-    /// Has the processor fetch what [`Panels::read_x`] will read of another block.
+    /// Prefetches what [`Panels::read_x`] will read of another block.
     fn prefetch_x(&self, segments: &[Segment], input: usize);
 
     /// Writes the rows of an input: row r of position p to `panel[p * stride + r]`.
     fn read_x<S: Simd>(&self, simd: S, segments: &[Segment], input: usize, panel: &mut [Row], stride: usize);
 
-    /// From the pixels of `dy` of one tile, `[TILE * TILE, columns]`, the values of each position p, to `to[p * step..][..columns]`.
+    /// From the pixels of `dy` of one tile, `[TILE * TILE, columns]`, the values of each position p, to `to[p *
+    /// step..][..columns]`.
     #[inline(always)]
     fn transform_dy<S: Simd>(&self, _: S, pixels: &[f32], columns: usize, to: &mut [f32], step: usize) {
         for (p, pixels) in pixels.chunks_exact(columns).enumerate() {
@@ -73,7 +75,8 @@ pub(crate) trait Panels: Sync {
     }
 }
 
-/// Sizes of the sums of a part: `[positions, rows, columns]`, rows and columns rounded up to whole tiles of the innermost loop.
+/// Sizes of the sums of a part: `[positions, rows, columns]`, rows and columns rounded up to whole tiles of the
+/// innermost loop.
 #[derive(Clone, Copy)]
 struct Sums {
     positions: usize,
@@ -87,7 +90,7 @@ impl Sums {
     }
 }
 
-/// The gradient, each pair of channels where [`Panels::weight_at`] puts it.
+/// The gradient; [`Panels::weight_at`] gives the index of each pair of channels.
 pub(crate) fn weight_gradient<P: Panels>(panels: &P) -> Vec<f32> {
     let (blocks, inputs, outputs) = (panels.grid().blocks(), panels.inputs(), panels.dy().shape.channels);
     let len = inputs * outputs * P::TAPS;
@@ -129,7 +132,7 @@ fn sum_part<P: Panels>(panels: &P, blocks: Range<usize>, outputs: Range<usize>, 
         PIXELS * P::TILE * P::TILE * sums.columns,
     ];
     scratch::with(lengths, |[x_panel, dy_panel, pixels]| {
-        // What is beyond the inputs and outputs stays zero.
+        // The padding beyond the inputs and outputs stays zero.
         x_panel.fill(0.0);
         pixels.fill(0.0);
         let x_panel = x_panel.as_chunks_mut().0;
@@ -137,7 +140,7 @@ fn sum_part<P: Panels>(panels: &P, blocks: Range<usize>, outputs: Range<usize>, 
     });
 }
 
-/// The sums of a part of the blocks and some of the outputs.
+/// The sums of one part of the blocks for a range of outputs.
 struct Part<'a, P> {
     panels: &'a P,
     blocks: Range<usize>,
@@ -218,7 +221,7 @@ impl<P: Panels> Part<'_, P> {
     }
 }
 
-/// Adds the parts up and makes weights of them.
+/// Adds up the parts and computes the weights.
 struct Finish<'a, P, I> {
     panels: &'a P,
     parts: I,

@@ -1,8 +1,6 @@
-//! What a detector is: one TOML file in `configs/detectors`, typed once.
+//! The configuration of a detector: one TOML file in `configs/detectors`.
 
-mod pointrcnn;
-
-pub use pointrcnn::*;
+pub use crate::NetworkConfig;
 
 use crate::ModelError;
 use data::augment::AugmentConfig;
@@ -10,114 +8,26 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// A detector with everything that decides its numbers: classes, range, network, loss, detections, training.
+/// Configuration of a detector: classes, range, network, loss, detections, training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DetectorConfig {
     /// Name in run folders and tables.
     pub name: String,
-    /// Classes that the network tells apart; the data set must have them all.
+    /// Classes that the network distinguishes; the data set must have all of them.
     pub classes: Vec<String>,
     /// Values of a point that the network reads: 3 (x, y, z) or 4 (and intensity).
     pub channels: usize,
     /// `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame. Points and training boxes outside are dropped.
     pub range_m: [f32; 6],
-    /// The network's own sizes.
+    /// The network and its sizes.
     pub network: NetworkConfig,
     /// How the network is trained.
     #[serde(default)]
     pub optimization: OptimizationConfig,
-    /// How training frames are varied; the default is the reference's.
+    /// Augmentation of training frames; the default is that of OpenPCDet.
     #[serde(default)]
     pub augmentation: AugmentConfig,
-}
-
-/// Which network, and its sizes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(tag = "kind", rename_all = "lowercase")]
-pub enum NetworkConfig {
-    /// PointPillars (Lang et al. 2019) as OpenPCDet builds it.
-    PointPillars(PointPillarsConfig),
-    /// PointRCNN (Shi et al. 2019) as OpenPCDet builds it.
-    PointRcnn(PointRcnnConfig),
-}
-
-/// Sizes of PointPillars; the defaults are the published KITTI network.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct PointPillarsConfig {
-    /// Pillars.
-    #[serde(default)]
-    pub pillars: PillarsConfig,
-    /// Channels of the pillar feature net, one entry a layer; one layer is built.
-    #[serde(default = "default_vfe_filters")]
-    pub vfe_filters: usize,
-    /// The 2D backbone.
-    #[serde(default)]
-    pub backbone: BackboneConfig,
-    /// Anchors, one entry a class, in the order of `classes`.
-    pub anchors: Vec<AnchorConfig>,
-    /// Head and direction classifier.
-    #[serde(default)]
-    pub head: HeadConfig,
-    /// Weights of the losses.
-    #[serde(default)]
-    pub loss: LossConfig,
-    /// From head outputs to boxes.
-    #[serde(default)]
-    pub detection: DetectionConfig,
-}
-
-fn default_vfe_filters() -> usize {
-    64
-}
-
-/// Size and number of the pillars.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct PillarsConfig {
-    /// Extent of a pillar along x, y and z, m.
-    pub size_m: [f32; 3],
-    /// Points kept in a pillar, first come first kept.
-    pub max_points: usize,
-    /// Pillars kept in a training frame.
-    pub max_train: usize,
-    /// Pillars kept otherwise.
-    pub max_test: usize,
-}
-
-impl Default for PillarsConfig {
-    fn default() -> Self {
-        PillarsConfig { size_m: [0.16, 0.16, 4.0], max_points: 32, max_train: 16_000, max_test: 40_000 }
-    }
-}
-
-/// Blocks that shrink the bird's eye canvas, and transposed convolutions that bring them back to one size.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct BackboneConfig {
-    /// Convolutions of a block after its first.
-    pub layers: Vec<usize>,
-    /// Stride of a block's first convolution.
-    pub strides: Vec<usize>,
-    /// Channels of a block.
-    pub filters: Vec<usize>,
-    /// Stride (and kernel) of the transposed convolution behind each block.
-    pub upsample_strides: Vec<usize>,
-    /// Its channels.
-    pub upsample_filters: Vec<usize>,
-}
-
-impl Default for BackboneConfig {
-    fn default() -> Self {
-        BackboneConfig {
-            layers: vec![3, 5, 5],
-            strides: vec![2, 2, 2],
-            filters: vec![64, 128, 256],
-            upsample_strides: vec![1, 2, 4],
-            upsample_filters: vec![128, 128, 128],
-        }
-    }
 }
 
 /// The anchors of one class.
@@ -128,78 +38,19 @@ pub struct AnchorConfig {
     pub class: String,
     /// Length, width, height, m.
     pub size_m: [f32; 3],
-    /// Height of the anchor's underside, m, LiDAR frame.
+    /// z of the bottom face, m, LiDAR frame.
     pub bottom_m: f32,
     /// Headings, rad.
     #[serde(default = "default_rotations")]
     pub rotations_rad: Vec<f32>,
     /// Overlap from which an anchor is positive.
     pub matched: f32,
-    /// Overlap below which an anchor is background; between the two it does not count.
+    /// Overlap below which an anchor is background; between the two thresholds it is ignored.
     pub unmatched: f32,
 }
 
 fn default_rotations() -> Vec<f32> {
     vec![0.0, 1.57]
-}
-
-/// The direction classifier's constants.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct HeadConfig {
-    /// Where the first direction bin begins, rad.
-    pub dir_offset_rad: f32,
-    /// Offset of the period into which the regressed heading is folded.
-    pub dir_limit_offset: f32,
-    /// Number of direction bins.
-    pub dir_bins: usize,
-}
-
-impl Default for HeadConfig {
-    #[expect(clippy::approx_constant, reason = "the reference's own digits, not a quarter of pi")]
-    fn default() -> Self {
-        HeadConfig { dir_offset_rad: 0.78539, dir_limit_offset: 0.0, dir_bins: 2 }
-    }
-}
-
-/// Weights of the three losses.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct LossConfig {
-    /// Focal loss of the classes.
-    pub class_weight: f32,
-    /// Smooth L1 of the box residuals.
-    pub box_weight: f32,
-    /// Weights of the seven residuals.
-    pub code_weights: [f32; 7],
-    /// Cross entropy of the direction bins.
-    pub direction_weight: f32,
-}
-
-impl Default for LossConfig {
-    fn default() -> Self {
-        LossConfig { class_weight: 1.0, box_weight: 2.0, code_weights: [1.0; 7], direction_weight: 0.2 }
-    }
-}
-
-/// From scores to final boxes.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct DetectionConfig {
-    /// Lowest score of a detection.
-    pub score_threshold: f32,
-    /// BEV overlap above which the weaker of two boxes is dropped, whatever their classes.
-    pub nms_iou: f32,
-    /// Boxes that enter the suppression.
-    pub nms_pre: usize,
-    /// Boxes that may leave it.
-    pub nms_post: usize,
-}
-
-impl Default for DetectionConfig {
-    fn default() -> Self {
-        DetectionConfig { score_threshold: 0.1, nms_iou: 0.01, nms_pre: 4096, nms_post: 500 }
-    }
 }
 
 /// OpenPCDet's `adam_onecycle`.
@@ -214,11 +65,11 @@ pub struct OptimizationConfig {
     pub lr_max: f64,
     /// Decoupled weight decay, on every parameter.
     pub weight_decay: f64,
-    /// Largest global norm of the gradient.
+    /// Largest global L2 norm of the gradients (clipping).
     pub clip_norm: f64,
-    /// First and last learning rate of the rise: `lr_max / div_factor`.
+    /// The initial learning rate is `lr_max / div_factor`.
     pub div_factor: f64,
-    /// Share of the steps in which the rate rises.
+    /// Fraction of the steps in which the learning rate rises.
     pub pct_start: f64,
     /// Adam's beta1 at the ends of the cycle and at its peak.
     pub momentum: [f64; 2],
@@ -266,7 +117,7 @@ impl DetectorConfig {
             return fail(format!("channels = {}: 3 (xyz) or 4 (xyzi)", self.channels));
         }
         if (0..3).any(|i| !(self.range_m[i] < self.range_m[i + 3]) || !self.range_m[i].is_finite()) {
-            return fail(format!("range_m = {:?}: each minimum must lie below its maximum", self.range_m));
+            return fail(format!("range_m = {:?}: each minimum must be below its maximum", self.range_m));
         }
         let o = &self.optimization;
         if o.epochs == 0 || o.batch_size == 0 || !(o.lr_max > 0.0) || !(o.clip_norm > 0.0) || !(o.div_factor >= 1.0) {
@@ -280,85 +131,6 @@ impl DetectorConfig {
         {
             return fail("optimization: pct_start in [0, 1], momentum in [0, 1), weight_decay not negative".into());
         }
-        match &self.network {
-            NetworkConfig::PointPillars(net) => net.check(self),
-            NetworkConfig::PointRcnn(net) => net.check(self),
-        }
-    }
-}
-
-impl PointPillarsConfig {
-    /// Whether the sizes fit together and to the detector's range and classes; the message names the key.
-    pub fn check(&self, detector: &DetectorConfig) -> Result<(), String> {
-        let (net, fail) = (self, |message: String| Err(message));
-        let named: Vec<&String> = net.anchors.iter().map(|a| &a.class).collect();
-        if named != detector.classes.iter().collect::<Vec<_>>() {
-            return fail(format!(
-                "network.anchors name {named:?}, classes are {:?}: one anchor a class, in order",
-                detector.classes
-            ));
-        }
-        for a in &net.anchors {
-            if a.size_m.iter().any(|&s| !(s > 0.0 && s.is_finite())) || a.rotations_rad.is_empty() {
-                return fail(format!(
-                    "network.anchors of {}: sizes must be above 0 and there must be a rotation",
-                    a.class
-                ));
-            }
-            if !(a.unmatched > 0.0 && a.unmatched <= a.matched && a.matched <= 1.0) {
-                return fail(format!("network.anchors of {}: 0 < unmatched <= matched <= 1", a.class));
-            }
-            if a.rotations_rad.len() != net.anchors[0].rotations_rad.len() {
-                return fail("network.anchors: every class needs the same number of rotations".into());
-            }
-        }
-        let b = &net.backbone;
-        let blocks = b.layers.len();
-        if blocks == 0
-            || [b.strides.len(), b.filters.len(), b.upsample_strides.len(), b.upsample_filters.len()]
-                .iter()
-                .any(|&n| n != blocks)
-        {
-            return fail("network.backbone: layers, strides, filters, upsample_strides and upsample_filters need one entry a block".into());
-        }
-        if b.strides.iter().chain(&b.filters).chain(&b.upsample_strides).chain(&b.upsample_filters).any(|&n| n == 0) {
-            return fail("network.backbone: strides and filters must be above 0".into());
-        }
-        let mut scale = 1;
-        let mut scales = Vec::new();
-        for (stride, up) in b.strides.iter().zip(&b.upsample_strides) {
-            scale *= stride;
-            scales.push((scale, *up));
-        }
-        if scales.iter().any(|(scale, up)| scale % up != 0 || scale / up != scales[0].0 / scales[0].1) {
-            return fail("network.backbone: strides and upsample_strides bring the blocks to different sizes".into());
-        }
-        let p = &net.pillars;
-        if p.size_m.iter().any(|&s| !(s > 0.0 && s.is_finite()))
-            || p.max_points == 0
-            || p.max_train == 0
-            || p.max_test == 0
-        {
-            return fail("network.pillars: sizes and limits must be above 0".into());
-        }
-        let [nx, ny, nz] = self.grid_size(detector);
-        if nz != 1 {
-            return fail(format!("network.pillars.size_m: {nz} pillars above each other; z must span the whole range"));
-        }
-        if nx % scale != 0 || ny % scale != 0 || nx == 0 || ny == 0 {
-            return fail(format!(
-                "range_m and network.pillars.size_m give {nx} x {ny} pillars; both must be multiples of {scale}, the product of the strides"
-            ));
-        }
-        if net.vfe_filters == 0 || net.head.dir_bins < 2 {
-            return fail("network.vfe_filters must be above 0, network.head.dir_bins at least 2".into());
-        }
-        Ok(())
-    }
-
-    /// Pillars along x, y and z.
-    pub fn grid_size(&self, detector: &DetectorConfig) -> [usize; 3] {
-        let range = detector.range_m;
-        [0, 1, 2].map(|i| ((range[i + 3] - range[i]) as f64 / self.pillars.size_m[i] as f64).round() as usize)
+        self.network.check(self)
     }
 }

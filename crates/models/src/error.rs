@@ -1,8 +1,8 @@
-//! What can be wrong with a network, its file or its input.
+//! Errors of networks, their files and their inputs.
 
 use std::path::PathBuf;
 
-/// A detector that cannot be built, loaded or run.
+/// An error of a detector.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// A file of the data set, or any file that cannot be read or written.
@@ -19,7 +19,7 @@ pub enum ModelError {
     /// Weights that do not fit the network.
     #[error("{0}")]
     Weights(String),
-    /// A frame that the network cannot take.
+    /// A frame that the network cannot read.
     #[error("frame {id}: {message}")]
     Frame {
         /// Its id.
@@ -27,10 +27,10 @@ pub enum ModelError {
         /// What is wrong and what to do.
         message: String,
     },
-    /// A value that is not a number, or infinite, where the network should give numbers.
+    /// An output of the network that is NaN or infinite.
     #[error("{0}")]
     NonFinite(String),
-    /// A tensor that does not hold what it should.
+    /// A tensor of an unexpected type or kind.
     #[error("tensor: {0}")]
     Tensor(String),
 }

@@ -1,9 +1,9 @@
-//! The one pass of a detector over frames that detection, validation and studies share.
+//! Inference of a detector over frames, shared by detection, validation and studies.
 
 use crate::{Detector, ModelError, Prediction, Preparer, Sample};
 use data::{Dataset, Frame, Prefetch, prefetch};
 
-/// What the network reads of frames of a data set, in their order. The samples are made ahead on `workers` threads; labels are not read.
+/// The samples of frames of a data set, in their order, prefetched on `workers` threads. Labels are not read.
 pub fn inference_samples(
     detector: &Detector,
     set: &Dataset,
@@ -16,7 +16,7 @@ pub fn inference_samples(
     })
 }
 
-/// What a detector finds in each sample. A sample without points is not given to the network: nothing is found in it.
+/// The predictions for each sample. A sample without points is not passed to the network and has no detections.
 ///
 /// # Errors
 /// As [`Detector::predict`].
@@ -33,11 +33,11 @@ pub fn predict_samples(detector: &Detector, samples: &[Sample]) -> Result<Vec<Pr
     Ok(samples.iter().map(of_sample).collect())
 }
 
-/// Runs a detector over samples in batches, in their order. `on_batch` takes what was found in each sample of a batch, beside the value
-/// that came with the sample.
+/// Runs a detector over samples in batches, in their order. `on_batch` is called with the predictions of a batch, each
+/// with the value that was passed with its sample.
 ///
 /// # Errors
-/// The first error of a sample, of the network or of `on_batch`. Of the batch in which it occurs nothing is handed on.
+/// The first error of a sample, of the network or of `on_batch`. `on_batch` is not called for a batch with an error.
 pub fn predict_frames<T, E: From<ModelError>>(
     detector: &Detector,
     batch_size: usize,

@@ -1,71 +1,39 @@
-//! What every layer of a network makes of a frame, as one vector a layer.
+//! The output of one layer for one frame, as a vector.
 
-use crate::detector::{Detector, Network, Sample};
-use crate::layers::{Mode, host};
-use crate::{ModelError, pointpillars, pointrcnn};
-use burn::module::Module;
+use crate::ModelError;
+use crate::layers::host;
 use burn::tensor::Tensor;
 
-/// The mean over all places of what a layer computes.
+/// The output of a layer, averaged over all places (pillars, cells or points).
 #[derive(Clone, Debug, PartialEq)]
 pub struct LayerFeatures {
-    /// The layer, in the order of the pass.
+    /// Name of the layer, such as `block 1`.
     pub layer: String,
     /// A value a channel.
     pub values: Vec<f32>,
 }
 
-impl Detector {
-    /// The layers of a pass over one frame, first to last; the last is what the head reads. Empty for a frame without points.
+impl LayerFeatures {
+    /// The mean of `rows` over the places.
     ///
-    /// PointPillars: the pillar feature net (mean over pillars), each block and the neck (mean over cells). PointRCNN: each level of set
-    /// abstraction and of feature propagation (mean over points).
+    /// # Shapes
+    /// `rows`: `[places, C]`.
     ///
     /// # Errors
-    /// A sample of another kind of network.
-    pub fn layer_features(&self, sample: &Sample) -> Result<Vec<LayerFeatures>, ModelError> {
-        if sample.is_empty() {
-            return Ok(Vec::new());
-        }
-        match (self.network.valid(), sample) {
-            (Network::PointPillars(network), Sample::PointPillars(sample)) => of_pillars(&network, sample),
-            (Network::PointRcnn(network), Sample::PointRcnn(sample)) => of_points(&network, sample),
-            _ => Err(ModelError::Tensor("the sample was prepared for another kind of network".into())),
-        }
+    /// Tensors that are not f32.
+    pub fn mean(layer: impl Into<String>, rows: Tensor<2>) -> Result<Self, ModelError> {
+        Ok(LayerFeatures { layer: layer.into(), values: host(rows.mean_dim(0))? })
     }
-}
 
-fn of_pillars(
-    network: &pointpillars::PointPillars,
-    sample: &pointpillars::Sample,
-) -> Result<Vec<LayerFeatures>, ModelError> {
-    let stages = network.forward(&[sample], Mode::Eval);
-    let mut layers = vec![layer("pillar features".into(), stages.pillar_features)?];
-    for (i, block) in stages.backbone.blocks.into_iter().enumerate() {
-        layers.push(layer(format!("block {}", i + 1), cells(block))?);
+    /// The mean of a feature map of one frame over its cells.
+    ///
+    /// # Shapes
+    /// `map`: `[1, C, H, W]`.
+    ///
+    /// # Errors
+    /// Tensors that are not f32.
+    pub fn map_mean(layer: impl Into<String>, map: Tensor<4>) -> Result<Self, ModelError> {
+        let [_, channels, height, width] = map.dims();
+        Self::mean(layer, map.reshape([channels, height * width]).transpose()) // [H * W, C]
     }
-    layers.push(layer("neck".into(), cells(stages.backbone.spatial_features_2d))?);
-    Ok(layers)
-}
-
-fn of_points(network: &pointrcnn::PointRcnn, sample: &pointrcnn::Sample) -> Result<Vec<LayerFeatures>, ModelError> {
-    let backbone = network.points(&[sample], Mode::Eval).backbone;
-    let mut layers = Vec::new();
-    for (i, level) in backbone.set_abstraction.into_iter().enumerate() {
-        layers.push(layer(format!("set abstraction {}", i + 1), level)?);
-    }
-    for (i, level) in backbone.propagation.into_iter().enumerate().rev() {
-        layers.push(layer(format!("propagation {}", i + 1), level)?);
-    }
-    Ok(layers)
-}
-
-/// `[1, C, H, W]` to `[H * W, C]`.
-fn cells(map: Tensor<4>) -> Tensor<2> {
-    let [_, channels, height, width] = map.dims();
-    map.reshape([channels, height * width]).transpose() // [H * W, C]
-}
-
-fn layer(layer: String, rows: Tensor<2>) -> Result<LayerFeatures, ModelError> {
-    Ok(LayerFeatures { layer, values: host(rows.mean_dim(0))? })
 }

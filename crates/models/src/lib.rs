@@ -1,4 +1,8 @@
-//! PointPillars and PointRCNN in burn, faithful to the published networks to the last tensor.
+//! Detectors in burn. The published networks equal OpenPCDet's tensor by tensor. The list `detectors!` at the end
+//! of this file has all of them; each implements [`Architecture`].
+
+#[macro_use]
+mod detectors;
 
 pub mod checkpoint;
 pub mod config;
@@ -7,18 +11,25 @@ pub mod layers;
 pub mod loss;
 pub mod named;
 pub mod point_ops;
-pub mod pointpillars;
-pub mod pointrcnn;
 
+mod architecture;
 mod built_in;
 mod detector;
 mod error;
 mod inference;
 mod layer_features;
 
+pub use architecture::{Architecture, NetworkInput};
 pub use built_in::{detector_text, find_detector};
-pub use detector::{Detector, Losses, Network, Prediction, Preparer, Sample, parameter_count};
+pub use detector::{Detector, Losses, Prediction, Preparer, parameter_count};
 pub use error::ModelError;
 pub use inference::{inference_samples, predict_frames, predict_samples};
 pub use layer_features::LayerFeatures;
 pub use named::reference_name;
+
+detectors! {
+    /// PointPillars (Lang et al. 2019) as OpenPCDet builds it.
+    PointPillars(pointpillars::PointPillars),
+    /// PointRCNN (Shi et al. 2019) as OpenPCDet builds it.
+    PointRcnn(pointrcnn::PointRcnn),
+}

@@ -4,7 +4,7 @@ use crate::kernel_ops::focal_loss_sum;
 use burn::tensor::activation::{log_softmax, sigmoid};
 use burn::tensor::{Int, Tensor, TensorData};
 
-/// Sigmoid focal loss with alpha 0.25 and gamma 2, one value an entry.
+/// Sigmoid focal loss with alpha 0.25 and gamma 2, one value per entry.
 ///
 /// # Shapes
 /// `logits`, `target` (0 or 1) and the result: `[N, C]`.
@@ -16,10 +16,11 @@ pub fn sigmoid_focal(logits: Tensor<2>, target: Tensor<2>) -> Tensor<2> {
     alpha * miss.clone() * miss * cross_entropy
 }
 
-/// The weighted sum of [`sigmoid_focal`] over rows and classes, in one operation where there is a kernel for it.
+/// The weighted sum of [`sigmoid_focal`] over rows and classes, as one operation if there is a kernel.
 ///
 /// # Shapes
-/// `logits`: `[N, C]`; `labels`: N, k for the class with index k - 1, no class for 0 and below; `weights`: N; result `[1]`.
+/// `logits`: `[N, C]`; `labels`: N, k for the class with index k - 1, 0 or less for background; `weights`: N; result
+/// `[1]`.
 pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: Vec<i32>, weights: Vec<f32>) -> Tensor<1> {
     let ([rows, classes], device) = (logits.dims(), logits.device());
     focal_loss_sum(&logits, &labels, &weights).unwrap_or_else(|| {
@@ -35,7 +36,7 @@ pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: Vec<i32>, weights: Vec<f32>)
 /// Smooth L1 of a difference: quadratic below `beta`, linear above.
 ///
 /// # Shapes
-/// Any, kept.
+/// Any; the result has the same.
 pub fn smooth_l1<const D: usize>(difference: Tensor<D>, beta: f64) -> Tensor<D> {
     let n = difference.abs();
     let small = n.clone().powi_scalar(2) * (0.5 / beta);
@@ -44,8 +45,8 @@ pub fn smooth_l1<const D: usize>(difference: Tensor<D>, beta: f64) -> Tensor<D> 
     large.mask_where(is_small, small)
 }
 
-/// Residuals with the seventh replaced on both sides so that their difference is the sine of the difference of headings:
-/// `sin p cos t` and `cos p sin t`.
+/// Residuals whose seventh value is replaced by `sin p cos t` and `cos p sin t`, so that their difference is the sine
+/// of the heading difference.
 ///
 /// # Shapes
 /// `pred`, `target` and both results: `[N, 7]`.

@@ -1,4 +1,4 @@
-//! The tensors of a network under OpenPCDet's names, out and in.
+//! Export and import of the tensors of a network under OpenPCDet's names.
 
 use crate::checkpoint::{HostTensor, HostValues, NamedTensors};
 use crate::{ModelError, layers};
@@ -6,64 +6,12 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 use std::collections::BTreeMap;
 
-/// OpenPCDet's name of the tensor at a path of field names.
-///
-/// The reference numbers the entries of a `Sequential`: padding, convolution, normalisation and ReLU count one by one.
+/// OpenPCDet's name of the tensor at a path of field names, `PointPillars.vfe.weight`.
 pub fn reference_name(path: &str) -> String {
-    let parts: Vec<&str> = path.split('.').collect();
-    // The kind of the network is a level of its own in `Network`.
-    let parts = match parts.as_slice() {
-        ["PointPillars" | "PointRcnn", rest @ ..] => rest,
-        all => all,
-    };
-    if let Some(name) = point_based_name(parts) {
-        return name;
-    }
-    match parts {
-        ["vfe", "weight"] => "vfe.pfn_layers.0.linear.weight".into(),
-        ["vfe", "norm", name] => format!("vfe.pfn_layers.0.norm.{name}"),
-        ["backbone_2d", "blocks", i, "convs", j, rest @ ..] => {
-            let first = 1 + 3 * j.parse::<usize>().unwrap_or(0);
-            match rest {
-                ["norm", name] => format!("backbone_2d.blocks.{i}.{}.{name}", first + 1),
-                _ => format!("backbone_2d.blocks.{i}.{first}.{}", rest.join(".")),
-            }
-        }
-        ["backbone_2d", "deblocks", i, "norm", name] => format!("backbone_2d.deblocks.{i}.1.{name}"),
-        ["backbone_2d", "deblocks", i, name] => format!("backbone_2d.deblocks.{i}.0.{name}"),
-        _ => parts.join("."),
-    }
+    crate::tensor_name(&path.split('.').collect::<Vec<_>>())
 }
 
-/// The names of PointRCNN: a linear layer, its normalisation and ReLU count one by one, and so does dropout.
-fn point_based_name(parts: &[&str]) -> Option<String> {
-    let at = |prefix: String, first: usize, rest: &[&str]| match rest {
-        ["norm", name] => format!("{prefix}.{}.{name}", first + 1),
-        _ => format!("{prefix}.{first}.{}", rest.join(".")),
-    };
-    Some(match *parts {
-        [part @ ("backbone_3d" | "roi_head"), "sa_modules", i, "mlps", g, "layers", j, ref rest @ ..] => {
-            at(format!("{part}.SA_modules.{i}.mlps.{g}"), 3 * j.parse::<usize>().ok()?, rest)
-        }
-        ["backbone_3d", "fp_modules", i, "mlp", j, ref rest @ ..] => {
-            at(format!("backbone_3d.FP_modules.{i}.mlp"), 3 * j.parse::<usize>().ok()?, rest)
-        }
-        ["point_head", chain, "hidden", j, ref rest @ ..] => {
-            at(format!("point_head.{chain}"), 3 * j.parse::<usize>().ok()?, rest)
-        }
-        ["point_head", chain, "last", name] => format!("point_head.{chain}.6.{name}"),
-        ["roi_head", chain, "hidden", j, ref rest @ ..] => {
-            at(format!("roi_head.{chain}"), 4 * j.parse::<usize>().ok()?, rest)
-        }
-        ["roi_head", chain, "last", name] => format!("roi_head.{chain}.7.{name}"),
-        ["roi_head", "xyz_up_layer", j, name] => {
-            format!("roi_head.xyz_up_layer.{}.{name}", 2 * j.parse::<usize>().ok()?)
-        }
-        _ => return None,
-    })
-}
-
-/// Follows the path of field names on a walk through a network.
+/// The path of field names while visiting a network.
 #[derive(Default)]
 struct Path(Vec<String>);
 
@@ -120,7 +68,7 @@ pub fn to_named<M: Module>(network: &M) -> Result<NamedTensors, ModelError> {
     collect.error.map_or(Ok(collect.tensors), Err)
 }
 
-/// Names and shapes of what is learned; running statistics are not.
+/// Names and shapes of the learned parameters, without running statistics.
 pub fn trainable<M: Module>(network: &M) -> BTreeMap<String, Vec<usize>> {
     #[derive(Default)]
     struct Shapes(Path, BTreeMap<String, Vec<usize>>);
@@ -143,10 +91,10 @@ pub fn trainable<M: Module>(network: &M) -> BTreeMap<String, Vec<usize>> {
     shapes.1
 }
 
-/// The same network with the values of `tensors`. Counters may be missing (files that hold floats only), nothing else.
+/// The same network with the values of `tensors`. Only counters may be missing (files that hold floats only).
 ///
 /// # Errors
-/// A tensor that is missing, has another shape or type, or has no place in this network.
+/// A tensor that is missing, has another shape or type, or does not belong to this network.
 pub fn load_named<M: Module>(network: M, tensors: &NamedTensors) -> Result<M, ModelError> {
     struct Load<'a> {
         path: Path,
@@ -197,12 +145,12 @@ pub fn load_named<M: Module>(network: M, tensors: &NamedTensors) -> Result<M, Mo
         message += &format!("; and {} more", load.wrong.len() - 3);
     }
     if foreign > 0 {
-        message += &format!("; {foreign} tensors of the file have no place here");
+        message += &format!("; {foreign} tensors of the file do not belong to it");
     }
     Err(ModelError::Weights(message))
 }
 
-/// The gradient of every learned tensor by name, zero where none reached it.
+/// The gradient of every learned parameter by name; zero without a gradient.
 ///
 /// # Errors
 /// Tensors that are not f32.

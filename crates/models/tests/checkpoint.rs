@@ -1,4 +1,4 @@
-//! Checkpoints as the reference writes them, damaged ones, and ones that ask for more than weights.
+//! Checkpoints of the reference, damaged checkpoints, and checkpoints that ask to run code.
 
 use lidarshift_models as models;
 use models::checkpoint::{HostTensor, HostValues, NamedTensors, parse_checkpoint, read_checkpoint, read_safetensors};
@@ -26,7 +26,7 @@ fn assert_refused(bytes: &[u8], with: &str) {
 }
 
 #[test]
-fn all_three_forms_hold_the_same_weights() {
+fn all_three_formats_hold_the_same_weights() {
     for name in ["pointpillars_tiny", "pointrcnn_tiny"] {
         let Some(folder) = case(name) else { continue };
         let reference = read_safetensors(&folder.join("checkpoint.safetensors")).unwrap();
@@ -50,7 +50,7 @@ fn same_bits(a: &HostTensor, b: &HostTensor) -> bool {
 }
 
 #[test]
-fn a_file_that_is_not_there_is_named() {
+fn a_missing_file_is_named() {
     let message = read_checkpoint(Path::new("/nowhere/model.pth")).unwrap_err().to_string();
     assert!(message.contains("/nowhere/model.pth"), "{message}");
 }
@@ -87,7 +87,7 @@ impl Script {
     }
 }
 
-/// A file in torch's older form: `{"model_state": OrderedDict(state), ..}`.
+/// A file in torch's legacy format: `{"model_state": OrderedDict(state), ..}`.
 fn legacy(state: Script, storages: &[(&str, &[u8], usize)]) -> Vec<u8> {
     let checkpoint = Script::default().raw(b"\x80\x02}(").text("epoch").int(3).text("model_state");
     let checkpoint = checkpoint.global("collections", "OrderedDict").raw(b")R(").raw(&state.0).raw(b"uu.");
@@ -117,7 +117,7 @@ fn views_parameters_and_inert_numbers() {
     let state = state.text("empty").tensor("FloatStorage", "7", 6, 0, &[0, 2], &[2, 1]);
     let state = state.text("parameter").global("torch._utils", "_rebuild_parameter").raw(b"(");
     let state = state.tensor("FloatStorage", "7", 6, 5, &[], &[]).raw(b"\x88}tR");
-    // A number of numpy, as the learning rate in the optimiser's state: present, without effect.
+    // A numpy scalar, like the learning rate in the optimiser's state, is ignored.
     let checkpoint =
         Script::default().raw(b"\x80\x02}(").text("optimizer_state").global("numpy.core.multiarray", "scalar");
     let checkpoint =
@@ -145,7 +145,7 @@ fn sizes_that_the_file_does_not_have() {
     };
     assert!(parse(&with(4, 0, &[2, 2], &[2, 1], 4)).is_ok());
     assert_refused(&with(i32::MAX, 0, &[4], &[1], i32::MAX as usize), "truncated inside storage 0");
-    assert_refused(&with(4, 0, &[4], &[1], 5), "does not have the 4 elements");
+    assert_refused(&with(4, 0, &[4], &[1], 5), "does not have the expected 4 elements");
     assert_refused(&with(-4, 0, &[4], &[1], 4), "reference to a storage");
     assert_refused(&with(3, 0, &[3], &[1], 3), "4 bytes follow the last storage");
     assert_refused(&with(4, 0, &[5], &[1], 4), "does not fit its storage");
@@ -161,7 +161,7 @@ fn sizes_that_the_file_does_not_have() {
 }
 
 #[test]
-fn what_is_no_checkpoint_of_weights() {
+fn files_without_weights_are_refused() {
     let tensor = |kind| Script::default().text("w").tensor(kind, "0", 2, 0, &[2], &[1]);
     assert!(parse(&legacy(tensor("FloatStorage"), &[("0", &[0; 8], 2)])).is_ok());
     assert_refused(&legacy(tensor("HalfStorage"), &[("0", &[0; 4], 2)]), "tensor w lies in a HalfStorage");
@@ -174,7 +174,7 @@ fn what_is_no_checkpoint_of_weights() {
     let code = Script::default().text("w").global("os", "system").text("true").raw(b"\x85R");
     assert_refused(&legacy(code, &[]), "asks for os.system");
     assert_refused(b"", "is empty");
-    assert_refused(b"hello, this is no checkpoint", "neither torch's (.pth) nor safetensors");
+    assert_refused(b"hello, this is not a checkpoint", "neither torch's (.pth) nor safetensors");
     assert_refused(b"PK\x03\x04 no archive at all, but long enough", "zip archive");
 }
 
@@ -187,7 +187,7 @@ fn a_small_file_cannot_fill_a_large_memory() {
     assert_refused(&legacy(state, &[("0", &content, 10_000)]), "than the file can hold");
 }
 
-/// Numbers for damages, the same in every run.
+/// Deterministic random numbers for the damage.
 struct Chance(u64);
 
 impl Chance {
@@ -199,7 +199,7 @@ impl Chance {
     }
 }
 
-/// One damage, somewhere between `from` and `to`.
+/// Damages the bytes at a random position between `from` and `to`.
 fn damage(bytes: &mut Vec<u8>, from: usize, to: usize, chance: &mut Chance) {
     let at = from + chance.below(to - from);
     let length = 1 + chance.below(12).min(bytes.len() - at - 1);
@@ -232,7 +232,7 @@ fn damaged_files_are_errors_or_harmless() {
         let mut accepted = 0;
         for round in 0..rounds {
             let mut bytes = whole.clone();
-            // Where a file says what it holds (for zip also at its end), and sometimes anywhere.
+            // Mostly in the header (for zip also at the end), sometimes anywhere.
             let (from, to) = match round % 4 {
                 0 => (0, whole.len()),
                 1 if file.contains("zip") => (whole.len() - 20_000, whole.len()),
@@ -243,10 +243,10 @@ fn damaged_files_are_errors_or_harmless() {
             accepted += usize::from(bytes != whole);
             assert!(bytes.len() >= whole.len() || !whole.starts_with(&bytes), "{file}: truncated and accepted");
             if file.contains("zip") {
-                // Checksums: what is read is what was written.
+                // With checksums, accepted content must be unchanged.
                 assert!(read.iter().eq(&reference), "{file}: other weights accepted");
             }
         }
-        eprintln!("{file}: {accepted} of {rounds} damages not seen");
+        eprintln!("{file}: {accepted} of {rounds} damaged files accepted");
     }
 }

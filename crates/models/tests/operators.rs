@@ -1,4 +1,4 @@
-//! Pillars, anchors, box coder, target assigner and decoding against numbers of the reference implementation.
+//! Pillars, anchors, box coder, target assigner and decoding against reference values of OpenPCDet.
 
 use lidarshift_models as models;
 use models::checkpoint::{HostTensor, HostValues, NamedTensors, read_safetensors};
@@ -13,7 +13,7 @@ fn own(name: &str) -> PathBuf {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../tests/golden")).join(name)
 }
 
-/// Reference numbers on real scans, which may not be copied into the repository.
+/// Reference values on real scans, which may not be copied into the repository.
 fn shared(case: &str) -> Option<PathBuf> {
     let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/golden")).join(case);
     if !folder.exists() {
@@ -117,7 +117,7 @@ fn box_coder_of_the_reference() {
     assert_close(decoded.as_flattened(), &floats(&file, "residual.decoded"), 4e-6);
 
     let angles = floats(&file, "limit_period.in");
-    // The second is the direction target's: measured from where the first bin begins.
+    // The second is that of the direction target, relative to the start of the first bin.
     for (start, offset, name) in
         [(0.0, 0.5, "limit_period.offset05_period_2pi"), (DIRECTION_OFFSET_RAD, 0.0, "limit_period.offset0_period_2pi")]
     {
@@ -126,7 +126,7 @@ fn box_coder_of_the_reference() {
     }
 
     let bins = ints(&file, "direction.bin");
-    // The bins are an input here: what a direction classifier might say.
+    // The bins are an input, in place of the direction classifier.
     let turned = angles.iter().zip(&bins);
     let headings: Vec<f32> = turned
         .map(|(&yaw, &bin)| box_coder::direction_decode(yaw, bin as usize, DIRECTION_OFFSET_RAD, 0.0, 2))
@@ -285,8 +285,8 @@ fn options(score_threshold: f32) -> DecodeOptions {
     }
 }
 
-/// The reference's scores and decoded boxes are whole only for a few anchors, so the outputs that would lead to them are made up: anchors
-/// that are the boxes, residuals of zero, logits of the scores.
+/// The reference stores scores and decoded boxes completely only for a few anchors. The head outputs are therefore
+/// constructed: the boxes as anchors, residuals of zero, and the logits of the scores.
 fn decode_again(boxes: &[[f32; 7]], scores: &[f32], options: &DecodeOptions) -> Vec<RawBox> {
     let logits: Vec<f32> = scores.iter().map(|&s| (f64::from(s) / (1.0 - f64::from(s))).ln() as f32).collect();
     let direction = [0.0, 1.0].repeat(boxes.len());
@@ -318,7 +318,7 @@ fn detections_stay_as_they_are() {
     }
 }
 
-/// Head outputs that give the anchors' own boxes back, for all anchors of the published network.
+/// Head outputs that decode to the anchors, for all anchors of the published network.
 #[test]
 fn decoding_is_the_inverse_of_the_targets() {
     let case = tiny(own("synthetic/pointpillars_tiny"));
@@ -341,7 +341,7 @@ fn decoding_is_the_inverse_of_the_targets() {
 }
 
 #[test]
-fn the_reference_tensors_are_what_they_say() {
+fn reference_tensors_have_the_expected_types() {
     let tensor: &HostTensor = &read(&own("operators/pillars.safetensors"))["points"];
     assert_eq!(tensor.shape, [600, 4]);
 }

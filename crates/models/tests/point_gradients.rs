@@ -1,4 +1,4 @@
-//! Gradients of the operations over points against central differences.
+//! Gradients of the point operations against central differences.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use data::stream;
@@ -12,7 +12,7 @@ fn random(count: usize, seed: u64) -> Vec<f32> {
     (0..count).map(|_| random.random_range(-1.0..1.0)).collect()
 }
 
-/// Compares the gradient of a weighted sum of `operation`'s output with differences of that sum, value by value.
+/// Compares the gradient of a weighted sum of `operation`'s output with central differences, value by value.
 #[track_caller]
 fn check(input: [usize; 2], operation: impl Fn(Tensor<2>) -> Tensor<2>) {
     let device = Device::flex().autodiff();
@@ -35,7 +35,7 @@ fn check(input: [usize; 2], operation: impl Fn(Tensor<2>) -> Tensor<2>) {
             f64::from(host(value(tensor(values))).unwrap()[0])
         };
         let slope = (moved(step) - moved(-step)) / f64::from(2.0 * step);
-        // Across a kink of a maximum or of a ReLU there is no slope.
+        // At a kink of a maximum or a ReLU the difference quotient is not the gradient.
         wrong += usize::from((slope - f64::from(*gradient)).abs() > 5e-3 * (1.0 + slope.abs()));
     }
     assert!(wrong <= 1 + gradient.len() / 50, "{wrong} of {} gradients differ", gradient.len());

@@ -1,4 +1,4 @@
-//! PointRCNN: size, names and shapes of the published network, a small one on a real scan, and input that is hardly any.
+//! PointRCNN: size, names and shapes of the published network, and degenerate input.
 
 use burn::tensor::Device;
 use data::{Cloud, Frame, Object, stream};
@@ -24,14 +24,14 @@ fn shared(path: &str) -> Option<PathBuf> {
     Some(found)
 }
 
-fn network(config: &mut DetectorConfig) -> &mut models::config::PointRcnnConfig {
+fn network(config: &mut DetectorConfig) -> &mut models::pointrcnn::PointRcnnConfig {
     match &mut config.network {
         NetworkConfig::PointRcnn(net) => net,
         other => panic!("{other:?}"),
     }
 }
 
-/// With three classes and intensity, and with cars and coordinates alone.
+/// The network with three classes and intensity, and with cars and coordinates only.
 fn published() -> [(DetectorConfig, usize, &'static str); 2] {
     let kitti = DetectorConfig::parse(PUBLISHED).unwrap();
     let mut car = kitti.clone();
@@ -93,7 +93,7 @@ fn car(x: f64, y: f64) -> Object {
     Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None }
 }
 
-/// Ground, and points in the boxes.
+/// Random points on the ground and in the boxes.
 fn frame(id: u64, points: usize, objects: Vec<Object>) -> Frame {
     let mut random = stream(id, "scene", 0, 0);
     let mut cloud = Cloud::new(4);
@@ -115,7 +115,7 @@ fn training(config: &DetectorConfig, frame: &Frame) -> Sample {
     Preparer::new(config).training(frame, &mut stream(1, "augment", 0, 0)).unwrap()
 }
 
-/// Losses and gradients are numbers; says which parameters no gradient reached.
+/// Asserts that losses and gradients are finite; returns the losses and the parameters without gradient.
 #[track_caller]
 fn learn(config: &DetectorConfig, batch: &[Sample]) -> (Vec<(&'static str, f32)>, Vec<String>) {
     let detector = Detector::new(config, 3, &Device::flex().autodiff());
@@ -152,7 +152,7 @@ fn predict(config: &DetectorConfig, frames: &[Frame]) -> Vec<usize> {
 }
 
 #[test]
-fn every_parameter_learns() {
+fn every_parameter_gets_a_gradient() {
     let config = tiny();
     let frames = [frame(1, 600, vec![car(10.0, 2.0), car(20.0, -4.0)]), frame(2, 600, vec![car(15.0, 0.0)])];
     let batch: Vec<Sample> = frames.iter().map(|f| training(&config, f)).collect();
@@ -161,13 +161,13 @@ fn every_parameter_learns() {
         parts.iter().map(|p| p.0).collect::<Vec<_>>(),
         ["point_cls", "point_box", "rcnn_cls", "rcnn_reg", "rcnn_corner"]
     );
-    // Untrained proposals hardly ever overlap an object enough for its box to be learned.
+    // Untrained proposals rarely overlap an object enough for box regression.
     assert!(missed.iter().all(|name| name.starts_with("roi_head.reg_layers")), "{missed:?}");
     assert_eq!(predict(&config, &frames).len(), 2);
 }
 
 #[test]
-fn hardly_any_input() {
+fn degenerate_input() {
     let config = tiny();
     let equal = |value: f32, points: usize| Frame {
         id: "equal".into(),
@@ -194,7 +194,7 @@ fn hardly_any_input() {
         learn(&config, &[training(&config, frame)]);
         predict(&config, std::slice::from_ref(frame));
     }
-    // Beside a frame with points, one without changes nothing.
+    // A frame without points does not change the losses of another one.
     let full = frame(1, 600, vec![car(10.0, 2.0)]);
     let alone = learn(&config, &[training(&config, &full)]).0;
     assert_eq!(learn(&config, &[training(&config, &cases[3].1), training(&config, &full)]).0, alone);
@@ -208,7 +208,7 @@ fn no_proposal_left() {
     network(&mut config).detection.score_threshold = 1.1;
     let frame = frame(1, 300, vec![car(10.0, 2.0)]);
     assert_eq!(predict(&config, std::slice::from_ref(&frame)), [0]);
-    // One region survives the suppression of everything; the others are boxes without extent.
+    // NMS keeps one region; the others are boxes without extent.
     network(&mut config).proposals.train.iou = 0.0;
     learn(&config, &[training(&config, &frame)]);
 }

@@ -1,15 +1,15 @@
 //! The sensor model on data sets that are finished, of this simulator or any other.
 
 use crate::SimulateError;
-use crate::attributes;
-use crate::cloud_scan::scan_of_cloud;
-use crate::effects::{EffectList, FrameContext, LabelledCar, Need};
-use crate::error::wrong;
-use crate::mesh::MaterialTable;
-use crate::rig::Rig;
-use crate::scan::Scan;
 use crate::scenario::FRAME_S;
+use data::toml_text::wrong;
 use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, PointColumns, write_atomic};
+use sensor::attributes;
+use sensor::cloud_scan::scan_of_cloud;
+use sensor::effects::{EffectList, FrameContext, LabelledCar, Need};
+use sensor::material::MaterialTable;
+use sensor::rig::Rig;
+use sensor::scan::Scan;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
@@ -75,7 +75,7 @@ impl Resim<'_> {
         let described = attributes::path(&source.root, &ids[0]).is_file();
         let materials = if described { attributes::read_materials(&source.root)? } else { MaterialTable::default() };
         if let Some((i, why)) = self.refusals(&known_of(self.dataset, &rig, &ids[0], described)?).into_iter().next() {
-            return Err(wrong(format!("effect[{i}]"), why));
+            return Err(wrong(format!("effect[{i}]"), why).into());
         }
 
         let mut manifest = ResimManifest {

@@ -6,7 +6,7 @@ use crate::error::{InPart, Result};
 use crate::folder::Study;
 use data::write::write_kitti_text;
 use data::{Dataset, write_atomic, write_json};
-use models::{Detector, LayerFeatures, Network, inference_samples, predict_frames};
+use models::{Detector, LayerFeatures, inference_samples, predict_frames};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -120,7 +120,7 @@ pub fn detect_all(
 /// The detections of a run on frames, a text a frame, and the regions of a two-stage network likewise.
 fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf; 2], workers: usize) -> Result<()> {
     let [of_detections, of_regions] = folders;
-    let two_stage = matches!(detector.network, Network::PointRcnn(_));
+    let two_stage = detector.config().network.is_two_stage();
     let samples = inference_samples(detector, set, ids, workers).zip(ids).map(|(sample, id)| Ok((sample?, id)));
     predict_frames(detector, detector.config().optimization.batch_size, samples, |batch| {
         for (id, found) in batch {

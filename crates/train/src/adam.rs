@@ -1,4 +1,4 @@
-//! Adam with true weight decay and global-norm clipping: OpenPCDet's `adam_onecycle`.
+//! Adam with decoupled weight decay and clipping by the global norm: OpenPCDet's `adam_onecycle`.
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::optim::GradientsParams;
@@ -11,13 +11,13 @@ use std::collections::BTreeMap;
 const BETA2: f64 = 0.99;
 const EPSILON: f64 = 1e-8;
 
-/// Gives a parameter its name for the outside (moments, messages) from its path in the module, `backbone.blocks.0.conv.weight`.
+/// Maps a parameter's path in the module (`backbone.blocks.0.conv.weight`) to its name in files and messages.
 pub type NameOf = fn(&str) -> String;
 
-/// Adam whose `beta1` changes from step to step, with the decay applied to the weights themselves before the step, on batch norms and
-/// biases too; the bias correction uses the current `beta1`.
+/// Adam whose `beta1` may change between steps; the bias correction uses the current one. Weight decay is decoupled: it
+/// is applied to all parameters before the step, including batch norms and biases.
 ///
-/// The two moments of a parameter are kept under its name, so a module that was saved and loaded again goes on with them.
+/// The moments are stored by parameter name, so that training continues with a module that was saved and loaded.
 pub struct Adam {
     weight_decay: f64,
     name_of: NameOf,
@@ -25,7 +25,7 @@ pub struct Adam {
     moments: BTreeMap<String, Moments>,
 }
 
-/// Running means of a parameter's gradient and of its square, flat, on the parameter's device.
+/// Running means of a parameter's gradient and squared gradient, flat, on the parameter's device.
 struct Moments {
     shape: Vec<usize>,
     exp_avg: Tensor<1>,
@@ -33,14 +33,15 @@ struct Moments {
 }
 
 impl Adam {
-    /// Before the first step.
+    /// The state before the first step.
     pub fn new(weight_decay: f64, name_of: NameOf) -> Self {
         Adam { weight_decay, name_of, steps: 0, moments: BTreeMap::new() }
     }
 
-    /// Moves every trainable parameter of `module` one step against its gradient.
+    /// Updates every trainable parameter of `module`.
     ///
-    /// `gradient_scale` multiplies every gradient first (see [`GradientNorm::clip_scale`]). A parameter without a gradient only decays.
+    /// Gradients are first multiplied by `gradient_scale` (see [`GradientNorm::clip_scale`]). Parameters without a
+    /// gradient get weight decay only.
     pub fn step<M: Module>(
         &mut self,
         module: M,
@@ -77,7 +78,8 @@ impl Adam {
         named
     }
 
-    /// Takes moments written by [`Adam::to_named`] after `steps` steps; the message says what does not fit.
+    /// Restores moments written by [`Adam::to_named`] after `steps` steps. The error message names the moment that does
+    /// not fit.
     pub fn load_named(&mut self, named: &NamedTensors, steps: u64, device: &Device) -> Result<(), String> {
         let device = device.clone().inner();
         let flat = |kind: &str, name: &str| -> Result<(Vec<usize>, Tensor<1>), String> {
@@ -118,19 +120,20 @@ impl Adam {
         };
         let tensors = [value, gradient, exp_avg, exp_avg_sq];
         let [moved, exp_avg, exp_avg_sq] =
-            move_by_kernel(tensors, step).unwrap_or_else(|tensors| move_on_device(tensors, step));
+            update_by_kernel(tensors, step).unwrap_or_else(|tensors| update_on_device(tensors, step));
         self.moments.insert(name, Moments { shape, exp_avg, exp_avg_sq });
         moved
     }
 }
 
-/// Value, gradient and moments to the new value and moments, in one pass where there is a kernel for it; else they come back.
-#[expect(clippy::result_large_err, reason = "the tensors come back where there is no kernel")]
-fn move_by_kernel(tensors: [Tensor<1>; 4], step: &AdamStep) -> Result<[Tensor<1>; 3], [Tensor<1>; 4]> {
+/// Computes new value and moments from value, gradient and moments with the CPU kernel. Without a kernel the inputs are
+/// returned as the error.
+#[expect(clippy::result_large_err, reason = "the tensors are returned if there is no kernel")]
+fn update_by_kernel(tensors: [Tensor<1>; 4], step: &AdamStep) -> Result<[Tensor<1>; 3], [Tensor<1>; 4]> {
     let Some(values) = tensors.iter().map(FlexValues::of).collect::<Option<Vec<_>>>() else { return Err(tensors) };
     let [value, gradient, exp_avg, exp_avg_sq] = <[FlexValues; 4]>::try_from(values).expect("one for each tensor");
     let device = tensors[0].device();
-    drop(tensors); // so that the moments are changed in their own memory
+    drop(tensors); // so that the moments are updated in place
     let [mut value, mut exp_avg, mut exp_avg_sq] = [value, exp_avg, exp_avg_sq].map(FlexValues::into_vec);
     step.apply(vec![Parameter {
         value: &mut value,
@@ -142,8 +145,8 @@ fn move_by_kernel(tensors: [Tensor<1>; 4], step: &AdamStep) -> Result<[Tensor<1>
     Ok([value, exp_avg, exp_avg_sq].map(|values| Tensor::from_data(TensorData::new(values, [length]), &device)))
 }
 
-/// The same by burn's operations.
-fn move_on_device([value, gradient, exp_avg, exp_avg_sq]: [Tensor<1>; 4], step: &AdamStep) -> [Tensor<1>; 3] {
+/// The same with burn's operations.
+fn update_on_device([value, gradient, exp_avg, exp_avg_sq]: [Tensor<1>; 4], step: &AdamStep) -> [Tensor<1>; 3] {
     let AdamStep { learning_rate, beta1, beta2, epsilon, weight_decay, step, gradient_scale } = *step;
     let gradient = if gradient_scale == 1.0 { gradient } else { gradient.mul_scalar(gradient_scale) };
     let exp_avg = exp_avg.mul_scalar(beta1).add(gradient.clone().mul_scalar(1.0 - beta1));
@@ -188,17 +191,18 @@ impl ModuleMapper for Stepper<'_> {
     }
 }
 
-/// The Euclidean norm over the gradients of all parameters together.
+/// The global L2 norm of the gradients of all parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GradientNorm {
-    /// Norm, before any clipping.
+    /// The norm before clipping.
     pub total: f64,
-    /// The first parameter, in the module's order, whose gradient has a NaN or an infinity (or, on a GPU, overflows f32 when squared).
+    /// The first parameter, in the module's order, whose gradient has a NaN or an infinity (or, on a GPU, overflows f32
+    /// when squared).
     pub not_finite: Option<String>,
 }
 
 impl GradientNorm {
-    /// Of the gradients of `module`; one transfer from the device.
+    /// The norm of the gradients of `module`, in one transfer from the device.
     pub fn of<M: Module>(module: &M, gradients: &GradientsParams, name_of: NameOf) -> Self {
         let mut visitor = FlatGradients { gradients, path: Vec::new(), names: Vec::new(), flat: Vec::new() };
         module.visit(&mut visitor);
@@ -217,7 +221,7 @@ impl GradientNorm {
         GradientNorm { total: sums.iter().map(|&s| s as f64).sum::<f64>().sqrt(), not_finite }
     }
 
-    /// What the gradients are multiplied with so that their norm is at most `max_norm`, as `torch.nn.utils.clip_grad_norm_` computes it.
+    /// Factor of the gradients that limits their norm to `max_norm`, as in `torch.nn.utils.clip_grad_norm_`.
     pub fn clip_scale(&self, max_norm: f64) -> f64 {
         (max_norm / (self.total + 1e-6)).min(1.0)
     }
@@ -322,7 +326,7 @@ mod tests {
         }
     }
 
-    /// Puts the golden values into a module, or compares them; a linear layer of burn is the transpose of torch's.
+    /// Loads the golden values into a module, or compares them. Linear weights of burn are the transpose of torch's.
     struct Exchange<'a> {
         golden: &'a Golden,
         prefix: &'a str,
@@ -407,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn saved_and_loaded_moments_go_on_to_the_bit() {
+    fn saved_and_loaded_moments_continue_bit_equal() {
         let golden = Golden::open();
         let (whole, _) = run(20, None, &golden);
         let (half, adam) = run(7, None, &golden);

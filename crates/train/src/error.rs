@@ -1,17 +1,17 @@
-//! Why a run cannot begin, go on or end.
+//! Errors of a training run.
 
 use data::DataError;
 use models::ModelError;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
-/// A run that cannot begin, go on or end.
+/// An error of a training run.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// A file of the data set, or any file that cannot be read or written.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// The network, its weights or a frame that it cannot take.
+    /// The network, its weights or a frame that it cannot read.
     #[error(transparent)]
     Model(#[from] ModelError),
     /// A file of the run folder, or the folder as a whole.
@@ -22,41 +22,41 @@ pub enum TrainError {
         /// What is wrong and what to do.
         message: String,
     },
-    /// What was asked for cannot be.
+    /// A configuration that is invalid.
     #[error("{0}")]
     Config(String),
-    /// A panic within a step; burn reports so that a device is lost, or out of memory.
+    /// A panic within a step. burn panics if a device is lost or out of memory.
     #[error(
-        "step {step}: computing broke off: {message}. The run's last checkpoint is good: the same words go on from there, also with another \
-         --device; where memory ran out, lower optimization.batch_size"
+        "step {step}: the computation failed: {message}. The run's last checkpoint is intact: the same command with --resume continues from it, \
+         also on another --device; if memory ran out, lower optimization.batch_size"
     )]
-    BrokeOff {
+    Panicked {
         /// Counted from 0.
         step: u64,
-        /// What the panic said.
+        /// The message of the panic.
         message: String,
     },
     /// The training has diverged, or its data are damaged.
     #[error(
-        "step {step}: {what} is not finite; the batch holds the frames {}. The run stops; its last checkpoint is good. \
+        "step {step}: {what} is not finite; the batch holds the frames {}. The run stops; its last checkpoint is intact. \
          Look at these frames with `lidarshift doctor`, or lower optimization.lr_max",
         frames.join(", ")
     )]
     NotFinite {
         /// Counted from 0.
         step: u64,
-        /// The loss, or the parameter whose gradient it is.
+        /// The loss or the parameter's gradient that is not finite.
         what: String,
         /// The frames of the batch.
         frames: Vec<String>,
     },
 }
 
-/// The result of a step's work, a panic in it as an error.
+/// Runs the work of a step and converts a panic into an error.
 pub(crate) fn without_panic<T>(step: u64, work: impl FnOnce() -> Result<T, TrainError>) -> Result<T, TrainError> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
         let text = panic.downcast_ref::<String>().map(String::as_str).or_else(|| panic.downcast_ref::<&str>().copied());
-        Err(TrainError::BrokeOff { step, message: text.unwrap_or("for no stated reason").into() })
+        Err(TrainError::Panicked { step, message: text.unwrap_or("for no stated reason").into() })
     })
 }
 
@@ -77,10 +77,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_lost_device_ends_a_run_with_a_message() {
+    fn a_lost_device_ends_a_run_with_an_error() {
         let lost = without_panic::<()>(7, || panic!("device {} was lost", 0)).unwrap_err().to_string();
         assert!(
-            lost.starts_with("step 7: computing broke off: device 0 was lost. The run's last checkpoint"),
+            lost.starts_with("step 7: the computation failed: device 0 was lost. The run's last checkpoint"),
             "{lost}"
         );
         assert!(without_panic(7, || Ok(3)).is_ok_and(|value| value == 3));

@@ -1,4 +1,5 @@
-//! The frames of a training run: their order, augmentation and preparation, each a function of (seed, epoch, frame) alone.
+//! The frames of a training run: their order, augmentation and preparation, each a function of (seed, epoch, frame)
+//! alone.
 
 use crate::{RunConfig, TrainError};
 use data::augment::{AugmentConfig, augment, crop_to_range};
@@ -9,7 +10,7 @@ use sha2::{Digest, Sha256};
 use std::path::Path;
 use std::sync::Arc;
 
-/// The frames that a run learns from.
+/// The training frames of a run.
 pub struct TrainingFrames {
     dataset: Dataset,
     ids: Vec<String>,
@@ -21,13 +22,13 @@ pub struct TrainingFrames {
 }
 
 impl TrainingFrames {
-    /// Of a run's data set: the training split with augmentation, or all frames as they are to overfit.
+    /// From a run's data set: the training split with augmentation, or all frames without augmentation to overfit.
     ///
-    /// The objects for ground-truth sampling are collected once and kept in `cache_folder`.
+    /// The database of ground-truth sampling is built once and cached in `cache_folder`.
     ///
     /// # Errors
-    /// A split that is missing or has no frame, classes or channels of the detector that the data set does not have, a frame that cannot be
-    /// read for the objects.
+    /// A split that is missing or has no frame, classes or channels of the detector that the data set does not have, a
+    /// frame that cannot be read for the objects.
     pub fn new(config: &RunConfig, dataset: &Dataset, cache_folder: &Path) -> Result<Self, TrainError> {
         let detector = &config.detector;
         check_fit(config, dataset)?;
@@ -62,17 +63,17 @@ impl TrainingFrames {
         crate::run_config::hex(&Sha256::digest(self.ids.join("\n")))
     }
 
-    /// Indices of all frames in the order in which `epoch` sees them.
+    /// Indices of all frames in the order of `epoch`.
     pub fn order(&self, epoch: u64) -> Vec<usize> {
         let mut order: Vec<usize> = (0..self.ids.len()).collect();
         order.shuffle(&mut stream(self.seed, "order", epoch, 0));
         order
     }
 
-    /// What the network gets when `epoch` comes to frame `index`.
+    /// The sample of frame `index` in `epoch`.
     ///
-    /// As in the reference, a frame without a box of the detector's classes in its range (after augmentation) is replaced by another one
-    /// drawn at random; not so when overfitting.
+    /// As in the reference, a frame without a box of the detector's classes in range after augmentation is replaced by
+    /// a random other one, except when overfitting.
     ///
     /// # Errors
     /// A frame that cannot be read, or no frame at all with a box.
@@ -99,7 +100,7 @@ impl TrainingFrames {
         Err(TrainError::folder(&self.dataset.config.root, message))
     }
 
-    /// The frame, augmented, with what lies in range only.
+    /// The augmented frame, cropped to the range.
     fn frame(&self, index: usize, random: &mut Stream) -> Result<Frame, TrainError> {
         let mut frame = self.dataset.load(&self.ids[index])?;
         if let Some((config, database)) = &self.augmentation {
@@ -111,7 +112,7 @@ impl TrainingFrames {
     }
 }
 
-/// The samples of all epochs from `(epoch, position)` on, made ahead by `workers` threads; `depth` of them at most lie ready.
+/// The samples of all epochs from `(epoch, position)` on, prefetched by `workers` threads; at most `depth` are queued.
 pub fn samples(
     frames: &Arc<TrainingFrames>,
     (epoch, position): (u64, usize),
@@ -126,7 +127,7 @@ pub fn samples(
     prefetch(jobs, workers, depth, move |&(epoch, index)| frames.sample(epoch, index))
 }
 
-/// Whether the data set has what the detector needs.
+/// Whether the data set has the classes, channels and labels that the detector needs.
 fn check_fit(config: &RunConfig, dataset: &Dataset) -> Result<(), TrainError> {
     let (detector, path) = (&config.detector, &config.dataset);
     let missing: Vec<&str> =
@@ -144,14 +145,15 @@ fn check_fit(config: &RunConfig, dataset: &Dataset) -> Result<(), TrainError> {
     let channels = dataset.config.points.channels();
     if channels < detector.channels {
         let message = format!(
-            "its points have {channels} values, the detector {} reads {}; give a detector for these points, or --set channels={channels}",
+            "its points have {channels} values, the detector {} reads {}; choose a detector for these points, or --set channels={channels}",
             detector.name, detector.channels
         );
         return Err(TrainError::folder(path, message));
     }
     if !dataset.has_labels() {
-        let message = format!("there are no labels in {}", dataset.config.layout.label_folder());
-        return Err(TrainError::folder(&dataset.config.root, message));
+        let labels = dataset.config.layout.labels_path(Path::new(""), "");
+        let folder = labels.parent().unwrap_or(&labels).display();
+        return Err(TrainError::folder(&dataset.config.root, format!("there are no labels in {folder}")));
     }
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Memory of this process, where the system says it (Linux).
+//! Memory use of this process (Linux only).
 
 /// Largest resident memory so far, or since [`reset_peak_mib`], MiB.
 pub fn peak_mib() -> Option<u64> {
@@ -7,7 +7,7 @@ pub fn peak_mib() -> Option<u64> {
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib / 1024)
 }
 
-/// Makes the largest resident memory the present one, and says it.
+/// Resets the peak of the resident memory and returns its current value.
 pub fn reset_peak_mib() -> Option<u64> {
     fs_err::write("/proc/self/clear_refs", "5").ok()?;
     peak_mib()

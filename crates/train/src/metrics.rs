@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::io::Write as _;
 use std::path::Path;
 
-/// What happened in the steps since the line before.
+/// Metrics of the steps since the previous line.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StepMetrics {
     /// Steps done.
@@ -16,7 +16,7 @@ pub struct StepMetrics {
     pub epoch: u64,
     /// Total loss of the last step.
     pub loss: f64,
-    /// Its summands.
+    /// The terms of the total loss.
     pub losses: BTreeMap<String, f64>,
     /// Learning rate of the last step.
     pub lr: f64,
@@ -30,22 +30,22 @@ pub struct StepMetrics {
     pub data_wait_share: f64,
 }
 
-/// What happened in an epoch.
+/// Metrics of an epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct EpochMetrics {
     /// Steps done.
     pub step: u64,
     /// The epoch, from 0.
     pub epoch: u64,
-    /// Mean of the total loss over the steps of this epoch that this process did.
+    /// Mean of the total loss over those steps of the epoch that ran in this process.
     pub train_loss: f64,
-    /// Where the time of those steps went.
+    /// Time of those steps by stage.
     pub seconds: StageSeconds,
-    /// Evaluation on the validation split, where it was the epoch's turn.
+    /// Evaluation on the validation split, if one was due.
     pub validation: Option<ValidationMetrics>,
 }
 
-/// Where time went, s.
+/// Time by stage, s.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct StageSeconds {
     /// Waiting for frames to be loaded and augmented.
@@ -65,13 +65,14 @@ pub struct StageSeconds {
 pub struct ValidationMetrics {
     /// Mean loss over the batches, with the running statistics.
     pub loss: f64,
-    /// Mean over the classes that occur of the exact-area average precision in 3D, no filter for difficulty, official overlaps; percent.
+    /// 3D average precision (exact area under the curve, no difficulty filter, KITTI's official overlaps), mean over
+    /// the classes that occur; percent.
     pub ap: Option<f64>,
-    /// The same at the reference's loose overlaps.
+    /// The same at the lower overlaps that OpenPCDet reports.
     pub ap_loose: Option<f64>,
     /// `ap` of each class; `null` for one that does not occur.
     pub ap_of_class: BTreeMap<String, Option<f64>>,
-    /// How long it took.
+    /// Duration, s.
     pub seconds: f64,
 }
 
@@ -88,9 +89,9 @@ pub(crate) struct MetricsFile {
 }
 
 impl MetricsFile {
-    /// Opens the file after cutting it back to what happened up to `step`: a resumed run writes the rest again.
+    /// Opens the file and removes all lines after `step`: a resumed run writes them again.
     pub fn open(path: &Path, step: u64) -> Result<Self, TrainError> {
-        cut_back(path, step)?;
+        truncate_after(path, step)?;
         Ok(MetricsFile { file: fs_err::OpenOptions::new().create(true).append(true).open(path)? })
     }
 
@@ -109,14 +110,14 @@ impl MetricsFile {
     }
 }
 
-fn cut_back(path: &Path, step: u64) -> Result<(), TrainError> {
+fn truncate_after(path: &Path, step: u64) -> Result<(), TrainError> {
     let bytes = match fs_err::read(path) {
         Ok(bytes) => bytes,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
         Err(e) => return Err(e.into()),
     };
     let mut kept = Vec::new();
-    // What stands behind the last line's end was cut off in the middle of writing.
+    // An incomplete last line is from a process that was killed while writing.
     for (i, line) in bytes.split_inclusive(|b| *b == b'\n').filter(|line| line.ends_with(b"\n")).enumerate() {
         let parsed: Option<serde_json::Value> = serde_json::from_slice(line).ok();
         let Some(at) = parsed.as_ref().and_then(|v| v.get("step")?.as_u64()) else {
@@ -152,7 +153,7 @@ mod tests {
     }
 
     #[test]
-    fn a_resumed_run_goes_on_behind_its_checkpoint() {
+    fn a_resumed_run_continues_after_its_checkpoint() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("metrics.jsonl");
         let mut file = MetricsFile::open(&path, 0).unwrap();

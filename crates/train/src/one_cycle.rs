@@ -1,13 +1,14 @@
-//! The one-cycle schedule of learning rate and momentum (Smith 2018), as fastai and OpenPCDet compute it.
+//! The one-cycle schedule of learning rate and momentum (Smith 2018), as in fastai and OpenPCDet.
 
 use models::config::OptimizationConfig;
 use std::f64::consts::PI;
 
 /// Learning rate and `beta1` of every iteration of a run.
 ///
-/// Both follow half cosines: over the first `pct_start` of the iterations the rate climbs from `lr_max / div_factor` to `lr_max` while
-/// the momentum falls from `momentum[0]` to `momentum[1]`; over the rest the rate falls to `lr_max / div_factor / 1e4` and the momentum
-/// climbs back. The values are set before an iteration, so iteration 0 runs at `lr_max / div_factor`.
+/// Both follow half cosines. Over the first `pct_start` of the iterations the rate rises from `lr_max / div_factor` to
+/// `lr_max` and the momentum falls from `momentum[0]` to `momentum[1]`. Over the rest the rate falls to `lr_max /
+/// div_factor / 1e4` and the momentum rises back to `momentum[0]`. The values are set before an iteration, so iteration
+/// 0 runs at `lr_max / div_factor`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OneCycle {
     total_steps: u64,
@@ -40,7 +41,7 @@ impl OneCycle {
     }
 }
 
-/// From `start` at share 0 to `end` at share 1 along half a cosine.
+/// Half-cosine interpolation from `start` at share 0 to `end` at share 1.
 fn half_cosine(start: f64, end: f64, share: f64) -> f64 {
     end + (start - end) / 2.0 * ((PI * share).cos() + 1.0)
 }

@@ -1,4 +1,4 @@
-//! `provenance.json`: what made a run, from what and where.
+//! `provenance.json`: program, data and machine of a run.
 
 use crate::run_config::hex;
 use crate::{RunConfig, TrainError};
@@ -11,7 +11,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// Version of `provenance.json`.
 pub const PROVENANCE_SCHEMA: &str = "lidarshift/provenance/1";
 
-/// What made a run, from what and where.
+/// Program, data and machine of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
@@ -21,13 +21,13 @@ pub struct Provenance {
     pub config_sha256: String,
     /// The data set.
     pub dataset: DatasetProvenance,
-    /// SHA-256 of the checkpoint that the run began with.
+    /// SHA-256 of the initial checkpoint.
     pub init_sha256: Option<String>,
-    /// The processes that worked on it, in order.
+    /// The processes that trained the run, in order.
     pub sessions: Vec<SessionProvenance>,
 }
 
-/// What a run learned from.
+/// The training data of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetProvenance {
@@ -41,13 +41,13 @@ pub struct DatasetProvenance {
     pub frames_sha256: String,
 }
 
-/// One process that worked on a run.
+/// One process that trained a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SessionProvenance {
-    /// Steps that had been done before it.
+    /// Number of steps before it.
     pub from_step: u64,
-    /// When it began, s since 1970.
+    /// Start time, s since 1970.
     pub began_unix_s: u64,
     /// Its command line.
     pub command: Vec<String>,
@@ -57,18 +57,18 @@ pub struct SessionProvenance {
     pub program_sha256: Option<String>,
     /// Operating system and architecture.
     pub system: String,
-    /// Model of the processor, where the system says it.
+    /// Model of the processor, if known.
     pub processor: Option<String>,
     /// Logical processors.
     pub threads: usize,
-    /// What computed.
+    /// Compute device.
     pub device: String,
-    /// Threads that loaded frames.
+    /// Number of loader threads.
     pub workers: usize,
 }
 
 impl SessionProvenance {
-    /// Of this process.
+    /// The entry of this process.
     pub fn now(from_step: u64, device: &str, workers: usize) -> Self {
         let program = std::env::current_exe().ok().and_then(|path| std::fs::read(path).ok());
         let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -88,7 +88,7 @@ impl SessionProvenance {
     }
 }
 
-/// Adds a session to the file, which the first one makes.
+/// Appends a session to the file and creates the file if needed.
 pub(crate) fn record_session(
     path: &Path,
     config: &RunConfig,

@@ -1,6 +1,7 @@
-//! Everything that decides the weights of a run, and nothing else: `config.toml` of a run folder.
+//! The configuration of a run, `config.toml` in its folder: all that the weights depend on.
 
 use crate::TrainError;
+use data::toml_text::{message_with_key, read_toml};
 use models::config::DetectorConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -8,40 +9,41 @@ use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 
-/// One run. Device and number of loader threads are not in it: they may change when a run is resumed.
+/// The configuration of a run. Device and number of loader threads are not part of it, because they may change when a
+/// run is resumed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RunConfig {
-    /// Of the weights, the order of the frames and the augmentation.
+    /// Seed of the initial weights, the order of the frames and the augmentation.
     pub seed: u64,
     /// Folder or TOML of the data set, absolute or relative to the working folder.
     pub dataset: PathBuf,
-    /// Train and evaluate on all frames, without augmentation: shows that a network can learn at all.
+    /// Overfit: train and evaluate on all frames without augmentation.
     #[serde(default)]
     pub overfit: bool,
-    /// Checkpoint whose weights the run begins with.
+    /// Checkpoint with the initial weights.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init: Option<PathBuf>,
-    /// When things happen.
+    /// Intervals of logging, checkpoints and evaluation.
     #[serde(default)]
     pub run: RunOptions,
-    /// What is trained, and how.
+    /// The detector and its training.
     pub detector: DetectorConfig,
 }
 
-/// When a run writes, keeps and evaluates.
+/// Splits, and intervals of logging, checkpoints and evaluation.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RunOptions {
-    /// Split to learn from.
+    /// Training split.
     pub train_split: String,
-    /// Split to choose the best checkpoint with; a data set without it is not evaluated during training.
+    /// Validation split for the best checkpoint. A data set without it is not evaluated during training.
     pub val_split: String,
     /// Steps between lines of `metrics.jsonl`.
     pub log_every_steps: u64,
-    /// Steps between checkpoints; there is one at the end of every epoch as well.
+    /// Steps between checkpoints. A checkpoint is also written at the end of every epoch.
     pub checkpoint_every_steps: u64,
-    /// Checkpoints that are kept beside the best one.
+    /// Number of checkpoints kept in addition to the best one.
     pub keep_checkpoints: usize,
     /// Epochs between evaluations; the last epoch is always evaluated. 0: never.
     pub evaluate_every_epochs: u64,
@@ -61,12 +63,13 @@ impl Default for RunOptions {
 }
 
 impl RunConfig {
-    /// From a table that has been merged before, typed and checked here once.
+    /// Parses and checks a merged table.
     ///
     /// # Errors
     /// An unknown key, a wrong type, or values that do not fit together; the message names the key.
     pub fn from_table(table: Table) -> Result<Self, TrainError> {
-        let config: RunConfig = table.try_into().map_err(|e: toml::de::Error| TrainError::Config(one_line(&e)))?;
+        let config: RunConfig =
+            table.try_into().map_err(|e: toml::de::Error| TrainError::Config(message_with_key(&e)))?;
         config.detector.check().map_err(TrainError::Config)?;
         config
             .detector
@@ -86,20 +89,17 @@ impl RunConfig {
     /// # Errors
     /// A file that cannot be read, or what [`RunConfig::from_table`] refuses.
     pub fn read(path: &Path) -> Result<Self, TrainError> {
-        let text = fs_err::read_to_string(path)?;
-        let table: Table =
-            text.parse().map_err(|e: toml::de::Error| TrainError::folder(path, e.to_string().trim_end()))?;
-        Self::from_table(table).map_err(|e| TrainError::folder(path, e.to_string()))
+        Self::from_table(read_toml(path, |_| Ok(()))?).map_err(|e| TrainError::folder(path, e.to_string()))
     }
 
-    /// As TOML, every default written out.
+    /// As TOML with all defaults.
     pub fn to_toml(&self) -> String {
         toml::to_string(self).expect("a run's configuration is plain TOML")
     }
 
-    /// As a table, to be merged with.
+    /// As a table for merging.
     pub fn to_table(&self) -> Table {
-        self.to_toml().parse().expect("what was written is read")
+        self.to_toml().parse().expect("own TOML is valid")
     }
 
     /// SHA-256 of the TOML, in hexadecimal.
@@ -107,7 +107,7 @@ impl RunConfig {
         hex(&Sha256::digest(self.to_toml()))
     }
 
-    /// The keys in which two runs differ, as `optimization.epochs is 10, not 20`: first the value of `self`.
+    /// The keys in which two runs differ, as `optimization.epochs is 10, not 20`, with the value of `self` first.
     pub fn differences(&self, other: &RunConfig) -> Vec<String> {
         let mut found = Vec::new();
         compare("", &Value::Table(self.to_table()), &Value::Table(other.to_table()), &mut found);
@@ -115,11 +115,12 @@ impl RunConfig {
     }
 }
 
-/// Sets `a.b=c` in a run's table before it is typed. A key whose first part is none of the run's own belongs to the detector, so
-/// `optimization.lr_max=0.001` is short for `detector.optimization.lr_max=0.001`. The value is TOML, or else a plain word.
+/// Sets `a.b=c` in a run's table before it is typed. A key whose first part is not a key of the run belongs to the
+/// detector: `optimization.lr_max=0.001` is short for `detector.optimization.lr_max=0.001`. The value is parsed as
+/// TOML; if it is not TOML it is a string.
 ///
 /// # Errors
-/// A text without `=`, or a key below something that is no table.
+/// A text without `=`, or a key below a value that is not a table.
 pub fn set_key(table: &mut Table, assignment: &str) -> Result<(), TrainError> {
     let wrong = |message: String| TrainError::Config(format!("--set {assignment}: {message}"));
     let (key, text) = assignment.split_once('=').ok_or_else(|| wrong("is not of the form a.b=c".into()))?;
@@ -158,11 +159,6 @@ fn compare(path: &str, ours: &Value, theirs: &Value, found: &mut Vec<String>) {
     } else if ours != theirs {
         found.push(format!("{path} is {ours}, not {theirs}"));
     }
-}
-
-/// The message with the key that it speaks of.
-fn one_line(error: &toml::de::Error) -> String {
-    error.to_string().trim().replace('\n', " ")
 }
 
 pub(crate) fn hex(bytes: &[u8]) -> String {
@@ -216,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_and_hashes_alike() {
+    fn a_written_configuration_is_read_with_the_same_hash() {
         let config = RunConfig::from_table(tiny_table(Path::new("/data"))).unwrap();
         let again = RunConfig::from_table(config.to_table()).unwrap();
         assert_eq!((&config, config.sha256()), (&again, again.sha256()));

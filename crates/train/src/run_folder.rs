@@ -1,8 +1,10 @@
-//! The folder of a run: `config.toml`, `metrics.jsonl`, `provenance.json` and `checkpoint/`, usable after a kill at any moment.
+//! The folder of a run: `config.toml`, `metrics.jsonl`, `provenance.json` and `checkpoint/`. It is consistent after a
+//! kill at any time.
 //!
-//! A checkpoint is two files, weights and moments of the optimiser, which appear whole and are never changed; then `state.json`, which
-//! names them, takes the place of the one before. Whatever is not named there does not count. `last.safetensors` and `best.safetensors` are
-//! further names of such weights, given before the state says so: whoever reads of a step there finds its weights under them.
+//! A checkpoint is two files, weights and moments of the optimiser. They are written atomically and never changed. Then
+//! `state.json`, which names them, is replaced atomically; files that it does not name are ignored. `last.safetensors`
+//! and `best.safetensors` are links to such weights. They are updated before the state, so that the weights of the
+//! state's step are always available under these names.
 
 use crate::TrainError;
 use crate::run_config::hex;
@@ -19,7 +21,7 @@ use std::path::{Path, PathBuf};
 /// Version of `state.json`.
 pub const STATE_SCHEMA: &str = "lidarshift/run-state/1";
 
-/// Where a run stands.
+/// The state of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RunState {
@@ -29,13 +31,13 @@ pub struct RunState {
     pub total_steps: u64,
     /// The epoch that the next step belongs to, from 0.
     pub epoch: u64,
-    /// Frames of that epoch that have been seen.
+    /// Frames of that epoch that have been processed.
     pub position: usize,
     /// The run's seed.
     pub seed: u64,
     /// [`crate::RunConfig::sha256`].
     pub config_sha256: String,
-    /// Of the ids of the training frames.
+    /// SHA-256 of the ids of the training frames.
     pub frames_sha256: String,
     /// The best checkpoint so far.
     pub best: Option<Best>,
@@ -45,13 +47,13 @@ pub struct RunState {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Best {
-    /// After that step.
+    /// The step after which it was written.
     pub step: u64,
     /// Average precision on the validation split, percent.
     pub ap: f64,
 }
 
-/// What `state.json` holds.
+/// The content of `state.json`.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct StateFile {
@@ -61,14 +63,14 @@ struct StateFile {
     sha256: BTreeMap<String, String>,
 }
 
-/// A run folder that no other process can open while this value lives.
+/// A run folder, locked against other processes while this value lives.
 pub struct RunFolder {
     path: PathBuf,
     _lock: File,
 }
 
 impl RunFolder {
-    /// Opens or makes the folder, and removes what a killed process left half written.
+    /// Opens or creates the folder and removes incomplete files of a killed process.
     ///
     /// # Errors
     /// A folder in use by another process, or one that cannot be written.
@@ -96,7 +98,7 @@ impl RunFolder {
         self.path.join("metrics.jsonl")
     }
 
-    /// Who made this, where and with what.
+    /// Program, data and machine of the run.
     pub fn provenance_path(&self) -> PathBuf {
         self.path.join("provenance.json")
     }
@@ -119,7 +121,7 @@ impl RunFolder {
         self.checkpoints().join("state.json")
     }
 
-    /// Where the run stands; `None` before its first checkpoint.
+    /// The state of the run; `None` before its first checkpoint.
     ///
     /// # Errors
     /// A state that is damaged.
@@ -131,10 +133,11 @@ impl RunFolder {
         read_state_file(&self.state_path())
     }
 
-    /// Writes a checkpoint; when this returns, a resume goes on from it. Older ones go but `keep`, and the best.
+    /// Writes a checkpoint; a resume continues from it once this returns. Keeps the last `keep` checkpoints and the
+    /// best one.
     ///
     /// # Errors
-    /// Files that cannot be written; the checkpoint before then still stands.
+    /// Files that cannot be written; the previous checkpoint then remains valid.
     pub fn save(
         &self,
         state: &RunState,
@@ -152,7 +155,7 @@ impl RunFolder {
             sha256.insert(name, hex(&Sha256::digest(bytes)));
         }
         let file = StateFile { schema: STATE_SCHEMA.into(), state: state.clone(), sha256 };
-        self.name_last_and_best(state)?;
+        self.link_last_and_best(state)?;
         write_json(&self.state_path(), &file)?;
         self.remove_all_but(state, keep)
     }
@@ -160,7 +163,7 @@ impl RunFolder {
     /// Weights and moments of the last checkpoint.
     ///
     /// # Errors
-    /// Files that are missing or not those that were written.
+    /// Files that are missing or have a wrong checksum.
     pub fn load(&self) -> Result<Option<(RunState, NamedTensors, NamedTensors)>, TrainError> {
         let Some(file) = self.state_file()? else { return Ok(None) };
         let [weights, moments] = names(file.state.step).map(|name| {
@@ -173,12 +176,13 @@ impl RunFolder {
             }
             Ok(read_safetensors(&path)?)
         });
-        self.name_last_and_best(&file.state)?;
+        self.link_last_and_best(&file.state)?;
         Ok(Some((file.state, weights?, moments?)))
     }
 
-    /// Gives the weights of the state's step their further names. Done again on loading: they may be those of a step whose state was never written.
-    fn name_last_and_best(&self, state: &RunState) -> Result<(), TrainError> {
+    /// Links `last` and `best` to the weights of the state. Repeated on loading, because they may belong to a step
+    /// whose state was never written.
+    fn link_last_and_best(&self, state: &RunState) -> Result<(), TrainError> {
         let weights = self.checkpoints().join(&names(state.step)[0]);
         link(&weights, &self.last_weights())?;
         if state.best.as_ref().is_some_and(|best| best.step == state.step) {
@@ -207,7 +211,8 @@ impl RunFolder {
     }
 }
 
-/// Where the run in a folder stands, without opening it: another process may be at work in it. `None` before its first checkpoint.
+/// The state of a run without locking its folder, which another process may be using. `None` before its first
+/// checkpoint.
 ///
 /// # Errors
 /// A state that is damaged.
@@ -238,7 +243,7 @@ fn names(step: u64) -> [String; 2] {
     [format!("step-{step}.safetensors"), format!("step-{step}.optimizer.safetensors")]
 }
 
-/// Checksum of a state, its AP to the sixth decimal: a number may change in its last bit when JSON is read.
+/// Checksum of a state with its AP rounded to six decimals, because reading JSON may change the last bit of a number.
 fn state_sha256(state: &RunState) -> String {
     let mut state = state.clone();
     if let Some(best) = &mut state.best {
@@ -247,17 +252,17 @@ fn state_sha256(state: &RunState) -> String {
     exact_sha256(&state)
 }
 
-/// As earlier versions wrote it.
+/// The checksum of earlier versions.
 fn exact_sha256(state: &RunState) -> String {
     hex(&Sha256::digest(serde_json::to_vec(state).expect("a state is plain JSON")))
 }
 
-/// A second name of a file that is never changed, in place of what had the name before; a copy where the file system has no links.
+/// Replaces `name` by a hard link to `file`, or by a copy if the file system has no links.
 fn link(file: &Path, name: &Path) -> Result<(), TrainError> {
     let temporary = name.with_file_name(format!(".writing-link-{}", std::process::id()));
     if fs_err::hard_link(file, &temporary).is_ok() {
         fs_err::rename(&temporary, name)?;
-        // Two names of one file: the rename did nothing, as POSIX wants it.
+        // Both names were the same file: POSIX defines that the rename then does nothing.
         match fs_err::remove_file(&temporary) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e.into()),
             _ => return Ok(()),
@@ -322,12 +327,12 @@ mod tests {
     }
 
     #[test]
-    fn an_ap_that_json_reads_off_by_its_last_bit_is_no_damage() {
+    fn an_ap_that_json_changes_in_its_last_bit_is_accepted() {
         let ap = 13.406_728_366_057_271_f64;
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("state.json");
         let state = state(5, Some(Best { step: 5, ap }));
-        // What the parser made of it once, and does no more with another version of it.
+        // The value that an earlier version of the parser read.
         for read in [f64::from_bits(ap.to_bits() + 1), ap] {
             let written = StateFile {
                 schema: STATE_SCHEMA.into(),
@@ -374,14 +379,14 @@ mod tests {
     }
 
     #[test]
-    fn what_a_kill_left_behind_does_not_count() {
+    fn files_of_a_killed_process_are_ignored() {
         let dir = tempfile::tempdir().unwrap();
         let folder = RunFolder::open(dir.path()).unwrap();
         let best = Some(Best { step: 10, ap: 50.0 });
         folder.save(&state(10, best.clone()), &tensors(10.0), &BTreeMap::new(), &tensors(1.0), 2).unwrap();
-        // Killed while writing a file, between the files of the next checkpoint, and before the further names were given.
+        // Killed while writing a file, between the files of the next checkpoint, and before linking.
         std::fs::write(folder.checkpoints().join(".writing-abc"), b"half").unwrap();
-        std::fs::write(folder.checkpoints().join("step-20.safetensors"), b"whole, but not named").unwrap();
+        std::fs::write(folder.checkpoints().join("step-20.safetensors"), b"complete, but not named").unwrap();
         std::fs::remove_file(folder.last_weights()).unwrap();
         std::fs::remove_file(folder.best_weights()).unwrap();
         drop(folder);
@@ -398,10 +403,10 @@ mod tests {
     }
 
     #[test]
-    fn the_last_weights_are_never_behind_the_state() {
+    fn last_weights_are_never_older_than_the_state() {
         let dir = tempfile::tempdir().unwrap();
         let folder = RunFolder::open(dir.path()).unwrap();
-        std::fs::create_dir(folder.state_path()).unwrap(); // stands for a kill when the state is written
+        std::fs::create_dir(folder.state_path()).unwrap(); // simulates a kill when the state is written
         assert!(folder.save(&state(10, None), &tensors(10.0), &BTreeMap::new(), &tensors(1.0), 2).is_err());
         assert_eq!(read_safetensors(&folder.last_weights()).unwrap(), tensors(10.0));
     }

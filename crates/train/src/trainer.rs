@@ -1,4 +1,4 @@
-//! The training loop, read top to bottom in [`train`].
+//! The training loop: [`train`].
 
 use crate::error::without_panic;
 use crate::provenance::record_session;
@@ -19,60 +19,60 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// How a process works on a run; nothing of it changes the weights, but for the rounding of another device.
+/// Settings of a process that trains a run. They do not change the weights, except for the rounding of another device.
 #[derive(Clone, Debug)]
 pub struct Session {
-    /// Where the network computes, without autodiff.
+    /// Compute device, without autodiff.
     pub device: Device,
     /// Its name, for the provenance.
     pub device_name: String,
     /// Threads that load and augment frames.
     pub workers: usize,
-    /// Go on with a run that is there; without it such a folder is refused.
+    /// Resume an existing run. Without it a folder with a run is refused.
     pub resume: bool,
 }
 
-/// What a run tells while it works.
+/// Progress of a run.
 #[derive(Clone, Debug)]
 pub enum Event<'a> {
-    /// Before the first step.
+    /// Sent before the first step.
     Begin {
-        /// Where the run stands.
+        /// The state of the run.
         state: &'a RunState,
         /// Epochs of the whole run.
         epochs: u64,
-        /// Frames it learns from.
+        /// Number of training frames.
         frames: usize,
-        /// Frames it is evaluated on; 0 without a validation split.
+        /// Number of validation frames; 0 without a validation split.
         validation_frames: usize,
     },
-    /// After each step.
+    /// Sent after each step.
     Step {
-        /// What happened since the last line of `metrics.jsonl`, and in this step.
+        /// Metrics since the last line of `metrics.jsonl`.
         metrics: &'a StepMetrics,
-        /// This is a line of `metrics.jsonl`.
+        /// Whether they were written to `metrics.jsonl`.
         logged: bool,
     },
-    /// After each epoch.
+    /// Sent after each epoch.
     Epoch(&'a EpochMetrics),
 }
 
-/// A run that has come to its end.
+/// A finished run.
 #[derive(Debug)]
 pub struct Trained {
-    /// With the weights of the last step.
+    /// The detector with the weights of the last step.
     pub detector: Detector,
-    /// Where the run stands.
+    /// The state of the run.
     pub state: RunState,
-    /// The last evaluation that this process did.
+    /// The last evaluation by this process.
     pub validation: Option<ValidationMetrics>,
 }
 
-/// Trains a detector in the run folder `out`, from the beginning or from where the run was stopped, to its end.
+/// Trains a detector in the run folder `out` to the end, from the beginning or from the last checkpoint.
 ///
 /// # Errors
-/// Another process in the folder, a run that is there already (without resume) or was begun otherwise, anything wrong with the data set,
-/// files that cannot be written, and the first loss or gradient that is not finite.
+/// A folder in use by another process, an existing run without `resume` or with another configuration, a data set that
+/// is wrong, files that cannot be written, and a loss or gradient that is not finite.
 pub fn train(
     config: &RunConfig,
     out: &Path,
@@ -122,7 +122,7 @@ pub fn train(
     Ok(Trained { detector: run.detector, state: run.state, validation })
 }
 
-/// What changes in the course of a run.
+/// The mutable state of a run.
 struct Run<'a> {
     config: &'a RunConfig,
     dataset: Dataset,
@@ -133,7 +133,7 @@ struct Run<'a> {
     state: RunState,
 }
 
-/// What one step says of itself.
+/// The metrics of one step.
 struct Step {
     losses: Vec<(&'static str, f64)>,
     gradient_norm: f64,
@@ -142,7 +142,7 @@ struct Step {
 }
 
 impl<'a> Run<'a> {
-    /// Opens data set and network, and takes up the last checkpoint if there is one.
+    /// Opens data set and network, and restores the last checkpoint if there is one.
     fn begin(
         config: &'a RunConfig,
         folder: &RunFolder,
@@ -200,13 +200,13 @@ impl<'a> Run<'a> {
         Ok((Run { config, dataset, validation_ids, schedule, adam, detector, state }, frames))
     }
 
-    /// One step: forward, backward, clip, move.
+    /// One step: forward, backward, clipping, update.
     fn learn(&mut self, batch: &[Sample], clock: &mut Clock) -> Result<Step, TrainError> {
         let (losses, values) = clock.forward(|| {
             let losses = self.detector.loss(batch)?;
             loss_values(&losses).map(|values| (losses, values))
         })?;
-        // The parts come before their sum, which is only as good as they are.
+        // The parts are checked before their sum, so that the message names the part.
         if let Some((name, _)) = values[1..].iter().chain(&values[..1]).find(|(_, value)| !value.is_finite()) {
             return Err(self.not_finite(format!("the loss {name}"), batch));
         }
@@ -237,7 +237,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// Whether the epoch that has just been trained is to be evaluated.
+    /// Whether an evaluation is due after the current epoch.
     fn is_evaluation_due(&self, epochs: u64) -> bool {
         let (done, every) = (self.state.epoch + 1, self.config.run.evaluate_every_epochs);
         !self.validation_ids.is_empty() && (done == epochs || done.is_multiple_of(every))
@@ -267,14 +267,14 @@ impl<'a> Run<'a> {
     }
 }
 
-/// A folder with a run in it is only gone on with when that is asked for, and with the same configuration.
+/// Refuses a folder with a run, unless it is to be resumed with the same configuration.
 fn refuse_other_run(config: &RunConfig, folder: &RunFolder, resume: bool) -> Result<(), TrainError> {
     let path = folder.config_path();
     if !path.is_file() {
         return Ok(());
     }
     if !resume {
-        let message = "there is a run in this folder already: add --resume to go on with it, or give another --out";
+        let message = "there is a run in this folder already: add --resume to continue it, or choose another --out";
         return Err(TrainError::folder(folder.path(), message));
     }
     let differences = RunConfig::read(&path)?.differences(config);
@@ -282,14 +282,14 @@ fn refuse_other_run(config: &RunConfig, folder: &RunFolder, resume: bool) -> Res
         return Ok(());
     }
     let message = format!(
-        "this run was begun with other settings ({}); they cannot change on the way: leave them out to go on, or begin a new run with \
+        "this run was started with other settings ({}), which cannot change: leave them out to continue, or start a new run with \
          another --out",
         differences.join("; ")
     );
     Err(TrainError::folder(&path, message))
 }
 
-/// Where the time of an epoch goes, and of the steps since the last line of metrics.
+/// Time by stage of an epoch, and of the steps since the last line of metrics.
 struct Clock {
     stages: StageSeconds,
     losses: f64,

@@ -8,7 +8,7 @@ use models::{Detector, Losses, ModelError, Prediction, Preparer, Sample, predict
 use std::collections::BTreeMap;
 use std::time::Instant;
 
-/// What a detector finds on labelled frames.
+/// The detections of a detector on labelled frames, and their evaluation.
 #[derive(Clone, Debug)]
 pub struct Evaluation {
     /// Labels and detections as texts, in the frame of the data set's labels.
@@ -19,11 +19,11 @@ pub struct Evaluation {
     pub report: EvalReport,
     /// Mean total loss over the batches, with the running statistics.
     pub loss: f64,
-    /// How long it took, s.
+    /// Duration, s.
     pub seconds: f64,
 }
 
-/// Runs the detector over frames of a data set with labels. `progress` hears how many are done.
+/// Runs the detector over frames of a data set with labels. `progress` is called with the number of frames done.
 ///
 /// # Errors
 /// A frame that cannot be read, or scores that are not numbers.
@@ -73,7 +73,7 @@ pub fn evaluate_detector(
 }
 
 impl Evaluation {
-    /// The numbers for `metrics.jsonl`.
+    /// The metrics for `metrics.jsonl`.
     pub fn metrics(&self, classes: &[String]) -> ValidationMetrics {
         let of_set = |set: usize| -> BTreeMap<String, Option<f64>> {
             let of_class = |class: &String| {

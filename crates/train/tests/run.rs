@@ -1,4 +1,4 @@
-//! Whole runs of a tiny network on made-up frames.
+//! Complete runs of a tiny network on synthetic frames.
 
 use burn::tensor::Device;
 use data::write::write_split;
@@ -163,7 +163,7 @@ fn a_run_stopped_at_any_step_and_resumed_ends_with_the_same_bits() {
 }
 
 #[test]
-fn pointrcnn_resumes_to_the_bit_whatever_the_workers() {
+fn pointrcnn_resumes_bit_equal_for_any_number_of_workers() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let config = pointrcnn(dir.path(), &[]);
@@ -189,7 +189,7 @@ fn pointrcnn_resumes_to_the_bit_whatever_the_workers() {
 }
 
 #[test]
-fn workers_change_nothing_and_seeds_everything() {
+fn workers_do_not_change_weights_but_seeds_do() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let [one, four, other] = ["one", "four", "other"].map(|name| dir.path().join(name));
@@ -202,7 +202,7 @@ fn workers_change_nothing_and_seeds_everything() {
 }
 
 #[test]
-fn the_folder_says_what_was_done() {
+fn the_folder_records_provenance_and_metadata() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let config = config(dir.path(), &["overfit=true", "run.evaluate_every_epochs=2"]);
@@ -220,13 +220,13 @@ fn the_folder_says_what_was_done() {
 }
 
 #[test]
-fn a_run_begins_with_the_weights_it_is_given_and_refuses_those_of_another_network() {
+fn initial_weights_are_loaded_and_must_fit_the_network() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let first = dir.path().join("first");
     run(&config(dir.path(), &["optimization.epochs=1"]), &first, 1, false).unwrap();
     let init = format!("init={}", first.join("checkpoint/last.safetensors").display());
-    // A rate of next to nothing leaves them as they are.
+    // A learning rate of almost zero does not change them.
     let same = config(dir.path(), &[&init, "optimization.epochs=1", "optimization.lr_max=1e-30"]);
     run(&same, &dir.path().join("same"), 1, false).unwrap();
     assert_eq!(
@@ -239,7 +239,7 @@ fn a_run_begins_with_the_weights_it_is_given_and_refuses_those_of_another_networ
 }
 
 #[test]
-fn what_cannot_be_resumed_is_refused() {
+fn changed_settings_or_frames_are_not_resumed() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let out = dir.path().join("run");
@@ -254,7 +254,7 @@ fn what_cannot_be_resumed_is_refused() {
 }
 
 #[test]
-fn the_first_number_that_is_none_stops_the_run() {
+fn a_value_that_is_not_finite_stops_the_run() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let config = config(dir.path(), &["optimization.lr_max=1e30"]);
@@ -263,7 +263,7 @@ fn the_first_number_that_is_none_stops_the_run() {
 }
 
 #[test]
-fn data_that_do_not_fit_are_refused() {
+fn data_sets_that_do_not_fit_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let refused = |assignments: &[&str], want: &str| {
@@ -283,7 +283,7 @@ fn data_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn frames_with_no_point_in_range_are_no_obstacle() {
+fn frames_without_points_in_range_are_accepted() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     for id in ["000001", "000006"] {

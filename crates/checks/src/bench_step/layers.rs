@@ -4,7 +4,8 @@ use super::{Timed, WARM_UP};
 use anyhow::Result;
 use kernels::{Algorithm, Conv3x3, Epilogue, PillarNet, PillarParameters, Pillars};
 use models::Sample;
-use models::config::{DetectorConfig, PointPillarsConfig};
+use models::config::DetectorConfig;
+use models::pointpillars::PointPillarsConfig;
 use rand::{Rng, RngExt};
 use std::hint::black_box;
 use std::time::Instant;
@@ -48,7 +49,7 @@ pub(super) fn pillar_net(network: &PointPillarsConfig, batch: &[Sample], steps: 
     let mut random = data::stream(0, "bench pillar net", 0, 0);
     let of_pillars = batch.iter().filter_map(|sample| match sample {
         Sample::PointPillars(sample) => Some(sample),
-        Sample::PointRcnn(_) => None,
+        _ => None,
     });
     let features: Vec<f32> = of_pillars.clone().flat_map(|s| s.features.iter().copied()).collect();
     let num_points: Vec<u32> = of_pillars.flat_map(|s| s.pillars.num_points.iter().copied()).collect();

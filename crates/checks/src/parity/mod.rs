@@ -4,12 +4,22 @@ mod manifest;
 mod network;
 mod operators;
 mod point_operators;
-mod pointpillars;
-mod pointrcnn;
 mod recipe;
 mod reference;
 mod rotations;
 mod toy_training;
+
+/// Declares the file of each detector and the table of their comparisons.
+macro_rules! detectors {
+    ($($file:ident),+ $(,)?) => {
+        $(mod $file;)+
+
+        /// All detectors that reference numbers are compared for.
+        const DETECTORS: &[network::DetectorChecks] = &[$($file::CHECKS),+];
+    };
+}
+
+detectors!(pointpillars, pointrcnn);
 
 use anyhow::{Context, Result};
 use clap::Args;

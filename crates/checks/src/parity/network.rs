@@ -1,15 +1,15 @@
 //! A network against a folder of reference numbers: what all networks have in common. Their stages are in files of their own.
 
 use super::manifest::Manifest;
+use super::recipe;
 use super::reference::{ReferenceFile, Row, numbers};
-use super::{pointpillars, pointrcnn, recipe};
 use anyhow::{Context, Result};
 use burn::tensor::{Device, Tensor};
 use data::{Cloud, Frame};
 use models::checkpoint::{HostValues, read_checkpoint, read_safetensors};
 use models::config::{DetectorConfig, NetworkConfig};
 use models::layers::host;
-use models::{Detector, Losses, Network, named};
+use models::{Detector, Losses, named};
 use std::path::Path;
 
 /// A stage may not differ by more than this, whatever the reference's own rounding.
@@ -20,6 +20,18 @@ pub const STAGE_LIMIT: f64 = 1e-3;
 /// whose gradients have a narrow limit, and in large ones.
 const NUDGES: [u64; 2] = [64, 12];
 const NUDGED_DIGITS: u64 = 12;
+
+/// The comparisons of one kind of detector.
+pub struct DetectorChecks {
+    /// `model_cfg.NAME` in the manifest.
+    pub name: &'static str,
+    /// Our configuration of the network that the manifest describes.
+    pub config: fn(&Manifest) -> Result<NetworkConfig>,
+    /// Every stage of a forward pass in evaluation mode, and the detections.
+    pub eval: fn(&mut Case, &Detector) -> Result<()>,
+    /// Every stage of a forward pass in training mode; the losses still have their graph.
+    pub train: fn(&mut Case, &Detector) -> Result<Losses>,
+}
 
 /// Compares every file of the folder.
 pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
@@ -33,15 +45,10 @@ pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
     };
     let mut case = Case { folder, manifest: &manifest, config: &config, rows: Vec::new() };
     case.checkpoints(&fresh(device)?)?;
-    match (&config.network, &fresh(device)?.network) {
-        (NetworkConfig::PointPillars(net), Network::PointPillars(network)) => {
-            pointpillars::eval(&mut case, net, network)?;
-        }
-        (NetworkConfig::PointRcnn(net), Network::PointRcnn(network)) => pointrcnn::eval(&mut case, net, network)?,
-        _ => unreachable!("a detector has the network of its configuration"),
-    }
+    let checks = manifest.checks()?;
+    (checks.eval)(&mut case, &fresh(device)?)?;
     let learning = fresh(&device.clone().autodiff())?;
-    let losses = case.train(&learning)?;
+    let losses = (checks.train)(&mut case, &learning)?;
     let mut gradients = case.gradients(&learning, losses.total)?;
     case.running_statistics(&learning)?;
     for trial in 0..NUDGES[usize::from(case.is_noisy())] {
@@ -52,7 +59,7 @@ pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
         let nudged =
             nudged.clone().load_named(&recipe::nudged(nudged.to_named()?, trial, 1 + trial % NUDGED_DIGITS))?;
         let mut aside = Case { folder, manifest: &manifest, config: &config, rows: Vec::new() };
-        let losses = aside.train(&nudged)?;
+        let losses = (checks.train)(&mut aside, &nudged)?;
         let others = aside.gradients(&nudged, losses.total)?;
         gradients.iter_mut().zip(others).filter(|(row, other)| !row.pass && other.pass).for_each(|(row, o)| *row = o);
     }
@@ -127,17 +134,6 @@ impl Case<'_> {
             }
         }
         Ok(())
-    }
-
-    /// Every stage of a forward in training mode; the losses still have their graph.
-    fn train(&mut self, detector: &Detector) -> Result<Losses> {
-        match (&self.config.network, &detector.network) {
-            (NetworkConfig::PointPillars(net), Network::PointPillars(network)) => {
-                pointpillars::train(self, net, network)
-            }
-            (NetworkConfig::PointRcnn(net), Network::PointRcnn(network)) => pointrcnn::train(self, net, network),
-            _ => unreachable!("a detector has the network of its configuration"),
-        }
     }
 
     /// Gradients carry noise by nature at full size, see the tolerances in the folder's description: a ReLU that changes

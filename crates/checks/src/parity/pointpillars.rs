@@ -1,17 +1,30 @@
 //! PointPillars' stages against reference numbers: forward, targets, detections.
 
-use super::network::{Case, frame, wide};
+mod sizes;
+
+use super::network::{Case, DetectorChecks, frame, wide};
 use super::reference::ReferenceFile;
-use anyhow::{Context, Result};
-use models::Losses;
-use models::config::PointPillarsConfig;
+use anyhow::{Context, Result, bail};
+use models::config::NetworkConfig;
 use models::layers::{Mode, host};
 use models::pointpillars::decode::{DecodeOptions, decode};
 use models::pointpillars::pillars::Pillars;
-use models::pointpillars::{PointPillars, Preparation, Sample, Stages};
+use models::pointpillars::{PointPillars, PointPillarsConfig, Preparation, Sample, Stages};
+use models::{Detector, Losses, Network};
+
+/// The comparisons of PointPillars.
+pub const CHECKS: DetectorChecks = DetectorChecks { name: "PointPillar", config: sizes::config, eval, train };
+
+fn parts<'a>(case: &Case<'a>, detector: &'a Detector) -> Result<(&'a PointPillarsConfig, &'a PointPillars)> {
+    match (&case.config.network, &detector.network) {
+        (NetworkConfig::PointPillars(net), Network::PointPillars(network)) => Ok((net, network)),
+        _ => bail!("{} is no PointPillars", case.config.name),
+    }
+}
 
 /// In evaluation mode.
-pub fn eval(case: &mut Case, net: &PointPillarsConfig, network: &PointPillars) -> Result<()> {
+fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
+    let (net, network) = parts(case, detector)?;
     let mut file = case.file("eval")?;
     let preparation = Preparation::new(case.config, net);
     let sample = preparation.sample(&frame(file.floats("in.points")?, case.config.channels), false)?;
@@ -86,7 +99,8 @@ pub fn eval(case: &mut Case, net: &PointPillarsConfig, network: &PointPillars) -
 }
 
 /// In training mode; the losses still have their graph.
-pub fn train(case: &mut Case, net: &PointPillarsConfig, network: &PointPillars) -> Result<Losses> {
+fn train(case: &mut Case, detector: &Detector) -> Result<Losses> {
+    let (net, network) = parts(case, detector)?;
     let mut file = case.file("train")?;
     let preparation = Preparation::new(case.config, net);
     let mut batch = Vec::new();

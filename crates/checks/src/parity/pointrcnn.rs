@@ -3,15 +3,16 @@
 //! Rows here are the reference's columns: a stage of shape `[B, C, N]` is compared with ours, `[B * N, C]`, turned round. Repeated points and
 //! centres, which are one row each in a region, are repeated again.
 
-use super::network::{Case, frame, wide};
+mod sizes;
+
+use super::network::{Case, DetectorChecks, frame, wide};
 use super::reference::ReferenceFile;
 use super::rotations::{centers, reference_rotations};
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use burn::tensor::Tensor;
 use data::Cloud;
 use geometry::{ball_query, three_nearest};
-use models::Losses;
-use models::config::{PointRcnnConfig, RoiHeadConfig};
+use models::config::NetworkConfig;
 use models::layers::{Mode, host};
 use models::pointrcnn::hierarchy::Hierarchy;
 use models::pointrcnn::loss::{point_losses, roi_losses};
@@ -19,11 +20,23 @@ use models::pointrcnn::proposals::{Proposals, point_boxes, proposals};
 use models::pointrcnn::roi_input::{RoiInput, Scene};
 use models::pointrcnn::roi_targets::{RoiTargets, overlaps};
 use models::pointrcnn::{
-    PointRcnn, PointStages, Preparation, RoiStages, Sample, SampleTargets, final_boxes, point_scores, suppress,
+    PointRcnn, PointRcnnConfig, PointStages, Preparation, RoiHeadConfig, RoiStages, Sample, SampleTargets, final_boxes,
+    point_scores, suppress,
 };
+use models::{Detector, Losses, Network};
+
+/// The comparisons of PointRCNN.
+pub const CHECKS: DetectorChecks = DetectorChecks { name: "PointRCNN", config: sizes::config, eval, train };
 
 /// Squared distances, boxes and codes that hang on coordinates alone.
 const EXACT: f64 = 1e-6;
+
+fn parts<'a>(case: &Case<'a>, detector: &'a Detector) -> Result<(&'a PointRcnnConfig, &'a PointRcnn)> {
+    match (&case.config.network, &detector.network) {
+        (NetworkConfig::PointRcnn(net), Network::PointRcnn(network)) => Ok((net, network)),
+        _ => bail!("{} is no PointRCNN", case.config.name),
+    }
+}
 
 /// Which file, and how many frames are in a batch.
 struct View<'a> {
@@ -121,7 +134,8 @@ fn sample(
 }
 
 /// In evaluation mode.
-pub fn eval(case: &mut Case, net: &PointRcnnConfig, network: &PointRcnn) -> Result<()> {
+fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
+    let (net, network) = parts(case, detector)?;
     let mut file = case.file("eval")?;
     let view = View { case, mode: "eval", frames: 1 };
     let preparation = Preparation::new(case.config, net);
@@ -261,7 +275,8 @@ fn pooled(
 }
 
 /// In training mode; the losses still have their graph. The regions are the reference's.
-pub fn train(case: &mut Case, net: &PointRcnnConfig, network: &PointRcnn) -> Result<Losses> {
+fn train(case: &mut Case, detector: &Detector) -> Result<Losses> {
+    let (net, network) = parts(case, detector)?;
     let mut file = case.file("train")?;
     let preparation = Preparation::new(case.config, net);
     let truth = case.ground_truth(&mut file)?;

@@ -6,7 +6,7 @@
 
 use super::reference::ReferenceFile;
 use anyhow::Result;
-use models::config::RoiHeadConfig;
+use models::pointrcnn::RoiHeadConfig;
 use models::pointrcnn::roi_input::{RoiInput, Scene};
 
 /// Positions of the second stage's centres, level by level, in the region's frame, m; regions one after the other, with repetitions as in

@@ -1,4 +1,4 @@
-//! Against the definition in f64.
+//! Comparison with the definition in f64.
 
 use super::*;
 use crate::reference::{assert_close, assert_same_for_threads, random};
@@ -68,7 +68,8 @@ fn equals_the_definition() {
                 assert!((got - want).abs() <= 1e-10 * want.abs().max(1.0), "{name} of {norm:?}: {got} {want}");
             }
         }
-        // In single precision a value at 50 has an error of 4e-6, and one lone value makes a slope of 1 / sqrt(epsilon).
+        // In single precision a value at 50 has an error of 4e-6, and one lone value makes a slope of 1 /
+        // sqrt(epsilon).
         for (name, got, want, tolerance) in [
             ("y", &y, &want.y, 2e-5),
             ("dx", &dx, &want.dx, 1e-4),
@@ -87,7 +88,7 @@ fn equals_the_definition() {
 }
 
 #[test]
-fn the_number_of_threads_changes_no_bit() {
+fn the_result_is_bit_equal_for_any_number_of_threads() {
     for [batch, channels, pixels] in [[2, 30, 700], [300, 50, 1], [60, 7, 9]] {
         let norm = BatchNorm { batch, channels, pixels, epsilon: 1e-3, relu: true };
         let [x, dy, gamma, beta] = inputs(&norm);
@@ -101,7 +102,7 @@ fn the_number_of_threads_changes_no_bit() {
 }
 
 #[test]
-fn what_is_not_a_number_comes_out_in_its_channel() {
+fn nan_propagates_in_its_channel() {
     for norm in shapes() {
         let [mut x, dy, gamma, beta] = inputs(&norm);
         x[0] = f32::NAN;

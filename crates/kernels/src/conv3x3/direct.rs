@@ -1,4 +1,4 @@
-//! The convolution as one product with the nine neighbours of each pixel.
+//! Direct convolution: one matrix product with the 3x3 neighbourhoods of all pixels (im2col in blocks).
 
 use crate::blocks::{Segment, TileGrid};
 use crate::images::{Images, ImagesOut};
@@ -8,14 +8,14 @@ use crate::tile::Row;
 use pulp::Simd;
 use std::ops::Range;
 
-/// A tile is one pixel of the output. Nothing else may be writing to `y`.
+/// A tile is one pixel of the output. No other code may write to `y`.
 pub(super) struct Direct<'a, const STRIDE: usize> {
     pub batch: usize,
     pub x: Images<'a>,
     pub y: ImagesOut<'a>,
 }
 
-/// Weights in the order of [`read_neighbours`]; `kernel(output, input)` gives those of one pair of channels.
+/// Weights in the order of [`read_neighbours`]; `kernel(output, input)` is the 3x3 kernel of one pair of channels.
 pub(super) fn pack(inputs: usize, outputs: usize, kernel: impl Fn(usize, usize) -> [f32; 9] + Sync) -> PackedWeights {
     PackedWeights::new(outputs, inputs * 9, |output, put| {
         for input in 0..inputs {

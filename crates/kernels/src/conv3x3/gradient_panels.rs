@@ -1,4 +1,4 @@
-//! The two factors of the gradient by the weights, for each way of computing a convolution.
+//! The two factors of the gradient with respect to the weights, for each convolution algorithm.
 
 use super::direct::read_neighbours;
 use super::winograd::{Winograd, transform_kernel_back};
@@ -25,7 +25,7 @@ impl Factors<'_> {
     }
 }
 
-/// Transformed tiles: the transpose of the minimal filtering.
+/// Transformed tiles: the transpose of Winograd's minimal filtering.
 pub(super) struct WinogradPanels<'a, F, const M: usize, const A: usize> {
     pub factors: Factors<'a>,
     pub transforms: PhantomData<F>,

@@ -1,4 +1,4 @@
-//! 3x3 convolution with padding 1 and no bias, as the backbone's blocks have it.
+//! 3x3 convolution with padding 1 and without bias, as in the blocks of the 2D backbone.
 
 mod direct;
 mod gradient_panels;
@@ -18,20 +18,20 @@ use strided_gradient::StridedGradient;
 use winograd::{F2, F4};
 use winograd_product::WinogradProduct;
 
-/// How a convolution of stride 1 is computed. One of stride 2 is always computed directly.
+/// Algorithm of a convolution of stride 1. Stride 2 is always computed directly.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Algorithm {
     /// Winograd's F(2x2, 3x3).
     #[default]
     WinogradF2,
-    /// Winograd's F(4x4, 3x3): faster, a digit less exact.
+    /// Winograd's F(4x4, 3x3): faster, rounding error about ten times larger.
     WinogradF4,
-    /// Nine products a pixel.
+    /// Direct convolution: nine multiplications a pixel.
     Direct,
 }
 
 /// A convolution of images `[batch, inputs, height, width]` with weights `[outputs, inputs, 3, 3]` to images
-/// `[batch, outputs, ceil(height / stride), ceil(width / stride)]`, with a border of zeros one pixel wide.
+/// `[batch, outputs, ceil(height / stride), ceil(width / stride)]`, zero padding of one pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Conv3x3 {
     /// Images.
@@ -46,7 +46,7 @@ pub struct Conv3x3 {
     pub width: usize,
     /// 1 or 2.
     pub stride: usize,
-    /// For stride 1.
+    /// Algorithm for stride 1.
     pub algorithm: Algorithm,
 }
 
@@ -84,7 +84,7 @@ impl Conv3x3 {
         self.outputs * self.inputs * 9
     }
 
-    /// The weights `[outputs, inputs, 3, 3]` in the form that [`Conv3x3::forward`] reads; it may be kept.
+    /// The weights `[outputs, inputs, 3, 3]` packed for [`Conv3x3::forward`]. The result may be reused.
     pub fn pack(&self, weight: &[f32]) -> PackedWeights {
         self.check_weight(weight);
         let kernel = |o: usize, i: usize| taps(&weight[(o * self.inputs + i) * 9..]);
@@ -95,13 +95,13 @@ impl Conv3x3 {
         }
     }
 
-    /// `y`, overwritten, whatever it held.
+    /// Computes `y`, which is overwritten.
     ///
     /// # Shapes
     /// `x`: `[batch, inputs, height, width]`; `y`: `[batch, outputs, out_height, out_width]`.
     pub fn forward(&self, x: &[f32], weights: &PackedWeights, epilogue: Epilogue<'_>, y: &mut Vec<f32>) {
         assert_eq!(x.len(), self.x_len(), "elements of x of {self:?}");
-        assert!(epilogue.bias.is_none_or(|b| b.len() == self.outputs), "one bias an output of {self:?}");
+        assert!(epilogue.bias.is_none_or(|b| b.len() == self.outputs), "biases of {self:?}");
         // SAFETY: the tiles of each scheme cover all pixels of all outputs.
         unsafe {
             fill(y, self.y_len(), |y| {
@@ -117,15 +117,16 @@ impl Conv3x3 {
         }
     }
 
-    /// Gradient by `x`; `dx` is overwritten, whatever it held.
+    /// Gradient with respect to `x`; `dx` is overwritten.
     ///
     /// # Shapes
-    /// `dy`: `[batch, outputs, out_height, out_width]`; `weight`: `[outputs, inputs, 3, 3]`; `dx`: `[batch, inputs, height, width]`.
+    /// `dy`: `[batch, outputs, out_height, out_width]`; `weight`: `[outputs, inputs, 3, 3]`; `dx`: `[batch, inputs,
+    /// height, width]`.
     pub fn data_gradient(&self, dy: &[f32], weight: &[f32], dx: &mut Vec<f32>) {
         assert_eq!(dy.len(), self.y_len(), "elements of dy of {self:?}");
         self.check_weight(weight);
         if self.stride == 1 {
-            // The convolution of dy with the kernels turned round, inputs and outputs exchanged.
+            // The convolution of dy with the kernels rotated by 180 degrees, inputs and outputs exchanged.
             let turned = Conv3x3 { inputs: self.outputs, outputs: self.inputs, ..*self };
             let kernel = |o: usize, i: usize| {
                 let mut taps = taps(&weight[(i * self.inputs + o) * 9..]);
@@ -152,7 +153,7 @@ impl Conv3x3 {
         }
     }
 
-    /// Gradient by the weights, `[outputs, inputs, 3, 3]`.
+    /// Gradient with respect to the weights, `[outputs, inputs, 3, 3]`.
     ///
     /// # Shapes
     /// `x`: `[batch, inputs, height, width]`; `dy`: `[batch, outputs, out_height, out_width]`.
@@ -175,7 +176,7 @@ impl Conv3x3 {
 
     fn check_weight(&self, weight: &[f32]) {
         assert_eq!(weight.len(), self.weight_len(), "elements of the weights of {self:?}");
-        assert!(matches!(self.stride, 1 | 2), "a stride of 1 or 2: {self:?}");
+        assert!(matches!(self.stride, 1 | 2), "the stride must be 1 or 2: {self:?}");
     }
 }
 

@@ -1,5 +1,5 @@
-//! Gradient by the data of a convolution of stride 2. A tile is 2 x 2 pixels of `dx`; of the nine taps, one reaches its first pixel, two each
-//! of its neighbours and four the last.
+//! Gradient with respect to the input of a convolution of stride 2. A tile is 2 x 2 pixels of `dx`. Of the nine kernel
+//! taps, one contributes to its first pixel, two each to the second and third, and four to the last.
 
 use super::Conv3x3;
 use crate::blocks::{Segment, TileGrid};
@@ -10,13 +10,14 @@ use crate::tile::Row;
 use pulp::Simd;
 use std::ops::Range;
 
-/// The pixels of `dy` that a tile reads, as (down, right) from its own place, in an order in which each product takes neighbours.
+/// The pixels of `dy` that a tile reads, as (row, column) offsets, ordered so that each product reads a contiguous
+/// range.
 const SHIFTS: [(usize, usize); 4] = [(1, 0), (0, 0), (0, 1), (1, 1)];
 
 /// For each pixel of a tile the range of [`SHIFTS`] and, for each of them, the tap `ky * 3 + kx`.
 const PRODUCTS: [(Range<usize>, &[usize]); 4] = [(1..2, &[4]), (1..3, &[5, 3]), (0..2, &[1, 7]), (0..4, &[2, 8, 6, 0])];
 
-/// Nothing else may be writing to `dx`.
+/// No other code may write to `dx`.
 pub(super) struct StridedGradient<'a> {
     pub batch: usize,
     pub dy: Images<'a>,

@@ -1,4 +1,4 @@
-//! Against the definition in f64.
+//! Comparison with the definition in f64.
 
 use super::*;
 use crate::reference::{assert_close, random};
@@ -73,7 +73,7 @@ fn equals_the_definition() {
 }
 
 #[test]
-fn the_number_of_threads_changes_no_bit() {
+fn the_result_is_bit_equal_for_any_number_of_threads() {
     for algorithm in [Algorithm::WinogradF2, Algorithm::WinogradF4, Algorithm::Direct] {
         for stride in [1, 2] {
             let conv = Conv3x3 { batch: 2, inputs: 12, outputs: 20, height: 50, width: 61, stride, algorithm };
@@ -100,7 +100,7 @@ fn bias_and_relu_behind_the_sum() {
 }
 
 #[test]
-fn what_is_not_a_number_comes_out() {
+fn nan_propagates() {
     for conv in shapes() {
         let (mut x, w) = (random(conv.x_len(), 1), random(conv.weight_len(), 2));
         let mut dy = random(conv.y_len(), 3);
@@ -111,7 +111,7 @@ fn what_is_not_a_number_comes_out() {
         }
         let mut y = Vec::new();
         conv.forward(&x, &conv.pack(&w), Epilogue { bias: None, relu: true }, &mut y);
-        assert!(y.iter().any(|v| v.is_nan()), "a ReLU keeps it");
+        assert!(y.iter().any(|v| v.is_nan()), "a ReLU propagates NaN");
     }
 }
 

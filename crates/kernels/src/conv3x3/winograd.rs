@@ -1,8 +1,9 @@
-//! Winograd's minimal filtering F(m x m, 3x3) (Lavin & Gray, "Fast Algorithms for Convolutional Neural Networks", 2016): the transforms.
+//! Winograd's minimal filtering F(m x m, 3x3) (Lavin & Gray, "Fast Algorithms for Convolutional Neural Networks",
+//! 2016): the transforms.
 
 use std::ops::{Add, Mul, Sub};
 
-/// What the transforms work on: single values or registers.
+/// Element type of the transforms: single values or registers.
 pub(crate) trait Value: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<f32, Output = Self> {}
 
 impl<T: Copy + Add<Output = T> + Sub<Output = T> + Mul<f32, Output = T>> Value for T {}
@@ -22,7 +23,7 @@ pub(crate) trait Winograd<const M: usize, const A: usize>: Copy + Send + Sync {
     fn gradient<T: Value>(g: [T; M]) -> [T; A];
 }
 
-/// F(2 x 2, 3 x 3): 2.25 times fewer multiplications, about as exact as the plain sum.
+/// F(2 x 2, 3 x 3): 2.25 times fewer multiplications, rounding error about that of the direct sum.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct F2;
 
@@ -45,7 +46,7 @@ impl Winograd<2, 4> for F2 {
     }
 }
 
-/// F(4 x 4, 3 x 3): 4 times fewer multiplications, a digit less exact.
+/// F(4 x 4, 3 x 3): 4 times fewer multiplications, rounding error about ten times larger.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct F4;
 

@@ -1,4 +1,5 @@
-//! The convolution of stride 1 by Winograd's minimal filtering: a product for each of the A x A values of a transformed tile.
+//! The convolution of stride 1 by Winograd's minimal filtering: a product for each of the A x A values of a transformed
+//! tile.
 
 use super::winograd::{Winograd, transform_kernel};
 use crate::blocks::{Segment, TileGrid};
@@ -20,7 +21,7 @@ pub(super) struct WinogradProduct<'a, F, const M: usize, const A: usize> {
 }
 
 impl<'a, F: Winograd<M, A>, const M: usize, const A: usize> WinogradProduct<'a, F, M, A> {
-    /// Nothing else may be writing to `y`.
+    /// No other code may write to `y`.
     pub fn new(batch: usize, x: Images<'a>, y: ImagesOut<'a>) -> Self {
         WinogradProduct { batch, x, y, transforms: PhantomData }
     }
@@ -99,7 +100,7 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Scheme for WinogradProdu
     }
 
     fn panel_rows(&self) -> usize {
-        // One row is left free behind each value, else all of them meet in the same places of the cache.
+        // One padding row after each value avoids cache conflicts.
         A * A * (self.inputs() + 1)
     }
 

@@ -1,10 +1,10 @@
-//! Gradients by the parameters of the pillar feature net.
+//! Gradients with respect to the parameters of the pillar feature net.
 
 use super::{MOST_INPUTS, NOWHERE, PADDING, PARTS, PillarGradients, PillarNet, PillarParameters, PillarState};
 use crate::simd::vectorized;
 use rayon::prelude::*;
 
-/// Over the rows that the maximum took: the sum of the gradient, and of the gradient times the row.
+/// Over the rows selected by the maximum: the sum of the gradient, and of the gradient times the row.
 #[derive(Clone, Copy)]
 struct Taken {
     sum: f64,
@@ -47,7 +47,7 @@ pub(super) fn backward(
     gradients
 }
 
-/// For each channel.
+/// Sums per channel.
 fn taken(net: &PillarNet, features: &[f32], starts: &[usize], argmax: &[u32], dout: &[f32]) -> Vec<Taken> {
     let mut total = vec![NONE; net.outputs];
     if argmax.is_empty() {

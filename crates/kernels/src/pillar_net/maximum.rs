@@ -1,14 +1,15 @@
-//! The maximum over the points of a pillar, the batch norm folded into the linear layer.
+//! The maximum over the points of a pillar, with the batch norm folded into the linear layer.
 
 use super::{MOST_INPUTS, NOWHERE, PADDING, PillarNet, PillarParameters};
 use crate::batch_norm::Statistics;
 use crate::simd::multiply_add;
 use pulp::{Simd, WithSimd};
 
-/// Channels are worked on in groups of this many.
+/// Channels that are processed together.
 const GROUP: usize = 16;
 
-/// Weights and bias of a group of channels, `[groups]` of `[F, GROUP]` and `[GROUP]`; zeros behind the last channel.
+/// Weights and bias of a group of channels, `[groups]` of `[F, GROUP]` and `[GROUP]`; padded with zeros after the last
+/// channel.
 pub(super) struct Maximum {
     inputs: usize,
     outputs: usize,
@@ -34,7 +35,7 @@ impl Maximum {
         Maximum { inputs: net.inputs, outputs: net.outputs, max_points: net.max_points, weights, bias }
     }
 
-    /// The pillars whose first rows are in `starts`; `write(pillar, channel, values)`.
+    /// Processes the pillars whose first rows are in `starts`; the result goes to `write(pillar, channel, values)`.
     pub fn over<'a, W: Fn(usize, usize, &[f32])>(
         &'a self,
         features: &'a [f32],
@@ -73,7 +74,7 @@ impl<W: Fn(usize, usize, &[f32])> WithSimd for OverPillars<'_, W> {
                         *register = S::as_simd_f32s(weights).0[part];
                     }
                     let bias = S::as_simd_f32s(bias).0[part];
-                    // The ReLU: zero stands unless something is larger.
+                    // The ReLU: the maximum starts at zero.
                     let mut best = simd.splat_f32s(0.0);
                     let mut place = simd.splat_u32s(NOWHERE);
                     if padded {
@@ -96,7 +97,7 @@ impl<W: Fn(usize, usize, &[f32])> WithSimd for OverPillars<'_, W> {
     }
 }
 
-/// The larger of two values and its place; the first of equal ones; NaN, once there, stays.
+/// The larger of two values and its row; the first one of equal values. NaN propagates.
 #[inline(always)]
 fn larger<S: Simd>(
     simd: S,

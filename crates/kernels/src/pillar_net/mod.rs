@@ -1,10 +1,12 @@
-//! Pillar feature net (OpenPCDet: `PillarVFE` with one layer): linear without bias, batch norm, ReLU, maximum over the points of a pillar.
+//! Pillar feature net (OpenPCDet: `PillarVFE` with one layer): linear without bias, batch norm, ReLU, maximum over the
+//! points of a pillar.
 //!
-//! The reference pads every pillar with zero rows up to `max_points`; these rows count in the statistics and take part in the maximum. Here
-//! only the points themselves are read. A zero row stays zero behind the linear layer, so what it adds is known.
+//! The reference pads every pillar with zero rows up to `max_points`. These rows count in the statistics and in the
+//! maximum. Here only the points are read: a zero row is zero after the linear layer, so its contribution is known.
 //!
-//! The linear layer's output y = w x is never stored: its mean and variance follow from the sum and the products of the inputs, w S / n and
-//! w M w^T / n - mean^2, and so do the parts of the gradient that are the same for all rows. Sums are in f64: in f32 metres cancel.
+//! The linear layer's output y = w x is never stored. Its mean w S / n and variance w M w^T / n - mean^2 follow from
+//! the sum S of the inputs and the sum M of their outer products, and so do the terms of the gradient that are equal
+//! for all rows. Sums are f64, because coordinates in metres cause cancellation in f32.
 
 mod backward;
 mod maximum;
@@ -17,31 +19,31 @@ use maximum::Maximum;
 use moments::Moments;
 use rayon::prelude::*;
 
-/// Values of a point at most.
+/// Largest number of values a point.
 pub const MOST_INPUTS: usize = 16;
 
-/// Parts that the pillars are cut into, whatever the number of threads.
+/// Number of parts that the pillars are divided into, for any number of threads.
 const PARTS: usize = 32;
 
-/// Where an output comes from: no row, since the ReLU made it zero.
+/// Source of an output: no row, since the ReLU made it zero.
 const NOWHERE: u32 = u32::MAX;
-/// Where an output comes from: a padding row.
+/// Source of an output: a padding row.
 const PADDING: u32 = u32::MAX - 1;
 
-/// The net.
+/// The shape of the pillar feature net.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PillarNet {
     /// Values of a point, F, at most [`MOST_INPUTS`].
     pub inputs: usize,
-    /// Values of a pillar, C.
+    /// Features of a pillar, C.
     pub outputs: usize,
-    /// Rows that the reference pads a pillar to.
+    /// Rows of a padded pillar in the reference.
     pub max_points: usize,
     /// Added to the variance.
     pub epsilon: f64,
 }
 
-/// The points of all pillars, pillar after pillar.
+/// The points of all pillars, sorted by pillar.
 #[derive(Clone, Copy, Debug)]
 pub struct Pillars<'a> {
     /// `[N, F]`.
@@ -64,7 +66,7 @@ pub struct PillarParameters<'a> {
 /// What the backward pass needs of the forward pass.
 #[derive(Clone, Debug)]
 pub struct PillarState {
-    /// Mean and variance over all rows, the padding included; zero where there are none.
+    /// Mean and variance over all rows, the padding included; zero without rows.
     pub statistics: Statistics,
     /// Number of these rows.
     pub count: usize,
@@ -73,7 +75,7 @@ pub struct PillarState {
     argmax: Vec<u32>,
 }
 
-/// Gradients by the parameters.
+/// Gradients with respect to the parameters.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PillarGradients {
     /// `[C, F]`.
@@ -85,7 +87,7 @@ pub struct PillarGradients {
 }
 
 impl PillarNet {
-    /// With the statistics of the points and the padding. `out`, `[P, C]`, is overwritten, whatever it held.
+    /// Forward pass with the statistics of the points and the padding. `out`, `[P, C]`, is overwritten.
     pub fn forward_train(
         &self,
         pillars: Pillars<'_>,
@@ -100,7 +102,7 @@ impl PillarNet {
         PillarState { statistics, count, moments, argmax }
     }
 
-    /// With given statistics. `out`, `[P, C]`, is overwritten, whatever it held.
+    /// Forward pass with given statistics. `out`, `[P, C]`, is overwritten.
     pub fn forward(
         &self,
         pillars: Pillars<'_>,
@@ -112,7 +114,8 @@ impl PillarNet {
         self.maximum(&pillars, &starts, parameters, statistics, out);
     }
 
-    /// Gradients by the parameters from the gradient by the outputs, `[P, C]`. The points are data: there is none by them.
+    /// Gradients with respect to the parameters from the gradient with respect to the outputs, `[P, C]`. None is
+    /// computed for the points.
     pub fn backward(
         &self,
         pillars: Pillars<'_>,
@@ -127,7 +130,7 @@ impl PillarNet {
 
     /// The first row of each pillar, and N.
     fn check(&self, pillars: &Pillars<'_>, parameters: &PillarParameters<'_>) -> Vec<usize> {
-        assert!(self.inputs <= MOST_INPUTS, "at most {MOST_INPUTS} values a point: {self:?}");
+        assert!(self.inputs <= MOST_INPUTS, "more than {MOST_INPUTS} values a point: {self:?}");
         assert_eq!(parameters.weight.len(), self.outputs * self.inputs, "elements of the weights of {self:?}");
         assert_eq!((parameters.gamma.len(), parameters.beta.len()), (self.outputs, self.outputs), "norm of {self:?}");
         let mut starts = vec![0];
@@ -181,7 +184,7 @@ impl PillarNet {
                     let first = part * pillars_a_part;
                     let starts = &starts[first..=first + argmax.len() / self.outputs];
                     dispatch(maximum.over(pillars.features, starts, argmax, |pillar, channel, values| {
-                        // SAFETY: no other part has this pillar.
+                        // SAFETY: each pillar is in one part.
                         out.write((first + pillar) * self.outputs + channel, values);
                     }));
                 });

@@ -1,22 +1,22 @@
-//! Sums over all points of their values and of the products of these.
+//! Sums over all points of their values and of their outer products.
 
 use super::MOST_INPUTS;
 use crate::simd::vectorized;
 use rayon::prelude::*;
 
-/// Sum and products of the inputs, in f64.
+/// First and second moments of the inputs, in f64.
 #[derive(Clone, Debug)]
 pub(super) struct Moments {
-    /// Sum over the points of x, `[F]`, zeros behind.
+    /// Sum over the points of x, `[F]`, padded with zeros.
     pub sum: [f64; MOST_INPUTS],
-    /// Sum over the points of x x^T, `[F, F]`, zeros around.
+    /// Sum over the points of x x^T, `[F, F]`, padded with zeros.
     pub products: [[f64; MOST_INPUTS]; MOST_INPUTS],
 }
 
 impl Moments {
     const ZERO: Moments = Moments { sum: [0.0; MOST_INPUTS], products: [[0.0; MOST_INPUTS]; MOST_INPUTS] };
 
-    /// Of `features`, `[N, inputs]`, cut into `parts` parts that are added in order.
+    /// The moments of `features`, `[N, inputs]`, summed in `parts` parts that are added in order.
     pub fn of(features: &[f32], inputs: usize, parts: usize) -> Self {
         if features.is_empty() {
             return Moments::ZERO;

@@ -1,4 +1,4 @@
-//! Against the padded form in f64.
+//! Comparison with the padded form in f64.
 
 use super::*;
 use crate::reference::{assert_close, assert_same_for_threads, random};
@@ -17,7 +17,7 @@ impl Case {
     fn new(inputs: usize, outputs: usize, max_points: usize, num_points: Vec<u32>) -> Self {
         let n = num_points.iter().sum::<u32>() as usize;
         let net = PillarNet { inputs, outputs, max_points, epsilon: 1e-3 };
-        // The first values are metres, far from zero.
+        // The first values are coordinates, far from zero.
         let features = random(n * inputs, 1);
         let features = features.into_iter().enumerate().map(|(i, v)| if i % inputs < 2 { 30.0 + 20.0 * v } else { v });
         let dout = random(num_points.len() * outputs, 5);
@@ -41,7 +41,7 @@ impl Case {
         ([out, g.weight, g.gamma, g.beta], state)
     }
 
-    /// Output, mean, variance, and the gradients by the parameters, all rows computed.
+    /// Output, mean, variance, and the gradients with respect to the parameters, all rows computed.
     fn reference(&self) -> [Vec<f64>; 6] {
         let (f, c, m) = (self.net.inputs, self.net.outputs, self.net.max_points);
         let pillars = self.num_points.len();
@@ -124,13 +124,13 @@ fn equals_the_padded_form() {
 }
 
 #[test]
-fn the_number_of_threads_changes_no_bit() {
+fn the_result_is_bit_equal_for_any_number_of_threads() {
     let case = Case::new(9, 40, 17, random(3000, 9).into_iter().map(|v| 1 + ((v + 1.0) * 8.0) as u32).collect());
     assert_same_for_threads(|| case.run().0);
 }
 
 #[test]
-fn without_pillars_nothing_comes_out() {
+fn no_pillars_give_an_empty_output() {
     let case = Case::new(10, 64, 32, vec![]);
     let ([out, dw, dgamma, dbeta], state) = case.run();
     assert!(out.is_empty());
@@ -139,7 +139,7 @@ fn without_pillars_nothing_comes_out() {
 }
 
 #[test]
-fn what_is_not_a_number_comes_out() {
+fn nan_propagates() {
     let mut case = Case::new(3, 5, 4, vec![2, 4, 1]);
     let statistics = case.run().1.statistics;
     case.features[3] = f32::NAN; // second point of the first pillar

@@ -1,17 +1,17 @@
-//! Rows cut into blocks that stay in the cache, and blocks into parts whose sums are added in order.
+//! Division of rows into blocks that fit the cache, and of blocks into parts whose sums are added in order.
 
 use super::RowGroups;
 use rayon::prelude::*;
 use std::borrow::Cow;
 use std::ops::Range;
 
-/// Rows of a block, unless one group has more.
+/// Rows of a block, unless a group is larger.
 const ROWS: usize = 256;
 
-/// Parts, whatever the number of threads.
+/// Number of parts, for any number of threads.
 const PARTS: usize = 16;
 
-/// Some rows, in whole groups.
+/// A range of rows that holds whole groups.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Block {
     pub rows: Range<usize>,
@@ -35,7 +35,7 @@ pub(super) struct Blocks<'a> {
 impl<'a> Blocks<'a> {
     pub fn new(rows: usize, groups: RowGroups<'a>) -> Self {
         let counts = groups.counts.map_or_else(|| Cow::Owned(vec![1.0; rows]), Cow::Borrowed);
-        assert_eq!(counts.len(), rows, "a count for each row");
+        assert_eq!(counts.len(), rows, "one count a row");
         let mut all = Vec::new();
         match groups.ends {
             None => all.extend(
@@ -63,14 +63,14 @@ impl<'a> Blocks<'a> {
         Blocks { all, ends: groups.ends, counts, total, rows, most_rows }
     }
 
-    /// Does some work for the blocks of each part, on all threads; the results in the order of the parts.
+    /// Runs `work` for the blocks of each part on all threads. The results are in the order of the parts.
     pub fn parts<R: Send>(&self, work: impl Fn(&[Block]) -> R + Sync) -> Vec<R> {
         let parts = self.all.len().min(PARTS);
         let of_part = |part: usize| work(&self.all[self.all.len() * part / parts..self.all.len() * (part + 1) / parts]);
         (0..parts).into_par_iter().map(of_part).collect()
     }
 
-    /// How often each row of a block counts.
+    /// Multiplicity of each row of a block.
     pub fn counts(&self, block: &Block) -> &[f32] {
         &self.counts[block.rows.clone()]
     }
@@ -87,7 +87,7 @@ impl<'a> Blocks<'a> {
     }
 }
 
-/// The sum of the parts' values, in their order.
+/// The sum of the parts' values, added in order.
 pub(super) fn sum(parts: impl IntoIterator<Item = Vec<f32>>, len: usize) -> Vec<f32> {
     let mut parts = parts.into_iter();
     let mut total = parts.next().unwrap_or_else(|| vec![0.0; len]);

@@ -1,4 +1,4 @@
-//! A layer whose output is kept for all rows.
+//! A layer whose output is stored for all rows.
 
 use super::blocks::{Block, Blocks, sum};
 use super::input::{Before, Input};
@@ -9,7 +9,7 @@ use crate::output::{Shared, fill};
 use crate::scratch;
 use std::mem::MaybeUninit;
 
-/// `y = input W^T`, `[rows, outputs]`, overwritten; returns its statistics.
+/// Computes `y = input W^T`, `[rows, outputs]`, which is overwritten, and returns its statistics.
 pub(super) fn forward(blocks: &Blocks<'_>, input: Input<'_>, weight: &[f32], y: &mut Vec<f32>) -> Statistics {
     let inputs = input.channels();
     let outputs = weight.len() / inputs;
@@ -36,7 +36,7 @@ pub(super) fn forward(blocks: &Blocks<'_>, input: Input<'_>, weight: &[f32], y: 
     ColumnSums::total(outputs, parts.iter()).statistics(blocks.total)
 }
 
-/// The statistics of rows that need no product.
+/// The statistics of rows that need no matrix product.
 pub(super) fn statistics(blocks: &Blocks<'_>, before: Before<'_>, channels: usize) -> Statistics {
     let parts = blocks.parts(|part| {
         let mut sums = ColumnSums::new(channels);
@@ -50,13 +50,13 @@ pub(super) fn statistics(blocks: &Blocks<'_>, before: Before<'_>, channels: usiz
     ColumnSums::total(channels, parts.iter()).statistics(blocks.total)
 }
 
-/// What a layer hands to the one before it: the gradient behind that one's batch norm, `[rows, channels]`, and its sums.
+/// The upstream gradient of a layer: with respect to the output of its batch norm, `[rows, channels]`, and its sums.
 pub(super) struct Upstream {
     pub gradient: Vec<f32>,
     pub sums: ColumnSums,
 }
 
-/// Masks the gradient by the output of the last layer, `relu(norm(before))`.
+/// Masks the output gradient `dout` with the ReLU of the last layer, `relu(norm(before))`, and computes its sums.
 pub(super) fn last(blocks: &Blocks<'_>, before: Before<'_>, norm: &Norm, dout: &[f32]) -> Upstream {
     let channels = norm.channels();
     let mut gradient = Vec::new();
@@ -84,7 +84,7 @@ pub(super) fn last(blocks: &Blocks<'_>, before: Before<'_>, norm: &Norm, dout: &
     Upstream { gradient, sums: ColumnSums::total(channels, parts.iter()) }
 }
 
-/// A layer as the backward pass sees it.
+/// A layer in the backward pass.
 #[derive(Clone, Copy)]
 pub(super) struct Layer<'a> {
     /// `[outputs, inputs]`.
@@ -96,7 +96,7 @@ pub(super) struct Layer<'a> {
 }
 
 impl Layer<'_> {
-    /// The gradient by the output before the batch norm of the rows of a block.
+    /// The gradient with respect to the output before the batch norm of the rows of a block.
     fn dy<'m>(
         &self,
         blocks: &Blocks<'_>,
@@ -114,7 +114,8 @@ impl Layer<'_> {
     }
 }
 
-/// The gradient by the weights, and what goes to the layer before; for the rows of the net the gradient by them instead, if it is wanted.
+/// The gradient with respect to the weights, and the upstream gradient of the previous layer; for the first layer the
+/// gradient with respect to the input instead, if requested.
 pub(super) fn backward(
     blocks: &Blocks<'_>,
     input: Input<'_>,
@@ -139,7 +140,7 @@ pub(super) fn backward(
                     if wanted {
                         let da = &mut da[..block.rows.len() * inputs];
                         multiply(dy, Matrix::new(layer.weight, inputs), da, Then::Store);
-                        pass_on(input, a, y, da, &mut sums);
+                        mask_and_sum(input, a, y, da, &mut sums);
                         // SAFETY: no row is in two blocks.
                         unsafe { before.write(block.rows.start * inputs, da) };
                     }
@@ -155,17 +156,17 @@ pub(super) fn backward(
     (sum(weights, layer.weight.len()), Upstream { gradient: before, sums })
 }
 
-/// Masks the gradient by the activations `a` of some rows and takes its sums, `y` what they were before their batch norm; nothing of this for
-/// the rows of the net itself.
-pub(super) fn pass_on(input: Input<'_>, a: &[f32], y: &[f32], da: &mut [f32], sums: &mut ColumnSums) {
+/// Masks the gradient `da` of some rows with the ReLU of their activations `a`, and adds it to the sums. `y`: the rows
+/// before their batch norm. Does nothing for the input rows of the net.
+pub(super) fn mask_and_sum(input: Input<'_>, a: &[f32], y: &[f32], da: &mut [f32], sums: &mut ColumnSums) {
     if let Input::Hidden { norm, .. } = input {
         mask(da, a);
         sums.add_gradients(da, y, norm);
     }
 }
 
-/// For a layer without a product: the gradient by its rows, `[rows, channels]`, and the sums over the rows of it times their offsets,
-/// `[channels, 3]`, where there are offsets.
+/// For a layer without a matrix product: the gradient with respect to its rows, `[rows, channels]`, and, with offsets,
+/// the sum over the rows of gradient times offset, `[channels, 3]`.
 pub(super) fn backward_first(
     blocks: &Blocks<'_>,
     layer: Layer<'_>,

@@ -1,4 +1,4 @@
-//! All layers of a block of rows at once, with given statistics.
+//! Inference: all layers of one block of rows after another, with given statistics.
 
 use super::blocks::Blocks;
 use super::input::Before;
@@ -12,7 +12,7 @@ use crate::scratch;
 use crate::simd::vectorized;
 use std::mem::MaybeUninit;
 
-/// `[groups, outputs]`, overwritten.
+/// Computes `[groups, outputs]`; the output is overwritten.
 pub(super) fn forward(
     mlp: &SharedMlp,
     blocks: &Blocks<'_>,
@@ -84,7 +84,7 @@ fn bias_relu(values: &mut [f32], bias: &[f32]) {
     }
 }
 
-/// The maximum of each column; NaN, once there, stays.
+/// The maximum of each column. NaN propagates.
 #[inline(always)]
 fn maximum(group: &[f32], best: &mut [f32]) {
     best.fill(f32::NEG_INFINITY);

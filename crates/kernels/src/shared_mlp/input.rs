@@ -1,4 +1,4 @@
-//! What a layer reads.
+//! The input of a layer.
 
 use super::MlpInput;
 use super::blocks::Block;
@@ -8,14 +8,15 @@ use crate::simd::vectorized;
 /// Rows before a batch norm.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Before<'a> {
-    /// There they are, `[rows, channels]`.
+    /// Stored, `[rows, channels]`.
     Stored(&'a [f32]),
-    /// Each is the sum of a row of `features`, `[P, channels]`, and of `weight`, `[channels, 3]`, times its offset.
+    /// Computed: each is the sum of a row of `features`, `[P, channels]`, and `weight`, `[channels, 3]`, times its
+    /// offset.
     Gathered { features: &'a [f32], source: &'a [u32], offset: &'a [[f32; 3]], weight: &'a [f32] },
 }
 
 impl<'a> Before<'a> {
-    /// The rows of the first layer, if they need no product; `weight` is the layer's.
+    /// The output rows of the first layer, if they need no matrix product; `weight` is that of the layer.
     pub fn first(input: MlpInput<'a>, weight: &'a [f32]) -> Option<Self> {
         match input {
             MlpInput::Rows(_) => None,
@@ -26,7 +27,7 @@ impl<'a> Before<'a> {
         }
     }
 
-    /// The rows of a block, in `memory` if they are nowhere else.
+    /// The rows of a block; computed into `memory` if they are not stored.
     pub fn rows<'m>(&self, block: &Block, channels: usize, memory: &'m mut [f32]) -> &'m [f32]
     where
         'a: 'm,
@@ -53,12 +54,12 @@ impl<'a> Before<'a> {
     }
 }
 
-/// The rows that a layer's weights are multiplied with.
+/// The input rows of a layer's matrix product.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Input<'a> {
-    /// The rows of the net, `[rows, channels]`.
+    /// The input of the net, `[rows, channels]`.
     Given { x: &'a [f32], channels: usize },
-    /// The layer before.
+    /// The previous layer.
     Hidden { before: Before<'a>, norm: &'a Norm },
 }
 
@@ -70,8 +71,8 @@ impl Input<'_> {
         }
     }
 
-    /// The rows of a block, in `memory` if they are not there already, and of a hidden layer what they were before its batch norm, in
-    /// `before` if they are nowhere else.
+    /// The rows of a block, computed into `memory` if they are not stored. The second slice holds the rows of a hidden
+    /// layer before its batch norm, computed into `before` if they are not stored.
     pub fn rows<'m>(&'m self, block: &Block, memory: &'m mut [f32], before: &'m mut [f32]) -> (&'m [f32], &'m [f32]) {
         match self {
             Input::Given { x, channels } => (&x[block.rows.start * channels..block.rows.end * channels], &[]),

@@ -1,8 +1,8 @@
-//! Shared MLP (PointNet++'s set abstraction, feature propagation and heads): layers of linear without bias, batch norm and ReLU on rows, and
-//! the maximum over groups of rows.
+//! Shared MLP (PointNet++'s set abstraction, feature propagation and heads): layers of linear without bias, batch norm
+//! and ReLU on rows, followed by the maximum over groups of rows.
 //!
-//! Blocks of rows are worked on while they are in the cache. In training the rows of a layer before its batch norm are kept, but for a first
-//! layer that is gathered and for the last before a maximum.
+//! Rows are processed in blocks that fit the cache. Training stores the rows of each layer before its batch norm,
+//! except those of a gathered first layer and those of the last layer before a maximum.
 
 mod blocks;
 mod dense;
@@ -26,20 +26,22 @@ use pooling::{Extremes, Pooled};
 pub struct SharedMlp {
     /// Rows, N.
     pub rows: usize,
-    /// Channels of the rows, C0, and behind each layer. C0 is 0 for [`MlpInput::Projected`] and 3 for [`MlpInput::Gathered`].
+    /// Channels of the input rows, C0, and of the output of each layer. C0 is 0 for [`MlpInput::Projected`] and 3 for
+    /// [`MlpInput::Gathered`].
     pub channels: Vec<usize>,
     /// Added to the variances.
     pub epsilon: f64,
 }
 
-/// What the first layer reads.
+/// The input of the first layer.
 #[derive(Clone, Copy, Debug)]
 pub enum MlpInput<'a> {
     /// Rows, `[N, C0]`.
     Rows(&'a [f32]),
-    /// What the first layer's linear part makes of them, `[N, C1]`.
+    /// The output of the first layer's linear part, `[N, C1]`.
     Projected(&'a [f32]),
-    /// Rows of neighbours: the linear part of features, computed once for each point, and offsets, on which the layer's weights `[C1, 3]` work.
+    /// Rows of neighbours: the linear part of the features is computed once per point, and the layer's weights `[C1,
+    /// 3]` apply to the offsets.
     Gathered {
         /// The linear part of the features of each point, `[P, C1]`.
         features: &'a [f32],
@@ -50,12 +52,13 @@ pub enum MlpInput<'a> {
     },
 }
 
-/// How rows belong together, and how often each counts.
+/// Grouping and multiplicity of the rows.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RowGroups<'a> {
-    /// Where each group ends, the first beginning at 0; none may be empty. Without, there is no maximum: each row is an output.
+    /// End of each group; the first begins at 0, and none may be empty. Without groups there is no maximum and each row
+    /// is an output.
     pub ends: Option<&'a [u32]>,
-    /// How often each row counts in the statistics, `[N]`; once if not given. A row that counts twice is as good as two equal rows of its group.
+    /// Multiplicity of each row, `[N]`; 1 if not given. A row with multiplicity 2 equals two equal rows of its group.
     pub counts: Option<&'a [f32]>,
 }
 
@@ -73,16 +76,16 @@ pub struct MlpLayer<'a> {
 /// What the backward pass needs of the forward pass.
 #[derive(Clone, Debug)]
 pub struct MlpState {
-    /// Mean and variance of each layer; zero where there are no rows.
+    /// Mean and variance of each layer; zero without rows.
     pub statistics: Vec<Statistics>,
-    /// Rows, as often as they count.
+    /// Sum of the multiplicities of the rows.
     pub count: f64,
-    /// The rows of each layer before the batch norm; empty where they are not kept.
+    /// The rows of each layer before the batch norm; empty if they are not stored.
     hidden: Vec<Vec<f32>>,
     extremes: Option<Extremes>,
 }
 
-/// Gradients by the parameters of a layer.
+/// Gradients with respect to the parameters of a layer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MlpGradients {
     /// `[outputs, inputs]`.
@@ -94,7 +97,7 @@ pub struct MlpGradients {
 }
 
 impl SharedMlp {
-    /// Normalises by the statistics of the rows. `out`, `[groups, outputs]`, is overwritten, whatever it held.
+    /// Forward pass with the statistics of the rows. `out`, `[groups, outputs]`, is overwritten.
     pub fn forward_train(
         &self,
         input: MlpInput<'_>,
@@ -131,10 +134,11 @@ impl SharedMlp {
         state
     }
 
-    /// Gradients by the parameters of each layer, and by the input, if `dx` is given: it is overwritten, whatever it held.
+    /// Gradients with respect to the parameters of each layer, and with respect to the input if `dx` is given, which is
+    /// overwritten.
     ///
     /// # Shapes
-    /// `dout`: `[groups, outputs]`; `dx`: as the rows, their projections, or the features that are gathered.
+    /// `dout`: `[groups, outputs]`; `dx`: the shape of the rows, of their projections, or of the gathered features.
     pub fn backward(
         &self,
         input: MlpInput<'_>,
@@ -187,7 +191,7 @@ impl SharedMlp {
         gradients
     }
 
-    /// Normalises by given statistics. `out`, `[groups, outputs]`, is overwritten, whatever it held.
+    /// Forward pass with given statistics. `out`, `[groups, outputs]`, is overwritten.
     pub fn forward(
         &self,
         input: MlpInput<'_>,
@@ -200,12 +204,12 @@ impl SharedMlp {
         inference::forward(self, &blocks, input, layers, statistics, out);
     }
 
-    /// Whether a maximum follows a layer and its rows need not be kept.
+    /// Whether a maximum follows a layer, so that its rows are not stored.
     fn pools(&self, groups: RowGroups<'_>, layer: usize) -> bool {
         groups.ends.is_some() && layer + 2 == self.channels.len()
     }
 
-    /// What a layer reads, or what comes out behind the last.
+    /// The input of a layer, or the output of the last one.
     fn input<'a>(
         &self,
         input: MlpInput<'a>,
@@ -227,7 +231,7 @@ impl SharedMlp {
     }
 
     fn check<'a>(&self, input: MlpInput<'_>, groups: RowGroups<'a>, layers: &[MlpLayer<'_>]) -> Blocks<'a> {
-        assert!(!layers.is_empty() && layers.len() + 1 == self.channels.len(), "a layer for each width of {self:?}");
+        assert!(!layers.is_empty() && layers.len() + 1 == self.channels.len(), "number of layers of {self:?}");
         let [first, second] = [self.channels[0], self.channels[1]];
         match input {
             MlpInput::Rows(x) => assert!(first > 0 && x.len() == self.rows * first, "elements of x of {self:?}"),
@@ -238,7 +242,7 @@ impl SharedMlp {
             }
         }
         let only_gathered = groups.ends.is_some() && layers.len() == 1 && !matches!(input, MlpInput::Rows(_));
-        assert!(!only_gathered, "a layer with a product before the maximum: {self:?}");
+        assert!(!only_gathered, "a gathered input needs a second layer before the maximum: {self:?}");
         for (layer, widths) in layers.iter().zip(self.channels.windows(2)) {
             assert!(widths[1] > 0, "channels of {self:?}");
             assert_eq!(layer.weight.len(), widths[0] * widths[1], "weights of {self:?}");
@@ -248,7 +252,7 @@ impl SharedMlp {
     }
 }
 
-/// The gradient by the weights of a first layer without a product, and by its input.
+/// The gradient with respect to the weights of a first layer without a matrix product, and with respect to its input.
 fn backward_first(
     blocks: &Blocks<'_>,
     input: MlpInput<'_>,

@@ -1,9 +1,9 @@
-//! Batch norm and ReLU of blocks of rows, `[rows, channels]`, while they are in the cache.
+//! Batch norm and ReLU of blocks of rows, `[rows, channels]`, in the cache.
 
 use crate::batch_norm::{Statistics, non_negative};
 use crate::simd::vectorized;
 
-/// Columns that sums are taken of together.
+/// Columns that are summed together.
 const COLUMNS: usize = 16;
 
 /// Two sums for each column, in f64.
@@ -18,7 +18,8 @@ impl ColumnSums {
         ColumnSums { first: vec![0.0; columns], second: vec![0.0; columns] }
     }
 
-    /// Adds to the sums `terms(a, b, weight of the row, column)` of each element of `a` and of `b`, both `[rows, columns]`.
+    /// Adds to the sums `terms(a, b, weight of the row, column)` of each element of `a` and of `b`, both `[rows,
+    /// columns]`.
     #[inline(always)]
     fn add(&mut self, a: &[f32], b: &[f32], weights: &[f32], terms: impl Fn(f32, f32, f64, usize) -> [f64; 2]) {
         let columns = self.first.len();
@@ -51,7 +52,7 @@ impl ColumnSums {
         }
     }
 
-    /// Adds values and squares, each row as often as it counts.
+    /// Adds values and squares, weighted by the multiplicity of each row.
     pub fn add_moments(&mut self, y: &[f32], counts: &[f32]) {
         vectorized(|| self.add(y, y, counts, |y, _, n, _| [n * y as f64, n * (y as f64 * y as f64)]));
     }
@@ -66,7 +67,7 @@ impl ColumnSums {
         }
     }
 
-    /// The sums of parts, added in order.
+    /// The sum of the parts, added in order.
     pub fn total<'a>(columns: usize, parts: impl Iterator<Item = &'a ColumnSums>) -> Self {
         let mut total = ColumnSums::new(columns);
         for part in parts {
@@ -80,7 +81,7 @@ impl ColumnSums {
         total
     }
 
-    /// Mean and variance, if these are the sums of [`ColumnSums::add_moments`] over rows that count `total` together.
+    /// Mean and variance from the sums of [`ColumnSums::add_moments`]; `total`: sum of the multiplicities.
     pub fn statistics(&self, total: f64) -> Statistics {
         let moments =
             |(sum, squares): (&f64, &f64)| (sum / total, non_negative(squares / total - (sum / total).powi(2)));
@@ -136,19 +137,20 @@ impl Norm {
     }
 }
 
-/// The gradient of a batch norm for a row that counts n times: `dy = g scale + n ((y - mean) slope + offset)`, g the gradient by z.
+/// The gradient of a batch norm for a row of multiplicity n: `dy = g scale + n ((y - mean) slope + offset)`, g the
+/// gradient with respect to z.
 #[derive(Clone, Debug)]
 pub(super) struct NormGradient {
     pub slope: Vec<f64>,
     pub offset: Vec<f64>,
-    /// Gradient by gamma.
+    /// Gradient with respect to gamma.
     pub gamma: Vec<f32>,
-    /// Gradient by beta.
+    /// Gradient with respect to beta.
     pub beta: Vec<f32>,
 }
 
 impl NormGradient {
-    /// From the sums of [`ColumnSums::add_gradients`] over rows that count `total` together.
+    /// From the sums of [`ColumnSums::add_gradients`] ; `total`: sum of the multiplicities.
     pub fn new(sums: &ColumnSums, total: f64, statistics: &Statistics, gamma: &[f32], epsilon: f64) -> Self {
         let mut gradient = NormGradient { slope: vec![], offset: vec![], gamma: vec![], beta: vec![] };
         for (c, (sum, product)) in sums.first.iter().zip(&sums.second).enumerate() {
@@ -180,7 +182,7 @@ impl NormGradient {
     }
 }
 
-/// Zero where the ReLU was: `activation` is not above zero.
+/// Sets the gradient to zero where `activation` is not above zero.
 pub(super) fn mask(gradient: &mut [f32], activation: &[f32]) {
     vectorized(|| {
         for (g, &a) in gradient.iter_mut().zip(activation) {

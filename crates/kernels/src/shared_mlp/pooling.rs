@@ -1,14 +1,14 @@
-//! The last layer and the maximum over a group behind it. Its output is not kept: relu(norm(y)) rises or falls with y, by the sign of gamma, so
-//! the largest or smallest y of a group is all that the output needs.
+//! The last layer and the maximum over the groups. The layer's output y is not stored: relu(norm(y)) is monotone in y,
+//! rising or falling with the sign of gamma, so the maximum over a group needs only its largest or smallest y.
 //!
-//! Nor does the gradient need it. With g the gradient at the rows that the maximum took, and n how often a row counts,
-//! `dy = g scale + n ((y - mean) slope + offset)` and y = a W^T,
-//! `da = g scale W + n (a Q + q)`, Q = W^T diag(slope) W, q = (offset - mean slope) W, and
-//! `dW = (g scale)^T a + diag(slope) W C + offset sum(n a)`, C the sum over rows of n times the products of a's deviations from its mean.
-//! The products with g touch one row in a group for each channel.
+//! The gradient does not need y either. With g the gradient at the rows selected by the maximum, and n the multiplicity
+//! of a row, `dy = g scale + n ((y - mean) slope + offset)` and y = a W^T, `da = g scale W + n (a Q + q)`, Q = W^T
+//! diag(slope) W, q = (offset - mean slope) W, and `dW = (g scale)^T a + diag(slope) W C + offset sum(n a)`, C the sum
+//! over rows of n times the products of a's deviations from its mean. The products with g touch one row in a group for
+//! each channel.
 
 use super::blocks::{Blocks, sum};
-use super::dense::{Upstream, pass_on};
+use super::dense::{Upstream, mask_and_sum};
 use super::input::Input;
 use super::norm::{ColumnSums, Norm, NormGradient};
 use crate::batch_norm::Statistics;
@@ -19,12 +19,12 @@ use crate::simd::vectorized;
 use rayon::prelude::*;
 use std::mem::MaybeUninit;
 
-/// Where each output of a group comes from.
+/// The extreme value of each group and channel, and its row.
 #[derive(Clone, Debug)]
 pub(super) struct Extremes {
-    /// y there, `[groups, channels]`.
+    /// The extreme y, `[groups, channels]`.
     pub y: Vec<f32>,
-    /// The row, `[groups, channels]`.
+    /// Its row, `[groups, channels]`.
     pub row: Vec<u32>,
 }
 
@@ -68,7 +68,7 @@ pub(super) fn forward(blocks: &Blocks<'_>, input: Input<'_>, weight: &[f32], gam
     (ColumnSums::total(outputs, parts.iter()).statistics(blocks.total), extremes)
 }
 
-/// For each column of a group the first value that is largest times its sign, and its row; NaN, once there, stays.
+/// For each column of a group the first value whose product with its sign is largest, and its row. NaN propagates.
 #[inline(always)]
 fn largest(group: &[f32], sign: &[f32], first_row: u32, best: &mut [f32], row: &mut [u32]) {
     let channels = sign.len();
@@ -107,7 +107,7 @@ pub(super) fn last(extremes: &Extremes, norm: &Norm, dout: &[f32]) -> Upstream {
     Upstream { gradient, sums }
 }
 
-/// The layer as the backward pass sees it.
+/// The last layer in the backward pass.
 #[derive(Clone, Copy)]
 pub(super) struct Pooled<'a> {
     /// `[outputs, inputs]`.
@@ -118,7 +118,8 @@ pub(super) struct Pooled<'a> {
     pub extremes: &'a Extremes,
 }
 
-/// The gradient by the weights, and what goes to the layer before; for the rows of the net the gradient by them instead, if it is wanted.
+/// The gradient with respect to the weights, and the upstream gradient of the previous layer; for the first layer the
+/// gradient with respect to the input instead, if requested.
 pub(super) fn backward(
     blocks: &Blocks<'_>,
     input: Input<'_>,
@@ -153,7 +154,7 @@ pub(super) fn backward(
                         Then::Add,
                     );
                     moments.add_moments(a, counts);
-                    let taken = Taken {
+                    let taken = Selected {
                         scaled: &scaled[block.groups.start * outputs..block.groups.end * outputs],
                         row: &extremes.row[block.groups.start * outputs..block.groups.end * outputs],
                         first_row: block.rows.start,
@@ -164,7 +165,7 @@ pub(super) fn backward(
                     if wanted {
                         multiply(Matrix::new(counted, inputs), Matrix::new(&square, inputs), da, Then::Store);
                         vectorized(|| taken.add_to_rows(weight, &shift, counts, da));
-                        pass_on(input, a, y, da, &mut sums);
+                        mask_and_sum(input, a, y, da, &mut sums);
                         // SAFETY: no row is in two blocks.
                         unsafe { before.write(block.rows.start * inputs, da) };
                     }
@@ -178,7 +179,7 @@ pub(super) fn backward(
     let moments = ColumnSums::total(inputs, parts.iter().map(|p| &p.2));
     let sums = ColumnSums::total(inputs, parts.iter().map(|p| &p.3));
     let sum_of_a = moments.first();
-    // C, in f64 until here.
+    // C; f64 up to here.
     let centred = |i: usize| {
         let products: f64 = parts.iter().map(|p| p.0[i] as f64).sum();
         (products - sum_of_a[i / inputs] * sum_of_a[i % inputs] / blocks.total) as f32
@@ -219,8 +220,8 @@ fn times_counts(a: &[f32], counts: &[f32], out: &mut [f32]) {
     }
 }
 
-/// The rows of a block that the maximum took, one a group and channel, with the gradient there times scale.
-struct Taken<'a> {
+/// The rows of a block selected by the maximum, one a group and channel, with the gradient times scale.
+struct Selected<'a> {
     scaled: &'a [f32],
     row: &'a [u32],
     first_row: usize,
@@ -228,8 +229,9 @@ struct Taken<'a> {
     outputs: usize,
 }
 
-impl Taken<'_> {
-    /// Gradient, place of the row in the block, and place of the channel's weights, of those that are not zero.
+impl Selected<'_> {
+    /// Calls `work` with gradient, index of the row in the block, and offset of the channel's weights for each nonzero
+    /// gradient.
     #[inline(always)]
     fn each(&self, mut work: impl FnMut(f32, usize, usize)) {
         for (k, (&g, &row)) in self.scaled.iter().zip(self.row).enumerate() {

@@ -1,15 +1,16 @@
-//! Sums of rows that were taken from the same place.
+//! Scatter-add of rows: the gradient of a gather.
 
 use crate::output::{Shared, fill};
 use crate::simd::vectorized;
 use rayon::prelude::*;
 
-/// Places that a task takes.
+/// Destination rows a task.
 const PLACES: usize = 64;
 
-/// For each of `places` places the sum of the rows that `source` says are from there, in their order; overwrites `out`, `[places, channels]`.
+/// For each of `places` destinations the sum of the rows with that `source`, in their order. `out`, `[places,
+/// channels]`, is overwritten.
 pub(super) fn add_up(rows: &[f32], source: &[u32], places: usize, channels: usize, out: &mut Vec<f32>) {
-    // The rows sorted by place.
+    // The rows sorted by destination.
     let mut begin = vec![0usize; places + 1];
     for &place in source {
         begin[place as usize + 1] += 1;
@@ -52,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn adds_what_belongs_together() {
+    fn adds_rows_of_the_same_source() {
         let rows = [1.0, 2.0, 10.0, 20.0, 100.0, 200.0];
         let mut out = vec![9.0];
         add_up(&rows, &[2, 0, 2], 4, 2, &mut out);

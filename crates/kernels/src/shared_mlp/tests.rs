@@ -1,9 +1,9 @@
-//! Against the definition in f64.
+//! Comparison with the definition in f64.
 
 use super::*;
 use crate::reference::{assert_close, assert_same_for_threads, random};
 
-/// Where the first layer's rows come from.
+/// Kind of input.
 #[derive(Clone, Copy, PartialEq)]
 enum First {
     Rows,
@@ -24,7 +24,7 @@ struct Case {
 }
 
 impl Case {
-    /// `groups`: rows in each group; nothing for rows without a maximum, then `rows` of them.
+    /// `groups`: rows in each group; empty for `rows` rows without a maximum.
     fn new(first: First, groups: &[usize], rows: usize, channels: &[usize]) -> Self {
         let ends: Vec<u32> =
             groups.iter().scan(0, |end, &n| Some(std::mem::replace(end, *end + n as u32) + n as u32)).collect();
@@ -73,19 +73,19 @@ impl Case {
         RowGroups { ends: self.ends.as_deref(), counts: self.counts.as_deref() }
     }
 
-    /// Output, gradient by the input, and the gradients by the parameters side by side.
+    /// Output, gradient with respect to the input, and the gradients with respect to the parameters side by side.
     fn run(&self) -> ([Vec<f32>; 3], MlpState) {
         let (mut out, mut dx) = (vec![4.0], vec![4.0]);
         let (input, groups, layers) = (self.input(), self.groups(), self.layers());
         let state = self.mlp.forward_train(input, groups, &layers, &mut out);
         let gradients = self.mlp.backward(input, groups, &layers, &state, &self.dout, Some(&mut dx));
         let without = self.mlp.backward(input, groups, &layers, &state, &self.dout, None);
-        assert_eq!(format!("{gradients:?}"), format!("{without:?}"), "whether dx is wanted changes nothing else");
+        assert_eq!(format!("{gradients:?}"), format!("{without:?}"), "the other gradients do not depend on dx");
         let gradients = gradients.into_iter().flat_map(|g| [g.weight, g.gamma, g.beta]).collect::<Vec<_>>().concat();
         ([out, dx, gradients], state)
     }
 
-    /// The same in f64, all rows of all layers kept, and mean and variance of each layer.
+    /// The same in f64, with all rows of all layers, and mean and variance of each layer.
     fn reference(&self) -> ([Vec<f64>; 3], Vec<[Vec<f64>; 2]>) {
         let n = self.mlp.rows;
         let count = |r: usize| self.counts.as_ref().map_or(1.0, |c| c[r] as f64);
@@ -200,7 +200,7 @@ fn equals_the_definition() {
         for (name, got, want) in
             [("out", &got[0], &want[0]), ("dx", &got[1], &want[1]), ("parameters", &got[2], &want[2])]
         {
-            // With a row or two a normalised value hangs on the last digits of the difference.
+            // With one or two rows, normalised values depend on the last digits of their difference.
             let want: Vec<f64> = want.iter().copied().chain([1.0]).collect();
             let got: Vec<f32> = got.iter().copied().chain([1.0]).collect();
             assert_close(&got, &want, 2e-5, &format!("{name} of case {i}, {:?}", case.mlp));
@@ -220,7 +220,7 @@ fn fixed_statistics_give_the_same() {
 }
 
 #[test]
-fn a_row_that_counts_three_times_is_three_rows() {
+fn multiplicity_3_equals_three_rows() {
     let repeat = |rows: &[f32], channels: usize| -> Vec<f32> {
         rows.chunks_exact(channels)
             .enumerate()
@@ -239,7 +239,7 @@ fn a_row_that_counts_three_times_is_three_rows() {
 }
 
 #[test]
-fn the_number_of_threads_changes_no_bit() {
+fn the_result_is_bit_equal_for_any_number_of_threads() {
     let uneven: Vec<usize> = (0..700).map(|i| 1 + i * 5 % 17).collect();
     for case in [
         Case::new(First::Rows, &[16; 200], 0, &[9, 16, 32]),
@@ -251,7 +251,7 @@ fn the_number_of_threads_changes_no_bit() {
 }
 
 #[test]
-fn without_rows_nothing_comes_out() {
+fn no_rows_give_an_empty_output() {
     for mut case in [Case::new(First::Rows, &[], 0, &[3, 4, 5]), Case::new(First::Projected, &[], 0, &[0, 4, 5])] {
         for ends in [None, Some(vec![])] {
             case.ends = ends;
@@ -263,7 +263,7 @@ fn without_rows_nothing_comes_out() {
 }
 
 #[test]
-fn what_is_not_a_number_comes_out() {
+fn nan_propagates() {
     for mut case in cases() {
         let statistics = case.run().1.statistics;
         case.x[0] = f32::NAN;

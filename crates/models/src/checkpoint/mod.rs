@@ -1,8 +1,8 @@
-//! Weights on disk: OpenPCDet's `.pth` in, safetensors in and out.
+//! Checkpoint files: reads OpenPCDet's `.pth`, reads and writes safetensors.
 //!
-//! Tensors keep OpenPCDet's names. What a damaged file says is checked against the file's length before memory is taken, and
-//! nothing in a file is ever run. The limits of that: neither torch's older form nor safetensors carries a checksum, so a changed byte
-//! **inside a weight** cannot be seen there (torch's zip form has checksums, and they are checked).
+//! Tensors keep OpenPCDet's names. Sizes in a file are checked against its length before memory is allocated, and code
+//! in a file is never run. Limitation: neither torch's legacy format nor safetensors has checksums, so a changed byte
+//! **inside a weight** is not detected there. torch's zip format has checksums, which are verified.
 
 mod pickle;
 mod pth;
@@ -20,9 +20,9 @@ pub type NamedTensors = BTreeMap<String, HostTensor>;
 /// A tensor in main memory, row-major.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HostTensor {
-    /// Extents; empty for a single number.
+    /// Dimensions; empty for a scalar.
     pub shape: Vec<usize>,
-    /// As many as the product of the extents.
+    /// As many as the product of the dimensions.
     pub values: HostValues,
 }
 
@@ -46,7 +46,7 @@ enum NumberType {
 }
 
 impl NumberType {
-    /// Values from little-endian bytes, a whole number of them.
+    /// Values from little-endian bytes; the length must be a multiple of the element size.
     fn values(self, bytes: &[u8]) -> HostValues {
         let (four, eight) = (bytes.as_chunks::<4>().0, bytes.as_chunks::<8>().0);
         match self {
@@ -57,17 +57,17 @@ impl NumberType {
     }
 }
 
-/// Weights of a network, from OpenPCDet's `.pth` (torch's zip form or the older one that OpenPCDet writes) or from safetensors.
-/// The content says which, not the name.
+/// Weights of a network from OpenPCDet's `.pth` (torch's zip format, or the legacy format that OpenPCDet writes) or
+/// from safetensors. The format is detected from the content, not from the name.
 ///
 /// # Errors
-/// A file that cannot be read, is none of the three, is damaged or truncated, has bytes left over, or asks to run code.
+/// A file that cannot be read, has another format, is damaged or truncated, has trailing bytes, or asks to run code.
 pub fn read_checkpoint(path: &Path) -> Result<NamedTensors, ModelError> {
     let bytes = fs_err::read(path).map_err(data::DataError::from)?;
     parse_checkpoint(path, &bytes)
 }
 
-/// The same of a file that is in memory already; `path` is only for messages.
+/// The same for the content of a file; `path` is only for messages.
 ///
 /// # Errors
 /// As [`read_checkpoint`].
@@ -81,11 +81,12 @@ fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
         [b'P', b'K', ..] => pth::parse_zip(bytes),
         [0x80, protocol, opcode, ..] if is_pickle(*protocol, *opcode) => pth::parse_legacy(bytes),
         [_, _, _, _, _, _, _, _, b'{', ..] => safetensors::parse(bytes),
-        _ => Err("is no checkpoint: neither torch's (.pth) nor safetensors, or its beginning is damaged".into()),
+        _ => Err("is not a checkpoint: neither torch's (.pth) nor safetensors, or its beginning is damaged".into()),
     }
 }
 
-/// Whether a file that begins with 0x80 is a pickle with a long number or a frame first, and not a safetensors header of 128 bytes.
+/// Whether a file that begins with 0x80 is a pickle whose first opcode is a long or a frame, and not a safetensors
+/// header of 128 bytes.
 fn is_pickle(protocol: u8, opcode: u8) -> bool {
     protocol > 0 && (opcode == 0x8a || opcode == 0x95)
 }

@@ -1,15 +1,15 @@
-//! Python's pickle as data: builds plain values, calls nothing.
+//! Reader of Python's pickle format that builds plain values and calls nothing.
 //!
-//! A pickle is a program for a stack machine. Here its values go into one list and refer to each other by position, so that neither
-//! sharing nor nesting costs memory or recursion. Of the calls that a pickle may ask for, those of `ACCEPTED` become inert values; any other name is refused as soon as
-//! it is mentioned. At most `MAX_OPCODES` are executed (a checkpoint of PointRCNN with its optimiser needs 25,000), which bounds
-//! memory to some 150 MB whatever the file says; a file of n bytes never takes more than about 100 n.
+//! A pickle is a program for a stack machine. Its values are stored in one list and refer to each other by index, so
+//! that sharing and nesting need neither copies nor recursion. Calls of the names in `ACCEPTED` become inert values;
+//! any other name is refused. At most `MAX_OPCODES` opcodes are executed (a checkpoint of PointRCNN with its optimiser
+//! needs 25,000). This limits memory to about 150 MB, and to about 100 n bytes for a file of n bytes.
 
 use std::collections::HashMap;
 
 const MAX_OPCODES: usize = 1 << 21;
 
-/// Position of a value in its pickle.
+/// Index of a value in its pickle.
 pub type Id = u32;
 
 /// One value.
@@ -19,13 +19,13 @@ pub enum Value<'a> {
     None,
     /// `True` or `False`.
     Bool(bool),
-    /// A whole number.
+    /// An integer.
     Int(i64),
-    /// A whole number beyond 64 bits, little-endian two's complement.
+    /// An integer beyond 64 bits, little-endian two's complement.
     Long(&'a [u8]),
     /// A floating point number.
     Float,
-    /// A text.
+    /// A string.
     Str(&'a str),
     /// Bytes.
     Bytes,
@@ -37,14 +37,14 @@ pub enum Value<'a> {
     Dict(Vec<(Id, Id)>),
     /// A name of `ACCEPTED`: module and name.
     Global(&'a str, &'a str),
-    /// What a global would make of a tuple of arguments.
+    /// The call of a global with a tuple of arguments.
     Call {
         /// The global.
         callable: Id,
         /// A tuple.
         arguments: Id,
     },
-    /// Something that lies outside of the pickle; here always a storage.
+    /// A persistent id; here always a storage.
     Persistent(Id),
 }
 
@@ -52,12 +52,12 @@ pub enum Value<'a> {
 pub struct Pickle<'a> {
     values: Vec<Value<'a>>,
     root: Id,
-    /// Bytes that the pickle takes at the beginning of the input.
+    /// Length of the pickle at the beginning of the input, bytes.
     pub length: usize,
 }
 
-/// Names that may occur: module and name. Tensors and dictionaries are understood; numbers of numpy occur in the state of OpenPCDet's
-/// optimiser and stay inert. Storages of `torch` are accepted beside these.
+/// Accepted names: module and name. Tensors and dictionaries are interpreted; numpy scalars occur in the state of
+/// OpenPCDet's optimiser and stay inert. Storages of `torch` are accepted in addition.
 const ACCEPTED: &[(&str, &str)] = &[
     ("torch._utils", "_rebuild_tensor_v2"),
     ("torch._utils", "_rebuild_parameter"),
@@ -69,7 +69,7 @@ const ACCEPTED: &[(&str, &str)] = &[
 ];
 
 impl<'a> Pickle<'a> {
-    /// Reads the pickle that `bytes` begin with.
+    /// Reads the pickle at the beginning of `bytes`.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, String> {
         let mut machine = Machine { bytes, at: 0, values: vec![], stack: vec![], marks: vec![], memo: HashMap::new() };
         match machine.run() {
@@ -78,17 +78,17 @@ impl<'a> Pickle<'a> {
         }
     }
 
-    /// What the pickle holds.
+    /// The root value.
     pub fn root(&self) -> &Value<'a> {
         self.get(self.root)
     }
 
     /// A value.
     pub fn get(&self, id: Id) -> &Value<'a> {
-        &self.values[id as usize] // ids are made by `push` only
+        &self.values[id as usize] // only `push` creates ids
     }
 
-    /// Every value, in the order in which they were made.
+    /// Every value, in the order of creation.
     pub fn values(&self) -> &[Value<'a>] {
         &self.values
     }
@@ -124,9 +124,9 @@ impl<'a> Machine<'a> {
         match opcode {
             0x80 => match self.byte()? {
                 2..=5 => Ok(()),
-                other => Err(format!("protocol {other} is not known")),
+                other => Err(format!("unknown protocol {other}")),
             },
-            0x95 => self.take(8).map(drop), // a frame; its length says nothing that the rest does not
+            0x95 => self.take(8).map(drop), // a frame; its length is not needed
             b'N' => self.push(Value::None),
             0x88 => self.push(Value::Bool(true)),
             0x89 => self.push(Value::Bool(false)),
@@ -211,7 +211,7 @@ impl<'a> Machine<'a> {
                 let names = self.pop_many(2)?;
                 match (&self.values[names[0] as usize], &self.values[names[1] as usize]) {
                     (Value::Str(module), Value::Str(name)) => self.global(module, name),
-                    _ => Err("a global without a name".into()),
+                    _ => Err("has a global without a name".into()),
                 }
             }
             b'R' => self.reduce(),
@@ -237,7 +237,7 @@ impl<'a> Machine<'a> {
                 let key = u32::from_le_bytes(self.array()?);
                 self.recall(key)
             }
-            other => Err(format!("instruction {other:#04x} is none that torch writes")),
+            other => Err(format!("instruction {other:#04x} is not one that torch writes")),
         }
     }
 
@@ -247,12 +247,12 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// Values above the last mark only: what lies below belongs to something else.
+    /// Pops a value above the last mark; values below it belong to another object.
     fn pop(&mut self) -> Result<Id, String> {
         if self.stack.len() <= self.marks.last().copied().unwrap_or(0) {
-            return Err("takes a value that is not there".into());
+            return Err("pops from an empty stack".into());
         }
-        self.stack.pop().ok_or_else(|| "takes a value that is not there".into())
+        self.stack.pop().ok_or_else(|| "pops from an empty stack".into())
     }
 
     fn pop_many(&mut self, count: usize) -> Result<Vec<Id>, String> {
@@ -278,7 +278,7 @@ impl<'a> Machine<'a> {
                 list.append(&mut items);
                 Ok(())
             }
-            _ => Err("appends to what is no list".into()),
+            _ => Err("appends to a value that is not a list".into()),
         }
     }
 
@@ -289,14 +289,16 @@ impl<'a> Machine<'a> {
                 entries.extend(pairs.iter().map(|[key, value]| (*key, *value)));
                 Ok(())
             }
-            _ => Err("adds entries to what is no dictionary, or half an entry".into()),
+            _ => Err("adds entries to a value that is not a dictionary, or half an entry".into()),
         }
     }
 
     fn global(&mut self, module: &'a str, name: &'a str) -> Result<(), String> {
         let storage = module == "torch" && storage_width(name).is_some();
         if !storage && !ACCEPTED.contains(&(module, name)) {
-            return Err(format!("asks for {module}.{name}, which no checkpoint of weights needs; the file is refused"));
+            return Err(format!(
+                "asks for {module}.{name}, which a checkpoint of weights does not need; the file is refused"
+            ));
         }
         self.push(Value::Global(module, name))
     }
@@ -308,13 +310,13 @@ impl<'a> Machine<'a> {
             (Value::Global("collections", "OrderedDict"), Value::Tuple(none)) if none.is_empty() => {
                 self.push(Value::Dict(vec![]))
             }
-            (Value::Global("collections", "OrderedDict"), _) => Err("an OrderedDict with arguments".into()),
+            (Value::Global("collections", "OrderedDict"), _) => Err("has an OrderedDict with arguments".into()),
             (Value::Global(..), Value::Tuple(_)) => self.push(Value::Call { callable, arguments }),
-            _ => Err("calls what is no accepted name, or without a tuple of arguments".into()),
+            _ => Err("calls a name that is not accepted, or without a tuple of arguments".into()),
         }
     }
 
-    /// Attributes of an object: the versions in a `state_dict`, the byte order of a numpy type. Nobody needs them.
+    /// Attributes of an object (versions in a `state_dict`, the byte order of a numpy type) are ignored.
     fn build(&mut self) -> Result<(), String> {
         self.pop()?;
         match self.top()? {
@@ -331,7 +333,7 @@ impl<'a> Machine<'a> {
     }
 
     fn recall(&mut self, key: u32) -> Result<(), String> {
-        let id = self.memo.get(&key).ok_or_else(|| format!("recalls value {key}, which was not stored"))?;
+        let id = self.memo.get(&key).ok_or_else(|| format!("reads memo {key}, which was not stored"))?;
         self.stack.push(*id);
         Ok(())
     }
@@ -376,17 +378,17 @@ impl<'a> Machine<'a> {
 
     fn take(&mut self, length: usize) -> Result<&'a [u8], String> {
         let rest = &self.bytes[self.at..];
-        let taken = rest.get(..length).ok_or_else(|| format!("wants {length} bytes, {} are left", rest.len()))?;
+        let taken = rest.get(..length).ok_or_else(|| format!("needs {length} bytes, {} are left", rest.len()))?;
         self.at += length;
         Ok(taken)
     }
 }
 
 fn utf8(bytes: &[u8]) -> Result<&str, String> {
-    std::str::from_utf8(bytes).map_err(|_| "holds a text that is not UTF-8".into())
+    std::str::from_utf8(bytes).map_err(|_| "holds a string that is not UTF-8".into())
 }
 
-/// Bytes of an element of one of torch's storages.
+/// Element size of a storage of torch, bytes.
 pub fn storage_width(name: &str) -> Option<usize> {
     match name {
         "DoubleStorage" | "LongStorage" => Some(8),
@@ -416,7 +418,7 @@ mod tests {
         assert_eq!((pickle.get(entries[0].0), pickle.get(entries[0].1)), (&Value::Str("a"), &Value::Int(5)));
         let Value::List(items) = pickle.get(entries[1].1) else { panic!() };
         assert_eq!(pickle.get(items[0]), &Value::Int(256));
-        assert_eq!(pickle.get(items[1]), pickle.root(), "a value may hold itself");
+        assert_eq!(pickle.get(items[1]), pickle.root(), "a value may contain itself");
     }
 
     #[test]
@@ -448,7 +450,7 @@ mod tests {
         }
         assert!(error(b"cos\nsystem\n.").contains("asks for os.system"));
         assert!(error(b"(ios\nsystem\n.").contains("instruction 0x69"));
-        assert!(error(b"X\x02\x00\x00\x00ls)R.").contains("no accepted name"));
+        assert!(error(b"X\x02\x00\x00\x00ls)R.").contains("not accepted"));
     }
 
     #[test]
@@ -476,7 +478,7 @@ mod tests {
             error(bytes);
         }
         assert!(error(&[b'('; MAX_OPCODES + 5]).contains("more than"));
-        // Deep nesting is no recursion, neither in reading nor in letting go.
+        // Deep nesting causes no recursion, neither in reading nor in dropping.
         let mut deep = vec![b']'; 1_000_000];
         deep.extend(vec![b'a'; 999_999]);
         deep.push(b'.');

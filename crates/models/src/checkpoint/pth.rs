@@ -1,9 +1,11 @@
 //! OpenPCDet's checkpoints, `{epoch, it, model_state, optimizer_state, version}`, as `torch.save` writes them.
 //!
-//! **Zip form**: an uncompressed archive of `NAME/data.pkl` and a file `NAME/data/KEY` for each storage, with checksums.
-//! **Older form** (OpenPCDet asks torch for it): one file of five pickles (a magic number, a version, facts of the machine, the checkpoint, a list
-//! of storage keys), then for each key the number of elements (i64) and the elements.
-//! Only `model_state` is taken. Where a storage lived (`cuda:0`) does not matter.
+//! **Zip format**: an uncompressed archive of `NAME/data.pkl` and a file `NAME/data/KEY` for each storage, with
+//! checksums. **Legacy format** (`_use_new_zipfile_serialization=False`, as OpenPCDet writes): one file of five pickles
+//! (magic number, version, properties of the machine, checkpoint, list of storage keys), then for each key the number
+//! of elements (i64) and the elements.
+//!
+//! Only `model_state` is read. The device of a storage (`cuda:0`) is ignored.
 
 use super::pickle::{Id, Pickle, Value, storage_width};
 use super::{HostTensor, NamedTensors, NumberType};
@@ -23,13 +25,13 @@ struct Storage<'a> {
     kind: &'a str,
     key: &'a str,
     elements: usize,
-    /// `elements` times the width of the kind.
+    /// `elements` times the element size.
     bytes: usize,
 }
 
-/// The zip form.
+/// Reads the zip format.
 pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
-    // torch writes no comment, so the end record is the last thing in the file.
+    // torch writes no archive comment, so the file ends with the end record.
     let end = bytes.len().checked_sub(22).map_or(&[][..], |from| &bytes[from..]);
     if !end.starts_with(b"PK\x05\x06") || !end.ends_with(&[0, 0]) {
         return Err(
@@ -37,11 +39,11 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
         );
     }
     let damaged = |e: &dyn std::fmt::Display| format!("is a damaged zip archive: {e}");
-    // The archive begins where the file does: nothing is searched for.
+    // The archive begins at the start of the file.
     let config = zip::read::Config { archive_offset: zip::read::ArchiveOffset::Known(0) };
     let mut archive = zip::ZipArchive::with_config(config, Cursor::new(bytes)).map_err(|e| damaged(&e))?;
     if archive.has_duplicate_names() {
-        return Err("is a damaged zip archive: it holds a name twice".into());
+        return Err("is a damaged zip archive: it has a duplicate name".into());
     }
     let mut roots = Vec::new();
     for name in archive.file_names() {
@@ -49,13 +51,15 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
             roots.push(root.to_string());
         }
     }
-    let [root] = roots.as_slice() else { return Err("is a zip archive without one data.pkl, so not torch's".into()) };
+    let [root] = roots.as_slice() else {
+        return Err("is a zip archive without exactly one data.pkl, so not of torch".into());
+    };
     let mut entry = |name: &str, expected: Option<usize>| -> Result<Vec<u8>, String> {
         let name = format!("{root}/{name}");
         let file = archive.by_name(&name).map_err(|e| format!("{name} of the archive: {e}"))?;
         let size = file.size();
         if file.compression() != zip::CompressionMethod::Stored || size > bytes.len() as u64 {
-            return Err(format!("{name} of the archive is compressed or damaged; torch stores it as it is"));
+            return Err(format!("{name} of the archive is compressed or damaged; torch stores files uncompressed"));
         }
         if expected.is_some_and(|expected| expected as u64 != size) {
             return Err(format!("{name} of the archive has {size} bytes, its tensor needs {}", expected.unwrap_or(0)));
@@ -68,7 +72,7 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
         Ok(content)
     };
     if entry("byteorder", None).is_ok_and(|order| order != b"little") {
-        return Err("was written on a big-endian machine, which is not read".into());
+        return Err("was written on a big-endian machine, which is not supported".into());
     }
     let content = entry("data.pkl", None)?;
     let pickle = Pickle::parse(&content)?;
@@ -79,7 +83,7 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
     model_state(&pickle, bytes.len(), &mut content)
 }
 
-/// The older form.
+/// Reads the legacy format.
 pub fn parse_legacy(bytes: &[u8]) -> Result<NamedTensors, String> {
     let mut at = 0;
     let mut next = || -> Result<Pickle, String> {
@@ -90,25 +94,30 @@ pub fn parse_legacy(bytes: &[u8]) -> Result<NamedTensors, String> {
     };
     let (magic, version, machine) = (next()?, next()?, next()?);
     if *magic.root() != Value::Long(&MAGIC) || *version.root() != Value::Int(VERSION) {
-        return Err("is a pickle, but no checkpoint of torch".into());
+        return Err("is a pickle, but not a checkpoint of torch".into());
     }
     let little_endian = lookup(&machine, machine.root(), "little_endian")?.map(|id| machine.get(id));
     if little_endian != Some(&Value::Bool(true)) {
-        return Err("was written on a big-endian machine, which is not read".into());
+        return Err("was written on a big-endian machine, which is not supported".into());
     }
     let (checkpoint, list) = (next()?, next()?);
-    let Value::List(keys) = list.root() else { return Err("is damaged: its list of storages is none".into()) };
-    // The optimiser's storages lie between those of the network: all have to be walked over.
+    let Value::List(keys) = list.root() else {
+        return Err("is damaged: its list of storages is not a list of strings".into());
+    };
+    // The optimiser's storages lie between those of the network, so all are read in order.
     let mut missing = storages(&checkpoint)?;
     let mut contents: BTreeMap<&str, &[u8]> = BTreeMap::new();
     let mut rest = &bytes[at..];
     for &key in keys {
-        let Value::Str(key) = *list.get(key) else { return Err("is damaged: its list of storages is none".into()) };
-        let storage = missing.remove(key).ok_or_else(|| format!("lists storage {key} twice, or does not use it"))?;
+        let Value::Str(key) = *list.get(key) else {
+            return Err("is damaged: its list of storages is not a list of strings".into());
+        };
+        let storage =
+            missing.remove(key).ok_or_else(|| format!("lists storage {key} twice, or a storage that is not used"))?;
         let truncated = || format!("is truncated inside storage {key}");
         let (elements, after) = rest.split_first_chunk::<8>().ok_or_else(truncated)?;
         if i64::from_le_bytes(*elements) != storage.elements as i64 {
-            return Err(format!("is damaged: storage {key} does not have the {} elements it should", storage.elements));
+            return Err(format!("is damaged: storage {key} does not have the expected {} elements", storage.elements));
         }
         let (content, after) = after.split_at_checked(storage.bytes).ok_or_else(truncated)?;
         contents.insert(key, content);
@@ -134,16 +143,16 @@ fn storages<'p>(pickle: &'p Pickle) -> Result<BTreeMap<&'p str, Storage<'p>>, St
         if let Value::Persistent(id) = value {
             let storage = storage(pickle, *id)?;
             if known.insert(storage.key, storage).is_some_and(|before| before != storage) {
-                return Err(format!("is damaged: storage {} is used in two ways", storage.key));
+                return Err(format!("is damaged: storage {} is used with two types", storage.key));
             }
         }
     }
     Ok(known)
 }
 
-/// `("storage", kind, key, location, elements)`; the older form adds a view of another storage, which torch has long left empty.
+/// `("storage", kind, key, location, elements)`; the legacy format adds a view, which is always empty.
 fn storage<'p>(pickle: &'p Pickle, id: Id) -> Result<Storage<'p>, String> {
-    let damaged = || String::from("is damaged: a reference to a storage is not of the form that torch writes");
+    let damaged = || String::from("is damaged: a reference to a storage is not as torch writes it");
     let Value::Tuple(parts) = pickle.get(id) else { return Err(damaged()) };
     let parts: Vec<&Value> = parts.iter().map(|&part| pickle.get(part)).collect();
     let (Value::Str("storage"), Value::Global("torch", kind), Value::Str(key), Value::Str(_), Value::Int(elements)) =
@@ -162,9 +171,9 @@ fn storage<'p>(pickle: &'p Pickle, id: Id) -> Result<Storage<'p>, String> {
     Ok(Storage { kind, key, elements, bytes })
 }
 
-/// The entry of a dictionary with that text as its key.
+/// The entry of a dictionary with a string as its key.
 fn lookup(pickle: &Pickle, dict: &Value, key: &str) -> Result<Option<Id>, String> {
-    let Value::Dict(entries) = dict else { return Err(format!("is damaged: no dictionary where {key} should be")) };
+    let Value::Dict(entries) = dict else { return Err(format!("is damaged: {key} is not in a dictionary")) };
     let mut found = entries.iter().filter(|(k, _)| *pickle.get(*k) == Value::Str(key)).map(|(_, value)| *value);
     match (found.next(), found.next()) {
         (first, None) => Ok(first),
@@ -172,21 +181,23 @@ fn lookup(pickle: &Pickle, dict: &Value, key: &str) -> Result<Option<Id>, String
     }
 }
 
-/// Gives the bytes of a storage, as many as it says.
+/// Returns the bytes of a storage.
 type Content<'c, 'b> = dyn FnMut(&Storage) -> Result<Cow<'b, [u8]>, String> + 'c;
 
 fn model_state(pickle: &Pickle, file_length: usize, content: &mut Content) -> Result<NamedTensors, String> {
     let Some(state) = lookup(pickle, pickle.root(), "model_state")? else {
-        return Err("has no entry model_state; only checkpoints as OpenPCDet writes them are read".into());
+        return Err("has no entry model_state; only checkpoints of OpenPCDet are supported".into());
     };
     let Value::Dict(entries) = pickle.get(state) else {
-        return Err("holds a model_state that is no dictionary".into());
+        return Err("has a model_state that is not a dictionary".into());
     };
     let mut tensors = NamedTensors::new();
-    // Tensors may share a storage, but a small file must neither fill a large memory nor take long.
+    // Tensors may share a storage. The total size is limited, so that a small file cannot use much memory or time.
     let mut budget = file_length.saturating_mul(4);
     for &(name, value) in entries {
-        let Value::Str(name) = *pickle.get(name) else { return Err("is damaged: a tensor's name is no text".into()) };
+        let Value::Str(name) = *pickle.get(name) else {
+            return Err("is damaged: the name of a tensor is not a string".into());
+        };
         let named = |message: String| format!("tensor {name} {message}");
         let view = View::of(pickle, value).map_err(named)?;
         budget = budget
@@ -205,12 +216,12 @@ struct View<'p> {
     storage: Storage<'p>,
     offset: usize,
     shape: Vec<usize>,
-    /// Elements between neighbours along each dimension.
+    /// Stride of each dimension, elements.
     strides: Vec<usize>,
 }
 
 impl<'p> View<'p> {
-    /// `_rebuild_tensor_v2(storage, offset, shape, strides, ..)`, or a parameter made of one.
+    /// `_rebuild_tensor_v2(storage, offset, shape, strides, ..)`, or a parameter of it.
     fn of(pickle: &'p Pickle, id: Id) -> Result<Self, String> {
         let call = |id: Id| match pickle.get(id) {
             Value::Call { callable, arguments } => match (pickle.get(*callable), pickle.get(*arguments)) {
@@ -226,7 +237,7 @@ impl<'p> View<'p> {
         let Some(("_rebuild_tensor_v2", &[source, offset, shape, strides, ..])) = made else {
             return Err("is no tensor".into());
         };
-        let damaged = || String::from("is damaged: it is not of the form that torch writes");
+        let damaged = || String::from("is damaged: it is not as torch writes it");
         let Value::Persistent(source) = *pickle.get(source) else { return Err(damaged()) };
         let whole = |id: Id| match pickle.get(id) {
             Value::Int(n) => usize::try_from(*n).ok(),
@@ -246,7 +257,8 @@ impl<'p> View<'p> {
         Ok(view)
     }
 
-    /// Every element lies inside the storage, no two in one place. Hence there are never more than the storage has.
+    /// Checks that all elements lie inside the storage and do not overlap. Their number is then at most that of the
+    /// storage.
     fn check(&self) -> Result<(), String> {
         let message = || format!("of shape {:?} and strides {:?} does not fit its storage", self.shape, self.strides);
         if self.shape.contains(&0) {
@@ -255,7 +267,7 @@ impl<'p> View<'p> {
         let mut steps: Vec<(usize, usize)> = self.strides.iter().copied().zip(self.shape.iter().copied()).collect();
         steps.retain(|&(_, extent)| extent > 1);
         steps.sort_unstable();
-        let mut span = 1usize; // elements from the first to the last, of the dimensions so far
+        let mut span = 1usize; // elements from the first to the last over the dimensions so far
         for (stride, extent) in steps {
             if stride < span {
                 return Err(message());
@@ -273,14 +285,16 @@ impl<'p> View<'p> {
             "DoubleStorage" => (NumberType::F64, 8),
             "LongStorage" => (NumberType::I64, 8),
             other => {
-                return Err(format!("lies in a {other}; only float32, float64 and int64 are read, convert it first"));
+                return Err(format!(
+                    "lies in a {other}; only float32, float64 and int64 are supported, convert it first"
+                ));
             }
         };
         let shape = self.shape.clone();
         if self.shape.contains(&0) {
             return Ok(HostTensor { shape, values: numbers.values(&[]) });
         }
-        let count: usize = self.shape.iter().product(); // no overflow: at most as many as the storage has
+        let count: usize = self.shape.iter().product(); // no overflow: at most the size of the storage
         let first = self.offset * width;
         if self.is_row_major() {
             return Ok(HostTensor { shape, values: numbers.values(&content[first..first + count * width]) });

@@ -16,17 +16,17 @@ pub fn read_safetensors(path: &Path) -> Result<NamedTensors, ModelError> {
     parse(&bytes).map_err(|message| file_error(path, message))
 }
 
-/// The texts that a safetensors file carries beside its tensors.
+/// The metadata of a safetensors file.
 ///
 /// # Errors
 /// A file that cannot be read, or whose header is damaged.
 pub fn read_metadata(path: &Path) -> Result<BTreeMap<String, String>, ModelError> {
     let bytes = fs_err::read(path).map_err(data::DataError::from)?;
-    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| file_error(path, no_safetensors(&e)))?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| file_error(path, not_safetensors(&e)))?;
     Ok(header.metadata().iter().flatten().map(|(key, text)| (key.clone(), text.clone())).collect())
 }
 
-/// Writes tensors, and texts beside them, whole or not at all. The same content gives the same bytes.
+/// Writes tensors and metadata atomically. The same content gives the same bytes.
 ///
 /// # Errors
 /// A file that cannot be written; a tensor whose values do not fill its shape.
@@ -40,14 +40,14 @@ pub fn write_safetensors(
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
-    let file = SafeTensors::deserialize(bytes).map_err(|e| no_safetensors(&e))?;
+    let file = SafeTensors::deserialize(bytes).map_err(|e| not_safetensors(&e))?;
     let mut tensors = NamedTensors::new();
     for (name, view) in file.iter() {
         let numbers = match view.dtype() {
             Dtype::F32 => NumberType::F32,
             Dtype::F64 => NumberType::F64,
             Dtype::I64 => NumberType::I64,
-            other => return Err(format!("tensor {name} holds {other:?}; only F32, F64 and I64 are read")),
+            other => return Err(format!("tensor {name} holds {other:?}; only F32, F64 and I64 are supported")),
         };
         let values = numbers.values(view.data());
         tensors.insert(name.into(), HostTensor { shape: view.shape().to_vec(), values });
@@ -55,12 +55,12 @@ pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
     Ok(tensors)
 }
 
-fn no_safetensors(error: &safetensors::SafeTensorError) -> String {
-    format!("is no safetensors file, or is damaged or truncated: {error}")
+fn not_safetensors(error: &safetensors::SafeTensorError) -> String {
+    format!("is not a safetensors file, or is damaged or truncated: {error}")
 }
 
-/// The library would write the texts in the random order of a hash map; hence the header by hand: its length (u64), JSON padded to
-/// 8 bytes, then the values, the widest types first so that all lie aligned.
+/// Writes the header here, because the library writes metadata in the random order of a hash map: its length (u64),
+/// JSON padded to 8 bytes, then the values, widest types first so that all are aligned.
 fn serialize(tensors: &NamedTensors, metadata: &BTreeMap<String, String>) -> Result<Vec<u8>, String> {
     let mut ordered: Vec<(&str, &HostTensor)> = tensors.iter().map(|(name, tensor)| (name.as_str(), tensor)).collect();
     ordered.sort_by_key(|(_, tensor)| matches!(tensor.values, HostValues::F32(_)));
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read() {
+    fn written_files_are_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("last.safetensors");
         let texts: BTreeMap<String, String> =

@@ -35,7 +35,8 @@ impl Kernel<1> for Scatter {
 /// Each pillar's features at its cell, zeros elsewhere.
 ///
 /// # Shapes
-/// `features`: `[P, C]`; `cells`: P indices into `[B, H, W]`, row-major, all different, one canvas after the other; result `[B, C, H, W]`.
+/// `features`: `[P, C]`; `cells`: P indices into `[B, H, W]`, row-major, all different, sorted by canvas; result `[B,
+/// C, H, W]`.
 pub fn scatter(features: &Tensor<2>, cells: &[u32], [batch, height, width]: [usize; 3]) -> Option<Tensor<4>> {
     let features_input = input(features)?;
     let channels = features.dims()[1];

@@ -1,4 +1,4 @@
-//! Convolutions, with the kernels' own gradients; and with the batch norm folded in, for inference.
+//! Convolutions with the kernels' gradients for training, and with folded batch norm for inference.
 
 use super::{Input, Kernel, Kernels, apply, chosen_kernels, input};
 use burn::tensor::Tensor;
@@ -46,7 +46,7 @@ pub fn conv3x3(x: &Tensor<4>, weight: &Tensor<4>, stride: usize) -> Option<Tenso
     apply(conv, [input(x), input(weight)]).map(|(y, ())| y)
 }
 
-/// A kernel with weights that already hold the batch norm behind it, and a ReLU.
+/// A kernel whose weights include the folded batch norm, followed by a ReLU.
 #[derive(Clone, Debug)]
 struct Inference<C> {
     conv: C,
@@ -91,12 +91,12 @@ impl Kernel<1> for Inference<TransposedConv> {
     }
 }
 
-/// Only tensors without a graph: a folded weight has no gradient.
+/// Only for tensors without autodiff graph: a folded weight has no gradient.
 fn plain(x: &Tensor<4>) -> Option<Input> {
     input(x).filter(|x| matches!(x, Input::Plain(_)))
 }
 
-/// A 3x3 convolution with a batch norm folded in, and a ReLU; for tensors without a graph.
+/// A 3x3 convolution with folded batch norm and ReLU; for tensors without autodiff graph.
 ///
 /// # Shapes
 /// As [`conv3x3`].
@@ -145,7 +145,7 @@ pub fn transposed(x: &Tensor<4>, weight: &Tensor<4>, stride: usize) -> Option<Te
     apply(conv, [input(x), input(weight)]).map(|(y, ())| y)
 }
 
-/// A transposed convolution with a batch norm folded in, and a ReLU; for tensors without a graph.
+/// A transposed convolution with folded batch norm and ReLU; for tensors without autodiff graph.
 ///
 /// # Shapes
 /// As [`transposed`].

@@ -1,4 +1,4 @@
-//! The sigmoid focal loss of all anchors as one number.
+//! The sum of the sigmoid focal loss over all anchors.
 
 use super::{Kernel, apply, input};
 use burn::tensor::Tensor;
@@ -12,7 +12,7 @@ struct FocalLoss {
 }
 
 impl Kernel<1> for FocalLoss {
-    /// The gradient: it comes with the loss.
+    /// The gradient, computed together with the loss.
     type State = Arc<[f32]>;
 
     fn forward(&self, [logits]: [&[f32]; 1]) -> (Vec<f32>, Arc<[f32]>) {

@@ -1,7 +1,6 @@
 //! The operations of crate `kernels` as differentiable operations of burn.
 //!
-//! A layer asks for its kernel; where the tensors live on the CPU device `flex` it gets the result, elsewhere `None`, and takes burn's own
-//! operations instead.
+//! The functions return `None` if the tensors are not on the CPU device `flex`. The layers then use burn's operations.
 
 mod canvas;
 mod convolution;
@@ -34,26 +33,26 @@ use std::sync::atomic::{AtomicU8, Ordering};
 
 type Ad = Autodiff<Flex>;
 
-/// Which form of an operation runs on the CPU device `flex`.
+/// The implementation of the operations on the CPU device `flex`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Kernels {
     /// The crate `kernels`, convolutions by Winograd's F(2x2, 3x3).
     #[default]
     Auto,
-    /// The same, convolutions by F(4x4, 3x3): faster, a digit less exact.
+    /// The same, convolutions by F(4x4, 3x3): faster, rounding error about ten times larger.
     AutoF4,
-    /// burn's own operations.
+    /// burn's operations.
     Burn,
 }
 
 static CHOSEN: AtomicU8 = AtomicU8::new(0);
 
-/// Chooses for this process, before the first network computes.
+/// Sets the choice for this process; call it before the first forward pass.
 pub fn choose_kernels(kernels: Kernels) {
     CHOSEN.store(kernels as u8, Ordering::Relaxed);
 }
 
-/// The choice that holds.
+/// The choice of this process.
 pub fn chosen_kernels() -> Kernels {
     match CHOSEN.load(Ordering::Relaxed) {
         0 => Kernels::Auto,
@@ -62,14 +61,14 @@ pub fn chosen_kernels() -> Kernels {
     }
 }
 
-/// An operation on slices, and its gradient. `N` inputs that a gradient may be wanted for.
+/// An operation on slices with its gradient; `N` inputs may require a gradient.
 trait Kernel<const N: usize>: Clone + Debug + Send + 'static {
-    /// What the gradient needs beside the inputs.
+    /// State of the forward pass that the gradient needs.
     type State: Clone + Debug + Send + 'static;
 
     fn forward(&self, inputs: [&[f32]; N]) -> (Vec<f32>, Self::State);
 
-    /// Gradients by those inputs that are wanted, given that by the result.
+    /// Gradients with respect to the requested inputs, from the gradient with respect to the result.
     fn backward(
         &self,
         inputs: [&[f32]; N],
@@ -81,13 +80,13 @@ trait Kernel<const N: usize>: Clone + Debug + Send + 'static {
     fn shape(&self) -> Vec<usize>;
 }
 
-/// A tensor of single precision on `flex`, with a graph or without.
+/// An f32 tensor on `flex`, with or without autodiff graph.
 enum Input {
     Tracked(FloatTensor<Ad>),
     Plain(FlexTensor),
 }
 
-/// The tensor's own form, if kernels are wanted and it lives where they run.
+/// The tensor as `flex` tensor, if kernels are enabled and it is on that device.
 fn input<const D: usize>(tensor: &Tensor<D>) -> Option<Input> {
     if chosen_kernels() == Kernels::Burn || tensor.dtype() != DType::F32 {
         return None;
@@ -98,7 +97,7 @@ fn input<const D: usize>(tensor: &Tensor<D>) -> Option<Input> {
     }
 }
 
-/// Runs the kernel where all inputs live on `flex`, all with a graph or all without.
+/// Runs the kernel if all inputs are on `flex`, either all with autodiff graph or all without.
 fn apply<K: Kernel<N>, const N: usize, const D: usize>(
     kernel: K,
     inputs: [Option<Input>; N],
@@ -132,7 +131,7 @@ fn apply_tracked<K: Kernel<N>, const N: usize>(kernel: K, inputs: [FloatTensor<A
     (y, state)
 }
 
-/// The backward half of a kernel.
+/// The backward pass of a kernel.
 #[derive(Clone, Debug)]
 struct Gradient<K>(K);
 
@@ -152,7 +151,7 @@ impl<K: Kernel<N>, const N: usize> Backward<Flex, N> for Gradient<K> {
     }
 }
 
-/// Views have no slice of their own.
+/// Makes views contiguous, so that they have a slice.
 fn contiguous(tensor: FlexTensor) -> FlexTensor {
     if tensor.as_slice::<f32>().is_some() { tensor } else { tensor.to_contiguous() }
 }
@@ -165,7 +164,7 @@ fn slices<const N: usize>(tensors: &[FlexTensor; N]) -> [&[f32]; N] {
     std::array::from_fn(|i| slice(&tensors[i]))
 }
 
-/// Takes the values over without a copy.
+/// A tensor that owns the values without a copy.
 fn tensor(values: Vec<f32>, shape: Vec<usize>) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape))
 }

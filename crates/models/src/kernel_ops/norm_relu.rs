@@ -1,4 +1,4 @@
-//! Batch normalisation by the statistics of the batch, and the ReLU behind it.
+//! Batch normalisation with the statistics of the batch, optionally followed by a ReLU.
 
 use super::{Kernel, apply, input};
 use burn::tensor::Tensor;
@@ -36,10 +36,10 @@ impl Kernel<3> for NormRelu {
     }
 }
 
-/// The normalised batch, cut at zero where `relu`, and its statistics.
+/// The normalised batch, with a ReLU if `relu`, and its statistics.
 ///
 /// # Shapes
-/// `x`: `[B, C, ...]`, the result alike; `gamma`, `beta`: `[C]`.
+/// `x` and result: `[B, C, ...]`; `gamma`, `beta`: `[C]`.
 pub fn norm_relu<const D: usize>(
     x: &Tensor<D>,
     gamma: &Tensor<1>,

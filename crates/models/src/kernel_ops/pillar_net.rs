@@ -10,7 +10,7 @@ struct PillarKernel {
     net: PillarNet,
     features: Arc<[f32]>,
     num_points: Arc<[u32]>,
-    /// Those of past batches, for inference.
+    /// Running statistics, for inference.
     statistics: Option<Statistics>,
 }
 
@@ -44,7 +44,7 @@ impl Kernel<3> for PillarKernel {
         dy: &[f32],
         _: [bool; 3],
     ) -> [Option<Vec<f32>>; 3] {
-        let state = state.as_ref().expect("a graph is only kept in training");
+        let state = state.as_ref().expect("only training has a backward pass");
         let found = self.net.backward(self.pillars(), PillarParameters { weight, gamma, beta }, state, dy);
         [Some(found.weight), Some(found.gamma), Some(found.beta)]
     }
@@ -54,10 +54,10 @@ impl Kernel<3> for PillarKernel {
     }
 }
 
-/// The points of all pillars of a batch on the host: `[N, F]`, and how many each pillar has, `[P]`.
+/// The points of all pillars of a batch on the host: `[N, F]`, and the number of points of each pillar, `[P]`.
 type Points = (Arc<[f32]>, Arc<[u32]>);
 
-/// Features of all pillars, and the statistics over all rows, padding included, with their number.
+/// Features of all pillars, the statistics over all rows (padding included), and the number of these rows.
 ///
 /// # Shapes
 /// `weight`: `[C, F]`; `gamma`, `beta`: `[C]`; result `[P, C]`.
@@ -70,11 +70,11 @@ pub fn pillar_net(
     let net = net(weight, max_points, epsilon)?;
     let kernel = PillarKernel { net, features, num_points, statistics: None };
     let (out, state) = apply(kernel, [input(weight), input(gamma), input(beta)])?;
-    let state = state.expect("in training there is one");
+    let state = state.expect("training has a state");
     Some((out, state.statistics.clone(), state.count))
 }
 
-/// The same with the statistics of past batches, for tensors without a graph.
+/// The same with running statistics, for tensors without autodiff graph.
 pub fn pillar_net_inference(
     (features, num_points): Points,
     (weight, gamma, beta): (&Tensor<2>, &Tensor<1>, &Tensor<1>),

@@ -1,4 +1,4 @@
-//! The heads of a detector: 1x1 convolutions of the same image whose outputs are read pixel by pixel.
+//! The heads of a detector: 1x1 convolutions of the same image with channels-last outputs.
 
 use super::{Kernel, apply, input};
 use burn::tensor::Tensor;
@@ -26,7 +26,7 @@ impl Kernel<3> for PixelHeads {
 /// Weight and bias of a 1x1 convolution.
 type Head<'a> = (&'a Tensor<4>, &'a Tensor<1>);
 
-/// 1x1 convolutions with bias of one image.
+/// Several 1x1 convolutions with bias of one image.
 ///
 /// # Shapes
 /// `x`: `[B, C, H, W]`; weights `[K, C, 1, 1]` and biases `[K]`; results `[B * H * W, K]`.

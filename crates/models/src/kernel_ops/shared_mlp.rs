@@ -6,14 +6,14 @@ use burn::tensor::Tensor;
 use kernels::{MlpInput, MlpLayer, MlpState, RowGroups, SharedMlp, Statistics};
 use std::sync::Arc;
 
-/// What the first layer reads.
+/// The input of the first layer.
 #[derive(Clone, Debug)]
 pub enum MlpRows {
     /// Rows, `[N, C0]`.
     Rows(Tensor<2>),
-    /// What the first layer's linear part makes of them, `[N, C1]`.
+    /// The output of the first layer's linear part, `[N, C1]`.
     Projected(Tensor<2>),
-    /// The linear part of the features of each point, `[P, C1]`; the groups say which rows take it.
+    /// The linear part of the features of each point, `[P, C1]`; the groups define which rows gather it.
     Gathered(Tensor<2>),
 }
 
@@ -28,7 +28,7 @@ impl MlpRows {
 /// Learned parameters of a layer.
 #[derive(Clone, Debug)]
 pub struct MlpParameters {
-    /// `[C_out, C_in]`; of a gathered first layer the columns that work on the offsets, `[C_out, 3]`.
+    /// `[C_out, C_in]`; for a gathered first layer only the columns of the offsets, `[C_out, 3]`.
     pub weight: Tensor<2>,
     /// `[C_out]`.
     pub gamma: Tensor<1>,
@@ -36,7 +36,7 @@ pub struct MlpParameters {
     pub beta: Tensor<1>,
 }
 
-/// The form of the first layer's input, for the backward pass too.
+/// The kind of the first layer's input.
 #[derive(Clone, Copy, Debug)]
 enum Form {
     Rows,
@@ -49,7 +49,7 @@ struct MlpKernel {
     mlp: SharedMlp,
     form: Form,
     groups: Option<Arc<Groups>>,
-    /// Those of past batches, for inference.
+    /// Running statistics, for inference.
     statistics: Option<Vec<Statistics>>,
 }
 
@@ -71,7 +71,7 @@ impl MlpKernel {
         })
     }
 
-    /// Of the inputs behind the rows; a projected first layer has no weight among them.
+    /// Indices of the inputs after the rows; a projected first layer has no weight.
     fn layers<'a>(&self, parameters: &[&'a [f32]]) -> Vec<MlpLayer<'a>> {
         let (projected, layers) = parameters.split_at(parameters.len() % 3);
         let first = projected.first().zip(projected.get(1)).map(|(gamma, beta)| MlpLayer { weight: &[], gamma, beta });
@@ -105,7 +105,7 @@ impl<const N: usize> Kernel<N> for MlpKernel {
         dy: &[f32],
         wanted: [bool; N],
     ) -> [Option<Vec<f32>>; N] {
-        let state = state.as_ref().expect("a graph is only kept in training");
+        let state = state.as_ref().expect("only training has a backward pass");
         let (x, layers) = (self.input(inputs[0]), self.layers(&inputs[1..]));
         let mut dx = Vec::new();
         let dx_wanted = wanted[0].then_some(&mut dx);
@@ -122,11 +122,11 @@ impl<const N: usize> Kernel<N> for MlpKernel {
     }
 }
 
-/// Layers of linear, batch norm and ReLU, and the maximum over `groups`; each row is an output without them. With the statistics of each layer, and
-/// how many rows they are of.
+/// Layers of linear, batch norm and ReLU, followed by the maximum over `groups` if given. Also returns the statistics
+/// of each layer and the number of rows.
 ///
 /// # Shapes
-/// `rows`: as [`MlpRows`] says; result `[G, C]`, or `[N, C]` without groups.
+/// `rows`: see [`MlpRows`]; result `[G, C]`, or `[N, C]` without groups.
 pub fn shared_mlp(
     rows: &MlpRows,
     groups: Option<&Arc<Groups>>,
@@ -134,11 +134,11 @@ pub fn shared_mlp(
     epsilon: f64,
 ) -> Option<(Tensor<2>, Vec<Statistics>, usize)> {
     let (out, state) = run(kernel(rows, groups, layers, epsilon, None)?, rows, layers)?;
-    let state = state.expect("in training there is one");
+    let state = state.expect("training has a state");
     Some((out, state.statistics.clone(), state.count as usize))
 }
 
-/// The same with the statistics of past batches, for tensors without a graph.
+/// The same with running statistics, for tensors without autodiff graph.
 pub fn shared_mlp_inference(
     rows: &MlpRows,
     groups: Option<&Arc<Groups>>,

@@ -1,4 +1,4 @@
-//! Every operation in both forms: the kernel's values and gradients against burn's own.
+//! Values and gradients of every kernel against those of burn's operations.
 
 use super::*;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, rows_kernel};
@@ -14,7 +14,7 @@ fn device() -> Device {
     Device::flex().autodiff()
 }
 
-/// Values between -1 and 1, the same for a seed.
+/// Values between -1 and 1, determined by the seed.
 fn values(count: usize, seed: u32) -> Vec<f32> {
     let mut state = seed.wrapping_mul(2_654_435_761) | 1;
     let mut next = || {
@@ -40,7 +40,7 @@ fn assert_close(what: &str, ours: &[f32], theirs: &[f32]) {
     assert!(ours.len() == theirs.len() && apart <= 2e-5 * largest, "{what}: {apart} of {largest}");
 }
 
-/// Compares values, and gradients by all inputs of a sum with random weights.
+/// Compares values and the gradients of a randomly weighted sum with respect to all inputs.
 macro_rules! check {
     ($what:expr, [$($input:ident),+], $ours:expr, $theirs:expr) => {{
         let (ours, theirs) = ($ours, $theirs);
@@ -76,7 +76,10 @@ fn convolutions() {
             conv_transpose2d(x.clone(), w.clone(), None, options)
         );
     }
-    assert!(transposed(&random([1, 1, 2, 2], 1), &random([1, 1, 3, 3], 1), 3).is_none(), "no kernel for a stride of 3");
+    assert!(
+        transposed(&random([1, 1, 2, 2], 1), &random([1, 1, 3, 3], 1), 3).is_none(),
+        "there is no kernel for stride 3"
+    );
 }
 
 #[test]
@@ -108,7 +111,8 @@ fn batch_norm_and_relu() {
     check!("batch norm", [x, gamma, beta], ours, relu(theirs.output));
 }
 
-/// Groups of 1 to `largest` rows that are taken from `points` points; rows that the reference repeats count more than once.
+/// Groups of 1 to `largest` rows gathered from `points` points; rows that the reference repeats have a multiplicity
+/// above 1.
 fn groups(count: usize, largest: usize, points: usize) -> Groups {
     let mut groups = Groups::default();
     let mut row = 0;
@@ -123,7 +127,7 @@ fn groups(count: usize, largest: usize, points: usize) -> Groups {
     groups
 }
 
-/// Layers with the names that their weights are drawn by.
+/// Layers with the names that key their initial weights.
 fn mlp(channels: &[usize]) -> Vec<RowsBnRelu<4>> {
     let device = device();
     let init = Init { seed: 3, device: &device };
@@ -136,7 +140,7 @@ fn mlp(channels: &[usize]) -> Vec<RowsBnRelu<4>> {
     channels.windows(2).enumerate().map(layer).collect()
 }
 
-/// Both forms of a net: values, gradients by the rows and by all parameters, and running statistics.
+/// Compares both implementations of a net: values, gradients with respect to rows and parameters, running statistics.
 fn check_mlp(
     what: &str,
     channels: &[usize],
@@ -153,7 +157,7 @@ fn check_mlp(
     let close = |name: &str, mine: Option<Vec<f32>>, burns: Option<Vec<f32>>| {
         assert_close(&format!("{what}: {name}"), &mine.unwrap(), &burns.unwrap());
     };
-    close("gradient by the rows", rows.grad(&gradients.0).map(host), rows.grad(&gradients.1).map(host));
+    close("gradient with respect to the rows", rows.grad(&gradients.0).map(host), rows.grad(&gradients.1).map(host));
     for (l, (a, b)) in a.iter().zip(&b).enumerate() {
         let gradient = |layer: &RowsBnRelu<4>, from| layer.weight.val().grad(from).map(host);
         close(&format!("weight {l}"), gradient(a, &gradients.0), gradient(b, &gradients.1));
@@ -257,7 +261,7 @@ fn focal_loss_of_all_anchors() {
 }
 
 #[test]
-fn what_is_no_number_comes_out() {
+fn nan_propagates() {
     let mut x = values(2 * 3 * 4 * 4, 13);
     x[20] = f32::NAN;
     let x = Tensor::<4>::from_data(TensorData::new(x, [2, 3, 4, 4]), &device());
@@ -269,7 +273,7 @@ fn what_is_no_number_comes_out() {
 
 #[test]
 fn tensors_elsewhere_have_no_kernel() {
-    #[expect(deprecated, reason = "offered as long as burn has it")]
+    #[expect(deprecated, reason = "supported as long as burn has it")]
     let elsewhere = Device::ndarray();
     let tensor = |shape: [usize; 4]| Tensor::<4>::zeros(shape, &elsewhere);
     assert!(conv3x3(&tensor([1, 1, 4, 4]), &tensor([1, 1, 3, 3]), 1).is_none());

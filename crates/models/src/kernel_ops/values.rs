@@ -1,15 +1,15 @@
-//! Tensors on the CPU device `flex` as slices, for whoever has a kernel for them.
+//! Tensors on the CPU device `flex` as slices.
 
 use super::{Input, contiguous, input, slice};
 use burn::backend::flex::FlexTensor;
 use burn::tensor::Tensor;
 
-/// The values of a tensor without a graph.
+/// The values of a tensor without autodiff graph.
 #[derive(Clone, Debug)]
 pub struct FlexValues(FlexTensor);
 
 impl FlexValues {
-    /// `None` where the tensor lives elsewhere, or kernels are not wanted.
+    /// `None` if the tensor is on another device or kernels are disabled.
     pub fn of<const D: usize>(tensor: &Tensor<D>) -> Option<Self> {
         match input(tensor)? {
             Input::Plain(tensor) => Some(FlexValues(contiguous(tensor))),
@@ -22,9 +22,9 @@ impl FlexValues {
         slice(&self.0)
     }
 
-    /// Without a copy where nobody else holds the tensor.
+    /// Takes the values, without a copy if the tensor is not shared.
     pub fn into_vec(self) -> Vec<f32> {
         let values = self.0.into_data().try_into_vec::<f32>();
-        values.expect("single precision, as asked before")
+        values.expect("f32, as checked before")
     }
 }

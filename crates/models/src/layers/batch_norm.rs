@@ -1,6 +1,7 @@
 //! Batch normalisation with PyTorch's running statistics.
 //!
-//! burn's own layer keeps the biased variance of a batch; PyTorch, and so every published checkpoint, the unbiased one.
+//! burn's layer accumulates the biased variance of a batch; PyTorch, and thus every published checkpoint, the unbiased
+//! one.
 
 use super::{Init, RowCounts, host};
 use crate::kernel_ops::norm_relu;
@@ -16,9 +17,9 @@ pub struct BatchNorm {
     pub weight: Param<Tensor<1>>,
     /// Shift, `[C]`.
     pub bias: Param<Tensor<1>>,
-    /// Mean over past batches, `[C]`.
+    /// Running mean, `[C]`.
     pub running_mean: RunningState<Tensor<1>>,
-    /// Unbiased variance over past batches, `[C]`.
+    /// Running unbiased variance, `[C]`.
     pub running_var: RunningState<Tensor<1>>,
     /// Number of updates so far, `[1]`.
     pub num_batches_tracked: RunningState<Tensor<1>>,
@@ -33,7 +34,7 @@ pub struct Moments {
     pub mean: Tensor<1>,
     /// Variance with divisor n, `[C]`.
     pub variance: Tensor<1>,
-    /// Number of values a channel.
+    /// Number of values per channel.
     pub count: usize,
 }
 
@@ -51,10 +52,10 @@ impl BatchNorm {
         }
     }
 
-    /// Normalises with the statistics of `x` and takes them into the running ones.
+    /// Normalises with the statistics of `x` and updates the running statistics.
     ///
     /// # Shapes
-    /// `x`: `[B, C, ...]`, the result alike.
+    /// `x` and result: `[B, C, ...]`.
     pub fn forward_train<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         let shape = x.dims();
         let [batch, channels] = [shape[0], shape[1]];
@@ -70,10 +71,10 @@ impl BatchNorm {
         out.reshape(shape)
     }
 
-    /// [`BatchNorm::forward_train`] and a ReLU, in one operation where there is a kernel for it.
+    /// [`BatchNorm::forward_train`] followed by a ReLU; one operation if there is a kernel.
     ///
     /// # Shapes
-    /// `x`: `[B, C, ...]`, the result alike.
+    /// `x` and result: `[B, C, ...]`.
     pub fn forward_train_relu<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         match norm_relu(&x, &self.weight.val(), &self.bias.val(), self.epsilon, true) {
             Some((y, statistics)) => {
@@ -85,7 +86,7 @@ impl BatchNorm {
         }
     }
 
-    /// Statistics from the host.
+    /// Statistics of a batch from host values.
     pub fn moments(&self, statistics: &Statistics, count: usize) -> Moments {
         let device = self.running_mean.value().device();
         let tensor = |values: &[f64]| {
@@ -95,7 +96,7 @@ impl BatchNorm {
         Moments { mean: tensor(&statistics.mean), variance: tensor(&statistics.variance), count }
     }
 
-    /// The statistics of past batches on the host.
+    /// The running statistics on the host.
     ///
     /// # Panics
     /// When they are not f32.
@@ -106,7 +107,7 @@ impl BatchNorm {
         Statistics { mean: of(&self.running_mean), variance: of(&self.running_var) }
     }
 
-    /// `fold` of this norm with its running statistics into the weights of what is before it.
+    /// Applies `fold` to this norm with its running statistics, to fold it into the weights of the preceding layer.
     ///
     /// # Panics
     /// When the parameters are not f32.
@@ -116,7 +117,7 @@ impl BatchNorm {
         fold(&NormParameters { gamma: &gamma, beta: &beta, statistics: &statistics, epsilon: self.epsilon })
     }
 
-    /// Added to a variance before its root.
+    /// Added to the variance before its square root.
     pub fn epsilon(&self) -> f64 {
         self.epsilon
     }
@@ -124,25 +125,25 @@ impl BatchNorm {
     /// Normalises with the running statistics.
     ///
     /// # Shapes
-    /// `x`: `[B, C, ...]`, the result alike.
+    /// `x` and result: `[B, C, ...]`.
     pub fn forward_eval<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         let (mean, variance) = (self.running_mean.value(), self.running_var.value());
         burn::tensor::module::batch_norm(x, self.weight.val(), self.bias.val(), mean, variance, self.epsilon)
     }
 
-    /// Normalises rows with given statistics, which stay in the graph.
+    /// Normalises rows with given statistics, which stay in the autodiff graph.
     ///
     /// # Shapes
-    /// `x`: `[N, C]`, the result alike.
+    /// `x` and result: `[N, C]`.
     pub fn normalise_rows(&self, x: Tensor<2>, moments: &Moments) -> Tensor<2> {
         let scale = self.weight.val() / (moments.variance.clone() + self.epsilon).sqrt(); // [C]
         (x - moments.mean.clone().unsqueeze::<2>()) * scale.unsqueeze() + self.bias.val().unsqueeze() // [N, C]
     }
 
-    /// Normalises rows with their own statistics and takes these into the running ones.
+    /// Normalises rows with their statistics and updates the running statistics.
     ///
     /// # Shapes
-    /// `x`: `[N, C]`, the result alike.
+    /// `x` and result: `[N, C]`.
     pub fn forward_rows_train(&self, x: Tensor<2>, counts: &RowCounts) -> Tensor<2> {
         let channels = x.dims()[1];
         let mean = counts.mean(x.clone()); // [1, C]
@@ -157,19 +158,19 @@ impl BatchNorm {
     /// Normalises rows with the running statistics.
     ///
     /// # Shapes
-    /// `x`: `[N, C]`, the result alike.
+    /// `x` and result: `[N, C]`.
     pub fn forward_rows_eval(&self, x: Tensor<2>) -> Tensor<2> {
         let scale = self.weight.val() / (self.running_var.value() + self.epsilon).sqrt(); // [C]
         let shift = self.bias.val() - self.running_mean.value() * scale.clone(); // [C]
         x * scale.unsqueeze() + shift.unsqueeze()
     }
 
-    /// The statistics of past batches, as [`BatchNorm::normalise_rows`] takes them.
+    /// The running statistics for [`BatchNorm::normalise_rows`].
     pub fn running(&self) -> Moments {
         Moments { mean: self.running_mean.value(), variance: self.running_var.value(), count: 0 }
     }
 
-    /// Takes the statistics of a batch into the running ones; nothing of it enters the graph.
+    /// Updates the running statistics with those of a batch, outside the autodiff graph.
     pub fn update(&self, batch: Moments) {
         let n = batch.count as f64;
         let unbiased = batch.variance.detach() * (n / (n - 1.0).max(1.0));
@@ -184,7 +185,8 @@ impl BatchNorm {
     }
 }
 
-/// Sum over all but the channels, first within groups: one running f32 sum over tens of thousands of values loses digits.
+/// Sum over all but the channels, first within groups, because a sequential f32 sum over tens of thousands of values
+/// loses precision.
 ///
 /// # Shapes
 /// `x`: `[B, C, L]`; result `[1, C, 1]`.

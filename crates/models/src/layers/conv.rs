@@ -1,4 +1,4 @@
-//! Convolutions with what follows them.
+//! Convolutions with batch norm and ReLU.
 
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode, host};
@@ -14,7 +14,7 @@ use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
 pub struct ConvBnRelu {
     /// `[C_out, C_in, 3, 3]`.
     pub weight: Param<Tensor<4>>,
-    /// After the convolution.
+    /// The batch norm after the convolution.
     pub norm: BatchNorm,
     stride: usize,
 }
@@ -48,7 +48,7 @@ impl ConvBnRelu {
 pub struct DeconvBnRelu {
     /// `[C_in, C_out, stride, stride]`.
     pub weight: Param<Tensor<4>>,
-    /// After the convolution.
+    /// The batch norm after the convolution.
     pub norm: BatchNorm,
     stride: usize,
 }
@@ -109,7 +109,7 @@ impl PointwiseConv {
         }
     }
 
-    /// Some of them on one image, with the outputs of each pixel in a row.
+    /// Applies several of them to one image; the outputs of a pixel form a row.
     ///
     /// # Shapes
     /// `x`: `[B, C_in, H, W]`; results `[B * H * W, C_out]`.

@@ -1,4 +1,4 @@
-//! Tensors on their way off the device.
+//! Transfer of tensors to the host.
 
 use crate::ModelError;
 use burn::tensor::Tensor;

@@ -5,12 +5,12 @@ use burn::tensor::{Device, Tensor, TensorData};
 use data::stream;
 use rand::RngExt;
 
-/// Where initial weights come from: a seed and the name of each tensor.
+/// Source of initial weights: each tensor has a random stream keyed by seed and name.
 #[derive(Clone, Copy, Debug)]
 pub struct Init<'a> {
     /// Seed of the run.
     pub seed: u64,
-    /// Where the tensors are put.
+    /// Device of the tensors.
     pub device: &'a Device,
 }
 
@@ -20,7 +20,8 @@ impl Init<'_> {
         Param::from_tensor(Tensor::full(shape, value, self.device))
     }
 
-    /// Uniform in `±1/sqrt(fan_in)`: PyTorch's default for linear layers and convolutions (Kaiming uniform with a = sqrt 5).
+    /// Uniform in `±1/sqrt(fan_in)`: PyTorch's default for linear layers and convolutions (Kaiming uniform with a =
+    /// sqrt 5).
     pub fn uniform<const D: usize>(&self, name: &str, shape: [usize; D], fan_in: usize) -> Param<Tensor<D>> {
         let bound = 1.0 / (fan_in as f32).sqrt();
         self.draw(name, shape, |random| (2.0 * random() - 1.0) * bound)

@@ -1,4 +1,4 @@
-//! Layers that the networks are built of.
+//! Layers of the networks.
 
 mod batch_norm;
 mod conv;
@@ -14,11 +14,11 @@ pub use init::Init;
 pub use precision::{Precision, choose_precision};
 pub use rows::{RowCounts, RowsBnRelu, RowsLinear, rows_kernel};
 
-/// Whether a pass learns (batch statistics, running ones updated) or only looks (running statistics).
+/// Mode of batch norms in a forward pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// Batch statistics; the running ones are updated.
+    /// Training: batch statistics, and the running statistics are updated.
     Train,
-    /// Running statistics.
+    /// Evaluation: running statistics.
     Eval,
 }

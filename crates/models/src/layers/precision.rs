@@ -1,38 +1,40 @@
-//! In which floats the layers multiply: all single, or products in half precision and everything else in single.
+//! Precision of the matrix products: f32, or f16 with everything else in f32.
 
 use burn::tensor::{Device, FloatDType, Tensor};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// What convolutions and linear layers multiply, forward and backward. Weights, batch norms, losses and the optimiser are f32 in both.
+/// Precision of convolutions and linear layers, forward and backward. Weights, batch norms, losses and the optimiser
+/// are always f32.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Precision {
-    /// 24 bits of mantissa.
+    /// f32.
     #[default]
     F32,
-    /// 11 bits: half of the memory traffic, and a GPU's matrix units where burn uses them. "Mixed precision" (Micikevicius et al. 2018).
+    /// f16 (mixed precision, Micikevicius et al. 2018): half the memory traffic, and tensor cores of GPUs where burn
+    /// uses them.
     F16,
 }
 
 static HALF: AtomicBool = AtomicBool::new(false);
 
-/// Chooses for this process, before the first network computes.
+/// Sets the choice for this process; call it before the first forward pass.
 pub fn choose_precision(precision: Precision) {
     HALF.store(precision == Precision::F16, Ordering::Relaxed);
 }
 
 impl Precision {
-    /// The choice that holds.
+    /// The choice of this process.
     pub fn chosen() -> Precision {
         if HALF.load(Ordering::Relaxed) { Precision::F16 } else { Precision::F32 }
     }
 
-    /// Whether the device computes in it.
+    /// Whether the device supports it.
     pub fn runs_on(self, device: &Device) -> bool {
         self == Precision::F32 || device.supports_dtype(FloatDType::F16)
     }
 
-    /// What the loss is multiplied with before its gradient is taken, and the gradients divided by afterwards: f16 ends at 6e-8, where many
-    /// gradients of an image of anchors lie.
+    /// The loss scale: the loss is multiplied by it before the backward pass and the gradients are divided by it
+    /// afterwards. Many gradients of dense heads are near 6e-8, the smallest f16.
     pub fn loss_scale(self) -> f64 {
         match self {
             Precision::F32 => 1.0,
@@ -41,10 +43,10 @@ impl Precision {
     }
 }
 
-/// `product` of two tensors in the precision that was chosen; the result is f32.
+/// `product` of two tensors in the chosen precision; the result is f32.
 ///
 /// # Shapes
-/// As `product` has them.
+/// Those of `product`.
 pub fn multiply<const A: usize, const B: usize, const C: usize>(
     a: Tensor<A>,
     b: Tensor<B>,
@@ -61,8 +63,8 @@ mod tests {
     use super::*;
     use burn::tensor::TensorData;
 
-    /// The gradient of a product by its first factor is the second: in half precision with its loss scale three digits of it are kept,
-    /// also where it lies below what f16 can hold.
+    /// The gradient of a product with respect to its first factor is the second factor. With f16 and loss scale three
+    /// digits are kept, even if the unscaled gradient is below the f16 range.
     #[test]
     fn small_gradients_live() {
         let device = Device::flex().autodiff();

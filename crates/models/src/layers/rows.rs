@@ -1,4 +1,4 @@
-//! Layers over rows: each row is a point, or a point of a group. What PyTorch writes as linear layers and 1x1 convolutions.
+//! Layers over rows, where a row is a point or a point of a group: linear layers and 1x1 convolutions of PyTorch.
 
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode};
@@ -9,13 +9,14 @@ use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
 use std::sync::Arc;
 
-/// Terms that are added one after the other, at most: one running f32 sum over tens of thousands of rows would lose digits.
+/// Largest number of terms of a sequential sum: a sequential f32 sum over tens of thousands of rows would lose
+/// precision.
 const BLOCK: usize = 16;
 
-/// Rows are filled up to a multiple of this, so that they fall into blocks.
+/// Rows are padded to a multiple of this, so that they divide into blocks.
 const FILL: usize = BLOCK * BLOCK;
 
-/// How often each row counts in the statistics of a batch: rows that the reference repeats are computed once.
+/// Multiplicity of each row in batch statistics: rows that the reference repeats are computed once.
 #[derive(Clone, Debug)]
 pub struct RowCounts {
     /// In blocks of equal length, `[N / K, 1, K]`.
@@ -25,7 +26,7 @@ pub struct RowCounts {
 }
 
 impl RowCounts {
-    /// One count for each row.
+    /// From one count per row.
     pub fn new(counts: Vec<f32>, device: &Device) -> Self {
         let n = counts.len();
         let total = counts.iter().map(|&c| f64::from(c)).sum::<f64>() as usize;
@@ -33,12 +34,12 @@ impl RowCounts {
         RowCounts { counts: Tensor::from_data(TensorData::new(counts, [n / length, 1, length]), device), total }
     }
 
-    /// Each of `rows` rows counts once.
+    /// Multiplicity 1 for each of `rows` rows.
     pub fn once(rows: usize, device: &Device) -> Self {
         RowCounts::new(vec![1.0; rows], device)
     }
 
-    /// The number of rows to fill up to, with rows that count nothing.
+    /// The padded number of rows; padding rows have multiplicity 0.
     pub fn filled_up(rows: usize) -> usize {
         rows.next_multiple_of(FILL)
     }
@@ -48,7 +49,7 @@ impl RowCounts {
         self.total
     }
 
-    /// Mean over the rows as often as they count.
+    /// Mean over the rows, weighted by multiplicity.
     ///
     /// # Shapes
     /// `x`: `[N, C]`; result `[1, C]`.
@@ -64,17 +65,18 @@ impl RowCounts {
     }
 }
 
-/// The largest part of at most [`BLOCK`] that `n` falls into without rest.
+/// The largest divisor of `n` up to [`BLOCK`].
 fn block(n: usize) -> usize {
     (1..=BLOCK.min(n)).rev().find(|length| n.is_multiple_of(*length)).unwrap_or(1)
 }
 
-/// Linear layer without bias, batch normalisation, ReLU. `D` is the number of dimensions that the reference stores the weight with.
+/// Linear layer without bias, batch normalisation, ReLU. `D` is the number of dimensions of the weight in the
+/// reference.
 #[derive(Module, Debug)]
 pub struct RowsBnRelu<const D: usize> {
     /// `[C_out, C_in, 1, ..]`.
     pub weight: Param<Tensor<D>>,
-    /// After the linear layer.
+    /// The batch norm after the linear layer.
     pub norm: BatchNorm,
 }
 
@@ -89,8 +91,8 @@ impl<const D: usize> RowsBnRelu<D> {
         RowsBnRelu { weight: init.xavier_normal(name, stored(channels), channels), norm }
     }
 
-    /// The linear part for the `x.dims()[1]` input channels from `first` on. A linear layer over channels side by side is the sum of linear
-    /// layers over each of them; so each part can be computed where it has the fewest rows.
+    /// The linear part for the `x.dims()[1]` input channels from `first` on. A linear layer over concatenated channels
+    /// is the sum of linear layers over the parts, so each part can be computed where it has the fewest rows.
     ///
     /// # Shapes
     /// `x`: `[N, K]`; result `[N, C_out]`.
@@ -98,10 +100,10 @@ impl<const D: usize> RowsBnRelu<D> {
         project(&self.weight, x, first)
     }
 
-    /// What follows the linear part.
+    /// Batch norm and ReLU after the linear part.
     ///
     /// # Shapes
-    /// `y`: `[N, C_out]`, the result alike.
+    /// `y` and result: `[N, C_out]`.
     pub fn norm_relu(&self, y: Tensor<2>, counts: &RowCounts, mode: Mode) -> Tensor<2> {
         relu(match mode {
             Mode::Train => self.norm.forward_rows_train(y, counts),
@@ -116,10 +118,10 @@ impl<const D: usize> RowsBnRelu<D> {
     }
 }
 
-/// Layers one behind the other and the maximum over groups, as one operation; `None` where there is no kernel for it.
+/// Consecutive layers and the maximum over groups as one operation; `None` without a kernel.
 ///
 /// # Shapes
-/// `rows`: as [`MlpRows`] says; result `[G, C]`, or `[N, C]` without groups.
+/// `rows`: see [`MlpRows`]; result `[G, C]`, or `[N, C]` without groups.
 pub fn rows_kernel<const D: usize>(
     layers: &[RowsBnRelu<D>],
     rows: &MlpRows,
@@ -225,7 +227,7 @@ mod tests {
         RowsBnRelu::new("layer", [3, 4], BatchNorm::new(4, 0.1, 1e-5, &init), &init)
     }
 
-    /// Values, gradient by the weight, and running variance.
+    /// Values, gradient with respect to the weight, and running variance.
     fn run(rows: &[f32], counts: RowCounts, pick: &[i32], device: &Device) -> [Vec<f32>; 3] {
         let layer = layer(device);
         let x = tensor(rows, [rows.len() / 3, 3], device);
@@ -237,7 +239,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_that_counts_three_times_is_three_rows() {
+    fn multiplicity_3_equals_three_rows() {
         let device = Device::flex().autodiff();
         let rows: Vec<f32> = (0..12).map(|i| ((i * 29 % 17) as f32 - 8.0) / 4.0).collect();
         let counts = [1usize, 3, 2, 1];

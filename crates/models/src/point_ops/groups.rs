@@ -1,30 +1,31 @@
-//! Groups of neighbours (OpenPCDet: `QueryAndGroup`, `GroupAll`), without the repetitions that fill them up.
+//! Groups of neighbours (OpenPCDet: `QueryAndGroup`, `GroupAll`), without repeated rows.
 
 use crate::layers::RowCounts;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-/// Neighbours of many centres, group after group. G groups have N rows.
+/// Neighbours of many centres, sorted by group. G groups have N rows.
 ///
-/// The reference gives every group the same number of rows and fills up with repetitions of the first neighbour. These count in the batch
-/// statistics and change no maximum; so each neighbour is one row here, and says how often it counts.
+/// The reference gives every group the same number of rows and pads with copies of the first neighbour. These count in
+/// the batch statistics and do not change the maximum. Here each neighbour is one row with a multiplicity.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Groups {
-    /// Input row that each row is taken from. Length N.
+    /// Input row of each row. Length N.
     pub source: Vec<u32>,
-    /// Position of each row, seen from the centre of its group, m. Length N.
+    /// Position of each row relative to the centre of its group, m. Length N.
     pub offset_m: Vec<[f32; 3]>,
-    /// How often each row counts. Length N.
+    /// Multiplicity of each row. Length N.
     pub count: Vec<f32>,
-    /// Where each group ends; the first begins at 0. Length G.
+    /// End of each group; the first begins at 0. Length G.
     pub ends: Vec<u32>,
 }
 
 impl Groups {
-    /// Adds a group: `slots` are its neighbours as `(source, position)`, repetitions included; all of it counts `times`.
+    /// Adds a group: `slots` are its neighbours as `(source, position)`, repetitions included; multiplicities are
+    /// multiplied by `times`.
     pub fn push(&mut self, center_m: [f32; 3], slots: impl Iterator<Item = (u32, [f32; 3])>, times: f32) {
         let begin = self.source.len();
         for (source, position) in slots {
-            // Groups are small, and repetitions are mostly of the first row.
+            // Linear search: groups are small, and repetitions are mostly of the first row.
             match self.source[begin..].iter().position(|&known| known == source) {
                 Some(known) => self.count[begin + known] += times,
                 None => {
@@ -52,7 +53,7 @@ impl Groups {
         Tensor::from_data(TensorData::new(values, [self.offset_m.len(), 3]), device)
     }
 
-    /// For the device. Rows that count nothing fill up to a number whose sums are exact.
+    /// The groups on a device, padded with rows of multiplicity 0.
     pub fn to_device(&self, device: &Device) -> GroupTensors {
         let filled = |values: &[f32], width: usize| {
             let mut values = values.to_vec();
@@ -66,7 +67,7 @@ impl Groups {
         let spans = self.ends.iter().map(|&end| (std::mem::replace(&mut begin, end), end));
         let spans: Vec<(u32, u32)> = spans.collect();
         let slots = spans.iter().map(|(begin, end)| end - begin).max().unwrap_or(0) as usize;
-        // Groups are filled up with their first row, which changes no maximum.
+        // Groups are padded with their first row, which does not change the maximum.
         let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
         let places = spans.iter().flat_map(|&(b, e)| (0..slots as u32).map(move |s| place(b, e, s) as i32));
         let int = |values: Vec<i32>| {
@@ -84,16 +85,16 @@ impl Groups {
     }
 }
 
-/// [`Groups`] on a device; N is their number of rows, filled up.
+/// [`Groups`] on a device; N is the padded number of rows.
 #[derive(Clone, Debug)]
 pub struct GroupTensors {
     /// `[N]`.
     pub source: Tensor<1, Int>,
     /// `[N, 3]`, m.
     pub offset: Tensor<2>,
-    /// N rows.
+    /// Multiplicities of the N rows.
     pub counts: RowCounts,
-    /// Rows of each group, filled up, `[G * S]`.
+    /// Rows of each group, padded to S, `[G * S]`.
     places: Tensor<1, Int>,
     groups: usize,
     slots: usize,

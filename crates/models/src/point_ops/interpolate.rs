@@ -1,24 +1,25 @@
-//! Features of points from those of their nearest known points (OpenPCDet: `three_interpolate`).
+//! Interpolation of features from the three nearest known points (OpenPCDet: `three_interpolate`).
 
 use burn::tensor::{Device, Int, Tensor, TensorData};
 use geometry::three_nearest;
 
-/// Keeps the weight of a point that lies on a known one finite, m.
+/// Added to distances so that the weight of a coincident point is finite, m.
 const LEAST_DISTANCE_M: f32 = 1e-8;
 
-/// Which known points each point takes its features from, and how much of each. U points.
+/// Source rows and weights of the interpolation at U points.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Interpolation {
     /// Rows of the known features, nearest first. Length U.
     pub source: Vec<[u32; 3]>,
-    /// They add up to 1. Length U.
+    /// Weights, which add up to 1. Length U.
     pub weight: Vec<[f32; 3]>,
     /// Squared distances, m2. Length U.
     pub distance2: Vec<[f32; 3]>,
 }
 
 impl Interpolation {
-    /// Weights are the inverse distances, not squared (as in OpenPCDet and the authors' code).
+    /// Weights proportional to the inverse distance, not the inverse squared distance, as in OpenPCDet and the authors'
+    /// code.
     pub fn new(unknown: &[[f32; 3]], known: &[[f32; 3]]) -> Self {
         let found = three_nearest(unknown, known);
         let weight = |distance2: &[f32; 3]| {
@@ -33,14 +34,14 @@ impl Interpolation {
         }
     }
 
-    /// Adds that of another cloud, whose known rows begin at `first_row`.
+    /// Appends that of another cloud, whose known rows begin at `first_row`.
     pub fn append(&mut self, other: &Interpolation, first_row: u32) {
         self.source.extend(other.source.iter().map(|three| three.map(|row| row + first_row)));
         self.weight.extend_from_slice(&other.weight);
         self.distance2.extend_from_slice(&other.distance2);
     }
 
-    /// For the device.
+    /// The interpolation on a device.
     pub fn to_device(&self, device: &Device) -> InterpolationTensors {
         let points = self.source.len();
         let source = self.source.as_flattened().iter().map(|&row| row as i32).collect::<Vec<_>>();
@@ -82,7 +83,7 @@ mod tests {
         assert_eq!(from.source, [[0, 1, 2], [1, 0, 2]]);
         let sum: f32 = from.weight[0].iter().sum();
         assert!((sum - 1.0).abs() < 1e-6 && (from.weight[0][0] / from.weight[0][1] - 2.0).abs() < 1e-5);
-        assert!((from.weight[1][0] - 1.0).abs() < 1e-6, "a point on a known one takes its features");
+        assert!((from.weight[1][0] - 1.0).abs() < 1e-6, "a coincident point has weight 1");
 
         let device = Device::flex().autodiff();
         let features = Tensor::<2>::from_floats([[1.0], [2.0], [3.0], [9.0]], &device).require_grad();

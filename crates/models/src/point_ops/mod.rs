@@ -1,7 +1,8 @@
 //! Operations of PointNet++ on tensors: grouping, the maximum over a group, interpolation.
 //!
-//! Who is whose neighbour depends on coordinates alone, which no network changes. So indices are found on the host, by `geometry`, and mostly
-//! ahead on loader threads; on the device there are only gathers, sums and maxima, with gradients, on every backend.
+//! Neighbours depend on coordinates alone, which no network changes. The crate `geometry` therefore finds the indices
+//! on the host, mostly on loader threads. The device only runs gathers, sums and maxima, with gradients, on every
+//! backend.
 
 mod groups;
 mod interpolate;

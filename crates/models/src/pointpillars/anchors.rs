@@ -1,4 +1,4 @@
-//! The boxes that PointPillars corrects into detections (OpenPCDet: `AnchorGenerator`, `align_center` off).
+//! The anchor boxes of PointPillars (OpenPCDet: `AnchorGenerator`, `align_center` off).
 
 /// The anchors of one class.
 #[derive(Clone, Debug, PartialEq)]
@@ -7,22 +7,22 @@ pub struct AnchorClass {
     pub name: String,
     /// Length, width, height, m.
     pub size: [f32; 3],
-    /// Height of the underside, m, LiDAR frame.
+    /// z of the bottom face, m, LiDAR frame.
     pub bottom: f32,
     /// Headings, rad.
     pub rotations: Vec<f32>,
     /// Overlap from which an anchor is positive.
     pub matched: f32,
-    /// Overlap below which an anchor is background; between the two it does not count. More than zero.
+    /// Overlap below which an anchor is background; between the two thresholds it is ignored. Above zero.
     pub unmatched: f32,
 }
 
-/// Anchors `[x, y, z, dx, dy, dz, yaw]` on a feature map of `[height, width]` cells over `range`
-/// (`[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame).
+/// Anchors `[x, y, z, dx, dy, dz, yaw]` on a feature map of `[height, width]` cells over `range` (`[x_min, y_min,
+/// z_min, x_max, y_max, z_max]`, m, LiDAR frame).
 ///
-/// The first and the last anchor of a row lie on the borders of the range. Positions are computed in f64 and rounded once; the
-/// reference takes them from `torch.arange`, whose vectorised steps round twice, so that some of its values are off in the last
-/// place (58 of 248 along y on the published map, by at most 4e-6 m; none along x).
+/// The first and the last anchor of a row lie on the borders of the range. Positions are computed in f64 and rounded
+/// once. The reference uses `torch.arange`, whose vectorised steps round twice, so some values differ by 1 ulp (58 of
+/// 248 along y on the published map, by at most 4e-6 m; none along x).
 ///
 /// # Shapes
 /// `[height, width, class, rotation]`, row-major: the order of the head's channels.

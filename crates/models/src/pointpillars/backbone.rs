@@ -1,34 +1,34 @@
 //! The 2D backbone and neck (OpenPCDet: `BaseBEVBackbone`).
 
-use crate::config::BackboneConfig;
+use super::config::BackboneConfig;
 use crate::layers::{BatchNorm, ConvBnRelu, DeconvBnRelu, Init, Mode};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Blocks of 3x3 convolutions, the first of each with a stride, and a transposed convolution behind each block.
+/// Blocks of 3x3 convolutions, the first of each with a stride, and a transposed convolution after each block.
 #[derive(Module, Debug)]
 pub struct BaseBevBackbone {
     /// The blocks, finest first.
     pub blocks: Vec<Block>,
-    /// One for each block.
+    /// The transposed convolution of each block.
     pub deblocks: Vec<DeconvBnRelu>,
 }
 
 /// Convolutions at one resolution.
 #[derive(Module, Debug)]
 pub struct Block {
-    /// The first has the stride.
+    /// The first one has the stride.
     pub convs: Vec<ConvBnRelu>,
 }
 
-/// What the backbone computes on its way.
+/// Intermediate outputs of the backbone.
 #[derive(Clone, Debug)]
 pub struct BackboneStages {
-    /// Behind each block.
+    /// Output of each block.
     pub blocks: Vec<Tensor<4>>,
-    /// Behind each transposed convolution, all of one size.
+    /// Output of each transposed convolution, all of one size.
     pub deblocks: Vec<Tensor<4>>,
-    /// The latter side by side.
+    /// The latter concatenated along the channels.
     pub spatial_features_2d: Tensor<4>,
 }
 
@@ -57,8 +57,8 @@ impl BaseBevBackbone {
     }
 
     /// # Shapes
-    /// `x`: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s = first stride over
-    /// its upsampling stride.
+    /// `x`: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s = first stride
+    /// over its upsampling stride.
     pub fn forward(&self, mut x: Tensor<4>, mode: Mode) -> BackboneStages {
         let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
         for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {

@@ -1,26 +1,27 @@
-//! Boxes as corrections of anchors, and headings as a correction and a direction bin (OpenPCDet: `ResidualCoder`).
+//! Encoding of boxes as residuals of anchors, and of headings as residual and direction bin (OpenPCDet:
+//! `ResidualCoder`).
 //!
 //! All in f32, in the reference's order of operations. Boxes are `[x, y, z, dx, dy, dz, yaw]`, m and rad.
 
 use std::f32::consts::TAU;
 
-/// Sizes below this are taken as this, m.
+/// Sizes are clamped to at least this, m.
 const SMALLEST_SIZE_M: f32 = 1e-5;
 
-/// Where the reference's first direction bin begins, rad: a quarter of pi, as its configuration rounds it.
+/// Start of the first direction bin of the reference, rad: pi / 4, rounded as in its configuration.
 #[expect(clippy::approx_constant, reason = "rounded as in the reference")]
 pub const DIRECTION_OFFSET_RAD: f32 = 0.78539;
 
-/// Direction bins that targets are made for.
+/// Number of direction bins of the targets.
 pub const DIRECTION_BINS: usize = 2;
 
-/// `value` moved by whole periods into `[-offset * period, (1 - offset) * period)`, up to rounding.
+/// `value` shifted by whole periods into `[-offset * period, (1 - offset) * period)`, up to rounding.
 pub fn limit_period(value: f32, offset: f32, period: f32) -> f32 {
     value - (value / period + offset).floor() * period
 }
 
-/// What has to be predicted at `anchor` to get `bbox`: centre offsets over the anchor's base diagonal and height, logarithms
-/// of the size ratios, difference of the headings.
+/// The residuals of `bbox` at `anchor`: centre offsets divided by the anchor's base diagonal and height, logarithms of
+/// the size ratios, difference of the headings.
 pub fn encode(bbox: [f32; 7], anchor: [f32; 7]) -> [f32; 7] {
     let [x, y, z, dx, dy, dz, yaw] = with_least_size(bbox);
     let [xa, ya, za, dxa, dya, dza, yaw_a] = with_least_size(anchor);
@@ -36,7 +37,7 @@ pub fn encode(bbox: [f32; 7], anchor: [f32; 7]) -> [f32; 7] {
     ]
 }
 
-/// The box that a prediction at `anchor` means; the inverse of [`encode`].
+/// The box of a residual at `anchor`; the inverse of [`encode`].
 pub fn decode(residual: [f32; 7], anchor: [f32; 7]) -> [f32; 7] {
     let [xt, yt, zt, dxt, dyt, dzt, yaw_t] = residual;
     let [xa, ya, za, dxa, dya, dza, yaw_a] = anchor;
@@ -52,14 +53,14 @@ pub fn decode(residual: [f32; 7], anchor: [f32; 7]) -> [f32; 7] {
     ]
 }
 
-/// The direction bin of a heading: bins of equal width, the first begins at `offset_rad`.
+/// The direction bin of a heading. Bins have equal width, and the first begins at `offset_rad`.
 pub fn direction_target(yaw_rad: f32, offset_rad: f32, bins: usize) -> usize {
     let turned = limit_period(yaw_rad - offset_rad, 0.0, TAU);
     let bin = (turned / (TAU / bins as f32)).floor();
     (bin.max(0.0) as usize).min(bins - 1)
 }
 
-/// The heading in a direction bin: `yaw_rad` up to whole bins says where in it, `bin` says which.
+/// The heading from `yaw_rad`, which defines the position within a bin, and the bin `bin`.
 pub fn direction_decode(yaw_rad: f32, bin: usize, offset_rad: f32, limit_offset: f32, bins: usize) -> f32 {
     let period = TAU / bins as f32;
     limit_period(yaw_rad - offset_rad, limit_offset, period) + offset_rad + period * bin as f32
@@ -89,14 +90,14 @@ mod tests {
             prop_assert!((0..7).all(|i| (back[i] - bbox[i]).abs() < 1e-4), "{:?} {:?}", back, bbox);
         }
 
-        /// Up to whole turns, heading = f(heading up to half a turn, bin).
+        /// The heading modulo 2 pi follows from the heading modulo pi and the bin.
         #[test]
         fn a_heading_survives_its_bin(yaw in -3.1f32..3.1, half_turns in -2i32..3) {
             let bin = direction_target(yaw, DIRECTION_OFFSET_RAD, DIRECTION_BINS);
             let folded = yaw + half_turns as f32 * std::f32::consts::PI;
             let back = direction_decode(folded, bin, DIRECTION_OFFSET_RAD, 0.0, DIRECTION_BINS);
             let difference = limit_period(back - yaw, 0.5, TAU).abs();
-            // At a border of the bins rounding may choose the other half turn.
+            // At a bin border, rounding may add pi.
             let border = limit_period(yaw - DIRECTION_OFFSET_RAD, 0.5, std::f32::consts::PI).abs();
             prop_assert!(difference < 1e-4 || border < 1e-4, "{} {}", back, yaw);
         }

@@ -1,29 +1,30 @@
-//! From the head's outputs to boxes (OpenPCDet: `generate_predicted_boxes`, `post_processing`, `class_agnostic_nms`).
+//! Decoding of the head's outputs to boxes (OpenPCDet: `generate_predicted_boxes`, `post_processing`,
+//! `class_agnostic_nms`).
 
 use super::box_coder;
 use geometry::{Box3, rotated_nms};
 
-/// How boxes are taken out of the predictions.
+/// Score threshold, NMS and direction constants.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DecodeOptions {
-    /// Lowest score that counts.
+    /// Lowest score of a detection.
     pub score_threshold: f32,
-    /// BEV IoU above which the weaker of two boxes goes, whatever their classes.
+    /// BEV IoU above which the box with the lower score is suppressed, regardless of their classes.
     pub nms_iou: f64,
-    /// Boxes with the highest scores that enter the suppression.
+    /// Boxes with the highest scores that enter the NMS.
     pub nms_pre: usize,
-    /// Boxes that may leave it.
+    /// Largest number of boxes kept.
     pub nms_post: usize,
-    /// Where the first direction bin begins, rad.
+    /// Start of the first direction bin, rad.
     pub dir_offset: f32,
-    /// Offset of the period that the regressed heading is folded into.
+    /// Offset of the period into which the regressed heading is wrapped.
     pub dir_limit_offset: f32,
 }
 
-/// A detected box before its class has a name.
+/// A detected box with a class index.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RawBox {
-    /// The anchor that it comes from.
+    /// Index of its anchor.
     pub anchor: usize,
     /// Class counted from 0.
     pub class: usize,
@@ -33,11 +34,11 @@ pub struct RawBox {
     pub score: f32,
 }
 
-/// The network said something that is no finite number.
+/// An output of the network that is not finite.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("anchor {anchor}: the network's {output} is not a finite number")]
+#[error("anchor {anchor}: the network's {output} is not finite")]
 pub struct NonFinite {
-    /// The first anchor found.
+    /// The first such anchor.
     pub anchor: usize,
     /// Which of the head's outputs.
     pub output: &'static str,
@@ -45,14 +46,14 @@ pub struct NonFinite {
 
 /// Detections of one frame by falling score, equal scores by anchor.
 ///
-/// Of each anchor the class with the highest score counts (the first of equal ones); then the score threshold, the `nms_pre` best, class-agnostic
-/// rotated suppression, and the first `nms_post` of what stays.
+/// Each anchor gets the class with the highest score (the first of equal ones). Then follow score threshold, selection
+/// of the `nms_pre` best, class-agnostic rotated NMS, and selection of the first `nms_post`.
 ///
 /// # Shapes
 /// `cls` `[A, classes]`, `boxes` `[A, 7]`, `dir` `[A, bins]`, all raw outputs.
 ///
 /// # Errors
-/// A score that is NaN or infinite anywhere, or such an output for a box among those that enter the suppression.
+/// A score that is NaN or infinite at any anchor, or such a box or direction output among the boxes that enter the NMS.
 pub fn decode(
     cls: &[f32],
     boxes: &[f32],
@@ -64,7 +65,7 @@ pub fn decode(
         return Ok(Vec::new());
     }
     let (classes, bins) = (cls.len() / anchors.len(), dir.len() / anchors.len());
-    assert_eq!((cls.len(), boxes.len()), (anchors.len() * classes, anchors.len() * 7), "one prediction an anchor");
+    assert_eq!((cls.len(), boxes.len()), (anchors.len() * classes, anchors.len() * 7), "one prediction per anchor");
     let mut best: Vec<(usize, f32)> = Vec::new();
     for (anchor, logits) in cls.chunks_exact(classes).enumerate() {
         if logits.iter().any(|logit| !logit.is_finite()) {
@@ -75,7 +76,7 @@ pub fn decode(
             best.push((anchor, score));
         }
     }
-    best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay by anchor
+    best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay ordered by anchor
     best.truncate(options.nms_pre);
 
     let mut found = Vec::with_capacity(best.len());
@@ -86,11 +87,11 @@ pub fn decode(
             return Err(NonFinite { anchor, output: "box" });
         }
         let bbox = decode_box(residual, direction, anchors[anchor], options);
-        // A size is an exponential: early in a training one can be beyond all numbers. No object is that large.
+        // Sizes are exponentials, which may overflow early in training. Such boxes are dropped.
         if !bbox.iter().all(|v| v.is_finite()) {
             continue;
         }
-        // Scores of different logits may be equal; then the first class counts, as in the reference.
+        // Different logits may give equal scores; then the first class is taken, as in the reference.
         let class = logits.iter().position(|&logit| sigmoid(logit) == score).unwrap_or(0);
         found.push(RawBox { anchor, class, bbox, score });
     }
@@ -157,7 +158,7 @@ mod tests {
     #[test]
     fn caps_and_suppression() {
         let (boxes, dir, mut anchors) = outputs(4);
-        anchors[1][0] = 0.5; // meets the first
+        anchors[1][0] = 0.5; // overlaps the first
         let cls = [3.0, 2.0, 1.0, 0.0];
         let of = |options: DecodeOptions| -> Vec<usize> {
             let found = decode(&cls, &boxes, &dir, &anchors, &options).unwrap();
@@ -171,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn a_size_beyond_all_numbers_is_no_object() {
+    fn boxes_of_infinite_size_are_dropped() {
         let (mut boxes, dir, anchors) = outputs(2);
         boxes[7 + 3] = 200.0; // its exponential overflows
         let found = decode(&[2.0, 3.0], &boxes, &dir, &anchors, &options()).unwrap();
@@ -179,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_number_is_an_error() {
+    fn outputs_that_are_not_finite_are_an_error() {
         let (boxes, dir, anchors) = outputs(2);
         let of = |cls: [f32; 2], boxes: &[f32], dir: &[f32]| decode(&cls, boxes, dir, &anchors, &options());
         assert_eq!(of([-5.0, f32::NAN], &boxes, &dir), Err(NonFinite { anchor: 1, output: "class score" }));
@@ -187,7 +188,7 @@ mod tests {
         let mut broken = boxes.clone();
         broken[7 + 3] = f32::NAN;
         assert_eq!(of([0.0, 0.0], &broken, &dir), Err(NonFinite { anchor: 1, output: "box" }));
-        assert!(of([0.0, -9.0], &broken, &dir).is_ok(), "boxes that nobody asks for do not matter");
+        assert!(of([0.0, -9.0], &broken, &dir).is_ok(), "boxes below the threshold are not checked");
         assert!(of([0.0, 0.0], &boxes, &[0.0, f32::NAN, 0.0, 0.0]).is_err());
     }
 }

@@ -7,15 +7,15 @@ use burn::tensor::Tensor;
 /// Three 1x1 convolutions: classes, boxes, direction bins.
 #[derive(Module, Debug)]
 pub struct AnchorHead {
-    /// Anchors a cell times classes.
+    /// Output channels: anchors per cell times classes.
     pub conv_cls: PointwiseConv,
-    /// Anchors a cell times 7.
+    /// Output channels: anchors per cell times 7.
     pub conv_box: PointwiseConv,
-    /// Anchors a cell times bins.
+    /// Output channels: anchors per cell times bins.
     pub conv_dir_cls: PointwiseConv,
 }
 
-/// What the head says of every anchor, in the anchors' order `[y, x, class, rotation]`.
+/// Outputs of the head for every anchor, in the order `[y, x, class, rotation]`.
 #[derive(Clone, Debug)]
 pub struct Predictions {
     /// Logits, `[B, A, classes]`.
@@ -29,10 +29,10 @@ pub struct Predictions {
 }
 
 impl AnchorHead {
-    /// `anchors`: anchors a cell.
+    /// `anchors`: anchors per cell.
     pub fn new(inputs: usize, anchors: usize, classes: usize, bins: usize, init: &Init<'_>) -> Self {
         let mut conv_cls = PointwiseConv::new("dense_head.conv_cls", [inputs, anchors * classes], init);
-        // Every anchor starts as background with probability 0.99.
+        // Initial probability of background: 0.99 for every anchor.
         conv_cls.bias = init.constant([anchors * classes], -(99f32.ln()));
         let mut conv_box = PointwiseConv::new("dense_head.conv_box", [inputs, anchors * 7], init);
         conv_box.weight = init.normal("dense_head.conv_box.weight", [anchors * 7, inputs, 1, 1], 0.001);

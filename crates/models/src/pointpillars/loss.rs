@@ -1,17 +1,17 @@
 //! The three losses of PointPillars (OpenPCDet: `AnchorHeadTemplate.get_loss`).
 
 use super::Sample;
+use super::config::LossConfig;
 use super::head::Predictions;
 use crate::Losses;
-use crate::config::LossConfig;
 use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal_sum, smooth_l1};
 use burn::tensor::{Int, Tensor, TensorData};
 
-/// Weighted losses of a batch: classes over all anchors that count, boxes and directions over the positive ones, each
-/// frame's divided by its number of positives, the sum divided by the number of frames.
+/// Weighted losses of a batch: classes over all anchors that are not ignored, boxes and directions over the positive
+/// ones. Each is divided by the number of positives of its frame and by the number of frames.
 ///
 /// # Panics
-/// When a sample was prepared without targets.
+/// If a sample was prepared without targets.
 pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig) -> Losses {
     let device = predictions.cls.device();
     let [b, anchors, classes] = predictions.cls.dims();

@@ -1,6 +1,8 @@
 //! PointPillars (Lang et al. 2019), as OpenPCDet builds it.
 
+mod architecture;
 mod backbone;
+mod config;
 mod head;
 mod loss;
 mod network;
@@ -15,6 +17,7 @@ pub mod scatter;
 pub mod target_assigner;
 
 pub use backbone::{BackboneStages, BaseBevBackbone, Block};
+pub use config::*;
 pub use head::{AnchorHead, Predictions};
 pub use loss::losses;
 pub use network::{PointPillars, Stages};

@@ -2,10 +2,11 @@
 
 use super::Sample;
 use super::backbone::{BackboneStages, BaseBevBackbone};
+use super::config::PointPillarsConfig;
 use super::head::{AnchorHead, Predictions};
 use super::scatter::scatter;
 use super::vfe::{PillarRows, PillarVfe};
-use crate::config::{DetectorConfig, PointPillarsConfig};
+use crate::config::DetectorConfig;
 use crate::layers::{Init, Mode};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -23,21 +24,21 @@ pub struct PointPillars {
     ny: usize,
 }
 
-/// Every stage of a pass, for who compares or looks.
+/// The outputs of every stage of a forward pass.
 #[derive(Clone, Debug)]
 pub struct Stages {
     /// `[P, C]`.
     pub pillar_features: Tensor<2>,
     /// `[B, C, H, W]`.
     pub spatial_features: Tensor<4>,
-    /// Blocks, neck, and both together.
+    /// Blocks and neck.
     pub backbone: BackboneStages,
-    /// Of every anchor.
+    /// Predictions of every anchor.
     pub predictions: Predictions,
 }
 
 impl PointPillars {
-    /// With fresh weights from `seed`.
+    /// A network with initial weights from `seed`.
     pub fn new(config: &DetectorConfig, net: &PointPillarsConfig, seed: u64, device: &Device) -> Self {
         let init = Init { seed, device };
         let neck = net.backbone.upsample_filters.iter().sum();
@@ -52,7 +53,7 @@ impl PointPillars {
         }
     }
 
-    /// All stages of a batch.
+    /// The forward pass of a batch.
     pub fn forward(&self, batch: &[&Sample], mode: Mode) -> Stages {
         let pillar_features = self.vfe.forward(self.pillar_rows(batch), mode);
         let (cells, shape) = self.cells(batch);
@@ -62,14 +63,14 @@ impl PointPillars {
         Stages { pillar_features, spatial_features, backbone, predictions }
     }
 
-    /// The points of all pillars of a batch, one sample after the other.
+    /// The points of all pillars of a batch, sorted by sample.
     pub fn pillar_rows(&self, batch: &[&Sample]) -> PillarRows {
         let features: Vec<f32> = batch.iter().flat_map(|s| s.features.iter().copied()).collect();
         let num_points: Vec<u32> = batch.iter().flat_map(|s| s.pillars.num_points.iter().copied()).collect();
         PillarRows { features: features.into(), num_points: num_points.into() }
     }
 
-    /// The cell of each pillar of a batch in the canvases laid end to end, and `[B, ny, nx]`.
+    /// The index of each pillar's cell in `[B, ny, nx]`, and this shape.
     pub fn cells(&self, batch: &[&Sample]) -> (Vec<u32>, [usize; 3]) {
         let cells = batch.iter().enumerate().flat_map(|(b, sample)| {
             let cell = move |&[_, y, x]: &[u32; 3]| ((b * self.ny + y as usize) * self.nx + x as usize) as u32;

@@ -1,18 +1,18 @@
-//! Points into pillars, and the features of a point in its pillar (OpenPCDet: `Point2Voxel`, `PillarVFE`).
+//! Voxelisation of points into pillars, and decoration of points (OpenPCDet: `Point2Voxel`, `PillarVFE`).
 
-/// Marks a cell without a pillar, or a point that is not kept.
+/// Marks a cell without a pillar, or a point that is dropped.
 const NONE: u32 = u32::MAX;
 
-/// The grid that pillars lie on, and how much it may hold.
+/// The grid of the pillars and its limits.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PillarGrid {
     /// `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame.
     pub range: [f32; 6],
     /// Extent of a cell along x, y and z, m.
     pub size: [f32; 3],
-    /// Points kept in a pillar, first come first kept.
+    /// Largest number of points of a pillar; the first ones are kept.
     pub max_points: usize,
-    /// Pillars kept in a frame, first come first kept.
+    /// Largest number of pillars of a frame; the first ones are kept.
     pub max_pillars: usize,
 }
 
@@ -39,29 +39,29 @@ impl PillarGrid {
     }
 }
 
-/// The kept points of one frame, pillar after pillar. P pillars hold N points of C values each.
+/// The kept points of one frame, sorted by pillar. P pillars hold N points of C values each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pillars {
-    /// Cell of each pillar as `[z, y, x]`, in the order of the pillars' first points. Length P.
+    /// Cell of each pillar as `[z, y, x]`, in the order of their first points. Length P.
     pub coords_zyx: Vec<[u32; 3]>,
     /// Points kept in each pillar, at least one. Length P.
     pub num_points: Vec<u32>,
-    /// Values of the kept points: pillar after pillar, inside a pillar in the order of the cloud. `[N, C]`.
+    /// Values of the kept points, sorted by pillar and then in the order of the cloud. `[N, C]`.
     pub points: Vec<f32>,
     /// Pillar of each kept point, ascending. Length N.
     pub pillar_of_point: Vec<u32>,
-    /// Where each kept point was in the cloud. Length N.
+    /// Index of each kept point in the cloud. Length N.
     pub point_index: Vec<u32>,
-    /// C: x, y, z in m, LiDAR frame, then intensity where there is one.
+    /// C: x, y, z in m, LiDAR frame, then intensity if present.
     pub channels: usize,
-    /// Points inside the grid that found no room: their pillar was full, or would have been one too many.
+    /// Number of points inside the grid that were dropped because of the limits.
     pub dropped: usize,
 }
 
 /// Sorts a cloud of `channels` values a point into pillars.
 ///
-/// A point opens a pillar in its cell while there are fewer than `max_pillars`, and joins one while it holds fewer than
-/// `max_points`; points outside the grid, also in z, are left out.
+/// A point creates a pillar in its cell while there are fewer than `max_pillars`, and joins one while it has fewer than
+/// `max_points`. Points outside the grid, also in z, are dropped.
 pub fn pillarise(points: &[f32], channels: usize, grid: &PillarGrid) -> Pillars {
     assert!(channels >= 3 && points.len().is_multiple_of(channels), "points of {channels} values");
     let cells @ [nx, ny, nz] = grid.grid_size();
@@ -89,7 +89,7 @@ pub fn pillarise(points: &[f32], channels: usize, grid: &PillarGrid) -> Pillars 
     });
     let pillar_of: Vec<u32> = pillar_of.collect();
 
-    // Counting sort by pillar: `next` is where the pillar's next point goes.
+    // Counting sort by pillar: `next` is the position of the pillar's next point.
     let mut total = 0;
     let mut next = Vec::with_capacity(num_points.len());
     for &count in &num_points {
@@ -111,8 +111,8 @@ pub fn pillarise(points: &[f32], channels: usize, grid: &PillarGrid) -> Pillars 
     Pillars { coords_zyx, num_points, points: kept, pillar_of_point, point_index, channels, dropped }
 }
 
-/// What the pillar feature net reads of each kept point:
-/// its C values, its offset from the mean of the pillar's kept points, its offset from the pillar's centre (in all three axes). m.
+/// The input of the pillar feature net for each kept point: its C values, its offset from the mean of the pillar's kept
+/// points (m), and its offset from the pillar's centre (m), each along three axes.
 ///
 /// # Shapes
 /// `[N, C + 6]`: 10 features with intensity, 9 without.
@@ -195,7 +195,7 @@ mod tests {
     }
 
     proptest! {
-        /// The definition: walk through the points, keep lists.
+        /// The definition with lists.
         #[test]
         fn equals_lists_of_points(
             points in prop::collection::vec((-0.5f32..4.5, -2.5f32..2.5, -1.5f32..1.5), 0..400),

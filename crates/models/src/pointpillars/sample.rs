@@ -1,11 +1,12 @@
-//! From a frame to what the network reads, and from what it says to detections. Runs on the host.
+//! Network input and targets of a frame, and decoding of the outputs. Runs on the host.
 
 use super::anchors::{AnchorClass, anchors};
+use super::config::{LossConfig, PointPillarsConfig};
 use super::decode::{DecodeOptions, RawBox, decode};
 use super::head::Predictions;
 use super::pillars::{PillarGrid, Pillars, decorate, pillarise};
 use super::target_assigner::{Targets, assign};
-use crate::config::{DetectorConfig, PointPillarsConfig};
+use crate::config::DetectorConfig;
 use crate::{ModelError, layers};
 use data::{Detection, Frame, Object};
 use geometry::Box3;
@@ -17,13 +18,13 @@ pub struct Sample {
     pub id: String,
     /// Cells and point counts of its pillars.
     pub pillars: Pillars,
-    /// Decorated points, pillar after pillar, `[N, F]`.
+    /// Decorated points, sorted by pillar, `[N, F]`.
     pub features: Vec<f32>,
-    /// What each anchor should say; only in training.
+    /// Targets of the anchors; only in training.
     pub targets: Option<Targets>,
 }
 
-/// What [`Sample`]s are made with: grid, anchors, classes.
+/// Grid, anchors, classes and decoding options.
 #[derive(Clone, Debug)]
 pub struct Preparation {
     classes: Vec<String>,
@@ -34,10 +35,11 @@ pub struct Preparation {
     anchors: Vec<[f32; 7]>,
     map: [usize; 2],
     decode: DecodeOptions,
+    pub(super) loss: LossConfig,
 }
 
 impl Preparation {
-    /// For that detector.
+    /// From the configuration of a detector.
     pub fn new(config: &DetectorConfig, net: &PointPillarsConfig) -> Self {
         let range = config.range_m;
         let stride = net.backbone.strides[0] / net.backbone.upsample_strides[0];
@@ -76,6 +78,7 @@ impl Preparation {
                 dir_offset: net.head.dir_offset_rad,
                 dir_limit_offset: net.head.dir_limit_offset,
             },
+            loss: net.loss.clone(),
         }
     }
 
@@ -84,17 +87,17 @@ impl Preparation {
         &self.anchors
     }
 
-    /// Height and width of the feature map that the anchors lie on.
+    /// Height and width of the feature map of the anchors.
     pub fn map(&self) -> [usize; 2] {
         self.map
     }
 
-    /// How detections are taken out of the predictions.
+    /// Options of the decoding.
     pub fn decode_options(&self) -> &DecodeOptions {
         &self.decode
     }
 
-    /// The network's input of a frame, with targets when it is to learn from it.
+    /// The network's input for a frame, with targets if `training`.
     ///
     /// # Errors
     /// A cloud with too few values a point.
@@ -127,7 +130,7 @@ impl Preparation {
         assign(&self.anchors, &self.anchor_classes, self.map, boxes, self.decode.dir_offset)
     }
 
-    /// Boxes of the detector's classes whose centre lies within the range, with their class counted from 1.
+    /// Boxes of the detector's classes whose centre lies within the range, with classes counted from 1.
     pub fn ground_truth(&self, objects: &[Object]) -> Vec<[f32; 8]> {
         let inside = |b: &Box3| {
             (0..3).all(|i| {
@@ -143,10 +146,10 @@ impl Preparation {
         objects.iter().filter_map(with_class).collect()
     }
 
-    /// Final boxes of a batch.
+    /// Detections of a batch.
     ///
     /// # Errors
-    /// Scores that are not numbers.
+    /// Outputs that are not finite.
     pub fn detections(&self, predictions: Predictions, batch: &[&Sample]) -> Result<Vec<Vec<Detection>>, ModelError> {
         let [b, anchors, classes] = predictions.cls.dims();
         let bins = predictions.dir.dims()[2];

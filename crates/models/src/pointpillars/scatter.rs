@@ -1,17 +1,18 @@
-//! Pillars onto the bird's eye canvas (OpenPCDet: `PointPillarScatter`).
+//! Scatter of pillar features to the BEV canvas (OpenPCDet: `PointPillarScatter`).
 
 use crate::kernel_ops;
 use burn::tensor::{IndexingUpdateOp, Int, Tensor, TensorData};
 
-/// Puts each pillar's features at its cell; the rest of the canvas is zero.
+/// Writes each pillar's features to its cell; the rest of the canvas is zero.
 ///
 /// # Shapes
-/// `features`: `[P, C]`; `cells`: P indices into `[B, H, W]`, row-major, all different, one canvas after the other; result `[B, C, H, W]`.
+/// `features`: `[P, C]`; `cells`: P indices into `[B, H, W]`, row-major, all different, sorted by canvas; result `[B,
+/// C, H, W]`.
 pub fn scatter(features: Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Tensor<4> {
     kernel_ops::scatter(&features, cells, canvas).unwrap_or_else(|| scatter_on_device(features, cells, canvas))
 }
 
-/// The same by burn's operations.
+/// The same with burn's operations.
 fn scatter_on_device(features: Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Tensor<4> {
     let [b, h, w] = canvas;
     let [p, c] = features.dims();

@@ -1,22 +1,22 @@
-//! What each anchor should say about a frame (OpenPCDet: `AxisAlignedTargetAssigner`).
+//! Targets of the anchors (OpenPCDet: `AxisAlignedTargetAssigner`).
 //!
-//! Every class on its own: its anchors against its ground-truth boxes, by the bird's eye IoU of boxes turned to the nearer axis.
-//! The reference computes the whole matrix of overlaps; here only anchors near a box are looked at, which gives the same, since all others
-//! have IoU 0. All in f32, in the reference's order of operations.
+//! Each class is assigned separately: its anchors against its ground-truth boxes, by the BEV IoU of boxes rotated to
+//! the nearest axis. The reference computes the full IoU matrix. Here only anchors near a box are visited, which is
+//! equivalent because all others have IoU 0. All in f32, in the reference's order of operations.
 
 use super::anchors::{AnchorClass, anchors_per_cell};
 use super::box_coder::{DIRECTION_BINS, direction_target, encode, limit_period};
 use std::f32::consts::{FRAC_PI_4, PI};
 
-/// Added to the distance at which boxes may touch, so that rounding never loses an anchor, m.
+/// Margin of the search for overlapping anchors, which allows for rounding, m.
 const REACH_MARGIN_M: f32 = 0.01;
 
-/// What the anchors of one frame should say. A anchors, K of them positive.
+/// Targets of the anchors of one frame. A anchors, K of them positive.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Targets {
-    /// Class from 1, 0 for background, -1 for anchors that do not count. Length A.
+    /// Class from 1, 0 for background, -1 for ignored anchors. Length A.
     pub labels: Vec<i32>,
-    /// Anchor and ground-truth box of each positive, by rising anchor. Length K.
+    /// Anchor and ground-truth box of each positive, sorted by anchor. Length K.
     pub positive: Vec<(usize, usize)>,
     /// Box residual of each positive. Length K.
     pub reg: Vec<[f32; 7]>,
@@ -26,14 +26,15 @@ pub struct Targets {
 
 /// Targets of one frame.
 ///
-/// `boxes` are `[x, y, z, dx, dy, dz, yaw, class]`, classes counted from 1 in the order of `classes`; others are ignored. `anchors` are those of
-/// [`super::anchors::anchors`] on a feature map of `[height, width]`. An anchor is
-/// 1. positive if no other anchor of its class overlaps some box more (ties count, IoU 0 does not); it takes the box that itself overlaps most;
-/// 2. else background below `unmatched`;
-/// 3. else positive from `matched` on;
-/// 4. else it does not count.
+/// `boxes` are `[x, y, z, dx, dy, dz, yaw, class]`, classes counted from 1 in the order of `classes`; others are
+/// ignored. `anchors` are those of [`super::anchors::anchors`] on a feature map of `[height, width]`. An anchor is
+/// 1. positive if it has the highest IoU above 0 of its class with some box (ties included); its target is the box with
+///   which its own IoU is highest;
+/// 2. else background if its highest IoU is below `unmatched`;
+/// 3. else positive if its highest IoU is at least `matched`;
+/// 4. else ignored.
 ///
-/// Of boxes that an anchor overlaps equally it takes the first.
+/// If an anchor has the same IoU with several boxes, the first one is its target.
 pub fn assign(
     anchors: &[[f32; 7]],
     classes: &[AnchorClass],
@@ -84,7 +85,7 @@ pub fn assign(
     positive.sort_unstable();
     let box_of = |truth: usize| std::array::from_fn(|i| boxes[truth][i]);
     let reg: Vec<[f32; 7]> = positive.iter().map(|&(anchor, truth)| encode(box_of(truth), anchors[anchor])).collect();
-    // The reference takes the heading back from the residual, rounding included.
+    // The reference recomputes the heading from the residual, including rounding.
     let dir = positive
         .iter()
         .zip(&reg)
@@ -93,15 +94,15 @@ pub fn assign(
     Targets { labels, positive, reg, dir }
 }
 
-/// A ground-truth box that an anchor meets.
+/// A ground-truth box that overlaps an anchor.
 struct Overlap {
     anchor: usize,
     truth: usize,
-    /// More than zero.
+    /// IoU, above zero.
     iou: f32,
 }
 
-/// Anchors on their regular map.
+/// Anchors on their regular grid.
 struct AnchorGrid<'a> {
     anchors: &'a [[f32; 7]],
     per_cell: usize,
@@ -112,7 +113,7 @@ struct AnchorGrid<'a> {
 }
 
 impl AnchorGrid<'_> {
-    /// Adds the anchors of one slot of the cells (one class and rotation, hence one size) that meet a box.
+    /// Adds the anchors of one slot of the cells (one class and rotation, hence one size) that overlap a box.
     fn overlaps(&self, slot: usize, truth: usize, bbox: &NearestBev, found: &mut Vec<Overlap>) {
         let anchor = NearestBev::new(&self.anchors[slot]);
         let near = |positions: &[f32], axis: usize| {
@@ -134,7 +135,7 @@ impl AnchorGrid<'_> {
     }
 }
 
-/// A box from above, turned to the nearer axis, m.
+/// The BEV rectangle of a box rotated to the nearest axis, m.
 #[derive(Clone, Copy, Debug)]
 pub struct NearestBev {
     /// Lowest x and y.
@@ -144,7 +145,7 @@ pub struct NearestBev {
 }
 
 impl NearestBev {
-    /// Of `[x, y, z, dx, dy, dz, yaw, ..]`.
+    /// From `[x, y, z, dx, dy, dz, yaw, ..]`.
     pub fn new(bbox: &[f32]) -> Self {
         let turned = limit_period(bbox[6], 0.5, PI).abs() >= FRAC_PI_4;
         let [dx, dy] = if turned { [bbox[4], bbox[3]] } else { [bbox[3], bbox[4]] };
@@ -185,7 +186,7 @@ mod tests {
         anchors([0.0, -5.0, -3.0, 8.0, 5.0, 1.0], MAP, &classes())
     }
 
-    /// The reference step by step, with the whole matrix.
+    /// The reference algorithm with the full IoU matrix.
     fn assign_by_matrix(
         anchors: &[[f32; 7]],
         classes: &[AnchorClass],
@@ -244,7 +245,7 @@ mod tests {
         ) {
             let mut truth = Vec::new();
             for (x, y, dx, dy, yaw, class, twice) in boxes {
-                // Positions on a coarse raster and repeated boxes make ties.
+                // Quantised positions and repeated boxes give ties.
                 let (x, y) = if twice { ((x * 2.0).round() / 2.0, (y * 2.0).round() / 2.0) } else { (x, y) };
                 let bbox = [x, y, -1.0, dx, dy, 1.5, yaw, f32::from(class)];
                 truth.push(bbox);
@@ -267,7 +268,7 @@ mod tests {
     }
 
     #[test]
-    fn a_box_out_of_reach_takes_no_anchor() {
+    fn a_box_outside_the_map_matches_no_anchor() {
         let far = [100.0, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0, 1.0];
         let flat = [4.0, 0.0, -1.0, 0.0, 1.6, 1.5, 0.0, 1.0];
         let broken = [f32::NAN, 0.0, -1.0, 3.9, 1.6, 1.5, 0.0, 1.0];

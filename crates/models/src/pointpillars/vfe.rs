@@ -1,4 +1,4 @@
-//! Pillar feature net (OpenPCDet: `PillarVFE`): what the points of a pillar become on the canvas.
+//! Pillar feature net (OpenPCDet: `PillarVFE`).
 
 use crate::kernel_ops::{pillar_net, pillar_net_inference};
 use crate::layers::{BatchNorm, Init, Mode, Moments};
@@ -9,19 +9,19 @@ use std::sync::Arc;
 
 /// Linear without bias, batch normalisation, ReLU, maximum over the pillar.
 ///
-/// The reference pads every pillar with zero rows up to `max_points` *before* the linear layer, and these rows count in
-/// the statistics and take part in the maximum. Here only the points themselves are computed: a zero row stays zero
-/// behind the linear layer, so its share in mean and variance is known, and one row stands for all of them in the maximum.
+/// The reference pads every pillar with zero rows up to `max_points` *before* the linear layer. These rows count in the
+/// statistics and in the maximum. Here only the points are computed. A zero row is zero after the linear layer, so its
+/// contribution to mean and variance is known, and one row represents all of them in the maximum.
 #[derive(Module, Debug)]
 pub struct PillarVfe {
     /// `[C, F]`, F = 10 with intensity, 9 without.
     pub weight: Param<Tensor<2>>,
-    /// After the linear layer.
+    /// The batch norm after the linear layer.
     pub norm: BatchNorm,
     max_points: usize,
 }
 
-/// The points of all pillars of a batch, pillar after pillar, on the host.
+/// The points of all pillars of a batch, sorted by pillar, on the host.
 #[derive(Clone, Debug)]
 pub struct PillarRows {
     /// Decorated points, `[N, F]`.
@@ -62,7 +62,7 @@ impl PillarVfe {
         }
     }
 
-    /// The same by burn's operations.
+    /// The same with burn's operations.
     fn forward_on_device(&self, rows: PillarRows, mode: Mode) -> Tensor<2> {
         let weight = self.weight.val();
         let device = weight.device();
@@ -98,7 +98,8 @@ fn padded_moments(x: Tensor<2>, count: usize) -> Moments {
     Moments { mean: mean.reshape([c]), variance: variance.reshape([c]), count }
 }
 
-/// Sum over the rows, first within groups of 64: one running f32 sum over tens of thousands of rows loses digits.
+/// Sum over the rows, first within groups of 64, because a sequential f32 sum over tens of thousands of rows loses
+/// precision.
 ///
 /// # Shapes
 /// `x`: `[N, C]`; result `[1, C]`.
@@ -110,8 +111,8 @@ fn sum_rows(x: Tensor<2>) -> Tensor<2> {
     filled.reshape([groups, GROUP, c]).sum_dim(1).reshape([groups, c]).sum_dim(0) // [G, 64, C] -> [G, C] -> [1, C]
 }
 
-/// For each pillar the rows of its points, filled up with the padding row `padding`. Slots: as many as the fullest pillar
-/// needs, and one for the padding where it is not full.
+/// For each pillar the rows of its points, padded with the row `padding`. The number of slots is that of the fullest
+/// pillar, plus one for the padding if it has fewer than `max_points` points.
 fn slot_index(num_points: &[u32], max_points: usize, padding: usize) -> (usize, Vec<i32>) {
     let fullest = num_points.iter().max().copied().unwrap_or(0) as usize;
     let slots = (fullest + 1).min(max_points);

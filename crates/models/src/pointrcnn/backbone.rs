@@ -1,15 +1,15 @@
 //! The backbone (Qi et al. 2017, PointNet++; OpenPCDet: `PointNet2MSG`).
 
+use super::config::PointRcnnConfig;
 use super::hierarchy::Hierarchy;
 use super::set_abstraction::SharedMlp;
-use crate::config::PointRcnnConfig;
 use crate::kernel_ops::MlpRows;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, rows_kernel};
 use crate::point_ops::{Groups, Interpolation, InterpolationTensors, interpolate};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
-/// Set abstraction down to a few points, feature propagation back to all of them.
+/// Set abstraction to ever fewer points, and feature propagation back to all points.
 #[derive(Module, Debug)]
 pub struct PointNet2Msg {
     /// Finest first.
@@ -21,28 +21,28 @@ pub struct PointNet2Msg {
 /// One level of set abstraction with multi-scale grouping.
 #[derive(Module, Debug)]
 pub struct SetAbstraction {
-    /// One for each scale.
+    /// The layers of each scale.
     pub mlps: Vec<SharedMlp>,
 }
 
-/// From the points of one level to those of the level above.
+/// Feature propagation from the points of one level to those of the next finer one.
 #[derive(Module, Debug)]
 pub struct FeaturePropagation {
     /// The layers.
     pub mlp: Vec<RowsBnRelu<4>>,
 }
 
-/// What the backbone computes on its way. Clouds of a batch follow each other.
+/// Intermediate outputs of the backbone. The clouds of a batch are concatenated.
 #[derive(Clone, Debug)]
 pub struct BackboneStages {
-    /// Behind each level of set abstraction, `[B * M, C]`.
+    /// Output of each level of set abstraction, `[B * M, C]`.
     pub set_abstraction: Vec<Tensor<2>>,
-    /// Behind each feature propagation, finest first, `[B * U, C]`.
+    /// Output of each feature propagation, finest first, `[B * U, C]`.
     pub propagation: Vec<Tensor<2>>,
 }
 
 impl PointNet2Msg {
-    /// For points with `inputs` values beside their coordinates.
+    /// For points with `inputs` values in addition to their coordinates.
     pub fn new(inputs: usize, net: &PointRcnnConfig, init: &Init<'_>) -> Self {
         let norm = |channels| BatchNorm::new(channels, 0.1, 1e-5, init);
         let mut channels = vec![inputs];
@@ -59,7 +59,7 @@ impl PointNet2Msg {
             sa_modules.push(SetAbstraction { mlps: scales.clone().enumerate().map(mlp).collect() });
             channels.push(scales.map(|filters| filters[filters.len() - 1]).sum());
         }
-        // Level i + 1 is interpolated, level i comes from the way down.
+        // Level i + 1 is interpolated, level i is the skip connection.
         let mut known = channels[channels.len() - 1];
         let mut fp_modules = Vec::new();
         for (i, filters) in net.propagation.iter().enumerate().rev() {
@@ -78,8 +78,8 @@ impl PointNet2Msg {
     }
 
     /// # Shapes
-    /// `features`: `[B * N, C]`, what the points hold beside their coordinates; `None` without. `propagation[0]` of the result:
-    /// `[B * N, C']`.
+    /// `features`: `[B * N, C]`, the values of the points besides their coordinates; `None` if there are none.
+    /// `propagation[0]` of the result: `[B * N, C']`.
     pub fn forward(
         &self,
         features: Option<Tensor<2>>,
@@ -123,8 +123,9 @@ impl PointNet2Msg {
 }
 
 impl FeaturePropagation {
-    /// Interpolated features beside the points' own. The first layer's share of the former is computed before the interpolation, where
-    /// there are fewer points; both are linear.
+    /// Applies the layers to interpolated features concatenated with the points' features. The first layer's product
+    /// with the former is computed before the interpolation, where there are fewer points; this is equivalent because
+    /// both are linear.
     ///
     /// # Shapes
     /// `known`: `[K, C1]`, `own`: `[U, C2]`; result `[U, C']`.

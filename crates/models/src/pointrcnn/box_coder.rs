@@ -1,14 +1,14 @@
-//! Boxes as codes at points (OpenPCDet: `PointResidualCoder`) and corners of boxes.
+//! Encoding of boxes relative to points (OpenPCDet: `PointResidualCoder`), and corners of boxes.
 //!
 //! All in f32, in the reference's order of operations. Boxes are `[x, y, z, dx, dy, dz, yaw]`, m and rad.
 
 use super::point_head::POINT_CODE;
 
-/// Sizes below this are taken as this, m.
+/// Sizes are clamped to at least this, m.
 const SMALLEST_SIZE_M: f32 = 1e-5;
 
-/// What a point has to say to mean a box: offsets of the centre over the base diagonal and height of a box of mean size, logarithms of the
-/// size ratios, cosine and sine of the heading.
+/// The code of a box at a point: centre offsets divided by the base diagonal and the height of a box of mean size,
+/// logarithms of the size ratios, cosine and sine of the heading.
 pub fn encode(bbox: [f32; 7], point: [f32; 3], mean_size: [f32; 3]) -> [f32; POINT_CODE] {
     let [x, y, z, dx, dy, dz, yaw] = bbox;
     let size = [dx, dy, dz].map(|s| s.max(SMALLEST_SIZE_M));
@@ -26,7 +26,7 @@ pub fn encode(bbox: [f32; 7], point: [f32; 3], mean_size: [f32; 3]) -> [f32; POI
     ]
 }
 
-/// The box that a code at a point means; the inverse of [`encode`].
+/// The box of a code at a point; the inverse of [`encode`].
 pub fn decode(code: [f32; POINT_CODE], point: [f32; 3], mean_size: [f32; 3]) -> [f32; 7] {
     let [length, width, height] = mean_size;
     let diagonal = (length * length + width * width).sqrt();

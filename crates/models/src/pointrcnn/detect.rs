@@ -1,26 +1,25 @@
 //! Detections of a batch (OpenPCDet: `generate_predicted_boxes`, `post_processing`).
 
+use super::config::RcnnDetectionConfig;
 use super::network::PointRcnn;
 use super::proposals::{point_boxes, proposals};
 use super::roi_input::{RoiInput, Scene};
 use super::sample::{Preparation, Sample};
 use super::training::point_scores;
-use crate::config::RcnnDetectionConfig;
 use crate::layers::{Mode, host};
 use crate::pointpillars::box_coder::decode;
 use crate::{ModelError, Prediction};
 use data::Detection;
 use geometry::{Box3, rotated_nms_first};
 
-/// Boxes of each sample, by falling score, and all refined regions. `names` are those of the classes.
+/// Boxes of each sample, by falling score, and all refined regions.
 ///
 /// # Errors
-/// Scores or boxes that are not numbers.
+/// Scores or boxes that are not finite.
 pub fn detections(
     network: &PointRcnn,
     batch: &[&Sample],
     preparation: &Preparation,
-    names: &[String],
 ) -> Result<Vec<Prediction>, ModelError> {
     let seen: Vec<&Sample> = batch.iter().copied().filter(|s| !s.points.is_empty()).collect();
     if seen.is_empty() {
@@ -59,11 +58,11 @@ pub fn detections(
         }
         let boxes = final_boxes(&regions.boxes, reg);
         let of = |&(i, score): &(usize, f32)| Detection {
-            class: names[regions.labels[i] as usize - 1].clone(),
+            class: preparation.classes[regions.labels[i] as usize - 1].clone(),
             bbox: Box3::from_array(boxes[i].map(f64::from)),
             score,
         };
-        // A size is an exponential: early in a training one can be beyond all numbers. No object is that large.
+        // Sizes are exponentials, which may overflow early in training. Such boxes are dropped.
         let is_number = |&(i, _): &(usize, f32)| boxes[i].iter().all(|v| v.is_finite());
         let kept = suppress(&boxes, cls, &net.detection);
         let all = cls.iter().map(|&logit| sigmoid(logit)).enumerate();
@@ -103,12 +102,12 @@ pub fn final_boxes(rois: &[[f32; 7]], reg: &[f32]) -> Vec<[f32; 7]> {
     rois.iter().zip(reg.as_chunks::<7>().0).map(refined).collect()
 }
 
-/// Regions that stay and their scores, by falling score: sigmoid, threshold, the `pre` best, rotated suppression whatever the class, the first
-/// `post` of what stays.
+/// Indices and scores of the regions kept, by falling score: sigmoid, score threshold, the `pre` best, class-agnostic
+/// rotated NMS, the first `post`.
 pub fn suppress(boxes: &[[f32; 7]], logits: &[f32], config: &RcnnDetectionConfig) -> Vec<(usize, f32)> {
     let scores = logits.iter().map(|&logit| sigmoid(logit));
     let mut best: Vec<(usize, f32)> = scores.enumerate().filter(|(_, s)| *s >= config.score_threshold).collect();
-    best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay by region
+    best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay ordered by region
     best.truncate(config.suppression.pre);
     let solid: Vec<Box3> = best.iter().map(|&(i, _)| Box3::from_array(boxes[i].map(f64::from))).collect();
     let scores: Vec<f32> = best.iter().map(|&(_, score)| score).collect();
@@ -121,7 +120,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_region_s_residual_is_in_its_own_frame() {
+    fn residuals_are_in_the_region_frame() {
         let roi = [10.0, 5.0, -1.0, 4.0, 3.0, 1.5, std::f32::consts::FRAC_PI_2];
         let found = final_boxes(&[roi], &[0.2, 0.0, 0.1, 0.0, 0.0, 0.0, 0.1]);
         let want = [10.0, 6.0, -0.85, 4.0, 3.0, 1.5, std::f32::consts::FRAC_PI_2 + 0.1];

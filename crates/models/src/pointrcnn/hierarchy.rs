@@ -1,31 +1,32 @@
-//! Which points each level of the backbone keeps, and who is whose neighbour. Coordinates alone decide it, so it is found on loader threads.
+//! The points of each level of the backbone, and their neighbours. They depend on coordinates alone, so loader threads
+//! compute them.
 
-use crate::config::LevelConfig;
+use super::config::LevelConfig;
 use crate::point_ops::{Groups, Interpolation};
 use geometry::{TieRule, ball_query, farthest_point_sampling};
 
-/// The levels of one cloud, finest first, and the ways back.
+/// The levels of one cloud, finest first, and the interpolations between them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Hierarchy {
-    /// Set abstraction.
+    /// Levels of set abstraction.
     pub levels: Vec<Level>,
-    /// Feature propagation from level i to the points above it: level i - 1, or the cloud itself.
+    /// Feature propagation from level i to level i - 1, or to the cloud.
     pub up: Vec<Interpolation>,
 }
 
-/// Points that one level keeps.
+/// The points of one level.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Level {
-    /// Where each of them is among the points above.
+    /// Index of each of them in the next finer level.
     pub picks: Vec<u32>,
     /// Their positions, m, LiDAR frame.
     pub points: Vec<[f32; 3]>,
-    /// Neighbours among the points above, one entry a scale.
+    /// Neighbours in the next finer level, one entry a scale.
     pub scales: Vec<Groups>,
 }
 
 impl Hierarchy {
-    /// Of a cloud that is not empty.
+    /// The levels of a cloud that is not empty.
     pub fn new(points: &[[f32; 3]], config: &[LevelConfig]) -> Self {
         let mut hierarchy = Hierarchy::default();
         let mut above = points;
@@ -62,7 +63,7 @@ impl Level {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::ScaleConfig;
+    use crate::pointrcnn::config::ScaleConfig;
 
     #[test]
     fn every_group_counts_as_many_rows_as_the_reference_s() {
@@ -77,7 +78,7 @@ mod tests {
                 assert_eq!(groups.count.iter().sum::<f32>(), 8.0 * centers as f32);
                 assert!(groups.source.len() <= 8 * centers);
             }
-            assert!(level.scales[0].source.len() < 8 * centers, "repetitions are not rows");
+            assert!(level.scales[0].source.len() < 8 * centers, "repeated neighbours are one row");
         }
         assert_eq!(hierarchy.up.iter().map(|up| up.source.len()).collect::<Vec<_>>(), [200, 50]);
     }

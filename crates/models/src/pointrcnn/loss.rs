@@ -1,17 +1,17 @@
 //! The five losses of PointRCNN (OpenPCDet: `PointHeadTemplate`, `RoIHeadTemplate`).
 
 use super::box_coder::{CORNER_SIGNS, corners};
+use super::config::PointRcnnLossConfig;
 use super::point_head::{POINT_CODE, PointPredictions};
 use super::point_targets::PointTargets;
 use super::roi_targets::RoiTargets;
-use crate::config::PointRcnnLossConfig;
 use crate::loss::{sigmoid_focal, smooth_l1};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
-/// Where smooth L1 of codes and residuals turns from square to line.
+/// Beta of the smooth L1 loss of codes and residuals.
 const BETA: f64 = 1.0 / 9.0;
 
-/// Squared lengths below this count as this, m2: the root of 0 has no gradient.
+/// Squared lengths are clamped to at least this, m2, because the square root has no gradient at 0.
 const LEAST_LENGTH2_M2: f64 = 1e-20;
 
 fn rows(values: Vec<f32>, shape: [usize; 2], device: &Device) -> Tensor<2> {
@@ -23,11 +23,11 @@ fn indices(values: Vec<i32>, device: &Device) -> Tensor<1, Int> {
     Tensor::from_data(TensorData::new(values, [length]), device)
 }
 
-/// Weighted losses of the points: classes over all that count, boxes over the positive ones, both divided by the number of positives of the
-/// whole batch.
+/// Weighted losses of the points: classes over all points that are not ignored, boxes over the positive ones. Both are
+/// divided by the number of positives of the whole batch.
 ///
 /// # Shapes
-/// `predictions`: rows of the frames one after the other; results `[1]`.
+/// `predictions`: rows sorted by frame; results `[1]`.
 pub fn point_losses(
     predictions: &PointPredictions,
     targets: &[&PointTargets],
@@ -56,9 +56,9 @@ pub fn point_losses(
     if n == 0 {
         return [cls, Tensor::zeros([1], &device)];
     }
-    let said = predictions.boxes.clone().select(0, indices(positive, &device)); // [n, 8]
+    let predicted = predictions.boxes.clone().select(0, indices(positive, &device)); // [n, 8]
     let code_weights = rows(weights.point_code_weights.to_vec(), [1, POINT_CODE], &device);
-    let difference = (said - rows(codes, [n, POINT_CODE], &device)) * code_weights;
+    let difference = (predicted - rows(codes, [n, POINT_CODE], &device)) * code_weights;
     let boxes = smooth_l1(difference, BETA).sum() * (share * f64::from(weights.point_box_weight));
     [cls, boxes]
 }
@@ -94,9 +94,9 @@ pub fn roi_losses(
     [cls, boxes, corner]
 }
 
-/// Cross entropy of the regions' scores, mean over those whose label is not -1.
+/// Binary cross entropy of the regions' scores, mean over those whose label is not -1.
 ///
-/// The reference takes logarithms of the sigmoid and cuts them off at -100; this form does not lose digits there.
+/// The reference takes logarithms of the sigmoid and clamps them at -100; this form keeps full precision there.
 ///
 /// # Shapes
 /// `logits`: `[R]`; result `[1]`.
@@ -110,7 +110,7 @@ pub fn roi_cross_entropy(logits: Tensor<1>, labels: &[i32]) -> Tensor<1> {
     (entropy * share).sum()
 }
 
-/// The boxes that residuals mean in their regions.
+/// The boxes of residuals relative to their regions.
 ///
 /// # Shapes
 /// `reg`: `[n, 7]`; result `[n, 7]`, `[x, y, z, dx, dy, dz, yaw]`, LiDAR frame.
@@ -118,11 +118,12 @@ pub fn decode_in_regions(reg: Tensor<2>, rois: &[[f32; 7]]) -> Tensor<2> {
     let device = reg.device();
     let n = rois.len();
     let column = |of: &dyn Fn(&[f32; 7]) -> f32| rows(rois.iter().map(of).collect(), [n, 1], &device);
-    let said = |from: usize, length: usize| reg.clone().narrow(1, from, length);
+    let predicted = |from: usize, length: usize| reg.clone().narrow(1, from, length);
     let diagonal = column(&|r| (r[3] * r[3] + r[4] * r[4]).sqrt());
-    let (x, y, z) = (said(0, 1) * diagonal.clone(), said(1, 1) * diagonal, said(2, 1) * column(&|r| r[5])); // [n, 1]
-    let size = said(3, 3).exp() * rows(rois.iter().flat_map(|r| [r[3], r[4], r[5]]).collect(), [n, 3], &device); // [n, 3]
-    let yaw = said(6, 1) + column(&|r| r[6]);
+    let (x, y, z) =
+        (predicted(0, 1) * diagonal.clone(), predicted(1, 1) * diagonal, predicted(2, 1) * column(&|r| r[5])); // [n, 1]
+    let size = predicted(3, 3).exp() * rows(rois.iter().flat_map(|r| [r[3], r[4], r[5]]).collect(), [n, 3], &device); // [n, 3]
+    let yaw = predicted(6, 1) + column(&|r| r[6]);
     let (sin, cos) = (column(&|r| r[6].sin()), column(&|r| r[6].cos()));
     let turned =
         [x.clone() * cos.clone() - y.clone() * sin.clone() + column(&|r| r[0]), x * sin + y * cos + column(&|r| r[1])];
@@ -130,8 +131,8 @@ pub fn decode_in_regions(reg: Tensor<2>, rois: &[[f32; 7]]) -> Tensor<2> {
     Tensor::cat(vec![x, y, z + column(&|r| r[2]), size, yaw], 1)
 }
 
-/// Smooth L1 (beta 1) of the distances between the corners of two boxes, mean over the eight; of the truth as it is and turned by half a turn
-/// the nearer corner counts.
+/// Corner loss: smooth L1 (beta 1) of the distances between the corners of two boxes, mean over the eight. Each
+/// distance is the smaller one to the ground truth and to the ground truth rotated by pi.
 ///
 /// # Shapes
 /// `boxes`: `[n, 7]`; `truth`: n boxes; result `[n]`.
@@ -163,7 +164,7 @@ mod tests {
     use crate::layers::host;
 
     #[test]
-    fn no_positive_and_no_region_that_counts() {
+    fn no_positive_point_and_only_ignored_regions() {
         let device = Device::flex().autodiff();
         let predictions =
             PointPredictions { cls: Tensor::zeros([4, 2], &device), boxes: Tensor::zeros([4, POINT_CODE], &device) };
@@ -197,7 +198,7 @@ mod tests {
         assert!(gradient.iter().all(|g| g.is_finite()));
     }
 
-    /// Every gradient of the corner loss by way of the region's frame, against central differences.
+    /// The gradient of the corner loss with respect to the residuals, against central differences.
     #[test]
     fn gradients_are_those_of_finite_differences() {
         let device = Device::flex().autodiff();

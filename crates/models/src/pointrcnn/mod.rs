@@ -1,6 +1,8 @@
 //! PointRCNN (Shi et al. 2019), as OpenPCDet builds it.
 
+mod architecture;
 mod backbone;
+mod config;
 mod detect;
 mod network;
 mod point_head;
@@ -18,6 +20,7 @@ pub mod roi_input;
 pub mod roi_targets;
 
 pub use backbone::{BackboneStages, FeaturePropagation, PointNet2Msg, SetAbstraction};
+pub use config::*;
 pub use detect::{detections, final_boxes, suppress};
 pub use network::{PointRcnn, PointStages};
 pub use point_head::{HiddenLayers, POINT_CODE, PointHead, PointPredictions};

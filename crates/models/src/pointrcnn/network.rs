@@ -2,10 +2,11 @@
 
 use super::Sample;
 use super::backbone::{BackboneStages, PointNet2Msg};
+use super::config::PointRcnnConfig;
 use super::hierarchy::Hierarchy;
 use super::point_head::{PointHead, PointPredictions};
 use super::roi_head::RoiHead;
-use crate::config::{DetectorConfig, PointRcnnConfig};
+use crate::config::DetectorConfig;
 use crate::layers::{Init, Mode};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -15,18 +16,18 @@ use burn::tensor::{Device, Tensor, TensorData};
 pub struct PointRcnn {
     /// PointNet++.
     pub backbone_3d: PointNet2Msg,
-    /// The first stage's head.
+    /// The head of the first stage.
     pub point_head: PointHead,
     /// The second stage.
     pub roi_head: RoiHead,
 }
 
-/// Every stage of the first half of a pass.
+/// The outputs of the first stage.
 #[derive(Clone, Debug)]
 pub struct PointStages {
     /// Set abstraction and feature propagation.
     pub backbone: BackboneStages,
-    /// Of every point.
+    /// Predictions of every point.
     pub predictions: PointPredictions,
 }
 
@@ -38,7 +39,7 @@ impl PointStages {
 }
 
 impl PointRcnn {
-    /// With fresh weights from `seed`.
+    /// A network with initial weights from `seed`.
     pub fn new(config: &DetectorConfig, net: &PointRcnnConfig, seed: u64, device: &Device) -> Self {
         let init = Init { seed, device };
         let features = net.propagation[0][net.propagation[0].len() - 1];
@@ -62,7 +63,7 @@ impl PointRcnn {
         PointStages { backbone, predictions }
     }
 
-    /// Where the weights are.
+    /// The device of the weights.
     pub fn device(&self) -> Device {
         self.point_head.cls_layers.last.bias.val().device()
     }

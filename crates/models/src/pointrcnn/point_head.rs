@@ -1,33 +1,33 @@
-//! The first stage's head: what single points say (OpenPCDet: `PointHeadBox`).
+//! The head of the first stage: classes and boxes of points (OpenPCDet: `PointHeadBox`).
 
-use crate::config::PointHeadConfig;
+use super::config::PointHeadConfig;
 use crate::kernel_ops::MlpRows;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear, rows_kernel};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Values that describe a box at a point.
+/// Length of the code of a box at a point.
 pub const POINT_CODE: usize = 8;
 
-/// Two chains of layers over each point's features.
+/// Two branches of layers over each point's features.
 #[derive(Module, Debug)]
 pub struct PointHead {
-    /// To the logits of the classes.
+    /// Branch of the class logits.
     pub cls_layers: HiddenLayers<2>,
-    /// To the codes of the boxes.
+    /// Branch of the box codes.
     pub box_layers: HiddenLayers<2>,
 }
 
-/// Two hidden layers and a last one.
+/// Two hidden layers and an output layer.
 #[derive(Module, Debug)]
 pub struct HiddenLayers<const D: usize> {
-    /// With normalisation.
+    /// Hidden layers with batch norm.
     pub hidden: Vec<RowsBnRelu<D>>,
-    /// Without.
+    /// Output layer without batch norm.
     pub last: RowsLinear<D>,
 }
 
-/// What the head says of every point. Clouds of a batch follow each other.
+/// Outputs of the head for every point. The clouds of a batch are concatenated.
 #[derive(Clone, Debug)]
 pub struct PointPredictions {
     /// Logits, `[B * N, classes]`.

@@ -1,4 +1,4 @@
-//! What each point should say about a frame (OpenPCDet: `PointHeadBox.assign_targets`).
+//! Targets of the points (OpenPCDet: `PointHeadBox.assign_targets`).
 
 use super::box_coder::encode;
 use super::point_head::POINT_CODE;
@@ -10,16 +10,16 @@ const MARGIN_M: f64 = 1e-5;
 /// Targets of the points of one frame. N points, K of them in a box.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct PointTargets {
-    /// Class from 1, 0 for background, -1 for points that do not count. Length N.
+    /// Class from 1, 0 for background, -1 for ignored points. Length N.
     pub labels: Vec<i32>,
-    /// Point and ground-truth box of each positive, by rising point. Length K.
+    /// Point and ground-truth box of each positive, sorted by point. Length K.
     pub positive: Vec<(usize, usize)>,
-    /// Its code. Length K.
+    /// Code of its box. Length K.
     pub codes: Vec<[f32; POINT_CODE]>,
 }
 
-/// Targets of one frame: a point in a box belongs to the first such box; one that is in no box, but in one enlarged by `extra_width_m` in
-/// total, does not count.
+/// Targets of one frame. A point in several boxes belongs to the first one. A point that is in no box, but in one
+/// enlarged by `extra_width_m` in total, is ignored.
 ///
 /// `boxes` are `[x, y, z, dx, dy, dz, yaw, class]`, classes counted from 1 in the order of `mean_sizes`.
 pub fn assign(

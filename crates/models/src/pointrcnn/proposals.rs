@@ -1,29 +1,29 @@
-//! From what points say to regions of interest (OpenPCDet: `RoIHeadTemplate.proposal_layer`). Runs on the host.
+//! Regions of interest from the predictions of points (OpenPCDet: `RoIHeadTemplate.proposal_layer`). Runs on the host.
 
 use super::box_coder::decode;
+use super::config::SuppressionConfig;
 use super::point_head::POINT_CODE;
-use crate::config::SuppressionConfig;
 use geometry::{Box3, rotated_nms_first};
 
-/// Regions of one frame, by falling score. When fewer boxes survive the suppression than are wanted, the rest are boxes without extent, with
-/// score 0 and class 1; in training they are easy background, as in the reference.
+/// Regions of one frame, by falling score. If NMS keeps fewer boxes than requested, the rest are boxes without extent,
+/// with score 0 and class 1. In training they are easy background, as in the reference.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Proposals {
     /// `[x, y, z, dx, dy, dz, yaw]`, m and rad, LiDAR frame.
     pub boxes: Vec<[f32; 7]>,
-    /// Largest logit of the point.
+    /// Largest logit of the region's point.
     pub scores: Vec<f32>,
     /// Class from 1.
     pub labels: Vec<i32>,
 }
 
-/// The class with the highest logit, the first of equal ones, and that logit.
+/// The class with the highest logit (the first of equal ones) and this logit.
 pub fn best_class(logits: &[f32]) -> (usize, f32) {
     let best = (0..logits.len()).fold(0, |best, c| if logits[c] > logits[best] { c } else { best });
     (best, logits[best])
 }
 
-/// The box that each point means: its code for the mean size of its best class.
+/// The box of each point: its code decoded with the mean size of its best class.
 ///
 /// # Shapes
 /// `logits`: `[N, classes]`, `codes`: `[N, 8]`; result `[N]`.
@@ -33,14 +33,15 @@ pub fn point_boxes(points: &[[f32; 3]], logits: &[f32], codes: &[f32], mean_size
     boxes.collect()
 }
 
-/// Regions of one frame: the `pre` boxes with the highest logits, rotated suppression whatever the class, the first `post` of what stays.
+/// Regions of one frame: the `pre` boxes with the highest logits, class-agnostic rotated NMS, the first `post` of the
+/// kept boxes.
 ///
 /// # Shapes
 /// `boxes`: `[N]`, `logits`: `[N, classes]`; result: `post` regions.
 pub fn proposals(boxes: &[[f32; 7]], logits: &[f32], classes: usize, config: &SuppressionConfig) -> Proposals {
     let best: Vec<(usize, f32)> = logits.chunks_exact(classes).map(best_class).collect();
     let mut order: Vec<usize> = (0..boxes.len()).collect();
-    order.sort_by(|&a, &b| best[b].1.total_cmp(&best[a].1)); // stable: equal ones stay by index
+    order.sort_by(|&a, &b| best[b].1.total_cmp(&best[a].1)); // stable: equal scores stay ordered by index
     order.truncate(config.pre);
     let solid: Vec<Box3> = order.iter().map(|&i| Box3::from_array(boxes[i].map(f64::from))).collect();
     let scores: Vec<f32> = order.iter().map(|&i| best[i].1).collect();

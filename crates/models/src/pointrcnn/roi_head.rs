@@ -1,38 +1,39 @@
-//! The second stage's network (Shi et al. 2019, PointRCNN, section 3.3; OpenPCDet: `PointRCNNHead`).
+//! The network of the second stage (Shi et al. 2019, PointRCNN, section 3.3; OpenPCDet: `PointRCNNHead`).
 
 use super::backbone::SetAbstraction;
+use super::config::RoiHeadConfig;
 use super::point_head::HiddenLayers;
 use super::roi_input::{PREFIX, RoiInput};
 use super::set_abstraction::SharedMlp;
-use crate::config::RoiHeadConfig;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear};
 use burn::module::Module;
 use burn::tensor::activation::relu;
 use burn::tensor::{Int, Tensor, TensorData};
 
-/// Refines regions of interest. Its set abstraction has batch normalisation, as in OpenPCDet, where `USE_BN` does not reach it.
+/// Refines regions of interest. Its set abstraction has batch norm, as in OpenPCDet, where `USE_BN` has no effect on
+/// it.
 #[derive(Module, Debug)]
 pub struct RoiHead {
-    /// Levels inside a region, then one over all of it.
+    /// Levels inside a region, then one over the whole region.
     pub sa_modules: Vec<SetAbstraction>,
-    /// Position, score and distance of a point.
+    /// Layers over position, score and distance of a point.
     pub xyz_up_layer: Vec<RowsLinear<4>>,
-    /// The former beside the point's features.
+    /// Layer over the former concatenated with the point's features.
     pub merge_down_layer: Vec<RowsLinear<4>>,
-    /// To the score.
+    /// Branch of the score.
     pub cls_layers: HiddenLayers<3>,
-    /// To the box.
+    /// Branch of the box.
     pub reg_layers: HiddenLayers<3>,
 }
 
-/// What the second stage computes on its way. P rows of points, see [`RoiInput`]; R regions.
+/// Intermediate outputs of the second stage. P rows of points, see [`RoiInput`]; R regions.
 #[derive(Clone, Debug)]
 pub struct RoiStages {
     /// `[P, C]`.
     pub xyz_up: Tensor<2>,
     /// `[P, C]`.
     pub merged: Tensor<2>,
-    /// Behind each level, rows as [`RoiInput::dense`] says; the last one `[R, C]`.
+    /// Output of each level, rows as in [`RoiInput::dense`]; the last one `[R, C]`.
     pub set_abstraction: Vec<Tensor<2>>,
     /// Logits, `[R, 1]`.
     pub cls: Tensor<2>,
@@ -90,7 +91,7 @@ impl RoiHead {
         let prefix = Tensor::<2>::from_data(prefix, &device); // [P, 5]
         let xyz_up = self.xyz_up_layer.iter().fold(prefix, |x, layer| relu(layer.forward(x)));
 
-        // A region without points reads zeros, from a row behind the last.
+        // A region without points reads the row of zeros appended after the last.
         let source: Vec<i32> = input.source.iter().map(|s| s.map_or(rows as i32, |row| row as i32)).collect();
         let source = Tensor::<1, Int>::from_data(TensorData::new(source, [points]), &device);
         let features = Tensor::cat(vec![point_features.detach(), Tensor::zeros([1, channels], &device)], 0);

@@ -1,55 +1,57 @@
-//! What the second stage reads of each region: points in its own frame, and their neighbours there (OpenPCDet:
+//! Input of the second stage for each region: points in the region frame and their neighbours (OpenPCDet:
 //! `PointRCNNHead.roipool3d_gpu`). Runs on the host.
 //!
-//! The reference fills a region up to 512 points by repeating them, and a level up to its number of centres likewise. Repetitions are not
-//! rows here, they are counted (see [`Groups`]).
+//! The reference repeats the points of a region up to 512, and the centres of a level likewise. Here repeated points
+//! are one row with a multiplicity (see [`Groups`]).
 
-use crate::config::RoiHeadConfig;
+use super::config::RoiHeadConfig;
 use crate::point_ops::Groups;
 use geometry::{Box3, TieRule, ball_query, farthest_point_sampling, roi_points};
 use rayon::prelude::*;
 
-/// Values of a point that the second stage reads first: position, score, distance.
+/// Number of values of a point besides its features: position, score, distance.
 pub const PREFIX: usize = 5;
 
-/// Regions of a batch. P different points in all of them.
+/// Regions of a batch, with P distinct points in total.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RoiInput {
-    /// Position in the region's frame (m), score (0 to 1), distance from the sensor (normalised), `[P]`. Zeros for a region without points.
+    /// Position in the region's frame (m), score (0 to 1), distance from the sensor (normalised), `[P]`. Zeros for a
+    /// region without points.
     pub prefix: Vec<[f32; PREFIX]>,
     /// Row of each point's features; `None` for that of a region without points. Length P.
     pub source: Vec<Option<u32>>,
     /// Set abstraction, finest level first: rows are those of the level above.
     pub levels: Vec<Groups>,
-    /// All that is left of each region.
+    /// The points of the last level, grouped by region.
     pub global: Groups,
-    /// Row of each of the reference's points, repetitions included: the pooled ones, then the centres of each level.
+    /// Row of each point of the reference, repetitions included: the pooled points, then the centres of each level.
     pub dense: Vec<Vec<u32>>,
-    /// Where each centre of a level is among the reference's points above.
+    /// Index of each centre of a level in the reference's points of the next finer level.
     pub picks: Vec<Vec<u32>>,
-    /// Different points of each region, 0 for an empty one.
+    /// Number of distinct points of each region, 0 for an empty one.
     pub count: Vec<u32>,
 }
 
-/// The points of one frame that regions are filled with.
+/// The points of one frame from which regions are pooled.
 #[derive(Clone, Copy, Debug)]
 pub struct Scene<'a> {
     /// Positions, m, LiDAR frame. Length N.
     pub points: &'a [[f32; 3]],
     /// Sigmoid of each point's largest logit. Length N.
     pub scores: &'a [f32],
-    /// Row of the first point's features.
+    /// Row of the features of the first point.
     pub first_row: u32,
 }
 
 impl RoiInput {
-    /// Of the regions of one frame.
+    /// The input for the regions of one frame.
     pub fn new(scene: Scene<'_>, rois: &[[f32; 7]], config: &RoiHeadConfig) -> Self {
         let rotations: Vec<[f32; 2]> = rois.iter().map(|roi| roi[6].sin_cos().into()).collect();
         RoiInput::rotated(scene, rois, &rotations, config)
     }
 
-    /// The same with the sine and cosine of each region's yaw as somebody else rounds them.
+    /// The same with given sine and cosine of each region's yaw, for comparison with a reference that rounds them
+    /// differently.
     pub fn rotated(scene: Scene<'_>, rois: &[[f32; 7]], rotations: &[[f32; 2]], config: &RoiHeadConfig) -> Self {
         let extra = config.extra_width_m;
         let enlarged = |r: &[f32; 7]| [r[0], r[1], r[2], r[3] + extra[0], r[4] + extra[1], r[5] + extra[2], r[6]];
@@ -67,7 +69,7 @@ impl RoiInput {
         all
     }
 
-    /// Of no region.
+    /// The input without regions.
     pub fn empty(config: &RoiHeadConfig) -> Self {
         RoiInput {
             levels: vec![Groups::default(); config.levels.len()],
@@ -90,7 +92,8 @@ impl RoiInput {
             let [x, y, z] = [0, 1, 2].map(|axis| p[axis] - roi[axis]);
             let depth_m = (p[0] * p[0] + p[1] * p[1] + p[2] * p[2]).sqrt();
             let depth = depth_m / config.depth_normalizer_m - 0.5;
-            // Fused as in the reference's product of matrices: which of two points is farther may hang on the last digit.
+            // Fused multiply-add as in the reference's matrix product: farthest point sampling may depend on the last
+            // digit.
             let (x, y) = (y.mul_add(sin, x * cos), y.mul_add(cos, -(x * sin)));
             region.prefix.push([x, y, z, scene.scores[i as usize], depth]);
             region.source.push(Some(scene.first_row + i));
@@ -101,13 +104,13 @@ impl RoiInput {
             region.source.push(None);
         }
         let position = |row: usize| -> [f32; 3] { std::array::from_fn(|axis| region.prefix[row][axis]) };
-        // The reference's points, and the row that each of them is.
+        // The row of each point of the reference.
         let mut rows: Vec<u32> = (0..region.prefix.len() as u32).cycle().take(config.points).collect();
         let mut points: Vec<[f32; 3]> = rows.iter().map(|&row| position(row as usize)).collect();
         region.dense[0] = rows.clone();
         for (l, level) in config.levels.iter().enumerate() {
             let picks = farthest_point_sampling(&points, level.centers, TieRule::ReferenceKernel);
-            // A row that was picked again is the same centre, which counts once more.
+            // A row that was picked again increases the multiplicity of its centre.
             let (mut centers, mut times, mut picked_rows) = (Vec::<u32>::new(), Vec::<f32>::new(), Vec::new());
             let mut center_of_row = vec![u32::MAX; rows.iter().max().map_or(0, |&row| row as usize + 1)];
             for &pick in &picks {
@@ -135,7 +138,7 @@ impl RoiInput {
         region
     }
 
-    /// Adds regions of another frame, or other regions of the same.
+    /// Appends other regions.
     pub fn append(&mut self, other: &RoiInput) {
         let mut first_row = self.prefix.len() as u32;
         self.prefix.extend_from_slice(&other.prefix);
@@ -163,7 +166,7 @@ impl RoiInput {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::RoiLevelConfig;
+    use crate::pointrcnn::config::RoiLevelConfig;
 
     fn config() -> RoiHeadConfig {
         let level = |centers| RoiLevelConfig { centers, radius_m: 0.5, samples: 4, filters: vec![4] };
@@ -191,10 +194,10 @@ mod tests {
         assert_eq!(input.global.count.iter().sum::<f32>(), 12.0);
         assert_eq!(input.regions(), 3);
         assert_eq!(input.dense.iter().map(Vec::len).collect::<Vec<_>>(), [48, 24, 12]);
-        // A region without points is one row at its centre.
+        // A region without points has one row at its centre.
         let last = input.levels[0].ends.len() - 1;
         assert_eq!(input.levels[0].count[input.levels[0].ends[last - 1] as usize], 32.0);
-        // In the region's frame its points lie inside of it.
+        // In the region frame its points lie inside the region.
         let inside = |p: &[f32; PREFIX]| p[0].abs() <= 1.0001 && p[1].abs() <= 0.5001 && p[2].abs() <= 1.0;
         assert!(input.prefix[..input.count[0] as usize].iter().all(inside));
     }

@@ -1,7 +1,7 @@
-//! Which regions the second stage learns from, and what it should say of them (OpenPCDet: `ProposalTargetLayer`). Runs on the host.
+//! Sampling of training regions and their targets (OpenPCDet: `ProposalTargetLayer`). Runs on the host.
 
+use super::config::RoiSamplingConfig;
 use super::proposals::Proposals;
-use crate::config::RoiSamplingConfig;
 use crate::pointpillars::box_coder::encode;
 use data::Stream;
 use geometry::{Box3, iou_3d};
@@ -18,18 +18,18 @@ pub struct RoiTargets {
     pub iou: Vec<f32>,
     /// The ground-truth box, `[x, y, z, dx, dy, dz, yaw, class]`; zeros in a frame without any.
     pub truth: Vec<[f32; 8]>,
-    /// The same seen from the region, heading folded into a quarter turn to either side.
+    /// The same in the region frame, with the heading wrapped to [-pi/2, pi/2].
     pub truth_canonical: Vec<[f32; 8]>,
-    /// 1 for an object, 0 for background, -1 where the region does not count.
+    /// 1 for an object, 0 for background, -1 for ignored regions.
     pub labels: Vec<i32>,
-    /// Whether the box is learned.
+    /// Whether the box is regressed.
     pub box_counts: Vec<bool>,
-    /// What the box should be corrected by.
+    /// Residuals of the box.
     pub residuals: Vec<[f32; 7]>,
 }
 
-/// Overlap of each region with the ground truth of its class, and which box that is: the first of equal ones; 0 and the first box of all
-/// where there is none of the class.
+/// Highest IoU of each region with the ground truth of its class, and the index of this box (the first of equal ones).
+/// Without a box of the class the result is 0 and the first box.
 ///
 /// `truth` is `[x, y, z, dx, dy, dz, yaw, class]`, regions and ground truth with classes from 1.
 pub fn overlaps(rois: &[[f32; 7]], labels: &[i32], truth: &[[f32; 8]]) -> (Vec<f32>, Vec<usize>) {
@@ -48,22 +48,22 @@ pub fn overlaps(rois: &[[f32; 7]], labels: &[i32], truth: &[[f32; 8]]) -> (Vec<f
     rois.iter().zip(labels).map(|(roi, &label)| best(roi, label)).unzip()
 }
 
-/// What an overlap makes of a region.
+/// The category of a region by its overlap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Kind {
-    /// May be drawn as foreground.
+    /// Can be sampled as foreground.
     pub foreground: bool,
-    /// Background that is far from any object.
+    /// Easy background.
     pub easy: bool,
-    /// Background that is not.
+    /// Hard background.
     pub hard: bool,
-    /// 1, 0 or -1.
+    /// Label: 1, 0 or -1.
     pub label: i32,
-    /// Whether the box is learned.
+    /// Whether the box is regressed.
     pub box_counts: bool,
 }
 
-/// By the thresholds, compared in f32 as the reference does.
+/// The category by the thresholds, compared in f32 as in the reference.
 pub fn kind(iou: f32, config: &RoiSamplingConfig) -> Kind {
     let unsure = iou > config.class_background && iou < config.class_foreground;
     Kind {
@@ -75,8 +75,8 @@ pub fn kind(iou: f32, config: &RoiSamplingConfig) -> Kind {
     }
 }
 
-/// Draws `config.regions` regions by their overlaps: foreground without replacement up to its share, the rest background with replacement,
-/// hard and easy in their shares. When one kind is missing the others fill up.
+/// Samples `config.regions` regions by their overlaps: foreground without replacement up to its fraction, the rest
+/// background with replacement, hard and easy by their fractions. If one category is missing, the others replace it.
 pub fn draw(iou: &[f32], config: &RoiSamplingConfig, stream: &mut Stream) -> Vec<usize> {
     let of = |wanted: fn(&Kind) -> bool| -> Vec<usize> {
         (0..iou.len()).filter(|&i| wanted(&kind(iou[i], config))).collect()
@@ -102,7 +102,7 @@ pub fn draw(iou: &[f32], config: &RoiSamplingConfig, stream: &mut Stream) -> Vec
     drawn
 }
 
-/// Draws regions out of the proposals and says what the second stage should make of them.
+/// Samples regions from the proposals and computes their targets.
 pub fn sample(
     proposals: &Proposals,
     truth: &[[f32; 8]],
@@ -119,7 +119,7 @@ pub fn sample(
 }
 
 impl RoiTargets {
-    /// Adds a region with the ground truth that it overlaps.
+    /// Appends a region with its ground truth.
     pub fn push(&mut self, roi: [f32; 7], iou: f32, truth: [f32; 8], config: &RoiSamplingConfig) {
         let kind = kind(iou, config);
         let canonical = seen_from(roi, truth);
@@ -133,7 +133,7 @@ impl RoiTargets {
         self.box_counts.push(kind.box_counts);
     }
 
-    /// Adds those of another frame.
+    /// Appends those of another frame.
     pub fn append(&mut self, other: &RoiTargets) {
         self.rois.extend_from_slice(&other.rois);
         self.iou.extend_from_slice(&other.iou);
@@ -145,8 +145,8 @@ impl RoiTargets {
     }
 }
 
-/// A box in the frame of a region: origin at its centre, x along its heading. The box's heading is folded to within a quarter turn, since the
-/// region may be the wrong way round.
+/// A box in the frame of a region: origin at its centre, x along its heading. The box's heading is wrapped to [-pi/2,
+/// pi/2], because the region may point backwards.
 fn seen_from(roi: [f32; 7], truth: [f32; 8]) -> [f32; 8] {
     let turn = roi[6].rem_euclid(TAU);
     let (sin, cos) = turn.sin_cos();
@@ -213,7 +213,7 @@ mod tests {
     }
 
     proptest! {
-        /// Seen from the region and back is the same box, up to half a turn.
+        /// Transforming to the region frame and back gives the same box, up to a heading difference of pi.
         #[test]
         fn canonical_and_back(
             roi in (prop::array::uniform3(-50.0f32..50.0), -7.0f32..7.0),

@@ -1,9 +1,10 @@
-//! From a frame to what the network reads. Runs on the host.
+//! Network input and targets of a frame. Runs on the host.
 
+use super::config::PointRcnnConfig;
 use super::hierarchy::Hierarchy;
 use super::point_targets::{PointTargets, assign};
 use crate::ModelError;
-use crate::config::{DetectorConfig, PointRcnnConfig};
+use crate::config::DetectorConfig;
 use data::{Cloud, Frame, Object, Stream};
 use rand::RngExt;
 use rand::seq::{SliceRandom, index};
@@ -13,41 +14,42 @@ use rand::seq::{SliceRandom, index};
 pub struct Sample {
     /// Id of the frame.
     pub id: String,
-    /// Positions of the points, m, LiDAR frame; none when no point lies in range.
+    /// Positions of the points, m, LiDAR frame; empty if no point is in range.
     pub points: Vec<[f32; 3]>,
-    /// What they hold beside, `[N, C - 3]`.
+    /// Their other values, `[N, C - 3]`.
     pub features: Vec<f32>,
     /// Levels and neighbours; empty without points.
     pub hierarchy: Hierarchy,
-    /// What the network should say; only in training.
+    /// Targets; only in training.
     pub targets: Option<SampleTargets>,
 }
 
-/// Ground truth of a frame, as the two stages need it.
+/// Targets of the two stages for a frame.
 #[derive(Clone, Debug)]
 pub struct SampleTargets {
-    /// Of the points.
+    /// Targets of the points.
     pub points: PointTargets,
     /// Boxes `[x, y, z, dx, dy, dz, yaw, class]`, classes from 1.
     pub boxes: Vec<[f32; 8]>,
-    /// Key of the random numbers that regions are drawn with.
+    /// Seed of the sampling of regions.
     pub roi_seed: u64,
 }
 
-/// What [`Sample`]s are made with.
+/// Configuration for making samples.
 #[derive(Clone, Debug)]
 pub struct Preparation {
-    classes: Vec<String>,
+    /// Names of the classes.
+    pub classes: Vec<String>,
     channels: usize,
     range_m: [f32; 6],
     /// The network's sizes.
     pub net: PointRcnnConfig,
-    /// Of each class.
+    /// Mean size of each class: length, width, height, m.
     pub mean_sizes: Vec<[f32; 3]>,
 }
 
 impl Preparation {
-    /// For that detector.
+    /// From the configuration of a detector.
     pub fn new(config: &DetectorConfig, net: &PointRcnnConfig) -> Self {
         Preparation {
             classes: config.classes.clone(),
@@ -58,8 +60,7 @@ impl Preparation {
         }
     }
 
-    /// The network's input of a frame, with targets when it is to learn from it. `stream` decides which points are read; the same stream,
-    /// the same points.
+    /// The network's input for a frame, with targets if `training`. The sampled points are determined by `stream`.
     ///
     /// # Errors
     /// A cloud with too few values a point.
@@ -75,7 +76,7 @@ impl Preparation {
         Ok(self.of_points(&frame.id, &frame.cloud, &chosen, boxes, stream.random()))
     }
 
-    /// The network's input of chosen points of a cloud.
+    /// The network's input for chosen points of a cloud.
     pub fn of_points(
         &self,
         id: &str,
@@ -100,7 +101,7 @@ impl Preparation {
         }
     }
 
-    /// Points whose x and y lie in range (the reference's mask does not look at z) and whose values are numbers.
+    /// Points whose x and y are in range (the reference's mask ignores z) and whose values are finite.
     fn usable(&self, cloud: &Cloud) -> Vec<usize> {
         let [x0, y0, _, x1, y1, _] = self.range_m;
         let in_range = |p: &[f32]| p[0] >= x0 && p[0] <= x1 && p[1] >= y0 && p[1] <= y1;
@@ -109,7 +110,7 @@ impl Preparation {
         usable.map(|(i, _)| i).collect()
     }
 
-    /// Boxes of the detector's classes whose centre lies within the range, with their class counted from 1.
+    /// Boxes of the detector's classes whose centre lies within the range, with classes counted from 1.
     pub fn ground_truth(&self, objects: &[Object]) -> Vec<[f32; 8]> {
         let with_class = |o: &Object| {
             let class = self.classes.iter().position(|c| *c == o.class)?;
@@ -121,8 +122,9 @@ impl Preparation {
     }
 }
 
-/// `count` of the usable points, in random order (OpenPCDet: `sample_points`): of too many, all far ones and a draw of the near ones; of too
-/// few, all, and repetitions. No point at all gives none.
+/// `count` of the usable points, in random order (OpenPCDet: `sample_points`). If there are more, all far points and a
+/// random sample of the near ones; if there are fewer, all points and random repetitions. Without usable points the
+/// result is empty.
 fn choose(cloud: &Cloud, usable: &[usize], count: usize, far_m: f32, stream: &mut Stream) -> Vec<usize> {
     if usable.is_empty() {
         return Vec::new();
@@ -177,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn few_points_are_repeated_and_none_stay_none() {
+    fn few_points_are_repeated() {
         let many = chosen(100, 1);
         let times = |i: usize| many.iter().filter(|&&k| k == i).count();
         assert!(many.len() == 100 && (0..40).all(|i| (2..=3).contains(&times(i))));

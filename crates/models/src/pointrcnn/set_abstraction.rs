@@ -1,4 +1,4 @@
-//! Layers shared by all points of a group, and the maximum over it (Qi et al. 2017, PointNet).
+//! Shared layers over the points of a group, followed by the maximum over the group (Qi et al. 2017, PointNet).
 
 use crate::kernel_ops::MlpRows;
 use crate::layers::{Mode, RowsBnRelu, rows_kernel};
@@ -10,12 +10,13 @@ use std::sync::Arc;
 /// The layers of one grouping.
 #[derive(Module, Debug)]
 pub struct SharedMlp {
-    /// In order.
+    /// The layers, in order.
     pub layers: Vec<RowsBnRelu<4>>,
 }
 
 impl SharedMlp {
-    /// For points with `inputs` features beside their offsets; `layer` makes the layer of an index and its channels.
+    /// For points with `inputs` features in addition to their offsets; `layer` creates the layer of an index with given
+    /// channels.
     pub fn new(inputs: usize, filters: &[usize], layer: impl Fn(usize, [usize; 2]) -> RowsBnRelu<4>) -> Self {
         let mut from = 3 + inputs;
         let mut layers = Vec::new();
@@ -26,9 +27,10 @@ impl SharedMlp {
         SharedMlp { layers }
     }
 
-    /// Offsets and features of each neighbour through the layers, then the maximum over the group.
+    /// Applies the layers to offsets and features of each neighbour, then takes the maximum over the group.
     ///
-    /// The first layer's share of the features is computed before grouping: a point is the neighbour of many centres.
+    /// The first layer's product with the features is computed before grouping, because a point is the neighbour of
+    /// many centres.
     ///
     /// # Shapes
     /// `features`: `[P, C]`; result `[G, C']`.
@@ -43,7 +45,7 @@ impl SharedMlp {
             .unwrap_or_else(|| self.forward_on_device(projected, &groups.to_device(device), mode))
     }
 
-    /// The same by burn's operations, behind the first layer's share of the features.
+    /// The same with burn's operations, after the first layer's product with the features.
     fn forward_on_device(&self, projected: Option<Tensor<2>>, groups: &GroupTensors, mode: Mode) -> Tensor<2> {
         let (first, rest) = (&self.layers[0], &self.layers[1..]);
         let mut y = first.project(groups.offset.clone(), 0); // [N, C]

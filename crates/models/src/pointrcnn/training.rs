@@ -12,10 +12,10 @@ use burn::tensor::Tensor;
 use data::stream;
 use rayon::prelude::*;
 
-/// Weighted losses of a batch. Frames without points teach nothing and are left out; a batch of such frames has losses of 0.
+/// Weighted losses of a batch. Frames without points are skipped; a batch of such frames has losses of 0.
 ///
 /// # Panics
-/// When a sample was prepared without targets.
+/// If a sample was prepared without targets.
 ///
 /// # Errors
 /// Tensors that are not f32.
@@ -28,7 +28,7 @@ pub fn losses(
     let batch: Vec<&Sample> = batch.iter().copied().filter(|s| !s.points.is_empty()).collect();
     let names = ["point_cls", "point_box", "rcnn_cls", "rcnn_reg", "rcnn_corner"];
     if batch.is_empty() {
-        // Tied to a weight, so that there is a graph to walk back.
+        // Depends on a weight, so that there is an autodiff graph.
         let nothing = network.point_head.cls_layers.last.bias.val().sum() * 0.0;
         let parts = names.map(|name| (name, nothing.clone())).to_vec();
         return Ok(Losses { total: nothing, parts });
