@@ -8,7 +8,7 @@ use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, KittiLine, write_atomic, write_json};
 use detectors::gain_of_detectors;
-use diagnose::{DetectorGain, Diagnosis, Options, SensorRig, Stage, Verdict, diagnose, diagnose_scans, extended_toml};
+use diagnose::{DetectorGain, Diagnosis, Options, Rig, Stage, Verdict, diagnose, diagnose_scans, extended_toml};
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{finding_name, write_finding_pictures};
 use simulate::race::RaceConfig;
@@ -92,10 +92,7 @@ impl DiagnoseArgs {
         };
         bar.finish_and_clear();
         self.write_json(&outcome.diagnosis)?;
-        write_atomic(
-            &self.out.join("extended.toml"),
-            extended_toml(&outcome.diagnosis, &rig, &outcome.rows_deg).as_bytes(),
-        )?;
+        write_atomic(&self.out.join("extended.toml"), extended_toml(&outcome.diagnosis).as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {
             write_labels(&self.out, &measured, id, boxes)?;
@@ -125,15 +122,15 @@ impl DiagnoseArgs {
         Ok(())
     }
 
-    fn rig(&self) -> Result<SensorRig> {
+    fn rig(&self) -> Result<Rig> {
         match (&self.sensor, &self.simulator) {
-            (Some(path), _) => Ok(SensorRig::read(path)?),
+            (Some(path), _) => Ok(Rig::read(path)?),
             (None, Some(config)) => {
                 let (race, files) = RaceConfig::find(config).with_context(|| format!("--simulator {config}"))?;
                 let (text, path) = files.text(&race.rig)?;
-                Ok(SensorRig::parse(&text, &path)?)
+                Ok(Rig::parse(&text, &path)?)
             }
-            (None, None) => Ok(SensorRig::single()),
+            (None, None) => Ok(Rig::single()),
         }
     }
 }

@@ -4,8 +4,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use data::Dataset;
 use indicatif::{ProgressBar, ProgressStyle};
-use simulate::Rig;
-use simulate::effects::EffectList;
+use sensor::{EffectList, Rig};
 use simulate::resim::Resim;
 use std::path::PathBuf;
 
@@ -16,7 +15,7 @@ use std::path::PathBuf;
 ///
 /// Examples:
 ///   lidarshift resim --effects configs/simulate/sim_noise.toml datasets/race/sim --out datasets/noisy
-///   lidarshift resim --effects my-effects.toml --rig configs/sensors/hdl64e.toml --seed 3 /data/kitti --out datasets/kitti-rain
+///   lidarshift resim --effects my-effects.toml --sensor configs/sensors/hdl64e.toml --seed 3 /data/kitti --out datasets/kitti-rain
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct ResimArgs {
@@ -30,8 +29,8 @@ pub struct ResimArgs {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     /// TOML of the sensors [default: those of the data set's TOML, or one at the origin of the clouds]
-    #[arg(long, value_name = "TOML")]
-    rig: Option<PathBuf>,
+    #[arg(long, alias = "rig", value_name = "TOML")]
+    sensor: Option<PathBuf>,
     /// Another seed gives other noise
     #[arg(long, value_name = "K", default_value_t = 0)]
     seed: u64,
@@ -43,7 +42,7 @@ impl ResimArgs {
     pub fn run(self) -> Result<()> {
         let dataset = Dataset::open(&self.dataset)?;
         let effects = EffectList::read(&self.effects)?;
-        let rig = self.rig.as_deref().map(Rig::read).transpose()?;
+        let rig = self.sensor.as_deref().map(Rig::read).transpose()?;
         let progress = ProgressBar::new(0)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
         let resim = Resim { dataset: &dataset, effects: &effects, rig, seed: self.seed };
@@ -75,7 +74,7 @@ mod tests {
             dataset: street.clone(),
             effects: effects.clone(),
             out: folder.path().join(out),
-            rig: None,
+            sensor: None,
             seed: 1,
         };
         std::fs::write(&effects, "[[effect]]\nkind = \"range_noise\"\n").unwrap();

@@ -1,5 +1,6 @@
 //! What a data set's TOML may say, and what holds where it says nothing.
 
+use crate::toml_text::{parse_toml, read_text};
 use crate::{DataError, LabelFrame, PointColumns};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -113,16 +114,12 @@ impl Default for DatasetConfig {
 impl DatasetConfig {
     /// Reads a data set's TOML; `root` and `rig` are then relative to the working folder and every default is filled in but the classes.
     pub fn read(path: &Path) -> Result<Self, DataError> {
-        let bytes = fs_err::read(path)?;
-        Self::parse(std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not text"))?, path)
+        Self::parse(&read_text(path)?, path)
     }
 
     /// A data set's TOML in memory; `path` is where it lies, for messages, `root` and `rig`.
     pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
-        let mut config: DatasetConfig = toml::from_str(text).map_err(|e| {
-            let line = 1 + e.span().map_or(0, |span| text[..span.start.min(text.len())].matches('\n').count());
-            DataError::line(path, line, e.message())
-        })?;
+        let mut config: DatasetConfig = parse_toml(text, path, |_| Ok(()))?;
         let folder = path.parent().unwrap_or(Path::new(""));
         config.root = folder.join(&config.root);
         config.rig = config.rig.map(|rig| folder.join(rig));

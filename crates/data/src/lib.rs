@@ -17,6 +17,7 @@ mod pcd_columns;
 mod pcd_header;
 mod prefetch;
 mod stream;
+pub mod toml_text;
 pub mod write;
 
 pub use augment::{AugmentConfig, augment};
@@ -33,4 +34,5 @@ pub use pcd_columns::{PcdColumn, encode_pcd_columns, parse_pcd_columns, write_pc
 pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
 pub use prefetch::{Prefetch, prefetch};
 pub use stream::{Stream, stream};
+pub use toml_text::KeyError;
 pub use write::{write_atomic, write_json};

@@ -88,6 +88,9 @@ pub struct Finding {
     pub separate_by: Option<String>,
     /// The picture: what is measured along the covariate, before and after.
     pub curve: Curve,
+    /// What a simulation has to be given to show the same: the entries of `extended.toml`. Not in the file.
+    #[serde(skip)]
+    pub effects: Vec<sensor::Effect>,
 }
 
 /// Whether a finding has a name.

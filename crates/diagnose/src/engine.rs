@@ -3,18 +3,19 @@
 use crate::channels::mask::Shown;
 use crate::channels::returns;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     FramePair, Mending, ObjectPair, Ray, ShownShift, check_identity, common_ids, find_sensors, pair_all, with_points,
 };
-use crate::rig::SensorRig;
 use crate::search::labels::Side;
 use crate::search::shutter::Sliding;
 use crate::search::{self, ChannelResult, Context, REPETITIONS, by_block, draw_blocks, mean_interval};
 use data::Dataset;
 use geometry::Box3;
 use nalgebra::Vector3;
+use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// What to look at.
@@ -45,15 +46,13 @@ pub struct Outcome {
     pub diagnosis: Diagnosis,
     /// Boxes of the measured labels moved to where they belong, by frame id; empty where the labels are not at fault.
     pub corrected: Vec<(String, Vec<Box3>)>,
-    /// Elevations of the rows of every sensor, from the lowest, degrees; empty where none stand out.
-    pub rows_deg: Vec<Vec<f64>>,
 }
 
 /// Diagnoses a pair of data sets.
 pub fn diagnose(
     measured: &Dataset,
     simulated: &Dataset,
-    rig: &SensorRig,
+    rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
@@ -75,7 +74,7 @@ pub fn diagnose(
     progress(Stage::Comparing, 2, 2);
     if !identity.identical {
         notes.insert(0, identity.reason);
-        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![], rows_deg: vec![] });
+        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![] });
     }
     for id in &identity.strangers {
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
@@ -95,7 +94,7 @@ pub fn diagnose(
             frames.len()
         ));
         let diagnosis = Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) };
-        return Ok(Outcome { diagnosis, corrected: vec![], rows_deg: vec![] });
+        return Ok(Outcome { diagnosis, corrected: vec![] });
     }
     let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
@@ -189,9 +188,12 @@ pub fn diagnose(
         notes.push(note);
     }
     let corrected = corrected(&context, &results);
+    // From the lowest row; empty where none stand out.
     let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
-    let rows_deg = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
-    Ok(Outcome { diagnosis: write_up(&context, results, notes), corrected, rows_deg })
+    let rows_deg: Vec<Vec<f64>> = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
+    let mut diagnosis = write_up(&context, results, notes);
+    fill_effects(&mut diagnosis.findings, rig, &rows_deg);
+    Ok(Outcome { diagnosis, corrected })
 }
 
 /// Number of searches, for the progress that is shown.
@@ -342,6 +344,7 @@ fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) 
                 says: f.says,
                 separate_by: f.separate_by,
                 curve: f.curve,
+                effects: vec![],
             });
         }
     }

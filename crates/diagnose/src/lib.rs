@@ -3,14 +3,15 @@
 //! `pairing` brings two data sets together return by return, `channels` sums up what is looked at, `inference` weighs causes, `search`
 //! goes through the channels, `engine` is the whole way. Nothing here knows a simulator: clouds, labels and the places of the sensors do.
 
+mod angle;
 pub mod channels;
 pub mod diagnosis;
+mod effects;
 mod engine;
 mod error;
 mod extended;
 pub mod inference;
 pub mod pairing;
-mod rig;
 mod scans;
 pub mod search;
 
@@ -18,5 +19,5 @@ pub use diagnosis::{Curve, CurvePoint, DetectorGain, Diagnosis, Finding, Finding
 pub use engine::{Options, Outcome, Progress, Stage, diagnose};
 pub use error::DiagnoseError;
 pub use extended::extended_toml;
-pub use rig::{SensorMount, SensorRig, wrapped};
 pub use scans::diagnose_scans;
+pub use sensor::Rig;

@@ -1,8 +1,8 @@
 //! What is put on a simulated data set by `resim` is found again, and what is written as an extension mends it.
 
 use data::Dataset;
-use lidarshift_diagnose::{Diagnosis, Options, Outcome, SensorRig, Status, diagnose, extended_toml};
-use simulate::effects::EffectList;
+use lidarshift_diagnose::{Diagnosis, Options, Outcome, Rig, Status, diagnose, extended_toml};
+use sensor::EffectList;
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
 use std::path::Path;
@@ -26,9 +26,9 @@ fn with_effects(dataset: &Dataset, effects: &str, out: &Path, seed: u64) -> Data
     Dataset::open(out).unwrap()
 }
 
-fn diagnosed(measured: &Dataset, simulated: &Dataset, folder: &Path) -> (Outcome, SensorRig) {
-    let rig = SensorRig::read(&folder.join("rig.toml")).unwrap();
-    (diagnose(measured, simulated, &rig, &Options::default(), &|_, _, _| ()).unwrap(), rig)
+fn diagnosed(measured: &Dataset, simulated: &Dataset, folder: &Path) -> Outcome {
+    let rig = Rig::read(&folder.join("rig.toml")).unwrap();
+    diagnose(measured, simulated, &rig, &Options::default(), &|_, _, _| ()).unwrap()
 }
 
 fn named(d: &Diagnosis) -> Vec<&str> {
@@ -45,7 +45,7 @@ fn the_papers_two_causes_are_found_and_mended() {
     let causes =
         "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.02\n[[effect]]\nkind = \"random_dropout\"\nshare = 0.2\n";
     let measured = with_effects(&sim, causes, &folder.path().join("measured"), 11);
-    let (outcome, rig) = diagnosed(&measured, &sim, folder.path());
+    let outcome = diagnosed(&measured, &sim, folder.path());
     let d = &outcome.diagnosis;
     assert_eq!(named(d), ["random_dropout", "range_noise"], "{:?}", d.findings);
     for (cause, name, truth) in [("range_noise", "std_m", 0.02), ("random_dropout", "share", 0.2)] {
@@ -55,9 +55,9 @@ fn the_papers_two_causes_are_found_and_mended() {
     }
     assert!(d.gain.closed.unwrap() > 0.9, "{:?}", d.gain);
     // The extended simulation leaves nothing to be found.
-    let extended = extended_toml(d, &rig, &outcome.rows_deg);
+    let extended = extended_toml(d);
     let again = with_effects(&sim, &extended, &folder.path().join("extended"), 12);
-    let (outcome, _) = diagnosed(&measured, &again, folder.path());
+    let outcome = diagnosed(&measured, &again, folder.path());
     assert!(outcome.diagnosis.findings.is_empty(), "{:?}", outcome.diagnosis.findings);
 }
 
@@ -70,16 +70,16 @@ fn what_has_no_name_is_mended_by_a_table() {
                    at = [-61.0, -45.0, -44.0, -20.0, -19.0, 5.0, 6.0, 30.0, 31.0, 61.0]\n\
                    loss = [0.0, 0.0, 0.4, 0.4, 0.0, 0.0, 0.4, 0.4, 0.0, 0.0]\n";
     let measured = with_effects(&sim, stripes, &folder.path().join("measured"), 11);
-    let (outcome, rig) = diagnosed(&measured, &sim, folder.path());
+    let outcome = diagnosed(&measured, &sim, folder.path());
     let d = &outcome.diagnosis;
     // The mean of the stripes may be called a random loss; what is left over the azimuth has no name.
     let unnamed = d.findings.iter().find(|f| f.status == Status::Unexplained).unwrap();
     assert_eq!((unnamed.channel.as_str(), unnamed.covariate.as_str()), ("hits", "azimuth"), "{:?}", d.findings);
     assert!(unnamed.gain.ci95[0] > 0.0 && d.findings.iter().all(|f| f.channel == "hits"), "{:?}", d.findings);
     let found: f64 = d.findings.iter().map(|f| f.gain.nats_per_ray).sum();
-    let extended = extended_toml(d, &rig, &outcome.rows_deg);
+    let extended = extended_toml(d);
     let again = with_effects(&sim, &extended, &folder.path().join("extended"), 12);
-    let (outcome, _) = diagnosed(&measured, &again, folder.path());
+    let outcome = diagnosed(&measured, &again, folder.path());
     let left: f64 = outcome.diagnosis.findings.iter().map(|f| f.gain.nats_per_ray).sum();
     assert!(left < 0.1 * found, "{left} of {found}");
 }

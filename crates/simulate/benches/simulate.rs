@@ -1,8 +1,8 @@
 //! A scan of the race: rays alone, a frame of `sim`, a frame of `measured`.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use lidarshift_simulate::beams::Beams;
 use lidarshift_simulate::race::{ConfigFiles, RaceConfig, Simulator};
+use sensor::beams::Beams;
 use std::hint::black_box;
 
 fn frames(criterion: &mut Criterion) {

@@ -11,13 +11,13 @@
 
 #![expect(clippy::print_stdout, reason = "it is what it is for")]
 
-use lidarshift_simulate::beams::Beams;
 use lidarshift_simulate::mesh::Mesh;
 use lidarshift_simulate::race::{ConfigFiles, RaceConfig, Simulator};
 use lidarshift_simulate::race_car::race_car;
 use lidarshift_simulate::raycast::{Hit, Instance, InstructionSet, Ray, Scene, Tree};
-use lidarshift_simulate::track::Group;
 use rayon::prelude::*;
+use sensor::beams::Beams;
+use sensor::object::Group;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;

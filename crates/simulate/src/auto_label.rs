@@ -1,15 +1,15 @@
 //! Labels as they are made on the road: recorded positions of all cars, brought to the time of the cloud, as boxes in the own car's frame,
 //! shifted to where the points are (Huch et al. 2023, section III-A).
 
-use crate::SimulateError;
-use crate::error::within;
-use crate::race_car::car_box;
 use crate::scenario::{CarState, Trajectory};
+use data::KeyError;
+use data::toml_text::within;
 use data::{Cloud, stream};
 use geometry::{Box3, move_box, points_in_boxes};
 use nalgebra::Vector3;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
+use sensor::car::car_box;
 use serde::{Deserialize, Serialize};
 
 /// How positions are recorded and labels made of them.
@@ -44,7 +44,7 @@ impl Default for AutoLabel {
 }
 
 impl AutoLabel {
-    pub(crate) fn check(&self) -> Result<(), SimulateError> {
+    pub(crate) fn check(&self) -> Result<(), KeyError> {
         within("rate_hz", self.rate_hz, 2.0, 1000.0)?;
         within("phase_s", self.phase_s, 0.0, 1.0 / self.rate_hz)?;
         within("position_std_m", self.position_std_m, 0.0, 10.0)?;
@@ -199,11 +199,12 @@ pub fn label_errors(pairs: impl Iterator<Item = (Box3, Box3)>) -> Vec<LabelError
 mod tests {
     use super::*;
     use crate::frame_scene::FrameScene;
-    use crate::mesh::{MaterialTable, cuboid};
+    use crate::mesh::cuboid;
     use crate::race_car::race_car;
-    use crate::rig::{Pattern, Rig, RowBlock};
     use crate::scenario::Motion;
     use crate::world::{CarShape, World};
+    use sensor::material::MaterialTable;
+    use sensor::rig::{Pattern, Rig, RowBlock};
     use std::path::Path;
 
     fn straight(x: f64, y: f64, speed: f64) -> Trajectory {
@@ -259,7 +260,7 @@ mod tests {
         let mut rig = Rig::parse("[[sensor]]\nname = \"a\"\nposition = [0, 0, 0.6]\n", Path::new("r.toml")).unwrap();
         rig.sensors[0].pattern =
             Some(Pattern::grid(RowBlock { rows: 64, top_deg: 5.0, bottom_deg: -19.0 }, 1440, 360.0, 20.0));
-        let cloud = scene.scan(&crate::beams::Beams::of(&rig)).cloud();
+        let cloud = scene.scan(&sensor::beams::Beams::of(&rig)).cloud();
         (cloud, move_box(&geometry::upright_pose([x, y, 0.0], yaw), &car_box()))
     }
 

@@ -1,14 +1,15 @@
 //! One moment of the race as rays see it: the static world, the cars where they are, and the car that carries the sensors.
 
-use crate::beams::{BeamWidth, Beams, Pick, SensorBeams};
-use crate::mesh::{MaterialId, MaterialTable};
 use crate::raycast::{Hit, Instance, Ray, Scene};
-use crate::scan::{Echo, Scan, dot};
 use crate::scenario::Motion;
-use crate::track::FIRST_CAR;
 use crate::world::{CarShape, World};
 use geometry::Pose;
 use nalgebra::{Matrix3, Point3, UnitQuaternion, Vector3};
+use sensor::beams::{BeamWidth, Beams, Pick, SensorBeams};
+use sensor::material::{MaterialId, MaterialTable};
+use sensor::object::FIRST_CAR;
+use sensor::scan::{Echo, Scan, dot};
+use sensor::{RayCaster, Surface};
 
 /// The scene of one cloud.
 pub struct FrameScene<'a> {
@@ -17,21 +18,6 @@ pub struct FrameScene<'a> {
     materials: &'a MaterialTable,
     scene: Scene,
     ego: Motion,
-}
-
-/// What a ray meets.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Surface {
-    /// Distance, m; infinite when there is nothing.
-    pub range_m: f32,
-    /// Unit normal towards the ray's origin, cloud's frame.
-    pub normal: [f32; 3],
-    /// Cosine of the angle of incidence.
-    pub cos_incidence: f32,
-    /// What it is made of.
-    pub material: MaterialId,
-    /// What it is: a group of the track, or [`FIRST_CAR`] and more for a car; 0 for nothing.
-    pub object: u16,
 }
 
 impl<'a> FrameScene<'a> {
@@ -62,25 +48,6 @@ impl<'a> FrameScene<'a> {
     /// `world_from_cloud` at the middle of the scan.
     pub fn world_from_cloud(&self) -> Pose {
         self.ego.pose
-    }
-
-    /// What rays of the cloud's frame meet at the middle of the scan. Origins in m, directions of length 1.
-    pub fn cast(&self, rays: &[([f32; 3], [f32; 3])]) -> Vec<Surface> {
-        let sight = Sight::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
-        let world: Vec<Ray> = rays
-            .iter()
-            .map(|(origin, direction)| {
-                let offset = sight.rotation * Vector3::from(*origin);
-                let mut ray = sight.ray(*direction, 0.0);
-                (0..3).for_each(|k| ray.origin[k] += offset[k]);
-                ray
-            })
-            .collect();
-        let mut hits = vec![Hit::MISS; rays.len()];
-        if !rays.is_empty() {
-            self.scene.cast(&world, rays.len(), &mut hits);
-        }
-        hits.iter().zip(&world).map(|(hit, ray)| self.surface(hit, ray)).collect()
     }
 
     /// The scan of these shots.
@@ -156,9 +123,9 @@ impl<'a> FrameScene<'a> {
         seconds: &mut Vec<Echo>,
     ) {
         let bundle = bundle(width);
-        let ray = |(shot, direction): (&crate::rig::Shot, &[f32; 3])| {
+        let ray = |(shot, direction): (&sensor::rig::Shot, &[f32; 3])| {
             let (direction, time_s) = (*direction, shot.time_s as f32);
-            bundle.iter().map(move |(left, up, _)| sight.ray(crate::beams::turned(direction, *left, *up), time_s))
+            bundle.iter().map(move |(left, up, _)| sight.ray(sensor::beams::turned(direction, *left, *up), time_s))
         };
         let rays: Vec<Ray> = sensor.shots.iter().zip(sensor.directions()).flat_map(ray).collect();
         let mut hits = vec![Hit::MISS; rays.len()];
@@ -226,6 +193,26 @@ impl<'a> FrameScene<'a> {
             material,
             object,
         }
+    }
+}
+
+impl RayCaster for FrameScene<'_> {
+    fn cast(&self, rays: &[([f32; 3], [f32; 3])]) -> Vec<Surface> {
+        let sight = Sight::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
+        let world: Vec<Ray> = rays
+            .iter()
+            .map(|(origin, direction)| {
+                let offset = sight.rotation * Vector3::from(*origin);
+                let mut ray = sight.ray(*direction, 0.0);
+                (0..3).for_each(|k| ray.origin[k] += offset[k]);
+                ray
+            })
+            .collect();
+        let mut hits = vec![Hit::MISS; rays.len()];
+        if !rays.is_empty() {
+            self.scene.cast(&world, rays.len(), &mut hits);
+        }
+        hits.iter().zip(&world).map(|(hit, ray)| self.surface(hit, ray)).collect()
     }
 }
 

@@ -3,25 +3,14 @@
 //! Everything is in the car's frame, which is also the frame of its clouds: origin at the middle of the rear axle, 0.198 m above the
 //! ground (the frame of the published sensor mounts), x forward, y left, z up, m.
 
-use crate::mesh::{MaterialId, MaterialTable, Mesh, cuboid, cylinder, loft};
-use geometry::Box3;
+use crate::mesh::{Mesh, cuboid, cylinder, loft};
+use sensor::car::{CAR_SIZE_M, ORIGIN_ABOVE_GROUND_M, REAR_M};
+use sensor::material::{MaterialId, MaterialTable};
 
-/// Length, width, height, m (Huch et al. 2023, section III-C).
-pub const CAR_SIZE_M: [f64; 3] = [4.88, 1.90, 1.18];
-/// Height of the car's frame above the ground, m (RACECAR's description of the car, `av21.urdf`).
-pub const ORIGIN_ABOVE_GROUND_M: f64 = 0.198;
 /// Distance between the axles, m (Dallara IL-15, on which the AV-21 is built).
 const WHEELBASE_M: f64 = 2.97;
-/// The rearmost point, at the rear wing, m.
-const REAR_M: f64 = -0.84;
 const WHEEL_RADIUS_M: f64 = 0.33;
 const GROUND_M: f64 = -ORIGIN_ABOVE_GROUND_M;
-
-/// The car's box in its own frame, upright.
-pub fn car_box() -> Box3 {
-    let [length, _, height] = CAR_SIZE_M;
-    Box3 { center: [REAR_M + length / 2.0, 0.0, GROUND_M + height / 2.0], size: CAR_SIZE_M, yaw_rad: 0.0 }
-}
 
 /// A cross-section of the body: place along the car, half width, lowest and highest z, and how square it is (2 an ellipse, larger squarer).
 struct Section(f64, f64, f64, f64, f64);
@@ -133,6 +122,7 @@ fn wheel(x: f64, side: f64, width: f64) -> Mesh {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use sensor::car::car_box;
 
     #[test]
     fn it_fills_its_box() {

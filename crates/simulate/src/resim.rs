@@ -1,20 +1,20 @@
 //! The sensor model on data sets that are finished, of this simulator or any other.
 
 use crate::SimulateError;
-use crate::attributes;
-use crate::cloud_scan::scan_of_cloud;
-use crate::effects::{EffectList, FrameContext, LabelledCar, Need};
-use crate::error::wrong;
-use crate::mesh::MaterialTable;
-use crate::rig::Rig;
-use crate::scan::Scan;
 use crate::scenario::FRAME_S;
+use data::toml_text::wrong;
 use data::write::{label_lines, write_bin, write_dataset_toml, write_kitti_text, write_pcd, write_split};
 use data::{
     DataError, Dataset, DatasetConfig, Frame, KittiLine, LabelFrame, Layout, PcdEncoding, PointColumns, write_atomic,
     write_json,
 };
 use rayon::prelude::*;
+use sensor::attributes;
+use sensor::cloud_scan::scan_of_cloud;
+use sensor::effects::{EffectList, FrameContext, LabelledCar, Need};
+use sensor::material::MaterialTable;
+use sensor::rig::Rig;
+use sensor::scan::Scan;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
@@ -69,7 +69,7 @@ impl Resim<'_> {
         let described = attributes::path(&source.root, &ids[0]).is_file();
         let materials = if described { attributes::read_materials(&source.root)? } else { MaterialTable::default() };
         if let Some((i, why)) = self.refusals(&known_of(self.dataset, &rig, &ids[0], described)?).into_iter().next() {
-            return Err(wrong(format!("effect[{i}]"), why));
+            return Err(wrong(format!("effect[{i}]"), why).into());
         }
 
         let mut manifest = ResimManifest {

@@ -1,8 +1,8 @@
 //! A configuration of `simulate` by its name or its file, whatever it describes.
 
-use crate::error::wrong;
 use crate::race::{ConfigFiles, RaceConfig};
 use crate::{FrameCounts, RoadConfig, SimulateError};
+use data::toml_text::wrong;
 use std::path::Path;
 
 /// What a configuration describes.

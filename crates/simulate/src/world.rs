@@ -1,7 +1,8 @@
 //! The static world and the shape of the cars, ready for rays, with what each triangle is made of.
 
-use crate::mesh::{Face, MaterialId, Mesh};
+use crate::mesh::{Face, Mesh};
 use crate::raycast::Tree;
+use sensor::material::MaterialId;
 use std::sync::Arc;
 
 /// Everything that stands still.

@@ -231,10 +231,7 @@ impl StudyConfig {
     /// # Errors
     /// As [`StudyConfig::read`].
     pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
-        let mut study: StudyConfig = toml::from_str(text).map_err(|e| {
-            let line = e.span().map_or(1, |span| 1 + text[..span.start].matches('\n').count());
-            DataError::line(path, line, e.message().to_string())
-        })?;
+        let mut study: StudyConfig = data::toml_text::parse_toml(text, path, |_| Ok(()))?;
         for (name, title) in study.datasets.iter_mut().map(|d| (&d.name, &mut d.title)) {
             if title.is_empty() {
                 title.clone_from(name);

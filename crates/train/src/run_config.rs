@@ -1,6 +1,7 @@
 //! The configuration of a run, `config.toml` in its folder: all that the weights depend on.
 
 use crate::TrainError;
+use data::toml_text::{message_with_key, read_toml};
 use models::config::DetectorConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -67,7 +68,8 @@ impl RunConfig {
     /// # Errors
     /// An unknown key, a wrong type, or values that do not fit together; the message names the key.
     pub fn from_table(table: Table) -> Result<Self, TrainError> {
-        let config: RunConfig = table.try_into().map_err(|e: toml::de::Error| TrainError::Config(one_line(&e)))?;
+        let config: RunConfig =
+            table.try_into().map_err(|e: toml::de::Error| TrainError::Config(message_with_key(&e)))?;
         config.detector.check().map_err(TrainError::Config)?;
         config
             .detector
@@ -87,10 +89,7 @@ impl RunConfig {
     /// # Errors
     /// A file that cannot be read, or what [`RunConfig::from_table`] refuses.
     pub fn read(path: &Path) -> Result<Self, TrainError> {
-        let text = fs_err::read_to_string(path)?;
-        let table: Table =
-            text.parse().map_err(|e: toml::de::Error| TrainError::folder(path, e.to_string().trim_end()))?;
-        Self::from_table(table).map_err(|e| TrainError::folder(path, e.to_string()))
+        Self::from_table(read_toml(path, |_| Ok(()))?).map_err(|e| TrainError::folder(path, e.to_string()))
     }
 
     /// As TOML with all defaults.
@@ -160,11 +159,6 @@ fn compare(path: &str, ours: &Value, theirs: &Value, found: &mut Vec<String>) {
     } else if ours != theirs {
         found.push(format!("{path} is {ours}, not {theirs}"));
     }
-}
-
-/// The message with the key that it speaks of.
-fn one_line(error: &toml::de::Error) -> String {
-    error.to_string().trim().replace('\n', " ")
 }
 
 pub(crate) fn hex(bytes: &[u8]) -> String {

@@ -7,7 +7,7 @@
 //! `--keep` leaves the drawn pairs in a folder and takes from there what is drawn already; `--draw-only` draws and diagnoses nothing.
 
 use data::Dataset;
-use diagnose::{Options, SensorRig, diagnose};
+use diagnose::{Options, Rig, diagnose};
 use lidarshift_blind::score::{Outcome, score, summarise};
 use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, Truth, draw_case, write_case};
 use rand::RngExt;
@@ -94,7 +94,7 @@ fn draw(seed: u64, arguments: &Arguments, folder: &Path) -> Truth {
 fn run(truth: &Truth, folder: &Path) -> (Outcome, serde_json::Value) {
     let begin = Instant::now();
     let open = |side: &str| Dataset::open(&folder.join(side)).expect("a data set");
-    let rig = SensorRig::read(&folder.join("sensor.toml")).expect("a rig");
+    let rig = Rig::read(&folder.join("sensor.toml")).expect("a rig");
     let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
     let value = match found {
         Ok(o) => serde_json::to_value(&o.diagnosis).expect("JSON"),

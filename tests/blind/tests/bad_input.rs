@@ -1,7 +1,7 @@
 //! Pairs that cannot be diagnosed as they are: an answer that says what cannot be known, or an error that says what to do; never a panic.
 
 use data::Dataset;
-use diagnose::{Diagnosis, Options, SensorRig, Verdict, diagnose};
+use diagnose::{Diagnosis, Options, Rig, Verdict, diagnose};
 use lidarshift_blind::{CaseSize, Kind, draw_case, write_case};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
@@ -48,7 +48,7 @@ impl Pair {
 
     fn diagnosis(&self) -> Result<Diagnosis, String> {
         let open = |side: &str| Dataset::open(&self.path(side)).unwrap();
-        let rig = SensorRig::read(&self.path("sensor.toml")).unwrap();
+        let rig = Rig::read(&self.path("sensor.toml")).unwrap();
         let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
         let diagnosis = found.map_err(|e| e.to_string())?.diagnosis;
         // What is said can be written and read: all its numbers are numbers.

@@ -3,7 +3,7 @@
 //! A few cases of the large set, `cargo xtask bench blind`: what a change of the diagnosis must not lose.
 
 use data::Dataset;
-use diagnose::{Options, SensorRig, diagnose};
+use diagnose::{Options, Rig, diagnose};
 use lidarshift_blind::score::{Outcome, score};
 use lidarshift_blind::{CAUSES, CaseSize, Kind, draw_case, write_case};
 use rayon::prelude::*;
@@ -12,7 +12,7 @@ fn outcome(seed: u64, kind: Kind) -> Outcome {
     let folder = tempfile::tempdir().unwrap();
     let truth = write_case(&draw_case(seed, kind, CaseSize::USUAL), folder.path()).unwrap();
     let open = |side: &str| Dataset::open(&folder.path().join(side)).unwrap();
-    let rig = SensorRig::read(&folder.path().join("sensor.toml")).unwrap();
+    let rig = Rig::read(&folder.path().join("sensor.toml")).unwrap();
     let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ()).unwrap();
     score(&truth, &serde_json::to_value(&found.diagnosis).unwrap(), 0.0)
 }

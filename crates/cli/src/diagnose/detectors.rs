@@ -6,7 +6,7 @@ use anyhow::{Context, Result, bail};
 use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
-use simulate::effects::EffectList;
+use sensor::EffectList;
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
 use study::numbers::{Found, matrix};

@@ -3,9 +3,9 @@
 
 use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
 use crate::pairing::{FramePair, Ray};
-use crate::rig::SensorRig;
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
+use sensor::Rig;
 
 /// What makes rays a group.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -114,7 +114,7 @@ pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -
 /// Sums of all frames. `structure` is what each kind of surface is off by, m.
 pub fn group_frames(
     frames: &[FramePair],
-    rig: &SensorRig,
+    rig: &Rig,
     poses: &[OwnPoses],
     structure: [f64; KINDS],
     grouping: Grouping,

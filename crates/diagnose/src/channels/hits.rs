@@ -4,8 +4,8 @@ use super::cells::{CELLS, Place, cell};
 use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use super::mask::Mask;
 use crate::pairing::FramePair;
-use crate::rig::SensorRig;
 use rayon::prelude::*;
+use sensor::Rig;
 
 /// Counts of one cell of one frame.
 #[derive(Clone, Copy, Debug, Default)]
@@ -67,7 +67,7 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a HitFrame>) -> Vec<HitCell> {
 /// Shares of returns that groups of directions lose beyond what `kept` tells of each cell, as sums of every frame.
 pub fn loss_groups(
     frames: &[FramePair],
-    rig: &SensorRig,
+    rig: &Rig,
     mask: &Mask,
     grouping: Grouping,
     kept: &(dyn Fn(usize) -> f64 + Sync),

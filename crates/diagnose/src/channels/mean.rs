@@ -5,9 +5,9 @@
 
 use crate::inference::median;
 use crate::pairing::{FramePair, Ray, Surface, met_squarely};
-use crate::rig::{SensorMount, SensorRig};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
 use rayon::prelude::*;
+use sensor::{Rig, Sensor};
 
 /// A linear cause: one column of the fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,7 +30,7 @@ pub enum Column {
 pub const OWN: usize = 9;
 
 /// All columns for a rig, those of the frames' own first.
-pub fn columns(rig: &SensorRig) -> Vec<Column> {
+pub fn columns(rig: &Rig) -> Vec<Column> {
     let mut all: Vec<Column> = (0..6).map(Column::Pose).collect();
     all.extend((0..3).map(Column::Sweep));
     all.extend([Column::RangeOffset, Column::RangeScale]);
@@ -203,7 +203,7 @@ pub struct Levers {
 
 impl Levers {
     /// Of a measured ray of a sensor at `origin`.
-    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &SensorMount) -> Self {
+    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &Sensor) -> Self {
         Levers {
             sensor: ray.sensor as usize,
             kind: kind_of(ray),
@@ -232,7 +232,7 @@ impl Levers {
 /// Sums of all frames.
 pub fn mean_frames(
     frames: &[FramePair],
-    rig: &SensorRig,
+    rig: &Rig,
     columns: &[Column],
     poses: &[OwnPoses],
     noise_m: f64,
@@ -272,7 +272,7 @@ pub fn mean_frames(
 }
 
 /// Origins of the sensors in the cloud's frame.
-pub fn origins(rig: &SensorRig) -> Vec<Point3<f64>> {
+pub fn origins(rig: &Rig) -> Vec<Point3<f64>> {
     rig.sensors.iter().map(|s| Point3::from(Vector3::from(s.position))).collect()
 }
 

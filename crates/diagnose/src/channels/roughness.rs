@@ -4,8 +4,8 @@
 use super::cells::{CELLS, Place, cell};
 use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use crate::pairing::{FramePair, Ray, Surface};
-use crate::rig::SensorRig;
 use rayon::prelude::*;
+use sensor::Rig;
 
 /// Sums of one cell of one frame.
 #[derive(Clone, Copy, Debug, Default)]
@@ -133,7 +133,7 @@ pub fn total<'a>(frames: impl Iterator<Item = &'a RoughFrame>) -> Vec<RoughCell>
 /// of every frame. `variances` gives the two sides' variances of a cell, `expected` the measured one in units of the simulated one.
 pub fn rough_groups(
     frames: &[FramePair],
-    rig: &SensorRig,
+    rig: &Rig,
     scales: &[f64],
     grouping: Grouping,
     variances: &(dyn Fn(usize) -> Option<[f64; 2]> + Sync),

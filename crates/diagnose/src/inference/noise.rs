@@ -4,6 +4,7 @@ use super::linear::LinearFrame;
 use crate::channels::cells::CELLS;
 use crate::channels::roughness::{RoughCell, RoughFrame};
 use nalgebra::{DMatrix, DVector};
+use sensor::signal::{DIAGNOSIS_REFLECTIVITY, signal_index};
 
 /// A law of added variance; each is one column.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -61,7 +62,9 @@ impl NoiseLaw {
         match self {
             NoiseLaw::Constant => 1.0,
             NoiseLaw::Growing(g) => (1.0 + g * range_m).powi(2),
-            NoiseLaw::Signal(gamma) => (-gamma * (cos.ln() + 2.0 * (250.0 / range_m).ln() - USUAL_SIGNAL)).exp(),
+            NoiseLaw::Signal(gamma) => {
+                (-gamma * (signal_index(DIAGNOSIS_REFLECTIVITY, cos, range_m) - USUAL_SIGNAL)).exp()
+            }
             NoiseLaw::Angular => {
                 let lever = range_m * (1.0 / (cos * cos) - 1.0).max(0.0).sqrt();
                 lever.min(LONGEST_LEVER_M).powi(2)

@@ -8,10 +8,10 @@ use super::ray::{Ray, Surface};
 use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
 use super::sight::Sight;
 use super::surface::fit_surface;
-use crate::rig::SensorRig;
 use data::{Cloud, Object};
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
+use sensor::Rig;
 
 /// One frame of both sides.
 #[derive(Clone, Debug)]
@@ -46,7 +46,7 @@ pub struct ObjectPair {
 /// What is known of the sensors before any frame is looked at.
 pub struct Sensors {
     /// Mounts.
-    pub rig: SensorRig,
+    pub rig: Rig,
     /// Scan pattern of each.
     pub patterns: Vec<ScanPattern>,
     /// Farther than that across a plane a neighbour belongs to something else, m.
@@ -299,7 +299,7 @@ mod tests {
         let (rows, step) = ([-0.06f32, -0.04, -0.02, 0.0], 0.01f32);
         let steps = Steps { azimuth_rad: step, elevation_rad: 0.02 };
         let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
-        let sensors = Sensors { rig: SensorRig::single(), patterns: vec![pattern], edge_m: 0.1 };
+        let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.1 };
         let scan_up_to = |columns: usize| {
             let shots: Vec<_> = rows.iter().flat_map(|el| (0..columns).map(move |k| (k as f32 * step, *el))).collect();
             SensorScan {

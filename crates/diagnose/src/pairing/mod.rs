@@ -22,10 +22,10 @@ pub use scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
 pub use surface::{LocalSurface, fit_surface};
 
 use crate::error::DiagnoseError;
-use crate::rig::SensorRig;
 use data::{Cloud, Dataset, Object};
 use rand::RngExt;
 use rayon::prelude::*;
+use sensor::Rig;
 use std::collections::BTreeSet;
 use std::io::Read;
 use std::path::Path;
@@ -121,7 +121,7 @@ pub fn find_sensors(
     measured: &Dataset,
     simulated: &Dataset,
     ids: &[String],
-    rig: &SensorRig,
+    rig: &Rig,
 ) -> Result<Sensors, DiagnoseError> {
     let step = ids.len().div_ceil(PATTERN_FRAMES).max(1);
     let some: Vec<&String> = ids.iter().step_by(step).collect();

@@ -1,6 +1,7 @@
 //! One return with everything that is known of it.
 
 use nalgebra::{Point3, Vector3};
+use sensor::signal::{DIAGNOSIS_REFLECTIVITY, signal_index};
 
 /// What a ray meets in the simulation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -132,8 +133,8 @@ impl Ray {
         }
     }
 
-    /// ln(0.1 cos / R^2) - ln(0.1 / 250^2): 0 for a surface at 250 m met squarely.
+    /// The signal index of the predicted surface, at the reflectivity that the diagnosis assumes.
     pub fn signal(&self) -> f64 {
-        f64::from(self.cos_incidence.max(1e-4)).ln() + 2.0 * (250.0 / f64::from(self.range_m.max(0.1))).ln()
+        signal_index(DIAGNOSIS_REFLECTIVITY, self.cos_incidence.max(1e-4).into(), self.range_m.max(0.1).into())
     }
 }

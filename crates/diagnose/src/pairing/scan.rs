@@ -1,8 +1,9 @@
 //! The points of one sensor by direction, and an index to find the neighbours of a direction.
 
-use crate::rig::{SensorMount, SensorRig};
 use data::Cloud;
 use nalgebra::Point3;
+use sensor::assignment::{Assigned, Assignment};
+use sensor::{Rig, Sensor};
 use std::f64::consts::TAU;
 
 /// The returns of one sensor in one frame, in its own frame.
@@ -27,7 +28,7 @@ impl SensorScan {
         for i in 0..self.len() {
             let [az, el, range] = [self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]].map(f64::from);
             let p = Point3::new(range * el.cos() * az.cos(), range * el.cos() * az.sin(), range * el.sin());
-            let [az, el, range] = SensorMount::spherical(&moved(&p)).map(|v| v as f32);
+            let [az, el, range] = Sensor::spherical(&moved(&p)).map(|v| v as f32);
             (self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]) = (az, el, range.max(NEAREST_M as f32));
         }
     }
@@ -41,27 +42,18 @@ impl SensorScan {
 /// Nearer than this there is no direction worth the name, m.
 const NEAREST_M: f64 = 0.05;
 
-/// Gives each point of an unordered cloud to a sensor: the one in whose field of view it lies most centrally. Two clouds of the same
-/// scene are split alike.
-pub fn split_by_sensor(cloud: &Cloud, rig: &SensorRig) -> Vec<SensorScan> {
-    let sensors: Vec<_> = rig.sensors.iter().map(|s| (s.pose().inverse(), s.half_fov_rad())).collect();
-    let mut scans = vec![SensorScan::default(); sensors.len()];
+/// Gives each point of an unordered cloud to a sensor, as [`Assignment`] says. Two clouds of the same scene are split alike.
+pub fn split_by_sensor(cloud: &Cloud, rig: &Rig) -> Vec<SensorScan> {
+    let assignment = Assignment::new(rig);
+    let mut scans = vec![SensorScan::default(); rig.sensors.len()];
     for point in cloud.points() {
         let p = Point3::new(f64::from(point[0]), f64::from(point[1]), f64::from(point[2]));
-        let mut best: Option<(f64, usize, [f64; 3])> = None;
-        for (k, (sensor_from_cloud, half_fov)) in sensors.iter().enumerate() {
-            let spherical = SensorMount::spherical(&(sensor_from_cloud * p));
-            let outside = spherical[0].abs() / half_fov;
-            if best.is_none_or(|(least, ..)| outside < least) {
-                best = Some((outside, k, spherical));
-            }
-        }
-        if let Some((_, k, [az, el, range])) = best
+        if let Some(Assigned { sensor, spherical: [az, el, range] }) = assignment.of_point(p)
             && range > NEAREST_M
         {
-            scans[k].azimuth_rad.push(az as f32);
-            scans[k].elevation_rad.push(el as f32);
-            scans[k].range_m.push(range as f32);
+            scans[sensor].azimuth_rad.push(az as f32);
+            scans[sensor].elevation_rad.push(el as f32);
+            scans[sensor].range_m.push(range as f32);
         }
     }
     scans
@@ -218,7 +210,7 @@ mod tests {
 
     #[test]
     fn points_go_to_the_sensor_that_sees_them() {
-        let mut rig = SensorRig::single();
+        let mut rig = Rig::single();
         rig.sensors[0].horizontal_fov_deg = 120.0;
         let mut left = rig.sensors[0].clone();
         left.yaw_deg = 120.0;

@@ -104,5 +104,6 @@ fn comb_found(seen: &Seen, told: comb::Comb) -> Finding {
         says: format!("ranges are rounded to {:.3} mm, each laser with a phase of its own", 1000.0 * step),
         separate_by: None,
         curve: Curve { x: "range / step, fraction".into(), y: "share of the returns".into(), points: points.collect() },
+        effects: vec![],
     }
 }

@@ -14,16 +14,17 @@ mod scatter;
 mod tilt;
 
 use crate::diagnosis::{Diagnosis, FindingGain, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::effects::fill_effects;
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
-use crate::rig::SensorRig;
 use crate::search::REPETITIONS;
 use data::Dataset;
 use planes::Patch;
 use rand::RngExt;
 use rayon::prelude::*;
 use rings::{Beam, RingScan};
+use sensor::Rig;
 
 /// Fewer scans do not let one be held out.
 const FEWEST_SCANS: usize = 3;
@@ -43,7 +44,7 @@ struct Seen {
 /// Diagnoses the scans of one spinning sensor at the clouds' origin, against an ideal one.
 pub fn diagnose_scans(
     dataset: &Dataset,
-    rig: &SensorRig,
+    rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
@@ -127,7 +128,7 @@ pub fn diagnose_scans(
     let used: Vec<String> = seen.scans.iter().map(|s| s.id.clone()).collect();
     let together: f64 = found.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
     let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
-    let diagnosis = Diagnosis {
+    let mut diagnosis = Diagnosis {
         schema: SCHEMA.into(),
         verdict,
         frames: FrameRoles { select: vec![], estimate: used.clone(), hold_out: used },
@@ -146,7 +147,8 @@ pub fn diagnose_scans(
         considered,
         notes,
     };
-    Ok(Outcome { diagnosis, corrected: vec![], rows_deg: vec![rows_deg] })
+    fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
+    Ok(Outcome { diagnosis, corrected: vec![] })
 }
 
 /// Draws of scans with replacement, the same for every finding.

@@ -13,8 +13,8 @@ use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, as_good, choose, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
-use crate::rig::SensorMount;
 use nalgebra::{DMatrix, DVector, Vector3};
+use sensor::Sensor;
 
 /// What is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -283,7 +283,7 @@ fn row(
     let nearest = (0..context.rig.sensors.len()).min_by(|&a, &b| {
         let off = |k: usize| {
             let mount = &context.rig.sensors[k];
-            crate::rig::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()).abs() / mount.half_fov_rad()
+            crate::angle::wrapped(s.azimuth_rad - mount.yaw_deg.to_radians()).abs() / mount.half_fov_rad()
         };
         off(a).total_cmp(&off(b))
     });
@@ -307,7 +307,7 @@ fn row(
             (0..3).for_each(|k| x[k][3] = seen[k]);
             let mount = &context.rig.sensors[sensor];
             let [azimuth_rad, elevation_rad, _] =
-                SensorMount::spherical(&mount.pose().inverse_transform_point(&center.into()));
+                Sensor::spherical(&mount.pose().inverse_transform_point(&center.into()));
             let phase = mount.scan_phase(azimuth_rad, elevation_rad);
             (0..3).for_each(|k| x[k][7] = seen[k] * phase);
             match motion.and_then(|m| m[s.frame]) {

@@ -18,14 +18,14 @@ use crate::diagnosis::{Considered, Curve, FindingGain, Minimum, Parameter, Statu
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
-use crate::rig::SensorRig;
 use rand::RngExt;
+use sensor::Rig;
 
 /// What all searches share.
 #[derive(Clone)]
 pub struct Context<'a> {
     /// Sensors.
-    pub rig: &'a SensorRig,
+    pub rig: &'a Rig,
     /// Frames in order.
     pub frames: &'a [FramePair],
     /// Role and block of each.

@@ -13,10 +13,10 @@ use crate::inference::choice::{significant, total_and_z};
 use crate::inference::median;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray, Surface};
-use crate::rig::{SensorMount, SensorRig};
 use geometry::Box3;
 use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
+use sensor::{Rig, Sensor};
 
 /// How the scene slides over a scan.
 pub struct Slide {
@@ -25,7 +25,7 @@ pub struct Slide {
     /// Of every frame: the own motion and the objects with what the own car sees of their motion, m/s.
     motions: Vec<Motion>,
     /// Every sensor, and its frame from the cloud's.
-    sensors: Vec<(SensorMount, Isometry3<f64>)>,
+    sensors: Vec<(Sensor, Isometry3<f64>)>,
 }
 
 /// What moves in one frame.
@@ -57,7 +57,7 @@ impl Slide {
     /// How far a point of a frame that a sensor shows is from where it was in the middle of the scan, m, cloud's frame.
     pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
         let (mount, sensor_from_cloud) = &self.sensors[sensor];
-        let [azimuth_rad, elevation_rad, _] = SensorMount::spherical(&(sensor_from_cloud * Point3::from(*point)));
+        let [azimuth_rad, elevation_rad, _] = Sensor::spherical(&(sensor_from_cloud * Point3::from(*point)));
         let phase = mount.scan_phase(azimuth_rad, elevation_rad);
         self.motions[frame].at(point, self.scan_s.abs()) * (phase * self.scan_s)
     }
@@ -90,7 +90,7 @@ struct Sliders {
 }
 
 impl Sliders {
-    fn new(frame: &FramePair, motion: &Motion, rig: &SensorRig, origins: &[Point3<f64>], longest: f64) -> Self {
+    fn new(frame: &FramePair, motion: &Motion, rig: &Rig, origins: &[Point3<f64>], longest: f64) -> Self {
         let at = |r: &Ray, off_m: f64| origins[r.sensor as usize] + r.direction_vector() * (r.own_range_m() - off_m);
         let near = |r: &&Ray| (3.0..REACH_M).contains(&r.own_range_m());
         let stands = |r: &&Ray| r.surface != Surface::Ground || !r.smooth || r.across_m() > 0.25;
@@ -348,7 +348,7 @@ mod tests {
 
     /// Twenty frames of posts, seen at 40 m/s by a scan that takes `scan_s`, counter-clockwise.
     fn found(scan_s: f64) -> Option<f64> {
-        let rig = SensorRig::single();
+        let rig = Rig::single();
         let velocity = Vector3::new(-40.0, 0.0, 0.0);
         let frames: Vec<FramePair> = (0..20)
             .map(|f| {

@@ -89,6 +89,7 @@ mod tests {
                 y: "share".into(),
                 points: vec![point(0.0), point(5.0), point(1000.0), point(1005.0)],
             },
+            effects: vec![],
         };
         let svg = figure(&finding).svg();
         for words in [

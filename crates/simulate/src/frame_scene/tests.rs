@@ -1,9 +1,9 @@
 use super::*;
-use crate::beams::Shutter;
 use crate::mesh::{Mesh, cuboid};
 use crate::race_car::race_car;
-use crate::rig::{Pattern, Rig, RowBlock};
 use geometry::upright_pose;
+use sensor::beams::Shutter;
+use sensor::rig::{Pattern, Rig, RowBlock};
 use std::path::Path;
 
 fn motion(x: f64, y: f64, velocity: [f64; 3]) -> Motion {

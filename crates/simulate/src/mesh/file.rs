@@ -1,9 +1,10 @@
 //! Meshes from OBJ, STL and glTF files.
 
-use super::{Face, MaterialId, MaterialTable, Mesh};
+use super::{Face, Mesh};
 use base64::Engine as _;
 use data::DataError;
 use schemars::JsonSchema;
+use sensor::material::{MaterialId, MaterialTable};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Cursor;

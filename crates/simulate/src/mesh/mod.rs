@@ -1,16 +1,15 @@
 //! Triangle meshes: what the world and the cars are made of.
 
 mod file;
-mod material;
 mod shapes;
 
 pub use file::{MeshFile, UpAxis};
-pub use material::{Material, MaterialId, MaterialTable};
 pub use shapes::{cuboid, cylinder, grid, loft};
 
 use crate::raycast::Tree;
 use geometry::Pose;
 use nalgebra::Point3;
+use sensor::material::MaterialId;
 use std::collections::BTreeMap;
 
 /// One triangle: corners as indices of vertices, what it is made of and what it belongs to.
@@ -20,7 +19,7 @@ pub struct Face {
     pub corners: [u32; 3],
     /// Its material.
     pub material: MaterialId,
-    /// Number of the object that it belongs to; see [`crate::track::Group`].
+    /// Number of the object that it belongs to; see [`sensor::object::Group`].
     pub object: u16,
 }
 

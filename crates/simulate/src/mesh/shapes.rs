@@ -1,6 +1,7 @@
 //! Simple bodies as meshes. All but [`grid`] are closed.
 
-use super::{Face, MaterialId, Mesh};
+use super::{Face, Mesh};
+use sensor::material::MaterialId;
 
 /// Rows of points joined to a surface, each cell two triangles. `points[row][column]`, m.
 pub fn grid(points: &[Vec<[f64; 3]>], material: MaterialId) -> Mesh {

@@ -2,15 +2,16 @@
 
 use crate::SimulateError;
 use crate::auto_label::AutoLabel;
-use crate::config_text::parse_toml;
-use crate::effects::EffectList;
-use crate::error::{within, wrong};
-use crate::mesh::{Material, MeshFile};
+use crate::mesh::MeshFile;
 use crate::race::files::ConfigFiles;
-use crate::rig::Rig;
 use crate::scenario::{RaceModel, RunFiles};
+use data::KeyError;
 use data::Layout;
+use data::toml_text::{parse_toml, within, wrong};
 use schemars::JsonSchema;
+use sensor::effects::EffectList;
+use sensor::material::Material;
+use sensor::rig::Rig;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -142,11 +143,11 @@ impl RaceConfig {
 
     /// A configuration in memory; `path` is where it lies, for messages.
     pub fn parse(text: &str, path: &Path) -> Result<RaceConfig, SimulateError> {
-        parse_toml(text, path, RaceConfig::check)
+        Ok(parse_toml(text, path, RaceConfig::check)?)
     }
 
     /// Refuses what cannot be made, naming the key.
-    pub fn check(&self) -> Result<(), SimulateError> {
+    pub fn check(&self) -> Result<(), KeyError> {
         check_name("name", &self.name)?;
         within("resolution", self.resolution, 0.01, 8.0)?;
         within("crop_m", self.crop_m, 1.0, 5000.0)?;
@@ -174,7 +175,7 @@ impl RaceConfig {
         Ok(())
     }
 
-    fn check_set(&self, set: &SetConfig, before: &[SetConfig]) -> Result<(), SimulateError> {
+    fn check_set(&self, set: &SetConfig, before: &[SetConfig]) -> Result<(), KeyError> {
         check_name("name", &set.name)?;
         let named = |name: &String| before.iter().any(|s| s.name == *name);
         if named(&set.name) {
@@ -220,7 +221,7 @@ impl RaceConfig {
 }
 
 /// Names become folders.
-fn check_name(key: &str, name: &str) -> Result<(), SimulateError> {
+fn check_name(key: &str, name: &str) -> Result<(), KeyError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if name.is_empty() || !name.chars().all(plain) {
         return Err(wrong(key, format!("{name:?} is no name of a folder: letters, digits, _ and - only")));

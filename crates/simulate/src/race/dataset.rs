@@ -5,17 +5,18 @@ use super::files::ConfigFiles;
 use super::frames::{FrameKey, SPLITS};
 use super::simulator::{PreparedSet, Simulator};
 use crate::SimulateError;
-use crate::attributes;
 use crate::auto_label::{LabelError, label_errors};
-use crate::effects::{Effect, EffectList};
-use crate::matched::{RangeHistogram, fit_range_dropout};
 use crate::street::SplitCounts;
+use data::toml_text::wrong;
 use data::write::{remove_unfinished, write_dataset_toml, write_frame, write_split};
 use data::{
     DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Layout, PointColumns, read_kitti_text, write_atomic,
     write_json,
 };
 use rayon::prelude::*;
+use sensor::attributes;
+use sensor::effects::{Effect, EffectList};
+use sensor::matched::{RangeHistogram, fit_range_dropout};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -65,7 +66,7 @@ pub fn make_race_datasets(
     config.check()?;
     if let Some(name) = only.iter().find(|name| !config.datasets.iter().any(|s| s.name == **name)) {
         let known: Vec<&str> = config.datasets.iter().map(|s| s.name.as_str()).collect();
-        return Err(crate::error::wrong("dataset", format!("there is no {name:?}; there are: {}", known.join(", "))));
+        return Err(wrong("dataset", format!("there is no {name:?}; there are: {}", known.join(", "))).into());
     }
     let simulator = Simulator::new(config.clone(), files)?;
     let wanted: Vec<&SetConfig> =
@@ -203,11 +204,11 @@ fn write_descriptions(
 }
 
 fn to_toml<T: Serialize>(value: &T) -> Result<String, SimulateError> {
-    toml::to_string_pretty(value).map_err(|e| crate::error::wrong("", e.to_string()))
+    toml::to_string_pretty(value).map_err(|e| wrong("", e.to_string()).into())
 }
 
 /// The loss that makes the ranges of `from` those of `target`, from the frames that both have to train on.
-fn matched(target: &Path, from: &Path) -> Result<crate::effects::RangeDropout, SimulateError> {
+fn matched(target: &Path, from: &Path) -> Result<sensor::effects::RangeDropout, SimulateError> {
     let histogram = |folder: &Path| {
         let dataset = Dataset::open(folder)?;
         let ids = dataset.ids("train")?;

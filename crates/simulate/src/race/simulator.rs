@@ -5,13 +5,9 @@ use super::files::ConfigFiles;
 use super::frames::{FrameKey, choose};
 use crate::SimulateError;
 use crate::auto_label::{AutoLabel, refine};
-use crate::beams::Beams;
-use crate::effects::{EffectList, FrameContext, LabelledCar, WorldPlan};
 use crate::frame_scene::FrameScene;
-use crate::mesh::{MaterialTable, Mesh};
-use crate::race_car::{car_box, race_car};
-use crate::rig::Rig;
-use crate::scan::Scan;
+use crate::mesh::Mesh;
+use crate::race_car::race_car;
 use crate::scenario::{FRAME_S, Motion, Run};
 use crate::track::{CentreLine, Track, las_vegas};
 use crate::world::{CarShape, World};
@@ -19,6 +15,12 @@ use data::{DataError, Frame, Object, stream};
 use geometry::{Box3, move_box, yaw_rad};
 use nalgebra::UnitQuaternion;
 use rand_distr::{Distribution, StandardNormal};
+use sensor::beams::Beams;
+use sensor::car::car_box;
+use sensor::effects::{EffectList, FrameContext, LabelledCar, WorldPlan};
+use sensor::material::MaterialTable;
+use sensor::rig::Rig;
+use sensor::scan::Scan;
 use std::path::Path;
 
 /// Everything that all data sets of a race share.

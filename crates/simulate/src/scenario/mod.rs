@@ -7,12 +7,12 @@ pub use race::RaceModel;
 pub use trajectory::{CarState, Motion, Trajectory};
 
 use crate::SimulateError;
-use crate::race_car::{CAR_SIZE_M, car_box};
 use crate::track::Track;
 use data::DataError;
 use geometry::{bev_intersection, move_box};
 use nalgebra::Point3;
 use schemars::JsonSchema;
+use sensor::car::{CAR_SIZE_M, car_box};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 

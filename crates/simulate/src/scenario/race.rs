@@ -3,14 +3,14 @@
 
 use super::trajectory::{CarState, Trajectory};
 use super::{FRAME_S, Run};
-use crate::SimulateError;
-use crate::error::{within, wrong};
-use crate::race_car::ORIGIN_ABOVE_GROUND_M;
 use crate::track::Track;
+use data::KeyError;
+use data::toml_text::{within, wrong};
 use data::{Stream, stream};
 use geometry::Pose;
 use rand::RngExt;
 use schemars::JsonSchema;
+use sensor::car::ORIGIN_ABOVE_GROUND_M;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
@@ -54,7 +54,7 @@ const SPACING_M: f64 = 13.0;
 const MARGIN_M: f64 = 1.25;
 
 impl RaceModel {
-    pub(crate) fn check(&self) -> Result<(), SimulateError> {
+    pub(crate) fn check(&self) -> Result<(), KeyError> {
         within("runs", self.runs.into(), 1.0, 100.0)?;
         within("rivals", self.rivals as f64, 0.0, PLACES.len() as f64)?;
         let [low, high] = self.speed_mps;
@@ -219,9 +219,9 @@ impl Waves {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::race_car::car_box;
     use crate::track::las_vegas;
     use geometry::{bev_intersection, move_box};
+    use sensor::car::car_box;
 
     fn track() -> Track {
         Track { line: las_vegas(), seed: 1 }

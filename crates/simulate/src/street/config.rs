@@ -1,10 +1,10 @@
 //! What a synthetic road data set is made of, as people write it in TOML.
 
 use crate::SimulateError;
-use crate::config_text::read_toml;
-use crate::error::wrong;
 use crate::street::scene::SceneConfig;
 use crate::street::sensor::SensorConfig;
+use data::KeyError;
+use data::toml_text::{read_toml, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -67,11 +67,11 @@ impl FrameCounts {
 impl RoadConfig {
     /// Reads a TOML; what it leaves out keeps its default.
     pub fn read(path: &Path) -> Result<Self, SimulateError> {
-        read_toml(path, RoadConfig::check)
+        Ok(read_toml(path, RoadConfig::check)?)
     }
 
     /// Refuses what cannot be simulated, naming the key.
-    pub fn check(&self) -> Result<(), SimulateError> {
+    pub fn check(&self) -> Result<(), KeyError> {
         for (field, n) in
             [("frames.train", self.frames.train), ("frames.val", self.frames.val), ("frames.test", self.frames.test)]
         {

@@ -1,13 +1,13 @@
 //! One scene: a road, cars on and beside it, and what stands around.
 
-use crate::SimulateError;
-use crate::error::{within, wrong};
 use crate::street::cars::Car;
 use crate::street::road::{LANE_M, PARKING_M, Road};
 use crate::street::roadside;
 use crate::street::sensor::SensorConfig;
 use crate::street::solid::Solid;
+use data::KeyError;
 use data::Stream;
+use data::toml_text::{within, wrong};
 use geometry::{Box3, bev_intersection};
 use rand::RngExt;
 use rand_distr::{Distribution, Normal};
@@ -52,7 +52,7 @@ impl Default for SceneConfig {
 }
 
 impl SceneConfig {
-    pub(crate) fn check(&self) -> Result<(), SimulateError> {
+    pub(crate) fn check(&self) -> Result<(), KeyError> {
         for (field, [least, greatest]) in [("scene.cars", self.cars), ("scene.distractors", self.distractors)] {
             if least > greatest || greatest > 200 {
                 return Err(wrong(field, format!("[{least}, {greatest}] is not a range of numbers up to 200")));

@@ -1,9 +1,9 @@
 //! A spinning LiDAR of many beams: which rays it sends, and what comes back.
 
-use crate::SimulateError;
-use crate::error::{within, wrong};
 use crate::street::scene::Scene;
 use crate::street::solid::{Hit, Material};
+use data::KeyError;
+use data::toml_text::{within, wrong};
 use data::{Cloud, Stream};
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -64,7 +64,7 @@ impl Default for SensorConfig {
 }
 
 impl SensorConfig {
-    pub(crate) fn check(&self) -> Result<(), SimulateError> {
+    pub(crate) fn check(&self) -> Result<(), KeyError> {
         within("sensor.height_m", self.height_m, 0.3, 5.0)?;
         if self.beam_blocks.is_empty() || self.beam_blocks.iter().any(|b| !(1..=256).contains(&b.rows)) {
             return Err(wrong("sensor.beam_blocks", "there must be a block, and 1 to 256 rows in each"));

@@ -12,66 +12,8 @@ pub use oval::las_vegas;
 use crate::mesh::Mesh;
 use geometry::Pose;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-
-/// What a triangle of the static world belongs to; its number stands in the column `object` of attributes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-#[repr(u16)]
-pub enum Group {
-    /// The racing surface.
-    Surface = 1,
-    /// The flatter strip inside of it.
-    Apron = 2,
-    /// Ground inside of the track.
-    Infield = 3,
-    /// The wall along the outer edge.
-    OuterWall = 4,
-    /// Posts and cables on the outer wall.
-    Fence = 5,
-    /// The wall of the pit lane.
-    PitWall = 6,
-    /// Rows of seats along the front stretch.
-    Grandstand = 7,
-    /// Buildings, vehicles and poles inside of the track.
-    InfieldObjects = 8,
-    /// Ground outside of the wall.
-    OutsideGround = 9,
-    /// Buildings, vehicles and poles outside of the wall.
-    OutsideObjects = 10,
-}
-
-impl Group {
-    /// All groups, in the order of their numbers.
-    pub const ALL: [Group; 10] = [
-        Group::Surface,
-        Group::Apron,
-        Group::Infield,
-        Group::OuterWall,
-        Group::Fence,
-        Group::PitWall,
-        Group::Grandstand,
-        Group::InfieldObjects,
-        Group::OutsideGround,
-        Group::OutsideObjects,
-    ];
-}
-
-/// Numbers of cars in the column `object` of attributes begin here; the car whose cloud it is has none.
-pub const FIRST_CAR: u16 = 100;
-
-/// A waviness of the ground that is not in the plans: `h(way) = amplitude * sin(2 pi way / length + phase)`, m, of the surface and all that
-/// stands on it.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Undulation {
-    /// Greatest height, m.
-    pub amplitude_m: f64,
-    /// Length of a wave along the centre line, m; rounded so that whole waves fit into a lap.
-    pub length_m: f64,
-    /// Where it begins, rad.
-    pub phase_rad: f64,
-}
+use sensor::effects::Undulation;
+use sensor::object::Group;
 
 /// A track on a centre line.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,11 +1,13 @@
 //! What stands beside the track: the fence, and buildings, vehicles and poles on both sides.
 
+use super::Track;
 use super::surface::{OUTSIDE_LEVEL_M, WALL_GAP_M, WALL_HEIGHT_M, WALL_M, across_at, height_m, strip};
-use super::{Group, Track};
-use crate::mesh::{MaterialTable, Mesh, cuboid, cylinder, grid};
+use crate::mesh::{Mesh, cuboid, cylinder, grid};
 use data::{Stream, stream};
 use geometry::upright_pose;
 use rand::RngExt;
+use sensor::material::MaterialTable;
+use sensor::object::Group;
 use std::f64::consts::PI;
 
 /// Way between two posts of the fence, m.

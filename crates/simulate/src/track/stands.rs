@@ -2,7 +2,8 @@
 
 use super::Track;
 use super::surface::across_at;
-use crate::mesh::{MaterialTable, Mesh, grid};
+use crate::mesh::{Mesh, grid};
+use sensor::material::MaterialTable;
 
 /// From the outer edge of the surface to the first row, m.
 const DISTANCE_M: f64 = 16.0;

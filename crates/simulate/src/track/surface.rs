@@ -1,9 +1,11 @@
 //! Ground and walls: strips along the centre line.
 
-use super::{Group, Station, Track};
-use crate::mesh::{MaterialTable, Mesh, grid};
+use super::{Station, Track};
+use crate::mesh::{Mesh, grid};
 use data::stream;
 use rand::RngExt;
+use sensor::material::MaterialTable;
+use sensor::object::Group;
 
 /// Width of the apron, m.
 const APRON_M: f64 = 8.0;

@@ -93,6 +93,7 @@ pub(super) fn elevation_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Fi
         ),
         separate_by: (!named)
             .then(|| "a level hall or a survey of the road under the car, and plumb walls on all sides".into()),
+        effects: vec![],
         curve: Curve {
             x: "distance, m".into(),
             y: "height of the ground over its plane, m".into(),

@@ -133,6 +133,7 @@ pub(super) fn noise_found(seen: &Seen, step_m: f64, notes: &mut Vec<String>) -> 
         says,
         separate_by: None,
         curve,
+        effects: vec![],
     };
     let mut found = vec![finding(
         "range_noise",

@@ -120,6 +120,7 @@ pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Find
         ),
         separate_by: None,
         curve: row_curve(seen, &told, &cis, 0.0, "offset of range on flat walls, m"),
+        effects: vec![],
     })
 }
 
@@ -191,5 +192,6 @@ pub(super) fn intensity_found(seen: &Seen) -> Option<Finding> {
         ),
         separate_by: None,
         curve: row_curve(seen, &told, &cis, 0.0, "intensity beyond the trend of the rows"),
+        effects: vec![],
     })
 }

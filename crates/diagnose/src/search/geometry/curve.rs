@@ -5,10 +5,10 @@ use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable
 use crate::diagnosis::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
-use crate::rig::SensorMount;
 use crate::search::Context;
 use nalgebra::{Point3, SVector};
 use rayon::prelude::*;
+use sensor::Sensor;
 
 /// Bins of a picture.
 const BINS: usize = 16;
@@ -20,7 +20,7 @@ const FEWEST: f64 = 30.0;
 const STRAY_M: f64 = 0.5;
 
 /// What a picture's axis shows of a ray.
-type Axis = (&'static str, fn(&Ray, &SensorMount) -> f64);
+type Axis = (&'static str, fn(&Ray, &Sensor) -> f64);
 
 /// How far surfaces stand off in the direction in which `columns` of a fit move them, by what the cause depends on: range for a bias,
 /// distance along the car for a tilt, phase for a shutter, azimuth for a sensor. Rays that the cause does not move are left out.

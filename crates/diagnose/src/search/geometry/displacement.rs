@@ -6,8 +6,8 @@ use crate::channels::groups::{Grouping, STRIP_RAD, elevation_lever, group_of, pl
 use crate::channels::mean::Column;
 use crate::inference::grouped;
 use crate::pairing::Ray;
-use crate::rig::SensorRig;
 use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
+use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// What was found of the geometry, to be taken out before other channels are looked at.
@@ -66,7 +66,7 @@ impl Displacement {
 
 /// Of what was chosen, as the selecting frames tell it.
 pub(super) fn displacement(
-    rig: &SensorRig,
+    rig: &Rig,
     sums: &Sums,
     select: &[usize],
     blocks: &[usize],

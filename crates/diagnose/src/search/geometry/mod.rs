@@ -27,9 +27,9 @@ use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::median;
 use crate::inference::roles::Role;
-use crate::rig::SensorRig;
 use nalgebra::SVector;
 use rayon::prelude::*;
+use sensor::Rig;
 
 /// Share of a pose's gain that a second pose must bring.
 const A_SECOND_POSE: f64 = 0.3;
@@ -239,7 +239,7 @@ fn sums(context: &Context, select: &[usize]) -> Sums {
 
 /// Variances of what every frame may have of its own: of its pose as they scatter, robust, about the mean of each sensor; of its slide as cars drive,
 /// where a scan takes row after row: what stands slides along columns then, unlike anything else but a little like a sensor's pose.
-fn own_scatter(rig: &SensorRig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
+fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
     let least = [2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4];
     let scatter = |k: usize| {
         let mut deviations = Vec::new();
@@ -250,7 +250,7 @@ fn own_scatter(rig: &SensorRig, poses: &[OwnPoses], select: &[usize]) -> SVector
         }
         (median(deviations) / 0.6745).max(least[k])
     };
-    let by_rows = rig.sensors.iter().find(|s| !s.rows_in_turn.is_empty());
+    let by_rows = rig.sensors.iter().find(|s| !s.rows_in_turn().is_empty());
     let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);
     SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide(k - 6) }.powi(2))
 }

@@ -5,6 +5,7 @@ use crate::diagnosis::{Curve, CurvePoint, Parameter, Status};
 use crate::inference::law::{FittedLaw, Law, in_zone};
 use crate::inference::losses::LossTable;
 use crate::search::Found;
+use sensor::signal::index_offset;
 
 /// Numbers of a law as people read them.
 fn reading(law: &FittedLaw) -> Vec<(&'static str, f64, &'static str)> {
@@ -16,9 +17,9 @@ fn reading(law: &FittedLaw) -> Vec<(&'static str, f64, &'static str)> {
         Law::Incidence => {
             vec![("cos_half", law.half().exp(), "1"), ("steepness", law.steepness(), "1"), ("most", law.most(), "1")]
         }
-        // u: ln(0.1 cos / R^2) - ln(0.1 / 250^2).
+        // As the signal index at the reflectivity that the diagnosis assumes.
         Law::Signal => vec![
-            ("threshold", law.half() + 2.0 * 250f64.ln(), "1"),
+            ("threshold", law.half() + index_offset(), "1"),
             ("steepness", law.steepness(), "1"),
             ("most", law.most(), "1"),
             ("brighter_standing", law.numbers[4], "1"),
@@ -139,7 +140,7 @@ fn form_error(law: Law) -> f64 {
 fn curve(table: &LossTable, law: Law, all: &[FittedLaw]) -> Curve {
     let x_of = |[ln_range, ln_cos]: [f64; 2]| match law {
         Law::Incidence => ln_cos.exp().min(1.0).asin().to_degrees(),
-        Law::Signal => ln_cos - 2.0 * ln_range + 2.0 * 250f64.ln(),
+        Law::Signal => ln_cos - 2.0 * ln_range + index_offset(),
         _ => ln_range.exp(),
     };
     let only = |zone: usize| match law {

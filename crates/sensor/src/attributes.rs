@@ -1,0 +1,149 @@
+//! What is known of each point beside its place: a PCD with one row a point, in the order of the cloud.
+//!
+//! Columns: `x y z` (as in the cloud, m), `range` (m, from the sensor), `normal_x normal_y normal_z` (towards the sensor, cloud's frame),
+//! `cos_incidence`, `reflectivity` (head-on, against a white plate), `returned` (part of the light that came back), `time` (s, from the middle of
+//! the scan), `object` (groups of the track from 1, cars from 100, 0 unknown), `row`, `column` (65535 unknown), `sensor` (number in the rig),
+//! `material` (number in `names.json` beside it), `echo` (0 first return, 1 second).
+
+use crate::material::{MaterialId, MaterialTable};
+use crate::object::{FIRST_CAR, Group};
+use crate::rig::Rig;
+use crate::scan::{Echo, Scan};
+use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_json};
+use serde_json::json;
+use std::path::{Path, PathBuf};
+
+/// Folder of the attributes below a data set's root.
+pub const FOLDER: &str = "attributes";
+
+const NAMES: [&str; 17] = [
+    "x",
+    "y",
+    "z",
+    "range",
+    "normal_x",
+    "normal_y",
+    "normal_z",
+    "cos_incidence",
+    "reflectivity",
+    "returned",
+    "time",
+    "object",
+    "row",
+    "column",
+    "sensor",
+    "material",
+    "echo",
+];
+
+/// The file of a frame's attributes.
+pub fn path(root: &Path, id: &str) -> PathBuf {
+    root.join(FOLDER).join(format!("{id}.pcd"))
+}
+
+/// The file's bytes for the returns of a scan.
+pub fn encode(scan: &Scan) -> Vec<u8> {
+    let echoes: Vec<&Echo> = scan.returns().collect();
+    let float = |f: &dyn Fn(&Echo) -> f32| PcdColumn::F32(echoes.iter().map(|e| f(e)).collect());
+    let short = |f: &dyn Fn(&Echo) -> u16| PcdColumn::U16(echoes.iter().map(|e| f(e)).collect());
+    let byte = |f: &dyn Fn(&Echo) -> u8| PcdColumn::U8(echoes.iter().map(|e| f(e)).collect());
+    let columns = [
+        float(&|e| e.point()[0]),
+        float(&|e| e.point()[1]),
+        float(&|e| e.point()[2]),
+        float(&|e| e.range_m),
+        float(&|e| e.normal[0]),
+        float(&|e| e.normal[1]),
+        float(&|e| e.normal[2]),
+        float(&|e| e.cos_incidence),
+        float(&|e| e.reflectivity),
+        float(&|e| e.returned),
+        float(&|e| e.time_s),
+        short(&|e| e.object),
+        short(&|e| e.row),
+        short(&|e| e.column),
+        byte(&|e| e.sensor),
+        byte(&|e| e.material.0),
+        byte(&|e| e.number),
+    ];
+    encode_pcd_columns(&NAMES.into_iter().zip(columns).collect::<Vec<_>>())
+}
+
+/// The names behind the numbers of sensors, materials and objects: `names.json` in the folder of attributes.
+pub fn write_names(root: &Path, rig: &Rig, materials: &MaterialTable) -> Result<(), DataError> {
+    let objects: serde_json::Map<String, serde_json::Value> =
+        Group::ALL.into_iter().map(|g| ((g as u16).to_string(), json!(g))).collect();
+    let sensors: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
+    let names =
+        json!({ "sensors": sensors, "materials": materials.names(), "objects": objects, "first_car": FIRST_CAR });
+    write_json(&root.join(FOLDER).join("names.json"), &names)
+}
+
+/// The materials of a data set by the numbers in its attributes.
+pub fn read_materials(root: &Path) -> Result<MaterialTable, DataError> {
+    let path = root.join(FOLDER).join("names.json");
+    let value: serde_json::Value = serde_json::from_str(&fs_err::read_to_string(&path)?)
+        .map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
+    let names = value["materials"].as_array().into_iter().flatten().map(|n| n.as_str().map(String::from));
+    match names.collect::<Option<Vec<_>>>() {
+        Some(names) if (1..=256).contains(&names.len()) => Ok(MaterialTable::named(&names)),
+        _ => Err(DataError::file(&path, "has no list of names under \"materials\"")),
+    }
+}
+
+/// The returns of a frame from its attributes. Sensors stand where `rig` has them.
+pub fn read(path: &Path, rig: &Rig) -> Result<Scan, DataError> {
+    let columns = parse_pcd_columns(&fs_err::read(path)?, path, &NAMES)?;
+    let origins: Vec<[f32; 3]> = rig.sensors.iter().map(|s| s.position.map(|v| v as f32)).collect();
+    let echo = |i: usize| {
+        let v: [f32; NAMES.len()] = std::array::from_fn(|k| columns[k][i]);
+        let origin = origins.get(v[14] as usize).copied().unwrap_or_default();
+        let mut echo = Echo {
+            range_m: v[3],
+            normal: [v[4], v[5], v[6]],
+            cos_incidence: v[7],
+            reflectivity: v[8],
+            returned: v[9],
+            time_s: v[10],
+            object: v[11] as u16,
+            row: v[12] as u16,
+            column: v[13] as u16,
+            sensor: v[14] as u8,
+            material: MaterialId(v[15] as u8),
+            number: v[16] as u8,
+            ..Echo::nothing(origin, [1.0, 0.0, 0.0])
+        };
+        echo.move_point([v[0], v[1], v[2]]);
+        echo
+    };
+    Ok(Scan { echoes: (0..columns[0].len()).map(echo).collect() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::effects::testing::{rig, scene};
+    use data::write_atomic;
+
+    #[test]
+    fn what_is_written_reads_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = path(folder.path(), "000001");
+        let scan = scene();
+        write_atomic(&file, &encode(&scan)).unwrap();
+        write_names(folder.path(), &rig(), &MaterialTable::default()).unwrap();
+        let read = read(&file, &rig()).unwrap();
+        let returns: Vec<&Echo> = scan.returns().collect();
+        assert_eq!(read.echoes.len(), returns.len());
+        for (a, b) in read.echoes.iter().zip(returns) {
+            assert!((a.range_m - b.range_m).abs() < 1e-4 && (0..3).all(|k| (a.point()[k] - b.point()[k]).abs() < 1e-4));
+            assert_eq!(
+                (a.row, a.column, a.object, a.material, a.normal),
+                (b.row, b.column, b.object, b.material, b.normal)
+            );
+        }
+        let names = std::fs::read_to_string(folder.path().join("attributes/names.json")).unwrap();
+        assert_eq!(read_materials(folder.path()).unwrap(), MaterialTable::default());
+        assert!(names.contains("outer_wall") && names.contains("rubber") && names.contains("front"));
+    }
+}

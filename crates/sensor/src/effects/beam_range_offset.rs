@@ -1,0 +1,91 @@
+//! A7: every beam has an offset of its own.
+
+use super::{Draws, FrameContext, Need, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use rand_distr::{Distribution, StandardNormal};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// All ranges of row b of a sensor get `offsets_m[b]`, or, without a table, `std_m * N(0, 1)` drawn once for each row of each sensor, m.
+///
+/// Typical: 1 to 5 cm between the lasers of a Velodyne HDL-64E as delivered; a third of that after a calibration of one's own (Glennie and
+/// Lichti 2010).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct BeamRangeOffset {
+    /// Standard deviation between rows, m.
+    pub std_m: f64,
+    /// Offset of each row from the top, m, for every sensor; rows beyond have none. Takes the place of `std_m`.
+    pub offsets_m: Vec<f64>,
+}
+
+impl Default for BeamRangeOffset {
+    fn default() -> Self {
+        BeamRangeOffset { std_m: 0.015, offsets_m: Vec::new() }
+    }
+}
+
+impl BeamRangeOffset {
+    fn offset_m(&self, sensor: u8, row: u16, draws: &Draws) -> f32 {
+        if !self.offsets_m.is_empty() {
+            return self.offsets_m.get(usize::from(row)).map_or(0.0, |v| *v as f32);
+        }
+        let noise: f32 = StandardNormal.sample(&mut draws.of_set(u64::from(sensor) << 16 | u64::from(row)));
+        self.std_m as f32 * noise
+    }
+}
+
+impl SensorEffect for BeamRangeOffset {
+    fn check(&self) -> Result<(), KeyError> {
+        within("std_m", self.std_m, 0.0, 10.0)?;
+        self.offsets_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("offsets_m[{i}]"), *v, -10.0, 10.0))
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(&[Need::Row])
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        let mut known = (u8::MAX, u16::MAX, 0.0);
+        for echo in scan.returns_mut() {
+            if (known.0, known.1) != (echo.sensor, echo.row) {
+                known = (echo.sensor, echo.row, self.offset_m(echo.sensor, echo.row, draws));
+            }
+            echo.range_m = (echo.range_m + known.2).max(0.01);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn rows_keep_their_offset_in_every_frame() {
+        let (before, effect) = (scene(), BeamRangeOffset::default());
+        let (one, other) = (applied_in(1, &effect, &before), applied_in(2, &effect, &before));
+        assert_eq!(one, other);
+        let mut of_row = vec![Vec::new(); GRID.0];
+        for (a, b) in before.echoes.iter().zip(&one.echoes).filter(|(a, _)| a.is_return()) {
+            of_row[usize::from(a.row)].push(f64::from(b.range_m - a.range_m));
+        }
+        let means: Vec<f64> = of_row.iter().filter(|r| !r.is_empty()).map(|r| {
+            let (mean, std) = moments(r);
+            assert!(std < 1e-5);
+            mean
+        }).collect();
+        let (_, std) = moments(&means);
+        assert!((0.008..0.025).contains(&std), "{std}");
+    }
+
+    #[test]
+    fn a_table_is_taken_as_it_is() {
+        let before = plate(3000, 20.0, 0.5);
+        let after = applied(&BeamRangeOffset { std_m: 0.0, offsets_m: vec![0.1, -0.2] }, &before);
+        let off = residuals(&before, &after);
+        assert!((off[0] - 0.1).abs() < 1e-5 && (off[1000] + 0.2).abs() < 1e-5 && off[2000] == 0.0);
+    }
+}

@@ -1,0 +1,91 @@
+//! B10: a bright target blinds the receiver for its neighbours.
+
+use super::{Draws, FrameContext, Need, SensorEffect};
+use super::shot_grid::{ShotGrid, reach};
+use crate::scan::{Scan, dot};
+use data::KeyError;
+use data::toml_text::within;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A return within `radius_deg` of one from a surface that returns more than `returned_above` is lost with probability `share`: the
+/// suppression of blooming takes good returns too.
+///
+/// Typical: 0.2 to 1 degree around signs and number plates (returned light above that of a white plate, 1).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct BrightTargetDropout {
+    /// Part of the light, against a white plate head-on.
+    pub returned_above: f64,
+    /// Degrees.
+    pub radius_deg: f64,
+    /// 0 to 1.
+    pub share: f64,
+}
+
+impl Default for BrightTargetDropout {
+    fn default() -> Self {
+        BrightTargetDropout { returned_above: 2.0, radius_deg: 0.6, share: 0.5 }
+    }
+}
+
+impl SensorEffect for BrightTargetDropout {
+    fn check(&self) -> Result<(), KeyError> {
+        within("returned_above", self.returned_above, 0.0, 1e4)?;
+        within("radius_deg", self.radius_deg, 0.0, 10.0)?;
+        within("share", self.share, 0.0, 1.0)
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(&[Need::Reflectivity, Need::Grid])
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        let grid = ShotGrid::new(scan);
+        let limit = self.returned_above as f32;
+        let (radius, nearest) = (self.radius_deg.to_radians() as f32, self.radius_deg.to_radians().cos() as f32);
+        let mut blinded = vec![false; scan.echoes.len()];
+        for bright in scan.returns().filter(|e| e.returned > limit) {
+            let (rows, columns) = reach(scan, &grid, bright, radius, 200);
+            for i in grid.around(bright, rows, columns) {
+                let other = &scan.echoes[i];
+                blinded[i] |= other.returned <= limit && dot(other.direction, bright.direction) >= nearest;
+            }
+        }
+        let mut random = draws.of_frame();
+        for (echo, blinded) in scan.echoes.iter_mut().zip(blinded) {
+            if echo.is_return() && blinded && random.random_range(0.0..1.0_f32) < self.share as f32 {
+                echo.lose();
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn only_the_neighbours_of_the_board_suffer() {
+        let before = scene();
+        let effect = BrightTargetDropout { returned_above: 5.0, radius_deg: 3.0, share: 1.0 };
+        let after = applied(&effect, &before);
+        // The board is +-1 m at 40 m: +-1.43 degrees.
+        for (a, b) in before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return()) {
+            let [x, y, z] = a.direction;
+            let (az, el) = (y.atan2(x).to_degrees().abs(), z.asin().to_degrees().abs());
+            let bright = a.reflectivity > 5.0;
+            let beside = (az - 1.43).max(0.0).hypot((el - 1.43).max(0.0));
+            if bright || beside > 3.9 {
+                assert!(b.is_return(), "{az} {el}");
+            } else if beside < 1.8 {
+                assert!(!b.is_return(), "{az} {el}");
+            }
+        }
+        let half = lost(&before, &applied(&BrightTargetDropout { share: 0.5, ..effect.clone() }, &before));
+        let whole = lost(&before, &after);
+        assert!((half / whole - 0.5).abs() < 0.1, "{half} {whole}");
+    }
+}

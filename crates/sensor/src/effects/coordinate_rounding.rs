@@ -1,0 +1,54 @@
+//! A9: coordinates in steps, as a file format has them.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Each of x, y, z becomes `step_m * round(v / step_m)`, m. Unlike [`super::RangeQuantisation`] it leaves no comb in the ranges.
+///
+/// Typical: 1 mm (the files of KITTI).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct CoordinateRounding {
+    /// m.
+    pub step_m: f64,
+}
+
+impl Default for CoordinateRounding {
+    fn default() -> Self {
+        CoordinateRounding { step_m: 0.001 }
+    }
+}
+
+impl SensorEffect for CoordinateRounding {
+    fn check(&self) -> Result<(), KeyError> {
+        within("step_m", self.step_m, 1e-6, 10.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        for echo in scan.returns_mut() {
+            let rounded = echo.point().map(|v| ((f64::from(v) / self.step_m).round() * self.step_m) as f32);
+            echo.move_point(rounded);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn points_lie_on_a_grid() {
+        let before = scene();
+        let after = applied(&CoordinateRounding { step_m: 0.1 }, &before);
+        for (a, b) in before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return()) {
+            for (v, w) in a.point().into_iter().zip(b.point()) {
+                assert!((v - w).abs() <= 0.0501 && (w * 10.0 - (w * 10.0).round()).abs() < 2e-3, "{v} {w}");
+            }
+        }
+    }
+}

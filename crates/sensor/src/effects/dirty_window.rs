@@ -1,0 +1,107 @@
+//! B8: a dirty spot on a sensor's window.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use nalgebra::Vector3;
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Within a spot the window lets less light through: one way `T = 1 - (1 - transmission) * exp(-(psi / radius)^4)`, psi the angle from the
+/// middle of the spot. The light that comes back falls by `T^2`, a return is lost with probability `loss * (1 - T^2)`, and a range gets
+/// `noise_m * (1 / T - 1) * N(0, 1)`, m.
+///
+/// Typical: transmission 0.1 to 0.7 in a spot of 2 to 10 degrees.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct DirtyWindow {
+    /// Name of the sensor.
+    pub sensor: String,
+    /// Middle of the spot, degrees, counter-clockwise from the sensor's middle.
+    pub azimuth_deg: f64,
+    /// Middle of the spot, degrees above the sensor's horizon.
+    pub elevation_deg: f64,
+    /// Its radius, degrees.
+    pub radius_deg: f64,
+    /// Part of the light that passes in its middle, one way, above 0.
+    pub transmission: f64,
+    /// Returns lost where nothing passes, 0 to 1.
+    pub loss: f64,
+    /// Noise where half of the light passes, m.
+    pub noise_m: f64,
+}
+
+impl Default for DirtyWindow {
+    fn default() -> Self {
+        DirtyWindow {
+            sensor: "front".into(),
+            azimuth_deg: 20.0,
+            elevation_deg: -3.0,
+            radius_deg: 6.0,
+            transmission: 0.4,
+            loss: 0.8,
+            noise_m: 0.02,
+        }
+    }
+}
+
+impl SensorEffect for DirtyWindow {
+    fn check(&self) -> Result<(), KeyError> {
+        within("azimuth_deg", self.azimuth_deg, -180.0, 180.0)?;
+        within("elevation_deg", self.elevation_deg, -90.0, 90.0)?;
+        within("radius_deg", self.radius_deg, 0.01, 180.0)?;
+        within("transmission", self.transmission, 0.01, 1.0)?;
+        within("loss", self.loss, 0.0, 1.0)?;
+        within("noise_m", self.noise_m, 0.0, 10.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let Some(number) = frame.rig.find(&self.sensor) else { return };
+        let [azimuth, elevation] = [self.azimuth_deg, self.elevation_deg].map(f64::to_radians);
+        let middle = frame.rig.sensors[number].pose().rotation * Vector3::from(crate::rig::direction(azimuth, elevation));
+        let middle: [f32; 3] = middle.map(|v| v as f32).into();
+        let radius = self.radius_deg.to_radians() as f32;
+        let mut random = draws.of_frame();
+        for echo in scan.returns_mut().filter(|e| usize::from(e.sensor) == number) {
+            let psi = crate::scan::dot(echo.direction, middle).clamp(-1.0, 1.0).acos();
+            let passes = 1.0 - (1.0 - self.transmission as f32) * (-(psi / radius).powi(4)).exp();
+            if passes > 0.999 {
+                continue;
+            }
+            echo.returned *= passes * passes;
+            let noise: f32 = StandardNormal.sample(&mut random);
+            echo.range_m = (echo.range_m + self.noise_m as f32 * (1.0 / passes - 1.0) * noise).max(0.01);
+            if random.random_range(0.0..1.0_f32) < self.loss as f32 * (1.0 - passes * passes) {
+                echo.lose();
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn a_soft_spot_in_the_sensor_s_frame() {
+        let before = scene();
+        let effect = DirtyWindow { transmission: 0.5, loss: 1.0, noise_m: 0.1, elevation_deg: -5.0, ..DirtyWindow::default() };
+        let after = applied(&effect, &before);
+        let share = |low: f64, high: f64| {
+            let inside = |d: [f32; 3]| {
+                let (az, el) = (f64::from(d[1].atan2(d[0])).to_degrees(), f64::from(d[2].asin()).to_degrees());
+                (low..high).contains(&(az - 20.0).hypot(el + 5.0))
+            };
+            let all: Vec<_> = before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && inside(a.direction)).collect();
+            all.iter().filter(|(_, b)| !b.is_return()).count() as f64 / all.len() as f64
+        };
+        let (inner, outer) = (share(0.0, 3.0), share(10.0, 20.0));
+        assert!((inner - 0.75).abs() < 0.08 && outer == 0.0, "{inner} {outer}");
+        let other = DirtyWindow { sensor: "rear".into(), ..effect };
+        assert_eq!(applied(&other, &before), before, "a sensor that is not there");
+    }
+}

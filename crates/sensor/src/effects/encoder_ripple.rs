@@ -1,0 +1,61 @@
+//! E1: ranges that swing with azimuth.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A range gets `amplitude_m * sin(periods * a + phase_rad)`, m, a the azimuth in the cloud's frame. No effect of the usual catalogues.
+///
+/// Typical: millimetres to centimetres.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct EncoderRipple {
+    /// m.
+    pub amplitude_m: f64,
+    /// Swings a turn.
+    pub periods: f64,
+    /// rad.
+    pub phase_rad: f64,
+}
+
+impl Default for EncoderRipple {
+    fn default() -> Self {
+        EncoderRipple { amplitude_m: 0.02, periods: 6.0, phase_rad: 0.0 }
+    }
+}
+
+impl SensorEffect for EncoderRipple {
+    fn check(&self) -> Result<(), KeyError> {
+        within("amplitude_m", self.amplitude_m, -5.0, 5.0)?;
+        within("periods", self.periods, 0.0, 1e4)?;
+        within("phase_rad", self.phase_rad, -100.0, 100.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        for echo in scan.returns_mut() {
+            let azimuth = f64::from(echo.direction[1]).atan2(echo.direction[0].into());
+            let off = self.amplitude_m * (self.periods * azimuth + self.phase_rad).sin();
+            echo.range_m = (echo.range_m + off as f32).max(0.01);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn a_sine_over_azimuth() {
+        let before = scene();
+        let after = applied(&EncoderRipple { amplitude_m: 0.05, periods: 12.0, phase_rad: 0.5 }, &before);
+        for (a, b) in before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return()) {
+            let azimuth = f64::from(a.direction[1].atan2(a.direction[0]));
+            let want = 0.05 * (12.0 * azimuth + 0.5).sin();
+            assert!((f64::from(b.range_m - a.range_m) - want).abs() < 2e-5);
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! D5: returns of nothing: noise of the receiver, more of it towards the sun.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A shot reports a range that is uniform between 0 and `reach_m` with probability `rate + sun_rate * exp(-(d / sun_width_deg)^2)`, d the angle
+/// from the azimuth of the sun; where it has a return, only when the false one is nearer.
+///
+/// Typical: 1e-4 (the rate to which Ouster's data sheet refers) to 1e-2 towards the sun.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct FalseAlarms {
+    /// 0 to 1.
+    pub rate: f64,
+    /// On top, straight towards the sun, 0 to 1.
+    pub sun_rate: f64,
+    /// Azimuth of the sun in the world, degrees, counter-clockwise from +x (east).
+    pub sun_azimuth_deg: f64,
+    /// Degrees.
+    pub sun_width_deg: f64,
+    /// m.
+    pub reach_m: f64,
+}
+
+impl Default for FalseAlarms {
+    fn default() -> Self {
+        FalseAlarms { rate: 1e-4, sun_rate: 0.0, sun_azimuth_deg: -60.0, sun_width_deg: 15.0, reach_m: 200.0 }
+    }
+}
+
+impl SensorEffect for FalseAlarms {
+    fn check(&self) -> Result<(), KeyError> {
+        within("rate", self.rate, 0.0, 1.0)?;
+        within("sun_rate", self.sun_rate, 0.0, 1.0)?;
+        within("sun_azimuth_deg", self.sun_azimuth_deg, -360.0, 360.0)?;
+        within("sun_width_deg", self.sun_width_deg, 0.1, 360.0)?;
+        within("reach_m", self.reach_m, 0.1, 5000.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let sun = (self.sun_azimuth_deg.to_radians() + frame.world_x_rad) as f32;
+        let width = self.sun_width_deg.to_radians() as f32;
+        let mut random = draws.of_frame();
+        for echo in &mut scan.echoes {
+            let mut rate = self.rate as f32;
+            if self.sun_rate > 0.0 {
+                let off = echo.direction[1].atan2(echo.direction[0]) - sun;
+                let off = off.sin().atan2(off.cos());
+                rate += self.sun_rate as f32 * (-(off / width).powi(2)).exp();
+            }
+            let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
+            let range_m = self.reach_m as f32 * part;
+            if chance < rate && range_m < echo.range_m && range_m > 0.1 {
+                *echo = crate::scan::Echo { range_m, normal: [0.0; 3], reflectivity: 0.02, returned: 0.02, object: 0, ..*echo };
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn uniform_in_range_where_nothing_is() {
+        let mut before = plate(40_000, 100.0, 0.5);
+        before.echoes.iter_mut().for_each(|e| e.lose());
+        let effect = FalseAlarms { rate: 0.05, reach_m: 200.0, ..FalseAlarms::default() };
+        let ranges: Vec<f64> = applied(&effect, &before).returns().map(|e| e.range_m.into()).collect();
+        let share = ranges.len() as f64 / 40_000.0;
+        let (mean, std) = moments(&ranges);
+        assert!((share - 0.05).abs() < 0.004, "{share}");
+        assert!((mean - 100.0).abs() < 5.0 && (std - 200.0 / 12_f64.sqrt()).abs() < 4.0, "{mean} {std}");
+    }
+
+    #[test]
+    fn more_towards_the_sun() {
+        let mut before = scene();
+        before.echoes.iter_mut().for_each(|e| e.lose());
+        let effect = FalseAlarms { rate: 0.0, sun_rate: 0.5, sun_azimuth_deg: 30.0, sun_width_deg: 10.0, ..FalseAlarms::default() };
+        let azimuths: Vec<f64> =
+            applied(&effect, &before).returns().map(|e| f64::from(e.direction[1].atan2(e.direction[0])).to_degrees()).collect();
+        let (mean, std) = moments(&azimuths);
+        assert!((mean - 30.0).abs() < 1.0 && (std - 10.0 / 2_f64.sqrt()).abs() < 1.0, "{mean} {std}");
+    }
+}

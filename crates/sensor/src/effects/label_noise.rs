@@ -1,0 +1,95 @@
+//! C7: labels that are off by another amount in every frame.
+
+use super::{Draws, FrameContext, LabelledCar, SensorEffect};
+use data::KeyError;
+use data::toml_text::within;
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A label is moved by independent normal errors along, across and above its heading and turned by one; with `slip_probability` it slips
+/// `slip_m` forward or back on top.
+///
+/// Typical: 2 to 5 cm and 0.1 to 0.5 degrees (RTK); slips of about 0.8 m in some frames (paper, figure 8).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LabelNoise {
+    /// Along the heading, m.
+    pub longitudinal_std_m: f64,
+    /// Across it, m.
+    pub lateral_std_m: f64,
+    /// Up and down, m.
+    pub vertical_std_m: f64,
+    /// Degrees.
+    pub yaw_std_deg: f64,
+    /// Share of the labels that slip.
+    pub slip_probability: f64,
+    /// By how much, m.
+    pub slip_m: f64,
+}
+
+impl Default for LabelNoise {
+    fn default() -> Self {
+        LabelNoise {
+            longitudinal_std_m: 0.05,
+            lateral_std_m: 0.03,
+            vertical_std_m: 0.03,
+            yaw_std_deg: 0.2,
+            slip_probability: 0.0,
+            slip_m: 0.8,
+        }
+    }
+}
+
+impl SensorEffect for LabelNoise {
+    fn check(&self) -> Result<(), KeyError> {
+        for (key, value) in [
+            ("longitudinal_std_m", self.longitudinal_std_m),
+            ("lateral_std_m", self.lateral_std_m),
+            ("vertical_std_m", self.vertical_std_m),
+            ("slip_m", self.slip_m),
+        ] {
+            within(key, value, 0.0, 20.0)?;
+        }
+        within("yaw_std_deg", self.yaw_std_deg, 0.0, 180.0)?;
+        within("slip_probability", self.slip_probability, 0.0, 1.0)
+    }
+
+    fn on_labels(&self, cars: &mut [LabelledCar], _frame: &FrameContext, draws: &Draws) {
+        let mut random = draws.of_frame();
+        for car in cars {
+            let [along, across, up, turn]: [f64; 4] = std::array::from_fn(|_| StandardNormal.sample(&mut random));
+            let slips = random.random_bool(self.slip_probability);
+            let slip = if slips { self.slip_m * if random.random_bool(0.5) { 1.0 } else { -1.0 } } else { 0.0 };
+            let shift = [self.longitudinal_std_m * along + slip, self.lateral_std_m * across, self.vertical_std_m * up];
+            car.label.center = car.label.from_local(shift);
+            car.label.yaw_rad += (self.yaw_std_deg * turn).to_radians();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn errors_have_the_sizes_that_are_said() {
+        let effect = LabelNoise { longitudinal_std_m: 0.3, lateral_std_m: 0.1, vertical_std_m: 0.05, yaw_std_deg: 1.0, slip_probability: 0.2, slip_m: 5.0 };
+        let mut shifts: Vec<[f64; 4]> = Vec::new();
+        for frame in 0..3000 {
+            let mut cars = cars();
+            with_frame(frame, |frame, draws| effect.on_labels(&mut cars, frame, draws));
+            let [x, y, z] = cars[0].true_box.to_local(cars[0].label.center);
+            shifts.push([x, y, z, (cars[0].label.yaw_rad - cars[0].true_box.yaw_rad).to_degrees()]);
+        }
+        let slipped = shifts.iter().filter(|s| s[0].abs() > 2.5).count() as f64 / shifts.len() as f64;
+        assert!((slipped - 0.2).abs() < 0.03, "{slipped}");
+        shifts.retain(|s| s[0].abs() < 2.5);
+        for (k, want) in [0.3, 0.1, 0.05, 1.0].into_iter().enumerate() {
+            let (mean, std) = moments(&shifts.iter().map(|s| s[k]).collect::<Vec<_>>());
+            assert!(mean.abs() < 0.1 * want && (std / want - 1.0).abs() < 0.06, "{k}: {mean} {std}");
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! C6: labels that are off by the same amount in every car.
+
+use super::{Draws, FrameContext, LabelledCar, SensorEffect};
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A label is moved by `forward_m`, `left_m`, `up_m` in its own frame and turned by `yaw_deg`: the lever arm from antenna to middle is wrong.
+///
+/// Typical: 0.1 to 1 m.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct LabelOffset {
+    /// m.
+    pub forward_m: f64,
+    /// m.
+    pub left_m: f64,
+    /// m.
+    pub up_m: f64,
+    /// Degrees, counter-clockwise.
+    pub yaw_deg: f64,
+}
+
+impl Default for LabelOffset {
+    fn default() -> Self {
+        LabelOffset { forward_m: 0.15, left_m: 0.0, up_m: 0.0, yaw_deg: 0.0 }
+    }
+}
+
+impl SensorEffect for LabelOffset {
+    fn check(&self) -> Result<(), KeyError> {
+        for (key, value) in [("forward_m", self.forward_m), ("left_m", self.left_m), ("up_m", self.up_m)] {
+            within(key, value, -20.0, 20.0)?;
+        }
+        within("yaw_deg", self.yaw_deg, -180.0, 180.0)
+    }
+
+    fn on_labels(&self, cars: &mut [LabelledCar], _frame: &FrameContext, _draws: &Draws) {
+        for car in cars {
+            car.label.center = car.label.from_local([self.forward_m, self.left_m, self.up_m]);
+            car.label.yaw_rad += self.yaw_deg.to_radians();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn the_shift_is_in_the_car_s_frame() {
+        let effect = LabelOffset { forward_m: 0.4, left_m: -0.2, up_m: 0.1, yaw_deg: 2.0 };
+        let mut cars = cars();
+        with_frame(0, |frame, draws| effect.on_labels(&mut cars, frame, draws));
+        let local = cars[0].true_box.to_local(cars[0].label.center);
+        assert!((local[0] - 0.4).abs() < 1e-9 && (local[1] + 0.2).abs() < 1e-9 && (local[2] - 0.1).abs() < 1e-9);
+        assert!((cars[0].label.yaw_rad - cars[0].true_box.yaw_rad - 2_f64.to_radians()).abs() < 1e-12);
+    }
+}

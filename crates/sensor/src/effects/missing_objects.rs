@@ -1,0 +1,54 @@
+//! C10: a world that lacks what is there.
+
+use super::{Need, SensorEffect, WorldPlan};
+use crate::object::Group;
+use data::KeyError;
+use data::toml_text::wrong;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// `groups` of the static world are not there.
+///
+/// Typical: the paper's simulation has nothing behind the outer wall.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct MissingObjects {
+    /// What is left out.
+    pub groups: Vec<Group>,
+}
+
+impl Default for MissingObjects {
+    fn default() -> Self {
+        MissingObjects { groups: vec![Group::OutsideGround, Group::OutsideObjects] }
+    }
+}
+
+impl SensorEffect for MissingObjects {
+    fn check(&self) -> Result<(), KeyError> {
+        if self.groups.is_empty() { Err(wrong("groups", "names none")) } else { Ok(()) }
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        None
+    }
+
+    fn on_world(&self, world: &mut WorldPlan) {
+        world.groups.retain(|group| !self.groups.contains(group));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::ExtraObjects;
+    use super::*;
+
+    #[test]
+    fn groups_go_and_come_back() {
+        let mut world = WorldPlan::default();
+        MissingObjects::default().on_world(&mut world);
+        assert_eq!(world.groups.len(), Group::ALL.len() - 2);
+        assert!(!world.groups.contains(&Group::OutsideObjects));
+        ExtraObjects { groups: vec![Group::OutsideObjects] }.on_world(&mut world);
+        assert!(world.groups.contains(&Group::OutsideObjects) && !world.groups.contains(&Group::OutsideGround));
+    }
+}

@@ -1,0 +1,286 @@
+//! The sensor model: an ordered list of physical effects.
+//!
+//! Each effect is one file with one struct: its formula, units, source and typical values are said there. An effect may act in four places,
+//! and in each of them the effects of a list act in their order:
+//!
+//! 1. on the **world**: what stands where, before any ray is cast;
+//! 2. on the **beams**: where shots really go, and when;
+//! 3. on the **scan**: ranges, returns, intensities;
+//! 4. on the **labels**.
+//!
+//! Random numbers come from streams of their own: one for each (seed, data set, place in the list, kind, frame), and one without the frame
+//! for what stays the same in a whole data set, as the offset of a beam. So an effect changes neither when another is added behind it nor
+//! with the number of threads.
+//!
+//! The codes (A1, B2, ...) are those of the catalogue in `docs/src/reference/effects.md`.
+
+mod context;
+mod local_plane;
+mod shot_grid;
+mod table;
+#[cfg(test)]
+pub(crate) mod testing;
+
+pub use context::{Draws, FrameContext, LabelledCar, Need, Undulation, WorldPlan};
+pub use empirical::Covariate;
+pub use label_time_offset::Clock;
+
+use crate::beams::Beams;
+use crate::scan::Scan;
+use data::toml_text::{parse_toml, read_toml, wrong};
+use data::{DataError, KeyError};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// One physical effect. What it does not touch it leaves as it is.
+pub trait SensorEffect {
+    /// Refuses parameters that cannot be, naming the key.
+    fn check(&self) -> Result<(), KeyError> {
+        Ok(())
+    }
+
+    /// What must be known for the effect to act on a finished cloud; `None` when it cannot.
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(&[])
+    }
+
+    /// Changes what stands where.
+    fn on_world(&self, _world: &mut WorldPlan) {}
+
+    /// Changes where shots go.
+    fn on_beams(&self, _beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {}
+
+    /// Changes what came back.
+    fn on_scan(&self, _scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {}
+
+    /// Changes a finished cloud, of which no ray can be cast any more.
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        self.on_scan(scan, frame, draws);
+    }
+
+    /// Changes the labels.
+    fn on_labels(&self, _cars: &mut [LabelledCar], _frame: &FrameContext, _draws: &Draws) {}
+}
+
+macro_rules! effects {
+    ($($file:ident::$name:ident $code:literal,)*) => {
+        $(mod $file;)*
+        $(pub use $file::$name;)*
+
+        /// One entry of the list; `kind` says which.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+        #[serde(tag = "kind", rename_all = "snake_case")]
+        #[allow(missing_docs, reason = "each variant is the struct of its name, which is documented")]
+        pub enum Effect {
+            $($name($name),)*
+        }
+
+        impl Effect {
+            /// The model behind it.
+            pub fn model(&self) -> &dyn SensorEffect {
+                match self {
+                    $(Effect::$name(effect) => effect,)*
+                }
+            }
+
+            /// Its name in a list.
+            pub fn kind(&self) -> &'static str {
+                match self {
+                    $(Effect::$name(_) => stringify!($file),)*
+                }
+            }
+
+            /// Its code in the catalogue.
+            pub fn code(&self) -> &'static str {
+                match self {
+                    $(Effect::$name(_) => $code,)*
+                }
+            }
+
+            /// Name and code of every effect.
+            pub const CATALOGUE: &'static [(&'static str, &'static str)] = &[$((stringify!($file), $code),)*];
+        }
+    };
+}
+
+effects! {
+    range_noise::RangeNoise "A1",
+    range_noise_by_range::RangeNoiseByRange "A2",
+    range_noise_by_signal::RangeNoiseBySignal "A3",
+    range_noise_by_incidence::RangeNoiseByIncidence "A4",
+    heavy_tails::HeavyTails "A5",
+    range_bias::RangeBias "A6",
+    beam_range_offset::BeamRangeOffset "A7",
+    reflectivity_walk::ReflectivityWalk "A8",
+    range_quantisation::RangeQuantisation "A9",
+    coordinate_rounding::CoordinateRounding "A9",
+    range_drift::RangeDrift "A10",
+    random_dropout::RandomDropout "B1",
+    signal_dropout::SignalDropout "B2",
+    range_dropout::RangeDropout "B3",
+    incidence_dropout::IncidenceDropout "B4",
+    material_dropout::MaterialDropout "B5",
+    range_limits::RangeLimits "B6",
+    ego_body_mask::EgoBodyMask "B7",
+    dirty_window::DirtyWindow "B8",
+    packet_loss::PacketLoss "B9",
+    bright_target_dropout::BrightTargetDropout "B10",
+    angular_jitter::AngularJitter "C1",
+    sensor_pose_error::SensorPoseError "C2",
+    beam_angle_error::BeamAngleError "C3",
+    rolling_shutter::RollingShutter "C4",
+    label_time_offset::LabelTimeOffset "C5",
+    label_offset::LabelOffset "C6",
+    label_noise::LabelNoise "C7",
+    ego_attitude::EgoAttitude "C8",
+    target_attitude::TargetAttitude "C8",
+    ground_error::GroundError "C9",
+    missing_objects::MissingObjects "C10",
+    extra_objects::ExtraObjects "C10",
+    target_shape::TargetShape "C11",
+    beam_divergence::BeamDivergence "D1",
+    ghosts::Ghosts "D2",
+    blooming::Blooming "D3",
+    fog::Fog "D4",
+    rain::Rain "D4",
+    spray::Spray "D4",
+    false_alarms::FalseAlarms "D5",
+    dual_returns::DualReturns "D6",
+    intensity_law::IntensityLaw "D7",
+    encoder_ripple::EncoderRipple "E1",
+    mount_vibration::MountVibration "E2",
+    point_order::PointOrder "E3",
+    empirical::Empirical "E4",
+}
+
+/// An ordered list of effects, as a TOML of `[[effect]]` tables.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct EffectList {
+    /// The effects, in their order.
+    #[serde(rename = "effect", default)]
+    pub effects: Vec<Effect>,
+}
+
+impl EffectList {
+    /// Reads a list.
+    pub fn read(path: &Path) -> Result<EffectList, DataError> {
+        read_toml(path, EffectList::check)
+    }
+
+    /// A list in memory; `path` is for messages.
+    pub fn parse(text: &str, path: &Path) -> Result<EffectList, DataError> {
+        parse_toml(text, path, EffectList::check)
+    }
+
+    /// Refuses parameters that cannot be, naming the key.
+    pub fn check(&self) -> Result<(), KeyError> {
+        for (i, effect) in self.effects.iter().enumerate() {
+            effect.model().check().map_err(|e| e.below(&format!("effect[{i}]")))?;
+        }
+        if self.effects.iter().enumerate().any(|(i, e)| {
+            matches!(e, Effect::DualReturns(_))
+                && !self.effects[..i].iter().any(|e| matches!(e, Effect::BeamDivergence(_)))
+        }) {
+            return Err(wrong("effect", "dual_returns needs a beam_divergence before it: a line has one return"));
+        }
+        Ok(())
+    }
+
+    /// What each effect of the list draws from.
+    fn each<'a>(&'a self, seed: u64, set: &'a str, frame: u64) -> impl Iterator<Item = (&'a Effect, Draws)> + 'a {
+        let draws = move |(i, effect): (usize, &'a Effect)| {
+            (effect, Draws::new(seed, format!("{set}/effect {i} {}", effect.kind()), frame))
+        };
+        self.effects.iter().enumerate().map(draws)
+    }
+
+    /// Lets the list act on the world.
+    pub fn on_world(&self, world: &mut WorldPlan) {
+        self.effects.iter().for_each(|effect| effect.model().on_world(world));
+    }
+
+    /// Lets the list act on the shots of a frame.
+    pub fn on_beams(&self, beams: &mut Beams, frame: &FrameContext) {
+        for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
+            effect.model().on_beams(beams, frame, &draws);
+        }
+    }
+
+    /// Lets the list act on what came back.
+    pub fn on_scan(&self, scan: &mut Scan, frame: &FrameContext) {
+        for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
+            effect.model().on_scan(scan, frame, &draws);
+        }
+    }
+
+    /// Lets the list act on a finished cloud.
+    pub fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext) {
+        for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
+            effect.model().on_cloud(scan, frame, &draws);
+        }
+    }
+
+    /// Lets the list act on the labels.
+    pub fn on_labels(&self, cars: &mut [LabelledCar], frame: &FrameContext) {
+        for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
+            effect.model().on_labels(cars, frame, &draws);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_are_read_in_their_order() {
+        let text =
+            "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.03\n\n[[effect]]\nkind = \"random_dropout\"\nshare = 0.2\n";
+        let list = EffectList::parse(text, Path::new("e.toml")).unwrap();
+        assert_eq!(
+            list.effects.iter().map(|e| (e.kind(), e.code())).collect::<Vec<_>>(),
+            [("range_noise", "A1"), ("random_dropout", "B1")]
+        );
+        assert_eq!(EffectList::parse(&toml::to_string(&list).unwrap(), Path::new("e")).unwrap(), list);
+        assert_eq!(EffectList::parse("", Path::new("e")).unwrap(), EffectList::default());
+    }
+
+    #[test]
+    fn bad_lists_are_refused_by_line() {
+        for (text, want) in [
+            ("[[effect]]\nkind = \"range_noise\"\nstd_m = -1\n", "e.toml:3: effect[0].std_m: -1 is not between"),
+            (
+                "[[effect]]\nkind = \"range_noise\"\n[[effect]]\nkind = \"random_dropout\"\nshare = 2\n",
+                "e.toml:5: effect[1].share: 2",
+            ),
+            ("[[effect]]\nkind = \"range_noise\"\nstd_mm = 1\n", "e.toml:1: unknown field `std_mm`"),
+            ("a = 1\n", "e.toml:1: unknown field `a`"),
+            ("[[effect]]\nkind = \"range_nose\"\n", "unknown variant `range_nose`"),
+            ("[[effect]]\nkind = \"dual_returns\"\n", "needs a beam_divergence before it"),
+        ] {
+            let error = EffectList::parse(text, Path::new("e.toml")).unwrap_err().to_string();
+            assert!(error.contains(want), "{error}, not {want}");
+        }
+    }
+
+    #[test]
+    fn the_catalogue_is_whole() {
+        let kinds: Vec<&str> = Effect::CATALOGUE.iter().map(|(kind, _)| *kind).collect();
+        assert!(kinds.len() >= 30);
+        let mut sorted = kinds.clone();
+        sorted.sort_unstable();
+        sorted.dedup();
+        assert_eq!(sorted.len(), kinds.len());
+        for kind in kinds {
+            // Every effect stands with its defaults, and its name in a list is that of its file.
+            let text = format!("[[effect]]\nkind = \"beam_divergence\"\n[[effect]]\nkind = \"{kind}\"\n");
+            let list = EffectList::parse(&text, Path::new("e.toml")).unwrap();
+            assert_eq!(list.effects[1].kind(), kind);
+        }
+        for code in ["A1", "A10", "B1", "B10", "C1", "C11", "D1", "D7"] {
+            assert!(Effect::CATALOGUE.iter().any(|(_, c)| *c == code), "{code}");
+        }
+    }
+}

@@ -1,0 +1,60 @@
+//! B1: returns lost at random.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::{Echo, Scan};
+use data::KeyError;
+use data::toml_text::within;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A return is lost with probability `share`.
+///
+/// Typical: 0.20 is the paper's "sim downsampled"; CARLA's default is 0.45; what road data show on average is 0.05 to 0.15.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RandomDropout {
+    /// 0 to 1.
+    pub share: f64,
+}
+
+impl Default for RandomDropout {
+    fn default() -> Self {
+        RandomDropout { share: 0.2 }
+    }
+}
+
+impl SensorEffect for RandomDropout {
+    fn check(&self) -> Result<(), KeyError> {
+        within("share", self.share, 0.0, 1.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        drop_some(scan, draws, |_| self.share as f32);
+    }
+}
+
+/// Loses each return with the probability that `share` says for it.
+pub(super) fn drop_some(scan: &mut Scan, draws: &Draws, share: impl Fn(&Echo) -> f32) {
+    let mut random = draws.of_frame();
+    for echo in scan.returns_mut() {
+        if random.random_range(0.0..1.0_f32) < share(echo) {
+            echo.lose();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn the_share_is_lost_everywhere() {
+        let before = scene();
+        for share in [0.0, 0.2, 1.0] {
+            let got = lost(&before, &applied(&RandomDropout { share }, &before));
+            assert!((got - share).abs() < 0.02, "{share}: {got}");
+        }
+    }
+}

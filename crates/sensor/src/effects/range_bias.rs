@@ -1,0 +1,55 @@
+//! A6: all ranges off by the same amount and the same part.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A range R becomes `R * (1 + scale) + offset_m`, m.
+///
+/// Typical: millimetres to centimetres; scale 1e-4 to 1e-3.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RangeBias {
+    /// m.
+    pub offset_m: f64,
+    /// m a metre.
+    pub scale: f64,
+}
+
+impl Default for RangeBias {
+    fn default() -> Self {
+        RangeBias { offset_m: 0.02, scale: 0.0 }
+    }
+}
+
+impl SensorEffect for RangeBias {
+    fn check(&self) -> Result<(), KeyError> {
+        within("offset_m", self.offset_m, -10.0, 10.0)?;
+        within("scale", self.scale, -0.5, 0.5)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        for echo in scan.returns_mut() {
+            let range_m = f64::from(echo.range_m);
+            echo.range_m = (range_m * (1.0 + self.scale) + self.offset_m).max(0.01) as f32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn a_line_in_the_range() {
+        for range_m in [5.0, 100.0] {
+            let before = plate(10, range_m, 0.5);
+            let off = residuals(&before, &applied(&RangeBias { offset_m: -0.05, scale: 0.001 }, &before));
+            assert!(off.iter().all(|v| (v + 0.05 - 0.001 * f64::from(range_m)).abs() < 1e-5), "{off:?}");
+        }
+    }
+}

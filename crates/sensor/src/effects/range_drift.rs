@@ -1,0 +1,55 @@
+//! A10: ranges that drift with time, as the sensor warms up.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A range gets `drift_m * (1 - exp(-t / time_constant_s))`, m, t the time since the beginning of the data set, s.
+///
+/// Typical: some millimetres to centimetres within half an hour (Glennie and Lichti 2011 on the HDL-64E).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RangeDrift {
+    /// Where it ends, m.
+    pub drift_m: f64,
+    /// After this time 63 % of it are there, s.
+    pub time_constant_s: f64,
+}
+
+impl Default for RangeDrift {
+    fn default() -> Self {
+        RangeDrift { drift_m: 0.02, time_constant_s: 600.0 }
+    }
+}
+
+impl SensorEffect for RangeDrift {
+    fn check(&self) -> Result<(), KeyError> {
+        within("drift_m", self.drift_m, -10.0, 10.0)?;
+        within("time_constant_s", self.time_constant_s, 0.01, 1e6)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+        let drift = (self.drift_m * (1.0 - (-frame.time_s / self.time_constant_s).exp())) as f32;
+        for echo in scan.returns_mut() {
+            echo.range_m = (echo.range_m + drift).max(0.01);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn it_begins_at_nothing_and_ends_where_it_is_said() {
+        let (before, effect) = (plate(5, 30.0, 0.5), RangeDrift { drift_m: 0.05, time_constant_s: 10.0 });
+        for (frame, want) in [(0, 0.0), (200, 0.05 * (1.0 - (-1.0_f64).exp())), (20_000, 0.05)] {
+            let off = residuals(&before, &applied_in(frame, &effect, &before));
+            assert!((off[0] - want).abs() < 1e-5, "{frame}: {} {want}", off[0]);
+        }
+    }
+}

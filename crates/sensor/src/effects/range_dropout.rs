@@ -1,0 +1,75 @@
+//! B3: returns lost by their range alone, along a table.
+
+use super::{Draws, FrameContext, SensorEffect};
+use super::random_dropout::drop_some;
+use super::table::{check_table, interpolated};
+use crate::scan::Scan;
+use data::KeyError;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A return at range R is lost with the probability that lies on the line through the points (`range_m`, `share`); beyond both ends that of the
+/// end.
+///
+/// Typical: 0 near by to 0.3 at 100 m. The paper's "distribution-matched" downsampling is a table fitted to a pair of data sets:
+/// [`crate::matched::fit_range_dropout`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RangeDropout {
+    /// Ranges, ascending, m.
+    pub range_m: Vec<f64>,
+    /// Probability of a loss at each, 0 to 1.
+    pub share: Vec<f64>,
+}
+
+impl Default for RangeDropout {
+    fn default() -> Self {
+        RangeDropout { range_m: vec![0.0, 100.0], share: vec![0.0, 0.3] }
+    }
+}
+
+impl RangeDropout {
+    /// The probability of a loss at a range.
+    pub fn share_at(&self, range_m: f64) -> f64 {
+        interpolated(&self.range_m, &self.share, range_m)
+    }
+}
+
+impl SensorEffect for RangeDropout {
+    fn check(&self) -> Result<(), KeyError> {
+        check_table(("range_m", &self.range_m, [0.0, 1e4]), ("share", &self.share, [0.0, 1.0]))
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        drop_some(scan, draws, |echo| self.share_at(echo.range_m.into()) as f32);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn losses_follow_the_table() {
+        let effect = RangeDropout { range_m: vec![10.0, 50.0, 100.0], share: vec![0.1, 0.5, 0.3] };
+        for (range_m, want) in [(5.0, 0.1), (30.0, 0.3), (75.0, 0.4), (200.0, 0.3)] {
+            let before = plate(20_000, range_m, 0.5);
+            let got = lost(&before, &applied(&effect, &before));
+            assert!((got - want).abs() < 0.012, "{range_m}: {got} {want}");
+        }
+    }
+
+    #[test]
+    fn bad_tables_are_refused() {
+        let table = |range_m: &[f64], share: &[f64]| RangeDropout { range_m: range_m.into(), share: share.into() };
+        for (effect, want) in [
+            (table(&[], &[]), "no table"),
+            (table(&[1.0, 2.0], &[0.1]), "no table"),
+            (table(&[1.0, 1.0], &[0.1, 0.2]), "range_m[1]: is not larger"),
+            (table(&[1.0, 2.0], &[0.1, 1.2]), "share[1]: 1.2"),
+        ] {
+            assert!(effect.check().unwrap_err().to_string().contains(want));
+        }
+    }
+}

@@ -1,0 +1,56 @@
+//! B6: nothing nearer, nothing farther.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Returns outside of `min_m..=max_m` are lost.
+///
+/// Typical: 0.3 to 1 m (dead zone; Ouster OS1 0.8 m) and 100 to 250 m.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RangeLimits {
+    /// m.
+    pub min_m: f64,
+    /// m.
+    pub max_m: f64,
+}
+
+impl Default for RangeLimits {
+    fn default() -> Self {
+        RangeLimits { min_m: 0.8, max_m: 250.0 }
+    }
+}
+
+impl SensorEffect for RangeLimits {
+    fn check(&self) -> Result<(), KeyError> {
+        within("max_m", self.max_m, 0.0, 1e4)?;
+        within("min_m", self.min_m, 0.0, self.max_m)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        let limits = self.min_m as f32..=self.max_m as f32;
+        for echo in scan.returns_mut().filter(|e| !limits.contains(&e.range_m)) {
+            echo.lose();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn a_step_at_both_ends() {
+        let before = scene();
+        let after = applied(&RangeLimits { min_m: 10.0, max_m: 30.0 }, &before);
+        for (a, b) in before.echoes.iter().zip(&after.echoes) {
+            assert_eq!(b.is_return(), a.is_return() && (10.0..=30.0).contains(&a.range_m));
+        }
+        assert!((0.1..0.9).contains(&lost(&before, &after)));
+    }
+}

@@ -1,0 +1,66 @@
+//! A1: noise of one size.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use rand_distr::{Distribution, StandardNormal};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Every range gets `std_m * N(0, 1)`, m.
+///
+/// Typical: 0.02 (the default of the simulator of Huch et al. 2023 and their "sim noise"), 0.01 to 0.03 in data sheets.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RangeNoise {
+    /// Standard deviation, m.
+    pub std_m: f64,
+}
+
+impl Default for RangeNoise {
+    fn default() -> Self {
+        RangeNoise { std_m: 0.02 }
+    }
+}
+
+impl SensorEffect for RangeNoise {
+    fn check(&self) -> Result<(), KeyError> {
+        within("std_m", self.std_m, 0.0, 10.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        add_noise(scan, draws, |_| self.std_m as f32);
+    }
+}
+
+/// Adds Gaussian noise of the deviation (m) that `std_m` says for each return. Ranges stay above 1 cm.
+pub(super) fn add_noise(scan: &mut Scan, draws: &Draws, std_m: impl Fn(&crate::scan::Echo) -> f32) {
+    let mut random = draws.of_frame();
+    for echo in scan.returns_mut() {
+        let noise: f32 = StandardNormal.sample(&mut random);
+        echo.range_m = (echo.range_m + std_m(echo) * noise).max(0.01);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn its_size_is_that_at_every_range() {
+        for range_m in [5.0, 50.0, 200.0] {
+            let before = plate(20_000, range_m, 0.5);
+            let (mean, std) = moments(&residuals(&before, &applied(&RangeNoise { std_m: 0.03 }, &before)));
+            assert!(mean.abs() < 1e-3 && (std - 0.03).abs() < 1e-3, "{range_m}: {mean} {std}");
+        }
+    }
+
+    #[test]
+    fn frames_differ_and_repeat() {
+        let (before, effect) = (plate(100, 20.0, 0.5), RangeNoise::default());
+        assert_eq!(applied_in(3, &effect, &before), applied_in(3, &effect, &before));
+        assert_ne!(applied_in(3, &effect, &before), applied_in(4, &effect, &before));
+    }
+}

@@ -1,0 +1,57 @@
+//! A9: ranges in steps.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A range R becomes `step_m * round(R / step_m)`, m.
+///
+/// Typical: 2 mm (Velodyne HDL-64E), 1.2 cm (Ouster OS1 gen 1), 3 cm (ZVISION ML-30S).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RangeQuantisation {
+    /// m.
+    pub step_m: f64,
+}
+
+impl Default for RangeQuantisation {
+    fn default() -> Self {
+        RangeQuantisation { step_m: 0.01 }
+    }
+}
+
+impl SensorEffect for RangeQuantisation {
+    fn check(&self) -> Result<(), KeyError> {
+        within("step_m", self.step_m, 1e-6, 10.0)
+    }
+
+    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        for echo in scan.returns_mut() {
+            let steps = (f64::from(echo.range_m) / self.step_m).round().max(1.0);
+            echo.range_m = (steps * self.step_m) as f32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn ranges_lie_on_a_comb() {
+        let before = scene();
+        let after = applied(&RangeQuantisation { step_m: 0.05 }, &before);
+        let off = residuals(&before, &after);
+        assert!(off.iter().all(|v| v.abs() <= 0.0251));
+        let (mean, std) = moments(&off);
+        assert!(mean.abs() < 2e-3 && (std - 0.05 / 12_f64.sqrt()).abs() < 2e-3, "{mean} {std}");
+        assert!(after.returns().all(|e| {
+            let steps = f64::from(e.range_m) / 0.05;
+            (steps - steps.round()).abs() < 1e-3
+        }));
+    }
+}

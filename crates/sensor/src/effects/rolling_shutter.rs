@@ -1,0 +1,106 @@
+//! C4: a scan takes time, in which everything moves.
+
+use super::{Draws, FrameContext, Need, SensorEffect};
+use crate::beams::{Beams, Shutter};
+use crate::scan::Scan;
+use data::KeyError;
+use nalgebra::Vector3;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Every shot is sent at its own time, and sees the cars where they are then, from where its own car is then. `deskewed` moves the points by
+/// the own car's motion to the middle of the scan, as drivers do: then what stands still is right, and other cars are smeared by their
+/// own motion; otherwise all is smeared by the relative motion.
+///
+/// Typical: 50 ms a scan; at 70 m/s that is +-1.75 m.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct RollingShutter {
+    /// Points are moved to where they would be seen from at the middle of the scan.
+    pub deskewed: bool,
+}
+
+impl Default for RollingShutter {
+    fn default() -> Self {
+        RollingShutter { deskewed: true }
+    }
+}
+
+impl SensorEffect for RollingShutter {
+    fn check(&self) -> Result<(), KeyError> {
+        Ok(())
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(&[Need::Time, Need::Cars, Need::Motion])
+    }
+
+    fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {
+        beams.shutter = Some(Shutter { deskewed: self.deskewed });
+    }
+
+    /// On a finished cloud: points in the boxes of cars move with their car, all others as the own car moves.
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+        let ego = Vector3::from(frame.ego_velocity);
+        let turn = Vector3::from(frame.ego_turn_rate);
+        for echo in scan.returns_mut() {
+            let point = echo.point().map(f64::from);
+            let inside = |b: &geometry::Box3| {
+                let local = b.to_local(point);
+                (0..3).all(|k| local[k].abs() <= b.size[k] / 2.0 + 0.1)
+            };
+            let car = frame.cars.iter().find(|car| inside(&car.true_box));
+            let mut velocity = car.map_or(Vector3::zeros(), |car| Vector3::from(car.velocity));
+            if !self.deskewed {
+                velocity -= ego + turn.cross(&Vector3::from(point));
+            }
+            if velocity != Vector3::zeros() {
+                let moved = Vector3::from(point) + velocity * f64::from(echo.time_s);
+                echo.move_point(moved.map(|v| v as f32).into());
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+    use crate::scan::Echo;
+
+    /// A point of the car of `cars()` and one beside, both shot at 20 ms.
+    fn two() -> Scan {
+        let at = |point: [f32; 3]| {
+            let mut echo = Echo { time_s: 0.02, range_m: 1.0, ..Echo::nothing([0.0; 3], [1.0, 0.0, 0.0]) };
+            echo.move_point(point);
+            echo
+        };
+        Scan { echoes: vec![at([19.0, 2.0, -1.0]), at([30.0, -8.0, 0.0])] }
+    }
+
+    #[test]
+    fn deskewed_only_cars_move() {
+        let mut scan = two();
+        with_frame(0, |frame, draws| RollingShutter { deskewed: true }.on_cloud(&mut scan, frame, draws));
+        let (s, c) = 0.1_f32.sin_cos();
+        let (on_car, beside) = (scan.echoes[0].point(), scan.echoes[1].point());
+        assert!((on_car[0] - 19.0 - 1.2 * c).abs() < 1e-4 && (on_car[1] - 2.0 - 1.2 * s).abs() < 1e-4);
+        assert!((beside[0] - 30.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn raw_all_moves_against_the_own_car() {
+        let mut scan = two();
+        with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_cloud(&mut scan, frame, draws));
+        let beside = scan.echoes[1].point();
+        // 50 m/s forward and 0.2 rad/s to the left for 20 ms.
+        assert!((beside[0] - (30.0 - 1.0 - 0.2 * 8.0 * 0.02)).abs() < 1e-3 && (beside[1] - (-8.0 - 0.2 * 30.0 * 0.02)).abs() < 1e-3, "{beside:?}");
+    }
+
+    #[test]
+    fn beams_are_told() {
+        let mut beams = Beams::of(&rig());
+        with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_beams(&mut beams, frame, draws));
+        assert_eq!(beams.shutter, Some(Shutter { deskewed: false }));
+    }
+}

@@ -1,0 +1,97 @@
+//! C2: a sensor that is not mounted where it is said to be.
+
+use super::{Draws, FrameContext, SensorEffect};
+use crate::beams::Beams;
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use geometry::Pose;
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// The sensor really stands at its pose of the rig, moved by `translation_m` and turned by `rotation_deg` (roll, pitch, yaw), both in its own
+/// frame; its points are shown by the rig.
+///
+/// Typical: 1 to 10 cm, 0.05 to 0.3 degrees. The published description of the AV-21 has two values for the front sensor, 10 cm apart in x.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SensorPoseError {
+    /// Name of the sensor.
+    pub sensor: String,
+    /// Forward, left, up in the sensor's frame, m.
+    pub translation_m: [f64; 3],
+    /// Roll, pitch, yaw, degrees.
+    pub rotation_deg: [f64; 3],
+}
+
+impl Default for SensorPoseError {
+    fn default() -> Self {
+        SensorPoseError { sensor: "front".into(), translation_m: [0.0; 3], rotation_deg: [0.0, 0.1, 0.0] }
+    }
+}
+
+impl SensorPoseError {
+    /// `believed_from_true`, sensor's frames.
+    fn error(&self) -> Pose {
+        let [roll, pitch, yaw] = self.rotation_deg.map(f64::to_radians);
+        Isometry3::from_parts(Translation3::from(self.translation_m), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
+    }
+}
+
+impl SensorEffect for SensorPoseError {
+    fn check(&self) -> Result<(), KeyError> {
+        for k in 0..3 {
+            within(&format!("translation_m[{k}]"), self.translation_m[k], -5.0, 5.0)?;
+            within(&format!("rotation_deg[{k}]"), self.rotation_deg[k], -45.0, 45.0)?;
+        }
+        Ok(())
+    }
+
+    fn on_beams(&self, beams: &mut Beams, frame: &FrameContext, _draws: &Draws) {
+        if let Some(sensor) = frame.rig.find(&self.sensor).and_then(|i| beams.sensors.get_mut(i)) {
+            sensor.true_mount *= self.error();
+        }
+    }
+
+    /// A point that the sensor really saw at p, from where it is said to stand, is shown at `error^-1 * p`: the cloud of the sensor moves as a
+    /// whole, by what it sees unchanged.
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+        let Some(number) = frame.rig.find(&self.sensor) else { return };
+        let mount = frame.rig.sensors[number].pose();
+        let shown_from_seen = mount * self.error().inverse() * mount.inverse();
+        for echo in scan.returns_mut().filter(|e| usize::from(e.sensor) == number) {
+            let point = shown_from_seen * Point3::from(echo.point().map(f64::from));
+            echo.move_point(point.coords.map(|v| v as f32).into());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn the_true_mount_moves_and_the_believed_one_stays() {
+        let effect = SensorPoseError { translation_m: [0.1, 0.0, 0.0], rotation_deg: [0.0, 0.0, 1.0], ..SensorPoseError::default() };
+        let mut beams = Beams::of(&rig());
+        with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
+        let sensor = &beams.sensors[0];
+        assert!((sensor.true_mount.translation.x - 0.1).abs() < 1e-12 && sensor.believed_mount.translation.x == 0.0);
+        assert!((geometry::yaw_rad(&sensor.true_mount).to_degrees() - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_sensor_turned_down_lifts_the_ground() {
+        let before = scene();
+        let effect = SensorPoseError { rotation_deg: [0.0, 0.5, 0.0], ..SensorPoseError::default() };
+        let mut after = before.clone();
+        with_frame(0, |frame, draws| effect.on_cloud(&mut after, frame, draws));
+        let slope = 0.5_f32.to_radians().tan();
+        for (a, b) in before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && a.object == 1) {
+            let (p, q) = (a.point(), b.point());
+            assert!((q[2] - p[2] - p[0] * slope).abs() < 2e-3, "{p:?} {q:?}");
+        }
+    }
+}

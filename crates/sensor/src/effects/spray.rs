@@ -1,0 +1,116 @@
+//! D4: the plume of water or dust behind a car.
+
+use super::{Draws, FrameContext, Need, SensorEffect};
+use crate::scan::Scan;
+use data::KeyError;
+use data::toml_text::within;
+use geometry::Box3;
+use rand::RngExt;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Behind every other car lies a plume as wide as the car, `length_m` long and `height_m` high. A shot that passes through it for w m before its
+/// surface reports a droplet with probability `1 - exp(-density_per_m * w)`, at a range with density proportional to `exp(-density_per_m * r)`
+/// along that way.
+///
+/// Typical: 0.01 to 0.2 a metre on a wet road at speed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Spray {
+    /// 1/m.
+    pub density_per_m: f64,
+    /// m.
+    pub length_m: f64,
+    /// m.
+    pub height_m: f64,
+}
+
+impl Default for Spray {
+    fn default() -> Self {
+        Spray { density_per_m: 0.05, length_m: 12.0, height_m: 1.5 }
+    }
+}
+
+impl SensorEffect for Spray {
+    fn check(&self) -> Result<(), KeyError> {
+        within("density_per_m", self.density_per_m, 1e-6, 100.0)?;
+        within("length_m", self.length_m, 0.01, 200.0)?;
+        within("height_m", self.height_m, 0.01, 20.0)
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        Some(&[Need::Cars])
+    }
+
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let plumes: Vec<Box3> = frame.cars.iter().map(|car| self.plume(&car.true_box)).collect();
+        let density = self.density_per_m as f32;
+        let mut random = draws.of_frame();
+        for echo in &mut scan.echoes {
+            for plume in &plumes {
+                let Some([near, far]) = way_through(plume, echo.origin, echo.direction, echo.range_m) else { continue };
+                let passed = (-density * (far - near)).exp();
+                let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
+                if chance < 1.0 - passed {
+                    echo.range_m = near - (1.0 - part * (1.0 - passed)).ln() / density;
+                    (echo.returned, echo.reflectivity, echo.object) = (0.05, 0.05, 0);
+                }
+            }
+        }
+    }
+}
+
+impl Spray {
+    fn plume(&self, car: &Box3) -> Box3 {
+        let bottom = -car.size[2] / 2.0;
+        let back = -(car.size[0] + self.length_m) / 2.0;
+        let center = car.from_local([back, 0.0, bottom + self.height_m / 2.0]);
+        Box3 { center, size: [self.length_m, car.size[1], self.height_m], yaw_rad: car.yaw_rad }
+    }
+}
+
+/// Where a ray enters and leaves a box before `until_m`, m.
+fn way_through(b: &Box3, origin: [f32; 3], direction: [f32; 3], until_m: f32) -> Option<[f32; 2]> {
+    let start = b.to_local(origin.map(f64::from));
+    let (s, c) = b.yaw_rad.sin_cos();
+    let d = direction.map(f64::from);
+    let local = [d[0] * c + d[1] * s, d[1] * c - d[0] * s, d[2]];
+    let (mut near, mut far) = (0.0, f64::from(until_m));
+    for k in 0..3 {
+        let half = b.size[k] / 2.0;
+        if local[k] == 0.0 {
+            if start[k].abs() > half {
+                return None;
+            }
+            continue;
+        }
+        let (a, z) = ((-half - start[k]) / local[k], (half - start[k]) / local[k]);
+        near = f64::max(near, a.min(z));
+        far = f64::min(far, a.max(z));
+    }
+    (near < far).then_some([near as f32, far as f32])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::*;
+    use super::*;
+
+    #[test]
+    fn droplets_hang_behind_the_car() {
+        let effect = Spray { density_per_m: 0.2, length_m: 8.0, height_m: 2.0 };
+        let before = scene();
+        let after = applied(&effect, &before);
+        let plume = effect.plume(&cars()[0].true_box);
+        let changed: Vec<_> = before.echoes.iter().zip(&after.echoes).filter(|(a, b)| a.range_m != b.range_m).collect();
+        assert!(changed.len() > 20, "{}", changed.len());
+        for (_, b) in &changed {
+            let local = plume.to_local(b.point().map(f64::from));
+            assert!((0..3).all(|k| local[k].abs() <= plume.size[k] / 2.0 + 1e-3), "{local:?}");
+        }
+        // Of the shots that pass all of the plume, 1 - exp(-0.2 * 8) are stopped.
+        let through = |e: &crate::scan::Echo| way_through(&plume, e.origin, e.direction, e.range_m);
+        let expected: f64 = before.echoes.iter().filter_map(through).map(|[n, f]| 1.0 - f64::from((-0.2 * (f - n)).exp())).sum();
+        assert!((changed.len() as f64 / expected - 1.0).abs() < 0.15, "{} {expected}", changed.len());
+    }
+}

@@ -1,0 +1,69 @@
+//! C8: the other cars stand otherwise on the road than they are believed to.
+
+use super::{Need, SensorEffect, WorldPlan};
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Every other car is really turned against its believed pose by roll `roll_deg + roll_std_deg * N(0, 1)` and pitch
+/// `pitch_deg + pitch_std_deg * N(0, 1)` (positive: nose down) about the middle of its rear axle; new in every frame.
+///
+/// Typical: 0.1 to 0.3 degrees. Labels have neither roll nor pitch (paper, section V).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TargetAttitude {
+    /// Degrees.
+    pub roll_deg: f64,
+    /// Degrees.
+    pub pitch_deg: f64,
+    /// Degrees.
+    pub roll_std_deg: f64,
+    /// Degrees.
+    pub pitch_std_deg: f64,
+}
+
+impl Default for TargetAttitude {
+    fn default() -> Self {
+        TargetAttitude { roll_deg: 0.0, pitch_deg: 0.0, roll_std_deg: 0.2, pitch_std_deg: 0.2 }
+    }
+}
+
+impl SensorEffect for TargetAttitude {
+    fn check(&self) -> Result<(), KeyError> {
+        within("roll_deg", self.roll_deg, -20.0, 20.0)?;
+        within("pitch_deg", self.pitch_deg, -20.0, 20.0)?;
+        within("roll_std_deg", self.roll_std_deg, 0.0, 10.0)?;
+        within("pitch_std_deg", self.pitch_std_deg, 0.0, 10.0)
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        None
+    }
+
+    fn on_world(&self, world: &mut WorldPlan) {
+        let own = [[self.roll_deg, self.roll_std_deg], [self.pitch_deg, self.pitch_std_deg]];
+        for (sum, own) in world.car_tilt.iter_mut().zip(own) {
+            let [mean, std] = own.map(f64::to_radians);
+            *sum = [sum[0] + mean, sum[1].hypot(std)];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tilts_of_two_effects_add_up() {
+        let effect = TargetAttitude { roll_deg: 1.0, pitch_deg: -2.0, roll_std_deg: 0.3, pitch_std_deg: 0.0 };
+        let mut world = WorldPlan::default();
+        effect.on_world(&mut world);
+        effect.on_world(&mut world);
+        let degrees = world.car_tilt.map(|t| t.map(f64::to_degrees));
+        let want = [[2.0, 0.3 * 2_f64.sqrt()], [-4.0, 0.0]];
+        for (got, want) in degrees.iter().flatten().zip(want.iter().flatten()) {
+            assert!((got - want).abs() < 1e-9, "{degrees:?}");
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! C11: the cars are not quite as they are modelled.
+
+use super::{Need, SensorEffect, WorldPlan};
+use data::KeyError;
+use data::toml_text::within;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// The cars' bodies are really stretched by `scale` (length, width, height) about the middle of the bottom of their box, and moved by `shift_m`
+/// (forward, left, up) against it.
+///
+/// Typical: centimetres to a decimetre.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TargetShape {
+    /// Length, width, height, as a part of the modelled ones.
+    pub scale: [f64; 3],
+    /// Forward, left, up, m.
+    pub shift_m: [f64; 3],
+}
+
+impl Default for TargetShape {
+    fn default() -> Self {
+        TargetShape { scale: [0.98, 1.0, 0.96], shift_m: [0.0; 3] }
+    }
+}
+
+impl SensorEffect for TargetShape {
+    fn check(&self) -> Result<(), KeyError> {
+        for k in 0..3 {
+            within(&format!("scale[{k}]"), self.scale[k], 0.2, 5.0)?;
+            within(&format!("shift_m[{k}]"), self.shift_m[k], -5.0, 5.0)?;
+        }
+        Ok(())
+    }
+
+    fn needs(&self) -> Option<&'static [Need]> {
+        None
+    }
+
+    fn on_world(&self, world: &mut WorldPlan) {
+        for k in 0..3 {
+            world.car_scale[k] *= self.scale[k];
+            world.car_shift_m[k] += self.shift_m[k];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shapes_add_up() {
+        let mut world = WorldPlan::default();
+        let effect = TargetShape { scale: [0.5, 1.0, 2.0], shift_m: [0.1, 0.0, -0.2] };
+        effect.on_world(&mut world);
+        effect.on_world(&mut world);
+        assert_eq!(world.car_scale, [0.25, 1.0, 4.0]);
+        assert_eq!(world.car_shift_m, [0.2, 0.0, -0.4]);
+    }
+}
