@@ -1,4 +1,5 @@
-//! The scans of a spinning sensor against an ideal one, with pictures: what `lidarshift diagnose --scans` does, without the detectors.
+//! Compares the scans of a spinning sensor with an ideal one and draws figures: `lidarshift diagnose --scans` without
+//! the detectors.
 //!
 //! `cargo run --release -p lidarshift-report --example diagnose_scans -- DATASET SENSOR.toml OUT`
 
@@ -7,8 +8,10 @@ use diagnose::{Options, SensorRig, diagnose_scans, extended_toml};
 use std::path::PathBuf;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let words: Vec<PathBuf> = std::env::args().skip(1).map(PathBuf::from).collect();
-    let [dataset, sensor, out] = words.as_slice() else { return Err("DATASET SENSOR.toml OUT are wanted".into()) };
+    let args: Vec<PathBuf> = std::env::args().skip(1).map(PathBuf::from).collect();
+    let [dataset, sensor, out] = args.as_slice() else {
+        return Err("usage: diagnose_scans DATASET SENSOR.toml OUT".into());
+    };
     let rig = SensorRig::read(sensor)?;
     let outcome = diagnose_scans(&Dataset::open(dataset)?, &rig, &Options::default(), &|_, _, _| ())?;
     write_atomic(&out.join("diagnosis.json"), &serde_json::to_vec_pretty(&outcome.diagnosis)?)?;
