@@ -1,4 +1,5 @@
-//! One moment of the race as rays see it: the static world, the cars where they are, and the car that carries the sensors.
+//! Ray casting scene of one moment of the race: the static world, the cars at their poses, and the ego vehicle with
+//! the sensors.
 
 use crate::beams::{BeamWidth, Beams, Pick, SensorBeams};
 use crate::mesh::{MaterialId, MaterialTable};
@@ -10,7 +11,7 @@ use crate::world::{CarShape, World};
 use geometry::Pose;
 use nalgebra::{Matrix3, Point3, UnitQuaternion, Vector3};
 
-/// The scene of one cloud.
+/// Ray casting scene of one cloud.
 pub struct FrameScene<'a> {
     world: &'a World,
     car: &'a CarShape,
@@ -19,23 +20,23 @@ pub struct FrameScene<'a> {
     ego: Motion,
 }
 
-/// What a ray meets.
+/// Surface hit by a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Surface {
-    /// Distance, m; infinite when there is nothing.
+    /// Distance, m; infinite if nothing is hit.
     pub range_m: f32,
-    /// Unit normal towards the ray's origin, cloud's frame.
+    /// Unit normal towards the ray's origin, in the cloud frame.
     pub normal: [f32; 3],
     /// Cosine of the angle of incidence.
     pub cos_incidence: f32,
-    /// What it is made of.
+    /// Material.
     pub material: MaterialId,
-    /// What it is: a group of the track, or [`FIRST_CAR`] and more for a car; 0 for nothing.
+    /// Object: a group of the track, or [`FIRST_CAR`] and above for a car; 0 if nothing is hit.
     pub object: u16,
 }
 
 impl<'a> FrameScene<'a> {
-    /// `cars` are all but the one that carries the sensors, each with its motion (the pose is `world_from_car`).
+    /// `cars` are all cars except the ego vehicle, with their motion (the pose is `world_from_car`).
     pub fn new(
         world: &'a World,
         car: &'a CarShape,
@@ -64,7 +65,7 @@ impl<'a> FrameScene<'a> {
         self.ego.pose
     }
 
-    /// What rays of the cloud's frame meet at the middle of the scan. Origins in m, directions of length 1.
+    /// Casts rays in the cloud frame at the middle of the scan. Origins in m, unit directions.
     pub fn cast(&self, rays: &[([f32; 3], [f32; 3])]) -> Vec<Surface> {
         let sight = Sight::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
         let world: Vec<Ray> = rays
@@ -83,11 +84,11 @@ impl<'a> FrameScene<'a> {
         hits.iter().zip(&world).map(|(hit, ray)| self.surface(hit, ray)).collect()
     }
 
-    /// The scan of these shots.
+    /// Simulates the scan of these shots.
     pub fn scan(&self, beams: &Beams) -> Scan {
         let mut scan = Scan { echoes: Vec::with_capacity(beams.shots()) };
         let mut seconds = Vec::new();
-        // The car as it really stands.
+        // The true pose of the ego vehicle.
         let mut ego = self.ego;
         ego.pose.translation.vector += self.ego.pose.rotation * Vector3::z() * beams.ego_heave_m;
         ego.pose.rotation *= beams.ego_tilt;
@@ -110,7 +111,7 @@ impl<'a> FrameScene<'a> {
         scan
     }
 
-    /// The shots of a sensor as it believes them, without returns.
+    /// The shots of a sensor with their nominal directions, without returns.
     fn believed(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
         let mount = &sensor.believed_mount;
         let rotation: Matrix3<f32> = mount.rotation.to_rotation_matrix().matrix().map(|v| v as f32);
@@ -146,7 +147,7 @@ impl<'a> FrameScene<'a> {
         }
     }
 
-    /// Every shot as a bundle; returns are the groups of surfaces that lie within a pulse.
+    /// Casts every shot as a bundle of rays; returns are groups of surfaces within a pulse length.
     fn cast_bundles(
         &self,
         sensor: &SensorBeams,
@@ -229,11 +230,11 @@ impl<'a> FrameScene<'a> {
     }
 }
 
-/// From a sensor's frame to the coordinates of the scene, at any time within the scan.
+/// Transform from a sensor frame to scene coordinates, at any time within the scan.
 struct Sight {
     origin: Vector3<f32>,
     rotation: Matrix3<f32>,
-    /// Velocity of the sensor and rate of turn, scene's axes.
+    /// Velocity and angular velocity of the sensor, scene axes.
     motion: Option<(Vector3<f32>, Vector3<f32>)>,
 }
 
@@ -269,8 +270,8 @@ impl Sight {
     }
 }
 
-/// Offsets to the left and up (rad) and weights of the rays of a beam: the middle and one or two rings, weighted as a Gaussian beam whose
-/// light has fallen to exp(-2) at the edge.
+/// Offsets to the left and up (rad) and weights of the rays of a beam: the centre and one or two rings, weighted as a
+/// Gaussian beam with intensity exp(-2) at the edge.
 fn bundle(width: &BeamWidth) -> Vec<(f32, f32, f32)> {
     let half = width.divergence_rad / 2.0;
     let rings: &[(u32, f32)] = if width.rays > 7 { &[(1, 0.0), (6, 0.4), (12, 0.8)] } else { &[(1, 0.0), (6, 0.66)] };
@@ -285,8 +286,8 @@ fn bundle(width: &BeamWidth) -> Vec<(f32, f32, f32)> {
     rays.into_iter().map(|(left, up, weight)| (left, up, weight / sum)).collect()
 }
 
-/// Groups of surfaces with no gap of a pulse between them, from the nearest: each with the mean range and the whole light, and for the rest
-/// what its brightest ray met.
+/// Groups surfaces without a gap of a pulse length between them, nearest first. Each group has the mean range and the
+/// total light; its other attributes are those of its brightest ray.
 fn returns_of(mut met: Vec<(Surface, f32)>, pulse_m: f32) -> Vec<(Surface, f32)> {
     met.sort_by(|a, b| a.0.range_m.total_cmp(&b.0.range_m));
     let mut groups = Vec::new();
@@ -296,7 +297,7 @@ fn returns_of(mut met: Vec<(Surface, f32)>, pulse_m: f32) -> Vec<(Surface, f32)>
             continue;
         }
         let group = &met[begin..end];
-        // A surface that sends nothing back still has a range.
+        // A surface with zero reflectivity still has a range.
         let light: f32 = group.iter().map(|(s, l)| (l + 1e-12) / (s.range_m * s.range_m)).sum();
         let range_m = group.iter().map(|(s, l)| s.range_m * (l + 1e-12) / (s.range_m * s.range_m)).sum::<f32>() / light;
         let brightest = group.iter().max_by(|a, b| a.1.total_cmp(&b.1)).expect("a group has a surface").0;
@@ -306,10 +307,10 @@ fn returns_of(mut met: Vec<(Surface, f32)>, pulse_m: f32) -> Vec<(Surface, f32)>
     groups
 }
 
-/// The group that sends back the most light, `but` one left out.
+/// Index of the group with the most light, excluding `but`.
 fn strongest(groups: &[(Surface, f32)], but: Option<usize>) -> usize {
     let light = |i: usize| groups[i].1 / (groups[i].0.range_m * groups[i].0.range_m);
-    // Of equals the nearest.
+    // The nearest one if tied.
     (0..groups.len()).filter(|i| Some(*i) != but).rev().max_by(|a, b| light(*a).total_cmp(&light(*b))).unwrap_or(0)
 }
 

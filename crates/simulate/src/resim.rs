@@ -1,4 +1,4 @@
-//! The sensor model on data sets that are finished, of this simulator or any other.
+//! Applies sensor effects to existing data sets, of this simulator or any other.
 
 use crate::SimulateError;
 use crate::attributes;
@@ -21,46 +21,47 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const RESIM_MANIFEST_SCHEMA: &str = "lidarshift/resim-dataset/1";
 
-/// What the folder of a data set with effects on top holds: its `manifest.json`.
+/// Content of the `manifest.json` of a data set with effects applied.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ResimManifest {
     /// [`RESIM_MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Name of the data set that the effects act on.
+    /// Name of the source data set.
     pub source: String,
-    /// Seed of the effects.
+    /// Random seed of the effects.
     pub seed: u64,
-    /// SHA-256 of effects, rig, seed, and the version of this program.
+    /// SHA-256 of effects, rig, seed, and program version.
     pub config_sha256: String,
-    /// Frames.
+    /// Number of frames.
     pub frames: usize,
     /// Points of all frames, before and after.
     pub points: [usize; 2],
 }
 
-/// A data set, and what acts on it.
+/// A data set and the effects applied to it.
 pub struct Resim<'a> {
     /// The data set.
     pub dataset: &'a Dataset,
-    /// What acts on it.
+    /// The effects.
     pub effects: &'a EffectList,
-    /// Its sensors; `None`: those that its TOML names, or one at the clouds' origin.
+    /// Its sensor rig; `None`: the rig referenced by the data set, or a single sensor at the cloud origin.
     pub rig: Option<Rig>,
-    /// Another seed gives other noise.
+    /// Random seed.
     pub seed: u64,
 }
 
 impl Resim<'_> {
-    /// Makes the data set in the folder `out`, in the layout and label frame of the source.
+    /// Writes the data set to the folder `out`, in the layout and label frame of the source.
     ///
-    /// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same words finished
-    /// are kept; a folder with other content is refused. The files do not depend on the number of threads.
+    /// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an
+    /// earlier run with the same arguments are kept; a folder with other content is an error. The files do not depend
+    /// on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
         let source = &self.dataset.config;
@@ -114,14 +115,15 @@ impl Resim<'_> {
         Ok(rig)
     }
 
-    /// Which effects of the list cannot act on this finished data set, by their place, and why.
+    /// Effects of the list that cannot be applied to this data set: index and reason.
     pub fn refused(&self) -> Result<Vec<(usize, String)>, SimulateError> {
         let ids = self.dataset.all_ids()?;
         let described = attributes::path(&self.dataset.config.root, &ids[0]).is_file();
         Ok(self.refusals(&known_of(self.dataset, &self.rig()?, &ids[0], described)?))
     }
 
-    /// One frame with the effects on it; `index` is its place in the order of names. Its points, and what is known of them.
+    /// One frame with the effects applied; `index` is its position in name order. Returns its points and what is known
+    /// about them.
     pub fn frame(
         &self,
         index: usize,
@@ -201,7 +203,7 @@ impl Resim<'_> {
         refused
     }
 
-    /// Writes one frame, unless it is there; its points before and after.
+    /// Writes one frame unless it exists; returns its number of points before and after.
     fn make_frame_file(
         &self,
         out: &Path,
@@ -244,7 +246,7 @@ impl Resim<'_> {
         Ok([points(&self.dataset.cloud_path(id), config.points)?, points(&cloud, config.points)?])
     }
 
-    /// Labels as they are where no effect touched them, to the byte; else in the label frame of the source.
+    /// Copies labels byte by byte if no effect changed them; otherwise writes them in the label frame of the source.
     fn write_labels(&self, path: &Path, id: &str, frame: &Frame) -> Result<(), SimulateError> {
         let source = self.dataset.labels(id)?;
         let boxes = self.dataset.objects(id, &source)?;
@@ -283,7 +285,7 @@ impl Resim<'_> {
             root: ".".into(),
             splits,
             rig: rig_path.clone(),
-            // A crop was made when the clouds were read.
+            // Clouds were already cropped when they were read.
             fov_crop: false,
             ..source.clone()
         };
@@ -308,14 +310,14 @@ impl Resim<'_> {
     }
 }
 
-/// What is known of the points of a data set.
+/// What is known about the points of a data set.
 fn known_of(dataset: &Dataset, rig: &Rig, id: &str, described: bool) -> Result<BTreeSet<Need>, SimulateError> {
     if described {
         use Need::{Cars, Grid, Incidence, Material, Reflectivity, Row, Time};
         return Ok([Cars, Grid, Incidence, Material, Reflectivity, Row, Time].into());
     }
     let mut cloud = dataset.load_cloud(id)?;
-    // What is known depends on the rig alone; some points are enough to ask.
+    // What is known depends on the rig only; a few points are enough to check.
     cloud.values.truncate(cloud.channels);
     if dataset.config.points == PointColumns::Xyz {
         cloud = cloud.with_channels(3);
@@ -323,7 +325,7 @@ fn known_of(dataset: &Dataset, rig: &Rig, id: &str, described: bool) -> Result<B
     Ok(scan_of_cloud(&cloud, rig).1)
 }
 
-/// The folder must be empty, or begun with the same words.
+/// Checks that the folder is empty or was started with the same arguments.
 fn check_folder(out: &Path, manifest_path: &Path, wanted: &ResimManifest) -> Result<(), SimulateError> {
     if manifest_path.is_file() {
         let text = fs_err::read_to_string(manifest_path)?;
@@ -378,7 +380,7 @@ mod tests {
         for id in made.all_ids().unwrap() {
             assert_eq!(made.load(&id).unwrap().objects, dataset.load(&id).unwrap().objects);
         }
-        // Noise alone, to compare points one by one: they move along their ray.
+        // Noise only, to compare points one by one: they move along their ray.
         let noisy = folder.path().join("noisy");
         make(&dataset, &effects("[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n"), None, &noisy).unwrap();
         let (a, b) = (
@@ -432,7 +434,7 @@ mod tests {
             let error = make(&dataset, &list, None, &folder.path().join(kind)).unwrap_err();
             assert!(error.contains(want), "{error}");
         }
-        // With the sensor's pattern rows are known.
+        // With the sensor's pattern, rows are known.
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/sensors/hdl64e.toml");
         let rig = Rig::read(Path::new(path)).unwrap();
         let list = effects("[[effect]]\nkind = \"beam_range_offset\"\n");

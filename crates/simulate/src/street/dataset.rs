@@ -1,4 +1,4 @@
-//! A synthetic road data set on disk.
+//! Writes a synthetic street data set.
 
 use crate::SimulateError;
 use crate::street::config::RoadConfig;
@@ -13,31 +13,31 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const MANIFEST_SCHEMA: &str = "lidarshift/simulated-dataset/1";
 
-/// A car with fewer points is not labelled: nobody could find it.
+/// Cars with fewer points are not labelled, as they could not be detected.
 const LEAST_POINTS: usize = 5;
 
-/// What a folder made by [`make_road_dataset`] holds: its `manifest.json`.
+/// Content of the `manifest.json` written by [`make_road_dataset`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// [`MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Seed of the scenes.
+    /// Random seed of the scenes.
     pub seed: u64,
-    /// SHA-256 of the configuration, seed and numbers of frames included; another version of this program counts as another configuration.
+    /// SHA-256 of configuration, seed, numbers of frames and program version.
     pub config_sha256: String,
     /// The whole configuration.
     pub config: RoadConfig,
-    /// What is there, by split.
+    /// Counts by split.
     pub splits: BTreeMap<String, SplitCounts>,
 }
 
-/// What a split holds.
+/// Counts of a split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SplitCounts {
     /// Frames.
@@ -48,7 +48,7 @@ pub struct SplitCounts {
     pub points: usize,
 }
 
-/// One frame: its cloud and the cars with at least five points on them, in the LiDAR frame.
+/// One frame: its cloud and the cars with at least five points, in the LiDAR frame.
 pub fn make_road_frame(config: &RoadConfig, split: &str, index: usize) -> Frame {
     let random = |purpose: &str| stream(config.seed, &format!("road/{split}/{purpose}"), 0, index as u64);
     let scene = Scene::make(&config.scene, &config.sensor, &mut random("scene"));
@@ -68,10 +68,12 @@ fn frame_id(split: &str, index: usize) -> String {
     format!("{split}_{index:06}")
 }
 
-/// Makes a data set in the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`, `manifest.json`.
+/// Writes a data set to the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`,
+/// `manifest.json`.
 ///
-/// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same configuration
-/// finished are kept; a folder with other content is refused. The files do not depend on the number of threads.
+/// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an earlier
+/// run with the same configuration are kept; a folder with other content is an error. The files do not depend on the
+/// number of threads.
 pub fn make_road_dataset(
     config: &RoadConfig,
     out: &Path,
@@ -119,7 +121,7 @@ pub fn make_road_dataset(
     Ok(manifest)
 }
 
-/// Writes one frame, unless it is there; counts what it holds.
+/// Writes one frame unless it exists; returns its counts.
 fn make_frame_file(config: &RoadConfig, out: &Path, split: &str, index: usize) -> Result<SplitCounts, SimulateError> {
     let id = frame_id(split, index);
     let (cloud, label) = (out.join(format!("velodyne/{id}.bin")), out.join(format!("label_2/{id}.txt")));
@@ -131,7 +133,7 @@ fn make_frame_file(config: &RoadConfig, out: &Path, split: &str, index: usize) -
     Ok(SplitCounts { frames: 1, cars, points })
 }
 
-/// The folder must be empty, or begun with the same configuration.
+/// Checks that the folder is empty or was started with the same configuration.
 fn check_folder(out: &Path, manifest_path: &Path, wanted: &Manifest) -> Result<(), SimulateError> {
     if manifest_path.is_file() {
         let text = fs_err::read_to_string(manifest_path)?;
@@ -176,7 +178,7 @@ mod tests {
         RoadConfig { seed, frames: FrameCounts { train: 4, val: 2, test: 2 }, ..RoadConfig::default() }
     }
 
-    /// Every file below a folder with its bytes, by path.
+    /// All files below a folder with their bytes, by path.
     fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
         let (mut open, mut found) = (vec![root.to_owned()], BTreeMap::new());
         while let Some(folder) = open.pop() {

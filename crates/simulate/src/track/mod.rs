@@ -1,4 +1,4 @@
-//! The track and what stands around it, as triangles.
+//! The track and its surroundings as triangle meshes.
 
 mod centre_line;
 mod oval;
@@ -15,16 +15,16 @@ use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vect
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What a triangle of the static world belongs to; its number stands in the column `object` of attributes.
+/// Object group of a static triangle; its number is in the attribute column `object`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[repr(u16)]
 pub enum Group {
     /// The racing surface.
     Surface = 1,
-    /// The flatter strip inside of it.
+    /// The flatter strip inside the racing surface.
     Apron = 2,
-    /// Ground inside of the track.
+    /// Ground inside the track.
     Infield = 3,
     /// The wall along the outer edge.
     OuterWall = 4,
@@ -32,18 +32,18 @@ pub enum Group {
     Fence = 5,
     /// The wall of the pit lane.
     PitWall = 6,
-    /// Rows of seats along the front stretch.
+    /// Seats along the front stretch.
     Grandstand = 7,
-    /// Buildings, vehicles and poles inside of the track.
+    /// Buildings, vehicles and poles inside the track.
     InfieldObjects = 8,
-    /// Ground outside of the wall.
+    /// Ground outside the wall.
     OutsideGround = 9,
-    /// Buildings, vehicles and poles outside of the wall.
+    /// Buildings, vehicles and poles outside the wall.
     OutsideObjects = 10,
 }
 
 impl Group {
-    /// All groups, in the order of their numbers.
+    /// All groups, by number.
     pub const ALL: [Group; 10] = [
         Group::Surface,
         Group::Apron,
@@ -58,37 +58,39 @@ impl Group {
     ];
 }
 
-/// Numbers of cars in the column `object` of attributes begin here; the car whose cloud it is has none.
+/// First number of cars in the attribute column `object`; the ego vehicle has none.
 pub const FIRST_CAR: u16 = 100;
 
-/// A waviness of the ground that is not in the plans: `h(way) = amplitude * sin(2 pi way / length + phase)`, m, of the surface and all that
-/// stands on it.
+/// Unevenness of the ground: `h(way) = amplitude * sin(2 pi way / length + phase)`, m, applied to the surface and
+/// everything on it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Undulation {
-    /// Greatest height, m.
+    /// Amplitude, m.
     pub amplitude_m: f64,
-    /// Length of a wave along the centre line, m; rounded so that whole waves fit into a lap.
+    /// Wavelength along the centre line, m; rounded to an integer number of waves per lap.
     pub length_m: f64,
-    /// Where it begins, rad.
+    /// Phase at the start, rad.
     pub phase_rad: f64,
 }
 
-/// A track on a centre line.
+/// A track with its surroundings.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
     /// Its centre line; turns to the left.
     pub line: CentreLine,
-    /// Seed of what stands around.
+    /// Seed of the surroundings.
     pub seed: u64,
 }
 
 impl Track {
-    /// Height of the surface at `way_m` along and `left_m` to the left of the centre line, m; apron and infield inside, ground outside.
+    /// Height of the surface at `way_m` along and `left_m` to the left of the centre line, m; includes apron, infield
+    /// and outside ground.
     pub fn height_m(&self, way_m: f64, left_m: f64) -> f64 {
         surface::height_m(&self.line.at(way_m), left_m)
     }
 
-    /// The frame of a car on the surface: x along the track turned left by `yaw_rad`, z the surface's normal, origin `above_m` above it.
+    /// Pose of a car on the surface: x along the track, rotated left by `yaw_rad`, z along the surface normal, origin
+    /// `above_m` above it.
     pub fn pose_on(&self, way_m: f64, left_m: f64, yaw_rad: f64, above_m: f64) -> Pose {
         let station = self.line.at(way_m);
         let (s, c) = station.heading_rad.sin_cos();
@@ -104,18 +106,18 @@ impl Track {
         Isometry3::from_parts(Translation3::from(ground + up * above_m), rotation)
     }
 
-    /// How far to the left a car's middle may be at `way_m`, least and greatest, m, with `margin_m` to both edges.
+    /// Minimum and maximum lateral offset of a car's centre at `way_m`, with `margin_m` to both edges, m.
     pub fn lateral_limits_m(&self, way_m: f64, margin_m: f64) -> [f64; 2] {
         let station = self.line.at(way_m);
         [margin_m - station.width_right_m, station.width_left_m - margin_m]
     }
 
-    /// Where the face of the outer wall is at `way_m`, m to the left of the centre line: a negative number.
+    /// Lateral position of the outer wall's face at `way_m`, to the left of the centre line, m: negative.
     pub fn outer_wall_m(&self, way_m: f64) -> f64 {
         -self.line.at(way_m).width_right_m - surface::WALL_GAP_M
     }
 
-    /// Everything that stands still, in the world's frame.
+    /// All static objects of these groups, in the world frame.
     pub fn mesh(&self, groups: &[Group], undulation: Option<Undulation>) -> Mesh {
         let mut mesh = Mesh::default();
         for group in Group::ALL.into_iter().filter(|g| groups.contains(g)) {
