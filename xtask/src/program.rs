@@ -1,4 +1,4 @@
-//! The program `lidarshift`: built in release with the wanted backend, then run with the caller's words.
+//! The program `lidarshift`: built in release with the requested backend, then run with the caller's arguments.
 
 use crate::cargo;
 use anyhow::{Context, Result, bail};
@@ -12,7 +12,8 @@ use std::time::Duration;
 /// A build that takes longer than this is announced.
 const SILENCE: Duration = Duration::from_millis(1500);
 
-/// Builds the program and becomes it: same folder, same words, its exit code; signals reach it directly.
+/// Builds the program and replaces this process with it: same working folder, arguments and exit code; signals reach
+/// it directly.
 pub fn hand_over(root: &Path, args: &[OsString]) -> Result<()> {
     let mut program = Command::new(build(root, backend_feature(args))?);
     program.args(args);
@@ -30,7 +31,7 @@ pub fn hand_over(root: &Path, args: &[OsString]) -> Result<()> {
     }
 }
 
-/// Builds the program and runs it in the folder of the workspace; an exit code other than 0 is an error.
+/// Builds the program and runs it in the workspace root; a non-zero exit code is an error.
 pub fn run(root: &Path, args: &[OsString]) -> Result<()> {
     let status = Command::new(build(root, backend_feature(args))?).args(args).current_dir(root).status()?;
     if !status.success() {
@@ -39,7 +40,7 @@ pub fn run(root: &Path, args: &[OsString]) -> Result<()> {
     Ok(())
 }
 
-/// The path of the program, built in release, with a backend beyond the default ones where wanted.
+/// Path of the program, built in release, with an additional backend feature if requested.
 pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
     let mut cargo = cargo(root);
     cargo.args(["build", "--quiet", "--release", "--package", "lidarshift", "--bin", "lidarshift"]);
@@ -48,7 +49,7 @@ pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
         cargo.args(["--features", feature]);
     }
     let (done, is_done) = channel::<()>();
-    let speaker = std::thread::spawn(move || {
+    let announcer = std::thread::spawn(move || {
         if is_done.recv_timeout(SILENCE) == Err(RecvTimeoutError::Timeout) {
             eprintln!("building lidarshift (release)...");
         }
@@ -60,20 +61,20 @@ pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
     }
     let status = build.wait()?;
     drop(done);
-    speaker.join().expect("the speaker does not panic");
+    announcer.join().expect("the announcing thread does not panic");
     if !status.success() {
         bail!("the program lidarshift could not be built");
     }
-    executable.context("cargo names no executable of lidarshift")
+    executable.context("cargo reported no executable of lidarshift")
 }
 
-/// The executable that one line of cargo's messages names.
+/// The executable named in one line of cargo's JSON messages.
 fn executable_of(line: &str) -> Option<PathBuf> {
     let message: serde_json::Value = serde_json::from_str(line).ok()?;
     message["executable"].as_str().map(PathBuf::from)
 }
 
-/// The cargo feature that `--device wgpu` or `--device=cuda` needs; the default backends need none.
+/// The cargo feature required by `--device wgpu` or `--device=cuda`; `None` for the default backends.
 fn backend_feature(args: &[OsString]) -> Option<&'static str> {
     let args: Vec<_> = args.iter().map(|a| a.to_string_lossy()).take_while(|a| a != "--").collect();
     let after =
