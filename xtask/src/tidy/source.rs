@@ -26,7 +26,8 @@ pub fn lines(path: &str, text: &str) -> Vec<Line> {
         let fence = prose.starts_with("```") || prose.starts_with("~~~");
         line.wraps = !prose.is_empty() && !prose.starts_with(['|', '<']) && !fenced && !fence;
         fenced = if fence { !fenced } else { fenced && line.code.trim().is_empty() };
-        line.prose = if line.wraps || prose.starts_with(['|', '<']) { without_inline_code(prose) } else { String::new() };
+        line.prose =
+            if line.wraps || prose.starts_with(['|', '<']) { without_inline_code(prose) } else { String::new() };
     }
     lines
 }
@@ -48,8 +49,8 @@ fn hash_comment(line: &str) -> &str {
 /// Removes text between backticks on the same line.
 fn without_inline_code(line: &str) -> String {
     let parts: Vec<&str> = line.split('`').collect();
-    let closed = parts.len() % 2 == 1;
-    let kept = |i: usize| i % 2 == 0 || !closed && i == parts.len() - 1;
+    let closed = !parts.len().is_multiple_of(2);
+    let kept = |i: usize| i.is_multiple_of(2) || !closed && i == parts.len() - 1;
     (0..parts.len()).filter(|i| kept(*i)).map(|i| parts[i]).collect::<Vec<_>>().join(" ")
 }
 

@@ -68,7 +68,11 @@ impl MeshFile {
             Some("obj") => read_obj(&path)?,
             Some("stl") => read_stl(&path)?,
             Some("gltf" | "glb") => read_gltf(&path)?,
-            _ => return Err(wrong("is not a supported mesh file: its name must end in .obj, .stl, .gltf or .glb".into())),
+            _ => {
+                return Err(wrong(
+                    "is not a supported mesh file: its name must end in .obj, .stl, .gltf or .glb".into(),
+                ));
+            }
         };
         if !(self.scale.is_finite() && self.scale > 0.0) {
             return Err(wrong(format!("scale = {} is not a positive finite number", self.scale)));
