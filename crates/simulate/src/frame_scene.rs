@@ -67,12 +67,12 @@ impl<'a> FrameScene<'a> {
 
     /// Casts rays in the cloud frame at the middle of the scan. Origins in m, unit directions.
     pub fn cast(&self, rays: &[([f32; 3], [f32; 3])]) -> Vec<Surface> {
-        let sight = Sight::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
+        let transform = RayTransform::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
         let world: Vec<Ray> = rays
             .iter()
             .map(|(origin, direction)| {
-                let offset = sight.rotation * Vector3::from(*origin);
-                let mut ray = sight.ray(*direction, 0.0);
+                let offset = transform.rotation * Vector3::from(*origin);
+                let mut ray = transform.ray(*direction, 0.0);
                 (0..3).for_each(|k| ray.origin[k] += offset[k]);
                 ray
             })
@@ -94,12 +94,13 @@ impl<'a> FrameScene<'a> {
         ego.pose.rotation *= beams.ego_tilt;
         for (number, sensor) in beams.sensors.iter().enumerate() {
             let first = scan.echoes.len();
-            self.believed(number, sensor, beams, &mut scan.echoes);
-            let sight = Sight::new(&ego.pose, &sensor.true_mount, self.world.origin, beams.shutter.map(|_| &ego));
+            self.nominal_shots(number, sensor, beams, &mut scan.echoes);
+            let transform =
+                RayTransform::new(&ego.pose, &sensor.true_mount, self.world.origin, beams.shutter.map(|_| &ego));
             let echoes = &mut scan.echoes[first..];
             match beams.width {
-                None => self.cast_lines(sensor, &sight, echoes),
-                Some(width) => self.cast_bundles(sensor, &sight, &width, echoes, &mut seconds),
+                None => self.cast_lines(sensor, &transform, echoes),
+                Some(width) => self.cast_bundles(sensor, &transform, &width, echoes, &mut seconds),
             }
             for echo in echoes.iter_mut().chain(&mut seconds) {
                 if !(sensor.limits_m[0]..=sensor.limits_m[1]).contains(&echo.range_m) {
@@ -112,7 +113,7 @@ impl<'a> FrameScene<'a> {
     }
 
     /// The shots of a sensor with their nominal directions, without returns.
-    fn believed(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
+    fn nominal_shots(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
         let mount = &sensor.believed_mount;
         let rotation: Matrix3<f32> = mount.rotation.to_rotation_matrix().matrix().map(|v| v as f32);
         let origin: Vector3<f32> = mount.translation.vector.map(|v| v as f32);
@@ -137,9 +138,9 @@ impl<'a> FrameScene<'a> {
         }
     }
 
-    fn cast_lines(&self, sensor: &SensorBeams, sight: &Sight, echoes: &mut [Echo]) {
+    fn cast_lines(&self, sensor: &SensorBeams, transform: &RayTransform, echoes: &mut [Echo]) {
         let rays: Vec<Ray> =
-            sensor.shots.iter().zip(sensor.directions()).map(|(s, d)| sight.ray(*d, s.time_s as f32)).collect();
+            sensor.shots.iter().zip(sensor.directions()).map(|(s, d)| transform.ray(*d, s.time_s as f32)).collect();
         let mut hits = vec![Hit::MISS; rays.len()];
         self.scene.cast(&rays, sensor.columns, &mut hits);
         for ((hit, ray), echo) in hits.iter().zip(&rays).zip(echoes) {
@@ -151,7 +152,7 @@ impl<'a> FrameScene<'a> {
     fn cast_bundles(
         &self,
         sensor: &SensorBeams,
-        sight: &Sight,
+        transform: &RayTransform,
         width: &BeamWidth,
         echoes: &mut [Echo],
         seconds: &mut Vec<Echo>,
@@ -159,7 +160,7 @@ impl<'a> FrameScene<'a> {
         let bundle = bundle(width);
         let ray = |(shot, direction): (&crate::rig::Shot, &[f32; 3])| {
             let (direction, time_s) = (*direction, shot.time_s as f32);
-            bundle.iter().map(move |(left, up, _)| sight.ray(crate::beams::turned(direction, *left, *up), time_s))
+            bundle.iter().map(move |(left, up, _)| transform.ray(crate::beams::turned(direction, *left, *up), time_s))
         };
         let rays: Vec<Ray> = sensor.shots.iter().zip(sensor.directions()).flat_map(ray).collect();
         let mut hits = vec![Hit::MISS; rays.len()];
@@ -231,27 +232,27 @@ impl<'a> FrameScene<'a> {
 }
 
 /// Transform from a sensor frame to scene coordinates, at any time within the scan.
-struct Sight {
+struct RayTransform {
     origin: Vector3<f32>,
     rotation: Matrix3<f32>,
     /// Velocity and angular velocity of the sensor, scene axes.
     motion: Option<(Vector3<f32>, Vector3<f32>)>,
 }
 
-impl Sight {
+impl RayTransform {
     fn new(
         world_from_cloud: &Pose,
         cloud_from_sensor: &Pose,
         scene_origin: [f64; 3],
         moving: Option<&Motion>,
-    ) -> Sight {
+    ) -> RayTransform {
         let world_from_sensor = world_from_cloud * cloud_from_sensor;
         let origin = (world_from_sensor * Point3::origin()).coords - Vector3::from(scene_origin);
         let motion = moving.map(|ego| {
             let lever = world_from_cloud.rotation * cloud_from_sensor.translation.vector;
             ((ego.velocity + ego.turn_rate.cross(&lever)).map(|v| v as f32), ego.turn_rate.map(|v| v as f32))
         });
-        Sight {
+        RayTransform {
             origin: origin.map(|v| v as f32),
             rotation: world_from_sensor.rotation.to_rotation_matrix().matrix().map(|v| v as f32),
             motion,

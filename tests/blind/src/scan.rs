@@ -27,7 +27,7 @@ pub struct Nuisances {
 
 /// Nuisances of one side only: small errors that are not findings.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct OwnErrors {
+pub struct SideErrors {
     /// Standard deviation of the ego pose error: m, rad.
     pub pose: [f64; 2],
     /// Standard deviation of the label error, m.
@@ -43,7 +43,7 @@ pub struct Side<'a> {
     /// Nuisances, equal on both sides.
     pub nuisances: Nuisances,
     /// Nuisances of this side.
-    pub own: OwnErrors,
+    pub own: SideErrors,
     /// Hidden effects.
     pub effects: &'a [Effect],
     /// Per sensor and row: range offset, m, and elevation offset, rad.

@@ -19,7 +19,7 @@ pub struct Outcome {
     /// Number of unexplained findings.
     pub unexplained: usize,
     /// Parameters of correctly named causes: true value, estimate, interval, bound.
-    pub parameters: Vec<Judged>,
+    pub parameters: Vec<ParameterScore>,
     /// Fraction of the gap closed, as reported by the diagnosis.
     pub closed: Option<f64>,
     /// Run time of the diagnosis, s.
@@ -28,7 +28,7 @@ pub struct Outcome {
 
 /// An estimated parameter and its true value.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Judged {
+pub struct ParameterScore {
     /// `CAUSE.PARAMETER`.
     pub name: String,
     /// True value.
@@ -41,7 +41,7 @@ pub struct Judged {
     pub bound: Option<f64>,
 }
 
-impl Judged {
+impl ParameterScore {
     /// Whether the interval contains the true value.
     pub fn inside(&self) -> bool {
         self.ci95[0] <= self.truth && self.truth <= self.ci95[1]
@@ -71,7 +71,7 @@ pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
             {
                 let name_of = format!("{}.{name}", hidden.cause);
                 let bound = hidden.bound.get(name).copied();
-                parameters.push(Judged { name: name_of, truth: *value, estimate, ci95: [low, high], bound });
+                parameters.push(ParameterScore { name: name_of, truth: *value, estimate, ci95: [low, high], bound });
             }
         }
     }
@@ -151,7 +151,7 @@ pub struct Summary {
 /// Summarises results.
 pub fn summarise(outcomes: &[Outcome]) -> Summary {
     let mut summary = Summary::default();
-    let mut judged: BTreeMap<String, Vec<Judged>> = BTreeMap::new();
+    let mut judged: BTreeMap<String, Vec<ParameterScore>> = BTreeMap::new();
     for o in outcomes {
         *summary.grades.entry(o.truth.kind.clone()).or_default().entry(o.grade().into()).or_default() += 1;
         if o.truth.kind == "single" || o.truth.kind == "off_catalogue" {

@@ -3,7 +3,7 @@
 use crate::case::{Case, Kind};
 use crate::effect::{Effect, Hidden, Truth};
 use crate::rig::{draw_rig, rig_toml};
-use crate::scan::{Nuisances, OwnErrors, Scan, Side, Sums};
+use crate::scan::{Nuisances, Scan, Side, SideErrors, Sums};
 use crate::solid::{Form, Material, Solid};
 use crate::world::{World, draw_world};
 use data::write::write_kitti_frame;
@@ -55,10 +55,10 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
             _ => {}
         }
     }
-    let own = OwnErrors { pose: [0.003, 8e-5], labels_m: rng.random_range(0.02..0.05) };
+    let own = SideErrors { pose: [0.003, 8e-5], labels_m: rng.random_range(0.02..0.05) };
     let measured = Side { world: &measured_world, rig: &rig, nuisances, own, effects: &case.effects, beams: &beams };
     let simulated =
-        Side { world: &simulated_world, rig: &rig, nuisances, own: OwnErrors::default(), effects: &[], beams: &level };
+        Side { world: &simulated_world, rig: &rig, nuisances, own: SideErrors::default(), effects: &[], beams: &level };
     write_atomic(&folder.join("sensor.toml"), rig_toml(&rig).as_bytes())?;
     let sums: Vec<Result<Sums, DataError>> = (0..case.size.frames)
         .into_par_iter()
@@ -126,7 +126,7 @@ fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
 /// The truth with Cramér-Rao bounds from the Fisher information of the frames' returns. For per-row offsets each
 /// offset may be known exactly; the standard deviation of their (uniform) distribution is limited by the number of
 /// rows.
-fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, rows: usize, sums: &Sums) -> Truth {
+fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums: &Sums) -> Truth {
     let bound = |effect: &Effect| -> BTreeMap<String, f64> {
         let own_variance = 2.0 * nuisances.noise_m.powi(2);
         let n = sums.returns.max(1.0);

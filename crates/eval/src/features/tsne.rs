@@ -128,7 +128,7 @@ pub fn tsne(features: &Features, options: &TsneOptions) -> Result<(Vec<[f64; 2]>
     };
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let one = one.map_err(|e| FeatureError::Setting(format!("no thread could be started: {e}")))?;
-    let places = one.install(|| phases.into_iter().fold(beginning(features, options.seed), descend));
+    let places = one.install(|| phases.into_iter().fold(initial_positions(features, options.seed), descend));
     if let Some(i) = places.iter().position(|v| !v.is_finite()) {
         return wrong(format!("the descent left the numbers at sample {}; try another perplexity", i / 2));
     }
@@ -218,7 +218,7 @@ fn nearest_rows(features: &Features, n_neighbors: usize) -> Vec<Vec<Neighbor<f32
 
 /// PCA initialisation: first two principal components, the first scaled to a deviation of 1e-4 as in other
 /// implementations, plus a perturbation a hundredth as large.
-fn beginning(features: &Features, seed: u64) -> Vec<f32> {
+fn initial_positions(features: &Features, seed: u64) -> Vec<f32> {
     let (x, _) = features.centered();
     let eigen = SymmetricEigen::new(x.tr_mul(&x));
     let mut order: Vec<usize> = (0..features.dim()).collect();
