@@ -181,7 +181,7 @@ mod tests {
             assert_ne!(mutant.broken(&text).unwrap(), text);
         }
         let gone = Mutant { from: "no such line".into(), ..list.mutant.into_iter().next().unwrap() };
-        assert!(gone.broken("").unwrap_err().to_string().contains("stands 0 times"));
+        assert!(gone.broken("").unwrap_err().to_string().contains("occurs 0 times"));
     }
 
     #[test]
