@@ -1,8 +1,8 @@
 //! Tests of the configuration files in the repository.
 
 use data::DatasetConfig;
-use lidarshift::detectors::find_detector;
 use lidarshift_tests::workspace;
+use models::find_detector;
 
 #[test]
 fn data_sets_and_detectors_are_right() {

@@ -2,10 +2,10 @@
 
 use burn::tensor::Device;
 use data::{Dataset, stream};
-use lidarshift::detectors::find_detector;
 use lidarshift_tests::shared;
 use models::checkpoint::HostValues;
 use models::config::{DetectorConfig, NetworkConfig};
+use models::find_detector;
 use models::{Detector, Preparer, parameter_count};
 use std::collections::BTreeMap;
 

@@ -1,6 +1,6 @@
 """Times training steps of the two networks, inference and the costliest layers in PyTorch on the CPU, on made-up inputs of given sizes.
 
-Reads the report of `lidarshift bench-step --json` and builds the same network from the configuration in it, so that both sides have the
+Reads the report of `lidarshift-checks bench-step --json` and builds the same network from the configuration in it, so that both sides have the
 same layers, the same number of points and the same number of pillars. Prints one line of JSON.
 
 What the reference is spared: reading and augmenting, making pillars, anchors and targets, proposals and their suppression. The times here
@@ -16,7 +16,7 @@ import time
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("report", help="JSON of `lidarshift bench-step --json`")
+    parser.add_argument("report", help="JSON of `lidarshift-checks bench-step --json`")
     parser.add_argument("--form", choices=["openpcdet", "best"], default="openpcdet")
     parser.add_argument("--threads", type=int, required=True)
     parser.add_argument("--steps", type=int, required=True)

@@ -1,7 +1,7 @@
 //! `cargo xtask bench train [FILTER]`: training steps, inference and the most expensive layers, compared with the same
 //! networks in PyTorch. Both sides run alternately.
 
-use crate::program;
+use crate::program::{self, Program};
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -87,7 +87,7 @@ pub fn bench_train(root: &Path, filters: &[String]) -> Result<()> {
     let cases = cases(filters);
     ensure!(!cases.is_empty(), "no row id contains {}; an example of an id: {}", filters.join(" and "), example());
     let python = python()?;
-    let program = program::build(root, None)?;
+    let program = program::build(root, Program::Checks, None)?;
     let mut measured = Vec::new();
     for case in cases {
         measured.extend(case.measure(root, &program, &python)?);

@@ -6,14 +6,15 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-/// Format, house rules, clippy, and tests, which include doc tests and a smoke run of the program.
+/// Format, house rules, the book, clippy, and tests, which include doc tests and a smoke run of the program.
 ///
 /// Everything is built once with the wgpu backend, which compiles without a GPU.
 pub fn ci(root: &Path) -> Result<()> {
     const FEATURES: [&str; 2] = ["--features", "lidarshift/wgpu"];
     let start = Instant::now();
-    step("format", || component(root, "fmt", &["--all", "--check"]))?;
+    step("format", || crate::format::format(root, true))?;
     step("tidy", crate::tidy)?;
+    step("book", || book(root))?;
     step("clippy", || {
         let args = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];
         component(root, "clippy", &args)
@@ -31,6 +32,16 @@ fn component(root: &Path, name: &str, args: &[&str]) -> Result<()> {
         return Ok(());
     }
     must(cargo(root).arg(name).args(args))
+}
+
+/// Builds the book in `docs`; prints a note if mdBook is not installed.
+fn book(root: &Path) -> Result<()> {
+    let there = Command::new("mdbook").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+    if !there.is_ok_and(|status| status.success()) {
+        eprintln!("mdbook is not installed: the book is not built (cargo install mdbook)");
+        return Ok(());
+    }
+    must(Command::new("mdbook").current_dir(root).args(["build", "docs"]))
 }
 
 /// Runs `work` under a heading; an error carries the name of the step.

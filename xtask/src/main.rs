@@ -1,20 +1,23 @@
-//! `cargo xtask COMMAND ...`: workspace tasks; any other command is passed to the program `lidarshift`, built in
-//! release.
+//! `cargo xtask COMMAND ...`: workspace tasks, some of them run by the program `lidarshift-checks`; any other command
+//! is passed to the program `lidarshift`. Both programs are built in release.
 
 mod bench;
 mod bench_mutants;
 mod bench_train;
 mod ci;
+mod format;
+mod pages;
 mod program;
 mod tidy;
 
 use anyhow::{Result, bail};
 use clap::{Parser, Subcommand};
+use program::Program::{Checks, Lidarshift};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-/// Workspace tasks. Every other command (train, eval, simulate, detect, doctor, parity, ...) is passed to the program
+/// Workspace tasks. Every other command (train, eval, simulate, detect, doctor, ...) is passed to the program
 /// `lidarshift`, built in release with the backend required by `--device`.
 #[derive(Parser)]
 #[command(
@@ -33,9 +36,16 @@ struct Xtask {
 enum Task {
     /// Run all required checks: format, house rules, clippy, tests, a smoke run.
     Ci,
-    /// Check the house rules: dependencies between crates, lints, file names and lengths, machine paths, wording.
+    /// Format all sources, including those named by macros.
+    Format {
+        /// Only check whether they are formatted.
+        #[arg(long)]
+        check: bool,
+    },
+    /// Check the house rules: dependencies between crates, lints, file names and lengths, machine paths, wording, links
+    /// between pages.
     Tidy,
-    /// Write configs/schema.json and docs/configuration.md from the Rust types.
+    /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
     /// Run the benchmarks. NAME is a benchmark or a crate; further arguments go to Criterion. `bench train` compares
     /// training steps with PyTorch; `bench mutants` runs the blind cases against a diagnosis with deliberate defects.
@@ -47,9 +57,24 @@ enum Task {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<String>,
     },
+    /// Compare every tensor with a folder of reference numbers: `parity ../shared/golden/pointpillars_tiny`.
+    #[command(disable_help_flag = true)]
+    Parity {
+        /// Arguments of `lidarshift-checks parity`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        args: Vec<OsString>,
+    },
+    /// Time a training step by stage.
+    #[command(hide = true, disable_help_flag = true)]
+    BenchStep {
+        /// Arguments of `lidarshift-checks bench-step`.
+        #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
+        args: Vec<OsString>,
+    },
     /// Test every file reader with mutated inputs: `fuzz --inputs 1000000`.
+    #[command(disable_help_flag = true)]
     Fuzz {
-        /// Arguments of the program's `fuzz` command.
+        /// Arguments of `lidarshift-checks fuzz`.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<OsString>,
     },
@@ -61,11 +86,14 @@ enum Task {
 fn main() -> ExitCode {
     let outcome = match Xtask::parse().task {
         Task::Ci => ci::ci(&root()),
+        Task::Format { check } => format::format(&root(), check),
         Task::Tidy => tidy(),
-        Task::Schema => program::run(&root(), &["schema".into()]),
+        Task::Schema => program::run(&root(), Checks, &["schema".into()]),
         Task::Bench { name, args } => bench::bench(&root(), name.as_deref(), &args),
-        Task::Fuzz { args } => program::hand_over(&root(), &[vec!["fuzz".into()], args].concat()),
-        Task::Program(args) => program::hand_over(&root(), &args),
+        Task::Parity { args } => program::hand_over(&root(), Checks, &[vec!["parity".into()], args].concat()),
+        Task::BenchStep { args } => program::hand_over(&root(), Checks, &[vec!["bench-step".into()], args].concat()),
+        Task::Fuzz { args } => program::hand_over(&root(), Checks, &[vec!["fuzz".into()], args].concat()),
+        Task::Program(args) => program::hand_over(&root(), Lidarshift, &args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

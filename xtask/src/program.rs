@@ -1,4 +1,5 @@
-//! The program `lidarshift`: built in release with the requested backend, then run with the caller's arguments.
+//! The programs `lidarshift` and `lidarshift-checks`: built in release with the requested backend, then run with the
+//! caller's arguments.
 
 use crate::cargo;
 use anyhow::{Context, Result, bail};
@@ -12,10 +13,29 @@ use std::time::Duration;
 /// A build that takes longer than this is announced.
 const SILENCE: Duration = Duration::from_millis(1500);
 
-/// Builds the program and replaces this process with it: same working folder, arguments and exit code; signals reach
-/// it directly.
-pub fn hand_over(root: &Path, args: &[OsString]) -> Result<()> {
-    let mut program = Command::new(build(root, backend_feature(args))?);
+/// A program of the workspace.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Program {
+    /// The program for users.
+    Lidarshift,
+    /// The program with the checks of it: `parity`, `fuzz`, `bench-step`, `schema`.
+    Checks,
+}
+
+impl Program {
+    /// Name of its package and of its executable.
+    fn name(self) -> &'static str {
+        match self {
+            Program::Lidarshift => "lidarshift",
+            Program::Checks => "lidarshift-checks",
+        }
+    }
+}
+
+/// Builds a program and replaces this process with it: same working folder, arguments and exit code; signals reach it
+/// directly.
+pub fn hand_over(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
+    let mut program = Command::new(build(root, program, backend_feature(args))?);
     program.args(args);
     #[cfg(unix)]
     {
@@ -31,19 +51,20 @@ pub fn hand_over(root: &Path, args: &[OsString]) -> Result<()> {
     }
 }
 
-/// Builds the program and runs it in the workspace root; a non-zero exit code is an error.
-pub fn run(root: &Path, args: &[OsString]) -> Result<()> {
-    let status = Command::new(build(root, backend_feature(args))?).args(args).current_dir(root).status()?;
+/// Builds a program and runs it in the workspace root; a non-zero exit code is an error.
+pub fn run(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
+    let status = Command::new(build(root, program, backend_feature(args))?).args(args).current_dir(root).status()?;
     if !status.success() {
-        bail!("lidarshift {} ended with {status}", args.join(OsStr::new(" ")).display());
+        bail!("{} {} ended with {status}", program.name(), args.join(OsStr::new(" ")).display());
     }
     Ok(())
 }
 
-/// Path of the program, built in release, with an additional backend feature if requested.
-pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
+/// Path of a program, built in release, with an additional backend feature if requested.
+pub fn build(root: &Path, program: Program, feature: Option<&str>) -> Result<PathBuf> {
+    let name = program.name();
     let mut cargo = cargo(root);
-    cargo.args(["build", "--quiet", "--release", "--package", "lidarshift", "--bin", "lidarshift"]);
+    cargo.args(["build", "--quiet", "--release", "--package", name, "--bin", name]);
     cargo.arg("--message-format=json-render-diagnostics");
     if let Some(feature) = feature {
         cargo.args(["--features", feature]);
@@ -51,7 +72,7 @@ pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
     let (done, is_done) = channel::<()>();
     let announcer = std::thread::spawn(move || {
         if is_done.recv_timeout(SILENCE) == Err(RecvTimeoutError::Timeout) {
-            eprintln!("building lidarshift (release)...");
+            eprintln!("building {name} (release)...");
         }
     });
     let mut build = cargo.stdout(Stdio::piped()).spawn().context("could not start cargo")?;
@@ -63,9 +84,9 @@ pub fn build(root: &Path, feature: Option<&str>) -> Result<PathBuf> {
     drop(done);
     announcer.join().expect("the announcing thread does not panic");
     if !status.success() {
-        bail!("the program lidarshift could not be built");
+        bail!("the program {name} could not be built");
     }
-    executable.context("cargo reported no executable of lidarshift")
+    executable.with_context(|| format!("cargo reported no executable of {name}"))
 }
 
 /// The executable named in one line of cargo's JSON messages.

@@ -3,6 +3,7 @@
 mod source;
 mod wording;
 
+use crate::pages;
 use anyhow::{Context, Result};
 use fs_err as fs;
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,13 +21,15 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("train", &["kernels", "models", "eval"]),
     ("diagnose", &["simulate", "data", "eval"]),
     ("report", &["eval", "diagnose"]),
-    ("cli", &["simulate", "train", "report"]),
-    ("tests", &["cli"]),
+    ("study", &["simulate", "train", "report"]),
+    ("cli", &["study"]),
+    ("checks", &["cli"]),
+    ("tests", &["checks"]),
     ("xtask", &[]),
 ];
 
 /// Crates that may depend on burn.
-const KNOWS_BURN: &[&str] = &["models", "train", "cli", "tests"];
+const KNOWS_BURN: &[&str] = &["models", "train", "study", "cli", "checks", "tests"];
 
 /// File names without meaning.
 const EMPTY_NAMES: &[&str] = &["utils", "util", "common", "base", "helper", "helpers", "manager"];
@@ -98,7 +101,10 @@ pub fn complaints(root: &Path) -> Result<Vec<String>> {
         let path = shown(root, &manifest.path);
         found.extend(manifest_complaints(&manifest).into_iter().map(|c| format!("{path}: {c}")));
     }
-    for file in texts(root)? {
+    let files = texts(root)?;
+    let pages: Vec<PathBuf> = files.iter().filter(|f| f.extension().is_some_and(|e| e == "md")).cloned().collect();
+    found.extend(pages::complaints(root, &pages)?);
+    for file in files {
         let path = shown(root, &file);
         let text = fs::read_to_string(&file)?;
         let mut of_file = text_complaints(&path, &text);
@@ -206,7 +212,7 @@ fn lines_before_tests(text: &str) -> usize {
 }
 
 /// All files written by hand, sorted by path: sources, manifests, scripts, documents; not generated output.
-fn texts(root: &Path) -> Result<Vec<PathBuf>> {
+pub fn texts(root: &Path) -> Result<Vec<PathBuf>> {
     let (mut open, mut files) = (vec![root.to_owned()], Vec::new());
     while let Some(folder) = open.pop() {
         for entry in fs::read_dir(&folder)? {
@@ -258,6 +264,11 @@ mod tests {
             ("report", "simulate", true),
             ("report", "train", false),
             ("cli", "geometry", true),
+            ("study", "report", true),
+            ("eval", "study", false),
+            ("study", "lidarshift", false),
+            ("checks", "lidarshift", true),
+            ("lidarshift", "checks", false),
             ("tests", "lidarshift", true),
             ("train", "lidarshift", false),
             ("xtask", "geometry", false),

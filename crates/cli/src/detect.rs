@@ -1,6 +1,5 @@
 //! `lidarshift detect`: boxes in one cloud, or in a whole split of a data set.
 
-use crate::detectors::find_detector;
 use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
@@ -9,7 +8,7 @@ use data::{Cloud, Dataset, Detection, Frame, PointColumns, read_cloud, write_ato
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
-use models::{Detector, Preparer};
+use models::{Detector, Preparer, find_detector, inference_samples, predict_frames, predict_samples};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -63,22 +62,6 @@ struct Found<'a> {
     detections: &'a [Detection],
 }
 
-/// A detector with its weights.
-struct Loaded {
-    detector: Detector,
-    preparer: Preparer,
-}
-
-impl Loaded {
-    fn detect(&self, frame: &Frame) -> Result<Vec<Detection>> {
-        let sample = self.preparer.inference(frame)?;
-        if sample.is_empty() {
-            return Ok(Vec::new());
-        }
-        Ok(self.detector.predict(&[sample])?.remove(0))
-    }
-}
-
 impl DetectArgs {
     /// Finds, prints and draws.
     pub fn run(self) -> Result<()> {
@@ -88,26 +71,26 @@ impl DetectArgs {
         let detector = Detector::new(&config, 0, &device)
             .load_named(&weights)
             .with_context(|| format!("{} does not fit the detector {}", self.checkpoint.display(), config.name))?;
-        let loaded = Loaded { preparer: Preparer::new(&config), detector };
         let ending = self.input.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
         match ending.as_str() {
-            "bin" | "pcd" => self.cloud(&loaded),
-            _ => self.split(&loaded),
+            "bin" | "pcd" => self.cloud(&detector),
+            _ => self.split(&detector),
         }
     }
 
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
-    fn cloud(&self, loaded: &Loaded) -> Result<()> {
+    fn cloud(&self, detector: &Detector) -> Result<()> {
         let columns = match self.points {
             Some(Points::Xyz) => PointColumns::Xyz,
             Some(Points::Xyzi) => PointColumns::Xyzi,
-            None if loaded.detector.config().channels == 3 && self.is_xyz_size()? => PointColumns::Xyz,
+            None if detector.config().channels == 3 && self.is_xyz_size()? => PointColumns::Xyz,
             None => PointColumns::Xyzi,
         };
         let cloud = read_cloud(&self.input, columns)?;
         let id = self.input.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let frame = Frame { id: id.clone(), cloud, objects: Vec::new() };
-        let detections = loaded.detect(&frame)?;
+        let sample = Preparer::new(detector.config()).inference(&frame)?;
+        let detections = predict_samples(detector, &[sample])?.remove(0).detections;
         for detection in &detections {
             println!("{}", KittiLine::from_box(&detection.class, &detection.bbox, Some(detection.score)));
         }
@@ -131,7 +114,7 @@ impl DetectArgs {
         Ok(bytes % 12 == 0 && bytes % 16 != 0)
     }
 
-    fn split(&self, loaded: &Loaded) -> Result<()> {
+    fn split(&self, detector: &Detector) -> Result<()> {
         let Some(out) = &self.out else { bail!("a data set needs --out DIR for its detections") };
         let dataset = Dataset::open(&self.input)?;
         let ids = match &self.split {
@@ -141,14 +124,16 @@ impl DetectArgs {
         let progress = ProgressBar::new(ids.len() as u64)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
         let mut boxes = 0;
-        for id in &ids {
-            let cloud = dataset.load_cloud(id)?;
-            let detections = loaded.detect(&Frame { id: id.clone(), cloud, objects: Vec::new() })?;
-            boxes += detections.len();
-            let lines = dataset.detection_lines(id, &detections)?;
-            data::write::write_kitti_text(&out.join(format!("{id}.txt")), &lines)?;
-            progress.inc(1);
-        }
+        let samples = inference_samples(detector, &dataset, &ids, 1).zip(&ids).map(|(sample, id)| Ok((sample?, id)));
+        predict_frames(detector, 1, samples, |batch| {
+            for (id, found) in batch {
+                boxes += found.detections.len();
+                let lines = dataset.detection_lines(id, &found.detections)?;
+                data::write::write_kitti_text(&out.join(format!("{id}.txt")), &lines)?;
+                progress.inc(1);
+            }
+            Ok::<(), anyhow::Error>(())
+        })?;
         progress.finish_and_clear();
         eprintln!("{boxes} boxes in {} frames, in {}", ids.len(), out.display());
         Ok(())
@@ -158,7 +143,7 @@ impl DetectArgs {
 /// The detector that weights belong to: as told, or as the run folder around them says.
 fn detector_of(checkpoint: &Path, told: Option<&str>) -> Result<DetectorConfig> {
     if let Some(name) = told {
-        return find_detector(name);
+        return Ok(find_detector(name)?);
     }
     for folder in checkpoint.ancestors().skip(1).take(3) {
         let path = folder.join("config.toml");

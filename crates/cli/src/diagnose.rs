@@ -2,6 +2,7 @@
 
 mod detectors;
 
+use crate::commands::End;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
@@ -57,8 +58,8 @@ pub struct DiagnoseArgs {
 }
 
 impl DiagnoseArgs {
-    /// Diagnoses, writes the files and says what was found; `false` when the two do not show the same scenes.
-    pub fn run(self) -> Result<bool> {
+    /// Diagnoses, writes the files and says what was found.
+    pub fn run(self) -> Result<End> {
         let rig = self.rig()?;
         if self.out.is_file() {
             bail!("--out {}: is a file; a folder is wanted", self.out.display());
@@ -110,7 +111,10 @@ impl DiagnoseArgs {
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis)?;
         }
-        Ok(outcome.diagnosis.verdict != Verdict::NotScenarioIdentical)
+        Ok(match outcome.diagnosis.verdict {
+            Verdict::NotScenarioIdentical => End::NotTheSameScenes,
+            _ => End::Done,
+        })
     }
 
     fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {

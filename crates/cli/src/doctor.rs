@@ -1,11 +1,11 @@
 //! `lidarshift doctor`: what is wrong with a data set, in words.
 
-use crate::detectors::find_detector;
 use anyhow::Result;
 use clap::Args;
 use data::Dataset;
 use data::doctor::{AnchorFacts, DetectorFacts, doctor};
 use models::config::{DetectorConfig, NetworkConfig};
+use models::find_detector;
 use std::path::PathBuf;
 
 /// Examine a data set before anything is trained on it: files, splits, duplicates, boxes, and whether the labels mean what is declared.

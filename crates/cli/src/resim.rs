@@ -23,7 +23,7 @@ pub struct ResimArgs {
     /// Data set: its folder or its TOML
     #[arg(value_name = "DATASET")]
     dataset: PathBuf,
-    /// TOML with the list of effects; docs/simulation.md has them all
+    /// TOML with the list of effects; docs/src/reference/effects.md has them all
     #[arg(long, value_name = "TOML")]
     effects: PathBuf,
     /// Folder for the data set: new, empty, or begun with the same words

@@ -1,12 +1,12 @@
 //! `lidarshift simulate`: synthetic data sets on disk.
 
-use anyhow::{Context, Result, bail};
+use anyhow::Result;
 use clap::Args;
 use data::{Dataset, write_atomic};
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
 use simulate::race::{ConfigFiles, RaceConfig, RaceManifest, make_race_datasets};
-use simulate::{FrameCounts, RoadConfig, make_road_dataset};
+use simulate::{RoadConfig, Scenery, make_road_dataset};
 use std::path::{Path, PathBuf};
 
 /// Make data sets: a race on an oval as it stands for the road and as simulators show it, or streets with cars. The same seed gives the
@@ -21,70 +21,30 @@ use std::path::{Path, PathBuf};
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct SimulateArgs {
-    /// What to make: race, race_small, race_full, street, or a TOML; docs/configuration.md lists the keys
+    /// What to make: race, race_small, race_full, street, or a TOML; docs/src/reference/configuration.md lists the keys
     #[arg(long, value_name = "CONFIG", default_value = "race")]
-    pub config: String,
+    config: String,
     /// Folder for the data sets: new, empty, or begun with the same words [default: datasets/NAME]
     #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
+    out: Option<PathBuf>,
     /// Frames of each data set
     #[arg(long, value_name = "N")]
-    pub frames: Option<usize>,
+    frames: Option<usize>,
     /// Another seed gives other scenes
     #[arg(long, value_name = "K")]
-    pub seed: Option<u64>,
+    seed: Option<u64>,
     /// Of a race only these data sets, with commas between them
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
-    pub dataset: Vec<String>,
-}
-
-/// What a configuration describes.
-pub enum Scenery {
-    /// Streets.
-    Street(RoadConfig),
-    /// A race, and the files that it names.
-    Race(Box<(RaceConfig, ConfigFiles)>),
+    dataset: Vec<String>,
 }
 
 impl SimulateArgs {
     /// Makes the data sets and says what is in them.
     pub fn run(self) -> Result<()> {
-        match self.scenery()? {
+        match Scenery::find(&self.config, self.frames, self.seed)? {
             Scenery::Street(config) => self.street(&config),
             Scenery::Race(race) => self.race(&race.0, &race.1),
         }
-    }
-
-    /// The configuration that the words name.
-    pub fn scenery(&self) -> Result<Scenery> {
-        let path = Path::new(&self.config);
-        let is_street = if path.is_file() {
-            let text = fs_err::read_to_string(path)?;
-            // A race names its sensors; a file that is no TOML at all is refused by line where it is read.
-            text.parse::<toml::Table>().is_ok_and(|table| !table.contains_key("rig"))
-        } else {
-            self.config == "street"
-        };
-        if is_street {
-            return Ok(Scenery::Street(self.street_config(path.is_file().then_some(path))?));
-        }
-        let (mut config, files) = RaceConfig::find(&self.config)?;
-        config.seed = self.seed.unwrap_or(config.seed);
-        config.frames = self.frames.unwrap_or(config.frames);
-        config.check().context("--frames or --seed do not fit the configuration")?;
-        Ok(Scenery::Race(Box::new((config, files))))
-    }
-
-    fn street_config(&self, path: Option<&Path>) -> Result<RoadConfig> {
-        let mut config = path.map_or(Ok(RoadConfig::default()), RoadConfig::read)?;
-        config.seed = self.seed.unwrap_or(config.seed);
-        if let Some(total) = self.frames {
-            config.frames = match FrameCounts::scaled_to(&config.frames, total) {
-                Some(frames) => frames,
-                None => bail!("--frames {total}: there must be at least 3, one for each split"),
-            };
-        }
-        Ok(config)
     }
 
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
@@ -156,36 +116,4 @@ fn summary(manifest: &RaceManifest) -> String {
         );
     }
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn args(config: &str, frames: Option<usize>, seed: Option<u64>) -> SimulateArgs {
-        SimulateArgs { config: config.into(), out: None, frames, seed, dataset: Vec::new() }
-    }
-
-    #[test]
-    fn words_win_over_the_configuration() {
-        let Scenery::Street(config) = args("street", Some(36), Some(9)).scenery().unwrap() else { panic!("a street") };
-        assert_eq!((config.frames.total(), config.seed), (36, 9));
-        assert!(args("street", Some(2), None).scenery().is_err());
-        let Scenery::Race(race) = args("race", Some(36), Some(9)).scenery().unwrap() else { panic!("a race") };
-        assert_eq!((race.0.frames, race.0.seed), (36, 9));
-        assert!(args("race", Some(2), None).scenery().is_err());
-        let error = args("rce", None, None).scenery().err().unwrap().to_string();
-        assert!(error.contains("race_small"), "{error}");
-    }
-
-    #[test]
-    fn files_are_told_apart_by_their_sensors() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("a.toml");
-        std::fs::write(&path, "[frames]\ntrain = 5\n").unwrap();
-        assert!(matches!(args(path.to_str().unwrap(), None, None).scenery(), Ok(Scenery::Street(_))));
-        std::fs::write(&path, "name = \"a\"\nrig = \"r.toml\"\nframes = 2\n").unwrap();
-        let error = args(path.to_str().unwrap(), None, None).scenery().err().unwrap().to_string();
-        assert!(error.contains("a.toml:3: frames"), "{error}");
-    }
 }

@@ -3,17 +3,17 @@
 mod progress;
 mod results;
 
-use crate::detectors::detector_text;
 use crate::device::DeviceArgs;
-use crate::study::folder::Study;
-use crate::study::{HowToRun, Step, run_study};
+use crate::study::{HowToRun, run_study};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
 use models::config::NetworkConfig;
+use models::detector_text;
 use progress::Progress;
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
 use std::path::{Path, PathBuf};
+use study::{Step, Study};
 use toml::{Table, Value};
 use train::{RunConfig, Session, evaluate_detector, set_key, train};
 
@@ -88,7 +88,7 @@ impl TrainArgs {
     pub fn run(mut self) -> Result<()> {
         if let Some(study) = &self.study {
             let study = Study::open(study, self.out.as_deref())?;
-            return run_study(&study, &[Step::Data, Step::Train], &self.how, &self.device);
+            return run_study(&study, &self.how.options(vec![Step::Data, Step::Train], &self.device));
         }
         let device = self.device.open()?;
         let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;

@@ -1,4 +1,4 @@
-//! Prints the JSON schema of `diagnosis.json`: `cargo run -p lidarshift-diagnose --example schema > docs/diagnosis.schema.json`.
+//! Prints the JSON schema of `diagnosis.json`: `cargo run -p lidarshift-diagnose --example schema > docs/src/reference/diagnosis.schema.json`.
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn main() {

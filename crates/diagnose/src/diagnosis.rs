@@ -71,7 +71,7 @@ pub struct Finding {
     pub candidates: Option<Vec<String>>,
     /// `range_error`, `detection`, `geometry`, `timing`, `labels`, `returns` or `unknown`.
     pub family: String,
-    /// Fitted parameters; docs/diagnosis.md has names, units and signs.
+    /// Fitted parameters; docs/src/reference/causes.md has names, units and signs.
     pub parameters: BTreeMap<String, Parameter>,
     /// Share of block-bootstrap repetitions that choose the same name.
     pub confidence: f64,
@@ -219,7 +219,7 @@ pub struct CurvePoint {
     pub error: f64,
 }
 
-/// The JSON schema of the file, as docs/diagnosis.schema.json has it.
+/// The JSON schema of the file, as docs/src/reference/diagnosis.schema.json has it.
 pub fn schema_json() -> String {
     format!("{:#}\n", schemars::schema_for!(Diagnosis).to_value())
 }
@@ -230,10 +230,11 @@ mod tests {
 
     #[test]
     fn the_schema_in_the_docs_is_up_to_date() {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/diagnosis.schema.json");
+        let path =
+            std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/reference/diagnosis.schema.json");
         let text = fs_err::read_to_string(path).unwrap();
-        let how = "run `cargo run -p lidarshift-diagnose --example schema > docs/diagnosis.schema.json`";
-        assert!(text == schema_json(), "docs/diagnosis.schema.json is stale: {how}");
+        let how = "run `cargo run -p lidarshift-diagnose --example schema > docs/src/reference/diagnosis.schema.json`";
+        assert!(text == schema_json(), "docs/src/reference/diagnosis.schema.json is stale: {how}");
     }
 
     #[test]

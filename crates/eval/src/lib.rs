@@ -20,7 +20,6 @@ mod read;
 mod recall;
 mod report;
 mod statistics;
-pub mod study;
 pub mod targets;
 
 pub use bootstrap::{BootstrapOptions, Interval};

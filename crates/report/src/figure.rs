@@ -1,18 +1,20 @@
 //! Figures of a study. Each is built once and written as SVG, as PNG, or into the report.
 
-mod bars;
-mod dots;
-mod heat;
-mod marginals;
-mod scatter;
-mod target_views;
+/// The kinds of figures, a file each; what is public in it is public in the crate.
+macro_rules! figures {
+    ($($file:ident,)*) => {
+        $(mod $file; pub use $file::*;)*
+    };
+}
 
-pub use bars::{Bar, bars};
-pub use dots::{DotGroup, DotPanel, dots};
-pub use heat::heat_map;
-pub use marginals::{LocatedTargets, locations};
-pub use scatter::{ScatterGroup, scatter};
-pub use target_views::{TargetCloud, aggregated_targets, target_views};
+figures! {
+    bars,
+    dots,
+    heat,
+    marginals,
+    scatter,
+    target_views,
+}
 
 use crate::curve::curve_page;
 use crate::page::{Anchor, COLORS, INK, Page, Rgb};

@@ -1,4 +1,4 @@
-//! Figures, tables, and the report of a study as one page.
+//! Figures, tables, the report of a study as one HTML page, and the figures of a diagnosis.
 //!
 //! Every figure is first a list of drawing primitives, then written as SVG or PNG; both look the same.
 
@@ -6,22 +6,22 @@ mod axis;
 mod birds_eye;
 mod curve;
 mod figure;
-mod findings;
 mod html;
 mod page;
+mod pages;
 mod png;
 mod scene;
 mod stroke_font;
-mod study;
 mod svg;
 mod tensorboard;
 
 pub use birds_eye::{BirdsEyeOptions, Style, birds_eye_png, birds_eye_svg};
 pub use curve::{CurveOptions, Series, curve_svg};
 pub use figure::*;
-pub use findings::{finding_name, write_finding_pictures};
+pub use pages::diagnosis::{finding_name, write_finding_pictures};
+pub use pages::study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
 pub use scene::{Layer, LayerContent, Scene};
-pub use study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
+
 pub use tensorboard::write_event_files;
 
 /// Why a figure or report could not be made.

@@ -5,7 +5,7 @@
 //! <https://github.com/tensorflow/tensorboard/blob/master/tensorboard/compat/proto/event.proto>.
 
 use crate::ReportError;
-use crate::study::metrics_lines;
+use crate::pages::study::metrics_lines;
 use data::{DataError, write_atomic};
 use serde_json::Value;
 use std::path::{Path, PathBuf};

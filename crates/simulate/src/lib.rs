@@ -17,10 +17,12 @@ pub mod resim;
 pub mod rig;
 pub mod scan;
 pub mod scenario;
+mod scenery;
 pub mod street;
 pub mod track;
 pub mod world;
 
 pub use error::SimulateError;
 pub use rig::{Rig, Sensor};
+pub use scenery::Scenery;
 pub use street::{FrameCounts, MANIFEST_SCHEMA, Manifest, RoadConfig, SplitCounts, make_road_dataset, make_road_frame};

@@ -3,6 +3,7 @@
 mod adam;
 mod error;
 mod frames;
+pub mod memory;
 mod metrics;
 mod one_cycle;
 mod provenance;

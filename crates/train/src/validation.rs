@@ -4,7 +4,7 @@ use crate::{TrainError, ValidationMetrics};
 use burn::tensor::Tensor;
 use data::{Dataset, Detection, KittiLine, prefetch, stream};
 use eval::{Difficulty, EvalFrame, EvalOptions, EvalReport, Metric, evaluate, reference_overlaps};
-use models::{Detector, Losses, ModelError, Preparer, Sample};
+use models::{Detector, Losses, ModelError, Prediction, Preparer, Sample, predict_frames};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -47,13 +47,13 @@ pub fn evaluate_detector(
     });
     let mut detections = Vec::with_capacity(ids.len());
     let mut losses = Vec::new();
-    while detections.len() < ids.len() {
-        let batch: Vec<(Sample, Sample)> = samples.by_ref().take(batch_size).collect::<Result<_, _>>()?;
-        let (inference, training): (Vec<Sample>, Vec<Sample>) = batch.into_iter().unzip();
+    predict_frames(detector, batch_size, &mut samples, |batch: Vec<(Sample, Prediction)>| {
+        let (training, found): (Vec<Sample>, Vec<Prediction>) = batch.into_iter().unzip();
         losses.push(loss_values(&detector.validation_loss(&training)?)?[0].1);
-        detections.extend(detector.predict(&inference)?);
+        detections.extend(found.into_iter().map(|found| found.detections));
         progress(detections.len());
-    }
+        Ok::<(), TrainError>(())
+    })?;
     let frames = ids
         .iter()
         .zip(&detections)

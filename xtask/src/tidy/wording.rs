@@ -1,6 +1,7 @@
-//! Rules for comments, Markdown and names: the field's terms instead of private ones, and lines that can be read.
+//! Rules for wording in comments, Markdown and names, and for the length of comment lines.
 
 use super::source::{Line, lines};
+use crate::pages;
 
 /// Folders and files that follow these rules. Empty: everything.
 const CLEAN: &[&str] = &[
@@ -24,10 +25,7 @@ const CLEAN: &[&str] = &[
     "xtask",
 ];
 
-/// Pages that a command writes.
-const GENERATED: &[&str] = &["docs/configuration.md", "docs/reference/configuration.md"];
-
-/// Longest line of a comment or of Markdown, characters.
+/// Maximum length of a line with a comment, characters. For Markdown see [`crate::pages`].
 const MAX_COLUMNS: usize = 120;
 
 /// Phrases that may not stand in comments and Markdown, and the term to use. Compared by whole words, in any case.
@@ -83,14 +81,15 @@ pub fn complaints(path: &str, text: &str) -> Vec<(usize, String)> {
 }
 
 fn check(path: &str, text: &str) -> Vec<(usize, String)> {
-    if GENERATED.contains(&path) {
+    let is_page = path.ends_with(".md");
+    if is_page && pages::is_generated(text) {
         return Vec::new();
     }
     let mut found = Vec::new();
     let lines = lines(path, text);
     for (i, (line, raw)) in lines.iter().zip(text.lines()).enumerate() {
         let columns = without_links(raw).chars().count();
-        if line.wraps && columns > MAX_COLUMNS {
+        if line.wraps && !is_page && columns > MAX_COLUMNS {
             found.push((i + 1, format!("{columns} characters, more than {MAX_COLUMNS}: wrap the line")));
         }
         let phrases = phrases_in(line, lines.get(i + 1));
@@ -206,11 +205,9 @@ mod tests {
             ("a.rs", format!("// {long}\n"), 1),
             ("a.rs", format!("f(\"{long}\");\n"), 0),
             ("a.rs", format!("f(); // {long}\n"), 1),
-            ("a.md", format!("{long}\n"), 1),
-            ("a.md", format!("| {long} |\n```\n{long}\n```\n"), 0),
-            ("a.md", format!("see [this](https://example.org/{})\n", "x".repeat(120)), 0),
-            ("a.md", format!("see https://example.org/{} {long}\n", "x".repeat(120)), 1),
-            ("docs/configuration.md", format!("{long}\n"), 0),
+            ("a.rs", format!("//! | {long} |\n//! ```\n//! {long}\n//! ```\n"), 0),
+            ("a.rs", format!("// see [this](https://example.org/{})\n", "x".repeat(120)), 0),
+            ("a.rs", format!("// see https://example.org/{} {long}\n", "x".repeat(120)), 1),
             ("a.toml", format!("# {long}\n"), 1),
         ] {
             assert_eq!(terms(path, &text).len(), count, "{path}: {text}");

@@ -1,17 +1,16 @@
 //! `lidarshift diagnose --detectors STUDY`: are detectors trained on the extended simulation better on measured data?
 
 use crate::device::DeviceArgs;
-use crate::study::folder::Study;
-use crate::study::numbers::{Found, matrix};
-use crate::study::{HowToRun, Step, run_study};
+use crate::study::run_study;
 use anyhow::{Context, Result, bail};
 use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
-use eval::study::{Source, StudyConfig, StudyDataset};
 use simulate::effects::EffectList;
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
+use study::numbers::{Found, matrix};
+use study::{RunOptions, Source, Study, StudyConfig, StudyDataset};
 
 const MEASURED: &str = "measured";
 const BEFORE: &str = "simulated";
@@ -36,12 +35,7 @@ pub(super) fn gain_of_detectors(
     let text = toml::to_string(&study_of(template, measured, simulated, &effects)?)?;
     write_atomic(&path, text.as_bytes())?;
     let study = Study::open(&path.to_string_lossy(), Some(&out.join("detectors")))?;
-    run_study(
-        &study,
-        &[Step::Data, Step::Train, Step::Detect, Step::Report],
-        &HowToRun::here(),
-        &DeviceArgs::default(),
-    )?;
+    run_study(&study, &RunOptions::here(DeviceArgs::default().words()))?;
     Ok((gains(&matrix(&study, &Found::look(&study)?)?)?, left_out))
 }
 

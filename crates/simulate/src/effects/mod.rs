@@ -12,7 +12,7 @@
 //! for what stays the same in a whole data set, as the offset of a beam. So an effect changes neither when another is added behind it nor
 //! with the number of threads.
 //!
-//! The codes (A1, B2, ...) are those of the catalogue in `docs/simulation.md`.
+//! The codes (A1, B2, ...) are those of the catalogue in `docs/src/reference/effects.md`.
 
 mod context;
 mod local_plane;

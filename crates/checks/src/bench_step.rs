@@ -1,0 +1,307 @@
+//! `lidarshift-checks bench-step`: where the time of one training step goes, and how much memory it takes; and the same of an inference, and of the
+//! layers that cost most.
+
+mod layers;
+
+use anyhow::{Result, bail};
+use burn::optim::GradientsParams;
+use burn::tensor::{Device, Tensor};
+use clap::{Args, ValueEnum};
+use data::augment::{AugmentConfig, augment, crop_to_range};
+use data::{Frame, stream};
+use lidarshift::device::DeviceArgs;
+use models::config::{DetectorConfig, NetworkConfig, PointPillarsConfig};
+use models::find_detector;
+use models::layers::Mode;
+use models::pointpillars::pillars::{PillarGrid, pillarise};
+use models::pointpillars::{losses, scatter::scatter};
+use models::{Detector, Network, Preparer, Sample, reference_name};
+use rand::RngExt;
+use serde::Serialize;
+use simulate::{RoadConfig, make_road_frame};
+use std::path::PathBuf;
+use std::time::Instant;
+use train::{Adam, GradientNorm};
+
+/// Times one training step by stage, on made-up road frames that are augmented anew for every step.
+#[derive(Args, Debug)]
+pub struct BenchStepArgs {
+    /// A name or a TOML
+    #[arg(long, default_value = "pointpillars_small")]
+    detector: String,
+    /// Frames a step
+    #[arg(long, default_value_t = 1)]
+    batch: usize,
+    /// Timed steps; two before them warm up
+    #[arg(long, default_value_t = 7)]
+    steps: usize,
+    /// What is timed
+    #[arg(long, value_enum, default_value_t)]
+    work: Work,
+    #[command(flatten)]
+    device: DeviceArgs,
+    /// Also write the medians as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// What is timed.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
+#[serde(rename_all = "kebab-case")]
+enum Work {
+    /// A whole training step
+    #[default]
+    Step,
+    /// From clouds in memory to final boxes
+    Inference,
+    /// The backbone's 3x3 convolutions of stride 1, forward and both gradients (PointPillars, on the CPU)
+    Convolutions,
+    /// The pillar feature net, forward and gradients (PointPillars, on the CPU)
+    PillarNet,
+}
+
+#[derive(Serialize)]
+struct Report {
+    schema: &'static str,
+    work: Work,
+    detector: String,
+    device: String,
+    batch: usize,
+    steps: usize,
+    /// What the detector reads of the last batch: points that are in pillars or are drawn, and pillars.
+    read: [usize; 2],
+    /// The whole of each timed step, ms.
+    whole_ms: Vec<f64>,
+    /// Median of each stage and of the whole step, ms.
+    median_ms: Vec<(&'static str, f64)>,
+    /// Largest resident memory of the process, MiB.
+    peak_mib: Option<u64>,
+    config: DetectorConfig,
+}
+
+impl BenchStepArgs {
+    /// Prints a table.
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    pub fn run(self) -> Result<()> {
+        let config = find_detector(&self.detector)?;
+        let device = self.device.open()?.autodiff();
+        let road = RoadConfig::default();
+        let frames: Vec<Frame> = (0..self.batch).map(|i| make_road_frame(&road, "train", i)).collect();
+        let timed = match self.work {
+            Work::Step => self.training_steps(&config, &device, &frames)?,
+            Work::Inference => self.inferences(&config, &device, &frames)?,
+            Work::Convolutions => layers::convolutions(pointpillars(&config)?, &config, self.batch, self.steps),
+            Work::PillarNet => layers::pillar_net(pointpillars(&config)?, &samples(&config, &frames, 0)?, self.steps)?,
+        };
+        let report = Report {
+            schema: "lidarshift/bench-step/3",
+            work: self.work,
+            read: timed.read,
+            whole_ms: timed.stages.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
+            median_ms: timed.stages.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
+            peak_mib: train::memory::peak_mib(),
+            detector: config.name.clone(),
+            device: self.device.describe(),
+            batch: self.batch,
+            steps: self.steps,
+            config,
+        };
+        if self.work == Work::Step {
+            println!("pillars of 120,000 points, cells of 0.16 m: {:.1} ms", median(pillarise_ms()));
+        }
+        println!(
+            "{}, batch {}, {}: medians of {} times in ms",
+            report.detector, report.batch, report.device, report.steps
+        );
+        for (stage, ms) in &report.median_ms {
+            println!("  {stage:<11} {ms:>9.1} ms");
+        }
+        if let Some(mib) = report.peak_mib {
+            println!("  peak memory {mib:>9} MiB");
+        }
+        if let Some(path) = &self.json {
+            data::write_json(path, &report)?;
+        }
+        Ok(())
+    }
+}
+
+impl BenchStepArgs {
+    fn training_steps(&self, config: &DetectorConfig, device: &Device, frames: &[Frame]) -> Result<Timed> {
+        let mut detector = Detector::new(config, 0, device);
+        let mut adam = Adam::new(config.optimization.weight_decay, reference_name);
+        let mut timed = Timed::default();
+        for step in 0..self.steps + WARM_UP {
+            let mut clock = Clock::start(device);
+            let batch = samples(config, frames, step)?;
+            timed.read = read_of(&batch);
+            clock.mark("data")?;
+            let total = forward(&detector, &batch, &mut clock)?;
+            let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
+            let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
+            clock.mark("backward")?;
+            let clip = norm.clip_scale(config.optimization.clip_norm);
+            detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-4, 0.9));
+            clock.mark("optimizer")?;
+            timed.add(step, clock.stages());
+        }
+        Ok(timed)
+    }
+
+    fn inferences(&self, config: &DetectorConfig, device: &Device, frames: &[Frame]) -> Result<Timed> {
+        let detector = Detector::new(config, 0, device);
+        let preparer = Preparer::new(config);
+        let mut timed = Timed::default();
+        for step in 0..self.steps + WARM_UP {
+            let mut clock = Clock::start(device);
+            let batch = frames.iter().map(|frame| preparer.inference(frame)).collect::<Result<Vec<_>, _>>()?;
+            timed.read = read_of(&batch);
+            clock.mark("data")?;
+            std::hint::black_box(detector.predict(&batch)?);
+            clock.mark("network")?;
+            timed.add(step, clock.stages());
+        }
+        Ok(timed)
+    }
+}
+
+/// Steps that are not timed.
+const WARM_UP: usize = 2;
+
+/// What was timed.
+#[derive(Default)]
+struct Timed {
+    /// Points and pillars of the last batch.
+    read: [usize; 2],
+    /// ms of each timed step, stage by stage, the whole last.
+    stages: Vec<(&'static str, Vec<f64>)>,
+}
+
+impl Timed {
+    fn add(&mut self, step: usize, stages: Vec<(&'static str, f64)>) {
+        if step < WARM_UP {
+            return;
+        }
+        for (i, (stage, ms)) in stages.into_iter().enumerate() {
+            if self.stages.len() == i {
+                self.stages.push((stage, Vec::new()));
+            }
+            self.stages[i].1.push(ms);
+        }
+    }
+}
+
+fn pointpillars(config: &DetectorConfig) -> Result<&PointPillarsConfig> {
+    match &config.network {
+        NetworkConfig::PointPillars(network) => Ok(network),
+        NetworkConfig::PointRcnn(_) => bail!("{} is no PointPillars: --work step or inference", config.name),
+    }
+}
+
+/// The batch of a step, augmented anew.
+fn samples(config: &DetectorConfig, frames: &[Frame], step: usize) -> Result<Vec<Sample>> {
+    let preparer = Preparer::new(config);
+    let sample = |(i, frame): (usize, &Frame)| {
+        let mut random = stream(0, "bench", step as u64, i as u64);
+        let augmented = augment(frame.clone(), &AugmentConfig::default(), None, &mut random);
+        let cropped = crop_to_range(augmented, &config.range_m.map(f64::from));
+        Ok(preparer.training(&cropped, &mut random)?)
+    };
+    frames.iter().enumerate().map(sample).collect()
+}
+
+/// Points and pillars of a batch.
+fn read_of(batch: &[Sample]) -> [usize; 2] {
+    let of_sample = |sample: &Sample| match sample {
+        Sample::PointPillars(sample) => {
+            let num_points = &sample.pillars.num_points;
+            [num_points.iter().map(|&n| n as usize).sum(), num_points.len()]
+        }
+        Sample::PointRcnn(sample) => [sample.points.len(), 0],
+    };
+    batch.iter().map(of_sample).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]))
+}
+
+/// The losses of a batch, stage by stage where the network has stages that stand alone.
+fn forward(detector: &Detector, batch: &[Sample], clock: &mut Clock<'_>) -> Result<Tensor<1>> {
+    if let (Network::PointPillars(network), NetworkConfig::PointPillars(net)) =
+        (&detector.network, &detector.config().network)
+    {
+        let batch: Vec<_> = batch
+            .iter()
+            .filter_map(|sample| match sample {
+                Sample::PointPillars(sample) => Some(sample),
+                Sample::PointRcnn(_) => None,
+            })
+            .collect();
+        let pillars = network.vfe.forward(network.pillar_rows(&batch), Mode::Train);
+        clock.mark("encoder")?;
+        let (cells, shape) = network.cells(&batch);
+        let canvas = scatter(pillars, &cells, shape);
+        clock.mark("scatter")?;
+        let features = network.backbone_2d.forward(canvas, Mode::Train).spatial_features_2d;
+        clock.mark("backbone")?;
+        let predictions = network.dense_head.forward(features);
+        clock.mark("head")?;
+        let total = losses(&predictions, &batch, &net.loss).total;
+        clock.mark("loss")?;
+        return Ok(total);
+    }
+    let total = detector.loss(batch)?.total;
+    clock.mark("forward")?;
+    Ok(total)
+}
+
+/// When each stage of a step ended, the device being done with it.
+struct Clock<'a> {
+    device: &'a Device,
+    marks: Vec<(&'static str, Instant)>,
+}
+
+impl<'a> Clock<'a> {
+    fn start(device: &'a Device) -> Self {
+        Clock { device, marks: vec![("", Instant::now())] }
+    }
+
+    fn mark(&mut self, stage: &'static str) -> Result<()> {
+        self.device.sync()?;
+        self.marks.push((stage, Instant::now()));
+        Ok(())
+    }
+
+    /// Each stage and the whole step, ms.
+    fn stages(&self) -> Vec<(&'static str, f64)> {
+        let ms = |from: Instant, to: Instant| 1e3 * (to - from).as_secs_f64();
+        let (begin, end) = (self.marks[0].1, self.marks[self.marks.len() - 1].1);
+        let stages = self.marks.windows(2).map(|pair| (pair[1].0, ms(pair[0].1, pair[1].1)));
+        stages.chain([("whole", ms(begin, end))]).collect()
+    }
+}
+
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// The published grid on a cloud of the size of a whole KITTI scan, all in range; ms of some repetitions.
+fn pillarise_ms() -> Vec<f64> {
+    let grid = PillarGrid {
+        range: [0.0, -39.68, -3.0, 69.12, 39.68, 1.0],
+        size: [0.16, 0.16, 4.0],
+        max_points: 32,
+        max_pillars: 16_000,
+    };
+    let mut random = stream(0, "bench", 0, 0);
+    let point = |_| {
+        // As dense near the sensor as a scan is.
+        let (range_m, azimuth) = (69.0 * random.random::<f32>().powi(2), random.random_range(-0.5..0.5f32));
+        [range_m * azimuth.cos(), range_m * azimuth.sin(), random.random_range(-2.0..0.0), random.random()]
+    };
+    let points: Vec<f32> = (0..120_000).flat_map(point).collect();
+    let once = |_| {
+        let begin = Instant::now();
+        std::hint::black_box(pillarise(std::hint::black_box(&points), 4, &grid));
+        1e3 * begin.elapsed().as_secs_f64()
+    };
+    (0..15).map(once).collect()
+}

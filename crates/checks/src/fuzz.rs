@@ -1,0 +1,189 @@
+//! `cargo xtask fuzz`: damaged files for every reader. A reader answers with data that keeps its promises or with an error; it never
+//! panics, hangs, or takes memory that the file cannot fill.
+
+mod targets;
+
+use anyhow::{Result, bail};
+use clap::Args;
+use data::stream;
+use indicatif::{ProgressBar, ProgressStyle};
+use rand::RngExt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+use targets::{Target, targets};
+use train::memory::{peak_mib, reset_peak_mib};
+
+/// The files are of a few kilobytes; a reader that takes this much more memory believes a size that it should have checked.
+const MEMORY_BOUND_MIB: u64 = 64;
+/// A reader that takes longer for one file hangs.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Feeds damaged files to every reader: no panic, no hanging, no more memory than the files need, no broken promise.
+#[derive(Args, Debug)]
+pub struct FuzzArgs {
+    /// Damaged inputs for each reader
+    #[arg(long, default_value_t = 1000)]
+    inputs: u64,
+    /// Of the damage
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Only the readers whose name contains this
+    #[arg(long, default_value = "", hide_default_value = true)]
+    only: String,
+}
+
+impl FuzzArgs {
+    /// Whether every reader stood.
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    pub fn run(self) -> Result<bool> {
+        // In memory where the system offers it: the readers of run folders write millions of files.
+        let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir())?;
+        let mut stood = true;
+        let hook = std::panic::take_hook();
+        std::panic::set_hook(Box::new(|_| {}));
+        let mut targets = targets(folder.path())?;
+        let names: Vec<_> = targets.iter().map(|t| t.name).collect();
+        targets.retain(|t| t.name.contains(&self.only));
+        if targets.is_empty() {
+            bail!("no reader's name contains {:?}: {}", self.only, names.join(", "));
+        }
+        for target in &targets {
+            let found = self.face(target)?;
+            let memory = found.peak_mib.map_or("unknown".into(), |mib| format!("{mib} MiB"));
+            println!(
+                "{:<18} {} inputs, {} taken as data, {} broken, memory {memory}",
+                target.name,
+                self.inputs,
+                found.taken,
+                found.broken.len()
+            );
+            found.broken.iter().take(5).for_each(|b| println!("    {b}"));
+            stood &= found.broken.is_empty();
+        }
+        std::panic::set_hook(hook);
+        Ok(stood)
+    }
+
+    fn face(&self, target: &Target) -> Result<Found> {
+        let bar = ProgressBar::new(self.inputs)
+            .with_style(ProgressStyle::with_template("{msg} {bar:30} {pos}/{len}, {eta} left")?)
+            .with_message(target.name);
+        let watched = Watch::begin(target.name);
+        let before = reset_peak_mib();
+        let mut found = Found::default();
+        for input in 0..self.inputs {
+            let bytes = damaged(&target.sound, self.seed, target.name, input);
+            watched.input(input);
+            match catch_unwind(AssertUnwindSafe(|| (target.read)(&bytes))) {
+                Ok(Ok(was_taken)) => found.taken += u64::from(was_taken),
+                Ok(Err(promise)) => found.broken.push(format!("input {input}: {promise}")),
+                Err(_) => found.broken.push(format!("input {input}: panic")),
+            }
+            if input % 1024 == 0 {
+                bar.set_position(input);
+            }
+        }
+        bar.finish_and_clear();
+        found.peak_mib = before.and_then(|before| Some(peak_mib()?.saturating_sub(before)));
+        if let Some(mib) = found.peak_mib.filter(|&mib| mib > MEMORY_BOUND_MIB) {
+            found.broken.push(format!("took {mib} MiB, more than {MEMORY_BOUND_MIB}"));
+        }
+        Ok(found)
+    }
+}
+
+/// What a reader did with its inputs.
+#[derive(Default)]
+struct Found {
+    taken: u64,
+    broken: Vec<String>,
+    /// Beyond what was in use before; `None` where the system does not say.
+    peak_mib: Option<u64>,
+}
+
+/// Ends the program when a reader does not come back.
+struct Watch {
+    input: Arc<AtomicU64>,
+}
+
+impl Watch {
+    const OVER: u64 = u64::MAX;
+
+    fn begin(name: &'static str) -> Self {
+        let input = Arc::new(AtomicU64::new(0));
+        let seen = input.clone();
+        std::thread::spawn(move || {
+            let mut last = 0;
+            loop {
+                std::thread::sleep(PATIENCE);
+                match seen.load(Ordering::Relaxed) {
+                    Watch::OVER => return,
+                    now if now == last && now > 0 => {
+                        eprintln!("error: {name}: input {now} takes more than {} s", PATIENCE.as_secs());
+                        std::process::exit(1);
+                    }
+                    now => last = now,
+                }
+            }
+        });
+        Watch { input }
+    }
+
+    fn input(&self, input: u64) {
+        self.input.store(input + 1, Ordering::Relaxed);
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        self.input.store(Watch::OVER, Ordering::Relaxed);
+    }
+}
+
+/// One to four changes: a bit, a byte, a cut, a repeated piece, a swapped piece.
+fn damaged(sound: &[u8], seed: u64, name: &str, input: u64) -> Vec<u8> {
+    let mut random = stream(seed, &format!("fuzz/{name}"), 0, input);
+    let mut bytes = sound.to_vec();
+    for _ in 0..random.random_range(1..=4) {
+        if bytes.is_empty() {
+            break;
+        }
+        let at = random.random_range(0..bytes.len());
+        let until = (at + random.random_range(1..=16)).min(bytes.len());
+        match random.random_range(0..6) {
+            0 => bytes[at] ^= 1 << random.random_range(0..8),
+            1 => bytes[at] = random.random(),
+            2 => bytes.truncate(at),
+            3 => drop(bytes.drain(at..until)),
+            4 => {
+                let piece = bytes[at..until].to_vec();
+                let to = random.random_range(0..=bytes.len());
+                bytes.splice(to..to, piece);
+            }
+            _ => {
+                const NUMBERS: [&[u8]; 6] = [b"-1", b"nan", b"inf", b"99999999999999999999", b"0", b"\xff\xff\xff\xff"];
+                let number = NUMBERS[random.random_range(0..NUMBERS.len())];
+                bytes.splice(at..until, number.iter().copied());
+            }
+        }
+    }
+    bytes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_reader_that_falls_is_found() {
+        let panics: Target = Target { name: "panics", sound: vec![7; 40], read: Box::new(|bytes| Ok(bytes[39] == 7)) };
+        let fuzz = FuzzArgs { inputs: 50, seed: 1, only: String::new() };
+        assert!(fuzz.face(&panics).unwrap().broken.iter().any(|b| b.contains("panic")));
+        let greedy = |_: &[u8]| Ok(std::hint::black_box(vec![1u8; 200 << 20]).len() > 7);
+        let fuzz = FuzzArgs { inputs: 2, ..fuzz };
+        let broken = fuzz.face(&Target { name: "greedy", sound: vec![7; 40], read: Box::new(greedy) }).unwrap().broken;
+        assert_eq!(broken.iter().any(|b| b.contains("MiB")), cfg!(target_os = "linux"));
+    }
+}

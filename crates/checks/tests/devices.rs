@@ -1,0 +1,42 @@
+//! The reference numbers on every device that this build has and this machine offers, and on the CPU with every set of instructions.
+
+#[allow(dead_code, reason = "each test file uses a part of it")]
+mod program;
+
+use program::{golden, must, program, run, said};
+
+#[test]
+fn reference_numbers_on_every_device() {
+    let mut devices = Vec::new();
+    for device in ["flex", "ndarray", "wgpu", "cuda"] {
+        let output = run(&golden("synthetic/pointpillars_tiny"), &format!("parity . --device {device}"));
+        let text = said(&output);
+        if output.status.success() {
+            devices.push(device);
+            must(&golden("synthetic/pointrcnn_tiny"), &format!("parity . --device {device}"));
+        } else {
+            let absent = ["was built without the feature", "no adapter"].iter().any(|reason| text.contains(reason));
+            assert!(absent, "{device}: {text}");
+            eprintln!("not tested: {}", text.trim());
+        }
+    }
+    assert!(devices.starts_with(&["flex", "ndarray"]), "{devices:?}");
+}
+
+/// Processors without newer instructions, as far as a test can make this one such.
+#[test]
+fn reference_numbers_with_fewer_instructions() {
+    for set in ["portable", "avx2"] {
+        for network in ["pointpillars_tiny", "pointrcnn_tiny"] {
+            let output = program(&golden(&format!("synthetic/{network}")), "parity .")
+                .env("LIDARSHIFT_SIMD", set)
+                .output()
+                .unwrap();
+            assert!(output.status.success(), "{set}, {network}: {}", said(&output));
+        }
+    }
+    let unknown =
+        program(&golden("synthetic/pointpillars_tiny"), "parity .").env("LIDARSHIFT_SIMD", "avx9").output().unwrap();
+    assert_eq!(unknown.status.code(), Some(1));
+    assert!(said(&unknown).contains("portable, neon, avx2 or avx512"), "{}", said(&unknown));
+}

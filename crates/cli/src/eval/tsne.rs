@@ -1,0 +1,71 @@
+//! `lidarshift eval tsne`: what the networks of a study see.
+
+use crate::study::StudyPlace;
+use anyhow::{Result, bail};
+use clap::Args;
+use data::write_json;
+use report::StudyReport;
+use std::path::PathBuf;
+use study::features::features;
+
+/// Features of every run of a study on the same test clouds: t-SNE of each network, linear CKA layer by layer, and the Fréchet distance
+/// between train sets. With --figures also as figures.
+///
+/// Examples:
+///   lidarshift eval tsne quick
+///   lidarshift eval tsne my-study.toml --out runs/mine --figures features --json features.json
+#[derive(Args, Debug)]
+#[command(verbatim_doc_comment)]
+pub struct EvalTsneArgs {
+    #[command(flatten)]
+    place: StudyPlace,
+    /// Folder for report.html, figures and tables
+    #[arg(long, value_name = "DIR")]
+    figures: Option<PathBuf>,
+    /// Write places, similarities and distances as JSON, too
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+impl EvalTsneArgs {
+    /// Prints the numbers.
+    ///
+    /// # Errors
+    /// A study of which no run has been tested.
+    #[expect(clippy::print_stdout, reason = "results go to stdout")]
+    pub fn run(self) -> Result<()> {
+        let study = self.place.open()?;
+        let found = features(&study)?;
+        if found.embeddings.is_empty() && found.frechet.is_empty() && found.warnings.is_empty() {
+            bail!("no run of the study has been tested yet: `lidarshift study {}` does it", study.named);
+        }
+        if let Some(path) = &self.json {
+            write_json(path, &found)?;
+        }
+        for e in &found.embeddings {
+            let (n, kl) = (e.points.len(), e.kl_divergence);
+            println!("{}: {n} points on {}, {}; Kullback-Leibler divergence {kl:.3}", e.network, e.test_set, e.layer);
+        }
+        for (name, table) in &found.cka {
+            let same: Vec<String> = (0..table.layers_a.len())
+                .map(|i| {
+                    let value = table.values[i].get(i).copied().flatten();
+                    format!("{} {}", table.layers_a[i], value.map_or("-".into(), |v| format!("{v:.3}")))
+                })
+                .collect();
+            println!("{name}: CKA of equal layers: {}", same.join(", "));
+        }
+        for row in &found.frechet {
+            let floor = row.floor.map_or("-".into(), |f| format!("{f:.3}"));
+            println!("{}, {} and {}: Fréchet distance {:.3} (floor {floor})", row.network, row.a, row.b, row.distance);
+        }
+        found.warnings.iter().for_each(|warning| println!("{warning}"));
+        if let Some(out) = &self.figures {
+            let title = format!("Features of the study {}", study.config.name);
+            let (embeddings, cka, frechet, warnings) = (found.embeddings, found.cka, found.frechet, found.warnings);
+            let report = StudyReport { title, embeddings, cka, frechet, warnings, ..StudyReport::default() };
+            println!("figures: {}", report.write(out)?.page.display());
+        }
+        Ok(())
+    }
+}

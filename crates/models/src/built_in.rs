@@ -1,0 +1,56 @@
+//! Detectors by name: the files of `configs/detectors`, built into the program.
+
+use crate::ModelError;
+use crate::config::DetectorConfig;
+use std::path::Path;
+
+/// Name and text of each file.
+const BUILT_IN: [(&str, &str); 8] = [
+    ("pointpillars", include_str!("../../../configs/detectors/pointpillars.toml")),
+    ("pointpillars_small", include_str!("../../../configs/detectors/pointpillars_small.toml")),
+    ("pointpillars_race", include_str!("../../../configs/detectors/pointpillars_race.toml")),
+    ("pointpillars_race_small", include_str!("../../../configs/detectors/pointpillars_race_small.toml")),
+    ("pointrcnn", include_str!("../../../configs/detectors/pointrcnn.toml")),
+    ("pointrcnn_small", include_str!("../../../configs/detectors/pointrcnn_small.toml")),
+    ("pointrcnn_race", include_str!("../../../configs/detectors/pointrcnn_race.toml")),
+    ("pointrcnn_race_small", include_str!("../../../configs/detectors/pointrcnn_race_small.toml")),
+];
+
+/// The text of a detector's TOML, by its name or its path.
+///
+/// # Errors
+/// Neither a name nor a file.
+pub fn detector_text(name_or_path: &str) -> Result<String, ModelError> {
+    if let Some((_, text)) = BUILT_IN.iter().find(|(name, _)| *name == name_or_path) {
+        return Ok((*text).to_string());
+    }
+    let path = Path::new(name_or_path);
+    if !path.is_file() {
+        let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
+        let message = format!("there is no such detector: neither a file nor one of {}", names.join(", "));
+        return Err(ModelError::File { path: path.into(), message });
+    }
+    Ok(fs_err::read_to_string(path).map_err(data::DataError::from)?)
+}
+
+/// A detector by its name or its path.
+///
+/// # Errors
+/// Neither a name nor a file, or a file that is wrong.
+pub fn find_detector(name_or_path: &str) -> Result<DetectorConfig, ModelError> {
+    let text = detector_text(name_or_path)?;
+    DetectorConfig::parse(&text).map_err(|message| ModelError::File { path: name_or_path.into(), message })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn built_in_files_are_right() {
+        for (name, _) in BUILT_IN {
+            assert_eq!(find_detector(name).unwrap().name, name);
+        }
+        assert!(find_detector("pointpilars").unwrap_err().to_string().contains("pointpillars_small"));
+    }
+}

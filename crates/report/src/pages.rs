@@ -1,0 +1,4 @@
+//! What is put together of figures and tables: a file for each thing that is reported on.
+
+pub(crate) mod diagnosis;
+pub(crate) mod study;

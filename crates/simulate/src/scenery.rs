@@ -1,0 +1,77 @@
+//! A configuration of `simulate` by its name or its file, whatever it describes.
+
+use crate::error::wrong;
+use crate::race::{ConfigFiles, RaceConfig};
+use crate::{FrameCounts, RoadConfig, SimulateError};
+use std::path::Path;
+
+/// What a configuration describes.
+pub enum Scenery {
+    /// Streets.
+    Street(RoadConfig),
+    /// A race, and the files that it names.
+    Race(Box<(RaceConfig, ConfigFiles)>),
+}
+
+impl Scenery {
+    /// The configuration of a name (`race`, `race_small`, `street`, ...) or a TOML; `frames` and `seed` replace its own.
+    ///
+    /// # Errors
+    /// Neither a name nor a file, a file that is wrong, or a number of frames that it cannot have.
+    pub fn find(name_or_path: &str, frames: Option<usize>, seed: Option<u64>) -> Result<Self, SimulateError> {
+        let path = Path::new(name_or_path);
+        let is_street = if path.is_file() {
+            let text = fs_err::read_to_string(path)?;
+            // A race names its sensors; a file that is no TOML at all is refused by line where it is read.
+            text.parse::<toml::Table>().is_ok_and(|table| !table.contains_key("rig"))
+        } else {
+            name_or_path == "street"
+        };
+        if is_street {
+            return Ok(Scenery::Street(street(path.is_file().then_some(path), frames, seed)?));
+        }
+        let (mut config, files) = RaceConfig::find(name_or_path)?;
+        config.seed = seed.unwrap_or(config.seed);
+        config.frames = frames.unwrap_or(config.frames);
+        config.check().map_err(|e| wrong("--frames or --seed do not fit the configuration", e.to_string()))?;
+        Ok(Scenery::Race(Box::new((config, files))))
+    }
+}
+
+fn street(path: Option<&Path>, frames: Option<usize>, seed: Option<u64>) -> Result<RoadConfig, SimulateError> {
+    let mut config = path.map_or(Ok(RoadConfig::default()), RoadConfig::read)?;
+    config.seed = seed.unwrap_or(config.seed);
+    if let Some(total) = frames {
+        config.frames = FrameCounts::scaled_to(&config.frames, total)
+            .ok_or_else(|| wrong(format!("--frames {total}"), "there must be at least 3, one for each split"))?;
+    }
+    Ok(config)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_win_over_the_configuration() {
+        let Scenery::Street(config) = Scenery::find("street", Some(36), Some(9)).unwrap() else { panic!("a street") };
+        assert_eq!((config.frames.total(), config.seed), (36, 9));
+        assert!(Scenery::find("street", Some(2), None).is_err());
+        let Scenery::Race(race) = Scenery::find("race", Some(36), Some(9)).unwrap() else { panic!("a race") };
+        assert_eq!((race.0.frames, race.0.seed), (36, 9));
+        assert!(Scenery::find("race", Some(2), None).is_err());
+        let error = Scenery::find("rce", None, None).err().unwrap().to_string();
+        assert!(error.contains("race_small"), "{error}");
+    }
+
+    #[test]
+    fn files_are_told_apart_by_their_sensors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.toml");
+        std::fs::write(&path, "[frames]\ntrain = 5\n").unwrap();
+        assert!(matches!(Scenery::find(path.to_str().unwrap(), None, None), Ok(Scenery::Street(_))));
+        std::fs::write(&path, "name = \"a\"\nrig = \"r.toml\"\nframes = 2\n").unwrap();
+        let error = Scenery::find(path.to_str().unwrap(), None, None).err().unwrap().to_string();
+        assert!(error.contains("a.toml:3: frames"), "{error}");
+    }
+}

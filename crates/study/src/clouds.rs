@@ -1,0 +1,121 @@
+//! What the data sets of a study have in common and what not: distances and targets.
+
+use crate::cache::cached;
+use crate::config::StudyDataset;
+use crate::data_sets::{labelled_sha256, open};
+use crate::detections::spread;
+use crate::error::{Result, refused};
+use crate::folder::Study;
+use crate::{Event, Listener};
+use data::augment::{AugmentConfig, augment, crop_to_range};
+use data::{Dataset, Frame, stream};
+use eval::distance::{
+    Compared, DISTANCES_SCHEMA, DistanceError, DistanceOptions, Distances, Regions, compare, paired_ids,
+};
+use eval::targets::{Targets, targets};
+use models::config::DetectorConfig;
+
+/// What the training loader of a detector does to a cloud.
+pub struct Loader {
+    range_m: [f64; 6],
+    augmentation: AugmentConfig,
+}
+
+impl Loader {
+    /// That of a detector.
+    pub fn of(detector: &DetectorConfig) -> Loader {
+        Loader { range_m: detector.range_m.map(f64::from), augmentation: detector.augmentation.clone() }
+    }
+
+    /// The frame as it is compared. Ground-truth sampling, which puts targets of other frames in, is left out.
+    fn apply(&self, frame: Frame, compared: Compared) -> Frame {
+        let mut random = stream(0, &format!("compared {}", frame.id), 0, 0);
+        match compared {
+            Compared::Raw => frame,
+            Compared::Loader => crop_to_range(frame, &self.range_m),
+            Compared::Augmented => crop_to_range(augment(frame, &self.augmentation, None, &mut random), &self.range_m),
+        }
+    }
+}
+
+/// Distances of two data sets over `most` frames of a split that both have.
+///
+/// # Errors
+/// Splits that do not pair, and frames that cannot be read.
+pub fn distances_of(
+    names: [&str; 2],
+    [a, b]: [&Dataset; 2],
+    split: &str,
+    most: Option<usize>,
+    loader: Option<&Loader>,
+    options: &DistanceOptions,
+) -> Result<Distances> {
+    let ids = paired_ids(&a.ids(split)?, &b.ids(split)?)?;
+    let ids = spread(&ids, most.unwrap_or(ids.len()));
+    let load = |id: &str| -> Result<[Frame; 2], DistanceError> {
+        let frames = [a.load(id)?, b.load(id)?];
+        Ok(match loader {
+            Some(loader) => frames.map(|frame| loader.apply(frame, options.compared)),
+            None => frames,
+        })
+    };
+    Ok(compare(names, &ids, load, Some(&Regions::of_scenery()), options)?)
+}
+
+/// The first data set of a study against each other one, kept in `distances/`; and a sentence for each pair that cannot be compared.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub(crate) fn all_distances(study: &Study, listener: Listener<'_>) -> Result<(Vec<Distances>, Vec<String>)> {
+    let evaluation = &study.config.evaluation;
+    let split = &study.config.splits.train;
+    let loader = match study.config.runs().first() {
+        Some(run) if evaluation.distances.compared != Compared::Raw => {
+            Some(Loader::of(&study.run_config(run)?.detector))
+        }
+        _ => None,
+    };
+    let (first, others) = study.config.datasets.split_first().ok_or_else(|| refused("a study has data sets"))?;
+    let a = open(study, &first.name)?;
+    let a_key = labelled_sha256(&a, &a.ids(split)?)?;
+    let (mut out, mut warnings) = (Vec::new(), Vec::new());
+    for other in others {
+        let b = open(study, &other.name)?;
+        let b_ids = b.ids(split)?;
+        if let Err(problem) = paired_ids(&a.ids(split)?, &b_ids) {
+            warnings.push(format!("no distances between {} and {}: {problem}", first.title, other.title));
+            continue;
+        }
+        listener(Event::Note(&format!("distances between {} and {}", first.name, other.name)));
+        let key = (
+            DISTANCES_SCHEMA,
+            [&a_key, &labelled_sha256(&b, &b_ids)?],
+            &evaluation.distances,
+            evaluation.distance_frames,
+            [&first.title, &other.title],
+        );
+        let path = study.folder.join(format!("distances/{}--{}.json", first.name, other.name));
+        out.push(cached(&path, &key, || {
+            let names = [first.title.as_str(), &other.title];
+            distances_of(names, [&a, &b], split, evaluation.distance_frames, loader.as_ref(), &evaluation.distances)
+        })?);
+    }
+    Ok((out, warnings))
+}
+
+/// The targets of every data set of a study, kept in `targets/`.
+///
+/// # Errors
+/// Frames that cannot be read.
+pub(crate) fn all_targets(study: &Study) -> Result<Vec<Targets>> {
+    let (split, options) = (&study.config.splits.train, &study.config.evaluation.targets);
+    let of_set = |dataset: &StudyDataset| {
+        let set = open(study, &dataset.name)?;
+        let ids = set.ids(split)?;
+        let path = study.folder.join(format!("targets/{}.json", dataset.name));
+        cached(&path, &(labelled_sha256(&set, &ids)?, options, &dataset.title), || {
+            Ok(targets(&dataset.title, &ids, |id| set.load(id), options)?)
+        })
+    };
+    study.config.datasets.iter().map(of_set).collect()
+}

@@ -1,0 +1,215 @@
+//! A study and its folder: what its file says, resolved to data sets, runs and files.
+
+use crate::config::{Source, StudyConfig, StudyDataset, StudyRun};
+use crate::error::{InPart, Result, refused};
+use data::{write_atomic, write_json};
+use models::detector_text;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use toml::{Table, Value};
+use train::{RunConfig, set_key};
+
+/// Studies that come with the program.
+const BUILT_IN: [(&str, &str); 4] = [
+    ("quick", include_str!("../../../configs/studies/quick.toml")),
+    ("cpu", include_str!("../../../configs/studies/cpu.toml")),
+    ("gain", include_str!("../../../configs/studies/gain.toml")),
+    ("paper", include_str!("../../../configs/studies/paper.toml")),
+];
+
+/// The copy of a study's file in its folder, as it was when the folder was last worked on; and where the file came from.
+const COPY: &str = "study.toml";
+const ORIGIN: &str = "origin.json";
+
+#[derive(Serialize, Deserialize)]
+struct Origin {
+    named: String,
+    base: PathBuf,
+}
+
+/// A study with its folder.
+#[derive(Clone, Debug)]
+pub struct Study {
+    /// What its file says.
+    pub config: StudyConfig,
+    /// As it was named on the command line.
+    pub named: String,
+    /// The text of its file.
+    pub text: String,
+    /// The folder of its file; paths in it are relative to this one.
+    base: PathBuf,
+    /// Its folder, absolute.
+    pub folder: PathBuf,
+}
+
+impl Study {
+    /// A study by the path of its TOML, by the name of one in configs/studies or in the program, or by its folder. Its folder is `out`, or
+    /// `runs/NAME`.
+    ///
+    /// # Errors
+    /// Neither a file nor a name, or a file that is wrong.
+    pub fn open(named: &str, out: Option<&Path>) -> Result<Study> {
+        if Self::is_folder(Path::new(named)) {
+            return Self::of_folder(Path::new(named));
+        }
+        let below = PathBuf::from(format!("configs/studies/{named}.toml"));
+        let path = [PathBuf::from(named), below.clone()].into_iter().find(|path| path.is_file());
+        let built_in = BUILT_IN.iter().find(|(name, _)| *name == named);
+        let (text, path) = match (path, built_in) {
+            (Some(path), _) => (fs_err::read_to_string(&path)?, path),
+            (None, Some((_, text))) => ((*text).to_string(), below),
+            (None, None) => {
+                let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
+                return Err(refused(format!("no study {named:?}: neither a file nor one of {}", names.join(", "))));
+            }
+        };
+        let config = StudyConfig::parse(&text, &path)?;
+        let base = std::path::absolute(&path)?.parent().map(Path::to_path_buf).unwrap_or_default();
+        let folder = out.map_or_else(|| Path::new("runs").join(&config.name), Path::to_path_buf);
+        Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
+    }
+
+    /// Whether a folder is that of a study.
+    pub fn is_folder(folder: &Path) -> bool {
+        folder.join(COPY).is_file()
+    }
+
+    /// The study that made a folder, by the copy of its file.
+    fn of_folder(folder: &Path) -> Result<Study> {
+        let path = folder.join(COPY);
+        let text = fs_err::read_to_string(&path)?;
+        let config = StudyConfig::parse(&text, &path)?;
+        let origin: Origin = serde_json::from_slice(&fs_err::read(folder.join(ORIGIN))?)
+            .in_part(|| format!("{}: is damaged", folder.join(ORIGIN).display()))?;
+        Ok(Study { config, named: origin.named, text, base: origin.base, folder: std::path::absolute(folder)? })
+    }
+
+    /// A path that the study's file names.
+    pub fn path(&self, relative: &Path) -> PathBuf {
+        // Without `..` in the middle, so that the same file always has the same path.
+        let mut path = self.base.clone();
+        for part in relative.components() {
+            match part {
+                std::path::Component::ParentDir => drop(path.pop()),
+                std::path::Component::CurDir => {}
+                part => path.push(part),
+            }
+        }
+        path
+    }
+
+    /// A data set by its name.
+    ///
+    /// # Errors
+    /// A name that the study does not have.
+    pub fn dataset(&self, name: &str) -> Result<&StudyDataset> {
+        self.config
+            .datasets
+            .iter()
+            .find(|d| d.name == name)
+            .ok_or_else(|| refused(format!("the study has no data set {name:?}")))
+    }
+
+    /// The title of a data set.
+    pub fn title<'a>(&'a self, dataset: &'a str) -> &'a str {
+        self.config.datasets.iter().find(|d| d.name == dataset).map_or(dataset, |d| &d.title)
+    }
+
+    /// Where a data set lies, or will lie: a folder or a TOML.
+    pub fn dataset_path(&self, dataset: &StudyDataset) -> PathBuf {
+        match &dataset.source {
+            Source::Path(path) => self.path(path),
+            Source::Simulate { config, dataset, frames, seed } => {
+                let scenes = self.scenes_folder(config, *frames, *seed);
+                dataset.as_ref().map_or(scenes.clone(), |name| scenes.join(name))
+            }
+            Source::Resim { .. } => self.folder.join("data").join(&dataset.name),
+        }
+    }
+
+    /// Where all data sets of one simulation lie: they share their scenes.
+    pub fn scenes_folder(&self, config: &Path, frames: usize, seed: u64) -> PathBuf {
+        let stem = config.file_stem().unwrap_or_default().to_string_lossy();
+        self.folder.join("data").join(format!("{stem}-{frames}-seed-{seed}"))
+    }
+
+    /// What `simulate --config` is given: a file beside the study's, or a name.
+    pub fn scenes_config(&self, config: &Path) -> String {
+        let path = self.path(config);
+        if path.is_file() { path.display().to_string() } else { config.display().to_string() }
+    }
+
+    /// The configuration of a run, from the study's file alone.
+    ///
+    /// # Errors
+    /// A detector that does not exist, or settings that it does not take.
+    pub fn run_config(&self, run: &StudyRun) -> Result<RunConfig> {
+        let named = run.config.as_ref().map_or(run.detector.clone(), |file| self.path(file).display().to_string());
+        let mut table = Table::new();
+        let detector: Table = detector_text(&named)?.parse().in_part(|| named.clone())?;
+        table.insert("detector".into(), Value::Table(detector));
+        table.insert(
+            "seed".into(),
+            Value::Integer(i64::try_from(run.id.seed).map_err(|_| refused("a seed is too large"))?),
+        );
+        let dataset = self.dataset_path(self.dataset(&run.id.train_set)?);
+        let Some(dataset) = dataset.to_str() else {
+            return Err(refused(format!("{}: its name is not UTF-8", dataset.display())));
+        };
+        table.insert("dataset".into(), Value::String(dataset.into()));
+        let splits = &self.config.splits;
+        let mut set = vec![format!("run.train_split={:?}", splits.train), format!("run.val_split={:?}", splits.val)];
+        set.extend(run.epochs.map(|epochs| format!("optimization.epochs={epochs}")));
+        for assignment in set.iter().chain(&run.set) {
+            set_key(&mut table, assignment)?;
+        }
+        RunConfig::from_table(table).in_part(|| format!("run {run}"))
+    }
+
+    /// A run by its folder's name below that of the study.
+    ///
+    /// # Errors
+    /// A name that the study does not have.
+    pub fn run(&self, name: &str) -> Result<StudyRun> {
+        let runs = self.config.runs();
+        let found = runs.into_iter().find(|run| run.to_string() == name);
+        found.ok_or_else(|| refused(format!("the study has no run {name:?}; `lidarshift study status` lists them")))
+    }
+
+    /// The data set whose test clouds show what the networks see.
+    pub fn feature_set(&self) -> &str {
+        self.config.evaluation.tsne_dataset.as_ref().unwrap_or(&self.config.datasets[0].name)
+    }
+
+    /// What changed in the study's file since its folder was last worked on, in sentences; then the new file takes the place of the old.
+    ///
+    /// # Errors
+    /// A copy that cannot be read or written.
+    pub fn note_changes(&self) -> Result<Vec<String>> {
+        let copy = self.folder.join(COPY);
+        let mut said = Vec::new();
+        if copy.is_file() {
+            let changes = self.config.changes_since(&StudyConfig::read(&copy)?);
+            said.extend(changes.invalid.iter().map(|(id, reasons)| {
+                format!("{}/{}/seed-{} is no longer valid: {}", id.network, id.train_set, id.seed, reasons.join("; "))
+            }));
+            said.extend(
+                changes.tests.iter().map(|set| format!("the detections on {set} are no longer valid: it changed")),
+            );
+            said.extend(
+                changes.added.iter().map(|id| format!("{}/{}/seed-{} is new", id.network, id.train_set, id.seed)),
+            );
+            let removed = |id: &eval::matrix::RunId| {
+                format!(
+                    "{}/{}/seed-{} is no longer part of the study; its folder stays",
+                    id.network, id.train_set, id.seed
+                )
+            };
+            said.extend(changes.removed.iter().map(removed));
+        }
+        let origin = Origin { named: self.named.clone(), base: self.base.clone() };
+        write_json(&self.folder.join(ORIGIN), &origin)?;
+        write_atomic(&copy, self.text.as_bytes())?;
+        Ok(said)
+    }
+}

@@ -1,0 +1,164 @@
+//! The report of a study from what its folder holds.
+
+use crate::clouds::{all_distances, all_targets};
+use crate::config::{Source, StudyDataset, StudyRun};
+use crate::data_sets::open;
+use crate::error::Result;
+use crate::features::features;
+use crate::folder::Study;
+use crate::numbers::{Found, analyses, matrix, network_title, some_test_frames};
+use crate::{Event, Listener};
+use data::{KittiText, read_kitti_text};
+use eval::matrix::Matrix;
+use geometry::Box3;
+use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
+
+/// Test frames in the view of clouds.
+const SCENES: usize = 3;
+/// Data sets whose clouds are in it.
+const SCENE_SETS: usize = 2;
+/// Colours of the layers: clouds, labels, detections; of these as many as the paper's grid has networks and data sets.
+const CLOUDS: [&str; SCENE_SETS] = ["#0072b2", "#d55e00"];
+const LABELS: &str = "#009e73";
+const DETECTIONS: [&str; 8] = ["#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#882255", "#44aa99", "#999933", "#8c6bb1"];
+
+/// Evaluates what there is and writes `report.html` with its figures and tables into the study's folder; and the matrix.
+///
+/// # Errors
+/// Data sets that are not there, files that are damaged.
+pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, ReportFiles)> {
+    let found = Found::look(study)?;
+    listener(Event::Note("matrix"));
+    let matrix = matrix(study, &found)?;
+    listener(Event::Note("analyses"));
+    let analyses = analyses(study, &found)?;
+    listener(Event::Note("features"));
+    let features = features(study)?;
+    let (distances, mut warnings) = all_distances(study, listener)?;
+    listener(Event::Note("targets"));
+    let targets = all_targets(study)?;
+    warnings.extend(features.warnings);
+    let report = StudyReport {
+        title: format!("lidarshift study: {}", study.config.name),
+        about: study.config.about.clone(),
+        command: format!("lidarshift study {}", study.named),
+        facts: facts(study)?,
+        warnings,
+        matrix: Some(matrix.clone()),
+        analyses,
+        embeddings: features.embeddings,
+        cka: features.cka,
+        frechet: features.frechet,
+        distances,
+        targets,
+        training: training(study)?,
+        scenes: scenes(study, &found)?,
+    };
+    Ok((matrix, report.write(&study.folder)?))
+}
+
+/// Name and value of what was run; nothing that differs between a study in one go and one that was interrupted.
+fn facts(study: &Study) -> Result<Vec<(String, String)>> {
+    let mut facts = Vec::new();
+    let mut fact = |name: &str, value: String| facts.push((name.to_string(), value));
+    fact("program", format!("lidarshift {}", env!("CARGO_PKG_VERSION")));
+    for dataset in &study.config.datasets {
+        let set = open(study, &dataset.name)?;
+        let splits = &study.config.splits;
+        let counts = [&splits.train, &splits.val, &splits.test]
+            .map(|split| set.ids(split).map_or("no frames".to_string(), |ids| format!("{} frames", ids.len())));
+        let [train, val, test] = counts;
+        fact(
+            &format!("data set {}", dataset.title),
+            format!("{train} to train on, {val} to watch, {test} to test on; {}", source(study, dataset)),
+        );
+    }
+    for planned in study.config.plan().networks {
+        let of_network: Vec<StudyRun> =
+            study.config.runs().into_iter().filter(|run| run.id.network == planned.network.name).collect();
+        let seeds: Vec<String> = planned.seeds.iter().map(u64::to_string).collect();
+        let config = study.run_config(&of_network[0])?;
+        let optimization = &config.detector.optimization;
+        let mut text = format!(
+            "{}: {} epochs, batches of {}, highest learning rate {}; seeds {}",
+            of_network[0].detector,
+            optimization.epochs,
+            optimization.batch_size,
+            optimization.lr_max,
+            seeds.join(", ")
+        );
+        if !of_network[0].set.is_empty() {
+            text += &format!("; set: {}", of_network[0].set.join(", "));
+        }
+        fact(&format!("network {}", planned.network.title), text);
+    }
+    let recall = "OpenPCDet's: of all refined regions of a two-stage network, of the final boxes otherwise";
+    fact("recall", recall.into());
+    Ok(facts)
+}
+
+fn source(study: &Study, dataset: &StudyDataset) -> String {
+    match &dataset.source {
+        Source::Path(path) => path.display().to_string(),
+        Source::Simulate { config, dataset, frames, seed } => {
+            let set = dataset.as_ref().map_or(String::new(), |name| format!(" {name} of"));
+            format!("simulated:{set} {}, {frames} frames, seed {seed}", config.display())
+        }
+        Source::Resim { of, effects } => format!("{} with the effects of {}", study.title(of), effects.display()),
+    }
+}
+
+/// Curves of all runs that have begun.
+fn training(study: &Study) -> Result<Vec<TrainingRun>> {
+    let mut out = Vec::new();
+    for run in study.config.runs() {
+        let path = run.folder(&study.folder).join("metrics.jsonl");
+        if path.is_file() {
+            let network = network_title(study, &run.id.network);
+            let name = format!("{network}, {}, seed {}", study.title(&run.id.train_set), run.id.seed);
+            out.push(read_training_run(&name, &path)?);
+        }
+    }
+    Ok(out)
+}
+
+/// Some test frames of the first data sets with their labels, and what the first run of each network and train set found in the first.
+fn scenes(study: &Study, found: &Found) -> Result<Vec<Scene>> {
+    let names: Vec<&str> = study.config.datasets.iter().map(|d| d.name.as_str()).take(SCENE_SETS).collect();
+    let first = open(study, names[0])?;
+    let mut scenes = Vec::new();
+    for id in some_test_frames(study, &first, SCENES)? {
+        let mut layers = Vec::new();
+        let mut focus_m = None;
+        for (name, color) in names.iter().zip(CLOUDS) {
+            let set = open(study, name)?;
+            // Data sets of other scenes have other frames.
+            let Ok(frame) = set.load(&id) else { continue };
+            if *name == names[0] {
+                focus_m = frame.objects.first().map(|object| object.bbox.center);
+                let boxes: Vec<Box3> = frame.objects.iter().map(|object| object.bbox).collect();
+                layers.push(layer("labels", LABELS, LayerContent::Boxes(boxes)));
+            }
+            layers.push(layer(study.title(name), color, LayerContent::Cloud(frame.cloud.with_channels(3))));
+        }
+        let mut seen = Vec::new();
+        for (run, _) in found.standings.iter().filter(|(_, standing)| Found::has(standing, names[0])) {
+            let of = (&run.id.network, &run.id.train_set);
+            if seen.contains(&of) || first.config.label_frame != data::LabelFrame::Lidar {
+                continue;
+            }
+            let color = DETECTIONS[seen.len() % DETECTIONS.len()];
+            seen.push(of);
+            let path = run.detections(&study.folder, names[0]).join(format!("{id}.txt"));
+            let boxes = read_kitti_text(&path, KittiText::Detections)?.iter().map(|line| line.lidar_box()).collect();
+            let name = format!("{} trained on {}", network_title(study, of.0), study.title(of.1));
+            layers.push(layer(&name, color, LayerContent::Boxes(boxes)));
+        }
+        scenes.push(Scene { name: format!("{}, frame {id}", study.title(names[0])), layers, focus_m });
+    }
+    Ok(scenes)
+}
+
+fn layer(name: &str, color: &str, content: LayerContent) -> Layer {
+    Layer { name: name.into(), color: color.into(), content }
+}
