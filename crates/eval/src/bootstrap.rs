@@ -1,22 +1,22 @@
-//! Intervals by drawing again with replacement (the bootstrap's percentiles), from named streams.
+//! Bootstrap percentile intervals, drawn from named random streams.
 
 use data::stream;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use statistics::{draw, draw_runs, quantile_linear};
 
-/// How intervals are drawn.
+/// Bootstrap settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BootstrapOptions {
-    /// Draws; 0: no intervals.
+    /// Number of replicates; 0: no intervals.
     pub replicates: usize,
-    /// Share of the draws inside an interval.
+    /// Confidence level, 0 to 1.
     pub level: f64,
-    /// Seed of the draws.
+    /// Random seed.
     pub seed: u64,
-    /// Frames are drawn in runs of so many that follow each other. Frames of one drive resemble their neighbours, and intervals
-    /// over single frames (1) are then too narrow.
+    /// Block length: frames are resampled in blocks of this many consecutive frames. Consecutive frames of a drive are
+    /// correlated; resampling single frames (1) gives intervals that are too narrow.
     pub block_frames: usize,
 }
 
@@ -26,7 +26,7 @@ impl Default for BootstrapOptions {
     }
 }
 
-/// From low to high.
+/// A confidence interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Interval {
     /// Lower end.
@@ -36,18 +36,19 @@ pub struct Interval {
 }
 
 impl BootstrapOptions {
-    /// How often each of `n_frames` frames is drawn. Equal purposes give equal draws, so that what is compared on the same frames
-    /// is drawn alike.
+    /// How often each of `n_frames` frames is drawn in a replicate. Equal purposes give equal draws, so comparisons on
+    /// the same frames use the same resamples.
     pub(crate) fn frame_weights(&self, purpose: &str, replicate: usize, n_frames: usize) -> Vec<u32> {
         draw_runs(n_frames, self.block_frames, &mut stream(self.seed, purpose, 0, replicate as u64))
     }
 
-    /// `n` draws out of `n`.
+    /// Resamples `n` indices with replacement.
     pub(crate) fn draws(&self, purpose: &str, replicate: usize, n: usize) -> Vec<usize> {
         draw(n, &mut stream(self.seed, purpose, 0, replicate as u64))
     }
 
-    /// The middle `level` of the values. `None` with fewer than 20 defined values, or where more than one in twenty is undefined (NaN).
+    /// Percentile interval at `level`. `None` with fewer than 20 defined values, or if more than 5 % are undefined
+    /// (NaN).
     pub(crate) fn interval(&self, mut values: Vec<f64>) -> Option<Interval> {
         let all = values.len();
         values.retain(|v| !v.is_nan());

@@ -1,4 +1,4 @@
-//! General statistics of two data sets of the same frames: Table I of Huch et al. 2023.
+//! Statistics of two data sets over the same frames: Table I of Huch et al. 2023.
 
 use data::{DataError, Dataset, Frame};
 use geometry::points_in_boxes;
@@ -8,63 +8,63 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fmt;
 
-/// Version of [`StatisticsReport`] as JSON.
+/// Schema version of [`StatisticsReport`] as JSON.
 pub const STATISTICS_SCHEMA: &str = "lidarshift.eval_statistics/1";
 
-/// Mean, least and greatest of something.
+/// Mean, minimum and maximum of a quantity.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Extent {
     /// Mean.
     pub mean: f64,
-    /// Least.
+    /// Minimum.
     pub min: f64,
-    /// Greatest.
+    /// Maximum.
     pub max: f64,
 }
 
-/// One data set in numbers.
+/// Statistics of one data set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct SetStatistics {
     /// Its name.
     pub name: String,
     /// x, y and z of all points within the range, m.
     pub xyz_m: [Extent; 3],
-    /// Points within the range a cloud.
+    /// Points per cloud, within the range.
     pub points_per_cloud: Extent,
-    /// Points a box; `None` when there is no box within the range.
+    /// Points per box; `None` if there is no box within the range.
     pub points_per_box: Option<Extent>,
-    /// Boxes whose middle lies within the range, seen from above.
+    /// Boxes whose centre is within the range, in bird's eye view.
     pub boxes: usize,
-    /// Those of them that hold no point.
+    /// Boxes without a point.
     pub boxes_without_points: usize,
 }
 
-/// Two data sets beside each other.
+/// Statistics of two data sets.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct StatisticsReport {
     /// [`STATISTICS_SCHEMA`].
     pub schema: String,
     /// The split whose frames were counted.
     pub split: String,
-    /// Frames counted in each.
+    /// Number of frames counted in each data set.
     pub frames: usize,
-    /// Points farther than this along x or y do not count, nor do boxes farther away; m.
+    /// Points with |x| or |y| above this are not counted, nor are boxes farther away, m.
     pub range_m: f64,
     /// First and second data set.
     pub sets: [SetStatistics; 2],
 }
 
-/// What one frame adds.
+/// Counts of one frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FrameCounts {
-    /// Sum, least and greatest of x, y, z, m.
+    /// Sum, minimum and maximum of x, y, z, m.
     xyz: [[f64; 3]; 3],
     points: usize,
     box_points: Vec<usize>,
 }
 
 impl FrameCounts {
-    /// Counts a frame: points within +-`range_m` along x and y, boxes whose middle is at most that far away.
+    /// Counts a frame: points with |x| and |y| up to `range_m`, boxes whose centre is at most that far away.
     pub fn of(frame: &Frame, range_m: f64) -> FrameCounts {
         let mut xyz = [[0.0, f64::INFINITY, f64::NEG_INFINITY]; 3];
         let mut points = 0;
@@ -84,7 +84,7 @@ impl FrameCounts {
     }
 }
 
-/// The statistics of a data set from the counts of its frames; `None` when there is not one point within the range.
+/// Statistics of a data set from the counts of its frames; `None` if there is no point within the range.
 pub fn sum_up(name: &str, frames: &[FrameCounts]) -> Option<SetStatistics> {
     let points: usize = frames.iter().map(|f| f.points).sum();
     if points == 0 {
@@ -111,7 +111,7 @@ pub fn sum_up(name: &str, frames: &[FrameCounts]) -> Option<SetStatistics> {
     })
 }
 
-/// Counts the frames of a split of `a` in both data sets. `b` must have all of them, under the same names.
+/// Computes the statistics of a split of `a` in both data sets. `b` must hold the same frames under the same names.
 pub fn compare_statistics(a: &Dataset, b: &Dataset, split: &str, range_m: f64) -> Result<StatisticsReport, DataError> {
     let ids = a.ids(split)?;
     let there: BTreeSet<String> = b.all_ids()?.into_iter().collect();
@@ -121,7 +121,7 @@ pub fn compare_statistics(a: &Dataset, b: &Dataset, split: &str, range_m: f64) -
     }
     let count = |set: &Dataset| {
         let frames = ids.par_iter().map(|id| Ok(FrameCounts::of(&set.load(id)?, range_m)));
-        // Collecting results of all frames first names the first bad frame, whatever the threads do.
+        // Collects all results first, so that the first bad frame is reported for any number of threads.
         let frames: Vec<Result<FrameCounts, DataError>> = frames.collect();
         let frames = frames.into_iter().collect::<Result<Vec<_>, _>>()?;
         let none =
@@ -133,7 +133,7 @@ pub fn compare_statistics(a: &Dataset, b: &Dataset, split: &str, range_m: f64) -
 }
 
 impl StatisticsReport {
-    /// The rows of the table: what, of what, and the value in both data sets.
+    /// Table rows: label, values in both data sets, and the number of decimals.
     fn rows(&self) -> Vec<(String, [Option<f64>; 2], usize)> {
         let mut rows = Vec::new();
         let both = |f: &dyn Fn(&SetStatistics) -> Option<f64>| [f(&self.sets[0]), f(&self.sets[1])];
@@ -155,7 +155,7 @@ impl StatisticsReport {
         rows
     }
 
-    /// Points a box in the first data set, as a part of those in the second: the paper's estimate of what is lost.
+    /// Mean points per box in the first data set divided by that in the second: the paper's estimate of lost points.
     pub fn box_point_ratio(&self) -> Option<f64> {
         let [a, b] = [&self.sets[0], &self.sets[1]].map(|s| s.points_per_box.map(|e| e.mean));
         Some(a? / b.filter(|mean| *mean > 0.0)?)

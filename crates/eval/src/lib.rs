@@ -1,8 +1,8 @@
-//! Boxes, clouds and features in, numbers out: KITTI average precision and recall, the matrix of train and test sets, and the statistics
-//! of two data sets.
+//! Evaluation of boxes, clouds and features: KITTI average precision and recall, the matrix of train and test sets,
+//! and statistics of two data sets.
 //!
-//! Everything is computed on the numbers of the texts, in the frame they are written in. KITTI's camera and LiDAR frames are
-//! tilted against each other, so that a box upright in one is not upright in the other: a conversion would change overlaps.
+//! Boxes are compared in the frame in which they are written. KITTI's camera and LiDAR frames are tilted against each
+//! other, so a box that is upright in one frame is not upright in the other, and a conversion would change overlaps.
 
 pub mod analysis;
 mod bootstrap;

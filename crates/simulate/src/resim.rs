@@ -1,4 +1,4 @@
-//! The sensor model on data sets that are finished, of this simulator or any other.
+//! Applies sensor effects to existing data sets, of this simulator or any other.
 
 use crate::SimulateError;
 use crate::scenario::FRAME_S;
@@ -15,24 +15,24 @@ use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const RESIM_MANIFEST_SCHEMA: &str = "lidarshift/resim-dataset/1";
 
-/// What the folder of a data set with effects on top holds: its `manifest.json`.
+/// Content of the `manifest.json` of a data set with effects applied.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ResimManifest {
     /// [`RESIM_MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Name of the data set that the effects act on.
+    /// Name of the source data set.
     pub source: String,
-    /// Seed of the effects.
+    /// Random seed of the effects.
     pub seed: u64,
-    /// SHA-256 of effects, rig, seed, and the version of this program.
+    /// SHA-256 of effects, rig, seed, and program version.
     pub config_sha256: String,
-    /// Frames.
+    /// Number of frames.
     pub frames: usize,
     /// Points of all frames, before and after.
     pub points: [usize; 2],
@@ -54,19 +54,20 @@ impl Manifest for ResimManifest {
 pub struct Resim<'a> {
     /// The data set.
     pub dataset: &'a Dataset,
-    /// What acts on it.
+    /// The effects.
     pub effects: &'a EffectList,
-    /// Its sensors; `None`: those that its TOML names, or one at the clouds' origin.
+    /// Its sensor rig; `None`: the rig referenced by the data set, or a single sensor at the cloud origin.
     pub rig: Option<Rig>,
-    /// Another seed gives other noise.
+    /// Random seed.
     pub seed: u64,
 }
 
 impl Resim<'_> {
-    /// Makes the data set in the folder `out`, in the layout and label frame of the source.
+    /// Writes the data set to the folder `out`, in the layout and label frame of the source.
     ///
-    /// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same words finished
-    /// are kept; a folder with other content is refused. The files do not depend on the number of threads.
+    /// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an
+    /// earlier run with the same arguments are kept; a folder with other content is an error. The files do not depend
+    /// on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
         let source = &self.dataset.config;
@@ -113,14 +114,15 @@ impl Resim<'_> {
         Ok(rig)
     }
 
-    /// Which effects of the list cannot act on this finished data set, by their place, and why.
+    /// Effects of the list that cannot be applied to this data set: index and reason.
     pub fn refused(&self) -> Result<Vec<(usize, String)>, SimulateError> {
         let ids = self.dataset.all_ids()?;
         let described = attributes::path(&self.dataset.config.root, &ids[0]).is_file();
         Ok(self.refusals(&known_of(self.dataset, &self.rig()?, &ids[0], described)?))
     }
 
-    /// One frame with the effects on it; `index` is its place in the order of names. Its points, and what is known of them.
+    /// One frame with the effects applied; `index` is its position in name order. Returns its points and what is known
+    /// about them.
     pub fn frame(
         &self,
         index: usize,
@@ -200,7 +202,7 @@ impl Resim<'_> {
         refused
     }
 
-    /// Writes one frame, unless it is there; its points before and after.
+    /// Writes one frame unless it exists; returns its number of points before and after.
     fn make_frame_file(
         &self,
         new: &NewDataset,
@@ -235,7 +237,7 @@ impl Resim<'_> {
         Ok([self.dataset.count_points(id)?, layout.count_points(out, id, self.dataset.config.points)?])
     }
 
-    /// Labels as they are where no effect touched them, to the byte; else in the label frame of the source.
+    /// Copies labels byte by byte if no effect changed them; otherwise writes them in the label frame of the source.
     fn write_labels(&self, new: &NewDataset, frame: &Frame) -> Result<(), SimulateError> {
         let source = self.dataset.labels(&frame.id)?;
         let boxes = self.dataset.objects(&frame.id, &source)?;
@@ -255,7 +257,7 @@ impl Resim<'_> {
         let config = DatasetConfig {
             name: format!("{}-resim", source.name),
             rig: rig_path.clone(),
-            // A crop was made when the clouds were read.
+            // Clouds were already cropped when they were read.
             fov_crop: false,
             ..source.clone()
         };
@@ -280,14 +282,14 @@ impl Resim<'_> {
     }
 }
 
-/// What is known of the points of a data set.
+/// What is known about the points of a data set.
 fn known_of(dataset: &Dataset, rig: &Rig, id: &str, described: bool) -> Result<BTreeSet<Need>, SimulateError> {
     if described {
         use Need::{Cars, Grid, Incidence, Material, Reflectivity, Row, Time};
         return Ok([Cars, Grid, Incidence, Material, Reflectivity, Row, Time].into());
     }
     let mut cloud = dataset.load_cloud(id)?;
-    // What is known depends on the rig alone; some points are enough to ask.
+    // What is known depends on the rig only; a few points are enough to check.
     cloud.values.truncate(cloud.channels);
     if dataset.config.points == PointColumns::Xyz {
         cloud = cloud.with_channels(3);
@@ -334,7 +336,7 @@ mod tests {
         for id in made.all_ids().unwrap() {
             assert_eq!(made.load(&id).unwrap().objects, dataset.load(&id).unwrap().objects);
         }
-        // Noise alone, to compare points one by one: they move along their ray.
+        // Noise only, to compare points one by one: they move along their ray.
         let noisy = folder.path().join("noisy");
         make(&dataset, &effects("[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n"), None, &noisy).unwrap();
         let (a, b) = (
@@ -388,7 +390,7 @@ mod tests {
             let error = make(&dataset, &list, None, &folder.path().join(kind)).unwrap_err();
             assert!(error.contains(want), "{error}");
         }
-        // With the sensor's pattern rows are known.
+        // With the sensor's pattern, rows are known.
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/sensors/hdl64e.toml");
         let rig = Rig::read(Path::new(path)).unwrap();
         let list = effects("[[effect]]\nkind = \"beam_range_offset\"\n");

@@ -1,4 +1,4 @@
-//! The data sets of a race on disk.
+//! Writes the data sets of a race.
 
 use super::config::{RaceConfig, SetConfig};
 use super::files::ConfigFiles;
@@ -18,30 +18,31 @@ use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const RACE_MANIFEST_SCHEMA: &str = "lidarshift/race-dataset/1";
-/// Bytes of a point in a cloud and in its attributes.
+/// Bytes per point in a cloud and in its attributes.
 const POINT_BYTES: (u64, u64) = (16, 53);
-/// Free space that stays untouched, bytes.
+/// Disk space that is kept free, bytes.
 const SPARE_BYTES: u64 = 200 << 20;
 
-/// What a data set's folder holds: its `manifest.json`.
+/// Content of a data set's `manifest.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RaceManifest {
     /// [`RACE_MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Name of the race and of the data set.
+    /// Names of the race and of the data set.
     pub name: [String; 2],
     /// Seed of the race.
     pub seed: u64,
-    /// SHA-256 of all that decides the frames: configuration, rig, trajectories, effects, and the version of this program.
+    /// SHA-256 of everything that determines the frames: configuration, rig, trajectories, effects, and program
+    /// version.
     pub config_sha256: String,
-    /// What is there, by split.
+    /// Counts by split.
     pub splits: BTreeMap<String, SplitCounts>,
-    /// How far labels are from the true boxes, for labels made as on the road.
+    /// Label errors, for automatic labels.
     pub label_errors: Vec<LabelError>,
 }
 
@@ -57,12 +58,12 @@ impl Manifest for RaceManifest {
     }
 }
 
-/// Makes the data sets of a race below `out`, a folder each: clouds, labels, `ImageSets/`, `dataset.toml`, `rig.toml`, `manifest.json`, and
-/// `effects.toml` unless it is hidden. `only` names those to make; all when empty.
+/// Writes the data sets of a race below `out`, one folder each: clouds, labels, `ImageSets/`, `dataset.toml`,
+/// `rig.toml`, `manifest.json`, and `effects.toml` unless hidden. `only` selects data sets by name; empty for all.
 ///
-/// `progress` hears the name of the data set and how many of its frames of how many are there, from several threads. Frames that an earlier
-/// run with the same configuration finished are kept; a folder with other content is refused. The files do not depend on the number of
-/// threads.
+/// `progress(name, done, total)` is called with the data set and its number of frames, from several threads. Frames
+/// finished by an earlier run with the same configuration are kept; a folder with other content is an error. The files
+/// do not depend on the number of threads.
 pub fn make_race_datasets(
     config: &RaceConfig,
     files: &ConfigFiles,
@@ -119,7 +120,7 @@ fn make_set(
     Ok(manifest)
 }
 
-/// Writes one frame, unless it is there; counts what it holds.
+/// Writes one frame unless it exists; returns its counts.
 fn make_frame_file(
     simulator: &Simulator,
     set: &PreparedSet,
@@ -143,7 +144,7 @@ fn make_frame_file(
     Ok(SplitCounts { frames: 1, cars, points })
 }
 
-/// Everything about the data set that is no frame.
+/// Writes all files of a data set except the frames.
 fn write_descriptions(
     simulator: &Simulator,
     new: &NewDataset,
@@ -177,7 +178,7 @@ fn to_toml<T: Serialize>(value: &T) -> Result<String, SimulateError> {
     toml::to_string_pretty(value).map_err(|e| wrong("", e.to_string()).into())
 }
 
-/// The loss that makes the ranges of `from` those of `target`, from the frames that both have to train on.
+/// The dropout that matches the ranges of `from` to those of `target`, from their common training frames.
 fn matched(target: &Path, from: &Path) -> Result<sensor::effects::RangeDropout, SimulateError> {
     let histogram = |folder: &Path| {
         let dataset = Dataset::open(folder)?;
@@ -187,7 +188,7 @@ fn matched(target: &Path, from: &Path) -> Result<sensor::effects::RangeDropout, 
     Ok(fit_range_dropout(&histogram(target)?, &histogram(from)?))
 }
 
-/// Labels on disk against where the cars really are.
+/// Compares the written labels with the true boxes.
 fn errors_of_labels(simulator: &Simulator, new: &NewDataset) -> Result<Vec<LabelError>, SimulateError> {
     let of_frame = |key: &FrameKey| {
         let labels = new.layout().read_labels(new.root(), &key.id())?;
@@ -199,9 +200,9 @@ fn errors_of_labels(simulator: &Simulator, new: &NewDataset) -> Result<Vec<Label
     Ok(label_errors(pairs?.into_iter().flatten()))
 }
 
-/// A hash of all that decides the frames of a data set.
+/// Hash of everything that determines the frames of a data set.
 fn fingerprint(simulator: &Simulator, set: &PreparedSet) -> String {
-    // The other data sets of the configuration do not matter, nor where its files lie: what is in them does.
+    // Other data sets of the configuration and file locations do not matter; the content of the files does.
     let config = RaceConfig { datasets: Vec::new(), runs: Vec::new(), car: None, ..simulator.config.clone() };
     let mut hash = Sha256::new();
     for text in [
@@ -232,7 +233,7 @@ fn json<T: Serialize>(value: &T) -> String {
     serde_json::to_string(value).expect("a configuration is plain data")
 }
 
-/// Refuses to begin what the disk cannot hold.
+/// Checks that the disk has enough free space.
 fn check_space(simulator: &Simulator, out: &Path, sets: &[&SetConfig]) -> Result<(), SimulateError> {
     let point = POINT_BYTES.0 + if simulator.config.attributes { POINT_BYTES.1 } else { 0 };
     let frame = simulator.shots() as u64 * point + 1024;
@@ -245,7 +246,7 @@ fn check_space(simulator: &Simulator, out: &Path, sets: &[&SetConfig]) -> Result
     check_free(out, needed, &format!("{} data sets of {} frames", sets.len(), simulator.keys().len()))
 }
 
-/// Refuses when the disk of `folder` (which need not exist yet) has no room for `needed` bytes.
+/// Checks that the disk of `folder` (which need not exist yet) has `needed` free bytes.
 fn check_free(folder: &Path, needed: u64, what: &str) -> Result<(), SimulateError> {
     let mut existing = folder;
     while !existing.is_dir() {

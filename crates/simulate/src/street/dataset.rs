@@ -1,4 +1,4 @@
-//! A synthetic road data set on disk.
+//! Writes a synthetic street data set.
 
 use crate::SimulateError;
 use crate::street::config::RoadConfig;
@@ -10,27 +10,27 @@ use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const MANIFEST_SCHEMA: &str = "lidarshift/simulated-dataset/1";
 
-/// A car with fewer points is not labelled: nobody could find it.
+/// Cars with fewer points are not labelled, as they could not be detected.
 const LEAST_POINTS: usize = 5;
 
-/// What a folder made by [`make_road_dataset`] holds: its `manifest.json`.
+/// Content of the `manifest.json` written by [`make_road_dataset`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// [`MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Seed of the scenes.
+    /// Random seed of the scenes.
     pub seed: u64,
-    /// SHA-256 of the configuration, seed and numbers of frames included; another version of this program counts as another configuration.
+    /// SHA-256 of configuration, seed, numbers of frames and program version.
     pub config_sha256: String,
     /// The whole configuration.
     pub config: RoadConfig,
-    /// What is there, by split.
+    /// Counts by split.
     pub splits: BTreeMap<String, SplitCounts>,
 }
 
@@ -91,10 +91,12 @@ fn frame_id(split: &str, index: usize) -> String {
     format!("{split}_{index:06}")
 }
 
-/// Makes a data set in the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`, `manifest.json`.
+/// Writes a data set to the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`,
+/// `manifest.json`.
 ///
-/// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same configuration
-/// finished are kept; a folder with other content is refused. The files do not depend on the number of threads.
+/// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an earlier
+/// run with the same configuration are kept; a folder with other content is an error. The files do not depend on the
+/// number of threads.
 pub fn make_road_dataset(
     config: &RoadConfig,
     out: &Path,
@@ -123,7 +125,7 @@ pub fn make_road_dataset(
     Ok(manifest)
 }
 
-/// Writes one frame, unless it is there; counts what it holds.
+/// Writes one frame unless it exists; returns its counts.
 fn make_frame_file(
     config: &RoadConfig,
     set: &NewDataset,
@@ -164,7 +166,7 @@ mod tests {
         RoadConfig { seed, frames: FrameCounts { train: 4, val: 2, test: 2 }, ..RoadConfig::default() }
     }
 
-    /// Every file below a folder with its bytes, by path.
+    /// All files below a folder with their bytes, by path.
     fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
         let (mut open, mut found) = (vec![root.to_owned()], BTreeMap::new());
         while let Some(folder) = open.pop() {
