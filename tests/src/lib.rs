@@ -1,4 +1,4 @@
-//! Where the tests that cross crates find their data.
+//! Locates the data of tests that cross crates.
 
 use std::path::{Path, PathBuf};
 
@@ -7,9 +7,9 @@ pub fn workspace(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(path)
 }
 
-/// Data that the licence of KITTI keeps out of the repository, in `../shared` beside the workspace.
+/// Data that must not be in the repository because of KITTI's licence, in `../shared` next to the workspace.
 ///
-/// `None`, with a line on stderr, where it is absent: the test then has nothing to look at.
+/// `None`, with a line on stderr, if it is absent: the test is then skipped.
 pub fn shared(path: &str) -> Option<PathBuf> {
     let found = workspace("../shared").join(path);
     if found.exists() {

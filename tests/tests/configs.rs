@@ -1,4 +1,4 @@
-//! The files that people edit, as they lie in the repository.
+//! Tests of the configuration files in the repository.
 
 use data::DatasetConfig;
 use lidarshift_tests::workspace;
@@ -19,7 +19,7 @@ fn data_sets_and_detectors_are_right() {
     }
     for path in tomls("configs/detectors") {
         let name = path.file_stem().unwrap().to_str().unwrap();
-        // Built into the program under its name, and the same when it is read from the file.
+        // A built-in configuration is equal to the file of the same name.
         assert_eq!(find_detector(path.to_str().unwrap()).unwrap(), find_detector(name).unwrap());
     }
 }

@@ -1,4 +1,4 @@
-//! The published PointPillars: its size, its names, and one step on a real scan.
+//! The published PointPillars: its size, parameter names, and one step on a real scan.
 
 use burn::tensor::Device;
 use data::{Dataset, stream};
@@ -8,7 +8,7 @@ use models::config::{DetectorConfig, NetworkConfig};
 use models::{Detector, Preparer, find_detector, parameter_count};
 use std::collections::BTreeMap;
 
-/// With three classes and intensity, and with cars and coordinates alone.
+/// With three classes and intensity, and with cars and coordinates only.
 fn published() -> [(DetectorConfig, usize, &'static str); 2] {
     let kitti = find_detector("pointpillars").unwrap();
     let mut car = kitti.clone();

@@ -1,4 +1,4 @@
-//! `cargo xtask bench [NAME]`: the benchmarks that the crates have, and training steps beside PyTorch's.
+//! `cargo xtask bench [NAME]`: benchmarks of the crates, and training steps compared with PyTorch.
 
 use crate::bench_mutants::bench_mutants;
 use crate::bench_train::bench_train;
@@ -6,14 +6,15 @@ use crate::{cargo, tidy::manifests};
 use anyhow::{Result, bail};
 use std::path::Path;
 
-/// Runs the benchmarks called `name`, those of the crate folder `name`, the training steps beside PyTorch's (`train`; `words` are parts of the ids
-/// of the wanted rows), the blind cases with a diagnosis that is broken (`mutants`), or all benchmarks of crates.
-pub fn bench(root: &Path, name: Option<&str>, words: &[String]) -> Result<()> {
+/// Runs the benchmark `name`, the benchmarks of the crate folder `name`, the comparison of training steps with PyTorch
+/// (`train`; `args` are parts of the row ids), the blind cases with mutated diagnosis code (`mutants`), or all
+/// benchmarks of the crates.
+pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     if name == Some("train") {
-        return bench_train(root, words);
+        return bench_train(root, args);
     }
     if name == Some("mutants") {
-        return bench_mutants(root, words);
+        return bench_mutants(root, args);
     }
     let mut known = Vec::new();
     let mut ran = false;
@@ -27,7 +28,7 @@ pub fn bench(root: &Path, name: Option<&str>, words: &[String]) -> Result<()> {
             ran = true;
             let status = cargo(root)
                 .args(["bench", "--quiet", "--package", &manifest.package, "--bench", &bench, "--"])
-                .args(words)
+                .args(args)
                 .status()?;
             if !status.success() {
                 bail!("the benchmark {bench} failed");
@@ -36,7 +37,7 @@ pub fn bench(root: &Path, name: Option<&str>, words: &[String]) -> Result<()> {
     }
     known.extend(["mutants".into(), "train".into()]);
     if !ran {
-        bail!("no such benchmark; there are: {}", known.join(", "));
+        bail!("no such benchmark; available: {}", known.join(", "));
     }
     Ok(())
 }

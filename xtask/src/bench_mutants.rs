@@ -1,5 +1,5 @@
-//! `cargo xtask bench mutants [WORDS]`: whether the blind cases notice a diagnosis that is broken. Each mutant of `tests/blind/mutants.toml` changes one
-//! place of a copy of the sources; the same cases are diagnosed by it and by the sources as they are.
+//! `cargo xtask bench mutants [FILTER]`: mutation test of the diagnosis. Each mutant of `tests/blind/mutants.toml`
+//! changes one place in a copy of the sources; the same blind cases are diagnosed with and without the change.
 
 use crate::cargo;
 use anyhow::{Context, Result, bail, ensure};
@@ -8,10 +8,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The list.
+/// The list of mutants.
 const FILE: &str = "tests/blind/mutants.toml";
 
-/// Size of a case.
+/// Frames per case.
 const FRAMES: &str = "40";
 const SHOTS: &str = "12000";
 
@@ -28,20 +28,20 @@ struct List {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Mutant {
-    /// What it breaks, in words.
+    /// Description of the defect.
     breaks: String,
-    /// The file that it changes.
+    /// The changed file.
     file: PathBuf,
-    /// What stands there, once.
+    /// The original code, which must occur exactly once.
     from: String,
     to: String,
 }
 
 impl Mutant {
-    /// The broken text of a file.
+    /// Applies the mutant to the text of its file.
     fn broken(&self, text: &str) -> Result<String> {
         let found = text.matches(&self.from).count();
-        ensure!(found == 1, "{FILE}: `{}` stands {found} times in {}, not once", self.from, self.file.display());
+        ensure!(found == 1, "{FILE}: `{}` occurs {found} times in {}, not once", self.from, self.file.display());
         Ok(text.replace(&self.from, &self.to))
     }
 }
@@ -51,54 +51,55 @@ fn list(root: &Path) -> Result<List> {
     toml::from_str(&text).with_context(|| FILE.to_owned())
 }
 
-/// How well a set of cases is answered.
+/// Score of a set of cases.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Score {
-    /// Cases answered rightly.
+    /// Number of cases answered correctly.
     right: usize,
-    /// Parameters whose true value lies in the interval.
+    /// Number of parameters whose interval contains the true value.
     inside: usize,
 }
 
-/// What the blind bench sums up.
+/// Summary written by the blind bench.
 #[derive(Deserialize)]
 struct Summary {
-    words: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By parameter: cases, share inside, and more.
+    grades: BTreeMap<String, BTreeMap<String, usize>>,
+    /// By parameter: number of cases, fraction inside the interval, and more.
     parameters: BTreeMap<String, Vec<Option<f64>>>,
 }
 
 impl Summary {
     fn score(&self) -> Score {
-        let good = |kind: &str, word: &str| {
-            matches!(word, "right" | "clean" | "refused") || kind == "off_catalogue" && word == "unexplained"
+        let good = |kind: &str, grade: &str| {
+            matches!(grade, "right" | "clean" | "refused") || kind == "off_catalogue" && grade == "unexplained"
         };
-        let words = self.words.iter().flat_map(|(kind, words)| words.iter().map(move |(word, n)| (kind, word, n)));
+        let grades =
+            self.grades.iter().flat_map(|(kind, grades)| grades.iter().map(move |(grade, n)| (kind, grade, n)));
         let inside = |p: &Vec<Option<f64>>| (p[0].unwrap_or(0.0) * p[1].unwrap_or(0.0)).round() as usize;
         Score {
-            right: words.filter(|(kind, word, _)| good(kind, word)).map(|(.., n)| n).sum(),
+            right: grades.filter(|(kind, grade, _)| good(kind, grade)).map(|(.., n)| n).sum(),
             inside: self.parameters.values().map(inside).sum(),
         }
     }
 }
 
-/// Breaks the diagnosis in all ways whose description has one of the words, and tells the scores.
+/// Runs all mutants whose description contains one of the filters, and prints the scores.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
-pub fn bench_mutants(root: &Path, words: &[String]) -> Result<()> {
+pub fn bench_mutants(root: &Path, filters: &[String]) -> Result<()> {
     let list = list(root)?;
-    let wanted = |m: &&Mutant| words.is_empty() || words.iter().any(|w| m.breaks.contains(w.as_str()));
+    let wanted = |m: &&Mutant| filters.is_empty() || filters.iter().any(|f| m.breaks.contains(f.as_str()));
     let mutants: Vec<&Mutant> = list.mutant.iter().filter(wanted).collect();
-    ensure!(!mutants.is_empty(), "no mutant has these words; there are: {}", descriptions(&list));
+    ensure!(!mutants.is_empty(), "no mutant matches; available: {}", descriptions(&list));
     let folder = root.join("target/mutants");
     let tree = folder.join("tree");
     copy_sources(root, &tree)?;
-    // Drawn anew: the generator may have changed.
+    // Generated anew: the generator may have changed.
     let pairs = folder.join("pairs");
     if pairs.exists() {
         fs_err::remove_dir_all(&pairs)?;
     }
     let whole = run(&tree, &folder, &list)?;
-    println!("the diagnosis as it is: {} cases right, {} parameters inside their interval", whole.right, whole.inside);
+    println!("unchanged diagnosis: {} cases right, {} parameters inside their interval", whole.right, whole.inside);
     let mut unnoticed = Vec::new();
     for mutant in mutants {
         let path = tree.join(&mutant.file);
@@ -108,14 +109,14 @@ pub fn bench_mutants(root: &Path, words: &[String]) -> Result<()> {
         fs_err::write(&path, text)?;
         let score = score.with_context(|| mutant.breaks.clone())?;
         let fell = score.right + score.inside < whole.right + whole.inside;
-        let told = if fell { "noticed" } else { "NOT NOTICED" };
-        println!("{told}: {}: {} right, {} inside", mutant.breaks, score.right, score.inside);
+        let result = if fell { "noticed" } else { "NOT NOTICED" };
+        println!("{result}: {}: {} right, {} inside", mutant.breaks, score.right, score.inside);
         if !fell {
             unnoticed.push(mutant.breaks.as_str());
         }
     }
     if !unnoticed.is_empty() {
-        bail!("the blind cases do not notice that {}", unnoticed.join("; "));
+        bail!("not noticed by the blind cases: {}", unnoticed.join("; "));
     }
     Ok(())
 }
@@ -124,14 +125,14 @@ fn descriptions(list: &List) -> String {
     list.mutant.iter().map(|m| m.breaks.as_str()).collect::<Vec<_>>().join("; ")
 }
 
-/// Copies the files that git knows or would add; unchanged ones are left alone, so that little is compiled again.
+/// Copies the files that are tracked or would be added by git; unchanged files are kept, to limit recompilation.
 fn copy_sources(root: &Path, tree: &Path) -> Result<()> {
     let mut git = Command::new("git");
     git.current_dir(root).args(["ls-files", "-z", "--cached", "--others", "--exclude-standard"]);
-    let listed = git.output().context("git lists the sources")?;
+    let listed = git.output().context("could not run git ls-files")?;
     ensure!(listed.status.success(), "git ls-files: {}", String::from_utf8_lossy(&listed.stderr));
     for name in String::from_utf8(listed.stdout)?.split('\0').filter(|n| !n.is_empty()) {
-        // Listed and gone: deleted since the last commit.
+        // Listed by git, but deleted since the last commit.
         let Ok(content) = std::fs::read(root.join(name)) else { continue };
         let to = tree.join(name);
         if std::fs::read(&to).is_ok_and(|old| old == content) {
@@ -156,13 +157,13 @@ fn run(tree: &Path, folder: &Path, list: &List) -> Result<Score> {
         command.args(["--kind", kind]);
     }
     let n = list.kinds.len() as u64;
-    // The kind of a case is its seed modulo their number.
+    // The kind of a case is given by its seed modulo the number of kinds.
     let first = list.first_seed.next_multiple_of(n).to_string();
     command
         .args(["--first", &first, "--cases", &n.to_string(), "--frames", FRAMES, "--shots", SHOTS, "--out"])
         .arg(&out);
     command.arg("--keep").arg(folder.join("pairs")).stdout(std::process::Stdio::null());
-    ensure!(command.status()?.success(), "the cases were not diagnosed");
+    ensure!(command.status()?.success(), "the blind bench failed");
     let summary: Summary = serde_json::from_slice(&fs_err::read(out.join("summary.json"))?)?;
     Ok(summary.score())
 }
@@ -180,12 +181,12 @@ mod tests {
             assert_ne!(mutant.broken(&text).unwrap(), text);
         }
         let gone = Mutant { from: "no such line".into(), ..list.mutant.into_iter().next().unwrap() };
-        assert!(gone.broken("").unwrap_err().to_string().contains("stands 0 times"));
+        assert!(gone.broken("").unwrap_err().to_string().contains("occurs 0 times"));
     }
 
     #[test]
     fn scores_count_right_answers_and_intervals_that_hold() {
-        let text = r#"{"words": {"null": {"clean": 2, "false alarm": 1}, "single": {"right": 3, "wrong name": 1, "unexplained": 1},
+        let text = r#"{"grades": {"null": {"clean": 2, "false alarm": 1}, "single": {"right": 3, "wrong name": 1, "unexplained": 1},
             "off_catalogue": {"unexplained": 1}},
             "parameters": {"a": [4.0, 0.75, null], "b": [1.0, 0.0]}, "closed": 0.9}"#;
         let summary: Summary = serde_json::from_str(text).unwrap();

@@ -1,5 +1,5 @@
-//! `cargo xtask bench train [WORDS]`: whole training steps, inference and the costliest layers here and of the same networks in PyTorch,
-//! in turns.
+//! `cargo xtask bench train [FILTER]`: training steps, inference and the most expensive layers, compared with the same
+//! networks in PyTorch. Both sides run alternately.
 
 use crate::program::{self, Program};
 use anyhow::{Context, Result, bail, ensure};
@@ -7,19 +7,19 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Names the Python that has PyTorch.
+/// Environment variable with the path of a Python that has PyTorch.
 const VARIABLE: &str = "LIDARSHIFT_PYTHON";
 
-/// Where the rows are kept.
+/// File in which the rows are kept.
 const FILE: &str = "bench/train.json";
 
-/// How often both sides take their turn.
+/// Number of alternating rounds.
 const ROUNDS: usize = 3;
 
-/// Timed steps of a turn.
+/// Timed steps per round.
 const STEPS: usize = 3;
 
-/// A timed piece of work: its name in ids, its name for `bench-step --work`, and the references, each with its name in ids and its `--form`.
+/// What is timed: id in row names, `bench-step --work` argument, and the references as (name, form).
 type Work = (&'static str, &'static str, &'static [[&'static str; 2]]);
 
 /// A kind of detector that is timed.
@@ -49,7 +49,7 @@ const NETWORKS: &[Network] = &[
     },
 ];
 
-/// Work here beside that of the reference.
+/// Timing compared with one reference.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct Row {
     /// `network/size/work/batchB/threadsT/reference`.
@@ -58,11 +58,11 @@ struct Row {
     ours_ms: f64,
     /// Median, ms.
     reference_ms: f64,
-    /// The first over the second.
+    /// `ours_ms / reference_ms`.
     ratio: f64,
-    /// Largest resident memory of the process, MiB; only where the system says it.
+    /// Peak resident memory of the process, MiB; `None` if the system does not report it.
     ours_peak_mib: Option<u64>,
-    /// Largest resident memory of the process, PyTorch's libraries included, MiB.
+    /// Peak resident memory of the process including PyTorch's libraries, MiB.
     reference_peak_mib: Option<u64>,
 }
 
@@ -72,30 +72,30 @@ struct Rows {
     rows: Vec<Row>,
 }
 
-/// What one turn says.
+/// Output of one round.
 #[derive(Clone, Debug, Deserialize)]
 struct Turn {
     whole_ms: Vec<f64>,
     peak_mib: Option<u64>,
-    /// Only ours has stages.
+    /// Only reported by our side.
     #[serde(default)]
     median_ms: Vec<(String, f64)>,
 }
 
-/// Some work of one network at one size, batch and number of threads, beside some references.
+/// One measurement: network, size, batch and number of threads, with its references.
 struct Case {
     detector: &'static str,
     work: &'static str,
     batch: usize,
     threads: usize,
-    /// Id and form.
+    /// Name and form.
     references: Vec<(String, &'static str)>,
 }
 
-/// Times the cases whose ids have all of `words` in them, and puts their rows into [`FILE`].
-pub fn bench_train(root: &Path, words: &[String]) -> Result<()> {
-    let cases = cases(words);
-    ensure!(!cases.is_empty(), "no row has {} in its id; ids are as {}", words.join(" and "), example());
+/// Times the cases whose ids contain all of `filters`, and stores their rows in [`FILE`].
+pub fn bench_train(root: &Path, filters: &[String]) -> Result<()> {
+    let cases = cases(filters);
+    ensure!(!cases.is_empty(), "no row id contains {}; an example of an id: {}", filters.join(" and "), example());
     let python = python()?;
     let program = program::build(root, Program::Checks, None)?;
     let mut measured = Vec::new();
@@ -115,7 +115,7 @@ fn example() -> String {
     cases(&[])[0].references[0].0.clone()
 }
 
-fn cases(words: &[String]) -> Vec<Case> {
+fn cases(filters: &[String]) -> Vec<Case> {
     let mut cases = Vec::new();
     for Network { name: network, detectors, works } in NETWORKS {
         let pairs = detectors.iter().flat_map(|detector| works.iter().map(move |work| (detector, work)));
@@ -123,7 +123,8 @@ fn cases(words: &[String]) -> Vec<Case> {
             for (batch, threads) in [(1, 2), (1, 1), (4, 2), (4, 1)] {
                 let id = |reference: &str| format!("{network}/{size}/{name}/batch{batch}/threads{threads}/{reference}");
                 let all = references.iter().map(|&[reference, form]| (id(reference), form));
-                let references: Vec<_> = all.filter(|(id, _)| words.iter().all(|word| id.contains(word))).collect();
+                let references: Vec<_> =
+                    all.filter(|(id, _)| filters.iter().all(|filter| id.contains(filter))).collect();
                 if !references.is_empty() {
                     cases.push(Case { detector, work, batch, threads, references });
                 }
@@ -180,12 +181,11 @@ impl Row {
     }
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+fn median(values: Vec<f64>) -> f64 {
+    statistics::median_upper(values).unwrap_or(f64::NAN)
 }
 
-/// New rows take the place of those of the same id; in the order of their ids.
+/// Replaces rows with the same id by the new ones; sorted by id.
 fn merged(known: Vec<Row>, measured: Vec<Row>) -> Vec<Row> {
     let kept = known.into_iter().filter(|row| measured.iter().all(|new| new.id != row.id));
     let mut rows: Vec<Row> = kept.chain(measured.iter().cloned()).collect();
@@ -213,7 +213,7 @@ fn write(file: &Path, rows: &Rows) -> Result<()> {
     Ok(fs_err::rename(&partial, file)?)
 }
 
-/// The Python that has all that the reference needs.
+/// The Python that has all requirements of the reference.
 fn python() -> Result<PathBuf> {
     let python = PathBuf::from(std::env::var_os(VARIABLE).unwrap_or_else(|| "python3".into()));
     let imports = Command::new(&python).args(["-c", "import torch, numba, numpy"]).output();
@@ -228,7 +228,7 @@ fn python() -> Result<PathBuf> {
     }
 }
 
-/// What a command prints.
+/// Runs a command and returns its stdout.
 fn output(command: &mut Command) -> Result<Vec<u8>> {
     let name = command.get_program().display().to_string();
     let output = command.output().with_context(|| format!("could not start {name}"))?;
@@ -245,10 +245,10 @@ mod tests {
     }
 
     #[test]
-    fn words_choose_rows() {
-        let ids = |words: &[&str]| -> Vec<String> {
-            let words: Vec<String> = words.iter().map(|&w| w.into()).collect();
-            cases(&words).into_iter().flat_map(|case| case.references).map(|(id, _)| id).collect()
+    fn filters_choose_rows() {
+        let ids = |filters: &[&str]| -> Vec<String> {
+            let filters: Vec<String> = filters.iter().map(|&w| w.into()).collect();
+            cases(&filters).into_iter().flat_map(|case| case.references).map(|(id, _)| id).collect()
         };
         assert_eq!(ids(&[]).len(), 72);
         assert_eq!(

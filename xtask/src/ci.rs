@@ -1,4 +1,4 @@
-//! `cargo xtask ci`: all that has to pass, in the order in which it fails fastest.
+//! `cargo xtask ci`: all required checks, fastest first.
 
 use crate::cargo;
 use anyhow::{Context, Result, bail};
@@ -6,9 +6,9 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-/// Format, house rules, the book, clippy, tests: doc tests and the smallest default run through the program are among them.
+/// Format, house rules, the book, clippy, and tests, which include doc tests and a smoke run of the program.
 ///
-/// Everything is built once, with wgpu in it, which compiles without a GPU.
+/// Everything is built once with the wgpu backend, which compiles without a GPU.
 pub fn ci(root: &Path) -> Result<()> {
     const FEATURES: [&str; 2] = ["--features", "lidarshift/wgpu"];
     let start = Instant::now();
@@ -16,25 +16,25 @@ pub fn ci(root: &Path) -> Result<()> {
     step("tidy", crate::tidy)?;
     step("book", || book(root))?;
     step("clippy", || {
-        let words = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];
-        component(root, "clippy", &words)
+        let args = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];
+        component(root, "clippy", &args)
     })?;
     step("test", || must(cargo(root).args(["test", "--workspace"]).args(FEATURES)))?;
     eprintln!("ci: all passed in {:.0} s", start.elapsed().as_secs_f64());
     Ok(())
 }
 
-/// A component of the toolchain; where it is not installed, that is said.
-fn component(root: &Path, name: &str, words: &[&str]) -> Result<()> {
+/// Runs a component of the toolchain; prints a note if it is not installed.
+fn component(root: &Path, name: &str, args: &[&str]) -> Result<()> {
     let there = cargo(root).args([name, "--version"]).stdout(Stdio::null()).stderr(Stdio::null()).status()?;
     if !there.success() {
         eprintln!("cargo {name} is not installed: skipped (rustup component add {name})");
         return Ok(());
     }
-    must(cargo(root).arg(name).args(words))
+    must(cargo(root).arg(name).args(args))
 }
 
-/// Builds the book of `docs`; where mdBook is not installed, that is said.
+/// Builds the book in `docs`; prints a note if mdBook is not installed.
 fn book(root: &Path) -> Result<()> {
     let there = Command::new("mdbook").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
     if !there.is_ok_and(|status| status.success()) {
@@ -44,13 +44,13 @@ fn book(root: &Path) -> Result<()> {
     must(Command::new("mdbook").current_dir(root).args(["build", "docs"]))
 }
 
-/// Runs `work` under a heading; an error carries the step's name.
+/// Runs `work` under a heading; an error carries the name of the step.
 fn step(name: &str, work: impl FnOnce() -> Result<()>) -> Result<()> {
     eprintln!("== {name}");
     work().with_context(|| format!("ci stopped at: {name}"))
 }
 
-/// Runs a command; an exit code other than 0 is an error.
+/// Runs a command; a non-zero exit code is an error.
 fn must(command: &mut Command) -> Result<()> {
     let status = command.status().with_context(|| format!("could not start {command:?}"))?;
     if !status.success() {

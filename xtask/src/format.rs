@@ -1,12 +1,12 @@
-//! `cargo xtask format`: rustfmt on every source file. `cargo fmt` does not find files that are named in a macro (`effects!`, `commands!`,
-//! `figures!`).
+//! `cargo xtask format`: rustfmt on every source file. `cargo fmt` does not find files that are named in a macro
+//! (`effects!`, `commands!`, `figures!`).
 
 use crate::tidy::texts;
 use anyhow::{Context, Result, bail};
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// Formats all sources, or with `check` only says whether they are. Without rustfmt nothing is done, and that is said.
+/// Formats all sources, or only checks them with `check`. Prints a note if rustfmt is not installed.
 pub fn format(root: &Path, check: bool) -> Result<()> {
     let there = Command::new("rustfmt").arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
     if !there.is_ok_and(|status| status.success()) {

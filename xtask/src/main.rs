@@ -1,5 +1,5 @@
-//! `cargo xtask WORD ...`: the program `lidarshift`, built in release and run with the same words; and the chores of who works on it, some of
-//! which the program `lidarshift-checks` does.
+//! `cargo xtask COMMAND ...`: workspace tasks, some of them run by the program `lidarshift-checks`; any other command
+//! is passed to the program `lidarshift`. Both programs are built in release.
 
 mod bench;
 mod bench_mutants;
@@ -17,81 +17,83 @@ use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
-/// Chores of the workspace; every other word (train, eval, simulate, detect, doctor, ...) goes to the program
-/// `lidarshift`, built in release with the backend that `--device` asks for.
+/// Workspace tasks. Every other command (train, eval, simulate, detect, doctor, ...) is passed to the program
+/// `lidarshift`, built in release with the backend required by `--device`.
 #[derive(Parser)]
 #[command(
     name = "cargo xtask",
     bin_name = "cargo xtask",
     arg_required_else_help = true,
     disable_help_subcommand = true,
-    after_help = "Any other word goes to the program: `cargo xtask train --help`, `cargo xtask help` for all of them."
+    after_help = "Any other command is passed to the program: `cargo xtask train --help`; `cargo xtask help` lists all."
 )]
 struct Xtask {
     #[command(subcommand)]
-    word: Word,
+    task: Task,
 }
 
 #[derive(Subcommand)]
-enum Word {
-    /// All that has to pass: format, house rules, clippy, tests, a smoke run. The README's test command.
+enum Task {
+    /// Run all required checks: format, house rules, clippy, tests, a smoke run.
     Ci,
-    /// Format all sources, those that macros name included.
+    /// Format all sources, including those named by macros.
     Format {
-        /// Only say whether they are formatted.
+        /// Only check whether they are formatted.
         #[arg(long)]
         check: bool,
     },
-    /// The house rules: arrows between crates, lints, file names and lengths, no machine paths, links between pages.
+    /// Check the house rules: dependencies between crates, lints, file names and lengths, machine paths, wording, links
+    /// between pages.
     Tidy,
     /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
-    /// Run the benchmarks; NAME is a benchmark or a crate, further words go to Criterion. `bench train` times training steps beside PyTorch's;
-    /// `bench mutants` breaks the diagnosis in many ways and sees whether the blind cases notice.
+    /// Run the benchmarks. NAME is a benchmark or a crate; further arguments go to Criterion. `bench train` compares
+    /// training steps with PyTorch; `bench mutants` runs the blind cases against a diagnosis with deliberate defects.
     Bench {
-        /// A benchmark (`crates/*/benches/NAME.rs`), the folder of a crate, `train` or `mutants`; all but these two when left out.
+        /// A benchmark (`crates/*/benches/NAME.rs`), a crate folder, `train` or `mutants`; default: all benchmarks of
+        /// crates.
         name: Option<String>,
-        /// For Criterion, as `--quick` or a filter; for `train` parts of the ids of the wanted rows.
+        /// Arguments for Criterion, such as `--quick` or a filter; for `train` and `mutants`: parts of the wanted ids.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
-        words: Vec<String>,
+        args: Vec<String>,
     },
     /// Compare every tensor with a folder of reference numbers: `parity ../shared/golden/pointpillars_tiny`.
     #[command(disable_help_flag = true)]
     Parity {
-        /// For the `parity` of `lidarshift-checks`.
+        /// Arguments of `lidarshift-checks parity`.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<OsString>,
     },
     /// Time a training step by stage.
     #[command(hide = true, disable_help_flag = true)]
     BenchStep {
-        /// For the `bench-step` of `lidarshift-checks`.
+        /// Arguments of `lidarshift-checks bench-step`.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<OsString>,
     },
-    /// Face every reader of files with mutated inputs: `fuzz --inputs 1000000`.
+    /// Test every file reader with mutated inputs: `fuzz --inputs 1000000`.
     #[command(disable_help_flag = true)]
     Fuzz {
-        /// For the `fuzz` of `lidarshift-checks`.
+        /// Arguments of `lidarshift-checks fuzz`.
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         args: Vec<OsString>,
     },
-    /// A word of the program.
+    /// A command of the program.
     #[command(external_subcommand)]
     Program(Vec<OsString>),
 }
 
 fn main() -> ExitCode {
-    let outcome = match Xtask::parse().word {
-        Word::Ci => ci::ci(&root()),
-        Word::Format { check } => format::format(&root(), check),
-        Word::Tidy => tidy(),
-        Word::Schema => program::run(&root(), Checks, &["schema".into()]),
-        Word::Bench { name, words } => bench::bench(&root(), name.as_deref(), &words),
-        Word::Parity { args } => program::hand_over(&root(), Checks, &[vec!["parity".into()], args].concat()),
-        Word::BenchStep { args } => program::hand_over(&root(), Checks, &[vec!["bench-step".into()], args].concat()),
-        Word::Fuzz { args } => program::hand_over(&root(), Checks, &[vec!["fuzz".into()], args].concat()),
-        Word::Program(args) => program::hand_over(&root(), Lidarshift, &args),
+    let outcome = match Xtask::parse().task {
+        Task::Ci => ci::ci(&root()),
+        Task::Format { check } => format::format(&root(), check),
+        Task::Tidy => tidy(),
+        Task::Schema => program::run(&root(), Checks, &["schema".into()]),
+        Task::Bench { name, args } => bench::bench(&root(), name.as_deref(), &args),
+        Task::Parity { args } => program::hand_over(&root(), Checks, &[vec!["parity".into()], args].concat()),
+        Task::BenchStep { args } => program::hand_over(&root(), Checks, &[vec!["bench-step".into()], args].concat()),
+        Task::Fuzz { args } => program::hand_over(&root(), Checks, &[vec!["fuzz".into()], args].concat()),
+        Task::Program(args) => program::hand_over(&root(), Lidarshift, &args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
@@ -113,12 +115,12 @@ fn tidy() -> Result<()> {
     }
 }
 
-/// The folder of the workspace.
+/// Root folder of the workspace.
 fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the workspace").into()
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask is in the workspace").into()
 }
 
-/// The cargo that runs us, in the folder of the workspace.
+/// The cargo that runs xtask, in the workspace root.
 fn cargo(root: &Path) -> Command {
     let mut command = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.current_dir(root);

@@ -1,20 +1,20 @@
-//! Rules for pages in Markdown: relative links lead somewhere, the book's table of contents is complete, lines are short.
+//! Rules for Markdown pages: relative links have a target, the book's table of contents is complete, lines are short.
 
 use anyhow::Result;
 use fs_err as fs;
 use std::collections::BTreeSet;
 use std::path::{Component, Path, PathBuf};
 
-/// Pages of the book, relative to the repository.
+/// Folder of the book's pages, relative to the repository.
 const BOOK: &str = "docs/src";
 
-/// Its table of contents.
+/// Table of contents of the book.
 const SUMMARY: &str = "docs/src/SUMMARY.md";
 
-/// Characters of a line outside of tables and code.
+/// Maximum line length outside tables and code.
 const MAX_WIDTH: usize = 120;
 
-/// Everything that breaks a rule for pages. `pages` are the paths of all Markdown files, below `root`.
+/// All violations of the rules for pages. `pages` are the paths of all Markdown files, below `root`.
 pub fn complaints(root: &Path, pages: &[PathBuf]) -> Result<Vec<String>> {
     let mut found = Vec::new();
     for page in pages {
@@ -36,13 +36,13 @@ pub fn complaints(root: &Path, pages: &[PathBuf]) -> Result<Vec<String>> {
 /// A link of a page.
 #[derive(Debug, PartialEq)]
 struct Link {
-    /// From 1.
+    /// Line number, from 1.
     line: usize,
-    /// As it is written: a path, a path with an anchor, an anchor, or an address.
+    /// As written: a path, a path with an anchor, an anchor, or a URL.
     target: String,
 }
 
-/// Lines outside of fenced code with their numbers from 1.
+/// Lines outside code fences, with line numbers from 1.
 fn prose(text: &str) -> impl Iterator<Item = (usize, &str)> {
     let mut in_code = false;
     text.lines().enumerate().filter_map(move |(i, line)| {
@@ -52,7 +52,7 @@ fn prose(text: &str) -> impl Iterator<Item = (usize, &str)> {
     })
 }
 
-/// Links, images and included files of a page. Code is not looked at.
+/// Links, images and included files of a page, outside code.
 fn links(text: &str) -> Vec<Link> {
     let mut found = Vec::new();
     for (number, line) in prose(text) {
@@ -67,12 +67,13 @@ fn links(text: &str) -> Vec<Link> {
     found
 }
 
-/// The line without what stands between backticks.
+/// The line without inline code.
 fn without_code(line: &str) -> String {
     line.split('`').step_by(2).collect::<Vec<_>>().join("`")
 }
 
-/// What is wrong with a link of the page at `page`; nothing where it leads to a file, to a heading, or out of the repository.
+/// What is wrong with a link of the page at `page`; `None` if it leads to a file, to a heading, or out of the
+/// repository.
 fn broken(page: &Path, text: &str, target: &str) -> Option<&'static str> {
     if target.contains("://") || target.starts_with("mailto:") {
         return None;
@@ -90,7 +91,7 @@ fn broken(page: &Path, text: &str, target: &str) -> Option<&'static str> {
     (!known).then_some("leads to no heading of that page")
 }
 
-/// The anchor that mdBook and GitHub give a heading; `None` for other lines.
+/// The anchor that mdBook and GitHub assign to a heading; `None` for other lines.
 fn heading_anchor(line: &str) -> Option<String> {
     let title = line.trim_start_matches('#');
     if title.len() == line.len() || !title.starts_with(' ') {
@@ -100,18 +101,18 @@ fn heading_anchor(line: &str) -> Option<String> {
     Some(letters.map(|c| if c == ' ' { '-' } else { c }).flat_map(char::to_lowercase).collect())
 }
 
-/// Whether a program wrote the page.
-fn is_generated(text: &str) -> bool {
+/// Whether the page is generated.
+pub fn is_generated(text: &str) -> bool {
     text.lines().take(4).any(|l| l.starts_with("Generated "))
 }
 
-/// Numbers of lines that are too long, outside of tables and code.
+/// Line numbers of lines that are too long, outside tables and code.
 fn wide_lines(text: &str) -> impl Iterator<Item = usize> {
     let too_wide = |line: &str| !line.starts_with('|') && line.chars().count() > MAX_WIDTH;
     prose(text).filter(move |(_, line)| too_wide(line)).map(|(number, _)| number)
 }
 
-/// Pages of the book that its table of contents does not name.
+/// Pages of the book that are missing from its table of contents.
 fn not_in_summary(root: &Path, pages: &[PathBuf]) -> Result<Vec<String>> {
     let (book, summary) = (root.join(BOOK), root.join(SUMMARY));
     if !summary.is_file() {
@@ -124,7 +125,7 @@ fn not_in_summary(root: &Path, pages: &[PathBuf]) -> Result<Vec<String>> {
     Ok(missing.map(|p| format!("{}: is not in {SUMMARY}", relative(p))).collect())
 }
 
-/// The path without `.`.
+/// The path without `.` components.
 fn tidied(path: &Path) -> PathBuf {
     path.components().filter(|c| *c != Component::CurDir).collect()
 }

@@ -1,4 +1,5 @@
-//! The programs `lidarshift` and `lidarshift-checks`: built in release with the wanted backend, then run with the caller's words.
+//! The programs `lidarshift` and `lidarshift-checks`: built in release with the requested backend, then run with the
+//! caller's arguments.
 
 use crate::cargo;
 use anyhow::{Context, Result, bail};
@@ -15,14 +16,14 @@ const SILENCE: Duration = Duration::from_millis(1500);
 /// A program of the workspace.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Program {
-    /// What users run.
+    /// The program for users.
     Lidarshift,
-    /// What checks it: `parity`, `fuzz`, `bench-step`, `schema`.
+    /// The program with the checks of it: `parity`, `fuzz`, `bench-step`, `schema`.
     Checks,
 }
 
 impl Program {
-    /// Its package, and its executable.
+    /// Name of its package and of its executable.
     fn name(self) -> &'static str {
         match self {
             Program::Lidarshift => "lidarshift",
@@ -31,7 +32,8 @@ impl Program {
     }
 }
 
-/// Builds a program and becomes it: same folder, same words, its exit code; signals reach it directly.
+/// Builds a program and replaces this process with it: same working folder, arguments and exit code; signals reach it
+/// directly.
 pub fn hand_over(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
     let mut program = Command::new(build(root, program, backend_feature(args))?);
     program.args(args);
@@ -49,7 +51,7 @@ pub fn hand_over(root: &Path, program: Program, args: &[OsString]) -> Result<()>
     }
 }
 
-/// Builds a program and runs it in the folder of the workspace; an exit code other than 0 is an error.
+/// Builds a program and runs it in the workspace root; a non-zero exit code is an error.
 pub fn run(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
     let status = Command::new(build(root, program, backend_feature(args))?).args(args).current_dir(root).status()?;
     if !status.success() {
@@ -58,7 +60,7 @@ pub fn run(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
     Ok(())
 }
 
-/// The path of a program, built in release, with a backend beyond the default ones where wanted.
+/// Path of a program, built in release, with an additional backend feature if requested.
 pub fn build(root: &Path, program: Program, feature: Option<&str>) -> Result<PathBuf> {
     let name = program.name();
     let mut cargo = cargo(root);
@@ -68,7 +70,7 @@ pub fn build(root: &Path, program: Program, feature: Option<&str>) -> Result<Pat
         cargo.args(["--features", feature]);
     }
     let (done, is_done) = channel::<()>();
-    let speaker = std::thread::spawn(move || {
+    let announcer = std::thread::spawn(move || {
         if is_done.recv_timeout(SILENCE) == Err(RecvTimeoutError::Timeout) {
             eprintln!("building {name} (release)...");
         }
@@ -80,20 +82,20 @@ pub fn build(root: &Path, program: Program, feature: Option<&str>) -> Result<Pat
     }
     let status = build.wait()?;
     drop(done);
-    speaker.join().expect("the speaker does not panic");
+    announcer.join().expect("the announcing thread does not panic");
     if !status.success() {
         bail!("the program {name} could not be built");
     }
-    executable.with_context(|| format!("cargo names no executable of {name}"))
+    executable.with_context(|| format!("cargo reported no executable of {name}"))
 }
 
-/// The executable that one line of cargo's messages names.
+/// The executable named in one line of cargo's JSON messages.
 fn executable_of(line: &str) -> Option<PathBuf> {
     let message: serde_json::Value = serde_json::from_str(line).ok()?;
     message["executable"].as_str().map(PathBuf::from)
 }
 
-/// The cargo feature that `--device wgpu` or `--device=cuda` needs; the default backends need none.
+/// The cargo feature required by `--device wgpu` or `--device=cuda`; `None` for the default backends.
 fn backend_feature(args: &[OsString]) -> Option<&'static str> {
     let args: Vec<_> = args.iter().map(|a| a.to_string_lossy()).take_while(|a| a != "--").collect();
     let after =

@@ -1,4 +1,7 @@
-//! `cargo xtask tidy`: the house rules that a machine can check. ARCHITECTURE.md gives the reason of each.
+//! `cargo xtask tidy`: checks the house rules in CONTRIBUTING.md that can be checked automatically.
+
+mod source;
+mod wording;
 
 use crate::pages;
 use anyhow::{Context, Result};
@@ -6,11 +9,13 @@ use fs_err as fs;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Who may know whom: a crate's folder, and the folders that it may depend on directly. What those may know, it may know too.
+/// Allowed dependencies: a crate's folder, and the folders on which it may depend directly. Indirect dependencies are
+/// allowed as well.
 const ARROWS: &[(&str, &[&str])] = &[
     ("geometry", &[]),
     ("kernels", &[]),
-    ("data", &["geometry"]),
+    ("statistics", &[]),
+    ("data", &["geometry", "statistics"]),
     ("sensor", &["data"]),
     ("simulate", &["sensor"]),
     ("models", &["data", "kernels"]),
@@ -23,30 +28,30 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("cli", &["study"]),
     ("checks", &["cli"]),
     ("tests", &["checks"]),
-    ("xtask", &[]),
+    ("xtask", &["statistics"]),
 ];
 
-/// The crates that may know tensors.
+/// Crates that may depend on burn.
 const KNOWS_BURN: &[&str] = &["models", "train", "study", "cli", "checks", "tests"];
 
-/// File names that say nothing.
+/// File names without meaning.
 const EMPTY_NAMES: &[&str] = &["utils", "util", "common", "base", "helper", "helpers", "manager"];
 
-/// Lines of a source file before its tests.
+/// Maximum number of lines of a source file before its tests.
 const MAX_LINES: usize = 400;
 
-/// Macros that stand for work not done.
+/// Macros for unfinished work.
 const UNDONE: &[&str] = &[concat!("to", "do!("), concat!("unimple", "mented!(")];
 
-/// Beginnings of paths that exist on one machine only.
+/// Prefixes of paths that exist on one machine only.
 const MACHINE_PATHS: &[&str] =
     &[concat!("/ho", "me/"), concat!("/ro", "ot/"), concat!("/wo", "rk/"), concat!("/Us", "ers/"), concat!("C:", "\\")];
 
-/// What the manifest of one member of the workspace says.
+/// Manifest of a workspace member.
 pub struct Manifest {
-    /// The last part of its folder: `geometry`, `xtask`.
+    /// Name of its folder: `geometry`, `xtask`.
     pub folder: String,
-    /// The package's name, as cargo wants it.
+    /// Name of the package.
     pub package: String,
     path: PathBuf,
     toml: toml::Table,
@@ -57,11 +62,11 @@ impl Manifest {
         let toml: toml::Table = fs::read_to_string(&path)?.parse().with_context(|| path.display().to_string())?;
         let package = toml.get("package").and_then(|p| p.get("name")).and_then(|n| n.as_str());
         let package = package.with_context(|| format!("{}: no package.name", path.display()))?.to_owned();
-        let folder = path.parent().and_then(|p| p.file_name()).context("a manifest lies in a folder")?;
+        let folder = path.parent().and_then(|p| p.file_name()).context("a manifest without a folder")?;
         Ok(Manifest { folder: folder.to_string_lossy().into(), package, path, toml })
     }
 
-    /// Names of all dependencies, those for tests and builds included.
+    /// Names of all dependencies, including those for tests and builds.
     fn dependencies(&self) -> BTreeSet<&str> {
         ["dependencies", "dev-dependencies", "build-dependencies"]
             .into_iter()
@@ -81,7 +86,7 @@ impl Manifest {
     }
 }
 
-/// The manifests of all members, by path.
+/// The manifests of all workspace members, sorted by path.
 pub fn manifests(root: &Path) -> Result<Vec<Manifest>> {
     let mut paths = vec![root.join("tests/Cargo.toml"), root.join("xtask/Cargo.toml")];
     for entry in fs::read_dir(root.join("crates"))? {
@@ -92,7 +97,7 @@ pub fn manifests(root: &Path) -> Result<Vec<Manifest>> {
     paths.into_iter().map(Manifest::read).collect()
 }
 
-/// Everything that breaks a rule of the house, one sentence each, in the order of paths.
+/// All violations of the house rules, one message each, sorted by path.
 pub fn complaints(root: &Path) -> Result<Vec<String>> {
     let mut found = Vec::new();
     for manifest in manifests(root)? {
@@ -105,7 +110,10 @@ pub fn complaints(root: &Path) -> Result<Vec<String>> {
     for file in files {
         let path = shown(root, &file);
         let text = fs::read_to_string(&file)?;
-        found.extend(text_complaints(&path, &text).into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));
+        let mut of_file = text_complaints(&path, &text);
+        of_file.extend(wording::complaints(&path, &text));
+        of_file.sort_by_key(|(line, _)| *line);
+        found.extend(of_file.into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));
     }
     Ok(found)
 }
@@ -122,7 +130,7 @@ fn manifest_complaints(manifest: &Manifest) -> Vec<String> {
     let known: BTreeSet<&str> = ARROWS.iter().map(|(folder, _)| *folder).collect();
     let Some(allowed) = may_know(&manifest.folder) else {
         found.push(format!(
-            "{} has no place in the picture: add it to ARROWS in xtask and to ARCHITECTURE.md",
+            "{} is missing from the crate map: add it to ARROWS in xtask and to ARCHITECTURE.md",
             manifest.folder
         ));
         return found;
@@ -130,10 +138,10 @@ fn manifest_complaints(manifest: &Manifest) -> Vec<String> {
     for dependency in manifest.dependencies() {
         let folder = if dependency == "lidarshift" { "cli" } else { dependency };
         if known.contains(folder) && !allowed.contains(folder) {
-            found.push(format!("{} may not know {folder}; it may know: {}", manifest.folder, list(&allowed)));
+            found.push(format!("{} may not depend on {folder}; allowed: {}", manifest.folder, list(&allowed)));
         }
         if dependency == "burn" && !KNOWS_BURN.contains(&manifest.folder.as_str()) {
-            found.push(format!("{} may not know burn", manifest.folder));
+            found.push(format!("{} may not depend on burn", manifest.folder));
         }
     }
     found
@@ -143,7 +151,7 @@ fn list(names: &BTreeSet<&str>) -> String {
     if names.is_empty() { "none".into() } else { names.iter().copied().collect::<Vec<_>>().join(", ") }
 }
 
-/// All crates that `folder` may depend on; `None` when it is not in the picture.
+/// All crates that `folder` may depend on; `None` if it is not in [`ARROWS`].
 fn may_know(folder: &str) -> Option<BTreeSet<&'static str>> {
     let arrows: BTreeMap<_, _> = ARROWS.iter().copied().collect();
     let mut open = arrows.get(folder)?.to_vec();
@@ -156,7 +164,7 @@ fn may_know(folder: &str) -> Option<BTreeSet<&'static str>> {
     Some(known)
 }
 
-/// Line (from 1) and complaint.
+/// Line number (from 1) and message.
 fn text_complaints(path: &str, text: &str) -> Vec<(usize, String)> {
     let mut found = Vec::new();
     for (i, line) in text.lines().enumerate() {
@@ -174,7 +182,7 @@ fn text_complaints(path: &str, text: &str) -> Vec<(usize, String)> {
     }
     let stem = Path::new(path).file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
     if EMPTY_NAMES.contains(&stem.as_str()) {
-        found.push((1, format!("`{stem}` says nothing: name the idea that the file is about")));
+        found.push((1, format!("`{stem}` has no meaning: name the file after its content")));
     }
     let lines = lines_before_tests(text);
     if lines > MAX_LINES && !is_test(path) {
@@ -186,7 +194,7 @@ fn text_complaints(path: &str, text: &str) -> Vec<(usize, String)> {
     found
 }
 
-/// Whether `line` holds `prefix` as the beginning of a path, not as the middle of one.
+/// Whether `line` contains `prefix` at the beginning of a path.
 fn names_path(line: &str, prefix: &str) -> bool {
     line.match_indices(prefix).any(|(at, _)| {
         let before = line[..at].chars().next_back();
@@ -194,19 +202,19 @@ fn names_path(line: &str, prefix: &str) -> bool {
     })
 }
 
-/// Files that hold tests alone.
+/// Whether a file contains only tests.
 fn is_test(path: &str) -> bool {
     path.starts_with("tests/") || path.contains("/tests/") || path.ends_with("/tests.rs")
 }
 
-/// Lines up to `#[cfg(test)] mod ...`.
+/// Number of lines up to `#[cfg(test)] mod ...`.
 fn lines_before_tests(text: &str) -> usize {
     let lines: Vec<&str> = text.lines().collect();
     let tests = lines.windows(2).position(|w| w[0] == "#[cfg(test)]" && w[1].starts_with("mod "));
     tests.unwrap_or(lines.len())
 }
 
-/// Everything a person wrote in the repository, by path: sources, manifests, scripts, documents; not what a run made.
+/// All files written by hand, sorted by path: sources, manifests, scripts, documents; not generated output.
 pub fn texts(root: &Path) -> Result<Vec<PathBuf>> {
     let (mut open, mut files) = (vec![root.to_owned()], Vec::new());
     while let Some(folder) = open.pop() {

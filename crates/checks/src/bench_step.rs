@@ -247,9 +247,8 @@ impl<'a> Clock<'a> {
     }
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
+fn median(values: Vec<f64>) -> f64 {
+    statistics::median_upper(values).unwrap_or(f64::NAN)
 }
 
 /// The published grid on a cloud of the size of a whole KITTI scan, all in range; ms of some repetitions.

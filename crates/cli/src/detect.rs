@@ -3,8 +3,10 @@
 use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
-use data::kitti_text::{KittiLine, KittiText, parse_kitti_text};
-use data::{Cloud, Dataset, Detection, Frame, PointColumns, read_cloud, write_atomic, write_json};
+use data::{
+    Cloud, Dataset, Detection, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud, read_kitti_text,
+    write_atomic, write_json,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
@@ -92,14 +94,15 @@ impl DetectArgs {
         let sample = Preparer::new(detector.config()).inference(&frame)?;
         let detections = predict_samples(detector, &[sample])?.remove(0).detections;
         for detection in &detections {
-            println!("{}", KittiLine::from_box(&detection.class, &detection.bbox, Some(detection.score)));
+            let found = LabelBox::from_box(&detection.class, &detection.bbox, Some(detection.score));
+            println!("{}", KittiLine(&found));
         }
         if let Some(path) = &self.json {
             let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
             write_json(path, &found)?;
         }
         let truth = match &self.labels {
-            Some(path) => parse_kitti_text(&fs_err::read_to_string(path)?, path, KittiText::Labels)?,
+            Some(path) => read_kitti_text(path, KittiText::Labels)?,
             None => Vec::new(),
         };
         let picture = self.out.clone().unwrap_or_else(|| ".".into()).join(format!("{id}.png"));
@@ -128,8 +131,8 @@ impl DetectArgs {
         predict_frames(detector, 1, samples, |batch| {
             for (id, found) in batch {
                 boxes += found.detections.len();
-                let lines = dataset.detection_lines(id, &found.detections)?;
-                data::write::write_kitti_text(&out.join(format!("{id}.txt")), &lines)?;
+                let labels = dataset.detection_boxes(id, &found.detections)?;
+                data::write::write_kitti_text(&out.join(format!("{id}.txt")), &labels)?;
                 progress.inc(1);
             }
             Ok::<(), anyhow::Error>(())
@@ -159,8 +162,8 @@ fn detector_of(checkpoint: &Path, told: Option<&str>) -> Result<DetectorConfig> 
 }
 
 /// Points, ground truth and detections from above.
-fn draw(path: &Path, cloud: &Cloud, truth: &[KittiLine], detections: &[Detection]) -> Result<()> {
-    let mut boxes: Vec<_> = truth.iter().map(|line| (line.lidar_box(), Style::GroundTruth)).collect();
+fn draw(path: &Path, cloud: &Cloud, truth: &[LabelBox], detections: &[Detection]) -> Result<()> {
+    let mut boxes: Vec<_> = truth.iter().map(|label| (label.lidar_box(), Style::GroundTruth)).collect();
     boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));
     let picture = birds_eye_png(cloud, &boxes, &BirdsEyeOptions::default())?;
     Ok(write_atomic(path, &picture)?)

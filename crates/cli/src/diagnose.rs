@@ -6,7 +6,7 @@ use crate::commands::End;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::write::write_kitti_text;
-use data::{Dataset, KittiLine, write_atomic, write_json};
+use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
     DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Verdict, diagnose, diagnose_scans, extended_toml,
@@ -140,7 +140,7 @@ impl DiagnoseArgs {
 /// Corrected labels, in the clouds' frame and of the data set's first class.
 fn write_labels(out: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box3]) -> Result<()> {
     let class = measured.config.classes.first().map_or("Car", String::as_str);
-    let lines: Vec<KittiLine> = boxes.iter().map(|b| KittiLine::from_box(class, b, None)).collect();
+    let lines: Vec<LabelBox> = boxes.iter().map(|b| LabelBox::from_box(class, b, None)).collect();
     Ok(write_kitti_text(&out.join(format!("label_2/{id}.txt")), &lines)?)
 }
 

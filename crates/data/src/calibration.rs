@@ -2,7 +2,7 @@
 //!
 //! The camera frame is KITTI's rectified one: x right, y down, z forward. Conventions as in OpenPCDet's `calibration_kitti.py` and `box_utils.py`.
 
-use crate::{DataError, KittiLine};
+use crate::{DataError, LabelBox};
 use geometry::{Box3, limit_period};
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::path::Path;
@@ -74,15 +74,15 @@ impl Calibration {
         point_cam[2] >= 0.0 && u >= 0.0 && u < image_size[0].into() && v >= 0.0 && v < image_size[1].into()
     }
 
-    /// The LiDAR-frame box of a line in KITTI's own convention (location = bottom centre in the camera frame).
-    pub fn lidar_box(&self, line: &KittiLine) -> Box3 {
+    /// The LiDAR-frame box of a label in KITTI's own convention (location = bottom centre in the camera frame).
+    pub fn lidar_box(&self, line: &LabelBox) -> Box3 {
         let [h, w, l] = line.size_hwl;
         let [x, y, z] = self.lidar_point(line.location);
         let yaw_rad = limit_period(-(line.rotation_y + FRAC_PI_2), 0.5, 2.0 * PI);
         Box3 { center: [x, y, z + h / 2.0], size: [l, w, h], yaw_rad }
     }
 
-    /// The inverse of [`Calibration::lidar_box`]: a line in KITTI's own convention, with alpha and the image box projected and
+    /// The inverse of [`Calibration::lidar_box`]: a label in KITTI's own convention, with alpha and the image box projected and
     /// clipped to an image of `[width, height]` px. Truncation and occlusion are -1 for a detection (with a score) and 0 for a label.
     pub fn camera_from_lidar_box(
         &self,
@@ -90,12 +90,12 @@ impl Calibration {
         bbox: &Box3,
         score: Option<f32>,
         image_size: [u32; 2],
-    ) -> KittiLine {
+    ) -> LabelBox {
         let [l, w, h] = bbox.size;
         let [x, y, z] = bbox.center;
         let location = self.cam_point([x, y, z - h / 2.0]);
         let rotation_y = limit_period(-bbox.yaw_rad - FRAC_PI_2, 0.5, 2.0 * PI);
-        let mut line = KittiLine::from_box(class, bbox, score);
+        let mut line = LabelBox::from_box(class, bbox, score);
         line.alpha = limit_period(rotation_y - (-y).atan2(x), 0.5, 2.0 * PI);
         line.size_hwl = [h, w, l];
         line.location = location;
@@ -106,7 +106,7 @@ impl Calibration {
 
     /// Left, top, right, bottom of the projected corners of a camera-frame box, clipped to the image. Corners behind the camera count as
     /// 0.1 m in front of it.
-    fn image_box(&self, line: &KittiLine, image_size: [u32; 2]) -> [f64; 4] {
+    fn image_box(&self, line: &LabelBox, image_size: [u32; 2]) -> [f64; 4] {
         let [h, w, l] = line.size_hwl;
         let (s, c) = line.rotation_y.sin_cos();
         let mut bounds = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY];

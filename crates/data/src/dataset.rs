@@ -1,9 +1,9 @@
 //! A data set on disk: frames by id, in the LiDAR frame whatever the labels are written in.
 
 use crate::dataset_config::DatasetConfig;
-use crate::kitti_text::{KittiText, read_kitti_text};
-use crate::{Calibration, Cloud, DataError, Detection, Frame, KittiLine, LabelFrame, Object, PointColumns};
-use crate::{parse_pcd_header, read_cloud};
+use crate::layout::PointDetails;
+use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
+use geometry::Pose;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -26,11 +26,9 @@ impl Dataset {
             DatasetConfig::of_folder(path)?
         };
         let mut dataset = Dataset { config };
-        let clouds = dataset.config.root.join(dataset.config.layout.cloud_folder());
-        if !clouds.is_dir() {
-            return Err(DataError::file(&clouds, "does not exist: check root and layout of the data set"));
-        }
-        if dataset.config.points == PointColumns::Xyzi && !dataset.has_intensity()? {
+        let DatasetConfig { layout, root, points, .. } = &dataset.config;
+        layout.check_root(root)?;
+        if *points == PointColumns::Xyzi && !layout.has_intensity(root)? {
             dataset.config.points = PointColumns::Xyz;
         }
         if dataset.config.classes.is_empty() {
@@ -46,9 +44,8 @@ impl Dataset {
         let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(&path, "is not text"))?;
         let mut ids = Vec::new();
         for (line, id) in parse_split(text, &path)? {
-            let cloud = self.cloud_path(id);
-            if !cloud.is_file() {
-                let message = format!("frame {id} has no cloud: {} does not exist", cloud.display());
+            if !self.config.layout.has_cloud(&self.config.root, id) {
+                let message = format!("frame {id} has no cloud: {} does not exist", self.cloud_path(id).display());
                 return Err(DataError::line(&path, line, message));
             }
             ids.push(id.to_string());
@@ -73,43 +70,49 @@ impl Dataset {
         }
     }
 
-    /// The ids of all clouds of the folder, sorted.
+    /// The ids of all frames that have a cloud, sorted.
     pub fn all_ids(&self) -> Result<Vec<String>, DataError> {
-        let folder = self.config.root.join(self.config.layout.cloud_folder());
-        let mut ids = BTreeSet::new();
-        for entry in fs_err::read_dir(&folder)? {
-            let path = entry?.path();
-            let ending = path.extension().and_then(|e| e.to_str());
-            let (Some("bin" | "pcd"), Some(id)) = (ending, path.file_stem()) else { continue };
-            let id = id.to_str().ok_or_else(|| DataError::file(&path, "its name is not UTF-8"))?;
-            ids.insert(id.to_string());
-        }
-        if ids.is_empty() {
-            return Err(DataError::file(&folder, "has no .bin and no .pcd"));
-        }
-        Ok(ids.into_iter().collect())
+        self.config.layout.frame_ids(&self.config.root)
     }
 
     /// The file of a cloud; where there is none, the one that the layout would have.
     pub fn cloud_path(&self, id: &str) -> PathBuf {
-        let folder = self.config.root.join(self.config.layout.cloud_folder());
-        let [usual, other] = self.config.layout.endings().map(|ending| folder.join(format!("{id}.{ending}")));
-        if !usual.is_file() && other.is_file() { other } else { usual }
+        self.config.layout.cloud_path(&self.config.root, id)
     }
 
     /// The file of a frame's labels.
     pub fn labels_path(&self, id: &str) -> PathBuf {
-        self.config.root.join(self.config.layout.label_folder()).join(format!("{id}.txt"))
+        self.config.layout.labels_path(&self.config.root, id)
     }
 
-    /// The file of a frame's calibration.
-    pub fn calibration_path(&self, id: &str) -> PathBuf {
-        self.config.root.join("calib").join(format!("{id}.txt"))
+    /// The file of a frame's calibration, in layouts that can have one.
+    pub fn calibration_path(&self, id: &str) -> Option<PathBuf> {
+        self.config.layout.calibration_path(&self.config.root, id)
     }
 
-    /// The folder of labels exists. A data set without one (the testing part of KITTI) has frames without objects.
+    /// There are labels. A data set without them (the testing part of KITTI) has frames without objects.
     pub fn has_labels(&self) -> bool {
-        self.config.root.join(self.config.layout.label_folder()).is_dir()
+        self.config.layout.has_labels(&self.config.root)
+    }
+
+    /// When the frame was taken, s from a start that all frames share; `None` where not known.
+    pub fn stamp_s(&self, id: &str) -> Result<Option<f64>, DataError> {
+        self.config.layout.stamp_s(&self.config.root, id)
+    }
+
+    /// Pose of the LiDAR in a world that all frames share; `None` where not known.
+    pub fn world_from_lidar(&self, id: &str) -> Result<Option<Pose>, DataError> {
+        self.config.layout.world_from_lidar(&self.config.root, id)
+    }
+
+    /// What is known of the points of a frame's whole cloud beside place and intensity.
+    pub fn point_details(&self, id: &str) -> Result<PointDetails, DataError> {
+        self.config.layout.read_point_details(&self.config.root, id)
+    }
+
+    /// Number of points of a frame's whole cloud.
+    pub fn count_points(&self, id: &str) -> Result<usize, DataError> {
+        self.config.layout.count_points(&self.config.root, id, self.config.points)
     }
 
     /// Cloud and objects of a frame. DontCare and objects without a 3D box are left out.
@@ -134,26 +137,28 @@ impl Dataset {
 
     pub(crate) fn load_whole_cloud(&self, id: &str) -> Result<Cloud, DataError> {
         check_frame_id(id).map_err(|message| DataError::file(&self.config.root, message))?;
-        let path = self.cloud_path(id);
-        let cloud = read_cloud(&path, self.config.points)?;
+        let cloud = self.config.layout.read_cloud(&self.config.root, id, self.config.points)?;
         if cloud.channels != self.config.points.channels() {
-            return Err(DataError::file(&path, "has no intensity, though other clouds of this data set do"));
+            return Err(DataError::file(
+                &self.cloud_path(id),
+                "has no intensity, though other clouds of this data set do",
+            ));
         }
         Ok(cloud)
     }
 
-    /// The label lines of a frame as they are written, DontCare included.
-    pub fn labels(&self, id: &str) -> Result<Vec<KittiLine>, DataError> {
-        read_kitti_text(&self.labels_path(id), KittiText::Labels)
+    /// The labels of a frame in the label frame, DontCare included.
+    pub fn labels(&self, id: &str) -> Result<Vec<LabelBox>, DataError> {
+        self.config.layout.read_labels(&self.config.root, id)
     }
 
     /// The calibration of a frame.
     pub fn calibration(&self, id: &str) -> Result<Calibration, DataError> {
-        Calibration::read(&self.calibration_path(id))
+        self.config.layout.read_calibration(&self.config.root, id)
     }
 
-    /// Label lines of a frame as objects of the LiDAR frame.
-    pub fn objects(&self, id: &str, lines: &[KittiLine]) -> Result<Vec<Object>, DataError> {
+    /// Labels of a frame as objects of the LiDAR frame. DontCare and labels without a 3D box are left out.
+    pub fn objects(&self, id: &str, lines: &[LabelBox]) -> Result<Vec<Object>, DataError> {
         let mut lines = lines.iter().filter(|line| !line.is_dont_care() && line.has_box()).peekable();
         if lines.peek().is_none() {
             return Ok(Vec::new());
@@ -162,7 +167,7 @@ impl Dataset {
             LabelFrame::Camera => Some(self.calibration(id)?),
             LabelFrame::Lidar => None,
         };
-        let object = |line: &KittiLine| Object {
+        let object = |line: &LabelBox| Object {
             class: line.class.clone(),
             bbox: calibration.as_ref().map_or_else(|| line.lidar_box(), |c| c.lidar_box(line)).with_wrapped_yaw(),
             truncation: Some(line.truncation).filter(|v| *v >= 0.0),
@@ -172,30 +177,36 @@ impl Dataset {
         Ok(lines.map(object).collect())
     }
 
-    /// A detection as a line of KITTI text in the frame of this data set's labels.
-    pub fn detection_line(&self, id: &str, detection: &Detection) -> Result<KittiLine, DataError> {
-        Ok(self.detection_lines(id, std::slice::from_ref(detection))?.remove(0))
+    /// Labels of a frame's objects in the frame of this data set's labels, in their order.
+    pub fn label_boxes(&self, frame: &Frame) -> Result<Vec<LabelBox>, DataError> {
+        if self.config.label_frame == LabelFrame::Lidar {
+            return Ok(crate::write::label_boxes(frame));
+        }
+        let (calibration, size) = (self.calibration(&frame.id)?, self.config.image_size);
+        let label = |object: &Object| {
+            let mut label = calibration.camera_from_lidar_box(&object.class, &object.bbox, None, size);
+            label.truncation = object.truncation.unwrap_or(-1.0);
+            label.occlusion = object.occlusion.map_or(-1.0, f64::from);
+            label
+        };
+        Ok(frame.objects.iter().map(label).collect())
     }
 
-    /// The detections of a frame as lines of KITTI text in the frame of this data set's labels, in their order.
-    pub fn detection_lines(&self, id: &str, detections: &[Detection]) -> Result<Vec<KittiLine>, DataError> {
-        let line: Box<dyn Fn(&Detection) -> KittiLine> = match self.config.label_frame {
-            LabelFrame::Lidar => Box::new(|d| KittiLine::from_box(&d.class, &d.bbox, Some(d.score))),
+    /// A detection in the frame of this data set's labels.
+    pub fn detection_box(&self, id: &str, detection: &Detection) -> Result<LabelBox, DataError> {
+        Ok(self.detection_boxes(id, std::slice::from_ref(detection))?.remove(0))
+    }
+
+    /// The detections of a frame in the frame of this data set's labels, in their order.
+    pub fn detection_boxes(&self, id: &str, detections: &[Detection]) -> Result<Vec<LabelBox>, DataError> {
+        let line: Box<dyn Fn(&Detection) -> LabelBox> = match self.config.label_frame {
+            LabelFrame::Lidar => Box::new(|d| LabelBox::from_box(&d.class, &d.bbox, Some(d.score))),
             LabelFrame::Camera => {
                 let (calibration, size) = (self.calibration(id)?, self.config.image_size);
                 Box::new(move |d| calibration.camera_from_lidar_box(&d.class, &d.bbox, Some(d.score), size))
             }
         };
         Ok(detections.iter().map(line).collect())
-    }
-
-    /// What the first cloud says, for a `.pcd`; a `.bin` says nothing and is believed.
-    fn has_intensity(&self) -> Result<bool, DataError> {
-        let path = self.cloud_path(&self.all_ids()?[0]);
-        if path.extension().is_some_and(|e| e == "bin") {
-            return Ok(true);
-        }
-        Ok(parse_pcd_header(&fs_err::read(&path)?, &path)?.has_intensity())
     }
 
     fn default_classes(&self) -> Result<Vec<String>, DataError> {
@@ -238,7 +249,7 @@ fn check_frame_id(id: &str) -> Result<(), String> {
 mod tests {
     use super::*;
     use crate::Layout;
-    use crate::write::{write_dataset_toml, write_frame, write_split};
+    use crate::write::{write_dataset_toml, write_split};
     use geometry::Box3;
 
     fn frame(id: &str, channels: usize) -> Frame {
@@ -257,7 +268,7 @@ mod tests {
     fn made_up(layout: Layout, channels: usize) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         for id in ["000000", "000001"] {
-            write_frame(folder.path(), layout, &frame(id, channels)).unwrap();
+            layout.write_frame(folder.path(), &frame(id, channels)).unwrap();
         }
         write_split(&folder.path().join("ImageSets/train.txt"), &["000001", "000000"]).unwrap();
         let points = if channels == 4 { PointColumns::Xyzi } else { PointColumns::Xyz };
@@ -365,7 +376,7 @@ mod tests {
         let detection = Detection { class: "Car".into(), bbox: frame("", 3).objects[0].bbox, score: 0.75 };
         for label_frame in ["lidar", "camera"] {
             let dataset = with_toml(folder.path(), &format!("label_frame = \"{label_frame}\"")).unwrap();
-            let line = dataset.detection_line("000000", &detection).unwrap();
+            let line = dataset.detection_box("000000", &detection).unwrap();
             assert_eq!((line.score, line.truncation), (Some(0.75), -1.0));
             let back = dataset.objects("000000", &[line]).unwrap()[0].bbox.to_array();
             assert!(back.iter().zip(detection.bbox.to_array()).all(|(a, b)| (a - b).abs() < 1e-9), "{label_frame}");

@@ -1,48 +1,11 @@
 //! What a data set's TOML may say, and what holds where it says nothing.
 
 use crate::toml_text::{parse_toml, read_text};
-use crate::{DataError, LabelFrame, PointColumns};
+use crate::{DataError, LabelFrame, Layout, PointColumns};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-
-/// Where the files lie below the root.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Layout {
-    /// `velodyne/*.bin`, `label_2/*.txt` and, where there is a camera, `calib/*.txt`.
-    #[default]
-    Kitti,
-    /// `data/pcl/*.pcd` and `data/label/*.txt`, without calibration.
-    S2rDad,
-}
-
-impl Layout {
-    /// The folder of the clouds, relative to the root.
-    pub fn cloud_folder(self) -> &'static str {
-        match self {
-            Layout::Kitti => "velodyne",
-            Layout::S2rDad => "data/pcl",
-        }
-    }
-
-    /// The folder of the labels, relative to the root.
-    pub fn label_folder(self) -> &'static str {
-        match self {
-            Layout::Kitti => "label_2",
-            Layout::S2rDad => "data/label",
-        }
-    }
-
-    /// The usual ending of a cloud first, then the other one.
-    pub(crate) fn endings(self) -> [&'static str; 2] {
-        match self {
-            Layout::Kitti => ["bin", "pcd"],
-            Layout::S2rDad => ["pcd", "bin"],
-        }
-    }
-}
 
 /// A data set: files, frame of the labels, classes, splits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -129,33 +92,18 @@ impl DatasetConfig {
         Ok(config)
     }
 
-    /// What a folder without a TOML is: KITTI (itself or in `training/` below it), or S2R-DAD.
+    /// What a folder without a TOML is: the first layout that knows it.
     pub fn of_folder(folder: &Path) -> Result<Self, DataError> {
-        let holds = |layout: Layout, root: &Path| root.join(layout.cloud_folder()).is_dir();
-        let with = |layout, root: &Path| DatasetConfig { layout, root: root.into(), ..DatasetConfig::default() };
-        let training = folder.join("training");
-        let mut config = if holds(Layout::Kitti, folder) {
-            with(Layout::Kitti, folder)
-        } else if holds(Layout::Kitti, &training) {
-            let mut config = with(Layout::Kitti, &training);
-            config.name = folder_name(folder);
-            // Above `training/` lie the lists of the whole benchmark, whose `test.txt` speaks of the frames of `testing/`.
-            for name in ["train", "val"] {
-                let list = PathBuf::from(format!("../ImageSets/{name}.txt"));
-                if training.join(&list).is_file() {
-                    config.splits.insert(name.into(), list);
-                }
+        let Some(mut config) = Layout::ALL.iter().find_map(|layout| layout.recognise(folder)) else {
+            if !folder.is_dir() {
+                return Err(DataError::file(folder, "does not exist; a data set is a folder or its TOML"));
             }
-            config
-        } else if holds(Layout::S2rDad, folder) {
-            with(Layout::S2rDad, folder)
-        } else if folder.is_dir() {
-            return Err(DataError::file(
-                folder,
-                "is no data set: it has neither dataset.toml nor velodyne/ (KITTI), training/velodyne/ or data/pcl/ (S2R-DAD)",
-            ));
-        } else {
-            return Err(DataError::file(folder, "does not exist; a data set is a folder or its TOML"));
+            let signs: Vec<&str> = Layout::ALL.iter().flat_map(|layout| layout.signs()).copied().collect();
+            let signs = match &signs[..] {
+                [others @ .., last] if !others.is_empty() => format!("{} or {last}", others.join(", ")),
+                signs => signs.concat(),
+            };
+            return Err(DataError::file(folder, format!("is no data set: it has neither dataset.toml nor {signs}")));
         };
         config.fill_in(true, true);
         Ok(config)
@@ -165,8 +113,8 @@ impl DatasetConfig {
         if self.name.is_empty() {
             self.name = folder_name(&self.root);
         }
-        if label_frame_unsaid && self.layout == Layout::Kitti && self.root.join("calib").is_dir() {
-            self.label_frame = LabelFrame::Camera;
+        if label_frame_unsaid {
+            self.label_frame = self.layout.usual_label_frame(&self.root);
         }
         if fov_crop_unsaid {
             self.fov_crop = self.label_frame == LabelFrame::Camera;
@@ -186,13 +134,14 @@ impl DatasetConfig {
         if self.image_size.contains(&0) {
             return wrong(format!("image_size {:?} px has no pixel", self.image_size));
         }
-        if self.layout == Layout::S2rDad && self.label_frame == LabelFrame::Camera {
-            return wrong(
-                "label_frame = \"camera\" needs a calibration, which the layout s2r_dad does not have".into(),
-            );
-        }
-        if self.layout == Layout::S2rDad && self.fov_crop {
-            return wrong("fov_crop needs a calibration, which the layout s2r_dad does not have".into());
+        if !self.layout.knows_camera() {
+            let without = format!("needs a calibration, which the layout {} does not have", self.layout.name());
+            if self.label_frame == LabelFrame::Camera {
+                return wrong(format!("label_frame = \"camera\" {without}"));
+            }
+            if self.fov_crop {
+                return wrong(format!("fov_crop {without}"));
+            }
         }
         for (i, class) in self.classes.iter().enumerate() {
             if class.is_empty()
@@ -207,7 +156,7 @@ impl DatasetConfig {
     }
 }
 
-fn folder_name(folder: &Path) -> String {
+pub(crate) fn folder_name(folder: &Path) -> String {
     let name = |p: &Path| p.file_name().map(|n| n.to_string_lossy().into_owned());
     name(folder).or_else(|| name(&folder.canonicalize().ok()?)).unwrap_or_else(|| "data set".into())
 }

@@ -164,8 +164,8 @@ fn cache_key(dataset: &Dataset, ids: &[String], classes: &[String], config: &GtS
         format!("{MAGIC:?} {root:?} {:?} {classes:?} {} {}\n", dataset.config, config.min_points, config.drop_too_hard);
     for id in ids {
         write!(text, "{id}").expect("a String takes all");
-        for path in [dataset.cloud_path(id), dataset.labels_path(id), dataset.calibration_path(id)] {
-            let state = std::fs::metadata(path).ok().map(|m| (m.len(), m.modified().ok()));
+        for path in [Some(dataset.cloud_path(id)), Some(dataset.labels_path(id)), dataset.calibration_path(id)] {
+            let state = path.and_then(|path| std::fs::metadata(path).ok()).map(|m| (m.len(), m.modified().ok()));
             write!(text, " {state:?}").expect("a String takes all");
         }
         text.push('\n');
@@ -178,8 +178,7 @@ fn cache_key(dataset: &Dataset, ids: &[String], classes: &[String], config: &GtS
 mod tests {
     use super::*;
     use crate::augment::sample_gt;
-    use crate::write::write_kitti_frame;
-    use crate::{Cloud, stream};
+    use crate::{Cloud, Layout, stream};
     use geometry::bev_intersection;
 
     /// Cars of twelve points in a row; every frame has its row elsewhere.
@@ -207,7 +206,7 @@ mod tests {
     fn data_set() -> (tempfile::TempDir, Dataset, Vec<String>) {
         let folder = tempfile::tempdir().unwrap();
         for row in 0..5 {
-            write_kitti_frame(folder.path(), &frame(row, 6)).unwrap();
+            Layout::Kitti.write_frame(folder.path(), &frame(row, 6)).unwrap();
         }
         let dataset = Dataset::open(folder.path()).unwrap();
         let ids = dataset.all_ids().unwrap();

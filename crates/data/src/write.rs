@@ -1,8 +1,7 @@
 //! Files appear whole or not at all: temporary file in the same folder, sync, rename.
 
-use crate::dataset_config::{DatasetConfig, Layout};
 use crate::kitti_text::to_kitti_text;
-use crate::{Cloud, DataError, Frame, KittiLine, PcdEncoding, encode_pcd};
+use crate::{Cloud, DataError, DatasetConfig, Frame, LabelBox, PcdEncoding, encode_pcd};
 use serde::Serialize;
 use std::io::Write as _;
 use std::path::Path;
@@ -62,41 +61,21 @@ pub fn write_pcd(path: &Path, cloud: &Cloud, encoding: PcdEncoding) -> Result<()
     write_atomic(path, &encode_pcd(cloud, encoding))
 }
 
-/// Label lines of a frame in the label frame "lidar": KITTI's columns, location = box centre, rotation = yaw counter-clockwise from +x.
-pub fn label_lines(frame: &Frame) -> Vec<KittiLine> {
-    let line = |object: &crate::Object| {
-        let mut line = KittiLine::from_box(&object.class, &object.bbox, None);
-        line.truncation = object.truncation.unwrap_or(line.truncation);
-        line.occlusion = object.occlusion.map_or(line.occlusion, f64::from);
-        line.image_box = object.image_box.unwrap_or(line.image_box);
-        line
+/// Labels of a frame in the label frame "lidar": location = box centre, rotation = yaw counter-clockwise from +x.
+pub fn label_boxes(frame: &Frame) -> Vec<LabelBox> {
+    let label = |object: &crate::Object| {
+        let mut label = LabelBox::from_box(&object.class, &object.bbox, None);
+        label.truncation = object.truncation.unwrap_or(label.truncation);
+        label.occlusion = object.occlusion.map_or(label.occlusion, f64::from);
+        label.image_box = object.image_box.unwrap_or(label.image_box);
+        label
     };
-    frame.objects.iter().map(line).collect()
+    frame.objects.iter().map(label).collect()
 }
 
-/// KITTI text, one line each.
-pub fn write_kitti_text(path: &Path, lines: &[KittiLine]) -> Result<(), DataError> {
-    write_atomic(path, to_kitti_text(lines).as_bytes())
-}
-
-/// One frame in the KITTI layout: `velodyne/ID.bin` and `label_2/ID.txt`, labels in the label frame "lidar".
-pub fn write_kitti_frame(root: &Path, frame: &Frame) -> Result<(), DataError> {
-    write_bin(&root.join(format!("velodyne/{}.bin", frame.id)), &frame.cloud)?;
-    write_kitti_text(&root.join(format!("label_2/{}.txt", frame.id)), &label_lines(frame))
-}
-
-/// One frame in the S2R-DAD layout: `data/pcl/ID.pcd` and `data/label/ID.txt`, labels in the label frame "lidar".
-pub fn write_s2r_dad_frame(root: &Path, frame: &Frame, encoding: PcdEncoding) -> Result<(), DataError> {
-    write_pcd(&root.join(format!("data/pcl/{}.pcd", frame.id)), &frame.cloud, encoding)?;
-    write_kitti_text(&root.join(format!("data/label/{}.txt", frame.id)), &label_lines(frame))
-}
-
-/// One frame in either layout; PCD in its binary form.
-pub fn write_frame(root: &Path, layout: Layout, frame: &Frame) -> Result<(), DataError> {
-    match layout {
-        Layout::Kitti => write_kitti_frame(root, frame),
-        Layout::S2rDad => write_s2r_dad_frame(root, frame, PcdEncoding::Binary),
-    }
+/// KITTI text, a line a box.
+pub fn write_kitti_text(path: &Path, labels: &[LabelBox]) -> Result<(), DataError> {
+    write_atomic(path, to_kitti_text(labels).as_bytes())
 }
 
 /// A data set's TOML; the file name that [`crate::Dataset::open`] looks for in a folder is `dataset.toml`.

@@ -49,6 +49,19 @@ pub enum Verdict {
     NotScenarioIdentical,
 }
 
+impl Verdict {
+    /// The verdict of findings on data that could be compared.
+    pub fn of(findings: &[Finding]) -> Self {
+        let named = findings.iter().filter(|f| f.status == Status::Named).count();
+        match (findings.len(), named) {
+            (0, _) => Verdict::NothingFound,
+            (all, named) if all == named => Verdict::Explained,
+            (_, 0) => Verdict::Unexplained,
+            _ => Verdict::PartlyExplained,
+        }
+    }
+}
+
 /// Ids of the frames by role.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct FrameRoles {
@@ -211,19 +224,6 @@ pub struct Considered {
     pub z: f64,
     /// `chosen`, or the reason why not.
     pub outcome: String,
-}
-
-impl Verdict {
-    /// What follows from the numbers of findings and of those with a name.
-    pub fn of(findings: &[Finding]) -> Self {
-        let named = findings.iter().filter(|f| f.status == Status::Named).count();
-        match (findings.len(), named) {
-            (0, _) => Verdict::NothingFound,
-            (all, named) if all == named => Verdict::Explained,
-            (_, 0) => Verdict::Unexplained,
-            _ => Verdict::PartlyExplained,
-        }
-    }
 }
 
 /// The JSON schema of the file, as docs/src/reference/diagnosis.schema.json has it.

@@ -1,18 +1,18 @@
 //! KITTI AP of a validation set: 3,769 frames with ten detections each, on one core.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use data::{KittiLine, stream};
+use data::{LabelBox, stream};
 use lidarshift_eval::{EvalFrame, EvalOptions, evaluate};
 use rand::RngExt;
 
 fn frames() -> Vec<EvalFrame> {
     let mut rng = stream(1, "bench", 0, 0);
     let mut frame = |i: usize| {
-        let labels: Vec<KittiLine> = (0..8)
+        let labels: Vec<LabelBox> = (0..8)
             .map(|k| {
                 let class = ["Car", "Car", "Car", "Pedestrian", "Cyclist", "Van", "Car", "Car"][k];
                 let top = rng.random_range(100.0..200.0);
-                KittiLine {
+                LabelBox {
                     class: class.into(),
                     truncation: 0.0,
                     occlusion: f64::from(k as u32 % 3),
@@ -22,6 +22,7 @@ fn frames() -> Vec<EvalFrame> {
                     location: [4.0 * k as f64, 1.7, rng.random_range(5.0..60.0)],
                     rotation_y: rng.random_range(-3.0..3.0),
                     score: None,
+                    track: None,
                 }
             })
             .collect();

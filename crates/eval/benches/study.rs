@@ -1,11 +1,12 @@
-//! What a study computes beside its trainings: t-SNE, Chamfer and earth mover's distance, and a matrix of 16 cells.
+//! The evaluation work of a study besides training: t-SNE, Chamfer and earth mover's distance, and a matrix of 16
+//! cells.
 //!
-//! `cargo bench -p lidarshift-eval --bench study [-- FOLDER]`: with a folder the inputs are written there, for `study.py`, which times
-//! scikit-learn, openTSNE, SciPy, POT and Open3D on the same numbers.
+//! `cargo bench -p lidarshift-eval --bench study [-- FOLDER]`: if a folder is given, the inputs are written there for
+//! `study.py`, which times scikit-learn, openTSNE, SciPy, POT and Open3D on the same inputs.
 
 #![expect(clippy::print_stdout, reason = "times go to stdout")]
 
-use data::{KittiLine, LabelFrame, stream};
+use data::{LabelBox, LabelFrame, stream};
 use geometry::Box3;
 use lidarshift_eval::EvalFrame;
 use lidarshift_eval::distance::{Point, chamfer, emd};
@@ -24,7 +25,7 @@ const VECTORS: usize = 10_000;
 const DIM: usize = 128;
 
 fn main() {
-    let folder = std::env::args().skip(1).find(|word| !word.starts_with('-')).map(PathBuf::from);
+    let folder = std::env::args().skip(1).find(|arg| !arg.starts_with('-')).map(PathBuf::from);
     let keep = |name: &str, values: &[f32]| {
         if let Some(folder) = &folder {
             let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -87,7 +88,7 @@ fn vectors() -> Vec<f32> {
     (0..VECTORS * DIM).map(value).collect()
 }
 
-/// Four train sets on four test sets, one run each.
+/// Four train sets times four test sets, one run each.
 fn matrix() -> usize {
     let places: Vec<Place> = (0..4).map(|i| Place::new(&format!("set {i}"))).collect();
     let network = PlannedNetwork { network: Place::new("network"), train_sets: places.clone(), seeds: vec![1] };
@@ -104,7 +105,7 @@ fn matrix() -> usize {
     build(&plan, &results, &options).cells.len()
 }
 
-/// Three cars, found with errors, and two false alarms.
+/// Three cars detected with box errors, and two false positives.
 fn frame(k: u64, run: u64) -> EvalFrame {
     let mut random = stream(run, "study bench frames", 0, k);
     let mut frame = EvalFrame { id: k.to_string(), labels: Vec::new(), detections: Vec::new() };
@@ -112,11 +113,11 @@ fn frame(k: u64, run: u64) -> EvalFrame {
         let mut places = stream(0, "study bench places", i, k);
         let mut car = [places.random_range(-90.0..90.0), places.random_range(-30.0..30.0), 0.0, 4.9, 1.9, 1.2, 0.1];
         if i < 3 {
-            frame.labels.push(KittiLine::from_box("Car", &Box3::from_array(car), None));
+            frame.labels.push(LabelBox::from_box("Car", &Box3::from_array(car), None));
         }
         car[0] += random.random_range(-0.6..0.6);
         car[1] += random.random_range(-0.2..0.2);
-        frame.detections.push(KittiLine::from_box("Car", &Box3::from_array(car), Some(random.random())));
+        frame.detections.push(LabelBox::from_box("Car", &Box3::from_array(car), Some(random.random())));
     }
     frame
 }

@@ -1,5 +1,5 @@
-//! What is behind the average precision of one run on one test set: the errors of its boxes, what its scores mean, and where the
-//! ground truths are that it does not find.
+//! Analysis of one run on one test set beyond average precision: box errors, score calibration, and AP by distance,
+//! heading, number of points and overlap.
 
 mod calibration;
 mod errors;
@@ -17,29 +17,29 @@ use data::LabelFrame;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Version of [`RunAnalysis`] as JSON.
+/// Schema version of [`RunAnalysis`] as JSON.
 pub const ANALYSIS_SCHEMA: &str = "lidarshift.run_analysis/1";
 
-/// What is looked at.
+/// Settings of the analysis.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AnalysisOptions {
-    /// Class, compared without regard to case.
+    /// Class name, compared case-insensitively.
     pub class: String,
-    /// The frame of labels and detections.
+    /// Coordinate frame of labels and detections.
     pub label_frame: LabelFrame,
-    /// 3D overlap that a hit has to exceed, for everything but the errors.
+    /// 3D IoU that a true positive has to exceed. Not used for the box errors.
     pub overlap: f64,
-    /// Ground truth and detections whose centre is farther away on the ground are ignored, m.
+    /// Ground truth and detections whose centre is farther away on the ground plane are ignored, m.
     pub max_range_m: f64,
-    /// Sections of distance for the errors.
+    /// Range sections for which box errors are reported.
     pub sections: Vec<RangeSection>,
-    /// For the errors and the repairs, a detection and a ground truth are a pair when their centres are at most so far apart on the
-    /// ground, m. A limit on the overlap would cut the errors off.
+    /// Box errors and oracle repairs: a detection and a ground truth form a pair if their centres are at most this far
+    /// apart on the ground plane, m. An IoU limit would truncate the error distribution.
     pub pair_distance_m: f64,
-    /// Detections with a lower score are left out of the errors.
+    /// Detections with a lower score are excluded from the box errors.
     pub least_score: f64,
-    /// Width of the steps of distance, m.
+    /// Bin width for AP by distance, m.
     pub step_m: f64,
 }
 
@@ -58,30 +58,30 @@ impl Default for AnalysisOptions {
     }
 }
 
-/// Everything about one run on one test set.
+/// Analysis of one run on one test set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunAnalysis {
     /// [`ANALYSIS_SCHEMA`].
     pub schema: String,
-    /// By which rules.
+    /// Settings used.
     pub options: AnalysisOptions,
-    /// Errors of the boxes.
+    /// Errors of the predicted boxes.
     pub errors: BoxErrors,
-    /// What scores mean.
+    /// Score calibration.
     pub calibration: Calibration,
-    /// AP against the distance on the ground.
+    /// AP by ground-plane distance.
     pub by_distance: Vec<Stratum>,
-    /// AP against the heading relative to the ray from the sensor, degrees.
+    /// AP by heading relative to the ray from the sensor, degrees.
     pub by_heading: Vec<Stratum>,
-    /// AP against the number of points in the box; empty without clouds.
+    /// AP by number of points in the box; empty if no clouds were given.
     pub by_points: Vec<Stratum>,
-    /// AP against the overlap that is asked for.
+    /// AP by IoU threshold.
     pub by_overlap: Vec<Stratum>,
-    /// What AP becomes when a component of the boxes is set to the truth.
+    /// AP after replacing one component of the predicted boxes with the ground truth.
     pub oracle: Vec<Repair>,
 }
 
-/// Analyses one run. `points` are the numbers of points in the boxes of each frame, where clouds are at hand.
+/// Analyses one run. `points` holds the number of points in each box of each frame, if clouds are available.
 pub fn analyse(frames: &[EvalFrame], points: Option<&[BoxPoints]>, options: &AnalysisOptions) -> RunAnalysis {
     RunAnalysis {
         schema: ANALYSIS_SCHEMA.into(),

@@ -1,22 +1,22 @@
-//! Intervals by drawing again with replacement (the bootstrap's percentiles), from named streams.
+//! Bootstrap percentile intervals, drawn from named random streams.
 
 use data::stream;
-use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::{draw, draw_runs, quantile_linear};
 
-/// How intervals are drawn.
+/// Bootstrap settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BootstrapOptions {
-    /// Draws; 0: no intervals.
+    /// Number of replicates; 0: no intervals.
     pub replicates: usize,
-    /// Share of the draws inside an interval.
+    /// Confidence level, 0 to 1.
     pub level: f64,
-    /// Seed of the draws.
+    /// Random seed.
     pub seed: u64,
-    /// Frames are drawn in runs of so many that follow each other. Frames of one drive resemble their neighbours, and intervals
-    /// over single frames (1) are then too narrow.
+    /// Block length: frames are resampled in blocks of this many consecutive frames. Consecutive frames of a drive are
+    /// correlated; resampling single frames (1) gives intervals that are too narrow.
     pub block_frames: usize,
 }
 
@@ -26,7 +26,7 @@ impl Default for BootstrapOptions {
     }
 }
 
-/// From low to high.
+/// A confidence interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Interval {
     /// Lower end.
@@ -36,30 +36,19 @@ pub struct Interval {
 }
 
 impl BootstrapOptions {
-    /// How often each of `n_frames` frames is drawn. Equal purposes give equal draws, so that what is compared on the same frames
-    /// is drawn alike.
+    /// How often each of `n_frames` frames is drawn in a replicate. Equal purposes give equal draws, so comparisons on
+    /// the same frames use the same resamples.
     pub(crate) fn frame_weights(&self, purpose: &str, replicate: usize, n_frames: usize) -> Vec<u32> {
-        let mut rng = stream(self.seed, purpose, 0, replicate as u64);
-        let mut weights = vec![0; n_frames];
-        let block = self.block_frames.clamp(1, n_frames.max(1));
-        let mut left = n_frames;
-        while left > 0 {
-            let first = rng.random_range(0..n_frames);
-            for i in 0..block.min(left) {
-                weights[(first + i) % n_frames] += 1;
-            }
-            left -= block.min(left);
-        }
-        weights
+        draw_runs(n_frames, self.block_frames, &mut stream(self.seed, purpose, 0, replicate as u64))
     }
 
-    /// `n` draws out of `n`.
+    /// Resamples `n` indices with replacement.
     pub(crate) fn draws(&self, purpose: &str, replicate: usize, n: usize) -> Vec<usize> {
-        let mut rng = stream(self.seed, purpose, 0, replicate as u64);
-        (0..n).map(|_| rng.random_range(0..n)).collect()
+        draw(n, &mut stream(self.seed, purpose, 0, replicate as u64))
     }
 
-    /// The middle `level` of the values. `None` with fewer than 20 defined values, or where more than one in twenty is undefined (NaN).
+    /// Percentile interval at `level`. `None` with fewer than 20 defined values, or if more than 5 % are undefined
+    /// (NaN).
     pub(crate) fn interval(&self, mut values: Vec<f64>) -> Option<Interval> {
         let all = values.len();
         values.retain(|v| !v.is_nan());
@@ -68,44 +57,22 @@ impl BootstrapOptions {
         }
         values.sort_by(f64::total_cmp);
         let outside = (1.0 - self.level) / 2.0;
-        Some(Interval { low: quantile(&values, outside), high: quantile(&values, 1.0 - outside) })
+        Some(Interval { low: quantile_linear(&values, outside), high: quantile_linear(&values, 1.0 - outside) })
     }
-}
-
-/// The value that a share of all does not exceed, linear between neighbours; NaN of nothing.
-pub(crate) fn quantile(sorted: &[f64], share: f64) -> f64 {
-    let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
-    let at = share.clamp(0.0, 1.0) * last as f64;
-    let (low, part) = (at.floor() as usize, at.fract());
-    sorted[low] + part * (sorted[(low + 1).min(last)] - sorted[low])
-}
-
-/// Arithmetic mean; NaN of nothing.
-pub(crate) fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
-}
-
-/// Standard deviation with divisor n, the number of values.
-pub(crate) fn deviation(values: &[f64]) -> f64 {
-    let center = mean(values);
-    (values.iter().map(|v| (v - center) * (v - center)).sum::<f64>() / values.len() as f64).sqrt()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rand::RngExt;
+    use statistics::mean;
 
     #[test]
-    fn every_draw_has_as_many_frames() {
-        for block_frames in [1, 7, 1000] {
-            let options = BootstrapOptions { block_frames, ..BootstrapOptions::default() };
-            let weights = options.frame_weights("test", 3, 100);
-            assert_eq!(weights.iter().sum::<u32>(), 100);
-            assert_eq!(weights, options.frame_weights("test", 3, 100));
-            let all = block_frames >= 100; // every draw is then all frames, once
-            assert_eq!(weights == options.frame_weights("test", 4, 100), all);
-        }
-        assert!(BootstrapOptions::default().frame_weights("test", 0, 0).is_empty());
+    fn equal_purposes_draw_alike() {
+        let options = BootstrapOptions { block_frames: 7, ..BootstrapOptions::default() };
+        let weights = options.frame_weights("test", 3, 100);
+        assert_eq!(weights, options.frame_weights("test", 3, 100));
+        assert_ne!(weights, options.frame_weights("test", 4, 100));
     }
 
     #[test]
@@ -125,11 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn quantiles_and_deviations() {
-        assert_eq!(quantile(&[1.0, 2.0, 4.0], 0.75), 3.0);
-        assert_eq!(quantile(&[5.0], 0.1), 5.0);
-        assert!(quantile(&[], 0.5).is_nan());
-        assert_eq!(deviation(&[1.0, 3.0]), 1.0);
+    fn few_or_undefined_values_have_no_interval() {
         let options = BootstrapOptions::default();
         assert!(options.interval(vec![1.0; 5]).is_none());
         assert!(options.interval([vec![1.0; 30], vec![f64::NAN; 30]].concat()).is_none());

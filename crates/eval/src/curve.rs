@@ -1,21 +1,22 @@
-//! Precision over recall, and the average precisions that are read off it.
+//! Precision-recall curves and the average precisions computed from them.
 
 use crate::matching::Counts;
 
 /// Recall positions of the KITTI curve.
 const POINTS: usize = 41;
 
-/// Counts as the score limit falls.
+/// Counts as the score threshold falls.
 pub(crate) struct CountsByScore {
-    /// Each distinct score at which something changes, falling, with the counts of all detections of at least this score.
+    /// Each distinct score at which the counts change, descending, with the counts of all detections of at least that
+    /// score.
     points: Vec<(f64, Counts)>,
     nothing: Counts,
 }
 
 impl CountsByScore {
-    /// From what changes in single frames at a score, in any order of scores. `n_gt` ground truths are missed at first.
+    /// From the count changes of single frames per score, in any order. Starts with all `n_gt` ground truths missed.
     pub(crate) fn new(mut changes: Vec<(f64, Counts)>, n_gt: i64) -> Self {
-        changes.sort_by(|a, b| b.0.total_cmp(&a.0)); // stable, hence the order of the frames for equal scores
+        changes.sort_by(|a, b| b.0.total_cmp(&a.0)); // stable, so equal scores keep the frame order
         let nothing = Counts { fn_: n_gt, ..Counts::default() };
         let mut points: Vec<(f64, Counts)> = Vec::new();
         let mut now = nothing;
@@ -29,7 +30,7 @@ impl CountsByScore {
         CountsByScore { points, nothing }
     }
 
-    /// With the detections of at least this score.
+    /// Counts of the detections with at least this score.
     fn at(&self, least_score: f64) -> Counts {
         match self.points.partition_point(|(score, _)| *score >= least_score) {
             0 => self.nothing,
@@ -37,13 +38,14 @@ impl CountsByScore {
         }
     }
 
-    /// With all detections.
+    /// Counts of all detections.
     pub(crate) fn all(&self) -> Counts {
         self.points.last().map_or(self.nothing, |(_, counts)| *counts)
     }
 
-    /// Area under precision (or `similarity` in the place of the hits) over recall, in percent, with a point at every distinct
-    /// score: at each recall the highest precision at that recall or beyond. Points of 0/0 are left out. 0 without ground truth.
+    /// Area under precision (or orientation similarity if `similarity`) over recall, percent, with a point at every
+    /// distinct score and precision interpolated as the maximum at equal or higher recall. Points with 0/0 are
+    /// skipped. 0 without ground truth.
     pub(crate) fn exact_area(&self, n_gt: i64, similarity: bool) -> f64 {
         let point = |(_, c): &(f64, Counts)| (c.tp, share(c, similarity));
         let mut points: Vec<(i64, f64)> = self.points.iter().map(point).filter(|(_, p)| !p.is_nan()).collect();
@@ -58,26 +60,26 @@ impl CountsByScore {
     }
 }
 
-/// Precision, or orientation similarity over all detections; NaN for 0/0.
+/// Precision, or orientation similarity divided by the number of detections; NaN for 0/0.
 fn share(c: &Counts, similarity: bool) -> f64 {
     let part = if similarity { c.similarity } else { c.tp as f64 };
     part / (c.tp + c.fp) as f64
 }
 
-/// KITTI's curve of 41 points.
+/// KITTI's precision-recall curve with 41 points.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct PrecisionCurve {
-    /// Score limits, falling, at most 41.
+    /// Score thresholds, descending, at most 41.
     pub thresholds: Vec<f64>,
-    /// At each of them, with all detections of at least this score.
+    /// Counts of the detections with at least each threshold.
     pub counts: Vec<Counts>,
-    /// 41 values: precision (orientation similarity for aos) after the running maximum from the right; 0 where no score limit
-    /// reaches the recall, NaN where the maximum runs over a 0/0.
+    /// 41 values: precision (orientation similarity for AOS) after the running maximum from the right; 0 for recalls
+    /// that no threshold reaches, NaN where the running maximum includes 0/0.
     pub precision: Vec<f64>,
 }
 
 impl PrecisionCurve {
-    /// From the scores of the hits of the first pass and the counts of the second.
+    /// From the true-positive scores of the first pass and the counts of the second.
     pub(crate) fn new(hit_scores: &[f64], n_gt: i64, counts: &CountsByScore, similarity: bool) -> Self {
         let thresholds = score_thresholds(hit_scores, n_gt);
         let counts: Vec<Counts> = thresholds.iter().map(|t| counts.at(*t)).collect();
@@ -91,17 +93,17 @@ impl PrecisionCurve {
         PrecisionCurve { thresholds, counts, precision }
     }
 
-    /// Mean of the points 0, 4, ..., 40 in percent; `None` where one of them is 0/0.
+    /// Mean of the points 0, 4, ..., 40, percent; `None` if one of them is 0/0.
     pub fn ap11(&self) -> Option<f64> {
         mean_percent(self.precision.iter().step_by(4), 11.0)
     }
 
-    /// Mean of the points 1 to 40 in percent; `None` where one of them is 0/0.
+    /// Mean of the points 1 to 40, percent; `None` if one of them is 0/0.
     pub fn ap40(&self) -> Option<f64> {
         mean_percent(self.precision.iter().skip(1), 40.0)
     }
 
-    /// Points of the curve with neither a hit nor a false alarm.
+    /// Number of curve points with neither true nor false positives.
     pub fn undefined_points(&self) -> usize {
         self.counts.iter().filter(|c| c.tp + c.fp == 0).count()
     }
@@ -111,7 +113,7 @@ fn mean_percent<'a>(values: impl Iterator<Item = &'a f64>, n: f64) -> Option<f64
     Some(values.sum::<f64>() / n * 100.0).filter(|mean| !mean.is_nan())
 }
 
-/// The score limits that come closest to the recalls 0, 1/40, ..., 1. The last hit always gives one.
+/// Score thresholds closest to the recalls 0, 1/40, ..., 1. The lowest-scoring true positive always adds one.
 fn score_thresholds(hit_scores: &[f64], n_gt: i64) -> Vec<f64> {
     let mut scores = hit_scores.to_vec();
     scores.sort_by(|a, b| b.total_cmp(a));
@@ -130,8 +132,8 @@ fn score_thresholds(hit_scores: &[f64], n_gt: i64) -> Vec<f64> {
     thresholds
 }
 
-/// The most that AP40 can be with so many ground truths, in percent: (n - 1) / 40 of it, since each hit gives one point of the
-/// curve and the first point does not count. `None` without ground truth.
+/// Upper bound of AP40 with `n_gt` ground truths, percent: (n - 1) / 40, since each true positive yields one curve
+/// point and the first point is not averaged. `None` without ground truth.
 pub fn ceiling_ap40(n_gt: i64) -> Option<f64> {
     (n_gt > 0).then(|| (n_gt - 1).min(40) as f64 / 40.0 * 100.0)
 }

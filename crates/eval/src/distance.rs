@@ -1,7 +1,8 @@
-//! Distances between clouds: Chamfer, earth mover's, sliced Wasserstein, each with its floor, by part of the cloud and by region.
+//! Distances between point clouds: Chamfer, earth mover's and sliced Wasserstein distance, each with its noise floor,
+//! by part of the cloud and by region.
 //!
-//! Clouds are lists of positions `[x, y, z]` in m. A cloud without a point, or with one that is not finite, is refused: a kd-tree
-//! answers such questions with infinity and without a word.
+//! Clouds are slices of positions `[x, y, z]` in m. Empty clouds and non-finite positions are errors: the kd-tree
+//! would silently return infinite distances for them.
 
 mod chamfer;
 mod compare;
@@ -29,28 +30,28 @@ pub type Point = [f32; 3];
 /// Why two clouds cannot be compared.
 #[derive(Debug, thiserror::Error)]
 pub enum DistanceError {
-    /// One of them has no point.
+    /// A cloud has no points.
     #[error("a cloud without a point has no distance to another")]
     Empty,
-    /// A position is not a number.
+    /// A position is not finite.
     #[error("point {index} of {of} is {point:?}: a distance needs finite positions")]
     NotFinite {
-        /// Which point.
+        /// Index of the point.
         index: usize,
-        /// Of how many.
+        /// Number of points.
         of: usize,
         /// Its position, m.
         point: Point,
     },
-    /// The tree could not be built.
+    /// The kd-tree could not be built.
     #[error("the kd-tree of {n} points could not be built: {message}")]
     Tree {
         /// Number of points.
         n: usize,
-        /// What the library says.
+        /// Message of the kd-tree library.
         message: String,
     },
-    /// Two sub-samples are not of one size.
+    /// Two subsamples have different sizes.
     #[error("an assignment needs two clouds of one size, not {a} and {b} points")]
     Sizes {
         /// Points of the first.
@@ -58,7 +59,7 @@ pub enum DistanceError {
         /// Points of the second.
         b: usize,
     },
-    /// Two data sets do not show the same frames.
+    /// Two data sets do not hold the same frames.
     #[error("the two data sets do not pair: {0}")]
     Pairing(String),
     /// A frame could not be read.
@@ -66,7 +67,7 @@ pub enum DistanceError {
     Data(#[from] DataError),
 }
 
-/// Refuses clouds that have no distance.
+/// Checks that a cloud is not empty and all positions are finite.
 pub(crate) fn check(points: &[Point]) -> Result<(), DistanceError> {
     if points.is_empty() {
         return Err(DistanceError::Empty);
@@ -77,7 +78,7 @@ pub(crate) fn check(points: &[Point]) -> Result<(), DistanceError> {
     }
 }
 
-/// Distance of two points, m.
+/// Euclidean distance of two points, m.
 pub(crate) fn apart_m(a: &Point, b: &Point) -> f64 {
     (0..3).map(|k| f64::from(a[k]) - f64::from(b[k])).map(|d| d * d).sum::<f64>().sqrt()
 }

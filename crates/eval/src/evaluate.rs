@@ -1,4 +1,4 @@
-//! From frames to rows.
+//! Evaluation of frames: one row per class, metric, overlap limit and difficulty.
 
 use crate::curve::{CountsByScore, PrecisionCurve, ceiling_ap40};
 use crate::evidence::FrameEvidence;
@@ -9,7 +9,7 @@ use crate::report::{EvalReport, OverlapSet, Row, SCHEMA};
 use crate::{Difficulty, EvalFrame, EvalOptions, Metric, default_classes, reference_overlaps};
 use rayon::prelude::*;
 
-/// One curve to draw.
+/// One precision-recall curve to compute.
 struct Job {
     class: String,
     metric: Metric,
@@ -18,9 +18,8 @@ struct Job {
     difficulty: Difficulty,
 }
 
-/// Evaluates detections against labels: every class, metric, overlap limit and difficulty, and recall.
-///
-/// The same numbers for any number of threads.
+/// Evaluates detections against labels: every class, metric, overlap limit and difficulty, and recall. The result does
+/// not depend on the number of threads.
 pub fn evaluate(frames: &[EvalFrame], options: &EvalOptions) -> EvalReport {
     let classes = if options.classes.is_empty() { default_classes(frames) } else { options.classes.clone() };
     let with_overlaps: Vec<(&EvalFrame, FrameOverlaps)> =
@@ -76,7 +75,7 @@ fn jobs(classes: &[String], options: &EvalOptions) -> Vec<Job> {
     jobs
 }
 
-/// The row of a job; for image boxes that of aos, too.
+/// Computes the row of a job; for image boxes, the AOS row as well.
 fn draw(job: Job, frames: &[(&EvalFrame, FrameOverlaps)], options: &EvalOptions, orientation: bool) -> Vec<Row> {
     let near = |frame: &EvalFrame, index: BoxIndex| {
         let line = match index {
@@ -98,8 +97,8 @@ fn draw(job: Job, frames: &[(&EvalFrame, FrameOverlaps)], options: &EvalOptions,
     let row = |metric: Metric| {
         let similarity = metric == Metric::Aos;
         let curve = PrecisionCurve::new(&hit_scores, n_gt, &counts, similarity);
-        let told = !similarity || orientation;
-        let note = if !told {
+        let defined = !similarity || orientation;
+        let note = if !defined {
             Some("undefined: the first detection has no observation angle (alpha is -10), or there is none".into())
         } else if n_gt == 0 {
             Some("no ground truth: 0 by the reference's definition".into())
@@ -118,9 +117,9 @@ fn draw(job: Job, frames: &[(&EvalFrame, FrameOverlaps)], options: &EvalOptions,
             overlap: job.overlap,
             overlap_sets: job.overlap_sets.clone(),
             difficulty: job.difficulty,
-            ap11: curve.ap11().filter(|_| told),
-            ap40: curve.ap40().filter(|_| told),
-            ap_area: Some(counts.exact_area(n_gt, similarity)).filter(|_| told),
+            ap11: curve.ap11().filter(|_| defined),
+            ap40: curve.ap40().filter(|_| defined),
+            ap_area: Some(counts.exact_area(n_gt, similarity)).filter(|_| defined),
             n_gt,
             n_tp: all.tp,
             n_fp: all.fp,
@@ -137,7 +136,8 @@ fn draw(job: Job, frames: &[(&EvalFrame, FrameOverlaps)], options: &EvalOptions,
     }
 }
 
-/// OpenPCDet's rule: the first detection of the first frame that has one knows its observation angle.
+/// OpenPCDet's rule: AOS is evaluated if the first detection of the first frame with detections has an observation
+/// angle (alpha).
 fn has_orientation(frames: &[EvalFrame]) -> bool {
     frames.iter().flat_map(|frame| &frame.detections).next().is_some_and(|line| line.alpha != -10.0)
 }

@@ -1,21 +1,21 @@
-//! What the frames contribute to a curve, kept apart frame by frame, so that frames can be drawn again and again.
+//! Contributions of single frames to a curve, kept separately so that frames can be resampled.
 
 use crate::EvalFrame;
 use crate::matching::{BoxIndex, Counts, CurveKey, FrameMatching};
 use crate::overlaps::FrameOverlaps;
 
-/// What one frame contributes to one curve.
+/// Contribution of one frame to one curve.
 pub(crate) struct FrameEvidence {
     /// Ground truths that count.
     pub n_gt: i64,
-    /// Scores of the hits of the first pass.
+    /// Scores of the true positives of the first pass.
     pub hit_scores: Vec<f64>,
-    /// Scores at which the counts of the second pass change, falling, with the change.
+    /// Scores at which the counts of the second pass change, descending, with the change.
     pub changes: Vec<(f64, Counts)>,
 }
 
 impl FrameEvidence {
-    /// `inside` says which boxes are looked at; see [`FrameMatching::new`].
+    /// `inside` selects the boxes that are evaluated; see [`FrameMatching::new`].
     pub(crate) fn collect(
         frame: (&EvalFrame, &FrameOverlaps),
         key: &CurveKey,
@@ -36,21 +36,21 @@ impl FrameEvidence {
     }
 }
 
-/// What all frames of a run contribute to one curve, sorted by falling score once.
+/// Contributions of all frames of a run to one curve, sorted once by descending score.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Evidence {
-    /// Ground truths of each frame.
+    /// Ground truths per frame.
     n_gt: Vec<u32>,
-    /// Score and frame of each hit of the first pass.
+    /// Score and frame of each true positive of the first pass.
     hits: Vec<(f64, u32)>,
-    /// Score, frame, hits and false alarms that come with it.
+    /// Score, frame, and the change in true and false positives.
     changes: Vec<(f64, u32, i32, i32)>,
 }
 
-/// Average precisions, and the counts behind them.
+/// Average precisions and the underlying counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Precisions {
-    /// Percent; NaN where precision is 0/0 at a score limit.
+    /// Percent; NaN if precision is 0/0 at a threshold.
     pub ap40: f64,
     /// Percent.
     pub ap_area: f64,
@@ -69,12 +69,12 @@ impl Evidence {
             let change = |(score, c): (f64, Counts)| (score, i, c.tp as i32, c.fp as i32);
             out.changes.extend(frame.changes.into_iter().map(change));
         }
-        out.hits.sort_by(|a, b| b.0.total_cmp(&a.0)); // stable: frames stay in order
+        out.hits.sort_by(|a, b| b.0.total_cmp(&a.0)); // stable: equal scores keep the frame order
         out.changes.sort_by(|a, b| b.0.total_cmp(&a.0));
         out
     }
 
-    /// With frame `i` taken `weights[i]` times; without weights, each once.
+    /// Precisions with frame `i` repeated `weights[i]` times; without weights, once each.
     pub(crate) fn precisions(&self, weights: Option<&[u32]>) -> Precisions {
         let weight = |frame: u32| weights.map_or(1, |w| i64::from(w[frame as usize]));
         let n_gt: i64 = self.n_gt.iter().enumerate().map(|(i, n)| i64::from(*n) * weight(i as u32)).sum();
@@ -119,7 +119,7 @@ impl Evidence {
         sum / (POINTS - 1) as f64 * 100.0
     }
 
-    /// As `CountsByScore::exact_area`, with repeated frames; and all hits and false alarms.
+    /// As `CountsByScore::exact_area`, with repeated frames; also returns all true and false positives.
     fn exact_area(&self, n_gt: i64, weight: impl Fn(u32) -> i64) -> (f64, i64, i64) {
         let mut points: Vec<(i64, f64)> = Vec::new();
         let (mut tp, mut fp) = (0, 0);
@@ -135,7 +135,8 @@ impl Evidence {
             return (0.0, tp, fp);
         }
         if !points.is_sorted_by_key(|(tp, _)| *tp) {
-            points.sort_by_key(|(tp, _)| *tp); // a lower limit can cost a hit: its ground truth takes an ignored detection
+            // A lower threshold can remove a true positive: its ground truth may take an ignored detection.
+            points.sort_by_key(|(tp, _)| *tp);
         }
         let (mut area, mut highest) = (0.0, 0.0f64);
         for (i, (tp, precision)) in points.iter().enumerate().rev() {
@@ -151,24 +152,24 @@ impl Evidence {
 mod tests {
     use super::*;
     use crate::{Difficulty, Metric};
-    use data::{KittiLine, LabelFrame, stream};
+    use data::{LabelBox, LabelFrame, stream};
     use proptest::prelude::*;
     use rand::RngExt;
 
-    /// Frames with up to three cars, found or not, and with scores that are often equal.
+    /// Frames with up to three cars, detected or not, with many equal scores.
     fn frames(seed: u64) -> Vec<EvalFrame> {
         let mut rng = stream(seed, "evidence test", 0, 0);
         let mut car = |x: f64, score: bool| {
             let bbox = geometry::Box3::from_array([x, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0]);
             let score = score.then(|| rng.random_range(0..8) as f32 / 8.0);
-            (KittiLine::from_box("Car", &bbox, score), rng.random_range(0.0..1.0))
+            (LabelBox::from_box("Car", &bbox, score), rng.random_range(0.0..1.0))
         };
         (0..12)
             .map(|i| {
                 let mut frame = EvalFrame { id: i.to_string(), labels: vec![], detections: vec![] };
                 for k in 0..3 {
                     let x = 10.0 * f64::from(k);
-                    let (label, chance): (KittiLine, f64) = car(x, false);
+                    let (label, chance): (LabelBox, f64) = car(x, false);
                     if chance < 0.7 {
                         frame.labels.push(label);
                     }

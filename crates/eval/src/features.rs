@@ -1,4 +1,4 @@
-//! Features of networks: a picture of them (t-SNE), and two numbers that keep what t-SNE does not, linear CKA and the Fréchet distance.
+//! Comparison of network features: t-SNE for display, and linear CKA and the Fréchet distance as metrics.
 
 mod cka;
 mod frechet;
@@ -10,7 +10,7 @@ pub use tsne::{Embedded, Embedding, TSNE_SCHEMA, TsneMethod, TsneOptions, tsne};
 
 use nalgebra::DMatrix;
 
-/// Vectors of one length, one a sample.
+/// Feature vectors of equal length, one per sample.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Features {
     dim: usize,
@@ -20,43 +20,43 @@ pub struct Features {
 /// Why features cannot be compared.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum FeatureError {
-    /// A value is not a number, or the vectors differ in length.
+    /// A value is not finite, or the vectors differ in length.
     #[error("features: {0}")]
     Values(String),
-    /// Too few of them.
+    /// Not enough samples.
     #[error("{what} needs at least {least} samples, not {n}")]
     TooFew {
-        /// What was asked for.
+        /// The computation.
         what: &'static str,
-        /// So many are needed.
+        /// Minimum number of samples.
         least: usize,
-        /// So many are there.
+        /// Number of samples given.
         n: usize,
     },
-    /// Two sets that should show the same samples do not.
+    /// Two feature sets do not hold the same samples.
     #[error("linear CKA compares the same samples in two networks, not {a} and {b} of them")]
     Unpaired {
-        /// Samples of the first.
+        /// Samples in the first set.
         a: usize,
-        /// Samples of the second.
+        /// Samples in the second set.
         b: usize,
     },
-    /// The setting makes no sense.
+    /// Invalid setting.
     #[error("t-SNE: {0}")]
     Setting(String),
 }
 
 impl Features {
-    /// From `values` of so many vectors of `dim` values each, one after the other.
+    /// From the concatenated vectors of length `dim`.
     ///
     /// # Shapes
     /// `values`: `[N * dim]`.
     ///
     /// # Errors
-    /// Values that are not finite, or that do not fill the last vector.
+    /// Non-finite values, or a length that is not a multiple of `dim`.
     pub fn new(dim: usize, values: Vec<f32>) -> Result<Self, FeatureError> {
         if dim == 0 || !values.len().is_multiple_of(dim) {
-            return Err(FeatureError::Values(format!("{} values are no vectors of {dim}", values.len())));
+            return Err(FeatureError::Values(format!("{} values cannot be split into vectors of {dim}", values.len())));
         }
         if let Some(i) = values.iter().position(|v| !v.is_finite()) {
             let message = format!("value {} of sample {} is {}, not a finite number", i % dim, i / dim, values[i]);
@@ -70,7 +70,7 @@ impl Features {
         self.values.len() / self.dim.max(1)
     }
 
-    /// No sample at all.
+    /// Whether there are no samples.
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
     }
@@ -80,12 +80,12 @@ impl Features {
         self.dim
     }
 
-    /// The vectors.
+    /// Iterator over the vectors.
     pub fn rows(&self) -> std::slice::ChunksExact<'_, f32> {
         self.values.chunks_exact(self.dim.max(1))
     }
 
-    /// `[N, dim]`, each column less its mean; and the means.
+    /// `[N, dim]` with the column means subtracted; and the column means.
     fn centered(&self) -> (DMatrix<f64>, Vec<f64>) {
         let n = self.len();
         let mut matrix = DMatrix::from_fn(n, self.dim, |i, j| f64::from(self.values[i * self.dim + j]));

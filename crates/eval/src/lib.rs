@@ -1,13 +1,14 @@
-//! Boxes, clouds and features in, numbers out: KITTI average precision and recall, the matrix of train and test sets, and the statistics
-//! of two data sets.
+//! Evaluation of boxes, clouds and features: KITTI average precision and recall, the matrix of train and test sets,
+//! and statistics of two data sets.
 //!
-//! Everything is computed on the numbers of the texts, in the frame they are written in. KITTI's camera and LiDAR frames are
-//! tilted against each other, so that a box upright in one is not upright in the other: a conversion would change overlaps.
+//! Boxes are compared in the frame in which they are written. KITTI's camera and LiDAR frames are tilted against each
+//! other, so a box that is upright in one frame is not upright in the other, and a conversion would change overlaps.
 
 pub mod analysis;
 mod bootstrap;
 mod csv_text;
 mod curve;
+mod dataset_statistics;
 pub mod distance;
 mod evaluate;
 mod evidence;
@@ -19,18 +20,17 @@ mod overlaps;
 mod read;
 mod recall;
 mod report;
-mod statistics;
 pub mod targets;
 
 pub use bootstrap::{BootstrapOptions, Interval};
 pub use csv_text::csv_text;
 pub use curve::{PrecisionCurve, ceiling_ap40};
+pub use dataset_statistics::{
+    Extent, FrameCounts, STATISTICS_SCHEMA, SetStatistics, StatisticsReport, compare_statistics, sum_up,
+};
 pub use evaluate::evaluate;
 pub use matching::Counts;
 pub use options::{Difficulty, EvalFrame, EvalOptions, Metric, RangeSection, default_classes, reference_overlaps};
 pub use read::{ids_of_folder, read_frames, read_ids};
 pub use recall::{RECALL_OVERLAPS, Recall, RecallDefinition};
 pub use report::{EvalReport, OverlapSet, Row, SCHEMA};
-pub use statistics::{
-    Extent, FrameCounts, STATISTICS_SCHEMA, SetStatistics, StatisticsReport, compare_statistics, sum_up,
-};

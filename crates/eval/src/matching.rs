@@ -1,21 +1,23 @@
-//! KITTI's assignment of detections to ground truths in one frame, step by step as OpenPCDet's `kitti_object_eval_python/eval.py`.
+//! KITTI's assignment of detections to ground truths in one frame, equivalent to OpenPCDet's
+//! `kitti_object_eval_python/eval.py`.
 
 use crate::overlaps::{FrameOverlaps, Pair};
 use crate::{Difficulty, EvalFrame, Metric};
-use data::KittiLine;
+use data::LabelBox;
 use serde::{Deserialize, Serialize};
 use std::ops::{AddAssign, Sub};
 
-/// Hits, false alarms and misses.
+/// True positives, false positives and false negatives.
 #[derive(Clone, Copy, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct Counts {
-    /// Hits.
+    /// True positives.
     pub tp: i64,
-    /// False alarms.
+    /// False positives.
     pub fp: i64,
-    /// Misses. A ground truth that an ignored detection takes is neither hit nor miss.
+    /// False negatives. A ground truth matched by an ignored detection is neither a true positive nor a false
+    /// negative.
     pub fn_: i64,
-    /// Sum over the hits of (1 + cos of the error of alpha) / 2.
+    /// Sum over the true positives of (1 + cos(alpha error)) / 2.
     pub similarity: f64,
 }
 
@@ -41,18 +43,18 @@ impl AddAssign for Counts {
     }
 }
 
-/// What a label or detection is to the evaluation of one class and difficulty.
+/// How a label or detection is treated for one class and difficulty.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Role {
-    /// Counts (KITTI's 0).
+    /// Counted (KITTI's 0).
     Counted,
-    /// Takes a partner, but counts neither way (KITTI's 1).
+    /// Can be matched, but is not counted (KITTI's 1).
     Ignored,
     /// Of another class (KITTI's -1).
     Absent,
 }
 
-/// What one curve is drawn of.
+/// Class, difficulty, metric and overlap limit of a curve.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct CurveKey<'a> {
     pub class: &'a str,
@@ -62,30 +64,31 @@ pub(crate) struct CurveKey<'a> {
     pub difficulty: Difficulty,
 }
 
-/// A box of a frame, by its index.
+/// Index of a label or detection in a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum BoxIndex {
     Label(usize),
     Detection(usize),
 }
 
-/// One frame, seen by one class, difficulty, metric and overlap limit.
+/// Matching of one frame for one class, difficulty, metric and overlap limit.
 pub(crate) struct FrameMatching<'a> {
     frame: &'a EvalFrame,
     labels: Vec<Role>,
     detections: Vec<Role>,
-    /// Detections that may match, but are no false alarm when left over: those outside what is looked at.
+    /// Detections that can match but are no false positive if unmatched: those outside the evaluated region.
     spared: Vec<bool>,
     pairs: &'a [Pair],
     dont_care: &'a [Pair],
     min_overlap: f64,
     taken: Vec<bool>,
-    /// Detections that were hits when last counted.
+    /// Detections that were true positives in the last count.
     hits: Vec<bool>,
 }
 
 impl<'a> FrameMatching<'a> {
-    /// `inside` says which boxes are looked at. Ground truth outside is ignored, and so is a detection outside that finds nothing.
+    /// `inside` selects the boxes that are evaluated. Ground truth outside is ignored, and so are unmatched detections
+    /// outside.
     pub(crate) fn new(
         (frame, overlaps): (&'a EvalFrame, &'a FrameOverlaps),
         key: &CurveKey,
@@ -119,7 +122,7 @@ impl<'a> FrameMatching<'a> {
         self.frame.detections[detection].score.unwrap_or(0.0)
     }
 
-    /// Scores of the detections that take part, falling, each once.
+    /// Distinct scores of the detections that take part, descending.
     pub(crate) fn distinct_scores(&self) -> Vec<f64> {
         let taking_part = (0..self.detections.len()).filter(|&j| self.detections[j] != Role::Absent);
         let mut scores: Vec<f64> = taking_part.map(|j| self.score(j)).collect();
@@ -128,8 +131,8 @@ impl<'a> FrameMatching<'a> {
         scores
     }
 
-    /// The first pass, without a score limit: each ground truth takes the free detection of highest score among those that
-    /// overlap enough. Adds the scores of the hits.
+    /// First pass, without a score threshold: each ground truth takes the free detection of highest score among those
+    /// with sufficient overlap. Appends the scores of the true positives.
     pub(crate) fn collect_hit_scores(&mut self, scores: &mut Vec<f64>) {
         self.taken.fill(false);
         let mut pairs = self.pairs;
@@ -156,8 +159,9 @@ impl<'a> FrameMatching<'a> {
         }
     }
 
-    /// The second pass, with the detections of at least this score: each ground truth takes the free detection of highest
-    /// overlap, an ignored one only where there is no other. What is left over is a false alarm, unless DontCare forgives it.
+    /// Second pass, with detections of at least this score: each ground truth takes the free detection of highest
+    /// overlap, and an ignored one only if there is no other. Unmatched detections are false positives unless they
+    /// overlap a DontCare region.
     pub(crate) fn count(&mut self, least_score: f64) -> Counts {
         self.taken.fill(false);
         self.hits.fill(false);
@@ -168,7 +172,8 @@ impl<'a> FrameMatching<'a> {
             if self.labels[label] == Role::Absent {
                 continue;
             }
-            let mut best: Option<(usize, f64)> = None; // an ignored detection stands with overlap 0: any counted one is better
+            // An ignored detection is stored with overlap 0, so any counted one is better.
+            let mut best: Option<(usize, f64)> = None;
             for pair in own.iter().filter(|pair| pair.overlap > self.min_overlap) {
                 let j = pair.detection;
                 if self.taken[j] || self.score(j) < least_score {
@@ -208,7 +213,8 @@ impl<'a> FrameMatching<'a> {
 }
 
 impl FrameMatching<'_> {
-    /// Of each detection, with no score limit: whether it is a hit (`true`) or a false alarm; `None` where it counts neither way.
+    /// Outcome of each detection without a score threshold: true positive (`true`), false positive (`false`), or
+    /// `None` if not counted.
     pub(crate) fn outcomes(&mut self) -> Vec<Option<bool>> {
         self.count(f64::NEG_INFINITY);
         let outcome = |j: usize| match self.detections[j] {
@@ -220,14 +226,14 @@ impl FrameMatching<'_> {
     }
 }
 
-/// Takes the pairs of one label off the front; the rest begins with the next label.
+/// Splits off the leading pairs that belong to one label.
 fn split_off_pairs<'a>(pairs: &mut &'a [Pair], label: usize) -> &'a [Pair] {
     let (own, rest) = pairs.split_at(pairs.iter().take_while(|pair| pair.label == label).count());
     *pairs = rest;
     own
 }
 
-fn label_role(line: &KittiLine, class: &str, difficulty: Difficulty, far: bool) -> Role {
+fn label_role(line: &LabelBox, class: &str, difficulty: Difficulty, far: bool) -> Role {
     let is = |name: &str| line.class.eq_ignore_ascii_case(name);
     let neighbour = difficulty != Difficulty::All
         && ((class.eq_ignore_ascii_case("Car") && is("Van"))
@@ -242,9 +248,9 @@ fn label_role(line: &KittiLine, class: &str, difficulty: Difficulty, far: bool) 
     }
 }
 
-fn detection_role(line: &KittiLine, class: &str, difficulty: Difficulty) -> Role {
+fn detection_role(line: &LabelBox, class: &str, difficulty: Difficulty) -> Role {
     if (line.image_box[3] - line.image_box[1]).abs() < difficulty.least_height_px() {
-        Role::Ignored // of whatever class: the reference looks at the height first
+        Role::Ignored // of any class: the reference checks the height first
     } else if line.class.eq_ignore_ascii_case(class) {
         Role::Counted
     } else {

@@ -1,12 +1,12 @@
 //! The matrix: train set x test set x network, with means, deviations and intervals over the runs of each cell.
 //!
-//! The road: a [`TestSet`] reads the labels of a test set once; [`RunScores`] are what one run does on one test set; a
-//! [`MatrixPlan`] says which cells there should be; [`build`] puts the scores of all runs into them. A cell without a run stays in
-//! the tables and says why.
+//! Data flow: a [`TestSet`] reads the labels of a test set once; [`RunScores`] hold the scores of one run on one test
+//! set; a [`MatrixPlan`] lists the planned cells; [`build`] aggregates the scores of all runs. A cell without a run
+//! stays in the tables with the reason.
 //!
-//! The deviation is the one of the runs themselves, with divisor n. The paper (table in the appendix) does not say which it
-//! prints; five of its PointRCNN recalls, which are means of five numbers of the form k / 1000, can only come from divisor n
-//! (recall 99.46 (0.1), for one), and none only from n - 1.
+//! The deviation over runs has divisor n. The paper (table in the appendix) does not state its divisor. Five of its
+//! PointRCNN recalls, which are means of five numbers of the form k / 1000, are only possible with divisor n (for
+//! example recall 99.46 (0.1)), and none only with n - 1.
 
 mod build;
 mod csv_lines;
@@ -27,67 +27,67 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Version of [`Matrix`] as JSON.
+/// Schema version of [`Matrix`] as JSON.
 pub const MATRIX_SCHEMA: &str = "lidarshift.matrix/1";
 
-/// A network or a data set as a place in the matrix.
+/// A network or data set: one axis entry of the matrix.
 #[derive(Clone, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Place {
-    /// As folders and results call it.
+    /// Name in folders and results.
     pub name: String,
-    /// As tables call it.
+    /// Title in tables.
     pub title: String,
-    /// What the paper calls the same thing, where it is the same: its numbers then stand beside ours.
+    /// The paper's name for it, if it is the same; the paper's numbers are then shown next to ours.
     pub paper: Option<String>,
 }
 
 impl Place {
-    /// A place whose title is its name.
+    /// An entry whose title is its name.
     pub fn new(name: &str) -> Self {
         Place { name: name.into(), title: name.into(), paper: None }
     }
 }
 
-/// The runs that should exist of one network.
+/// The planned runs of one network.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct PlannedNetwork {
-    /// The network, with its variant where a study has several.
+    /// The network, including its variant if the study has several.
     pub network: Place,
-    /// What it is trained on.
+    /// Its train sets.
     pub train_sets: Vec<Place>,
-    /// One run for each, of every train set.
+    /// Seeds; one run per train set and seed.
     pub seeds: Vec<u64>,
 }
 
-/// Which cells there should be.
+/// The planned cells.
 #[derive(Clone, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct MatrixPlan {
-    /// In the order of the tables.
+    /// In table order.
     pub networks: Vec<PlannedNetwork>,
-    /// What every run is tested on, in the order of the tables.
+    /// Test sets of every run, in table order.
     pub test_sets: Vec<Place>,
 }
 
-/// By which rules the numbers are made.
+/// Evaluation settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MatrixOptions {
-    /// Classes, compared without regard to case.
+    /// Class names, compared case-insensitively.
     pub classes: Vec<String>,
-    /// 3D overlaps that have to be exceeded.
+    /// 3D IoU thresholds.
     pub overlaps: Vec<f64>,
-    /// Which ground truths count. For data without images `all` is the same as the three of KITTI.
+    /// KITTI difficulty filter. For data without images, `all` is equal to the three KITTI levels.
     pub difficulty: Difficulty,
-    /// Ground truth and detections whose centre is farther away on the ground are ignored, m.
+    /// Ground truth and detections whose centre is farther away on the ground plane are ignored, m.
     pub max_range_m: Option<f64>,
-    /// Sections of distance to report beside the whole.
+    /// Range sections reported in addition to the full range.
     pub sections: Vec<RangeSection>,
-    /// How intervals are drawn.
+    /// Bootstrap settings.
     pub bootstrap: BootstrapOptions,
 }
 
 impl Default for MatrixOptions {
-    /// The paper's: AP at 0.5 and 0.7, up to 100 m, in three sections.
+    /// The paper's settings: AP at 0.5 and 0.7, up to 100 m, in three range sections.
     fn default() -> Self {
         MatrixOptions {
             classes: vec!["Car".into()],
@@ -100,20 +100,20 @@ impl Default for MatrixOptions {
     }
 }
 
-/// What a number says.
+/// A metric of the matrix.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Quantity {
-    /// KITTI's average precision over 40 recalls, in space.
+    /// KITTI 3D AP over 40 recall positions.
     Ap40,
-    /// Area under the curve with a point at every score, in space; has no ceiling for few ground truths.
+    /// Area under the 3D precision-recall curve with a point at every score; not capped with few ground truths.
     ApArea,
-    /// OpenPCDet's recall: ground truths whose highest overlap with any box is over the limit. Of a two-stage network all refined regions
-    /// count, before the score limit and the last suppression.
+    /// OpenPCDet's recall: ground truths whose highest IoU with any box exceeds the threshold. For two-stage networks,
+    /// all refined RoIs are used, before the score threshold and the final NMS.
     RecallAnyBox,
-    /// Hits of KITTI's matching over ground truths.
+    /// True positives of KITTI's matching divided by the number of ground truths.
     RecallMatched,
-    /// As [`Quantity::RecallAnyBox`], but of the final boxes, whatever the network.
+    /// As [`Quantity::RecallAnyBox`], but for the final boxes of any network.
     RecallFinalBoxes,
 }
 
@@ -121,12 +121,12 @@ impl Quantity {
     /// In the order of [`RunScores`].
     pub const ALL: [Quantity; 5] =
         [Quantity::Ap40, Quantity::ApArea, Quantity::RecallAnyBox, Quantity::RecallMatched, Quantity::RecallFinalBoxes];
-    /// Its name in files.
+    /// Its key in files.
     pub fn key(self) -> &'static str {
         ["ap40", "ap_area", "recall_any_box", "recall_matched", "recall_final_boxes"][self as usize]
     }
 
-    /// Those of the paper's table.
+    /// The metrics in the paper's table.
     pub const PAPER: [Quantity; 2] = [Quantity::Ap40, Quantity::RecallAnyBox];
 }
 
@@ -142,7 +142,7 @@ impl fmt::Display for Quantity {
     }
 }
 
-/// Which run.
+/// Identifies a run.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
 pub struct RunId {
     /// [`Place::name`] of its network.
@@ -153,15 +153,15 @@ pub struct RunId {
     pub seed: u64,
 }
 
-/// How a run stands in a cell.
+/// State of a run in a cell.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", tag = "state", content = "reason")]
 pub enum RunState {
-    /// Its numbers are in the cell.
+    /// Its scores are included in the cell.
     Done,
-    /// There is none.
+    /// It does not exist.
     Missing,
-    /// There is one that cannot be used, and why.
+    /// It exists but cannot be used, with the reason.
     Failed(String),
 }
 
@@ -170,12 +170,12 @@ pub enum RunState {
 pub struct CellRun {
     /// Its seed.
     pub seed: u64,
-    /// How it stands.
+    /// Its state.
     #[serde(flatten)]
     pub state: RunState,
 }
 
-/// What a run's number is.
+/// Value of a metric for one run.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunNumber {
     /// The run's seed.
@@ -184,34 +184,34 @@ pub struct RunNumber {
     pub value: Option<f64>,
 }
 
-/// One number of a cell, over its runs.
+/// Value of a metric for a cell, over its runs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct CellNumber {
     /// Class name.
     pub class: String,
-    /// Section of distance; `None`: the whole.
+    /// Range section; `None`: full range.
     pub section: Option<RangeSection>,
-    /// What the number says.
+    /// The metric.
     pub quantity: Quantity,
-    /// 3D overlap that has to be exceeded.
+    /// 3D IoU threshold.
     pub overlap: f64,
-    /// Ground truths of the test set that count; `None` where only the runs' numbers are known.
+    /// Number of counted ground truths in the test set; `None` if only the runs' values are known.
     pub n_gt: Option<i64>,
-    /// For [`Quantity::Ap40`], the most that a perfect detector gets: (n - 1) / 40, percent.
+    /// Upper bound for [`Quantity::Ap40`]: (n - 1) / 40, percent.
     pub ceiling: Option<f64>,
     /// Mean over the runs, percent; `None` where undefined.
     pub mean: Option<f64>,
     /// Standard deviation over the runs with divisor n, percent; `None` with fewer than two.
     pub deviation: Option<f64>,
-    /// Bootstrap interval of the mean over seeds and frames; over frames alone where there is one run.
+    /// Bootstrap interval of the mean over seeds and frames; over frames only if there is one run.
     pub interval: Option<Interval>,
-    /// The runs behind the mean.
+    /// Values of the single runs.
     pub of_runs: Vec<RunNumber>,
-    /// What the paper prints, where this cell is one of the paper's.
+    /// The paper's value, if this cell is in the paper.
     pub published: Option<Published>,
 }
 
-/// One pairing of train set and test set of one network.
+/// One combination of network, train set and test set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Cell {
     /// [`Place::name`] of the network.
@@ -220,21 +220,21 @@ pub struct Cell {
     pub train_set: String,
     /// [`Place::name`] of the test set.
     pub test_set: String,
-    /// Test frames; `None` without a run.
+    /// Number of test frames; `None` without a run.
     pub frames: Option<usize>,
-    /// Every run that should be there.
+    /// All planned runs.
     pub runs: Vec<CellRun>,
-    /// By class, section, overlap, quantity; empty without a run.
+    /// By class, section, overlap and metric; empty without a run.
     pub numbers: Vec<CellNumber>,
 }
 
 impl Cell {
-    /// Runs whose numbers are in the cell.
+    /// Number of runs whose scores are included.
     pub fn n_done(&self) -> usize {
         self.runs.iter().filter(|run| run.state == RunState::Done).count()
     }
 
-    /// The number of a class, section, quantity and overlap.
+    /// The value for a class, section, metric and overlap.
     pub fn number(
         &self,
         class: &str,
@@ -248,46 +248,46 @@ impl Cell {
     }
 }
 
-/// What a network loses on a test set because it was trained on another set: the number of the cell that was trained on the test
-/// set's own training part, less that of this cell. The paper's domain shift.
+/// Domain gap: the mean of the cell trained on the test set's own domain minus the mean of this cell, for one network
+/// and test set. The paper's domain shift.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Gap {
     /// [`Place::name`] of the network.
     pub network: String,
     /// [`Place::name`] of the test set.
     pub test_set: String,
-    /// [`Place::name`] of the train set whose number is taken off.
+    /// [`Place::name`] of the train set whose value is subtracted.
     pub train_set: String,
-    /// [`Place::name`] of the train set that it is compared to: the test set's own, or a later one of the study.
+    /// [`Place::name`] of the reference train set: that of the test set's domain, or a later one of the study.
     pub compared_to: String,
     /// Class name.
     pub class: String,
-    /// Section of distance; `None`: the whole.
+    /// Range section; `None`: full range.
     pub section: Option<RangeSection>,
-    /// What is compared.
+    /// The metric.
     pub quantity: Quantity,
-    /// 3D overlap that has to be exceeded.
+    /// 3D IoU threshold.
     pub overlap: f64,
-    /// Difference of the means, points of percent.
+    /// Difference of the means, percentage points.
     pub gap: f64,
-    /// Bootstrap interval: the same frames are drawn for both, seeds for each.
+    /// Bootstrap interval: the same frame resamples for both cells, seeds resampled for each.
     pub interval: Option<Interval>,
 }
 
-/// All cells.
+/// The complete matrix.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Matrix {
     /// [`MATRIX_SCHEMA`].
     pub schema: String,
-    /// What was asked for.
+    /// The planned cells.
     pub plan: MatrixPlan,
-    /// By which rules.
+    /// Settings used.
     pub options: MatrixOptions,
-    /// By network, train set, test set, in the order of the plan.
+    /// By network, train set and test set, in plan order.
     pub cells: Vec<Cell>,
     /// By network, test set, train set.
     pub gaps: Vec<Gap>,
-    /// What to know before reading the numbers.
+    /// Warnings to consider before using the numbers.
     pub warnings: Vec<String>,
 }
 
@@ -307,14 +307,15 @@ impl Matrix {
     /// The matrix as JSON.
     ///
     /// # Panics
-    /// Never: all of it is plain data.
+    /// Never: serialisation of plain data cannot fail.
     pub fn to_json(&self) -> String {
         let mut text = serde_json::to_string_pretty(self).expect("a matrix is plain data");
         text.push('\n');
         text
     }
 
-    /// Columns of the tables: those of the paper's, and the recall of the final boxes where a network has another one besides.
+    /// Table columns: those of the paper, and the recall of the final boxes if a network has a separate any-box
+    /// recall.
     pub fn columns(&self) -> Vec<(Quantity, f64)> {
         let mean = |cell: &Cell, class: &str, quantity, overlap| cell.number(class, None, quantity, overlap)?.mean;
         let differs = |cell: &Cell, class: &str, overlap: f64| {
@@ -334,13 +335,13 @@ impl Matrix {
     }
 }
 
-/// As the paper writes numbers: two digits behind the point at most, one at least.
+/// Formats a number as in the paper: one or two decimals.
 pub(crate) fn paper_number(value: f64) -> String {
     let text = format!("{value:.2}");
     text.strip_suffix('0').map_or(text.clone(), String::from)
 }
 
-/// `mean (deviation)` as in the paper's table; a dash for what is not there.
+/// `mean (deviation)` as in the paper's table; a dash if missing.
 pub(crate) fn paper_cell(mean: Option<f64>, deviation: Option<f64>) -> String {
     match (mean, deviation) {
         (Some(mean), Some(deviation)) => format!("{} ({})", paper_number(mean), paper_number(deviation)),

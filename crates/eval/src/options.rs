@@ -1,31 +1,32 @@
-//! What is evaluated and by which rules.
+//! Evaluation input and settings.
 
-use data::{KittiLine, LabelFrame};
+use data::{LabelBox, LabelFrame};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Ground truth and detections of one frame, as their texts write them.
+/// Ground truth and detections of one frame, as written in their files.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvalFrame {
-    /// The file name without ending.
+    /// File name without extension.
     pub id: String,
-    /// Label lines, DontCare included.
-    pub labels: Vec<KittiLine>,
+    /// Label lines, including DontCare.
+    pub labels: Vec<LabelBox>,
     /// Detection lines; each has a score.
-    pub detections: Vec<KittiLine>,
+    pub detections: Vec<LabelBox>,
 }
 
-/// What to evaluate.
+/// Evaluation settings.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvalOptions {
-    /// Classes in the order of the report, compared without regard to case. Empty: [`default_classes`].
+    /// Classes in report order, compared case-insensitively. Empty: [`default_classes`].
     pub classes: Vec<String>,
-    /// The frame of labels and detections. Boxes are compared as they are written, never converted.
+    /// Coordinate frame of labels and detections. Boxes are compared as written, without conversion.
     pub label_frame: LabelFrame,
-    /// Ground truth and detections whose centre is farther away on the ground are ignored: neither hit, miss nor false alarm.
+    /// Ground truth and detections whose centre is farther away on the ground plane are ignored: neither true
+    /// positive, false negative nor false positive.
     pub max_range_m: Option<f64>,
-    /// Overlap limits in [0, 1) to report beside the two sets of the reference, for every class and metric.
+    /// Additional overlap limits in [0, 1), for every class and metric.
     pub more_overlaps: Vec<f64>,
 }
 
@@ -40,15 +41,15 @@ impl Default for EvalOptions {
     }
 }
 
-/// A section of distances on the ground, m.
+/// A range section: an interval of ground-plane distances, m.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RangeSection {
-    /// The first distance in it, m.
+    /// Lower bound, inclusive, m.
     pub from_m: f64,
-    /// Where it ends, m.
+    /// Upper bound, m.
     pub to_m: f64,
-    /// Whether `to_m` itself is in it.
+    /// Whether `to_m` is included.
     #[serde(default)]
     pub closed: bool,
 }
@@ -61,12 +62,12 @@ impl RangeSection {
         RangeSection { from_m: 66.6, to_m: 100.0, closed: true },
     ];
 
-    /// Everything up to a distance, itself included.
+    /// All distances up to and including `to_m`.
     pub fn up_to(to_m: f64) -> Self {
         RangeSection { from_m: 0.0, to_m, closed: true }
     }
 
-    /// Whether a distance on the ground is in it, m.
+    /// Whether a ground-plane distance (m) is in the section.
     pub fn contains(&self, range_m: f64) -> bool {
         range_m >= self.from_m && (range_m < self.to_m || (self.closed && range_m == self.to_m))
     }
@@ -78,17 +79,18 @@ impl fmt::Display for RangeSection {
     }
 }
 
-/// What two boxes are compared by.
+/// How two boxes are compared.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Metric {
-    /// Image boxes.
+    /// 2D IoU of image boxes.
     Bbox,
-    /// As [`Metric::Bbox`], but a hit counts by how well its observation angle fits.
+    /// Average orientation similarity: as [`Metric::Bbox`], with each true positive weighted by its observation angle
+    /// error.
     Aos,
-    /// Rotated boxes seen from above.
+    /// Rotated boxes in bird's eye view.
     Bev,
-    /// Upright boxes in space.
+    /// Upright 3D boxes.
     #[serde(rename = "3d")]
     ThreeD,
 }
@@ -104,17 +106,17 @@ impl fmt::Display for Metric {
     }
 }
 
-/// Which ground truths count.
+/// Difficulty level: which ground truths are counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Difficulty {
-    /// Image box over 40 px high, not occluded, truncation up to 0.15.
+    /// Image box height over 40 px, not occluded, truncation up to 0.15.
     Easy,
-    /// Over 25 px, partly occluded, up to 0.3.
+    /// Height over 25 px, partly occluded, truncation up to 0.3.
     Moderate,
-    /// Over 25 px, largely occluded, up to 0.5.
+    /// Height over 25 px, largely occluded, truncation up to 0.5.
     Hard,
-    /// Every label of the class counts: no filter, no neighbouring class, no DontCare; matched as KITTI does.
+    /// Every label of the class: no filter, no neighbouring classes, no DontCare; otherwise KITTI's matching.
     All,
 }
 
@@ -125,10 +127,11 @@ impl fmt::Display for Difficulty {
 }
 
 impl Difficulty {
-    /// In the order of the report.
+    /// In report order.
     pub const ALL: [Difficulty; 4] = [Difficulty::Easy, Difficulty::Moderate, Difficulty::Hard, Difficulty::All];
 
-    /// A ground truth with an image box of this height or less does not count; lower detections are ignored. px.
+    /// Ground truths with an image box of at most this height are not counted, and detections below it are ignored,
+    /// px.
     pub(crate) fn least_height_px(self) -> f64 {
         [40.0, 25.0, 25.0, f64::NEG_INFINITY][self as usize]
     }
@@ -142,8 +145,8 @@ impl Difficulty {
     }
 }
 
-/// Overlap limits of the reference for a class and a metric: the official one, and the one of OpenPCDet's second, loose set.
-/// Classes that the reference does not know have those of Car.
+/// Overlap limits of the reference for a class and metric: the official one, and that of OpenPCDet's second, loose
+/// set. Classes unknown to the reference use those of Car.
 pub fn reference_overlaps(class: &str, metric: Metric) -> [f64; 2] {
     let small = ["pedestrian", "cyclist", "person_sitting"].iter().any(|name| name.eq_ignore_ascii_case(class));
     let (official, loose) = if small { (0.5, 0.25) } else { (0.7, 0.5) };
@@ -153,12 +156,12 @@ pub fn reference_overlaps(class: &str, metric: Metric) -> [f64; 2] {
     }
 }
 
-/// The classes that are reported when none is named: those of labels and detections, KITTI's three first. Without DontCare, and
-/// without what KITTI labels but does not evaluate.
+/// Classes reported if none is given: those in labels and detections, KITTI's three first. Excludes DontCare and the
+/// classes that KITTI labels but does not evaluate.
 pub fn default_classes(frames: &[EvalFrame]) -> Vec<String> {
     const LEFT_OUT: [&str; 6] = [data::DONT_CARE, "Van", "Person_sitting", "Truck", "Tram", "Misc"];
     let mut found: Vec<&str> = Vec::new();
-    for class in frames.iter().flat_map(|f| f.labels.iter().chain(&f.detections)).map(|line| line.class.as_str()) {
+    for class in frames.iter().flat_map(|f| f.labels.iter().chain(&f.detections)).map(|b| b.class.as_str()) {
         if !LEFT_OUT.iter().chain(&found).any(|name| name.eq_ignore_ascii_case(class)) {
             found.push(class);
         }

@@ -1,19 +1,19 @@
-//! Overlap of every label with every detection of a frame, in the image, seen from above and in space.
+//! IoU of every label with every detection of a frame: image, BEV and 3D.
 
 use crate::{EvalFrame, Metric};
-use data::{KittiLine, LabelFrame};
+use data::{LabelBox, LabelFrame};
 use geometry::{Box3, bev_intersection};
 
-/// A label and a detection, by their index, that overlap.
+/// Indices of a label and a detection that overlap.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Pair {
     pub label: usize,
     pub detection: usize,
-    /// Intersection over union, over 0. For DontCare regions: intersection over the area of the detection.
+    /// Intersection over union, greater than 0. For DontCare regions: intersection over the area of the detection.
     pub overlap: f64,
 }
 
-/// All pairs of a frame that overlap, by label, then by detection.
+/// All overlapping pairs of a frame, sorted by label, then by detection.
 pub(crate) struct FrameOverlaps {
     pub bbox: Vec<Pair>,
     pub bev: Vec<Pair>,
@@ -68,18 +68,18 @@ fn image_intersection(a: &[f64; 4], b: &[f64; 4]) -> f64 {
     if width > 0.0 && height > 0.0 { width * height } else { 0.0 }
 }
 
-/// A box that stands on the ground plane of the frame its text is written in.
+/// An upright box in the frame in which it is written.
 struct Upright {
     base: Box3,
-    /// Lowest and highest point, m.
+    /// Bottom and top, m.
     height: (f64, f64),
     area: f64,
     volume: f64,
 }
 
-/// The box of a line in a frame with z up: its own for [`LabelFrame::Lidar`]; for [`LabelFrame::Camera`] x to the right, y forward
-/// (KITTI's z) and z up (KITTI's -y), which is right-handed.
-pub(crate) fn upright_box(line: &KittiLine, label_frame: LabelFrame) -> Box3 {
+/// The box of a line in a z-up frame: unchanged for [`LabelFrame::Lidar`]. For [`LabelFrame::Camera`]: x right, y
+/// forward (KITTI's z), z up (KITTI's -y), which is right-handed.
+pub(crate) fn upright_box(line: &LabelBox, label_frame: LabelFrame) -> Box3 {
     match label_frame {
         LabelFrame::Lidar => line.lidar_box(),
         LabelFrame::Camera => {
@@ -89,18 +89,18 @@ pub(crate) fn upright_box(line: &KittiLine, label_frame: LabelFrame) -> Box3 {
     }
 }
 
-/// The inverse of [`upright_box`]: the line with another box.
-pub(crate) fn with_upright_box(line: &KittiLine, b: &Box3, label_frame: LabelFrame) -> KittiLine {
+/// Inverse of [`upright_box`]: the line with another box.
+pub(crate) fn with_upright_box(line: &LabelBox, b: &Box3, label_frame: LabelFrame) -> LabelBox {
     let ([x, y, z], [l, w, h]) = (b.center, b.size);
     let (location, rotation_y) = match label_frame {
         LabelFrame::Lidar => (b.center, b.yaw_rad),
         LabelFrame::Camera => ([x, -(z - h / 2.0), y], -b.yaw_rad),
     };
-    KittiLine { location, rotation_y, size_hwl: [h, w, l], ..line.clone() }
+    LabelBox { location, rotation_y, size_hwl: [h, w, l], ..line.clone() }
 }
 
 impl Upright {
-    fn new(line: &KittiLine, label_frame: LabelFrame) -> Self {
+    fn new(line: &LabelBox, label_frame: LabelFrame) -> Self {
         let [h, w, l] = line.size_hwl;
         let base = upright_box(line, label_frame);
         let height = match label_frame {
@@ -110,7 +110,7 @@ impl Upright {
         Upright { base, height, area: l * w, volume: l * h * w }
     }
 
-    /// Seen from above, and in space.
+    /// BEV and 3D IoU.
     fn overlaps(&self, other: &Upright) -> (f64, f64) {
         let shared = bev_intersection(&self.base, &other.base);
         if shared <= 0.0 {
@@ -126,8 +126,8 @@ impl Upright {
     }
 }
 
-/// Distance of a box on the ground, m.
-pub(crate) fn range_m(line: &KittiLine, label_frame: LabelFrame) -> f64 {
+/// Ground-plane distance of a box, m.
+pub(crate) fn range_m(line: &LabelBox, label_frame: LabelFrame) -> f64 {
     let [x, y, z] = line.location;
     match label_frame {
         LabelFrame::Camera => x.hypot(z),

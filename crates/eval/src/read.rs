@@ -1,12 +1,12 @@
-//! Labels and detections from folders of KITTI text.
+//! Reads labels and detections from folders of KITTI text files.
 
 use crate::EvalFrame;
 use data::{DataError, KittiText, read_kitti_text};
 use rayon::prelude::*;
 use std::path::Path;
 
-/// Reads the labels and detections of these frames, in their order. A detection file that does not exist is an error: a frame in
-/// which nothing was detected has an empty one.
+/// Reads the labels and detections of the given frames, in their order. A missing detection file is an error: a frame
+/// without detections has an empty file.
 pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<Vec<EvalFrame>, DataError> {
     for folder in [labels, detections] {
         if !folder.is_dir() {
@@ -24,11 +24,11 @@ pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<V
             detections: read_kitti_text(&detected, KittiText::Detections)?,
         })
     };
-    // Collecting results of all frames first names the first bad frame, whatever the threads do.
+    // Collects all results first, so that the first bad frame is reported for any number of threads.
     ids.par_iter().map(read).collect::<Vec<_>>().into_iter().collect()
 }
 
-/// The frames of a folder of labels, sorted by name: every `.txt` in it.
+/// The frame ids of a label folder, sorted: every `.txt` file in it.
 pub fn ids_of_folder(labels: &Path) -> Result<Vec<String>, DataError> {
     let mut ids = Vec::new();
     for entry in fs_err::read_dir(labels)? {
@@ -48,14 +48,14 @@ pub fn ids_of_folder(labels: &Path) -> Result<Vec<String>, DataError> {
     Ok(ids)
 }
 
-/// Reads a list of frames: file names without ending, one a line. Blank lines are left out.
+/// Reads a list of frame ids: file names without extension, one per line. Blank lines are skipped.
 pub fn read_ids(path: &Path) -> Result<Vec<String>, DataError> {
     let text = fs_err::read_to_string(path)?;
     let mut ids: Vec<String> = Vec::new();
     let mut known = std::collections::HashSet::new();
     for (i, id) in text.lines().map(str::trim).enumerate().filter(|(_, id)| !id.is_empty()) {
         let problem = if id.contains(['/', '\\', '\0']) || id == "." || id == ".." {
-            Some("is no file name: it must not contain a path separator")
+            Some("is not a file name: it must not contain a path separator")
         } else if !known.insert(id) {
             Some("is there twice")
         } else {
@@ -115,7 +115,7 @@ mod tests {
         let folder = folder();
         let list = folder.path().join("val.txt");
         for (text, message) in [
-            ("a\n../b\n", "val.txt:2: frame id \"../b\" is no file name"),
+            ("a\n../b\n", "val.txt:2: frame id \"../b\" is not a file name"),
             ("a\n\nb\na\n", "val.txt:4: frame id \"a\" is there twice"),
             (" \n", "val.txt: names no frame"),
         ] {

@@ -8,31 +8,32 @@ use serde::{Deserialize, Serialize};
 /// Overlap limits of OpenPCDet's recall.
 pub const RECALL_OVERLAPS: [f64; 3] = [0.3, 0.5, 0.7];
 
-/// How a recall is counted.
+/// Definition of recall.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum RecallDefinition {
-    /// OpenPCDet's `recall_rcnn`: ground truths whose highest 3D overlap with any detection, of any class and score, is over the
-    /// limit. One detection may find several.
+    /// OpenPCDet's `recall_rcnn`: ground truths whose highest 3D IoU with any detection, of any class and score,
+    /// exceeds the limit. One detection may cover several.
     AnyBox,
-    /// Hits of KITTI's matching over ground truths, in space, difficulty `all`: one detection finds one ground truth of its class.
+    /// True positives of KITTI's 3D matching with difficulty `all`, divided by ground truths: each detection matches
+    /// one ground truth of its class.
     Matched,
 }
 
-/// One recall.
+/// A recall value.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Recall {
-    /// How it is counted.
+    /// Its definition.
     pub definition: RecallDefinition,
-    /// `None`: all evaluated classes together.
+    /// `None`: all evaluated classes.
     pub class: Option<String>,
-    /// 3D overlap that has to be exceeded.
+    /// 3D IoU threshold.
     pub overlap: f64,
-    /// Ground truths, whatever their difficulty.
+    /// Number of ground truths of any difficulty.
     pub n_gt: i64,
-    /// Those that were found.
+    /// Number of detected ground truths.
     pub hits: i64,
-    /// Their share, 0 to 1; `None` without ground truth.
+    /// Recall, 0 to 1; `None` without ground truth.
     pub recall: Option<f64>,
 }
 
@@ -42,13 +43,13 @@ pub(crate) fn any_box_recall(
     classes: &[String],
     options: &EvalOptions,
 ) -> Vec<Recall> {
-    let mut highest = Vec::new(); // of each ground truth
+    let mut highest = Vec::new(); // per ground truth
     for (frame, overlaps) in frames {
         let mut best = vec![0.0f64; frame.labels.len()];
         for pair in &overlaps.three_d {
             best[pair.label] = best[pair.label].max(pair.overlap);
         }
-        let counts = |line: &data::KittiLine| {
+        let counts = |line: &data::LabelBox| {
             classes.iter().any(|class| class.eq_ignore_ascii_case(&line.class))
                 && options.max_range_m.is_none_or(|most| range_m(line, options.label_frame) <= most)
         };

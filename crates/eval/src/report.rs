@@ -1,4 +1,4 @@
-//! The result: rows for machines, a table for people.
+//! Evaluation result: rows as JSON, and a plain-text table.
 
 use crate::{Difficulty, Metric, PrecisionCurve, Recall, RecallDefinition};
 use data::LabelFrame;
@@ -6,18 +6,18 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Version of [`EvalReport`] as JSON.
+/// Schema version of [`EvalReport`] as JSON.
 pub const SCHEMA: &str = "lidarshift/eval-ap/1";
 
-/// Where an overlap limit comes from.
+/// Origin of an overlap limit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum OverlapSet {
     /// KITTI's own: 0.7 for Car, 0.5 for Pedestrian and Cyclist.
     Official,
-    /// OpenPCDet's second set: 0.5 and 0.25 from above and in space.
+    /// OpenPCDet's second set: 0.5 and 0.25 for BEV and 3D.
     Loose,
-    /// Asked for.
+    /// Set by the user.
     Given,
 }
 
@@ -26,68 +26,69 @@ pub enum OverlapSet {
 pub struct Row {
     /// Class name.
     pub class: String,
-    /// What boxes are compared by.
+    /// The metric.
     pub metric: Metric,
-    /// Overlap that has to be exceeded.
+    /// IoU threshold.
     pub overlap: f64,
-    /// Where it comes from; more than one where the sets agree.
+    /// Origin of the overlap limit; several if the sets agree.
     pub overlap_sets: Vec<OverlapSet>,
-    /// Which ground truths count.
+    /// The difficulty level.
     pub difficulty: Difficulty,
     /// Mean of 11 points of KITTI's curve, percent; `None` where undefined (0/0).
     pub ap11: Option<f64>,
     /// Mean of 40 points of KITTI's curve, percent; `None` where undefined (0/0).
     pub ap40: Option<f64>,
-    /// Area under the curve with a point at every distinct score, percent; has no ceiling for few ground truths.
+    /// Area under the curve with a point at every distinct score, percent; not capped with few ground truths.
     pub ap_area: Option<f64>,
-    /// Ground truths that count.
+    /// Number of counted ground truths.
     pub n_gt: i64,
-    /// Hits, with all detections.
+    /// True positives, with all detections.
     pub n_tp: i64,
-    /// False alarms, with all detections.
+    /// False positives, with all detections.
     pub n_fp: i64,
-    /// Misses, with all detections. Ground truth that an ignored detection takes is neither hit nor miss.
+    /// False negatives, with all detections. A ground truth matched by an ignored detection is neither a true positive
+    /// nor a false negative.
     pub n_fn: i64,
     /// `n_tp / n_gt`, 0 to 1; `None` without ground truth.
     pub recall: Option<f64>,
-    /// The most that `ap40` can be with `n_gt` ground truths: (n - 1) / 40, percent.
+    /// Upper bound of `ap40` with `n_gt` ground truths: (n - 1) / 40, percent.
     pub ceiling_ap40: Option<f64>,
-    /// Why a number is missing or says little.
+    /// Why a value is missing or of little significance.
     pub note: Option<String>,
-    /// The curve behind `ap11` and `ap40`.
+    /// The curve from which `ap11` and `ap40` are computed.
     #[serde(skip)]
     #[schemars(skip)]
     pub curve: PrecisionCurve,
 }
 
-/// Everything that `evaluate` finds.
+/// Result of `evaluate`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct EvalReport {
     /// [`SCHEMA`].
     pub schema: String,
     /// Number of frames.
     pub frames: usize,
-    /// The frame of the boxes.
+    /// Coordinate frame of the boxes.
     pub label_frame: LabelFrame,
-    /// Ground truth and detections beyond are ignored.
+    /// Ground truth and detections farther away are ignored.
     pub max_range_m: Option<f64>,
-    /// What to know before reading the rows.
+    /// Notes to consider before using the rows.
     pub notes: Vec<String>,
-    /// By class, metric, overlap, difficulty.
+    /// By class, metric, overlap and difficulty.
     pub rows: Vec<Row>,
     /// In both definitions.
     pub recall: Vec<Recall>,
 }
 
 impl EvalReport {
-    /// The row of a class, metric, overlap limit and difficulty.
+    /// The row for a class, metric, overlap limit and difficulty.
     pub fn row(&self, class: &str, metric: Metric, overlap: f64, difficulty: Difficulty) -> Option<&Row> {
         self.rows.iter().find(|row| {
             row.class == class && row.metric == metric && row.overlap == overlap && row.difficulty == difficulty
         })
     }
 
-    /// Easy, moderate, hard and all of one class, metric and overlap limit, for each of them in order.
+    /// Per class, metric and overlap: the rows for easy, moderate, hard and all.
     fn lines(&self) -> Vec<Vec<&Row>> {
         let mut lines: Vec<Vec<&Row>> = Vec::new();
         for row in &self.rows {
@@ -111,7 +112,7 @@ fn four<'a>(line: &[&'a Row], cell: impl Fn(&'a Row) -> String) -> String {
     line.iter().map(|row| format!("{:>7}", cell(row))).collect()
 }
 
-/// The table for people.
+/// The plain-text table.
 impl fmt::Display for EvalReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let frame = match self.label_frame {
@@ -157,10 +158,10 @@ impl fmt::Display for EvalReport {
             writeln!(f, "Note: {note}.")?;
         }
         for line in self.lines() {
-            let mut told: Vec<&str> = Vec::new();
+            let mut printed: Vec<&str> = Vec::new();
             for note in line.iter().filter(|row| row.n_gt > 0).filter_map(|row| row.note.as_deref()) {
-                if !told.contains(&note) {
-                    told.push(note);
+                if !printed.contains(&note) {
+                    printed.push(note);
                     let same = line.iter().filter(|row| row.note.as_deref() == Some(note));
                     let difficulties: Vec<String> = same.map(|row| row.difficulty.to_string()).collect();
                     let (class, metric, overlap) = (&line[0].class, line[0].metric, line[0].overlap);

@@ -1,31 +1,31 @@
-//! Targets of a data set: their points in the frame of their box, aggregated by distance; their counts and places; and the numbers of
-//! the paper's table of data sets.
+//! Statistics of labelled targets: their points in the box frame, aggregated by distance, their counts and positions,
+//! and the values of the paper's data set table.
 
 use crate::RangeSection;
-use crate::bootstrap::mean;
 use data::{DataError, Frame, stream};
 use geometry::points_in_boxes;
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::mean;
 
-/// Version of [`Targets`] as JSON.
+/// Schema version of [`Targets`] as JSON.
 pub const TARGETS_SCHEMA: &str = "lidarshift.targets/1";
 
-/// What is collected.
+/// Settings of the collection.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetOptions {
-    /// Class, compared without regard to case.
+    /// Class name, compared case-insensitively.
     pub class: String,
-    /// Points and targets farther away on the ground are left out, m.
+    /// Points and targets farther away on the ground plane are excluded, m.
     pub max_range_m: f64,
-    /// Sections of distance.
+    /// Range sections.
     pub sections: Vec<RangeSection>,
-    /// At most so many points of a section are kept, drawn by chance; the paper draws 20,000.
+    /// Maximum number of points kept per section, drawn at random; the paper draws 20,000.
     pub most_points: usize,
-    /// Seed of the draw.
+    /// Random seed.
     pub seed: u64,
 }
 
@@ -44,9 +44,9 @@ impl Default for TargetOptions {
 /// A labelled target.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Target {
-    /// Its frame.
+    /// Frame id.
     pub frame: String,
-    /// Centre on the ground, m, LiDAR frame: forward, left.
+    /// Centre on the ground plane in the LiDAR frame, m: forward, left.
     pub at_m: [f64; 2],
     /// Heading, rad.
     pub yaw_rad: f64,
@@ -54,57 +54,57 @@ pub struct Target {
     pub points: u32,
 }
 
-/// All targets of a section, laid over each other.
+/// All targets of a range section, aggregated in the box frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct TargetSection {
-    /// Which distances.
+    /// The range section.
     pub section: RangeSection,
-    /// Targets there.
+    /// Number of targets.
     pub targets: usize,
-    /// Their points.
+    /// Number of points in them.
     pub n_points: u64,
-    /// Points in the frame of the box: m from its centre, forward, left, up. All of them, or a draw of
+    /// Points in the box frame: offset from the box centre, m, forward, left, up. All points, or a random subset of
     /// [`TargetOptions::most_points`].
     pub points_m: Vec<[f32; 3]>,
 }
 
-/// Least, mean and greatest.
+/// Minimum, mean and maximum.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Spread {
-    /// Mean; `None` of nothing.
+    /// Mean; `None` without values.
     pub mean: Option<f64>,
-    /// Least.
+    /// Minimum.
     pub min: Option<f64>,
-    /// Greatest.
+    /// Maximum.
     pub max: Option<f64>,
 }
 
-/// Targets and numbers of a data set.
+/// Targets and statistics of a data set.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Targets {
     /// [`TARGETS_SCHEMA`].
     pub schema: String,
-    /// The data set.
+    /// Name of the data set.
     pub dataset: String,
-    /// By which rules.
+    /// Settings used.
     pub options: TargetOptions,
     /// Number of frames.
     pub frames: usize,
     /// x, y and z of all points, m.
     pub coordinates_m: [Spread; 3],
-    /// Points a cloud.
+    /// Points per cloud.
     pub points_per_cloud: Spread,
-    /// Points a target.
+    /// Points per target.
     pub points_per_target: Spread,
-    /// Mean size of the boxes: length, width, height, m; `None` without one.
+    /// Mean box size: length, width, height, m; `None` without boxes.
     pub mean_size_m: Option<[f64; 3]>,
-    /// Every target in range, by frame.
+    /// All targets in range, by frame.
     pub targets: Vec<Target>,
-    /// By distance.
+    /// By range section.
     pub sections: Vec<TargetSection>,
 }
 
-/// What one frame contributes.
+/// Contribution of one frame.
 struct OfFrame {
     n_points: usize,
     sums: [f64; 3],
@@ -113,9 +113,7 @@ struct OfFrame {
     targets: Vec<(Target, [f64; 3], Vec<[f32; 3]>)>,
 }
 
-/// Collects the targets of the frames with these ids.
-///
-/// The same numbers for any number of threads.
+/// Collects the targets of the frames with these ids. The result does not depend on the number of threads.
 ///
 /// # Errors
 /// A frame that cannot be read.
@@ -213,7 +211,7 @@ mod tests {
     use data::{Cloud, Object};
     use geometry::Box3;
 
-    /// A car at `x` whose left front wheel alone is seen, `n` times.
+    /// A car at `x` with `n` points, all on its left front wheel.
     fn frame(x: f64, n: usize) -> Frame {
         let bbox = Box3::from_array([x, 3.0, 0.5, 4.0, 2.0, 1.2, 0.7]);
         let wheel = bbox.from_local([1.5, 0.9, -0.4]).map(|v| v as f32);

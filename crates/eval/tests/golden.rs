@@ -1,4 +1,5 @@
-//! The numbers of the reference evaluators, on all golden sets (`tests/golden/evaluation/README.md` says how they were made).
+//! Comparison with the reference evaluators on all golden sets (`tests/golden/evaluation/README.md` describes how they
+//! were made).
 
 use data::LabelFrame;
 use lidarshift_eval::{
@@ -45,7 +46,7 @@ fn triple(counts: &Counts) -> [i64; 3] {
     [counts.tp, counts.fp, counts.fn_]
 }
 
-/// Everything of one set; gives the number of curves.
+/// Compares all values of one set; returns the number of curves.
 fn check(name: &str, folder: &Path, expected: &Value) -> usize {
     let frames = frames(folder);
     let kitti = expected["kitti"].as_object().unwrap();
@@ -116,8 +117,8 @@ fn check_curve(name: &str, report: &EvalReport, kitti: &serde_json::Map<String, 
     }
 }
 
-/// Difficulty `all` is KITTI's matching without filters. On these sets it gives what the plain definition gives, in which a
-/// detection takes the best ground truth that is free (COCO's), with equal scores grouped.
+/// Difficulty `all` is KITTI's matching without filters. On these sets it agrees with the plain definition (COCO's),
+/// in which a detection takes the best free ground truth and equal scores are grouped.
 fn check_plain(name: &str, class: &str, set: &str, report: &EvalReport, expected: &Value) {
     for (metric_name, metric) in METRICS {
         let want = &expected["plain"][class][set][metric_name];
@@ -172,7 +173,7 @@ fn edge_cases() {
     }
 }
 
-/// Real labels, which may not be copied into the repository.
+/// Real labels, which may not be redistributed in the repository.
 #[test]
 fn kitti_real() {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/golden/evaluation/kitti_real");
@@ -182,7 +183,7 @@ fn kitti_real() {
     check("kitti_real", &folder, &json(&folder.join("expected.json")));
 }
 
-/// The recall of unfiltered proposals: the same definition on other boxes.
+/// Recall of unfiltered proposals: the same definition on other boxes.
 #[test]
 fn recall_of_proposals() {
     let folder = golden().join("single");
@@ -195,7 +196,7 @@ fn recall_of_proposals() {
     }
 }
 
-/// A limit of the range does what the range bins of the reference do.
+/// A range limit gives the same result as the range bins of the reference.
 #[test]
 fn range_limit() {
     let folder = golden().join("single");
@@ -218,7 +219,7 @@ fn range_limit() {
     assert_eq!(compared, 4);
 }
 
-/// Boxes of race cars have no tilt between the frames, so that their AP is the same in the LiDAR frame.
+/// Race car boxes are not tilted between the frames, so their AP is the same in the LiDAR frame.
 #[test]
 fn lidar_frame() {
     let folder = golden().join("single");

@@ -1,6 +1,6 @@
-//! The matrix: the paper's table from per-run values, and cells from detections.
+//! Tests of the matrix: the paper's table from per-run values, and cells from detections.
 
-use data::{KittiLine, LabelFrame, stream};
+use data::{LabelBox, LabelFrame, stream};
 use lidarshift_eval::matrix::{
     Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity, RunId, RunResult, RunScores, RunState,
     RunValue, build, from_run_values, published,
@@ -29,12 +29,13 @@ fn paper_plan() -> MatrixPlan {
     }
 }
 
-/// Five values of this mean and this deviation (divisor n).
+/// Five values with this mean and deviation (divisor n).
 fn five(mean: f64, deviation: f64) -> [f64; 5] {
     [-2.0, -1.0, 0.0, 1.0, 2.0].map(|k: f64| mean + k * deviation / 2f64.sqrt())
 }
 
-/// Five numbers of the form k / 1000 whose mean and deviation print as given: what recalls of 1,000 frames with one car each are.
+/// Five numbers of the form k / 1000 whose mean and deviation round to the given values: possible recalls on 1,000
+/// frames with one car each.
 fn five_recalls(mean: f64, deviation: f64) -> Option<[f64; 5]> {
     let sum = (mean * 50.0).round() as i64;
     let center = sum / 5;
@@ -61,7 +62,7 @@ fn five_recalls(mean: f64, deviation: f64) -> Option<[f64; 5]> {
     None
 }
 
-/// The paper's table, from five values a number.
+/// The paper's table, from five values per entry.
 fn paper_matrix() -> Matrix {
     let plan = paper_plan();
     let mut values = Vec::new();
@@ -103,7 +104,7 @@ fn the_papers_table_comes_out_of_per_run_values() {
     for row in rows {
         assert!(latex.lines().any(|line| line == row), "{row}\n{latex}");
     }
-    // Every number of the table stands beside the one that is published.
+    // Every value of the table is shown next to the published one.
     for cell in &matrix.cells {
         for n in &cell.numbers {
             let p = n.published.unwrap();
@@ -112,12 +113,13 @@ fn the_papers_table_comes_out_of_per_run_values() {
             );
         }
     }
-    // 0.0 over five runs is not what independent runs give: one warning for each cell of PointPillars, none for PointRCNN.
+    // Independent runs do not give a deviation of 0.0 over five runs: one warning per PointPillars cell, none for
+    // PointRCNN.
     let zero = |name: &str| matrix.warnings.iter().filter(|w| w.starts_with(name) && w.contains("exactly 0")).count();
     assert_eq!((zero("pointpillars"), zero("pointrcnn")), (16, 0));
 }
 
-/// The whole table against the paper's source, where that is at hand.
+/// Compares the whole table with the paper's source, if it is available.
 #[test]
 fn the_table_is_laid_out_as_in_the_papers_source() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/paper.tex");
@@ -134,8 +136,8 @@ fn the_table_is_laid_out_as_in_the_papers_source() {
     assert_eq!(plain(&paper_matrix().to_latex()), plain(table));
 }
 
-fn car(x: f64, y: f64, yaw: f64, score: Option<f64>) -> KittiLine {
-    KittiLine {
+fn car(x: f64, y: f64, yaw: f64, score: Option<f64>) -> LabelBox {
+    LabelBox {
         class: "Car".into(),
         truncation: 0.0,
         occlusion: 0.0,
@@ -145,10 +147,11 @@ fn car(x: f64, y: f64, yaw: f64, score: Option<f64>) -> KittiLine {
         location: [x, y, 0.5],
         rotation_y: yaw,
         score,
+        track: None,
     }
 }
 
-/// Frames with one or two cars, found with this noise (m) and with false alarms.
+/// Frames with one or two cars, detected with this noise (m) and with false positives.
 fn frames(seed: u64, noise: f64, n: usize) -> Vec<EvalFrame> {
     (0..n)
         .map(|i| {
@@ -193,7 +196,7 @@ fn key(train: &str, seed: u64, test: &str) -> (RunId, String) {
     (RunId { network: "pp".into(), train_set: train.into(), seed }, test.into())
 }
 
-/// All cells but those that `but` names.
+/// All results except those in `but`.
 fn results(but: &[(&str, u64, &str)]) -> BTreeMap<(RunId, String), RunResult> {
     let mut results = BTreeMap::new();
     for (train, test) in [("real", "real"), ("real", "sim"), ("sim", "real"), ("sim", "sim")] {
@@ -232,7 +235,7 @@ fn numbers_of_a_run_are_those_of_eval_ap() {
             assert!((got - want).abs() < 1e-9 && got > 5.0, "{quantity} {overlap}: {got} instead of {want}");
         }
     }
-    // One run has no deviation, and the interval is over frames alone.
+    // A single run has no deviation, and the interval is over frames only.
     let ap = cell.number("Car", None, Quantity::Ap40, 0.5).unwrap();
     assert!(ap.deviation.is_none() && ap.interval.unwrap().low < ap.mean.unwrap());
 }
@@ -268,7 +271,7 @@ fn sections_share_out_the_ground_truths() {
     let cell = matrix.cell("pp", "sim", "real").unwrap();
     let n_gt = |section| cell.number("Car", section, Quantity::Ap40, 0.7).unwrap().n_gt.unwrap();
     assert_eq!(options().sections.iter().map(|s| n_gt(Some(*s))).sum::<i64>(), n_gt(None));
-    // Under 41 ground truths: AP40 is capped, and the report says so.
+    // With fewer than 41 ground truths AP40 is capped, and the report says so.
     let few = options().sections.iter().filter(|s| n_gt(Some(**s)) < 41).count();
     assert_eq!(matrix.warnings.iter().filter(|w| w.contains("AP40 cannot exceed")).count(), few);
 }
@@ -297,18 +300,18 @@ fn cells_without_runs_stay_visible_and_say_why() {
 }
 
 #[test]
-fn equal_seeds_and_poor_training_are_told() {
+fn equal_seeds_and_poor_training_are_reported() {
     let mut results = results(&[]);
     let copy = results[&key("sim", 1, "sim")].clone();
     results.insert(key("sim", 2, "sim"), copy);
     results.insert(key("real", 1, "real"), Ok(scores(&frames(1, 2.0, 120))));
     results.insert(key("real", 2, "real"), Ok(scores(&frames(2, 2.0, 120))));
     let matrix = build(&plan(&[1, 2]), &results, &options());
-    let told = |parts: &[&str]| matrix.warnings.iter().any(|w| parts.iter().all(|part| w.contains(part)));
-    assert!(told(&["pp, sim to sim", "do the same on every frame"]), "{:#?}", matrix.warnings);
-    assert!(told(&["pp, sim to sim", "exactly 0"]));
-    assert!(told(&["pp, real to real: undertrained"]));
-    assert!(!told(&["real to sim", "exactly 0"]));
+    let warned = |parts: &[&str]| matrix.warnings.iter().any(|w| parts.iter().all(|part| w.contains(part)));
+    assert!(warned(&["pp, sim to sim", "do the same on every frame"]), "{:#?}", matrix.warnings);
+    assert!(warned(&["pp, sim to sim", "exactly 0"]));
+    assert!(warned(&["pp, real to real: undertrained"]));
+    assert!(!warned(&["real to sim", "exactly 0"]));
     assert!(build(&plan(&[1, 1]), &results, &options()).warnings.iter().any(|w| w.contains("seed 1 is there twice")));
 }
 

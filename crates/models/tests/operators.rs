@@ -341,7 +341,7 @@ fn decoding_is_the_inverse_of_the_targets() {
 }
 
 #[test]
-fn reference_tensors_have_the_expected_types() {
+fn the_reference_file_has_the_expected_shape() {
     let tensor: &HostTensor = &read(&own("operators/pillars.safetensors"))["points"];
     assert_eq!(tensor.shape, [600, 4]);
 }

@@ -1,10 +1,11 @@
-//! The report of the paper's grid: two networks, four data sets, five seeds, from numbers that are there to files that are written.
+//! Report of the paper's grid: two networks, four data sets, five seeds; from values in memory to written files.
 //!
-//! `cargo bench -p lidarshift-report --bench paper_grid [-- FOLDER]`: the report is written into the folder, or into a temporary one.
+//! `cargo bench -p lidarshift-report --bench paper_grid [-- FOLDER]`: the report is written to the folder, or to a
+//! temporary one.
 
 #![expect(clippy::print_stdout, reason = "times go to stdout")]
 
-use data::{Cloud, Frame, KittiLine, LabelFrame, Object, stream};
+use data::{Cloud, Frame, LabelBox, LabelFrame, Object, stream};
 use eval::EvalFrame;
 use eval::analysis::{AnalysisOptions, RunAnalysis, analyse};
 use eval::features::{CkaTable, Embedded, Embedding, TSNE_SCHEMA, TsneOptions};
@@ -24,11 +25,11 @@ const SEEDS: u64 = 5;
 const TEST_FRAMES: u64 = 1000;
 const EPOCHS: u32 = 75;
 const CLOUD_POINTS: usize = 75_000;
-/// Test clouds of each run in a picture of features, as in the paper.
+/// Test clouds per run in the feature figure, as in the paper.
 const FEATURE_FRAMES: usize = 500;
 
 fn main() {
-    let kept = std::env::args().skip(1).find(|word| !word.starts_with('-')).map(PathBuf::from);
+    let kept = std::env::args().skip(1).find(|arg| !arg.starts_with('-')).map(PathBuf::from);
     let temporary = tempfile::tempdir().expect("a temporary folder");
     let folder = kept.unwrap_or_else(|| temporary.path().into());
     let scores = scores();
@@ -91,11 +92,11 @@ fn matrix(scores: &Scores) -> Matrix {
     build(&plan, scores, &MatrixOptions::default())
 }
 
-/// A car, found with an error, and a false alarm.
+/// A car, detected with an error, and a false positive.
 fn frame(id: u64, run: u64) -> EvalFrame {
     let (mut places, mut random) = (stream(0, "grid places", 0, id), stream(run, "grid detections", 0, id));
     let mut car = [places.random_range(-90.0..90.0), places.random_range(-30.0..30.0), 0.0, 4.9, 1.9, 1.2, 0.1];
-    let line = |at: [f64; 7], score| KittiLine::from_box("Car", &Box3::from_array(at), score);
+    let line = |at: [f64; 7], score| LabelBox::from_box("Car", &Box3::from_array(at), score);
     let labels = vec![line(car, None)];
     car[0] += random.random_range(-0.9..0.9);
     car[1] += random.random_range(-0.3..0.3);

@@ -1,4 +1,5 @@
-//! The scans of a spinning sensor against an ideal one, with pictures: what `lidarshift diagnose --scans` does, without the detectors.
+//! Compares the scans of a spinning sensor with an ideal one and draws figures: `lidarshift diagnose --scans` without
+//! the detectors.
 //!
 //! `cargo run --release -p lidarshift-report --example diagnose_scans -- DATASET SENSOR.toml OUT`
 

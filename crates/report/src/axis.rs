@@ -1,18 +1,18 @@
-//! Axes with round ticks.
+//! Axes with round tick values.
 
-/// One axis: the values it spans, and where its ends lie on the page.
+/// One axis: its value range, and the pixel positions of its ends.
 pub(crate) struct Axis {
     pub low: f64,
     pub high: f64,
     px: [f64; 2],
-    /// Distance of two ticks.
+    /// Tick spacing.
     step: f64,
-    /// Values are powers of ten.
+    /// Logarithmic axis: values are exponents of ten.
     log: bool,
 }
 
 impl Axis {
-    /// An axis for all values, its ends at ticks where they are near.
+    /// An axis that covers all values; its ends are rounded to ticks.
     pub fn new(values: impl Iterator<Item = f64>, px: [f64; 2], log: bool) -> Axis {
         let (low, high) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
         let (low, high) = match (low, high) {
@@ -34,7 +34,7 @@ impl Axis {
         self.px[0] + (value - self.low) / (self.high - self.low) * (self.px[1] - self.px[0])
     }
 
-    /// Value and name of each tick.
+    /// Value and label of each tick.
     pub fn ticks(&self) -> Vec<(f64, String)> {
         let (first, last) =
             ((self.low / self.step - 1e-9).ceil() as i64, (self.high / self.step + 1e-9).floor() as i64);

@@ -1,4 +1,4 @@
-//! A cloud and its boxes from above: forward is up, left is left.
+//! Bird's eye view of a cloud and its boxes: forward is up, left is left.
 
 use crate::ReportError;
 use crate::page::{Anchor, INK, Mark, Page, Rgb};
@@ -12,36 +12,36 @@ use geometry::Box3;
 const PAPER: Rgb = [252, 252, 250];
 const RING: Rgb = [205, 212, 220];
 const TRUTH: Rgb = [22, 140, 62];
-const SURE: Rgb = [226, 98, 8];
-const UNSURE: Rgb = [36, 104, 190];
-/// Points from the ground up.
+const HIGH_SCORE: Rgb = [226, 98, 8];
+const LOW_SCORE: Rgb = [36, 104, 190];
+/// Colours by height, from the ground up.
 const HEIGHTS: [Rgb; 6] =
     [[198, 203, 209], [170, 177, 185], [140, 149, 159], [110, 120, 131], [82, 93, 105], [54, 66, 79]];
-/// Heights above the lowest points that the shades tell apart, m.
+/// Height range above the lowest points that is mapped to colours, m.
 const TALL_M: f32 = 3.0;
-/// A detection with a lower score is drawn as unsure.
-const SURE_SCORE: f32 = 0.5;
+/// Detections below this score are drawn in the low-score colour.
+const SCORE_LIMIT: f32 = 0.5;
 
-/// What a box is.
+/// How a box is drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Style {
     /// A label: green.
     GroundTruth,
-    /// What a network reports: orange, or blue below a score of 0.5; the score stands beside it.
+    /// A detection: orange, or blue below a score of 0.5, with the score next to it.
     Detection {
         /// Confidence, 0 to 1.
         score: f32,
     },
 }
 
-/// What the picture shows and how large it is.
+/// Area and size of the figure.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BirdsEyeOptions {
-    /// `[x from, x to, y from, y to]` in m; `None`: all boxes, nearly all points, and the sensor.
+    /// `[x from, x to, y from, y to]` in m; `None`: an area with all boxes, nearly all points, and the sensor.
     pub area_m: Option<[f64; 4]>,
-    /// Width of the picture, px; its height follows.
+    /// Width, px; the height follows from the area.
     pub width_px: u32,
-    /// Write scores beside detections.
+    /// Whether scores are written next to detections.
     pub scores: bool,
 }
 
@@ -51,7 +51,7 @@ impl Default for BirdsEyeOptions {
     }
 }
 
-/// The picture as the bytes of a PNG file.
+/// The figure as PNG bytes.
 pub fn birds_eye_png(
     cloud: &Cloud,
     boxes: &[(Box3, Style)],
@@ -60,7 +60,7 @@ pub fn birds_eye_png(
     png(&View::new(cloud, boxes, options)?.page(cloud, boxes, options))
 }
 
-/// The picture as the text of an SVG file, with a legend.
+/// The figure as SVG text, with a legend.
 pub fn birds_eye_svg(cloud: &Cloud, boxes: &[(Box3, Style)], options: &BirdsEyeOptions) -> Result<String, ReportError> {
     let view = View::new(cloud, boxes, options)?;
     let mut page = view.page(cloud, boxes, options);
@@ -68,7 +68,7 @@ pub fn birds_eye_svg(cloud: &Cloud, boxes: &[(Box3, Style)], options: &BirdsEyeO
     Ok(svg(&page, Theme::Paper))
 }
 
-/// From metres to pixels.
+/// Mapping from metres to pixels.
 struct View {
     area_m: [f64; 4],
     px_per_m: f64,
@@ -117,7 +117,7 @@ impl View {
         page
     }
 
-    /// Range rings around the sensor; returns their distance, m.
+    /// Draws range rings around the sensor; returns their spacing, m.
     fn rings(&self, page: &mut Page) -> f64 {
         let [x0, x1, y0, y1] = self.area_m;
         let far_m = [[x0, y0], [x0, y1], [x1, y0], [x1, y1]].iter().map(|[x, y]| x.hypot(*y)).fold(0.0, f64::max);
@@ -132,7 +132,7 @@ impl View {
         every_m
     }
 
-    /// The distance of each ring: straight ahead and behind, or a little aside where a box is in the way.
+    /// Labels each ring with its distance: straight ahead and behind, or slightly offset if a box is in the way.
     fn ring_names(&self, page: &mut Page, every_m: f64, boxes: &[(Box3, Style)]) {
         let [x0, x1, ..] = self.area_m;
         let boxes: Vec<[f64; 2]> = boxes.iter().map(|(b, _)| self.px([b.center[0], b.center[1]])).collect();
@@ -152,7 +152,7 @@ impl View {
         }
     }
 
-    /// One square a pixel cell, shaded by the highest point in it, so that a picture of any cloud stays small.
+    /// One square per pixel cell, coloured by its highest point, so that the file size is bounded for any cloud.
     fn points(&self, page: &mut Page, cloud: &Cloud) {
         let side = (self.px_per_m / 5.0).floor().clamp(1.0, 3.0);
         let [columns, rows] = self.size.map(|px| (px / side).ceil() as usize);
@@ -178,13 +178,13 @@ impl View {
         }
     }
 
-    /// An arrow head where the sensor is.
+    /// An arrow head at the sensor position.
     fn sensor(&self, page: &mut Page) {
         let [u, v] = self.px([0.0, 0.0]);
         page.shape(vec![[u, v - 9.0], [u + 6.0, v + 7.0], [u, v + 3.0], [u - 6.0, v + 7.0]], INK, 1.0, 1.0);
     }
 
-    /// A box's base, and a tick from its middle out of its front.
+    /// Outline of a box's base, and a line from its centre through its front.
     fn outline(&self, page: &mut Page, b: &Box3, style: Style) {
         let (color, width) = match style {
             Style::GroundTruth => (TRUTH, 3.0),
@@ -198,7 +198,7 @@ impl View {
         page.line(vec![ahead(0.0), ahead(b.size[0] / 2.0 + 0.8)], color, width);
     }
 
-    /// A detection's score, right of its box.
+    /// The score of a detection, to the right of its box.
     fn score(&self, page: &mut Page, b: &Box3, style: Style) {
         let Style::Detection { score } = style else { return };
         let corners = b.bev_corners().map(|corner| self.px(corner));
@@ -207,7 +207,7 @@ impl View {
         page.text([right + 5.0, middle + 4.0], format!("{score:.2}"), 13.0, ink(style), Anchor::Start);
     }
 
-    /// A bar of known length at the bottom left.
+    /// A scale bar at the bottom left.
     fn scale(&self, page: &mut Page, length_m: f64) {
         let [left, y, length] = [16.0, self.size[1] - 16.0, length_m * self.px_per_m];
         page.line(vec![[left, y - 5.0], [left, y], [left + length, y], [left + length, y - 5.0]], INK, 2.0);
@@ -218,14 +218,14 @@ impl View {
 fn ink(style: Style) -> Rgb {
     match style {
         Style::GroundTruth => TRUTH,
-        Style::Detection { score } if score >= SURE_SCORE => SURE,
-        Style::Detection { .. } => UNSURE,
+        Style::Detection { score } if score >= SCORE_LIMIT => HIGH_SCORE,
+        Style::Detection { .. } => LOW_SCORE,
     }
 }
 
-/// What the colours mean, as far as they occur, at the bottom right.
+/// Legend of the colours in use, at the bottom right.
 fn legend(page: &mut Page, boxes: &[(Box3, Style)]) {
-    let names = [(TRUTH, "ground truth"), (SURE, "detection"), (UNSURE, "detection, score below 0.5")];
+    let names = [(TRUTH, "ground truth"), (HIGH_SCORE, "detection"), (LOW_SCORE, "detection, score below 0.5")];
     let [width, height] = page.size;
     let mut y = height - 14.0;
     for (color, name) in names.into_iter().rev() {
@@ -236,7 +236,7 @@ fn legend(page: &mut Page, boxes: &[(Box3, Style)]) {
     }
 }
 
-/// An area around all boxes, nearly all points, and the sensor.
+/// An area with all boxes, nearly all points, and the sensor.
 fn area_of(cloud: &Cloud, boxes: &[(Box3, Style)]) -> [f64; 4] {
     const MARGIN_M: f64 = 3.0;
     let axis = |axis: usize| {
@@ -250,7 +250,7 @@ fn area_of(cloud: &Cloud, boxes: &[(Box3, Style)]) -> [f64; 4] {
     [x0, x1, y0, y1]
 }
 
-/// Values that the given shares of all values do not exceed; 0 where there is none.
+/// Quantiles at the given fractions; 0 without values.
 fn quantiles(mut values: Vec<f64>, shares: [f64; 2]) -> [f64; 2] {
     values.sort_by(f64::total_cmp);
     shares.map(|share| values.get((share * values.len() as f64) as usize).copied().unwrap_or(0.0))

@@ -1,36 +1,36 @@
-//! Curves over a common axis, as training losses.
+//! Curves on common axes, such as training losses.
 
 use crate::axis::Axis;
 use crate::page::{Anchor, COLORS, GRID, INK, Mark, Page};
 use crate::svg::{Theme, svg};
 
 const SIZE: [f64; 2] = [860.0, 480.0];
-/// Left, right, top and bottom of the axes on the page, px.
+/// Left, right, top and bottom of the plot area, px.
 const FRAME: [f64; 4] = [84.0, 836.0, 56.0, 420.0];
 
-/// A curve with its name.
+/// A named curve.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Series {
-    /// For the legend.
+    /// Name in the legend.
     pub name: String,
-    /// x and y. A value that is not finite (on a logarithmic axis: not positive) is a gap.
+    /// x and y. A non-finite value (on a logarithmic axis: a non-positive one) is a gap.
     pub points: Vec<[f64; 2]>,
 }
 
-/// What stands around the curves.
+/// Title and axis labels.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct CurveOptions {
-    /// Above the picture.
+    /// Title.
     pub title: String,
-    /// Below the horizontal axis.
+    /// Label of the horizontal axis.
     pub x_label: String,
-    /// Left of the vertical axis.
+    /// Label of the vertical axis.
     pub y_label: String,
     /// Logarithmic vertical axis.
     pub log_y: bool,
 }
 
-/// Curves with axes, grid and legend as the text of an SVG file.
+/// Curves with axes, grid and legend as SVG text.
 pub fn curve_svg(series: &[Series], options: &CurveOptions) -> String {
     svg(&curve_page(series, options), Theme::Paper)
 }
@@ -59,14 +59,14 @@ pub(crate) fn curve_page(series: &[Series], options: &CurveOptions) -> Page {
     page
 }
 
-/// The line of the i-th series, in dashes where a series before has its color.
+/// Line of the i-th series, dashed if an earlier series has the same colour.
 fn strokes(line: Vec<[f64; 2]>, i: usize) -> Vec<Vec<[f64; 2]>> {
-    const DASH: f64 = 6.0; // as long as the gap behind it, px
+    const DASH: f64 = 6.0; // length of dashes and gaps, px
     if i < COLORS.len() {
         return vec![line];
     }
     let mut strokes = Vec::new();
-    let mut walked = 0.0; // dashes and gaps so far
+    let mut walked = 0.0; // number of dashes and gaps so far
     for ends in line.windows(2) {
         let ([x, y], [to_x, to_y]) = (ends[0], ends[1]);
         let length = (to_x - x).hypot(to_y - y) / DASH;

@@ -1,4 +1,4 @@
-//! Figures of a study. Each is made once and written as SVG, as PNG, or into the report.
+//! Figures of a study. Each is built once and written as SVG, as PNG, or into the report.
 
 /// The kinds of figures, a file each; what is public in it is public in the crate.
 macro_rules! figures {
@@ -23,10 +23,10 @@ use crate::{CurveOptions, ReportError, Series};
 use resvg::{tiny_skia, usvg};
 use std::sync::{Arc, LazyLock};
 
-/// A figure, to be written in any form.
+/// A figure, independent of the output format.
 pub struct Figure(pub(crate) Page);
 
-/// What PNG figures write text with.
+/// Font of PNG figures.
 static FONT: &[u8] = include_bytes!("../assets/DejaVuSans-subset.ttf");
 
 static FONTS: LazyLock<Arc<usvg::fontdb::Database>> = LazyLock::new(|| {
@@ -36,22 +36,22 @@ static FONTS: LazyLock<Arc<usvg::fontdb::Database>> = LazyLock::new(|| {
 });
 
 impl Figure {
-    /// Curves over a common axis.
+    /// Curves on common axes.
     pub fn curves(series: &[Series], options: &CurveOptions) -> Self {
         Figure(curve_page(series, options))
     }
 
-    /// The text of an SVG file, light.
+    /// The figure as SVG text, light theme.
     pub fn svg(&self) -> String {
         svg(&self.0, Theme::Paper)
     }
 
-    /// SVG for inside the report: its neutral colours are the report's, light or dark.
+    /// SVG for the report, with the report's light or dark theme.
     pub(crate) fn svg_for_report(&self) -> String {
         svg(&self.0, Theme::Report)
     }
 
-    /// The bytes of a PNG file, `scale` pixels for each of the figure's.
+    /// The figure as PNG bytes, with `scale` PNG pixels per figure pixel.
     ///
     /// # Errors
     /// A figure that is far too large.
@@ -72,12 +72,12 @@ impl Figure {
     }
 }
 
-/// The colour of the k-th group.
+/// Colour of the k-th group.
 pub(crate) fn color(k: usize) -> Rgb {
     COLORS[k % COLORS.len()]
 }
 
-/// Names beside dots of their colours, from left to right, in rows; returns the height that they take, px.
+/// Draws a legend of names with coloured dots, in rows from left to right; returns its height, px.
 pub(crate) fn legend(page: &mut Page, names: &[&str], [left, top]: [f64; 2], width: f64) -> f64 {
     let (mut x, mut y) = (left, top + 12.0);
     for (k, name) in names.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! The page: sections of figures, tables and views, as one HTML file that needs nothing else.
+//! The report page: sections of figures, tables and 3D views in one self-contained HTML file.
 
 use crate::ReportError;
 use crate::figure::Figure;
@@ -14,35 +14,35 @@ pub(crate) struct Section {
     pub items: Vec<Item>,
 }
 
-/// A figure, a table or a view, with what stands beside it.
+/// A figure, table or 3D view with its caption.
 pub(crate) struct Item {
-    /// Name of its files and its anchor.
+    /// File name stem and anchor.
     pub id: String,
     /// "Figure 3".
     pub label: String,
     pub caption: String,
-    /// The numbers behind it.
+    /// The underlying data as CSV.
     pub csv: String,
     pub csv_base64: String,
     pub body: Body,
-    /// To be written as a file of its own.
+    /// The figure, if it is also written as a separate file.
     pub figure: Option<Figure>,
 }
 
-/// What an item shows.
+/// Content of an item.
 pub(crate) enum Body {
     Figure { svg: String, wide: bool },
     Table { columns: Vec<String>, rows: Vec<TableRow>, text_columns: usize },
     View { scenes_json: String },
 }
 
-/// A row of a table; `begins` draws a line above it.
+/// A table row; `begins` draws a line above it.
 pub(crate) struct TableRow {
     pub begins: bool,
     pub cells: Vec<TableCell>,
 }
 
-/// A cell, with small text below.
+/// A table cell with small text below.
 pub(crate) struct TableCell {
     pub text: String,
     pub small: String,
@@ -65,7 +65,7 @@ impl TableRow {
 }
 
 impl Item {
-    /// A figure with the numbers behind it: columns and lines.
+    /// A figure with its data: columns and lines.
     pub fn figure(
         id: impl Into<String>,
         caption: impl Into<String>,
@@ -78,7 +78,8 @@ impl Item {
         Item { figure: Some(figure), ..Item::new(id.into(), caption.into(), csv, Body::Figure { svg, wide }) }
     }
 
-    /// A table; the first `text_columns` columns are words, the others numbers. `csv`: all of it as CSV, or empty: the table itself.
+    /// A table; the first `text_columns` columns are text, the others numbers. `csv`: the table data as CSV; if empty,
+    /// it is made from the table.
     pub fn table(
         id: impl Into<String>,
         caption: impl Into<String>,
@@ -121,7 +122,7 @@ struct PageTemplate<'a> {
     viewer_script: &'static str,
 }
 
-/// What stands around the sections.
+/// Title, introduction and facts of the page.
 pub(crate) struct PageText<'a> {
     pub title: &'a str,
     pub about: &'a [String],
@@ -129,7 +130,7 @@ pub(crate) struct PageText<'a> {
     pub footer: &'a str,
 }
 
-/// Numbers figures and tables, and writes the page.
+/// Numbers the figures and tables, and renders the page.
 pub(crate) fn page(text: &PageText, sections: &mut [Section]) -> Result<String, ReportError> {
     let (mut figures, mut tables, mut viewer) = (0, 0, false);
     for item in sections.iter_mut().flat_map(|section| &mut section.items) {

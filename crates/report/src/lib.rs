@@ -1,6 +1,6 @@
-//! Pictures, tables, and what is made of them: the report of a study as one HTML page, the pictures of a diagnosis.
+//! Figures, tables, the report of a study as one HTML page, and the figures of a diagnosis.
 //!
-//! Every picture is first a list of marks on a page, then written as SVG text or as PNG: both show the same.
+//! Every figure is first a list of drawing primitives, then written as SVG or PNG; both look the same.
 
 mod axis;
 mod birds_eye;
@@ -24,21 +24,21 @@ pub use scene::{Layer, LayerContent, Scene};
 
 pub use tensorboard::write_event_files;
 
-/// Why a picture could not be made.
+/// Why a figure or report could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum ReportError {
-    /// The picture's area is empty or not a number.
-    #[error("area_m {area_m:?} has no inside: it is [x from, x to, y from, y to] in m")]
+    /// The area of the figure is empty or not finite.
+    #[error("area_m {area_m:?} is empty or not finite: it is [x from, x to, y from, y to] in m")]
     Area {
-        /// As asked for.
+        /// The requested area.
         area_m: [f64; 4],
     },
-    /// The picture has no pixel, or far too many.
+    /// The figure has zero pixels, or far too many.
     #[error("a picture of {width} x {height} pixels: each side must have 16 to 20000; change width_px or area_m")]
     Size {
-        /// Pixels.
+        /// Width, px.
         width: f64,
-        /// Pixels.
+        /// Height, px.
         height: f64,
     },
     /// The page could not be rendered.

@@ -1,11 +1,11 @@
-//! A page as PNG. Text is limited to what the stroke font knows: digits, full stop, m.
+//! PNG output. Text is limited to the characters of the stroke font: digits, full stop, m.
 
 use crate::ReportError;
 use crate::page::{Anchor, Mark, Page, Rgb};
 use crate::stroke_font;
 use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Rect, Stroke, Transform};
 
-/// The page as the bytes of a PNG file.
+/// The page as PNG bytes.
 pub(crate) fn png(page: &Page) -> Result<Vec<u8>, ReportError> {
     let [width, height] = page.size;
     let mut pixels = Pixmap::new(width as u32, height as u32).ok_or(ReportError::Size { width, height })?;

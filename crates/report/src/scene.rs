@@ -1,14 +1,14 @@
-//! Clouds and boxes for the interactive view.
+//! Clouds and boxes for the interactive 3D view.
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use data::Cloud;
 use geometry::Box3;
 use serde::Serialize;
 
-/// Beyond this a position does not fit into whole centimetres of 16 bits, m.
+/// Largest coordinate that fits into centimetres as 16-bit integers, m.
 const FARTHEST_M: f32 = 327.0;
 
-/// What is drawn of one colour and can be switched off.
+/// Content of a layer.
 #[derive(Clone, Debug, PartialEq)]
 pub enum LayerContent {
     /// A cloud.
@@ -17,25 +17,25 @@ pub enum LayerContent {
     Boxes(Vec<Box3>),
 }
 
-/// A layer of a scene.
+/// A layer of a scene, with one colour; it can be hidden.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Layer {
-    /// Beside its switch.
+    /// Name next to its checkbox.
     pub name: String,
-    /// As CSS writes it: `#0072b2`.
+    /// CSS colour: `#0072b2`.
     pub color: String,
-    /// What it shows.
+    /// Clouds or boxes.
     pub content: LayerContent,
 }
 
-/// One moment: measured and simulated clouds, labels, detections.
+/// One frame: measured and simulated clouds, labels, detections.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Scene {
-    /// In the list of frames.
+    /// Name in the list of frames.
     pub name: String,
-    /// Drawn in this order.
+    /// Layers in drawing order.
     pub layers: Vec<Layer>,
-    /// What "Target" looks at, m; `None`: the origin.
+    /// Camera target of the "Target" button, m; `None`: the origin.
     pub focus_m: Option<[f64; 3]>,
 }
 
@@ -56,7 +56,7 @@ struct LayerJson<'a> {
     boxes: Option<Vec<[f64; 7]>>,
 }
 
-/// The scenes as JSON that may stand inside a script element.
+/// The scenes as JSON that is safe inside a script element.
 pub(crate) fn scenes_json(scenes: &[Scene]) -> String {
     let layer = |layer: &'_ Layer| -> (Option<String>, Option<Vec<[f64; 7]>>) {
         match &layer.content {
@@ -82,11 +82,11 @@ pub(crate) fn scenes_json(scenes: &[Scene]) -> String {
                 .collect(),
         })
         .collect();
-    // No text of a scene can end the script element.
+    // Escapes `<`, so that no text of a scene can end the script element.
     serde_json::to_string(&scenes).expect("a scene is plain data").replace('<', "\\u003c")
 }
 
-/// Positions in whole centimetres, little-endian; what is not finite or too far is left out.
+/// Positions in centimetres as 16-bit little-endian integers; non-finite or too distant points are skipped.
 fn centimetres(cloud: &Cloud) -> String {
     let near = |p: &&[f32]| p[..3].iter().all(|v| v.abs() <= FARTHEST_M);
     let bytes: Vec<u8> = cloud

@@ -1,9 +1,9 @@
-//! Digits drawn as lines, for pictures without a font.
+//! Digits drawn as strokes, for figures without a font.
 
-/// Width of a character with the gap behind it, in heights of a digit.
+/// Character width including the gap, in digit heights.
 const ADVANCE: f64 = 1.0;
 
-/// The lines of one character on a grid 4 wide and 6 high, y down; nothing for a character that is not known.
+/// The strokes of a character on a grid 4 wide and 6 high, y down; empty for an unknown character.
 fn strokes(c: char) -> &'static [&'static [[u8; 2]]] {
     match c {
         '0' => &[&[[0, 1], [1, 0], [3, 0], [4, 1], [4, 5], [3, 6], [1, 6], [0, 5], [0, 1]]],
@@ -25,7 +25,7 @@ fn strokes(c: char) -> &'static [&'static [[u8; 2]]] {
     }
 }
 
-/// Width of a text whose digits are `height` high.
+/// Width of a text with digits of height `height`.
 pub(crate) fn width(text: &str, height: f64) -> f64 {
     text.chars().map(|c| advance(c) * height).sum()
 }
@@ -34,7 +34,7 @@ fn advance(c: char) -> f64 {
     if matches!(c, '.' | ' ') { ADVANCE / 2.0 } else { ADVANCE }
 }
 
-/// The lines of a text whose base line starts at `at`, digits `height` high.
+/// The strokes of a text whose base line starts at `at`, with digits of height `height`.
 pub(crate) fn lines(text: &str, [x, y]: [f64; 2], height: f64) -> Vec<Vec<[f64; 2]>> {
     let (mut left, mut lines) = (x, Vec::new());
     for c in text.chars() {

@@ -3,16 +3,16 @@
 use crate::page::{Anchor, GRID, INK, Mark, Page, Rgb};
 use std::fmt::Write;
 
-/// Where the picture is shown.
+/// Where the figure is shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Theme {
-    /// On paper: a file of its own, always light.
+    /// A separate file, always light.
     Paper,
-    /// Inside the report, which has the colours of paper, ink and grid as CSS variables, light and dark.
+    /// Inside the report, which defines background, ink and grid colours as CSS variables for light and dark mode.
     Report,
 }
 
-/// The page as the text of an SVG file.
+/// The page as SVG text.
 pub(crate) fn svg(page: &Page, theme: Theme) -> String {
     let hex = |color: Rgb| match theme {
         Theme::Report if color == INK => "var(--ink)".into(),
@@ -38,8 +38,8 @@ pub(crate) fn svg(page: &Page, theme: Theme) -> String {
 fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>, hex: &dyn Fn(Rgb) -> String) -> std::fmt::Result {
     match mark {
         Mark::Line { points, closed, color, width, fill } => {
-            let (word, hex) = (if *closed { "polygon" } else { "polyline" }, hex(*color));
-            write!(out, "<{word} points=\"")?;
+            let (element, hex) = (if *closed { "polygon" } else { "polyline" }, hex(*color));
+            write!(out, "<{element} points=\"")?;
             for (i, [x, y]) in points.iter().enumerate() {
                 write!(out, "{}{x:.1},{y:.1}", if i > 0 { " " } else { "" })?;
             }
@@ -65,7 +65,7 @@ fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>, hex: &dyn Fn(Rgb)
             write!(out, "\"/>")
         }
         Mark::Dots { centers, radius, color, opacity } => {
-            // Lines without length and with round ends: a tenth of the text of as many circles.
+            // Zero-length lines with round caps: a tenth of the file size of the same number of circles.
             write!(out, "<path fill=\"none\" stroke=\"{}\" stroke-linecap=\"round\" ", hex(*color))?;
             write!(out, "stroke-width=\"{:.1}\" stroke-opacity=\"{opacity}\" d=\"", 2.0 * radius)?;
             for [x, y] in centers {
@@ -78,7 +78,7 @@ fn write_mark(out: &mut String, mark: &Mark, rim: Option<Rgb>, hex: &dyn Fn(Rgb)
                 0.0 => String::new(),
                 turn => format!(" transform=\"rotate({turn} {x:.1} {y:.1})\""),
             };
-            let (anchor, text) = (word(*anchor), escaped(text));
+            let (anchor, text) = (text_anchor(*anchor), escaped(text));
             let start = format!("<text x=\"{x:.1}\" y=\"{y:.1}\" font-size=\"{size}\" text-anchor=\"{anchor}\"{turn}");
             if let Some(rim) = rim.map(&hex) {
                 writeln!(
@@ -95,7 +95,7 @@ fn hex([r, g, b]: Rgb) -> String {
     format!("#{r:02x}{g:02x}{b:02x}")
 }
 
-fn word(anchor: Anchor) -> &'static str {
+fn text_anchor(anchor: Anchor) -> &'static str {
     match anchor {
         Anchor::Start => "start",
         Anchor::Middle => "middle",

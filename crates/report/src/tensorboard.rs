@@ -1,6 +1,7 @@
-//! Curves of training as event files of TensorBoard.
+//! Training curves as TensorBoard event files.
 //!
-//! An event file is a row of TFRecords (length and bytes, each followed by its masked CRC-32C), a protocol buffer of the type `Event` each:
+//! An event file is a sequence of TFRecords (length and content, each followed by its masked CRC-32C), each with a
+//! protocol buffer of type `Event`:
 //! <https://github.com/tensorflow/tensorboard/blob/master/tensorboard/compat/proto/event.proto>.
 
 use crate::ReportError;
@@ -10,19 +11,20 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
-/// What training writes into a run folder.
+/// The metrics file that training writes into a run folder.
 const METRICS: &str = "metrics.jsonl";
 /// TensorBoard reads files with `tfevents` in their name.
 const EVENT_FILE: &str = "events.out.tfevents.0.lidarshift";
 
-/// Writes an event file into `out` for every `metrics.jsonl` below `runs`, in a folder of the same name relative to it: TensorBoard
-/// calls the runs by these. Gives the files in the order of their names.
+/// Writes an event file into `out` for every `metrics.jsonl` below `runs`, in a folder with the same relative path,
+/// which TensorBoard shows as the run name. Returns the files in the order of their names.
 ///
-/// Every number of a line becomes a scalar: of a step `train/NAME`, of an epoch `epoch/NAME`, of its validation `validation/NAME`. The
-/// lines hold no times; all events have that of the last change of their file, so that the same file gives the same bytes.
+/// Every number of a line becomes a scalar: `train/NAME` for a step, `epoch/NAME` for an epoch, `validation/NAME` for
+/// its validation. The lines hold no times; all events have the modification time of their file, so that the same file
+/// gives the same bytes.
 ///
 /// # Errors
-/// No `metrics.jsonl` below `runs`, one that is damaged, files that cannot be written.
+/// No `metrics.jsonl` below `runs`, a damaged one, or files that cannot be written.
 pub fn write_event_files(runs: &Path, out: &Path) -> Result<Vec<PathBuf>, ReportError> {
     let mut found = Vec::new();
     find_metrics(runs, &mut found)?;
@@ -87,12 +89,12 @@ fn event_file(metrics: &Path, wall_time_s: f64) -> Result<Vec<u8>, ReportError> 
     Ok(file)
 }
 
-/// Every number below `value` with its tag, in the order of the file.
+/// Collects every number below `value` with its tag, in file order.
 fn collect(tag: &str, value: &Value, scalars: &mut Vec<(String, f32)>) {
     match value {
         Value::Number(number) => scalars.extend(number.as_f64().map(|v| (tag.to_string(), v as f32))),
         Value::Object(below) => {
-            // What counts the lines is no curve, and validation is a group of its own.
+            // Counters are not curves, and validation is a separate group.
             let kept = below.iter().filter(|(key, _)| !matches!(key.as_str(), "step" | "epoch" | "validation"));
             kept.for_each(|(key, value)| collect(&format!("{tag}/{key}"), value, scalars));
         }
@@ -110,7 +112,7 @@ fn record(file: &mut Vec<u8>, content: &[u8]) {
     }
 }
 
-// A field of a protocol buffer: number and wire type, then the value. Zeros are left out, as everywhere in proto3.
+// A protocol buffer field: field number and wire type, then the value. Zeros are omitted, as in proto3.
 
 fn int_field(field: u8, value: u64) -> Vec<u8> {
     if value == 0 { Vec::new() } else { [vec![field << 3], varint(value)].concat() }
@@ -120,7 +122,7 @@ fn f64_field(field: u8, value: f64) -> Vec<u8> {
     if value == 0.0 { Vec::new() } else { [&[field << 3 | 1], &value.to_le_bytes()[..]].concat() }
 }
 
-/// Written even if zero: it is one of several kinds of values, and says which.
+/// Written even if zero: it is a oneof member and selects the kind of value.
 fn f32_field(field: u8, value: f32) -> Vec<u8> {
     [&[field << 3 | 5], &value.to_le_bytes()[..]].concat()
 }
@@ -129,7 +131,7 @@ fn bytes_field(field: u8, content: &[u8]) -> Vec<u8> {
     [&[field << 3 | 2], &varint(content.len() as u64)[..], content].concat()
 }
 
-/// Seven bits a byte, the lowest first; the highest bit says that more follow.
+/// Varint: seven bits per byte, lowest first; the highest bit marks continuation.
 fn varint(mut value: u64) -> Vec<u8> {
     let mut bytes = Vec::new();
     while value > 0x7f {
@@ -144,7 +146,8 @@ fn varint(mut value: u64) -> Vec<u8> {
 mod tests {
     use super::*;
 
-    /// `make_events.py` beside the golden file wrote it with TensorBoard's own writer and read it with TensorBoard's own reader.
+    /// The golden file was written by TensorBoard's own writer and checked with its own reader, by `make_events.py`
+    /// next to it.
     #[test]
     fn the_file_is_the_one_that_tensorboard_writes() {
         let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/golden/tensorboard");
@@ -161,7 +164,7 @@ mod tests {
         assert!(error.contains("no metrics.jsonl below it"), "{error}");
         for run in ["b/seed-1", "a/seed-1"] {
             std::fs::create_dir_all(runs.join(run)).unwrap();
-            // A run that is being written: its last line is not whole.
+            // A run that is being written: its last line is incomplete.
             let text = "{\"kind\":\"step\",\"step\":1,\"loss\":3.5}\n{\"kind\":\"st";
             std::fs::write(runs.join(run).join(METRICS), text).unwrap();
         }

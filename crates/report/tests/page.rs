@@ -1,6 +1,6 @@
-//! The report of a study as a whole: one page that needs nothing else, and its files.
+//! Tests of the complete report of a study: the self-contained page and its files.
 
-use data::{Cloud, Detection, Frame, KittiLine, LabelFrame, Object, stream};
+use data::{Cloud, Detection, Frame, LabelBox, LabelFrame, Object, stream};
 use eval::analysis::{AnalysisOptions, BoxPoints, analyse};
 use eval::distance::{DistanceOptions, Regions, compare};
 use eval::features::{CkaTable, Embedded, Embedding, TSNE_SCHEMA, TsneOptions};
@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// A road with a wall, a car on it, and with `noise` in the ranges.
+/// A road with a wall and a car, with range noise of `noise`.
 fn frame(id: usize, noise: f32) -> Frame {
     let mut rng = stream(id as u64, "report test scene", 0, 0);
     let (x, y, yaw) = (rng.random_range(-90.0..90.0), rng.random_range(-8.0..8.0), rng.random_range(-0.2..0.2));
@@ -41,7 +41,7 @@ fn frame(id: usize, noise: f32) -> Frame {
     Frame { id: format!("{id:06}"), cloud, objects: vec![object] }
 }
 
-/// What a network of this quality finds.
+/// Detections of a network with this box noise.
 fn found(frame: &Frame, seed: u64, noise: f64) -> Vec<Detection> {
     let mut rng = stream(seed, "report test run", 0, frame.id.parse().unwrap());
     let mut out = Vec::new();
@@ -62,7 +62,7 @@ fn found(frame: &Frame, seed: u64, noise: f64) -> Vec<Detection> {
 }
 
 fn eval_frames(frames: &[Frame], seed: u64, noise: f64) -> Vec<EvalFrame> {
-    let line = |class: &str, b: &Box3, score| KittiLine::from_box(class, b, score);
+    let line = |class: &str, b: &Box3, score| LabelBox::from_box(class, b, score);
     frames
         .iter()
         .map(|f| EvalFrame {
@@ -111,7 +111,7 @@ fn report() -> StudyReport {
     }
     let analysis = |name: &str, noise: f64| {
         let of_run = eval_frames(&frames, 1, noise);
-        let boxes = |lines: &[KittiLine]| lines.iter().map(KittiLine::lidar_box).collect::<Vec<_>>();
+        let boxes = |lines: &[LabelBox]| lines.iter().map(LabelBox::lidar_box).collect::<Vec<_>>();
         let points: Vec<BoxPoints> = frames
             .iter()
             .zip(&of_run)
@@ -235,7 +235,7 @@ fn written() -> (PathBuf, String) {
     (files.page, html)
 }
 
-/// The page as the browser builds it, if there is one. It has no network.
+/// The DOM of the page in a browser without network, if a browser is installed.
 fn in_browser(page: &Path, more: &[&str]) -> Option<String> {
     let browser = ["chromium", "chromium-browser", "google-chrome"]
         .into_iter()
@@ -265,7 +265,7 @@ fn in_browser(page: &Path, more: &[&str]) -> Option<String> {
 #[test]
 fn the_page_is_whole_and_needs_nothing() {
     let (page, html) = written();
-    // Nothing is loaded: no address but those of namespaces and of data inside, outside of the view's own program.
+    // Nothing is loaded: the only addresses are namespaces and embedded data, apart from the code of the 3D view.
     let begin = html.rfind("<script>").unwrap();
     let text = &html[..begin];
     for part in ["src=", "<link", "@import", "url("] {
@@ -275,13 +275,13 @@ fn the_page_is_whole_and_needs_nothing() {
         .match_indices("://")
         .filter(|(at, _)| !text[..*at].ends_with("http") || !text[*at..].starts_with("://www.w3.org/"));
     assert_eq!(addresses.count(), 0);
-    // Text stays text.
+    // Text is escaped.
     assert!(html.contains("A study of &#60;made up&#62; data") || html.contains("A study of &lt;made up&gt; data"));
     assert_eq!(text.matches("</script>").count(), 1, "the scene's name must not end its element");
     for part in ["NaN", "inf%", "{{", "{%"] {
         assert!(!text.contains(part), "{part}");
     }
-    // What the reader must not miss.
+    // Content that must not be missing.
     for part in [
         "is of another configuration",
         "seed 2 is missing",

@@ -1,9 +1,10 @@
-//! What is known of each point beside its place: a PCD with one row a point, in the order of the cloud.
+//! Per-point attributes: a PCD file with one row per point, in the order of the cloud.
 //!
-//! Columns: `x y z` (as in the cloud, m), `range` (m, from the sensor), `normal_x normal_y normal_z` (towards the sensor, cloud's frame),
-//! `cos_incidence`, `reflectivity` (head-on, against a white plate), `returned` (part of the light that came back), `time` (s, from the middle of
-//! the scan), `object` (groups of the track from 1, cars from 100, 0 unknown), `row`, `column` (65535 unknown), `sensor` (number in the rig),
-//! `material` (number in `names.json` beside it), `echo` (0 first return, 1 second).
+//! Columns: `x y z` (as in the cloud, m), `range` (from the sensor, m), `normal_x normal_y normal_z` (towards the
+//! sensor, cloud frame), `cos_incidence`, `reflectivity` (at normal incidence, relative to a white plate), `returned`
+//! (fraction of the light that returned), `time` (relative to the middle of the scan, s), `object` (track groups from
+//! 1, cars from 100, 0 unknown), `row`, `column` (65535 unknown), `sensor` (index in the rig), `material` (index in
+//! `names.json` in the same folder), `echo` (0 first return, 1 second).
 
 use crate::material::{MaterialId, MaterialTable};
 use crate::object::{FIRST_CAR, Group};
@@ -13,7 +14,7 @@ use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_js
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Folder of the attributes below a data set's root.
+/// Attribute folder below the root of a data set.
 pub const FOLDER: &str = "attributes";
 
 const NAMES: [&str; 17] = [
@@ -36,12 +37,12 @@ const NAMES: [&str; 17] = [
     "echo",
 ];
 
-/// The file of a frame's attributes.
+/// Path of a frame's attribute file.
 pub fn path(root: &Path, id: &str) -> PathBuf {
     root.join(FOLDER).join(format!("{id}.pcd"))
 }
 
-/// The file's bytes for the returns of a scan.
+/// Encodes the returns of a scan.
 pub fn encode(scan: &Scan) -> Vec<u8> {
     let echoes: Vec<&Echo> = scan.returns().collect();
     let float = |f: &dyn Fn(&Echo) -> f32| PcdColumn::F32(echoes.iter().map(|e| f(e)).collect());
@@ -69,7 +70,7 @@ pub fn encode(scan: &Scan) -> Vec<u8> {
     encode_pcd_columns(&NAMES.into_iter().zip(columns).collect::<Vec<_>>())
 }
 
-/// The names behind the numbers of sensors, materials and objects: `names.json` in the folder of attributes.
+/// Writes `names.json` with the names of sensors, materials and objects to the attribute folder.
 pub fn write_names(root: &Path, rig: &Rig, materials: &MaterialTable) -> Result<(), DataError> {
     let objects: serde_json::Map<String, serde_json::Value> =
         Group::ALL.into_iter().map(|g| ((g as u16).to_string(), json!(g))).collect();
@@ -79,7 +80,7 @@ pub fn write_names(root: &Path, rig: &Rig, materials: &MaterialTable) -> Result<
     write_json(&root.join(FOLDER).join("names.json"), &names)
 }
 
-/// The materials of a data set by the numbers in its attributes.
+/// The materials of a data set, by their index in the attributes.
 pub fn read_materials(root: &Path) -> Result<MaterialTable, DataError> {
     let path = root.join(FOLDER).join("names.json");
     let value: serde_json::Value = serde_json::from_str(&fs_err::read_to_string(&path)?)
@@ -91,7 +92,7 @@ pub fn read_materials(root: &Path) -> Result<MaterialTable, DataError> {
     }
 }
 
-/// The returns of a frame from its attributes. Sensors stand where `rig` has them.
+/// Reads the returns of a frame from its attributes. Sensor positions are taken from `rig`.
 pub fn read(path: &Path, rig: &Rig) -> Result<Scan, DataError> {
     let columns = parse_pcd_columns(&fs_err::read(path)?, path, &NAMES)?;
     let origins: Vec<[f32; 3]> = rig.sensors.iter().map(|s| s.position.map(|v| v as f32)).collect();

@@ -1,22 +1,23 @@
-//! The paper's downsampling by distribution: a loss by range that makes the ranges of one data set those of another.
+//! The paper's downsampling by distribution: range-dependent dropout that matches the range distribution of another
+//! data set.
 
 use crate::effects::RangeDropout;
 use data::{Cloud, DataError, Dataset};
 use rayon::prelude::*;
 
-/// Width of a bin of ranges, m.
+/// Width of a range bin, m.
 pub const BIN_M: f64 = 5.0;
-/// Ranges beyond count in the last bin, m.
+/// Larger ranges are counted in the last bin, m.
 const FARTHEST_M: f64 = 150.0;
 
-/// How many points lie at which range from the cloud's origin, by bins of [`BIN_M`].
+/// Histogram of ranges from the cloud origin, in bins of [`BIN_M`].
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct RangeHistogram {
     counts: Vec<u64>,
 }
 
 impl RangeHistogram {
-    /// Counts the points of a cloud.
+    /// Adds the points of a cloud.
     pub fn add(&mut self, cloud: &Cloud) {
         let bins = (FARTHEST_M / BIN_M) as usize;
         self.counts.resize(bins, 0);
@@ -32,7 +33,7 @@ impl RangeHistogram {
         self
     }
 
-    /// Counts the points of these frames of a data set.
+    /// Histogram of these frames of a data set.
     pub fn of_dataset(dataset: &Dataset, ids: &[String]) -> Result<RangeHistogram, DataError> {
         let count = |id: &String| {
             let mut histogram = RangeHistogram::default();
@@ -43,8 +44,8 @@ impl RangeHistogram {
     }
 }
 
-/// The share of the points of `simulated` that must be lost at each range so that as many are left as `measured` has; where it has more, none.
-/// Both are counts over the same frames.
+/// The dropout by range that reduces `simulated` to the point counts of `measured`; 0 where `measured` has more. Both
+/// histograms are over the same frames.
 pub fn fit_range_dropout(measured: &RangeHistogram, simulated: &RangeHistogram) -> RangeDropout {
     let share = |i: usize| {
         let (m, s) = (measured.counts.get(i).copied().unwrap_or(0) as f64, simulated.counts[i] as f64);
@@ -64,7 +65,7 @@ mod tests {
     use crate::effects::testing::applied;
     use crate::scan::{Echo, Scan};
 
-    /// Points at all ranges up to 100 m, fewer than one in two beyond 50 m.
+    /// Points at all ranges up to 100 m, less than half of them beyond 50 m.
     fn clouds() -> (Scan, Scan) {
         let at = |range_m: f32| Echo { range_m, ..Echo::nothing([0.0; 3], [1.0, 0.0, 0.0]) };
         let all: Vec<Echo> = (0..100_000).map(|i| at(i as f32 * 1e-3)).collect();
@@ -86,7 +87,7 @@ mod tests {
         let after = histogram(&applied(&effect, &simulated));
         let want = histogram(&measured);
         for i in 0..20 {
-            // At 50 m the table has a ramp between two bins.
+            // At 50 m the table has a linear ramp between two bins.
             let tolerance = if (9..=10).contains(&i) { 0.5 } else { 0.05 };
             assert!((after.counts[i] as f64 / want.counts[i] as f64 - 1.0).abs() < tolerance, "bin {i}");
         }

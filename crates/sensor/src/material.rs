@@ -1,4 +1,4 @@
-//! What surfaces are made of, and how much light they send back.
+//! Surface materials and their reflectance.
 
 use data::KeyError;
 use data::toml_text::{within, wrong};
@@ -10,21 +10,22 @@ use std::collections::BTreeMap;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct MaterialId(pub u8);
 
-/// How a surface reflects at the laser's wavelength.
+/// Reflectance of a surface at the laser's wavelength.
 ///
-/// A beam that meets it under incidence i comes back with the part `reflectivity * f(cos i)` of what a white Lambertian plate would send
-/// back head-on, where `f(c) = (1 - lobe) * c + lobe * c^exponent`: Lambert's law and a lobe towards the sensor, f(1) = 1. Tyres and mats
-/// follow Lambert (lobe 0); paint and metal send most of their light back only when met head-on (Muckenhuber et al. 2020 measured such
-/// curves for automotive materials at 905 nm).
+/// At an angle of incidence i, the returned light is `reflectivity * f(cos i)` relative to a white Lambertian plate at
+/// normal incidence, where `f(c) = (1 - lobe) * c + lobe * c^exponent`: a Lambertian part and a lobe towards the
+/// sensor, f(1) = 1. Tyres and mats are Lambertian (lobe 0); paint and metal return most light at normal incidence
+/// (Muckenhuber et al. 2020 measured such curves for automotive materials at 905 nm).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Material {
-    /// Against a white plate, head-on. 0.04 rubber, 0.2 asphalt, 0.5 paint; above 1 for retro-reflectors.
+    /// Reflectivity at normal incidence, relative to a white plate. 0.04 rubber, 0.2 asphalt, 0.5 paint; above 1 for
+    /// retro-reflectors.
     pub reflectivity: f64,
-    /// Share of the light in the lobe, 0 to 1.
+    /// Fraction of the light in the lobe, 0 to 1.
     #[serde(default)]
     pub lobe: f64,
-    /// Narrowness of the lobe, at least 1.
+    /// Exponent of the lobe, at least 1; larger is narrower.
     #[serde(default = "one")]
     pub exponent: f64,
 }
@@ -34,7 +35,7 @@ fn one() -> f64 {
 }
 
 impl Material {
-    /// The part of the light that comes back under this cosine of incidence.
+    /// Fraction of the light returned at this cosine of incidence.
     pub fn returned(&self, cos_incidence: f64) -> f64 {
         let c = cos_incidence.clamp(0.0, 1.0);
         self.reflectivity * ((1.0 - self.lobe) * c + self.lobe * c.powf(self.exponent))
@@ -47,7 +48,8 @@ impl Material {
     }
 }
 
-/// Name, reflectivity, lobe, exponent. Typical values for near infrared; tyres, carbon and paint after the ranges in Muckenhuber et al. 2020.
+/// Name, reflectivity, lobe, exponent. Typical near-infrared values; tyres, carbon and paint follow the ranges in
+/// Muckenhuber et al. 2020.
 const BUILT_IN: [(&str, f64, f64, f64); 20] = [
     ("asphalt", 0.20, 0.0, 1.0),
     ("apron", 0.24, 0.0, 1.0),
@@ -71,7 +73,7 @@ const BUILT_IN: [(&str, f64, f64, f64); 20] = [
     ("unknown", 0.20, 0.0, 1.0),
 ];
 
-/// Materials by name and number.
+/// Materials by name and index.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MaterialTable {
     names: Vec<String>,
@@ -89,7 +91,7 @@ impl Default for MaterialTable {
 }
 
 impl MaterialTable {
-    /// The built-in materials, with some replaced and others added.
+    /// The built-in materials with changes and additions.
     pub fn with(changes: &BTreeMap<String, Material>) -> Result<Self, KeyError> {
         let mut table = MaterialTable::default();
         for (name, material) in changes {
@@ -106,35 +108,36 @@ impl MaterialTable {
         Ok(table)
     }
 
-    /// A table with these names in this order, as a data set's attributes number them; names that are not built in reflect as "unknown".
+    /// A table of these names in this order, as in a data set's attributes. Names that are not built in get the
+    /// reflectance of "unknown".
     pub fn named(names: &[String]) -> Self {
         let built_in = MaterialTable::default();
         let material = |name: &String| *built_in.get(built_in.find(name).unwrap_or(MaterialTable::built_in("unknown")));
         MaterialTable { names: names.to_vec(), materials: names.iter().map(material).collect() }
     }
 
-    /// The number of a name.
+    /// Index of a name.
     pub fn find(&self, name: &str) -> Option<MaterialId> {
         self.names.iter().position(|n| n == name).map(|i| MaterialId(i as u8))
     }
 
-    /// The number of a built-in name; a name that is not built in is a mistake of the program.
+    /// Index of a built-in name.
     pub fn built_in(name: &str) -> MaterialId {
         let place = BUILT_IN.iter().position(|m| m.0 == name);
         MaterialId(place.unwrap_or_else(|| panic!("{name} is in the list of built-in materials")) as u8)
     }
 
-    /// The material of a number.
+    /// Material of an index.
     pub fn get(&self, id: MaterialId) -> &Material {
         &self.materials[usize::from(id.0)]
     }
 
-    /// The name of a number.
+    /// Name of an index.
     pub fn name(&self, id: MaterialId) -> &str {
         &self.names[usize::from(id.0)]
     }
 
-    /// All names, in the order of their numbers.
+    /// All names, by index.
     pub fn names(&self) -> &[String] {
         &self.names
     }

@@ -1,4 +1,4 @@
-//! A scan of the race: rays alone, a frame of `sim`, a frame of `measured`.
+//! Simulation of one race scan: ray casting only, a frame of `sim`, a frame of `measured`.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use lidarshift_simulate::race::{ConfigFiles, RaceConfig, Simulator};

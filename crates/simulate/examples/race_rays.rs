@@ -1,13 +1,14 @@
-//! Rays of the race against its triangles, timed, and beside Embree where Open3D is there.
+//! Timing of the race's ray casting, compared with Embree if Open3D is installed.
 //!
 //! ```sh
 //! python3 -m venv .venv && .venv/bin/pip install open3d numpy
 //! cargo run --release -p lidarshift-simulate --example race_rays -- bench/raycast .venv/bin/python
 //! ```
 //!
-//! Writes triangles and rays of 20 frames to the folder, casts them with each instruction set on one and on two threads, lets
-//! `embree.py` cast the same ones with Open3D's `RaycastingScene`, and casts once more, so that both are measured in one run. Own rays meet the
-//! two-level tree (the cars as instances); Embree gets one scene a frame with the cars' triangles where they are.
+//! Writes triangles and rays of 20 frames to the folder and casts them with each instruction set on one and two
+//! threads. Then `embree.py` casts the same rays with Open3D's `RaycastingScene`, followed by another run here, so
+//! that both are measured under the same conditions. Our rays are cast against the two-level tree (cars as instances);
+//! Embree gets one scene per frame with transformed cars.
 
 #![expect(clippy::print_stdout, reason = "it is what it is for")]
 
@@ -24,17 +25,17 @@ use std::sync::Arc;
 use std::time::Instant;
 
 const FRAMES: usize = 20;
-/// Rays of a frame are cast that often, so that a run takes seconds.
+/// Repetitions per frame, for a run time of seconds.
 const ROUNDS: usize = 10;
 
 type Corners = [[f32; 3]; 3];
 
-/// One frame: its scene, and its rays as a grid for each sensor.
+/// One frame: its scene, and its rays as a grid per sensor.
 struct Case {
     scene: Scene,
     rays: Vec<Ray>,
     columns: usize,
-    /// The cars' triangles where they are.
+    /// Triangles of the cars in scene coordinates.
     cars: Vec<Corners>,
 }
 
@@ -115,7 +116,8 @@ fn corners(mesh: &Mesh) -> Vec<Corners> {
     mesh.faces.iter().map(|face| face.corners.map(corner)).collect()
 }
 
-/// `static.f32`, and for each frame `cars_NN.f32` (triangles), `rays_NN.f32` (origin, direction) and `hits_NN.f32` (ranges).
+/// Writes `static.f32`, and for each frame `cars_NN.f32` (triangles), `rays_NN.f32` (origin, direction) and
+/// `hits_NN.f32` (ranges).
 fn export(folder: &Path, world: &Mesh, cases: &[Case]) -> std::io::Result<()> {
     let write = |name: String, values: Vec<f32>| {
         let bytes: Vec<u8> = values.iter().flat_map(|v| v.to_le_bytes()).collect();
@@ -132,7 +134,7 @@ fn export(folder: &Path, world: &Mesh, cases: &[Case]) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Million rays a second on one and on two threads: the best of three runs, after one to warm up.
+/// Million rays per second on one and two threads: the best of three runs after a warm-up.
 fn measure(cases: &[Case], set: InstructionSet, rays: usize) -> Result<(), Box<dyn std::error::Error>> {
     let mut line = format!("lidarshift {set:?}:");
     for threads in [1, 2] {

@@ -1,5 +1,5 @@
-//! Labels as they are made on the road: recorded positions of all cars, brought to the time of the cloud, as boxes in the own car's frame,
-//! shifted to where the points are (Huch et al. 2023, section III-A).
+//! Automatic labels as made from road recordings: recorded positions of all cars, interpolated to the time of the
+//! cloud, become boxes in the ego frame and are shifted to fit the points (Huch et al. 2023, section III-A).
 
 use crate::scenario::{CarState, Trajectory};
 use data::KeyError;
@@ -12,21 +12,21 @@ use schemars::JsonSchema;
 use sensor::car::car_box;
 use serde::{Deserialize, Serialize};
 
-/// How positions are recorded and labels made of them.
+/// How positions are recorded and labels are derived from them.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AutoLabel {
-    /// Records a second of each car.
+    /// Recording rate per car, Hz.
     pub rate_hz: f64,
-    /// Records come that long after the middle of a scan, s: positions and clouds are not taken together.
+    /// Time of the records relative to the middle of a scan, s: positions and clouds are not synchronised.
     pub phase_s: f64,
-    /// Error of each recorded position along each axis, m.
+    /// Standard deviation of the recorded position per axis, m.
     pub position_std_m: f64,
-    /// Error of each recorded heading, degrees.
+    /// Standard deviation of the recorded heading, degrees.
     pub heading_std_deg: f64,
-    /// Error of each recorded roll and pitch, degrees.
+    /// Standard deviation of the recorded roll and pitch, degrees.
     pub tilt_std_deg: f64,
-    /// Shift the boxes to the points.
+    /// Whether boxes are shifted to fit the points.
     pub refine: bool,
 }
 
@@ -52,8 +52,8 @@ impl AutoLabel {
         within("tilt_std_deg", self.tilt_std_deg, 0.0, 45.0)
     }
 
-    /// What is recorded of a car around `time_s`: two records before and two after, with their errors. The errors of a record are the same
-    /// whoever asks: they depend on (seed, purpose, number of the record).
+    /// The records of a car around `time_s`: two before and two after, with noise. The noise depends only on (seed,
+    /// purpose, record index), so every caller gets the same.
     fn records(&self, car: &Trajectory, time_s: f64, seed: u64, purpose: &str) -> Option<Trajectory> {
         let number = ((time_s - self.phase_s) * self.rate_hz).floor() as i64;
         let record = |number: i64| {
@@ -77,8 +77,8 @@ impl AutoLabel {
         states.map(Trajectory::from_states)
     }
 
-    /// The boxes of `cars` at the time of a cloud in the frame of `ego`, from what is recorded of all of them; upright, as labels are. `None`
-    /// for a car without records around that time. `purpose` names the run.
+    /// The boxes of `cars` at the time of a cloud, in the frame of `ego`, derived from the records; upright, as labels
+    /// are. `None` for a car without records around that time. `purpose` names the random stream of the run.
     pub fn boxes(
         &self,
         ego: &Trajectory,
@@ -97,17 +97,17 @@ impl AutoLabel {
     }
 }
 
-/// Points needed to believe them rather than the record.
+/// Minimum number of points for a shift.
 const FEWEST: usize = 20;
-/// Points lower above the bottom of a box may be ground, m.
+/// Points below this height above the bottom of a box may be ground, m.
 const GROUND_M: f64 = 0.15;
-/// Boxes are shifted no farther than this along and across, m.
+/// Maximum shift along and across the box, m.
 const FARTHEST_M: [f64; 2] = [1.2, 0.5];
-/// Share of the points at either end that are not believed.
+/// Fraction of the points at either end that are treated as outliers.
 const TRIMMED: f64 = 0.02;
 
-/// The box shifted so that the points in and around it touch the faces that the sensor sees. Boxes with few points stay where they are, and a
-/// shift that would lose points is not made.
+/// Shifts a box so that the points in and around it touch the faces visible to the sensor. Boxes with few points are
+/// not shifted, and neither are boxes that would lose points.
 pub fn refine(cloud: &Cloud, bbox: &Box3) -> Box3 {
     let around = Box3 {
         center: [bbox.center[0], bbox.center[1], bbox.center[2] + GROUND_M],
@@ -130,7 +130,7 @@ pub fn refine(cloud: &Cloud, bbox: &Box3) -> Box3 {
         } else if sensor[axis] > half {
             high - half
         } else if high - low > 1.6 * half {
-            (low + high) / 2.0 // both faces are seen
+            (low + high) / 2.0 // both faces are visible
         } else {
             0.0
         };
@@ -150,24 +150,24 @@ pub fn refine(cloud: &Cloud, bbox: &Box3) -> Box3 {
 /// Range sections of the paper, m.
 pub const SECTIONS_M: [[f64; 2]; 3] = [[0.0, 33.3], [33.3, 66.6], [66.6, 100.0]];
 
-/// How far labels are from the true boxes in one section of ranges.
+/// Label errors in one range section.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, Default)]
 pub struct LabelError {
-    /// From and to, m.
+    /// Lower and upper bound, m.
     pub range_m: [f64; 2],
-    /// Labels.
+    /// Number of labels.
     pub labels: usize,
-    /// Root mean square along the true heading, across it, and up, m.
+    /// RMS error along the true heading, across it, and up, m.
     pub rms_m: [f64; 3],
-    /// Mean along the true heading, across it, and up, m.
+    /// Mean error along the true heading, across it, and up, m.
     pub mean_m: [f64; 3],
-    /// Root mean square of the heading, degrees.
+    /// RMS heading error, degrees.
     pub yaw_rms_deg: f64,
-    /// Share of the labels that overlap their car by less than 0.7 (IoU of boxes).
+    /// Fraction of the labels with a 3D IoU below 0.7.
     pub below_iou_0_7: f64,
 }
 
-/// The errors of labels against true boxes, by section of ranges.
+/// Label errors by range section, from pairs of label and true box.
 pub fn label_errors(pairs: impl Iterator<Item = (Box3, Box3)>) -> Vec<LabelError> {
     let mut sums = [[0.0; 8]; 3];
     let mut counts = [0_usize; 3];
@@ -240,14 +240,15 @@ mod tests {
         let pairs = (0..2000).map(|i| (auto.boxes(&ego, &cars, 0.05 * f64::from(i), 1, "run 0")[0].unwrap(), truth));
         let errors = label_errors(pairs);
         assert_eq!(errors.iter().map(|e| e.labels).collect::<Vec<_>>(), [2000, 0, 0]);
-        // Two cars; between two records (17 of 50 ms after the first) errors are averaged: weights 0.74 and 0.26 of the cubic.
+        // Two cars; between two records (17 of 50 ms after the first) errors are averaged: cubic weights 0.74 and
+        // 0.26.
         for (rms, mean) in errors[0].rms_m.iter().zip(errors[0].mean_m) {
             assert!((0.08..0.14).contains(rms) && mean.abs() < 0.01, "{errors:?}");
         }
         assert_eq!(errors[0].yaw_rms_deg, 0.0);
     }
 
-    /// The cloud of a car at a place, seen from above the own car, on a level ground.
+    /// Cloud and box of a car on level ground, in the ego frame.
     fn cloud_of(x: f64, y: f64, yaw: f64) -> (Cloud, Box3) {
         let ground = cuboid([-200.0, -200.0, -2.0], [200.0, 200.0, 0.0], MaterialTable::built_in("asphalt"));
         let (world, car, materials) = (World::new(&ground), CarShape::new(&race_car()), MaterialTable::default());
@@ -269,7 +270,7 @@ mod tests {
         for (x, y, yaw) in [(20.0, 5.0, 0.0), (-28.0, -5.0, 0.02), (12.0, -4.0, -0.1), (35.0, 5.0, 0.1)] {
             let (cloud, truth) = cloud_of(x, y, yaw);
             let off = |b: &Box3| truth.to_local(b.center);
-            // Farther away fewer points lie on the edges of a car.
+            // At larger distances fewer points are on the edges of a car.
             let allowed = if x < 30.0 { 0.25 } else { 0.45 };
             for shift in [[0.7, 0.1], [-0.7, -0.1], [0.4, -0.25]] {
                 let wrong = Box3 { center: truth.from_local([shift[0], shift[1], 0.0]), ..truth };

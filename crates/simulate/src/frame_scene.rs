@@ -1,4 +1,5 @@
-//! One moment of the race as rays see it: the static world, the cars where they are, and the car that carries the sensors.
+//! Ray casting scene of one moment of the race: the static world, the cars at their poses, and the ego vehicle with
+//! the sensors.
 
 use crate::raycast::{Hit, Instance, Ray, Scene};
 use crate::scenario::Motion;
@@ -11,7 +12,7 @@ use sensor::object::FIRST_CAR;
 use sensor::scan::{Echo, Scan, dot};
 use sensor::{RayCaster, Surface};
 
-/// The scene of one cloud.
+/// Ray casting scene of one cloud.
 pub struct FrameScene<'a> {
     world: &'a World,
     car: &'a CarShape,
@@ -21,7 +22,7 @@ pub struct FrameScene<'a> {
 }
 
 impl<'a> FrameScene<'a> {
-    /// `cars` are all but the one that carries the sensors, each with its motion (the pose is `world_from_car`).
+    /// `cars` are all cars except the ego vehicle, with their motion (the pose is `world_from_car`).
     pub fn new(
         world: &'a World,
         car: &'a CarShape,
@@ -50,22 +51,23 @@ impl<'a> FrameScene<'a> {
         self.ego.pose
     }
 
-    /// The scan of these shots.
+    /// Simulates the scan of these shots.
     pub fn scan(&self, beams: &Beams) -> Scan {
         let mut scan = Scan { echoes: Vec::with_capacity(beams.shots()) };
         let mut seconds = Vec::new();
-        // The car as it really stands.
+        // The true pose of the ego vehicle.
         let mut ego = self.ego;
         ego.pose.translation.vector += self.ego.pose.rotation * Vector3::z() * beams.ego_heave_m;
         ego.pose.rotation *= beams.ego_tilt;
         for (number, sensor) in beams.sensors.iter().enumerate() {
             let first = scan.echoes.len();
-            self.believed(number, sensor, beams, &mut scan.echoes);
-            let sight = Sight::new(&ego.pose, &sensor.true_mount, self.world.origin, beams.shutter.map(|_| &ego));
+            self.nominal_shots(number, sensor, beams, &mut scan.echoes);
+            let transform =
+                RayTransform::new(&ego.pose, &sensor.true_mount, self.world.origin, beams.shutter.map(|_| &ego));
             let echoes = &mut scan.echoes[first..];
             match beams.width {
-                None => self.cast_lines(sensor, &sight, echoes),
-                Some(width) => self.cast_bundles(sensor, &sight, &width, echoes, &mut seconds),
+                None => self.cast_lines(sensor, &transform, echoes),
+                Some(width) => self.cast_bundles(sensor, &transform, &width, echoes, &mut seconds),
             }
             for echo in echoes.iter_mut().chain(&mut seconds) {
                 if !(sensor.limits_m[0]..=sensor.limits_m[1]).contains(&echo.range_m) {
@@ -77,8 +79,8 @@ impl<'a> FrameScene<'a> {
         scan
     }
 
-    /// The shots of a sensor as it believes them, without returns.
-    fn believed(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
+    /// The shots of a sensor with their nominal directions, without returns.
+    fn nominal_shots(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
         let mount = &sensor.believed_mount;
         let rotation: Matrix3<f32> = mount.rotation.to_rotation_matrix().matrix().map(|v| v as f32);
         let origin: Vector3<f32> = mount.translation.vector.map(|v| v as f32);
@@ -103,9 +105,9 @@ impl<'a> FrameScene<'a> {
         }
     }
 
-    fn cast_lines(&self, sensor: &SensorBeams, sight: &Sight, echoes: &mut [Echo]) {
+    fn cast_lines(&self, sensor: &SensorBeams, transform: &RayTransform, echoes: &mut [Echo]) {
         let rays: Vec<Ray> =
-            sensor.shots.iter().zip(sensor.directions()).map(|(s, d)| sight.ray(*d, s.time_s as f32)).collect();
+            sensor.shots.iter().zip(sensor.directions()).map(|(s, d)| transform.ray(*d, s.time_s as f32)).collect();
         let mut hits = vec![Hit::MISS; rays.len()];
         self.scene.cast(&rays, sensor.columns, &mut hits);
         for ((hit, ray), echo) in hits.iter().zip(&rays).zip(echoes) {
@@ -113,11 +115,11 @@ impl<'a> FrameScene<'a> {
         }
     }
 
-    /// Every shot as a bundle; returns are the groups of surfaces that lie within a pulse.
+    /// Casts every shot as a bundle of rays; returns are groups of surfaces within a pulse length.
     fn cast_bundles(
         &self,
         sensor: &SensorBeams,
-        sight: &Sight,
+        transform: &RayTransform,
         width: &BeamWidth,
         echoes: &mut [Echo],
         seconds: &mut Vec<Echo>,
@@ -125,7 +127,7 @@ impl<'a> FrameScene<'a> {
         let bundle = bundle(width);
         let ray = |(shot, direction): (&sensor::rig::Shot, &[f32; 3])| {
             let (direction, time_s) = (*direction, shot.time_s as f32);
-            bundle.iter().map(move |(left, up, _)| sight.ray(sensor::beams::turned(direction, *left, *up), time_s))
+            bundle.iter().map(move |(left, up, _)| transform.ray(sensor::beams::turned(direction, *left, *up), time_s))
         };
         let rays: Vec<Ray> = sensor.shots.iter().zip(sensor.directions()).flat_map(ray).collect();
         let mut hits = vec![Hit::MISS; rays.len()];
@@ -198,12 +200,12 @@ impl<'a> FrameScene<'a> {
 
 impl RayCaster for FrameScene<'_> {
     fn cast(&self, rays: &[([f32; 3], [f32; 3])]) -> Vec<Surface> {
-        let sight = Sight::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
+        let transform = RayTransform::new(&self.ego.pose, &Pose::identity(), self.world.origin, None);
         let world: Vec<Ray> = rays
             .iter()
             .map(|(origin, direction)| {
-                let offset = sight.rotation * Vector3::from(*origin);
-                let mut ray = sight.ray(*direction, 0.0);
+                let offset = transform.rotation * Vector3::from(*origin);
+                let mut ray = transform.ray(*direction, 0.0);
                 (0..3).for_each(|k| ray.origin[k] += offset[k]);
                 ray
             })
@@ -216,28 +218,28 @@ impl RayCaster for FrameScene<'_> {
     }
 }
 
-/// From a sensor's frame to the coordinates of the scene, at any time within the scan.
-struct Sight {
+/// Transform from a sensor frame to scene coordinates, at any time within the scan.
+struct RayTransform {
     origin: Vector3<f32>,
     rotation: Matrix3<f32>,
-    /// Velocity of the sensor and rate of turn, scene's axes.
+    /// Velocity and angular velocity of the sensor, scene axes.
     motion: Option<(Vector3<f32>, Vector3<f32>)>,
 }
 
-impl Sight {
+impl RayTransform {
     fn new(
         world_from_cloud: &Pose,
         cloud_from_sensor: &Pose,
         scene_origin: [f64; 3],
         moving: Option<&Motion>,
-    ) -> Sight {
+    ) -> RayTransform {
         let world_from_sensor = world_from_cloud * cloud_from_sensor;
         let origin = (world_from_sensor * Point3::origin()).coords - Vector3::from(scene_origin);
         let motion = moving.map(|ego| {
             let lever = world_from_cloud.rotation * cloud_from_sensor.translation.vector;
             ((ego.velocity + ego.turn_rate.cross(&lever)).map(|v| v as f32), ego.turn_rate.map(|v| v as f32))
         });
-        Sight {
+        RayTransform {
             origin: origin.map(|v| v as f32),
             rotation: world_from_sensor.rotation.to_rotation_matrix().matrix().map(|v| v as f32),
             motion,
@@ -256,8 +258,8 @@ impl Sight {
     }
 }
 
-/// Offsets to the left and up (rad) and weights of the rays of a beam: the middle and one or two rings, weighted as a Gaussian beam whose
-/// light has fallen to exp(-2) at the edge.
+/// Offsets to the left and up (rad) and weights of the rays of a beam: the centre and one or two rings, weighted as a
+/// Gaussian beam with intensity exp(-2) at the edge.
 fn bundle(width: &BeamWidth) -> Vec<(f32, f32, f32)> {
     let half = width.divergence_rad / 2.0;
     let rings: &[(u32, f32)] = if width.rays > 7 { &[(1, 0.0), (6, 0.4), (12, 0.8)] } else { &[(1, 0.0), (6, 0.66)] };
@@ -272,8 +274,8 @@ fn bundle(width: &BeamWidth) -> Vec<(f32, f32, f32)> {
     rays.into_iter().map(|(left, up, weight)| (left, up, weight / sum)).collect()
 }
 
-/// Groups of surfaces with no gap of a pulse between them, from the nearest: each with the mean range and the whole light, and for the rest
-/// what its brightest ray met.
+/// Groups surfaces without a gap of a pulse length between them, nearest first. Each group has the mean range and the
+/// total light; its other attributes are those of its brightest ray.
 fn returns_of(mut met: Vec<(Surface, f32)>, pulse_m: f32) -> Vec<(Surface, f32)> {
     met.sort_by(|a, b| a.0.range_m.total_cmp(&b.0.range_m));
     let mut groups = Vec::new();
@@ -283,7 +285,7 @@ fn returns_of(mut met: Vec<(Surface, f32)>, pulse_m: f32) -> Vec<(Surface, f32)>
             continue;
         }
         let group = &met[begin..end];
-        // A surface that sends nothing back still has a range.
+        // A surface with zero reflectivity still has a range.
         let light: f32 = group.iter().map(|(s, l)| (l + 1e-12) / (s.range_m * s.range_m)).sum();
         let range_m = group.iter().map(|(s, l)| s.range_m * (l + 1e-12) / (s.range_m * s.range_m)).sum::<f32>() / light;
         let brightest = group.iter().max_by(|a, b| a.1.total_cmp(&b.1)).expect("a group has a surface").0;
@@ -293,10 +295,10 @@ fn returns_of(mut met: Vec<(Surface, f32)>, pulse_m: f32) -> Vec<(Surface, f32)>
     groups
 }
 
-/// The group that sends back the most light, `but` one left out.
+/// Index of the group with the most light, excluding `but`.
 fn strongest(groups: &[(Surface, f32)], but: Option<usize>) -> usize {
     let light = |i: usize| groups[i].1 / (groups[i].0.range_m * groups[i].0.range_m);
-    // Of equals the nearest.
+    // The nearest one if tied.
     (0..groups.len()).filter(|i| Some(*i) != but).rev().max_by(|a, b| light(*a).total_cmp(&light(*b))).unwrap_or(0)
 }
 

@@ -1,21 +1,21 @@
-//! The car: an open-wheel racing car after the Dallara AV-21, built from its outer measures.
+//! Built-in car: an open-wheel racing car with the outer dimensions of the Dallara AV-21.
 //!
-//! Everything is in the car's frame, which is also the frame of its clouds: origin at the middle of the rear axle, 0.198 m above the
-//! ground (the frame of the published sensor mounts), x forward, y left, z up, m.
+//! Coordinates are in the car frame, which is also the frame of its clouds: origin at the centre of the rear axle,
+//! 0.198 m above the ground (the frame of the published sensor mounts), x forward, y left, z up, m.
 
 use crate::mesh::{Mesh, cuboid, cylinder, loft};
 use sensor::car::{CAR_SIZE_M, ORIGIN_ABOVE_GROUND_M, REAR_M};
 use sensor::material::{MaterialId, MaterialTable};
 
-/// Distance between the axles, m (Dallara IL-15, on which the AV-21 is built).
+/// Wheelbase, m (Dallara IL-15, on which the AV-21 is based).
 const WHEELBASE_M: f64 = 2.97;
 const WHEEL_RADIUS_M: f64 = 0.33;
 const GROUND_M: f64 = -ORIGIN_ABOVE_GROUND_M;
 
-/// A cross-section of the body: place along the car, half width, lowest and highest z, and how square it is (2 an ellipse, larger squarer).
+/// A cross-section of the body: x, half width, minimum and maximum z, and superellipse exponent (2 is an ellipse).
 struct Section(f64, f64, f64, f64, f64);
 
-/// Nose, tub with the sensors' recess, engine cover.
+/// Nose, tub with the sensor recess, engine cover.
 const BODY: [Section; 12] = [
     Section(REAR_M + CAR_SIZE_M[0] - 0.02, 0.05, -0.02, 0.06, 2.5),
     Section(3.80, 0.11, -0.05, 0.14, 2.5),
@@ -40,7 +40,7 @@ fn ring(&Section(x, half_width, low, high, squareness): &Section) -> Vec<[f64; 3
     (0..28).map(point).collect()
 }
 
-/// The car as a mesh of closed parts: nose, tub and engine cover, side pods, floor, wheels, suspension, front and rear wing.
+/// The car as closed meshes: nose, tub and engine cover, side pods, floor, wheels, suspension, front and rear wing.
 pub fn race_car() -> Mesh {
     let [paint, carbon, metal] = ["paint", "carbon", "metal"].map(MaterialTable::built_in);
     let front_m = REAR_M + CAR_SIZE_M[0];
@@ -54,7 +54,7 @@ pub fn race_car() -> Mesh {
             let [left, right] = y(across[0], across[1]);
             add(cuboid([x[0], left, z[0]], [x[1], right, z[1]], material));
         };
-        // Front wing: main plane, flap, end plate. The foremost and lowest parts of the wing are the box's front.
+        // Front wing: main plane, flap, end plate. Its foremost and lowest points define the box.
         block([front_m - 0.32, front_m], [0.04, 0.90], [-0.13, -0.10], carbon);
         block([front_m - 0.34, front_m - 0.16], [0.25, 0.90], [-0.07, -0.04], paint);
         block([front_m - 0.45, front_m - 0.02], [0.90, 0.92], [-0.15, 0.02], paint);
@@ -62,8 +62,8 @@ pub fn race_car() -> Mesh {
         block([REAR_M + 0.05, REAR_M + 0.38], [0.0, 0.52], [top_m - 0.20, top_m - 0.16], carbon);
         block([REAR_M, REAR_M + 0.20], [0.0, 0.52], [top_m - 0.10, top_m - 0.06], carbon);
         block([REAR_M, REAR_M + 0.45], [0.52, 0.54], [top_m - 0.42, top_m], paint);
-        block([REAR_M + 0.10, REAR_M + 0.30], [0.08, 0.10], [0.10, top_m - 0.18], metal); // its support
-        // Arms of the suspension.
+        block([REAR_M + 0.10, REAR_M + 0.30], [0.08, 0.10], [0.10, top_m - 0.18], metal); // wing support
+        // Suspension arms.
         for x in [-0.12, 0.12, WHEELBASE_M - 0.14, WHEELBASE_M + 0.14] {
             block([x - 0.02, x + 0.02], [0.08, 0.70], [0.08, 0.11], metal);
             block([x - 0.02, x + 0.02], [0.08, 0.70], [0.22, 0.25], metal);
@@ -93,7 +93,7 @@ fn side_pod(side: f64, paint: MaterialId) -> Mesh {
     loft(&sections.map(ring), paint)
 }
 
-/// A tyre around a rim; its outer face is the side of the box, its lowest point the ground.
+/// A tyre with a rim; its outer face is on the side of the box, its lowest point on the ground.
 fn wheel(x: f64, side: f64, width: f64) -> Mesh {
     const SIDES: u32 = 32;
     let outer = CAR_SIZE_M[1] / 2.0;
@@ -107,7 +107,7 @@ fn wheel(x: f64, side: f64, width: f64) -> Mesh {
     ];
     let ring = |(radius, inwards): (f64, f64)| {
         let point = |i: u32| {
-            // Turned by half a side less a quarter, so that a corner stands on the ground.
+            // Rotated by a quarter of a side, so that a corner touches the ground.
             let (s, c) = (std::f64::consts::TAU * f64::from(i) / f64::from(SIDES)).sin_cos();
             [x + radius * s, side * (outer - inwards), GROUND_M + WHEEL_RADIUS_M - radius * c]
         };

@@ -1,14 +1,9 @@
-//! The sensor model on data sets that are finished, of this simulator or any other.
+//! Applies sensor effects to existing data sets, of this simulator or any other.
 
 use crate::SimulateError;
 use crate::scenario::FRAME_S;
 use data::toml_text::wrong;
-use data::write::{label_lines, write_bin, write_dataset_toml, write_kitti_text, write_pcd, write_split};
-use data::{
-    DataError, Dataset, DatasetConfig, Frame, KittiLine, LabelFrame, Layout, PcdEncoding, PointColumns, write_atomic,
-    write_json,
-};
-use rayon::prelude::*;
+use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, PointColumns, write_atomic};
 use sensor::attributes;
 use sensor::cloud_scan::scan_of_cloud;
 use sensor::effects::{EffectList, FrameContext, LabelledCar, Need};
@@ -19,48 +14,60 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const RESIM_MANIFEST_SCHEMA: &str = "lidarshift/resim-dataset/1";
 
-/// What the folder of a data set with effects on top holds: its `manifest.json`.
+/// Content of the `manifest.json` of a data set with effects applied.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ResimManifest {
     /// [`RESIM_MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Name of the data set that the effects act on.
+    /// Name of the source data set.
     pub source: String,
-    /// Seed of the effects.
+    /// Random seed of the effects.
     pub seed: u64,
-    /// SHA-256 of effects, rig, seed, and the version of this program.
+    /// SHA-256 of effects, rig, seed, and program version.
     pub config_sha256: String,
-    /// Frames.
+    /// Number of frames.
     pub frames: usize,
     /// Points of all frames, before and after.
     pub points: [usize; 2],
+}
+
+impl Manifest for ResimManifest {
+    const OTHERWISE: &'static str = "with other effects, another seed or version";
+
+    fn identity(&self) -> [&str; 2] {
+        [&self.schema, &self.config_sha256]
+    }
+
+    fn set_complete(&mut self, complete: bool) {
+        self.complete = complete;
+    }
 }
 
 /// A data set, and what acts on it.
 pub struct Resim<'a> {
     /// The data set.
     pub dataset: &'a Dataset,
-    /// What acts on it.
+    /// The effects.
     pub effects: &'a EffectList,
-    /// Its sensors; `None`: those that its TOML names, or one at the clouds' origin.
+    /// Its sensor rig; `None`: the rig referenced by the data set, or a single sensor at the cloud origin.
     pub rig: Option<Rig>,
-    /// Another seed gives other noise.
+    /// Random seed.
     pub seed: u64,
 }
 
 impl Resim<'_> {
-    /// Makes the data set in the folder `out`, in the layout and label frame of the source.
+    /// Writes the data set to the folder `out`, in the layout and label frame of the source.
     ///
-    /// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same words finished
-    /// are kept; a folder with other content is refused. The files do not depend on the number of threads.
+    /// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an
+    /// earlier run with the same arguments are kept; a folder with other content is an error. The files do not depend
+    /// on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
         let source = &self.dataset.config;
@@ -81,26 +88,19 @@ impl Resim<'_> {
             frames: ids.len(),
             points: [0; 2],
         };
-        let manifest_path = out.join("manifest.json");
-        check_folder(out, &manifest_path, &manifest)?;
-        write_json(&manifest_path, &manifest)?;
-        self.write_descriptions(out, &rig)?;
+        let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER], &mut manifest)?;
+        self.write_descriptions(&new, &rig)?;
         if described {
             attributes::write_names(out, &rig, &materials)?;
         }
-        let done = AtomicUsize::new(0);
-        progress(0, ids.len());
-        let counts = ids.par_iter().enumerate().map(|(index, id)| {
-            let points = self.make_frame_file(out, index, id, &rig, &materials, described)?;
-            progress(done.fetch_add(1, Ordering::Relaxed) + 1, ids.len());
-            Ok(points)
-        });
-        for [before, after] in counts.collect::<Result<Vec<_>, SimulateError>>()? {
+        let counts = new.make_frames(&ids, progress, |index, id| {
+            self.make_frame_file(&new, index, id, &rig, &materials, described)
+        })?;
+        for [before, after] in counts {
             manifest.points[0] += before;
             manifest.points[1] += after;
         }
-        manifest.complete = true;
-        write_json(&manifest_path, &manifest)?;
+        new.finish(&mut manifest)?;
         Ok(manifest)
     }
 
@@ -114,14 +114,15 @@ impl Resim<'_> {
         Ok(rig)
     }
 
-    /// Which effects of the list cannot act on this finished data set, by their place, and why.
+    /// Effects of the list that cannot be applied to this data set: index and reason.
     pub fn refused(&self) -> Result<Vec<(usize, String)>, SimulateError> {
         let ids = self.dataset.all_ids()?;
         let described = attributes::path(&self.dataset.config.root, &ids[0]).is_file();
         Ok(self.refusals(&known_of(self.dataset, &self.rig()?, &ids[0], described)?))
     }
 
-    /// One frame with the effects on it; `index` is its place in the order of names. Its points, and what is known of them.
+    /// One frame with the effects applied; `index` is its position in name order. Returns its points and what is known
+    /// about them.
     pub fn frame(
         &self,
         index: usize,
@@ -201,93 +202,66 @@ impl Resim<'_> {
         refused
     }
 
-    /// Writes one frame, unless it is there; its points before and after.
+    /// Writes one frame unless it exists; returns its number of points before and after.
     fn make_frame_file(
         &self,
-        out: &Path,
+        new: &NewDataset,
         index: usize,
         id: &str,
         rig: &Rig,
         materials: &MaterialTable,
         described: bool,
     ) -> Result<[usize; 2], SimulateError> {
-        let config = &self.dataset.config;
-        let cloud = out.join(config.layout.cloud_folder()).join(match config.layout {
-            Layout::Kitti => format!("{id}.bin"),
-            Layout::S2rDad => format!("{id}.pcd"),
-        });
-        let label = out.join(config.layout.label_folder()).join(format!("{id}.txt"));
+        let (layout, out) = (new.layout(), new.root());
         let beside = attributes::path(out, id);
         let labelled = self.dataset.has_labels();
-        let there = cloud.is_file() && (!labelled || label.is_file()) && (!described || beside.is_file());
-        if !there {
+        if !(new.has_frame(id, labelled) && (!described || beside.is_file())) {
             let (frame, scan) = self.frame(index, id, rig, materials)?;
             if frame.cloud.is_empty() {
-                return Err(DataError::file(&cloud, "would be empty: the effects leave no point").into());
+                let message = "would be empty: the effects leave no point";
+                return Err(DataError::file(&layout.cloud_path(out, id), message).into());
             }
             if labelled {
-                self.write_labels(&label, id, &frame)?;
+                self.write_labels(new, &frame)?;
             }
-            let calibration = self.dataset.calibration_path(id);
-            if calibration.is_file() {
-                write_atomic(&out.join("calib").join(format!("{id}.txt")), &fs_err::read(calibration)?)?;
+            if let (Some(from), Some(to)) = (self.dataset.calibration_path(id), layout.calibration_path(out, id))
+                && from.is_file()
+            {
+                write_atomic(&to, &fs_err::read(from)?)?;
             }
             if described {
                 write_atomic(&beside, &attributes::encode(&scan))?;
             }
-            match config.layout {
-                Layout::Kitti => write_bin(&cloud, &frame.cloud)?,
-                Layout::S2rDad => write_pcd(&cloud, &frame.cloud, PcdEncoding::Binary)?,
-            }
+            layout.write_cloud(out, id, &frame.cloud)?;
         }
-        let points = |set: &Path, columns| Ok::<usize, DataError>(data::read_cloud(set, columns)?.len());
-        Ok([points(&self.dataset.cloud_path(id), config.points)?, points(&cloud, config.points)?])
+        Ok([self.dataset.count_points(id)?, layout.count_points(out, id, self.dataset.config.points)?])
     }
 
-    /// Labels as they are where no effect touched them, to the byte; else in the label frame of the source.
-    fn write_labels(&self, path: &Path, id: &str, frame: &Frame) -> Result<(), SimulateError> {
-        let source = self.dataset.labels(id)?;
-        let boxes = self.dataset.objects(id, &source)?;
+    /// Copies labels byte by byte if no effect changed them; otherwise writes them in the label frame of the source.
+    fn write_labels(&self, new: &NewDataset, frame: &Frame) -> Result<(), SimulateError> {
+        let source = self.dataset.labels(&frame.id)?;
+        let boxes = self.dataset.objects(&frame.id, &source)?;
         if boxes.iter().zip(&frame.objects).all(|(a, b)| a.bbox == b.bbox) {
-            write_atomic(path, &fs_err::read(self.dataset.labels_path(id))?)?;
-            return Ok(());
+            let path = new.layout().labels_path(new.root(), &frame.id);
+            return Ok(write_atomic(&path, &fs_err::read(self.dataset.labels_path(&frame.id))?)?);
         }
-        let mut lines: Vec<KittiLine> = match self.dataset.config.label_frame {
-            LabelFrame::Lidar => label_lines(frame),
-            LabelFrame::Camera => {
-                let (calibration, size) = (self.dataset.calibration(id)?, self.dataset.config.image_size);
-                let line = |object: &data::Object| {
-                    let mut line = calibration.camera_from_lidar_box(&object.class, &object.bbox, None, size);
-                    line.truncation = object.truncation.unwrap_or(-1.0);
-                    line.occlusion = object.occlusion.map_or(-1.0, f64::from);
-                    line
-                };
-                frame.objects.iter().map(line).collect()
-            }
-        };
-        lines.extend(source.into_iter().filter(|line| line.is_dont_care() || !line.has_box()));
-        Ok(write_kitti_text(path, &lines)?)
+        let mut labels = self.dataset.label_boxes(frame)?;
+        labels.extend(source.into_iter().filter(|label| label.is_dont_care() || !label.has_box()));
+        Ok(new.layout().write_labels(new.root(), &frame.id, &labels)?)
     }
 
-    fn write_descriptions(&self, out: &Path, rig: &Rig) -> Result<(), SimulateError> {
-        let source = &self.dataset.config;
-        let mut splits = std::collections::BTreeMap::new();
-        for name in source.splits.keys() {
-            let list = PathBuf::from(format!("ImageSets/{name}.txt"));
-            write_split(&out.join(&list), &self.dataset.ids(name)?)?;
-            splits.insert(name.clone(), list);
-        }
+    fn write_descriptions(&self, new: &NewDataset, rig: &Rig) -> Result<(), SimulateError> {
+        let (source, out) = (&self.dataset.config, new.root());
+        let splits = source.splits.keys().map(|name| Ok((name, self.dataset.ids(name)?)));
         let rig_path = (*rig != Rig::single()).then(|| PathBuf::from("rig.toml"));
         let config = DatasetConfig {
             name: format!("{}-resim", source.name),
-            root: ".".into(),
-            splits,
             rig: rig_path.clone(),
-            // A crop was made when the clouds were read.
+            // Clouds were already cropped when they were read.
             fov_crop: false,
             ..source.clone()
         };
-        write_dataset_toml(&out.join("dataset.toml"), &config)?;
+        new.describe(config, splits.collect::<Result<Vec<_>, DataError>>()?)?;
         let to_toml = |text: Result<String, toml::ser::Error>| text.map_err(|e| wrong("", e.to_string()));
         if let Some(path) = rig_path {
             write_atomic(&out.join(path), to_toml(toml::to_string_pretty(rig))?.as_bytes())?;
@@ -308,14 +282,14 @@ impl Resim<'_> {
     }
 }
 
-/// What is known of the points of a data set.
+/// What is known about the points of a data set.
 fn known_of(dataset: &Dataset, rig: &Rig, id: &str, described: bool) -> Result<BTreeSet<Need>, SimulateError> {
     if described {
         use Need::{Cars, Grid, Incidence, Material, Reflectivity, Row, Time};
         return Ok([Cars, Grid, Incidence, Material, Reflectivity, Row, Time].into());
     }
     let mut cloud = dataset.load_cloud(id)?;
-    // What is known depends on the rig alone; some points are enough to ask.
+    // What is known depends on the rig only; a few points are enough to check.
     cloud.values.truncate(cloud.channels);
     if dataset.config.points == PointColumns::Xyz {
         cloud = cloud.with_channels(3);
@@ -323,27 +297,11 @@ fn known_of(dataset: &Dataset, rig: &Rig, id: &str, described: bool) -> Result<B
     Ok(scan_of_cloud(&cloud, rig).1)
 }
 
-/// The folder must be empty, or begun with the same words.
-fn check_folder(out: &Path, manifest_path: &Path, wanted: &ResimManifest) -> Result<(), SimulateError> {
-    if manifest_path.is_file() {
-        let text = fs_err::read_to_string(manifest_path)?;
-        let found: ResimManifest =
-            serde_json::from_str(&text).map_err(|e| DataError::line(manifest_path, e.line(), e.to_string()))?;
-        if found.config_sha256 != wanted.config_sha256 || found.schema != wanted.schema {
-            let message =
-                "was made with other effects, another seed or version; choose another folder, or remove this one";
-            return Err(DataError::file(out, message).into());
-        }
-    } else if out.is_dir() && fs_err::read_dir(out)?.next().is_some() {
-        return Err(DataError::file(out, "is not empty and has no manifest.json; choose another folder").into());
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::street::{FrameCounts, RoadConfig, make_road_dataset};
+    use data::LabelFrame;
 
     fn street(folder: &Path) -> Dataset {
         let config = RoadConfig { frames: FrameCounts { train: 2, val: 1, test: 1 }, ..RoadConfig::default() };
@@ -378,7 +336,7 @@ mod tests {
         for id in made.all_ids().unwrap() {
             assert_eq!(made.load(&id).unwrap().objects, dataset.load(&id).unwrap().objects);
         }
-        // Noise alone, to compare points one by one: they move along their ray.
+        // Noise only, to compare points one by one: they move along their ray.
         let noisy = folder.path().join("noisy");
         make(&dataset, &effects("[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n"), None, &noisy).unwrap();
         let (a, b) = (
@@ -432,7 +390,7 @@ mod tests {
             let error = make(&dataset, &list, None, &folder.path().join(kind)).unwrap_err();
             assert!(error.contains(want), "{error}");
         }
-        // With the sensor's pattern rows are known.
+        // With the sensor's pattern, rows are known.
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/sensors/hdl64e.toml");
         let rig = Rig::read(Path::new(path)).unwrap();
         let list = effects("[[effect]]\nkind = \"beam_range_offset\"\n");

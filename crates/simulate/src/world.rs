@@ -1,21 +1,21 @@
-//! The static world and the shape of the cars, ready for rays, with what each triangle is made of.
+//! The static world and the car shape, prepared for ray casting, with the material of each triangle.
 
 use crate::mesh::{Face, Mesh};
 use crate::raycast::Tree;
 use sensor::material::MaterialId;
 use std::sync::Arc;
 
-/// Everything that stands still.
+/// The static world.
 #[derive(Clone, Debug)]
 pub struct World {
     pub(crate) tree: Arc<Tree>,
     surfaces: Vec<(MaterialId, u16)>,
-    /// The place in the world that is the origin of the tree's coordinates, m.
+    /// World position of the tree's origin, m.
     pub(crate) origin: [f64; 3],
 }
 
 impl World {
-    /// From a mesh in the world's frame, which may lie anywhere: rays are cast relative to its middle.
+    /// From a mesh in the world frame at any position: rays are cast relative to its centre.
     pub fn new(mesh: &Mesh) -> World {
         let [low, high] = mesh.bounds().unwrap_or_default();
         let origin = [(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, 0.0];
@@ -28,7 +28,7 @@ impl World {
     }
 }
 
-/// What all cars look like, in the car's frame.
+/// The shape of all cars, in the car frame.
 #[derive(Clone, Debug)]
 pub struct CarShape {
     pub(crate) tree: Arc<Tree>,
@@ -36,7 +36,7 @@ pub struct CarShape {
 }
 
 impl CarShape {
-    /// From a mesh in the car's frame.
+    /// From a mesh in the car frame.
     pub fn new(mesh: &Mesh) -> CarShape {
         CarShape { tree: Arc::new(mesh.tree([0.0; 3])), surfaces: surfaces(&mesh.faces) }
     }

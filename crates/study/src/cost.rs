@@ -85,9 +85,8 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<Network
 }
 
 /// A machine that pauses for a moment does not change it.
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
+fn median(values: Vec<f64>) -> f64 {
+    statistics::median_upper(values).unwrap_or(0.0)
 }
 
 /// The costs that are known of a study.

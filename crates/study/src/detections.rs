@@ -125,9 +125,9 @@ fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf
     predict_frames(detector, detector.config().optimization.batch_size, samples, |batch| {
         for (id, found) in batch {
             let name = format!("{id}.txt");
-            write_kitti_text(&of_detections.join(&name), &set.detection_lines(id, &found.detections)?)?;
+            write_kitti_text(&of_detections.join(&name), &set.detection_boxes(id, &found.detections)?)?;
             if two_stage {
-                write_kitti_text(&of_regions.join(&name), &set.detection_lines(id, &found.regions)?)?;
+                write_kitti_text(&of_regions.join(&name), &set.detection_boxes(id, &found.regions)?)?;
             }
         }
         Ok(())

@@ -7,7 +7,7 @@ use crate::detections::{spread, weights_sha256};
 use crate::error::Result;
 use crate::folder::Study;
 use crate::standing::{Standing, standing};
-use data::{DataError, Dataset, KittiLine};
+use data::{DataError, Dataset, LabelBox};
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
 use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
 use rayon::prelude::*;
@@ -172,7 +172,7 @@ fn of_run(study: &Study, run: &StudyRun, test_set: &str) -> Result<RunAnalysis> 
 }
 
 fn points(dataset: &Dataset, frames: &[eval::EvalFrame]) -> Result<Vec<BoxPoints>> {
-    let boxes = |lines: &[KittiLine]| lines.iter().map(KittiLine::lidar_box).collect::<Vec<_>>();
+    let boxes = |lines: &[LabelBox]| lines.iter().map(LabelBox::lidar_box).collect::<Vec<_>>();
     let of_frame = |frame: &eval::EvalFrame| {
         let cloud = dataset.load_cloud(&frame.id)?;
         Ok(BoxPoints::count(&cloud, &boxes(&frame.labels), &boxes(&frame.detections)))

@@ -151,8 +151,9 @@ fn check_fit(config: &RunConfig, dataset: &Dataset) -> Result<(), TrainError> {
         return Err(TrainError::folder(path, message));
     }
     if !dataset.has_labels() {
-        let message = format!("there are no labels in {}", dataset.config.layout.label_folder());
-        return Err(TrainError::folder(&dataset.config.root, message));
+        let labels = dataset.config.layout.labels_path(Path::new(""), "");
+        let folder = labels.parent().unwrap_or(&labels).display();
+        return Err(TrainError::folder(&dataset.config.root, format!("there are no labels in {folder}")));
     }
     Ok(())
 }

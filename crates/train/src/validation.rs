@@ -2,7 +2,7 @@
 
 use crate::{TrainError, ValidationMetrics};
 use burn::tensor::Tensor;
-use data::{Dataset, Detection, KittiLine, prefetch, stream};
+use data::{Dataset, Detection, prefetch, stream};
 use eval::{Difficulty, EvalFrame, EvalOptions, EvalReport, Metric, evaluate, reference_overlaps};
 use models::{Detector, Losses, ModelError, Prediction, Preparer, Sample, predict_frames};
 use std::collections::BTreeMap;
@@ -58,8 +58,8 @@ pub fn evaluate_detector(
         .iter()
         .zip(&detections)
         .map(|(id, found)| {
-            let labels: Vec<KittiLine> = dataset.labels(id)?;
-            Ok(EvalFrame { id: id.clone(), labels, detections: dataset.detection_lines(id, found)? })
+            let labels = dataset.labels(id)?;
+            Ok(EvalFrame { id: id.clone(), labels, detections: dataset.detection_boxes(id, found)? })
         })
         .collect::<Result<Vec<_>, TrainError>>()?;
     let options = EvalOptions {

@@ -1,8 +1,8 @@
 //! Complete runs of a tiny network on synthetic frames.
 
 use burn::tensor::Device;
-use data::write::{write_kitti_frame, write_split};
-use data::{Cloud, Frame, Object, stream};
+use data::write::write_split;
+use data::{Cloud, Frame, Layout, Object, stream};
 use geometry::Box3;
 use lidarshift_train::{Event, Provenance, RunConfig, Session, TrainError, Trained, set_key, train};
 use models::checkpoint::{NamedTensors, read_checkpoint, read_metadata};
@@ -37,7 +37,7 @@ fn data_set(folder: &Path) {
                 image_box: None,
             });
         }
-        write_kitti_frame(folder, &frame).unwrap();
+        Layout::Kitti.write_frame(folder, &frame).unwrap();
         ids.push(frame.id);
     }
     write_split(&folder.join("ImageSets/train.txt"), &ids[..5]).unwrap();

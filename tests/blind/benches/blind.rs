@@ -1,10 +1,11 @@
-//! The large blind set: many cases with something hidden, or nothing; each result is written as soon as it is there, so that a stopped
-//! run goes on.
+//! The large blind set: many cases with or without a hidden difference. Each result is written as soon as it is
+//! available, so an interrupted run can be resumed.
 //!
-//! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N] [--shots N]
-//! [--out DIR] [--keep DIR] [--draw-only]`
+//! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N]
+//! [--shots N] [--out DIR] [--keep DIR] [--draw-only]`
 //!
-//! `--keep` leaves the drawn pairs in a folder and takes from there what is drawn already; `--draw-only` draws and diagnoses nothing.
+//! `--keep` stores the generated pairs in a folder and reuses those already there; `--draw-only` generates pairs
+//! without diagnosing them.
 
 use data::Dataset;
 use diagnose::{Options, Rig, diagnose};
@@ -34,10 +35,10 @@ fn arguments() -> Arguments {
         keep: None,
         draw_only: false,
     };
-    let mut words = std::env::args().skip(1);
-    while let Some(word) = words.next() {
-        let mut value = || words.next().unwrap_or_else(|| panic!("{word} wants a value"));
-        match word.as_str() {
+    let mut args = std::env::args().skip(1);
+    while let Some(arg) = args.next() {
+        let mut value = || args.next().unwrap_or_else(|| panic!("{arg} needs a value"));
+        match arg.as_str() {
             "--kind" => out.kinds.push(value()),
             "--cases" => out.cases = value().parse().expect("a number of cases"),
             "--first" => out.first = value().parse().expect("a seed"),
@@ -47,13 +48,14 @@ fn arguments() -> Arguments {
             "--keep" => out.keep = Some(value().into()),
             "--draw-only" => out.draw_only = true,
             "--bench" => {}
-            other => panic!("unknown word {other}"),
+            other => panic!("unknown argument {other}"),
         }
     }
     out
 }
 
-/// The kind of a seed: a quarter nulls, four tenths single, and so on; or one of those asked for.
+/// The kind of the case of a seed: drawn at random (25 % null, 47 % single, 15 % pair, 10 % off-catalogue, 3 %
+/// shuffled), or `kinds` in turn.
 fn kind_of(seed: u64, kinds: &[String]) -> Kind {
     let mut rng = data::stream(seed, "blind kind", 0, 0);
     let cause = |name: &str| CAUSES.iter().position(|c| *c == name);
@@ -79,14 +81,15 @@ fn kind_of(seed: u64, kinds: &[String]) -> Kind {
     }
 }
 
-/// Draws the pair of a seed into `folder`, unless it lies there; the truth lies beside the folder, not in it.
+/// Generates the pair of a seed in `folder`, unless it exists. The truth file is written next to the folder, not into
+/// it.
 fn draw(seed: u64, arguments: &Arguments, folder: &Path) -> Truth {
-    let told = folder.with_extension("truth.json");
-    let drawn = std::fs::read(&told).ok().and_then(|bytes| serde_json::from_slice::<Truth>(&bytes).ok());
+    let truth_file = folder.with_extension("truth.json");
+    let drawn = std::fs::read(&truth_file).ok().and_then(|bytes| serde_json::from_slice::<Truth>(&bytes).ok());
     drawn.unwrap_or_else(|| {
         let case = draw_case(seed, kind_of(seed, &arguments.kinds), arguments.size);
         let truth = write_case(&case, folder).expect("a case can be written");
-        data::write_atomic(&told, &serde_json::to_vec_pretty(&truth).expect("JSON")).expect("the truth");
+        data::write_atomic(&truth_file, &serde_json::to_vec_pretty(&truth).expect("JSON")).expect("the truth");
         truth
     })
 }
@@ -120,8 +123,9 @@ fn main() {
         let outcome = done.unwrap_or_else(|| {
             let truth = draw(seed, &arguments, &place);
             let (outcome, value) = run(&truth, &place);
-            let told = arguments.out.join(format!("diagnosis-{seed}.json"));
-            data::write_atomic(&told, &serde_json::to_vec_pretty(&value).expect("JSON")).expect("a diagnosis");
+            let diagnosis_file = arguments.out.join(format!("diagnosis-{seed}.json"));
+            data::write_atomic(&diagnosis_file, &serde_json::to_vec_pretty(&value).expect("JSON"))
+                .expect("a diagnosis");
             data::write_atomic(&path, &serde_json::to_vec_pretty(&outcome).expect("JSON")).expect("a result");
             outcome
         });
@@ -131,7 +135,7 @@ fn main() {
             "{seed}: {} [{}] -> {} named {:?} ambiguous {:?} unexplained {} closed {:?} {:.1} s",
             outcome.truth.kind,
             hidden.join("; "),
-            outcome.word(),
+            outcome.grade(),
             outcome.named,
             outcome.ambiguous,
             outcome.unexplained,

@@ -1,29 +1,29 @@
-//! Cars of different makes: a few boxes and four wheels. Own frame: x forward, z up, origin at the middle of the box around it.
+//! Car shapes: a few boxes and four wheels. Car frame: x forward, z up, origin at the centre of the bounding box.
 
-use crate::solid::{Form, Solid, Stuff};
+use crate::solid::{Form, Material, Solid};
 use data::Stream;
 use nalgebra::{Isometry3, Vector3};
 use rand::RngExt;
 
-/// A make of car.
+/// A car shape.
 #[derive(Clone, Debug)]
 pub struct CarShape {
-    /// Length, width, height of the box around it, m.
+    /// Length, width, height of the bounding box, m.
     pub size_m: [f64; 3],
-    /// Its parts.
+    /// The parts.
     pub parts: Vec<Solid>,
 }
 
-/// Reflectivity of paint is drawn a car; the others are those of the material.
+/// Draws a car shape. Paint reflectivity is drawn per car elsewhere; other materials have fixed reflectivity.
 pub fn draw_shape(rng: &mut Stream) -> CarShape {
     if rng.random_bool(0.6) { open_wheeler(rng) } else { saloon(rng) }
 }
 
-fn part(center: [f64; 3], size: [f64; 3], stuff: Stuff) -> Solid {
+fn part(center: [f64; 3], size: [f64; 3], material: Material) -> Solid {
     Solid {
         pose: Isometry3::translation(center[0], center[1], center[2]),
         form: Form::Cuboid(Vector3::from(size) / 2.0),
-        stuff,
+        material,
     }
 }
 
@@ -32,7 +32,7 @@ fn wheels(size: [f64; 3], axles: [f64; 2], radius: f64, width: f64) -> Vec<Solid
     let at = |x: f64, y: f64| Solid {
         pose: Isometry3::translation(x, y, radius - size[2] / 2.0),
         form: Form::Wheel(radius, width / 2.0),
-        stuff: Stuff::Rubber,
+        material: Material::Rubber,
     };
     axles.iter().flat_map(|&x| [at(x, y), at(x, -y)]).collect()
 }
@@ -42,14 +42,14 @@ fn open_wheeler(rng: &mut Stream) -> CarShape {
         [4.7 + 0.5 * rng.random::<f64>(), 1.85 + 0.15 * rng.random::<f64>(), 1.1 + 0.15 * rng.random::<f64>()];
     let floor = -h / 2.0;
     let mut parts = wheels([l, w, h], [0.33 * l, -0.30 * l], 0.32, 0.33);
-    parts.push(part([0.30 * l, 0.0, floor + 0.30], [0.40 * l, 0.34, 0.24], Stuff::Paint)); // nose
-    parts.push(part([-0.03 * l, 0.0, floor + 0.36], [0.36 * l, 0.70, 0.46], Stuff::Paint)); // tub
-    parts.push(part([-0.14 * l, 0.0, floor + 0.26], [0.30 * l, 1.35, 0.34], Stuff::Paint)); // side pods
-    parts.push(part([-0.16 * l, 0.0, floor + 0.72], [0.22 * l, 0.38, 0.50], Stuff::Paint)); // engine cover
-    parts.push(part([0.47 * l, 0.0, floor + 0.14], [0.06 * l, w, 0.08], Stuff::Carbon)); // front wing
-    parts.push(part([-0.46 * l, 0.0, floor + 0.86], [0.08 * l, 0.9 * w, 0.24], Stuff::Carbon)); // rear wing
-    parts.push(part([-0.43 * l, 0.0, floor + 0.5], [0.10 * l, 0.2, 0.6], Stuff::Carbon)); // its pillar
-    parts.push(part([-0.2 * l, 0.0, h / 2.0 - 0.06], [0.3, 0.2, 0.12], Stuff::Carbon)); // head of the sensors
+    parts.push(part([0.30 * l, 0.0, floor + 0.30], [0.40 * l, 0.34, 0.24], Material::Paint)); // nose
+    parts.push(part([-0.03 * l, 0.0, floor + 0.36], [0.36 * l, 0.70, 0.46], Material::Paint)); // tub
+    parts.push(part([-0.14 * l, 0.0, floor + 0.26], [0.30 * l, 1.35, 0.34], Material::Paint)); // side pods
+    parts.push(part([-0.16 * l, 0.0, floor + 0.72], [0.22 * l, 0.38, 0.50], Material::Paint)); // engine cover
+    parts.push(part([0.47 * l, 0.0, floor + 0.14], [0.06 * l, w, 0.08], Material::Carbon)); // front wing
+    parts.push(part([-0.46 * l, 0.0, floor + 0.86], [0.08 * l, 0.9 * w, 0.24], Material::Carbon)); // rear wing
+    parts.push(part([-0.43 * l, 0.0, floor + 0.5], [0.10 * l, 0.2, 0.6], Material::Carbon)); // rear wing pillar
+    parts.push(part([-0.2 * l, 0.0, h / 2.0 - 0.06], [0.3, 0.2, 0.12], Material::Carbon)); // sensor head
     CarShape { size_m: [l, w, h], parts }
 }
 
@@ -58,8 +58,8 @@ fn saloon(rng: &mut Stream) -> CarShape {
         [4.1 + 0.8 * rng.random::<f64>(), 1.75 + 0.2 * rng.random::<f64>(), 1.35 + 0.25 * rng.random::<f64>()];
     let floor = -h / 2.0;
     let mut parts = wheels([l, w, h], [0.3 * l, -0.3 * l], 0.31, 0.22);
-    parts.push(part([0.0, 0.0, floor + 0.5], [l, 0.94 * w, 0.6], Stuff::Paint));
-    parts.push(part([-0.06 * l, 0.0, (floor + 0.8 + h / 2.0) / 2.0], [0.52 * l, 0.86 * w, h - 0.8], Stuff::Paint));
+    parts.push(part([0.0, 0.0, floor + 0.5], [l, 0.94 * w, 0.6], Material::Paint));
+    parts.push(part([-0.06 * l, 0.0, (floor + 0.8 + h / 2.0) / 2.0], [0.52 * l, 0.86 * w, h - 0.8], Material::Paint));
     CarShape { size_m: [l, w, h], parts }
 }
 

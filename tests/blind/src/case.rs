@@ -1,50 +1,50 @@
-//! Cases: a seed, a size, and what is hidden.
+//! Cases: a seed, a size, and the hidden effects.
 
 use crate::effect::{Clock, Effect};
 use data::Stream;
 use rand::RngExt;
 
-/// How much data a case has.
+/// Amount of data in a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CaseSize {
-    /// Frames of each side.
+    /// Frames per side.
     pub frames: usize,
-    /// Shots a scan.
+    /// Shots per scan.
     pub shots: usize,
 }
 
 impl CaseSize {
-    /// Of the large set.
+    /// Size used in the large set.
     pub const USUAL: CaseSize = CaseSize { frames: 40, shots: 25_000 };
-    /// Of real recordings.
+    /// Size of real recordings.
     pub const FULL: CaseSize = CaseSize { frames: 200, shots: 75_000 };
 }
 
-/// What a case is for.
+/// Kind of a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// Nothing is hidden.
+    /// No hidden effect.
     Null,
-    /// One effect of the catalogue, by its place in [`CAUSES`].
+    /// One effect of the catalogue, by its index in [`CAUSES`].
     Single(usize),
-    /// Two of the catalogue.
+    /// Two effects of the catalogue.
     Pair(usize, usize),
-    /// One that is not in the catalogue.
+    /// One effect that is not in the catalogue.
     OffCatalogue(usize),
-    /// Nothing is hidden, but the frames are paired wrongly.
+    /// No hidden effect, but frames are paired wrongly.
     Shuffled,
 }
 
-/// A case to be written.
+/// A blind case.
 #[derive(Clone, Debug)]
 pub struct Case {
-    /// Everything is drawn from it.
+    /// Random seed of the case.
     pub seed: u64,
     /// Frames and shots.
     pub size: CaseSize,
-    /// What it is for.
+    /// Kind of the case.
     pub kind: Kind,
-    /// What is hidden in the measured side.
+    /// Effects hidden in the measured side.
     pub effects: Vec<Effect>,
     /// Time between frames, s.
     pub step_s: f64,
@@ -79,7 +79,7 @@ pub const CAUSES: [&str; 22] = [
 /// Number of effects that are in no catalogue.
 pub const OFF_CATALOGUE: usize = 4;
 
-/// The case of a seed.
+/// Draws the case of a seed.
 pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
     let mut rng = data::stream(seed, "blind case", 0, 0);
     let step_s = if rng.random_bool(0.5) { 0.25 } else { 0.05 };
@@ -92,7 +92,7 @@ pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
     Case { seed, size, kind, effects, step_s }
 }
 
-/// Uniform in the logarithm.
+/// Log-uniform random number.
 fn log_uniform(rng: &mut Stream, low: f64, high: f64) -> f64 {
     (low.ln() + (high / low).ln() * rng.random::<f64>()).exp()
 }

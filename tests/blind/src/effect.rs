@@ -1,78 +1,79 @@
-//! What may be hidden in the measured side, and the truth that is told afterwards.
+//! Effects that can be hidden in the measured side, and the truth file.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Which clock is wrong.
+/// The clock that is wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Clock {
-    /// That of the targets' positions.
+    /// Clock of the target positions.
     Targets,
-    /// That of the cloud against all positions, the ego car's too.
+    /// Clock of the cloud relative to all positions, including the ego vehicle's.
     Cloud,
 }
 
 #[expect(missing_docs, reason = "the variants say what their numbers are, the names say the units")]
-/// A hidden difference. Forms differ on purpose from the usual textbook ones.
+/// A hidden effect. Functional forms deliberately differ from the textbook ones.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Effect {
-    /// Noise along the ray: a sum of uniform numbers, standard deviation in m, growing with range by a share per m.
+    /// Range noise: a sum of uniform random numbers, standard deviation in m, growing linearly with range by
+    /// `growth_per_m`.
     RangeNoise { sigma_m: f64, growth_per_m: f64 },
-    /// Added to every range: an offset and a share of the range.
+    /// Range bias: a constant offset and a scale error.
     RangeBias { offset_m: f64, scale: f64 },
-    /// A fixed offset for each row of each sensor, uniform, of that standard deviation.
+    /// A constant range offset per row of each sensor, uniform with the given standard deviation.
     BeamRangeOffset { std_m: f64 },
-    /// A fixed error of each row's elevation, uniform, of that standard deviation.
+    /// A constant elevation error per row, uniform with the given standard deviation.
     BeamElevationOffset { std_rad: f64 },
-    /// Ranges rounded to whole steps.
+    /// Range quantisation.
     Quantisation { step_m: f64 },
-    /// The light goes elsewhere than the sensor believes; uniform on a disc, standard deviation of each angle.
+    /// Beam direction jitter unknown to the sensor; uniform on a disc, standard deviation per angle.
     AngularJitter { sigma_rad: f64 },
-    /// Returns are lost at random.
+    /// Random loss of returns.
     RandomDropout { share: f64 },
-    /// Returns are lost as the received energy with speckle falls below a threshold.
+    /// Loss of returns when the received energy, with speckle, falls below a threshold.
     SignalDropout { half_at: f64, speckle: f64 },
-    /// Returns are lost with range alone.
+    /// Loss of returns depending on range only.
     RangeDropout { half_at_m: f64, softness_m: f64 },
-    /// Returns are lost with the angle of incidence alone.
+    /// Loss of returns depending on the angle of incidence only.
     IncidenceDropout { half_at_cos: f64, power: f64 },
-    /// One class of surface is darker than believed.
+    /// Loss of returns on one surface class: lower reflectivity than modelled.
     MaterialDropout { tyres: bool, share: f64 },
-    /// Nothing beyond a range.
+    /// No returns beyond a range.
     RangeCut { max_m: f64 },
-    /// A part of the own car stands in the way: a plate in front of the sensor.
+    /// Occlusion by a part of the ego vehicle: a plate in front of the sensor.
     EgoOcclusion { center_m: [f64; 3], size_m: [f64; 3] },
-    /// Labels are late or early.
+    /// Time offset of the labels or the cloud.
     TimeOffset { seconds: f64, clock: Clock },
-    /// Labels are off by a constant in the target's own frame: forward, left, up.
+    /// Constant label offset in the target frame: forward, left, up.
     LabelOffset { offset_m: [f64; 3] },
-    /// One sensor is mounted otherwise than believed: turns about x, y, z, and a shift.
+    /// Wrong extrinsics of one sensor: rotations about x, y, z, and a translation.
     SensorExtrinsics { sensor: usize, turn_rad: [f64; 3], shift_m: [f64; 3] },
-    /// The own car leans otherwise than believed, in all frames.
+    /// Constant pitch and roll error of the ego pose.
     PitchRoll { pitch_rad: f64, roll_rad: f64 },
-    /// The scan takes its time and nobody corrects it.
+    /// Uncorrected motion distortion of the scan.
     RollingShutter { scan_s: f64 },
     /// False alarms, uniform over range.
     Outliers { share: f64 },
-    /// Beams have a width; at an edge the ranges mix.
+    /// Beam divergence: ranges mix at edges.
     MixedPixels { divergence_rad: f64 },
-    /// Things beside the road that the simulation has not got.
+    /// Objects beside the road that the simulation lacks.
     MissingObject { things: usize },
-    /// Cars have another form than believed: longer and higher by these shares.
+    /// Wrong target shape: longer and higher by these fractions.
     WrongShape { length: f64, height: f64 },
-    /// Not of the catalogue: the range waves with the azimuth.
+    /// Not in the catalogue: range error periodic in azimuth.
     AzimuthRipple { amplitude_m: f64, waves: f64 },
-    /// Not of the catalogue: losses in stripes of elevation.
+    /// Not in the catalogue: losses in stripes of elevation.
     StripedLoss { share: f64, stripes: f64 },
-    /// Not of the catalogue: noise that grows towards one side of the field of view.
+    /// Not in the catalogue: noise that grows towards one side of the field of view.
     SidedNoise { sigma_m: f64 },
-    /// Not of the catalogue: losses within an ellipse of directions of the first sensor, with a soft edge. Its middle is told as a share of the
-    /// field of view, from -1/2 to 1/2 across and from 0 at the lowest row to 1.
+    /// Not in the catalogue: losses within an ellipse of directions of the first sensor, with a soft edge. `middle` is
+    /// given as a fraction of the field of view: -1/2 to 1/2 horizontally, 0 (lowest row) to 1 vertically.
     Smear { share: f64, middle: [f64; 2], half_rad: [f64; 2] },
 }
 
 impl Effect {
-    /// The catalogue's name; `None` for what is not in it.
+    /// Name in the catalogue; `None` if not in it.
     pub fn cause(&self) -> Option<&'static str> {
         Some(match self {
             Effect::RangeNoise { .. } => "range_noise",
@@ -105,34 +106,36 @@ impl Effect {
     }
 }
 
-/// One hidden difference as it is told.
+/// A hidden effect in the truth file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Hidden {
-    /// The catalogue's name; of what is not in it, a description.
+    /// Name in the catalogue; otherwise a description.
     pub cause: String,
-    /// Whether the catalogue has it.
+    /// Whether it is in the catalogue.
     pub in_catalogue: bool,
-    /// True values; the names say the units.
+    /// True values; units are part of the names.
     pub parameters: BTreeMap<String, f64>,
-    /// Standard errors of an estimator that knows the form, for some of the parameters.
+    /// Standard errors of an efficient estimator that knows the functional form (Cramér-Rao bound), for some
+    /// parameters.
     pub bound: BTreeMap<String, f64>,
-    /// Returns of all frames that what is hidden takes away, adds, or puts elsewhere by more than 0.35 m; 0 of what changes all a little.
+    /// Number of returns over all frames that the effect removes, adds, or moves by more than 0.35 m; 0 for effects
+    /// that change all returns slightly.
     pub touched: f64,
 }
 
-/// What a case hides.
+/// Truth of a case.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
     /// Seed of the case.
     pub seed: u64,
     /// `null`, `single`, `pair`, `off_catalogue` or `shuffled`.
     pub kind: String,
-    /// All hidden differences.
+    /// All hidden effects.
     pub hidden: Vec<Hidden>,
 }
 
 impl Effect {
-    /// The true values by name.
+    /// All true parameter values by name.
     pub fn parameters(&self) -> BTreeMap<String, f64> {
         let deg = f64::to_degrees;
         let list: Vec<(&str, f64)> = match self {

@@ -1,9 +1,9 @@
-//! Pairs of data sets with a hidden difference, to try the diagnosis on.
+//! Generator of data set pairs with a hidden difference, to test the diagnosis.
 //!
-//! A small race simulator of its own. It shares no code and no formula with the diagnosis or the project's simulator: surfaces are
-//! analytic, effects have other functional forms than the diagnosis fits, and nuisances are always on (noise and losses on both sides,
-//! other shooting directions, pose noise, label noise, walls and cars that are a little wrong). What is hidden is written beside the
-//! data, not into them.
+//! A small independent race simulator. It shares no code and no formula with the diagnosis or the project's simulator:
+//! surfaces are analytic, effects have other functional forms than those the diagnosis fits, and nuisances are always
+//! present (noise and losses on both sides, different shot directions, pose noise, label noise, slightly wrong walls
+//! and cars). The truth is written next to the data, not into them.
 
 mod car;
 mod case;

@@ -8,15 +8,15 @@ use std::fmt::Write;
 /// One sensor of a rig.
 #[derive(Clone, Debug)]
 pub struct Mount {
-    /// Place in the car's frame, m.
+    /// Position in the vehicle frame, m.
     pub position_m: [f64; 3],
-    /// Where its middle looks, rad.
+    /// Direction of the centre of the field of view, rad.
     pub yaw_rad: f64,
-    /// Field of view seen from above, rad.
+    /// Horizontal field of view, rad.
     pub fov_rad: f64,
-    /// Elevations of the rows, top first, rad.
+    /// Elevations of the rows, from the top, rad.
     pub rows_rad: Vec<f64>,
-    /// Shots a row.
+    /// Shots per row.
     pub columns: usize,
 }
 
@@ -27,18 +27,18 @@ impl Mount {
         Isometry3::from_parts(Translation3::from(self.position_m), turn)
     }
 
-    /// Angle between columns, rad.
+    /// Azimuth step between columns, rad.
     pub fn column_step_rad(&self) -> f64 {
         self.fov_rad / self.columns as f64
     }
 
-    /// Mean angle between rows, rad.
+    /// Mean elevation step between rows, rad.
     pub fn row_step_rad(&self) -> f64 {
         (self.rows_rad[0] - self.rows_rad[self.rows_rad.len() - 1]) / (self.rows_rad.len() - 1) as f64
     }
 }
 
-/// A rig with about that many shots a scan, and the height of its reference over the road, m.
+/// Draws a rig with about `shots` shots per scan, and the height of the vehicle origin above the road, m.
 pub fn draw_rig(rng: &mut Stream, shots: usize) -> (Vec<Mount>, f64) {
     let kind = rng.random_range(0..4);
     let rows = if shots > 12_000 { rng.random_range(28..44) } else { rng.random_range(20..26) };
@@ -85,7 +85,7 @@ pub fn draw_rig(rng: &mut Stream, shots: usize) -> (Vec<Mount>, f64) {
     }
 }
 
-/// What a user would write of a rig: names, places, fields of view.
+/// The rig file a user would write: names, positions, fields of view.
 pub fn rig_toml(mounts: &[Mount]) -> String {
     let mut text = String::new();
     for (i, m) in mounts.iter().enumerate() {

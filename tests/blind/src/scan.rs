@@ -1,8 +1,8 @@
-//! One scan: which shots, what they meet, what comes back, and what the sensor says of it.
+//! Simulation of one scan: shot directions, ray casting, detection, and the reported points.
 
 use crate::effect::{Clock, Effect};
 use crate::rig::Mount;
-use crate::solid::{Form, Hit, Solid, Stuff};
+use crate::solid::{Form, Hit, Material, Solid};
 use crate::world::{REACH_M, World};
 use data::Stream;
 use geometry::Box3;
@@ -10,66 +10,66 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
-/// What both sides have: no difference.
+/// Nuisances that are equal on both sides.
 #[derive(Clone, Copy, Debug)]
 pub struct Nuisances {
-    /// Noise along the ray, standard deviation, m.
+    /// Standard deviation of range noise, m.
     pub noise_m: f64,
-    /// Share of returns lost at random.
+    /// Fraction of returns lost at random.
     pub lost: f64,
-    /// Share of shots with a false return.
+    /// Fraction of shots with a false return.
     pub false_returns: f64,
-    /// Weakest energy that still returns, as a logarithm of rho cos / R^2.
+    /// Detection threshold: minimum of ln(rho cos / R^2).
     pub weakest: f64,
-    /// Jitter of the shots' directions, in shares of the step between columns and rows. The sensor knows them.
+    /// Dither of the shot directions, as a fraction of the column and row steps. Known to the sensor.
     pub dither: [f64; 2],
 }
 
-/// What one side has by itself: small errors that nobody would call a finding.
+/// Nuisances of one side only: small errors that are not findings.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct OwnErrors {
-    /// Standard deviation of the ego pose: m, rad.
+pub struct SideErrors {
+    /// Standard deviation of the ego pose error: m, rad.
     pub pose: [f64; 2],
-    /// Standard deviation of the labels, m.
+    /// Standard deviation of the label error, m.
     pub labels_m: f64,
 }
 
-/// A side of a pair: the world as it is there, and what happens to its scans.
+/// One side of a pair: its world and its sensor model.
 pub struct Side<'a> {
-    /// Cars, walls, road.
+    /// Cars, walls and road.
     pub world: &'a World,
-    /// Sensors as the user believes them to be.
+    /// Nominal sensor rig.
     pub rig: &'a [Mount],
-    /// The same on both sides.
+    /// Nuisances, equal on both sides.
     pub nuisances: Nuisances,
-    /// Only here.
-    pub own: OwnErrors,
-    /// What is hidden.
+    /// Nuisances of this side.
+    pub own: SideErrors,
+    /// Hidden effects.
     pub effects: &'a [Effect],
-    /// Per sensor and row: offset of range, m, and of elevation, rad.
+    /// Per sensor and row: range offset, m, and elevation offset, rad.
     pub beams: &'a [Vec<[f64; 2]>],
 }
 
-/// What a side writes for one frame.
+/// Simulated output for one frame.
 pub struct Scan {
-    /// Points in the ego frame, m, in no order.
+    /// Points in the ego frame, m, unordered.
     pub points: Vec<[f32; 3]>,
     /// Labels in the ego frame.
     pub boxes: Vec<Box3>,
-    /// Sums for the bounds of estimators that know the form.
+    /// Sums for the Cramér-Rao bounds.
     pub sums: Sums,
 }
 
-/// Sums over shots that met something.
+/// Sums over shots that hit something.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sums {
-    /// Shots that came back before anything hidden was lost.
+    /// Number of returns before hidden losses.
     pub returns: f64,
-    /// Sum of (R tan(incidence))^2 where it is below 100 m^2.
+    /// Sum of (R tan(incidence))^2, where below 100 m^2.
     pub lever: f64,
-    /// Returns that what is hidden takes away, adds, or puts elsewhere by more than 0.35 m.
+    /// Returns that hidden effects remove, add, or move by more than 0.35 m.
     pub touched: f64,
-    /// Boxes with five points or more, and the sum of their squared speeds.
+    /// Number of boxes with at least five points, and the sum of their squared speeds.
     pub boxes: [f64; 2],
 }
 
@@ -77,7 +77,7 @@ fn normal(rng: &mut Stream) -> f64 {
     StandardNormal.sample(rng)
 }
 
-/// Zero mean, unit variance, lighter tails than the normal law.
+/// Random number with zero mean, unit variance, and lighter tails than the normal distribution.
 fn bell(rng: &mut Stream) -> f64 {
     (0..6).map(|_| rng.random::<f64>()).sum::<f64>() * 2f64.sqrt() - 3.0 * 2f64.sqrt()
 }
@@ -87,7 +87,7 @@ fn small_turn(rad: [f64; 3]) -> UnitQuaternion<f64> {
 }
 
 impl Side<'_> {
-    /// The scan at `t` seconds.
+    /// Simulates the scan at time `t`, s.
     pub fn scan(&self, t: f64, rng: &mut Stream) -> Scan {
         let believed = self.world.pose(0, t);
         let mut pose_error = Isometry3::from_parts(
@@ -123,7 +123,7 @@ impl Side<'_> {
             Effect::EgoOcclusion { center_m, size_m } => Some(Solid {
                 pose: Isometry3::translation(center_m[0], center_m[1], center_m[2]),
                 form: Form::Cuboid(Vector3::from(*size_m) / 2.0),
-                stuff: Stuff::Carbon,
+                material: Material::Carbon,
             }),
             _ => None,
         });
@@ -149,7 +149,7 @@ impl Side<'_> {
                         - (column as f64 + phase + normal(rng) * self.nuisances.dither[0]) * column_step;
                     let el = elevation + normal(rng) * self.nuisances.dither[1] * row_step;
                     let direction = |az: f64, el: f64| Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin());
-                    let said = direction(az, el);
+                    let reported = direction(az, el);
                     let mut shot = direction(az, el + self.beams[k][row][1]);
                     let mut divergence = 0.0;
                     for effect in self.effects {
@@ -157,7 +157,8 @@ impl Side<'_> {
                             Effect::AngularJitter { sigma_rad } => {
                                 let radius = 2.0 * sigma_rad * rng.random::<f64>().sqrt();
                                 let angle = rng.random::<f64>() * std::f64::consts::TAU;
-                                // Across the shot, not about the sensor's axes: a turn about y leaves a shot along y where it is.
+                                // Perpendicular to the shot, not about the sensor axes: a rotation about y does not
+                                // move a shot along y.
                                 let side = Vector3::new(-az.sin(), az.cos(), 0.0);
                                 let up = shot.cross(&side);
                                 shot = (shot + (side * angle.cos() + up * angle.sin()) * radius.tan()).normalize();
@@ -172,7 +173,7 @@ impl Side<'_> {
                     let met = wing.as_ref().and_then(|w| w.cast(&origin, &ray)).map(|(range_m, n)| Hit {
                         range_m,
                         normal: n,
-                        stuff: Stuff::Carbon,
+                        material: Material::Carbon,
                         car: None,
                     });
                     scan.sums.touched += f64::from(u8::from(met.is_some()));
@@ -194,13 +195,13 @@ impl Side<'_> {
                         if let Some(car) = hit.car {
                             on_car[car] += 1;
                         }
-                        let other = hit.stuff == Stuff::Container || hit.car.is_some() && reshaped;
+                        let other = hit.material == Material::Container || hit.car.is_some() && reshaped;
                         scan.sums.touched += f64::from(u8::from(other));
                     }
                     let angles = [az, el];
                     let lost = &mut scan.sums.touched;
                     if let Some(range) = self.returned(hit, &ray, k, row, angles, mount, lost, rng) {
-                        let p = believed_pose * Point3::from(said * range);
+                        let p = believed_pose * Point3::from(reported * range);
                         scan.points.push([p.x as f32, p.y as f32, p.z as f32]);
                     }
                 }
@@ -213,7 +214,7 @@ impl Side<'_> {
         scan
     }
 
-    /// The range that the sensor reports, if it reports any.
+    /// The reported range; `None` if there is no return.
     #[expect(clippy::too_many_arguments, reason = "one shot and all that is known of it")]
     fn returned(
         &self,
@@ -240,7 +241,7 @@ impl Side<'_> {
         if rng.random::<f64>() < self.nuisances.lost || energy < self.nuisances.weakest {
             return None;
         }
-        let mut said = range + normal(rng) * self.nuisances.noise_m + self.beams[sensor][row][0];
+        let mut reported = range + normal(rng) * self.nuisances.noise_m + self.beams[sensor][row][0];
         for effect in self.effects {
             let kept = match effect {
                 Effect::RandomDropout { share } => 1.0 - share,
@@ -256,7 +257,7 @@ impl Side<'_> {
                     u / (1.0 + u)
                 }
                 Effect::MaterialDropout { tyres, share } => {
-                    let dark = if *tyres { hit.stuff == Stuff::Rubber } else { hit.stuff == Stuff::Paint };
+                    let dark = if *tyres { hit.material == Material::Rubber } else { hit.material == Material::Paint };
                     if dark { 1.0 - share } else { 1.0 }
                 }
                 Effect::RangeCut { max_m } => f64::from(u8::from(range <= *max_m)),
@@ -279,22 +280,22 @@ impl Side<'_> {
             }
             match effect {
                 Effect::RangeNoise { sigma_m, growth_per_m } => {
-                    said += bell(rng) * sigma_m * (1.0 + growth_per_m * range)
+                    reported += bell(rng) * sigma_m * (1.0 + growth_per_m * range)
                 }
-                Effect::RangeBias { offset_m, scale } => said += offset_m + scale * range,
-                Effect::AzimuthRipple { amplitude_m, waves } => said += amplitude_m * (waves * az).sin(),
+                Effect::RangeBias { offset_m, scale } => reported += offset_m + scale * range,
+                Effect::AzimuthRipple { amplitude_m, waves } => reported += amplitude_m * (waves * az).sin(),
                 Effect::SidedNoise { sigma_m } => {
-                    said += bell(rng) * sigma_m * (0.5 + az / mount.fov_rad).clamp(0.0, 1.0);
+                    reported += bell(rng) * sigma_m * (0.5 + az / mount.fov_rad).clamp(0.0, 1.0);
                 }
                 _ => {}
             }
         }
         for effect in self.effects {
             if let Effect::Quantisation { step_m } = effect {
-                said = (said / step_m).round() * step_m;
+                reported = (reported / step_m).round() * step_m;
             }
         }
-        (said > 0.5 && said < REACH_M).then_some(said)
+        (reported > 0.5 && reported < REACH_M).then_some(reported)
     }
 
     fn label(&self, t: f64, believed: &Isometry3<f64>, on_car: &[usize], rng: &mut Stream, scan: &mut Scan) {
@@ -336,7 +337,8 @@ impl Side<'_> {
     }
 }
 
-/// Range of a beam with a width: energy of nineteen rays over its section, those within a pulse's length of the strongest group mix.
+/// Range of a beam with divergence: energy of nineteen rays over the beam section. Ranges within a pulse length of the
+/// strongest group are averaged.
 fn blurred(hit: &Hit, divergence: f64, shot: &Vector3<f64>, cast: impl Fn(Vector3<f64>) -> Option<f64>) -> f64 {
     let side = shot.cross(&Vector3::z()).normalize();
     let up = side.cross(shot);
@@ -350,7 +352,7 @@ fn blurred(hit: &Hit, divergence: f64, shot: &Vector3<f64>, cast: impl Fn(Vector
     }
     let near = ranges.iter().copied().fold(f64::INFINITY, f64::min);
     let far = ranges.iter().copied().fold(0.0, f64::max);
-    // Smooth surfaces do not mix: the inverse ranges of a tilted plane spread evenly about that of its middle.
+    // Smooth surfaces do not mix: the inverse ranges on a tilted plane are symmetric about that at the beam centre.
     let uneven = (1.0 / near + 1.0 / far - 2.0 / hit.range_m).abs() > 0.2 * (1.0 / near - 1.0 / far);
     if far - near < 0.25 + 0.1 * near * 0.2 || !uneven {
         return hit.range_m;

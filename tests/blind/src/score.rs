@@ -1,53 +1,55 @@
-//! How well a diagnosis tells what was hidden. Reads the file `diagnosis.json` alone.
+//! Scores a diagnosis against the truth. Reads `diagnosis.json` only.
 
 use crate::effect::Truth;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
+use statistics::median_upper;
 use std::collections::BTreeMap;
 
-/// What became of one case.
+/// Result of one case.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Outcome {
-    /// What was hidden.
+    /// The truth.
     pub truth: Truth,
-    /// The diagnosis' word on the whole.
+    /// The overall verdict of the diagnosis.
     pub verdict: String,
-    /// Causes that it names.
+    /// Causes named by the diagnosis.
     pub named: Vec<String>,
-    /// Causes that it cannot tell apart, one list a finding.
+    /// Candidate causes of each ambiguous finding.
     pub ambiguous: Vec<Vec<String>>,
-    /// Findings without a name.
+    /// Number of unexplained findings.
     pub unexplained: usize,
-    /// Parameters of hidden causes that were named: true value, estimate, interval, bound.
-    pub parameters: Vec<Judged>,
-    /// What the diagnosis says was closed of the gap.
+    /// Parameters of correctly named causes: true value, estimate, interval, bound.
+    pub parameters: Vec<ParameterScore>,
+    /// Fraction of the gap closed, as reported by the diagnosis.
     pub closed: Option<f64>,
-    /// Seconds that the diagnosis took.
+    /// Run time of the diagnosis, s.
     pub seconds: f64,
 }
 
-/// One parameter beside its true value.
+/// An estimated parameter and its true value.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Judged {
-    /// Cause and parameter.
+pub struct ParameterScore {
+    /// `CAUSE.PARAMETER`.
     pub name: String,
-    /// As it was hidden.
+    /// True value.
     pub truth: f64,
-    /// As it was found.
+    /// Estimate.
     pub estimate: f64,
-    /// Interval.
+    /// 95 % confidence interval.
     pub ci95: [f64; 2],
-    /// Standard error of an estimator that knows the form, where it is known.
+    /// Cramér-Rao bound of the standard error, if known.
     pub bound: Option<f64>,
 }
 
-impl Judged {
-    /// Whether the interval holds the true value.
+impl ParameterScore {
+    /// Whether the interval contains the true value.
     pub fn inside(&self) -> bool {
         self.ci95[0] <= self.truth && self.truth <= self.ci95[1]
     }
 
-    /// Whether it is as close as wished: within 1.5 times the bound or 5 % of the true value, 10 % of mixed pixels, jitter and laws of the signal.
+    /// Whether the estimate meets the accuracy target: within 1.5 times the bound or 5 % of the true value (10 % for
+    /// mixed pixels, jitter and signal parameters).
     pub fn close(&self) -> bool {
         let coarse = ["mixed_pixels", "angular_jitter", "signal_dropout"].iter().any(|c| self.name.starts_with(c));
         let share = if coarse { 0.1 } else { 0.05 };
@@ -55,7 +57,7 @@ impl Judged {
     }
 }
 
-/// Compares a diagnosis with the truth.
+/// Scores a diagnosis.
 pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
     let findings = diagnosis["findings"].as_array().cloned().unwrap_or_default();
     let with = |status: &str| findings.iter().filter(|f| f["status"] == status).cloned().collect::<Vec<_>>();
@@ -64,13 +66,13 @@ pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
     for finding in with("named") {
         let Some(hidden) = truth.hidden.iter().find(|h| finding["cause"] == h.cause.as_str()) else { continue };
         for (name, value) in &hidden.parameters {
-            let said = &finding["parameters"][name];
+            let reported = &finding["parameters"][name];
             if let (Some(estimate), Some(low), Some(high)) =
-                (said["estimate"].as_f64(), said["ci95"][0].as_f64(), said["ci95"][1].as_f64())
+                (reported["estimate"].as_f64(), reported["ci95"][0].as_f64(), reported["ci95"][1].as_f64())
             {
                 let name_of = format!("{}.{name}", hidden.cause);
                 let bound = hidden.bound.get(name).copied();
-                parameters.push(Judged { name: name_of, truth: *value, estimate, ci95: [low, high], bound });
+                parameters.push(ParameterScore { name: name_of, truth: *value, estimate, ci95: [low, high], bound });
             }
         }
     }
@@ -90,8 +92,8 @@ pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
 }
 
 impl Outcome {
-    /// In a few words.
-    pub fn word(&self) -> &'static str {
+    /// Grade of the result.
+    pub fn grade(&self) -> &'static str {
         let hidden: Vec<&str> = self.truth.hidden.iter().filter(|h| h.in_catalogue).map(|h| h.cause.as_str()).collect();
         let nothing = self.named.is_empty() && self.ambiguous.is_empty() && self.unexplained == 0;
         let wrong = self.named.iter().any(|n| !hidden.contains(&n.as_str()));
@@ -131,37 +133,37 @@ impl Outcome {
     }
 }
 
-/// Counts over a set of cases.
+/// Summary of a set of cases.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Number of cases by kind and word.
-    pub words: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By hidden cause (of single cases) what was said: `confusion[hidden][said]`.
+    /// Number of cases by kind and grade.
+    pub grades: BTreeMap<String, BTreeMap<String, usize>>,
+    /// For single cases, by hidden cause and reported cause: `confusion[hidden][reported]`.
     pub confusion: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By parameter: cases, share inside the interval, median of |error| / |truth|, root mean square of error over bound where it is known, share
-    /// as close as wished.
+    /// By parameter: number of cases, fraction inside the interval, median of |error| / |truth|, RMS of error / bound
+    /// where known, fraction meeting the accuracy target.
     pub parameters: BTreeMap<String, [f64; 5]>,
-    /// Median of what was closed where something was named rightly.
+    /// Median fraction of the gap closed over the cases graded "right".
     pub closed: Option<f64>,
-    /// Median and largest time of a diagnosis, s.
+    /// Median and maximum run time of the diagnosis, s.
     pub seconds: [f64; 2],
 }
 
-/// Sums outcomes up.
+/// Summarises results.
 pub fn summarise(outcomes: &[Outcome]) -> Summary {
     let mut summary = Summary::default();
-    let mut judged: BTreeMap<String, Vec<Judged>> = BTreeMap::new();
+    let mut judged: BTreeMap<String, Vec<ParameterScore>> = BTreeMap::new();
     for o in outcomes {
-        *summary.words.entry(o.truth.kind.clone()).or_default().entry(o.word().into()).or_default() += 1;
+        *summary.grades.entry(o.truth.kind.clone()).or_default().entry(o.grade().into()).or_default() += 1;
         if o.truth.kind == "single" || o.truth.kind == "off_catalogue" {
             let hidden = o.truth.hidden[0].cause.split(' ').next().unwrap_or_default().to_owned();
-            let mut said: Vec<String> = o.named.clone();
-            said.extend(o.ambiguous.iter().map(|a| format!("ambiguous({})", a.join("|"))));
-            said.extend((0..o.unexplained).map(|_| "unexplained".to_owned()));
-            if said.is_empty() {
-                said.push("nothing".into());
+            let mut reported: Vec<String> = o.named.clone();
+            reported.extend(o.ambiguous.iter().map(|a| format!("ambiguous({})", a.join("|"))));
+            reported.extend((0..o.unexplained).map(|_| "unexplained".to_owned()));
+            if reported.is_empty() {
+                reported.push("nothing".into());
             }
-            for s in said {
+            for s in reported {
                 *summary.confusion.entry(hidden.clone()).or_default().entry(s).or_default() += 1;
             }
         }
@@ -169,22 +171,19 @@ pub fn summarise(outcomes: &[Outcome]) -> Summary {
             judged.entry(p.name.clone()).or_default().push(p.clone());
         }
     }
-    let median = |mut v: Vec<f64>| {
-        v.sort_by(f64::total_cmp);
-        v.get(v.len() / 2).copied()
-    };
     for (name, list) in judged {
         let n = list.len() as f64;
         let inside = list.iter().filter(|p| p.inside()).count() as f64 / n;
         let close = list.iter().filter(|p| p.close()).count() as f64 / n;
-        let relative = median(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
+        let relative =
+            median_upper(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
         let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
         let rms =
             if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
         summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms, close]);
     }
-    summary.closed = median(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());
+    summary.closed = median_upper(outcomes.iter().filter(|o| o.grade() == "right").filter_map(|o| o.closed).collect());
     let times: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
-    summary.seconds = [median(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
+    summary.seconds = [median_upper(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
     summary
 }

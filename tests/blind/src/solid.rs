@@ -1,27 +1,27 @@
-//! Boxes and upright cylinders that rays meet.
+//! Boxes and upright cylinders for ray casting.
 
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// What a surface is made of.
+/// Surface material.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stuff {
+pub enum Material {
     /// The road.
     Asphalt,
-    /// Walls and stands.
+    /// Walls and grandstands.
     Concrete,
-    /// Posts, boards.
+    /// Posts and boards.
     Metal,
     /// Bodywork.
     Paint,
-    /// Wings, floors.
+    /// Wings and floors.
     Carbon,
     /// Tyres.
     Rubber,
-    /// Things that only one side has.
+    /// Objects that only one side has.
     Container,
 }
 
-/// Where a ray meets a surface, in the frame of the ray.
+/// Intersection of a ray with a surface, in the frame of the ray.
 #[derive(Clone, Copy, Debug)]
 pub struct Hit {
     /// Distance along the ray, m.
@@ -29,8 +29,8 @@ pub struct Hit {
     /// Unit normal towards the ray's origin.
     pub normal: Vector3<f64>,
     /// Material.
-    pub stuff: Stuff,
-    /// Number of the car, if it is one.
+    pub material: Material,
+    /// Index of the car, if a car was hit.
     pub car: Option<usize>,
 }
 
@@ -41,28 +41,28 @@ impl Hit {
     }
 }
 
-/// Form of a part.
+/// Shape of a part.
 #[derive(Clone, Copy, Debug)]
 pub enum Form {
     /// Half extents, m.
     Cuboid(Vector3<f64>),
-    /// A wheel: axis along y, radius and half width, m.
+    /// Wheel with its axis along y: radius and half width, m.
     Wheel(f64, f64),
 }
 
-/// A part of a car or a thing beside the road.
+/// A part of a car, or an object beside the road.
 #[derive(Clone, Copy, Debug)]
 pub struct Solid {
-    /// Where its middle stands.
+    /// Pose of the centre.
     pub pose: Isometry3<f64>,
-    /// Form.
+    /// Shape.
     pub form: Form,
     /// Material.
-    pub stuff: Stuff,
+    pub material: Material,
 }
 
 impl Solid {
-    /// Range and normal of the first surface that the ray enters.
+    /// Range and normal at the first entry of the ray.
     pub fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<(f64, Vector3<f64>)> {
         let o = self.pose.inverse_transform_point(origin).coords;
         let d = self.pose.rotation.inverse_transform_vector(direction);
@@ -73,7 +73,7 @@ impl Solid {
         Some((t, self.pose.rotation * normal))
     }
 
-    /// Radius of a ball around its middle that holds it, m.
+    /// Radius of the bounding sphere around the centre, m.
     pub fn reach_m(&self) -> f64 {
         match self.form {
             Form::Cuboid(half) => half.norm(),
@@ -133,7 +133,7 @@ mod tests {
     #[test]
     fn rays_meet_what_stands_in_their_way() {
         let at = Isometry3::translation(10.0, 0.0, 0.0);
-        let solid = Solid { pose: at, form: Form::Cuboid(Vector3::new(1.0, 2.0, 0.5)), stuff: Stuff::Metal };
+        let solid = Solid { pose: at, form: Form::Cuboid(Vector3::new(1.0, 2.0, 0.5)), material: Material::Metal };
         let (t, n) = solid.cast(&Point3::origin(), &Vector3::x()).unwrap();
         assert!((t - 9.0).abs() < 1e-12 && (n + Vector3::x()).norm() < 1e-12);
         assert!(solid.cast(&Point3::origin(), &Vector3::new(1.0, 0.0, 0.1).normalize()).is_none());

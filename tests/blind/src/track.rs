@@ -1,30 +1,31 @@
-//! A banked oval: two straights and two half circles, driven counter-clockwise. World frame: x along the first straight, z up, m.
+//! A banked oval: two straights and two half circles, driven counter-clockwise. World frame: x along the first
+//! straight, z up, m.
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::PI;
 
-/// Shape of the road.
+/// Shape of the track.
 #[derive(Clone, Debug)]
 pub struct Track {
     /// Length of a straight, m.
     pub straight_m: f64,
     /// Radius of the centre line in the turns, m.
     pub radius_m: f64,
-    /// Slope across the road on the straights and in the turns: tangents of the banking.
+    /// Cross slope on the straights and in the turns: tangent of the banking angle.
     pub slope: [f64; 2],
-    /// Half of the road's width, m.
+    /// Half width of the road, m.
     pub half_width_m: f64,
-    /// Amplitude of long waves of the surface, m.
+    /// Amplitude of long-wave road unevenness, m.
     pub waves_m: f64,
 }
 
 impl Track {
-    /// One lap along the centre line, m.
+    /// Length of a lap along the centre line, m.
     pub fn lap_m(&self) -> f64 {
         2.0 * self.straight_m + 2.0 * PI * self.radius_m
     }
 
-    /// Position along the centre line and to its left, m.
+    /// Position along the centre line and lateral offset to its left, m.
     pub fn curve_coordinates(&self, x: f64, y: f64) -> (f64, f64) {
         let (half, radius) = (self.straight_m / 2.0, self.radius_m);
         if x.abs() <= half {
@@ -38,7 +39,7 @@ impl Track {
         let (dx, dy) = (x - side * half, y);
         let from_center = dx.hypot(dy);
         if side > 0.0 {
-            let angle = dy.atan2(dx) + PI / 2.0; // 0 where the first straight ends
+            let angle = dy.atan2(dx) + PI / 2.0; // 0 at the end of the first straight
             (self.straight_m + angle * radius, radius - from_center)
         } else {
             let angle = (-dy).atan2(-dx) + PI / 2.0;
@@ -46,7 +47,7 @@ impl Track {
         }
     }
 
-    /// World position (without height) and heading of a point of the curve.
+    /// World position (without height) and heading at a position along the curve.
     pub fn at(&self, s: f64, left: f64) -> ([f64; 2], f64) {
         let (half, radius, straight) = (self.straight_m / 2.0, self.radius_m, self.straight_m);
         let s = s.rem_euclid(self.lap_m());
@@ -64,7 +65,7 @@ impl Track {
         }
     }
 
-    /// Slope across the road at a position along the centre line; positive: the left edge is down.
+    /// Cross slope at a position along the centre line; positive: the left edge is lower.
     fn slope_at(&self, s: f64) -> f64 {
         let turn = PI * self.radius_m;
         let ramp = 50.0;
@@ -86,18 +87,18 @@ impl Track {
         self.plain_m(s, left) + waves
     }
 
-    /// Height that the road does not reach beyond, waves included, m.
+    /// Upper bound of the road height including unevenness, m.
     pub fn at_most_m(&self, x: f64, y: f64) -> f64 {
         let (s, left) = self.curve_coordinates(x, y);
         self.plain_m(s, left) + 1.6 * self.waves_m
     }
 
-    /// Height without waves, m.
+    /// Height without unevenness, m.
     fn plain_m(&self, s: f64, left: f64) -> f64 {
         -left.clamp(-1.3 * self.half_width_m, 1.6 * self.half_width_m) * self.slope_at(s)
     }
 
-    /// Pose of a car whose reference stands `above_m` over the road: x along the curve, z along the surface's normal.
+    /// Pose of a car whose origin is `above_m` above the road: x along the curve, z along the surface normal.
     pub fn pose(&self, s: f64, left: f64, above_m: f64) -> Isometry3<f64> {
         let ([x, y], heading) = self.at(s, left);
         let h = 0.6;

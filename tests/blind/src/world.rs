@@ -1,30 +1,31 @@
-//! The scene: road, walls, things beside the road, cars on their way; and what a ray meets.
+//! The scene (road, walls, roadside objects, moving cars) and ray casting.
 
 use crate::car::{CarShape, draw_shape};
-use crate::solid::{Form, Hit, Solid, Stuff};
+use crate::solid::{Form, Hit, Material, Solid};
 use crate::track::Track;
 use data::Stream;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 
-/// Farther than this nothing is met, m.
+/// Maximum range, m.
 pub const REACH_M: f64 = 150.0;
 
 /// A wall along the road.
 #[derive(Clone, Debug)]
 pub struct Wall {
-    /// Where it stands, to the left of the centre line, m.
+    /// Lateral position, to the left of the centre line, m.
     pub left_m: f64,
-    /// Height over the road beside it, m.
+    /// Height above the adjacent road, m.
     pub height_m: f64,
-    /// Gaps: begin and end along the centre line, m.
+    /// Gaps: start and end along the centre line, m.
     pub gaps_m: Vec<(f64, f64)>,
 }
 
-/// A car on its way: position along the centre line is `s + v t` with a slow change of speed, beside it `left` with a slow swing.
+/// Motion of a car: `s + v t` along the centre line with a slow change of speed; `left` beside it with a slow
+/// oscillation.
 #[derive(Clone, Debug)]
 pub struct Driver {
-    /// Index of its make.
+    /// Index of its shape.
     pub shape: usize,
     /// Reflectivity of its paint.
     pub paint: f64,
@@ -36,7 +37,7 @@ pub struct Driver {
 }
 
 impl Driver {
-    /// Position along and beside the centre line at `t` seconds.
+    /// Position along the centre line and lateral offset at time `t`, s.
     pub fn place(&self, t: f64) -> (f64, f64) {
         let wave = |[size, rate, phase]: [f64; 3]| size * (rate * t + phase).sin();
         (self.start_m + self.speed_m_s * t + wave(self.surge), self.left_m + wave(self.swing))
@@ -48,26 +49,26 @@ impl Driver {
     }
 }
 
-/// Everything that does not depend on the sensor.
+/// The scene, independent of the sensor.
 #[derive(Clone, Debug)]
 pub struct World {
     /// The road.
     pub track: Track,
     /// Walls.
     pub walls: Vec<Wall>,
-    /// Things beside the road, in the world's frame.
+    /// Roadside objects in the world frame.
     pub things: Vec<Solid>,
-    /// Makes of cars.
+    /// Car shapes.
     pub shapes: Vec<CarShape>,
-    /// The ego car comes first.
+    /// All cars; the ego vehicle is first.
     pub drivers: Vec<Driver>,
-    /// Height of the ego car's reference over the road, m.
+    /// Height of the ego vehicle's origin above the road, m.
     pub ego_above_m: f64,
-    /// Reflectivity of asphalt and of concrete.
+    /// Reflectivity of asphalt and concrete.
     pub reflectivity: [f64; 2],
 }
 
-/// The scene at one moment, ready to be shot at; in the frame of the ego car at that moment.
+/// The scene at one moment, ready for ray casting; in the ego frame at that moment.
 pub struct Moment<'a> {
     world: &'a World,
     world_from_ego: Isometry3<f64>,
@@ -75,7 +76,7 @@ pub struct Moment<'a> {
     cars: Vec<(usize, Vec<Solid>, Point3<f64>, f64)>,
 }
 
-/// Draws a world with a race in it.
+/// Draws a world with a race.
 pub fn draw_world(rng: &mut Stream, ego_above_m: f64) -> World {
     let track = Track {
         straight_m: rng.random_range(120.0..420.0),
@@ -117,25 +118,25 @@ pub fn draw_world(rng: &mut Stream, ego_above_m: f64) -> World {
 
 fn draw_things(rng: &mut Stream, track: &Track, outer: f64, inner: f64) -> Vec<Solid> {
     let mut things = Vec::new();
-    let mut stand = |rng: &mut Stream, s: f64, left: f64, size: [f64; 3], lift: f64, stuff: Stuff| {
+    let mut stand = |rng: &mut Stream, s: f64, left: f64, size: [f64; 3], lift: f64, material: Material| {
         let ([x, y], heading) = track.at(s, left);
         let z = track.height_m(x, y) + lift + size[2] / 2.0;
         let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading + rng.random_range(-0.05..0.05));
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), turn);
-        things.push(Solid { pose, form: Form::Cuboid(Vector3::from(size) / 2.0), stuff });
+        things.push(Solid { pose, form: Form::Cuboid(Vector3::from(size) / 2.0), material });
     };
     let lap = track.lap_m();
     let every = rng.random_range(12.0..20.0);
     let mut s = 0.0;
     while s < lap {
-        stand(rng, s, outer - 0.4, [0.25, 0.25, 4.5], -0.3, Stuff::Metal);
+        stand(rng, s, outer - 0.4, [0.25, 0.25, 4.5], -0.3, Material::Metal);
         if rng.random_bool(0.3) {
             let size = [rng.random_range(4.0..18.0), rng.random_range(2.0..6.0), rng.random_range(3.0..8.0)];
-            stand(rng, s, outer - 8.0, size, -1.0, Stuff::Concrete);
+            stand(rng, s, outer - 8.0, size, -1.0, Material::Concrete);
         }
         if rng.random_bool(0.25) {
             let size = [rng.random_range(1.0..6.0), rng.random_range(0.4..3.0), rng.random_range(1.6..3.5)];
-            stand(rng, s, inner + 4.0, size, -0.3, Stuff::Concrete);
+            stand(rng, s, inner + 4.0, size, -0.3, Material::Concrete);
         }
         s += every;
     }
@@ -143,31 +144,31 @@ fn draw_things(rng: &mut Stream, track: &Track, outer: f64, inner: f64) -> Vec<S
 }
 
 impl World {
-    /// Pose of a car at a time: the ego's reference, or the middle of another's box.
+    /// Pose of a car at a time: the ego vehicle's origin, or the box centre of another car.
     pub fn pose(&self, driver: usize, t: f64) -> Isometry3<f64> {
         let (s, left) = self.drivers[driver].place(t);
         let above = if driver == 0 { self.ego_above_m } else { self.shape(driver).size_m[2] / 2.0 };
         self.track.pose(s, left, above)
     }
 
-    /// Make of a car.
+    /// Shape of a car.
     pub fn shape(&self, driver: usize) -> &CarShape {
         &self.shapes[self.drivers[driver].shape]
     }
 
-    /// Reflectivity of what was met.
+    /// Reflectivity at a hit.
     pub fn reflectivity(&self, hit: &Hit) -> f64 {
-        match hit.stuff {
-            Stuff::Asphalt => self.reflectivity[0],
-            Stuff::Concrete => self.reflectivity[1],
-            Stuff::Metal | Stuff::Container => 0.5,
-            Stuff::Paint => hit.car.map_or(0.4, |car| self.drivers[car].paint),
-            Stuff::Carbon => 0.07,
-            Stuff::Rubber => 0.04,
+        match hit.material {
+            Material::Asphalt => self.reflectivity[0],
+            Material::Concrete => self.reflectivity[1],
+            Material::Metal | Material::Container => 0.5,
+            Material::Paint => hit.car.map_or(0.4, |car| self.drivers[car].paint),
+            Material::Carbon => 0.07,
+            Material::Rubber => 0.04,
         }
     }
 
-    /// The scene at `t` seconds in the frame `world_from_ego`.
+    /// The scene at time `t` (s) in the ego frame given by `world_from_ego`.
     pub fn moment(&self, t: f64, world_from_ego: Isometry3<f64>) -> Moment<'_> {
         let ego_from_world = world_from_ego.inverse();
         let near = |p: &Point3<f64>, reach: f64| p.coords.norm() < REACH_M + reach;
@@ -189,9 +190,9 @@ impl World {
 }
 
 impl Moment<'_> {
-    /// What a ray of the ego's frame meets first.
+    /// First hit of a ray in the ego frame.
     pub fn cast(&self, origin: &Point3<f64>, direction: &Vector3<f64>) -> Option<Hit> {
-        let mut best = Hit { range_m: REACH_M, normal: Vector3::z(), stuff: Stuff::Asphalt, car: None };
+        let mut best = Hit { range_m: REACH_M, normal: Vector3::z(), material: Material::Asphalt, car: None };
         let mut found = false;
         let passes = |center: &Point3<f64>, reach: f64| {
             let to = center - origin;
@@ -202,7 +203,7 @@ impl Moment<'_> {
             if let Some((t, normal)) = solid.cast(origin, direction)
                 && t < best.range_m
             {
-                (best, found) = (Hit { range_m: t, normal, stuff: solid.stuff, car }, true);
+                (best, found) = (Hit { range_m: t, normal, material: solid.material, car }, true);
             }
         };
         for (solid, center, reach) in &self.things {
@@ -217,20 +218,20 @@ impl Moment<'_> {
         }
         let o = self.world_from_ego * origin;
         let d = self.world_from_ego.rotation * direction;
-        let mut meet = |t: f64, normal_world: Vector3<f64>, stuff: Stuff| {
+        let mut meet = |t: f64, normal_world: Vector3<f64>, material: Material| {
             if t < best.range_m {
                 let normal = self.world_from_ego.rotation.inverse_transform_vector(&normal_world);
-                (best, found) = (Hit { range_m: t, normal, stuff, car: None }, true);
+                (best, found) = (Hit { range_m: t, normal, material, car: None }, true);
             }
         };
         for wall in &self.world.walls {
             if let Some((t, normal)) = self.world.cast_wall(wall, &o, &d) {
-                meet(t, normal, Stuff::Concrete);
+                meet(t, normal, Material::Concrete);
             }
         }
         if let Some((t, normal)) = self.world.cast_road(&o, &d, best.range_m) {
             let normal = self.world_from_ego.rotation.inverse_transform_vector(&normal);
-            (best, found) = (Hit { range_m: t, normal, stuff: Stuff::Asphalt, car: None }, true);
+            (best, found) = (Hit { range_m: t, normal, material: Material::Asphalt, car: None }, true);
         }
         found.then_some(best)
     }
@@ -281,7 +282,7 @@ impl World {
         })
     }
 
-    /// Marches with steps that cannot pass the surface, then closes in on it by chords.
+    /// Marches with steps that cannot cross the surface, then refines the intersection by chords.
     fn cast_road(&self, o: &Point3<f64>, d: &Vector3<f64>, before_m: f64) -> Option<(f64, Vector3<f64>)> {
         let track = &self.track;
         let gap = |t: f64| {
@@ -290,7 +291,7 @@ impl World {
         };
         let steepest = track.slope[1].max(track.slope[0]) + 0.02;
         let fall = (steepest * d.xy().norm() - d.z).max(1e-3);
-        // Above the highest waves their phase does not matter.
+        // Above the highest wave crest its phase is irrelevant.
         let (mut t, mut above) = (0.0, f64::INFINITY);
         while above > 0.15 {
             let p = o + d * t;
@@ -328,7 +329,7 @@ impl World {
     }
 }
 
-/// Where a function falls through zero between two places: chords, the end that stays counted half.
+/// Zero crossing of a falling function between two positions, by the Illinois variant of regula falsi.
 fn crossing(mut above: (f64, f64), mut below: (f64, f64), gap: impl Fn(f64) -> f64) -> f64 {
     for _ in 0..40 {
         let t = (above.0 * below.1 - below.0 * above.1) / (below.1 - above.1);
@@ -358,11 +359,11 @@ mod tests {
         let moment = world.moment(1.0, pose);
         let mount = Point3::new(0.0, 0.0, 1.5);
         let down = moment.cast(&mount, &Vector3::new(0.3, 0.0, -1.0).normalize()).unwrap();
-        assert_eq!(down.stuff, Stuff::Asphalt);
+        assert_eq!(down.material, Material::Asphalt);
         assert!((down.range_m - 1.8 * 1.09f64.sqrt()).abs() < 0.05, "{}", down.range_m);
         assert!((down.normal.z - 1.0).abs() < 0.01);
         let right = moment.cast(&mount, &Vector3::new(0.0, -1.0, -0.12).normalize()).unwrap();
-        assert!(right.range_m < 12.0 && right.normal.y > 0.9 || right.stuff == Stuff::Asphalt, "{right:?}");
+        assert!(right.range_m < 12.0 && right.normal.y > 0.9 || right.material == Material::Asphalt, "{right:?}");
         let mut cars = 0;
         for driver in 1..world.drivers.len() {
             let center = Point3::from((pose.inverse() * world.pose(driver, 1.0)).translation.vector);

@@ -1,20 +1,19 @@
-//! A case on disk: `measured/`, `simulated/`, `sensor.toml`; the truth is handed back and lies nowhere beside them.
+//! Writes a case: `measured/`, `simulated/`, `sensor.toml`. The truth is returned and not written next to them.
 
 use crate::case::{Case, Kind};
 use crate::effect::{Effect, Hidden, Truth};
 use crate::rig::{draw_rig, rig_toml};
-use crate::scan::{Nuisances, OwnErrors, Scan, Side, Sums};
-use crate::solid::{Form, Solid, Stuff};
+use crate::scan::{Nuisances, Scan, Side, SideErrors, Sums};
+use crate::solid::{Form, Material, Solid};
 use crate::world::{World, draw_world};
-use data::write::write_kitti_frame;
-use data::{Cloud, DataError, Frame, Object, write_atomic};
+use data::{Cloud, DataError, Frame, Layout, Object, write_atomic};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Writes both sides and the rig into `folder`; returns what is hidden.
+/// Writes both sides and the rig into `folder`; returns the truth.
 pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
     let mut rng = data::stream(case.seed, "blind world", 0, 0);
     let (rig, above_m) = draw_rig(&mut rng, case.size.shots);
@@ -55,10 +54,10 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
             _ => {}
         }
     }
-    let own = OwnErrors { pose: [0.003, 8e-5], labels_m: rng.random_range(0.02..0.05) };
+    let own = SideErrors { pose: [0.003, 8e-5], labels_m: rng.random_range(0.02..0.05) };
     let measured = Side { world: &measured_world, rig: &rig, nuisances, own, effects: &case.effects, beams: &beams };
     let simulated =
-        Side { world: &simulated_world, rig: &rig, nuisances, own: OwnErrors::default(), effects: &[], beams: &level };
+        Side { world: &simulated_world, rig: &rig, nuisances, own: SideErrors::default(), effects: &[], beams: &level };
     write_atomic(&folder.join("sensor.toml"), rig_toml(&rig).as_bytes())?;
     let sums: Vec<Result<Sums, DataError>> = (0..case.size.frames)
         .into_par_iter()
@@ -68,7 +67,7 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
             let shown =
                 if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
             let sums = scan.sums;
-            // Ids count scans at 20 Hz, whether all of them are kept or not.
+            // Frame ids count scans at 20 Hz, including those that are not kept.
             let every = (case.step_s * 20.0).round() as usize;
             write_scan(&folder.join("measured"), shown * every, scan)?;
             let scan = simulated.scan(t, &mut data::stream(case.seed, "blind simulated", 0, i as u64));
@@ -95,7 +94,7 @@ fn write_scan(root: &Path, id: usize, scan: Scan) -> Result<(), DataError> {
         cloud: Cloud { values, channels: 3 },
         objects: scan.boxes.into_iter().map(object).collect(),
     };
-    write_kitti_frame(root, &frame)?;
+    Layout::Kitti.write_frame(root, &frame)?;
     write_atomic(&root.join("dataset.toml"), b"points = \"xyz\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\"]\n")
 }
 
@@ -109,7 +108,7 @@ fn scale_parts(parts: &mut [Solid], by: [f64; 3]) {
     }
 }
 
-/// Containers beside and behind the walls.
+/// Adds containers beside and behind the walls.
 fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
     for _ in 0..n {
         let s = rng.random_range(0.0..world.track.lap_m());
@@ -119,13 +118,14 @@ fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
         let z = world.track.height_m(x, y) + size.z / 2.0;
         let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), heading);
         let pose = Isometry3::from_parts(Translation3::new(x, y, z), turn);
-        world.things.push(Solid { pose, form: Form::Cuboid(size / 2.0), stuff: Stuff::Container });
+        world.things.push(Solid { pose, form: Form::Cuboid(size / 2.0), material: Material::Container });
     }
 }
 
-/// The truth with standard errors of estimators that know the form: Fisher information of the frames' returns. Of rows that are drawn, the offsets
-/// of every one may be known; the standard deviation that they were drawn with (uniform) is not known better than so few tell.
-fn truth(case: &Case, nuisances: &Nuisances, own: &OwnErrors, rows: usize, sums: &Sums) -> Truth {
+/// The truth with Cramér-Rao bounds from the Fisher information of the frames' returns. For per-row offsets each
+/// offset may be known exactly; the standard deviation of their (uniform) distribution is limited by the number of
+/// rows.
+fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums: &Sums) -> Truth {
     let bound = |effect: &Effect| -> BTreeMap<String, f64> {
         let own_variance = 2.0 * nuisances.noise_m.powi(2);
         let n = sums.returns.max(1.0);

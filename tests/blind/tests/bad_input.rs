@@ -1,4 +1,5 @@
-//! Pairs that cannot be diagnosed as they are: an answer that says what cannot be known, or an error that says what to do; never a panic.
+//! Pairs that cannot be diagnosed as they are: the diagnosis must state what cannot be determined or return an error
+//! with advice, and never panic.
 
 use data::Dataset;
 use diagnose::{Diagnosis, Options, Rig, Verdict, diagnose};
@@ -6,7 +7,7 @@ use lidarshift_blind::{CaseSize, Kind, draw_case, write_case};
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-/// A pair with nothing hidden.
+/// A pair without hidden effects.
 struct Pair(TempDir);
 
 impl Pair {
@@ -21,7 +22,7 @@ impl Pair {
         self.0.path().join(of)
     }
 
-    /// Files of a folder by name.
+    /// Files of a folder, sorted by name.
     fn files(&self, of: &str) -> Vec<PathBuf> {
         let mut files: Vec<PathBuf> = fs_err::read_dir(self.path(of)).unwrap().map(|e| e.unwrap().path()).collect();
         files.sort();
@@ -51,7 +52,7 @@ impl Pair {
         let rig = Rig::read(&self.path("sensor.toml")).unwrap();
         let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
         let diagnosis = found.map_err(|e| e.to_string())?.diagnosis;
-        // What is said can be written and read: all its numbers are numbers.
+        // The diagnosis survives a JSON round trip: all numbers are finite.
         let text = serde_json::to_string(&diagnosis).unwrap();
         assert!(serde_json::from_str::<Diagnosis>(&text).is_ok(), "{text}");
         Ok(diagnosis)
@@ -76,13 +77,13 @@ fn unequal_numbers_of_frames_and_empty_clouds_are_left_out_by_name() {
     pair.remove("simulated", &simulated[13]);
     fs_err::write(&simulated[7], b"").unwrap();
     let d = pair.diagnosis().unwrap();
-    let told = notes(&d);
-    for words in [
+    let message = notes(&d);
+    for expected in [
         "2 frames are only in the measured data set",
         "1 frames are only in the simulated data set",
         "the simulated cloud has no point",
     ] {
-        assert!(told.contains(words), "{words}: {told}");
+        assert!(message.contains(expected), "{expected}: {message}");
     }
     assert_eq!(d.frames.select.len() + d.frames.estimate.len() + d.frames.hold_out.len(), 10);
 }
@@ -116,7 +117,7 @@ fn one_frame_is_too_few() {
 }
 
 #[test]
-fn clouds_cut_at_different_ranges_are_told() {
+fn clouds_cut_at_different_ranges_are_reported() {
     let near = |limit: f32| move |_: usize, p: [f32; 3]| (p[0].hypot(p[1]) < limit).then_some(p);
     let pair = Pair::new(5, 20);
     pair.change("simulated", near(25.0));
@@ -137,20 +138,20 @@ fn points_that_are_no_numbers_are_an_error_that_names_the_file() {
 }
 
 #[test]
-fn labels_in_another_frame_are_told() {
+fn labels_in_another_frame_are_reported() {
     let pair = Pair::new(7, 14);
     for file in pair.files("measured/label_2") {
         let text = fs_err::read_to_string(&file).unwrap();
         let turned = text.lines().map(|line| {
-            let mut words: Vec<&str> = line.split_whitespace().collect();
-            words.swap(11, 12);
-            words.join(" ") + "\n"
+            let mut fields: Vec<&str> = line.split_whitespace().collect();
+            fields.swap(11, 12);
+            fields.join(" ") + "\n"
         });
         let turned: String = turned.collect();
         fs_err::write(&file, turned).unwrap();
     }
-    let told = pair.diagnosis().map_or_else(|e| e, |d| notes(&d));
-    assert!(told.contains("written in the same frame") || told.contains("not scenario-identical"), "{told}");
+    let message = pair.diagnosis().map_or_else(|e| e, |d| notes(&d));
+    assert!(message.contains("written in the same frame") || message.contains("not scenario-identical"), "{message}");
 }
 
 #[test]
@@ -171,7 +172,7 @@ fn copies_of_one_frame_are_one_frame() {
 
 #[test]
 fn another_sensor_is_no_panic() {
-    // Every other return of the simulation, and all of it turned by a fifth of a degree.
+    // The simulation with every other return removed and rotated by 0.2 degrees.
     let pair = Pair::new(9, 14);
     let (s, c) = 0.0035f32.sin_cos();
     pair.change("simulated", |i, [x, y, z]| i.is_multiple_of(2).then_some([c * x - s * y, s * x + c * y, z]));

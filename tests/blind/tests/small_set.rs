@@ -1,6 +1,6 @@
-//! A small blind set with fixed seeds: what is hidden must be named, nothing else, and nothing where nothing is hidden.
+//! A small blind set with fixed seeds: hidden causes must be named, and nothing else.
 //!
-//! A few cases of the large set, `cargo xtask bench blind`: what a change of the diagnosis must not lose.
+//! A few cases of the large set, `cargo xtask bench blind`, as a regression test of the diagnosis.
 
 use data::Dataset;
 use diagnose::{Options, Rig, diagnose};
@@ -36,14 +36,14 @@ fn what_is_hidden_is_named() {
         .par_iter()
         .filter_map(|&(seed, kind, want)| {
             let o = outcome(seed, kind);
-            let told = format!(
+            let mismatch = format!(
                 "{seed}: {:?} gives {} ({:?} {:?}), not {want}",
                 o.truth.hidden,
-                o.word(),
+                o.grade(),
                 o.named,
                 o.ambiguous
             );
-            (o.word() != want).then_some(told)
+            (o.grade() != want).then_some(mismatch)
         })
         .collect();
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));

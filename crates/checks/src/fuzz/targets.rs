@@ -44,7 +44,7 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
         sound: label.into(),
         read: text(|t| {
             let lines = parse_kitti_text(t, Path::new("fuzz.txt"), KittiText::Labels).ok();
-            let sound = |line: &data::KittiLine| line.location.iter().chain(&line.size_hwl).all(|v| v.is_finite());
+            let sound = |line: &data::LabelBox| line.location.iter().chain(&line.size_hwl).all(|v| v.is_finite());
             lines.map(|lines| lines.iter().all(sound))
         }),
     });

@@ -158,9 +158,8 @@ impl Case<'_> {
     /// Whether the reference's own gradients hang on rounding, as those of networks of published size do.
     fn is_noisy(&self) -> bool {
         let gradients = self.manifest.f32_minus_f64.iter().filter(|(k, _)| k.starts_with("grad/"));
-        let mut natural: Vec<f64> = gradients.filter_map(|(_, n)| n.rel_l2).collect();
-        natural.sort_by(f64::total_cmp);
-        natural.get(natural.len() / 2).is_some_and(|median| *median > 2e-5)
+        let natural: Vec<f64> = gradients.filter_map(|(_, n)| n.rel_l2).collect();
+        statistics::median_upper(natural).is_some_and(|median| median > 2e-5)
     }
 
     fn running_statistics(&mut self, detector: &Detector) -> Result<()> {

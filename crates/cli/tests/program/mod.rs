@@ -1,7 +1,7 @@
 //! The program, and a data set small enough to train on in seconds.
 
-use data::write::{write_kitti_frame, write_split};
-use data::{Cloud, Frame, Object, stream};
+use data::write::write_split;
+use data::{Cloud, Frame, Layout, Object, stream};
 use geometry::Box3;
 use rand::RngExt;
 use std::path::Path;
@@ -90,7 +90,7 @@ pub fn data_set(folder: &Path) {
             let class = "Car".into();
             frame.objects.push(Object { class, bbox, truncation: None, occlusion: None, image_box: None });
         }
-        write_kitti_frame(folder, &frame).unwrap();
+        Layout::Kitti.write_frame(folder, &frame).unwrap();
         ids.push(frame.id);
     }
     write_split(&folder.join("ImageSets/train.txt"), &ids[..5]).unwrap();

@@ -6,7 +6,7 @@
 use super::ground::Ground;
 use super::report::Findings;
 use super::survey::FrameFacts;
-use crate::{Calibration, Dataset, KittiLine, LabelFrame};
+use crate::{Calibration, Dataset, LabelBox, LabelFrame};
 use geometry::Box3;
 use serde::Serialize;
 use std::f64::consts::FRAC_PI_2;
@@ -75,7 +75,7 @@ fn declared(label_frame: LabelFrame) -> usize {
 }
 
 /// A label's box by one reading.
-fn read(line: &KittiLine, (place, turn, sizes): (Place, Turn, Sizes), calibration: Option<&Calibration>) -> Box3 {
+fn read(line: &LabelBox, (place, turn, sizes): (Place, Turn, Sizes), calibration: Option<&Calibration>) -> Box3 {
     let [a, b, c] = line.size_hwl;
     let size = match sizes {
         Sizes::HeightWidthLength => [c, b, a],
@@ -99,10 +99,10 @@ fn read(line: &KittiLine, (place, turn, sizes): (Place, Turn, Sizes), calibratio
     Box3 { center, size, yaw_rad }
 }
 
-pub(super) fn evidence(dataset: &Dataset, id: &str, lines: &[KittiLine], ground: &Ground) -> Vec<Evidence> {
+pub(super) fn evidence(dataset: &Dataset, id: &str, lines: &[LabelBox], ground: &Ground) -> Vec<Evidence> {
     let calibration = dataset.calibration(id).ok();
     let lines = lines.iter().filter(|line| !line.is_dont_care() && line.has_box());
-    let count = |line: &KittiLine| -> Evidence {
+    let count = |line: &LabelBox| -> Evidence {
         let mut counts = [0; READINGS];
         for (count, reading) in counts.iter_mut().zip(all()) {
             let bbox = read(line, reading, calibration.as_ref());
@@ -194,7 +194,7 @@ mod tests {
         let calibration = Calibration::parse(crate::calibration::tests::MADE_UP, std::path::Path::new("c")).unwrap();
         let bbox = Box3::from_array([20.0, 3.0, -1.0, 4.0, 1.8, 1.5, 0.4]);
         let readings: Vec<_> = all().collect();
-        let lidar = KittiLine::from_box("Car", &bbox, None);
+        let lidar = LabelBox::from_box("Car", &bbox, None);
         assert_eq!(read(&lidar, readings[declared(LabelFrame::Lidar)], None), bbox);
         let camera = calibration.camera_from_lidar_box("Car", &bbox, None, [1242, 375]);
         let again = read(&camera, readings[declared(LabelFrame::Camera)], Some(&calibration));

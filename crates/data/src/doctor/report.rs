@@ -4,6 +4,7 @@ use super::reading::Reading;
 use super::survey::FrameFacts;
 use crate::{Dataset, LabelFrame, PointColumns};
 use serde::Serialize;
+use statistics::median_upper_of_sorted;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
@@ -81,7 +82,10 @@ impl Spread {
         values.sort_by(f64::total_cmp);
         match values[..] {
             [] => Spread::default(),
-            [min, ..] => Spread { min, median: values[values.len() / 2], max: values[values.len() - 1] },
+            [min, ..] => {
+                let median = median_upper_of_sorted(&values).unwrap_or(min);
+                Spread { min, median, max: values[values.len() - 1] }
+            }
         }
     }
 }

@@ -1,8 +1,8 @@
 //! Planted faults: each is found, by name, and nothing is found where nothing was planted.
 
 use super::*;
-use crate::write::{write_bin, write_dataset_toml, write_kitti_frame, write_kitti_text, write_split};
-use crate::{Calibration, Cloud, DatasetConfig, Frame, KittiLine, LabelFrame, Object, stream};
+use crate::write::{write_bin, write_dataset_toml, write_kitti_text, write_split};
+use crate::{Calibration, Cloud, DatasetConfig, Frame, LabelBox, LabelFrame, Layout, Object, stream};
 use geometry::Box3;
 use rand::RngExt;
 use std::f64::consts::FRAC_PI_2;
@@ -46,7 +46,7 @@ fn data_set(label_frame: LabelFrame) -> tempfile::TempDir {
     let root = folder.path();
     for seed in 0..FRAMES {
         let frame = scene(seed);
-        write_kitti_frame(root, &frame).unwrap();
+        Layout::Kitti.write_frame(root, &frame).unwrap();
         if label_frame == LabelFrame::Camera {
             crate::write_atomic(
                 &root.join(format!("calib/{}.txt", frame.id)),
@@ -71,7 +71,7 @@ fn labels(root: &Path, seed: u64) -> PathBuf {
     root.join(format!("label_2/{seed:06}.txt"))
 }
 
-fn change_labels(root: &Path, change: impl Fn(&mut KittiLine)) {
+fn change_labels(root: &Path, change: impl Fn(&mut LabelBox)) {
     let dataset = Dataset::open(root).unwrap();
     for seed in 0..FRAMES {
         let mut lines = dataset.labels(&format!("{seed:06}")).unwrap();
@@ -116,7 +116,7 @@ fn sound_data_are_called_sound() {
 
 #[test]
 fn wrong_conventions_are_told_from_the_points() {
-    type Change = (LabelFrame, fn(&mut KittiLine), &'static str);
+    type Change = (LabelFrame, fn(&mut LabelBox), &'static str);
     let changes: [Change; 8] = [
         (LabelFrame::Lidar, |l| l.rotation_y *= -1.0, "clockwise"),
         (LabelFrame::Lidar, |l| l.rotation_y += FRAC_PI_2, "swapped"),
@@ -276,10 +276,10 @@ fn real_scans_are_called_sound_and_planted_faults_are_not() {
     // The same scans with labels in the LiDAR frame, then with each fault in turn.
     let folder = tempfile::tempdir().unwrap();
     let frames: Vec<Frame> = dataset.all_ids().unwrap().iter().map(|id| dataset.load(id).unwrap()).collect();
-    frames.iter().for_each(|frame| write_kitti_frame(folder.path(), frame).unwrap());
-    let with = |change: fn(&mut KittiLine)| {
+    frames.iter().for_each(|frame| Layout::Kitti.write_frame(folder.path(), frame).unwrap());
+    let with = |change: fn(&mut LabelBox)| {
         for frame in &frames {
-            let mut lines = crate::write::label_lines(frame);
+            let mut lines = crate::write::label_boxes(frame);
             lines.iter_mut().for_each(change);
             write_kitti_text(&folder.path().join(format!("label_2/{}.txt", frame.id)), &lines).unwrap();
         }

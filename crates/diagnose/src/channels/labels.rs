@@ -37,9 +37,8 @@ pub fn times_s(ids: &[String], rate_hz: f64) -> Option<Vec<f64>> {
     if numbers.windows(2).any(|w| w[1] <= w[0]) {
         return None;
     }
-    let mut gaps: Vec<f64> = numbers.windows(2).map(|w| w[1] - w[0]).collect();
-    gaps.sort_by(f64::total_cmp);
-    let usual = *gaps.get(gaps.len() / 2)?;
+    let gaps: Vec<f64> = numbers.windows(2).map(|w| w[1] - w[0]).collect();
+    let usual = statistics::median_upper(gaps)?;
     let unit = if usual >= 1e6 { 1e-9 } else { 1.0 / rate_hz };
     Some(numbers.iter().map(|n| (n - numbers[0]) * unit).collect())
 }

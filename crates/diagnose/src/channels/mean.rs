@@ -68,14 +68,13 @@ pub type OwnPoses = Vec<SVector<f64, 6>>;
 
 /// Range noise of the simulated side, m: the median over its smooth returns.
 pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
-    let mut values: Vec<f32> = frames
+    let values: Vec<f32> = frames
         .iter()
         .flat_map(|f| f.simulated.iter().step_by(17))
         .filter(|r| r.smooth && r.cos_incidence > 0.2 && r.roughness_m.is_finite())
         .map(|r| r.roughness_m.abs() / (1.0 + r.roughness_leverage).sqrt())
         .collect();
-    values.sort_by(f32::total_cmp);
-    values.get(values.len() / 2).map_or(0.01, |v| f64::from(*v) / 0.6745).max(0.002)
+    statistics::median_upper(values).map_or(0.01, |v| f64::from(v) / 0.6745).max(0.002)
 }
 
 /// Whether a measured ray is used for the place of a surface.

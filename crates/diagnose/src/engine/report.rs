@@ -3,7 +3,8 @@
 use crate::catalogue::Channel;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
 use crate::inference::roles::Role;
-use crate::search::{ChannelResult, Context, Found, REPETITIONS, by_block, draw_blocks, mean_interval};
+use crate::search::{ChannelResult, Context, Found, REPETITIONS, mean_interval};
+use statistics::{blocks_of, draw_blocks, interval_nearest};
 use std::collections::BTreeMap;
 
 /// A diagnosis of notes alone.
@@ -129,12 +130,9 @@ fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gai
     let closed =
         |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0 && !nothing).then(|| gained / gained.max(table));
     let all = total(&(0..sums.len()).collect::<Vec<_>>());
-    let members = by_block(blocks);
+    let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let mut drawn: Vec<f64> =
-        (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
-    drawn.sort_by(f64::total_cmp);
-    let at = |q: f64| drawn.get(((drawn.len() as f64 - 1.0) * q).round() as usize).copied();
+    let drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
     let gained = if nothing { 0.0 } else { all[1] };
     let least = gained.max(if nothing { 0.0 } else { all[2] });
     let before = all[0].max(least);
@@ -144,7 +142,7 @@ fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gai
         after: (before - gained) / returns,
         floor: (before - least) / returns,
         closed: closed(all),
-        ci95: closed(all).and_then(|_| Some([at(0.025)?, at(0.975)?])),
+        ci95: closed(all).and_then(|_| interval_nearest(drawn)),
         channels: BTreeMap::new(),
     }
 }

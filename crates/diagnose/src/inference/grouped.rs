@@ -111,12 +111,11 @@ pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
     let offsets = offsets(sums, how);
     let known = |k: Group| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
     let second = |k: &Group| Some((known(*k)? - 0.5 * (known(k.previous()?)? + known(k.next())?)).abs());
-    let mut differences: Vec<f64> = sums.keys().filter_map(second).collect();
+    let differences: Vec<f64> = sums.keys().filter_map(second).collect();
     if differences.len() < 4 {
         return 0.0;
     }
-    differences.sort_by(f64::total_cmp);
-    differences[differences.len() / 2] / 0.6745 / 1.5f64.sqrt()
+    median(differences) / 0.6745 / 1.5f64.sqrt()
 }
 
 /// Groups with an offset of more than this many times the median variance are left out of spreads.

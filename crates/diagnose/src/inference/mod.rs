@@ -11,7 +11,6 @@ pub mod roles;
 pub mod simplex;
 
 /// Median of some values, the upper one of the two in the middle; 0 of none.
-pub fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
+pub fn median(values: Vec<f64>) -> f64 {
+    statistics::median_upper(values).unwrap_or(0.0)
 }

@@ -23,7 +23,6 @@ use crate::pairing::load;
 use crate::search::REPETITIONS;
 use data::{Cloud, Dataset, Object};
 use planes::Patch;
-use rand::RngExt;
 use rayon::prelude::*;
 use rings::{Beam, RingScan};
 use sensor::{Rig, Sensor};
@@ -175,15 +174,13 @@ fn report(
 /// Draws of scans with replacement, the same for every finding.
 fn draws(scans: usize) -> Vec<Vec<usize>> {
     let mut rng = data::stream(0, "diagnose scans", 0, 0);
-    (0..REPETITIONS / 2).map(|_| (0..scans).map(|_| rng.random_range(0..scans)).collect()).collect()
+    (0..REPETITIONS / 2).map(|_| statistics::draw(scans, &mut rng)).collect()
 }
 
 /// 95 % interval of drawn values.
 fn interval(mut drawn: Vec<f64>) -> [f64; 2] {
     drawn.retain(|v| v.is_finite());
-    drawn.sort_by(f64::total_cmp);
-    let at = |q: f64| drawn.get(((drawn.len().max(1) - 1) as f64 * q).round() as usize).copied().unwrap_or(0.0);
-    [at(0.025), at(0.975)]
+    statistics::interval_nearest(drawn).unwrap_or_default()
 }
 
 /// Gain in nats a return from the nats and returns of each scan, with an interval over draws of scans.

@@ -99,7 +99,7 @@ pub fn fit(walls: &[&WallSums], beams: &[Beam]) -> Offsets {
         for (b, offset) in offsets.iter_mut().enumerate() {
             let seen: Vec<(f64, f64)> =
                 walls.iter().zip(&planes).filter_map(|(w, plane)| w.left(b, plane)).filter(|s| s.1 >= 3.0).collect();
-            *offset = (seen.len() >= FEWEST_WALLS).then(|| median(seen)).flatten();
+            *offset = (seen.len() >= FEWEST_WALLS).then(|| statistics::weighted_median(seen)).flatten();
         }
         centre(&mut offsets, beams);
     }
@@ -123,18 +123,4 @@ fn centre(offsets: &mut [Option<f64>], beams: &[Beam]) {
             *o -= mean[1] + slope * (b.elevation_rad.tan() - mean[0]);
         }
     }
-}
-
-/// The value below which half of the weight lies, of `(value, weight)`.
-pub(super) fn median(mut values: Vec<(f64, f64)>) -> Option<f64> {
-    values.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let half = values.iter().map(|v| v.1).sum::<f64>() / 2.0;
-    let mut below = 0.0;
-    values
-        .iter()
-        .find(|(_, w)| {
-            below += w;
-            below >= half
-        })
-        .map(|v| v.0)
 }

@@ -177,9 +177,7 @@ fn wall(all: Points, ground: &Plane, rng: &mut Stream) -> Option<(Option<Patch>,
     let mut beams: Vec<usize> = on.iter().map(|s| s.0.beam).collect();
     beams.sort_unstable();
     beams.dedup();
-    let mut offs: Vec<f64> = on.iter().map(|s| plane.off(&s.1).abs()).collect();
-    offs.sort_by(f64::total_cmp);
-    let median = *offs.get(offs.len() / 2)?;
+    let median = statistics::median_upper(on.iter().map(|s| plane.off(&s.1).abs()).collect::<Vec<f64>>())?;
     on.retain(|s| plane.off(&s.1).abs() < MEDIANS * median);
     let heights = on.iter().map(|s| ground.off(&s.1)).fold([f64::MAX, f64::MIN], |[l, h], v| [l.min(v), h.max(v)]);
     let good = on.len() >= WALL_POINTS

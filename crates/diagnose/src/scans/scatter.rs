@@ -97,9 +97,8 @@ pub fn pooled(scans: &[&ScatterSums]) -> BTreeMap<(i32, i32), [f64; 4]> {
         sum.values.extend(&bin.values);
     }
     let usual = |values: &[f32]| {
-        let mut sizes: Vec<f32> = values.iter().map(|v| v.abs()).collect();
-        sizes.sort_by(f32::total_cmp);
-        f64::from(sizes[sizes.len() / 2]) / 0.6745
+        let median = statistics::median_upper(values.iter().map(|v| v.abs()).collect());
+        f64::from(median.unwrap_or(0.0)) / 0.6745
     };
     all.into_iter()
         .filter(|(_, b)| b.n >= FEWEST)

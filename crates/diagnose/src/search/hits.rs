@@ -5,8 +5,8 @@ mod describe;
 use self::describe::found;
 use super::unexplained::{Unexplained, mean_by_group};
 use super::{
-    ChannelResult, Context, Found, Selected, Z_STAR, by_block, causes_of, confidence, draw_blocks, first_demands,
-    record, rivals_and_confidence, trimmed,
+    ChannelResult, Context, Found, Selected, Z_STAR, causes_of, confidence, first_demands, record,
+    rivals_and_confidence, trimmed,
 };
 use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::cells::cell;
@@ -22,6 +22,7 @@ use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
 use rayon::prelude::*;
+use statistics::{blocks_of, draw_blocks};
 use std::collections::BTreeMap;
 
 /// Smallest share of lost returns that is reported.
@@ -270,7 +271,7 @@ impl<'a> Search<'a> {
         if laws.is_empty() {
             return vec![];
         }
-        let members = by_block(&self.context.blocks(&self.estimate));
+        let members = blocks_of(&self.context.blocks(&self.estimate));
         let repeat = |r: usize| {
             let drawn = draw_blocks(&members, &mut data::stream(0, "diagnose losses", 0, r as u64));
             let frames: Vec<usize> = drawn.iter().map(|&i| self.estimate[i]).collect();

@@ -21,8 +21,8 @@ use crate::diagnosis::{Considered, FindingGain, Minimum, Parameter, Status};
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
-use rand::RngExt;
 use sensor::Rig;
+use statistics::{blocks_of, draw_blocks, interval_nearest};
 
 /// Input that all searches share.
 #[derive(Clone)]
@@ -191,34 +191,9 @@ pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
 /// Number of bootstrap repetitions.
 pub const REPETITIONS: usize = 400;
 
-/// A draw of blocks with replacement; `members[b]` lists what belongs to block b.
-pub fn draw_blocks(members: &[Vec<usize>], rng: &mut data::Stream) -> Vec<usize> {
-    let mut drawn = Vec::new();
-    for _ in 0..members.len() {
-        drawn.extend(&members[rng.random_range(0..members.len())]);
-    }
-    drawn
-}
-
-/// Places of equal blocks together.
-pub fn by_block(blocks: &[usize]) -> Vec<Vec<usize>> {
-    let mut members: Vec<Vec<usize>> = Vec::new();
-    let mut last = None;
-    for (i, b) in blocks.iter().enumerate() {
-        if last != Some(b) {
-            members.push(Vec::new());
-            last = Some(b);
-        }
-        if let Some(block) = members.last_mut() {
-            block.push(i);
-        }
-    }
-    members
-}
-
 /// Share of block-bootstrap repetitions of the gains that choose the same cause.
 pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: Cause, demands: &Demands) -> f64 {
-    let members = by_block(blocks);
+    let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose confidence", trials.len() as u64, 0);
     let repetitions = 200;
     let same = (0..repetitions)
@@ -258,17 +233,15 @@ pub fn rivals_and_confidence(
 
 /// Interval of the mean of per-frame values by a bootstrap over blocks, divided by `per`.
 pub fn mean_interval(values: &[f64], blocks: &[usize], per: f64) -> FindingGain {
-    let members = by_block(blocks);
+    let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose interval", values.len() as u64, 0);
-    let mut sums: Vec<f64> = (0..REPETITIONS)
+    let sums: Vec<f64> = (0..REPETITIONS)
         .map(|_| {
             let drawn = draw_blocks(&members, &mut rng);
             drawn.iter().map(|&i| values[i]).sum::<f64>() / drawn.len().max(1) as f64 * values.len() as f64 / per
         })
         .collect();
-    sums.sort_by(f64::total_cmp);
-    let at = |q: f64| sums.get(((sums.len() as f64 - 1.0) * q).round() as usize).copied().unwrap_or(0.0);
-    FindingGain { nats_per_ray: values.iter().sum::<f64>() / per, ci95: [at(0.025), at(0.975)] }
+    FindingGain { nats_per_ray: values.iter().sum::<f64>() / per, ci95: interval_nearest(sums).unwrap_or_default() }
 }
 
 /// What a step of the selection says beside the chosen hypothesis.

@@ -1,7 +1,7 @@
 //! Patches of directions that lose more than others, as by dirt on a window, a scratch or a reflection. No cause of
 //! the catalogue.
 
-use super::{Context, Found, NamedParameter, Z_STAR, by_block, draw_blocks, parameter, sensor_number};
+use super::{Context, Found, NamedParameter, Z_STAR, parameter, sensor_number};
 use crate::catalogue::{Channel, Covariate, Quantity};
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{AZIMUTH_RAD, ELEVATION_RAD, Mask, with_neighbours};
@@ -14,6 +14,7 @@ use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::search::hits::refit;
 use rayon::prelude::*;
+use statistics::{blocks_of, draw_blocks};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Largest number of patches that are reported.
@@ -122,7 +123,7 @@ fn parameters(
     sensor: usize,
     estimates: [f64; 4],
 ) -> Vec<NamedParameter> {
-    let members = by_block(blocks);
+    let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose patch", 0, 0);
     let draws: Vec<[f64; 4]> =
         (0..REPETITIONS).map(|_| spot(&sum_of(patch, of_estimate, &draw_blocks(&members, &mut rng)), patch)).collect();

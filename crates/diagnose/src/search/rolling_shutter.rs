@@ -5,7 +5,7 @@
 //! duration is that with the most returns in occupied cells of the simulation, in bird's-eye view. Rays need not be
 //! paired, so that displacements of metres are found.
 
-use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR, by_block, draw_blocks};
+use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::labels::seen_velocity;
 use crate::channels::mean::{common_bias_m, origins};
@@ -20,6 +20,7 @@ use geometry::Box3;
 use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
 use sensor::{Rig, Sensor};
+use statistics::{blocks_of, draw_blocks};
 
 /// Displacement of the scene over a scan.
 pub struct Slide {
@@ -201,7 +202,7 @@ impl Fitted {
     fn new(context: &Context, model: &Model, best: f64, estimate: &[usize]) -> Self {
         let fine: Vec<f64> = (-20..=20).map(|k| best + 0.2 * model.step * f64::from(k)).collect();
         let counts = model.counts(estimate, &fine);
-        let members = by_block(&context.blocks(estimate));
+        let members = blocks_of(&context.blocks(estimate));
         let mut rng = data::stream(0, "diagnose shutter", 0, 0);
         let all: Vec<usize> = (0..estimate.len()).collect();
         let scan_s = peak(&fine, &counts, &all);

@@ -1,4 +1,4 @@
-//! What scores mean: the share of hits among the detections of a score.
+//! Score calibration: precision of the detections as a function of their score.
 
 use super::AnalysisOptions;
 use super::strata::near;
@@ -9,34 +9,34 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Detections of similar score.
+/// A bin of detections with similar scores.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ScoreBin {
-    /// Scores from.
+    /// Lowest score in the bin.
     pub from: f64,
-    /// Scores to; the last bin holds 1 itself.
+    /// Highest score, exclusive; the last bin includes 1.
     pub to: f64,
-    /// Detections that are a hit or a false alarm.
+    /// Detections that are a true or false positive.
     pub n: usize,
-    /// Their mean score; `None` without one.
+    /// Mean score; `None` if the bin is empty.
     pub mean_score: Option<f64>,
-    /// Share of hits among them; `None` without one.
+    /// Fraction of true positives; `None` if the bin is empty.
     pub precision: Option<f64>,
 }
 
-/// How well scores are probabilities.
+/// Calibration of the detection scores as probabilities.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Calibration {
-    /// Ten of equal width.
+    /// Ten bins of equal width.
     pub bins: Vec<ScoreBin>,
-    /// Expected calibration error: mean distance of score and precision over the bins, by their number of detections; `None` without
-    /// a detection.
+    /// Expected calibration error: mean of |score - precision| over the bins, weighted by the number of detections;
+    /// `None` without detections.
     pub expected_error: Option<f64>,
-    /// Detections whose score is not between 0 and 1; they are in no bin.
+    /// Detections whose score is outside [0, 1]; they are in no bin.
     pub n_outside: usize,
 }
 
-/// Scores against precision, with all detections and KITTI's matching without difficulty.
+/// Precision per score bin over all detections, with KITTI's matching and no difficulty filter.
 pub fn calibration(frames: &[EvalFrame], options: &AnalysisOptions) -> Calibration {
     let key = CurveKey {
         class: &options.class,

@@ -1,54 +1,54 @@
-//! Errors of found boxes, component by component, in the frame of the true box.
+//! Errors of the detected boxes per component, in the frame of the ground-truth box.
 
 use super::AnalysisOptions;
 use super::pairs::{BoxPair, pairs};
-use crate::bootstrap::{deviation, mean, quantile};
 use crate::{EvalFrame, RangeSection};
 use geometry::limit_period;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::{deviation, mean, quantile_linear};
 use std::f64::consts::{FRAC_PI_2, PI};
 
-/// The error of one component: found less true.
+/// Error of one component: predicted minus true.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ComponentError {
-    /// `along_m`, `across_m`, `up_m`: the centre, in the frame of the true box (forward, left, up). `yaw_deg`: modulo a half turn.
-    /// `length_m`, `width_m`, `height_m`.
+    /// `along_m`, `across_m`, `up_m`: the centre, in the frame of the ground-truth box (forward, left, up). `yaw_deg`:
+    /// modulo 180 degrees. `length_m`, `width_m`, `height_m`: the extents.
     pub component: String,
-    /// Mean, the bias.
+    /// Mean error (bias).
     pub mean: f64,
     /// Standard deviation, divisor n.
     pub deviation: f64,
-    /// Half of the errors are at most so large.
+    /// Median of the absolute errors.
     pub median_abs: f64,
-    /// Nine in ten errors are at most so large.
+    /// 90th percentile of the absolute errors.
     pub p90_abs: f64,
 }
 
-/// The errors in one section of distance.
+/// Errors in one range section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ErrorSection {
-    /// `None`: the whole.
+    /// `None`: all distances.
     pub section: Option<RangeSection>,
     /// Pairs of a ground truth and a detection.
     pub n: usize,
-    /// Share of them whose heading is nearer to the opposite of the true one, 0 to 1.
+    /// Fraction of pairs whose predicted heading is closer to the opposite of the true heading, 0 to 1.
     pub turned: f64,
-    /// In a fixed order; empty without a pair.
+    /// In a fixed order; empty if there are no pairs.
     pub components: Vec<ComponentError>,
 }
 
-/// The errors of all pairs, and by section.
+/// Errors of all pairs and per range section.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct BoxErrors {
-    /// The whole first, then the sections.
+    /// All distances first, then the sections.
     pub sections: Vec<ErrorSection>,
 }
 
 const COMPONENTS: [&str; 7] = ["along_m", "across_m", "up_m", "yaw_deg", "length_m", "width_m", "height_m"];
 
-/// Errors of the detections that are paired with a ground truth by the distance of their centres.
+/// Errors of the detections that are paired with a ground truth by centre distance.
 pub fn box_errors(frames: &[EvalFrame], options: &AnalysisOptions) -> BoxErrors {
     let of_frame = |frame: &EvalFrame| -> Vec<(f64, bool, [f64; 7])> {
         let found = pairs(frame, options, options.least_score);
@@ -68,8 +68,8 @@ pub fn box_errors(frames: &[EvalFrame], options: &AnalysisOptions) -> BoxErrors 
                 component: (*name).into(),
                 mean: mean(&values),
                 deviation: deviation(&values),
-                median_abs: quantile(&sizes, 0.5),
-                p90_abs: quantile(&sizes, 0.9),
+                median_abs: quantile_linear(&sizes, 0.5),
+                p90_abs: quantile_linear(&sizes, 0.9),
             }
         };
         let any = !inside.is_empty();
@@ -97,10 +97,10 @@ fn is_turned(pair: &BoxPair) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use data::{KittiLine, LabelFrame};
+    use data::{LabelBox, LabelFrame};
     use geometry::Box3;
 
-    /// The error of one box is told in the frame of the true one, whatever the frame of the text.
+    /// Errors are expressed in the frame of the ground-truth box, whatever the label frame.
     #[test]
     fn errors_are_along_across_and_up() {
         let truth = Box3::from_array([20.0, 10.0, 0.0, 4.0, 2.0, 1.5, 0.5]);
@@ -110,7 +110,7 @@ mod tests {
         found.yaw_rad = 0.5 + PI + 0.02;
         for label_frame in [LabelFrame::Lidar, LabelFrame::Camera] {
             let line = |b: &Box3, score| {
-                crate::overlaps::with_upright_box(&KittiLine::from_box("Car", b, score), b, label_frame)
+                crate::overlaps::with_upright_box(&LabelBox::from_box("Car", b, score), b, label_frame)
             };
             let frame = EvalFrame {
                 id: "0".into(),

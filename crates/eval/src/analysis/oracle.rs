@@ -1,4 +1,4 @@
-//! Which component of the boxes costs the average precision: each is set to the truth in turn.
+//! Which box component costs average precision: each component is replaced by the ground truth in turn.
 
 use super::pairs::pairs;
 use super::strata::whole;
@@ -9,30 +9,30 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A part of a box that is set to the truth.
+/// A box component that is replaced by the ground truth.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Component {
-    /// Nothing: the boxes as they are.
+    /// Nothing: the boxes as predicted.
     None,
-    /// The centre along the true heading.
+    /// Centre position along the true heading.
     Along,
-    /// The centre across it.
+    /// Centre position across the true heading.
     Across,
-    /// The height of the centre.
+    /// Height of the centre.
     Up,
     /// The heading.
     Yaw,
     /// All three extents.
     Size,
-    /// The whole centre.
+    /// All three centre coordinates.
     Center,
-    /// All of it: what is left is what no box of the run can repair, missed ground truths and false alarms.
+    /// Everything. The remaining loss is due to missed ground truths and false positives.
     All,
 }
 
 impl Component {
-    /// In the order of the report.
+    /// In report order.
     pub const ALL: [Component; 8] = [
         Component::None,
         Component::Along,
@@ -45,19 +45,19 @@ impl Component {
     ];
 }
 
-/// What average precision becomes.
+/// AP after replacing one component.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Repair {
-    /// What is set to the truth.
+    /// The replaced component.
     pub component: Component,
-    /// The numbers then.
+    /// AP and recall after the replacement.
     pub then: Stratum,
-    /// AP40 gained by it, points of percent; `None` where undefined.
+    /// AP40 gained, percentage points; `None` where undefined.
     pub gained: Option<f64>,
 }
 
-/// AP with each component of the detections set to that of the ground truth they are paired with (by distance, whatever the score);
-/// detections without a pair stay as they are.
+/// AP with each component of the detections replaced by that of the paired ground truth. Pairs are formed by centre
+/// distance, with no score limit; detections without a pair stay unchanged.
 pub fn oracle(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Repair> {
     let mut before = None;
     let repair = |component| {
@@ -93,11 +93,11 @@ fn with_truth(frame: &EvalFrame, component: Component, options: &AnalysisOptions
 mod tests {
     use super::super::analyse;
     use super::*;
-    use data::{KittiLine, stream};
+    use data::{LabelBox, stream};
     use geometry::Box3;
     use rand::RngExt;
 
-    /// A detector whose only fault is its yaw: the yaw repairs it, and nothing else does.
+    /// A detector with only a yaw error: replacing the yaw restores the AP, replacing anything else does not.
     #[test]
     fn the_faulty_component_repairs_the_precision() {
         for fault in [Component::Along, Component::Up, Component::Yaw, Component::Size] {
@@ -112,7 +112,7 @@ mod tests {
                         Component::Yaw => found.yaw_rad += 0.4,
                         _ => found.size = [3.5, 1.4, 1.18],
                     }
-                    let line = |b: &Box3, score| KittiLine::from_box("Car", b, score);
+                    let line = |b: &Box3, score| LabelBox::from_box("Car", b, score);
                     let detections = vec![line(&found, Some(rng.random_range(0.2..1.0)))];
                     EvalFrame { id: format!("{i}"), labels: vec![line(&truth, None)], detections }
                 })
@@ -128,7 +128,7 @@ mod tests {
             let hits: i64 = result.by_distance.iter().map(|s| s.n_gt).sum();
             assert_eq!((hits, result.by_heading.iter().map(|s| s.n_gt).sum()), (60, 60));
             assert!(result.by_overlap[2].ap40 > Some(90.0) && result.by_overlap[18].ap40 == Some(0.0));
-            // All scores are told as false: the error of calibration is the mean score.
+            // All detections are false positives, so the calibration error is the mean score.
             let mean = frames.iter().map(|f| f.detections[0].score.unwrap()).sum::<f64>() / 60.0;
             assert!((result.calibration.expected_error.unwrap() - mean).abs() < 1e-9);
         }

@@ -1,20 +1,21 @@
-//! Detections and ground truths that belong together by distance.
+//! Pairs of detections and ground truths by centre distance.
 
 use super::AnalysisOptions;
 use crate::EvalFrame;
 use crate::overlaps::upright_box;
 use geometry::Box3;
 
-/// A ground truth and the detection that is taken for it.
+/// A ground truth and the detection assigned to it.
 pub(super) struct BoxPair {
     pub detection: usize,
     pub truth: Box3,
     pub found: Box3,
-    /// Distance of the ground truth on the ground, m.
+    /// Ground-plane distance of the ground truth, m.
     pub range_m: f64,
 }
 
-/// Detections by falling score take the nearest free ground truth of the class within [`AnalysisOptions::pair_distance_m`].
+/// In order of descending score, each detection takes the nearest free ground truth of the class within
+/// [`AnalysisOptions::pair_distance_m`].
 pub(super) fn pairs(frame: &EvalFrame, options: &AnalysisOptions, least_score: f64) -> Vec<BoxPair> {
     let is_class = |class: &str| class.eq_ignore_ascii_case(&options.class);
     let truths: Vec<Box3> = frame

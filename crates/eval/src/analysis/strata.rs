@@ -1,34 +1,34 @@
-//! Average precision of the boxes of one kind: at one distance, of one heading, with so many points.
+//! Average precision of subsets of the boxes: by distance, heading, or number of points.
 
 use super::AnalysisOptions;
 use crate::evidence::{Evidence, FrameEvidence};
 use crate::matching::{BoxIndex, CurveKey};
 use crate::overlaps::{FrameOverlaps, range_m, upright_box};
 use crate::{Difficulty, EvalFrame, Metric, ceiling_ap40};
-use data::{Cloud, KittiLine};
+use data::{Cloud, LabelBox};
 use geometry::{Box3, limit_period, points_in_boxes};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::f64::consts::PI;
 
-/// The boxes of one kind.
+/// Evaluation of one subset of the boxes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Stratum {
-    /// Values from (of the overlap limit: the limit).
+    /// Lower bound of the binned quantity. For AP by overlap: the IoU threshold.
     pub from: f64,
-    /// Values to, itself not included; infinite (`null` in JSON) for the last of those without an end.
+    /// Upper bound, exclusive; infinite (`null` in JSON) for an open last bin.
     #[serde(deserialize_with = "or_infinite")]
     pub to: f64,
-    /// Ground truths of that kind.
+    /// Ground truths in the subset.
     pub n_gt: i64,
-    /// KITTI's average precision over 40 recalls, percent; `None` where undefined.
+    /// KITTI AP over 40 recall positions, percent; `None` where undefined.
     pub ap40: Option<f64>,
-    /// The most that it can be with so few ground truths, percent.
+    /// Highest possible AP40 with this number of ground truths, percent.
     pub ceiling_ap40: Option<f64>,
-    /// Area with a point at every score, percent; `None` without ground truth.
+    /// Area under the precision-recall curve with a point at every score, percent; `None` without ground truth.
     pub ap_area: Option<f64>,
-    /// Share of the ground truths that are hit, percent; `None` without one.
+    /// Recall, percent; `None` without ground truth.
     pub recall: Option<f64>,
 }
 
@@ -36,17 +36,17 @@ fn or_infinite<'de, D: Deserializer<'de>>(from: D) -> Result<f64, D::Error> {
     Ok(Option::<f64>::deserialize(from)?.unwrap_or(f64::INFINITY))
 }
 
-/// How many points of a frame's cloud lie in each of its boxes.
+/// Number of points of a frame's cloud in each of its boxes.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct BoxPoints {
-    /// Of each label.
+    /// Per label.
     pub labels: Vec<u32>,
-    /// Of each detection.
+    /// Per detection.
     pub detections: Vec<u32>,
 }
 
 impl BoxPoints {
-    /// Counts the points of a cloud in boxes of the LiDAR frame.
+    /// Counts the points of a cloud in boxes given in the LiDAR frame.
     pub fn count(cloud: &Cloud, labels: &[Box3], detections: &[Box3]) -> Self {
         let count = |boxes: &[Box3]| {
             let inside = points_in_boxes(&cloud.values, cloud.channels, boxes, 0.0);
@@ -56,28 +56,28 @@ impl BoxPoints {
     }
 }
 
-/// Whether a box is near enough to be looked at.
+/// Whether a box is within [`AnalysisOptions::max_range_m`].
 pub(super) fn near(frame: &EvalFrame, index: BoxIndex, options: &AnalysisOptions) -> bool {
     range_m(line(frame, index), options.label_frame) <= options.max_range_m
 }
 
-fn line(frame: &EvalFrame, index: BoxIndex) -> &KittiLine {
+fn line(frame: &EvalFrame, index: BoxIndex) -> &LabelBox {
     match index {
         BoxIndex::Label(i) => &frame.labels[i],
         BoxIndex::Detection(j) => &frame.detections[j],
     }
 }
 
-/// By distance on the ground, in steps of [`AnalysisOptions::step_m`]. As everywhere, what lies outside a step is ignored on both
-/// sides, and a detection outside that finds an ignored ground truth is no false alarm.
+/// By ground-plane distance, in steps of [`AnalysisOptions::step_m`]. Boxes outside a step are ignored, and a
+/// detection outside that matches an ignored ground truth is no false positive.
 pub fn by_distance(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratum> {
     let n = (options.max_range_m / options.step_m).ceil().clamp(1.0, 1000.0) as usize;
     let edges: Vec<f64> = (0..=n).map(|i| i as f64 * options.step_m).collect();
     strata(frames, options, &edges, |f, index| range_m(line(&frames[f], index), options.label_frame))
 }
 
-/// By heading relative to the ray from the sensor, modulo a half turn: 0 degrees is seen from the front or the back, 90 from the
-/// side. Six steps of 15 degrees.
+/// By heading relative to the ray from the sensor, modulo 180 degrees: 0 is seen from the front or back, 90 from the
+/// side. Six bins of 15 degrees.
 pub fn by_heading(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratum> {
     let edges: Vec<f64> = (0..=6).map(|i| f64::from(i) * 15.0 + if i == 6 { 1e-9 } else { 0.0 }).collect();
     strata(frames, options, &edges, |f, index| {
@@ -87,10 +87,10 @@ pub fn by_heading(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratu
     })
 }
 
-/// By the number of points in the box: of a ground truth in the true one, of a false alarm in its own.
+/// By number of points in the box: in the ground-truth box, or in the detected box of a false positive.
 ///
 /// # Panics
-/// Where `points` are not those of `frames`.
+/// If `points` does not match `frames`.
 pub fn by_points(frames: &[EvalFrame], points: &[BoxPoints], options: &AnalysisOptions) -> Vec<Stratum> {
     let edges = [0.0, 1.0, 5.0, 20.0, 100.0, 500.0, 2000.0, f64::INFINITY];
     strata(frames, options, &edges, |f, index| {
@@ -101,7 +101,7 @@ pub fn by_points(frames: &[EvalFrame], points: &[BoxPoints], options: &AnalysisO
     })
 }
 
-/// By the overlap that is asked for, 0.05 to 0.95.
+/// By IoU threshold, 0.05 to 0.95.
 pub fn by_overlap(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratum> {
     let overlaps = overlaps(frames, options);
     let of_limit = |k: u32| {
@@ -112,7 +112,7 @@ pub fn by_overlap(frames: &[EvalFrame], options: &AnalysisOptions) -> Vec<Stratu
     (1..20u32).collect::<Vec<_>>().into_par_iter().map(of_limit).collect()
 }
 
-/// AP of all boxes at the asked overlap, with overlaps at hand.
+/// AP of all boxes at the configured IoU threshold, from precomputed overlaps.
 pub(super) fn whole(frames: &[EvalFrame], options: &AnalysisOptions) -> Stratum {
     let overlaps = overlaps(frames, options);
     let near = |f: usize, index| near(&frames[f], index, options);

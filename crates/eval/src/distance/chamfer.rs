@@ -2,36 +2,37 @@
 
 use super::{DistanceError, Nearest, Point, nearest};
 
-/// Chamfer distances of two clouds A and B in several forms, which the literature calls by one name.
+/// Chamfer distances of two clouds A and B, in the variants that the literature calls by this name.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Chamfer {
-    /// Sum of the squared distances from every point to the nearest of the other cloud, both directions, m2. It grows with the number
-    /// of points; the paper's 2.3 million is of this kind.
+    /// Sum of the squared distances from every point to its nearest neighbour in the other cloud, both directions, m2.
+    /// Grows with the number of points. The paper's value of 2.3 million is of this variant.
     pub sum_m2: f64,
-    /// Mean squared distance from the points of A to the nearest of B, m2.
+    /// Mean squared distance from the points of A to their nearest neighbours in B, m2.
     pub a_to_b_m2: f64,
     /// From B to A, m2.
     pub b_to_a_m2: f64,
     /// Sum of the two means, m2.
     pub mean_m2: f64,
-    /// Mean distance, not squared, m: half the sum of both directions.
+    /// Mean distance (not squared), averaged over both directions, m.
     pub mean_m: f64,
-    /// Density-aware (Wu et al. 2021), 0 to 1: mean of 1 - exp(-distance / 1 m) / n, with n the points that have the same nearest
-    /// point; half the sum of both directions. Far points do not rule it, and crowding costs.
+    /// Density-aware Chamfer distance (Wu et al. 2021), 0 to 1: mean of 1 - exp(-distance / 1 m) / n, where n is the
+    /// number of points with the same nearest neighbour, averaged over both directions. Bounded for far points, and
+    /// sensitive to density differences.
     pub density_aware: f64,
 }
 
 /// Chamfer distances of two clouds.
 ///
 /// # Errors
-/// A cloud without a point, or one with a position that is not finite.
+/// An empty cloud or a non-finite position.
 pub fn chamfer(a: &[Point], b: &[Point]) -> Result<Chamfer, DistanceError> {
     let (forth, back) = rayon::join(|| nearest(a, b), || nearest(b, a));
     Ok(Chamfer::of_nearest(&forth?, &back?))
 }
 
 impl Chamfer {
-    /// From the nearest points of both directions: `forth` of A's points in B, `back` of B's in A.
+    /// From the nearest neighbours in both directions: `forth` of A's points in B, `back` of B's points in A.
     pub(super) fn of_nearest(forth: &[Nearest], back: &[Nearest]) -> Self {
         let sum = |from: &[Nearest]| from.iter().map(|n| f64::from(n.squared_m2)).sum::<f64>();
         let sum_m = |from: &[Nearest]| from.iter().map(|n| f64::from(n.squared_m2).sqrt()).sum::<f64>();

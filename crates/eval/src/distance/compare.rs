@@ -2,7 +2,6 @@
 
 use super::regions::RegionSums;
 use super::{Chamfer, DistanceError, Point, RegionRow, Regions, emd, nearest, sinkhorn, sliced_wasserstein};
-use crate::bootstrap::{deviation, mean};
 use crate::{BootstrapOptions, Interval, RangeSection};
 use data::{Frame, stream};
 use geometry::{Box3, points_in_boxes};
@@ -10,16 +9,17 @@ use rand::seq::SliceRandom;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::{deviation, mean};
 use std::collections::BTreeSet;
 use std::fmt;
 
-/// Version of [`Distances`] as JSON.
+/// Schema version of [`Distances`] as JSON.
 pub const DISTANCES_SCHEMA: &str = "lidarshift.distances/2";
 
-/// Edge of the cells in which a cloud is halved for its floor, m.
+/// Edge length of the cells used to split a cloud into halves for the noise floor, m.
 pub const FLOOR_CELL_M: f64 = 4.0;
 
-/// What is measured.
+/// A distance measure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
@@ -35,16 +35,16 @@ pub enum Measure {
     ChamferMeanM,
     /// [`Chamfer::density_aware`].
     ChamferDensityAware,
-    /// [`emd`] of sub-samples, the paper's EMD.
+    /// [`emd`] of subsamples, the paper's EMD.
     EmdM,
-    /// [`sinkhorn`] of sub-samples.
+    /// [`sinkhorn`] of subsamples.
     SinkhornM,
     /// [`sliced_wasserstein`].
     SlicedWassersteinM,
 }
 
 impl Measure {
-    /// In the order of the tables.
+    /// In table order.
     pub const ALL: [Measure; 9] = [
         Measure::ChamferSumM2,
         Measure::ChamferMeanM2,
@@ -74,15 +74,15 @@ impl fmt::Display for Measure {
     }
 }
 
-/// Which points of the clouds.
+/// The subset of points that is compared.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Part {
-    /// All of them, up to the range.
+    /// All points within the maximum range.
     Whole,
-    /// Those in the labelled boxes of their own frame.
+    /// Points in the labelled boxes of their frame.
     Targets,
-    /// Those at this distance on the ground.
+    /// Points in this range section (ground-plane distance).
     Section(RangeSection),
 }
 
@@ -96,16 +96,16 @@ impl fmt::Display for Part {
     }
 }
 
-/// What the clouds are that are compared.
+/// The processing stage at which clouds are compared.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Compared {
-    /// As the data set holds them.
+    /// As stored in the data set.
     #[default]
     Raw,
-    /// What the training loader gives before augmentation: cut to the detector's range.
+    /// Output of the training loader before augmentation: cropped to the detector's range.
     Loader,
-    /// What the network is trained on: the same after augmentation.
+    /// Network input during training: the same after augmentation.
     Augmented,
 }
 
@@ -119,29 +119,29 @@ impl fmt::Display for Compared {
     }
 }
 
-/// By which rules distances are made.
+/// Settings of the comparison.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DistanceOptions {
-    /// What the clouds are; every table says it.
+    /// Processing stage of the clouds; every table states it.
     pub compared: Compared,
-    /// Points farther away on the ground are left out, m.
+    /// Points farther away on the ground plane are excluded, m.
     pub max_range_m: f64,
-    /// Sections of distance beside the whole and the targets.
+    /// Range sections reported in addition to the whole cloud and the targets.
     pub sections: Vec<RangeSection>,
-    /// Points of each cloud in the exact assignment; of a smaller cloud all, and as many of the other.
+    /// Points per cloud for the exact assignment. If one cloud has fewer, both use that number.
     pub emd_points: usize,
-    /// Points of each cloud in Sinkhorn's iteration.
+    /// Points per cloud for the Sinkhorn iteration.
     pub sinkhorn_points: usize,
-    /// Its entropy, m.
+    /// Entropic regularisation of the Sinkhorn iteration, m.
     pub sinkhorn_epsilon_m: f64,
-    /// Its rounds at most.
+    /// Maximum number of Sinkhorn iterations.
     pub sinkhorn_iterations: usize,
-    /// Directions of the sliced Wasserstein distance.
+    /// Number of projection directions of the sliced Wasserstein distance.
     pub directions: usize,
-    /// Seed of sub-samples and directions.
+    /// Seed of subsamples and directions.
     pub seed: u64,
-    /// How intervals over the frames are drawn.
+    /// Bootstrap settings for intervals over the frames.
     pub bootstrap: BootstrapOptions,
 }
 
@@ -162,26 +162,28 @@ impl Default for DistanceOptions {
     }
 }
 
-/// One measure of one part, over all frames.
+/// One measure on one part, over all frames.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct MeasureRow {
-    /// Which points.
+    /// Subset of points.
     pub part: Part,
-    /// What is measured.
+    /// Distance measure.
     pub measure: Measure,
-    /// Pairs of frames in which both have such points.
+    /// Frame pairs in which both clouds have such points.
     pub frames: usize,
-    /// Pairs in which one of them has none.
+    /// Frame pairs in which one cloud has none.
     pub left_out: usize,
-    /// Mean over the pairs; `None` without one.
+    /// Mean over the frame pairs; `None` without pairs.
     pub mean: Option<f64>,
-    /// Standard deviation over the pairs, divisor n.
+    /// Standard deviation over the frame pairs, divisor n.
     pub deviation: Option<f64>,
-    /// Bootstrap interval of the mean over the pairs.
+    /// Bootstrap interval of the mean over the frame pairs.
     pub interval: Option<Interval>,
-    /// What two draws of A's own cloud give: its two halves by chance, cell of [`FLOOR_CELL_M`] by cell, so that no half loses an object
-    /// whole; the odd point of a cell is in both. For [`Measure::EmdM`] and [`Measure::SinkhornM`] sub-samples of the two. Nearer than that is
-    /// no difference. Halves are thinner than the cloud, so that for the Chamfer distances of dense clouds this is an upper bound.
+    /// Noise floor: the distance between two random halves of A's own cloud. Points are split per cell of
+    /// [`FLOOR_CELL_M`], so that neither half loses an object entirely; the odd point of a cell goes into both halves.
+    /// [`Measure::EmdM`] and [`Measure::SinkhornM`] use subsamples of the halves. Smaller distances are not
+    /// significant. Halves are sparser than the cloud, so for Chamfer distances of dense clouds this is an upper
+    /// bound.
     pub floor: Option<f64>,
 }
 
@@ -190,24 +192,24 @@ pub struct MeasureRow {
 pub struct Distances {
     /// [`DISTANCES_SCHEMA`].
     pub schema: String,
-    /// The first data set.
+    /// Name of the first data set.
     pub a: String,
-    /// The second data set.
+    /// Name of the second data set.
     pub b: String,
-    /// By which rules.
+    /// Settings used.
     pub options: DistanceOptions,
-    /// Pairs of frames.
+    /// Number of frame pairs.
     pub frames: usize,
-    /// By part, then measure.
+    /// By part, then by measure.
     pub rows: Vec<MeasureRow>,
-    /// Where the Chamfer sum of the whole comes from; empty without regions.
+    /// Contribution of each region to the Chamfer sum of the whole cloud; empty without regions.
     pub regions: Vec<RegionRow>,
 }
 
-/// The ids that both data sets have, in the order of the first.
+/// The frame ids that both data sets have, in the order of the first.
 ///
 /// # Errors
-/// An id that only one of them has: what is compared must show the same moments.
+/// An id that only one data set has: both must hold the same moments.
 pub fn paired_ids(a: &[String], b: &[String]) -> Result<Vec<String>, DistanceError> {
     let (in_a, in_b): (BTreeSet<&String>, BTreeSet<&String>) = (a.iter().collect(), b.iter().collect());
     let only_a = in_a.difference(&in_b).count();
@@ -224,12 +226,11 @@ pub fn paired_ids(a: &[String], b: &[String]) -> Result<Vec<String>, DistanceErr
     Ok(a.to_vec())
 }
 
-/// Compares two data sets frame by frame. `load` gives the two frames of an id; `names` are those of the data sets.
-///
-/// The same numbers for any number of threads.
+/// Compares two data sets frame by frame. `load` returns both frames of an id; `names` are the data set names. The
+/// result does not depend on the number of threads.
 ///
 /// # Errors
-/// A frame that cannot be read, or a position that is not finite.
+/// A frame that cannot be read, or a non-finite position.
 pub fn compare(
     names: [&str; 2],
     ids: &[String],
@@ -305,11 +306,11 @@ fn interval(values: &[f64], bootstrap: &BootstrapOptions) -> Option<Interval> {
     bootstrap.interval((0..bootstrap.replicates).map(draw).collect())
 }
 
-/// The points of a part, in the order of the cloud.
+/// Points of a part, in cloud order.
 fn select(frame: &Frame, part: Part, max_range_m: f64) -> Vec<Point> {
     let cloud = &frame.cloud;
     let range_m = |p: &Point| f64::from(p[0]).hypot(f64::from(p[1]));
-    // A position that is not finite has no range; it stays, so that it is refused and not lost.
+    // A non-finite position has no range. It is kept here so that it is reported as an error later.
     let whole = |p: &Point| !(range_m(p) > max_range_m);
     match part {
         Part::Whole => (0..cloud.len()).map(|i| cloud.xyz(i)).filter(whole).collect(),
@@ -357,7 +358,7 @@ fn of_sinkhorn(a: &[Point], b: &[Point], options: &DistanceOptions) -> Result<f6
     sinkhorn(a, b, options.sinkhorn_epsilon_m, options.sinkhorn_iterations)
 }
 
-/// The distances between two draws of one cloud; `None` for a cloud of one point.
+/// Distances between two random halves of one cloud; `None` for a single-point cloud.
 fn floor(cloud: &[Point], sample: usize, options: &DistanceOptions) -> Result<Option<[f64; 9]>, DistanceError> {
     if cloud.len() < 2 {
         return Ok(None);
@@ -367,7 +368,7 @@ fn floor(cloud: &[Point], sample: usize, options: &DistanceOptions) -> Result<Op
     measures(&chamfer, &a, &b, sample, options).map(Some)
 }
 
-/// Two halves by chance, cell by cell; the odd point of a cell is in both.
+/// Two random halves, split per cell; the odd point of a cell goes into both.
 fn halves(cloud: &[Point], sample: usize, options: &DistanceOptions) -> [Vec<Point>; 2] {
     let cell = |p: &Point| p.map(|v| (f64::from(v) / FLOOR_CELL_M).floor() as i32);
     let mut all = shuffled(cloud, cloud.len(), "distances floor", sample, options);
@@ -382,7 +383,7 @@ fn halves(cloud: &[Point], sample: usize, options: &DistanceOptions) -> [Vec<Poi
     halves
 }
 
-/// The first `n` of the points in a drawn order; all of a smaller cloud.
+/// Random subsample of `n` points; all points of a smaller cloud, shuffled.
 fn shuffled(cloud: &[Point], n: usize, purpose: &str, sample: usize, options: &DistanceOptions) -> Vec<Point> {
     let mut points = cloud.to_vec();
     let n = n.min(points.len());
@@ -396,7 +397,7 @@ mod tests {
     use data::{Cloud, Object};
     use rand::RngExt;
 
-    /// A ground, a car, and in B a wall 60 m away that A does not have.
+    /// A ground and a car; B also has a wall 60 m away.
     fn frames(id: &str) -> [Frame; 2] {
         let mut rng = stream(id.parse().unwrap(), "compare test", 0, 0);
         let mut cloud = |wall: bool| {
@@ -460,7 +461,7 @@ mod tests {
                 assert!(targets.mean.unwrap() < 2.0 * targets.floor.unwrap() + 0.05, "{measure}: {targets:?}");
             }
         }
-        // A has nothing in the middle section: no pair, and that is said.
+        // A has no points in the middle section: the pair is counted as left out.
         let mid = row(Part::Section(RangeSection::PAPER[1]), Measure::EmdM);
         assert_eq!((mid.frames, mid.left_out, mid.mean), (0, 30, None));
     }

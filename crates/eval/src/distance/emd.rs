@@ -1,13 +1,13 @@
-//! Earth mover's distance: exact, by assignment.
+//! Earth mover's distance by exact assignment.
 
 use super::{DistanceError, Point, apart_m, check};
 
-/// Mean distance that the points of `a` have to be moved to become `b`, each one to another place, at best; m. Exact: the cheapest of
-/// all assignments, by shortest augmenting paths (Jonker and Volgenant 1987, in the form of Crouse 2016). Time grows with the third power of the
-/// number of points: a few thousand at most.
+/// Minimum over all one-to-one assignments of `a` to `b` of the mean point distance, m. Exact, by shortest augmenting
+/// paths (Jonker and Volgenant 1987, in the form of Crouse 2016). Run time is cubic in the number of points: use a few
+/// thousand at most.
 ///
 /// # Errors
-/// Clouds of different size, without a point, or with a position that is not finite.
+/// Clouds of different size, an empty cloud, or a non-finite position.
 pub fn emd(a: &[Point], b: &[Point]) -> Result<f64, DistanceError> {
     check(a)?;
     check(b)?;
@@ -16,17 +16,18 @@ pub fn emd(a: &[Point], b: &[Point]) -> Result<f64, DistanceError> {
     }
     let n = a.len();
     let costs: Vec<f64> = a.iter().flat_map(|p| b.iter().map(|q| apart_m(p, q))).collect();
-    let row_of = pulp::Arch::new().dispatch(|| cheapest_assignment(&costs, n)); // with the widest instructions there are
+    // Uses the widest available SIMD instructions.
+    let row_of = pulp::Arch::new().dispatch(|| cheapest_assignment(&costs, n));
     Ok(row_of.iter().enumerate().map(|(column, row)| costs[row * n + column]).sum::<f64>() / n as f64)
 }
 
-/// Nothing is assigned.
+/// Marks an unassigned row or column.
 const NONE: usize = usize::MAX;
 
-/// The row of each column of `costs`, `[n, n]` and finite, so that the sum is least.
+/// Minimum-cost assignment: the row of each column of `costs`, `[n, n]` and finite.
 #[inline(always)]
 fn cheapest_assignment(costs: &[f64], n: usize) -> Vec<usize> {
-    // Prices u of rows and v of columns: u + v is nowhere above the cost, and equals it where row and column are assigned.
+    // Dual variables u of rows and v of columns: u + v <= cost everywhere, with equality for assigned pairs.
     let mut v = vec![f64::INFINITY; n];
     for row in costs.chunks_exact(n) {
         v.iter_mut().zip(row).for_each(|(v, cost)| *v = v.min(*cost));
@@ -41,14 +42,15 @@ fn cheapest_assignment(costs: &[f64], n: usize) -> Vec<usize> {
             (row_of[column], column_of[i]) = (i, column);
         }
     }
-    // Of each column: the length of the shortest path, the same where the column is still open (else infinity), and the row before it.
+    // Per column: length of the shortest path, the same if the column is still open (else infinity), and the previous
+    // row.
     let (mut shortest, mut open, mut before) = (vec![0.0; n], vec![0.0; n], vec![NONE; n]);
     let mut closed = vec![false; n];
     for start in 0..n {
         if column_of[start] != NONE {
             continue;
         }
-        // Dijkstra's paths over reduced costs from the row to a column that is free.
+        // Dijkstra over reduced costs, from the row to the nearest free column.
         shortest.fill(f64::INFINITY);
         closed.fill(false);
         let (mut row, mut length, mut visited) = (start, 0.0, vec![]);
@@ -89,7 +91,7 @@ fn cheapest_assignment(costs: &[f64], n: usize) -> Vec<usize> {
     row_of
 }
 
-/// The first place of the least value, and that value.
+/// Index of the smallest value (the first one if tied), and the value.
 #[inline(always)]
 fn least(values: &[f64]) -> (usize, f64) {
     let min = |a: f64, b: f64| if b < a { b } else { a };
@@ -108,7 +110,7 @@ mod tests {
     use data::stream;
     use rand::RngExt;
 
-    /// The cheapest of all permutations, by trying them.
+    /// Minimum over all permutations, by brute force.
     fn tried(a: &[Point], b: &[Point], used: &mut Vec<bool>, k: usize) -> f64 {
         if k == a.len() {
             return 0.0;

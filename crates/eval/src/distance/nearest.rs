@@ -1,10 +1,10 @@
-//! The nearest point of another cloud, for every point.
+//! Nearest-neighbour search between clouds.
 
 use super::{DistanceError, Point, check};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
-/// The nearest point of the other cloud.
+/// The nearest neighbour in the other cloud.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Nearest {
     /// Its index in the other cloud.
@@ -13,10 +13,10 @@ pub struct Nearest {
     pub squared_m2: f32,
 }
 
-/// For every point of `from`, the nearest of `to`. Where several are equally near, any of them.
+/// The nearest neighbour in `to` of every point of `from`. Ties are broken arbitrarily.
 ///
 /// # Errors
-/// A cloud without a point, or one with a position that is not finite.
+/// An empty cloud or a non-finite position.
 pub fn nearest(from: &[Point], to: &[Point]) -> Result<Vec<Nearest>, DistanceError> {
     check(from)?;
     check(to)?;
@@ -35,7 +35,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn cloud(least: usize) -> impl Strategy<Value = Vec<Point>> {
-        // A coarse grid: many points are equal, as in a cloud of a wall.
+        // A coarse grid: many equal distances, as in the cloud of a wall.
         prop::collection::vec(prop::array::uniform3((-20i8..20).prop_map(|v| f32::from(v) / 4.0)), least..200)
     }
 

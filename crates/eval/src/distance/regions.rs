@@ -1,4 +1,4 @@
-//! Which part of the Chamfer distance comes from which region.
+//! Contribution of each region to the Chamfer distance.
 
 use super::{Nearest, Point};
 use data::Frame;
@@ -7,29 +7,30 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 
-/// Regions of a frame: their names, and which ones points belong to (m, LiDAR frame), indices into the names.
+/// A division of a frame into regions: their names, and the region index of each point (m, LiDAR frame).
 pub struct Regions<'a> {
-    /// For tables.
+    /// Names, used in tables.
     pub names: Vec<String>,
-    /// The region of each point of a frame's cloud.
-    #[expect(clippy::type_complexity, reason = "one closure, said once")]
+    /// Returns the region index of each point of a frame's cloud.
+    #[expect(clippy::type_complexity, reason = "one closure, used once")]
     pub of: Box<dyn Fn(&Frame, &[Point]) -> Vec<usize> + Sync + 'a>,
 }
 
-/// So far over the lowest point of its square metre a point still counts as ground, m.
+/// Maximum height above the lowest point of the same square metre at which a point counts as ground, m.
 const GROUND_M: f32 = 0.4;
-/// Directions in which a wall is looked for.
+/// Number of azimuth bins for the wall search.
 const DIRECTIONS: usize = 360;
-/// As many points that rise over the ground, within [`WALL_M`] of range, are a wall; fewer may be stray returns.
+/// Number of points above ground within [`WALL_M`] of range that count as a wall; fewer may be stray returns.
 const WALL_POINTS: usize = 3;
-/// How far behind its nearest point a wall reaches, m.
+/// Depth of a wall behind its nearest point, m.
 const WALL_M: f32 = 2.0;
 
 impl Regions<'static> {
-    /// What any labelled cloud can be divided into: targets, ground, and what rises over it, up to the first wall in each direction and
-    /// behind it. Every point belongs to one of them.
+    /// Regions for any labelled cloud: targets, ground, and points above ground up to the first wall in their azimuth
+    /// bin or behind it. Every point belongs to exactly one region.
     ///
-    /// A wall is whatever rises over the ground first in a direction of one degree, targets aside, by at least three points within 2 m.
+    /// A wall is the nearest group of at least three points above ground within 2 m of range in an azimuth bin of one
+    /// degree, targets excluded.
     pub fn of_scenery() -> Self {
         let names = [
             "targets".to_string(),
@@ -62,7 +63,7 @@ fn scenery(frame: &Frame, points: &[Point]) -> Vec<usize> {
     regions
 }
 
-/// Range of the wall in each direction; infinite without one.
+/// Range of the wall in each azimuth bin; infinite without a wall.
 fn walls_m<'a>(risen: impl Iterator<Item = &'a Point>) -> Vec<f32> {
     let mut ranges_m = vec![Vec::new(); DIRECTIONS];
     risen.for_each(|p| ranges_m[direction(p)].push(range_m(p)));
@@ -83,7 +84,7 @@ fn range_m(p: &Point) -> f32 {
     p[0].hypot(p[1])
 }
 
-/// What one region contributes to the Chamfer sum, over all frames.
+/// Contribution of one region to the Chamfer sum, over all frames.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RegionRow {
     /// Its name.
@@ -92,25 +93,25 @@ pub struct RegionRow {
     pub points_a: u64,
     /// Points of B in it.
     pub points_b: u64,
-    /// Sum of the squared distances of A's points in it to the nearest of B, m2.
+    /// Sum of the squared distances of A's points in the region to their nearest neighbours in B, m2.
     pub a_to_b_m2: f64,
-    /// Of B's points in it to the nearest of A, m2.
+    /// Same for B's points to their nearest neighbours in A, m2.
     pub b_to_a_m2: f64,
-    /// Its share of the Chamfer sum, 0 to 1. The shares of all regions add up to 1.
+    /// Fraction of the Chamfer sum, 0 to 1. The fractions of all regions add up to 1.
     pub share: f64,
 }
 
-/// Points and sums of each region, while frames are added.
+/// Accumulated points and sums of each region.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct RegionSums(Vec<[(u64, f64); 2]>);
 
 impl RegionSums {
-    /// Of one frame. `sides` are A and B: region and nearest point of each point.
+    /// Sums of one frame. `sides` are A and B: region and nearest neighbour of each point.
     pub fn new(n_regions: usize, sides: [(&[usize], &[Nearest]); 2]) -> Self {
         let mut sums = vec![[(0, 0.0); 2]; n_regions];
         for (side, (regions, nearest)) in sides.into_iter().enumerate() {
             for (region, nearest) in regions.iter().zip(nearest) {
-                // A region that the closure does not know is the last one's business: nothing is left out.
+                // An out-of-range region index is counted in the last region, so that no point is lost.
                 let sum = &mut sums[(*region).min(n_regions - 1)][side];
                 *sum = (sum.0 + 1, sum.1 + f64::from(nearest.squared_m2));
             }
@@ -155,11 +156,11 @@ mod tests {
         let mut points: Vec<(Point, usize)> = vec![([5.0, 0.5, 0.0], 1), ([10.0, 4.0, 0.8], 0), ([5.5, 0.5, 0.3], 1)];
         for i in 0..100 {
             let y = -4.95 + 0.1 * i as f32;
-            // A wall at 20 m with ground before it, a fence on it that leans back, and a stand behind it.
+            // A wall at 20 m with ground in front of it, a fence on top that leans back, and a grandstand behind.
             points.extend([([20.2, y, 0.0], 1), ([20.4, y, 0.9], 2), ([21.4, y, 0.0], 1), ([21.4, y, 2.5], 2)]);
             points.extend([([50.5, y, 1.0], 1), ([50.5, y, 6.0], 3)]);
         }
-        // One stray return in the air is no wall, and where nothing rises nothing is behind it.
+        // A single stray return in the air is no wall, and without a wall there is no region behind it.
         points.extend([([8.5, -1.5, 0.0], 1), ([8.5, -1.5, 1.5], 2), ([-60.5, 0.5, 0.0], 1), ([-60.5, 0.5, 3.0], 2)]);
         let positions: Vec<Point> = points.iter().map(|(p, _)| *p).collect();
         for ((p, want), found) in points.iter().zip(scenery(&frame, &positions)) {

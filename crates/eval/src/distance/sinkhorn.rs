@@ -1,14 +1,14 @@
-//! Earth mover's distance with entropy, by Sinkhorn's iteration.
+//! Entropy-regularised earth mover's distance, by Sinkhorn's iteration.
 
 use super::{DistanceError, Point, apart_m, check};
 use rayon::prelude::*;
 
-/// Sinkhorn divergence of two clouds of equal weights, m: the cost of the plan with entropy `epsilon_m` times its information, less
-/// half of that of each cloud with itself, so that equal clouds are at 0 (Feydy et al. 2019). Costs are distances, as in
-/// [`super::emd`], which it tends to as `epsilon_m` goes to 0; the sizes may differ.
+/// Sinkhorn divergence of two uniformly weighted clouds, m (Feydy et al. 2019): the regularised transport cost of (a,
+/// b) minus half the costs of (a, a) and (b, b), so that equal clouds have distance 0. The ground cost is the
+/// Euclidean distance, as in [`super::emd`], which is the limit for `epsilon_m` -> 0. Sizes may differ.
 ///
 /// # Errors
-/// A cloud without a point, or one with a position that is not finite.
+/// An empty cloud or a non-finite position.
 pub fn sinkhorn(a: &[Point], b: &[Point], epsilon_m: f64, iterations: usize) -> Result<f64, DistanceError> {
     check(a)?;
     check(b)?;
@@ -16,11 +16,12 @@ pub fn sinkhorn(a: &[Point], b: &[Point], epsilon_m: f64, iterations: usize) -> 
     Ok(cost(a, b) - (cost(a, a) + cost(b, b)) / 2.0)
 }
 
-/// The dual value: mean of the potentials of both clouds, after so many rounds in the logarithmic domain, stopped when they rest.
+/// Dual value: mean of the potentials of both clouds after at most `iterations` log-domain iterations, or at
+/// convergence.
 fn regularised(a: &[Point], b: &[Point], epsilon_m: f64, iterations: usize) -> f64 {
     let (mut f, mut g) = (vec![0.0; a.len()], vec![0.0; b.len()]);
     for _ in 0..iterations {
-        // The mean of old and new potentials: for a cloud with itself plain rounds swing to and fro.
+        // Averages old and new potentials: with a = b, the plain iteration oscillates.
         let (next_f, next_g) = (potentials(a, b, &g, epsilon_m), potentials(b, a, &f, epsilon_m));
         let mut moved = 0.0f64;
         for (old, new) in f.iter_mut().zip(next_f).chain(g.iter_mut().zip(next_g)) {
@@ -35,7 +36,7 @@ fn regularised(a: &[Point], b: &[Point], epsilon_m: f64, iterations: usize) -> f
     f.iter().sum::<f64>() / a.len() as f64 + g.iter().sum::<f64>() / b.len() as f64
 }
 
-/// The best potentials of `from` for potentials of `to`: -epsilon log mean exp((g - cost) / epsilon).
+/// Optimal potentials of `from` given the potentials of `to`: -epsilon log mean exp((g - cost) / epsilon).
 fn potentials(from: &[Point], to: &[Point], g: &[f64], epsilon_m: f64) -> Vec<f64> {
     let one = |p: &Point| {
         let gain = |(q, g): (&Point, &f64)| (g - apart_m(p, q)) / epsilon_m;

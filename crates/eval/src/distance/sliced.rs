@@ -5,11 +5,11 @@ use data::stream;
 use rand::RngExt;
 use rayon::prelude::*;
 
-/// Mean over directions of the distance that the shadows of the clouds on a line have to be moved, m (Wasserstein-1). Directions are
-/// even on the sphere, from the stream of `seed`; clouds of any size, each point of a cloud with the same weight.
+/// Mean over projection directions of the 1D Wasserstein-1 distance of the projected clouds, m. Directions are uniform
+/// on the sphere, drawn from `seed`. Clouds may differ in size; the points of a cloud have equal weights.
 ///
 /// # Errors
-/// A cloud without a point, or one with a position that is not finite.
+/// An empty cloud or a non-finite position.
 pub fn sliced_wasserstein(a: &[Point], b: &[Point], directions: usize, seed: u64) -> Result<f64, DistanceError> {
     check(a)?;
     check(b)?;
@@ -33,7 +33,7 @@ pub fn sliced_wasserstein(a: &[Point], b: &[Point], directions: usize, seed: u64
 fn wasserstein_1(a: &[f64], b: &[f64]) -> f64 {
     let (n, m) = (a.len(), b.len());
     let (mut i, mut j, mut at, mut area) = (0, 0, 0u64, 0.0);
-    let whole = n as u64 * m as u64; // a's steps are m wide, b's n
+    let whole = n as u64 * m as u64; // in units of 1 / (n m): steps of a are m wide, steps of b n
     while at < whole {
         let (end_a, end_b) = ((i as u64 + 1) * m as u64, (j as u64 + 1) * n as u64);
         let end = end_a.min(end_b);

@@ -5,11 +5,12 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How alike two layers see the same samples, 0 to 1: |YᵀX|² / (|XᵀX| |YᵀY|) of the centred features, Frobenius norms. It does not
-/// change when features are rotated or scaled as a whole. With fewer samples than features it is biased upwards.
+/// Similarity of two layers on the same samples, 0 to 1: |YᵀX|² / (|XᵀX| |YᵀY|) of the centred features, Frobenius
+/// norms. Invariant to rotation and isotropic scaling of the features. Biased upwards if there are fewer samples than
+/// features.
 ///
 /// # Errors
-/// Features of different samples, of fewer than two, or of which one has no spread at all.
+/// Different samples, fewer than two samples, or a layer with zero variance.
 pub fn linear_cka(a: &Features, b: &Features) -> Result<f64, FeatureError> {
     if a.len() != b.len() {
         return Err(FeatureError::Unpaired { a: a.len(), b: b.len() });
@@ -18,7 +19,7 @@ pub fn linear_cka(a: &Features, b: &Features) -> Result<f64, FeatureError> {
         return Err(FeatureError::TooFew { what: "linear CKA", least: 2, n: a.len() });
     }
     let ((x, _), (y, _)) = (a.centered(), b.centered());
-    // The same three numbers from [dim, dim] or from [N, N], whichever is smaller.
+    // The same three norms from [dim, dim] or from [N, N], whichever is smaller.
     let [xy, xx, yy] = if a.len() < a.dim().max(b.dim()) {
         let (k, l) = (&x * x.transpose(), &y * y.transpose());
         [k.dot(&l), k.norm(), l.norm()]
@@ -38,11 +39,11 @@ pub struct CkaTable {
     pub layers_a: Vec<String>,
     /// Layers of the second.
     pub layers_b: Vec<String>,
-    /// A row for each of `layers_a`; `None` where a layer has no spread.
+    /// One row per entry of `layers_a`; `None` if a layer has zero variance.
     pub values: Vec<Vec<Option<f64>>>,
 }
 
-/// The table of two networks that have seen the same samples, each layer by its name.
+/// CKA table of two networks on the same samples; layers are given with their names.
 ///
 /// # Errors
 /// Layers with different numbers of samples, or fewer than two.
@@ -81,7 +82,7 @@ mod tests {
             let b = Features::new(dim, turned.collect()).unwrap();
             assert!((linear_cka(&a, &b).unwrap() - 1.0).abs() < 1e-5);
         }
-        // Both ways of computing agree: with a column of zeros more the smaller one is another.
+        // Both ways of computing agree: an additional column of zeros changes which matrix is smaller.
         let (a, b) = (random(10, 9, 1), random(10, 4, 2));
         let wide = Features::new(12, a.rows().flat_map(|v| v.iter().copied().chain([0.0; 3])).collect()).unwrap();
         assert!((linear_cka(&a, &b).unwrap() - linear_cka(&wide, &b).unwrap()).abs() < 1e-9);

@@ -1,11 +1,11 @@
-//! Fréchet distance of two sets of features, taken for normal distributions (as FID; Heusel et al. 2017).
+//! Fréchet distance of two feature sets, modelled as normal distributions (as in FID; Heusel et al. 2017).
 
 use super::{FeatureError, Features};
 use nalgebra::{DMatrix, SymmetricEigen};
 
-/// |mean difference|² + trace(A + B - 2 (AB)^1/2), with the covariances A and B (divisor n - 1), in squared units of the features.
-/// The samples need not be the same. With hardly more samples than features it is biased upwards: compare it with that of two halves of
-/// one set.
+/// |mean difference|² + trace(A + B - 2 (AB)^1/2), with the covariances A and B (divisor n - 1), in squared feature
+/// units. The samples need not be the same. Biased upwards if there are few samples per feature: compare with the
+/// distance between two halves of one set.
 ///
 /// # Errors
 /// Vectors of different length, or fewer than two samples.
@@ -22,7 +22,7 @@ pub fn frechet_distance(a: &Features, b: &Features) -> Result<f64, FeatureError>
     let covariance = |x: &DMatrix<f64>| x.tr_mul(x) / (x.nrows() - 1) as f64;
     let (cov_a, cov_b) = (covariance(&x), covariance(&y));
     let apart: f64 = mean_x.iter().zip(&mean_y).map(|(p, q)| (p - q) * (p - q)).sum();
-    // (AB)^1/2 has the trace of (A^1/2 B A^1/2)^1/2, which is symmetric.
+    // (AB)^1/2 has the same trace as (A^1/2 B A^1/2)^1/2, which is symmetric.
     let root = square_root(&cov_a);
     let middle = &root * &cov_b * &root;
     let middle = (&middle + middle.transpose()) / 2.0;
@@ -42,14 +42,14 @@ mod tests {
 
     #[test]
     fn of_independent_columns_it_is_the_sum_of_their_own() {
-        // Two columns that do not correlate: the distance is that of means and deviations, column by column.
+        // Two uncorrelated columns: the distance is the sum over columns of the mean and deviation terms.
         let signs = [[-1.0f32, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
         let set = |scale: [f32; 2], mean: [f32; 2]| {
             let values = signs.iter().flat_map(|s| [s[0] * scale[0] + mean[0], s[1] * scale[1] + mean[1]]);
             Features::new(2, values.collect()).unwrap()
         };
         let (a, b) = (set([1.0, 2.0], [0.0, 0.0]), set([3.0, 5.0], [1.0, -2.0]));
-        let spread = 4.0 / 3.0; // sum of squares over n - 1
+        let spread = 4.0 / 3.0; // sum of squares divided by n - 1
         let want = 5.0 + spread * (2.0 * 2.0 + 3.0 * 3.0);
         assert!((frechet_distance(&a, &b).unwrap() - want).abs() < 1e-9);
         assert!(frechet_distance(&a, &a).unwrap() < 1e-9);

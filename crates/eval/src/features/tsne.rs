@@ -1,4 +1,5 @@
-//! t-SNE (van der Maaten and Hinton 2008; Barnes-Hut 2014; interpolated, Linderman et al. 2019), through the crate `bhtsne`.
+//! t-SNE (van der Maaten and Hinton 2008; Barnes-Hut 2014; interpolated, Linderman et al. 2019), through the crate
+//! `bhtsne`.
 
 use super::{FeatureError, Features};
 use bhtsne::Neighbor;
@@ -9,18 +10,18 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Version of [`Embedding`] as JSON.
+/// Schema version of [`Embedding`] as JSON.
 pub const TSNE_SCHEMA: &str = "lidarshift.tsne/1";
 
-/// How the forces between far points are computed.
+/// How repulsive forces are computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", tag = "kind", deny_unknown_fields)]
 pub enum TsneMethod {
     /// All pairs.
     Exact,
-    /// By a tree; nearer to exact the smaller `theta` is, 0.5 as usual.
+    /// Barnes-Hut tree; a smaller `theta` is more exact, 0.5 is common.
     BarnesHut {
-        /// Over 0.
+        /// Greater than 0.
         theta: f64,
     },
     /// By interpolation on a grid.
@@ -31,13 +32,13 @@ pub enum TsneMethod {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TsneOptions {
-    /// About as many neighbours as each point keeps near.
+    /// Effective number of neighbours per point.
     pub perplexity: f64,
-    /// Steps of the descent.
+    /// Number of gradient descent steps.
     pub steps: usize,
-    /// Seed of the small shifts by which the beginning differs from the first two principal components.
+    /// Seed of the small perturbation of the PCA initialisation.
     pub seed: u64,
-    /// How forces are computed.
+    /// How repulsive forces are computed.
     pub method: TsneMethod,
 }
 
@@ -47,7 +48,7 @@ impl Default for TsneOptions {
     }
 }
 
-/// A point of the picture.
+/// An embedded sample.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Embedded {
     /// What the network was trained on.
@@ -56,39 +57,41 @@ pub struct Embedded {
     pub seed: u64,
     /// The test frame.
     pub frame: String,
-    /// Place in the picture, without unit.
+    /// Position in the embedding, without unit.
     pub at: [f64; 2],
 }
 
-/// A picture of features, for the report.
+/// A 2D embedding of features, for the report.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Embedding {
     /// [`TSNE_SCHEMA`].
     pub schema: String,
     /// The network.
     pub network: String,
-    /// The layer, and how its values become one vector a cloud.
+    /// The layer, and how its values are pooled into one vector per cloud.
     pub layer: String,
-    /// What the networks were tested on.
+    /// The test set.
     pub test_set: String,
-    /// By which rules.
+    /// Settings used.
     pub options: TsneOptions,
-    /// The Kullback-Leibler divergence that is left.
+    /// Final Kullback-Leibler divergence.
     pub kl_divergence: f64,
     /// All points.
     pub points: Vec<Embedded>,
 }
 
-/// Places in the plane for the samples, and the divergence that is left. Neighbours in the features are neighbours in the plane;
-/// distances between clusters and their sizes say nothing.
+/// Embeds the samples in the plane and returns the positions and the final KL divergence. Neighbourhoods are
+/// preserved; distances between clusters and cluster sizes are not meaningful.
 ///
-/// It begins at the first two principal components. 250 steps go with affinities twelve times as large and a learning rate of n / 12 (Belkina et
-/// al. 2019), the others with a rate of 3 n: the library bounds its gains at 2 and leaves out the gradient's factor of 4, and needs that to
-/// come as far as others do. The same numbers for any number of threads:
-/// neighbours are searched in parallel, the descent of the library runs on one thread, since its sums over threads have no fixed order.
+/// Initialised with the first two principal components. The first 250 steps use early exaggeration of 12 and a
+/// learning rate of n / 12 (Belkina et al. 2019), the remaining steps a rate of 3 n. The library clips its gains at 2
+/// and omits the gradient's factor of 4, and needs that rate to converge as other implementations do.
+///
+/// The result does not depend on the number of threads: the neighbour search is parallel, but the library's gradient
+/// descent runs on one thread, since its parallel sums have no fixed order.
 ///
 /// # Errors
-/// Fewer samples than three times the perplexity, and settings without sense.
+/// Fewer samples than three times the perplexity, or invalid settings.
 pub fn tsne(features: &Features, options: &TsneOptions) -> Result<(Vec<[f64; 2]>, f64), FeatureError> {
     let wrong = |message: String| Err(FeatureError::Setting(message));
     if !(options.perplexity >= 1.0 && options.perplexity.is_finite()) {
@@ -125,7 +128,7 @@ pub fn tsne(features: &Features, options: &TsneOptions) -> Result<(Vec<[f64; 2]>
     };
     let one = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let one = one.map_err(|e| FeatureError::Setting(format!("no thread could be started: {e}")))?;
-    let places = one.install(|| phases.into_iter().fold(beginning(features, options.seed), descend));
+    let places = one.install(|| phases.into_iter().fold(initial_positions(features, options.seed), descend));
     if let Some(i) = places.iter().position(|v| !v.is_finite()) {
         return wrong(format!("the descent left the numbers at sample {}; try another perplexity", i / 2));
     }
@@ -134,20 +137,21 @@ pub fn tsne(features: &Features, options: &TsneOptions) -> Result<(Vec<[f64; 2]>
     Ok((places, divergence))
 }
 
-/// Steps with larger affinities, and how many times as large they are (van der Maaten and Hinton 2008; Belkina et al. 2019).
+/// Steps with early exaggeration, and its factor (van der Maaten and Hinton 2008; Belkina et al. 2019).
 const EXAGGERATED_STEPS: usize = 250;
 const EXAGGERATION: f32 = 12.0;
 
-/// Learning rate after that, for each sample: from 2 to 4 the divergence hardly changes, on 10,000 x 128 and on 400 x 128; with 1 it is larger.
+/// Learning rate per sample after early exaggeration. Between 2 and 4 the divergence hardly changes (tested on 10,000
+/// x 128 and 400 x 128); with 1 it is larger.
 const LATE_RATE: f32 = 3.0;
 
-/// Learning rate of few samples.
+/// Minimum learning rate, used for few samples.
 const LEAST_RATE: f32 = 50.0;
 
-/// A theta with which the tree takes every point by itself.
+/// A theta at which the tree treats every point individually.
 const NO_CELL_IS_FAR: f32 = 1e-6;
 
-/// Kullback-Leibler divergence of the picture's affinities from those of the nearest neighbours, over all pairs.
+/// KL divergence between the affinities of the embedding and those of the nearest neighbours, over all pairs.
 fn divergence(neighbors: &[Vec<Neighbor<f32>>], perplexity: f64, places: &[[f64; 2]]) -> f64 {
     let closeness = |a: &[f64; 2], b: &[f64; 2]| 1.0 / (1.0 + (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2));
     let of_row = |a: &[f64; 2]| places.iter().map(|b| closeness(a, b)).sum::<f64>() - 1.0;
@@ -157,7 +161,7 @@ fn divergence(neighbors: &[Vec<Neighbor<f32>>], perplexity: f64, places: &[[f64;
         let pair = |&(j, forth): &(usize, f64)| {
             let back = weights[j].iter().find(|(k, _)| *k == i).map(|(_, back)| *back);
             let p = (forth + back.unwrap_or(0.0)) / (2.0 * places.len() as f64);
-            // A neighbour that has this one for its own neighbour meets it again in its own row.
+            // Mutual neighbours are found again in the other row.
             let orders = if back.is_some() { 1.0 } else { 2.0 };
             if p > 0.0 { orders * p * (p * total / closeness(&places[i], &places[j])).ln() } else { 0.0 }
         };
@@ -166,7 +170,7 @@ fn divergence(neighbors: &[Vec<Neighbor<f32>>], perplexity: f64, places: &[[f64;
     (0..places.len()).into_par_iter().map(of_row).collect::<Vec<_>>().iter().sum()
 }
 
-/// Of every neighbour of a sample its index and its share, such that the shares have the perplexity.
+/// Index and conditional probability of every neighbour of a sample; the distribution has the given perplexity.
 fn weights(row: &[Neighbor<f32>], perplexity: f64) -> Vec<(usize, f64)> {
     let squared: Vec<f64> = row.iter().map(|n| f64::from(n.distance).powi(2)).collect();
     let mean = squared.iter().sum::<f64>() / squared.len() as f64;
@@ -176,7 +180,7 @@ fn weights(row: &[Neighbor<f32>], perplexity: f64) -> Vec<(usize, f64)> {
         raw.iter().map(|r| r / sum).collect()
     };
     let entropy = |p: &[f64]| -> f64 { p.iter().filter(|p| **p > 0.0).map(|p| -p * p.ln()).sum() };
-    // The entropy falls as beta grows, whose logarithm is searched.
+    // Binary search over log(beta): the entropy falls as beta grows.
     let scale = if mean > 0.0 { mean.ln() } else { 0.0 };
     let [mut low, mut high] = [-30.0 - scale, 30.0 - scale];
     for _ in 0..60 {
@@ -190,10 +194,11 @@ fn squared(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum()
 }
 
-/// The nearest rows of every row but itself, by rising distance; of equally near ones the first.
+/// The nearest rows of every row, excluding itself, by ascending distance; ties keep the row order.
 ///
-/// Distances are such that their squares count from the nearest one's. Affinities hang on differences of squares alone, and the library,
-/// which takes `exp(-beta d^2)` in single precision, would lose those of samples that are far from all others.
+/// The squared distance of the nearest neighbour is subtracted from all squared distances. Affinities depend on
+/// differences of squared distances only, and the library's single-precision `exp(-beta d^2)` would underflow for
+/// outlying samples.
 fn nearest_rows(features: &Features, n_neighbors: usize) -> Vec<Vec<Neighbor<f32>>> {
     let rows: Vec<&[f32]> = features.rows().collect();
     let of_row = |i: usize| {
@@ -211,8 +216,9 @@ fn nearest_rows(features: &Features, n_neighbors: usize) -> Vec<Vec<Neighbor<f32
     (0..rows.len()).into_par_iter().map(of_row).collect()
 }
 
-/// The first two principal components, the first with deviation 1e-4 as other implementations begin, and shifts a hundredth as large.
-fn beginning(features: &Features, seed: u64) -> Vec<f32> {
+/// PCA initialisation: first two principal components, the first scaled to a deviation of 1e-4 as in other
+/// implementations, plus a perturbation a hundredth as large.
+fn initial_positions(features: &Features, seed: u64) -> Vec<f32> {
     let (x, _) = features.centered();
     let eigen = SymmetricEigen::new(x.tr_mul(&x));
     let mut order: Vec<usize> = (0..features.dim()).collect();
@@ -220,7 +226,7 @@ fn beginning(features: &Features, seed: u64) -> Vec<f32> {
     let component = |k: usize| -> Vec<f64> {
         let Some(&column) = order.get(k) else { return vec![0.0; features.len()] };
         let direction = eigen.eigenvectors.column(column);
-        // An eigenvector has no sign of its own: its largest value is made positive.
+        // The sign of an eigenvector is arbitrary: its largest entry is made positive.
         let largest = direction.iter().copied().fold(0.0, |a: f64, b| if b.abs() > a.abs() { b } else { a });
         (&x * direction).iter().map(|v| v * largest.signum()).collect()
     };
@@ -266,7 +272,7 @@ mod tests {
         }
     }
 
-    /// The same from full matrices.
+    /// The same computed from full matrices.
     #[test]
     fn divergence_is_that_of_all_pairs() {
         let features = clusters();
@@ -294,8 +300,9 @@ mod tests {
         assert!((all - found).abs() < 1e-9, "{found} is not {all}");
     }
 
-    /// Eight groups in 128 dimensions, four of them wide. In their rows every affinity is next to nothing before it is normalised.
-    /// scikit-learn 1.9 reaches 1.446 (`TSNE(perplexity=10, init="pca", angle=0.1)`), openTSNE 1.0 1.351 (`theta=0.1`).
+    /// Eight clusters in 128 dimensions, four of them wide; the affinities of those underflow before normalisation.
+    /// scikit-learn 1.9 reaches 1.446 (`TSNE(perplexity=10, init="pca", angle=0.1)`), openTSNE 1.0 1.351
+    /// (`theta=0.1`).
     #[test]
     fn divergence_is_as_small_as_that_of_other_implementations() {
         let value = |i: usize, k: usize| {

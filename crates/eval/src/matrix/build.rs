@@ -1,32 +1,30 @@
-//! From the scores of runs to cells, gaps and warnings.
+//! Builds cells, gaps and warnings from the scores of runs.
 
 use super::scores::RunScores;
 use super::{
     Cell, CellNumber, CellRun, Gap, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity,
     RunId, RunNumber, RunState, published,
 };
-use crate::bootstrap::{deviation, mean};
 use crate::{RangeSection, ceiling_ap40};
 use rayon::prelude::*;
+use statistics::{deviation, mean};
 use std::collections::BTreeMap;
 
-/// A run on a test set: its scores, or why there are none.
+/// The scores of a run on a test set, or the reason why there are none.
 pub type RunResult = Result<RunScores, String>;
 
-/// Below this AP at overlap 0.5 on the set that it was trained on, a network is called undertrained, percent.
+/// A network is reported as undertrained if its AP at overlap 0.5 on its own train domain is below this, percent.
 const UNDERTRAINED_AP: f64 = 60.0;
 
-/// A cell with the draws behind its intervals.
+/// A cell with the bootstrap replicates behind its intervals.
 struct Drawn {
     cell: Cell,
-    /// Of each number of the cell, in its order: the mean over seeds and frames drawn again.
+    /// Per value of the cell, in its order: the mean over seeds and frames of each bootstrap replicate.
     draws: Vec<Vec<f64>>,
 }
 
-/// Builds the matrix. `results` are keyed by run and by [`Place::name`] of the test set; a planned run that is not among them is
-/// missing, one that is not planned is left out.
-///
-/// The same numbers for any number of threads.
+/// Builds the matrix. `results` is keyed by run and [`Place::name`] of the test set. Planned runs without a result are
+/// marked missing; unplanned runs are ignored. The result does not depend on the number of threads.
 pub fn build(plan: &MatrixPlan, results: &BTreeMap<(RunId, String), RunResult>, options: &MatrixOptions) -> Matrix {
     let mut keys = Vec::new();
     for network in &plan.networks {
@@ -67,7 +65,7 @@ fn draw(
         };
         runs.push(CellRun { seed, state });
     }
-    // A run over other frames cannot be drawn together with the rest.
+    // A run on other frames cannot be resampled together with the rest.
     if let Some(first) = done.first().map(|(_, scores)| scores.frames) {
         for run in &mut runs {
             if let Some((_, scores)) = done.iter().find(|(seed, s)| *seed == run.seed && s.frames != first) {
@@ -135,7 +133,7 @@ fn draw(
     out
 }
 
-/// What a number of a cell is about.
+/// Identifies a value of a cell.
 pub(super) struct NumberKey {
     pub class: String,
     pub section: Option<RangeSection>,
@@ -144,8 +142,8 @@ pub(super) struct NumberKey {
 }
 
 impl CellNumber {
-    /// Mean and deviation over runs, seed and value (NaN where undefined) of each; without an interval. `places` are the network,
-    /// the train set and the test set.
+    /// Mean and deviation over runs, given seed and value (NaN if undefined) of each; without an interval. `places`
+    /// are the network, the train set and the test set.
     pub(super) fn of_runs(key: NumberKey, runs: Vec<(u64, f64)>, places: [&Place; 3]) -> Self {
         let NumberKey { class, section, quantity, overlap } = key;
         let values: Vec<f64> = runs.iter().map(|(_, value)| *value).collect();
@@ -258,7 +256,7 @@ pub(super) fn cell_warnings(cell: &Cell, results: &BTreeMap<(RunId, String), Run
     let zero: Vec<String> = cell
         .numbers
         .iter()
-        // Recalls are counts: those of two runs may well agree by chance.
+        // Recalls are counts: two runs may agree by chance.
         .filter(|n| n.section.is_none() && n.deviation == Some(0.0))
         .filter(|n| matches!(n.quantity, Quantity::Ap40 | Quantity::ApArea) || n.of_runs.len() > 2)
         .map(|n| format!("{} ({})", n.quantity, n.overlap))
@@ -289,17 +287,17 @@ pub(super) fn cell_warnings(cell: &Cell, results: &BTreeMap<(RunId, String), Run
     warnings
 }
 
-/// Where a test set has so few ground truths that AP40 is capped, or none.
+/// Warns about test sets whose few ground truths cap AP40, and test sets without ground truth.
 fn ceiling_warnings(test_set: &Place, drawn: &[Drawn]) -> Vec<String> {
     let Some(known) = drawn.iter().find(|d| d.cell.test_set == test_set.name && !d.cell.numbers.is_empty()) else {
         return Vec::new();
     };
-    let (mut warnings, mut told) = (Vec::new(), Vec::new());
+    let (mut warnings, mut reported) = (Vec::new(), Vec::new());
     for n in known.cell.numbers.iter().filter(|n| n.quantity == Quantity::Ap40) {
-        if told.contains(&(&n.class, n.section)) {
+        if reported.contains(&(&n.class, n.section)) {
             continue;
         }
-        told.push((&n.class, n.section));
+        reported.push((&n.class, n.section));
         let place = n.section.map_or(String::new(), |section| format!(", {section}"));
         let place = format!("test set {}, {}{place}", test_set.title, n.class);
         match (n.n_gt, n.ceiling) {

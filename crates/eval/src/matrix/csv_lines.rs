@@ -1,4 +1,4 @@
-//! The matrix as CSV: a line a number.
+//! The matrix as CSV: one line per value.
 
 use super::{Matrix, markdown::runs};
 use crate::csv_text;
@@ -26,8 +26,8 @@ const COLUMNS: [&str; 19] = [
 ];
 
 impl Matrix {
-    /// One line for every number of every cell, with the values of the single runs; a cell without a run has one line without
-    /// numbers.
+    /// One line per value of every cell, with the values of the single runs; a cell without a run has one line without
+    /// values.
     pub fn to_csv(&self) -> String {
         let mut lines: Vec<Vec<String>> = Vec::new();
         let number = |v: Option<f64>| v.map_or(String::new(), |v| v.to_string());

@@ -1,11 +1,11 @@
-//! The matrix as LaTeX, laid out as the paper's table of all results.
+//! The matrix as LaTeX, in the layout of the paper's table of all results.
 
 use super::{Matrix, paper_cell};
 use std::fmt::Write;
 
 impl Matrix {
     /// A `tabular` for `booktabs` and `multirow`: network, train set, test set, then AP and recall at each overlap as
-    /// `mean (deviation)`, for the whole range. A cell without a run is a dash. Of several classes, each has its own table.
+    /// `mean (deviation)`, for the full range. A cell without a run is a dash. Each class has its own table.
     pub fn to_latex(&self) -> String {
         self.options.classes.iter().map(|class| self.latex_of_class(class)).collect::<Vec<_>>().join("\n")
     }

@@ -5,7 +5,7 @@ use crate::RangeSection;
 use std::fmt::{self, Write};
 
 impl Matrix {
-    /// Tables of all numbers of the whole range, of AP by section, and of what is lost on a foreign train set; then the warnings.
+    /// Tables of all values over the full range, of AP by range section, and of the domain gap; then the warnings.
     pub fn to_markdown(&self) -> String {
         let mut out = String::new();
         for class in &self.options.classes {
@@ -25,7 +25,7 @@ impl Matrix {
         out
     }
 
-    /// What the numbers of the tables are, in sentences.
+    /// Describes how the values in the tables are computed.
     pub fn rules(&self) -> String {
         let o = &self.options;
         let range =
@@ -136,7 +136,7 @@ impl Matrix {
     }
 }
 
-/// How many of the runs are there; what became of the others.
+/// Number of available runs, and the state of the others.
 pub(super) fn runs(cell: &Cell) -> String {
     let failed = cell.runs.iter().filter(|run| matches!(run.state, RunState::Failed(_))).count();
     let missing = cell.runs.iter().filter(|run| run.state == RunState::Missing).count();
@@ -158,7 +158,7 @@ fn with_interval(n: &CellNumber) -> String {
     }
 }
 
-/// The tables for people.
+/// The tables in plain text.
 impl fmt::Display for Matrix {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.to_markdown())

@@ -1,4 +1,4 @@
-//! What the paper prints: its table of all results (appendix), as data.
+//! The paper's published numbers: its table of all results (appendix), as data.
 
 use super::Quantity;
 use schemars::JsonSchema;
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 const TABLE: &str = include_str!("published.csv");
 
-/// A number of the paper.
+/// A published value.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Published {
     /// Mean of five runs, percent.
@@ -15,8 +15,8 @@ pub struct Published {
     pub deviation: f64,
 }
 
-/// What the paper prints for a network (`PointRCNN`, `PointPillars`), trained and tested on two of its data sets (`Real`, `Sim`,
-/// `Sim Noise`, `Sim Downsampled`): AP40 in space and OpenPCDet's recall, at overlap 0.5 or 0.7.
+/// The published value for a network (`PointRCNN`, `PointPillars`), trained and tested on two of the paper's data sets
+/// (`Real`, `Sim`, `Sim Noise`, `Sim Downsampled`): 3D AP40 and OpenPCDet's recall, at overlap 0.5 or 0.7.
 pub fn published(
     network: &str,
     train_set: &str,
@@ -62,7 +62,8 @@ mod tests {
         assert!(published("PointRCNN", "Sim", "Real", Quantity::ApArea, 0.7).is_none());
     }
 
-    /// Recalls of the paper's PointRCNN are means of five numbers k / 1000. Which divisors of the deviation can give what is printed?
+    /// Recalls of the paper's PointRCNN are means of five numbers k / 1000. Checks which divisors of the deviation can
+    /// give the printed values.
     #[test]
     fn the_paper_divides_by_n() {
         let sets = ["Real", "Sim", "Sim Noise", "Sim Downsampled"];
@@ -70,8 +71,8 @@ mod tests {
         for (train, test) in sets.iter().flat_map(|train| sets.map(|test| (train, test))) {
             for overlap in [0.5, 0.7] {
                 let p = published("PointRCNN", train, test, Quantity::RecallAnyBox, overlap).unwrap();
-                let rest = (p.mean * 50.0).round() as i64 % 5; // the sum of the five, in thousandths
-                // The sum of squares around the mean is q - rest^2 / 5, with q as even or odd as the rest.
+                let rest = (p.mean * 50.0).round() as i64 % 5; // the sum of the five modulo 5, in thousandths
+                // The sum of squared deviations is q - rest^2 / 5, where q has the same parity as the rest.
                 let fits = |divisor: f64| {
                     (0..20_000).filter(|q| (q - rest) % 2 == 0).any(|q| {
                         let squares = q as f64 - (rest * rest) as f64 / 5.0;

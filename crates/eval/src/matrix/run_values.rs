@@ -1,27 +1,28 @@
-//! A matrix of numbers that are known run by run, without the detections behind them.
+//! A matrix from values that are known per run, without the detections.
 
 use super::build::{NumberKey, cell_warnings, plan_warnings};
 use super::{Cell, CellNumber, CellRun, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Quantity, RunId, RunState};
 use std::collections::BTreeMap;
 
-/// A number of one run on one test set.
+/// A value of one run on one test set.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunValue {
-    /// Which run.
+    /// The run.
     pub run: RunId,
     /// [`super::Place::name`] of the test set.
     pub test_set: String,
     /// Class name.
     pub class: String,
-    /// What the number says.
+    /// The metric.
     pub quantity: Quantity,
-    /// 3D overlap that has to be exceeded.
+    /// 3D IoU threshold.
     pub overlap: f64,
     /// Percent; NaN where undefined.
     pub value: f64,
 }
 
-/// The matrix of such numbers: means and deviations over the runs, for the whole range. Without frames there are no intervals.
+/// Builds the matrix from such values: means and deviations over the runs, for the full range. There are no intervals,
+/// since there are no frames to resample.
 pub fn from_run_values(plan: &MatrixPlan, values: &[RunValue], options: &MatrixOptions) -> Matrix {
     let mut cells = Vec::new();
     for planned in &plan.networks {

@@ -1,4 +1,4 @@
-//! What one run does on one test set.
+//! Scores of one run on one test set.
 
 use super::{MatrixOptions, Quantity};
 use crate::evidence::{Evidence, FrameEvidence};
@@ -18,20 +18,20 @@ pub struct TestSet {
 }
 
 impl TestSet {
-    /// The labels of a split of a data set.
+    /// Reads the labels of a data set's split.
     ///
     /// # Errors
-    /// A label file that is missing or wrong.
+    /// A missing or invalid label file.
     pub fn read(dataset: &Dataset, split: &str) -> Result<Self, DataError> {
         let ids = dataset.ids(split)?;
         let read = |id: &String| Ok(EvalFrame { id: id.clone(), labels: dataset.labels(id)?, detections: vec![] });
-        // Collecting all first names the first bad frame, whatever the threads do.
+        // Collects all results first, so that the first bad frame is reported for any number of threads.
         let frames: Vec<Result<EvalFrame, DataError>> = ids.par_iter().map(read).collect();
         let frames = frames.into_iter().collect::<Result<_, _>>()?;
         Ok(TestSet { label_frame: dataset.config.label_frame, frames })
     }
 
-    /// From labels at hand; detections in the frames are dropped.
+    /// From labels in memory; detections in the frames are dropped.
     pub fn new(label_frame: LabelFrame, mut frames: Vec<EvalFrame>) -> Self {
         frames.iter_mut().for_each(|frame| frame.detections.clear());
         TestSet { label_frame, frames }
@@ -42,15 +42,16 @@ impl TestSet {
         self.frames.len()
     }
 
-    /// No frame at all.
+    /// Whether there are no frames.
     pub fn is_empty(&self) -> bool {
         self.frames.is_empty()
     }
 
-    /// The frames with the detections of a run: `folder/ID.txt`, a frame without detections has an empty file.
+    /// The frames with the detections of a run, read from `folder/ID.txt`. A frame without detections has an empty
+    /// file.
     ///
     /// # Errors
-    /// A detection file that is missing or wrong.
+    /// A missing or invalid detection file.
     pub fn with_detections(&self, folder: &Path) -> Result<Vec<EvalFrame>, DataError> {
         let read = |frame: &EvalFrame| {
             let path = folder.join(format!("{}.txt", frame.id));
@@ -67,29 +68,29 @@ impl TestSet {
     }
 }
 
-/// What one run does on one test set: enough to draw its curves again with any choice of frames.
+/// Scores of one run on one test set, in a form that allows its curves to be recomputed for any resample of frames.
 #[derive(Clone, Debug)]
 pub struct RunScores {
     pub(super) frames: usize,
     pub(super) curves: Vec<RunCurve>,
 }
 
-/// One class, section and overlap of a run.
+/// One class, range section and overlap of a run.
 #[derive(Clone, Debug)]
 pub(super) struct RunCurve {
     pub class: String,
     pub section: Option<RangeSection>,
     pub overlap: f64,
     evidence: Evidence,
-    /// Of each frame: ground truths, those that any box covers, and those that any detection covers.
+    /// Per frame: ground truths, those covered by any region, and those covered by any detection.
     covered: Vec<[u32; 3]>,
 }
 
 impl RunScores {
-    /// The scores of a run's detections. Every overlap is computed once.
+    /// Computes the scores of a run's detections. Every overlap is computed once.
     ///
-    /// `regions` are the boxes that OpenPCDet's recall looks at where they are not the detections: of two-stage networks it
-    /// takes all refined RoIs, before the score limit and the last NMS. Their frames are those of `frames`, in that order.
+    /// `regions` are the boxes for OpenPCDet's recall, if they differ from the detections: for two-stage networks, all
+    /// refined RoIs before the score threshold and the final NMS. They are in the order of `frames`.
     pub fn new(
         frames: &[EvalFrame],
         regions: Option<&[EvalFrame]>,
@@ -135,14 +136,15 @@ impl RunScores {
         RunScores { frames: frames.len(), curves: keys.into_par_iter().map(curve).collect() }
     }
 
-    /// Whether a run does the same on every frame as another: two seeds that do were one, unless they find nothing.
+    /// Whether two runs give the same result on every frame. Two seeds that do were the same run, unless they detect
+    /// nothing.
     pub(super) fn is_same_as(&self, other: &RunScores) -> bool {
         let finds = self.curves.iter().any(|curve| curve.covered.iter().any(|[_, hits, _]| *hits > 0));
         finds && self.curves.iter().zip(&other.curves).all(|(a, b)| a.evidence == b.evidence && a.covered == b.covered)
     }
 }
 
-/// The highest overlap of each label with any box.
+/// Highest overlap of each label with any box.
 fn highest(overlaps: &FrameOverlaps, n_labels: usize) -> Vec<f64> {
     let mut best = vec![0.0f64; n_labels];
     for pair in &overlaps.three_d {
@@ -152,7 +154,8 @@ fn highest(overlaps: &FrameOverlaps, n_labels: usize) -> Vec<f64> {
 }
 
 impl RunCurve {
-    /// The numbers in the order of [`Quantity::ALL`], percent, NaN where undefined; and the ground truths that count.
+    /// Values in the order of [`Quantity::ALL`], percent, NaN where undefined; and the number of counted ground
+    /// truths.
     pub(super) fn numbers(&self, weights: Option<&[u32]>) -> ([f64; Quantity::ALL.len()], i64) {
         let p = self.evidence.precisions(weights);
         let mut covered = [0u64; 3];

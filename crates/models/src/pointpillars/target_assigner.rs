@@ -29,7 +29,7 @@ pub struct Targets {
 /// `boxes` are `[x, y, z, dx, dy, dz, yaw, class]`, classes counted from 1 in the order of `classes`; others are
 /// ignored. `anchors` are those of [`super::anchors::anchors`] on a feature map of `[height, width]`. An anchor is
 /// 1. positive if it has the highest IoU above 0 of its class with some box (ties included); its target is the box with
-///   which its own IoU is highest;
+///    which its own IoU is highest;
 /// 2. else background if its highest IoU is below `unmatched`;
 /// 3. else positive if its highest IoU is at least `matched`;
 /// 4. else ignored.

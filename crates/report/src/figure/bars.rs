@@ -1,4 +1,4 @@
-//! Bars with names, lying.
+//! Horizontal bar charts.
 
 use super::{Figure, color};
 use crate::axis::Axis;
@@ -7,26 +7,26 @@ use crate::page::{Anchor, GRID, INK, Page};
 /// One bar.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Bar {
-    /// Left of it.
+    /// Label to the left.
     pub name: String,
-    /// Its length; `None`: nothing is known, a dash.
+    /// Length; `None`: unknown, drawn as a dash.
     pub value: Option<f64>,
-    /// Behind it.
+    /// Text at the end of the bar.
     pub text: String,
-    /// Index of its colour.
+    /// Colour index.
     pub series: usize,
 }
 
 const WIDTH: f64 = 860.0;
 
-/// Bars below each other on a common axis that holds zero.
+/// Horizontal bars on a common axis that includes zero.
 pub fn bars(bars: &[Bar], x_label: &str) -> Figure {
     let longest = bars.iter().map(|b| b.name.chars().count()).max().unwrap_or(0) as f64;
     let (left, right) = (20.0 + (longest * 7.0).clamp(60.0, 320.0), WIDTH - 130.0);
     let bottom = 16.0 + 26.0 * bars.len() as f64;
     let mut page = Page::new([WIDTH, bottom + 52.0], [255; 3], false);
     let values = bars.iter().filter_map(|b| b.value).filter(|v| v.is_finite());
-    // Where all bars are nothing, the axis still begins at zero.
+    // If all bars are empty, the axis still starts at zero.
     let ends = if values.clone().all(|v| v == 0.0) { [0.0, 1.0] } else { [0.0, 0.0] };
     let axis = Axis::new(values.chain(ends), [left, right], false);
     for (value, name) in axis.ticks() {

@@ -1,41 +1,41 @@
-//! A dot for each run and a line at the mean, as in the paper's figures of average precision by distance.
+//! Dot plots: a dot per run and a line at the mean, as in the paper's figures of AP by distance.
 
 use super::{Figure, color, legend};
 use crate::axis::Axis;
 use crate::page::{Anchor, GRID, INK, Page};
 
-/// The runs of one pairing.
+/// The runs of one train and test set combination.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct DotGroup {
-    /// Below the axis.
+    /// Label below the axis.
     pub label: String,
-    /// Index into the names of the legend, which gives the colour.
+    /// Index into the legend names; sets the colour.
     pub series: usize,
-    /// One for each run; empty where there is none.
+    /// One value per run; may be empty.
     pub values: Vec<f64>,
-    /// Where the line is drawn.
+    /// Position of the mean line.
     pub mean: Option<f64>,
-    /// Ends of the interval of the mean.
+    /// Bounds of the interval of the mean.
     pub interval: Option<[f64; 2]>,
-    /// The most that is possible, a dashed line.
+    /// Upper bound, drawn as a dashed line.
     pub ceiling: Option<f64>,
 }
 
 /// One panel.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct DotPanel {
-    /// Above it.
+    /// Title.
     pub title: String,
-    /// The same groups in every panel.
+    /// Groups; the same in every panel.
     pub groups: Vec<DotGroup>,
 }
 
 const ROW: f64 = 300.0;
 const WIDTH: f64 = 980.0;
-/// Left of the first axis, at least.
+/// Minimum margin left of the first axis.
 const MARGIN: f64 = 56.0;
 
-/// Panels of dots on a common vertical axis from 0 to 100; `series` are the names of the legend.
+/// Dot panels on a common vertical axis from 0 to 100; `series` are the legend names.
 pub fn dots(panels: &[DotPanel], series: &[&str], y_label: &str) -> Figure {
     let most = panels.iter().map(|p| p.groups.len()).max().unwrap_or(0);
     let longest = panels.iter().flat_map(|p| &p.groups).map(|g| g.label.chars().count()).max().unwrap_or(0);
@@ -46,11 +46,11 @@ pub fn dots(panels: &[DotPanel], series: &[&str], y_label: &str) -> Figure {
     }
     .min(panels.len().max(1));
     let rows = panels.len().div_ceil(columns);
-    // Labels stand upright where they have the room, else they lean.
+    // Labels are vertical if there is room, otherwise slanted.
     let width_beside = |margin: f64| (WIDTH - 4.0 - margin) / columns as f64;
     let step_within = |panel_width: f64| (panel_width - 24.0) / most.max(1) as f64;
     let leaning = longest as f64 * 6.4 > step_within(width_beside(MARGIN));
-    // A leaning label reaches to the left of its group.
+    // A slanted label extends to the left of its group.
     let reach = longest as f64 * 5.4 - step_within(width_beside(MARGIN)) / 2.0;
     let margin = if leaning { MARGIN.max(reach) } else { MARGIN };
     let panel_width = width_beside(margin);

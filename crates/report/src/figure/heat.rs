@@ -1,9 +1,9 @@
-//! A table of numbers from 0 to 1 as shades.
+//! Heat maps of values from 0 to 1.
 
 use super::Figure;
 use crate::page::{Anchor, INK, Page};
 
-/// Shades with the numbers on them, rows downwards; `None` is a dash.
+/// Heat map with the values written on the cells, rows downwards; `None` is a dash.
 pub fn heat_map(rows: &[String], columns: &[String], values: &[Vec<Option<f64>>]) -> Figure {
     let longest = |names: &[String]| names.iter().map(|n| n.chars().count()).max().unwrap_or(0) as f64;
     let (left, top) = (20.0 + 7.0 * longest(rows), 24.0 + 5.2 * longest(columns));

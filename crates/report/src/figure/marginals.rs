@@ -1,13 +1,13 @@
-//! Where the targets are, seen from above, with the distribution of either coordinate.
+//! Target positions in bird's eye view, with the marginal distribution of each coordinate.
 
 use super::{Figure, color, legend};
 use crate::axis::Axis;
 use crate::page::{Anchor, GRID, INK, Page};
 
-/// The targets of one data set.
+/// Target positions of one data set.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct LocatedTargets {
-    /// For the legend.
+    /// Name in the legend.
     pub name: String,
     /// x (forward) and y (left), m, LiDAR frame.
     pub at_m: Vec<[f64; 2]>,
@@ -17,8 +17,8 @@ const SIDE: f64 = 520.0;
 const MARGIN: f64 = 100.0;
 const BINS: usize = 40;
 
-/// Targets of one or more data sets within `range_m` of the sensor: x to the right, which is the driving direction, y upwards; above
-/// and right of it the share of targets in each of forty steps.
+/// Targets of one or more data sets within `range_m` of the sensor: x (driving direction) to the right, y upwards.
+/// Above and to the right: the fraction of targets in each of forty bins.
 pub fn locations(sets: &[LocatedTargets], range_m: f64) -> Figure {
     let mut page = Page::new([SIDE + MARGIN + 90.0, SIDE + MARGIN + 80.0], [255; 3], false);
     let names: Vec<&str> = sets.iter().map(|s| s.name.as_str()).collect();
@@ -65,7 +65,7 @@ pub fn locations(sets: &[LocatedTargets], range_m: f64) -> Figure {
     Figure(page)
 }
 
-/// The share of the targets in each step.
+/// Fraction of the targets per bin.
 fn histogram(at_m: &[[f64; 2]], axis: usize, range_m: f64) -> Vec<f64> {
     let mut counts = vec![0.0; BINS];
     for p in at_m.iter().filter(|p| p.iter().all(|v| v.abs() <= range_m)) {

@@ -1,4 +1,4 @@
-//! Points of several groups in a plane without units, as t-SNE gives them.
+//! Scatter plots without axis units, for t-SNE.
 
 use super::{Figure, color, legend};
 use crate::page::{INK, Page};
@@ -6,15 +6,15 @@ use crate::page::{INK, Page};
 /// Points of one colour.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct ScatterGroup {
-    /// For the legend.
+    /// Name in the legend.
     pub name: String,
-    /// Places; those that are not finite are left out.
+    /// Positions; non-finite ones are skipped.
     pub points: Vec<[f64; 2]>,
 }
 
 const SIZE: f64 = 640.0;
 
-/// A square picture in which both axes have one scale, without ticks: the places mean nothing by themselves.
+/// A square plot with equal scale on both axes and no ticks: t-SNE coordinates have no meaning by themselves.
 pub fn scatter(groups: &[ScatterGroup]) -> Figure {
     let finite = |p: &&[f64; 2]| p.iter().all(|v| v.is_finite());
     let all = || groups.iter().flat_map(|g| &g.points).filter(finite);

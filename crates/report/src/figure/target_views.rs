@@ -1,34 +1,34 @@
-//! Targets laid over each other: by distance and data set, and from the side, from above, from the front and from behind.
+//! Aggregated target points: by distance and data set, and in side, top, front and back view.
 
 use super::{Figure, color};
 use crate::page::{Anchor, GRID, INK, Page, Rgb};
 
-/// Points of targets in the frame of their box.
+/// Points of targets in the box frame.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct TargetCloud {
-    /// Above its panel.
+    /// Title of the panel.
     pub title: String,
-    /// m from the centre of the box: forward, left, up.
+    /// Offset from the box centre, m: forward, left, up.
     pub points_m: Vec<[f32; 3]>,
 }
 
-/// From where a target is looked at.
+/// Viewing direction.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Look {
-    /// From its right side: forward is right, up is up.
+    /// Right side: forward points right, up points up.
     Side,
-    /// From above: forward is right, left is up.
+    /// Top: forward points right, left points up.
     Top,
-    /// From ahead: left is right, up is up.
+    /// Front: left points right, up points up.
     Front,
-    /// From behind: left is left, up is up.
+    /// Back: left points left, up points up.
     Back,
     /// From behind, left and above.
     Slanted,
 }
 
 impl Look {
-    /// Right, up and towards the one who looks, m.
+    /// Screen coordinates: right, up and towards the viewer, m.
     fn project(self, [x, y, z]: [f32; 3]) -> [f64; 3] {
         let [x, y, z] = [x, y, z].map(f64::from);
         match self {
@@ -37,16 +37,16 @@ impl Look {
             Look::Front => [y, z, x],
             Look::Back => [-y, z, -x],
             Look::Slanted => {
-                let (s, c) = 0.6f64.sin_cos(); // turned
+                let (s, c) = 0.6f64.sin_cos(); // rotation
                 let (u, v) = (x * c + y * s, -x * s + y * c);
-                let (s, c) = 0.45f64.sin_cos(); // tilted
+                let (s, c) = 0.45f64.sin_cos(); // tilt
                 [u, z * c + v * s, z * s - v * c]
             }
         }
     }
 }
 
-/// One view of one cloud into a panel; `half_m` is what fits to either side of the centre, across and up.
+/// Draws one view of a cloud into a panel; `half_m` is the half extent of the panel, horizontal and vertical.
 fn draw(
     page: &mut Page,
     cloud: &TargetCloud,
@@ -66,7 +66,7 @@ fn draw(
     .map(|m| m * 0.62);
     let scale = (width / (2.0 * half[0])).min(height / (2.0 * half[1]));
     let px = |[u, v, _]: [f64; 3]| [left + width / 2.0 + u * scale, top + height / 2.0 - v * scale];
-    // Nearer points are darker and lie on top.
+    // Nearer points are darker and drawn on top.
     let mut seen: Vec<[f64; 3]> =
         cloud.points_m.iter().map(|p| look.project(*p)).filter(|p| p.iter().all(|v| v.is_finite())).collect();
     seen.sort_by(|a, b| a[2].total_cmp(&b[2]));
@@ -88,8 +88,8 @@ fn draw(
     }
 }
 
-/// A panel for each cloud, one row a data set and one column a section of distance (`columns` panels a row), seen from behind, left and
-/// above. `size_m` is the mean box: length, width, height.
+/// One panel per cloud, seen from behind, left and above: a row per data set and a column per range section (`columns`
+/// panels per row). `size_m` is the mean box: length, width, height.
 pub fn aggregated_targets(clouds: &[TargetCloud], columns: usize, size_m: Option<[f64; 3]>) -> Figure {
     let columns = columns.max(1);
     let (width, height) = (320.0, 190.0);
@@ -110,7 +110,7 @@ pub fn aggregated_targets(clouds: &[TargetCloud], columns: usize, size_m: Option
     Figure(page)
 }
 
-/// Side, top, front and back view of one cloud, all at their own largest scale, with a bar of one metre.
+/// Side, top, front and back view of one cloud, each at its largest scale that fits, with a scale bar of one metre.
 pub fn target_views(cloud: &TargetCloud, size_m: Option<[f64; 3]>) -> Figure {
     let mut page = Page::new([900.0, 560.0], [255; 3], false);
     let panels = [

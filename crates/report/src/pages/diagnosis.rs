@@ -1,14 +1,14 @@
-//! One picture of each finding: what was measured along its covariate, what the simulation shows, and what it shows with the finding.
+//! One figure per finding: measured and simulated values over the covariate, with and without the finding.
 
 use crate::{CurveOptions, Figure, ReportError, Series};
 use data::write_atomic;
 use diagnose::{Diagnosis, Finding, Status};
 use std::path::Path;
 
-/// Pixels of a PNG for each of the SVG's.
+/// PNG pixels per SVG pixel.
 const SCALE: f32 = 2.0;
 
-/// Writes `finding-N-NAME.svg` and `.png` of every finding of a diagnosis into `out`.
+/// Writes `finding-N-NAME.svg` and `.png` for every finding of a diagnosis into `out`.
 ///
 /// # Errors
 /// A file that cannot be written; the message names it.
@@ -22,7 +22,7 @@ pub fn write_finding_pictures(diagnosis: &Diagnosis, out: &Path) -> Result<(), R
     Ok(())
 }
 
-/// The cause of a finding, its candidates, or that there is none.
+/// Name of a finding: its cause, its candidates, or "unexplained".
 pub fn finding_name(finding: &Finding) -> String {
     match finding.status {
         Status::Named => finding.cause.map_or_else(String::new, |c| c.to_string()),

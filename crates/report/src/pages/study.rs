@@ -1,4 +1,4 @@
-//! The report of a study: one page, and its figures and tables as files beside it.
+//! The report of a study: one page, with its figures and tables as separate files.
 
 mod analyses;
 mod clouds;
@@ -22,79 +22,80 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Everything that a report shows; what is empty is left out.
+/// Content of a report; empty parts are omitted.
 #[derive(Clone, Debug, Default)]
 pub struct StudyReport {
-    /// Above all.
+    /// Title.
     pub title: String,
-    /// What the study is, what it scales down from the paper, and what was compared; a paragraph each.
+    /// Paragraphs: what the study is, how it is scaled down from the paper, and what was compared.
     pub about: Vec<String>,
-    /// The command that makes this report again.
+    /// The command that reproduces this report.
     pub command: String,
-    /// Name and value: seeds, machine, versions, times.
+    /// Name and value of each fact: seeds, machine, versions, times.
     pub facts: Vec<(String, String)>,
-    /// What to know before reading, beside the warnings of the matrix.
+    /// Warnings to read first, in addition to those of the matrix.
     pub warnings: Vec<String>,
-    /// Train sets x test sets.
+    /// Matrix of train and test sets.
     pub matrix: Option<Matrix>,
-    /// What is behind the average precision of single runs, by name.
+    /// Analyses of single runs, by name.
     pub analyses: Vec<(String, RunAnalysis)>,
-    /// Pictures of features.
+    /// t-SNE embeddings of features.
     pub embeddings: Vec<Embedding>,
-    /// Layers of two networks, by name.
+    /// CKA tables of pairs of networks, by name.
     pub cka: Vec<(String, CkaTable)>,
-    /// Distances of features.
+    /// Fréchet distances of features.
     pub frechet: Vec<FrechetRow>,
-    /// Distances of data sets.
+    /// Distances between data sets.
     pub distances: Vec<Distances>,
     /// Targets of the data sets.
     pub targets: Vec<Targets>,
-    /// Losses and validation.
+    /// Training losses and validation AP.
     pub training: Vec<TrainingRun>,
     /// Clouds with boxes.
     pub scenes: Vec<Scene>,
 }
 
-/// The Fréchet distance between the features of two train sets.
+/// Fréchet distance between the features of two train sets.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct FrechetRow {
     /// The network.
     pub network: String,
-    /// One train set.
+    /// First train set.
     pub a: String,
-    /// The other.
+    /// Second train set.
     pub b: String,
-    /// Squared units of the features.
+    /// In squared units of the features.
     pub distance: f64,
-    /// That of two halves of the first's features: nearer is no difference.
+    /// Noise floor: the distance between two halves of the first set's features. Smaller distances are not
+    /// significant.
     pub floor: Option<f64>,
 }
 
-/// Pixels of a PNG for each of the figure's.
+/// PNG pixels per figure pixel.
 const PNG_SCALE: f32 = 1.5;
 
-/// What was written.
+/// Files written by [`StudyReport::write`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ReportFiles {
-    /// The page.
+    /// Path of the page.
     pub page: PathBuf,
-    /// Bytes of the page.
+    /// Size of the page, bytes.
     pub page_bytes: usize,
     /// Figures (each as SVG and PNG) and tables.
     pub others: Vec<PathBuf>,
 }
 
 impl StudyReport {
-    /// The page alone: it needs no other file and no network.
+    /// Renders the page. It is self-contained and needs no network.
     ///
     /// # Errors
-    /// Only what cannot be rendered.
+    /// A page that cannot be rendered.
     pub fn html(&self) -> Result<String, ReportError> {
         self.render(&mut self.sections())
     }
 
-    /// Writes `report.html`, `figures/NAME.svg`, `figures/NAME.png` and `tables/NAME.csv` into a folder; of the matrix, `matrix.md` and
-    /// `matrix.tex`, too.
+    /// Writes `report.html`, `figures/NAME.svg`, `figures/NAME.png` and `tables/NAME.csv` into a folder, and
+    /// `matrix.md` and `matrix.tex` if there is a matrix.
     ///
     /// # Errors
     /// A file that cannot be written, or a figure that cannot be drawn.
@@ -188,19 +189,19 @@ impl StudyReport {
     }
 }
 
-/// A file name out of words.
-pub(crate) fn slug(words: &str) -> String {
-    let kept = words.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' });
+/// Converts a title to a file name.
+pub(crate) fn slug(title: &str) -> String {
+    let kept = title.chars().map(|c| if c.is_ascii_alphanumeric() { c.to_ascii_lowercase() } else { '-' });
     let parts: String = kept.collect();
     parts.split('-').filter(|part| !part.is_empty()).collect::<Vec<_>>().join("-")
 }
 
-/// A number with so many digits behind the point; a dash for none.
+/// Formats a number with the given decimals; a dash for `None`.
 pub(crate) fn number(value: Option<f64>, digits: usize) -> String {
     value.filter(|v| v.is_finite()).map_or("–".into(), |v| format!("{v:.digits$}"))
 }
 
-/// A number for CSV; empty for none.
+/// Formats a number for CSV; empty for `None`.
 pub(crate) fn csv_number(value: Option<f64>) -> String {
     value.map_or(String::new(), |v| v.to_string())
 }

@@ -255,7 +255,10 @@ mod tests {
                 "[[effect]]\nkind = \"range_noise\"\n[[effect]]\nkind = \"random_dropout\"\nshare = 2\n",
                 "e.toml:5: effect[1].share: 2",
             ),
-            ("[[effect]]\nkind = \"range_noise\"\nstd_mm = 1\n", "e.toml:1: unknown field `std_mm`"),
+            (
+                "[[effect]]\nkind = \"range_noise\"\nstd_mm = 1\n",
+                "e.toml:3: unknown field `std_mm`: did you mean `std_m`?",
+            ),
             ("a = 1\n", "e.toml:1: unknown field `a`"),
             ("[[effect]]\nkind = \"range_nose\"\n", "unknown variant `range_nose`"),
             ("[[effect]]\nkind = \"dual_returns\"\n", "needs a beam_divergence before it"),

@@ -10,7 +10,7 @@ fn motion(x: f64, y: f64, velocity: [f64; 3]) -> Motion {
     Motion { pose: upright_pose([x, y, 0.198], 0.0), velocity: velocity.into(), turn_rate: Vector3::zeros() }
 }
 
-/// A level ground and a wall 30 m to the left, far from the world's origin.
+/// Level ground and a wall 30 m to the left, far from the world origin.
 fn world() -> World {
     let mut mesh =
         cuboid([4800.0, -200.0, -1.0], [5200.0, 200.0, 0.0], MaterialTable::built_in("asphalt")).of_object(1);
@@ -79,7 +79,7 @@ fn a_deskewed_scan_shows_the_world_at_rest_and_smears_what_moves() {
         let [_, y, z] = echo.point();
         assert!((y - 30.0).abs() < 5e-3 || (y - 31.0).abs() < 5e-3 || (z - 19.8).abs() < 5e-3, "{y}");
     }
-    // Rows are shot from the top: what is shot at 20 ms after the middle shows the rival 1.2 m farther on.
+    // Rows are shot from the top: a shot 20 ms after the middle of the scan sees the rival 1.2 m farther ahead.
     let shift = |scan: &Scan| {
         let mut sum = (0.0, 0);
         for echo in scan.returns().filter(|e| e.object == FIRST_CAR && e.cos_incidence > 0.5 && e.normal[0] < -0.9) {
@@ -92,7 +92,7 @@ fn a_deskewed_scan_shows_the_world_at_rest_and_smears_what_moves() {
     let at_rest: Vec<f64> = at_rest.map(|e| e.point()[0].into()).collect();
     let at_rest = at_rest.iter().sum::<f64>() / at_rest.len() as f64;
     assert!((shift(&scan(ego, 60.0, Some(Shutter { deskewed: true }))) - at_rest).abs() < 0.15);
-    // As it comes, a rival of the same speed does not move at all.
+    // Without motion compensation, a rival with the ego vehicle's speed appears static.
     let raw = scan(ego, 60.0, Some(Shutter { deskewed: false }));
     let moved = raw.echoes.iter().zip(&still.echoes).filter(|(a, b)| a.object == FIRST_CAR && b.object == FIRST_CAR);
     for (a, b) in moved {
@@ -140,7 +140,7 @@ fn wide_beams_mix_what_is_near_and_what_is_far() {
     assert!(on_post(&first) > on_post(&lines), "the post looks wider");
     let last = scan(BeamWidth { pick: Pick::Last, second: false, ..width });
     assert!(on_post(&last) < on_post(&lines));
-    // The light of a beam that meets one surface is that of a line.
+    // A beam that hits a single surface returns the same light as a single ray.
     for (a, b) in lines.echoes.iter().zip(&last.echoes).take(20) {
         assert!((a.returned - b.returned).abs() < 1e-4 && (a.range_m - b.range_m).abs() < 2e-3);
     }

@@ -10,25 +10,25 @@ use std::collections::BTreeMap;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
-/// A mesh on disk and how it is to be read.
+/// A mesh file and its import settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct MeshFile {
-    /// `.obj`, `.stl`, `.gltf` or `.glb`, relative to the file that names it.
+    /// `.obj`, `.stl`, `.gltf` or `.glb`, relative to the file that contains this path.
     pub file: PathBuf,
-    /// Metres a unit of the file.
+    /// Metres per file unit.
     #[serde(default = "one")]
     pub scale: f64,
-    /// The axis that points up in the file.
+    /// Up axis of the file.
     #[serde(default)]
     pub up: UpAxis,
-    /// Our material for each material of the file. Default: the one of the same name.
+    /// Maps material names of the file to ours. Default: the same name.
     #[serde(default)]
     pub materials: BTreeMap<String, String>,
-    /// Our material where the file names none.
+    /// Our material for faces without one.
     #[serde(default = "unknown")]
     pub default_material: String,
-    /// Take a surface that does not close as it is.
+    /// Accept a mesh that is not closed.
     #[serde(default)]
     pub allow_open: bool,
 }
@@ -41,18 +41,18 @@ fn unknown() -> String {
     "unknown".into()
 }
 
-/// Which axis of a file points up.
+/// Up axis of a mesh file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum UpAxis {
-    /// x forward, y left, z up, as here.
+    /// x forward, y left, z up, as in this program.
     #[default]
     Z,
     /// glTF's convention: y up, z forward, x left.
     Y,
 }
 
-/// A mesh of the file with the names of its materials.
+/// A mesh of the file with its material names.
 struct Part {
     positions: Vec<[f64; 3]>,
     corners: Vec<u32>,
@@ -60,7 +60,7 @@ struct Part {
 }
 
 impl MeshFile {
-    /// Reads the mesh; `folder` is what the path is relative to.
+    /// Reads the mesh; the path is relative to `folder`.
     pub fn read(&self, folder: &Path, table: &MaterialTable) -> Result<Mesh, DataError> {
         let path = folder.join(&self.file);
         let wrong = |message: String| DataError::file(&path, message);
@@ -69,10 +69,14 @@ impl MeshFile {
             Some("obj") => read_obj(&path)?,
             Some("stl") => read_stl(&path)?,
             Some("gltf" | "glb") => read_gltf(&path)?,
-            _ => return Err(wrong("is no mesh: its name must end in .obj, .stl, .gltf or .glb".into())),
+            _ => {
+                return Err(wrong(
+                    "is not a supported mesh file: its name must end in .obj, .stl, .gltf or .glb".into(),
+                ));
+            }
         };
         if !(self.scale.is_finite() && self.scale > 0.0) {
-            return Err(wrong(format!("scale = {} is no size", self.scale)));
+            return Err(wrong(format!("scale = {} is not a positive finite number", self.scale)));
         }
         let mut mesh = Mesh::default();
         for part in parts {
@@ -114,7 +118,7 @@ impl MeshFile {
 
 fn read_obj(path: &Path) -> Result<Vec<Part>, DataError> {
     let bytes = fs_err::read(path)?;
-    let failed = |e: tobj::LoadError| DataError::file(path, format!("is no OBJ: {e}"));
+    let failed = |e: tobj::LoadError| DataError::file(path, format!("is not a valid OBJ file: {e}"));
     let options = tobj::LoadOptions { triangulate: true, single_index: true, ..tobj::LoadOptions::default() };
     let folder = path.parent().unwrap_or(Path::new(""));
     let library = |name: &Path| match std::fs::read(folder.join(name)) {
@@ -122,7 +126,7 @@ fn read_obj(path: &Path) -> Result<Vec<Part>, DataError> {
         Err(_) => Err(tobj::LoadError::OpenFileFailed),
     };
     let (models, materials) = tobj::load_obj_buf(&mut bytes.as_slice(), &options, library).map_err(failed)?;
-    let materials = materials.unwrap_or_default(); // without its library a file has triangles all the same
+    let materials = materials.unwrap_or_default(); // a file without its material library still has triangles
     let part = |model: tobj::Model| Part {
         positions: model.mesh.positions.chunks_exact(3).map(|p| [p[0], p[1], p[2]].map(f64::from)).collect(),
         corners: model.mesh.indices,
@@ -133,7 +137,7 @@ fn read_obj(path: &Path) -> Result<Vec<Part>, DataError> {
 
 fn read_stl(path: &Path) -> Result<Vec<Part>, DataError> {
     let bytes = fs_err::read(path)?;
-    let failed = |e: &dyn std::fmt::Display| DataError::file(path, format!("is no STL: {e}"));
+    let failed = |e: &dyn std::fmt::Display| DataError::file(path, format!("is not a valid STL file: {e}"));
     let mesh = stl_io::read_stl(&mut Cursor::new(bytes)).map_err(|e| failed(&e))?;
     let positions = mesh.vertices.iter().map(|v| [v[0], v[1], v[2]].map(f64::from)).collect();
     let corners = mesh.faces.iter().flat_map(|face| face.vertices.map(|v| v as u32)).collect();
@@ -143,7 +147,7 @@ fn read_stl(path: &Path) -> Result<Vec<Part>, DataError> {
 fn read_gltf(path: &Path) -> Result<Vec<Part>, DataError> {
     let wrong = |message: String| DataError::file(path, message);
     let gltf::Gltf { document, mut blob } =
-        gltf::Gltf::from_slice(&fs_err::read(path)?).map_err(|e| wrong(format!("is no glTF: {e}")))?;
+        gltf::Gltf::from_slice(&fs_err::read(path)?).map_err(|e| wrong(format!("is not a valid glTF file: {e}")))?;
     let mut buffers = Vec::new();
     for buffer in document.buffers() {
         let bytes = match buffer.source() {

@@ -1,4 +1,4 @@
-//! Triangle meshes: what the world and the cars are made of.
+//! Triangle meshes of the world and the cars.
 
 mod file;
 mod shapes;
@@ -12,14 +12,14 @@ use nalgebra::Point3;
 use sensor::material::MaterialId;
 use std::collections::BTreeMap;
 
-/// One triangle: corners as indices of vertices, what it is made of and what it belongs to.
+/// A triangle: vertex indices, material and object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Face {
     /// Indices into [`Mesh::vertices`].
     pub corners: [u32; 3],
     /// Its material.
     pub material: MaterialId,
-    /// Number of the object that it belongs to; see [`sensor::object::Group`].
+    /// Object number; see [`crate::track::Group`].
     pub object: u16,
 }
 
@@ -33,31 +33,31 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// Adds the triangles of another mesh.
+    /// Appends the triangles of another mesh.
     pub fn append(&mut self, other: &Mesh) {
         let first = self.vertices.len() as u32;
         self.vertices.extend(&other.vertices);
         self.faces.extend(other.faces.iter().map(|face| Face { corners: face.corners.map(|c| c + first), ..*face }));
     }
 
-    /// The same mesh with every vertex changed.
+    /// The mesh with a function applied to every vertex.
     pub fn mapped(mut self, change: impl Fn([f64; 3]) -> [f64; 3]) -> Mesh {
         self.vertices.iter_mut().for_each(|v| *v = change(*v));
         self
     }
 
-    /// The same mesh in the frame `dst`.
+    /// The mesh transformed to the frame `dst`.
     pub fn moved(self, dst_from_mesh: &Pose) -> Mesh {
         self.mapped(|v| (dst_from_mesh * Point3::from(v)).coords.into())
     }
 
-    /// The same mesh as a part of one object.
+    /// The mesh with all faces assigned to one object.
     pub fn of_object(mut self, object: u16) -> Mesh {
         self.faces.iter_mut().for_each(|face| face.object = object);
         self
     }
 
-    /// Least and greatest x, y, z, m; `None` for an empty mesh.
+    /// Minimum and maximum of x, y, z, m; `None` for an empty mesh.
     pub fn bounds(&self) -> Option<[[f64; 3]; 2]> {
         let first = *self.vertices.first()?;
         Some(self.vertices.iter().fold([first; 2], |[low, high], v| {
@@ -65,7 +65,7 @@ impl Mesh {
         }))
     }
 
-    /// The tree for casting rays. `origin` (m) becomes the origin of its coordinates, in f64, before they are rounded to f32.
+    /// Builds the tree for ray casting. `origin` (m) is subtracted in f64 before coordinates are rounded to f32.
     pub fn tree(&self, origin: [f64; 3]) -> Tree {
         let corner = |i: u32| {
             let v = self.vertices[i as usize];
@@ -75,7 +75,7 @@ impl Mesh {
         Tree::new(&corners)
     }
 
-    /// What makes the mesh unusable, in words.
+    /// Describes why the mesh is unusable.
     pub fn check(&self) -> Result<(), String> {
         if self.faces.is_empty() {
             return Err("the mesh has no triangle".into());
@@ -90,14 +90,15 @@ impl Mesh {
         Ok(())
     }
 
-    /// Edges that an odd number of triangles share: none for a closed surface. Vertices at one place count as one.
+    /// Number of edges shared by an odd number of triangles; 0 for a closed surface. Vertices at the same position are
+    /// merged.
     pub fn open_edges(&self) -> usize {
         let mut place_of: BTreeMap<[u64; 3], usize> = BTreeMap::new();
         let place: Vec<usize> = self
             .vertices
             .iter()
             .map(|v| {
-                let key = v.map(|c| (c + 0.0).to_bits()); // -0.0 is 0.0
+                let key = v.map(|c| (c + 0.0).to_bits()); // maps -0.0 to 0.0
                 let next = place_of.len();
                 *place_of.entry(key).or_insert(next)
             })

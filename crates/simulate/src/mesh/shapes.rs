@@ -1,9 +1,9 @@
-//! Simple bodies as meshes. All but [`grid`] are closed.
+//! Basic mesh shapes. All except [`grid`] are closed.
 
 use super::{Face, Mesh};
 use sensor::material::MaterialId;
 
-/// Rows of points joined to a surface, each cell two triangles. `points[row][column]`, m.
+/// Joins rows of points to a surface, two triangles per cell. `points[row][column]`, m.
 pub fn grid(points: &[Vec<[f64; 3]>], material: MaterialId) -> Mesh {
     let columns = points.first().map_or(0, Vec::len);
     let mut mesh = Mesh { vertices: points.iter().flatten().copied().collect(), faces: Vec::new() };
@@ -17,7 +17,7 @@ pub fn grid(points: &[Vec<[f64; 3]>], material: MaterialId) -> Mesh {
     mesh
 }
 
-/// Rings of equally many points joined to a tube, closed at both ends by a fan. m.
+/// Joins rings with equal numbers of points to a tube, closed at both ends by a fan. m.
 pub fn loft(rings: &[Vec<[f64; 3]>], material: MaterialId) -> Mesh {
     let n = rings.first().map_or(0, Vec::len) as u32;
     let mut mesh = Mesh { vertices: rings.iter().flatten().copied().collect(), faces: Vec::new() };
@@ -37,13 +37,13 @@ pub fn loft(rings: &[Vec<[f64; 3]>], material: MaterialId) -> Mesh {
     mesh
 }
 
-/// A box between two corners, m.
+/// A box given by two corners, m.
 pub fn cuboid(low: [f64; 3], high: [f64; 3], material: MaterialId) -> Mesh {
     let ring = |x: f64| vec![[x, low[1], low[2]], [x, high[1], low[2]], [x, high[1], high[2]], [x, low[1], high[2]]];
     loft(&[ring(low[0]), ring(high[0])], material)
 }
 
-/// A cylinder of `sides` sides from `from` to `to`, m.
+/// A cylinder with `sides` sides from `from` to `to`, m.
 pub fn cylinder(from: [f64; 3], to: [f64; 3], radius_m: f64, sides: usize, material: MaterialId) -> Mesh {
     let axis = nalgebra::Vector3::from(to) - nalgebra::Vector3::from(from);
     let across = if axis.z.abs() < 0.9 * axis.norm() { nalgebra::Vector3::z() } else { nalgebra::Vector3::x() };

@@ -1,4 +1,4 @@
-//! What a race's data sets are made of, as people write it in TOML.
+//! TOML configuration of a race's data sets.
 
 use crate::SimulateError;
 use crate::auto_label::AutoLabel;
@@ -16,104 +16,106 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A race and the data sets that are made of it. Paths are relative to the file.
+/// A race and its data sets. Paths are relative to the file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RaceConfig {
-    /// Name of the folder of the data sets, and the first part of their names.
+    /// Folder name of the data sets, and the first part of their names.
     pub name: String,
-    /// Another seed gives another race and other noise.
+    /// Random seed of the race and of the noise.
     #[serde(default)]
     pub seed: u64,
-    /// The sensors.
+    /// The sensor rig file.
     pub rig: PathBuf,
-    /// Rows and columns of the sensors, as a part of those of the rig.
+    /// Scale of the sensors' rows and columns relative to the rig.
     #[serde(default = "one")]
     pub resolution: f64,
-    /// Frames that are kept, evenly over all runs.
+    /// Number of frames kept, evenly spaced over all runs.
     pub frames: usize,
-    /// How frames go into train, val and test.
+    /// How frames are assigned to train, val and test.
     #[serde(default)]
     pub split: SplitKind,
-    /// Points farther than this from the origin along x or y are left out, m.
+    /// Points with |x| or |y| above this are cropped, m.
     #[serde(default = "hundred")]
     pub crop_m: f64,
-    /// Cars whose middle is farther away, seen from above, have no label, m.
+    /// Cars whose centre is farther away on the ground plane are not labelled, m.
     #[serde(default = "hundred")]
     pub label_range_m: f64,
-    /// Cars of which the rig without any effect has fewer returns, because others hide them or no shot meets them, have no label.
+    /// Cars with fewer returns in a simulation without effects, due to occlusion or because no shot hits them, are not
+    /// labelled.
     #[serde(default = "five")]
     pub label_points: usize,
-    /// Class of the cars in the labels.
+    /// Class name of the cars in the labels.
     #[serde(default = "car")]
     pub class: String,
-    /// Where the files lie below the folder of a data set.
+    /// File layout of a data set folder.
     #[serde(default)]
     pub layout: Layout,
-    /// Write what is known of each point beside the clouds.
+    /// Write per-point attributes next to the clouds.
     #[serde(default)]
     pub attributes: bool,
     /// The track.
     #[serde(default)]
     pub track: TrackConfig,
-    /// The race that the program makes, unless there are runs in files.
+    /// The generated race; not used if `runs` is given.
     #[serde(default)]
     pub race: RaceModel,
-    /// Runs from files.
+    /// Recorded runs.
     #[serde(default, rename = "run")]
     pub runs: Vec<RunFiles>,
-    /// The mesh of the cars in the car's frame; without one the program's own racing car.
+    /// Car mesh in the car frame; default: the built-in racing car.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub car: Option<MeshFile>,
     /// Materials that are changed or added.
     #[serde(default)]
     pub materials: BTreeMap<String, Material>,
-    /// The data sets, in the order in which they are made.
+    /// The data sets, in the order in which they are generated.
     #[serde(default, rename = "dataset")]
     pub datasets: Vec<SetConfig>,
 }
 
-/// The track and what stands around it.
+/// The track and its surroundings.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackConfig {
-    /// CSV of the centre line; without one an oval after the Las Vegas Motor Speedway.
+    /// CSV file of the centre line; default: an oval modelled on the Las Vegas Motor Speedway.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub file: Option<PathBuf>,
-    /// Another seed, another roadside.
+    /// Random seed of the roadside objects.
     pub seed: u64,
 }
 
-/// How frames go into train, val and test, in the shares 4 : 1 : 1.
+/// How frames are assigned to train, val and test, in the ratio 4 : 1 : 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SplitKind {
-    /// In each run one block after the other, frames left out between them where there are more than are kept.
+    /// In each run, consecutive blocks, with unused frames between them if there are more frames than are kept.
     #[default]
     Blocks,
-    /// Each frame by lot: neighbours of a frame to train on are tested.
+    /// Each frame at random: test frames can be neighbours of training frames.
     Random,
 }
 
-/// One of the data sets; all have the same frames.
+/// A data set; all data sets of a race have the same frames.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SetConfig {
-    /// Name of its folder.
+    /// Folder name.
     pub name: String,
-    /// File of its effects; none without.
+    /// Effects file; default: no effects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effects: Option<PathBuf>,
-    /// It is this other data set (named before it) with the effects on top.
+    /// Another data set, listed before this one, to which the effects are added.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub from: Option<String>,
-    /// On top of its effects, points are lost by range until their ranges are distributed as in this other data set (named before it).
+    /// Another data set, listed before this one, whose range distribution is matched by dropout after all other
+    /// effects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub matched_to: Option<String>,
-    /// Labels as they are made on the road; without it they are exact.
+    /// Make labels as from road recordings; default: exact labels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub auto_label: Option<AutoLabel>,
-    /// Do not write its effects into its folder: for a data set that stands for the road.
+    /// Do not write the effects to the data set folder: for a data set that replaces road data.
     #[serde(default)]
     pub hidden: bool,
 }
@@ -135,18 +137,18 @@ fn car() -> String {
 }
 
 impl RaceConfig {
-    /// A configuration by the path of its TOML, or by the name of one that comes with the program.
+    /// Finds a configuration by the path of its TOML file or by a built-in name.
     pub fn find(name_or_path: &str) -> Result<(RaceConfig, ConfigFiles), SimulateError> {
         let (text, path, files) = ConfigFiles::open(name_or_path)?;
         Ok((parse_toml(&text, &path, RaceConfig::check)?, files))
     }
 
-    /// A configuration in memory; `path` is where it lies, for messages.
+    /// Parses a configuration; `path` is used in error messages.
     pub fn parse(text: &str, path: &Path) -> Result<RaceConfig, SimulateError> {
         Ok(parse_toml(text, path, RaceConfig::check)?)
     }
 
-    /// Refuses what cannot be made, naming the key.
+    /// Checks the configuration; errors name the key.
     pub fn check(&self) -> Result<(), KeyError> {
         check_name("name", &self.name)?;
         within("resolution", self.resolution, 0.01, 8.0)?;
@@ -192,7 +194,7 @@ impl RaceConfig {
         set.auto_label.as_ref().map_or(Ok(()), |auto| auto.check().map_err(|e| e.below("auto_label")))
     }
 
-    /// The effects of a data set: lists with the name under which each draws its random numbers, those of `from` first.
+    /// The effect lists of a data set, with the name of the random stream of each; those of `from` come first.
     pub fn effects_of(&self, set: &SetConfig, files: &ConfigFiles) -> Result<Vec<(String, EffectList)>, SimulateError> {
         let mut lists = match set.from.as_ref().and_then(|from| self.datasets.iter().find(|s| s.name == *from)) {
             Some(from) => self.effects_of(from, files)?,
@@ -205,7 +207,7 @@ impl RaceConfig {
         Ok(lists)
     }
 
-    /// The sensors at the wanted resolution. Each has a pattern.
+    /// The rig at the configured resolution. Every sensor must have a pattern.
     pub fn rig(&self, files: &ConfigFiles) -> Result<Rig, SimulateError> {
         let (text, path) = files.text(&self.rig)?;
         let rig = Rig::parse(&text, &path)?;
@@ -220,7 +222,7 @@ impl RaceConfig {
     }
 }
 
-/// Names become folders.
+/// Checks that a name can be used as a folder name.
 fn check_name(key: &str, name: &str) -> Result<(), KeyError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     if name.is_empty() || !name.chars().all(plain) {

@@ -1,4 +1,4 @@
-//! The data sets of a race on disk.
+//! Writes the data sets of a race.
 
 use super::config::{RaceConfig, SetConfig};
 use super::files::ConfigFiles;
@@ -8,11 +8,7 @@ use crate::SimulateError;
 use crate::auto_label::{LabelError, label_errors};
 use crate::street::SplitCounts;
 use data::toml_text::wrong;
-use data::write::{remove_unfinished, write_dataset_toml, write_frame, write_split};
-use data::{
-    DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Layout, PointColumns, read_kitti_text, write_atomic,
-    write_json,
-};
+use data::{DataError, Dataset, DatasetConfig, LabelFrame, Manifest, NewDataset, PointColumns, write_atomic};
 use rayon::prelude::*;
 use sensor::attributes;
 use sensor::effects::{Effect, EffectList};
@@ -20,42 +16,54 @@ use sensor::matched::{RangeHistogram, fit_range_dropout};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::path::Path;
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const RACE_MANIFEST_SCHEMA: &str = "lidarshift/race-dataset/1";
-/// Bytes of a point in a cloud and in its attributes.
+/// Bytes per point in a cloud and in its attributes.
 const POINT_BYTES: (u64, u64) = (16, 53);
-/// Free space that stays untouched, bytes.
+/// Disk space that is kept free, bytes.
 const SPARE_BYTES: u64 = 200 << 20;
 
-/// What a data set's folder holds: its `manifest.json`.
+/// Content of a data set's `manifest.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RaceManifest {
     /// [`RACE_MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Name of the race and of the data set.
+    /// Names of the race and of the data set.
     pub name: [String; 2],
     /// Seed of the race.
     pub seed: u64,
-    /// SHA-256 of all that decides the frames: configuration, rig, trajectories, effects, and the version of this program.
+    /// SHA-256 of everything that determines the frames: configuration, rig, trajectories, effects, and program
+    /// version.
     pub config_sha256: String,
-    /// What is there, by split.
+    /// Counts by split.
     pub splits: BTreeMap<String, SplitCounts>,
-    /// How far labels are from the true boxes, for labels made as on the road.
+    /// Label errors, for automatic labels.
     pub label_errors: Vec<LabelError>,
 }
 
-/// Makes the data sets of a race below `out`, a folder each: clouds, labels, `ImageSets/`, `dataset.toml`, `rig.toml`, `manifest.json`, and
-/// `effects.toml` unless it is hidden. `only` names those to make; all when empty.
+impl Manifest for RaceManifest {
+    const OTHERWISE: &'static str = "from another configuration or version";
+
+    fn identity(&self) -> [&str; 2] {
+        [&self.schema, &self.config_sha256]
+    }
+
+    fn set_complete(&mut self, complete: bool) {
+        self.complete = complete;
+    }
+}
+
+/// Writes the data sets of a race below `out`, one folder each: clouds, labels, `ImageSets/`, `dataset.toml`,
+/// `rig.toml`, `manifest.json`, and `effects.toml` unless hidden. `only` selects data sets by name; empty for all.
 ///
-/// `progress` hears the name of the data set and how many of its frames of how many are there, from several threads. Frames that an earlier
-/// run with the same configuration finished are kept; a folder with other content is refused. The files do not depend on the number of
-/// threads.
+/// `progress(name, done, total)` is called with the data set and its number of frames, from several threads. Frames
+/// finished by an earlier run with the same configuration are kept; a folder with other content is an error. The files
+/// do not depend on the number of threads.
 pub fn make_race_datasets(
     config: &RaceConfig,
     files: &ConfigFiles,
@@ -98,100 +106,63 @@ fn make_set(
         splits: BTreeMap::new(),
         label_errors: Vec::new(),
     };
-    let manifest_path = root.join("manifest.json");
-    check_folder(&root, &manifest_path, &manifest)?;
-    let layout = simulator.config.layout;
-    for inside in ["", layout.cloud_folder(), layout.label_folder(), attributes::FOLDER, "ImageSets"] {
-        remove_unfinished(&root.join(inside))?;
-    }
-    write_json(&manifest_path, &manifest)?;
-    write_descriptions(simulator, &root, set, &prepared)?;
-
-    let (done, total) = (AtomicUsize::new(0), simulator.keys().len());
-    progress(&set.name, 0, total);
-    let made = simulator.keys().par_iter().map(|key| {
-        let counts = make_frame_file(simulator, &prepared, &root, key)?;
-        progress(&set.name, done.fetch_add(1, Ordering::Relaxed) + 1, total);
-        Ok((key.split_name(), counts))
-    });
-    for (split, counts) in made.collect::<Result<Vec<_>, SimulateError>>()? {
-        let sum = manifest.splits.entry(split.into()).or_default();
-        sum.frames += counts.frames;
-        sum.cars += counts.cars;
-        sum.points += counts.points;
-    }
+    let new = NewDataset::begin(&root, simulator.config.layout, &[attributes::FOLDER], &mut manifest)?;
+    write_descriptions(simulator, &new, set, &prepared)?;
+    let progress = |done: usize, all: usize| progress(&set.name, done, all);
+    let counts = new.make_frames(simulator.keys(), &progress, |_, key| {
+        Ok::<_, SimulateError>((key.split_name(), make_frame_file(simulator, &prepared, &new, key)?))
+    })?;
+    manifest.splits = SplitCounts::of_splits(counts);
     if set.auto_label.is_some() {
-        manifest.label_errors = errors_of_labels(simulator, &root)?;
+        manifest.label_errors = errors_of_labels(simulator, &new)?;
     }
-    manifest.complete = true;
-    write_json(&manifest_path, &manifest)?;
+    new.finish(&mut manifest)?;
     Ok(manifest)
 }
 
-/// Writes one frame, unless it is there; counts what it holds.
+/// Writes one frame unless it exists; returns its counts.
 fn make_frame_file(
     simulator: &Simulator,
     set: &PreparedSet,
-    root: &Path,
+    new: &NewDataset,
     key: &FrameKey,
 ) -> Result<SplitCounts, SimulateError> {
     let (config, id) = (&simulator.config, key.id());
-    let (cloud, label) = frame_paths(config.layout, root, &id);
-    let beside = attributes::path(root, &id);
-    if !(cloud.is_file() && label.is_file() && (!config.attributes || beside.is_file())) {
+    let beside = attributes::path(new.root(), &id);
+    if !(new.has_frame(&id, true) && (!config.attributes || beside.is_file())) {
         let made = simulator.make(set, key)?;
         if made.frame.cloud.is_empty() {
             let message = "would be empty: no shot has a return within the crop; check rig, effects and crop_m";
-            return Err(DataError::file(&cloud, message).into());
+            return Err(DataError::file(&new.layout().cloud_path(new.root(), &id), message).into());
         }
         if config.attributes {
             write_atomic(&beside, &attributes::encode(&made.scan))?;
         }
-        write_frame(root, config.layout, &made.frame)?;
+        new.layout().write_frame(new.root(), &made.frame)?;
     }
-    let cars = fs_err::read_to_string(&label)?.lines().count();
-    let points = match config.layout {
-        Layout::Kitti => (fs_err::metadata(&cloud)?.len() / POINT_BYTES.0) as usize,
-        Layout::S2rDad => data::read_cloud(&cloud, PointColumns::Xyzi)?.len(),
-    };
+    let [points, cars] = new.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
 }
 
-fn frame_paths(layout: Layout, root: &Path, id: &str) -> (PathBuf, PathBuf) {
-    let ending = match layout {
-        Layout::Kitti => "bin",
-        Layout::S2rDad => "pcd",
-    };
-    (
-        root.join(layout.cloud_folder()).join(format!("{id}.{ending}")),
-        root.join(layout.label_folder()).join(format!("{id}.txt")),
-    )
-}
-
-/// Everything about the data set that is no frame.
+/// Writes all files of a data set except the frames.
 fn write_descriptions(
     simulator: &Simulator,
-    root: &Path,
+    new: &NewDataset,
     set: &SetConfig,
     prepared: &PreparedSet,
 ) -> Result<(), SimulateError> {
-    let config = &simulator.config;
-    for (split, (name, _)) in SPLITS.iter().enumerate() {
-        let ids: Vec<String> = simulator.keys().iter().filter(|k| k.split == split).map(FrameKey::id).collect();
-        write_split(&root.join(format!("ImageSets/{name}.txt")), &ids)?;
-    }
-    let splits = SPLITS.map(|(name, _)| (name.to_string(), format!("ImageSets/{name}.txt").into()));
+    let (config, root) = (&simulator.config, new.root());
+    let ids = |split: usize| simulator.keys().iter().filter(move |k| k.split == split).map(FrameKey::id);
+    let splits = SPLITS.iter().enumerate().map(|(split, (name, _))| (*name, ids(split).collect()));
     let dataset = DatasetConfig {
         name: format!("{}-{}", config.name, set.name),
-        layout: config.layout,
         points: PointColumns::Xyzi,
         label_frame: LabelFrame::Lidar,
         classes: vec![config.class.clone()],
-        splits: splits.into(),
         rig: Some("rig.toml".into()),
         ..DatasetConfig::default()
     };
-    write_dataset_toml(&root.join("dataset.toml"), &dataset)?;
+    new.describe(dataset, splits)?;
     write_atomic(&root.join("rig.toml"), to_toml(&simulator.rig)?.as_bytes())?;
     if config.attributes {
         attributes::write_names(root, &simulator.rig, &simulator.materials)?;
@@ -207,7 +178,7 @@ fn to_toml<T: Serialize>(value: &T) -> Result<String, SimulateError> {
     toml::to_string_pretty(value).map_err(|e| wrong("", e.to_string()).into())
 }
 
-/// The loss that makes the ranges of `from` those of `target`, from the frames that both have to train on.
+/// The dropout that matches the ranges of `from` to those of `target`, from their common training frames.
 fn matched(target: &Path, from: &Path) -> Result<sensor::effects::RangeDropout, SimulateError> {
     let histogram = |folder: &Path| {
         let dataset = Dataset::open(folder)?;
@@ -217,22 +188,21 @@ fn matched(target: &Path, from: &Path) -> Result<sensor::effects::RangeDropout, 
     Ok(fit_range_dropout(&histogram(target)?, &histogram(from)?))
 }
 
-/// Labels on disk against where the cars really are.
-fn errors_of_labels(simulator: &Simulator, root: &Path) -> Result<Vec<LabelError>, SimulateError> {
+/// Compares the written labels with the true boxes.
+fn errors_of_labels(simulator: &Simulator, new: &NewDataset) -> Result<Vec<LabelError>, SimulateError> {
     let of_frame = |key: &FrameKey| {
-        let (_, path) = frame_paths(simulator.config.layout, root, &key.id());
-        let labels = read_kitti_text(&path, KittiText::Labels)?;
+        let labels = new.layout().read_labels(new.root(), &key.id())?;
         let cars = simulator.cars(key)?.into_iter().zip(simulator.labelled(key)?);
         let truth = cars.filter(|(_, labelled)| *labelled).map(|(car, _)| car.true_box);
-        Ok(labels.iter().map(|line| line.lidar_box()).zip(truth).collect())
+        Ok(labels.iter().map(|label| label.lidar_box()).zip(truth).collect())
     };
     let pairs: Result<Vec<Vec<_>>, SimulateError> = simulator.keys().par_iter().map(of_frame).collect();
     Ok(label_errors(pairs?.into_iter().flatten()))
 }
 
-/// A hash of all that decides the frames of a data set.
+/// Hash of everything that determines the frames of a data set.
 fn fingerprint(simulator: &Simulator, set: &PreparedSet) -> String {
-    // The other data sets of the configuration do not matter, nor where its files lie: what is in them does.
+    // Other data sets of the configuration and file locations do not matter; the content of the files does.
     let config = RaceConfig { datasets: Vec::new(), runs: Vec::new(), car: None, ..simulator.config.clone() };
     let mut hash = Sha256::new();
     for text in [
@@ -263,36 +233,20 @@ fn json<T: Serialize>(value: &T) -> String {
     serde_json::to_string(value).expect("a configuration is plain data")
 }
 
-/// The folder must be empty, or begun with the same configuration.
-fn check_folder(root: &Path, manifest_path: &Path, wanted: &RaceManifest) -> Result<(), SimulateError> {
-    if manifest_path.is_file() {
-        let text = fs_err::read_to_string(manifest_path)?;
-        let found: RaceManifest =
-            serde_json::from_str(&text).map_err(|e| DataError::line(manifest_path, e.line(), e.to_string()))?;
-        if found.config_sha256 != wanted.config_sha256 || found.schema != wanted.schema {
-            let message = "was made from another configuration or version; choose another folder, or remove this one";
-            return Err(DataError::file(root, message).into());
-        }
-    } else if root.is_dir() && fs_err::read_dir(root)?.next().is_some() {
-        return Err(DataError::file(root, "is not empty and has no manifest.json; choose another folder").into());
-    }
-    Ok(())
-}
-
-/// Refuses to begin what the disk cannot hold.
+/// Checks that the disk has enough free space.
 fn check_space(simulator: &Simulator, out: &Path, sets: &[&SetConfig]) -> Result<(), SimulateError> {
     let point = POINT_BYTES.0 + if simulator.config.attributes { POINT_BYTES.1 } else { 0 };
     let frame = simulator.shots() as u64 * point + 1024;
     let missing = |set: &&SetConfig| {
         let root = out.join(&set.name);
-        let there = |key: &&FrameKey| frame_paths(simulator.config.layout, &root, &key.id()).0.is_file();
+        let there = |key: &&FrameKey| simulator.config.layout.has_cloud(&root, &key.id());
         (simulator.keys().len() - simulator.keys().iter().filter(there).count()) as u64
     };
     let needed = sets.iter().map(missing).sum::<u64>() * frame;
     check_free(out, needed, &format!("{} data sets of {} frames", sets.len(), simulator.keys().len()))
 }
 
-/// Refuses when the disk of `folder` (which need not exist yet) has no room for `needed` bytes.
+/// Checks that the disk of `folder` (which need not exist yet) has `needed` free bytes.
 fn check_free(folder: &Path, needed: u64, what: &str) -> Result<(), SimulateError> {
     let mut existing = folder;
     while !existing.is_dir() {

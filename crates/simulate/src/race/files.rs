@@ -1,4 +1,4 @@
-//! Where configurations come from: a folder, or the program itself.
+//! Source of configuration files: a folder, or built into the program.
 
 use crate::SimulateError;
 use data::DataError;
@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 /// The files next to a configuration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ConfigFiles {
-    /// The folder of the configuration; `None` for one that comes with the program.
+    /// Folder of the configuration; `None` if built in.
     folder: Option<PathBuf>,
 }
 
-/// Every file that comes with the program, by its path below `configs/`.
+/// Built-in files, by their path below `configs/`.
 const BUILT_IN: [(&str, &str); 8] = [
     ("simulate/race.toml", include_str!("../../../../configs/simulate/race.toml")),
     ("simulate/race_small.toml", include_str!("../../../../configs/simulate/race_small.toml")),
@@ -24,15 +24,15 @@ const BUILT_IN: [(&str, &str); 8] = [
 ];
 
 impl ConfigFiles {
-    /// Names of the configurations that come with the program.
+    /// Names of the built-in configurations.
     pub const NAMES: [&str; 3] = ["race", "race_small", "race_full"];
 
-    /// The files of a folder.
+    /// Files in a folder.
     pub fn in_folder(folder: &Path) -> ConfigFiles {
         ConfigFiles { folder: Some(folder.into()) }
     }
 
-    /// Text and path of a configuration, by its path or by the name of one that comes with the program, and the files next to it.
+    /// Text and path of a configuration given by path or built-in name, and the files next to it.
     pub fn open(name_or_path: &str) -> Result<(String, PathBuf, ConfigFiles), SimulateError> {
         let path = PathBuf::from(name_or_path);
         if !path.is_file() && ConfigFiles::NAMES.contains(&name_or_path) {
@@ -49,7 +49,7 @@ impl ConfigFiles {
         Ok((read(&path)?, path, files))
     }
 
-    /// Text and path of a file that the configuration names.
+    /// Text and path of a file referenced by the configuration.
     pub fn text(&self, file: &Path) -> Result<(String, PathBuf), SimulateError> {
         match &self.folder {
             Some(folder) => {
@@ -67,7 +67,7 @@ impl ConfigFiles {
         }
     }
 
-    /// The folder that further paths are relative to.
+    /// Folder to which further paths are relative.
     pub fn folder(&self) -> PathBuf {
         self.folder.clone().unwrap_or_default()
     }

@@ -1,4 +1,4 @@
-//! Which frames of the runs are kept, and in which split each one is.
+//! Selection of frames from the runs and their assignment to splits.
 
 use super::config::SplitKind;
 use crate::scenario::Run;
@@ -6,38 +6,38 @@ use data::{DataError, stream};
 use rand::seq::SliceRandom;
 use std::path::Path;
 
-/// Names of the splits and their shares.
+/// Names and proportions of the splits.
 pub const SPLITS: [(&str, usize); 3] = [("train", 4), ("val", 1), ("test", 1)];
 
-/// A frame that is kept.
+/// A selected frame.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct FrameKey {
-    /// Number among all frames of all runs; also its name.
+    /// Index among all frames of all runs; also its name.
     pub number: usize,
-    /// The run.
+    /// Index of the run.
     pub run: usize,
-    /// Number within the run.
+    /// Frame index within the run.
     pub frame: usize,
-    /// Place in [`SPLITS`].
+    /// Index in [`SPLITS`].
     pub split: usize,
 }
 
 impl FrameKey {
-    /// The file name without ending; the same in every data set of the race.
+    /// File name without extension; the same in every data set of the race.
     pub fn id(&self) -> String {
         format!("{:06}", self.number)
     }
 
-    /// Name of its split.
+    /// Name of the split.
     pub fn split_name(&self) -> &'static str {
         SPLITS[self.split].0
     }
 }
 
-/// `kept` frames at an even stride over all runs, in the order of their numbers.
+/// Selects `kept` frames at an even stride over all runs, in ascending order.
 ///
-/// By blocks each run gives its share of every split one after the other; frames that are not kept lie between the blocks, so that the last
-/// frame of one and the first of the next do not show the same moment.
+/// With blocks, each run contributes its share of every split as one block. Unused frames are placed between the
+/// blocks, so that the end of one block and the start of the next do not show the same moment.
 pub fn choose(runs: &[Run], kept: usize, kind: SplitKind, seed: u64) -> Result<Vec<FrameKey>, DataError> {
     let total: usize = runs.iter().map(|r| r.frames).sum();
     if kept > total || kept < SPLITS.len() * runs.len() {
@@ -71,7 +71,7 @@ pub fn choose(runs: &[Run], kept: usize, kind: SplitKind, seed: u64) -> Result<V
     Ok(keys)
 }
 
-/// How many frames of each split each run gives: in proportion to its candidates, and no run more than it has.
+/// Number of frames per run and split: proportional to the run's candidates and at most their number.
 fn over_runs(split_sizes: &[usize], candidates: &[usize]) -> Vec<Vec<usize>> {
     let all: usize = candidates.iter().sum();
     let mut before = 0;
@@ -91,7 +91,7 @@ fn over_runs(split_sizes: &[usize], candidates: &[usize]) -> Vec<Vec<usize>> {
     own
 }
 
-/// `total` in these shares, at least one each; the first takes what rounding leaves.
+/// Splits `total` in these proportions, at least one each; the first gets the rounding remainder.
 fn shared(total: usize, shares: &[usize]) -> Vec<usize> {
     let sum: usize = shares.iter().sum();
     let mut parts: Vec<usize> = shares.iter().map(|s| (total * s / sum).max(1)).collect();
@@ -123,7 +123,7 @@ mod tests {
         assert_eq!((keys.len(), count(&keys)), (600, vec![400, 100, 100]));
         assert!(keys.windows(2).all(|w| w[0].number < w[1].number));
         assert!(keys.iter().all(|k| k.frame % 5 == 0 && k.frame < runs[k.run].frames));
-        // Neighbours in different splits are farther apart than neighbours in one.
+        // Neighbouring frames in different splits are farther apart than neighbours in one split.
         for pair in keys.windows(2).filter(|w| w[0].run == w[1].run) {
             let apart = pair[1].frame - pair[0].frame;
             assert!(if pair[0].split == pair[1].split { apart == 5 } else { apart > 25 }, "{pair:?}");

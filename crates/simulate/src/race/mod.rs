@@ -1,5 +1,5 @@
-//! A race on an oval and the data sets that are made of it: `measured`, which stands for the road on machines without road data, and what
-//! simulators make of the same race.
+//! A race on an oval and its data sets: `measured`, which replaces road data where there is none, and simulations of
+//! the same race.
 
 mod config;
 mod dataset;

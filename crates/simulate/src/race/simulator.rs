@@ -1,4 +1,4 @@
-//! A race that is ready to be scanned: frame by frame, for any list of effects.
+//! A prepared race that can be simulated frame by frame with any list of effects.
 
 use super::config::{RaceConfig, SetConfig};
 use super::files::ConfigFiles;
@@ -23,14 +23,14 @@ use sensor::rig::Rig;
 use sensor::scan::Scan;
 use std::path::Path;
 
-/// Everything that all data sets of a race share.
+/// State shared by all data sets of a race.
 #[derive(Clone, Debug)]
 pub struct Simulator {
     /// Its configuration.
     pub config: RaceConfig,
-    /// The sensors at the wanted resolution.
+    /// The rig at the configured resolution.
     pub rig: Rig,
-    /// Materials by number.
+    /// Materials by index.
     pub materials: MaterialTable,
     /// The track.
     pub track: Track,
@@ -42,7 +42,7 @@ pub struct Simulator {
     ideal: Surroundings,
 }
 
-/// What rays can meet, apart from where the cars are.
+/// Static surroundings.
 #[derive(Clone, Debug)]
 struct Surroundings {
     world: World,
@@ -61,30 +61,30 @@ impl Surroundings {
     }
 }
 
-/// One data set: its world and its effects.
+/// A data set: its world and its effects.
 #[derive(Clone, Debug)]
 pub struct PreparedSet {
-    /// Lists of effects with the name under which each draws its random numbers.
+    /// Effect lists with the name of the random stream of each.
     pub lists: Vec<(String, EffectList)>,
-    /// Labels as on the road; exact without.
+    /// Settings of automatic labels; exact labels if `None`.
     pub auto_label: Option<AutoLabel>,
     plan: WorldPlan,
     surroundings: Surroundings,
 }
 
-/// A frame of one data set.
+/// A simulated frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SimulatedFrame {
     /// Cloud and labels.
     pub frame: Frame,
-    /// The returns that the cloud consists of, in its order.
+    /// The returns of the cloud, in the same order.
     pub scan: Scan,
-    /// Where the labelled cars really are, in the order of the labels.
+    /// True boxes of the labelled cars, in label order.
     pub true_boxes: Vec<Box3>,
 }
 
 impl Simulator {
-    /// Reads all that the configuration names, and makes the race.
+    /// Reads all files of the configuration and generates the race.
     pub fn new(config: RaceConfig, files: &ConfigFiles) -> Result<Simulator, SimulateError> {
         let rig = config.rig(files)?;
         let materials = MaterialTable::with(&config.materials).map_err(|e| e.below("materials"))?;
@@ -114,27 +114,27 @@ impl Simulator {
         Ok(Simulator { config, rig, materials, track, runs, keys, car, beams, ideal })
     }
 
-    /// The frames, in the order of their numbers.
+    /// The selected frames, in ascending order.
     pub fn keys(&self) -> &[FrameKey] {
         &self.keys
     }
 
-    /// The frame of a name.
+    /// The frame with this id.
     pub fn key(&self, id: &str) -> Option<&FrameKey> {
         self.keys.iter().find(|key| key.id() == id)
     }
 
-    /// Number of shots of a scan.
+    /// Number of shots per scan.
     pub fn shots(&self) -> usize {
         self.beams.shots()
     }
 
-    /// World and effects of a data set of the configuration.
+    /// Prepares a data set of the configuration.
     pub fn set(&self, set: &SetConfig, files: &ConfigFiles) -> Result<PreparedSet, SimulateError> {
         Ok(self.prepare(self.config.effects_of(set, files)?, set.auto_label))
     }
 
-    /// World and effects of a data set with these lists, whose labels are exact unless they are made as on the road.
+    /// Prepares a data set with these effect lists; labels are exact unless `auto_label` is given.
     pub fn prepare(&self, lists: Vec<(String, EffectList)>, auto_label: Option<AutoLabel>) -> PreparedSet {
         let mut plan = WorldPlan::default();
         lists.iter().for_each(|(_, list)| list.on_world(&mut plan));
@@ -142,7 +142,7 @@ impl Simulator {
         PreparedSet { lists, auto_label, plan, surroundings }
     }
 
-    /// How the own car and the others move at the middle of a frame's scan.
+    /// Motion of the ego vehicle and of the other cars at the middle of a frame's scan.
     pub fn motions(&self, key: &FrameKey) -> Result<(Motion, Vec<Motion>), SimulateError> {
         let run = &self.runs[key.run];
         let time_s = run.time_s(key.frame);
@@ -153,7 +153,7 @@ impl Simulator {
         Ok((ego, cars))
     }
 
-    /// The scene of a frame as the rays of a data set meet it.
+    /// Ray casting scene of a frame for a data set.
     pub fn scene<'a>(&'a self, set: &'a PreparedSet, key: &FrameKey) -> Result<FrameScene<'a>, SimulateError> {
         let (ego, mut cars) = self.motions(key)?;
         self.tilt(set, key, &mut cars);
@@ -177,7 +177,7 @@ impl Simulator {
         }
     }
 
-    /// The other cars of a frame with exact labels, in the cloud's frame.
+    /// The other cars of a frame with exact labels, in the cloud frame.
     pub fn cars(&self, key: &FrameKey) -> Result<Vec<LabelledCar>, SimulateError> {
         let (ego, cars) = self.motions(key)?;
         let cloud_from_world = ego.pose.inverse();
@@ -189,8 +189,8 @@ impl Simulator {
         Ok(cars.iter().enumerate().map(labelled).collect())
     }
 
-    /// Which of the cars of a frame have a label: those in range that the rig meets when there are no effects, so that all data sets of a
-    /// race label the same cars.
+    /// Which cars of a frame are labelled: those in range that are hit in a simulation without effects, so that all
+    /// data sets of a race label the same cars.
     pub fn labelled(&self, key: &FrameKey) -> Result<Vec<bool>, SimulateError> {
         let (ego, motions) = self.motions(key)?;
         let scene = self.scene_of(&self.ideal, ego, &motions);
@@ -206,7 +206,7 @@ impl Simulator {
         Ok(cars.iter().zip(returns).map(|(car, n)| in_range(car) && n >= self.config.label_points).collect())
     }
 
-    /// One frame of a data set.
+    /// Simulates a frame of a data set.
     pub fn make(&self, set: &PreparedSet, key: &FrameKey) -> Result<SimulatedFrame, SimulateError> {
         let mut cars = self.cars(key)?;
         let (ego, mut motions) = self.motions(key)?;
@@ -255,7 +255,7 @@ impl Simulator {
         Ok(SimulatedFrame { frame: Frame { id: key.id(), cloud, objects }, scan, true_boxes })
     }
 
-    /// Replaces exact labels by those made of recorded positions.
+    /// Replaces exact labels by automatic ones.
     fn record(&self, auto: &AutoLabel, key: &FrameKey, cars: &mut [LabelledCar]) -> Result<(), SimulateError> {
         let run = &self.runs[key.run];
         let purpose = format!("{}/run {}", self.config.name, key.run);
@@ -270,7 +270,7 @@ impl Simulator {
     }
 }
 
-/// To the millimetre and the tenth of a milliradian, as labels are written.
+/// Rounds to 1 mm and 0.1 mrad, the precision of label files.
 fn rounded(bbox: &Box3) -> Box3 {
     let round = |v: f64, steps: f64| (v * steps).round() / steps;
     Box3 {

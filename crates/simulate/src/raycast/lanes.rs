@@ -1,10 +1,9 @@
-//! The few vector operations of the traversal, for any width; and their portable form.
+//! The vector operations of the traversal for any width, and their portable implementation.
 
-/// `WIDTH` numbers that are worked on at once.
+/// `WIDTH` f32 values processed in parallel.
 ///
 /// # Safety
-/// Every function may only be called where the CPU has the instructions of the implementing type; pointers must be good for `WIDTH`
-/// values.
+/// The CPU must support the instructions of the implementing type; pointers must be valid for `WIDTH` values.
 pub(super) trait Lanes: Copy {
     const WIDTH: usize;
     type Mask: Copy;
@@ -15,7 +14,7 @@ pub(super) trait Lanes: Copy {
     unsafe fn sub(self, b: Self) -> Self;
     unsafe fn mul(self, b: Self) -> Self;
     unsafe fn div(self, b: Self) -> Self;
-    /// `self * b + c` with one rounding.
+    /// `self * b + c` with a single rounding.
     unsafe fn mul_add(self, b: Self, c: Self) -> Self;
     unsafe fn min(self, b: Self) -> Self;
     unsafe fn max(self, b: Self) -> Self;
@@ -23,13 +22,13 @@ pub(super) trait Lanes: Copy {
     unsafe fn lt(self, b: Self) -> Self::Mask;
     unsafe fn eq(self, b: Self) -> Self::Mask;
     unsafe fn and(a: Self::Mask, b: Self::Mask) -> Self::Mask;
-    /// Bit i is set when lane i is.
+    /// Bit i is set if lane i is set.
     unsafe fn bits(mask: Self::Mask) -> u32;
-    /// `b` where the mask is set, else `a`.
+    /// `b` where the mask is set, otherwise `a`.
     unsafe fn select(mask: Self::Mask, a: Self, b: Self) -> Self;
 }
 
-/// Lanes without any special instruction: the same bits, slower.
+/// Lanes without special instructions: identical results, slower.
 #[derive(Clone, Copy)]
 pub(super) struct Portable([f32; 8]);
 

@@ -1,15 +1,16 @@
-//! Rays against triangle meshes: a two-level tree, traversed by packets of rays.
+//! Ray casting against triangle meshes: a two-level tree, traversed by packets of rays.
 //!
-//! The lower level holds one tree for everything that stands still and one for each shape that moves; the upper level is the list of
-//! [`Instance`]s, few in a race, each a shape with a pose. Rays carry the time at which they are sent, and an instance moves along its
-//! velocity within a frame, so that a scan that takes 50 ms sees it where it is.
+//! The lower level has one tree for the static world and one per moving shape; the upper level is the list of
+//! [`Instance`]s, few in a race, each a shape with a pose. Every ray has a time, and an instance moves with its
+//! velocity within a frame, so that a scan of 50 ms sees it at the right position.
 //!
-//! Coordinates are f32 and must be centred by the caller in f64 first: within 0.9 km of the origin ranges are right to about a
-//! millimetre, at UTM coordinates they are useless.
+//! Coordinates are f32 and must be centred by the caller in f64: within 0.9 km of the origin ranges are accurate to
+//! about 1 mm; UTM coordinates are not usable.
 //!
-//! The nearest hit of a ray is the least `(range, triangle)` over all triangles, whatever rays travel with it: boxes of the tree are
-//! padded by more than the rounding of a hit, equal ranges go to the lower triangle, and every instruction set does the same operations
-//! with the same fused multiply-adds. So the bits of a hit depend neither on the number of threads nor on the width of the registers.
+//! The nearest hit of a ray is the minimum of `(range, triangle)` over all triangles, independent of the other rays of
+//! the packet: tree boxes are padded by more than the rounding error of a hit, the lower triangle wins a tie, and
+//! every instruction set performs the same operations with the same fused multiply-adds. The bits of a hit therefore
+//! depend neither on the number of threads nor on the vector width.
 
 mod lanes;
 mod scene;
@@ -21,32 +22,32 @@ mod x86;
 pub use scene::{Instance, InstructionSet, Scene};
 pub use tree::Tree;
 
-/// A ray in the scene's coordinates.
+/// A ray in scene coordinates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
-    /// Where it starts, m.
+    /// Origin, m.
     pub origin: [f32; 3],
-    /// Unit vector.
+    /// Unit direction.
     pub direction: [f32; 3],
-    /// When it is sent, s, relative to the time at which the instances have their poses.
+    /// Emission time, s, relative to the time of the instance poses.
     pub time_s: f32,
 }
 
 /// The nearest surface along a ray.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
-    /// Distance, m; infinite when nothing is hit.
+    /// Distance, m; infinite if nothing is hit.
     pub range_m: f32,
-    /// Triangle, counted in the mesh that is hit.
+    /// Triangle index in the mesh that is hit.
     pub triangle: u32,
-    /// 0: what stands still; k: instance k - 1.
+    /// 0: the static world; k: instance k - 1.
     pub object: u32,
-    /// Unit normal in the scene's coordinates, on the side of the ray's origin.
+    /// Unit normal in scene coordinates, facing the ray origin.
     pub normal: [f32; 3],
 }
 
 impl Hit {
-    /// Nothing is hit.
+    /// No hit.
     pub const MISS: Hit = Hit { range_m: f32::INFINITY, triangle: u32::MAX, object: 0, normal: [0.0; 3] };
 
     /// Whether something is hit.

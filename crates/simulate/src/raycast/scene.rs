@@ -1,4 +1,4 @@
-//! What stands still, what moves, and the rays through both.
+//! The static mesh, the moving instances, and ray casting against both.
 
 use super::lanes::{Lanes, Portable};
 use super::traverse::{Best, MOST_LANES, Packet, lanes_of, traverse};
@@ -7,32 +7,32 @@ use super::{Hit, Ray};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// A shape somewhere in the scene.
+/// A shape with a pose in the scene.
 #[derive(Clone, Debug)]
 pub struct Instance {
-    /// Its mesh, in its own coordinates.
+    /// Its mesh, in shape coordinates.
     pub shape: Arc<Tree>,
     /// Rows of the rotation `scene_from_shape`.
     pub rotation: [[f32; 3]; 3],
-    /// Where the shape's origin is at time 0, m.
+    /// Position of the shape's origin at time 0, m.
     pub position: [f32; 3],
-    /// How it moves while rays are sent, m/s.
+    /// Velocity during the scan, m/s.
     pub velocity: [f32; 3],
 }
 
-/// Instructions that the traversal uses.
+/// Instruction set of the traversal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum InstructionSet {
-    /// None beyond the target's own.
+    /// No instructions beyond the compile target.
     Portable,
-    /// AVX2 and FMA: 8 rays a packet.
+    /// AVX2 and FMA: packets of 8 rays.
     Avx2,
-    /// AVX-512: 16 rays a packet.
+    /// AVX-512: packets of 16 rays.
     Avx512,
 }
 
 impl InstructionSet {
-    /// The widest that this CPU has.
+    /// The widest set supported by this CPU.
     pub fn best() -> Self {
         [InstructionSet::Avx512, InstructionSet::Avx2]
             .into_iter()
@@ -40,7 +40,7 @@ impl InstructionSet {
             .unwrap_or(InstructionSet::Portable)
     }
 
-    /// Whether this CPU has it.
+    /// Whether this CPU supports it.
     pub fn is_available(self) -> bool {
         #[cfg(target_arch = "x86_64")]
         {
@@ -71,33 +71,33 @@ pub struct Scene {
     instructions: InstructionSet,
 }
 
-/// An instance with the box that holds it at time 0, m.
+/// An instance with its bounding box at time 0, m.
 #[derive(Clone, Debug)]
 struct Placed {
     instance: Instance,
     bounds: [f32; 6],
 }
 
-/// Rows of a grid of rays that travel together.
+/// Rows of the ray grid per packet.
 const PACKET_ROWS: usize = 2;
-/// Rays that a thread takes at a time, at least.
+/// Minimum number of rays per parallel job.
 const RAYS_PER_JOB: usize = 4096;
 
 impl Scene {
-    /// `ground` is everything that stands still.
+    /// `ground` is the static mesh.
     pub fn new(ground: Arc<Tree>, instances: Vec<Instance>) -> Scene {
         let instances = instances.into_iter().map(Placed::new).collect();
         Scene { ground, instances, instructions: InstructionSet::best() }
     }
 
-    /// The same scene, cast with other instructions; those that the CPU has not fall back to portable ones.
+    /// The same scene with another instruction set; falls back to portable if the CPU does not support it.
     pub fn with_instructions(mut self, wanted: InstructionSet) -> Scene {
         self.instructions = if wanted.is_available() { wanted } else { InstructionSet::Portable };
         self
     }
 
-    /// The nearest hit of every ray. Rays are a grid of `columns` columns, row after row, neighbours looking in nearly the same
-    /// direction; a plain list has one row.
+    /// The nearest hit of every ray. Rays form a grid with `columns` columns, row by row, with nearly parallel
+    /// neighbours; an unordered list has one row.
     ///
     /// # Shapes
     /// `rays`, `hits`: `[rows * columns]`.
@@ -105,17 +105,17 @@ impl Scene {
         assert_eq!(rays.len(), hits.len(), "one hit a ray");
         assert!(columns > 0 && rays.len().is_multiple_of(columns), "{} rays fill no rows of {columns}", rays.len());
         match self.instructions {
-            // SAFETY: `with_instructions` and `best` let only sets pass that this CPU has.
+            // SAFETY: `with_instructions` and `best` only return sets that this CPU supports.
             #[cfg(target_arch = "x86_64")]
             InstructionSet::Avx512 => unsafe { cast_avx512(self, rays, columns, hits) },
             #[cfg(target_arch = "x86_64")]
             InstructionSet::Avx2 => unsafe { cast_avx2(self, rays, columns, hits) },
-            // SAFETY: these lanes need nothing of the CPU.
+            // SAFETY: the portable lanes have no CPU requirements.
             _ => unsafe { cast_grid::<Portable>(self, rays, columns, hits) },
         }
     }
 
-    /// As [`Scene::cast`], by all threads of the pool; the same bits.
+    /// As [`Scene::cast`], on all threads of the pool; identical results.
     pub fn cast_parallel(&self, rays: &[Ray], columns: usize, hits: &mut [Hit]) {
         let rows = (RAYS_PER_JOB / columns).next_multiple_of(PACKET_ROWS).max(PACKET_ROWS);
         let jobs = rays.par_chunks(rows * columns).zip(hits.par_chunks_mut(rows * columns));
@@ -153,7 +153,7 @@ unsafe fn cast_avx2(scene: &Scene, rays: &[Ray], columns: usize, hits: &mut [Hit
     unsafe { cast_grid::<std::arch::x86_64::__m256>(scene, rays, columns, hits) }
 }
 
-/// Cuts the grid into packets of two rows; lanes beyond its border repeat the last ray, to the same hit.
+/// Splits the grid into packets of two rows; lanes beyond its border repeat the last ray.
 #[inline(always)]
 unsafe fn cast_grid<L: Lanes>(scene: &Scene, rays: &[Ray], columns: usize, hits: &mut [Hit]) {
     let rows = rays.len() / columns;
@@ -196,7 +196,7 @@ unsafe fn cast_packet<L: Lanes>(scene: &Scene, rays: &[Ray], which: &[usize; MOS
         }
         let time = vector(6);
         for (i, Placed { instance, bounds }) in scene.instances.iter().enumerate() {
-            // In the scene as it moves with the instance, the ray starts elsewhere and looks the same way.
+            // In the instance's moving frame the ray has another origin and the same direction.
             let moved: [L; 3] = std::array::from_fn(|k| origin[k].sub(time.mul(L::splat(instance.velocity[k]))));
             let beside = Packet { origin: moved, ..packet };
             if L::bits(beside.enter(bounds, best.range).1) == 0 {
@@ -223,7 +223,7 @@ unsafe fn cast_packet<L: Lanes>(scene: &Scene, rays: &[Ray], which: &[usize; MOS
     }
 }
 
-/// The hit with its normal of length 1 and against the ray.
+/// Normalises the hit's normal and flips it to face the ray origin.
 fn facing(mut hit: Hit, direction: [f32; 3]) -> Hit {
     let n = hit.normal;
     let length = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt();
@@ -237,7 +237,7 @@ fn turn(rotation: &[[f32; 3]; 3], v: [f32; 3]) -> [f32; 3] {
     rotation.map(|row| row[0] * v[0] + row[1] * v[1] + row[2] * v[2])
 }
 
-/// The transposed rotation: scene to shape.
+/// Applies the transposed rotation: scene to shape.
 #[inline(always)]
 unsafe fn turn_back<L: Lanes>(rotation: &[[f32; 3]; 3], v: &[L; 3]) -> [L; 3] {
     std::array::from_fn(|k| unsafe {

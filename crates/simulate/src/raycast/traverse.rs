@@ -1,16 +1,17 @@
-//! A packet of rays through one tree.
+//! Traversal of one tree by a packet of rays.
 
 use super::lanes::Lanes;
 use super::tree::{COUNT_BITS, LEAF, PackedTriangle, Tree};
 use std::mem::MaybeUninit;
 
-/// Deeper than any tree gets: a level holds at least one triangle more than the one below it, and the builder balances.
+/// Maximum depth; larger than that of any tree: every level holds at least one triangle less than its parent, and the
+/// builder balances.
 const DEEPEST: usize = 128;
-/// The widest packet.
+/// Width of the widest packet.
 pub(super) const MOST_LANES: usize = 16;
-/// A box that begins farther away than the best hit by less than this factor is still looked into: both are rounded.
+/// Relative slack for box distances: both box and hit distances are rounded.
 const SLACK: f32 = 1.000_000_5;
-/// Takes the place of a component of exactly 0, for which slabs would give 0 * infinity.
+/// Replaces a direction component of exactly 0, which would give 0 * infinity in the slab test.
 const LEAST_COMPONENT: f32 = 1e-20;
 
 /// Rays side by side: lane i of each vector belongs to ray i.
@@ -33,7 +34,7 @@ impl<L: Lanes> Packet<L> {
         }
     }
 
-    /// Where each ray enters a box, and which rays do so before their best hit.
+    /// Entry distance of each ray into a box, and the mask of rays that enter before their best hit.
     ///
     /// # Safety
     /// See [`Lanes`].
@@ -56,11 +57,11 @@ impl<L: Lanes> Packet<L> {
 pub(super) struct Best<L: Lanes> {
     /// Range of each lane, m.
     pub(super) range: L,
-    /// Place in [`Tree::triangles`] of each lane's hit.
+    /// Index in [`Tree::triangles`] of each lane's hit.
     pub(super) place: [u32; MOST_LANES],
 }
 
-/// Finds what the rays hit nearer than `best`; bit i of the answer is set when lane i was improved.
+/// Finds hits nearer than `best`; bit i of the result is set if lane i was improved.
 ///
 /// # Safety
 /// See [`Lanes`].
@@ -76,7 +77,7 @@ pub(super) unsafe fn traverse<L: Lanes>(tree: &Tree, packet: &Packet<L>, best: &
                 let (near1, enters1) = packet.enter(&node.boxes[1], best.range);
                 let (bits0, bits1) = (L::bits(enters0), L::bits(enters1));
                 if bits0 != 0 && bits1 != 0 {
-                    // The child that most rays meet first goes first.
+                    // Visits first the child that more rays enter first.
                     let both = bits0 & bits1;
                     let first0 = (L::bits(near0.le(near1)) & both).count_ones() * 2 >= both.count_ones();
                     let (first, second, near, enters) = if first0 {
@@ -120,7 +121,7 @@ pub(super) unsafe fn traverse<L: Lanes>(tree: &Tree, packet: &Packet<L>, best: &
     }
 }
 
-/// One triangle against all rays (Möller-Trumbore without a division for rays that miss); both sides can be hit.
+/// Intersects one triangle with all rays (Möller-Trumbore, no division for misses); both sides can be hit.
 #[inline(always)]
 unsafe fn test<L: Lanes>(tree: &Tree, packet: &Packet<L>, place: u32, best: &mut Best<L>, improved: u32) -> u32 {
     unsafe {
@@ -146,7 +147,7 @@ unsafe fn test<L: Lanes>(tree: &Tree, packet: &Packet<L>, place: u32, best: &mut
         let range = along.div(det);
         let nearer = L::and(inside, L::and(zero.le(range), range.lt(best.range)));
         let mut better = L::bits(nearer);
-        // Equal ranges go to the lower triangle, so that the order of the visits does not matter.
+        // The lower triangle wins a tie, so that the order of visits does not matter.
         let equal = L::bits(L::and(inside, range.eq(best.range))) & improved;
         if equal != 0 {
             for lane in lanes_of(equal) {
@@ -166,7 +167,7 @@ unsafe fn test<L: Lanes>(tree: &Tree, packet: &Packet<L>, place: u32, best: &mut
     }
 }
 
-/// The set bits, from the lowest.
+/// Indices of the set bits, ascending.
 pub(super) fn lanes_of(mut bits: u32) -> impl Iterator<Item = usize> {
     std::iter::from_fn(move || {
         let lane = bits.trailing_zeros() as usize;

@@ -1,4 +1,4 @@
-//! The tree of one mesh: built by `obvhs`, laid out for the packet traversal.
+//! The tree of one mesh: built by `obvhs`, laid out for packet traversal.
 
 use obvhs::BvhBuildParams;
 use obvhs::bvh2::Bvh2;
@@ -6,15 +6,15 @@ use obvhs::bvh2::builder::build_bvh2_from_tris;
 use obvhs::triangle::Triangle;
 use std::time::Duration;
 
-/// Marks a reference to a leaf: the bit, then first triangle, then number of triangles.
+/// Flag of a leaf reference: flag, index of the first triangle, number of triangles.
 pub(super) const LEAF: u32 = 1 << 31;
-/// Low bits of a leaf that hold its number of triangles.
+/// Number of low bits that hold the number of triangles of a leaf.
 pub(super) const COUNT_BITS: u32 = 4;
 const TRIANGLES_PER_LEAF: u32 = 4;
-/// Rays are not longer than this where the padding of boxes is concerned, m.
+/// Maximum ray length assumed for the padding of boxes, m.
 const LONGEST_RAY_M: f32 = 300.0;
 
-/// An inner node: the boxes of both children (low x, y, z, high x, y, z) and where they are.
+/// An inner node: bounding boxes of both children (minimum x, y, z, maximum x, y, z) and their references.
 #[repr(C, align(64))]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Node {
@@ -22,7 +22,8 @@ pub(super) struct Node {
     pub(super) children: [u32; 2],
 }
 
-/// A triangle as the test wants it: a corner, two edges from it (the first reversed), their cross product.
+/// A triangle prepared for the intersection test: a corner, two edges from it (the first reversed), and their cross
+/// product.
 #[repr(C)]
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PackedTriangle {
@@ -32,21 +33,21 @@ pub(super) struct PackedTriangle {
     pub(super) normal: [f32; 3],
 }
 
-/// A mesh of triangles, ready to be hit.
+/// A triangle mesh prepared for ray casting.
 #[derive(Clone, Debug)]
 pub struct Tree {
     pub(super) nodes: Vec<Node>,
     pub(super) triangles: Vec<PackedTriangle>,
-    /// Index in the mesh of each of `triangles`.
+    /// Mesh index of each of `triangles`.
     pub(super) ids: Vec<u32>,
     pub(super) root: u32,
-    /// Least and greatest coordinates, m.
+    /// Minimum and maximum coordinates, m.
     pub(super) low: [f32; 3],
     pub(super) high: [f32; 3],
 }
 
 impl Tree {
-    /// The tree of these triangles, m. A corner that is not finite makes its triangle unhittable; without any triangle nothing is hit.
+    /// Builds the tree of these triangles, m. Triangles with a non-finite corner are never hit.
     pub fn new(corners: &[[[f32; 3]; 3]]) -> Tree {
         let sound: Vec<u32> = (0..corners.len() as u32)
             .filter(|i| corners[*i as usize].iter().flatten().all(|v| v.is_finite()))
@@ -87,12 +88,12 @@ impl Tree {
         self.triangles.len()
     }
 
-    /// Nothing can be hit.
+    /// Whether no triangle can be hit.
     pub fn is_empty(&self) -> bool {
         self.triangles.is_empty()
     }
 
-    /// Inner nodes in depth-first order, boxes padded beyond the rounding of a hit.
+    /// Stores inner nodes in depth-first order, with boxes padded by more than the rounding error of a hit.
     fn lay_out(&mut self, bvh: &Bvh2) {
         let mut place = vec![0_u32; bvh.nodes.len()];
         let (mut order, mut open) = (Vec::new(), vec![0_usize]);

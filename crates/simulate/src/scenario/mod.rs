@@ -1,4 +1,4 @@
-//! What happens: runs of an ego car and its rivals, from files or made by the program.
+//! Scenarios: runs of an ego vehicle and its rivals, from files or generated.
 
 mod race;
 mod trajectory;
@@ -19,12 +19,12 @@ use std::path::{Path, PathBuf};
 /// Time between two frames of the race, s.
 pub const FRAME_S: f64 = 0.05;
 
-/// One run: cars over time, and when clouds are taken.
+/// A run: trajectories of the cars, and the times of the clouds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Run {
-    /// The car that carries the sensors.
+    /// The ego vehicle, which carries the sensors.
     pub ego: Trajectory,
-    /// The others.
+    /// The other cars.
     pub rivals: Vec<Trajectory>,
     /// Time of the first cloud, s.
     pub first_s: f64,
@@ -41,25 +41,26 @@ impl Run {
     }
 }
 
-/// Trajectories of one run in files, relative to the file that names them.
+/// Trajectory files of one run, relative to the file that contains these paths.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RunFiles {
-    /// CSV of the car that carries the sensors.
+    /// CSV of the ego vehicle.
     pub ego: PathBuf,
-    /// CSVs of the others, of the same clock.
+    /// CSVs of the other cars, with the same clock.
     #[serde(default)]
     pub rivals: Vec<PathBuf>,
 }
 
 impl RunFiles {
-    /// Reads the run: clouds 20 times a second wherever all cars have states. `track` is what no car may leave, where there is one.
+    /// Reads the run: 20 clouds per second while all cars have states. If `track` is given, cars must stay within its
+    /// outer wall.
     pub fn read(&self, folder: &Path, track: Option<&Track>) -> Result<Run, SimulateError> {
         let read = |path: &PathBuf| Trajectory::read(&folder.join(path));
         let ego = read(&self.ego)?;
         let rivals = self.rivals.iter().map(read).collect::<Result<Vec<_>, _>>()?;
         let cars = || std::iter::once(&ego).chain(&rivals);
-        // A scan begins before its middle, and records of positions are needed before and after.
+        // A scan begins before its middle, and automatic labels need records before and after.
         let first_s = cars().map(|c| c.span_s()[0]).fold(f64::MIN, f64::max) + 3.0 * FRAME_S;
         let last_s = cars().map(|c| c.span_s()[1]).fold(f64::MAX, f64::min) - 3.0 * FRAME_S;
         if last_s <= first_s {
@@ -72,7 +73,7 @@ impl RunFiles {
         Ok(run)
     }
 
-    /// Refuses cars that stand in each other or in a wall.
+    /// Checks that cars do not intersect each other or the outer wall.
     fn check_places(&self, run: &Run, folder: &Path, track: Option<&Track>) -> Result<(), DataError> {
         let paths: Vec<PathBuf> = std::iter::once(&self.ego).chain(&self.rivals).map(|p| folder.join(p)).collect();
         let cars: Vec<&Trajectory> = std::iter::once(&run.ego).chain(&run.rivals).collect();
@@ -80,7 +81,7 @@ impl RunFiles {
             let t = run.time_s(frame);
             let poses: Vec<_> =
                 cars.iter().map(|car| car.at(t).expect("all cars have states in the run").pose).collect();
-            // The states of a file begin in its second line.
+            // Line 1 of a file is the header.
             let error = |i: usize, message: String| {
                 let line = cars[i].states().partition_point(|s| s.time_s < t) + 2;
                 DataError::line(&paths[i], line, message)
@@ -90,11 +91,11 @@ impl RunFiles {
                     bev_intersection(&move_box(&(pose.inverse() * poses[other]), &car_box()), &car_box()) > 0.0
                 };
                 if let Some(other) = (0..i).find(|other| inside(*other)) {
-                    let message = format!("at {t:.2} s the car stands in the car of {}", paths[other].display());
+                    let message = format!("at {t:.2} s the car intersects the car of {}", paths[other].display());
                     return Err(error(i, message));
                 }
                 if let Some(beyond) = track.and_then(|track| beyond_the_wall_m(track, pose)) {
-                    return Err(error(i, format!("at {t:.2} s the car stands {beyond:.2} m in the outer wall")));
+                    return Err(error(i, format!("at {t:.2} s the car is {beyond:.2} m inside the outer wall")));
                 }
             }
         }
@@ -102,7 +103,7 @@ impl RunFiles {
     }
 }
 
-/// How far a car reaches into the outer wall, m; `None` when it does not.
+/// Depth by which a car intersects the outer wall, m; `None` if it does not.
 fn beyond_the_wall_m(track: &Track, world_from_car: &geometry::Pose) -> Option<f64> {
     let bbox = car_box();
     let [hx, hy] = [CAR_SIZE_M[0] / 2.0, CAR_SIZE_M[1] / 2.0];
@@ -140,13 +141,13 @@ mod tests {
 
         let twice = RunFiles { ego: ego.clone(), rivals: vec![ego] };
         let error = twice.read(folder.path(), None).unwrap_err().to_string();
-        assert!(error.contains("ego.csv:") && error.contains("stands in the car of"), "{error}");
+        assert!(error.contains("ego.csv:") && error.contains("intersects the car of"), "{error}");
 
-        // The same lap on a track whose outer edge lies 4 m farther in.
+        // The same lap on a track whose outer edge is 4 m closer.
         let mut points = track.line.points().to_vec();
         points.iter_mut().for_each(|p| p.width_right_m -= 5.0);
         let narrow = Track { line: crate::track::CentreLine::from_points(points), seed: 1 };
         let error = files.read(folder.path(), Some(&narrow)).unwrap_err().to_string();
-        assert!(error.contains(".csv:") && error.contains("in the outer wall"), "{error}");
+        assert!(error.contains(".csv:") && error.contains("m inside the outer wall"), "{error}");
     }
 }

@@ -1,5 +1,5 @@
-//! A race made by the program: an ego car and rivals on the oval, whose places follow the picture of Huch et al. 2023, figure 4: rivals
-//! mostly about 35 m ahead to the left and 30 m behind to the right, some farther away, and some passing.
+//! Generated race: an ego vehicle and rivals on the oval. Relative positions follow figure 4 of Huch et al. 2023:
+//! rivals are mostly about 35 m ahead on the left and 30 m behind on the right, some farther away, and some passing.
 
 use super::trajectory::{CarState, Trajectory};
 use super::{FRAME_S, Run};
@@ -14,17 +14,17 @@ use sensor::car::ORIGIN_ABOVE_GROUND_M;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::TAU;
 
-/// A seeded race.
+/// A generated race with a random seed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RaceModel {
-    /// Runs on the track, each with a start of its own.
+    /// Number of runs, with different starting positions.
     pub runs: u32,
-    /// Frames of all runs together, 20 a second. 32,951 as in the paper are some 27 minutes.
+    /// Total number of frames of all runs, at 20 Hz. 32,951 as in the paper are about 27 minutes.
     pub frames: usize,
-    /// Rivals, 1 to 3. The first is mostly behind, the last mostly ahead.
+    /// Number of rivals, 1 to 3. The first is mostly behind, the last mostly ahead.
     pub rivals: usize,
-    /// Least and greatest speed of the ego car, m/s.
+    /// Minimum and maximum speed of the ego vehicle, m/s.
     pub speed_mps: [f64; 2],
 }
 
@@ -34,23 +34,23 @@ impl Default for RaceModel {
     }
 }
 
-/// Where each rival likes to be relative to the ego car, m ahead along the track, and how often.
+/// Preferred positions of each rival relative to the ego vehicle (m ahead along the track) and their weights.
 const PLACES: [&[(f64, f64)]; 3] = [
     &[(-30.0, 0.60), (-45.0, 0.15), (-70.0, 0.15), (-92.0, 0.10)],
     &[(-30.0, 0.30), (35.0, 0.40), (50.0, 0.15), (8.0, 0.05), (-10.0, 0.10)],
     &[(35.0, 0.55), (55.0, 0.20), (75.0, 0.15), (94.0, 0.10)],
 ];
-/// A rival stays at a place for that long, s.
+/// Time that a rival stays at a position, s.
 const STAY_S: [f64; 2] = [8.0, 25.0];
-/// Speed relative to the ego car while it changes its place, m/s.
+/// Speed relative to the ego vehicle while changing position, m/s.
 const CLOSING_MPS: f64 = 5.0;
-/// To the side of the ego car, m: to the left when ahead, to the right when behind and in passing.
+/// Lateral offset from the ego vehicle, m: to the left when ahead, to the right when behind or passing.
 const ASIDE_M: f64 = 5.0;
-/// A rival moves over to the left between these distances ahead, m.
+/// A rival moves to the left between these distances ahead, m.
 const MOVES_OVER_M: [f64; 2] = [13.0, 24.0];
-/// Rivals keep that far from each other along the track, m.
+/// Minimum distance between rivals along the track, m.
 const SPACING_M: f64 = 13.0;
-/// The middle of a car keeps that far from the edges, m.
+/// Minimum distance of a car's centre from the track edges, m.
 const MARGIN_M: f64 = 1.25;
 
 impl RaceModel {
@@ -66,7 +66,7 @@ impl RaceModel {
         Ok(())
     }
 
-    /// The runs, each with one frame less or more so that all frames are there.
+    /// Generates the runs; their lengths differ by at most one frame and add up to `frames`.
     pub fn runs(&self, track: &Track, seed: u64) -> Vec<Run> {
         let runs = self.runs as usize;
         (0..runs)
@@ -78,7 +78,8 @@ impl RaceModel {
     }
 
     fn run(&self, track: &Track, frames: usize, random: &mut dyn FnMut(&str) -> Stream) -> Run {
-        // A state more at both ends, so that the first and the last frame have their whole scan, and GPS a state before and after.
+        // One more state at both ends, so that the first and last frame have a complete scan and GPS records before
+        // and after.
         let states = frames + 8;
         let time = |i: usize| (i as f64 - 4.0) * FRAME_S;
         let mut ego_random = random("ego");
@@ -113,13 +114,13 @@ impl RaceModel {
     }
 }
 
-/// A car's frame at a place of the track, heading along it; kept off the edges.
+/// Pose of a car at a track position, heading along the track; kept off the edges.
 fn place(track: &Track, way_m: f64, left_m: f64) -> Pose {
     let [low, high] = track.lateral_limits_m(way_m, MARGIN_M);
     track.pose_on(way_m, left_m.clamp(low, high), 0.0, ORIGIN_ABOVE_GROUND_M)
 }
 
-/// States through poses at even times, with velocities by central differences; the first and the last pose are lost.
+/// States from equidistant poses, with velocities by central differences; the first and last pose are dropped.
 fn trajectory(poses: &[Pose], time: impl Fn(usize) -> f64) -> Trajectory {
     let state = |i: usize| {
         let velocity = (poses[i + 1].translation.vector - poses[i - 1].translation.vector) / (2.0 * FRAME_S);
@@ -128,14 +129,14 @@ fn trajectory(poses: &[Pose], time: impl Fn(usize) -> f64) -> Trajectory {
     Trajectory::from_states((1..poses.len() - 1).map(state).collect())
 }
 
-/// A smooth `max(v, 0)`, m.
+/// A smooth approximation of `max(v, 0)`, m.
 fn soft_positive(v: f64) -> f64 {
     const SCALE_M: f64 = 3.0;
     let x = v / SCALE_M;
     SCALE_M * (x.max(0.0) + (-x.abs()).exp().ln_1p())
 }
 
-/// One of the other cars.
+/// A rival.
 struct Rival {
     ahead_m: Stages,
     wobble: Waves,
@@ -156,7 +157,7 @@ impl Rival {
         let mut stages = Stages { values: vec![(-10.0, -5.0, pick(random))] };
         while stages.end_s() < until_s {
             let (start, next) = (stages.end_s() + random.random_range(STAY_S[0]..STAY_S[1]), pick(random));
-            // A smooth step is at most 1.5 times as fast as an even one.
+            // The peak rate of a smooth step is 1.5 times that of a linear one.
             let change_s = (1.5 * (next - stages.last()).abs() / CLOSING_MPS).max(2.0);
             stages.values.push((start, start + change_s, next));
         }
@@ -164,19 +165,19 @@ impl Rival {
     }
 }
 
-/// A value that stays, changes smoothly, stays: (begin of a change, its end, value from then on), s.
+/// A value with smooth changes between constant stages: (start of a change, its end, value afterwards), s.
 struct Stages {
     values: Vec<(f64, f64, f64)>,
 }
 
 impl Stages {
-    /// Speeds between two limits; most near the upper one, as in a race with slow laps between.
+    /// Speeds between two limits; mostly near the upper one, as in a race with slow laps in between.
     fn speeds([low, high]: [f64; 2], until_s: f64, random: &mut Stream) -> Stages {
         let pick = |random: &mut Stream| high - (high - low) * random.random_range(0.0_f64..1.0).powf(1.7);
         let mut stages = Stages { values: vec![(-10.0, -5.0, pick(random))] };
         while stages.end_s() < until_s {
             let (start, next) = (stages.end_s() + random.random_range(8.0..30.0), pick(random));
-            let change_s = (1.5 * (next - stages.last()).abs() / 3.5).max(2.0); // 3.5 m/s2 at most
+            let change_s = (1.5 * (next - stages.last()).abs() / 3.5).max(2.0); // at most 3.5 m/s2
             stages.values.push((start, start + change_s, next));
         }
         stages
@@ -199,11 +200,11 @@ impl Stages {
     }
 }
 
-/// A sum of three slow waves.
+/// A sum of three slow sine waves.
 struct Waves([(f64, f64, f64); 3]);
 
 impl Waves {
-    /// Of about that standard deviation, and periods around `period_s`.
+    /// Waves with about this standard deviation, and periods around `period_s`.
     fn make(random: &mut Stream, deviation: f64, period_s: f64) -> Waves {
         Waves([0.7, 1.0, 1.9].map(|stretch| {
             let rate = TAU / (period_s * stretch * random.random_range(0.8..1.25));
@@ -227,7 +228,7 @@ mod tests {
         Track { line: las_vegas(), seed: 1 }
     }
 
-    /// Boxes of the rivals in the ego car's frame, every half second.
+    /// Boxes of the rivals in the ego frame, every half second.
     fn relative(runs: &[Run]) -> Vec<Vec<geometry::Box3>> {
         let mut all = Vec::new();
         for run in runs {
@@ -290,7 +291,7 @@ mod tests {
         assert_eq!(runs.iter().map(|r| r.frames).collect::<Vec<_>>(), [100, 100, 101]);
         assert_eq!(runs, model.runs(&track, 1));
         assert_ne!(runs, model.runs(&track, 2));
-        // What the model makes passes the checks of what is read.
+        // Generated runs pass the checks of runs from files.
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rival.csv");
         std::fs::write(&path, runs[0].rivals[0].to_csv()).unwrap();

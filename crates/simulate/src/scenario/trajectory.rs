@@ -1,4 +1,4 @@
-//! Where a car is over time: states from a file or a model, and a smooth motion through them.
+//! Vehicle trajectories: states from a file or a model, with smooth interpolation.
 
 use data::DataError;
 use geometry::Pose;
@@ -9,16 +9,17 @@ use std::path::Path;
 
 /// A longer pause between two states is a gap, s.
 const LONGEST_PAUSE_S: f64 = 0.5;
-/// No car is faster, m/s.
+/// Maximum speed, m/s.
 const FASTEST_MPS: f64 = 120.0;
-/// Between two states a car may be this far from where its velocities take it, m; and this part of the way.
+/// Maximum distance of a state from the position predicted by the velocities: absolute, m, and relative to the
+/// distance driven.
 const JUMP: (f64, f64) = (0.5, 0.25);
 
-/// A state as GPS and inertial sensors tell it, in the world: x east, y north, z up.
+/// A vehicle state from GPS and IMU, in the world frame: x east, y north, z up.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CarState {
-    /// s.
+    /// Time, s.
     pub time_s: f64,
     /// East, m.
     pub x_m: f64,
@@ -26,9 +27,9 @@ pub struct CarState {
     pub y_m: f64,
     /// Up, m.
     pub z_m: f64,
-    /// About the car's x axis, positive lifts the left side, rad.
+    /// Roll about the car's x axis, positive lifts the left side, rad.
     pub roll_rad: f64,
-    /// About the car's y axis, positive lowers the nose, rad.
+    /// Pitch about the car's y axis, positive lowers the nose, rad.
     pub pitch_rad: f64,
     /// Heading, counter-clockwise from +x, rad.
     pub yaw_rad: f64,
@@ -62,7 +63,7 @@ impl CarState {
         Isometry3::from_parts(Translation3::from(self.position()), rotation)
     }
 
-    /// The state of a pose and a velocity (m/s) in the world.
+    /// State from a pose and a velocity (m/s) in the world frame.
     pub fn of(time_s: f64, world_from_car: &Pose, velocity: Vector3<f64>) -> CarState {
         let p = world_from_car.translation.vector;
         let (roll_rad, pitch_rad, yaw_rad) = world_from_car.rotation.euler_angles();
@@ -81,25 +82,25 @@ impl CarState {
     }
 }
 
-/// How a car moves at one moment, in the world.
+/// Motion of a car at one moment, in the world frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
     /// `world_from_car`.
     pub pose: Pose,
-    /// m/s.
+    /// Velocity, m/s.
     pub velocity: Vector3<f64>,
-    /// Axis times rate of turn, rad/s.
+    /// Angular velocity vector, rad/s.
     pub turn_rate: Vector3<f64>,
 }
 
-/// A car's states, in the order of time.
+/// States of a car in ascending time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trajectory {
     states: Vec<CarState>,
 }
 
 impl Trajectory {
-    /// A trajectory through these states; `wrong` makes the error of a state (counted from 0) or of the whole.
+    /// Checks the states; `wrong` makes the error of a state (counted from 0) or of the whole trajectory.
     fn checked(
         states: Vec<CarState>,
         wrong: impl Fn(Option<usize>, String) -> DataError,
@@ -144,7 +145,7 @@ impl Trajectory {
         Ok(Trajectory { states })
     }
 
-    /// A trajectory made by the program.
+    /// A generated trajectory.
     pub(crate) fn from_states(states: Vec<CarState>) -> Trajectory {
         Trajectory { states }
     }
@@ -169,7 +170,7 @@ impl Trajectory {
         })
     }
 
-    /// The CSV that [`Trajectory::read`] reads.
+    /// The trajectory in the CSV format of [`Trajectory::read`].
     pub fn to_csv(&self) -> String {
         let mut text = String::from("time_s,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,vx_mps,vy_mps,vz_mps\n");
         for state in &self.states {
@@ -189,8 +190,8 @@ impl Trajectory {
         [self.states[0].time_s, self.states[self.states.len() - 1].time_s]
     }
 
-    /// The motion at a time, s; `None` outside of the span. Between two states: the cubic through positions and velocities, and a turn at
-    /// an even rate.
+    /// The motion at a time, s; `None` outside the time span. Between two states: a cubic through positions and
+    /// velocities, and a constant angular velocity.
     pub fn at(&self, time_s: f64) -> Option<Motion> {
         let [first, last] = self.span_s();
         if !(first..=last).contains(&time_s) {

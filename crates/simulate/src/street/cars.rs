@@ -1,23 +1,23 @@
-//! Cars: boxes to detect, and the solids in them that a LiDAR sees.
+//! Cars of the street: boxes to detect, and the solids in them that the LiDAR sees.
 
 use crate::street::solid::{Material, Slice, Solid};
 use data::Stream;
 use geometry::Box3;
 use rand::RngExt;
 
-/// How a car is built, in shares of its length and height.
+/// Body style, relative to length and height.
 struct Style {
-    /// Middle of length, width and height, m.
+    /// Mean length, width and height, m.
     size_m: [f64; 3],
-    /// Height of the lower edge of the windows.
+    /// Height of the lower window edge.
     belt: f64,
-    /// Rear and front end of the windows, below and above, from -0.5 (rear) to 0.5 (front).
+    /// Rear and front end of the windows, at the bottom and top, from -0.5 (rear) to 0.5 (front).
     cabin: [[f64; 2]; 2],
-    /// How much the bonnet falls to the front.
+    /// Slope of the bonnet towards the front.
     bonnet_drop: f64,
 }
 
-/// Hatchback, saloon, SUV and van; together about 3.9 m x 1.6 m x 1.56 m.
+/// Hatchback, saloon, SUV and van; the mean size is about 3.9 m x 1.6 m x 1.56 m.
 const STYLES: [Style; 4] = [
     Style { size_m: [3.7, 1.60, 1.50], belt: 0.58, cabin: [[-0.48, 0.24], [-0.42, 0.04]], bonnet_drop: 0.06 },
     Style { size_m: [4.2, 1.64, 1.45], belt: 0.60, cabin: [[-0.38, 0.22], [-0.24, 0.04]], bonnet_drop: 0.05 },
@@ -25,17 +25,17 @@ const STYLES: [Style; 4] = [
     Style { size_m: [3.8, 1.62, 1.72], belt: 0.55, cabin: [[-0.50, 0.36], [-0.47, 0.20]], bonnet_drop: 0.08 },
 ];
 
-/// A car: its box, tight around all of it, and what it is made of.
+/// A car: its tight bounding box and its solids.
 #[derive(Clone, Debug)]
 pub struct Car {
-    /// The true box, wheels on the ground.
+    /// The true box, with the wheels on the ground.
     pub bbox: Box3,
     style: usize,
     paint: f64,
 }
 
 impl Car {
-    /// A car of some style, size and paint; its box stands at the origin until it is [placed](Car::placed).
+    /// Draws a car's style, size and paint; its box is at the origin until it is [placed](Car::placed).
     pub fn make(random: &mut Stream) -> Car {
         let style = random.random_range(0..STYLES.len());
         let scale = random.random_range(0.94..1.06);
@@ -44,7 +44,7 @@ impl Car {
         Car { bbox, style, paint: random.random_range(0.15..0.9) }
     }
 
-    /// The same car with its wheels on the ground at `place`, x, y, z in m.
+    /// The car moved to `place` (x, y, z in m) with its wheels on the ground.
     pub fn placed(mut self, [x, y, z]: [f64; 3], yaw_rad: f64) -> Car {
         self.bbox.center = [x, y, z + self.bbox.size[2] / 2.0];
         self.bbox.yaw_rad = yaw_rad;
@@ -52,7 +52,7 @@ impl Car {
         self
     }
 
-    /// Body, bonnet, windows under a roof, and two axles: all convex, all inside the box, touching each of its sides.
+    /// Body, bonnet, windows under a roof, and two axles: all convex, inside the box, and touching each of its sides.
     pub fn solids(&self) -> [Solid; 5] {
         let Style { belt, cabin, bonnet_drop, .. } = &STYLES[self.style];
         let [length, width, height] = self.bbox.size;

@@ -1,4 +1,4 @@
-//! What a synthetic road data set is made of, as people write it in TOML.
+//! TOML configuration of a synthetic street data set.
 
 use crate::SimulateError;
 use crate::street::scene::SceneConfig;
@@ -9,29 +9,29 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// A synthetic road data set. Every key may be left out.
+/// A synthetic street data set. All keys are optional.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RoadConfig {
-    /// Another seed gives other scenes.
+    /// Random seed of the scenes.
     pub seed: u64,
-    /// Number of frames of each split. Every frame is a scene of its own.
+    /// Number of frames per split. Every frame is an independent scene.
     pub frames: FrameCounts,
-    /// The road and what stands on it.
+    /// The road and the objects on it.
     pub scene: SceneConfig,
     /// The LiDAR.
     pub sensor: SensorConfig,
 }
 
-/// Number of frames of each split.
+/// Number of frames per split.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FrameCounts {
-    /// To learn from.
+    /// Training frames.
     pub train: usize,
-    /// To choose the best checkpoint with.
+    /// Validation frames, used to choose the best checkpoint.
     pub val: usize,
-    /// To report.
+    /// Test frames.
     pub test: usize,
 }
 
@@ -42,17 +42,17 @@ impl Default for FrameCounts {
 }
 
 impl FrameCounts {
-    /// Splits and their sizes, in the order in which they are made.
+    /// Splits and their sizes, in the order of generation.
     pub fn splits(&self) -> [(&'static str, usize); 3] {
         [("train", self.train), ("val", self.val), ("test", self.test)]
     }
 
-    /// Frames of all splits.
+    /// Total number of frames.
     pub fn total(&self) -> usize {
         self.train + self.val + self.test
     }
 
-    /// `total` frames in the proportions of these, at least one in each split; `None` for fewer than three frames.
+    /// `total` frames in the same proportions, at least one per split; `None` for fewer than three frames.
     pub fn scaled_to(&self, total: usize) -> Option<FrameCounts> {
         if total < 3 {
             return None;
@@ -65,12 +65,12 @@ impl FrameCounts {
 }
 
 impl RoadConfig {
-    /// Reads a TOML; what it leaves out keeps its default.
+    /// Reads a TOML file; missing keys keep their defaults.
     pub fn read(path: &Path) -> Result<Self, SimulateError> {
         Ok(read_toml(path, RoadConfig::check)?)
     }
 
-    /// Refuses what cannot be simulated, naming the key.
+    /// Checks the configuration; errors name the key.
     pub fn check(&self) -> Result<(), KeyError> {
         for (field, n) in
             [("frames.train", self.frames.train), ("frames.val", self.frames.val), ("frames.test", self.frames.test)]

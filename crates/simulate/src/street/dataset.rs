@@ -1,40 +1,49 @@
-//! A synthetic road data set on disk.
+//! Writes a synthetic street data set.
 
 use crate::SimulateError;
 use crate::street::config::RoadConfig;
 use crate::street::scene::Scene;
 use crate::street::sensor::scan;
-use data::write::{remove_unfinished, write_dataset_toml, write_kitti_frame, write_split};
-use data::{DataError, DatasetConfig, Frame, LabelFrame, Object, PointColumns, stream, write_json};
-use rayon::prelude::*;
+use data::{DatasetConfig, Frame, LabelFrame, Layout, NewDataset, Object, PointColumns, stream};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Version of the manifest.
+/// Schema version of the manifest.
 pub const MANIFEST_SCHEMA: &str = "lidarshift/simulated-dataset/1";
 
-/// A car with fewer points is not labelled: nobody could find it.
+/// Cars with fewer points are not labelled, as they could not be detected.
 const LEAST_POINTS: usize = 5;
 
-/// What a folder made by [`make_road_dataset`] holds: its `manifest.json`.
+/// Content of the `manifest.json` written by [`make_road_dataset`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// [`MANIFEST_SCHEMA`].
     pub schema: String,
-    /// Whether all frames are there. A run that was stopped leaves `false` and can be run again.
+    /// Whether all frames exist. An interrupted run leaves `false` and can be resumed.
     pub complete: bool,
-    /// Seed of the scenes.
+    /// Random seed of the scenes.
     pub seed: u64,
-    /// SHA-256 of the configuration, seed and numbers of frames included; another version of this program counts as another configuration.
+    /// SHA-256 of configuration, seed, numbers of frames and program version.
     pub config_sha256: String,
     /// The whole configuration.
     pub config: RoadConfig,
-    /// What is there, by split.
+    /// Counts by split.
     pub splits: BTreeMap<String, SplitCounts>,
+}
+
+impl data::Manifest for Manifest {
+    const OTHERWISE: &'static str = "from another configuration or version";
+
+    fn identity(&self) -> [&str; 2] {
+        [&self.schema, &self.config_sha256]
+    }
+
+    fn set_complete(&mut self, complete: bool) {
+        self.complete = complete;
+    }
 }
 
 /// What a split holds.
@@ -46,6 +55,20 @@ pub struct SplitCounts {
     pub cars: usize,
     /// Points.
     pub points: usize,
+}
+
+impl SplitCounts {
+    /// Sums over the frames of each split.
+    pub(crate) fn of_splits<'a>(frames: impl IntoIterator<Item = (&'a str, SplitCounts)>) -> BTreeMap<String, Self> {
+        let mut splits = BTreeMap::<String, SplitCounts>::new();
+        for (split, counts) in frames {
+            let sum = splits.entry(split.into()).or_default();
+            sum.frames += counts.frames;
+            sum.cars += counts.cars;
+            sum.points += counts.points;
+        }
+        splits
+    }
 }
 
 /// One frame: its cloud and the cars with at least five points on them, in the LiDAR frame.
@@ -68,17 +91,18 @@ fn frame_id(split: &str, index: usize) -> String {
     format!("{split}_{index:06}")
 }
 
-/// Makes a data set in the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`, `manifest.json`.
+/// Writes a data set to the folder `out`: `dataset.toml`, `velodyne/`, `label_2/` (label frame "lidar"), `ImageSets/`,
+/// `manifest.json`.
 ///
-/// `progress` hears how many frames of how many are there, from several threads. Frames that an earlier run with the same configuration
-/// finished are kept; a folder with other content is refused. The files do not depend on the number of threads.
+/// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an earlier
+/// run with the same configuration are kept; a folder with other content is an error. The files do not depend on the
+/// number of threads.
 pub fn make_road_dataset(
     config: &RoadConfig,
     out: &Path,
     progress: &(dyn Fn(usize, usize) + Sync),
 ) -> Result<Manifest, SimulateError> {
     config.check()?;
-    let manifest_path = out.join("manifest.json");
     let mut manifest = Manifest {
         schema: MANIFEST_SCHEMA.into(),
         complete: false,
@@ -87,64 +111,33 @@ pub fn make_road_dataset(
         config: config.clone(),
         splits: BTreeMap::new(),
     };
-    check_folder(out, &manifest_path, &manifest)?;
-    for inside in ["", "velodyne", "label_2", "ImageSets"] {
-        remove_unfinished(&out.join(inside))?;
-    }
-    write_json(&manifest_path, &manifest)?;
-
-    let jobs: Vec<(&str, usize)> =
-        config.frames.splits().into_iter().flat_map(|(split, n)| (0..n).map(move |i| (split, i))).collect();
-    let done = AtomicUsize::new(0);
-    progress(0, jobs.len());
-    let counts = jobs.par_iter().map(|(split, index)| {
-        let counts = make_frame_file(config, out, split, *index);
-        progress(done.fetch_add(1, Ordering::Relaxed) + 1, jobs.len());
-        counts.map(|counts| (*split, counts))
-    });
-    for (split, frame) in counts.collect::<Result<Vec<_>, _>>()? {
-        let sum = manifest.splits.entry(split.to_string()).or_default();
-        sum.frames += frame.frames;
-        sum.cars += frame.cars;
-        sum.points += frame.points;
-    }
-
-    for (split, n) in config.frames.splits() {
-        let ids: Vec<String> = (0..n).map(|i| frame_id(split, i)).collect();
-        write_split(&out.join(format!("ImageSets/{split}.txt")), &ids)?;
-    }
-    write_dataset_toml(&out.join("dataset.toml"), &dataset_config(config))?;
-    manifest.complete = true;
-    write_json(&manifest_path, &manifest)?;
+    let set = NewDataset::begin(out, Layout::Kitti, &[], &mut manifest)?;
+    let splits = config.frames.splits();
+    let ids = splits.map(|(split, n)| (split, (0..n).map(|i| frame_id(split, i)).collect()));
+    set.describe(dataset_config(), ids)?;
+    let frames: Vec<(&str, usize)> =
+        splits.into_iter().flat_map(|(split, n)| (0..n).map(move |i| (split, i))).collect();
+    let counts = set.make_frames(&frames, progress, |_, (split, index)| {
+        Ok::<_, SimulateError>((*split, make_frame_file(config, &set, split, *index)?))
+    })?;
+    manifest.splits = SplitCounts::of_splits(counts);
+    set.finish(&mut manifest)?;
     Ok(manifest)
 }
 
-/// Writes one frame, unless it is there; counts what it holds.
-fn make_frame_file(config: &RoadConfig, out: &Path, split: &str, index: usize) -> Result<SplitCounts, SimulateError> {
+/// Writes one frame unless it exists; returns its counts.
+fn make_frame_file(
+    config: &RoadConfig,
+    set: &NewDataset,
+    split: &str,
+    index: usize,
+) -> Result<SplitCounts, SimulateError> {
     let id = frame_id(split, index);
-    let (cloud, label) = (out.join(format!("velodyne/{id}.bin")), out.join(format!("label_2/{id}.txt")));
-    if !(cloud.is_file() && label.is_file()) {
-        write_kitti_frame(out, &make_road_frame(config, split, index))?;
+    if !set.has_frame(&id, true) {
+        set.layout().write_frame(set.root(), &make_road_frame(config, split, index))?;
     }
-    let cars = fs_err::read_to_string(&label)?.lines().count();
-    let points = fs_err::metadata(&cloud)?.len() as usize / (4 * size_of::<f32>());
+    let [points, cars] = set.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
-}
-
-/// The folder must be empty, or begun with the same configuration.
-fn check_folder(out: &Path, manifest_path: &Path, wanted: &Manifest) -> Result<(), SimulateError> {
-    if manifest_path.is_file() {
-        let text = fs_err::read_to_string(manifest_path)?;
-        let found: Manifest =
-            serde_json::from_str(&text).map_err(|e| DataError::line(manifest_path, e.line(), e.to_string()))?;
-        if found.config_sha256 != wanted.config_sha256 || found.schema != wanted.schema {
-            let message = "was made from another configuration or version; choose another folder, or remove this one";
-            return Err(DataError::file(out, message).into());
-        }
-    } else if out.is_dir() && fs_err::read_dir(out)?.next().is_some() {
-        return Err(DataError::file(out, "is not empty and has no manifest.json; choose another folder").into());
-    }
-    Ok(())
 }
 
 fn config_sha256(config: &RoadConfig) -> String {
@@ -153,15 +146,12 @@ fn config_sha256(config: &RoadConfig) -> String {
     digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-fn dataset_config(config: &RoadConfig) -> DatasetConfig {
-    let splits = config.frames.splits().map(|(split, _)| (split.to_string(), format!("ImageSets/{split}.txt").into()));
+fn dataset_config() -> DatasetConfig {
     DatasetConfig {
         name: "synthetic-road".into(),
-        root: ".".into(),
         points: PointColumns::Xyzi,
         label_frame: LabelFrame::Lidar,
         classes: vec!["Car".into()],
-        splits: splits.into(),
         ..DatasetConfig::default()
     }
 }
@@ -176,7 +166,7 @@ mod tests {
         RoadConfig { seed, frames: FrameCounts { train: 4, val: 2, test: 2 }, ..RoadConfig::default() }
     }
 
-    /// Every file below a folder with its bytes, by path.
+    /// All files below a folder with their bytes, by path.
     fn files(root: &Path) -> BTreeMap<String, Vec<u8>> {
         let (mut open, mut found) = (vec![root.to_owned()], BTreeMap::new());
         while let Some(folder) = open.pop() {

@@ -1,9 +1,9 @@
-//! A street with cars, walls, poles and things that are no cars, seen by one spinning LiDAR: a small data set of single frames.
+//! A street with cars, walls, poles and distractors, seen by one spinning LiDAR: a small data set of single frames.
 //!
-//! Everything is in the LiDAR frame: origin at the sensor, x forward, y left, z up, m; yaw counter-clockwise from +x, rad. A frame is a pure
-//! function of (configuration, split, index).
+//! All coordinates are in the LiDAR frame: origin at the sensor, x forward, y left, z up, m; yaw counter-clockwise
+//! from +x, rad. A frame is a pure function of (configuration, split, index).
 //!
-//! Every car with at least five points on it is labelled, however much of it is hidden; its label says how much (KITTI's occlusion level).
+//! Every car with at least five points is labelled, whatever its occlusion; the label has KITTI's occlusion level.
 
 pub mod cars;
 mod config;

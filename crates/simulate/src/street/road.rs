@@ -1,4 +1,4 @@
-//! The road under the sensor: where its lanes run, what its ground is made of and how high it lies.
+//! The road under the sensor: lanes, ground material and ground height.
 
 use crate::street::scene::SceneConfig;
 use crate::street::solid::{Hit, Material, dot};
@@ -7,19 +7,19 @@ use rand::RngExt;
 
 /// Width of a lane, m.
 pub const LANE_M: f64 = 3.4;
-/// Width of a strip of parked cars, m.
+/// Width of a parking strip, m.
 pub const PARKING_M: f64 = 2.2;
 
-/// A road, slightly bent, on slightly uneven ground, with the sensor above its right side.
+/// A slightly curved road on slightly uneven ground; the sensor is above its right side.
 #[derive(Clone, Debug)]
 pub struct Road {
-    /// Middle of the road, as y = a + b x + c x2, m.
+    /// Centre line y = a + b x + c x2, m.
     middle: [f64; 3],
-    /// Lanes in each direction; traffic keeps right.
+    /// Lanes per direction; right-hand traffic.
     pub lanes: u32,
-    /// Whether cars park on the right side, and on the left.
+    /// Whether there are parked cars on the right and on the left side.
     pub parking: [bool; 2],
-    /// Distance from the middle of the road to the walls, right and left, m.
+    /// Distance from the centre line to the walls, right and left, m.
     pub wall_m: [f64; 2],
     ground: Ground,
 }
@@ -29,12 +29,12 @@ pub struct Road {
 struct Ground {
     height_m: f64,
     slope: [f64; 2],
-    /// Wave vector (1/m), phase (rad) and amplitude (m) of each wave of the bumps.
+    /// Wave vector (rad/m), phase (rad) and amplitude (m) of each sine wave of the bumps.
     waves: [([f64; 2], f64, f64); 3],
 }
 
 impl Road {
-    /// A road with the sensor `sensor_height_m` above it.
+    /// Draws a road with the sensor `sensor_height_m` above it.
     pub fn make(config: &SceneConfig, sensor_height_m: f64, random: &mut Stream) -> Road {
         let lanes = random.random_range(1..=2u32);
         let own_lane = random.random_range(0..lanes);
@@ -59,12 +59,12 @@ impl Road {
         Road { middle: [from_sensor_to_middle, yaw_rad.tan(), bend_per_m / 2.0], lanes, parking, wall_m, ground }
     }
 
-    /// Half the width of the road on its right (0) or left (1) side, parked cars included, m.
+    /// Half width of the road on its right (0) or left (1) side, including parked cars, m.
     pub fn half_width_m(&self, side: usize) -> f64 {
         f64::from(self.lanes) * LANE_M + if self.parking[side] { PARKING_M } else { 0.0 }
     }
 
-    /// The place `lateral_m` to the left of the middle of the road near x = `along_m`: x, y (m) and heading of the road (rad).
+    /// Position `lateral_m` to the left of the centre line near x = `along_m`: x, y (m) and heading of the road (rad).
     pub fn place(&self, along_m: f64, lateral_m: f64) -> ([f64; 2], f64) {
         let [a, b, c] = self.middle;
         let yaw_rad = (b + 2.0 * c * along_m).atan();
@@ -72,19 +72,19 @@ impl Road {
         ([along_m - lateral_m * yaw_rad.sin(), y + lateral_m * yaw_rad.cos()], yaw_rad)
     }
 
-    /// How far to the left of the middle of the road a place is, m.
+    /// Lateral offset to the left of the centre line, m.
     pub fn lateral_m(&self, [x, y]: [f64; 2]) -> f64 {
         let [a, b, c] = self.middle;
         (y - a - (b + c * x) * x) * (b + 2.0 * c * x).atan().cos()
     }
 
-    /// Height of the ground without its bumps, m.
+    /// Height of the ground without bumps, m.
     pub fn height_m(&self, [x, y]: [f64; 2]) -> f64 {
         let Ground { height_m, slope, .. } = &self.ground;
         height_m + slope[0] * x + slope[1] * y
     }
 
-    /// Where a ray from the origin meets the ground.
+    /// Intersection of a ray from the origin with the ground.
     pub fn hit(&self, direction: [f64; 3]) -> Option<Hit> {
         let Ground { height_m, slope, waves } = &self.ground;
         let sinking = slope[0] * direction[0] + slope[1] * direction[1] - direction[2];

@@ -1,4 +1,4 @@
-//! What stands beside the road and is no car.
+//! Roadside objects other than cars.
 
 use crate::street::road::Road;
 use crate::street::scene::Taken;
@@ -8,7 +8,7 @@ use geometry::Box3;
 use rand::RngExt;
 use std::f64::consts::PI;
 
-/// Nothing is placed beyond, m.
+/// Maximum distance of objects, m.
 const FAR_M: f64 = 75.0;
 
 fn sign(side: usize) -> f64 {
@@ -59,7 +59,7 @@ pub(crate) fn poles(road: &Road, taken: &mut Taken, random: &mut Stream) -> Vec<
     solids
 }
 
-/// Up to `count` things between the road and the walls that a detector may take for a car.
+/// Up to `count` objects between the road and the walls that a detector may mistake for a car.
 pub(crate) fn distractors(road: &Road, count: u32, taken: &mut Taken, random: &mut Stream) -> Vec<Solid> {
     let mut solids = Vec::new();
     for _ in 0..count {
@@ -112,7 +112,7 @@ fn distractor(road: &Road, place: [f64; 2], yaw_rad: f64, taken: &mut Taken, ran
     }
 }
 
-/// A box of that size with its base on the ground.
+/// A box of this size with its base on the ground.
 fn standing(road: &Road, [x, y]: [f64; 2], size: [f64; 3], yaw_rad: f64) -> Box3 {
     Box3 { center: [x, y, road.height_m([x, y]) + size[2] / 2.0], size, yaw_rad }
 }

@@ -1,4 +1,4 @@
-//! One scene: a road, cars on and beside it, and what stands around.
+//! A street scene: a road, cars, and other objects.
 
 use crate::street::cars::Car;
 use crate::street::road::{LANE_M, PARKING_M, Road};
@@ -15,26 +15,26 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 
-/// Centres of cars lie between these distances ahead of the sensor, m.
+/// Range of car centres ahead of the sensor, m.
 pub const CAR_AHEAD_M: [f64; 2] = [3.0, 60.0];
-/// Centres of cars lie at most that far to the left or right of the sensor, m.
+/// Maximum lateral distance of car centres from the sensor, m.
 pub const CAR_ASIDE_M: f64 = 30.0;
 
-/// The road and what stands on it.
+/// The road and the objects on it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SceneConfig {
-    /// Least and greatest number of cars of a scene. Cars that find no free place are left out.
+    /// Minimum and maximum number of cars per scene. Cars without a free position are omitted.
     pub cars: [u32; 2],
-    /// Share of the cars that stand beside the road, with any heading; the others follow the road.
+    /// Fraction of the cars beside the road, with any heading; the others follow the road.
     pub any_heading_share: f64,
-    /// Least and greatest number of things that are no cars: pillars, bushes, bins, signs, containers, trees.
+    /// Minimum and maximum number of distractors: pillars, bushes, bins, signs, containers, trees.
     pub distractors: [u32; 2],
-    /// Greatest slope of the ground, m per m.
+    /// Maximum slope of the ground, m per m.
     pub max_slope: f64,
-    /// Height of the waves of the ground, m.
+    /// Height of the ground waves, m.
     pub roughness_m: f64,
-    /// Greatest angle between the sensor's forward axis and the road, degrees.
+    /// Maximum angle between the sensor's forward axis and the road, degrees.
     pub max_road_yaw_deg: f64,
 }
 
@@ -65,19 +65,19 @@ impl SceneConfig {
     }
 }
 
-/// All that a ray can meet.
+/// Everything that rays can hit.
 #[derive(Clone, Debug)]
 pub struct Scene {
     /// Road and ground.
     pub road: Road,
-    /// Cars, walls and everything else above the ground.
+    /// Cars, walls and other objects above the ground.
     pub solids: Vec<Solid>,
-    /// The true boxes of the cars; [`Solid::car`] counts in this list.
+    /// True boxes of the cars; [`Solid::car`] is an index into this list.
     pub cars: Vec<Box3>,
 }
 
 impl Scene {
-    /// A scene in front of `sensor`.
+    /// Draws a scene in front of `sensor`.
     pub fn make(config: &SceneConfig, sensor: &SensorConfig, random: &mut Stream) -> Scene {
         let road = Road::make(config, sensor.height_m, random);
         let mut taken = Taken::default();
@@ -96,12 +96,12 @@ impl Scene {
     }
 }
 
-/// The places where something stands already.
+/// Occupied positions.
 #[derive(Default)]
 pub(crate) struct Taken(Vec<Box3>);
 
 impl Taken {
-    /// Takes the base of `b`, unless something stands nearer than `gap_m` to it.
+    /// Occupies the base of `b` and returns true, unless an object is closer than `gap_m`.
     pub(crate) fn try_take(&mut self, b: &Box3, gap_m: f64) -> bool {
         let wide = Box3 { size: [b.size[0] + 2.0 * gap_m, b.size[1] + 2.0 * gap_m, b.size[2]], ..*b };
         let free = self.0.iter().all(|other| bev_intersection(&wide, other) == 0.0);
@@ -112,7 +112,7 @@ impl Taken {
     }
 }
 
-/// A car at a free place that the sensor covers whole; `None` when none was found in some tries.
+/// A car at a free position within the sensor's field of view; `None` if none was found after several tries.
 fn place_car(
     config: &SceneConfig,
     sensor: &SensorConfig,
@@ -138,7 +138,7 @@ fn place_car(
     None
 }
 
-/// A place in a lane, or at the kerb where cars park; traffic keeps right, parked cars look either way.
+/// A position in a lane, or at the kerb if cars are parked there; right-hand traffic, parked cars face either way.
 fn along_the_road(road: &Road, random: &mut Stream) -> ([f64; 2], f64) {
     let along_m = random.random_range(CAR_AHEAD_M[0]..CAR_AHEAD_M[1]);
     let left = random.random_bool(0.5);
@@ -153,7 +153,7 @@ fn along_the_road(road: &Road, random: &mut Stream) -> ([f64; 2], f64) {
     (place, road_yaw + swerve.sample(random) + if turned { PI } else { 0.0 })
 }
 
-/// A place between the road and the walls, with any heading.
+/// A position between the road and the walls, with any heading.
 fn beside_the_road(road: &Road, random: &mut Stream) -> ([f64; 2], f64) {
     let along_m = random.random_range(CAR_AHEAD_M[0]..CAR_AHEAD_M[1]);
     let side = usize::from(random.random_bool(0.5));

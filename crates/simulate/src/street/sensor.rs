@@ -1,4 +1,4 @@
-//! A spinning LiDAR of many beams: which rays it sends, and what comes back.
+//! A spinning multi-beam LiDAR: its rays and returns.
 
 use crate::street::scene::Scene;
 use crate::street::solid::{Hit, Material};
@@ -10,39 +10,40 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Light that must come back for a point, as reflectivity x cosine of incidence / range squared (1/m2). Asphalt fades out at about 50 m.
+/// Detection threshold: reflectivity x cosine of incidence / range squared (1/m2). Asphalt is detected up to about 50
+/// m.
 const LEAST_LIGHT_PER_M2: f64 = 4e-6;
 
-/// The LiDAR. The default covers the heights of a Velodyne HDL-64E (2 degrees above to 24.8 below the horizon, the upper of two blocks of
-/// lasers denser) with fewer beams, and turns through the region ahead only.
+/// The LiDAR. The default has the elevation range of a Velodyne HDL-64E (2 degrees above to 24.8 below the horizon,
+/// the upper of two laser blocks denser) with fewer beams, and covers only the region ahead.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorConfig {
     /// Height above the road, m.
     pub height_m: f64,
-    /// Blocks of lasers, from the top.
+    /// Laser blocks, from the top.
     pub beam_blocks: Vec<BeamBlock>,
-    /// Region that is measured, half of it to the left of the forward axis, degrees.
+    /// Horizontal field of view, centred on the forward axis, degrees.
     pub horizontal_fov_deg: f64,
-    /// Angle between two columns of points, degrees.
+    /// Azimuth step between columns, degrees.
     pub azimuth_step_deg: f64,
-    /// Nothing is measured beyond, m.
+    /// Maximum range, m.
     pub max_range_m: f64,
-    /// Standard deviation of a range, m.
+    /// Standard deviation of the range noise, m.
     pub range_noise_m: f64,
-    /// Share of the returns that are lost anyway.
+    /// Fraction of the returns lost at random.
     pub dropout: f64,
 }
 
-/// Lasers at equal angles.
+/// Lasers with equal angular spacing.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct BeamBlock {
     /// Number of lasers.
     pub rows: u32,
-    /// Elevation of the first, degrees above the horizon.
+    /// Elevation of the first laser, degrees above the horizon.
     pub top_deg: f64,
-    /// Elevation of the last, degrees above the horizon.
+    /// Elevation of the last laser, degrees above the horizon.
     pub bottom_deg: f64,
 }
 
@@ -80,7 +81,7 @@ impl SensorConfig {
         within("sensor.dropout", self.dropout, 0.0, 0.99)
     }
 
-    /// Whether a place (x, y) lies in the region that is measured.
+    /// Whether a position (x, y) is in the horizontal field of view.
     pub fn covers(&self, [x, y]: [f64; 2]) -> bool {
         y.atan2(x).abs().to_degrees() <= self.horizontal_fov_deg / 2.0
     }
@@ -102,28 +103,29 @@ impl SensorConfig {
     }
 }
 
-/// What the sensor saw of one scene.
+/// The scan of one scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scan {
-    /// x, y, z (m, to 1 mm) and intensity (0 to 1, in steps of 0.01, as in KITTI); row after row from the top, each from left to right.
+    /// x, y, z (m, rounded to 1 mm) and intensity (0 to 1, in steps of 0.01, as in KITTI); row by row from the top,
+    /// each from left to right.
     pub cloud: Cloud,
-    /// How each car of the scene was seen.
+    /// Visibility of each car of the scene.
     pub cars: Vec<Sight>,
 }
 
-/// How much of a car was seen.
+/// Visibility of a car.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub struct Sight {
-    /// Points on it.
+    /// Points on the car.
     pub points: usize,
-    /// Rays that meet it.
+    /// Rays that would hit it without occlusion.
     pub rays: usize,
-    /// Rays that meet it before anything else.
+    /// Rays that hit it first.
     pub free_rays: usize,
 }
 
 impl Sight {
-    /// KITTI's occlusion level: 0 for a car in view, 1 for one in part behind something, 2 for one for the most part behind something.
+    /// KITTI's occlusion level: 0 visible, 1 partly occluded, 2 largely occluded.
     pub fn occlusion(&self) -> i32 {
         match self.free_rays as f64 / self.rays.max(1) as f64 {
             free if free > 0.8 => 0,
@@ -133,7 +135,7 @@ impl Sight {
     }
 }
 
-/// One turn of the sensor.
+/// Simulates one scan.
 pub fn scan(scene: &Scene, sensor: &SensorConfig, random: &mut Stream) -> Scan {
     let azimuths = sensor.azimuths_rad();
     let columns: Vec<Vec<usize>> = azimuths.iter().map(|azimuth| in_sight(scene, *azimuth)).collect();
@@ -154,7 +156,7 @@ pub fn scan(scene: &Scene, sensor: &SensorConfig, random: &mut Stream) -> Scan {
     Scan { cloud, cars }
 }
 
-/// The solids that a column of rays may meet.
+/// Solids that a column of rays may hit.
 fn in_sight(scene: &Scene, azimuth_rad: f64) -> Vec<usize> {
     let near = |solid: &crate::street::solid::Solid| {
         let (middle, half) = solid.azimuths();
@@ -163,13 +165,13 @@ fn in_sight(scene: &Scene, azimuth_rad: f64) -> Vec<usize> {
     scene.solids.iter().enumerate().filter(|(_, solid)| near(solid)).map(|(i, _)| i).collect()
 }
 
-/// The nearest surface along a ray and the car it belongs to; counts the cars that the ray meets.
+/// The nearest surface along a ray and its car; counts the cars that the ray hits.
 fn cast(scene: &Scene, candidates: &[usize], direction: [f64; 3], cars: &mut [Sight]) -> (Option<Hit>, Option<usize>) {
     let (mut nearest, mut owner, mut last_counted) = (scene.road.hit(direction), None, None);
     for solid in candidates.iter().map(|i| &scene.solids[*i]) {
         let Some(hit) = solid.hit(direction) else { continue };
         if let Some(car) = solid.car.filter(|car| last_counted != Some(*car)) {
-            last_counted = Some(car); // the solids of a car follow each other
+            last_counted = Some(car); // solids of a car are consecutive
             cars[car].rays += 1;
         }
         if nearest.is_none_or(|n| hit.range_m < n.range_m) {
@@ -182,7 +184,7 @@ fn cast(scene: &Scene, candidates: &[usize], direction: [f64; 3], cars: &mut [Si
     (nearest, owner)
 }
 
-/// Range (m) and intensity that come back from a surface, or nothing.
+/// Range (m) and intensity returned by a surface, or `None`.
 fn measure(hit: &Hit, sensor: &SensorConfig, random: &mut Stream) -> Option<[f64; 2]> {
     let (lost, depth, noise): (f64, f64, [f64; 2]) =
         (random.random(), random.random(), [0, 1].map(|_| StandardNormal.sample(random)));

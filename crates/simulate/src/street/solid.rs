@@ -1,20 +1,20 @@
-//! Rays from the sensor against convex solids.
+//! Ray casting from the sensor against convex solids.
 //!
-//! One primitive serves for all: a convex solid is the space behind its planes, and a ray is inside from the last plane that it enters
-//! to the first that it leaves. Rays start at the origin, where the sensor is.
+//! The only primitive is a convex solid, given by half spaces: a ray is inside from the last plane it enters to the
+//! first it leaves. Rays start at the origin, where the sensor is.
 
 use geometry::Box3;
 
-/// What a surface is made of; decides intensity and lost returns.
+/// Surface material; determines intensity and lost returns.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Material {
     /// The road.
     Asphalt,
-    /// White lines on the road.
+    /// White road markings.
     Marking,
     /// Pavement and grass beside the road.
     Verge,
-    /// Plaster, brick, concrete; with its reflectivity.
+    /// Plaster, brick or concrete, with its reflectivity.
     Wall(f64),
     /// Car paint, with its reflectivity.
     Paint(f64),
@@ -24,7 +24,7 @@ pub enum Material {
     Rubber,
     /// Poles and signs.
     Metal,
-    /// Leaves: a surface without an exact place.
+    /// Leaves: a surface with random depth.
     Leaves,
 }
 
@@ -39,31 +39,31 @@ struct Plane {
 #[derive(Clone, Debug)]
 pub struct Solid {
     planes: Vec<Plane>,
-    /// A circle around it, seen from above: centre and radius, m.
+    /// Bounding circle in bird's eye view: centre and radius, m.
     circle: ([f64; 2], f64),
-    /// Material of what is seen from the side, and from above.
+    /// Material of the sides and of the top.
     pub materials: [Material; 2],
     /// Index of the car it belongs to.
     pub car: Option<usize>,
 }
 
-/// Where a ray meets a surface.
+/// Intersection of a ray with a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Distance from the sensor, m.
     pub range_m: f64,
-    /// Cosine of the angle of incidence: 1 for a ray along the surface's normal.
+    /// Cosine of the angle of incidence: 1 at normal incidence.
     pub cos_incidence: f64,
-    /// What is hit.
+    /// Material.
     pub material: Material,
 }
 
-/// A rectangle at one height of a [`Solid::frustum`]: from `x[0]` to `x[1]`, `half_width` to both sides, m.
+/// A cross-section of a [`Solid::frustum`] at one height: from `x[0]` to `x[1]`, `half_width` to both sides, m.
 #[derive(Clone, Copy, Debug)]
 pub struct Slice {
     /// Rear and front end.
     pub x: [f64; 2],
-    /// To the left and to the right.
+    /// Half width to the left and right.
     pub half_width: f64,
 }
 
@@ -74,7 +74,8 @@ impl Solid {
         Solid::frustum(b, [slice, slice], [-b.size[2] / 2.0, b.size[2] / 2.0], [material; 2])
     }
 
-    /// The solid between two rectangles, one above the other, given in the frame of `frame` (origin at its centre, x along its heading).
+    /// The solid between two rectangles, one above the other, in the frame of the box `frame` (origin at its centre, x
+    /// along its heading).
     pub fn frustum(frame: &Box3, [low, high]: [Slice; 2], z: [f64; 2], materials: [Material; 2]) -> Solid {
         let dz = z[1] - z[0];
         let local = [
@@ -90,7 +91,7 @@ impl Solid {
         Solid::of_planes(frame, &local, radius_m, materials)
     }
 
-    /// An upright prism of eight sides around a circle: poles, trunks, bushes.
+    /// An upright prism with eight sides around a circle: poles, trunks, bushes.
     pub fn column(center: [f64; 3], radius_m: f64, height_m: f64, material: Material) -> Solid {
         let frame = Box3 { center, size: [2.0 * radius_m, 2.0 * radius_m, height_m], yaw_rad: 0.0 };
         let half = height_m / 2.0;
@@ -102,7 +103,7 @@ impl Solid {
         Solid::of_planes(&frame, &local, radius_m * 1.09, [material; 2])
     }
 
-    /// From planes (normal of any length, and a point on it) in the frame of a box.
+    /// From planes (normal of any length, and a point) in the frame of a box.
     fn of_planes(frame: &Box3, local: &[([f64; 3], [f64; 3])], radius_m: f64, materials: [Material; 2]) -> Solid {
         let (s, c) = frame.yaw_rad.sin_cos();
         let planes = local.iter().map(|(n, point)| {
@@ -113,12 +114,12 @@ impl Solid {
         Solid { planes: planes.collect(), circle: ([frame.center[0], frame.center[1]], radius_m), materials, car: None }
     }
 
-    /// The same solid as a part of car `index`.
+    /// The solid as a part of car `index`.
     pub fn of_car(self, index: usize) -> Solid {
         Solid { car: Some(index), ..self }
     }
 
-    /// Where a ray from the origin along the unit vector `direction` enters.
+    /// Entry point of a ray from the origin along the unit vector `direction`.
     pub fn hit(&self, direction: [f64; 3]) -> Option<Hit> {
         let (mut enter, mut leave, mut normal) = (0.0, f64::INFINITY, None);
         for plane in &self.planes {
@@ -142,7 +143,8 @@ impl Solid {
         Some(Hit { range_m: enter, cos_incidence: -dot(normal, direction), material })
     }
 
-    /// Middle and half width of the azimuths under which it may be seen, rad; half width pi when it surrounds the sensor.
+    /// Centre and half width of the azimuth interval in which it may be visible, rad; half width pi if it surrounds
+    /// the sensor.
     pub fn azimuths(&self) -> (f64, f64) {
         let ([x, y], radius) = self.circle;
         let distance = x.hypot(y);

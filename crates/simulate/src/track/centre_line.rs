@@ -1,4 +1,4 @@
-//! The centre line of a closed track: a table of places, and a smooth curve through them.
+//! The centre line of a closed track: a table of points, and a smooth curve through them.
 
 use data::DataError;
 use serde::Deserialize;
@@ -6,7 +6,7 @@ use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// One place of the table, in the world: x east, y north, z up, m.
+/// A point of the table, in the world frame: x east, y north, z up, m.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CentrePoint {
@@ -14,15 +14,15 @@ pub struct CentrePoint {
     pub x_m: f64,
     /// North, m.
     pub y_m: f64,
-    /// Up, m; 0 where the table has no such column.
+    /// Up, m; 0 if the table has no such column.
     #[serde(default)]
     pub z_m: f64,
-    /// Cross slope, degrees; positive when the right side is higher, as for left turns.
+    /// Cross slope, degrees; positive if the right side is higher, as in left turns.
     #[serde(default)]
     pub bank_deg: f64,
-    /// To the left edge, m.
+    /// Distance to the left edge, m.
     pub width_left_m: f64,
-    /// To the right edge, m.
+    /// Distance to the right edge, m.
     pub width_right_m: f64,
 }
 
@@ -32,33 +32,33 @@ impl CentrePoint {
     }
 }
 
-/// A closed centre line; places are told by the way from its first point, m, and wrap around.
+/// A closed centre line. Positions are given by the arc length from its first point, m, modulo the lap.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CentreLine {
     points: Vec<CentrePoint>,
-    /// Way to each point, and the whole lap behind the last, m.
+    /// Arc length at each point, and the lap length at the end, m.
     way_m: Vec<f64>,
 }
 
-/// What the track is like at one place of its centre line.
+/// Geometry of the track at one position.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Station {
-    /// The centre, m.
+    /// Centre, m.
     pub position: [f64; 3],
     /// Direction of travel, rad, counter-clockwise from +x.
     pub heading_rad: f64,
-    /// Rise along the way, m per m.
+    /// Longitudinal slope, m per m.
     pub slope: f64,
-    /// Cross slope, rad; positive when the right side is higher.
+    /// Cross slope, rad; positive if the right side is higher.
     pub bank_rad: f64,
-    /// To the left edge, m.
+    /// Distance to the left edge, m.
     pub width_left_m: f64,
-    /// To the right edge, m.
+    /// Distance to the right edge, m.
     pub width_right_m: f64,
 }
 
 impl CentreLine {
-    /// A closed line through these points; `wrong` makes the error of a point (counted from 0) or of the whole.
+    /// A closed line through these points; `wrong` makes the error of a point (counted from 0) or of the whole line.
     fn new(
         points: Vec<CentrePoint>,
         wrong: impl Fn(Option<usize>, String) -> DataError,
@@ -95,7 +95,8 @@ impl CentreLine {
         Ok(CentreLine { points, way_m })
     }
 
-    /// Reads a CSV with the columns `x_m, y_m, z_m, bank_deg, width_left_m, width_right_m`; `z_m` or `bank_deg` may be left out.
+    /// Reads a CSV with the columns `x_m, y_m, z_m, bank_deg, width_left_m, width_right_m`; `z_m` and `bank_deg` are
+    /// optional.
     pub fn read(path: &Path) -> Result<CentreLine, DataError> {
         let bytes = fs_err::read(path)?;
         let mut reader =
@@ -116,13 +117,13 @@ impl CentreLine {
         })
     }
 
-    /// A line through points made by the program.
+    /// A line through generated points.
     pub(crate) fn from_points(points: Vec<CentrePoint>) -> CentreLine {
         let wrong = |_, message| DataError::file(Path::new("built-in track"), message);
         CentreLine::new(points, wrong).expect("a track made by the program is a track")
     }
 
-    /// The table as CSV, to the millimetre.
+    /// The table as CSV, rounded to 1 mm.
     pub fn to_csv(&self) -> String {
         let mut text = String::from("x_m,y_m,z_m,bank_deg,width_left_m,width_right_m\n");
         for p in &self.points {
@@ -137,12 +138,12 @@ impl CentreLine {
         self.way_m[self.points.len()]
     }
 
-    /// The places of the table.
+    /// The points of the table.
     pub fn points(&self) -> &[CentrePoint] {
         &self.points
     }
 
-    /// The track at `way_m` from the first point.
+    /// The track at arc length `way_m`.
     pub fn at(&self, way_m: f64) -> Station {
         let n = self.points.len();
         let way = way_m.rem_euclid(self.length_m());
@@ -175,8 +176,8 @@ impl CentreLine {
         }
     }
 
-    /// The way of the centre line that is nearest to a place, and how far to the left of it the place is, m. Exact where the place is
-    /// nearer to the line than its radius of curvature.
+    /// Arc length of the nearest point of the centre line, and the lateral offset to its left, m. Exact if the offset
+    /// is smaller than the radius of curvature.
     pub fn project(&self, [x, y]: [f64; 2]) -> (f64, f64) {
         let distance = |p: &CentrePoint| (p.x_m - x).hypot(p.y_m - y);
         let nearest = (0..self.points.len())
@@ -198,7 +199,7 @@ impl CentreLine {
         (way.rem_euclid(self.length_m()), left)
     }
 
-    /// Whether the line turns once to the left in a lap.
+    /// Whether the line makes one left turn per lap.
     pub fn turns_left(&self) -> bool {
         let n = self.points.len();
         let heading = |i: usize| {

@@ -1,4 +1,4 @@
-//! The track and what stands around it, as triangles.
+//! The track and its surroundings as triangle meshes.
 
 mod centre_line;
 mod oval;
@@ -15,22 +15,24 @@ use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vect
 use sensor::effects::Undulation;
 use sensor::object::Group;
 
-/// A track on a centre line.
+/// A track with its surroundings.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Track {
     /// Its centre line; turns to the left.
     pub line: CentreLine,
-    /// Seed of what stands around.
+    /// Seed of the surroundings.
     pub seed: u64,
 }
 
 impl Track {
-    /// Height of the surface at `way_m` along and `left_m` to the left of the centre line, m; apron and infield inside, ground outside.
+    /// Height of the surface at `way_m` along and `left_m` to the left of the centre line, m; includes apron, infield
+    /// and outside ground.
     pub fn height_m(&self, way_m: f64, left_m: f64) -> f64 {
         surface::height_m(&self.line.at(way_m), left_m)
     }
 
-    /// The frame of a car on the surface: x along the track turned left by `yaw_rad`, z the surface's normal, origin `above_m` above it.
+    /// Pose of a car on the surface: x along the track, rotated left by `yaw_rad`, z along the surface normal, origin
+    /// `above_m` above it.
     pub fn pose_on(&self, way_m: f64, left_m: f64, yaw_rad: f64, above_m: f64) -> Pose {
         let station = self.line.at(way_m);
         let (s, c) = station.heading_rad.sin_cos();
@@ -46,18 +48,18 @@ impl Track {
         Isometry3::from_parts(Translation3::from(ground + up * above_m), rotation)
     }
 
-    /// How far to the left a car's middle may be at `way_m`, least and greatest, m, with `margin_m` to both edges.
+    /// Minimum and maximum lateral offset of a car's centre at `way_m`, with `margin_m` to both edges, m.
     pub fn lateral_limits_m(&self, way_m: f64, margin_m: f64) -> [f64; 2] {
         let station = self.line.at(way_m);
         [margin_m - station.width_right_m, station.width_left_m - margin_m]
     }
 
-    /// Where the face of the outer wall is at `way_m`, m to the left of the centre line: a negative number.
+    /// Lateral position of the outer wall's face at `way_m`, to the left of the centre line, m: negative.
     pub fn outer_wall_m(&self, way_m: f64) -> f64 {
         -self.line.at(way_m).width_right_m - surface::WALL_GAP_M
     }
 
-    /// Everything that stands still, in the world's frame.
+    /// All static objects of these groups, in the world frame.
     pub fn mesh(&self, groups: &[Group], undulation: Option<Undulation>) -> Mesh {
         let mut mesh = Mesh::default();
         for group in Group::ALL.into_iter().filter(|g| groups.contains(g)) {

@@ -1,34 +1,36 @@
-//! The default track: an oval after the Las Vegas Motor Speedway, made from what is published of it.
+//! The default track: an oval modelled on the Las Vegas Motor Speedway from published figures.
 //!
-//! - A lap of 2,454 m, 12.5 to 15.5 m wide, banking of 6 to 20 degrees: figures of the Indy Autonomous Challenge's track.
-//! - D-shaped, left turns of 20 degrees, a front stretch of 9 degrees with a bend in its middle: iRacing's and the circuit's own description.
-//! - Front stretch 2,275 ft (693 m), back stretch 1,572 ft (479 m): the circuit's fact sheets. The lap they add up to is the 1.5 miles
+//! - A lap of 2,454 m, 12.5 to 15.5 m wide, banking of 6 to 20 degrees: figures of the Indy Autonomous Challenge.
+//! - D-shaped, left turns of 20 degrees, a front stretch of 9 degrees with a bend in its middle: descriptions of
+//!   iRacing and the circuit.
+//! - Front stretch 2,275 ft (693 m), back stretch 1,572 ft (479 m): the circuit's fact sheets. Their lap is 1.5 miles
 //!   (2,414 m) along the lower line; here all lengths are scaled to the lap above.
 //!
-//! Where the transitions lie and how the width changes is not published and chosen plausibly.
+//! The positions of the transitions and the change of width are not published and are plausible guesses.
 
 use super::centre_line::{CentreLine, CentrePoint};
 use std::f64::consts::PI;
 
 /// Length of a lap along the centre line, m.
 const LAP_M: f64 = 2454.0;
-/// Narrowest and widest place, m.
+/// Minimum and maximum width, m.
 const WIDTH_M: [f64; 2] = [12.5, 15.5];
 const BACK_BANK_DEG: f64 = 6.0;
 const FRONT_BANK_DEG: f64 = 9.0;
 const TURN_BANK_DEG: f64 = 20.0;
-/// Before all is scaled to the lap, m.
+/// Before scaling to the lap length, m.
 const BACK_STRETCH_M: f64 = 479.0;
 const TURN_RADIUS_M: f64 = 190.0;
 const BEND_RADIUS_M: f64 = 500.0;
-/// Half the angle of the bend of the front stretch, rad.
+/// Half the angle of the bend in the front stretch, rad.
 const HALF_BEND_RAD: f64 = 0.22;
-/// Way on which curvature and banking change between straight and turn, m.
+/// Length over which curvature and banking change between straight and turn, m.
 const TRANSITION_M: f64 = 90.0;
-/// Way between two points of the table, m.
+/// Spacing of the table, m.
 const STEP_M: f64 = 4.0;
 
-/// A part of the half lap: its length, curvature (1/m) and banking (degrees) at both ends, between which both change evenly.
+/// A part of the half lap: length, and curvature (1/m) and banking (degrees) at both ends, with linear interpolation
+/// between.
 #[derive(Clone, Copy)]
 struct Part {
     length_m: f64,
@@ -36,10 +38,12 @@ struct Part {
     bank_deg: [f64; 2],
 }
 
-/// From the middle of the front stretch to the middle of the back stretch; `straight_m` is the straight half of the front stretch.
+/// From the middle of the front stretch to the middle of the back stretch; `straight_m` is the length of the straight
+/// half of the front stretch.
 fn half_lap(straight_m: f64) -> [Part; 6] {
     let (turn, bend) = (1.0 / TURN_RADIUS_M, 1.0 / BEND_RADIUS_M);
-    let arc_m = (PI - HALF_BEND_RAD) * TURN_RADIUS_M - TRANSITION_M; // the transitions turn by half of an arc of their length
+    // A transition turns by half as much as an arc of its length.
+    let arc_m = (PI - HALF_BEND_RAD) * TURN_RADIUS_M - TRANSITION_M;
     let part = |length_m, curvature, bank_deg| Part { length_m, curvature, bank_deg };
     [
         part(HALF_BEND_RAD / bend - 20.0, [bend; 2], [FRONT_BANK_DEG + 1.0; 2]),
@@ -51,7 +55,7 @@ fn half_lap(straight_m: f64) -> [Part; 6] {
     ]
 }
 
-/// Position and heading after `way` of the half lap, and the banking there; beyond the parts it goes straight on.
+/// Position, heading and banking after `way_m` of the half lap; straight beyond its end.
 fn trace(parts: &[Part], way_m: f64) -> ([f64; 2], f64) {
     let (mut left, mut position, mut heading) = (way_m, [0.0; 2], 0.0_f64);
     let mut go = |length_m: f64, curvature: [f64; 2], whole_m: f64| {
@@ -92,9 +96,10 @@ fn bank_deg(parts: &[Part], way_m: f64) -> f64 {
     BACK_BANK_DEG
 }
 
-/// The track, driven counter-clockwise from the middle of its front stretch, which lies in the south and runs east.
+/// The track, driven counter-clockwise from the middle of its front stretch, which is in the south and runs east.
 pub fn las_vegas() -> CentreLine {
-    // The half lap ends above its start when the straight is right: by how much it overshoots grows evenly with it.
+    // With the correct straight length the half lap ends exactly above its start; the overshoot is linear in that
+    // length.
     let end = |straight_m: f64| {
         let parts = half_lap(straight_m);
         let way = parts.iter().map(|p| p.length_m).sum::<f64>() + BACK_STRETCH_M / 2.0;

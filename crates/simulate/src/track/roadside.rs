@@ -1,4 +1,4 @@
-//! What stands beside the track: the fence, and buildings, vehicles and poles on both sides.
+//! Objects beside the track: the fence, and buildings, vehicles and poles on both sides.
 
 use super::Track;
 use super::surface::{OUTSIDE_LEVEL_M, WALL_GAP_M, WALL_HEIGHT_M, WALL_M, across_at, height_m, strip};
@@ -10,7 +10,7 @@ use sensor::material::MaterialTable;
 use sensor::object::Group;
 use std::f64::consts::PI;
 
-/// Way between two posts of the fence, m.
+/// Spacing of the fence posts, m.
 const POST_M: f64 = 6.0;
 /// Height of the fence above the wall, m.
 const FENCE_M: f64 = 4.5;
@@ -19,7 +19,7 @@ const CABLES_M: [f64; 6] = [0.5, 1.1, 1.8, 2.6, 3.4, 4.3];
 /// Radius of a cable, m.
 const CABLE_M: f64 = 0.012;
 
-/// Posts and cables on the outer wall. The mesh between them is too fine to send a return back, and is left out.
+/// Posts and cables on the outer wall. The wire mesh between them is too fine to return light and is omitted.
 pub(super) fn fence(track: &Track) -> Mesh {
     let (steel, wire) = (MaterialTable::built_in("steel"), MaterialTable::built_in("wire"));
     let lap = track.line.length_m();
@@ -47,12 +47,12 @@ pub(super) fn fence(track: &Track) -> Mesh {
     mesh
 }
 
-/// Pit boxes and garages along the front stretch, vehicles, containers and light poles all over the infield.
+/// Pit boxes and garages along the front stretch; vehicles, containers and light poles in the infield.
 pub(super) fn infield_objects(track: &Track) -> Mesh {
     let mut random = stream(track.seed, "track/infield objects", 0, 0);
     let mut mesh = Mesh::default();
     for i in -10..=10 {
-        // Between the pit wall and the garages: a pit box each 14 m.
+        // Between the pit wall and the garages: a pit box every 14 m.
         let (way, left) = (f64::from(i) * 14.0, 30.0 + random.random_range(-0.5..0.5));
         let [x, y, z] = [random.random_range(1.5..3.0), 1.2, random.random_range(1.8..2.8)];
         mesh.append(&block(track, way, left, [x, y, z], 0.0, "plaster"));
@@ -71,7 +71,7 @@ pub(super) fn infield_objects(track: &Track) -> Mesh {
     mesh
 }
 
-/// What the simulation of the paper lacks: vehicles, containers, signs, trees and light towers behind the wall.
+/// Objects that the paper's simulation lacks: vehicles, containers, signs, trees and light towers behind the wall.
 pub(super) fn outside_objects(track: &Track) -> Mesh {
     let mut random = stream(track.seed, "track/outside objects", 0, 0);
     let lap = track.line.length_m();
@@ -86,12 +86,12 @@ pub(super) fn outside_objects(track: &Track) -> Mesh {
     mesh
 }
 
-/// Where the grandstand stands.
+/// Whether a position is along the grandstand.
 fn along_the_stand(track: &Track, way_m: f64) -> bool {
     geometry::limit_period(way_m, 0.5, track.line.length_m()).abs() < 320.0
 }
 
-/// Boxes, tents and trees at random places between two distances from the centre line, m (negative: to the right).
+/// Boxes, tents and trees at random positions between two distances from the centre line, m (negative: to the right).
 fn scatter(track: &Track, count: usize, [low, high]: [f64; 2], side: Group, random: &mut Stream) -> Mesh {
     let mut mesh = Mesh::default();
     for _ in 0..count {
@@ -119,13 +119,13 @@ fn scatter(track: &Track, count: usize, [low, high]: [f64; 2], side: Group, rand
     mesh
 }
 
-/// Ground at a place beside the track; infield and outside are level enough that the centre line's own height does.
+/// Ground position beside the track; infield and outside are level enough to use the centre line's height.
 fn ground_at(track: &Track, way_m: f64, left_m: f64) -> [f64; 3] {
     let [x, y, z] = across_at(track, way_m, |station| vec![(left_m, height_m(station, left_m))])[0];
     [x, y, if left_m < 0.0 { z.max(OUTSIDE_LEVEL_M) } else { z } - 0.15]
 }
 
-/// A box of length, width and height, turned against the track.
+/// A box of length, width and height, rotated relative to the track.
 fn block(track: &Track, way_m: f64, left_m: f64, [l, w, h]: [f64; 3], yaw_rad: f64, material: &str) -> Mesh {
     let box_mesh = cuboid([-l / 2.0, -w / 2.0, 0.0], [l / 2.0, w / 2.0, h], MaterialTable::built_in(material));
     box_mesh.moved(&upright_pose(ground_at(track, way_m, left_m), track.line.at(way_m).heading_rad + yaw_rad))
@@ -139,7 +139,7 @@ fn pole(track: &Track, way_m: f64, left_m: f64, height_m: f64) -> Mesh {
     mesh.moved(&upright_pose(ground_at(track, way_m, left_m), track.line.at(way_m).heading_rad))
 }
 
-/// A trunk and a crown.
+/// A tree: trunk and crown.
 fn tree(track: &Track, way_m: f64, left_m: f64, height_m: f64) -> Mesh {
     let leaves = MaterialTable::built_in("leaves");
     let mut mesh = cylinder([0.0; 3], [0.0, 0.0, 0.4 * height_m], 0.15, 6, leaves);

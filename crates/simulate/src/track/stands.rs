@@ -5,17 +5,17 @@ use super::surface::across_at;
 use crate::mesh::{Mesh, grid};
 use sensor::material::MaterialTable;
 
-/// From the outer edge of the surface to the first row, m.
+/// Distance from the outer edge of the surface to the first row, m.
 const DISTANCE_M: f64 = 16.0;
 const ROWS: u32 = 40;
 /// Depth and rise of a row, m.
 const STEP_M: [f64; 2] = [0.85, 0.48];
 /// Height of the first row above the edge of the track, m.
 const FIRST_M: f64 = 1.8;
-/// Half of its length along the track, m.
+/// Half length along the track, m.
 const HALF_LENGTH_M: f64 = 290.0;
 
-/// Steps of seats that look at the track, and a wall behind.
+/// Rows of seats facing the track, and a wall behind.
 pub(super) fn grandstand(track: &Track) -> Mesh {
     let sections = 72;
     let rows: Vec<Vec<[f64; 3]>> = (0..=sections)

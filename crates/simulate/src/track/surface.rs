@@ -1,4 +1,4 @@
-//! Ground and walls: strips along the centre line.
+//! Ground and walls as strips along the centre line.
 
 use super::{Station, Track};
 use crate::mesh::{Mesh, grid};
@@ -9,25 +9,25 @@ use sensor::object::Group;
 
 /// Width of the apron, m.
 const APRON_M: f64 = 8.0;
-/// Its cross slope, rad.
+/// Cross slope of the apron, rad.
 const APRON_BANK_RAD: f64 = 0.05;
-/// How far the infield is meshed beyond the apron, m.
+/// Width of the infield mesh beyond the apron, m.
 const INFIELD_M: f64 = 90.0;
-/// Where the infield lies below the inner edge of the apron, m.
+/// Drop of the infield below the inner edge of the apron, m.
 const INFIELD_DROP_M: f64 = 0.25;
-/// From the outer edge of the surface to the face of the wall, m.
+/// Distance from the outer edge of the surface to the face of the wall, m.
 pub(super) const WALL_GAP_M: f64 = 0.4;
 /// Thickness of the wall, m.
 pub(super) const WALL_M: f64 = 0.5;
 /// Height of the wall above the outer edge, m.
 pub(super) const WALL_HEIGHT_M: f64 = 1.1;
-/// How far the ground outside is meshed, m.
+/// Width of the outside ground mesh, m.
 const OUTSIDE_M: f64 = 110.0;
-/// Way on which the bank outside of the wall falls to the level ground, m.
+/// Width over which the bank outside the wall falls to the level ground, m.
 const EMBANKMENT_M: f64 = 14.0;
-/// Level of the ground outside, m.
+/// Height of the outside ground, m.
 pub(super) const OUTSIDE_LEVEL_M: f64 = -0.8;
-/// Way between two rows of triangles of the surface, m.
+/// Row spacing of the surface triangles, m.
 const ROW_M: f64 = 2.5;
 
 /// Height at `left_m` to the left of the centre, m.
@@ -49,7 +49,7 @@ pub(super) fn height_m(station: &Station, left_m: f64) -> f64 {
     }
 }
 
-/// Rows of points across the track: `across` gives (left of the centre, height) of each column.
+/// Meshes rows of points across the track: `across` gives (lateral offset, height) of each column.
 pub(super) fn strip(
     track: &Track,
     row_m: f64,
@@ -61,7 +61,7 @@ pub(super) fn strip(
     (0..=rows).map(row).collect()
 }
 
-/// Points across the track at one place.
+/// Points across the track at one position.
 pub(super) fn across_at(track: &Track, way_m: f64, across: impl Fn(&Station) -> Vec<(f64, f64)>) -> Vec<[f64; 3]> {
     let station = track.line.at(way_m);
     let (s, c) = station.heading_rad.sin_cos();
@@ -69,12 +69,12 @@ pub(super) fn across_at(track: &Track, way_m: f64, across: impl Fn(&Station) -> 
     across(&station).into_iter().map(|(left, z)| [x - s * left, y + c * left, z]).collect()
 }
 
-/// `n + 1` values from `low` to `high`.
+/// `n + 1` equidistant values from `low` to `high`.
 fn evenly(low: f64, high: f64, n: usize) -> impl Iterator<Item = f64> {
     (0..=n).map(move |i| low + (high - low) * i as f64 / n as f64)
 }
 
-/// One of the four strips of ground. Rough by some millimetres on the track and some centimetres beside it.
+/// One of the four strips of ground. Roughness is some millimetres on the track and some centimetres beside it.
 pub(super) fn ground(track: &Track, group: Group) -> Mesh {
     let (material, row_m, columns, rough_m) = match group {
         Group::Surface => ("asphalt", ROW_M, 8, 0.002),
@@ -104,7 +104,7 @@ pub(super) fn ground(track: &Track, group: Group) -> Mesh {
     });
     let mut mesh = grid(&points, MaterialTable::built_in(material));
     if group == Group::Infield {
-        // Far inside, one level plain just below the strips.
+        // In the deep infield, a level plane just below the strips.
         let level = points.iter().filter_map(|row| row.last()).map(|v| v[2]).fold(f64::INFINITY, f64::min) - 0.3;
         mesh.append(&plain(&points, level));
     }

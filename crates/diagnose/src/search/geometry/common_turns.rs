@@ -6,7 +6,7 @@ use super::hypotheses::Hypothesis;
 use super::sums::Sums;
 use crate::catalogue::Cause;
 use crate::channels::mean::{Column, OwnPoses};
-use crate::search::{Z_STAR, by_block};
+use crate::search::Z_STAR;
 
 /// Turns of the other sensors agree if the smallest is at least this share of the largest.
 const ALIKE: f64 = 0.5;
@@ -41,7 +41,7 @@ fn alike(poses: &[OwnPoses], select: &[usize], blocks: &[usize], except: usize) 
     if others.len() < 2 {
         return vec![];
     }
-    let members = by_block(blocks);
+    let members = statistics::blocks_of(blocks);
     let mean_and_error = |sensor: usize, turn: usize| {
         let mean =
             |which: &[usize]| which.iter().map(|&i| poses[select[i]][sensor][turn]).sum::<f64>() / which.len() as f64;

@@ -190,14 +190,13 @@ pub(super) fn set_noise(rows: &mut [Row], select: &[usize], side: Side) {
             right += &x * (w * r.shift[axis]);
         }
         let theta = gram.try_inverse().map_or_else(|| DVector::zeros(8), |inverse| inverse * right);
-        let mut left: Vec<f64> = rows
+        let left: Vec<f64> = rows
             .iter()
             .filter(|r| select.contains(&r.frame))
             .filter(|r| side == Side::Labels || r.variance[axis] < 0.1)
             .map(|r| (r.shift[axis] - (0..8).map(|k| r.x[axis][k] * theta[k]).sum::<f64>()).abs())
             .collect();
-        left.sort_by(f64::total_cmp);
-        let scale = (left.get(left.len() / 2).copied().unwrap_or(0.1) / 0.6745).max(0.008);
+        let scale = (statistics::median_upper(left).unwrap_or(0.1) / 0.6745).max(0.008);
         for r in rows.iter_mut() {
             r.variance[axis] = if side == Side::Labels { scale * scale } else { r.variance[axis] + scale * scale };
         }

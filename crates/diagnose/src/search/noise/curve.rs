@@ -2,6 +2,7 @@
 
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::noise::{NoiseLaw, NoiseTable};
+use statistics::weighted_median;
 
 /// Standard deviation along the covariate of a law.
 pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]) -> Curve {
@@ -25,7 +26,7 @@ pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]
         if n >= per || i + 1 == rows.len() && n > 0.2 * per {
             // A median: cells with an edge are rough on both sides and would dominate a mean.
             let sd = |of: fn(&(f64, f64, f64, f64, f64)) -> f64| {
-                weighted_median(cells.iter().map(|c| (of(c), c.1)).collect()).sqrt()
+                weighted_median(cells.iter().map(|c| (of(c), c.1)).collect()).unwrap_or(0.0).sqrt()
             };
             let measured = sd(|c| c.2);
             points.push(CurvePoint {
@@ -41,16 +42,4 @@ pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]
     }
     let x = if angular { "range x tan(incidence), m" } else { "range, m" };
     Curve { x: x.into(), y: "standard deviation along the ray, m".into(), by_sensor: false, points }
-}
-
-/// The value below which half of the weight lies, of `(value, weight)`.
-fn weighted_median(mut values: Vec<(f64, f64)>) -> f64 {
-    values.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let half = values.iter().map(|v| v.1).sum::<f64>() / 2.0;
-    let mut below = 0.0;
-    let found = values.iter().find(|(_, weight)| {
-        below += weight;
-        below >= half
-    });
-    found.map_or(0.0, |v| v.0)
 }

@@ -1,4 +1,4 @@
-//! What is behind the average precision of single runs.
+//! Section with the analyses of single runs.
 
 use super::{csv_number, number, slug};
 use crate::figure::{Bar, Figure, bars};
@@ -8,7 +8,7 @@ use eval::analysis::{Component, RunAnalysis, Stratum};
 
 type Named = (String, RunAnalysis);
 
-/// Errors, calibration, strata and repairs of the runs, beside each other.
+/// Box errors, calibration, AP by strata, and oracle repairs of the runs, side by side.
 pub(super) fn section(analyses: &[Named]) -> Section {
     let mut items = Vec::new();
     if !analyses.is_empty() {
@@ -85,7 +85,7 @@ fn errors(analyses: &[Named]) -> Item {
 }
 
 fn repairs(k: usize, (name, a): &Named) -> Item {
-    let word = |component| match component {
+    let component_name = |component| match component {
         Component::None => "as it is",
         Component::Along => "centre along the heading",
         Component::Across => "centre across the heading",
@@ -99,7 +99,7 @@ fn repairs(k: usize, (name, a): &Named) -> Item {
         let gained = repair.gained.filter(|_| repair.component != Component::None);
         let gained = gained.map_or(String::new(), |g| format!("  ({g:+.1})"));
         Bar {
-            name: word(repair.component).into(),
+            name: component_name(repair.component).into(),
             value: repair.then.ap40,
             text: format!("{}{gained}", number(repair.then.ap40, 1)),
             series: usize::from(repair.component != Component::None),
@@ -114,7 +114,12 @@ fn repairs(k: usize, (name, a): &Named) -> Item {
         .oracle
         .iter()
         .map(|r| {
-            vec![word(r.component).into(), csv_number(r.then.ap40), csv_number(r.then.ap_area), csv_number(r.gained)]
+            vec![
+                component_name(r.component).into(),
+                csv_number(r.then.ap40),
+                csv_number(r.then.ap_area),
+                csv_number(r.gained),
+            ]
         })
         .collect();
     let figure = bars(&a.oracle.iter().map(bar).collect::<Vec<_>>(), "3D AP (%)");

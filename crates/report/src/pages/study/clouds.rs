@@ -1,4 +1,4 @@
-//! Distances between data sets, and their targets.
+//! Sections with distances between data sets and with their targets.
 
 use super::{csv_number, number, slug};
 use crate::figure::{Bar, LocatedTargets, TargetCloud, aggregated_targets, bars, locations, target_views};
@@ -7,7 +7,7 @@ use eval::csv_text;
 use eval::distance::{Distances, Measure, RegionRow};
 use eval::targets::{Spread, Targets};
 
-/// Chamfer, EMD and the others, with their floors, and where the Chamfer sum comes from.
+/// Chamfer, EMD and other distances with their noise floors, and the Chamfer sum by region.
 pub(super) fn distance_section(all: &[Distances]) -> Section {
     let mut items: Vec<Item> = all.iter().map(table).collect();
     for d in all.iter().filter(|d| !d.regions.is_empty()) {
@@ -31,7 +31,7 @@ fn region_bars(d: &Distances) -> Item {
     Item::figure(format!("regions-{}-{}", slug(&d.a), slug(&d.b)), caption, figure, (&[], &[]))
 }
 
-/// The numbers behind the bars, and the whole, which they add up to.
+/// The data behind the bars, with the total.
 fn region_table(d: &Distances) -> Item {
     let mut whole = RegionRow { region: "whole cloud".into(), ..RegionRow::default() };
     for r in &d.regions {
@@ -119,7 +119,7 @@ fn table(d: &Distances) -> Item {
     Item::table(format!("distances-{}-{}", slug(&d.a), slug(&d.b)), caption, (&columns, 2), rows, None)
 }
 
-/// Numbers of the data sets, where their targets are, and what they look like.
+/// Statistics of the data sets, target positions and aggregated target points.
 pub(super) fn target_section(all: &[Targets]) -> Section {
     let mut items = Vec::new();
     if !all.is_empty() {
@@ -163,10 +163,10 @@ fn statistics(all: &[Targets]) -> Item {
         parts
             .into_iter()
             .enumerate()
-            .map(|(i, (word, part))| {
+            .map(|(i, (label, part))| {
                 let digits = if i == 0 || digits == 1 { digits } else { 0 };
                 let values = all.iter().map(|t| TableCell::new(number(part(&of(t)), digits)));
-                TableRow::new(i == 0, [TableCell::new(name), TableCell::new(word)].into_iter().chain(values))
+                TableRow::new(i == 0, [TableCell::new(name), TableCell::new(label)].into_iter().chain(values))
             })
             .collect()
     };
@@ -234,7 +234,7 @@ fn aggregated(all: &[Targets]) -> Item {
 }
 
 fn views(t: &Targets) -> Option<Item> {
-    // The first section that has points: the nearest targets show the most.
+    // The first range section that has points: the nearest targets have the most.
     let section = t.sections.iter().find(|s| !s.points_m.is_empty())?;
     let cloud =
         TargetCloud { title: format!("{}, {}", t.dataset, section.section), points_m: section.points_m.clone() };

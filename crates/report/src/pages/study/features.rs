@@ -1,4 +1,4 @@
-//! Features of the networks.
+//! Section with the network features.
 
 use super::{StudyReport, slug};
 use crate::figure::{ScatterGroup, heat_map, scatter};

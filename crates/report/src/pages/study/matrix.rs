@@ -1,4 +1,4 @@
-//! The matrix and average precision by distance.
+//! Sections with the matrix and AP by distance.
 
 use super::{csv_number, number, slug};
 use crate::figure::{DotGroup, DotPanel, dots};
@@ -6,7 +6,7 @@ use crate::html::{Item, Section, TableCell, TableRow};
 use eval::RangeSection;
 use eval::matrix::{CellNumber, Matrix, Quantity, RunState};
 
-/// Mean and deviation as the paper writes them, the interval below.
+/// Mean and deviation in the paper's format, with the interval below.
 fn cell(n: Option<&CellNumber>) -> TableCell {
     let Some(n) = n.filter(|n| n.mean.is_some()) else { return TableCell::new("–") };
     let text = match n.deviation {
@@ -16,7 +16,7 @@ fn cell(n: Option<&CellNumber>) -> TableCell {
     TableCell::with_small(text, n.interval.map_or(String::new(), |i| format!("{:.1} to {:.1}", i.low, i.high)))
 }
 
-/// The paper's table, and what a foreign train set costs.
+/// The paper's table, and the domain gap of each train set.
 pub(super) fn matrix_section(m: &Matrix) -> Section {
     let mut items = Vec::new();
     for class in &m.options.classes {
@@ -36,7 +36,7 @@ pub(super) fn matrix_section(m: &Matrix) -> Section {
             let failed = of.runs.iter().filter(|run| matches!(run.state, RunState::Failed(_))).count();
             let missing = of.runs.iter().filter(|run| run.state == RunState::Missing).count();
             let absent = [(failed, "failed"), (missing, "missing")];
-            let absent = absent.iter().filter(|(n, _)| *n > 0).map(|(n, word)| format!("{n} {word}"));
+            let absent = absent.iter().filter(|(n, _)| *n > 0).map(|(n, state)| format!("{n} {state}"));
             let runs = format!("{} of {}", of.n_done(), of.runs.len());
             let mut cells: Vec<TableCell> = names.into();
             cells.push(TableCell::with_small(runs, absent.collect::<Vec<_>>().join(", ")));
@@ -72,14 +72,14 @@ fn gaps(m: &Matrix, class: &str) -> Option<Item> {
     for g in of_class {
         let begins = last.replace((&g.network, &g.test_set)) != Some((&g.network, &g.test_set));
         let names = [&g.network, &g.test_set, &g.train_set].map(|name| TableCell::new(m.title(name)));
-        let sure = match g.interval {
+        let significant = match g.interval {
             Some(i) if i.low > 0.0 => "loses",
             Some(i) if i.high < 0.0 => "gains",
             Some(_) => "not distinguishable from 0",
             None => "no interval",
         };
         let interval = g.interval.map_or(String::new(), |i| format!("{:.2} to {:.2}", i.low, i.high));
-        let numbers = [g.overlap.to_string(), number(Some(g.gap), 2), interval, sure.into()].map(TableCell::new);
+        let numbers = [g.overlap.to_string(), number(Some(g.gap), 2), interval, significant.into()].map(TableCell::new);
         rows.push(TableRow::new(begins, names.into_iter().chain(numbers)));
     }
     let columns = ["network", "tested on", "trained on", "overlap", "3D AP lost", "interval", "verdict"];
@@ -90,7 +90,7 @@ fn gaps(m: &Matrix, class: &str) -> Option<Item> {
     (!rows.is_empty()).then(|| Item::table(format!("gaps-{}", slug(class)), caption, (&columns, 3), rows, None))
 }
 
-/// A dot for each run, by section of distance.
+/// A dot per run, by range section.
 pub(super) fn range_section(m: &Matrix) -> Section {
     let mut items = Vec::new();
     let mut series: Vec<&str> = Vec::new();

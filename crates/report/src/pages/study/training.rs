@@ -1,4 +1,4 @@
-//! Losses and validation of the runs.
+//! Section with training losses and validation AP.
 
 use crate::figure::Figure;
 use crate::html::{Item, Section};
@@ -10,18 +10,19 @@ use std::path::Path;
 /// The curves of one run.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct TrainingRun {
-    /// For the legend.
+    /// Name in the legend.
     pub name: String,
-    /// Step and mean loss of the logged steps of each epoch, or before the second epoch, the loss at each logged step.
+    /// Step and mean loss over the logged steps of each epoch; before the second epoch, step and loss of each logged
+    /// step.
     pub loss: Vec<[f64; 2]>,
-    /// Step and average precision on the validation split, percent.
+    /// Step and AP on the validation split, percent.
     pub validation_ap: Vec<[f64; 2]>,
 }
 
-/// The lines of a `metrics.jsonl`. One that was cut off at the end of the file is left out: the run is being written.
+/// Reads the lines of a `metrics.jsonl`. A truncated last line is skipped: the run is being written.
 ///
 /// # Errors
-/// A file that cannot be read, or a line in it that is no JSON.
+/// A file that cannot be read, or a line that is not valid JSON.
 pub(crate) fn metrics_lines(path: &Path) -> Result<Vec<Value>, ReportError> {
     let text = fs_err::read_to_string(path).map_err(DataError::from)?;
     let whole = text.rfind('\n').map_or(0, |end| end + 1);
@@ -32,10 +33,10 @@ pub(crate) fn metrics_lines(path: &Path) -> Result<Vec<Value>, ReportError> {
     text[..whole].lines().enumerate().map(parse).collect()
 }
 
-/// Reads the `metrics.jsonl` of a run folder. A line that was cut off at the end of the file is left out.
+/// Reads the `metrics.jsonl` of a run folder. A truncated last line is skipped.
 ///
 /// # Errors
-/// A file that cannot be read, or a line in it that is no JSON.
+/// A file that cannot be read, or a line that is not valid JSON.
 pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportError> {
     let (mut of_steps, mut of_epochs) = (Vec::<[f64; 2]>::new(), Vec::new());
     let mut epoch_begins = 0;
@@ -45,7 +46,7 @@ pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportE
         match (value["kind"].as_str(), at("step")) {
             (Some("step"), Some(step)) => of_steps.extend(at("loss").map(|loss| [step, loss])),
             (Some("epoch"), Some(step)) => {
-                // The lines' own mean is that of one process: it would tell where a run was interrupted.
+                // The mean in the lines covers one process only, so it would depend on where a run was interrupted.
                 let of_epoch = &of_steps[epoch_begins..];
                 epoch_begins = of_steps.len();
                 if !of_epoch.is_empty() {
@@ -60,7 +61,7 @@ pub fn read_training_run(name: &str, path: &Path) -> Result<TrainingRun, ReportE
     Ok(run)
 }
 
-/// One figure of losses and one of validation.
+/// A figure of losses and one of validation AP.
 pub(super) fn section(runs: &[TrainingRun]) -> Section {
     let mut items = Vec::new();
     type Part = (&'static str, &'static str, &'static str, bool, fn(&TrainingRun) -> &Vec<[f64; 2]>);

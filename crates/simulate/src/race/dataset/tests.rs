@@ -1,7 +1,7 @@
 use super::*;
 use data::doctor::doctor;
 
-/// A small race in a folder of its own: few frames, few shots, all kinds of data sets.
+/// A small race in its own folder: few frames, few shots, all kinds of data sets.
 fn small(folder: &Path, more: &str) -> (RaceConfig, ConfigFiles) {
     let text = format!(
         "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 18\nresolution = 0.25\nlabel_points = 1\nrace = {{ runs = 2, frames = 400 }}\n{more}\n\
@@ -25,7 +25,7 @@ fn make(config: &(RaceConfig, ConfigFiles), out: &Path, threads: usize) -> Resul
     pool.install(|| make_race_datasets(&config.0, &config.1, out, &[], &|_, _, _| ()))
 }
 
-/// Every file below a folder with its bytes, by path.
+/// All files below a folder with their bytes, by path.
 fn files_below(root: &Path) -> BTreeMap<String, Vec<u8>> {
     let (mut open, mut found) = (vec![root.to_owned()], BTreeMap::new());
     while let Some(folder) = open.pop() {
@@ -58,7 +58,7 @@ fn the_same_bytes_for_any_number_of_threads_and_after_a_stop() {
     assert!(all == files_below(&two), "a run again changes nothing");
     assert!(manifests.iter().all(|m| m.complete && m.splits["train"].frames == 12 && m.splits["test"].frames == 3));
 
-    // What `measured` hides is in none of its files.
+    // Hidden effects of `measured` are in none of its files.
     assert!(!all.contains_key("measured/effects.toml") && all.contains_key("sim/effects.toml"));
     for (name, bytes) in all.iter().filter(|(name, _)| name.starts_with("measured/") && !name.contains("/velodyne/")) {
         let text = String::from_utf8_lossy(bytes);
@@ -85,7 +85,7 @@ fn the_data_sets_show_the_same_race() {
             offsets.push(x.abs());
         }
         assert_eq!((s.objects.clone(), n.cloud.len()), (n.objects.clone(), s.cloud.len()));
-        // Noise moves points along their rays by centimetres, and nothing else.
+        // Noise moves points by centimetres along their rays, and has no other effect.
         let moved: Vec<f64> = (0..s.cloud.len())
             .map(|i| {
                 let (a, b) = (s.cloud.xyz(i), n.cloud.xyz(i));
@@ -107,7 +107,7 @@ fn the_data_sets_show_the_same_race() {
 fn doctor_finds_nothing_wrong() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = small(folder.path(), "");
-    // At a quarter of the resolution distant cars have no point, which the doctor would rightly say.
+    // At a quarter of the resolution distant cars have no points, which the doctor would report.
     config.0.resolution = 1.0;
     let out = folder.path().join("out");
     make(&config, &out, 2).unwrap();

@@ -6,7 +6,7 @@ use rand::RngExt;
 
 type Corners = [[f32; 3]; 3];
 
-/// One ray against one triangle in the operations of the packets.
+/// Intersects one ray with one triangle using the packet operations.
 fn meet(ray: &Ray, corners: &Corners) -> Option<f32> {
     let t = pack(corners);
     let (o, d) = (ray.origin, ray.direction);
@@ -20,7 +20,7 @@ fn meet(ray: &Ray, corners: &Corners) -> Option<f32> {
     (inside && range >= 0.0).then_some(range)
 }
 
-/// The least (range, triangle) over all triangles.
+/// Minimum of (range, triangle) over all triangles.
 fn brute(ray: &Ray, corners: &[Corners]) -> Hit {
     let mut best = Hit::MISS;
     for (i, triangle) in corners.iter().enumerate() {
@@ -36,7 +36,7 @@ fn unit(v: [f32; 3]) -> [f32; 3] {
     v.map(|c| c / length)
 }
 
-/// A ground of two triangles a cell with boxes of random triangles above: many edges and corners are shared.
+/// A ground with two triangles per cell and boxes of random triangles above: many edges and corners are shared.
 fn landscape(seed: u64, triangles: usize) -> Vec<Corners> {
     let mut random = stream(seed, "landscape", 0, 0);
     let height: Vec<f32> = (0..21 * 21).map(|_| random.random_range(-0.2..0.2)).collect();
@@ -56,7 +56,7 @@ fn landscape(seed: u64, triangles: usize) -> Vec<Corners> {
     all
 }
 
-/// A scan of `rows` x `columns` from near the middle, with moving origin.
+/// A scan of `rows` x `columns` from near the centre, with a moving origin.
 fn scan_rays(seed: u64, rows: usize, columns: usize) -> Vec<Ray> {
     let mut random = stream(seed, "rays", 0, 0);
     let start: [f32; 3] = [random.random_range(-3.0..3.0), random.random_range(-3.0..3.0), 0.0];
@@ -157,7 +157,7 @@ fn an_instance_is_its_moved_mesh() {
         let all: Vec<Corners> = ground.iter().copied().chain(moved).collect();
         let want = brute(ray, &all);
         let first = if got[i].object == 1 { ground.len() as u32 } else { 0 };
-        // A ray that grazes an edge may pass it in one arithmetic and not in the other.
+        // A ray that grazes an edge may hit in one arithmetic and miss in the other.
         if want.is_hit() && got[i].is_hit() && got[i].triangle + first == want.triangle {
             assert!((got[i].range_m - want.range_m).abs() < 2e-3, "{:?} {want:?}", got[i]);
             compared += 1;
@@ -202,7 +202,7 @@ fn nothing_to_hit_and_triangles_that_are_none() {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// Axis-parallel rays through corners of the grid: slabs of no width and components of exactly 0.
+    /// Axis-parallel rays through corners of the grid: zero-width slabs and components of exactly 0.
     #[test]
     fn axis_parallel_rays_are_hit_as_any_other(seed in 0_u64..1000, axis in 0_usize..3, sign in prop::bool::ANY, steps in prop::array::uniform3(-8_i32..8)) {
         let corners = landscape(seed, 60);
