@@ -225,7 +225,7 @@ fn row_offsets_m(f: &Finding, rig: &Rig) -> Vec<f64> {
     rows.iter().rev().map(|v| rounded(mean(v), 4)).collect()
 }
 
-/// The sensor that a finding speaks of.
+/// The sensor of a finding.
 fn sensor_of<'a>(f: &Finding, rig: &'a Rig) -> &'a Sensor {
     &rig.sensors[(value(f, Quantity::Sensor) as usize).min(rig.sensors.len() - 1)]
 }

@@ -1,4 +1,4 @@
-//! What is put on a simulated data set by `resim` is found again, and what is written as an extension mends it.
+//! Effects that `resim` applies to a simulated data set are found, and the extension that is written corrects the simulation.
 
 use data::Dataset;
 use lidarshift_diagnose::{
@@ -9,7 +9,7 @@ use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
 use std::path::Path;
 
-/// The race in small, once without any effect.
+/// A small race without any effect.
 fn race(folder: &Path) -> Dataset {
     let text = "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 30\nresolution = 0.3\nlabel_points = 1\nrace = { runs = 1, frames = 1500 }\n\
                 [[dataset]]\nname = \"sim\"\neffects = \"none.toml\"\n";
@@ -39,9 +39,9 @@ fn named(d: &Diagnosis) -> Vec<&str> {
     names
 }
 
-/// The two causes that the paper supposes for its gap: 2 cm of noise and a fifth of the returns lost.
+/// The two causes that the paper assumes for its gap: 2 cm of noise and a fifth of the returns lost.
 #[test]
-fn the_papers_two_causes_are_found_and_mended() {
+fn the_two_causes_of_the_paper_are_found_and_corrected() {
     let folder = tempfile::tempdir().unwrap();
     let sim = race(folder.path());
     let causes =
@@ -58,16 +58,16 @@ fn the_papers_two_causes_are_found_and_mended() {
         assert!((p.estimate / truth - 1.0).abs() < 0.05, "{cause}: {p:?}");
     }
     assert!(d.gain.closed.unwrap() > 0.9, "{:?}", d.gain);
-    // The extended simulation leaves nothing to be found.
+    // With the extended simulation there are no findings.
     let extended = extended_toml(d);
     let again = with_effects(&sim, &extended, &folder.path().join("extended"), 12);
     let outcome = diagnosed(&measured, &again, folder.path());
     assert!(outcome.diagnosis.findings.is_empty(), "{:?}", outcome.diagnosis.findings);
 }
 
-/// What has no name is extended as a table, and that mends it.
+/// An unexplained finding is extended as a lookup table, which corrects the simulation.
 #[test]
-fn what_has_no_name_is_mended_by_a_table() {
+fn an_unexplained_finding_is_corrected_by_a_table() {
     let folder = tempfile::tempdir().unwrap();
     let sim = race(folder.path());
     let stripes = "[[effect]]\nkind = \"empirical\"\ncovariate = \"azimuth_deg\"\n\
@@ -76,7 +76,7 @@ fn what_has_no_name_is_mended_by_a_table() {
     let measured = with_effects(&sim, stripes, &folder.path().join("measured"), 11);
     let outcome = diagnosed(&measured, &sim, folder.path());
     let d = &outcome.diagnosis;
-    // The mean of the stripes may be called a random loss; what is left over the azimuth has no name.
+    // The mean of the stripes may be named a random loss; the remaining dependence on the azimuth is unexplained.
     let unnamed = d.findings.iter().find(|f| f.status == Status::Unexplained).unwrap();
     assert_eq!((unnamed.channel, unnamed.covariate), (Channel::Hits, Covariate::Azimuth), "{:?}", d.findings);
     assert!(unnamed.gain.ci95[0] > 0.0 && d.findings.iter().all(|f| f.channel == Channel::Hits), "{:?}", d.findings);

@@ -5,6 +5,7 @@ use crate::pages;
 
 /// Folders and files that follow these rules. Empty: everything.
 const CLEAN: &[&str] = &[
+    "crates/diagnose",
     "crates/eval",
     "crates/report",
     "crates/simulate/benches",

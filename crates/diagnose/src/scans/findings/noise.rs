@@ -169,7 +169,7 @@ impl Forms {
 }
 
 /// Standard deviation along the ray, by the angle of incidence or by range: measured, of an ideal sensor, and fitted.
-/// Range is shown on surfaces that are met squarely, where there are enough.
+/// Range is shown on surfaces near normal incidence, where there are enough.
 fn curve(table: &Bins, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
     let row = |[r, l, m, sd]: &[f64; 4]| {
         let x = if by_angle { (l / r).atan().to_degrees() } else { *r };
