@@ -8,7 +8,9 @@ use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
-use diagnose::{DetectorGain, Diagnosis, Options, Rig, Stage, Verdict, diagnose, diagnose_scans, extended_toml};
+use diagnose::{
+    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Verdict, diagnose, diagnose_scans, extended_toml,
+};
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{finding_name, write_finding_pictures};
 use simulate::race::RaceConfig;
@@ -160,7 +162,7 @@ fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
     for f in &diagnosis.findings {
         let name = finding_name(f);
         println!("{name}: {}", f.says);
-        for (parameter, p) in f.parameters.iter().filter(|(n, _)| !n.contains('/')) {
+        for (parameter, p) in f.parameters.iter().filter(|(id, _)| matches!(id, ParameterId::Of(_))) {
             println!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
         }
         if let Some(how) = &f.separate_by {

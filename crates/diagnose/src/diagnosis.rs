@@ -1,5 +1,7 @@
 //! What a diagnosis says: the file `diagnosis.json`.
 
+use crate::catalogue::{Cause, Channel, Covariate, Family, Hypothesis, ParameterId, Quantity, Unit};
+use crate::curve::Curve;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -19,7 +21,7 @@ pub struct Diagnosis {
     /// What was found, the largest gain first.
     pub findings: Vec<Finding>,
     /// For each cause the smallest effect that would have been seen, as far as these data tell.
-    pub minimum_detectable: BTreeMap<String, Minimum>,
+    pub minimum_detectable: BTreeMap<Cause, Minimum>,
     /// Distance of the measured held-out frames from the simulation, before and after it is extended.
     pub gain: Gain,
     /// What detectors gain on measured data, where it was asked for (`--detectors`).
@@ -78,20 +80,20 @@ pub struct Finding {
     pub status: Status,
     /// Name of the cause, where it is named.
     #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub cause: Option<String>,
+    pub cause: Option<Cause>,
     /// Names of the causes that explain it as well or nearly so, where it is ambiguous; parameters are those of the first.
     #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub candidates: Option<Vec<String>>,
-    /// `range_error`, `detection`, `geometry`, `timing`, `labels`, `returns` or `unknown`.
-    pub family: String,
-    /// Fitted parameters; docs/src/reference/causes.md has names, units and signs.
-    pub parameters: BTreeMap<String, Parameter>,
+    pub candidates: Option<Vec<Cause>>,
+    /// Family of its cause.
+    pub family: Family,
+    /// Fitted parameters; docs/diagnosis.md has names, units and signs.
+    pub parameters: BTreeMap<ParameterId, Parameter>,
     /// Share of block-bootstrap repetitions that choose the same name.
     pub confidence: f64,
-    /// `residuals`, `roughness`, `hits`, `returns`, `objects`, `labels`, `ranges` or `intensity`.
-    pub channel: String,
+    /// What it was found in.
+    pub channel: Channel,
     /// On what it depends.
-    pub covariate: String,
+    pub covariate: Covariate,
     /// What it brings on frames held out.
     pub gain: FindingGain,
     /// The finding in a sentence.
@@ -104,6 +106,13 @@ pub struct Finding {
     /// What a simulation has to be given to show the same: the entries of `extended.toml`. Not in the file.
     #[serde(skip)]
     pub effects: Vec<sensor::Effect>,
+}
+
+impl Finding {
+    /// One of its parameters.
+    pub fn parameter(&self, quantity: Quantity) -> Option<&Parameter> {
+        self.parameters.get(&ParameterId::Of(quantity))
+    }
 }
 
 /// Whether a finding has a name.
@@ -119,12 +128,12 @@ pub enum Status {
 }
 
 /// A fitted number.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Parameter {
     /// Best value.
     pub estimate: f64,
     /// Its unit; `1` for a share.
-    pub unit: String,
+    pub unit: Unit,
     /// Interval that holds the true value with a probability of 95 %.
     pub ci95: [f64; 2],
 }
@@ -138,15 +147,22 @@ pub struct FindingGain {
     pub ci95: [f64; 2],
 }
 
+impl Minimum {
+    /// Of a quantity, with its unit.
+    pub fn new(parameter: Quantity, value: f64) -> Self {
+        Minimum { parameter, value, unit: parameter.unit() }
+    }
+}
+
 /// The smallest effect that would have been seen.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Minimum {
     /// Which number.
-    pub parameter: String,
+    pub parameter: Quantity,
     /// Its smallest value.
     pub value: f64,
     /// Its unit.
-    pub unit: String,
+    pub unit: Unit,
 }
 
 /// Distance between measured and simulated held-out frames.
@@ -166,7 +182,7 @@ pub struct Gain {
     pub ci95: Option<[f64; 2]>,
     /// `before`, `after` and `floor` channel by channel: where the simulation is off, and what is left.
     #[serde(default)]
-    pub channels: BTreeMap<String, [f64; 3]>,
+    pub channels: BTreeMap<Channel, [f64; 3]>,
 }
 
 /// Average precision on the measured test frames of a detector trained on each kind of data, percent.
@@ -198,41 +214,15 @@ pub struct DetectorGain {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Considered {
     /// Cause.
-    pub cause: String,
+    pub cause: Hypothesis,
     /// Channel.
-    pub channel: String,
+    pub channel: Channel,
     /// Gain on blocks of the selecting frames that it was not fitted on, nats per ray.
     pub nats_per_ray: f64,
     /// That over its standard error.
     pub z: f64,
     /// `chosen`, or why not.
     pub outcome: String,
-}
-
-/// Points of a picture.
-#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-pub struct Curve {
-    /// Name and unit along the horizontal axis.
-    pub x: String,
-    /// Name and unit of what is shown.
-    pub y: String,
-    /// The points.
-    pub points: Vec<CurvePoint>,
-}
-
-/// A point of a picture.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct CurvePoint {
-    /// Covariate.
-    pub x: f64,
-    /// Measured.
-    pub measured: f64,
-    /// Simulated as it is.
-    pub before: f64,
-    /// With the extended simulation.
-    pub after: f64,
-    /// Standard error of the measured value.
-    pub error: f64,
 }
 
 /// The JSON schema of the file, as docs/src/reference/diagnosis.schema.json has it.

@@ -3,16 +3,18 @@
 //! Every parameter of an effect is written: one that the finding does not have takes the value at which it changes
 //! nothing, not the effect's default, which is a typical strength.
 
+use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity};
+use crate::curve::CurvePoint;
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
 use crate::pairing::GAP_M;
 use nalgebra::Point3;
 use sensor::beams::Pick;
 use sensor::effects::{
-    AngularJitter, BeamAngleError, BeamDivergence, BeamRangeOffset, Clock, Covariate, DirtyWindow, Effect, EgoAttitude,
-    EgoBodyMask, Empirical, FalseAlarms, IncidenceDropout, LabelOffset, LabelTimeOffset, MaterialDropout,
-    RandomDropout, RangeBias, RangeDropout, RangeLimits, RangeNoise, RangeNoiseByIncidence, RangeNoiseByRange,
-    RangeNoiseBySignal, RangeQuantisation, RollingShutter, SensorPoseError, SignalDropout,
+    AngularJitter, BeamAngleError, BeamDivergence, BeamRangeOffset, Clock, Covariate as TableCovariate, DirtyWindow,
+    Effect, EgoAttitude, EgoBodyMask, Empirical, FalseAlarms, IncidenceDropout, LabelOffset, LabelTimeOffset,
+    MaterialDropout, RandomDropout, RangeBias, RangeDropout, RangeLimits, RangeNoise, RangeNoiseByIncidence,
+    RangeNoiseByRange, RangeNoiseBySignal, RangeQuantisation, RollingShutter, SensorPoseError, SignalDropout,
 };
 use sensor::{Rig, Sensor};
 
@@ -32,25 +34,27 @@ pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<
 /// candidate.
 pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
     match finding.status {
-        Status::Unexplained if finding.covariate == "direction" => dirty_window(finding, rig).into_iter().collect(),
+        Status::Unexplained if finding.covariate == Covariate::Direction => {
+            dirty_window(finding, rig).into_iter().collect()
+        }
         Status::Unexplained => tables(finding, rig, rows_deg),
         _ => named(finding, rig),
     }
 }
 
-/// The cause that a finding is mended by: its name, or the first candidate.
-pub(crate) fn cause_of(finding: &Finding) -> &str {
-    let first = || finding.candidates.as_ref().and_then(|c| c.first()).map(String::as_str);
-    finding.cause.as_deref().or_else(first).unwrap_or_default()
+/// The cause whose effect corrects the simulation: the named one, or the first candidate.
+pub(crate) fn cause_of(finding: &Finding) -> Cause {
+    let first = || finding.candidates.as_ref().and_then(|c| c.first()).copied();
+    finding.cause.or_else(first).unwrap_or(Cause::Unexplained)
 }
 
 /// A parameter's best value; 0 where the finding does not have it.
-fn value(f: &Finding, name: &str) -> f64 {
-    value_or(f, name, 0.0)
+fn value(f: &Finding, quantity: Quantity) -> f64 {
+    value_or(f, quantity, 0.0)
 }
 
-fn value_or(f: &Finding, name: &str, otherwise: f64) -> f64 {
-    f.parameters.get(name).map_or(otherwise, |p| rounded(p.estimate, 7))
+fn value_or(f: &Finding, quantity: Quantity, otherwise: f64) -> f64 {
+    f.parameter(quantity).map_or(otherwise, |p| rounded(p.estimate, 7))
 }
 
 /// As many places behind the point as a file needs.
@@ -59,9 +63,9 @@ fn rounded(v: f64, places: i32) -> f64 {
     (v * scale).round() / scale
 }
 
-/// Share that a law loses where nothing of it is felt.
+/// Share of the returns that are lost where the law has no effect.
 fn lost_anyway(f: &Finding) -> f64 {
-    f.parameters.get("most").map_or(0.0, |most| (1.0 - most.estimate).max(0.0))
+    f.parameter(Quantity::Most).map_or(0.0, |most| (1.0 - most.estimate).max(0.0))
 }
 
 /// A negative strength is no effect: the simulation has too much of it.
@@ -70,73 +74,77 @@ fn positive(strength: f64, effect: impl Into<Option<Effect>>) -> Vec<Effect> {
 }
 
 fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
-    let value = |name: &str| value(f, name);
+    let value = |quantity: Quantity| value(f, quantity);
     let effect = match cause_of(f) {
-        "range_noise" => return range_noise(f),
-        "signal_noise" => Effect::RangeNoiseBySignal(RangeNoiseBySignal {
-            std_m: value("std_m"),
-            exponent: value("exponent"),
+        Cause::RangeNoise => return range_noise(f),
+        Cause::SignalNoise => Effect::RangeNoiseBySignal(RangeNoiseBySignal {
+            std_m: value(Quantity::StdM),
+            exponent: value(Quantity::Exponent),
             signal: USUAL_SIGNAL,
             most_m: NO_LIMIT_M,
         }),
-        "incidence_noise" => Effect::RangeNoiseByIncidence(RangeNoiseByIncidence {
-            divergence_rad: rounded(2.0 * value("angle_rad"), 7),
+        Cause::IncidenceNoise => Effect::RangeNoiseByIncidence(RangeNoiseByIncidence {
+            divergence_rad: rounded(2.0 * value(Quantity::AngleRad), 7),
             samples: 1.0,
             most_m: NO_LIMIT_M,
         }),
-        "range_bias" => Effect::RangeBias(RangeBias { offset_m: value("offset_m"), scale: value("scale") }),
-        "beam_range_offset" => {
+        Cause::RangeBias => {
+            Effect::RangeBias(RangeBias { offset_m: value(Quantity::OffsetM), scale: value(Quantity::Scale) })
+        }
+        Cause::BeamRangeOffset => {
             Effect::BeamRangeOffset(BeamRangeOffset { std_m: 0.0, offsets_m: row_offsets_m(f, rig) })
         }
-        "beam_elevation_offset" => Effect::BeamAngleError(BeamAngleError {
-            elevation_deg: value("mean_deg"),
-            elevation_std_deg: value("std_deg"),
+        Cause::BeamElevationOffset => Effect::BeamAngleError(BeamAngleError {
+            elevation_deg: value(Quantity::MeanDeg),
+            elevation_std_deg: value(Quantity::StdDeg),
             azimuth_std_deg: 0.0,
         }),
-        "quantisation" => Effect::RangeQuantisation(RangeQuantisation { step_m: value("step_m") }),
-        "angular_jitter" => {
-            let std_deg = value("std_deg");
+        Cause::Quantisation => Effect::RangeQuantisation(RangeQuantisation { step_m: value(Quantity::StepM) }),
+        Cause::AngularJitter => {
+            let std_deg = value(Quantity::StdDeg);
             let jitter = AngularJitter { azimuth_std_deg: std_deg, elevation_std_deg: std_deg };
             return positive(std_deg, Effect::AngularJitter(jitter));
         }
-        "range_cut" => Effect::RangeLimits(RangeLimits { min_m: 0.0, max_m: value("max_m") }),
-        "ego_occlusion" => Effect::EgoBodyMask(EgoBodyMask { boxes: vec![blocked_box(f, rig)] }),
-        "sensor_extrinsics" => Effect::SensorPoseError(SensorPoseError {
+        Cause::RangeCut => Effect::RangeLimits(RangeLimits { min_m: 0.0, max_m: value(Quantity::MaxM) }),
+        Cause::EgoOcclusion => Effect::EgoBodyMask(EgoBodyMask { boxes: vec![blocked_box(f, rig)] }),
+        Cause::SensorExtrinsics => Effect::SensorPoseError(SensorPoseError {
             sensor: sensor_of(f, rig).name.clone(),
-            translation_m: ["forward_m", "left_m", "up_m"].map(value),
-            rotation_deg: ["roll_deg", "pitch_deg", "yaw_deg"].map(value),
+            translation_m: [Quantity::ForwardM, Quantity::LeftM, Quantity::UpM].map(value),
+            rotation_deg: [Quantity::RollDeg, Quantity::PitchDeg, Quantity::YawDeg].map(value),
         }),
-        "pitch_roll" => Effect::EgoAttitude(EgoAttitude {
-            roll_deg: value("roll_deg"),
-            pitch_deg: value("pitch_deg"),
+        Cause::PitchRoll => Effect::EgoAttitude(EgoAttitude {
+            roll_deg: value(Quantity::RollDeg),
+            pitch_deg: value(Quantity::PitchDeg),
             pitch_at_70mps_deg: 0.0,
             roll_std_deg: 0.0,
             pitch_std_deg: 0.0,
             heave_std_m: 0.0,
         }),
-        "rolling_shutter" => Effect::RollingShutter(RollingShutter { deskewed: false }),
-        "outliers" => Effect::FalseAlarms(FalseAlarms {
-            rate: value("rate"),
+        Cause::RollingShutter => Effect::RollingShutter(RollingShutter { deskewed: false }),
+        Cause::Outliers => Effect::FalseAlarms(FalseAlarms {
+            rate: value(Quantity::Rate),
             sun_rate: 0.0,
-            reach_m: value_or(f, "reach_m", USUAL_REACH_M),
+            reach_m: value_or(f, Quantity::ReachM, USUAL_REACH_M),
             ..FalseAlarms::default()
         }),
         // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
-        "mixed_pixels" if f.parameters.contains_key("divergence_rad") => Effect::BeamDivergence(BeamDivergence {
-            divergence_rad: value("divergence_rad"),
-            rays: 7,
-            pulse_m: GAP_M[1],
-            pick: Pick::Strongest,
-        }),
-        "label_offset" => Effect::LabelOffset(LabelOffset {
-            forward_m: value("forward_m"),
-            left_m: value("left_m"),
-            up_m: value("up_m"),
+        Cause::MixedPixels if f.parameter(Quantity::DivergenceRad).is_some() => {
+            Effect::BeamDivergence(BeamDivergence {
+                divergence_rad: value(Quantity::DivergenceRad),
+                rays: 7,
+                pulse_m: GAP_M[1],
+                pick: Pick::Strongest,
+            })
+        }
+        Cause::LabelOffset => Effect::LabelOffset(LabelOffset {
+            forward_m: value(Quantity::ForwardM),
+            left_m: value(Quantity::LeftM),
+            up_m: value(Quantity::UpM),
             yaw_deg: 0.0,
         }),
-        "time_offset" => Effect::LabelTimeOffset(LabelTimeOffset {
-            offset_s: value("offset_s"),
-            clock: if f.covariate == "seen_velocity_m_s" { Clock::Cloud } else { Clock::Cars },
+        Cause::TimeOffset => Effect::LabelTimeOffset(LabelTimeOffset {
+            offset_s: value(Quantity::OffsetS),
+            clock: if f.covariate == Covariate::SeenVelocity { Clock::Cloud } else { Clock::Cars },
         }),
         _ => return losses(f),
     };
@@ -144,7 +152,7 @@ fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
 }
 
 fn range_noise(f: &Finding) -> Vec<Effect> {
-    let (std_m, per_m) = (value(f, "std_m"), value(f, "per_m"));
+    let (std_m, per_m) = (value(f, Quantity::StdM), value(f, Quantity::PerM));
     if per_m > 0.0 {
         let noise = RangeNoiseByRange { base_m: std_m, per_m, quadratic: false };
         return vec![Effect::RangeNoiseByRange(noise)];
@@ -156,30 +164,30 @@ fn range_noise(f: &Finding) -> Vec<Effect> {
 fn losses(f: &Finding) -> Vec<Effect> {
     let random = |share: f64| Effect::RandomDropout(RandomDropout { share });
     match cause_of(f) {
-        "random_dropout" => positive(value(f, "share"), random(value(f, "share"))),
-        "signal_dropout" => vec![Effect::SignalDropout(SignalDropout {
-            most: value_or(f, "most", 1.0),
-            threshold: value(f, "threshold"),
-            steepness: value(f, "steepness"),
+        Cause::RandomDropout => positive(value(f, Quantity::Share), random(value(f, Quantity::Share))),
+        Cause::SignalDropout => vec![Effect::SignalDropout(SignalDropout {
+            most: value_or(f, Quantity::Most, 1.0),
+            threshold: value(f, Quantity::Threshold),
+            steepness: value(f, Quantity::Steepness),
             attenuation_per_m: 0.0,
         })],
-        "incidence_dropout" => {
-            let cos_half = value(f, "cos_half");
+        Cause::IncidenceDropout => {
+            let cos_half = value(f, Quantity::CosHalf);
             // The simulator's step is one over the cosine, the finding's one over its logarithm: as steep at one half.
-            let steepness = rounded(value(f, "steepness") / cos_half.max(1e-3), 7);
+            let steepness = rounded(value(f, Quantity::Steepness) / cos_half.max(1e-3), 7);
             let dropout = Effect::IncidenceDropout(IncidenceDropout { cos_half, steepness });
             let anyway = (lost_anyway(f) > 0.0).then(|| random(rounded(lost_anyway(f), 7)));
             std::iter::once(dropout).chain(anyway).collect()
         }
-        "range_dropout" => vec![Effect::RangeDropout(range_dropout(f))],
-        "material_dropout" => {
-            let material = match f.covariate.as_str() {
-                "surface: ground" => "asphalt",
-                "surface: standing" => "concrete",
-                "surface: object_corner" => "rubber",
+        Cause::RangeDropout => vec![Effect::RangeDropout(range_dropout(f))],
+        Cause::MaterialDropout => {
+            let material = match f.covariate {
+                Covariate::SurfaceGround => "asphalt",
+                Covariate::SurfaceStanding => "concrete",
+                Covariate::SurfaceObjectCorner => "rubber",
                 _ => "paint",
             };
-            let share = value(f, "share");
+            let share = value(f, Quantity::Share);
             positive(share, Effect::MaterialDropout(MaterialDropout { materials: vec![material.into()], share }))
         }
         _ => Vec::new(),
@@ -188,7 +196,7 @@ fn losses(f: &Finding) -> Vec<Effect> {
 
 /// The law over range as a table.
 fn range_dropout(f: &Finding) -> RangeDropout {
-    let (half, steepness) = (value(f, "half_at_m").max(1e-3), value(f, "steepness"));
+    let (half, steepness) = (value(f, Quantity::HalfAtM).max(1e-3), value(f, Quantity::Steepness));
     let most = 1.0 - lost_anyway(f);
     let kept = |r: f64| if r > 0.0 { most / (1.0 + (r / half).powf(steepness)) } else { most };
     let range_m: Vec<f64> = (0..=24).map(|i| 5.0 * f64::from(i)).collect();
@@ -200,9 +208,11 @@ fn range_dropout(f: &Finding) -> RangeDropout {
 fn row_offsets_m(f: &Finding, rig: &Rig) -> Vec<f64> {
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sensor in &rig.sensors {
-        for (name, p) in &f.parameters {
-            let row = name.strip_prefix(&format!("{}/", sensor.name)).and_then(|r| r.parse::<usize>().ok());
-            let Some(row) = row else { continue };
+        for (id, p) in &f.parameters {
+            let row = match id {
+                ParameterId::Row { sensor: of, row } if *of == sensor.name => *row,
+                _ => continue,
+            };
             if rows.len() <= row {
                 rows.resize(row + 1, Vec::new());
             }
@@ -215,16 +225,16 @@ fn row_offsets_m(f: &Finding, rig: &Rig) -> Vec<f64> {
 
 /// The sensor that a finding speaks of.
 fn sensor_of<'a>(f: &Finding, rig: &'a Rig) -> &'a Sensor {
-    &rig.sensors[(value(f, "sensor") as usize).min(rig.sensors.len() - 1)]
+    &rig.sensors[(value(f, Quantity::Sensor) as usize).min(rig.sensors.len() - 1)]
 }
 
 /// A thin box a metre before the sensor that fills the blocked directions.
 fn blocked_box(f: &Finding, rig: &Rig) -> [f64; 6] {
-    let radians = |name: &str| f.parameters.get(name).map_or(0.0, |p| p.estimate.to_radians());
+    let radians = |quantity: Quantity| f.parameter(quantity).map_or(0.0, |p| p.estimate.to_radians());
     let pose = sensor_of(f, rig).pose();
     let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    for azimuth in ["azimuth_from_deg", "azimuth_to_deg"] {
-        for elevation in ["elevation_from_deg", "elevation_to_deg"] {
+    for azimuth in [Quantity::AzimuthFromDeg, Quantity::AzimuthToDeg] {
+        for elevation in [Quantity::ElevationFromDeg, Quantity::ElevationToDeg] {
             for distance in [1.0, 1.05] {
                 let (a, e) = (radians(azimuth), radians(elevation));
                 let p = Point3::new(e.cos() * a.cos(), e.cos() * a.sin(), e.sin()) * distance;
@@ -242,20 +252,20 @@ fn blocked_box(f: &Finding, rig: &Rig) -> [f64; 6] {
 
 /// A patch of directions that loses more than others: the table over directions is a spot.
 fn dirty_window(f: &Finding, rig: &Rig) -> Option<Effect> {
-    let sensor = rig.sensors.get(value(f, "sensor") as usize)?;
+    let sensor = rig.sensors.get(value(f, Quantity::Sensor) as usize)?;
     Some(Effect::DirtyWindow(DirtyWindow {
         sensor: sensor.name.clone(),
-        azimuth_deg: value(f, "azimuth_deg"),
-        elevation_deg: value(f, "elevation_deg"),
-        radius_deg: value(f, "radius_deg"),
+        azimuth_deg: value(f, Quantity::AzimuthDeg),
+        elevation_deg: value(f, Quantity::ElevationDeg),
+        radius_deg: value(f, Quantity::RadiusDeg),
         // Half of the light, one way: three quarters of `loss` in the middle.
         transmission: 0.5,
-        loss: rounded((value(f, "share") / 0.75).clamp(0.0, 1.0), 7),
+        loss: rounded((value(f, Quantity::Share) / 0.75).clamp(0.0, 1.0), 7),
         noise_m: 0.0,
     }))
 }
 
-/// What has no name: for each sensor a table along its covariate.
+/// An unexplained finding: for each sensor a table along its covariate.
 fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
     let of_sensor = |(number, sensor): (usize, &Sensor)| {
         let table = table_of_sensor(f, number, rows_deg);
@@ -264,14 +274,17 @@ fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
         }
         let mut effect = Empirical {
             sensor: sensor.name.clone(),
-            covariate: if f.covariate == "row" { Covariate::ElevationDeg } else { Covariate::AzimuthDeg },
+            covariate: match f.covariate {
+                Covariate::Row => TableCovariate::ElevationDeg,
+                _ => TableCovariate::AzimuthDeg,
+            },
             at: table.iter().map(|p| rounded(p[0], 4)).collect(),
             ..Empirical::default()
         };
         let values = table.iter().map(|p| rounded(p[1], 4)).collect();
-        match f.channel.as_str() {
-            "hits" => effect.loss = values,
-            "roughness" => effect.std_m = values,
+        match f.channel {
+            Channel::Hits => effect.loss = values,
+            Channel::Roughness => effect.std_m = values,
             _ => effect.mean_m = values,
         }
         Some(Effect::Empirical(effect))
@@ -281,15 +294,13 @@ fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
 
 /// Place and value of the points of one sensor's curve, ascending.
 fn table_of_sensor(f: &Finding, sensor: usize, rows_deg: &[Vec<f64>]) -> Vec<[f64; 2]> {
-    let usual = f.parameters.get("simulated_std_m").map_or(0.0, |p| p.estimate);
-    // Curves of sensors stand a thousand apart.
-    let own = f.curve.points.iter().filter(|p| (p.x / 1000.0).round() == sensor as f64);
-    let point = |p: &crate::diagnosis::CurvePoint| {
-        let x = p.x - 1000.0 * sensor as f64;
-        let at = if f.covariate == "row" { *rows_deg.get(sensor)?.get(x as usize)? } else { x };
-        let value = match f.channel.as_str() {
-            "hits" => (1.0 - p.after).clamp(0.0, 1.0),
-            "roughness" => usual * (p.after * p.after - 1.0).max(0.0).sqrt(),
+    let usual = f.parameter(Quantity::SimulatedStdM).map_or(0.0, |p| p.estimate);
+    let own = f.curve.points.iter().filter(|p| p.sensor == sensor);
+    let point = |p: &CurvePoint| {
+        let at = if f.covariate == Covariate::Row { *rows_deg.get(sensor)?.get(p.x as usize)? } else { p.x };
+        let value = match f.channel {
+            Channel::Hits => (1.0 - p.after).clamp(0.0, 1.0),
+            Channel::Roughness => usual * (p.after * p.after - 1.0).max(0.0).sqrt(),
             _ => p.after,
         };
         Some([at, value])

@@ -1,25 +1,30 @@
 //! The whole way from two data sets to a diagnosis.
 
+mod report;
+
+use self::report::{refused, report};
 use crate::channels::mask::Shown;
-use crate::channels::returns;
-use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::channels::mean::origins;
+use crate::channels::{labels, motion, returns};
+use crate::diagnosis::{Diagnosis, Verdict};
 use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
-    FramePair, Mending, ObjectPair, Ray, ShownShift, check_identity, common_ids, find_sensors, pair_all, with_points,
+    Corrections, FramePair, ObjectPair, Ray, Recordings, Sensors, ShownShift, check_identity, common_ids, find_sensors,
+    pair_all, with_points,
 };
+use crate::search::geometry::Displacement;
 use crate::search::labels::Side;
-use crate::search::shutter::Sliding;
-use crate::search::{self, ChannelResult, Context, REPETITIONS, mean_interval};
+use crate::search::rolling_shutter::{self, Slide};
+use crate::search::{self, ChannelResult, Context};
 use data::Dataset;
 use geometry::Box3;
-use nalgebra::Vector3;
+use nalgebra::{Point3, Vector3};
 use sensor::Rig;
-use statistics::{blocks_of, draw_blocks, interval_nearest};
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
-/// What to look at.
+/// What to diagnose.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
     /// A split of both data sets; all frames without one.
@@ -37,19 +42,29 @@ pub enum Stage {
     Weighing,
 }
 
-/// Told what is being done, how much of it is finished and how much there is.
+/// Called with the stage, how much of it is finished and how much there is.
 pub type Progress<'a> = &'a (dyn Fn(Stage, usize, usize) + Sync);
 
 /// A diagnosis with what follows from it.
 #[derive(Clone, Debug)]
 pub struct Outcome {
-    /// What is said.
+    /// The diagnosis.
     pub diagnosis: Diagnosis,
-    /// Boxes of the measured labels moved to where they belong, by frame id; empty where the labels are not at fault.
+    /// Corrected boxes of the measured labels, by frame id; empty where the labels are correct.
     pub corrected: Vec<(String, Vec<Box3>)>,
 }
 
+impl Outcome {
+    /// A diagnosis without findings.
+    fn without_findings(diagnosis: Diagnosis) -> Self {
+        Outcome { diagnosis, corrected: vec![] }
+    }
+}
+
 /// Diagnoses a pair of data sets.
+///
+/// # Errors
+/// Data sets without a common frame, and files that cannot be read.
 pub fn diagnose(
     measured: &Dataset,
     simulated: &Dataset,
@@ -61,164 +76,227 @@ pub fn diagnose(
     progress(Stage::Comparing, 0, 2);
     let (ids, empty) = with_points(measured, simulated, ids)?;
     notes.extend(empty);
-    let sensors = find_sensors(measured, simulated, &ids, rig)?;
-    for (mount, pattern) in rig.sensors.iter().zip(&sensors.patterns) {
-        if pattern.rows_rad.is_empty() {
-            notes.push(format!(
-                "sensor {}: no rows stand out in its elevations; what depends on rows cannot be told",
-                mount.name
-            ));
-        }
-    }
+    let mut recordings = Recordings::new(measured, simulated, rig, ids);
+    let sensors = find_sensors(&recordings, rig)?;
+    notes.extend(without_rows(&sensors));
     progress(Stage::Comparing, 1, 2);
-    let identity = check_identity(measured, simulated, &ids, &sensors)?;
+    let identity = check_identity(&recordings, &sensors)?;
     progress(Stage::Comparing, 2, 2);
     if !identity.identical {
         notes.insert(0, identity.reason);
-        return Ok(Outcome { diagnosis: refused(notes), corrected: vec![] });
+        return Ok(Outcome::without_findings(refused(notes)));
     }
     for id in &identity.strangers {
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
     }
-    let ids: Vec<String> = ids.into_iter().filter(|id| !identity.strangers.contains(id)).collect();
-    let mut frames = pair_all(measured, simulated, &ids, &sensors, Mending::default(), &|done| {
-        progress(Stage::Pairing, done, ids.len())
-    })?;
-    let before = frames.len();
-    leave_out_copies(&mut frames);
-    if frames.len() < before {
-        notes.push(format!("{} frames are copies of others: each scene counts once", before - frames.len()));
-    }
+    recordings.retain(|id| identity.strangers.iter().all(|s| s != id));
+    let all = recordings.len();
+    let done = |finished| progress(Stage::Pairing, finished, all);
+    let mut frames = pair_all(&recordings, &sensors, Corrections::default(), &done)?;
+    notes.extend(leave_out_copies(&mut frames));
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
             frames.len()
         ));
         let diagnosis = Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) };
-        return Ok(Outcome { diagnosis, corrected: vec![] });
+        return Ok(Outcome::without_findings(diagnosis));
     }
-    let used: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
+    let used: BTreeSet<&str> = frames.iter().map(|f| f.id.as_str()).collect();
+    recordings.retain(|id| used.contains(id));
+    let context = context(rig, &frames, &mut notes);
+    let engine = Engine { recordings: &recordings, sensors: &sensors, origins: origins(rig), progress };
+    engine.diagnose(context, notes)
+}
+
+/// Notes about sensors whose rows are not known.
+fn without_rows(sensors: &Sensors) -> Vec<String> {
+    let all = sensors.rig.sensors.iter().zip(&sensors.patterns);
+    let note =
+        |name: &str| format!("sensor {name}: no rows stand out in its elevations; what depends on rows cannot be told");
+    all.filter(|(_, pattern)| pattern.rows_rad.is_empty()).map(|(mount, _)| note(&mount.name)).collect()
+}
+
+/// What all searches share: roles, times and ego motion of the frames; with notes about what is not known.
+fn context<'a>(rig: &'a Rig, frames: &'a [FramePair], notes: &mut Vec<String>) -> Context<'a> {
+    let ids: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
-    let times = crate::channels::labels::times_s(&used, rate_hz);
+    let times = labels::times_s(&ids, rate_hz);
     if times.is_none() {
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
-    notes.extend(limits(&frames));
-    notes.extend(times.as_deref().and_then(|t| one_speed(&frames, t)));
-    let origins = crate::channels::mean::origins(rig);
-    let motion = times.as_deref().map(|t| crate::channels::motion::own_motion(&frames, t, &origins));
-    let mut context = Context { rig, frames: &frames, roles: roles(frames.len()), times, motion };
-    let mut results: Vec<ChannelResult> = Vec::new();
-    let mut keep = |channel, result| results.push(ChannelResult { channel, ..result });
-    progress(Stage::Weighing, 0, SEARCHES);
-    let again = |mending: Mending| pair_all(measured, simulated, &used, &sensors, mending, &|_| ());
-    // What slides over a scan is moved back before anything else is looked at, but for the ranges as they were measured.
-    let (sliding, slide) = match search::shutter::search(&context) {
-        Sliding::No(result) => (result, None),
-        Sliding::Yes(result, slide) => (result, Some(slide)),
-        Sliding::Perhaps(result, slide, none) => {
-            let shift: ShownShift = &|frame, p, sensor| slide.shift_m(frame, p, sensor);
-            let moved_back = again(Mending { shift_m: Some(shift), ..Mending::default() })?;
-            let moved_back = Context { frames: &moved_back, ..context.clone() };
-            if search::returns::comes_to_lie(&context, &moved_back) { (result, Some(slide)) } else { (none, None) }
-        }
-    };
-    keep("slide", sliding);
-    let (rounding, step_m) = search::quantisation::search(&context);
-    keep("ranges", rounding);
-    let slid = |frame: usize, p: &Vector3<f64>, sensor: usize| match &slide {
-        Some(slide) => slide.shift_m(frame, p, sensor),
-        None => Vector3::zeros(),
-    };
-    // Coarse steps put level ground off by a whole row's width: the simulated side is rounded alike.
-    let coarse_m = step_m.filter(|step| *step > COARSE_M);
-    let standing = match (&slide, coarse_m) {
-        (None, None) => None,
-        _ => {
-            let shift: ShownShift = &slid;
-            Some(again(Mending { shift_m: slide.as_ref().map(|_| shift), step_m: coarse_m, ..Mending::default() })?)
-        }
-    };
-    let frames = standing.as_deref().unwrap_or(&frames);
-    context.frames = frames;
-    progress(Stage::Weighing, 2, SEARCHES);
-    let (geometry, displaced) = search::geometry::search(&context);
-    keep("residuals", geometry);
-    progress(Stage::Weighing, 3, SEARCHES);
-    // What stands elsewhere is moved back before silhouettes and single returns are looked at.
-    let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
-        slid(frame, p, sensor) + displaced.of_point(p, sensor, &origins[sensor])
-    };
-    let moves = slide.is_some() || displaced.moves();
-    let moved = Mending { shift_m: moves.then_some(&shift), step_m: coarse_m, ..Mending::default() };
-    let upright = if displaced.moves() { Some(again(moved)?) } else { None };
-    context.frames = upright.as_deref().unwrap_or(frames);
-    let elsewhere = slide.is_some() || displaced.moves() || displaced.aims();
-    let shown = match (slide.is_some() || displaced.aims(), displaced.moves()) {
-        (true, _) => Shown::Elsewhere,
-        (false, true) => Shown::MovedBack,
-        (false, false) => Shown::InPlace,
-    };
-    let (hidden, mask) = search::mask::search(&context, shown);
-    keep("hits", hidden);
-    keep("hits", search::hits::search(&context, &mask, elsewhere));
-    progress(Stage::Weighing, 5, SEARCHES);
-    keep("returns", search::returns::search(&context));
-    progress(Stage::Weighing, 6, SEARCHES);
-    // Rows that measure or aim wrongly look like noise between neighbouring rows: they are mended first.
-    let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
-    let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
-    let uneven = displaced.groups.is_some();
-    let even = match (uneven, step_m) {
-        (false, None) => None,
-        // Rounding steps are no noise: the simulated side is rounded alike.
-        _ => Some(again(Mending { range_m: uneven.then_some(&off), step_m, ..moved })?),
-    };
-    if let Some(even) = &even {
-        context.frames = even;
-    }
-    let least_cos = if uneven { 0.12 } else { 0.0 };
-    keep("roughness", search::noise::search(&context, least_cos));
-    context.frames = frames;
-    progress(Stage::Weighing, 7, SEARCHES);
-    keep("labels", search::labels::search(&context, Side::Labels, &displaced));
-    keep("objects", search::labels::search(&context, Side::Objects, &displaced));
-    progress(Stage::Weighing, SEARCHES, SEARCHES);
-    search::leftovers::without_leftovers(&mut results, context.returns(&context.of(Role::HoldOut)));
-    if let Some(note) = search::set_aside(&mut results) {
-        notes.push(note);
-    }
-    let corrected = corrected(&context, &results);
-    // From the lowest row; empty where none stand out.
-    let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
-    let rows_deg: Vec<Vec<f64>> = sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
-    let mut diagnosis = write_up(&context, results, notes);
-    fill_effects(&mut diagnosis.findings, rig, &rows_deg);
-    Ok(Outcome { diagnosis, corrected })
+    notes.extend(limits(frames));
+    notes.extend(times.as_deref().and_then(|t| one_speed(frames, t)));
+    let motion = times.as_deref().map(|t| motion::own_motion(frames, t, &origins(rig)));
+    Context { rig, frames, roles: roles(frames.len()), times, motion }
 }
 
 /// Number of searches, for the progress that is shown.
 const SEARCHES: usize = 9;
 
-/// Larger steps of the ranges matter to where surfaces lie, m.
+/// Quantisation step from which on the simulated side is rounded for all searches, m: coarse steps displace level ground by the distance of
+/// rows.
 const COARSE_M: f64 = 0.02;
 
-/// Keeps the first of frames that show the same to the bit: they say nothing twice.
-fn leave_out_copies(frames: &mut Vec<FramePair>) {
-    let mut seen = std::collections::BTreeSet::new();
+/// Smallest cosine of incidence for roughness where offsets of rows were corrected.
+const LEAST_COS: f64 = 0.12;
+
+/// Runs the searches one after the other, on frames that are paired anew where an earlier search found something to correct.
+struct Engine<'a> {
+    recordings: &'a Recordings<'a>,
+    sensors: &'a Sensors,
+    origins: Vec<Point3<f64>>,
+    progress: Progress<'a>,
+}
+
+/// What earlier searches found, to be corrected for later ones.
+struct Known {
+    slide: Option<Slide>,
+    /// Quantisation step, m.
+    step_m: Option<f64>,
+    displaced: Displacement,
+}
+
+impl Known {
+    /// Quantisation step that matters to where surfaces lie, m.
+    fn coarse_m(&self) -> Option<f64> {
+        self.step_m.filter(|step| *step > COARSE_M)
+    }
+
+    /// Displacement along the scan, m.
+    fn slide_m(&self, frame: usize, p: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
+        match &self.slide {
+            Some(slide) => slide.shift_m(frame, p, sensor),
+            None => Vector3::zeros(),
+        }
+    }
+
+    /// How the measured scene lies when silhouettes and single returns are compared.
+    fn shown(&self) -> Shown {
+        match (self.slide.is_some() || self.displaced.rows_aim_elsewhere(), self.displaced.moves()) {
+            (true, _) => Shown::Elsewhere,
+            (false, true) => Shown::MovedBack,
+            (false, false) => Shown::InPlace,
+        }
+    }
+}
+
+impl Engine<'_> {
+    /// Pairs all frames anew.
+    fn pair(&self, corrections: Corrections) -> Result<Vec<FramePair>, DiagnoseError> {
+        pair_all(self.recordings, self.sensors, corrections, &|_| ())
+    }
+
+    fn finished(&self, searches: usize) {
+        (self.progress)(Stage::Weighing, searches, SEARCHES);
+    }
+
+    /// All searches in turn. Motion distortion is undone before anything else is compared, except for the ranges as they were measured.
+    fn diagnose(&self, context: Context, mut notes: Vec<String>) -> Result<Outcome, DiagnoseError> {
+        self.finished(0);
+        let (sliding, slide) = self.rolling_shutter(&context)?;
+        let (rounding, step_m) = search::quantisation::search(&context);
+        let mut results = vec![sliding, rounding];
+        let mut known = Known { slide, step_m, displaced: Displacement::default() };
+        let standing = self.standing(&known)?;
+        let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
+        self.finished(2);
+        let (geometry, displaced) = search::geometry::search(&context);
+        results.push(geometry);
+        known.displaced = displaced;
+        self.finished(3);
+        results.extend(self.single_returns(&context, &known)?);
+        self.finished(7);
+        results.extend([Side::Labels, Side::Objects].map(|s| search::labels::search(&context, s, &known.displaced)));
+        self.finished(SEARCHES);
+        search::confounders::drop_confounded(&mut results, context.returns(&context.of(Role::HoldOut)));
+        notes.extend(search::set_aside(&mut results));
+        let corrected = corrected(&context, &results);
+        let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
+        let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
+        let mut diagnosis = report(&context, results, notes);
+        fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
+        Ok(Outcome { diagnosis, corrected })
+    }
+
+    /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on the simulation.
+    fn rolling_shutter(&self, context: &Context) -> Result<(ChannelResult, Option<Slide>), DiagnoseError> {
+        Ok(match rolling_shutter::search(context) {
+            rolling_shutter::Search::NotFound(result) => (result, None),
+            rolling_shutter::Search::Found(result, slide) => (result, Some(slide)),
+            rolling_shutter::Search::Undecided { found, slide, not_found } => {
+                let shift: ShownShift = &|frame, p, sensor| slide.shift_m(frame, p, sensor);
+                let moved_back = self.pair(Corrections { shift_m: Some(shift), ..Corrections::default() })?;
+                let moved_back = Context { frames: &moved_back, ..context.clone() };
+                if search::returns::is_explained_by_displacement(context, &moved_back) {
+                    (found, Some(slide))
+                } else {
+                    (not_found, None)
+                }
+            }
+        })
+    }
+
+    /// Frames with motion distortion and coarse quantisation corrected; `None` where there is none.
+    fn standing(&self, known: &Known) -> Result<Option<Vec<FramePair>>, DiagnoseError> {
+        if known.slide.is_none() && known.coarse_m().is_none() {
+            return Ok(None);
+        }
+        let shift: ShownShift = &|frame, p, sensor| known.slide_m(frame, p, sensor);
+        let shift_m = known.slide.as_ref().map(|_| shift);
+        self.pair(Corrections { shift_m, step_m: known.coarse_m(), ..Corrections::default() }).map(Some)
+    }
+
+    /// Searches of silhouettes and single returns, on frames with the displacement of the scene undone; then of noise, with offsets of rows and
+    /// quantisation corrected as well: they look like noise between neighbouring rows.
+    fn single_returns(&self, context: &Context, known: &Known) -> Result<Vec<ChannelResult>, DiagnoseError> {
+        let displaced = &known.displaced;
+        let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
+            known.slide_m(frame, p, sensor) + displaced.of_point(p, sensor, &self.origins[sensor])
+        };
+        let moves = known.slide.is_some() || displaced.moves();
+        let moved =
+            Corrections { shift_m: moves.then_some(&shift), step_m: known.coarse_m(), ..Corrections::default() };
+        let upright = if displaced.moves() { Some(self.pair(moved)?) } else { None };
+        let context = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let (hidden, mask) = search::mask::search(&context, known.shown());
+        let elsewhere = known.shown() != Shown::InPlace;
+        let mut results = vec![hidden, search::hits::search(&context, &mask, elsewhere)];
+        self.finished(5);
+        results.push(search::returns::search(&context));
+        self.finished(6);
+        let turns: Vec<_> = context.rig.sensors.iter().map(|s| s.pose().rotation).collect();
+        let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
+        let uneven = displaced.groups.is_some();
+        let even = match (uneven, known.step_m) {
+            (false, None) => None,
+            _ => Some(self.pair(Corrections { range_m: uneven.then_some(&off), step_m: known.step_m, ..moved })?),
+        };
+        let context = Context { frames: even.as_deref().unwrap_or(context.frames), ..context.clone() };
+        results.push(search::noise::search(&context, if uneven { LEAST_COS } else { 0.0 }));
+        Ok(results)
+    }
+}
+
+/// Keeps the first of frames that are identical to the bit; each scene counts once. Returns a note where there are some.
+fn leave_out_copies(frames: &mut Vec<FramePair>) -> Option<String> {
+    let before = frames.len();
+    let mut seen = BTreeSet::new();
     let sum = |rays: &[Ray]| rays.iter().map(|r| u64::from(r.range_m.to_bits())).fold(0u64, u64::wrapping_add);
     frames.retain(|f| {
         let counts = [f.measured.len(), f.simulated.len()];
         counts == [0; 2] || seen.insert((counts, sum(&f.measured), sum(&f.simulated)))
     });
+    let copies = before - frames.len();
+    (copies > 0).then(|| format!("{copies} frames are copies of others: each scene counts once"))
 }
 
-/// Speeds that differ by less do not tell a late clock from a constant offset, m/s.
+/// Standard deviation of the objects' speeds below which a late clock cannot be told from a constant offset, m/s.
 const ONE_SPEED_M_S: f64 = 0.5;
 
-/// Says so where all objects move alike.
+/// A note where all objects move at one speed.
 fn one_speed(frames: &[FramePair], times: &[f64]) -> Option<String> {
-    let shifts = crate::channels::labels::object_shifts(frames, Some(times));
+    let shifts = labels::object_shifts(frames, Some(times));
     let speeds: Vec<f64> = shifts.iter().filter_map(|s| Some(s.seen_velocity_m_s?[0])).collect();
     let n = speeds.len() as f64;
     let mean = speeds.iter().sum::<f64>() / n.max(1.0);
@@ -228,7 +306,7 @@ fn one_speed(frames: &[FramePair], times: &[f64]) -> Option<String> {
     })
 }
 
-/// What the pairs themselves do not let be judged: labels that do not meet, and a simulation that ends earlier.
+/// Notes about limits of the data: labels that do not match, and a simulation with a shorter range.
 fn limits(frames: &[FramePair]) -> Vec<String> {
     let mut notes = Vec::new();
     let count = |f: fn(&ObjectPair) -> bool| frames.iter().flat_map(|p| &p.objects).filter(|o| f(o)).count();
@@ -254,7 +332,7 @@ fn limits(frames: &[FramePair]) -> Vec<String> {
     notes
 }
 
-/// Measured boxes after all repairs; nothing where there is none.
+/// Measured boxes after all corrections; empty where there is none.
 fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
     let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
     if repairs.is_empty() {
@@ -271,121 +349,4 @@ fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<B
         (frame.id.clone(), moved.collect())
     };
     context.frames.iter().enumerate().map(boxes).collect()
-}
-
-/// A diagnosis that says nothing but its notes.
-fn refused(notes: Vec<String>) -> Diagnosis {
-    Diagnosis {
-        schema: SCHEMA.into(),
-        verdict: Verdict::NotScenarioIdentical,
-        frames: FrameRoles::default(),
-        findings: vec![],
-        minimum_detectable: Default::default(),
-        gain: Gain {
-            metric: "nats_per_ray".into(),
-            before: 0.0,
-            after: 0.0,
-            floor: 0.0,
-            closed: None,
-            ci95: None,
-            channels: BTreeMap::new(),
-        },
-        detectors: Vec::new(),
-        considered: vec![],
-        notes,
-    }
-}
-
-/// Puts the results of all channels together.
-fn write_up(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) -> Diagnosis {
-    let hold_out = context.of(Role::HoldOut);
-    let blocks = context.blocks(&hold_out);
-    let returns = context.returns(&hold_out).max(1.0);
-    let mut findings: Vec<Finding> = Vec::new();
-    let mut considered = Vec::new();
-    let mut minimum_detectable = BTreeMap::new();
-    let mut distance = vec![[0.0; 3]; hold_out.len()];
-    let mut channels = BTreeMap::<String, [f64; 3]>::new();
-    for result in results {
-        let of_channel = channels.entry(result.channel.into()).or_default();
-        for [before, gained, best] in &result.distance {
-            let left = [*before, before - gained, before - gained.max(*best)];
-            (0..3).for_each(|k| of_channel[k] += left[k] / returns);
-        }
-        considered.extend(result.considered);
-        minimum_detectable.extend(result.minimum);
-        for (sum, d) in distance.iter_mut().zip(&result.distance) {
-            (0..3).for_each(|k| sum[k] += d[k]);
-        }
-        for f in result.found {
-            let named = f.status == Status::Named;
-            let gain = mean_interval(&f.held_out_gains, &blocks, returns);
-            // One cause seen in two channels is one finding.
-            let same = findings
-                .iter_mut()
-                .find(|g: &&mut Finding| named && g.cause.as_deref() == f.causes.first().map(String::as_str));
-            if let Some(same) = same {
-                same.gain.nats_per_ray += gain.nats_per_ray;
-                (0..2).for_each(|k| same.gain.ci95[k] += gain.ci95[k]);
-                for (name, p) in f.parameters {
-                    same.parameters.entry(name).or_insert(p);
-                }
-                continue;
-            }
-            findings.push(Finding {
-                status: f.status,
-                cause: named.then(|| f.causes[0].clone()),
-                candidates: (f.status == Status::Ambiguous).then(|| f.causes.clone()),
-                family: f.family.into(),
-                parameters: f.parameters.into_iter().collect(),
-                confidence: f.confidence,
-                channel: f.channel.into(),
-                covariate: f.covariate,
-                gain,
-                says: f.says,
-                separate_by: f.separate_by,
-                curve: f.curve,
-                effects: vec![],
-            });
-        }
-    }
-    findings.sort_by(|a, b| b.gain.nats_per_ray.total_cmp(&a.gain.nats_per_ray));
-    let ids = |role| context.of(role).into_iter().map(|i| context.frames[i].id.clone()).collect();
-    Diagnosis {
-        schema: SCHEMA.into(),
-        verdict: Verdict::of(&findings),
-        frames: FrameRoles { select: ids(Role::Select), estimate: ids(Role::Estimate), hold_out: ids(Role::HoldOut) },
-        gain: Gain { channels, ..gain(&distance, &blocks, returns, findings.is_empty()) },
-        findings,
-        minimum_detectable,
-        detectors: Vec::new(),
-        considered,
-        notes,
-    }
-}
-
-/// Distances of the held-out frames together, with the interval of what is closed. `sums` holds of every frame its distance, what the findings
-/// gain, and what tables without any form would gain.
-fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
-    let total = |which: &[usize]| {
-        which.iter().fold([0.0; 3], |s, &i| [s[0] + sums[i][0], s[1] + sums[i][1], s[2] + sums[i][2]])
-    };
-    let closed =
-        |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0 && !nothing).then(|| gained / gained.max(table));
-    let all = total(&(0..sums.len()).collect::<Vec<_>>());
-    let members = blocks_of(blocks);
-    let mut rng = data::stream(0, "diagnose closed", 0, 0);
-    let drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
-    let gained = if nothing { 0.0 } else { all[1] };
-    let least = gained.max(if nothing { 0.0 } else { all[2] });
-    let before = all[0].max(least);
-    Gain {
-        metric: "nats_per_ray".into(),
-        before: before / returns,
-        after: (before - gained) / returns,
-        floor: (before - least) / returns,
-        closed: closed(all),
-        ci95: closed(all).and_then(|_| interval_nearest(drawn)),
-        channels: BTreeMap::new(),
-    }
 }

@@ -1,38 +1,12 @@
 //! The file `extended.toml`: the effects of all findings as a list for the simulator, with what was found and its
 //! intervals as comments. What the simulator has no effect for is a comment alone.
 
+use crate::catalogue::{Cause, Covariate, ParameterId, Quantity};
 use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::effects::cause_of;
 use sensor::{Effect, EffectList};
 use std::collections::BTreeSet;
 use std::fmt::Write;
-
-/// Order in which light meets the effects: the world, the shots, the returns, the numbers, the labels.
-const ORDER: [&str; 23] = [
-    "missing_object",
-    "wrong_shape",
-    "pitch_roll",
-    "sensor_extrinsics",
-    "beam_elevation_offset",
-    "angular_jitter",
-    "rolling_shutter",
-    "mixed_pixels",
-    "ego_occlusion",
-    "material_dropout",
-    "signal_dropout",
-    "incidence_dropout",
-    "range_dropout",
-    "random_dropout",
-    "outliers",
-    "range_bias",
-    "beam_range_offset",
-    "range_noise",
-    "signal_noise",
-    "range_cut",
-    "quantisation",
-    "label_offset",
-    "time_offset",
-];
 
 /// The text of `extended.toml`, for a diagnosis whose findings carry their effects.
 pub fn extended_toml(diagnosis: &Diagnosis) -> String {
@@ -40,10 +14,7 @@ pub fn extended_toml(diagnosis: &Diagnosis) -> String {
         "# What the diagnosis adds to the simulation's sensor model: a list of effects.\n\
          # Intervals (95 %) stand above each effect.\n",
     );
-    let place = |f: &Finding| {
-        let cause = if f.status == Status::Named { cause_of(f) } else { "" };
-        ORDER.iter().position(|o| *o == cause).unwrap_or(ORDER.len())
-    };
+    let place = |f: &Finding| f.cause.unwrap_or(Cause::Unexplained).place();
     let mut findings: Vec<&Finding> = diagnosis.findings.iter().collect();
     findings.sort_by_key(|f| place(f));
     if findings.is_empty() {
@@ -71,23 +42,27 @@ fn one_table(effect: &Effect) -> String {
 fn comments(f: &Finding) -> Vec<String> {
     let mut lines: Vec<String> = f.says.lines().map(str::to_owned).collect();
     if f.status == Status::Ambiguous {
-        let names = f.candidates.clone().unwrap_or_default().join(" and ");
+        let names: Vec<&str> = f.candidates.iter().flatten().map(|c| c.name()).collect();
+        let names = names.join(" and ");
         lines.push(format!("These data do not tell {names} apart for sure; the first of them stands here."));
     }
     if f.effects.is_empty() {
         lines.push(why_none(f));
         return lines;
     }
-    let of_rows = |name: &str| name.contains('/');
-    for (name, p) in f.parameters.iter().filter(|(name, _)| *name != "sensor" && !of_rows(name)) {
+    let mut sensors = BTreeSet::new();
+    for (id, p) in &f.parameters {
         let [low, high] = p.ci95.map(short);
-        lines.push(format!("{name}: {low} to {high}"));
+        match id {
+            ParameterId::Of(Quantity::Sensor) => {}
+            ParameterId::Of(quantity) => lines.push(format!("{quantity}: {low} to {high}")),
+            ParameterId::Row { sensor, .. } => drop(sensors.insert(sensor)),
+        }
     }
-    let sensors: BTreeSet<&str> = f.parameters.keys().filter_map(|n| Some(n.split_once('/')?.0)).collect();
     if sensors.len() > 1 {
         lines.push("One table serves for all sensors: the mean over them.".into());
     }
-    if f.status == Status::Unexplained && f.covariate != "direction" {
+    if f.status == Status::Unexplained && f.covariate != Covariate::Direction {
         let errors = || f.curve.points.iter().map(|p| p.error);
         let [low, high] = [errors().fold(f64::MAX, f64::min), errors().fold(0.0, f64::max)].map(short);
         lines.push(format!("standard errors of what was measured along the curve: {low} to {high}"));
@@ -97,17 +72,20 @@ fn comments(f: &Finding) -> Vec<String> {
 
 /// Why no effect stands for a finding.
 fn why_none(f: &Finding) -> String {
-    let negative = ["std_m", "std_deg", "share"].into_iter().find_map(|name| {
-        let p = f.parameters.get(name)?;
-        (p.estimate < 0.0).then_some((name, p.estimate))
+    let negative = [Quantity::StdM, Quantity::StdDeg, Quantity::Share].into_iter().find_map(|quantity| {
+        let p = f.parameter(quantity)?;
+        (p.estimate < 0.0).then_some((quantity, p.estimate))
     });
     match (cause_of(f), negative) {
-        ("range_noise" | "angular_jitter" | "random_dropout" | "material_dropout", Some((name, by))) => {
+        (
+            Cause::RangeNoise | Cause::AngularJitter | Cause::RandomDropout | Cause::MaterialDropout,
+            Some((quantity, by)),
+        ) => {
             let by = short(by);
-            format!("The simulation has more of it than the measurement: take it out there ({name} by {by}).")
+            format!("The simulation has more of it than the measurement: take it out there ({quantity} by {by}).")
         }
-        ("mixed_pixels", _) => "beam_divergence: how wide the beams are these data do not tell.".into(),
-        ("", _) => "There is no table of it for any sensor of the rig.".into(),
+        (Cause::MixedPixels, _) => "beam_divergence: how wide the beams are these data do not tell.".into(),
+        (Cause::Unexplained, _) => "There is no table of it for any sensor of the rig.".into(),
         (other, _) => {
             format!("The simulator has no effect that does this by itself ({other}): mend its world.")
         }
@@ -121,29 +99,40 @@ fn short(v: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::diagnosis::{Curve, CurvePoint, FindingGain, Gain, Parameter, SCHEMA, Verdict};
+    use crate::catalogue::{Channel, Unit};
+    use crate::curve::{Curve, CurvePoint};
+    use crate::diagnosis::{FindingGain, Gain, Parameter, SCHEMA, Verdict};
     use crate::effects::fill_effects;
     use sensor::Rig;
     use sensor::effects::{BeamAngleError, EgoAttitude, RangeBias, SignalDropout};
     use std::collections::BTreeMap;
 
-    fn finding(cause: &str, parameters: &[(&str, f64)]) -> Finding {
-        let parameter = |v: f64| Parameter { estimate: v, unit: "m".into(), ci95: [0.9 * v, 1.1 * v] };
+    fn finding(cause: Cause, parameters: &[(Quantity, f64)]) -> Finding {
+        let parameter =
+            |q: Quantity, v: f64| (q.into(), Parameter { estimate: v, unit: q.unit(), ci95: [0.9 * v, 1.1 * v] });
         Finding {
             status: Status::Named,
-            cause: Some(cause.into()),
+            cause: Some(cause),
             candidates: None,
-            family: "range_error".into(),
-            parameters: parameters.iter().map(|(n, v)| ((*n).to_owned(), parameter(*v))).collect::<BTreeMap<_, _>>(),
+            family: cause.family(),
+            parameters: parameters.iter().map(|(q, v)| parameter(*q, *v)).collect(),
             confidence: 1.0,
-            channel: "roughness".into(),
-            covariate: "none".into(),
+            channel: Channel::Roughness,
+            covariate: Covariate::None,
             gain: FindingGain::default(),
             says: format!("says {cause}"),
             separate_by: None,
             curve: Curve::default(),
             effects: vec![],
         }
+    }
+
+    fn with_rows(mut finding: Finding, offsets: [f64; 2]) -> Finding {
+        for (row, v) in offsets.into_iter().enumerate() {
+            let id = ParameterId::Row { sensor: "lidar".into(), row };
+            finding.parameters.insert(id, Parameter { estimate: v, unit: Unit::Metre, ci95: [v - 0.001, v + 0.001] });
+        }
+        finding
     }
 
     fn diagnosis(mut findings: Vec<Finding>) -> Diagnosis {
@@ -172,11 +161,11 @@ mod tests {
     #[test]
     fn effects_stand_in_the_order_in_which_light_meets_them() {
         let diagnosis = diagnosis(vec![
-            finding("label_offset", &[("forward_m", 0.3)]),
-            finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
-            finding("random_dropout", &[("share", 0.2)]),
-            finding("random_dropout", &[("share", -0.2)]),
-            finding("wrong_shape", &[("longer_m", 0.2)]),
+            finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.3)]),
+            finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 0.0)]),
+            finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)]),
+            finding(Cause::RandomDropout, &[(Quantity::Share, -0.2)]),
+            finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
         ]);
         let text = extended_toml(&diagnosis);
         let table: toml::Table = toml::from_str(&text).unwrap();
@@ -193,95 +182,95 @@ mod tests {
 
     #[test]
     fn the_simulator_reads_every_cause() {
-        let unexplained = |channel: &str, covariate: &str, at: &[f64]| Finding {
+        let unexplained = |channel: Channel, covariate: Covariate, at: &[f64]| Finding {
             status: Status::Unexplained,
             cause: None,
-            channel: channel.into(),
-            covariate: covariate.into(),
+            channel,
+            covariate,
             curve: Curve {
                 points: at
                     .iter()
-                    .map(|x| CurvePoint { x: *x, measured: 0.9, before: 1.0, after: 0.9, error: 0.1 })
+                    .map(|x| CurvePoint { sensor: 0, x: *x, measured: 0.9, before: 1.0, after: 0.9, error: 0.1 })
                     .collect(),
                 ..Curve::default()
             },
-            ..finding("", &[("simulated_std_m", 0.01)])
+            ..finding(Cause::Unexplained, &[(Quantity::SimulatedStdM, 0.01)])
         };
         let findings = vec![
-            finding("range_noise", &[("std_m", 0.02), ("per_m", 1e-4)]),
-            finding("range_noise", &[("std_m", 0.02), ("per_m", 0.0)]),
-            finding("signal_noise", &[("std_m", 0.02), ("exponent", 0.5)]),
-            finding("range_bias", &[("offset_m", -0.02), ("scale", 1e-3)]),
-            finding("beam_range_offset", &[("std_m", 0.02), ("lidar/0", 0.01), ("lidar/1", -0.01)]),
-            finding("beam_elevation_offset", &[("std_deg", 0.1)]),
-            finding("quantisation", &[("step_m", 0.02)]),
-            finding("angular_jitter", &[("std_deg", 0.05)]),
-            finding("random_dropout", &[("share", 0.2)]),
-            finding("signal_dropout", &[("threshold", 1.0), ("steepness", 3.0)]),
-            finding("incidence_dropout", &[("cos_half", 0.1), ("steepness", 3.0)]),
-            finding("range_dropout", &[("half_at_m", 50.0), ("steepness", 6.0)]),
-            finding("material_dropout", &[("share", 0.5)]),
-            finding("range_cut", &[("max_m", 80.0)]),
+            finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 1e-4)]),
+            finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 0.0)]),
+            finding(Cause::SignalNoise, &[(Quantity::StdM, 0.02), (Quantity::Exponent, 0.5)]),
+            finding(Cause::RangeBias, &[(Quantity::OffsetM, -0.02), (Quantity::Scale, 1e-3)]),
+            with_rows(finding(Cause::BeamRangeOffset, &[(Quantity::StdM, 0.02)]), [0.01, -0.01]),
+            finding(Cause::BeamElevationOffset, &[(Quantity::StdDeg, 0.1)]),
+            finding(Cause::Quantisation, &[(Quantity::StepM, 0.02)]),
+            finding(Cause::AngularJitter, &[(Quantity::StdDeg, 0.05)]),
+            finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)]),
+            finding(Cause::SignalDropout, &[(Quantity::Threshold, 1.0), (Quantity::Steepness, 3.0)]),
+            finding(Cause::IncidenceDropout, &[(Quantity::CosHalf, 0.1), (Quantity::Steepness, 3.0)]),
+            finding(Cause::RangeDropout, &[(Quantity::HalfAtM, 50.0), (Quantity::Steepness, 6.0)]),
+            finding(Cause::MaterialDropout, &[(Quantity::Share, 0.5)]),
+            finding(Cause::RangeCut, &[(Quantity::MaxM, 80.0)]),
             finding(
-                "ego_occlusion",
+                Cause::EgoOcclusion,
                 &[
-                    ("azimuth_from_deg", -10.0),
-                    ("azimuth_to_deg", 10.0),
-                    ("elevation_from_deg", -4.0),
-                    ("elevation_to_deg", 1.0),
+                    (Quantity::AzimuthFromDeg, -10.0),
+                    (Quantity::AzimuthToDeg, 10.0),
+                    (Quantity::ElevationFromDeg, -4.0),
+                    (Quantity::ElevationToDeg, 1.0),
                 ],
             ),
-            finding("sensor_extrinsics", &[("sensor", 0.0), ("yaw_deg", 0.2)]),
-            finding("pitch_roll", &[("pitch_deg", 0.2)]),
-            finding("rolling_shutter", &[("scan_s", 0.1)]),
-            finding("outliers", &[("rate", 0.01), ("reach_m", 90.0)]),
-            finding("mixed_pixels", &[("share", 0.01), ("divergence_rad", 0.004)]),
-            finding("label_offset", &[("forward_m", 0.2)]),
-            finding("time_offset", &[("offset_s", 0.02)]),
-            finding("wrong_shape", &[("longer_m", 0.2)]),
-            finding("missing_object", &[("share", 0.02)]),
-            unexplained("hits", "azimuth", &[-30.0, 10.0, 50.0]),
-            unexplained("roughness", "row", &[0.0, 1.0]),
-            unexplained("residuals", "azimuth", &[-30.0, 10.0]),
+            finding(Cause::SensorExtrinsics, &[(Quantity::Sensor, 0.0), (Quantity::YawDeg, 0.2)]),
+            finding(Cause::PitchRoll, &[(Quantity::PitchDeg, 0.2)]),
+            finding(Cause::RollingShutter, &[(Quantity::ScanS, 0.1)]),
+            finding(Cause::Outliers, &[(Quantity::Rate, 0.01), (Quantity::ReachM, 90.0)]),
+            finding(Cause::MixedPixels, &[(Quantity::Share, 0.01), (Quantity::DivergenceRad, 0.004)]),
+            finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.2)]),
+            finding(Cause::TimeOffset, &[(Quantity::OffsetS, 0.02)]),
+            finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
+            finding(Cause::MissingObject, &[(Quantity::Share, 0.02)]),
+            unexplained(Channel::Hits, Covariate::Azimuth, &[-30.0, 10.0, 50.0]),
+            unexplained(Channel::Roughness, Covariate::Row, &[0.0, 1.0]),
+            unexplained(Channel::Residuals, Covariate::Azimuth, &[-30.0, 10.0]),
             Finding {
                 parameters: finding(
-                    "",
+                    Cause::Unexplained,
                     &[
-                        ("sensor", 0.0),
-                        ("azimuth_deg", -20.0),
-                        ("elevation_deg", -4.0),
-                        ("radius_deg", 5.0),
-                        ("share", 0.4),
+                        (Quantity::Sensor, 0.0),
+                        (Quantity::AzimuthDeg, -20.0),
+                        (Quantity::ElevationDeg, -4.0),
+                        (Quantity::RadiusDeg, 5.0),
+                        (Quantity::Share, 0.4),
                     ],
                 )
                 .parameters,
-                ..unexplained("hits", "direction", &[-20.0])
+                ..unexplained(Channel::Hits, Covariate::Direction, &[-20.0])
             },
         ];
         for f in findings {
-            let what = f.cause.clone().unwrap_or_else(|| f.channel.clone());
+            let what = f.cause.map_or(f.channel.name(), Cause::name);
             let diagnosis = diagnosis(vec![f]);
             let text = extended_toml(&diagnosis);
             let read = EffectList::parse(&text, std::path::Path::new("extended.toml"));
             let effects = read.unwrap_or_else(|e| panic!("{what}: {e}\n{text}")).effects;
             assert_eq!(effects, diagnosis.findings[0].effects, "{what}: {text}");
-            let of_the_world = matches!(what.as_str(), "wrong_shape" | "missing_object");
+            let of_the_world = matches!(what, "wrong_shape" | "missing_object");
             assert_eq!(effects.is_empty(), of_the_world, "{what}: {text}");
         }
     }
 
     #[test]
     fn what_a_finding_does_not_have_changes_nothing() {
-        let effect = |cause: &str, parameters: &[(&str, f64)]| {
+        let effect = |cause: Cause, parameters: &[(Quantity, f64)]| {
             let diagnosis = diagnosis(vec![finding(cause, parameters)]);
             diagnosis.findings[0].effects.clone()
         };
         assert_eq!(
-            effect("range_bias", &[("scale", 1e-3)]),
+            effect(Cause::RangeBias, &[(Quantity::Scale, 1e-3)]),
             [Effect::RangeBias(RangeBias { offset_m: 0.0, scale: 1e-3 })]
         );
         assert_eq!(
-            effect("beam_elevation_offset", &[("mean_deg", 0.2)]),
+            effect(Cause::BeamElevationOffset, &[(Quantity::MeanDeg, 0.2)]),
             [Effect::BeamAngleError(BeamAngleError {
                 elevation_deg: 0.2,
                 elevation_std_deg: 0.0,
@@ -289,7 +278,7 @@ mod tests {
             })]
         );
         assert_eq!(
-            effect("signal_dropout", &[("threshold", 1.0), ("steepness", 3.0)]),
+            effect(Cause::SignalDropout, &[(Quantity::Threshold, 1.0), (Quantity::Steepness, 3.0)]),
             [Effect::SignalDropout(SignalDropout {
                 most: 1.0,
                 threshold: 1.0,
@@ -297,14 +286,16 @@ mod tests {
                 attenuation_per_m: 0.0
             })]
         );
-        let [Effect::EgoAttitude(attitude)] = &effect("pitch_roll", &[("roll_deg", 0.2)])[..] else { panic!() };
+        let [Effect::EgoAttitude(attitude)] = &effect(Cause::PitchRoll, &[(Quantity::RollDeg, 0.2)])[..] else {
+            panic!()
+        };
         let still = EgoAttitude { roll_deg: 0.2, pitch_deg: 0.0, roll_std_deg: 0.0, pitch_std_deg: 0.0, ..*attitude };
         assert_eq!((attitude, attitude.heave_std_m, attitude.pitch_at_70mps_deg), (&still, 0.0, 0.0));
     }
 
     #[test]
     fn effects_do_not_stand_in_the_json() {
-        let diagnosis = diagnosis(vec![finding("range_noise", &[("std_m", 0.02)])]);
+        let diagnosis = diagnosis(vec![finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02)])]);
         assert_eq!(diagnosis.findings[0].effects.len(), 1);
         let json = serde_json::to_value(&diagnosis).unwrap();
         assert!(json["findings"][0].get("effects").is_none());

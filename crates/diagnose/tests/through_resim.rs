@@ -1,7 +1,9 @@
 //! What is put on a simulated data set by `resim` is found again, and what is written as an extension mends it.
 
 use data::Dataset;
-use lidarshift_diagnose::{Diagnosis, Options, Outcome, Rig, Status, diagnose, extended_toml};
+use lidarshift_diagnose::{
+    Cause, Channel, Covariate, Diagnosis, Options, Outcome, Quantity, Rig, Status, diagnose, extended_toml,
+};
 use sensor::EffectList;
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
@@ -32,7 +34,7 @@ fn diagnosed(measured: &Dataset, simulated: &Dataset, folder: &Path) -> Outcome 
 }
 
 fn named(d: &Diagnosis) -> Vec<&str> {
-    let mut names: Vec<&str> = d.findings.iter().map(|f| f.cause.as_deref().unwrap_or("-")).collect();
+    let mut names: Vec<&str> = d.findings.iter().map(|f| f.cause.map_or("-", |c| c.name())).collect();
     names.sort_unstable();
     names
 }
@@ -48,8 +50,10 @@ fn the_papers_two_causes_are_found_and_mended() {
     let outcome = diagnosed(&measured, &sim, folder.path());
     let d = &outcome.diagnosis;
     assert_eq!(named(d), ["random_dropout", "range_noise"], "{:?}", d.findings);
-    for (cause, name, truth) in [("range_noise", "std_m", 0.02), ("random_dropout", "share", 0.2)] {
-        let p = &d.findings.iter().find(|f| f.cause.as_deref() == Some(cause)).unwrap().parameters[name];
+    for (cause, quantity, truth) in
+        [(Cause::RangeNoise, Quantity::StdM, 0.02), (Cause::RandomDropout, Quantity::Share, 0.2)]
+    {
+        let p = d.findings.iter().find(|f| f.cause == Some(cause)).unwrap().parameter(quantity).unwrap();
         assert!(p.ci95[0] <= truth && truth <= p.ci95[1], "{cause}: {p:?}");
         assert!((p.estimate / truth - 1.0).abs() < 0.05, "{cause}: {p:?}");
     }
@@ -74,8 +78,8 @@ fn what_has_no_name_is_mended_by_a_table() {
     let d = &outcome.diagnosis;
     // The mean of the stripes may be called a random loss; what is left over the azimuth has no name.
     let unnamed = d.findings.iter().find(|f| f.status == Status::Unexplained).unwrap();
-    assert_eq!((unnamed.channel.as_str(), unnamed.covariate.as_str()), ("hits", "azimuth"), "{:?}", d.findings);
-    assert!(unnamed.gain.ci95[0] > 0.0 && d.findings.iter().all(|f| f.channel == "hits"), "{:?}", d.findings);
+    assert_eq!((unnamed.channel, unnamed.covariate), (Channel::Hits, Covariate::Azimuth), "{:?}", d.findings);
+    assert!(unnamed.gain.ci95[0] > 0.0 && d.findings.iter().all(|f| f.channel == Channel::Hits), "{:?}", d.findings);
     let found: f64 = d.findings.iter().map(|f| f.gain.nats_per_ray).sum();
     let extended = extended_toml(d);
     let again = with_effects(&sim, &extended, &folder.path().join("extended"), 12);

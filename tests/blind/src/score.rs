@@ -182,7 +182,7 @@ pub fn summarise(outcomes: &[Outcome]) -> Summary {
             if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
         summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms, close]);
     }
-    summary.closed = median_upper(outcomes.iter().filter(|o| o.word() == "right").filter_map(|o| o.closed).collect());
+    summary.closed = median_upper(outcomes.iter().filter(|o| o.grade() == "right").filter_map(|o| o.closed).collect());
     let times: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
     summary.seconds = [median_upper(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
     summary

@@ -64,7 +64,7 @@ fn notes(d: &Diagnosis) -> String {
 }
 
 fn names(d: &Diagnosis) -> Vec<String> {
-    d.findings.iter().map(|f| f.cause.clone().unwrap_or_else(|| format!("{:?}", f.candidates))).collect()
+    d.findings.iter().map(|f| f.cause.map_or_else(|| format!("{:?}", f.candidates), |c| c.to_string())).collect()
 }
 
 #[test]

@@ -17,9 +17,6 @@ const COS_STEP: f64 = 0.4;
 /// Number of the first zone of objects.
 pub const OBJECT: usize = 2;
 
-/// Zones by name, for findings.
-pub const ZONE_NAMES: [&str; ZONES] = ["ground", "standing", "object", "object_corner"];
-
 /// Cosine at which the edges and curves of objects are taken to be met: they are too small for a surface of their own, wheels above all.
 const ROUND_COS: f64 = 0.6;
 

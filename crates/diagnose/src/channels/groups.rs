@@ -1,13 +1,14 @@
-//! Offsets of groups of rays: rows of a sensor, strips of azimuth. Each group has one number for its range, and rows one for their
-//! elevation as well; poses are taken out frame by frame before.
+//! Offsets of groups of rays: rows of a sensor, or strips of azimuth. Each group has one range offset, and rows have one elevation offset as
+//! well. The pose error of each frame is subtracted before.
 
 use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
+use crate::catalogue::Covariate;
 use crate::pairing::{FramePair, Ray};
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 use sensor::Rig;
 
-/// What makes rays a group.
+/// How rays are grouped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Grouping {
     /// Rows of each sensor.
@@ -16,33 +17,67 @@ pub enum Grouping {
     Azimuth,
 }
 
+impl Grouping {
+    /// What rays are grouped by, as findings name it.
+    pub fn name(self) -> &'static str {
+        Covariate::from(self).name()
+    }
+}
+
 /// Width of a strip of azimuth, rad.
 pub const STRIP_RAD: f64 = 0.0873;
 
 /// Strips of a full turn.
 const STRIPS: usize = 72;
 
-/// Rows that a sensor may have.
+/// Largest number of rows of a sensor.
 const ROWS: usize = 256;
 
-/// Number of the group of a ray.
-pub fn group_of(ray: &Ray, grouping: Grouping) -> Option<usize> {
-    let sensor = ray.sensor as usize;
-    match grouping {
-        Grouping::Row => (usize::from(ray.row) < ROWS).then(|| sensor * ROWS + usize::from(ray.row)),
-        Grouping::Azimuth => {
-            let strip = ((f64::from(ray.azimuth_rad) + std::f64::consts::PI) / STRIP_RAD).floor() as usize;
-            Some(sensor * STRIPS + strip.min(STRIPS - 1))
+/// A group of rays of one sensor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Group {
+    /// Number of the sensor.
+    pub sensor: u8,
+    /// Number of the row or strip.
+    pub index: u16,
+}
+
+impl Group {
+    /// The groups of the same sensor up to `reach` places away, itself among them.
+    pub fn around(self, reach: u16) -> std::ops::RangeInclusive<Group> {
+        let at = |index| Group { index, ..self };
+        at(self.index.saturating_sub(reach))..=at(self.index + reach)
+    }
+
+    /// The group before it.
+    pub fn previous(self) -> Option<Group> {
+        Some(Group { index: self.index.checked_sub(1)?, ..self })
+    }
+
+    /// The group after it.
+    pub fn next(self) -> Group {
+        Group { index: self.index + 1, ..self }
+    }
+
+    /// The number of the row, or the middle azimuth of the strip in rad.
+    pub fn place(self, grouping: Grouping) -> f64 {
+        match grouping {
+            Grouping::Row => f64::from(self.index),
+            Grouping::Azimuth => (f64::from(self.index) + 0.5) * STRIP_RAD - std::f64::consts::PI,
         }
     }
 }
 
-/// Sensor and place of a group: row, or middle azimuth in rad.
-pub fn place_of(group: usize, grouping: Grouping) -> (usize, f64) {
-    match grouping {
-        Grouping::Row => (group / ROWS, (group % ROWS) as f64),
-        Grouping::Azimuth => (group / STRIPS, ((group % STRIPS) as f64 + 0.5) * STRIP_RAD - std::f64::consts::PI),
-    }
+/// The group of a ray; `None` where its row is not known.
+pub fn group_of(ray: &Ray, grouping: Grouping) -> Option<Group> {
+    let index = match grouping {
+        Grouping::Row => Some(ray.row).filter(|row| usize::from(*row) < ROWS)?,
+        Grouping::Azimuth => {
+            let strip = ((f64::from(ray.azimuth_rad) + std::f64::consts::PI) / STRIP_RAD).floor() as usize;
+            strip.min(STRIPS - 1) as u16
+        }
+    };
+    Some(Group { sensor: ray.sensor, index })
 }
 
 /// Sums of one group of one frame, over an offset of range (m) and one of elevation (rad).
@@ -80,8 +115,8 @@ impl GroupSums {
     }
 }
 
-/// Groups of one frame, by number.
-pub type GroupFrame = Vec<(u32, GroupSums)>;
+/// Groups of one frame, in their order.
+pub type GroupFrame = Vec<(Group, GroupSums)>;
 
 /// Parts that the rays of a group are cut into.
 pub const PARTS: usize = 4;
@@ -123,10 +158,10 @@ pub fn group_frames(
 ) -> Vec<PartedFrame> {
     let origins = super::mean::origins(rig);
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
-    let groups = rig.sensors.len() * if grouping == Grouping::Row { ROWS } else { STRIPS };
+    let of_sensor = if grouping == Grouping::Row { ROWS } else { STRIPS };
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |(frame, poses): (&FramePair, &OwnPoses)| -> PartedFrame {
-        let mut sums = vec![[GroupSums::default(); PARTS]; groups];
+        let mut sums = vec![vec![[GroupSums::default(); PARTS]; of_sensor]; rig.sensors.len()];
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let Some(group) = group_of(ray, grouping) else { continue };
             let sensor = ray.sensor as usize;
@@ -138,14 +173,19 @@ pub fn group_frames(
             let y = y - structure[super::mean::kind_of(ray)];
             let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
             let w = weight(ray, noise_m) / design;
-            sums[group][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {
+            sums[sensor][usize::from(group.index)][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {
                 gram: [w * x[0] * x[0], w * x[0] * x[1], w * x[1] * x[1]],
                 right: [w * x[0] * y, w * x[1] * y],
                 n: 1.0,
             });
         }
         std::array::from_fn(|part| {
-            sums.iter().enumerate().filter(|(_, s)| s[part].n > 0.0).map(|(i, s)| (i as u32, s[part])).collect()
+            let of_sensor = |(sensor, sums): (usize, &Vec<[GroupSums; PARTS]>)| -> GroupFrame {
+                let group = |index| Group { sensor: sensor as u8, index: index as u16 };
+                let filled = sums.iter().enumerate().filter(|(_, s)| s[part].n > 0.0);
+                filled.map(|(index, s)| (group(index), s[part])).collect()
+            };
+            sums.iter().enumerate().flat_map(of_sensor).collect()
         })
     };
     frames.par_iter().zip(poses).map(one).collect()
@@ -157,8 +197,8 @@ pub fn whole(frame: &PartedFrame) -> GroupFrame {
 }
 
 /// Sums over frames, by group.
-pub fn total<'a>(frames: impl Iterator<Item = &'a GroupFrame>) -> std::collections::BTreeMap<u32, GroupSums> {
-    let mut all = std::collections::BTreeMap::<u32, GroupSums>::new();
+pub fn total<'a>(frames: impl Iterator<Item = &'a GroupFrame>) -> std::collections::BTreeMap<Group, GroupSums> {
+    let mut all = std::collections::BTreeMap::<Group, GroupSums>::new();
     for (i, sums) in frames.flatten() {
         all.entry(*i).or_default().merge(sums);
     }

@@ -1,7 +1,7 @@
 //! Which returns have a counterpart on the other side, by direction.
 
 use super::cells::{CELLS, Place, cell};
-use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
+use super::groups::{Group, GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use super::mask::Mask;
 use crate::pairing::FramePair;
 use rayon::prelude::*;
@@ -75,7 +75,7 @@ pub fn loss_groups(
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |frame: &FramePair| -> PartedFrame {
         // Of the simulated side and of the measured one: returns, and those without a counterpart; then those expected to be lost.
-        let mut sums = std::collections::BTreeMap::<(usize, usize), ([[f64; 2]; 2], f64)>::new();
+        let mut sums = std::collections::BTreeMap::<(Group, usize), ([[f64; 2]; 2], f64)>::new();
         for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
             for ray in rays {
                 let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
@@ -96,7 +96,7 @@ pub fn loss_groups(
             let w = n * n / (2.0 * (alone + odd + 2.0));
             // Matching one to one leaves as many without a counterpart on both sides.
             let y = (alone - lost) / n - odd / f64::max(seen, 1.0);
-            out[part].push((g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
+            out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
         }
         out
     };

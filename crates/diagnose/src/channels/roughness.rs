@@ -2,7 +2,7 @@
 //! slightly wrong walls cancel; noise along the ray and of the direction does not.
 
 use super::cells::{CELLS, Place, cell};
-use super::groups::{GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
+use super::groups::{Group, GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use crate::pairing::{FramePair, Ray, Surface};
 use rayon::prelude::*;
 use sensor::Rig;
@@ -142,7 +142,7 @@ pub fn rough_groups(
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |frame: &FramePair| -> PartedFrame {
         // Of each side: returns, sum of squares less what is expected, sum of variances of the squares.
-        let mut sums = std::collections::BTreeMap::<(usize, usize), [[f64; 3]; 2]>::new();
+        let mut sums = std::collections::BTreeMap::<(Group, usize), [[f64; 3]; 2]>::new();
         for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
             for ray in rays {
                 let (Some(c), Some(v), Some(g)) = (cell(ray), own_roughness_m(ray), group_of(ray, grouping)) else {
@@ -163,7 +163,7 @@ pub fn rough_groups(
             let y = a[1] / a[0] - b[1] / b[0];
             // Neighbours share neighbours.
             let w = 1.0 / (2.0 * (a[2] / (a[0] * a[0]) + b[2] / (b[0] * b[0])));
-            out[part].push((g as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n: a[0] }));
+            out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n: a[0] }));
         }
         out
     };

@@ -1,34 +1,34 @@
-//! One step of forward selection: which candidate explains frames that it was not fitted on, and which others could as well.
+//! One step of forward selection: the hypothesis that explains frames on which it was not fitted, and its rivals.
 
-/// Name of a trial of what is in no catalogue.
-pub const UNNAMED: &str = "unexplained";
+use crate::catalogue::Cause;
 
-/// What a candidate brought on each frame, when it was fitted on other blocks.
+/// A hypothesis with its gain on each frame, fitted on other blocks.
 #[derive(Clone, Debug)]
 pub struct Trial {
-    /// Its place in the list of candidates.
+    /// Its place in the list of hypotheses.
     pub candidate: usize,
-    /// Causes that tell the same story differently share a name.
-    pub name: String,
+    /// Its cause. Several forms of a law share one.
+    pub cause: Cause,
     /// Number of free parameters.
     pub parameters: usize,
     /// Gain of each frame over the model so far, nats.
     pub gains: Vec<f64>,
-    /// Whether the effect fitted on all frames is large enough to speak of.
+    /// Whether the effect fitted on all frames exceeds the smallest effect that is reported.
     pub above_floor: bool,
 }
 
-/// What a step must bring.
+/// What a hypothesis must bring to be chosen.
 #[derive(Clone, Copy, Debug)]
 pub struct Demands {
     /// Mean gain of a frame over its standard error.
     pub z: f64,
     /// Gain of all frames together, nats.
     pub nats: f64,
-    /// Share of the best gain by which a simpler candidate may fall behind.
+    /// Share of the best gain by which a simpler hypothesis may fall behind.
     pub slack: f64,
-    /// Share of the gain from which on a richer candidate of another name, better for sure, is told beside the simpler one.
-    pub told: f64,
+    /// Share of its gain by which a hypothesis with more parameters and another cause must exceed the simpler one, significantly, to be
+    /// reported beside it.
+    pub richer: f64,
 }
 
 /// The outcome of a step.
@@ -36,11 +36,12 @@ pub struct Demands {
 pub struct Choice {
     /// The chosen trial.
     pub chosen: usize,
-    /// Other names that explain as much, as far as these frames tell, or next to as much with fewer parameters.
+    /// Trials of other causes that explain as much as far as these frames tell, or nearly as much with fewer parameters.
     pub equals: Vec<usize>,
 }
 
-/// Sum and z of gains; z of a candidate that brings the same on every frame is bounded by the square root of their number times 30.
+/// Sum of the gains, and their mean over its standard error. The relative standard deviation is taken to be at least 1/30, which bounds z by
+/// 30 times the square root of the number of frames.
 pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
     let n = gains.len() as f64;
     let total: f64 = gains.iter().sum();
@@ -53,8 +54,8 @@ pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
     (total, mean / error)
 }
 
-/// Whether gains are there though few frames have most of them: what only some scenes show (a turn, a thing beside the road) gains much
-/// on some frames and loses next to nothing on the others.
+/// Whether gains are consistent although few frames have most of them. An effect that only some scenes show (a bend, an object beside the
+/// road) gains much on at least three frames, and all losses together are below 15 % of all gains.
 fn consistent(gains: &[f64]) -> bool {
     let won: f64 = gains.iter().filter(|g| **g > 0.0).sum();
     let lost: f64 = -gains.iter().filter(|g| **g < 0.0).sum::<f64>();
@@ -62,7 +63,7 @@ fn consistent(gains: &[f64]) -> bool {
     plenty >= 3 && lost < 0.15 * won
 }
 
-/// Gain of a single frame that chance does not make, nats.
+/// Gain of a single frame that does not occur by chance, nats.
 const PLENTY: f64 = 8.0;
 
 /// Whether gains are significant.
@@ -71,15 +72,15 @@ pub fn significant(gains: &[f64], z_least: f64) -> bool {
     z > z_least || z > 1.5 && consistent(gains)
 }
 
-/// Whether differences point the same way on so many frames that chance does not, by `z_least` standard errors, however unlike their sizes are (the sign test;
-/// frames without a difference do not count).
+/// Sign test: whether positive differences outnumber negative ones by more than `z_least` standard errors. Frames without a difference do
+/// not count.
 pub fn significant_by_signs(differences: &[f64], z_least: f64) -> bool {
     let more = differences.iter().filter(|d| **d > 0.0).count() as f64;
     let less = differences.iter().filter(|d| **d < 0.0).count() as f64;
     more - less > z_least * (more + less).sqrt()
 }
 
-/// Chooses, or finds nothing worth choosing.
+/// Chooses the simplest of the trials that are nearly as good as the best; `None` where no trial meets the demands.
 pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let eligible: Vec<usize> = (0..trials.len())
         .filter(|&i| {
@@ -89,7 +90,7 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
         .collect();
     let total = |i: usize| total_and_z(&trials[i].gains).0;
     let best = eligible.iter().copied().max_by(|a, b| total(*a).total_cmp(&total(*b)))?;
-    // How much of its gain a rival leaves, and whether these frames can tell.
+    // Difference of the gains, and its z.
     let ahead = |of: usize, rival: usize| {
         let differences: Vec<f64> = trials[of].gains.iter().zip(&trials[rival].gains).map(|(a, b)| a - b).collect();
         total_and_z(&differences)
@@ -102,32 +103,32 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let chosen = simpler
         .min_by(|a, b| trials[*a].parameters.cmp(&trials[*b].parameters).then(total(*b).total_cmp(&total(*a))))
         .unwrap_or(best);
-    // A slightly wrong form of the right cause is worth a little to a richer law; where it is worth more, and for sure, both are told.
+    // A slightly wrong form of the right cause lets a richer law gain a little. Where it gains more, significantly, both are reported.
     let worth_more = |&i: &usize| {
         let (more, z) = ahead(i, chosen);
         let richer = trials[i].parameters > trials[chosen].parameters;
-        let other = trials[i].name != trials[chosen].name && trials[i].name != UNNAMED;
-        richer && other && more > demands.told * total(i) && z > 3.0
+        let other = trials[i].cause != trials[chosen].cause && trials[i].cause != Cause::Unexplained;
+        richer && other && more > demands.richer * total(i) && z > 3.0
     };
     let richer = eligible.iter().copied().filter(worth_more).max_by(|&a, &b| total(a).total_cmp(&total(b)));
     let mut equals: Vec<usize> = eligible
         .iter()
         .copied()
-        .filter(|&i| trials[i].name != trials[chosen].name && trials[i].parameters <= trials[chosen].parameters)
+        .filter(|&i| trials[i].cause != trials[chosen].cause && trials[i].parameters <= trials[chosen].parameters)
         .filter(|&i| {
             let (deficit, z) = ahead(chosen, i);
             z < 2.0 && deficit < 0.1 * total(chosen)
         })
         .collect();
-    // What brings far more on the whole, though not on enough frames to be sure of it, forbids to be sure of another name.
+    // A rival with more than twice the gain, though below the demands on significance, makes the choice ambiguous.
     let far_better = |t: &Trial| {
         let (gain, z) = total_and_z(&t.gains);
-        t.above_floor && t.name != trials[chosen].name && gain > 2.0 * total(chosen) && z > 1.5
+        t.above_floor && t.cause != trials[chosen].cause && gain > 2.0 * total(chosen) && z > 1.5
     };
     equals.extend((0..trials.len()).filter(|i| !eligible.contains(i) && far_better(&trials[*i])));
     match richer {
         Some(richer) => {
-            equals.retain(|&i| trials[i].name != trials[richer].name);
+            equals.retain(|&i| trials[i].cause != trials[richer].cause);
             equals.insert(0, chosen);
             Some(Choice { chosen: richer, equals })
         }
@@ -135,35 +136,35 @@ pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     }
 }
 
-/// Names of other causes, no richer, that gain as much as the chosen one but for a share, be that sure or not.
-pub fn as_good(trials: &[Trial], chosen: usize, but_for: f64) -> Vec<String> {
+/// Other causes, without more parameters, whose gain falls behind the chosen one's by less than a share, significant or not.
+pub fn as_good(trials: &[Trial], chosen: usize, but_for: f64) -> Vec<Cause> {
     let c = &trials[chosen];
     let least = (1.0 - but_for) * total_and_z(&c.gains).0;
-    let others = trials.iter().filter(|t| t.above_floor && t.name != c.name && t.parameters <= c.parameters);
-    others.filter(|t| total_and_z(&t.gains).0 > least).map(|t| t.name.clone()).collect()
+    let others = trials.iter().filter(|t| t.above_floor && t.cause != c.cause && t.parameters <= c.parameters);
+    others.filter(|t| total_and_z(&t.gains).0 > least).map(|t| t.cause).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn trial(name: &str, parameters: usize, gains: &[f64]) -> Trial {
-        Trial { candidate: 0, name: name.into(), parameters, gains: gains.to_vec(), above_floor: true }
+    fn trial(cause: Cause, parameters: usize, gains: &[f64]) -> Trial {
+        Trial { candidate: 0, cause, parameters, gains: gains.to_vec(), above_floor: true }
     }
 
-    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02, told: 0.02 };
+    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02, richer: 0.02 };
 
     #[test]
     fn the_simplest_of_equals_wins() {
-        let simple = trial("simple", 1, &[10.0, 11.0, 9.0, 10.0]);
-        let complex = trial("complex", 3, &[10.1, 11.2, 9.0, 10.2]);
+        let simple = trial(Cause::RandomDropout, 1, &[10.0, 11.0, 9.0, 10.0]);
+        let complex = trial(Cause::RangeDropout, 3, &[10.1, 11.2, 9.0, 10.2]);
         let choice = choose(&[complex.clone(), simple.clone()], &DEMANDS).unwrap();
         assert_eq!((choice.chosen, choice.equals.len()), (1, 0));
-        let told = Demands { told: 0.005, ..DEMANDS };
-        let richer = trial("richer", 3, &[10.1, 11.1, 9.2, 10.2]);
-        let choice = choose(&[richer, simple.clone()], &told).unwrap();
-        assert_eq!((choice.chosen, choice.equals), (0, vec![1]), "better for sure, and by more than a wrong form");
-        let better = trial("better", 3, &[20.0, 21.0, 19.0, 20.0]);
+        let strict = Demands { richer: 0.005, ..DEMANDS };
+        let richer = trial(Cause::RangeDropout, 3, &[10.1, 11.1, 9.2, 10.2]);
+        let choice = choose(&[richer, simple.clone()], &strict).unwrap();
+        assert_eq!((choice.chosen, choice.equals), (0, vec![1]), "significantly better, and by more than a wrong form");
+        let better = trial(Cause::RangeDropout, 3, &[20.0, 21.0, 19.0, 20.0]);
         assert_eq!(choose(&[better, simple], &DEMANDS).unwrap().chosen, 0);
     }
 
@@ -185,16 +186,20 @@ mod tests {
     }
 
     #[test]
-    fn equals_are_told_and_noise_is_not_chosen() {
-        let a = trial("a", 1, &[10.0, 11.0, 9.0, 10.0]);
-        let b = trial("b", 1, &[10.4, 10.5, 9.6, 9.3]);
+    fn equals_are_reported_and_noise_is_not_chosen() {
+        let a = trial(Cause::RandomDropout, 1, &[10.0, 11.0, 9.0, 10.0]);
+        let b = trial(Cause::RangeDropout, 1, &[10.4, 10.5, 9.6, 9.3]);
         assert_eq!(choose(&[a.clone(), b], &DEMANDS).unwrap().equals.len(), 1);
-        let scattered = trial("seldom", 2, &[90.0, 5.0, -10.0, 80.0]);
-        assert_eq!(choose(&[a.clone(), scattered], &DEMANDS).unwrap().equals, [1], "far more, though not for sure");
-        assert!(choose(&[trial("noise", 1, &[30.0, -20.0, 25.0, -10.0])], &DEMANDS).is_none());
+        let scattered = trial(Cause::SignalDropout, 2, &[90.0, 5.0, -10.0, 80.0]);
+        assert_eq!(
+            choose(&[a.clone(), scattered], &DEMANDS).unwrap().equals,
+            [1],
+            "far more, though not significantly"
+        );
+        assert!(choose(&[trial(Cause::RangeNoise, 1, &[30.0, -20.0, 25.0, -10.0])], &DEMANDS).is_none());
         assert!(choose(&[Trial { above_floor: false, ..a.clone() }], &DEMANDS).is_none());
-        let nearly = trial("nearly", 1, &[9.9, 10.9, 8.9, 9.9]);
-        let [richer, less] = [trial("richer", 2, &[10.0; 4]), trial("less", 1, &[9.0; 4])];
-        assert_eq!(as_good(&[a, nearly, richer, less], 0, 0.02), ["nearly"]);
+        let nearly = trial(Cause::RangeDropout, 1, &[9.9, 10.9, 8.9, 9.9]);
+        let [richer, less] = [trial(Cause::SignalDropout, 2, &[10.0; 4]), trial(Cause::IncidenceDropout, 1, &[9.0; 4])];
+        assert_eq!(as_good(&[a, nearly, richer, less], 0, 0.02), [Cause::RangeDropout]);
     }
 }

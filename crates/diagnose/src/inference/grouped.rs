@@ -2,7 +2,7 @@
 
 use super::linear::{FOLDS, fold_of};
 use super::median;
-use crate::channels::groups::{GroupFrame, GroupSums, PARTS, PartedFrame, total};
+use crate::channels::groups::{Group, GroupFrame, GroupSums, PARTS, PartedFrame, total};
 use std::collections::BTreeMap;
 
 /// How offsets of groups are fitted.
@@ -19,8 +19,8 @@ pub struct GroupFit {
 }
 
 /// Offset of each group.
-pub fn offsets(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, f64> {
-    let mut out: BTreeMap<u32, f64> = sums.iter().map(|(k, s)| (*k, s.offset(how.column, how.precision))).collect();
+pub fn offsets(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> BTreeMap<Group, f64> {
+    let mut out: BTreeMap<Group, f64> = sums.iter().map(|(k, s)| (*k, s.offset(how.column, how.precision))).collect();
     if how.centred {
         let (mut sum, mut weight) = (0.0, 0.0);
         for (k, s) in sums {
@@ -35,17 +35,21 @@ pub fn offsets(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, 
 }
 
 /// Gain of a frame by offsets, nats.
-pub fn gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<u32, f64>) -> f64 {
+pub fn gain(frame: &GroupFrame, column: usize, offsets: &BTreeMap<Group, f64>) -> f64 {
     frame.iter().filter_map(|(k, s)| Some(s.gain(column, *offsets.get(k)?))).sum()
 }
 
 /// Groups on either side whose offsets a smooth law would tell.
-const NEIGHBOURS: u32 = 3;
+const NEIGHBOURS: u16 = 3;
 
 /// Mean offset of the neighbours of each group: what a law that is smooth from group to group would say.
-pub fn smooth(sums: &BTreeMap<u32, GroupSums>, offsets: &BTreeMap<u32, f64>, how: GroupFit) -> BTreeMap<u32, f64> {
-    let near = |k: u32| {
-        let around = sums.range(k.saturating_sub(NEIGHBOURS)..=k + NEIGHBOURS).filter(|(g, _)| **g != k);
+pub fn smooth(
+    sums: &BTreeMap<Group, GroupSums>,
+    offsets: &BTreeMap<Group, f64>,
+    how: GroupFit,
+) -> BTreeMap<Group, f64> {
+    let near = |k: Group| {
+        let around = sums.range(k.around(NEIGHBOURS)).filter(|(g, _)| **g != k);
         let (sum, weight) = around.fold((0.0, 0.0), |(sum, weight), (g, s)| {
             let w = s.gram[2 * how.column].min(10.0 * how.precision);
             (sum + w * offsets[g], weight + w)
@@ -56,7 +60,7 @@ pub fn smooth(sums: &BTreeMap<u32, GroupSums>, offsets: &BTreeMap<u32, f64>, how
 }
 
 /// Mean offset of all groups.
-fn level(sums: &BTreeMap<u32, GroupSums>, column: usize) -> f64 {
+fn level(sums: &BTreeMap<Group, GroupSums>, column: usize) -> f64 {
     let (right, gram) = sums.values().fold((0.0, 0.0), |(r, g), s| (r + s.right[column], g + s.gram[2 * column]));
     if gram > 0.0 { right / gram } else { 0.0 }
 }
@@ -82,7 +86,7 @@ pub fn cross_part_gains(
             level
         });
         for part in 0..PARTS {
-            let mut others = BTreeMap::<u32, GroupSums>::new();
+            let mut others = BTreeMap::<Group, GroupSums>::new();
             for (_, sums) in parts.iter().enumerate().filter(|(p, _)| *p != part) {
                 sums.iter().for_each(|(k, s)| others.entry(*k).or_default().merge(s));
             }
@@ -102,10 +106,10 @@ pub fn cross_part_gains(
 
 /// Spread of the offsets from row to row: from the median of second differences between neighbouring groups, so that offsets that are
 /// smooth but for a few jumps have none.
-pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
+pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
     let offsets = offsets(sums, how);
-    let known = |k: u32| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
-    let second = |k: &u32| Some((known(*k)? - 0.5 * (known(k.checked_sub(1)?)? + known(k + 1)?)).abs());
+    let known = |k: Group| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
+    let second = |k: &Group| Some((known(*k)? - 0.5 * (known(k.previous()?)? + known(k.next())?)).abs());
     let differences: Vec<f64> = sums.keys().filter_map(second).collect();
     if differences.len() < 4 {
         return 0.0;
@@ -117,10 +121,10 @@ pub fn rough_spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> f64 {
 const WORSE: f64 = 16.0;
 
 /// Offsets, with variances, of the groups that are known well: not much worse than most.
-fn known(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, (f64, f64)> {
+fn known(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> BTreeMap<Group, (f64, f64)> {
     let offsets = offsets(sums, how);
     let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
-    let mut known: BTreeMap<u32, (f64, f64)> =
+    let mut known: BTreeMap<Group, (f64, f64)> =
         known.map(|(k, s)| (*k, (offsets[k], 1.0 / s.gram[2 * how.column]))).collect();
     let usual = median(known.values().map(|(_, noise)| *noise).collect());
     known.retain(|_, (_, noise)| *noise <= WORSE * usual);
@@ -129,7 +133,7 @@ fn known(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> BTreeMap<u32, (f64, 
 
 /// Root mean square of the offsets beyond what their errors make, and the number of groups that are known well. The
 /// largest `trimmed` share of them does not count.
-pub fn spread(sums: &BTreeMap<u32, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
+pub fn spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
     let mut squares: Vec<(f64, f64)> = known(sums, how).into_values().map(|(o, noise)| (o.powi(2), noise)).collect();
     squares.sort_by(|a, b| a.0.total_cmp(&b.0));
     squares.truncate(((1.0 - trimmed) * squares.len() as f64).ceil() as usize);
@@ -143,10 +147,10 @@ const TOGETHER: f64 = 1.12;
 
 /// The same of rows. Walls that lie a little elsewhere shift many rows together: where the spread about the mean of their neighbours is less by more than
 /// rows that know nothing of each other make it, it is that.
-pub fn spread_of_rows(sums: &BTreeMap<u32, GroupSums>, how: GroupFit) -> (f64, f64) {
+pub fn spread_of_rows(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> (f64, f64) {
     let known = known(sums, how);
-    let about = |(k, (offset, noise)): (&u32, &(f64, f64))| {
-        let around = known.range(k.saturating_sub(NEIGHBOURS)..=k + NEIGHBOURS).filter(|(g, _)| *g != k);
+    let about = |(k, (offset, noise)): (&Group, &(f64, f64))| {
+        let around = known.range(k.around(NEIGHBOURS)).filter(|(g, _)| *g != k);
         let (n, sum, of_mean) = around.fold((0.0, 0.0, 0.0), |(n, sum, v), (_, (o, e))| (n + 1.0, sum + o, v + e));
         (n > 1.0).then(|| ((offset - sum / n).powi(2) - noise - of_mean / (n * n)) / (1.0 + 1.0 / n))
     };
@@ -162,17 +166,21 @@ mod tests {
     use super::*;
     use rand_distr::{Distribution, StandardNormal};
 
+    fn row(index: u16) -> Group {
+        Group { sensor: 0, index }
+    }
+
     #[test]
     fn offsets_and_their_spread_are_found_and_noise_gains_nothing() {
         let mut rng = data::stream(3, "grouped", 0, 0);
         // Offsets of groups, and what the surfaces of one part are wrong by.
         let mut made = |size: f64, of_a_part: f64| -> Vec<PartedFrame> {
-            let mut group = |k: u32, part: usize| {
+            let mut group = |k: u16, part: usize| {
                 let own = if k.is_multiple_of(2) { size } else { -size };
                 let truth = own + if part == 1 && k > 9 { of_a_part } else { 0.0 };
                 let noise: f64 = StandardNormal.sample(&mut rng);
                 let w = 100.0;
-                (k, GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.1 * noise), 0.0], n: 1.0 })
+                (row(k), GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.1 * noise), 0.0], n: 1.0 })
             };
             (0..16).map(|_| std::array::from_fn(|part| (0..20).map(|k| group(k, part)).collect())).collect()
         };
@@ -199,10 +207,12 @@ mod tests {
         let offsets: Vec<f64> =
             (0..200).map(|_| 0.05 * Distribution::<f64>::sample(&StandardNormal, &mut rng)).collect();
         let how = GroupFit { column: 0, precision: 1.0, centred: true, trust: 1.0 };
-        let with_step = |step: f64| -> BTreeMap<u32, GroupSums> {
+        let with_step = |step: f64| -> BTreeMap<Group, GroupSums> {
             let w = 1e6;
             let at = |k: usize| offsets[k] + if k < 100 { 0.0 } else { step };
-            (0..200).map(|k| (k as u32, GroupSums { gram: [w, 0.0, 0.0], right: [w * at(k), 0.0], n: 1.0 })).collect()
+            (0..200)
+                .map(|k| (row(k as u16), GroupSums { gram: [w, 0.0, 0.0], right: [w * at(k), 0.0], n: 1.0 }))
+                .collect()
         };
         assert_eq!(spread_of_rows(&with_step(0.0), how), spread(&with_step(0.0), how, 0.0));
         assert!((spread(&with_step(0.2), how, 0.0).0 - 0.11).abs() < 0.01);

@@ -1,5 +1,6 @@
 //! The forms that laws of lost returns have, and their numbers.
 
+use crate::catalogue::Cause;
 use crate::channels::cells::ZONES;
 
 /// A law of losses; several multiply.
@@ -70,14 +71,14 @@ fn half([a, ln_k, ln_skew]: [f64; 3]) -> f64 {
 const BRIGHTNESS: f64 = 1.2;
 
 impl Law {
-    /// The cause's name.
-    pub fn name(self) -> &'static str {
+    /// The cause that has this law.
+    pub fn cause(self) -> Cause {
         match self {
-            Law::Random => "random_dropout",
-            Law::Range => "range_dropout",
-            Law::Incidence => "incidence_dropout",
-            Law::Signal => "signal_dropout",
-            Law::Zone(_) => "material_dropout",
+            Law::Random => Cause::RandomDropout,
+            Law::Range => Cause::RangeDropout,
+            Law::Incidence => Cause::IncidenceDropout,
+            Law::Signal => Cause::SignalDropout,
+            Law::Zone(_) => Cause::MaterialDropout,
         }
     }
 

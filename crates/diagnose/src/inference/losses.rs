@@ -100,7 +100,7 @@ impl LossTable {
     }
 
     /// Share of matched returns of each cell as these frames have it, drawn a little towards the laws.
-    pub fn told(&self, laws: &[FittedLaw]) -> Vec<f64> {
+    pub fn matched_shares(&self, laws: &[FittedLaw]) -> Vec<f64> {
         let share = |(i, c): (usize, &HitCell)| {
             let towards = self.matched(laws, i);
             ((c.simulated_matched + PRIOR_RETURNS * towards) / (c.simulated.n + PRIOR_RETURNS)).clamp(1e-4, 1.0 - 1e-4)
@@ -110,14 +110,15 @@ impl LossTable {
 
     /// Shares of the simulated and of the measured returns of each cell that have no counterpart.
     pub fn unmatched(&self, laws: &[FittedLaw]) -> Vec<[f64; 2]> {
-        self.told(laws).into_iter().enumerate().map(|(i, told)| [1.0 - told, 1.0 - self.matched(&[], i)]).collect()
+        let unmatched = |(i, share): (usize, f64)| [1.0 - share, 1.0 - self.matched(&[], i)];
+        self.matched_shares(laws).into_iter().enumerate().map(unmatched).collect()
     }
 
     /// Gain of a frame by a table of matched shares, nats.
-    pub fn gain_by_table(&self, frame: &HitFrame, told: &[f64]) -> f64 {
+    pub fn gain_by_table(&self, frame: &HitFrame, shares: &[f64]) -> f64 {
         let used = frame.iter().filter(|(i, _)| self.cells[*i as usize].simulated.n >= FEWEST);
         used.map(|(i, c)| {
-            let (p, q) = (self.matched(&[], *i as usize), told[*i as usize]);
+            let (p, q) = (self.matched(&[], *i as usize), shares[*i as usize]);
             let (n, matched) = (c.simulated.n, c.simulated_matched);
             matched * (q / p).ln() + (n - matched) * ((1.0 - q) / (1.0 - p)).ln()
         })

@@ -1,6 +1,7 @@
 //! How causes are weighed against each other.
 
 pub mod choice;
+pub mod comb;
 pub mod grouped;
 pub mod law;
 pub mod linear;

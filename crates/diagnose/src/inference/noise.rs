@@ -1,6 +1,7 @@
 //! Laws of noise: how much rougher the measured returns are than the simulated ones, in variance, cell by cell.
 
 use super::linear::LinearFrame;
+use crate::catalogue::Cause;
 use crate::channels::cells::CELLS;
 use crate::channels::roughness::{RoughCell, RoughFrame};
 use nalgebra::{DMatrix, DVector};
@@ -40,12 +41,12 @@ pub const USUAL_SIGNAL: f64 = 4.0;
 const LONGEST_LEVER_M: f64 = 400.0;
 
 impl NoiseLaw {
-    /// The cause's name.
-    pub fn name(self) -> &'static str {
+    /// The cause that has this law.
+    pub fn cause(self) -> Cause {
         match self {
-            NoiseLaw::Angular => "angular_jitter",
-            NoiseLaw::Signal(_) => "signal_noise",
-            _ => "range_noise",
+            NoiseLaw::Angular => Cause::AngularJitter,
+            NoiseLaw::Signal(_) => Cause::SignalNoise,
+            _ => Cause::RangeNoise,
         }
     }
 

@@ -2,16 +2,17 @@
 
 use super::boxes::{BoxShift, SurfacePoint, fit_shift, in_or_beside};
 use super::gaps::{in_gap, mixed_per_rad};
-use super::matching::match_directions;
 use super::pattern::ScanPattern;
+use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
-use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
-use super::sight::Sight;
+use super::recordings::{Matched, SideFrame};
+use super::scan::{DirectionIndex, Entry, SensorScan, Steps};
 use super::surface::fit_surface;
-use data::{Cloud, Object};
+use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
 use sensor::Rig;
+use std::borrow::Cow;
 
 /// One frame of both sides.
 #[derive(Clone, Debug)]
@@ -24,7 +25,7 @@ pub struct FramePair {
     pub simulated: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
-    /// Shots around whose direction the simulation has nothing; of sensors whose rows are not known, returns that it has fewer.
+    /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns it has fewer.
     pub open: f64,
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
@@ -37,32 +38,32 @@ pub struct ObjectPair {
     pub simulated: Option<Box3>,
     /// The measured side's label.
     pub measured: Option<Box3>,
-    /// How far the measured returns stand from the simulated ones.
+    /// Shift of the measured returns against the simulated ones.
     pub shift: Option<BoxShift>,
     /// Returns of the measured and the simulated side in the box.
     pub points: [usize; 2],
 }
 
-/// What is known of the sensors before any frame is looked at.
+/// The sensors with their scan patterns.
 pub struct Sensors {
     /// Mounts.
     pub rig: Rig,
     /// Scan pattern of each.
     pub patterns: Vec<ScanPattern>,
-    /// Farther than that across a plane a neighbour belongs to something else, m.
+    /// Distance across a plane from which on a neighbour belongs to another surface, m.
     pub edge_m: f64,
 }
 
 /// Half widths of the window of neighbours, in steps.
 const WINDOW: [f32; 2] = [2.2, 1.4];
 
-/// Of so many shots of a row one is looked at, to count those that meet nothing.
+/// Of this many shots of a row one is tested, to count those without a return.
 const EVERY: usize = 3;
 
-/// Returns with no more than that in company are not of a surface.
+/// Returns with at most this many neighbours at their range are not of a surface.
 const LONE: u8 = 1;
 
-/// A measured return farther than that from the surface says nothing of its neighbours, m across.
+/// Distance from the predicted surface, across it, from which on a return is not used for the roughness of its neighbours, m.
 const STRAY_M: f64 = 0.5;
 
 impl Sensors {
@@ -71,7 +72,7 @@ impl Sensors {
         self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
     }
 
-    /// Shots of a scan, over the azimuths that its returns span, around which a side has nothing; `None` where rows are not known.
+    /// Shots of a scan, over the azimuths of its returns, around which a side has no return; `None` where rows are not known.
     fn open(&self, sensor: usize, scans: [&SensorScan; 2], side: &DirectionIndex) -> Option<f64> {
         let pattern = &self.patterns[sensor];
         let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
@@ -95,108 +96,58 @@ impl Sensors {
     }
 }
 
-/// How far a point of a frame and a sensor, each by its number, is shown from where it is, both in the cloud's frame, m.
+/// Displacement of a point of a frame and a sensor, by their numbers, in the cloud's frame, m.
 pub type ShownShift<'a> = &'a (dyn Fn(usize, &Vector3<f64>, usize) -> Vector3<f64> + Sync);
 
-/// What is known to be wrong with the measured side and is taken out before the frames are paired.
+/// Known differences between the sides that are corrected before frames are paired.
 #[derive(Clone, Copy, Default)]
-pub struct Mending<'a> {
-    /// What is to be taken off the range of a ray, m.
+pub struct Corrections<'a> {
+    /// Correction to subtract from the range of a measured ray, m.
     pub range_m: Option<&'a (dyn Fn(&Ray) -> f64 + Sync)>,
-    /// How far points are shown from where they are.
+    /// Displacement of measured points that is undone.
     pub shift_m: Option<ShownShift<'a>>,
-    /// Step to which simulated ranges are to be rounded as the measured ones are, m.
+    /// Step to which simulated ranges are rounded as the measured ones are, m.
     pub step_m: Option<f64>,
 }
 
-/// Pairs a frame, return by return; `number` is its place among all.
-pub fn pair_frame(
-    (number, id): (usize, &str),
-    measured: (&Cloud, &[Object]),
-    simulated: (&Cloud, &[Object]),
-    sensors: &Sensors,
-    mending: Mending,
-) -> FramePair {
-    let mut objects = pair_labels(measured.1, simulated.1);
+/// Both sides of a frame as they were recorded.
+pub struct RecordedFrame<'a> {
+    /// Its number.
+    pub number: usize,
+    /// Its id.
+    pub id: &'a str,
+    /// Measured side.
+    pub measured: &'a SideFrame,
+    /// Simulated side.
+    pub simulated: &'a SideFrame,
+    /// Which returns have a counterpart, by sensor.
+    pub matched: &'a [Matched],
+}
+
+/// Pairs a frame, return by return.
+pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corrections) -> FramePair {
+    let mut objects = pair_labels(&recorded.measured.objects, &recorded.simulated.objects);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
-    let mut scans = [measured.0, simulated.0].map(|cloud| split_by_sensor(cloud, &sensors.rig));
-    // Whether a shot came back is asked by the direction in which it was sent, wherever what it met is moved to.
-    let mut matched: Vec<_> = (0..sensors.rig.sensors.len())
-        .map(|k| {
-            let closes = sensors.rig.sensors[k].closes();
-            match_directions(&scans[0][k], &scans[1][k], &sensors.patterns[k], closes)
-        })
-        .collect();
-    let sent: Vec<[Vec<f32>; 2]> =
-        scans[0].iter().map(|scan| [scan.azimuth_rad.clone(), scan.elevation_rad.clone()]).collect();
-    if let Some(shift_m) = mending.shift_m {
-        for (sensor, scan) in scans[0].iter_mut().enumerate() {
-            let pose = sensors.rig.sensors[sensor].pose();
-            scan.move_points(|p| {
-                let at = pose * p;
-                pose.inverse() * (at - shift_m(number, &at.coords, sensor))
-            });
-        }
-    }
-    if let Some(step) = mending.step_m {
-        let round = |r: &mut f32| *r = ((f64::from(*r) / step).round() * step).max(0.05) as f32;
-        scans[1].iter_mut().flat_map(|s| &mut s.range_m).for_each(round);
-    }
+    let measured = moved_back(recorded, sensors, corrections.shift_m);
+    let simulated = rounded(&recorded.simulated.scans, corrections.step_m);
     let mut frame = FramePair {
-        id: id.into(),
+        id: recorded.id.into(),
         measured: Vec::new(),
         simulated: Vec::new(),
         mixed_per_rad: 0.0,
         open: 0.0,
         objects: Vec::new(),
     };
-    for sensor in 0..sensors.rig.sensors.len() {
-        let (measured_scans, simulated_scans) = scans.split_at_mut(1);
-        let (a, b) = (&mut measured_scans[0][sensor], &simulated_scans[0][sensor]);
-        let closes = sensors.rig.sensors[sensor].closes();
-        let (of_a, of_b) = std::mem::take(&mut matched[sensor]);
-        let sight = Sight::new(sensors, sensor, b, &boxes);
-        let mut simulated: Vec<Ray> = (0..b.len()).map(|i| sight.ray(b, i, true)).collect();
-        for (i, (ray, matched)) in simulated.iter_mut().zip(of_b).enumerate() {
-            ray.matched = matched;
-            ray.company = company(&sight.index, b, i);
-            (ray.roughness_m, ray.roughness_leverage) =
-                if ray.smooth && ray.company > LONE { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
-        }
-        let mut measured: Vec<Ray> = (0..a.len()).map(|i| sight.ray(a, i, false)).collect();
-        if let Some(correction) = mending.range_m {
-            for (i, ray) in measured.iter_mut().enumerate().filter(|(_, r)| r.smooth) {
-                let off = correction(ray) as f32;
-                ray.residual_m -= off;
-                a.range_m[i] = (a.range_m[i] - off).max(0.05);
-            }
-        }
-        let own = DirectionIndex::new(a, sensors.window(sensor), closes);
-        for (i, (ray, matched)) in measured.iter_mut().zip(of_a).enumerate() {
-            ray.matched = matched;
-            (ray.azimuth_rad, ray.elevation_rad) = (sent[sensor][0][i], sent[sensor][1][i]);
-            ray.row = sensors.row(sensor, ray.elevation_rad);
-            ray.company = company(&own, a, i);
-            ray.in_gap = in_gap(&sight.index, a, i);
-        }
-        simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));
-        // A return without any other at its range is no surface: false alarms would make all around them rough.
-        let stray: Vec<bool> =
-            measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
-        for (i, ray) in measured.iter_mut().enumerate() {
-            if ray.smooth && !stray[i] {
-                let others = |e: &super::scan::Entry| e.index != i as u32 && !stray[e.index as usize];
-                if let Some(s) = fit_surface(&own, sight.window, a.azimuth_rad[i], a.elevation_rad[i], others) {
-                    ray.roughness_m = (f64::from(a.range_m[i]) - s.range_m) as f32;
-                    ray.roughness_leverage = s.leverage as f32;
-                }
-            }
-        }
-        frame.mixed_per_rad += mixed_per_rad(&simulated, &sight.index);
-        let missing = measured.len() as f64 - simulated.len() as f64;
-        frame.open += sensors.open(sensor, [a, b], &sight.index).unwrap_or(missing.max(0.0));
-        frame.measured.append(&mut measured);
-        frame.simulated.append(&mut simulated);
+    for (sensor, scan) in measured.into_iter().enumerate() {
+        let pair = SensorPair {
+            sensors,
+            sensor,
+            sent: &recorded.measured.scans[sensor],
+            simulated: &simulated[sensor],
+            matched: &recorded.matched[sensor],
+            boxes: &boxes,
+        };
+        pair.add_to(&mut frame, scan, corrections.range_m);
     }
     frame.mixed_per_rad /= frame.simulated.len().max(1) as f64;
     fit_objects(&mut objects, &frame, sensors);
@@ -204,7 +155,109 @@ pub fn pair_frame(
     frame
 }
 
-/// Returns nearer to each other than that are in company, m.
+/// Measured scans with a displacement undone.
+fn moved_back(recorded: &RecordedFrame, sensors: &Sensors, shift_m: Option<ShownShift>) -> Vec<SensorScan> {
+    let mut scans = recorded.measured.scans.clone();
+    if let Some(shift_m) = shift_m {
+        for (sensor, scan) in scans.iter_mut().enumerate() {
+            let pose = sensors.rig.sensors[sensor].pose();
+            scan.move_points(|p| {
+                let at = pose * p;
+                pose.inverse() * (at - shift_m(recorded.number, &at.coords, sensor))
+            });
+        }
+    }
+    scans
+}
+
+/// Simulated scans with ranges rounded to a step.
+fn rounded(scans: &[SensorScan], step_m: Option<f64>) -> Cow<'_, [SensorScan]> {
+    let Some(step) = step_m else { return Cow::Borrowed(scans) };
+    let mut scans = scans.to_vec();
+    let round = |r: &mut f32| *r = ((f64::from(*r) / step).round() * step).max(0.05) as f32;
+    scans.iter_mut().flat_map(|s| &mut s.range_m).for_each(round);
+    Cow::Owned(scans)
+}
+
+/// One sensor of a frame.
+struct SensorPair<'a> {
+    sensors: &'a Sensors,
+    sensor: usize,
+    /// Measured scan as it was recorded: the directions in which shots were sent.
+    sent: &'a SensorScan,
+    simulated: &'a SensorScan,
+    matched: &'a Matched,
+    boxes: &'a [Box3],
+}
+
+impl SensorPair<'_> {
+    /// Adds the rays of both sides to a frame; `scan` is the measured scan.
+    fn add_to(&self, frame: &mut FramePair, mut scan: SensorScan, range_m: Option<&(dyn Fn(&Ray) -> f64 + Sync)>) {
+        let (a, b) = (&mut scan, self.simulated);
+        let predictor = Predictor::new(self.sensors, self.sensor, b, self.boxes);
+        let mut simulated = self.simulated_rays(&predictor);
+        let mut measured: Vec<Ray> = (0..a.len()).map(|i| predictor.ray(a, i, false)).collect();
+        if let Some(correction) = range_m {
+            for (i, ray) in measured.iter_mut().enumerate().filter(|(_, r)| r.smooth) {
+                let off = correction(ray) as f32;
+                ray.residual_m -= off;
+                a.range_m[i] = (a.range_m[i] - off).max(0.05);
+            }
+        }
+        let closes = self.sensors.rig.sensors[self.sensor].closes();
+        let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
+        self.complete_measured(&mut measured, a, &own, &predictor);
+        simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));
+        set_roughness(&mut measured, a, &own, predictor.window);
+        frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.index);
+        let missing = measured.len() as f64 - simulated.len() as f64;
+        frame.open += self.sensors.open(self.sensor, [a, b], &predictor.index).unwrap_or(missing.max(0.0));
+        frame.measured.append(&mut measured);
+        frame.simulated.append(&mut simulated);
+    }
+
+    /// Simulated rays, each predicted from the others.
+    fn simulated_rays(&self, predictor: &Predictor) -> Vec<Ray> {
+        let scan = self.simulated;
+        let mut rays: Vec<Ray> = (0..scan.len()).map(|i| predictor.ray(scan, i, true)).collect();
+        for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.1).enumerate() {
+            ray.matched = *matched;
+            ray.company = company(&predictor.index, scan, i);
+            (ray.roughness_m, ray.roughness_leverage) =
+                if ray.smooth && ray.company > LONE { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
+        }
+        rays
+    }
+
+    /// Sets what depends on the direction in which measured rays were sent, and on the returns around them. `own` is the index of the scan.
+    fn complete_measured(&self, rays: &mut [Ray], scan: &SensorScan, own: &DirectionIndex, predictor: &Predictor) {
+        for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.0).enumerate() {
+            ray.matched = *matched;
+            (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
+            ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
+            ray.company = company(own, scan, i);
+            ray.in_gap = in_gap(&predictor.index, scan, i);
+        }
+    }
+}
+
+/// Sets the roughness of measured rays. Lone returns and returns off the predicted surface are left out: false alarms would make all returns
+/// around them rough.
+fn set_roughness(measured: &mut [Ray], scan: &SensorScan, own: &DirectionIndex, window: [f64; 2]) {
+    let stray: Vec<bool> =
+        measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
+    for (i, ray) in measured.iter_mut().enumerate() {
+        if ray.smooth && !stray[i] {
+            let others = |e: &Entry| e.index != i as u32 && !stray[e.index as usize];
+            if let Some(s) = fit_surface(own, window, scan.azimuth_rad[i], scan.elevation_rad[i], others) {
+                ray.roughness_m = (f64::from(scan.range_m[i]) - s.range_m) as f32;
+                ray.roughness_leverage = s.leverage as f32;
+            }
+        }
+    }
+}
+
+/// Difference in range up to which returns are neighbours at the same range, m.
 pub fn company_m(range_m: f64) -> f64 {
     0.3 + 0.03 * range_m
 }
@@ -221,7 +274,7 @@ fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
     n
 }
 
-/// Labels farther apart than that are not of the same object, m.
+/// Distance from which on labels are not of the same object, m.
 const SAME_OBJECT_M: f64 = 4.0;
 
 /// Labels of the simulation in their order, each with the nearest one of the measured side; then what only the measured side has.
@@ -258,7 +311,7 @@ fn pair_labels(measured: &[Object], simulated: &[Object]) -> Vec<ObjectPair> {
     both.chain(alone).collect()
 }
 
-/// Returns around an object, this far beside its box, may be its own after a shift, m.
+/// Margin beside the box of an object within which returns may belong to it after a shift, m.
 const AROUND_M: f64 = 1.2;
 
 fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors) {
@@ -269,7 +322,7 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
     let mut simulated = vec![Vec::new(); boxes.len()];
     for ray in &frame.measured {
         let p = origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m();
-        // What the simulation says is ground, and lies on it, is ground.
+        // Returns on predicted ground are ground.
         let ground = ray.surface == Surface::Ground && ray.across_m().abs() < 0.15;
         for (k, b) in boxes.iter().enumerate() {
             if !ground && in_or_beside(b, p.into(), AROUND_M) {
@@ -295,7 +348,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shots_that_meet_nothing_are_counted_but_for_those_beside_what_others_meet() {
+    fn shots_without_a_return_are_counted_except_beside_returns() {
         let (rows, step) = ([-0.06f32, -0.04, -0.02, 0.0], 0.01f32);
         let steps = Steps { azimuth_rad: step, elevation_rad: 0.02 };
         let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };

@@ -1,12 +1,12 @@
 //! Do the two sides show the same scenes? Each measured frame must fit its own simulated frame better than others.
 
 use super::frame::Sensors;
-use super::load;
-use super::scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
+use super::recordings::{PairSide, Recordings};
+use super::scan::{DirectionIndex, SensorScan, Steps};
 use super::surface::fit_surface;
 use crate::error::DiagnoseError;
 use crate::inference::median;
-use data::{Dataset, Object};
+use data::Object;
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
@@ -38,13 +38,8 @@ const FIT: f64 = 0.85;
 const LATE: f64 = 0.35;
 
 /// Compares some measured frames with their own simulated frame, its neighbours and frames far away.
-pub fn check_identity(
-    measured: &Dataset,
-    simulated: &Dataset,
-    ids: &[String],
-    sensors: &Sensors,
-) -> Result<Identity, DiagnoseError> {
-    let n = ids.len();
+pub fn check_identity(recordings: &Recordings, sensors: &Sensors) -> Result<Identity, DiagnoseError> {
+    let n = recordings.len();
     if n < 2 {
         return Ok(Identity { identical: true, reason: String::new(), strangers: vec![] });
     }
@@ -54,7 +49,7 @@ pub fn check_identity(
     let mut far: Vec<usize> = (1..6).map(|k| k * n / 6).filter(|&k| k > 2 || n < 18 && k > 0).collect();
     far.dedup();
     let rows = chosen.par_iter().map(|&i| {
-        let parts = |j: usize| distance(measured, &ids[i], simulated, &ids[j], sensors);
+        let parts = |j: usize| distance(recordings, i, j, sensors);
         let score = |j: usize| parts(j).map(|[cloud, labels]| cloud + LABELS_COUNT * labels);
         let [cloud, labels] = parts(i)?;
         let own = cloud + LABELS_COUNT * labels;
@@ -66,7 +61,7 @@ pub fn check_identity(
         let strangers = far.iter().map(|k| score((i + k) % n)).collect::<Result<Vec<_>, _>>()?;
         Ok(FrameScores { frame: i, own, same: cloud < SAME_M && labels < LATE, near, strangers })
     });
-    Ok(judge(&super::in_order(rows)?, &lags, ids))
+    Ok(judge(&super::in_order(rows)?, &lags, &|frame| recordings.id(frame).to_owned()))
 }
 
 struct FrameScores {
@@ -78,10 +73,10 @@ struct FrameScores {
     strangers: Vec<f64>,
 }
 
-fn judge(rows: &[FrameScores], lags: &[i64], ids: &[String]) -> Identity {
+fn judge(rows: &[FrameScores], lags: &[i64], id: &dyn Fn(usize) -> String) -> Identity {
     let beaten = |r: &FrameScores| !r.same && r.strangers.iter().any(|s| *s <= r.own);
     let fits = rows.iter().filter(|r| !beaten(r)).count();
-    let strangers: Vec<String> = rows.iter().filter(|r| beaten(r)).map(|r| ids[r.frame].clone()).collect();
+    let strangers: Vec<String> = rows.iter().filter(|r| beaten(r)).map(|r| id(r.frame)).collect();
     let own_mean = rows.iter().map(|r| r.own).sum::<f64>() / rows.len() as f64;
     if (fits as f64) < FIT * rows.len() as f64 {
         return Identity {
@@ -125,19 +120,16 @@ const LABELS_COUNT: f64 = 0.5;
 
 /// Mean distance of measured returns from the simulated surfaces, across them, at most 1 m each, but for what all ranges are off by; and that of the labels, see [`label_distance`].
 fn distance(
-    measured: &Dataset,
-    measured_id: &str,
-    simulated: &Dataset,
-    simulated_id: &str,
+    recordings: &Recordings,
+    measured: usize,
+    simulated: usize,
     sensors: &Sensors,
 ) -> Result<[f64; 2], DiagnoseError> {
-    let ((a, labels_a), (b, labels_b)) = (load(measured, measured_id)?, load(simulated, simulated_id)?);
-    let scans_a = split_by_sensor(&a, &sensors.rig);
-    let scans_b = split_by_sensor(&b, &sensors.rig);
-    let total: usize = scans_a.iter().map(SensorScan::len).sum();
+    let (a, b) = (recordings.side(measured, PairSide::Measured)?, recordings.side(simulated, PairSide::Simulated)?);
+    let total: usize = a.scans.iter().map(SensorScan::len).sum();
     let stride = (total / RETURNS).max(1);
     let mut met = Vec::new();
-    for (k, (a, b)) in scans_a.iter().zip(&scans_b).enumerate() {
+    for (k, (a, b)) in a.scans.iter().zip(&b.scans).enumerate() {
         let steps = sensors.patterns[k].steps;
         let window = Steps { azimuth_rad: 2.2 * steps.azimuth_rad, elevation_rad: 1.4 * steps.elevation_rad };
         let index = DirectionIndex::new(b, window, sensors.rig.sensors[k].closes());
@@ -159,7 +151,7 @@ fn distance(
         count += weight;
     }
     let cloud = if count > 0.0 { sum / count } else { 1.0 };
-    Ok([cloud, label_distance(&labels_a, &labels_b)])
+    Ok([cloud, label_distance(&a.objects, &b.objects)])
 }
 
 /// Mean distance of each label from the nearest one of the other side, at most 4 m, in units of that.
@@ -198,14 +190,14 @@ mod tests {
 
     #[test]
     fn own_frames_must_fit_best() {
-        let ids: Vec<String> = (0..10).map(|i| i.to_string()).collect();
-        assert!(judge(&rows(0.1, 0.2, 0.5), &[1], &ids).identical);
-        assert!(judge(&rows(0.01, 0.01, 0.01), &[1], &ids).identical, "nothing moves");
-        let shuffled = judge(&rows(0.5, 0.4, 0.4), &[1], &ids);
+        let id = |i: usize| i.to_string();
+        assert!(judge(&rows(0.1, 0.2, 0.5), &[1], &id).identical);
+        assert!(judge(&rows(0.01, 0.01, 0.01), &[1], &id).identical, "nothing moves");
+        let shuffled = judge(&rows(0.5, 0.4, 0.4), &[1], &id);
         assert!(
             !shuffled.identical && shuffled.reason.contains("not scenario-identical") && shuffled.strangers.len() == 10
         );
-        let late = judge(&rows(0.3, 0.02, 0.5), &[1], &ids);
+        let late = judge(&rows(0.3, 0.02, 0.5), &[1], &id);
         assert!(!late.identical && late.reason.contains("1 places later"), "{}", late.reason);
     }
 }

@@ -6,23 +6,26 @@ mod gaps;
 mod identical;
 mod matching;
 mod pattern;
+mod prediction;
 mod ray;
+mod recordings;
 mod scan;
-mod sight;
 mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{FramePair, Mending, ObjectPair, Sensors, ShownShift, company_m, pair_frame};
+pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, Sensors, ShownShift, company_m, pair_frame};
 pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::match_directions;
 pub use pattern::ScanPattern;
 pub use ray::{Lies, Ray, Surface};
+pub(crate) use recordings::load;
+pub use recordings::{Matched, PairSide, Recordings, SideFrame};
 pub use scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
 pub use surface::{LocalSurface, fit_surface};
 
 use crate::error::DiagnoseError;
-use data::{Cloud, Dataset, Object};
+use data::Dataset;
 use rand::RngExt;
 use rayon::prelude::*;
 use sensor::Rig;
@@ -30,13 +33,16 @@ use std::collections::BTreeSet;
 use std::io::Read;
 use std::path::Path;
 
-/// Returns kept of each side over all frames: enough for every finding, and memory stays bounded.
+/// Returns that are kept of each side over all frames. More do not improve findings, and memory stays bounded.
 const KEPT: usize = 3_000_000;
 
-/// Frames looked at for the scan patterns.
+/// Distance across a plane from which on a neighbour belongs to another surface, m.
+const EDGE_M: f64 = 0.12;
+
+/// Frames that the scan patterns are estimated from.
 const PATTERN_FRAMES: usize = 10;
 
-/// Whether a cloud's file holds no point: no byte, or a PCD that says so.
+/// Whether a cloud's file holds no point: it is empty, or a PCD whose header says so.
 fn has_no_point(path: &Path) -> Result<bool, DiagnoseError> {
     let mut head = Vec::new();
     fs_err::File::open(path)?.take(2000).read_to_end(&mut head)?;
@@ -45,7 +51,7 @@ fn has_no_point(path: &Path) -> Result<bool, DiagnoseError> {
     Ok(head.is_empty() || pcd && String::from_utf8_lossy(&head).lines().any(says_so))
 }
 
-/// Those of the frames of which both sides have points, and what is to be said of the others.
+/// The frames of which both sides have points, and notes about the others.
 pub fn with_points(
     measured: &Dataset,
     simulated: &Dataset,
@@ -62,7 +68,7 @@ pub fn with_points(
             None => kept.push(id),
         }
     }
-    // A side without a point is said once.
+    // A side without any point makes one note, not one for each frame.
     const LISTED: usize = 8;
     if notes.len() > LISTED {
         let more = notes.len() - LISTED;
@@ -72,14 +78,7 @@ pub fn with_points(
     Ok((kept, notes))
 }
 
-/// Cloud and objects of a frame.
-pub(crate) fn load(dataset: &Dataset, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError> {
-    let cloud = dataset.load_cloud(id)?;
-    let lines = if dataset.has_labels() { dataset.labels(id)? } else { Vec::new() };
-    Ok((cloud, dataset.objects(id, &lines)?))
-}
-
-/// Ids that both sides have, in order, and what is to be said of the others.
+/// Ids that both sides have, in order, and notes about the others.
 pub fn common_ids(
     measured: &Dataset,
     simulated: &Dataset,
@@ -117,38 +116,37 @@ pub fn common_ids(
 }
 
 /// Scan patterns from some frames of both sides.
-pub fn find_sensors(
-    measured: &Dataset,
-    simulated: &Dataset,
-    ids: &[String],
-    rig: &Rig,
-) -> Result<Sensors, DiagnoseError> {
-    let step = ids.len().div_ceil(PATTERN_FRAMES).max(1);
-    let some: Vec<&String> = ids.iter().step_by(step).collect();
-    let scans = some
+pub fn find_sensors(recordings: &Recordings, rig: &Rig) -> Result<Sensors, DiagnoseError> {
+    let step = recordings.len().div_ceil(PATTERN_FRAMES).max(1);
+    let some: Vec<usize> = (0..recordings.len()).step_by(step).collect();
+    let sides = some
         .par_iter()
-        .flat_map_iter(|id| [measured, simulated].map(|d| load(d, id).map(|(cloud, _)| split_by_sensor(&cloud, rig))));
-    let scans: Vec<Vec<SensorScan>> = in_order(scans)?;
+        .flat_map_iter(|&i| [PairSide::Measured, PairSide::Simulated].map(|side| recordings.side(i, side)));
+    let sides: Vec<&SideFrame> = in_order(sides)?;
     let patterns = (0..rig.sensors.len())
-        .map(|k| ScanPattern::of_scans(&scans.iter().map(|s| &s[k]).collect::<Vec<_>>()))
+        .map(|k| ScanPattern::of_scans(&sides.iter().map(|s| &s.scans[k]).collect::<Vec<_>>()))
         .collect();
-    Ok(Sensors { rig: rig.clone(), patterns, edge_m: 0.12 })
+    Ok(Sensors { rig: rig.clone(), patterns, edge_m: EDGE_M })
 }
 
-/// Pairs all frames. `done` is told the number of frames finished so far.
+/// Pairs all frames. `done` receives the number of frames finished so far.
 pub fn pair_all(
-    measured: &Dataset,
-    simulated: &Dataset,
-    ids: &[String],
+    recordings: &Recordings,
     sensors: &Sensors,
-    mending: Mending,
+    corrections: Corrections,
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<Vec<FramePair>, DiagnoseError> {
-    let kept = (KEPT / ids.len().max(1)).max(500);
+    let kept = (KEPT / recordings.len().max(1)).max(500);
     let finished = std::sync::atomic::AtomicUsize::new(0);
-    in_order(ids.par_iter().enumerate().map(|(i, id)| {
-        let (a, b) = (load(measured, id)?, load(simulated, id)?);
-        let mut frame = pair_frame((i, id), (&a.0, &a.1), (&b.0, &b.1), sensors, mending);
+    in_order((0..recordings.len()).into_par_iter().map(|i| {
+        let recorded = RecordedFrame {
+            number: i,
+            id: recordings.id(i),
+            measured: recordings.side(i, PairSide::Measured)?,
+            simulated: recordings.side(i, PairSide::Simulated)?,
+            matched: recordings.matched(i, sensors)?,
+        };
+        let mut frame = pair_frame(&recorded, sensors, corrections);
         for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
             thin(rays, kept, i as u64, k as u64);
         }
@@ -157,12 +155,12 @@ pub fn pair_all(
     }))
 }
 
-/// Results in order: all are there before the first damaged one is named, whatever the threads.
+/// Results in order. The first error in that order is returned, whatever the number of threads.
 fn in_order<T: Send>(results: impl ParallelIterator<Item = Result<T, DiagnoseError>>) -> Result<Vec<T>, DiagnoseError> {
     results.collect::<Vec<_>>().into_iter().collect()
 }
 
-/// Keeps about `kept` of the rays, by chance.
+/// Keeps about `kept` of the rays, chosen at random.
 fn thin(rays: &mut Vec<Ray>, kept: usize, frame: u64, side: u64) {
     if rays.len() > kept {
         let share = kept as f64 / rays.len() as f64;

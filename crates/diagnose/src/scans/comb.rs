@@ -1,17 +1,22 @@
-//! The step of the ranges: each laser's ranges fall on a comb of its own phase.
+//! The step of the ranges: those of each laser fall on a comb of its own phase.
 
 use super::rings::RingScan;
-use rustfft::{FftPlanner, num_complex::Complex};
+use crate::inference::comb::{self, Refinement, Spectra};
 
-/// Width of a bin of ranges, m, and their number: ranges up to 131 m, steps from 1 mm.
-const BIN_M: f64 = 5e-4;
-const BINS: usize = 1 << 18;
-
-/// Largest step that is looked for, m.
+/// Largest step that is searched for, m.
 const LARGEST_M: f64 = 0.05;
 
-/// A power so many times that of chance is a comb.
+/// Ratio of the power of a comb to the power of random ranges from which on it is one.
 const STANDS_OUT: f64 = 12.0;
+
+/// Fewest returns of a laser.
+const FEWEST: f64 = 200.0;
+
+/// Harmonics up to this number are searched for a longer step.
+const HARMONICS: usize = 8;
+
+/// How the step is refined.
+const REFINEMENT: Refinement = Refinement { rounds: 4, to_either_side: 12, narrows: 6.0 };
 
 /// The step, and how much of the ranges falls on it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,47 +28,44 @@ pub struct Comb {
 }
 
 fn ranges<'a>(scans: &'a [&RingScan], beam: usize) -> impl Iterator<Item = f64> + 'a {
-    scans.iter().flat_map(move |s| &s.rings[beam]).map(|s| s.range_m).filter(|r| *r < BIN_M * (BINS - 1) as f64)
+    scans.iter().flat_map(move |s| &s.rings[beam]).map(|s| s.range_m).filter(|r| *r < comb::LAST_BIN_M)
 }
 
 /// The strongest comb; `None` where none stands out.
 pub fn find(scans: &[&RingScan]) -> Option<Comb> {
-    let beams = scans.first()?.rings.len();
-    let from = (BIN_M * BINS as f64 / LARGEST_M) as usize;
-    let mut power = vec![0.0f64; BINS / 2];
-    let mut used = 0.0;
-    let fft = FftPlanner::new().plan_fft_forward(BINS);
-    for beam in 0..beams {
-        let mut values = vec![Complex::new(0.0f32, 0.0); BINS];
-        let mut n = 0.0;
-        for r in ranges(scans, beam) {
-            values[(r / BIN_M) as usize].re += 1.0;
-            n += 1.0;
-        }
-        if n < 200.0 {
-            continue;
-        }
-        fft.process(&mut values);
-        power.iter_mut().zip(&values).for_each(|(p, v)| *p += f64::from(v.norm_sqr()) / n);
-        used += 1.0;
-    }
-    let k = (from..BINS / 2).max_by(|&i, &j| power[i].total_cmp(&power[j]))?;
+    let from = comb::frequency_of(LARGEST_M);
+    let (power, used) = power(scans)?;
+    let k = (from..power.len()).max_by(|&i, &j| power[i].total_cmp(&power[j]))?;
     if used < 1.0 || power[k] / used < STANDS_OUT {
         return None;
     }
-    // Overtones of a longer step stand out as well: the longest step that does nearly as much is the step.
-    let fundamental = (2..=8)
+    // Harmonics of a longer step stand out as well. The longest step with at least half of the power is the fundamental.
+    let fundamental = (2..=HARMONICS)
         .rev()
         .map(|m| k / m)
-        .find(|&low| low > from && (low.saturating_sub(1)..=low + 1).any(|i| power[i] > 0.5 * power[k]));
-    let guess = BIN_M * BINS as f64 / fundamental.unwrap_or(k) as f64;
-    let (mut best, mut width) = (guess, 1.0 / fundamental.unwrap_or(k) as f64);
-    for _ in 0..4 {
-        let tries = (-12..=12).map(|i| best * (1.0 + width * f64::from(i) / 12.0));
-        best = tries.map(|s| (coherence(scans, s), s)).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(best, |b| b.1);
-        width /= 6.0;
+        .find(|&low| low > from && (low.saturating_sub(1)..=low + 1).any(|i| power[i] > 0.5 * power[k]))
+        .unwrap_or(k);
+    let step_m =
+        REFINEMENT.best(comb::step_of(fundamental), 1.0 / fundamental as f64, |step_m| coherence(scans, step_m));
+    Some(Comb { step_m, coherence: coherence(scans, step_m) })
+}
+
+/// Power by frequency, in units of that of random ranges, summed over lasers, and the number of lasers.
+fn power(scans: &[&RingScan]) -> Option<(Vec<f64>, f64)> {
+    let beams = scans.first()?.rings.len();
+    let mut power = vec![0.0f64; comb::FREQUENCIES];
+    let mut used = 0.0;
+    let spectra = Spectra::new();
+    for beam in 0..beams {
+        let n = ranges(scans, beam).count() as f64;
+        if n < FEWEST {
+            continue;
+        }
+        let sums = spectra.of(ranges(scans, beam));
+        power.iter_mut().zip(&sums).for_each(|(p, v)| *p += f64::from(v.norm_sqr()) / n);
+        used += 1.0;
     }
-    Some(Comb { step_m: best, coherence: coherence(scans, best) })
+    Some((power, used))
 }
 
 /// Root mean square over lasers of the share of their ranges that falls on a comb, beyond chance.
@@ -71,13 +73,9 @@ pub fn coherence(scans: &[&RingScan], step_m: f64) -> f64 {
     let beams = scans.first().map_or(0, |s| s.rings.len());
     let (mut sum, mut all) = (0.0, 0.0);
     for beam in 0..beams {
-        let (mut re, mut im, mut n) = (0.0, 0.0, 0.0);
-        for r in ranges(scans, beam) {
-            let (s, c) = (std::f64::consts::TAU * r / step_m).sin_cos();
-            (re, im, n) = (re + c, im + s, n + 1.0);
-        }
-        if n >= 200.0 {
-            sum += (re * re + im * im) / n - 1.0;
+        let (phasor, n) = comb::phasor(ranges(scans, beam), step_m);
+        if n >= FEWEST {
+            sum += (phasor.re * phasor.re + phasor.im * phasor.im) / n - 1.0;
             all += n;
         }
     }

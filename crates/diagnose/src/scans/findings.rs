@@ -1,37 +1,80 @@
-//! What scans alone tell, as findings.
+//! Findings of scans alone.
 
 mod elevation;
 mod noise;
 mod rows;
 
 use super::{Seen, comb, gain_of, planes::Patch};
-use crate::diagnosis::{Considered, Curve, CurvePoint, Finding, Minimum, Parameter, Status};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Finding, FindingGain, Minimum, Parameter, Status};
+use crate::inference::comb::phasor;
+use crate::search::NamedParameter;
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
-type Told = (Vec<Finding>, BTreeMap<String, Minimum>, Vec<Considered>);
+/// Findings, detectable effect sizes, and hypotheses that were considered.
+type Findings = (Vec<Finding>, BTreeMap<Cause, Minimum>, Vec<Considered>);
 
-/// All findings, the smallest effects that would have been seen, and what was weighed.
-pub(super) fn all(seen: &Seen, notes: &mut Vec<String>) -> Told {
+/// Range step where no comb is found: that of the file, m.
+const FILE_STEP_M: f64 = 0.002;
+
+/// All findings.
+pub(super) fn all(seen: &Seen, notes: &mut Vec<String>) -> Findings {
     let step = comb::find(&seen.scans.iter().collect::<Vec<_>>());
     let mut found: Vec<Option<Finding>> = vec![rows::offsets_found(seen, notes), rows::intensity_found(seen)];
-    let (noise, considered) = noise::noise_found(seen, step.map_or(0.002, |c| c.step_m), notes);
+    let (noise, considered) = noise::noise_found(seen, step.map_or(FILE_STEP_M, |c| c.step_m), notes);
     found.extend(noise.into_iter().map(Some));
     found.push(step.map(|s| comb_found(seen, s)));
     found.push(elevation::elevation_found(seen, notes));
-    let least =
-        |parameter: &str, value: f64, unit: &str| Minimum { parameter: parameter.into(), value, unit: unit.into() };
     let minimum = BTreeMap::from([
-        ("beam_range_offset".into(), least("std_m", rows::LEAST_OFFSET_M, "m")),
-        ("beam_intensity".into(), least("std", rows::LEAST_INTENSITY, "1")),
-        ("quantisation".into(), least("step_m", 0.001, "m")),
+        (Cause::BeamRangeOffset, Minimum::new(Quantity::StdM, rows::LEAST_OFFSET_M)),
+        (Cause::BeamIntensity, Minimum::new(Quantity::Std, rows::LEAST_INTENSITY)),
+        (Cause::Quantisation, Minimum::new(Quantity::StepM, 0.001)),
     ]);
     (found.into_iter().flatten().collect(), minimum, considered)
 }
 
-fn parameter(estimate: f64, unit: &str, ci95: [f64; 2]) -> Parameter {
-    let ci95 = [ci95[0].min(estimate), ci95[1].max(estimate)];
-    Parameter { estimate, unit: unit.into(), ci95 }
+/// What differs between named findings of scans.
+struct Named {
+    cause: Cause,
+    parameters: Vec<NamedParameter>,
+    confidence: f64,
+    channel: Channel,
+    covariate: Covariate,
+    gain: FindingGain,
+    says: String,
+    curve: Curve,
+}
+
+impl From<Named> for Finding {
+    fn from(named: Named) -> Self {
+        Finding {
+            status: Status::Named,
+            cause: Some(named.cause),
+            candidates: None,
+            family: named.cause.family(),
+            parameters: named.parameters.into_iter().collect(),
+            confidence: named.confidence,
+            channel: named.channel,
+            covariate: named.covariate,
+            gain: named.gain,
+            says: named.says,
+            separate_by: None,
+            curve: named.curve,
+            effects: vec![],
+        }
+    }
+}
+
+/// A parameter whose interval contains its estimate.
+fn parameter(quantity: Quantity, estimate: f64, ci95: [f64; 2]) -> NamedParameter {
+    (quantity.into(), Parameter { estimate, unit: quantity.unit(), ci95: around(estimate, ci95) })
+}
+
+/// An interval that contains an estimate.
+fn around(estimate: f64, ci95: [f64; 2]) -> [f64; 2] {
+    [ci95[0].min(estimate), ci95[1].max(estimate)]
 }
 
 fn spread(values: impl Iterator<Item = f64> + Clone) -> f64 {
@@ -49,11 +92,12 @@ fn patches(seen: &Seen, scan: usize) -> impl Iterator<Item = &Patch> {
     seen.walls[scan].iter().chain(&seen.ground[scan])
 }
 
-fn comb_found(seen: &Seen, told: comb::Comb) -> Finding {
+/// The finding of a quantisation step.
+fn comb_found(seen: &Seen, found: comb::Comb) -> Finding {
     let n = seen.scans.len();
     let one = |s: usize| {
         let train: Vec<_> = others(n, s).map(|i| &seen.scans[i]).collect();
-        let step = comb::find(&train).map_or(told.step_m, |c| c.step_m);
+        let step = comb::find(&train).map_or(found.step_m, |c| c.step_m);
         let c = comb::coherence(&[&seen.scans[s]], step).min(0.999);
         let m: f64 = seen.scans[s].rings.iter().map(|r| r.len() as f64).sum();
         (step, [-(1.0 - c * c).ln() * m, m])
@@ -63,47 +107,48 @@ fn comb_found(seen: &Seen, told: comb::Comb) -> Finding {
     // Jackknife: each leaves one scan out.
     let error = spread(steps.iter().copied()) * (n as f64 - 1.0).sqrt();
     let half = (1.96 * error).max(2e-7);
-    let step = told.step_m;
+    let (step, coherence) = (found.step_m, found.coherence);
+    let named = Named {
+        cause: Cause::Quantisation,
+        parameters: vec![
+            parameter(Quantity::StepM, step, [step - half, step + half]),
+            parameter(Quantity::ShareOnComb, coherence, [coherence - 0.02, coherence + 0.02]),
+        ],
+        confidence: 1.0,
+        channel: Channel::Ranges,
+        covariate: Covariate::FractionOfTheStep,
+        gain: gain_of(&each.iter().map(|e| e.1).collect::<Vec<_>>()),
+        says: format!("ranges are rounded to {:.3} mm, each laser with a phase of its own", 1000.0 * step),
+        curve: comb_curve(seen, step),
+    };
+    named.into()
+}
+
+/// Distribution of the ranges over the step, the phase of each laser subtracted.
+fn comb_curve(seen: &Seen, step: f64) -> Curve {
     let mut share = [0.0f64; 20];
     let mut all = 0.0;
     for b in 0..seen.beams.len() {
         let ranges = || seen.scans.iter().flat_map(|s| &s.rings[b]).map(|s| s.range_m);
-        let [re, im] = ranges().fold([0.0; 2], |[re, im], r| {
-            let (s, c) = (std::f64::consts::TAU * r / step).sin_cos();
-            [re + c, im + s]
-        });
-        let phase = im.atan2(re) / std::f64::consts::TAU;
+        let (sum, _) = phasor(ranges(), step);
+        let phase = sum.im.atan2(sum.re) / std::f64::consts::TAU;
         for r in ranges() {
             share[(((r / step - phase + 0.5).rem_euclid(1.0)) * 20.0) as usize % 20] += 1.0;
             all += 1.0;
         }
     }
     let points = (0..20).map(|i| CurvePoint {
+        sensor: 0,
         x: (i as f64 + 0.5) / 20.0 - 0.5,
         measured: share[i] / all,
         before: 0.05,
         after: share[i] / all,
         error: share[i].sqrt() / all,
     });
-    Finding {
-        status: Status::Named,
-        cause: Some("quantisation".into()),
-        candidates: None,
-        family: "range_error".into(),
-        parameters: BTreeMap::from([
-            ("step_m".to_owned(), parameter(step, "m", [step - half, step + half])),
-            (
-                "share_on_comb".to_owned(),
-                parameter(told.coherence, "1", [told.coherence - 0.02, told.coherence + 0.02]),
-            ),
-        ]),
-        confidence: 1.0,
-        channel: "ranges".into(),
-        covariate: "fraction of the step".into(),
-        gain: gain_of(&each.iter().map(|e| e.1).collect::<Vec<_>>()),
-        says: format!("ranges are rounded to {:.3} mm, each laser with a phase of its own", 1000.0 * step),
-        separate_by: None,
-        curve: Curve { x: "range / step, fraction".into(), y: "share of the returns".into(), points: points.collect() },
-        effects: vec![],
+    Curve {
+        x: "range / step, fraction".into(),
+        y: "share of the returns".into(),
+        by_sensor: false,
+        points: points.collect(),
     }
 }

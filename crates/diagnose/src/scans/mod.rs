@@ -1,8 +1,8 @@
-//! Real scans of a spinning sensor by themselves, against an ideal sensor: what the sensor's own table of beams, ground and walls that are
-//! flat leave of the measured ranges and intensities.
+//! Scans of a spinning sensor alone, against an ideal sensor: residuals of ranges and intensities on flat ground and walls, given the sensor's
+//! own table of beams.
 //!
-//! The ideal side is computed where the scene is known: planes of the ground and of walls fitted to each scan. Everything else, and what
-//! is labelled, is masked. Each finding is fitted on all scans and its gain measured on each scan with what the others tell.
+//! The ideal side is computed on planes of the ground and of walls that are fitted to each scan. Everything else, and labelled objects, are
+//! masked. Each finding is fitted on all scans. Its gain is measured on each scan with a fit of the others.
 
 mod brightness;
 mod comb;
@@ -13,25 +13,27 @@ mod rings;
 mod scatter;
 mod tilt;
 
-use crate::diagnosis::{Diagnosis, FindingGain, FrameRoles, Gain, SCHEMA, Verdict};
+use crate::catalogue::Cause;
+use crate::diagnosis::{Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, SCHEMA, Verdict};
 use crate::effects::fill_effects;
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
 use crate::search::REPETITIONS;
-use data::Dataset;
+use data::{Cloud, Dataset, Object};
 use planes::Patch;
 use rayon::prelude::*;
 use rings::{Beam, RingScan};
-use sensor::Rig;
+use sensor::{Rig, Sensor};
+use std::collections::BTreeMap;
 
-/// Fewer scans do not let one be held out.
+/// Fewest scans: one is held out in turn.
 const FEWEST_SCANS: usize = 3;
 
-/// Points of all scans that are read at most: enough for every finding, and memory stays bounded.
+/// Largest number of points of all scans that are read. More do not improve findings, and memory stays bounded.
 const MOST_POINTS: usize = 30_000_000;
 
-/// The scans with the planes found in them.
+/// The scans with the planes that were found in them.
 struct Seen {
     name: String,
     beams: Vec<Beam>,
@@ -40,22 +42,17 @@ struct Seen {
     walls: Vec<Vec<Patch>>,
 }
 
-/// Diagnoses the scans of one spinning sensor at the clouds' origin, against an ideal one.
+/// Diagnoses the scans of one spinning sensor at the origin of the clouds, against an ideal one.
+///
+/// # Errors
+/// A rig with another mount, fewer than three scans, clouds that are not in the order of lasers, files that cannot be read.
 pub fn diagnose_scans(
     dataset: &Dataset,
     rig: &Rig,
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
-    let mount = match rig.sensors.as_slice() {
-        [one] if one.position == [0.0; 3] && [one.yaw_deg, one.pitch_deg, one.roll_deg] == [0.0; 3] => one,
-        _ => {
-            return Err(DiagnoseError::Pair(
-                "scans alone are diagnosed for one sensor that stands at the origin of its clouds, unturned: rings cannot be told in fused clouds"
-                    .into(),
-            ));
-        }
-    };
+    let mount = only_mount(rig)?;
     let ids = match &options.split {
         Some(split) => dataset.ids(split)?,
         None => dataset.all_ids()?,
@@ -67,64 +64,95 @@ pub fn diagnose_scans(
             ids.len()
         )));
     }
-    // What the camera sees of a scan is not all of it.
+    progress(Stage::Pairing, 0, ids.len());
+    let mut notes = Vec::new();
+    let (clouds, objects) = read(dataset, &ids, &mut notes)?;
+    let (beams, scans) = rings::rings(&clouds)?;
+    drop(clouds);
+    let seen = see(mount.name.clone(), beams, scans, &objects, progress);
+    notes.push(format!(
+        "{} lasers, {} scans, {} flat walls, ground in {} scans; all else is masked. Gains are of each scan with what the others tell",
+        seen.beams.len(),
+        seen.scans.len(),
+        seen.walls.iter().map(Vec::len).sum::<usize>(),
+        seen.ground.iter().flatten().count()
+    ));
+    progress(Stage::Weighing, 0, 1);
+    let (found, minimum_detectable, considered) = findings::all(&seen, &mut notes);
+    progress(Stage::Weighing, 1, 1);
+    let mut diagnosis = report(&seen, found, minimum_detectable, considered, notes);
+    let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
+    fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
+    Ok(Outcome { diagnosis, corrected: vec![] })
+}
+
+/// The one sensor of a rig that stands at the origin of its clouds, unturned.
+fn only_mount(rig: &Rig) -> Result<&Sensor, DiagnoseError> {
+    match rig.sensors.as_slice() {
+        [one] if one.position == [0.0; 3] && [one.yaw_deg, one.pitch_deg, one.roll_deg] == [0.0; 3] => Ok(one),
+        _ => Err(DiagnoseError::Pair(
+            "scans alone are diagnosed for one sensor that stands at the origin of its clouds, unturned: rings cannot be told in fused clouds"
+                .into(),
+        )),
+    }
+}
+
+/// Clouds with their ids, and the objects of each.
+type Clouds = (Vec<(String, Cloud)>, Vec<Vec<Object>>);
+
+/// Reads scans up to [`MOST_POINTS`]. Points outside of a camera's field of view are kept.
+fn read(dataset: &Dataset, ids: &[String], notes: &mut Vec<String>) -> Result<Clouds, DiagnoseError> {
     let mut whole = dataset.clone();
     whole.config.fov_crop = false;
-    progress(Stage::Pairing, 0, ids.len());
-    let mut frames = Vec::new();
+    let (mut clouds, mut objects) = (Vec::new(), Vec::new());
     let mut points = 0;
-    for id in &ids {
-        let frame = load(&whole, id)?;
-        points += frame.0.len();
-        frames.push(frame);
+    for id in ids {
+        let (cloud, of_cloud) = load(&whole, id)?;
+        points += cloud.len();
+        clouds.push((id.clone(), cloud));
+        objects.push(of_cloud);
         if points > MOST_POINTS {
             break;
         }
     }
-    let mut notes = Vec::new();
-    if frames.len() < ids.len() {
-        notes.push(format!("only the first {} of {} scans were read", frames.len(), ids.len()));
+    if clouds.len() < ids.len() {
+        notes.push(format!("only the first {} of {} scans were read", clouds.len(), ids.len()));
     }
-    let (clouds, objects): (Vec<_>, Vec<_>) =
-        frames.into_iter().zip(&ids).map(|((c, o), id)| ((id.clone(), c), o)).unzip();
-    let (beams, scans) = rings::rings(&clouds)?;
-    drop(clouds);
+    Ok((clouds, objects))
+}
+
+/// Finds the ground and flat walls of every scan.
+fn see(name: String, beams: Vec<Beam>, scans: Vec<RingScan>, objects: &[Vec<Object>], progress: Progress) -> Seen {
     let done = std::sync::atomic::AtomicUsize::new(0);
-    let planes: Vec<(Option<Patch>, Vec<Patch>)> = scans
-        .par_iter()
-        .zip(&objects)
-        .enumerate()
-        .map(|(i, (scan, boxes))| {
-            let mut rng = data::stream(0, "diagnose planes", 0, i as u64);
-            let ground = planes::ground(scan, &beams, boxes, &mut rng);
-            let walls =
-                ground.as_ref().map_or_else(Vec::new, |g| planes::walls(scan, &beams, boxes, &g.plane, &mut rng));
-            let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
-            progress(Stage::Pairing, finished, scans.len());
-            (ground, walls)
-        })
-        .collect();
+    let of_scan = |(i, (scan, boxes)): (usize, (&RingScan, &Vec<Object>))| {
+        let mut rng = data::stream(0, "diagnose planes", 0, i as u64);
+        let ground = planes::ground(scan, &beams, boxes, &mut rng);
+        let walls = ground.as_ref().map_or_else(Vec::new, |g| planes::walls(scan, &beams, boxes, &g.plane, &mut rng));
+        let finished = done.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1;
+        progress(Stage::Pairing, finished, scans.len());
+        (ground, walls)
+    };
+    let planes: Vec<(Option<Patch>, Vec<Patch>)> = scans.par_iter().zip(objects).enumerate().map(of_scan).collect();
     let (ground, walls): (Vec<_>, Vec<_>) = planes.into_iter().unzip();
-    let count = walls.iter().map(Vec::len).sum::<usize>();
-    notes.push(format!(
-        "{} lasers, {} scans, {count} flat walls, ground in {} scans; all else is masked. Gains are of each scan with what the others tell",
-        beams.len(),
-        scans.len(),
-        ground.iter().flatten().count()
-    ));
-    let seen = Seen { name: mount.name.clone(), beams, scans, ground, walls };
-    progress(Stage::Weighing, 0, 1);
-    let (mut found, minimum_detectable, considered) = findings::all(&seen, &mut notes);
-    progress(Stage::Weighing, 1, 1);
-    found.sort_by(|a, b| b.gain.nats_per_ray.total_cmp(&a.gain.nats_per_ray));
+    Seen { name, beams, scans, ground, walls }
+}
+
+/// The diagnosis of all findings. Scans alone have no distance of their own: it is the sum of the gains.
+fn report(
+    seen: &Seen,
+    mut findings: Vec<Finding>,
+    minimum_detectable: BTreeMap<Cause, Minimum>,
+    considered: Vec<Considered>,
+    notes: Vec<String>,
+) -> Diagnosis {
+    findings.sort_by(|a, b| b.gain.nats_per_ray.total_cmp(&a.gain.nats_per_ray));
     let used: Vec<String> = seen.scans.iter().map(|s| s.id.clone()).collect();
-    let together: f64 = found.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
-    let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
-    let mut diagnosis = Diagnosis {
+    let together: f64 = findings.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
+    Diagnosis {
         schema: SCHEMA.into(),
-        verdict: Verdict::of(&found),
+        verdict: Verdict::of(&findings),
         frames: FrameRoles { select: vec![], estimate: used.clone(), hold_out: used },
-        findings: found,
+        findings,
         minimum_detectable,
         gain: Gain {
             metric: "nats_per_ray".into(),
@@ -133,14 +161,12 @@ pub fn diagnose_scans(
             floor: 0.0,
             closed: None,
             ci95: None,
-            channels: Default::default(),
+            channels: BTreeMap::new(),
         },
         detectors: Vec::new(),
         considered,
         notes,
-    };
-    fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
-    Ok(Outcome { diagnosis, corrected: vec![] })
+    }
 }
 
 /// Draws of scans with replacement, the same for every finding.
@@ -155,7 +181,7 @@ fn interval(mut drawn: Vec<f64>) -> [f64; 2] {
     statistics::interval_nearest(drawn).unwrap_or_default()
 }
 
-/// Gain in nats a return, of each scan's nats and returns, with an interval over draws of scans.
+/// Gain in nats a return from the nats and returns of each scan, with an interval over draws of scans.
 fn gain_of(scans: &[[f64; 2]]) -> FindingGain {
     let mean = |which: &mut dyn Iterator<Item = usize>| {
         let sum = which.fold([0.0; 2], |s, i| [s[0] + scans[i][0], s[1] + scans[i][1]]);

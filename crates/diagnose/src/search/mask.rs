@@ -1,7 +1,8 @@
-//! What hides rays altogether: an end of the range, parts of the own car. Looked for before laws of losses are weighed.
+//! What hides rays altogether: the largest range, parts of the ego vehicle, patches of directions. Searched before laws of losses.
 
 use super::hits::refit;
-use super::{ChannelResult, Context, Found, parameter, patch};
+use super::{ChannelResult, Context, Found, NamedParameter, parameter, patch, sensor_number};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
@@ -9,20 +10,62 @@ use crate::channels::mask::{
     edge_cells, range_cut, with_neighbours,
 };
 use crate::channels::returns::OWN_CAR_M;
-use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Parameter, Status};
-use crate::inference::choice::UNNAMED;
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::law::Law;
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// The search; also what is to be left out by the others.
+/// Smallest azimuth range of a part of the ego vehicle that would be detected, cells.
+const LEAST_CELLS: f64 = 2.0;
+
+/// Factor by which a return beyond the largest range is less likely with the cut than without it.
+const CUT_SURPRISE: f64 = 100.0;
+
+/// Factor by which a return in a hidden direction, or one from the ego vehicle, is less likely without the occlusion.
+const OCCLUSION_SURPRISE: f64 = 20.0;
+
+/// The search, and the mask of what the other searches leave out.
 pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
+    let (mask, spots) = find(context, shown);
+    let mut result = ChannelResult::new(Channel::Hits, context.of(Role::HoldOut).len());
+    if let Some(cut) = mask.cut_m {
+        result.found.push(cut_found(context, cut));
+    }
+    if !mask.blocked.is_empty() {
+        result.found.push(blocked_found(context, &mask));
+    }
+    let patched = !spots.is_empty();
+    result.found.extend(spots);
+    let searched = [
+        (Cause::RangeCut, mask.cut_m.is_some()),
+        (Cause::EgoOcclusion, !mask.blocked.is_empty()),
+        (Cause::Unexplained, patched),
+    ];
+    result.considered.extend(searched.map(|(cause, found)| Considered {
+        cause: cause.into(),
+        channel: Channel::Hits,
+        nats_per_ray: 0.0,
+        z: 0.0,
+        outcome: if found { "chosen" } else { "no such place" }.into(),
+    }));
+    let minimum = Minimum::new(Quantity::AzimuthWidthDeg, LEAST_CELLS * AZIMUTH_RAD.to_degrees());
+    result.minimum.push((Cause::EgoOcclusion, minimum));
+    for found in &result.found {
+        result.distance.iter_mut().zip(&found.held_out_gains).for_each(|(d, g)| (0..3).for_each(|k| d[k] += g));
+    }
+    (result, mask)
+}
+
+/// The mask on the selecting frames, and findings of patches of directions.
+fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let select = context.of(Role::Select);
     let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
-    // What laws explain is none of it, be they fitted without the dark directions or with them: far ground may be dark all along.
+    // Losses that laws explain are no occlusion, whether the laws are fitted with the dark directions or without them. Far ground may be dark in
+    // all directions.
     let dark = blocked_cells(&counts, shown, |_| 1.0);
     let mut fits = vec![expected_shares(context, &select, &mask, &mask)];
     if !dark.is_empty() {
@@ -38,39 +81,10 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
     mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
     let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
-    let mut result =
-        ChannelResult { distance: vec![[0.0; 3]; context.of(Role::HoldOut).len()], ..ChannelResult::default() };
-    if let Some(cut) = mask.cut_m {
-        result.found.push(cut_found(context, cut));
-    }
-    if !mask.blocked.is_empty() {
-        result.found.push(blocked_found(context, &mask));
-    }
-    let patched = !spots.is_empty();
-    result.found.extend(spots);
-    let outcome = |found: bool| if found { "chosen" } else { "no such place" };
-    let looked_for =
-        [("range_cut", mask.cut_m.is_some()), ("ego_occlusion", !mask.blocked.is_empty()), (UNNAMED, patched)];
-    for (cause, found) in looked_for {
-        let outcome = outcome(found).into();
-        result.considered.push(Considered {
-            cause: cause.into(),
-            channel: "hits".into(),
-            nats_per_ray: 0.0,
-            z: 0.0,
-            outcome,
-        });
-    }
-    let cell_deg = AZIMUTH_RAD.to_degrees();
-    let minimum = Minimum { parameter: "azimuth_width_deg".into(), value: 2.0 * cell_deg, unit: "deg".into() };
-    result.minimum.push(("ego_occlusion".into(), minimum));
-    for found in &result.found {
-        result.distance.iter_mut().zip(&found.held_out_gains).for_each(|(d, g)| (0..3).for_each(|k| d[k] += g));
-    }
-    (result, mask)
+    (mask, spots)
 }
 
-/// Share that laws keep in each cell of directions, fitted on what `fitted_without` leaves.
+/// Share of the returns that laws keep in each cell of directions. The laws are fitted on the rays that `fitted_without` does not hide.
 fn expected_shares(
     context: &Context,
     frames: &[usize],
@@ -85,7 +99,7 @@ fn expected_shares(
         let kept = match cell(ray) {
             _ if mask.hides(ray) => 0.0,
             Some(c) => table.kept(&laws, c),
-            // Edges tell nothing of their incidence; whatever lies around them decides.
+            // The incidence of edges is not known; the rays around them decide.
             None => continue,
         };
         let sum = sums.entry(direction_cell(ray)).or_default();
@@ -95,12 +109,12 @@ fn expected_shares(
     sums.into_iter().filter(|(_, s)| s[1] >= 10.0).map(|(k, s)| (k, s[0] / s[1])).collect()
 }
 
+/// The finding of a largest range.
 fn cut_found(context: &Context, on_select: f64) -> Found {
     let [estimate, hold_out] = [Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let cut = range_cut(context.frames, &estimate).unwrap_or(on_select);
     let beyond = |i: usize| context.frames[i].simulated.iter().filter(|r| f64::from(r.range_m) > cut).count() as f64;
-    // Each return that a simulation without the cut has beyond it is a sure surprise: a factor of a hundred.
-    let held = hold_out.iter().map(|&i| beyond(i) * 100f64.ln()).collect();
+    let held = hold_out.iter().map(|&i| beyond(i) * CUT_SURPRISE.ln()).collect();
     let longest = 1.4 * cut;
     let points = (0..20).map(|b| {
         let [low, high] = [f64::from(b), f64::from(b + 1)].map(|v| v * longest / 20.0);
@@ -110,6 +124,7 @@ fn cut_found(context: &Context, on_select: f64) -> Found {
         };
         let (a, b) = (count(|f| &f.measured), count(|f| &f.simulated));
         CurvePoint {
+            sensor: 0,
             x: 0.5 * (low + high),
             measured: a,
             before: b,
@@ -119,84 +134,110 @@ fn cut_found(context: &Context, on_select: f64) -> Found {
     });
     Found {
         status: Status::Named,
-        causes: vec!["range_cut".into()],
-        family: "detection",
-        parameters: vec![parameter("max_m", cut, 0.004 * cut, "m")],
+        causes: vec![Cause::RangeCut],
+        parameters: vec![parameter(Quantity::MaxM, cut, 0.004 * cut)],
         confidence: 1.0,
-        channel: "hits",
-        covariate: "range_m".into(),
+        channel: Channel::Hits,
+        covariate: Covariate::Range,
         held_out_gains: held,
         says: format!("nothing is measured beyond {cut:.1} m; your simulator has returns there"),
         separate_by: None,
-        curve: Curve { x: "range, m".into(), y: "returns".into(), points: points.collect() },
+        curve: Curve { x: "range, m".into(), y: "returns".into(), by_sensor: false, points: points.collect() },
     }
 }
 
+/// Hidden directions of one sensor.
+struct Occlusion {
+    sensor: u8,
+    /// Azimuth and elevation, from and to, degrees.
+    azimuth: [f64; 2],
+    elevation: [f64; 2],
+}
+
+impl Occlusion {
+    /// That of the sensor with the most hidden cells.
+    fn of(mask: &Mask, sensors: usize) -> Self {
+        let sensor = (0..sensors as u8).max_by_key(|s| mask.blocked.iter().filter(|c| c.0 == *s).count()).unwrap_or(0);
+        let cells: Vec<&DirectionCell> = mask.blocked.iter().filter(|c| c.0 == sensor).collect();
+        let span = |f: fn(&DirectionCell) -> i32, step: f64| {
+            let low = cells.iter().map(|c| f(c)).min().unwrap_or(0);
+            let high = cells.iter().map(|c| f(c)).max().unwrap_or(0) + 1;
+            [f64::from(low) * step, f64::from(high) * step].map(f64::to_degrees)
+        };
+        Occlusion { sensor, azimuth: span(|c| c.1, AZIMUTH_RAD), elevation: span(|c| c.2, ELEVATION_RAD) }
+    }
+
+    /// Ends of the hidden directions, known within 0.6 of a cell, and the share of all returns that is in them.
+    fn parameters(&self, hidden: f64, all: f64) -> Vec<NamedParameter> {
+        let [az_step, el_step] = [AZIMUTH_RAD, ELEVATION_RAD].map(f64::to_degrees);
+        let edge = |quantity, v: f64, step: f64| parameter(quantity, v, 0.6 * step);
+        vec![
+            sensor_number(usize::from(self.sensor)),
+            edge(Quantity::AzimuthFromDeg, self.azimuth[0], az_step),
+            edge(Quantity::AzimuthToDeg, self.azimuth[1], az_step),
+            edge(Quantity::ElevationFromDeg, self.elevation[0], el_step),
+            edge(Quantity::ElevationToDeg, self.elevation[1], el_step),
+            parameter(Quantity::Share, hidden / all, 0.1 * hidden / all),
+        ]
+    }
+
+    /// Share of the simulated returns that are measured along the azimuth, over the hidden elevations.
+    fn curve(&self, context: &Context, frames: &[usize], mask: &Mask) -> Curve {
+        let [az_step, el_step] = [AZIMUTH_RAD, ELEVATION_RAD].map(f64::to_degrees);
+        let counts = direction_counts(context.frames, frames);
+        let level =
+            |c: &DirectionCell| (self.elevation[0]..self.elevation[1]).contains(&((f64::from(c.2) + 0.5) * el_step));
+        let points = counts.iter().filter(|(c, _)| c.0 == self.sensor && level(c));
+        let points = points.map(|(c, [n, seen, ..])| CurvePoint {
+            sensor: 0,
+            x: (f64::from(c.1) + 0.5) * az_step,
+            measured: seen / n.max(1.0),
+            before: 1.0,
+            after: if mask.blocked.contains(c) { 0.0 } else { 1.0 },
+            error: 1.0 / n.max(1.0).sqrt(),
+        });
+        Curve {
+            x: "azimuth, degrees".into(),
+            y: "share of simulated returns that are measured".into(),
+            by_sensor: false,
+            points: points.collect(),
+        }
+    }
+}
+
+/// The finding of a part of the ego vehicle in the field of view. The sensor with the most hidden cells is described.
 fn blocked_found(context: &Context, mask: &Mask) -> Found {
-    let hold_out = context.of(Role::HoldOut);
+    let [estimate, hold_out] = [Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let inside = |r: &Ray| mask.blocked.contains(&direction_cell(r));
-    // Returns that do not come, or that come from the own car where the simulation has nothing.
+    // Lost returns, or returns from the ego vehicle where the simulation has none.
     let surprises = |i: usize| {
         let frame = &context.frames[i];
         let hidden = frame.simulated.iter().filter(|r| inside(r)).count();
         let near = frame.measured.iter().filter(|r| r.own_range_m() < OWN_CAR_M && inside(r)).count();
         hidden.max(near) as f64
     };
-    let held: Vec<f64> = hold_out.iter().map(|&i| surprises(i) * 20f64.ln()).collect();
-    // The sensor with the most blocked cells is described.
-    let sensor = (0..context.rig.sensors.len() as u8)
-        .max_by_key(|s| mask.blocked.iter().filter(|c| c.0 == *s).count())
-        .unwrap_or(0);
-    let cells: Vec<&DirectionCell> = mask.blocked.iter().filter(|c| c.0 == sensor).collect();
-    let span = |f: fn(&DirectionCell) -> i32, step: f64| {
-        let low = cells.iter().map(|c| f(c)).min().unwrap_or(0);
-        let high = cells.iter().map(|c| f(c)).max().unwrap_or(0) + 1;
-        [f64::from(low) * step, f64::from(high) * step].map(f64::to_degrees)
-    };
-    let (az, el) = (span(|c| c.1, AZIMUTH_RAD), span(|c| c.2, ELEVATION_RAD));
-    let [az_step, el_step] = [AZIMUTH_RAD, ELEVATION_RAD].map(f64::to_degrees);
-    let estimate = context.of(Role::Estimate);
-    let all: f64 = context.returns(&estimate);
+    let held: Vec<f64> = hold_out.iter().map(|&i| surprises(i) * OCCLUSION_SURPRISE.ln()).collect();
+    let occlusion = Occlusion::of(mask, context.rig.sensors.len());
+    let all = context.returns(&estimate).max(1.0);
     let hidden = estimate.iter().flat_map(|&i| &context.frames[i].simulated).filter(|r| inside(r)).count() as f64;
-    let counts = direction_counts(context.frames, &estimate);
-    let points =
-        counts.iter().filter(|(c, _)| c.0 == sensor && (el[0]..el[1]).contains(&((f64::from(c.2) + 0.5) * el_step)));
-    let points = points.map(|(c, [n, seen, ..])| CurvePoint {
-        x: (f64::from(c.1) + 0.5) * az_step,
-        measured: seen / n.max(1.0),
-        before: 1.0,
-        after: if mask.blocked.contains(c) { 0.0 } else { 1.0 },
-        error: 1.0 / n.max(1.0).sqrt(),
-    });
-    let edge = |name: &str, v: f64, step: f64| parameter(name, v, 0.6 * step, "deg");
+    let (az, el) = (occlusion.azimuth, occlusion.elevation);
     Found {
         status: Status::Named,
-        causes: vec!["ego_occlusion".into()],
-        family: "detection",
-        parameters: vec![
-            (
-                "sensor".into(),
-                Parameter { estimate: f64::from(sensor), unit: "number".into(), ci95: [f64::from(sensor); 2] },
-            ),
-            edge("azimuth_from_deg", az[0], az_step),
-            edge("azimuth_to_deg", az[1], az_step),
-            edge("elevation_from_deg", el[0], el_step),
-            edge("elevation_to_deg", el[1], el_step),
-            parameter("share", hidden / all.max(1.0), 0.1 * hidden / all.max(1.0), "1"),
-        ],
+        causes: vec![Cause::EgoOcclusion],
+        parameters: occlusion.parameters(hidden, all),
         confidence: 1.0,
-        channel: "hits",
-        covariate: "direction".into(),
+        channel: Channel::Hits,
+        covariate: Covariate::Direction,
         held_out_gains: held,
         says: format!(
             "sensor {} sees nothing at azimuth {:.0} to {:.0} and elevation {:.0} to {:.0} degrees, in all frames: a part of the own car stands in the way",
-            context.rig.sensors[sensor as usize].name, az[0], az[1], el[0], el[1]
+            context.rig.sensors[usize::from(occlusion.sensor)].name,
+            az[0],
+            az[1],
+            el[0],
+            el[1]
         ),
         separate_by: None,
-        curve: Curve {
-            x: "azimuth, degrees".into(),
-            y: "share of simulated returns that are measured".into(),
-            points: points.collect(),
-        },
+        curve: occlusion.curve(context, &estimate, mask),
     }
 }

@@ -1,27 +1,30 @@
-//! What each channel finds: candidates are weighed on the selecting frames, fitted on the estimating ones, measured on those held out.
+//! The search of each channel: hypotheses are compared on the selecting frames, fitted on the estimating frames, and their gain is
+//! measured on the held-out frames.
 
+pub mod confounders;
 pub mod geometry;
 pub mod hits;
 pub mod labels;
-pub mod leftovers;
 pub mod mask;
 pub mod noise;
 mod patch;
 pub mod quantisation;
 pub mod returns;
-pub mod shutter;
-mod unnamed;
+pub mod rolling_shutter;
+mod unexplained;
 
+use crate::catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
 use crate::channels::groups::Grouping;
 use crate::channels::motion::OwnMotion;
-use crate::diagnosis::{Considered, Curve, FindingGain, Minimum, Parameter, Status};
+use crate::curve::Curve;
+use crate::diagnosis::{Considered, FindingGain, Minimum, Parameter, Status};
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
 use sensor::Rig;
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 
-/// What all searches share.
+/// Input that all searches share.
 #[derive(Clone)]
 pub struct Context<'a> {
     /// Sensors.
@@ -30,9 +33,9 @@ pub struct Context<'a> {
     pub frames: &'a [FramePair],
     /// Role and block of each.
     pub roles: Vec<(Role, usize)>,
-    /// Times of the frames, s, where their ids tell.
+    /// Times of the frames, s, where their ids give them.
     pub times: Option<Vec<f64>>,
-    /// How the own car moves at each frame, where the scenes tell.
+    /// Ego motion at each frame, where it can be estimated.
     pub motion: Option<Vec<Option<OwnMotion>>>,
 }
 
@@ -53,100 +56,125 @@ impl Context<'_> {
     }
 }
 
-/// A difference before it is put into words.
+/// A difference that a search found, before the results of all channels are put together.
 #[derive(Clone, Debug)]
 pub struct Found {
-    /// Status.
+    /// Whether it has a name.
     pub status: Status,
-    /// The cause, or the candidates with the one whose parameters stand here first.
-    pub causes: Vec<String>,
-    /// Family of causes.
-    pub family: &'static str,
+    /// The cause, or the candidates with the one first whose parameters these are.
+    pub causes: Vec<Cause>,
     /// Parameters by name.
-    pub parameters: Vec<(String, Parameter)>,
-    /// Share of repetitions with the same choice.
+    pub parameters: Vec<NamedParameter>,
+    /// Share of bootstrap repetitions with the same choice.
     pub confidence: f64,
     /// Channel.
-    pub channel: &'static str,
+    pub channel: Channel,
     /// Covariate.
-    pub covariate: String,
+    pub covariate: Covariate,
     /// Gain on held-out frames, nats, frame by frame in their order.
     pub held_out_gains: Vec<f64>,
-    /// In a sentence.
+    /// The finding in a sentence.
     pub says: String,
-    /// What would tell candidates apart.
+    /// What to record to tell the candidates apart.
     pub separate_by: Option<String>,
-    /// Picture.
+    /// Plot.
     pub curve: Curve,
 }
 
-/// What a channel's search hands back.
-#[derive(Clone, Debug, Default)]
+impl Found {
+    /// Whether it has this cause, and no other.
+    pub fn is(&self, cause: Cause) -> bool {
+        self.causes == [cause]
+    }
+
+    /// Family of its first cause.
+    pub fn family(&self) -> Family {
+        self.causes.first().map_or(Family::Unknown, |c| c.family())
+    }
+
+    /// One of its parameters.
+    pub fn parameter(&self, quantity: Quantity) -> Option<&Parameter> {
+        self.parameters.iter().find(|(id, _)| *id == ParameterId::Of(quantity)).map(|(_, p)| p)
+    }
+}
+
+/// What the search of one channel returns.
+#[derive(Clone, Debug)]
 pub struct ChannelResult {
-    /// Channel in which it searched; the engine, which runs the searches, writes it down.
-    pub channel: &'static str,
+    /// The channel.
+    pub channel: Channel,
     /// Findings.
     pub found: Vec<Found>,
-    /// Candidates and what became of them.
+    /// Hypotheses and what became of them.
     pub considered: Vec<Considered>,
-    /// Smallest effects that would have been seen.
-    pub minimum: Vec<(String, Minimum)>,
-    /// On held-out frames, frame by frame, nats: distance of the simulation, what the findings gain, and what tables without any form, fitted
-    /// on the same frames as the findings, would gain.
+    /// Detectable effect sizes.
+    pub minimum: Vec<(Cause, Minimum)>,
+    /// On held-out frames, frame by frame, nats: distance of the simulation, gain of the findings, and gain of unconstrained lookup tables
+    /// fitted on the same frames as the findings.
     pub distance: Vec<[f64; 3]>,
-    /// How measured labels are to be moved.
+    /// Corrections of measured labels.
     pub repairs: Vec<Repair>,
 }
 
-/// How a measured label is to be moved.
+impl ChannelResult {
+    /// Without any finding, for a number of held-out frames.
+    pub fn new(channel: Channel, hold_out: usize) -> Self {
+        ChannelResult {
+            channel,
+            found: Vec::new(),
+            considered: Vec::new(),
+            minimum: Vec::new(),
+            distance: vec![[0.0; 3]; hold_out],
+            repairs: Vec::new(),
+        }
+    }
+}
+
+/// Correction of a measured label.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Repair {
     /// Number of the frame.
     pub frame: usize,
     /// Number of the object in the frame.
     pub object: usize,
-    /// By how much, in the cloud's frame, m.
+    /// Shift to apply, in the cloud's frame, m.
     pub shift_m: [f64; 3],
 }
 
-/// Mean gain over its standard error that a finding must have: no null of the blind set came near.
+/// Mean gain over its standard error that a finding must exceed. No null case of the blind set reached it.
 pub const Z_STAR: f64 = 3.2;
 
-/// The demands of a first step.
+/// What the first step of a forward selection demands.
 pub fn first_demands() -> Demands {
-    Demands { z: Z_STAR, nats: 8.0, slack: 0.02, told: 0.02 }
+    Demands { z: Z_STAR, nats: 8.0, slack: 0.02, richer: 0.02 }
 }
 
-/// Share of rows whose offsets do not count in their spread: a row may follow the upper edge of a wall, which every shift of the wall
-/// moves.
+/// Share of groups, those with the largest offsets, that are left out of the spread. Rows: a single row may follow the upper edge of a wall,
+/// which every shift of the wall displaces.
 pub fn trimmed(grouping: Grouping) -> f64 {
     if grouping == Grouping::Row { 0.12 } else { 0.0 }
 }
 
-/// Objects that are swept by more than that over a scan leave nothing else to be judged by, m.
+/// Displacement of the fastest objects over one scan from which on motion distortion spoils the other channels, m.
 const SWEPT_M: f64 = 0.8;
 
-/// Sets aside what a scan that takes its time makes in the other channels: whole scenes shear, and surfaces, silhouettes and directions do not
-/// fit any more. Says so.
+/// Removes findings of other channels where objects show strong motion distortion: the whole scene is sheared, so that surfaces, silhouettes
+/// and directions do not match. Returns a note about what was removed.
 pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
-    let of_objects = |f: &Found| f.channel == "objects" && f.causes == ["rolling_shutter"];
+    let of_objects = |f: &Found| f.channel == Channel::Objects && f.is(Cause::RollingShutter);
     let found = results.iter().flat_map(|r| &r.found).find(|f| of_objects(f))?;
-    let scan_s = found.parameters.iter().find(|(name, _)| name == "scan_s")?.1.estimate.abs();
+    let scan_s = found.parameter(Quantity::ScanS)?.estimate.abs();
     let fastest = found.curve.points.iter().map(|p| p.x.abs()).fold(0.0, f64::max);
-    // Cars are met at tens of m/s over the ground, whatever the sensor sees of them.
+    // Vehicles drive at tens of m/s over the ground, whatever their velocity relative to the sensor.
     if scan_s * fastest.max(20.0) < SWEPT_M {
         return None;
     }
     let mut set_aside = Vec::new();
     for result in results.iter_mut() {
-        let sheared = |f: &Found| matches!(f.channel, "residuals" | "hits" | "roughness" | "returns");
-        set_aside.extend(
-            result
-                .found
-                .iter()
-                .filter(|f| sheared(f))
-                .map(|f| f.causes.first().map_or("unexplained", String::as_str).to_owned()),
-        );
+        let sheared =
+            |f: &Found| matches!(f.channel, Channel::Residuals | Channel::Hits | Channel::Roughness | Channel::Returns);
+        let first = |f: &Found| f.causes.first().copied().unwrap_or(Cause::Unexplained);
+        set_aside.extend(result.found.iter().filter(|f| sheared(f)).map(|f| first(f).name()));
         result.found.retain(|f| !sheared(f));
         if result.found.is_empty() {
             result.distance.iter_mut().for_each(|d| *d = [0.0; 3]);
@@ -163,8 +191,8 @@ pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
 /// Number of bootstrap repetitions.
 pub const REPETITIONS: usize = 400;
 
-/// Share of block bootstraps of the gains that choose a trial of the same name.
-pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: &str, demands: &Demands) -> f64 {
+/// Share of block-bootstrap repetitions of the gains that choose the same cause.
+pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: Cause, demands: &Demands) -> f64 {
     let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose confidence", trials.len() as u64, 0);
     let repetitions = 200;
@@ -176,30 +204,30 @@ pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: &str, demands: &De
                 .map(|t| Trial { gains: drawn.iter().map(|&i| t.gains[i]).collect(), ..t.clone() })
                 .collect();
             let easier = Demands { z: 0.0, nats: 0.0, ..*demands };
-            choose(&again, &easier).is_some_and(|c| again[c.chosen].name == chosen)
+            choose(&again, &easier).is_some_and(|c| again[c.chosen].cause == chosen)
         })
         .count();
     same as f64 / f64::from(repetitions)
 }
 
-/// Below this share of bootstraps the runner-up is told as well.
+/// Share of bootstrap repetitions below which the runner-up is reported as a candidate.
 const SURE: f64 = 0.8;
 
-/// What explains as much as the chosen one, and the confidence: where many bootstraps choose another name, that one as well.
-pub fn unless_unsure(
-    mut equals: Vec<String>,
+/// The rival causes of a chosen one and its confidence. Without rivals the runner-up becomes one where the confidence is low.
+pub fn rivals_and_confidence(
+    mut rivals: Vec<Cause>,
     trials: &[Trial],
     blocks: &[usize],
-    chosen: &str,
+    chosen: Cause,
     demands: &Demands,
-) -> (Vec<String>, f64) {
+) -> Selected {
     let confidence = confidence(trials, blocks, chosen, demands);
-    if equals.is_empty() && confidence < SURE {
-        let others = trials.iter().filter(|t| t.name != chosen && t.above_floor);
-        let rival = others.max_by(|a, b| total_and_z(&a.gains).0.total_cmp(&total_and_z(&b.gains).0));
-        equals.extend(rival.map(|t| t.name.clone()));
+    if rivals.is_empty() && confidence < SURE {
+        let others = trials.iter().filter(|t| t.cause != chosen && t.above_floor);
+        let runner_up = others.max_by(|a, b| total_and_z(&a.gains).0.total_cmp(&total_and_z(&b.gains).0));
+        rivals.extend(runner_up.map(|t| t.cause));
     }
-    (equals, confidence)
+    Selected { rivals, confidence }
 }
 
 /// Interval of the mean of per-frame values by a bootstrap over blocks, divided by `per`.
@@ -215,11 +243,40 @@ pub fn mean_interval(values: &[f64], blocks: &[usize], per: f64) -> FindingGain 
     FindingGain { nats_per_ray: values.iter().sum::<f64>() / per, ci95: interval_nearest(sums).unwrap_or_default() }
 }
 
-/// Writes down what became of every trial.
+/// What a step of the selection says beside the chosen hypothesis.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Selected {
+    /// Other causes that explain as much, as far as these frames tell.
+    pub rivals: Vec<Cause>,
+    /// Share of bootstrap repetitions that choose the same cause.
+    pub confidence: f64,
+}
+
+impl Selected {
+    /// Whether the cause is certain.
+    pub fn status(&self) -> Status {
+        if self.rivals.is_empty() { Status::Named } else { Status::Ambiguous }
+    }
+
+    /// The chosen cause with its rivals.
+    pub fn causes(self, chosen: Cause) -> Vec<Cause> {
+        std::iter::once(chosen).chain(self.rivals).collect()
+    }
+}
+
+/// The causes of some trials, each once.
+pub fn causes_of(trials: &[Trial], which: &[usize]) -> Vec<Cause> {
+    let mut causes: Vec<Cause> = which.iter().map(|&i| trials[i].cause).collect();
+    causes.sort();
+    causes.dedup();
+    causes
+}
+
+/// Records what became of every trial.
 pub fn record(
     trials: &[Trial],
     choice: Option<&Choice>,
-    channel: &str,
+    channel: Channel,
     rays: f64,
     demands: &Demands,
 ) -> Vec<Considered> {
@@ -236,13 +293,27 @@ pub fn record(
             }
             None => "not chosen".into(),
         };
-        Considered { cause: t.name.clone(), channel: channel.into(), nats_per_ray: total / rays, z, outcome }
+        Considered { cause: t.cause.into(), channel, nats_per_ray: total / rays, z, outcome }
     };
     trials.iter().enumerate().map(line).collect()
 }
 
+/// A parameter with its name.
+pub type NamedParameter = (ParameterId, Parameter);
+
 /// A parameter with a symmetric interval of 1.96 standard errors.
-pub fn parameter(name: &str, estimate: f64, error: f64, unit: &str) -> (String, Parameter) {
+pub fn parameter(quantity: Quantity, estimate: f64, error: f64) -> NamedParameter {
+    (quantity.into(), with_error(estimate, error, quantity.unit()))
+}
+
+/// An estimate with a symmetric interval of 1.96 standard errors.
+pub fn with_error(estimate: f64, error: f64, unit: Unit) -> Parameter {
     let half = 1.96 * error;
-    (name.into(), Parameter { estimate, unit: unit.into(), ci95: [estimate - half, estimate + half] })
+    Parameter { estimate, unit, ci95: [estimate - half, estimate + half] }
+}
+
+/// The number of a sensor as a parameter: exact.
+pub fn sensor_number(sensor: usize) -> NamedParameter {
+    let number = sensor as f64;
+    (Quantity::Sensor.into(), Parameter { estimate: number, unit: Unit::Number, ci95: [number; 2] })
 }

@@ -1,148 +1,152 @@
-//! Rounded ranges: do measured ranges fall on a comb that simulated ranges do not fall on?
+//! Quantisation: measured ranges fall on multiples of a step, simulated ranges do not.
 
 use super::{ChannelResult, Context, Found, parameter};
-use crate::diagnosis::{Considered, Curve, CurvePoint, Minimum, Status};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Minimum, Status};
+use crate::inference::comb::{self, BIN_M, LENGTH_M, Refinement, Spectra};
 use crate::inference::roles::Role;
-use rustfft::{FftPlanner, num_complex::Complex};
 
-/// Width of a bin of ranges, m, and their number: ranges up to 131 m, steps from 2 mm.
-const BIN_M: f64 = 5e-4;
-const BINS: usize = 1 << 18;
-
-/// Returns looked at.
+/// Returns that are used of each side, at most.
 const RETURNS: usize = 60_000;
 
-/// Share of the ranges that fall on the comb, from which on it is one; simulated ranges must stay below half of it.
+/// Fewest returns of each side.
+const FEWEST: usize = 500;
+
+/// Share of the measured ranges on the comb from which on it is one; the share of the simulated ranges must be below half of it.
 const COHERENT: f64 = 0.3;
 
-/// Largest step that is looked for, m: longer ones are structures of the scene.
+/// Largest step that is searched for, m: the structure of the scene causes longer periods.
 const LARGEST_M: f64 = 0.4;
 
-/// The search; also the step, m.
+/// Ranges that a refinement of the step uses, at most.
+const REFINED_ON: usize = 6000;
+
+/// How the step is refined.
+const REFINEMENT: Refinement = Refinement { rounds: 5, to_either_side: 20, narrows: 8.0 };
+
+/// Half width of the refinement on the estimating frames, as a share of the step.
+const WITHIN: f64 = 3e-4;
+
+/// The search, and the step, m.
 pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
-    let mut result = ChannelResult { distance: vec![[0.0; 3]; hold_out.len()], ..ChannelResult::default() };
-    let minimum = Minimum { parameter: "step_m".into(), value: 2.0 * BIN_M * 2.0, unit: "m".into() };
-    result.minimum.push(("quantisation".into(), minimum));
-    let ranges = |frames: &[usize], measured: bool| -> Vec<f64> {
-        let side = |i: usize| if measured { &context.frames[i].measured } else { &context.frames[i].simulated };
-        let all: usize = frames.iter().map(|&i| side(i).len()).sum();
-        let step = (all / RETURNS).max(1);
-        frames
-            .iter()
-            .flat_map(|&i| side(i))
-            .step_by(step)
-            .map(|r| r.own_range_m())
-            .filter(|r| *r < BIN_M * BINS as f64)
-            .collect()
-    };
-    let (a, b) = (ranges(&select, true), ranges(&select, false));
-    if a.len() < 500 || b.len() < 500 {
+    let mut result = ChannelResult::new(Channel::Ranges, hold_out.len());
+    result.minimum.push((Cause::Quantisation, Minimum::new(Quantity::StepM, 2.0 * BIN_M * 2.0)));
+    let (a, b) = (ranges(context, &select, true), ranges(context, &select, false));
+    if a.len() < FEWEST || b.len() < FEWEST {
         return (result, None);
     }
     let spectrum = [&a, &b].map(|r| spectrum(r));
-    let from = (BIN_M * BINS as f64 / LARGEST_M) as usize;
-    let first = (from..BINS / 2).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
-    // The flank of a peak comes before its top; near scenes make wide ones.
+    let from = comb::frequency_of(LARGEST_M);
+    let first = (from..comb::FREQUENCIES).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
+    // The flank of a peak comes before its top. Scenes of near surfaces have wide peaks.
     let peak = first.map(|k| top(&spectrum[0], k));
-    let strongest = (from..BINS / 2).map(|k| spectrum[0][k]).fold(0.0, f64::max);
+    let strongest = spectrum[0][from..].iter().copied().fold(0.0, f64::max);
     result.considered.push(Considered {
-        cause: "quantisation".into(),
-        channel: "ranges".into(),
+        cause: Cause::Quantisation.into(),
+        channel: Channel::Ranges,
         nats_per_ray: 0.0,
         z: strongest * (a.len() as f64).sqrt(),
         outcome: if peak.is_some() { "chosen".into() } else { "ranges fall on no comb".into() },
     });
     let Some(k) = peak else { return (result, None) };
-    // The peak within its bin, then the step from other frames around it.
-    let near = refine(&a, BIN_M * BINS as f64 / k as f64, 1.5 / k as f64);
-    let on_estimate = ranges(&estimate, true);
-    let step = refine(&on_estimate, near, 3e-4);
-    let on_comb = coherence(&on_estimate, step);
-    let longest = on_estimate.iter().copied().fold(1.0, f64::max);
-    let error = step * step / (std::f64::consts::TAU * longest * (on_estimate.len() as f64).sqrt()) * 10.0;
-    // A return on the comb tells its place among the steps: ln(step / resolution) nats, by the share that is on it.
-    let held: Vec<f64> = hold_out
-        .iter()
-        .map(|&i| {
-            let own = ranges(&[i], true);
-            let c = coherence(&own, step).clamp(0.0, 0.999);
-            0.5 * -(1.0 - c * c).ln() * context.frames[i].simulated.len() as f64
-        })
-        .collect();
+    // The peak within its bin on the selecting frames, then the step on the estimating ones.
+    let near = refine(&a, comb::step_of(k), 1.5 / k as f64);
+    let on_estimate = ranges(context, &estimate, true);
+    let step = refine(&on_estimate, near, WITHIN);
+    let held = held_out_gains(context, &hold_out, step);
     for (d, g) in result.distance.iter_mut().zip(&held) {
         *d = [*g; 3];
     }
-    let mut fractions = [0.0f64; 20];
-    let mut simulated = [0.0f64; 20];
-    for (list, counts) in [(&on_estimate, &mut fractions), (&b, &mut simulated)] {
-        for r in list {
-            counts[((r / step).fract() * 20.0) as usize % 20] += 1.0 / list.len() as f64;
-        }
-    }
-    let points = (0..20).map(|i| CurvePoint {
-        x: (i as f64 + 0.5) / 20.0,
-        measured: fractions[i],
-        before: simulated[i],
-        after: fractions[i],
-        error: (fractions[i] / on_estimate.len() as f64).sqrt(),
-    });
-    result.found.push(Found {
-        status: Status::Named,
-        causes: vec!["quantisation".into()],
-        family: "range_error",
-        parameters: vec![
-            parameter("step_m", step, error.max(1e-6), "m"),
-            parameter("share_on_comb", on_comb, 0.02, "1"),
-        ],
-        confidence: 1.0,
-        channel: "ranges",
-        covariate: "fraction of the step".into(),
-        held_out_gains: held,
-        says: format!("measured ranges are rounded to {:.1} mm; simulated ones are not", 1000.0 * step),
-        separate_by: None,
-        curve: Curve { x: "range / step, fraction".into(), y: "share of the returns".into(), points: points.collect() },
-    });
+    result.found.push(found(step, &on_estimate, &b, held));
     (result, Some(step))
 }
 
-/// The top of the peak on whose flank, or on a smaller one before it, a bin lies: scenes that end sharply make several. Multiples of the comb's
-/// frequency lie beyond.
+/// Ranges of one side, m, evenly thinned.
+fn ranges(context: &Context, frames: &[usize], measured: bool) -> Vec<f64> {
+    let side = |i: usize| if measured { &context.frames[i].measured } else { &context.frames[i].simulated };
+    let all: usize = frames.iter().map(|&i| side(i).len()).sum();
+    let step = (all / RETURNS).max(1);
+    let some = frames.iter().flat_map(|&i| side(i)).step_by(step);
+    some.map(|r| r.own_range_m()).filter(|r| *r < LENGTH_M).collect()
+}
+
+/// Gains of held-out frames, nats: a range on the comb gives its place between the steps, for the share of ranges on the comb.
+fn held_out_gains(context: &Context, hold_out: &[usize], step: f64) -> Vec<f64> {
+    let gain = |&i: &usize| {
+        let own = ranges(context, &[i], true);
+        let c = coherence(&own, step).clamp(0.0, 0.999);
+        0.5 * -(1.0 - c * c).ln() * context.frames[i].simulated.len() as f64
+    };
+    hold_out.iter().map(gain).collect()
+}
+
+/// The finding, with the distribution of the ranges over the step.
+fn found(step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64>) -> Found {
+    let longest = measured.iter().copied().fold(1.0, f64::max);
+    let n = measured.len() as f64;
+    let error = step * step / (std::f64::consts::TAU * longest * n.sqrt()) * 10.0;
+    let [before, after] = [simulated, measured].map(|ranges| {
+        let mut counts = [0.0f64; 20];
+        for r in ranges {
+            counts[((r / step).fract() * 20.0) as usize % 20] += 1.0 / ranges.len() as f64;
+        }
+        counts
+    });
+    let points = (0..20).map(|i| CurvePoint {
+        sensor: 0,
+        x: (i as f64 + 0.5) / 20.0,
+        measured: after[i],
+        before: before[i],
+        after: after[i],
+        error: (after[i] / n).sqrt(),
+    });
+    Found {
+        status: Status::Named,
+        causes: vec![Cause::Quantisation],
+        parameters: vec![
+            parameter(Quantity::StepM, step, error.max(1e-6)),
+            parameter(Quantity::ShareOnComb, coherence(measured, step), 0.02),
+        ],
+        confidence: 1.0,
+        channel: Channel::Ranges,
+        covariate: Covariate::FractionOfTheStep,
+        held_out_gains,
+        says: format!("measured ranges are rounded to {:.1} mm; simulated ones are not", 1000.0 * step),
+        separate_by: None,
+        curve: Curve {
+            x: "range / step, fraction".into(),
+            y: "share of the returns".into(),
+            by_sensor: false,
+            points: points.collect(),
+        },
+    }
+}
+
+/// The top of the peak on whose flank a frequency lies, or on the flank of a smaller peak before it: scenes with sharp ends have side peaks. The
+/// harmonics of the step lie beyond.
 fn top(spectrum: &[f64], flank: usize) -> usize {
     let end = (flank + flank / 2).min(spectrum.len() - 1);
     (flank..=end).max_by(|a, b| spectrum[*a].total_cmp(&spectrum[*b])).unwrap_or(flank)
 }
 
-/// |sum of exp(2 pi i R k)| / n for frequencies up to one in two bins.
+/// Share of the ranges on the comb of each frequency.
 fn spectrum(ranges: &[f64]) -> Vec<f64> {
-    let mut values = vec![Complex::new(0.0f32, 0.0); BINS];
-    for r in ranges {
-        values[((r / BIN_M) as usize).min(BINS - 1)].re += 1.0;
-    }
-    FftPlanner::new().plan_fft_forward(BINS).process(&mut values);
-    values[..BINS / 2].iter().map(|v| f64::from(v.norm()) / ranges.len() as f64).collect()
+    let sums = Spectra::new().of(ranges.iter().copied());
+    sums.iter().map(|v| f64::from(v.norm()) / ranges.len() as f64).collect()
 }
 
-/// Share of the ranges that fall on a comb of this step.
+/// Share of the ranges on the comb of a step.
 fn coherence(ranges: &[f64], step: f64) -> f64 {
-    let (mut re, mut im) = (0.0, 0.0);
-    for r in ranges {
-        let (s, c) = (std::f64::consts::TAU * r / step).sin_cos();
-        (re, im) = (re + c, im + s);
-    }
-    re.hypot(im) / ranges.len().max(1) as f64
+    let (sum, _) = comb::phasor(ranges.iter().copied(), step);
+    sum.re.hypot(sum.im) / ranges.len().max(1) as f64
 }
 
-/// The step with the largest coherence within a share of a first guess.
+/// The step with the largest coherence within a share of a first guess, m.
 fn refine(ranges: &[f64], guess: f64, within: f64) -> f64 {
-    let some: Vec<f64> = ranges.iter().step_by((ranges.len() / 6000).max(1)).copied().collect();
-    let (mut best, mut width) = (guess, within);
-    for _ in 0..5 {
-        let tries = (-20..=20).map(|i| best * (1.0 + width * f64::from(i) / 20.0));
-        best = tries.map(|s| (coherence(&some, s), s)).max_by(|a, b| a.0.total_cmp(&b.0)).map_or(best, |b| b.1);
-        width /= 8.0;
-    }
-    best
+    let some: Vec<f64> = ranges.iter().step_by((ranges.len() / REFINED_ON).max(1)).copied().collect();
+    REFINEMENT.best(guess, within, |step| coherence(&some, step))
 }
 
 #[cfg(test)]
@@ -155,9 +159,9 @@ mod tests {
         let mut rng = data::stream(4, "comb", 0, 0);
         let smooth: Vec<f64> = (0..5000).map(|_| 3.0 + 70.0 * rng.random::<f64>().powi(2)).collect();
         let rounded: Vec<f64> = smooth.iter().map(|r| (r / 0.0437).round() * 0.0437).collect();
-        let k = (0.0437f64.recip() * BIN_M * BINS as f64).round() as usize;
+        let k = (0.0437f64.recip() * LENGTH_M).round() as usize;
         assert!(spectrum(&rounded)[k] > 0.5 && spectrum(&smooth)[k] < 0.1);
-        assert!((refine(&rounded, BIN_M * BINS as f64 / k as f64, 1e-3) - 0.0437).abs() < 1e-5);
+        assert!((refine(&rounded, comb::step_of(k), 1e-3) - 0.0437).abs() < 1e-5);
     }
 
     #[test]

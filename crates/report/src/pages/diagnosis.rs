@@ -5,9 +5,6 @@ use data::write_atomic;
 use diagnose::{Diagnosis, Finding, Status};
 use std::path::Path;
 
-/// Offset along the covariate between the curves of different sensors.
-const A_SENSOR: f64 = 1000.0;
-
 /// PNG pixels per SVG pixel.
 const SCALE: f32 = 2.0;
 
@@ -28,23 +25,24 @@ pub fn write_finding_pictures(diagnosis: &Diagnosis, out: &Path) -> Result<(), R
 /// Name of a finding: its cause, its candidates, or "unexplained".
 pub fn finding_name(finding: &Finding) -> String {
     match finding.status {
-        Status::Named => finding.cause.clone().unwrap_or_default(),
-        Status::Ambiguous => finding.candidates.clone().unwrap_or_default().join(" or "),
+        Status::Named => finding.cause.map_or_else(String::new, |c| c.to_string()),
+        Status::Ambiguous => {
+            let names = finding.candidates.iter().flatten().map(|c| c.name());
+            names.collect::<Vec<_>>().join(" or ")
+        }
         Status::Unexplained => "unexplained".into(),
     }
 }
 
 fn figure(finding: &Finding) -> Figure {
     let curve = &finding.curve;
-    let of_sensors = curve.x.contains("1000 a sensor");
-    let sensor = |x: f64| if of_sensors { (x / A_SENSOR).round().max(0.0) } else { 0.0 };
-    let last = curve.points.iter().map(|p| sensor(p.x)).fold(0.0, f64::max) as usize;
+    let last = curve.points.iter().map(|p| p.sensor).max().unwrap_or(0);
     let mut series = Vec::new();
     for k in 0..=last {
-        let own: Vec<_> = curve.points.iter().filter(|p| sensor(p.x) as usize == k).collect();
+        let own: Vec<_> = curve.points.iter().filter(|p| p.sensor == k).collect();
         let word = |what: &str| if last > 0 { format!("{what}, sensor {k}") } else { what.to_owned() };
         let mut push = |what: &str, value: &dyn Fn(&diagnose::CurvePoint) -> f64| {
-            let points = own.iter().map(|p| [p.x - A_SENSOR * sensor(p.x), value(p)]).collect();
+            let points = own.iter().map(|p| [p.x, value(p)]).collect();
             series.push(Series { name: word(what), points });
         };
         push("measured", &|p| p.measured);
@@ -55,39 +53,37 @@ fn figure(finding: &Finding) -> Figure {
             push("simulated with the finding", &|p| p.after);
         }
     }
-    let options = CurveOptions {
-        title: finding_name(finding),
-        x_label: curve.x.replace(" (1000 a sensor)", ""),
-        y_label: curve.y.clone(),
-        log_y: false,
-    };
+    let options =
+        CurveOptions { title: finding_name(finding), x_label: curve.x.clone(), y_label: curve.y.clone(), log_y: false };
     Figure::curves(&series, &options)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use diagnose::{Curve, CurvePoint, FindingGain};
+    use diagnose::{Channel, Covariate, Curve, CurvePoint, Family, FindingGain};
 
     #[test]
     fn a_picture_shows_before_and_after_by_sensor() {
-        let point = |x: f64| CurvePoint { x, measured: 0.8, before: 1.0, after: 0.79, error: 0.01 };
+        let point =
+            |sensor: usize, x: f64| CurvePoint { sensor, x, measured: 0.8, before: 1.0, after: 0.79, error: 0.01 };
         let finding = Finding {
             status: Status::Unexplained,
             cause: None,
             candidates: None,
-            family: "unknown".into(),
+            family: Family::Unknown,
             parameters: Default::default(),
             confidence: 1.0,
-            channel: "hits".into(),
-            covariate: "row".into(),
+            channel: Channel::Hits,
+            covariate: Covariate::Row,
             gain: FindingGain::default(),
             says: String::new(),
             separate_by: None,
             curve: Curve {
-                x: "row (1000 a sensor)".into(),
+                x: "row".into(),
                 y: "share".into(),
-                points: vec![point(0.0), point(5.0), point(1000.0), point(1005.0)],
+                by_sensor: true,
+                points: vec![point(0, 0.0), point(0, 5.0), point(1, 0.0), point(1, 5.0)],
             },
             effects: vec![],
         };

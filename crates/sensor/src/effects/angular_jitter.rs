@@ -1,7 +1,7 @@
 //! C1: shots that do not go quite where they should.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::local_plane::measure_along;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, turned};
 use crate::scan::Scan;
 use data::KeyError;
@@ -78,13 +78,21 @@ mod tests {
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let sensor = &beams.sensors[0];
         let angle = |d: &[f32; 3]| (f64::from(d[1].atan2(d[0])).to_degrees(), f64::from(d[2].asin()).to_degrees());
-        let off: Vec<(f64, f64)> = sensor.believed.iter().zip(&sensor.true_directions).map(|(a, b)| {
-            let ((az, el), (az2, el2)) = (angle(a), angle(b));
-            (az2 - az, el2 - el)
-        }).collect();
+        let off: Vec<(f64, f64)> = sensor
+            .believed
+            .iter()
+            .zip(&sensor.true_directions)
+            .map(|(a, b)| {
+                let ((az, el), (az2, el2)) = (angle(a), angle(b));
+                (az2 - az, el2 - el)
+            })
+            .collect();
         let (mean, azimuth) = moments(&off.iter().map(|o| o.0).collect::<Vec<_>>());
         let (_, elevation) = moments(&off.iter().map(|o| o.1).collect::<Vec<_>>());
-        assert!(mean.abs() < 3e-3 && (azimuth - 0.05).abs() < 3e-3 && (elevation - 0.02).abs() < 2e-3, "{azimuth} {elevation}");
+        assert!(
+            mean.abs() < 3e-3 && (azimuth - 0.05).abs() < 3e-3 && (elevation - 0.02).abs() < 2e-3,
+            "{azimuth} {elevation}"
+        );
         assert_ne!(&sensor.believed[..], &sensor.true_directions[..]);
     }
 

@@ -1,7 +1,7 @@
 //! C3: every beam has an error of its own in its angles.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::local_plane::measure_along;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, turned};
 use crate::scan::Scan;
 use data::KeyError;

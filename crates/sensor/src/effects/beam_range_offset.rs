@@ -72,11 +72,15 @@ mod tests {
         for (a, b) in before.echoes.iter().zip(&one.echoes).filter(|(a, _)| a.is_return()) {
             of_row[usize::from(a.row)].push(f64::from(b.range_m - a.range_m));
         }
-        let means: Vec<f64> = of_row.iter().filter(|r| !r.is_empty()).map(|r| {
-            let (mean, std) = moments(r);
-            assert!(std < 1e-5);
-            mean
-        }).collect();
+        let means: Vec<f64> = of_row
+            .iter()
+            .filter(|r| !r.is_empty())
+            .map(|r| {
+                let (mean, std) = moments(r);
+                assert!(std < 1e-5);
+                mean
+            })
+            .collect();
         let (_, std) = moments(&means);
         assert!((0.008..0.025).contains(&std), "{std}");
     }

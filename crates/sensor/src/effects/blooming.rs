@@ -1,7 +1,7 @@
 //! D3: a bright target shines into its neighbours.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::shot_grid::{ShotGrid, reach};
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::{Scan, dot};
 use data::KeyError;
 use data::toml_text::within;
@@ -63,7 +63,14 @@ impl SensorEffect for Blooming {
             let echo = &mut scan.echoes[k];
             if echo.range_m > bright.range_m {
                 let halo = 0.1 * bright.returned;
-                *echo = crate::scan::Echo { range_m: bright.range_m, normal: bright.normal, returned: halo, object: bright.object, material: bright.material, ..*echo };
+                *echo = crate::scan::Echo {
+                    range_m: bright.range_m,
+                    normal: bright.normal,
+                    returned: halo,
+                    object: bright.object,
+                    material: bright.material,
+                    ..*echo
+                };
             }
         }
     }
@@ -83,7 +90,13 @@ mod tests {
         }
         let effect = Blooming { returned_above: 5.0, halo_deg: 0.5, strength: 1.0 };
         let after = applied(&effect, &before);
-        let new: Vec<_> = before.echoes.iter().zip(&after.echoes).filter(|(a, b)| !a.is_return() && b.is_return()).map(|(_, b)| b).collect();
+        let new: Vec<_> = before
+            .echoes
+            .iter()
+            .zip(&after.echoes)
+            .filter(|(a, b)| !a.is_return() && b.is_return())
+            .map(|(_, b)| b)
+            .collect();
         assert!(new.len() > 20, "{}", new.len());
         assert!(new.iter().all(|e| (39.9..41.2).contains(&e.range_m)));
         let angle = |e: &crate::scan::Echo| {

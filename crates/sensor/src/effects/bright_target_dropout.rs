@@ -1,7 +1,7 @@
 //! B10: a bright target blinds the receiver for its neighbours.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::shot_grid::{ShotGrid, reach};
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::{Scan, dot};
 use data::KeyError;
 use data::toml_text::within;

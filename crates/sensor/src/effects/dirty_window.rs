@@ -61,7 +61,8 @@ impl SensorEffect for DirtyWindow {
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let Some(number) = frame.rig.find(&self.sensor) else { return };
         let [azimuth, elevation] = [self.azimuth_deg, self.elevation_deg].map(f64::to_radians);
-        let middle = frame.rig.sensors[number].pose().rotation * Vector3::from(crate::rig::direction(azimuth, elevation));
+        let middle =
+            frame.rig.sensors[number].pose().rotation * Vector3::from(crate::rig::direction(azimuth, elevation));
         let middle: [f32; 3] = middle.map(|v| v as f32).into();
         let radius = self.radius_deg.to_radians() as f32;
         let mut random = draws.of_frame();
@@ -89,14 +90,16 @@ mod tests {
     #[test]
     fn a_soft_spot_in_the_sensor_s_frame() {
         let before = scene();
-        let effect = DirtyWindow { transmission: 0.5, loss: 1.0, noise_m: 0.1, elevation_deg: -5.0, ..DirtyWindow::default() };
+        let effect =
+            DirtyWindow { transmission: 0.5, loss: 1.0, noise_m: 0.1, elevation_deg: -5.0, ..DirtyWindow::default() };
         let after = applied(&effect, &before);
         let share = |low: f64, high: f64| {
             let inside = |d: [f32; 3]| {
                 let (az, el) = (f64::from(d[1].atan2(d[0])).to_degrees(), f64::from(d[2].asin()).to_degrees());
                 (low..high).contains(&(az - 20.0).hypot(el + 5.0))
             };
-            let all: Vec<_> = before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && inside(a.direction)).collect();
+            let all: Vec<_> =
+                before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && inside(a.direction)).collect();
             all.iter().filter(|(_, b)| !b.is_return()).count() as f64 / all.len() as f64
         };
         let (inner, outer) = (share(0.0, 3.0), share(10.0, 20.0));

@@ -115,7 +115,14 @@ mod tests {
 
     #[test]
     fn the_car_is_tilted_by_that_much() {
-        let effect = EgoAttitude { roll_deg: 0.2, pitch_deg: -0.1, pitch_at_70mps_deg: 0.49, roll_std_deg: 0.05, pitch_std_deg: 0.1, heave_std_m: 0.02 };
+        let effect = EgoAttitude {
+            roll_deg: 0.2,
+            pitch_deg: -0.1,
+            pitch_at_70mps_deg: 0.49,
+            roll_std_deg: 0.05,
+            pitch_std_deg: 0.1,
+            heave_std_m: 0.02,
+        };
         let tilts: Vec<[f64; 3]> = (0..3000)
             .map(|frame| {
                 let mut beams = Beams::of(&rig());

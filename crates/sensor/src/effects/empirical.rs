@@ -1,7 +1,7 @@
 //! E4: what was seen of a sensor and has no cause: losses, offsets and noise as tables over one covariate.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::table::{check_table, interpolated};
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::{Echo, Scan, dot};
 use data::KeyError;
 use nalgebra::Vector3;
@@ -52,11 +52,7 @@ pub struct Empirical {
 
 impl Empirical {
     fn tables(&self) -> [(&'static str, &Vec<f64>, [f64; 2]); 3] {
-        [
-            ("loss", &self.loss, [0.0, 1.0]),
-            ("mean_m", &self.mean_m, [-10.0, 10.0]),
-            ("std_m", &self.std_m, [0.0, 10.0]),
-        ]
+        [("loss", &self.loss, [0.0, 1.0]), ("mean_m", &self.mean_m, [-10.0, 10.0]), ("std_m", &self.std_m, [0.0, 10.0])]
     }
 
     fn value(&self, echo: &Echo, frame: &FrameContext) -> f64 {
@@ -160,11 +156,8 @@ mod tests {
 
     #[test]
     fn bad_tables_are_refused() {
-        let table = |at: &[f64], std_m: &[f64]| Empirical {
-            at: at.into(),
-            std_m: std_m.into(),
-            ..Empirical::default()
-        };
+        let table =
+            |at: &[f64], std_m: &[f64]| Empirical { at: at.into(), std_m: std_m.into(), ..Empirical::default() };
         for (effect, want) in [
             (table(&[], &[0.1]), "no table"),
             (table(&[1.0, 2.0], &[0.1]), "no table"),

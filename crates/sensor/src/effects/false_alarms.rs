@@ -56,7 +56,14 @@ impl SensorEffect for FalseAlarms {
             let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
             let range_m = self.reach_m as f32 * part;
             if chance < rate && range_m < echo.range_m && range_m > 0.1 {
-                *echo = crate::scan::Echo { range_m, normal: [0.0; 3], reflectivity: 0.02, returned: 0.02, object: 0, ..*echo };
+                *echo = crate::scan::Echo {
+                    range_m,
+                    normal: [0.0; 3],
+                    reflectivity: 0.02,
+                    returned: 0.02,
+                    object: 0,
+                    ..*echo
+                };
             }
         }
     }
@@ -83,9 +90,17 @@ mod tests {
     fn more_towards_the_sun() {
         let mut before = scene();
         before.echoes.iter_mut().for_each(|e| e.lose());
-        let effect = FalseAlarms { rate: 0.0, sun_rate: 0.5, sun_azimuth_deg: 30.0, sun_width_deg: 10.0, ..FalseAlarms::default() };
-        let azimuths: Vec<f64> =
-            applied(&effect, &before).returns().map(|e| f64::from(e.direction[1].atan2(e.direction[0])).to_degrees()).collect();
+        let effect = FalseAlarms {
+            rate: 0.0,
+            sun_rate: 0.5,
+            sun_azimuth_deg: 30.0,
+            sun_width_deg: 10.0,
+            ..FalseAlarms::default()
+        };
+        let azimuths: Vec<f64> = applied(&effect, &before)
+            .returns()
+            .map(|e| f64::from(e.direction[1].atan2(e.direction[0])).to_degrees())
+            .collect();
         let (mean, std) = moments(&azimuths);
         assert!((mean - 30.0).abs() < 1.0 && (std - 10.0 / 2_f64.sqrt()).abs() < 1.0, "{mean} {std}");
     }

@@ -1,7 +1,7 @@
 //! B4: returns lost where a surface is met at a grazing angle.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::random_dropout::drop_some;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;

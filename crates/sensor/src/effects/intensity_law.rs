@@ -62,9 +62,15 @@ mod tests {
     #[test]
     fn it_follows_the_law_and_saturates() {
         let effect = IntensityLaw { gain: 0.8, reference_m: 20.0, range_exponent: 2.0, gamma: 0.5, levels: 100 };
-        for (range_m, reflectivity, want) in [(20.0, 0.25, 0.4), (40.0, 0.25, 0.2), (20.0, 0.0625, 0.2), (5.0, 0.5, 1.0), (100.0, 0.01, 0.02)] {
+        for (range_m, reflectivity, want) in
+            [(20.0, 0.25, 0.4), (40.0, 0.25, 0.2), (20.0, 0.0625, 0.2), (5.0, 0.5, 1.0), (100.0, 0.01, 0.02)]
+        {
             let after = applied(&effect, &plate(1, range_m, reflectivity));
-            assert!((f64::from(after.echoes[0].intensity) - want).abs() < 1e-6, "{range_m} {reflectivity}: {}", after.echoes[0].intensity);
+            assert!(
+                (f64::from(after.echoes[0].intensity) - want).abs() < 1e-6,
+                "{range_m} {reflectivity}: {}",
+                after.echoes[0].intensity
+            );
         }
     }
 }

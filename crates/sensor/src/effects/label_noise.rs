@@ -76,7 +76,14 @@ mod tests {
 
     #[test]
     fn errors_have_the_sizes_that_are_said() {
-        let effect = LabelNoise { longitudinal_std_m: 0.3, lateral_std_m: 0.1, vertical_std_m: 0.05, yaw_std_deg: 1.0, slip_probability: 0.2, slip_m: 5.0 };
+        let effect = LabelNoise {
+            longitudinal_std_m: 0.3,
+            lateral_std_m: 0.1,
+            vertical_std_m: 0.05,
+            yaw_std_deg: 1.0,
+            slip_probability: 0.2,
+            slip_m: 5.0,
+        };
         let mut shifts: Vec<[f64; 4]> = Vec::new();
         for frame in 0..3000 {
             let mut cars = cars();

@@ -82,6 +82,9 @@ mod tests {
         let late = shift(Clock::Cars);
         assert!((late[0] + 0.6 * c).abs() < 1e-12 && (late[1] + 0.6 * s).abs() < 1e-12);
         let cloud = shift(Clock::Cloud);
-        assert!((cloud[0] - (late[0] + (50.0 - 0.2 * 2.0) * 0.01)).abs() < 1e-12 && (cloud[1] - (late[1] + 0.2 * 20.0 * 0.01)).abs() < 1e-12);
+        assert!(
+            (cloud[0] - (late[0] + (50.0 - 0.2 * 2.0) * 0.01)).abs() < 1e-12
+                && (cloud[1] - (late[1] + 0.2 * 20.0 * 0.01)).abs() < 1e-12
+        );
     }
 }

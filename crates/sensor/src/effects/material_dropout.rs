@@ -1,7 +1,7 @@
 //! B5: returns lost on some materials.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::random_dropout::drop_some;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::material::MaterialId;
 use crate::scan::Scan;
 use data::KeyError;

@@ -1,8 +1,8 @@
 //! B3: returns lost by their range alone, along a table.
 
-use super::{Draws, FrameContext, SensorEffect};
 use super::random_dropout::drop_some;
 use super::table::{check_table, interpolated};
+use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use schemars::JsonSchema;

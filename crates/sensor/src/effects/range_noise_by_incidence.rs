@@ -1,7 +1,7 @@
 //! A4: noise from the footprint of a beam that meets a surface at an angle.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::range_noise::add_noise;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;

@@ -1,7 +1,7 @@
 //! A2: noise that grows with range.
 
-use super::{Draws, FrameContext, SensorEffect};
 use super::range_noise::add_noise;
+use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;

@@ -1,7 +1,7 @@
 //! A3: noise that grows where little light comes back.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::range_noise::add_noise;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -58,7 +58,9 @@ mod tests {
     fn its_size_follows_the_light() {
         let effect = RangeNoiseBySignal { std_m: 0.02, exponent: 0.5, signal: 0.0, most_m: 0.1 };
         // A hundredth of the light is ten times the noise at exponent 0.5; then comes the limit.
-        for (range_m, reflectivity, want) in [(250.0, 0.1, 0.02), (25.0, 0.1, 0.002), (250.0, 0.01, 0.0632), (250.0, 1e-4, 0.1)] {
+        for (range_m, reflectivity, want) in
+            [(250.0, 0.1, 0.02), (25.0, 0.1, 0.002), (250.0, 0.01, 0.0632), (250.0, 1e-4, 0.1)]
+        {
             let before = plate(20_000, range_m, reflectivity);
             let (_, std) = moments(&residuals(&before, &applied(&effect, &before)));
             assert!((std / want - 1.0).abs() < 0.04, "{range_m} {reflectivity}: {std} {want}");

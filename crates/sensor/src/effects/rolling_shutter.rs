@@ -94,7 +94,11 @@ mod tests {
         with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_cloud(&mut scan, frame, draws));
         let beside = scan.echoes[1].point();
         // 50 m/s forward and 0.2 rad/s to the left for 20 ms.
-        assert!((beside[0] - (30.0 - 1.0 - 0.2 * 8.0 * 0.02)).abs() < 1e-3 && (beside[1] - (-8.0 - 0.2 * 30.0 * 0.02)).abs() < 1e-3, "{beside:?}");
+        assert!(
+            (beside[0] - (30.0 - 1.0 - 0.2 * 8.0 * 0.02)).abs() < 1e-3
+                && (beside[1] - (-8.0 - 0.2 * 30.0 * 0.02)).abs() < 1e-3,
+            "{beside:?}"
+        );
     }
 
     #[test]

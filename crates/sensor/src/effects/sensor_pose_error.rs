@@ -35,7 +35,10 @@ impl SensorPoseError {
     /// `believed_from_true`, sensor's frames.
     fn error(&self) -> Pose {
         let [roll, pitch, yaw] = self.rotation_deg.map(f64::to_radians);
-        Isometry3::from_parts(Translation3::from(self.translation_m), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
+        Isometry3::from_parts(
+            Translation3::from(self.translation_m),
+            UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+        )
     }
 }
 
@@ -74,7 +77,11 @@ mod tests {
 
     #[test]
     fn the_true_mount_moves_and_the_believed_one_stays() {
-        let effect = SensorPoseError { translation_m: [0.1, 0.0, 0.0], rotation_deg: [0.0, 0.0, 1.0], ..SensorPoseError::default() };
+        let effect = SensorPoseError {
+            translation_m: [0.1, 0.0, 0.0],
+            rotation_deg: [0.0, 0.0, 1.0],
+            ..SensorPoseError::default()
+        };
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let sensor = &beams.sensors[0];

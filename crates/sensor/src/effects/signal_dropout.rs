@@ -1,7 +1,7 @@
 //! B2: returns lost where too little light comes back: the lidar equation.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
 use super::random_dropout::drop_some;
+use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -63,9 +63,13 @@ mod tests {
         let effect = SignalDropout { most: 0.9, threshold: 0.0, steepness: 4.0, attenuation_per_m: 0.0 };
         let logistic = |u: f64| 1.0 - 0.9 / (1.0 + (-4.0 * u).exp());
         // Twice the range is a quarter of the light.
-        for (range_m, reflectivity, u) in
-            [(250.0, 0.1, 0.0), (125.0, 0.025, 0.0), (250.0, 0.15, 1.5_f64.ln()), (500.0, 0.1, -4.0_f64.ln()), (50.0, 0.1, 25_f64.ln())]
-        {
+        for (range_m, reflectivity, u) in [
+            (250.0, 0.1, 0.0),
+            (125.0, 0.025, 0.0),
+            (250.0, 0.15, 1.5_f64.ln()),
+            (500.0, 0.1, -4.0_f64.ln()),
+            (50.0, 0.1, 25_f64.ln()),
+        ] {
             let before = plate(20_000, range_m, reflectivity);
             let got = lost(&before, &applied(&effect, &before));
             assert!((got - logistic(u)).abs() < 0.015, "{range_m} {reflectivity}: {got} {}", logistic(u));

@@ -110,7 +110,8 @@ mod tests {
         }
         // Of the shots that pass all of the plume, 1 - exp(-0.2 * 8) are stopped.
         let through = |e: &crate::scan::Echo| way_through(&plume, e.origin, e.direction, e.range_m);
-        let expected: f64 = before.echoes.iter().filter_map(through).map(|[n, f]| 1.0 - f64::from((-0.2 * (f - n)).exp())).sum();
+        let expected: f64 =
+            before.echoes.iter().filter_map(through).map(|[n, f]| 1.0 - f64::from((-0.2 * (f - n)).exp())).sum();
         assert!((changed.len() as f64 / expected - 1.0).abs() < 0.15, "{} {expected}", changed.len());
     }
 }

@@ -1,168 +1,206 @@
 //! Noise of the range, over range and incidence.
 
-use super::{others, parameter, patches};
-use crate::diagnosis::{Considered, Curve, CurvePoint, Finding, FindingGain, Status};
-use crate::scans::{Seen, draws, gain_of, interval, scatter};
+use super::{Named, others, parameter, patches};
+use crate::catalogue::{Cause, Channel, Covariate, Hypothesis, NoiseForm, Quantity};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Finding};
+use crate::scans::scatter::{self, Free, NoiseFit, ScatterSums};
+use crate::scans::{Seen, draws, gain_of, interval};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
+/// Fewest bins of range and incidence that a law is fitted to.
+const FEWEST_BINS: usize = 4;
+
+/// Bins of range and incidence: mean range, mean lever, samples, standard deviation.
+type Bins = BTreeMap<(i32, i32), [f64; 4]>;
+
+/// Forms of a noise law, of growing freedom.
+const FORMS: [(NoiseForm, Free); 4] = [
+    (NoiseForm::Constant, Free { range: false, incidence: false }),
+    (NoiseForm::Incidence, Free { range: false, incidence: true }),
+    (NoiseForm::Range, Free { range: true, incidence: false }),
+    (NoiseForm::RangeAndIncidence, Free { range: true, incidence: true }),
+];
+
+/// Findings of noise, and the forms that were compared. `step_m` is the step of the ranges.
 pub(super) fn noise_found(seen: &Seen, step_m: f64, notes: &mut Vec<String>) -> (Vec<Finding>, Vec<Considered>) {
-    use scatter::{Free, NoiseFit};
     let n = seen.scans.len();
-    let sums: Vec<scatter::ScatterSums> = (0..n)
-        .into_par_iter()
-        .map(|s| {
-            let mut sums = scatter::ScatterSums::new();
-            patches(seen, s).for_each(|p| scatter::add(&mut sums, p, &seen.beams));
-            sums
-        })
-        .collect();
-    let bins = |scans: &[usize]| scatter::pooled(&scans.iter().map(|&s| &sums[s]).collect::<Vec<_>>());
+    let of_scan = |s: usize| {
+        let mut sums = ScatterSums::new();
+        patches(seen, s).for_each(|p| scatter::add(&mut sums, p, &seen.beams));
+        sums
+    };
+    let scans: Vec<ScatterSums> = (0..n).into_par_iter().map(of_scan).collect();
     let every: Vec<usize> = (0..n).collect();
-    if bins(&every).len() < 4 {
+    if bins(&scans, &every).len() < FEWEST_BINS {
         return (vec![], vec![]);
     }
-    // Steps of growing freedom; each must gain on scans that it was not fitted on.
-    let none = Free { range: false, incidence: false };
-    let steps = [
-        none,
-        Free { range: false, incidence: true },
-        Free { range: true, incidence: false },
-        Free { range: true, incidence: true },
-    ];
-    let likelihoods: Vec<Vec<[f64; 2]>> = steps
-        .par_iter()
-        .map(|free| {
+    let forms = Forms::new(scans);
+    let chosen = forms.choose(notes);
+    (forms.findings(chosen, step_m), forms.considered(chosen))
+}
+
+/// Bins over some scans.
+fn bins(scans: &[ScatterSums], which: &[usize]) -> Bins {
+    scatter::pooled(&which.iter().map(|&s| &scans[s]).collect::<Vec<_>>())
+}
+
+/// Scans with the likelihoods of the forms.
+struct Forms {
+    scans: Vec<ScatterSums>,
+    /// By form and scan: log likelihood of the scan under a fit on the other scans, nats, and samples.
+    likelihoods: Vec<Vec<[f64; 2]>>,
+}
+
+impl Forms {
+    fn new(scans: Vec<ScatterSums>) -> Self {
+        let n = scans.len();
+        let of_form = |(_, free): &(NoiseForm, Free)| {
             let of = |s: usize| {
-                scatter::likelihood(&sums[s], &scatter::fit(&bins(&others(n, s).collect::<Vec<_>>()), *free))
+                let rest = bins(&scans, &others(n, s).collect::<Vec<_>>());
+                scatter::likelihood(&scans[s], &scatter::fit(&rest, *free))
             };
             (0..n).map(of).collect()
-        })
-        .collect();
-    let over = |a: usize, b: usize| -> Vec<[f64; 2]> {
-        (0..n).map(|s| [likelihoods[a][s][0] - likelihoods[b][s][0], likelihoods[a][s][1]]).collect()
-    };
-    let total = |k: usize| likelihoods[k].iter().map(|l| l[0]).sum::<f64>();
-    let gains = |k: usize, from: usize| gain_of(&over(k, from)).ci95[0] > 0.0;
-    let mut chosen = 0;
-    for (k, from) in [(1, 0), (2, 0), (3, 1), (3, 2)] {
-        // The footprint of a beam makes noise at an angle whatever else there is: range must do better.
-        if (from == chosen || from == 0) && gains(k, from) && (chosen == 0 || gains(k, chosen)) {
-            chosen = k;
+        };
+        let likelihoods = FORMS.par_iter().map(of_form).collect();
+        Forms { scans, likelihoods }
+    }
+
+    fn every(&self) -> Vec<usize> {
+        (0..self.scans.len()).collect()
+    }
+
+    /// Gain of form `a` over form `b` by scan.
+    fn over(&self, a: usize, b: usize) -> Vec<[f64; 2]> {
+        let both = self.likelihoods[a].iter().zip(&self.likelihoods[b]);
+        both.map(|(a, b)| [a[0] - b[0], a[1]]).collect()
+    }
+
+    /// Whether form `k` gains significantly over form `from`.
+    fn gains(&self, k: usize, from: usize) -> bool {
+        gain_of(&self.over(k, from)).ci95[0] > 0.0
+    }
+
+    /// The form that gains significantly over all simpler ones. Incidence is tried before range: the footprint of a beam causes noise at grazing
+    /// incidence in any case, and a dependence on range must gain more than that.
+    fn choose(&self, notes: &mut Vec<String>) -> usize {
+        let mut chosen = 0;
+        for (k, from) in [(1, 0), (2, 0), (3, 1), (3, 2)] {
+            if (from == chosen || from == 0) && self.gains(k, from) && (chosen == 0 || self.gains(k, chosen)) {
+                chosen = k;
+            }
         }
+        if self.gains(1, 0) && self.gains(2, 0) && !self.gains(1, 2) && !self.gains(2, 1) {
+            notes.push(
+                "whether noise grows with range or with the angle of incidence these scans do not tell: far surfaces are met at an angle".into(),
+            );
+        }
+        chosen
     }
-    if gains(1, 0) && gains(2, 0) && !gains(1, 2) && !gains(2, 1) {
-        notes.push(
-            "whether noise grows with range or with the angle of incidence these scans do not tell: far surfaces are met at an angle".into(),
-        );
-    }
-    let samples: f64 = likelihoods[0].iter().map(|l| l[1]).sum();
-    let words = ["the same everywhere", "with incidence", "with range", "with range and incidence"];
-    let considered = (0..steps.len())
-        .map(|k| {
-            let gain = gain_of(&over(k, 0));
+
+    /// The forms that were compared.
+    fn considered(&self, chosen: usize) -> Vec<Considered> {
+        let samples: f64 = self.likelihoods[0].iter().map(|l| l[1]).sum();
+        let total = |k: usize| self.likelihoods[k].iter().map(|l| l[0]).sum::<f64>();
+        let of_form = |(k, (form, _)): (usize, &(NoiseForm, Free))| {
+            let gain = gain_of(&self.over(k, 0));
             let z = gain.nats_per_ray / ((gain.ci95[1] - gain.ci95[0]) / 3.92).max(1e-12);
-            let outcome =
-                if k == chosen { "chosen".to_owned() } else { "gains less, or no more with more numbers".into() };
+            let outcome = if k == chosen { "chosen" } else { "gains less, or no more with more numbers" };
             Considered {
-                cause: format!("range_noise, {}", words[k]),
-                channel: "roughness".into(),
+                cause: Hypothesis { cause: Cause::RangeNoise, form: Some(*form) },
+                channel: Channel::Roughness,
                 nats_per_ray: (total(k) - total(0)) / samples.max(1.0),
                 z,
-                outcome,
+                outcome: outcome.into(),
             }
-        })
-        .collect();
-    let fitted = scatter::fit(&bins(&every), steps[chosen]);
-    let drawn: Vec<NoiseFit> = draws(n).par_iter().map(|d| scatter::fit(&bins(d), steps[chosen])).collect();
-    let ci = |f: fn(&NoiseFit) -> f64| interval(drawn.iter().map(f).collect());
-    let ideal = NoiseFit { std_m: step_m / 12f64.sqrt(), per_m: 0.0, angle_rad: 0.0 };
-    let against: Vec<[f64; 2]> = (0..n)
-        .map(|s| {
-            let [before, m] = scatter::likelihood(&sums[s], &ideal);
-            [likelihoods[chosen][s][0] - before, m]
-        })
-        .collect();
-    let table = bins(&every);
-    let curve = |by_lever: bool| {
-        let mut rows: Vec<[f64; 5]> = table
-            .values()
-            .map(|[r, l, m, sd]| {
-                let x = if by_lever { (l / r).atan().to_degrees() } else { *r };
-                [x, *m, *sd, fitted.variance(*r, *l).sqrt(), ideal.std_m]
+        };
+        FORMS.iter().enumerate().map(of_form).collect()
+    }
+
+    /// Findings of the chosen form: noise of the range, and noise at grazing incidence where the form has it.
+    fn findings(&self, chosen: usize, step_m: f64) -> Vec<Finding> {
+        let free = FORMS[chosen].1;
+        let table = bins(&self.scans, &self.every());
+        let fitted = scatter::fit(&table, free);
+        let drawn: Vec<NoiseFit> =
+            draws(self.scans.len()).par_iter().map(|d| scatter::fit(&bins(&self.scans, d), free)).collect();
+        let ci = |f: fn(&NoiseFit) -> f64| interval(drawn.iter().map(f).collect());
+        let ideal = NoiseFit { std_m: step_m / 12f64.sqrt(), per_m: 0.0, angle_rad: 0.0 };
+        let against_ideal: Vec<[f64; 2]> = (0..self.scans.len())
+            .map(|s| {
+                let [before, m] = scatter::likelihood(&self.scans[s], &ideal);
+                [self.likelihoods[chosen][s][0] - before, m]
             })
             .collect();
-        // Range by what is met squarely, incidence by all.
-        if !by_lever {
-            let square: Vec<[f64; 5]> =
-                table.values().zip(&rows).filter(|([r, l, ..], _)| l < &(1.2 * r)).map(|(_, row)| *row).collect();
-            if square.len() >= 4 {
-                rows = square;
-            }
-        }
-        rows.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        let per = (rows.len() as f64 / 12.0).ceil() as usize;
-        let points = rows.chunks(per.max(1)).map(|c| {
-            let m: f64 = c.iter().map(|r| r[1]).sum();
-            let mean = |k: usize| c.iter().map(|r| r[1] * r[k]).sum::<f64>() / m;
-            CurvePoint {
-                x: mean(0),
-                measured: mean(2),
-                before: mean(4),
-                after: mean(3),
-                error: mean(2) / (2.0 * m).sqrt(),
-            }
-        });
-        let x = if by_lever {
-            "angle between ray and normal, degrees"
-        } else {
-            "range (surfaces met at less than 50 degrees), m"
+        let at = |range_m: f64| 1000.0 * (fitted.std_m + range_m * fitted.per_m);
+        let noise = Named {
+            cause: Cause::RangeNoise,
+            parameters: vec![
+                parameter(Quantity::StdM, fitted.std_m, ci(|f| f.std_m)),
+                parameter(Quantity::PerM, fitted.per_m, ci(|f| f.per_m)),
+            ],
+            confidence: 1.0,
+            channel: Channel::Roughness,
+            covariate: if free.range { Covariate::Range } else { Covariate::None },
+            gain: gain_of(&against_ideal),
+            says: format!(
+                "ranges scatter by {:.1} mm at 10 m and {:.1} mm at 30 m on surfaces met squarely; an ideal sensor's by its rounding alone",
+                at(10.0),
+                at(30.0)
+            ),
+            curve: curve(&table, &fitted, &ideal, false),
         };
-        Curve { x: x.into(), y: "standard deviation along the ray, m".into(), points: points.collect() }
-    };
-    let finding = |cause: &str, covariate: &str, parameters, gain: FindingGain, says: String, curve: Curve| Finding {
-        status: Status::Named,
-        cause: Some(cause.into()),
-        candidates: None,
-        family: "range_error".into(),
-        parameters,
-        confidence: 1.0,
-        channel: "roughness".into(),
-        covariate: covariate.into(),
-        gain,
-        says,
-        separate_by: None,
-        curve,
-        effects: vec![],
-    };
-    let mut found = vec![finding(
-        "range_noise",
-        if steps[chosen].range { "range_m" } else { "none" },
-        BTreeMap::from([
-            ("std_m".to_owned(), parameter(fitted.std_m, "m", ci(|f| f.std_m))),
-            ("per_m".to_owned(), parameter(fitted.per_m, "m/m", ci(|f| f.per_m))),
-        ]),
-        gain_of(&against),
-        format!(
-            "ranges scatter by {:.1} mm at 10 m and {:.1} mm at 30 m on surfaces met squarely; an ideal sensor's by its rounding alone",
-            1000.0 * (fitted.std_m + 10.0 * fitted.per_m),
-            1000.0 * (fitted.std_m + 30.0 * fitted.per_m)
-        ),
-        curve(false),
-    )];
-    if steps[chosen].incidence {
-        let without = if steps[chosen].range { 2 } else { 0 };
-        found.push(finding(
-            "incidence_noise",
-            "range_m * tan(incidence)",
-            BTreeMap::from([("angle_rad".to_owned(), parameter(fitted.angle_rad, "rad", ci(|f| f.angle_rad)))]),
-            gain_of(&over(chosen, without)),
-            format!(
+        let at_an_angle = free.incidence.then(|| Named {
+            cause: Cause::IncidenceNoise,
+            parameters: vec![parameter(Quantity::AngleRad, fitted.angle_rad, ci(|f| f.angle_rad))],
+            confidence: 1.0,
+            channel: Channel::Roughness,
+            covariate: Covariate::RangeTanIncidence,
+            gain: gain_of(&self.over(chosen, if free.range { 2 } else { 0 })),
+            says: format!(
                 "ranges scatter more on surfaces met at an angle, as if by {:.2} mrad: the footprint of the beam, or a jitter of its direction",
                 1000.0 * fitted.angle_rad
             ),
-            curve(true),
-        ));
+            curve: curve(&table, &fitted, &ideal, true),
+        });
+        std::iter::once(noise).chain(at_an_angle).map(Finding::from).collect()
     }
-    (found, considered)
+}
+
+/// Standard deviation along the ray, by the angle of incidence or by range: measured, of an ideal sensor, and fitted. Range is shown on surfaces
+/// that are met squarely, where there are enough.
+fn curve(table: &Bins, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
+    let row = |[r, l, m, sd]: &[f64; 4]| {
+        let x = if by_angle { (l / r).atan().to_degrees() } else { *r };
+        [x, *m, *sd, fitted.variance(*r, *l).sqrt(), ideal.std_m]
+    };
+    let mut rows: Vec<[f64; 5]> = table.values().map(row).collect();
+    if !by_angle {
+        let squarely = table.values().zip(&rows).filter(|([r, l, ..], _)| l < &(1.2 * r));
+        let squarely: Vec<[f64; 5]> = squarely.map(|(_, row)| *row).collect();
+        if squarely.len() >= FEWEST_BINS {
+            rows = squarely;
+        }
+    }
+    rows.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let per = (rows.len() as f64 / 12.0).ceil() as usize;
+    let points = rows.chunks(per.max(1)).map(|c| {
+        let m: f64 = c.iter().map(|r| r[1]).sum();
+        let mean = |k: usize| c.iter().map(|r| r[1] * r[k]).sum::<f64>() / m;
+        CurvePoint {
+            sensor: 0,
+            x: mean(0),
+            measured: mean(2),
+            before: mean(4),
+            after: mean(3),
+            error: mean(2) / (2.0 * m).sqrt(),
+        }
+    });
+    let x = if by_angle {
+        "angle between ray and normal, degrees"
+    } else {
+        "range (surfaces met at less than 50 degrees), m"
+    };
+    Curve { x: x.into(), y: "standard deviation along the ray, m".into(), by_sensor: false, points: points.collect() }
 }

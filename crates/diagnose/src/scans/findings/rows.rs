@@ -1,24 +1,77 @@
-//! Lasers by themselves: offsets of range and of intensity.
+//! Offsets of range and of intensity of single lasers.
 
-use super::{others, parameter, patches, spread};
-use crate::diagnosis::{Curve, CurvePoint, Finding, Status};
+use super::{Named, around, others, parameter, patches, spread};
+use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Finding, FindingGain, Parameter};
 use crate::scans::{Seen, brightness, draws, gain_of, interval, offsets};
+use crate::search::NamedParameter;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 
-/// Spread of offsets of lasers below which nothing is said, m; of intensities.
+/// Smallest spread of the lasers' range offsets that is reported, m.
 pub(super) const LEAST_OFFSET_M: f64 = 0.002;
+
+/// Smallest spread of the lasers' intensities that is reported, of 1.
 pub(super) const LEAST_INTENSITY: f64 = 0.004;
 
-/// Offsets with larger standard errors do not count in their spread, m.
-const SURE_M: f64 = 0.006;
+/// Offsets with larger standard errors are left out of the spread, m.
+const CERTAIN_M: f64 = 0.006;
 
-/// Name of a laser in findings: rows count from the lowest.
-fn row_name(seen: &Seen, beam: usize) -> String {
-    format!("{}/{}", seen.name, seen.beams.len() - 1 - beam)
+/// Fewest lasers whose offset is known.
+const FEWEST_LASERS: usize = 8;
+
+/// Offset of each laser; `None` where it is not known.
+type Offsets = Vec<Option<f64>>;
+
+/// Offsets of all lasers, with what scans say of their uncertainty.
+struct Fitted {
+    offsets: Offsets,
+    /// Offsets fitted on draws of scans.
+    drawn: Vec<Offsets>,
+    /// 95 % intervals of the offsets.
+    cis: Vec<[f64; 2]>,
+    /// Correlation of the offsets of two halves of the scans.
+    repeats: f64,
 }
 
-/// Correlation of what two halves of the scans tell.
+impl Fitted {
+    /// Fits offsets of `n` scans.
+    fn new(n: usize, fit: impl Fn(&[usize]) -> Offsets + Sync) -> Self {
+        let offsets = fit(&(0..n).collect::<Vec<_>>());
+        let drawn: Vec<Offsets> = draws(n).par_iter().map(|d| fit(d)).collect();
+        let ci = |b: usize| interval(drawn.iter().filter_map(|d| d[b]).collect());
+        let cis = (0..offsets.len()).map(ci).collect();
+        let [odd, even] = [0, 1].map(|h| fit(&(0..n).filter(|i| i % 2 == h).collect::<Vec<_>>()));
+        Fitted { offsets, drawn, cis, repeats: agreement(&odd, &even) }
+    }
+
+    /// Standard error of the offset of a laser.
+    fn error(&self, beam: usize) -> f64 {
+        (self.cis[beam][1] - self.cis[beam][0]) / 3.92
+    }
+
+    /// Offsets of the lasers as parameters; rows count from the lowest.
+    fn parameters(&self, seen: &Seen, unit: Unit) -> Vec<NamedParameter> {
+        let of_laser = |(b, offset): (usize, &Option<f64>)| {
+            let estimate = (*offset)?;
+            let id = ParameterId::Row { sensor: seen.name.clone(), row: seen.beams.len() - 1 - b };
+            Some((id, Parameter { estimate, unit, ci95: around(estimate, self.cis[b]) }))
+        };
+        self.offsets.iter().enumerate().filter_map(of_laser).collect()
+    }
+
+    /// Offsets along the rows.
+    fn curve(&self, seen: &Seen, y: &str) -> Curve {
+        let points = (0..self.offsets.len()).rev().filter_map(|b| {
+            let v = self.offsets[b]?;
+            let x = (seen.beams.len() - 1 - b) as f64;
+            Some(CurvePoint { sensor: 0, x, measured: v, before: 0.0, after: v, error: self.error(b) })
+        });
+        Curve { x: "row, from the lowest".into(), y: y.into(), by_sensor: false, points: points.collect() }
+    }
+}
+
+/// Correlation of offsets that both of two fits know.
 fn agreement(a: &[Option<f64>], b: &[Option<f64>]) -> f64 {
     let both: Vec<(f64, f64)> = a.iter().zip(b).filter_map(|(a, b)| Some(((*a)?, (*b)?))).collect();
     let n = both.len().max(1) as f64;
@@ -30,20 +83,7 @@ fn agreement(a: &[Option<f64>], b: &[Option<f64>]) -> f64 {
     s[2] / (s[0] * s[1]).sqrt().max(1e-12)
 }
 
-fn halves(n: usize) -> [Vec<usize>; 2] {
-    [0, 1].map(|h| (0..n).filter(|i| i % 2 == h).collect())
-}
-
-/// What one laser is off by, with its interval: along the rows.
-fn row_curve(seen: &Seen, values: &[Option<f64>], cis: &[[f64; 2]], before: f64, y: &str) -> Curve {
-    let points = (0..values.len()).rev().filter_map(|b| {
-        let v = values[b]?;
-        let x = (seen.beams.len() - 1 - b) as f64;
-        Some(CurvePoint { x, measured: v, before, after: v, error: (cis[b][1] - cis[b][0]) / 3.92 })
-    });
-    Curve { x: "row, from the lowest".into(), y: y.into(), points: points.collect() }
-}
-
+/// The finding of range offsets of single lasers.
 pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Finding> {
     let walls: Vec<Vec<offsets::WallSums>> = seen
         .walls
@@ -52,40 +92,14 @@ pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Find
         .collect();
     let n = walls.len();
     let fit = |scans: &[usize]| offsets::fit(&scans.iter().flat_map(|&s| &walls[s]).collect::<Vec<_>>(), &seen.beams);
-    let every: Vec<usize> = (0..n).collect();
-    let told = fit(&every);
-    let known = told.iter().flatten().count();
-    if known < 8 {
+    let known = fit(&(0..n).collect::<Vec<_>>()).iter().flatten().count();
+    if known < FEWEST_LASERS {
         notes.push("too few flat walls: nothing can be said of range offsets of single lasers".into());
         return None;
     }
-    let drawn: Vec<offsets::Offsets> = draws(n).par_iter().map(|d| fit(d)).collect();
-    let cis: Vec<[f64; 2]> = (0..told.len()).map(|b| interval(drawn.iter().filter_map(|d| d[b]).collect())).collect();
-    // What chance adds to the spread is taken out; lasers that few walls show are left out of it.
-    let error = |b: usize| (cis[b][1] - cis[b][0]) / 3.92;
-    let sure: Vec<usize> = (0..told.len()).filter(|&b| told[b].is_some() && error(b) < SURE_M).collect();
-    let noise = sure.iter().map(|&b| error(b).powi(2)).sum::<f64>() / sure.len().max(1) as f64;
-    let beyond = |o: &offsets::Offsets, times: f64| {
-        (spread(sure.iter().filter_map(|&b| o[b])).powi(2) - times * noise).max(0.0).sqrt()
-    };
-    let std = beyond(&told, 1.0);
-    // A draw adds as much chance again.
-    let std_ci = interval(drawn.iter().map(|d| beyond(d, 2.0)).collect());
-    let none = vec![None; told.len()];
-    let gains: Vec<[f64; 2]> = every
-        .par_iter()
-        .map(|&s| {
-            let offsets = fit(&others(n, s).collect::<Vec<_>>());
-            // Each wall with a plane and a scatter of its own.
-            walls[s].iter().fold([0.0; 2], |sum, w| {
-                let ([before, points], [after, _]) = (w.squares(&none), w.squares(&offsets));
-                [sum[0] + 0.5 * points * (before / after.max(1e-9)).ln(), sum[1] + points]
-            })
-        })
-        .collect();
-    let gain = gain_of(&gains);
-    let [odd, even] = halves(n).map(|h| fit(&h));
-    let repeats = agreement(&odd, &even);
+    let fitted = Fitted::new(n, fit);
+    let (std, std_ci) = spread_beyond_noise(&fitted);
+    let gain = offsets_gain(&walls, fit);
     if std < LEAST_OFFSET_M || gain.ci95[0] <= 0.0 {
         notes.push(format!(
             "range offsets of single lasers: {:.1} mm from one to the next, {:.4} nats a return on flat walls of other scans: nothing to speak of",
@@ -94,104 +108,109 @@ pub(super) fn offsets_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Find
         ));
         return None;
     }
-    let mut parameters = BTreeMap::from([("std_m".to_owned(), parameter(std, "m", std_ci))]);
-    for (b, offset) in told.iter().enumerate() {
-        if let Some(v) = offset {
-            parameters.insert(row_name(seen, b), parameter(*v, "m", cis[b]));
-        }
-    }
     notes.push(format!(
         "range offsets are known of {known} of {} lasers, up to an offset of all and one that grows with the tangent of the elevation: each wall has a plane of its own",
-        told.len()
+        fitted.offsets.len()
     ));
-    Some(Finding {
-        status: Status::Named,
-        cause: Some("beam_range_offset".into()),
-        candidates: None,
-        family: "range_error".into(),
+    let mut parameters = vec![parameter(Quantity::StdM, std, std_ci)];
+    parameters.extend(fitted.parameters(seen, Unit::Metre));
+    let named = Named {
+        cause: Cause::BeamRangeOffset,
         parameters,
-        confidence: repeats.clamp(0.0, 1.0),
-        channel: "residuals".into(),
-        covariate: "row".into(),
+        confidence: fitted.repeats.clamp(0.0, 1.0),
+        channel: Channel::Residuals,
+        covariate: Covariate::Row,
         gain,
         says: format!(
-            "each laser has a range offset of its own: {:.1} cm from one to the next; two halves of the scans tell the same (correlation {repeats:.2})",
-            100.0 * std
+            "each laser has a range offset of its own: {:.1} cm from one to the next; two halves of the scans tell the same (correlation {:.2})",
+            100.0 * std,
+            fitted.repeats
         ),
-        separate_by: None,
-        curve: row_curve(seen, &told, &cis, 0.0, "offset of range on flat walls, m"),
-        effects: vec![],
-    })
+        curve: fitted.curve(seen, "offset of range on flat walls, m"),
+    };
+    Some(named.into())
 }
 
+/// Standard deviation of the offsets beyond their errors, and its interval. A draw of scans has the variance of the errors twice.
+fn spread_beyond_noise(fitted: &Fitted) -> (f64, [f64; 2]) {
+    let lasers = 0..fitted.offsets.len();
+    let certain: Vec<usize> = lasers.filter(|&b| fitted.offsets[b].is_some() && fitted.error(b) < CERTAIN_M).collect();
+    let noise = certain.iter().map(|&b| fitted.error(b).powi(2)).sum::<f64>() / certain.len().max(1) as f64;
+    let beyond = |o: &Offsets, times: f64| {
+        (spread(certain.iter().filter_map(|&b| o[b])).powi(2) - times * noise).max(0.0).sqrt()
+    };
+    (beyond(&fitted.offsets, 1.0), interval(fitted.drawn.iter().map(|d| beyond(d, 2.0)).collect()))
+}
+
+/// Gain of each scan's walls by offsets fitted on the other scans. Each wall has a plane and a scatter of its own.
+fn offsets_gain(walls: &[Vec<offsets::WallSums>], fit: impl Fn(&[usize]) -> Offsets + Sync) -> FindingGain {
+    let of_scan = |s: usize| {
+        let offsets = fit(&others(walls.len(), s).collect::<Vec<_>>());
+        let none = vec![None; offsets.len()];
+        walls[s].iter().fold([0.0; 2], |sum, w| {
+            let ([before, points], [after, _]) = (w.squares(&none), w.squares(&offsets));
+            [sum[0] + 0.5 * points * (before / after.max(1e-9)).ln(), sum[1] + points]
+        })
+    };
+    gain_of(&(0..walls.len()).into_par_iter().map(of_scan).collect::<Vec<[f64; 2]>>())
+}
+
+/// The finding of intensities of single lasers.
 pub(super) fn intensity_found(seen: &Seen) -> Option<Finding> {
     let n = seen.scans.len();
-    let sums: Vec<brightness::ContrastSums> = (0..n)
-        .into_par_iter()
-        .map(|s| {
-            let mut sums = vec![[0.0; 3]; seen.beams.len()];
-            patches(seen, s).for_each(|p| brightness::add(&mut sums, p));
-            sums
-        })
-        .collect();
-    let fit = |scans: &[usize]| brightness::contrasts(&scans.iter().map(|&s| &sums[s]).collect::<Vec<_>>());
-    let contrasts = fit(&(0..n).collect::<Vec<_>>());
-    if contrasts.iter().flatten().count() < 8 {
+    let of_scan = |s: usize| {
+        let mut sums = vec![[0.0; 3]; seen.beams.len()];
+        patches(seen, s).for_each(|p| brightness::add(&mut sums, p));
+        sums
+    };
+    let sums: Vec<brightness::ContrastSums> = (0..n).into_par_iter().map(of_scan).collect();
+    let contrasts = |scans: &[usize]| brightness::contrasts(&scans.iter().map(|&s| &sums[s]).collect::<Vec<_>>());
+    if contrasts(&(0..n).collect::<Vec<_>>()).iter().flatten().count() < FEWEST_LASERS {
         return None;
     }
-    let values = |c: &[Option<f64>]| -> Vec<Option<f64>> {
+    let fitted = Fitted::new(n, |scans| {
+        let c = contrasts(scans);
         let near = |b: usize| c[b.saturating_sub(1)..(b + 2).min(c.len())].iter().any(Option::is_some);
-        brightness::offsets(c).into_iter().enumerate().map(|(b, v)| near(b).then_some(v)).collect()
-    };
-    let told = values(&contrasts);
-    let drawn: Vec<Vec<Option<f64>>> = draws(n).par_iter().map(|d| values(&fit(d))).collect();
-    let cis: Vec<[f64; 2]> = (0..told.len()).map(|b| interval(drawn.iter().filter_map(|d| d[b]).collect())).collect();
-    let gains: Vec<[f64; 2]> = (0..n)
-        .map(|s| {
-            let train: Vec<usize> = others(n, s).collect();
-            let told = fit(&train);
-            let none: Vec<Option<f64>> = told.iter().map(|t| t.map(|_| 0.0)).collect();
-            let variance = |t: &[Option<f64>]| {
-                let sum = train
-                    .iter()
-                    .map(|&i| brightness::squares(&sums[i], t))
-                    .fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
-                (sum[0] / sum[1].max(1.0)).max(1e-9)
-            };
-            let (v0, v1) = (variance(&none), variance(&told));
-            let ([s0, m], [s1, _]) = (brightness::squares(&sums[s], &none), brightness::squares(&sums[s], &told));
-            [0.5 * (s0 / v0 - s1 / v1) + 0.5 * m * (v0 / v1).ln(), m]
-        })
-        .collect();
-    let gain = gain_of(&gains);
-    let std = spread(told.iter().flatten().copied());
-    let [odd, even] = halves(n).map(|h| values(&fit(&h)));
-    let repeats = agreement(&odd, &even);
+        brightness::offsets(&c).into_iter().enumerate().map(|(b, v)| near(b).then_some(v)).collect()
+    });
+    let gain = intensity_gain(&sums, contrasts);
+    let std = spread(fitted.offsets.iter().flatten().copied());
     if std < LEAST_INTENSITY || gain.ci95[0] <= 0.0 {
         return None;
     }
-    let std_ci = interval(drawn.iter().map(|d| spread(d.iter().flatten().copied())).collect());
-    let mut parameters = BTreeMap::from([("std".to_owned(), parameter(std, "1", std_ci))]);
-    for (b, v) in told.iter().enumerate() {
-        if let Some(v) = v {
-            parameters.insert(row_name(seen, b), parameter(*v, "1", cis[b]));
-        }
-    }
-    Some(Finding {
-        status: Status::Named,
-        cause: Some("beam_intensity".into()),
-        candidates: None,
-        family: "returns".into(),
+    let std_ci = interval(fitted.drawn.iter().map(|d| spread(d.iter().flatten().copied())).collect());
+    let mut parameters = vec![parameter(Quantity::Std, std, std_ci)];
+    parameters.extend(fitted.parameters(seen, Unit::One));
+    let named = Named {
+        cause: Cause::BeamIntensity,
         parameters,
-        confidence: repeats.clamp(0.0, 1.0),
-        channel: "intensity".into(),
-        covariate: "row".into(),
+        confidence: fitted.repeats.clamp(0.0, 1.0),
+        channel: Channel::Intensity,
+        covariate: Covariate::Row,
         gain,
         says: format!(
-            "lasers are not equally bright: on the same surfaces their intensities differ by {std:.3} (of 1) from one to the next; two halves of the scans tell the same (correlation {repeats:.2})"
+            "lasers are not equally bright: on the same surfaces their intensities differ by {std:.3} (of 1) from one to the next; two halves of the scans tell the same (correlation {:.2})",
+            fitted.repeats
         ),
-        separate_by: None,
-        curve: row_curve(seen, &told, &cis, 0.0, "intensity beyond the trend of the rows"),
-        effects: vec![],
-    })
+        curve: fitted.curve(seen, "intensity beyond the trend of the rows"),
+    };
+    Some(named.into())
+}
+
+/// Gain of each scan by contrasts fitted on the other scans.
+fn intensity_gain(sums: &[brightness::ContrastSums], contrasts: impl Fn(&[usize]) -> Offsets) -> FindingGain {
+    let of_scan = |s: usize| {
+        let train: Vec<usize> = others(sums.len(), s).collect();
+        let fitted = contrasts(&train);
+        let none: Offsets = fitted.iter().map(|t| t.map(|_| 0.0)).collect();
+        let variance = |t: &[Option<f64>]| {
+            let of_scans = train.iter().map(|&i| brightness::squares(&sums[i], t));
+            let sum = of_scans.fold([0.0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+            (sum[0] / sum[1].max(1.0)).max(1e-9)
+        };
+        let (v0, v1) = (variance(&none), variance(&fitted));
+        let ([s0, m], [s1, _]) = (brightness::squares(&sums[s], &none), brightness::squares(&sums[s], &fitted));
+        [0.5 * (s0 / v0 - s1 / v1) + 0.5 * m * (v0 / v1).ln(), m]
+    };
+    gain_of(&(0..sums.len()).map(of_scan).collect::<Vec<[f64; 2]>>())
 }

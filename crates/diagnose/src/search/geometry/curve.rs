@@ -1,45 +1,44 @@
-//! Pictures of linear causes: how far surfaces stand off, against what that depends on.
+//! Plots of linear hypotheses: displacement of surfaces along the covariate of the cause.
 
-use super::Sums;
+use super::Search;
+use crate::catalogue::Cause;
 use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable, usual_noise_m};
-use crate::diagnosis::{Curve, CurvePoint};
+use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
-use crate::search::Context;
 use nalgebra::{Point3, SVector};
 use rayon::prelude::*;
 use sensor::Sensor;
 
-/// Bins of a picture.
+/// Points of a plot.
 const BINS: usize = 16;
 
-/// Fewer rays make no point.
+/// Fewest rays of a point.
 const FEWEST: f64 = 30.0;
 
-/// Farther than that a return is not of the surface, m.
+/// Largest distance of a return from the displaced surface, m.
 const STRAY_M: f64 = 0.5;
 
-/// What a picture's axis shows of a ray.
+/// Name of the horizontal axis, and its value for a ray.
 type Axis = (&'static str, fn(&Ray, &Sensor) -> f64);
 
-/// How far surfaces stand off in the direction in which `columns` of a fit move them, by what the cause depends on: range for a bias,
-/// distance along the car for a tilt, phase for a shutter, azimuth for a sensor. Rays that the cause does not move are left out.
-pub(super) fn linear_curve(
-    context: &Context,
-    sums: &Sums,
-    frames: &[usize],
-    fitted: &LinearFit,
-    columns: &[usize],
-    name: &str,
-) -> Curve {
-    let (x, value): Axis = match name {
-        "range_bias" => ("range, m", |r, _| f64::from(r.range_m)),
-        "pitch_roll" => ("distance along the car, m", |r, _| f64::from(r.direction[0] * r.range_m)),
-        "rolling_shutter" => {
+/// The horizontal axis of a cause: range for a bias, distance along the vehicle for a tilt, phase for motion distortion, azimuth for a sensor.
+fn axis(cause: Cause) -> Axis {
+    match cause {
+        Cause::RangeBias => ("range, m", |r, _| f64::from(r.range_m)),
+        Cause::PitchRoll => ("distance along the car, m", |r, _| f64::from(r.direction[0] * r.range_m)),
+        Cause::RollingShutter => {
             ("phase of the scan", |r, mount| mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad)))
         }
         _ => ("azimuth of the sensor, degrees", |r, _| f64::from(r.azimuth_rad).to_degrees()),
-    };
+    }
+}
+
+/// Displacement of surfaces in the direction in which `columns` of a fit move them, along the covariate of the cause. Rays that the columns do
+/// not move are left out.
+pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize], cause: Cause) -> Curve {
+    let (context, sums) = (search.context, &search.sums);
+    let (x, value) = axis(cause);
     let theta = |c: usize| fitted.columns.iter().position(|x| *x == c).map_or(0.0, |i| fitted.theta[i]);
     let moving: Vec<(Column, f64)> = columns.iter().map(|&c| (sums.columns[c], theta(c))).collect();
     let origins = origins(context.rig);
@@ -47,7 +46,7 @@ pub(super) fn linear_curve(
     let noise_m = usual_noise_m(context.frames);
     let of_frame = |&f: &usize| {
         let frame = &context.frames[f];
-        // How the frame as a whole lies off is told by the other sensors.
+        // The pose error of the whole frame is that of the other sensors.
         let mut pose = SVector::<f64, 6>::zeros();
         if let Some(s) = displaced {
             let own = own_poses(frame, &origins, noise_m);
@@ -58,19 +57,20 @@ pub(super) fn linear_curve(
             let sensor = ray.sensor as usize;
             let mount = &context.rig.sensors[sensor];
             let levers = Levers::new(ray, &origins[sensor], mount);
-            let told: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
+            let expected: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
             let y = ray.across_nearest_m() - pose_row(ray, &origins[sensor], &Point3::origin()).dot(&pose);
-            (told != 0.0 && (y - told).abs() < STRAY_M).then(|| [value(ray, mount), y * told.signum(), told.abs()])
+            (expected != 0.0 && (y - expected).abs() < STRAY_M)
+                .then(|| [value(ray, mount), y * expected.signum(), expected.abs()])
         };
         frame.measured.iter().filter(|r| usable(r)).filter_map(place).collect::<Vec<[f64; 3]>>()
     };
-    let mut places: Vec<[f64; 3]> = frames.par_iter().flat_map_iter(of_frame).collect();
+    let mut places: Vec<[f64; 3]> = search.estimate.par_iter().flat_map_iter(of_frame).collect();
     places.sort_by(|a, b| a[0].total_cmp(&b[0]));
     let points = places.chunks(places.len().div_ceil(BINS).max(1)).filter(|c| c.len() as f64 >= FEWEST).map(|chunk| {
         let n = chunk.len() as f64;
         let [x, measured, after] = [0, 1, 2].map(|k: usize| chunk.iter().map(|p| p[k]).sum::<f64>() / n);
         let variance = chunk.iter().map(|p| (p[1] - measured).powi(2)).sum::<f64>() / n;
-        CurvePoint { x, measured, before: 0.0, after, error: (variance / n).sqrt() }
+        CurvePoint { sensor: 0, x, measured, before: 0.0, after, error: (variance / n).sqrt() }
     });
-    Curve { x: x.into(), y: "surfaces stand off by, m".into(), points: points.collect() }
+    Curve { x: x.into(), y: "surfaces stand off by, m".into(), by_sensor: false, points: points.collect() }
 }

@@ -1,45 +1,53 @@
-//! What is too small to speak of.
+//! The smallest effects of geometry that are reported.
 
-use super::suspects::Suspect;
-use super::{Sums, fit_all, groups_of, how};
+use super::hypotheses::Hypothesis;
+use super::sums::{Sums, group_fit};
 use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
 use crate::inference::grouped;
 use nalgebra::{DMatrix, DVector};
 
-/// Smaller offsets of range are not spoken of, m; nor turns, rad; nor shifts, m.
+/// Smallest range bias that is reported, at 10 m, m.
 pub(super) const FLOOR_OFFSET_M: f64 = 0.012;
+
+/// Smallest turn of the scene that is reported, rad: 0.03 degrees.
 pub(super) const FLOOR_TURN_RAD: f64 = 5.2e-4;
+
+/// Smallest shift of the scene that is reported, m.
 const FLOOR_SHIFT_M: f64 = 0.04;
-/// Slower slides over a scan are not spoken of: m, m, rad.
+
+/// Smallest displacement over a scan that is reported: along x and y in m, about z in rad.
 const FLOOR_SWEEP: [f64; 3] = [0.3, 0.3, 0.01];
-/// Poses of one sensor that displace the surfaces that it sees by less are not spoken of, m: root of the mean square. Its six numbers take up what is wrong
-/// with the few surfaces that it alone sees.
+
+/// Smallest displacement of surfaces by the pose of one sensor that is reported, root mean square, m. The six parameters of a pose absorb
+/// errors of the few surfaces that this sensor alone sees.
 pub(super) const FLOOR_SENSOR_M: f64 = 0.004;
-/// Spread of offsets of groups below which nothing is said: rows, m and rad; strips of azimuth, m.
+
+/// Smallest spread of group offsets that is reported: rows in range, m; rows in elevation, rad; strips of azimuth in range, m.
 pub(super) const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
 
-/// Whether the last of some suspects is worth speaking of.
-pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspects: &[Suspect]) -> bool {
-    let Some(last) = suspects.last() else { return false };
+/// Whether the effect of the last of some hypotheses, fitted together, is large enough to be reported.
+pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> bool {
+    let Some(last) = hypotheses.last() else { return false };
     match last {
-        Suspect::Groups { grouping, column, .. } => {
-            let frames = groups_of(sums, *grouping);
+        Hypothesis::Groups { grouping, column, .. } => {
+            let frames = sums.groups_of(*grouping);
             let all = total(select.iter().map(|&i| &frames[i]));
             match grouping {
-                Grouping::Row => grouped::rough_spread(&all, how(*column)) > FLOOR_GROUPS[*column],
-                Grouping::Azimuth => grouped::spread(&all, how(*column), 0.0).0 > FLOOR_GROUPS[2],
+                Grouping::Row => grouped::rough_spread(&all, group_fit(*column)) > FLOOR_GROUPS[*column],
+                Grouping::Azimuth => grouped::spread(&all, group_fit(*column), 0.0).0 > FLOOR_GROUPS[2],
             }
         }
-        Suspect::Linear { columns, .. } => {
-            let fitted = fit_all(sums, select, blocks, suspects);
-            let told = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
-            let told: Vec<(usize, f64)> = told.map(|(c, t)| (*c, *t)).collect();
-            let own = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
-            if let Some(sensor) = columns.iter().find_map(own) {
-                return sums.displaced_m(select, sensor, &told) > FLOOR_SENSOR_M;
+        Hypothesis::Linear { columns, .. } => {
+            let fitted = sums.fit_all(select, blocks, hypotheses);
+            let own = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
+            let coefficients: Vec<(usize, f64)> = own.map(|(c, t)| (*c, *t)).collect();
+            let sensor_of = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
+            if let Some(sensor) = columns.iter().find_map(sensor_of) {
+                return sums.displaced_m(select, sensor, &coefficients) > FLOOR_SENSOR_M;
             }
-            let of = |column: Column| told.iter().find(|(c, _)| sums.columns[*c] == column).map_or(0.0, |(_, t)| *t);
+            let of =
+                |column: Column| coefficients.iter().find(|(c, _)| sums.columns[*c] == column).map_or(0.0, |(_, t)| *t);
             let bias_m = |range_m: f64| (of(Column::RangeOffset) + range_m * of(Column::RangeScale)).abs();
             let floor = |c: usize| match sums.columns[c] {
                 Column::Pose(0..3) => FLOOR_TURN_RAD,
@@ -51,32 +59,32 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], suspe
             };
             bias_m(10.0) > FLOOR_OFFSET_M
                 || bias_m(40.0) > 3.2 * FLOOR_OFFSET_M
-                || told.iter().any(|(c, t)| t.abs() > floor(*c))
+                || coefficients.iter().any(|(c, t)| t.abs() > floor(*c))
         }
     }
 }
 
 impl Sums {
-    /// By how much coefficients of some columns displace the surfaces that a sensor sees beyond what every frame's own pose and surfaces that lie a little
-    /// elsewhere take up, m: root of the mean square.
+    /// Displacement of the surfaces that a sensor sees by some columns, m, root mean square. The part that poses of single frames and offsets of
+    /// the surfaces absorb is subtracted.
     pub(super) fn displaced_m(&self, frames: &[usize], sensor: usize, coefficients: &[(usize, f64)]) -> f64 {
         let gram: DMatrix<f64> = frames.iter().map(|&f| &self.linear[f].gram).sum();
         let mut by = DVector::zeros(self.columns.len());
         coefficients.iter().for_each(|(c, x)| by[*c] = *x);
-        let push = &gram * &by;
+        let response = &gram * &by;
         let prior = |i: usize, j: usize| if i == j { self.precision[self.base[i]] } else { 0.0 };
         let n = self.base.len();
         let structure = DMatrix::from_fn(n, n, |i, j| gram[(self.base[i], self.base[j])] + prior(i, j));
-        let pushed = DVector::from_fn(n, |i, _| push[self.base[i]]);
-        let taken_up = structure.cholesky().map_or(0.0, |c| pushed.dot(&c.solve(&pushed)));
+        let on_base = DVector::from_fn(n, |i, _| response[self.base[i]]);
+        let absorbed = structure.cholesky().map_or(0.0, |c| on_base.dot(&c.solve(&on_base)));
         let weights: f64 = frames.iter().map(|&f| self.of_sensors[f][sensor]).sum();
-        ((by.dot(&push) - taken_up).max(0.0) / weights.max(1e-12)).sqrt()
+        ((by.dot(&response) - absorbed).max(0.0) / weights.max(1e-12)).sqrt()
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::Groups;
+    use super::super::sums::Groups;
     use super::*;
     use crate::inference::linear::LinearFrame;
 
@@ -105,9 +113,9 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_that_lies_elsewhere_takes_up_what_the_only_sensor_that_sees_it_is_shifted_by() {
+    fn a_displaced_wall_absorbs_the_shift_of_the_only_sensor_that_sees_it() {
         let sums = sums();
-        // 2500 of 1e6 are not taken up: 5 % of the shift, in half of the returns.
+        // 2500 of 1e6 are not absorbed: 5 % of the shift, in half of the returns.
         let across = sums.displaced_m(&[0], 0, &[(2, 0.02)]);
         assert!((across - 0.02 * 0.05 / 2f64.sqrt()).abs() < 1e-5, "{across}");
         let free = Sums { base: vec![], ..sums };

@@ -1,6 +1,6 @@
 //! A constant offset of labels, or a late clock? The dependence on the velocity that the own car sees.
 
-use super::Row;
+use super::rows::Row;
 use crate::channels::motion::OwnMotion;
 use crate::inference::linear::{LinearFrame, fit};
 use crate::inference::median;

@@ -1,10 +1,10 @@
-//! The picture of a finding of noise: roughness over what it depends on, before and after.
+//! The plot of a finding of noise: roughness along its covariate, before and after.
 
-use crate::diagnosis::{Curve, CurvePoint};
+use crate::curve::{Curve, CurvePoint};
 use crate::inference::noise::{NoiseLaw, NoiseTable};
 use statistics::weighted_median;
 
-/// Standard deviation along what the law depends on.
+/// Standard deviation along the covariate of a law.
 pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]) -> Curve {
     let angular = law == NoiseLaw::Angular;
     let x_of = |range: f64, cos: f64| if angular { range * (1.0 / (cos * cos) - 1.0).max(0.0).sqrt() } else { range };
@@ -24,12 +24,13 @@ pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]
         cells.push(*row);
         let n: f64 = cells.iter().map(|c| c.1).sum();
         if n >= per || i + 1 == rows.len() && n > 0.2 * per {
-            // Cells that hold an edge are rough on both sides and would hide the others in a mean.
+            // A median: cells with an edge are rough on both sides and would dominate a mean.
             let sd = |of: fn(&(f64, f64, f64, f64, f64)) -> f64| {
                 weighted_median(cells.iter().map(|c| (of(c), c.1)).collect()).unwrap_or(0.0).sqrt()
             };
             let measured = sd(|c| c.2);
             points.push(CurvePoint {
+                sensor: 0,
                 x: cells.iter().map(|c| c.0 * c.1).sum::<f64>() / n,
                 measured,
                 before: sd(|c| c.3),
@@ -40,5 +41,5 @@ pub(super) fn curve(table: &NoiseTable, law: NoiseLaw, terms: &[(NoiseLaw, f64)]
         }
     }
     let x = if angular { "range x tan(incidence), m" } else { "range, m" };
-    Curve { x: x.into(), y: "standard deviation along the ray, m".into(), points }
+    Curve { x: x.into(), y: "standard deviation along the ray, m".into(), by_sensor: false, points }
 }

@@ -1,33 +1,39 @@
-//! A lean of the car beside one sensor that is mounted otherwise than believed: what every other sensor sees by itself.
+//! Pitch and roll of the ego vehicle beside one sensor that is mounted otherwise than the rig says: turns that all other sensors see alike.
 
-use super::Sums;
 use super::floor::FLOOR_TURN_RAD;
-use super::suspects::Suspect;
+use super::hypotheses::Hypothesis;
+use super::sums::Sums;
+use crate::catalogue::Cause;
 use crate::channels::mean::{Column, OwnPoses};
 use crate::search::Z_STAR;
 
-/// The smallest of the others' turns is at least that share of the largest.
+/// Turns of the other sensors agree if the smallest is at least this share of the largest.
 const ALIKE: f64 = 0.5;
 
-/// The turns of the whole scene, where a sensor's pose was chosen and at least two other sensors agree on them.
-pub(super) fn agreed_turns(sums: &Sums, select: &[usize], blocks: &[usize], chosen: &[Suspect]) -> Option<Suspect> {
-    if chosen.iter().any(|c| c.name() == "pitch_roll") {
+/// Turns of the whole scene as a hypothesis, where a sensor's pose was chosen and at least two other sensors agree on the turns.
+pub(super) fn common_turns(
+    sums: &Sums,
+    select: &[usize],
+    blocks: &[usize],
+    chosen: &[Hypothesis],
+) -> Option<Hypothesis> {
+    if chosen.iter().any(|c| c.cause() == Cause::PitchRoll) {
         return None;
     }
     let sensor = chosen.iter().find_map(|c| match c {
-        Suspect::Linear { columns, .. } => columns.iter().find_map(|&c| match sums.columns[c] {
+        Hypothesis::Linear { columns, .. } => columns.iter().find_map(|&c| match sums.columns[c] {
             Column::SensorPose(sensor, _) => Some(sensor),
             _ => None,
         }),
-        Suspect::Groups { .. } => None,
+        Hypothesis::Groups { .. } => None,
     })?;
     let turns = alike(&sums.poses, select, blocks, sensor);
     let column = |turn: usize| sums.columns.iter().position(|c| *c == Column::Pose(turn));
     let columns: Vec<usize> = turns.into_iter().filter_map(column).collect();
-    (!columns.is_empty()).then_some(Suspect::Linear { name: "pitch_roll", columns })
+    (!columns.is_empty()).then_some(Hypothesis::Linear { cause: Cause::PitchRoll, columns })
 }
 
-/// Those of the turns about x and y that all sensors but one see alike, each for sure and by more than the floor.
+/// Those of the turns about x and y that all sensors but one see alike, each significantly and by more than the floor.
 fn alike(poses: &[OwnPoses], select: &[usize], blocks: &[usize], except: usize) -> Vec<usize> {
     let others: Vec<usize> = (0..poses.first().map_or(0, Vec::len)).filter(|s| *s != except).collect();
     if others.len() < 2 {
@@ -58,7 +64,7 @@ mod tests {
     use nalgebra::SVector;
 
     #[test]
-    fn what_all_others_see_alike_is_the_cars() {
+    fn turns_that_all_others_see_alike_belong_to_the_ego_vehicle() {
         let pitch = |of_third: f64| -> Vec<OwnPoses> {
             (0..24)
                 .map(|f| {

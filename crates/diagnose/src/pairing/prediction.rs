@@ -15,7 +15,7 @@ const BESIDE_M: f64 = 0.5;
 const OF_OBJECT_M: f64 = 0.2;
 
 /// The simulated side of one sensor, to be looked at from any direction.
-pub(super) struct Sight<'a> {
+pub(super) struct Predictor<'a> {
     sensor: usize,
     sensors: &'a Sensors,
     cloud_from_sensor: Isometry3<f64>,
@@ -27,12 +27,12 @@ pub(super) struct Sight<'a> {
     others: Vec<Box3>,
 }
 
-impl<'a> Sight<'a> {
+impl<'a> Predictor<'a> {
     /// Of a sensor by its number, its simulated returns, and the simulation's labels.
     pub(super) fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
         let mount = &sensors.rig.sensors[sensor];
         let window = sensors.window(sensor);
-        Sight {
+        Predictor {
             sensor,
             sensors,
             others: others(boxes, mount.pose().translation.vector.into()),

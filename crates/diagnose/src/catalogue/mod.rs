@@ -1,0 +1,104 @@
+//! The catalogue: causes, channels, covariates, parameters and units of a diagnosis. Each identifier is an enum with one table that holds
+//! its name in `diagnosis.json` and what else is fixed for it.
+
+mod causes;
+mod covariates;
+mod parameters;
+
+pub use causes::{Cause, Hypothesis, NoiseForm};
+pub use covariates::Covariate;
+pub use parameters::{ParameterId, Quantity, Unit};
+
+/// Defines an enum of identifiers with their names in `diagnosis.json`. Variants are listed in the order of their names, so that maps by
+/// identifier are written in the order of the names; a test holds every table to that.
+macro_rules! identifiers {
+    ($(#[$about:meta])* $id:ident { $($(#[$doc:meta])* $variant:ident = $name:literal,)* }) => {
+        $(#[$about])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[derive(serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
+        pub enum $id { $($(#[$doc])* #[serde(rename = $name)] $variant,)* }
+
+        impl $id {
+            /// All identifiers, in the order of their names.
+            pub const ALL: &[$id] = &[$($id::$variant,)*];
+
+            /// The name in `diagnosis.json`.
+            pub const fn name(self) -> &'static str {
+                match self { $($id::$variant => $name,)* }
+            }
+        }
+
+        impl std::fmt::Display for $id {
+            fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+                f.write_str(self.name())
+            }
+        }
+    };
+}
+use identifiers;
+
+identifiers! {
+    /// What a finding was found in.
+    Channel {
+        /// Which returns have a counterpart on the other side.
+        Hits = "hits",
+        /// Intensities of the returns.
+        Intensity = "intensity",
+        /// Measured labels against simulated labels.
+        Labels = "labels",
+        /// Measured returns on labelled objects against simulated ones.
+        Objects = "objects",
+        /// Range values as they were measured, for a quantisation.
+        Ranges = "ranges",
+        /// Distances of measured returns from simulated surfaces.
+        Residuals = "residuals",
+        /// Returns without a simulated surface at their place.
+        Returns = "returns",
+        /// Distances of returns from the surface through their own side's neighbours.
+        Roughness = "roughness",
+        /// Bird's-eye occupancy after undoing a displacement along the scan.
+        Slide = "slide",
+    }
+}
+
+identifiers! {
+    /// Family of causes.
+    Family {
+        /// Returns are lost.
+        Detection = "detection",
+        /// Surfaces or objects stand elsewhere, or have another shape.
+        Geometry = "geometry",
+        /// Labels are displaced.
+        Labels = "labels",
+        /// Ranges are biased, noisy or rounded.
+        RangeError = "range_error",
+        /// Returns without a surface, or with another intensity.
+        Returns = "returns",
+        /// Clocks and the duration of a scan.
+        Timing = "timing",
+        /// No cause of the catalogue.
+        Unknown = "unknown",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn identifiers_are_listed_in_the_order_of_their_names() {
+        let sorted = |names: Vec<&str>| assert!(names.is_sorted(), "{names:?}");
+        sorted(Cause::ALL.iter().map(|c| c.name()).collect());
+        sorted(Channel::ALL.iter().map(|c| c.name()).collect());
+        sorted(Covariate::ALL.iter().map(|c| c.name()).collect());
+        sorted(Family::ALL.iter().map(|c| c.name()).collect());
+        sorted(Quantity::ALL.iter().map(|c| c.name()).collect());
+    }
+
+    #[test]
+    fn identifiers_are_written_as_their_names() {
+        for cause in Cause::ALL {
+            assert_eq!(serde_json::to_value(cause).unwrap(), cause.name());
+        }
+    }
+}

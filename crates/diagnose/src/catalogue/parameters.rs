@@ -1,0 +1,252 @@
+//! Parameters of findings, with their units.
+
+use super::identifiers;
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
+use std::cmp::Ordering;
+use std::fmt;
+
+identifiers! {
+    /// A parameter that a finding may have, whatever the sensor.
+    Quantity {
+        /// Angular size of the beam footprint or of the jitter that explains the noise.
+        AngleRad = "angle_rad",
+        /// Middle of a patch of directions.
+        AzimuthDeg = "azimuth_deg",
+        /// Right end of the hidden directions.
+        AzimuthFromDeg = "azimuth_from_deg",
+        /// Left end of the hidden directions.
+        AzimuthToDeg = "azimuth_to_deg",
+        /// Width of the hidden directions.
+        AzimuthWidthDeg = "azimuth_width_deg",
+        /// Reflectivity of labelled objects over that of the ground, ln.
+        BrighterObjects = "brighter_objects",
+        /// Reflectivity of standing surfaces over that of the ground, ln.
+        BrighterStanding = "brighter_standing",
+        /// Cosine of incidence at which half of the returns are lost.
+        CosHalf = "cos_half",
+        /// Full width of the beam.
+        DivergenceRad = "divergence_rad",
+        /// Middle of a patch of directions.
+        ElevationDeg = "elevation_deg",
+        /// Lower end of the hidden directions.
+        ElevationFromDeg = "elevation_from_deg",
+        /// Upper end of the hidden directions.
+        ElevationToDeg = "elevation_to_deg",
+        /// Exponent of the noise over the signal.
+        Exponent = "exponent",
+        /// Shift along the x axis of the object, or of the sensor.
+        ForwardM = "forward_m",
+        /// Range at which half of the returns are lost.
+        HalfAtM = "half_at_m",
+        /// Measured objects are higher by this.
+        HigherM = "higher_m",
+        /// Shift along the y axis of the object, or of the sensor.
+        LeftM = "left_m",
+        /// Measured objects are longer by this.
+        LongerM = "longer_m",
+        /// Largest range that is measured.
+        MaxM = "max_m",
+        /// Mean elevation error from the lean of walls.
+        MeanByWallsDeg = "mean_by_walls_deg",
+        /// Mean elevation error of all rows.
+        MeanDeg = "mean_deg",
+        /// Detection probability where the law has no effect.
+        Most = "most",
+        /// Constant range offset.
+        OffsetM = "offset_m",
+        /// Time offset.
+        OffsetS = "offset_s",
+        /// Growth of the noise with range.
+        PerM = "per_m",
+        /// Turn about the y axis.
+        PitchDeg = "pitch_deg",
+        /// Radius of a patch of directions.
+        RadiusDeg = "radius_deg",
+        /// False alarms for each shot.
+        Rate = "rate",
+        /// Largest range of false alarms.
+        ReachM = "reach_m",
+        /// Turn about the x axis.
+        RollDeg = "roll_deg",
+        /// Relative range error.
+        Scale = "scale",
+        /// Duration of a scan.
+        ScanS = "scan_s",
+        /// Number of the sensor in the rig.
+        Sensor = "sensor",
+        /// Share of returns.
+        Share = "share",
+        /// Share of the ranges at multiples of the step.
+        ShareOnComb = "share_on_comb",
+        /// Displacement along x over a scan.
+        ShearXM = "shear_x_m",
+        /// Displacement along y over a scan.
+        ShearYM = "shear_y_m",
+        /// Turn about z over a scan.
+        ShearYawDeg = "shear_yaw_deg",
+        /// Range noise of the simulated side.
+        SimulatedStdM = "simulated_std_m",
+        /// Standard deviation of the intensity over rows.
+        Std = "std",
+        /// Standard deviation of an angle.
+        StdDeg = "std_deg",
+        /// Standard deviation of a range.
+        StdM = "std_m",
+        /// Slope of the law at one half.
+        Steepness = "steepness",
+        /// Quantisation step.
+        StepM = "step_m",
+        /// Signal at which half of the returns are lost.
+        Threshold = "threshold",
+        /// Shift along the z axis of the object, or of the sensor.
+        UpM = "up_m",
+        /// Measured objects are wider by this.
+        WiderM = "wider_m",
+        /// Turn about the z axis.
+        YawDeg = "yaw_deg",
+    }
+}
+
+identifiers! {
+    /// Unit of a parameter.
+    Unit {
+        /// A share, or another number without a unit.
+        One = "1",
+        /// Degrees.
+        Degree = "deg",
+        /// Metres.
+        Metre = "m",
+        /// Metres for each metre of range.
+        MetrePerMetre = "m/m",
+        /// A number of a sensor.
+        Number = "number",
+        /// Radians.
+        Radian = "rad",
+        /// Seconds.
+        Second = "s",
+    }
+}
+
+impl Quantity {
+    /// Its unit.
+    pub const fn unit(self) -> Unit {
+        match self {
+            Quantity::ForwardM
+            | Quantity::HalfAtM
+            | Quantity::HigherM
+            | Quantity::LeftM
+            | Quantity::LongerM
+            | Quantity::MaxM
+            | Quantity::OffsetM
+            | Quantity::ReachM
+            | Quantity::ShearXM
+            | Quantity::ShearYM
+            | Quantity::SimulatedStdM
+            | Quantity::StdM
+            | Quantity::StepM
+            | Quantity::UpM
+            | Quantity::WiderM => Unit::Metre,
+            Quantity::AzimuthDeg
+            | Quantity::AzimuthFromDeg
+            | Quantity::AzimuthToDeg
+            | Quantity::AzimuthWidthDeg
+            | Quantity::ElevationDeg
+            | Quantity::ElevationFromDeg
+            | Quantity::ElevationToDeg
+            | Quantity::MeanByWallsDeg
+            | Quantity::MeanDeg
+            | Quantity::PitchDeg
+            | Quantity::RadiusDeg
+            | Quantity::RollDeg
+            | Quantity::ShearYawDeg
+            | Quantity::StdDeg
+            | Quantity::YawDeg => Unit::Degree,
+            Quantity::AngleRad | Quantity::DivergenceRad => Unit::Radian,
+            Quantity::OffsetS | Quantity::ScanS => Unit::Second,
+            Quantity::PerM => Unit::MetrePerMetre,
+            Quantity::Sensor => Unit::Number,
+            _ => Unit::One,
+        }
+    }
+}
+
+/// Identifies a parameter of a finding: a quantity, or the value of one row of a sensor.
+#[derive(Clone, Debug, PartialEq, Eq, JsonSchema)]
+#[schemars(with = "String")]
+pub enum ParameterId {
+    /// A quantity of the catalogue.
+    Of(Quantity),
+    /// Offset of one row; written as `SENSOR/ROW`.
+    Row {
+        /// Name of the sensor.
+        sensor: String,
+        /// Number of the row, from the lowest.
+        row: usize,
+    },
+}
+
+impl From<Quantity> for ParameterId {
+    fn from(quantity: Quantity) -> Self {
+        ParameterId::Of(quantity)
+    }
+}
+
+impl fmt::Display for ParameterId {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            ParameterId::Of(quantity) => f.write_str(quantity.name()),
+            ParameterId::Row { sensor, row } => write!(f, "{sensor}/{row}"),
+        }
+    }
+}
+
+/// In the order of the names as they are written.
+impl Ord for ParameterId {
+    fn cmp(&self, other: &Self) -> Ordering {
+        match (self, other) {
+            (ParameterId::Of(a), ParameterId::Of(b)) => a.cmp(b),
+            _ => self.to_string().cmp(&other.to_string()),
+        }
+    }
+}
+
+impl PartialOrd for ParameterId {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl Serialize for ParameterId {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl<'de> Deserialize<'de> for ParameterId {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        if let Some(quantity) = Quantity::ALL.iter().find(|q| q.name() == text) {
+            return Ok(ParameterId::Of(*quantity));
+        }
+        let row = text.rsplit_once('/').and_then(|(sensor, row)| Some((sensor.to_owned(), row.parse().ok()?)));
+        let (sensor, row) = row.ok_or_else(|| D::Error::custom(format!("unknown parameter `{text}`")))?;
+        Ok(ParameterId::Row { sensor, row })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn parameters_are_written_and_read_as_their_names() {
+        let row = |row| ParameterId::Row { sensor: "a/b".into(), row };
+        for (id, text) in [(Quantity::StdM.into(), "std_m"), (row(12), "a/b/12")] {
+            assert_eq!(serde_json::to_value(&id).unwrap(), text);
+            assert_eq!(serde_json::from_value::<ParameterId>(text.into()).unwrap(), id);
+        }
+        assert!(serde_json::from_value::<ParameterId>("nothing".into()).is_err());
+        assert!(row(10) < row(2) && row(2) < Quantity::AzimuthDeg.into(), "the order of the text");
+    }
+}

@@ -1,0 +1,103 @@
+//! The frames of both data sets, read once and held in memory for every pairing.
+
+use super::frame::Sensors;
+use super::matching::match_directions;
+use super::scan::{SensorScan, split_by_sensor};
+use crate::error::DiagnoseError;
+use data::{Cloud, Dataset, Object};
+use sensor::Rig;
+use std::sync::OnceLock;
+
+/// One side of a frame: its returns by sensor (12 bytes a return) and its labelled objects.
+#[derive(Clone, Debug)]
+pub struct SideFrame {
+    /// Returns of each sensor.
+    pub scans: Vec<SensorScan>,
+    /// Labelled objects.
+    pub objects: Vec<Object>,
+}
+
+/// Which side of a pair.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PairSide {
+    /// Measured.
+    Measured,
+    /// Simulated.
+    Simulated,
+}
+
+/// Of one sensor whether each measured and each simulated return has a counterpart on the other side.
+pub type Matched = (Vec<bool>, Vec<bool>);
+
+/// The frames that both data sets have.
+pub struct Recordings<'a> {
+    datasets: [&'a Dataset; 2],
+    rig: &'a Rig,
+    frames: Vec<Held>,
+}
+
+/// What is held of a frame, each part from its first use on.
+struct Held {
+    id: String,
+    sides: [OnceLock<SideFrame>; 2],
+    matched: OnceLock<Vec<Matched>>,
+}
+
+impl<'a> Recordings<'a> {
+    /// Frames by their ids; nothing is read yet.
+    pub fn new(measured: &'a Dataset, simulated: &'a Dataset, rig: &'a Rig, ids: Vec<String>) -> Self {
+        let held = |id| Held { id, sides: Default::default(), matched: OnceLock::new() };
+        Recordings { datasets: [measured, simulated], rig, frames: ids.into_iter().map(held).collect() }
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// No frame.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Id of a frame.
+    pub fn id(&self, frame: usize) -> &str {
+        &self.frames[frame].id
+    }
+
+    /// Keeps the frames of some ids, in their order.
+    pub fn retain(&mut self, keep: impl Fn(&str) -> bool) {
+        self.frames.retain(|f| keep(&f.id));
+    }
+
+    /// One side of a frame.
+    pub fn side(&self, frame: usize, side: PairSide) -> Result<&SideFrame, DiagnoseError> {
+        let held = &self.frames[frame];
+        let cell = &held.sides[side as usize];
+        if let Some(side) = cell.get() {
+            return Ok(side);
+        }
+        let (cloud, objects) = load(self.datasets[side as usize], &held.id)?;
+        let read = SideFrame { scans: split_by_sensor(&cloud, self.rig), objects };
+        Ok(cell.get_or_init(|| read))
+    }
+
+    /// Which returns of a frame have a counterpart, by sensor. Shots are matched by the directions in which they were sent, whatever is corrected
+    /// later.
+    pub fn matched(&self, frame: usize, sensors: &Sensors) -> Result<&[Matched], DiagnoseError> {
+        let [measured, simulated] = [self.side(frame, PairSide::Measured)?, self.side(frame, PairSide::Simulated)?];
+        let of_sensor = |k: usize| {
+            let closes = sensors.rig.sensors[k].closes();
+            match_directions(&measured.scans[k], &simulated.scans[k], &sensors.patterns[k], closes)
+        };
+        let all = || (0..sensors.rig.sensors.len()).map(of_sensor).collect();
+        Ok(self.frames[frame].matched.get_or_init(all))
+    }
+}
+
+/// Cloud and objects of a frame.
+pub(crate) fn load(dataset: &Dataset, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError> {
+    let cloud = dataset.load_cloud(id)?;
+    let lines = if dataset.has_labels() { dataset.labels(id)? } else { Vec::new() };
+    Ok((cloud, dataset.objects(id, &lines)?))
+}

@@ -1,0 +1,307 @@
+//! Findings of geometry: parameters, sentences and plots.
+
+use super::curve::linear_curve;
+use super::floor::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SENSOR_M, FLOOR_TURN_RAD};
+use super::hypotheses::Hypothesis;
+use super::sums::{Sums, group_fit, split};
+use super::{Search, Selected};
+use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
+use crate::channels::groups::{Group, GroupSums, Grouping, total};
+use crate::channels::mean::Column;
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Minimum, Status};
+use crate::inference::grouped::{self, GroupFit};
+use crate::inference::linear::{LinearFit, LinearFrame, fit};
+use crate::search::{Found, NamedParameter, Z_STAR, parameter, sensor_number, with_error};
+use nalgebra::Vector3;
+use sensor::Rig;
+use std::collections::BTreeMap;
+
+/// What is said of one hypothesis.
+struct Description {
+    covariate: Covariate,
+    says: String,
+    curve: Curve,
+    parameters: Vec<NamedParameter>,
+}
+
+/// The finding of one of the chosen hypotheses.
+pub(super) fn found(
+    search: &Search,
+    hypothesis: &Hypothesis,
+    chosen: &[Hypothesis],
+    selected: Selected,
+    held_out_gains: Vec<f64>,
+) -> Found {
+    let cause = hypothesis.cause();
+    let Description { covariate, says, curve, parameters } = match hypothesis {
+        Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
+        Hypothesis::Groups { cause, grouping, column } => groups(search, *cause, *grouping, *column),
+    };
+    let named = cause != Cause::Unexplained;
+    let rivals = selected.rivals.iter().copied().filter(|r| named && *r != Cause::Unexplained);
+    let causes: Vec<Cause> = std::iter::once(cause).filter(|_| named).chain(rivals).collect();
+    let status = match causes.len() {
+        0 => Status::Unexplained,
+        1 => Status::Named,
+        _ => Status::Ambiguous,
+    };
+    let separate_by = (status == Status::Ambiguous)
+        .then(|| "surfaces on all sides at many ranges, and a second sensor that sees the same ones".to_owned());
+    Found {
+        status,
+        causes,
+        parameters,
+        confidence: selected.confidence,
+        channel: Channel::Residuals,
+        covariate,
+        held_out_gains,
+        says,
+        separate_by,
+        curve,
+    }
+}
+
+/// Describes a linear hypothesis.
+fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis]) -> Description {
+    let (sums, rig) = (&search.sums, search.context.rig);
+    let fitted = sums.fit_all(&search.estimate, &search.estimate_blocks, chosen);
+    let spurious = spurious_poses(search, columns, chosen);
+    let parameters = linear_parameters(sums, rig, &fitted, columns, spurious, cause);
+    let is_sensor = |id: &ParameterId| *id == ParameterId::Of(Quantity::Sensor);
+    let sensor = parameters.iter().find(|(id, _)| is_sensor(id)).map(|(_, p)| p.estimate as usize);
+    let numbers = parameters.iter().filter(|(id, _)| !is_sensor(id));
+    let list: Vec<String> = numbers.map(|(id, p)| format!("{id} {:.4} {}", p.estimate, p.unit)).collect();
+    let seen_by = sensor.map_or("lidar", |s| rig.sensors[s].name.as_str());
+    let displaced = format!("sensor {seen_by} sees the scene displaced: it is mounted otherwise than believed");
+    let (covariate, what) = match cause {
+        Cause::RangeBias => {
+            (Covariate::CosIncidence, "all ranges are measured longer (shorter where negative) than they are")
+        }
+        Cause::PitchRoll => {
+            (Covariate::Range, "the whole scene is tilted: the car leans otherwise than the simulation believes")
+        }
+        Cause::RollingShutter => (
+            Covariate::ScanPhase,
+            "the scene shears over a scan: points of a moving car are put where the car is at one moment",
+        ),
+        _ => (Covariate::Sensor, displaced.as_str()),
+    };
+    Description {
+        covariate,
+        says: format!("{what}: {}", list.join(", ")),
+        curve: linear_curve(search, &fitted, columns, cause),
+        parameters,
+    }
+}
+
+/// Describes offsets of groups of rays.
+fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize) -> Description {
+    let frames = search.sums.groups_of(grouping);
+    let all = total(search.estimate.iter().map(|&i| &frames[i]));
+    let (std, n) = match grouping {
+        Grouping::Row => grouped::spread_of_rows(&all, group_fit(column)),
+        Grouping::Azimuth => grouped::spread(&all, group_fit(column), 0.0),
+    };
+    let error = std / (2.0 * n.max(1.0)).sqrt();
+    // The prior of rows with few returns is the spread of the others.
+    let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
+    let precision = std.max(least).powi(-2).max(group_fit(column).precision);
+    let fit = GroupFit { precision, ..group_fit(column) };
+    let offsets = grouped::offsets(&all, fit);
+    let (scale, unit) = if column == 0 { (1.0, Unit::Metre) } else { (1f64.to_degrees(), Unit::Degree) };
+    let mut parameters: Vec<NamedParameter> = Vec::new();
+    if cause != Cause::Unexplained {
+        let spread = if column == 0 { Quantity::StdM } else { Quantity::StdDeg };
+        parameters.push(parameter(spread, std * scale, (error.hypot(0.05 * std)) * scale));
+        parameters.extend(offsets.iter().map(|(group, v)| {
+            let error = 1.0 / (all[group].gram[2 * column] + fit.precision).sqrt();
+            let sensor = search.context.rig.sensors[usize::from(group.sensor)].name.clone();
+            let id = ParameterId::Row { sensor, row: usize::from(group.index) };
+            (id, with_error(v * scale, error * scale, unit))
+        }));
+    }
+    let says = match (grouping, column) {
+        (Grouping::Row, 0) => format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0),
+        (Grouping::Row, _) => {
+            format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * scale)
+        }
+        _ => format!(
+            "ranges are off by {:.1} cm in a way that depends on the azimuth; no cause of the catalogue does that",
+            std * 100.0
+        ),
+    };
+    Description {
+        covariate: grouping.into(),
+        says,
+        curve: group_curve(&all, &offsets, grouping, fit, scale),
+        parameters,
+    }
+}
+
+/// Pose errors that the same fit attributes to sensors that are mounted correctly, beyond chance: three turns, rad, then three shifts, m, root
+/// mean square over the other sensors. They measure the error of the model of a sensor's pose. Zero where fewer than two others are there.
+fn spurious_poses(search: &Search, columns: &[usize], chosen: &[Hypothesis]) -> [f64; 6] {
+    let sums = &search.sums;
+    let pose = |c: usize| if let Column::SensorPose(s, k) = sums.columns[c] { Some((s, k)) } else { None };
+    let fitted_columns = split(chosen).0;
+    let displaced: Vec<usize> = fitted_columns.iter().filter_map(|c| Some(pose(*c)?.0)).collect();
+    let others: Vec<usize> = (0..sums.poses.first().map_or(0, Vec::len)).filter(|s| !displaced.contains(s)).collect();
+    // The same numbers as those of the finding.
+    let numbers: Vec<usize> = columns.iter().filter_map(|c| Some(pose(*c)?.1)).collect();
+    if others.len() < 2 || numbers.is_empty() {
+        return [0.0; 6];
+    }
+    let frames: Vec<&LinearFrame> = search.estimate.iter().map(|&i| &sums.linear[i]).collect();
+    let mut squares = [0.0; 6];
+    for other in &others {
+        let of_other = |c: usize| pose(c).filter(|(s, k)| s == other && numbers.contains(k));
+        let own = (0..sums.columns.len()).filter(|c| of_other(*c).is_some());
+        let with: Vec<usize> = sums.base.iter().chain(&fitted_columns).copied().chain(own).collect();
+        let fitted = fit(&frames, &search.estimate_blocks, &with, &sums.precision);
+        for (at, (_, k)) in with.iter().enumerate().filter_map(|(at, c)| Some((at, of_other(*c)?))) {
+            squares[k] += (fitted.theta[at].powi(2) - fitted.error(at).powi(2)).max(0.0);
+        }
+    }
+    // Each of them is compared with the other others, the finding with all of them.
+    let n = others.len() as f64;
+    squares.map(|s| ((n * n - 1.0) / (n * n) * s / n).sqrt())
+}
+
+/// Turn and shift of the ego vehicle or of a sensor, with their errors, rad and m.
+struct Pose {
+    turn: Vector3<f64>,
+    turn_error: Vector3<f64>,
+    shift: Vector3<f64>,
+    shift_error: Vector3<f64>,
+    /// The sensor, where it is that of one sensor.
+    sensor: Option<usize>,
+}
+
+/// Parameters of a linear hypothesis.
+fn linear_parameters(
+    sums: &Sums,
+    rig: &Rig,
+    fitted: &LinearFit,
+    columns: &[usize],
+    spurious: [f64; 6],
+    cause: Cause,
+) -> Vec<NamedParameter> {
+    let value = |c: usize| {
+        let i = fitted.columns.iter().position(|x| *x == c)?;
+        Some((fitted.theta[i], fitted.error(i)))
+    };
+    let mut parameters = Vec::new();
+    let [mut turn, mut turn_error, mut shift, mut shift_error] = [Vector3::<f64>::zeros(); 4];
+    let mut sensor = None;
+    for &c in columns {
+        let Some((theta, error)) = value(c) else { continue };
+        match sums.columns[c] {
+            Column::RangeOffset => parameters.push(parameter(Quantity::OffsetM, theta, error.hypot(0.003))),
+            Column::RangeScale => parameters.push(parameter(Quantity::Scale, theta, error.hypot(1e-4))),
+            Column::Sweep(k) => {
+                let shear = [Quantity::ShearXM, Quantity::ShearYM, Quantity::ShearYawDeg][k];
+                let by = if k == 2 { 1f64.to_degrees() } else { 1.0 };
+                parameters.push(parameter(shear, by * theta, by * error));
+            }
+            // The scene turns and moves against the vehicle: the vehicle moves the other way.
+            Column::Pose(k) | Column::SensorPose(_, k) => {
+                if let Column::SensorPose(s, _) = sums.columns[c] {
+                    sensor = Some(s);
+                }
+                let error = error.hypot(spurious[k]);
+                if k < 3 {
+                    (turn[k], turn_error[k]) = (-theta, error);
+                } else {
+                    (shift[k - 3], shift_error[k - 3]) = (-theta, error.hypot(0.003));
+                }
+            }
+            Column::Structure(_) => {}
+        }
+    }
+    parameters.extend(pose_parameters(rig, Pose { turn, turn_error, shift, shift_error, sensor }, cause));
+    parameters
+}
+
+/// Parameters of a pose; none where it has no turn and no shift.
+fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
+    let Pose { mut turn, mut turn_error, mut shift, mut shift_error, sensor } = pose;
+    let mut parameters = Vec::new();
+    if turn == Vector3::zeros() && shift == Vector3::zeros() {
+        return parameters;
+    }
+    if cause == Cause::SensorExtrinsics {
+        let s = sensor.unwrap_or(0);
+        parameters.push(sensor_number(s));
+        // In the sensor's own frame, as the effect of the simulator has them.
+        let turn_of = rig.sensors[s].pose().rotation;
+        let matrix = turn_of.inverse().to_rotation_matrix();
+        let error_of = |e: Vector3<f64>| {
+            Vector3::from_fn(|i, _| (0..3).map(|j| (matrix[(i, j)] * e[j]).powi(2)).sum::<f64>().sqrt())
+        };
+        (turn, shift) = (turn_of.inverse_transform_vector(&turn), turn_of.inverse_transform_vector(&shift));
+        (turn_error, shift_error) = (error_of(turn_error), error_of(shift_error));
+    }
+    let deg = f64::to_degrees;
+    // Relative error of the model: poses of frames and offsets of surfaces absorb a part of the turn of a single sensor.
+    let form = if sensor.is_some() { 0.07 } else { 0.03 };
+    for (k, angle) in [Quantity::RollDeg, Quantity::PitchDeg, Quantity::YawDeg].into_iter().enumerate() {
+        if turn[k].abs() > 1e-9 {
+            let value = deg(turn[k]);
+            parameters.push(parameter(angle, value, deg(turn_error[k]).hypot(0.002).hypot(form * value)));
+        }
+    }
+    for (k, length) in [Quantity::ForwardM, Quantity::LeftM, Quantity::UpM].into_iter().enumerate() {
+        if shift[k].abs() > 1e-9 {
+            parameters.push(parameter(length, shift[k], shift_error[k]));
+        }
+    }
+    parameters
+}
+
+/// Offsets of groups along their rows or azimuths, a curve for each sensor.
+fn group_curve(
+    sums: &BTreeMap<Group, GroupSums>,
+    offsets: &BTreeMap<Group, f64>,
+    grouping: Grouping,
+    fit: GroupFit,
+    scale: f64,
+) -> Curve {
+    let points = offsets.iter().map(|(group, v)| {
+        let place = group.place(grouping);
+        let x = if grouping == Grouping::Row { place } else { place.to_degrees() };
+        let error = 1.0 / (sums[group].gram[2 * fit.column] + fit.precision).sqrt();
+        let sensor = usize::from(group.sensor);
+        CurvePoint { sensor, x, measured: v * scale, before: 0.0, after: v * scale, error: error * scale }
+    });
+    let x = if grouping == Grouping::Row { "row" } else { "azimuth, degrees" };
+    let y = if fit.column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
+    Curve { x: x.into(), y: y.into(), by_sensor: true, points: points.collect() }
+}
+
+/// Detectable effect sizes.
+pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(Cause, Minimum)> {
+    let frames: Vec<&LinearFrame> = select.iter().map(|&i| &sums.linear[i]).collect();
+    let error = |c: Column| {
+        let k = sums.columns.iter().position(|x| *x == c)?;
+        let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
+        Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
+    };
+    let mut all = Vec::new();
+    let mut push = |cause: Cause, quantity: Quantity, value: Option<f64>, floor: f64, factor: f64| {
+        if let Some(v) = value {
+            all.push((cause, Minimum::new(quantity, factor * (Z_STAR * v).max(floor))));
+        }
+    };
+    let deg = 1f64.to_degrees();
+    push(Cause::RangeBias, Quantity::OffsetM, error(Column::RangeOffset), FLOOR_OFFSET_M, 1.0);
+    push(Cause::PitchRoll, Quantity::PitchDeg, error(Column::Pose(1)), FLOOR_TURN_RAD, deg);
+    let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
+    let of_one = sums.columns.iter().position(|x| *x == one).filter(|_| one != Column::Pose(2));
+    let displaced_m = of_one.map(|k| sums.displaced_m(select, 0, &[(k, 1.0)]));
+    let floor = displaced_m.map_or(FLOOR_TURN_RAD, |by_one_rad| FLOOR_SENSOR_M / by_one_rad.max(1e-3));
+    push(Cause::SensorExtrinsics, Quantity::YawDeg, error(one), floor, deg);
+    push(Cause::BeamRangeOffset, Quantity::StdM, Some(0.0), FLOOR_GROUPS[0], 1.0);
+    push(Cause::BeamElevationOffset, Quantity::StdDeg, Some(0.0), FLOOR_GROUPS[1], deg);
+    all
+}

@@ -1,0 +1,139 @@
+//! Findings of returns off the simulated surfaces: parameters, sentences and plots.
+
+use super::false_alarms::{FalseAlarms, false_alarms};
+use super::{NamedParameter, Search, cause};
+use crate::catalogue::{Channel, Covariate, Quantity};
+use crate::channels::returns::{self, Odd, OddFrame};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Parameter, Status};
+use crate::pairing::Ray;
+use crate::search::{Context, Found, parameter};
+
+/// Factor by which the true width of a beam may differ from that of a uniform disc that mixes as many ranges.
+const WIDTH_FACTOR: f64 = 5.0;
+
+/// Plausible widths of beams, rad.
+const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
+
+/// What is said of one kind of returns.
+struct Description {
+    covariate: Covariate,
+    says: String,
+    parameters: Vec<NamedParameter>,
+}
+
+/// The finding of an excess of one kind of returns; `share` is the excess, `z` its significance on the selecting frames.
+pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
+    let Description { covariate, says, parameters } = match kind {
+        Odd::Alone => of_false_alarms(search, &share),
+        Odd::Between => mixed(search, share),
+        Odd::GroupInFront => Description {
+            covariate: Covariate::Place,
+            says: format!(
+                "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
+                100.0 * share.estimate
+            ),
+            parameters: vec![(Quantity::Share.into(), share)],
+        },
+        Odd::GroupBehind => behind(share),
+    };
+    Found {
+        status: Status::Named,
+        causes: vec![cause(kind)],
+        parameters,
+        confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
+        channel: Channel::Returns,
+        covariate,
+        held_out_gains,
+        says,
+        separate_by: None,
+        curve: curve(search.context, kind, &search.estimate),
+    }
+}
+
+/// Describes lone returns.
+fn of_false_alarms(search: &Search, share: &Parameter) -> Description {
+    let (more, error) = (share.estimate, (share.ci95[1] - share.ci95[0]) / 2.0 / 1.96);
+    let FalseAlarms { rate, reach_m } = false_alarms(search.context, &search.estimate, search.end_m);
+    let form = (error / more.abs().max(1e-9)).hypot(0.06);
+    Description {
+        covariate: Covariate::None,
+        says: format!(
+            "{:.2} % of the measured returns stand alone where nothing is: false alarms, of {:.2} % of the shots, that your simulator does not make",
+            100.0 * more,
+            100.0 * rate
+        ),
+        parameters: vec![
+            parameter(Quantity::Rate, rate, form * rate),
+            parameter(Quantity::ReachM, reach_m, 0.05 * reach_m),
+        ],
+    }
+}
+
+/// Describes ranges between the two surfaces of an edge. The width of the beam is reported where it is plausible; how a sensor weights what a
+/// beam meets is not known.
+fn mixed(search: &Search, share: Parameter) -> Description {
+    let more = share.estimate;
+    let mut parameters = vec![(Quantity::Share.into(), share)];
+    let sum = |f: fn(&OddFrame) -> f64| search.estimate.iter().map(|&i| f(&search.odd[i])).sum::<f64>();
+    let width = more * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
+    let so_wide = if WIDTHS_RAD.contains(&width) {
+        let ci95 = [width / WIDTH_FACTOR, width * WIDTH_FACTOR];
+        let unit = Quantity::DivergenceRad.unit();
+        parameters.push((Quantity::DivergenceRad.into(), Parameter { estimate: width, unit, ci95 }));
+        format!(", about {:.1} mrad", 1e3 * width)
+    } else {
+        String::new()
+    };
+    Description {
+        covariate: Covariate::Edge,
+        says: format!(
+            "{:.2} % of the measured returns lie between the two surfaces of an edge: beams have a width{so_wide}, your simulator's are lines",
+            100.0 * more
+        ),
+        parameters,
+    }
+}
+
+/// Describes grouped returns behind simulated surfaces: objects that only the simulation has, a negative share of missing ones.
+fn behind(share: Parameter) -> Description {
+    let [low, high] = share.ci95;
+    Description {
+        covariate: Covariate::Place,
+        says: format!(
+            "{:.2} % of the measured returns lie together behind what the simulation has there: it has things that are not on the road",
+            100.0 * share.estimate
+        ),
+        parameters: vec![(
+            Quantity::Share.into(),
+            Parameter { estimate: -share.estimate, ci95: [-high, -low], ..share },
+        )],
+    }
+}
+
+/// Share of such returns by range.
+fn curve(context: &Context, kind: Odd, frames: &[usize]) -> Curve {
+    const BINS: usize = 12;
+    let bin = |r: &Ray| ((r.own_range_m() / 10.0) as usize).min(BINS - 1);
+    let mut counts = [[0.0f64; BINS]; 4];
+    for &f in frames {
+        for (side, rays) in [&context.frames[f].measured, &context.frames[f].simulated].into_iter().enumerate() {
+            for ray in rays {
+                counts[2 * side][bin(ray)] += 1.0;
+                if returns::odd(ray) == Some(kind) {
+                    counts[2 * side + 1][bin(ray)] += 1.0;
+                }
+            }
+        }
+    }
+    let total: [f64; 2] = [0, 2].map(|k: usize| counts[k].iter().sum::<f64>().max(1.0));
+    let points = (0..BINS).map(|b| CurvePoint {
+        sensor: 0,
+        x: 10.0 * b as f64 + 5.0,
+        measured: counts[1][b] / total[0],
+        before: counts[3][b] / total[1],
+        after: counts[1][b] / total[0],
+        error: counts[1][b].sqrt() / total[0],
+    });
+    Curve { x: "range, m".into(), y: "share of all returns".into(), by_sensor: false, points: points.collect() }
+}

@@ -1,0 +1,455 @@
+//! Motion distortion: static objects are displaced along the scan as the ego vehicle drives, by metres at speed. Searched first, since it
+//! shears whole scenes, and undone for the other channels.
+//!
+//! For each duration of a scan, measured returns are moved back to their place in the middle of the scan. The duration is that with the most
+//! returns in occupied cells of the simulation, in bird's-eye view. Rays need not be paired, so that displacements of metres are found.
+
+use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::channels::labels::seen_velocity;
+use crate::channels::mean::{common_bias_m, origins};
+use crate::channels::motion::{CELL_M, Cells, OwnMotion};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Minimum, Parameter, Status};
+use crate::inference::choice::{significant, total_and_z};
+use crate::inference::median;
+use crate::inference::roles::Role;
+use crate::pairing::{FramePair, Ray, Surface};
+use geometry::Box3;
+use nalgebra::{Isometry3, Point3, Vector2, Vector3};
+use rayon::prelude::*;
+use sensor::{Rig, Sensor};
+use statistics::{blocks_of, draw_blocks};
+
+/// Displacement of the scene over a scan.
+pub struct Slide {
+    /// Duration of a scan from phase -1/2 to +1/2, s.
+    scan_s: f64,
+    /// Motion in every frame.
+    motions: Vec<Motion>,
+    /// Every sensor with `sensor_from_cloud`.
+    sensors: Vec<(Sensor, Isometry3<f64>)>,
+}
+
+/// Motion in one frame: of the ego vehicle, and of the labelled objects relative to it, m/s.
+struct Motion {
+    own: OwnMotion,
+    objects: Vec<(Box3, Vector3<f64>)>,
+}
+
+impl Motion {
+    /// Velocity of what is at a point relative to the ego vehicle, m/s.
+    fn at(&self, point: &Vector3<f64>, longest_s: f64) -> Vector3<f64> {
+        let on = |(b, v): &&(Box3, Vector3<f64>)| {
+            let local = b.to_local((*point).into());
+            let margin = 0.5 + 0.5 * v.norm() * longest_s;
+            (0..2).all(|k| local[k].abs() < b.size[k] / 2.0 + margin) && local[2].abs() < b.size[2] / 2.0 + 0.3
+        };
+        match self.objects.iter().find(on) {
+            Some((_, v)) => *v,
+            None => Vector3::new(
+                -self.own.speed_m_s + self.own.yaw_rate_rad_s * point.y,
+                -self.own.yaw_rate_rad_s * point.x,
+                0.0,
+            ),
+        }
+    }
+}
+
+impl Slide {
+    /// Displacement of a point of a frame and a sensor from its place in the middle of the scan, m, cloud's frame.
+    pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
+        let (mount, sensor_from_cloud) = &self.sensors[sensor];
+        let [azimuth_rad, elevation_rad, _] = Sensor::spherical(&(sensor_from_cloud * Point3::from(*point)));
+        let phase = mount.scan_phase(azimuth_rad, elevation_rad);
+        self.motions[frame].at(point, self.scan_s.abs()) * (phase * self.scan_s)
+    }
+}
+
+/// Returns of a frame that are moved, at most.
+const POINTS: usize = 2500;
+
+/// Largest range of returns that are used, m: farther ones are too sparse.
+const REACH_M: f64 = 60.0;
+
+/// Steps of the grid to either side of zero.
+const STEPS: i32 = 28;
+
+/// Step of the duration of a scan, s.
+const STEP_S: f64 = 0.005;
+
+/// Step of the displacement over a scan where the ego speed is not known, m.
+const STEP_M: f64 = 0.25;
+
+/// Smallest displacement that is searched for, m: smaller ones are found by surfaces.
+const LEAST_M: f64 = 0.3;
+
+/// Smallest relative increase of the number of returns on the simulation.
+const LEAST_SHARE: f64 = 0.015;
+
+/// Returns of one frame in bird's-eye view.
+struct TopView {
+    /// Cells that the simulation occupies.
+    occupied: Cells,
+    /// Place of a measured return, m, and its displacement for each second of scan, m/s.
+    points: Vec<(Vector2<f64>, Vector2<f64>)>,
+    /// Measured returns for each of the points.
+    each: f64,
+}
+
+impl TopView {
+    fn new(frame: &FramePair, motion: &Motion, rig: &Rig, origins: &[Point3<f64>], longest: f64) -> Self {
+        let at = |r: &Ray, off_m: f64| origins[r.sensor as usize] + r.direction_vector() * (r.own_range_m() - off_m);
+        let near = |r: &&Ray| (3.0..REACH_M).contains(&r.own_range_m());
+        let stands = |r: &&Ray| r.surface != Surface::Ground || !r.smooth || r.across_m() > 0.25;
+        let simulated = frame.simulated.iter().filter(near).filter(|r| r.surface != Surface::Ground);
+        let occupied = Cells::new(&simulated.map(|r| at(r, 0.0).coords.xy()).collect::<Vec<_>>());
+        let measured: Vec<_> = frame.measured.iter().filter(near).filter(stands).collect();
+        let stride = measured.len().div_ceil(POINTS).max(1);
+        // A common range bias is no displacement along the scan.
+        let bias_m = common_bias_m(frame);
+        let points = measured.iter().step_by(stride).map(|r| {
+            let p = at(r, bias_m).coords;
+            let mount = &rig.sensors[r.sensor as usize];
+            let phase = mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad));
+            let displacement = motion.at(&p, longest) * phase;
+            (p.xy(), displacement.xy())
+        });
+        TopView { occupied, points: points.collect(), each: stride as f64 }
+    }
+
+    /// Number of the points in occupied cells if a scan takes `scan_s`.
+    fn on(&self, scan_s: f64) -> f64 {
+        let on = self.points.iter().filter(|(p, per_s)| self.occupied.contains(&(p - per_s * scan_s)));
+        on.count() as f64
+    }
+}
+
+/// Mean gain over its standard error from which on an insignificant displacement is tested further, by moving the scene back.
+const DOUBTFUL_Z: f64 = 1.5;
+
+/// Result of the search.
+pub enum Search {
+    /// No displacement along the scan.
+    NotFound(ChannelResult),
+    /// A significant displacement.
+    Found(ChannelResult, Slide),
+    /// A displacement that is not significant from above. Whether it is one is decided after the whole scene was moved back by it.
+    Undecided {
+        /// Result if it is one.
+        found: ChannelResult,
+        /// The displacement.
+        slide: Slide,
+        /// Result if it is none.
+        not_found: ChannelResult,
+    },
+}
+
+/// The search.
+pub fn search(context: &Context) -> Search {
+    let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
+    let mut result = ChannelResult::new(Channel::Slide, hold_out.len());
+    let mut models = vec![Model::without_speed(context)];
+    models.extend(Model::with_speed(context));
+    let grids = models.iter().map(|model| model.grid(&select)).collect::<Vec<_>>();
+    let total = |k: usize| total_and_z(&grids[k].gains).0;
+    let best = (0..models.len()).max_by(|&a, &b| total(a).total_cmp(&total(b)));
+    let Some(k) = best else { return Search::NotFound(result) };
+    let (grid, model) = (&grids[k], models.swap_remove(k));
+    let (gain, z) = total_and_z(&grid.gains);
+    let significant = significant(&grid.gains, Z_STAR) && gain > LEAST_SHARE * (grid.most - gain);
+    let far_enough = grid.best.abs() * model.fastest > LEAST_M;
+    let considered = |outcome: &str| Considered {
+        cause: Cause::RollingShutter.into(),
+        channel: Channel::Slide,
+        nats_per_ray: 0.0,
+        z,
+        outcome: outcome.into(),
+    };
+    result.minimum.push((Cause::RollingShutter, Minimum::new(Quantity::ShearXM, LEAST_M)));
+    let outcome =
+        if significant { "too small to be seen from above" } else { "no more returns come to lie on the simulation" };
+    let not_found = ChannelResult { considered: vec![considered(outcome)], ..result.clone() };
+    if !far_enough || !significant && z < DOUBTFUL_Z {
+        return Search::NotFound(not_found);
+    }
+    result.considered.push(considered("chosen"));
+    let fitted = Fitted::new(context, &model, grid.best, &estimate);
+    let held = model.held_out_gains(grid, &fitted, &select, &hold_out);
+    result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [g.max(0.0), *g, g.max(0.0)]);
+    result.found.push(fitted.found(&model, &estimate, held));
+    let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
+    let slide = Slide { scan_s: fitted.scan_s, motions: model.motions, sensors };
+    if significant { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
+}
+
+/// The duration of a scan, fitted on the estimating frames.
+struct Fitted {
+    /// Durations of a finer grid about the best of the selecting frames, and the counts of every frame.
+    fine: Vec<f64>,
+    counts: Vec<Vec<f64>>,
+    scan_s: f64,
+    /// Standard error, s.
+    error: f64,
+    /// Share of bootstrap repetitions with the same sign.
+    confidence: f64,
+}
+
+impl Fitted {
+    fn new(context: &Context, model: &Model, best: f64, estimate: &[usize]) -> Self {
+        let fine: Vec<f64> = (-20..=20).map(|k| best + 0.2 * model.step * f64::from(k)).collect();
+        let counts = model.counts(estimate, &fine);
+        let members = blocks_of(&context.blocks(estimate));
+        let mut rng = data::stream(0, "diagnose shutter", 0, 0);
+        let all: Vec<usize> = (0..estimate.len()).collect();
+        let scan_s = peak(&fine, &counts, &all);
+        let draws: Vec<f64> =
+            (0..REPETITIONS).map(|_| peak(&fine, &counts, &draw_blocks(&members, &mut rng))).collect();
+        let spread = (draws.iter().map(|d| (d - scan_s).powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
+        // The size of a cell, and an error of 3 % of the ego speed.
+        let error = spread.hypot(0.03 * scan_s).hypot(0.1 * CELL_M / model.fastest.max(1.0));
+        let confidence = draws.iter().filter(|d| d.signum() == scan_s.signum()).count() as f64 / draws.len() as f64;
+        Fitted { fine, counts, scan_s, error, confidence }
+    }
+
+    /// The finding. Scans that turn clockwise have a positive duration.
+    fn found(&self, model: &Model, estimate: &[usize], held_out_gains: Vec<f64>) -> Found {
+        let Fitted { scan_s, error, .. } = *self;
+        let middle = median(model.motions.iter().map(|m| m.own.speed_m_s).collect());
+        let parameter = |quantity: Quantity, estimate: f64, error: f64| -> NamedParameter {
+            let ci95 = [estimate - 2.0 * error, estimate + 2.0 * error];
+            (quantity.into(), Parameter { estimate, unit: quantity.unit(), ci95 })
+        };
+        let duration = model.speed_known.then(|| parameter(Quantity::ScanS, -scan_s, error));
+        let shear = parameter(Quantity::ShearXM, -middle * scan_s, middle * error);
+        let speed = if model.speed_known {
+            format!(" at {middle:.0} m/s: a scan takes {:.0} ms", 1e3 * scan_s.abs())
+        } else {
+            String::new()
+        };
+        Found {
+            status: Status::Named,
+            causes: vec![Cause::RollingShutter],
+            parameters: duration.into_iter().chain([shear]).collect(),
+            confidence: self.confidence,
+            channel: Channel::Slide,
+            covariate: Covariate::ScanPhase,
+            held_out_gains,
+            says: format!(
+                "what stands still slides by {:.2} m over a scan{speed}, and nobody moves its points back; your simulator shoots all at once",
+                (middle * scan_s).abs()
+            ),
+            separate_by: None,
+            curve: self.curve(model, estimate),
+        }
+    }
+
+    /// Share of the static returns that lie on the simulation, by the duration of a scan.
+    fn curve(&self, model: &Model, estimate: &[usize]) -> Curve {
+        let points = model.points(estimate);
+        let share = |on: f64| on / points.max(1.0);
+        let on = |at: f64| estimate.iter().map(|&f| model.frames[f].on(at)).sum();
+        let [before, after] = [0.0, self.scan_s].map(|at| share(on(at)));
+        let points = self.fine.iter().enumerate().map(|(k, s)| {
+            let measured = share(self.counts.iter().map(|counts| counts[k]).sum());
+            CurvePoint { sensor: 0, x: -s, measured, before, after, error: 0.0 }
+        });
+        Curve {
+            x: if model.speed_known { "time that a scan takes, s" } else { "slide over a scan, m" }.into(),
+            y: "share of standing returns on the simulation".into(),
+            by_sensor: false,
+            points: points.collect(),
+        }
+    }
+}
+
+/// A model of the motion in all frames.
+struct Model {
+    motions: Vec<Motion>,
+    frames: Vec<TopView>,
+    /// Largest ego speed, m/s. Where it is not known it is 1, and durations are displacements in m.
+    fastest: f64,
+    /// Step of the grid, s or m.
+    step: f64,
+    speed_known: bool,
+}
+
+impl Model {
+    /// With the motion of the ego vehicle and of the objects, where both are known.
+    fn with_speed(context: &Context) -> Option<Model> {
+        let (times, own) = (context.times.as_ref()?, context.motion.as_ref()?);
+        let motion = |f: usize| {
+            let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
+            let moving = boxes.filter_map(|b| Some((b, seen_velocity(context.frames, times, f, &b)?)));
+            let still = OwnMotion { speed_m_s: 0.0, yaw_rate_rad_s: 0.0 };
+            Motion { own: own[f].unwrap_or(still), objects: moving.collect() }
+        };
+        let motions: Vec<Motion> = (0..context.frames.len()).map(motion).collect();
+        let fastest = motions.iter().map(|m| m.own.speed_m_s.abs()).fold(0.0, f64::max);
+        (fastest > 1.0).then(|| Model::new(context, motions, fastest, STEP_S, true))
+    }
+
+    /// With the same displacement in all frames; objects are not displaced.
+    fn without_speed(context: &Context) -> Model {
+        let motion = |frame: &FramePair| Motion {
+            own: OwnMotion { speed_m_s: 1.0, yaw_rate_rad_s: 0.0 },
+            objects: frame.objects.iter().filter_map(|o| Some((o.simulated?, Vector3::zeros()))).collect(),
+        };
+        Model::new(context, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
+    }
+
+    fn new(context: &Context, motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model {
+        let origins = origins(context.rig);
+        let longest = step * f64::from(STEPS);
+        let of_frame = |(frame, motion)| TopView::new(frame, motion, context.rig, &origins, longest);
+        let frames = context.frames.par_iter().zip(&motions).map(of_frame).collect();
+        Model { motions, frames, fastest, step, speed_known }
+    }
+
+    /// Of every frame the numbers of points in occupied cells, for each duration.
+    fn counts(&self, frames: &[usize], durations: &[f64]) -> Vec<Vec<f64>> {
+        frames.par_iter().map(|&f| durations.iter().map(|&s| self.frames[f].on(s)).collect()).collect()
+    }
+
+    /// Number of points of some frames.
+    fn points(&self, frames: &[usize]) -> f64 {
+        frames.iter().map(|&f| self.frames[f].points.len() as f64).sum::<f64>()
+    }
+
+    /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the best and the worst share is
+    /// the gain of one more point.
+    fn held_out_gains(&self, grid: &Grid, fitted: &Fitted, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
+        let points = self.points(select);
+        let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
+        let [chance, there] = [grid.least, grid.most].map(share);
+        let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
+        let gain = |&f: &usize| {
+            let view = &self.frames[f];
+            (view.on(fitted.scan_s) - view.on(0.0)) * view.each * worth
+        };
+        hold_out.iter().map(gain).collect()
+    }
+
+    /// Counts on a grid of durations.
+    fn grid(&self, frames: &[usize]) -> Grid {
+        let grid: Vec<f64> = (-STEPS..=STEPS).map(|k| self.step * f64::from(k)).collect();
+        let on = self.counts(frames, &grid);
+        let sums: Vec<f64> = (0..grid.len()).map(|k| on.iter().map(|c| c[k]).sum()).collect();
+        let still = STEPS as usize;
+        let best = (0..grid.len()).max_by(|&a, &b| sums[a].total_cmp(&sums[b])).unwrap_or(still);
+        Grid {
+            best: grid[best],
+            gains: on.iter().map(|c| c[best] - c[still]).collect(),
+            least: sums.iter().copied().fold(f64::INFINITY, f64::min),
+            most: sums[best],
+        }
+    }
+}
+
+/// Counts on a grid of durations.
+struct Grid {
+    /// The duration with the most points in occupied cells.
+    best: f64,
+    /// Increase of that number on each frame over no displacement.
+    gains: Vec<f64>,
+    /// Smallest and largest number over all durations.
+    least: f64,
+    most: f64,
+}
+
+/// The duration with the most points in occupied cells: the mean of the durations whose counts are within 15 % of the best, in units of the
+/// difference between best and worst, weighted by what exceeds that.
+fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
+    let sums: Vec<f64> = (0..times.len()).map(|k| which.iter().map(|&i| counts[i][k]).sum()).collect();
+    let [low, high] = [sums.iter().copied().fold(f64::INFINITY, f64::min), sums.iter().copied().fold(0.0, f64::max)];
+    let weight = |s: f64| (s - (high - 0.15 * (high - low))).max(0.0);
+    let total: f64 = sums.iter().map(|s| weight(*s)).sum();
+    sums.iter().zip(times).map(|(s, t)| weight(*s) * t).sum::<f64>() / total.max(1e-9)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::inference::roles::roles;
+    use rand::RngExt;
+
+    /// A return of a static surface.
+    fn standing(at: &Vector3<f64>) -> Ray {
+        Ray {
+            sensor: 0,
+            surface: Surface::Standing,
+            smooth: true,
+            corner: false,
+            at_object: false,
+            matched: true,
+            company: 5,
+            in_gap: false,
+            row: 0,
+            object: u16::MAX,
+            azimuth_rad: at.y.atan2(at.x) as f32,
+            elevation_rad: 0.0,
+            range_m: at.norm() as f32,
+            cos_incidence: 1.0,
+            direction: at.normalize().cast::<f32>().into(),
+            normal: [1.0, 0.0, 0.0],
+            residual_m: 0.0,
+            bulge_m: 0.0,
+            leverage: 0.2,
+            roughness_m: 0.0,
+            roughness_leverage: 0.2,
+            near_far_m: [at.norm() as f32; 2],
+        }
+    }
+
+    /// Twenty frames of posts, seen at 40 m/s by a scan that takes `scan_s`, counter-clockwise.
+    fn found(scan_s: f64) -> Option<f64> {
+        let rig = Rig::single();
+        let velocity = Vector3::new(-40.0, 0.0, 0.0);
+        let frames: Vec<FramePair> = (0..20)
+            .map(|f| {
+                let mut rng = data::stream(f, "posts", 0, 0);
+                let mut place = || rng.random_range(-45.0..45.0f64);
+                let posts: Vec<Vector3<f64>> = (0..150).map(|_| Vector3::new(place(), place(), 0.0)).collect();
+                let shown = |p: &Vector3<f64>| p + velocity * (p.y.atan2(p.x) / std::f64::consts::TAU * scan_s);
+                FramePair {
+                    mixed_per_rad: 0.0,
+                    open: 0.0,
+                    id: f.to_string(),
+                    measured: posts.iter().map(|p| standing(&shown(p))).collect(),
+                    simulated: posts.iter().map(standing).collect(),
+                    objects: vec![],
+                }
+            })
+            .collect();
+        let own = OwnMotion { speed_m_s: 40.0, yaw_rate_rad_s: 0.0 };
+        let context = Context {
+            rig: &rig,
+            frames: &frames,
+            roles: roles(frames.len()),
+            times: Some((0..20).map(|f| 0.05 * f64::from(f)).collect()),
+            motion: Some(vec![Some(own); 20]),
+        };
+        let (result, slide) = match search(&context) {
+            Search::Found(result, slide) => (result, Some(slide)),
+            Search::NotFound(result) | Search::Undecided { not_found: result, .. } => (result, None),
+        };
+        assert_eq!(result.found.len(), usize::from(slide.is_some()));
+        let p = Vector3::new(0.0, 20.0, 0.0);
+        if let Some(slide) = slide {
+            let shift = slide.shift_m(3, &p, 0);
+            assert!((shift - velocity * (0.25 * slide.scan_s)).norm() < 1e-9, "{shift}");
+        }
+        let scan_s = &result.found.first()?.parameters[0].1;
+        assert!(scan_s.ci95[0] < scan_s.estimate && scan_s.estimate < scan_s.ci95[1]);
+        Some(-scan_s.estimate)
+    }
+
+    #[test]
+    fn the_duration_of_a_scan_is_found_and_none_where_it_is_zero() {
+        for truth in [-0.08, 0.05] {
+            let estimate = found(truth).unwrap();
+            assert!((estimate - truth).abs() < 0.003, "{estimate} {truth}");
+        }
+        assert_eq!(found(0.0), None);
+    }
+}
