@@ -156,8 +156,8 @@ fn sizes_that_the_file_does_not_have() {
         &with(4, 0, &[i32::MAX, i32::MAX, i32::MAX], &[1, i32::MAX, i32::MAX], 4),
         "does not fit its storage",
     );
-    assert_refused(&with(4, 0, &[4], &[1, 1], 4), "not of the form");
-    assert_refused(&with(4, 0, &[-1], &[1], 4), "not of the form");
+    assert_refused(&with(4, 0, &[4], &[1, 1], 4), "not as torch writes it");
+    assert_refused(&with(4, 0, &[-1], &[1], 4), "not as torch writes it");
 }
 
 #[test]
