@@ -1,4 +1,4 @@
-//! C1: shots that do not go quite where they should.
+//! C1: random direction errors of single shots.
 
 use super::local_plane::measure_along;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -11,17 +11,17 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every shot is turned by `azimuth_std_deg * N(0, 1)` and `elevation_std_deg * N(0, 1)`, but shown where it should have gone. A ray is cast
-/// along the true direction, so that points stay on what was hit in range, as in a sensor; on a finished cloud the plane around the point
-/// takes the place of the world.
+/// The true direction of every shot differs from the nominal one by `azimuth_std_deg * N(0, 1)` in azimuth and
+/// `elevation_std_deg * N(0, 1)` in elevation. The range is measured in the true direction and reported in the nominal
+/// one. On a finished cloud the range in the true direction is that of the plane through the neighbouring points.
 ///
 /// Typical: 0.01 to 0.03 degrees (Ouster OS1 +-0.01, NVIDIA Isaac 0.025, Robotec's GPU LiDAR 1 mrad).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AngularJitter {
-    /// Degrees.
+    /// Standard deviation of the azimuth error, degrees.
     pub azimuth_std_deg: f64,
-    /// Degrees.
+    /// Standard deviation of the elevation error, degrees.
     pub elevation_std_deg: f64,
 }
 
@@ -72,7 +72,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shots_are_turned_by_that_much() {
+    fn direction_errors_have_the_configured_deviation() {
         let effect = AngularJitter { azimuth_std_deg: 0.05, elevation_std_deg: 0.02 };
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
@@ -97,7 +97,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_cloud_it_follows_the_surface() {
+    fn ranges_of_a_finished_cloud_follow_the_local_plane() {
         let effect = AngularJitter { azimuth_std_deg: 0.0, elevation_std_deg: 0.02 };
         let before = scene();
         let mut after = before.clone();
