@@ -79,7 +79,7 @@ mod tests {
         let sensor = &beams.sensors[0];
         let angle = |d: &[f32; 3]| (f64::from(d[1].atan2(d[0])).to_degrees(), f64::from(d[2].asin()).to_degrees());
         let off: Vec<(f64, f64)> = sensor
-            .believed
+            .nominal_directions
             .iter()
             .zip(&sensor.true_directions)
             .map(|(a, b)| {
@@ -93,7 +93,7 @@ mod tests {
             mean.abs() < 3e-3 && (azimuth - 0.05).abs() < 3e-3 && (elevation - 0.02).abs() < 2e-3,
             "{azimuth} {elevation}"
         );
-        assert_ne!(&sensor.believed[..], &sensor.true_directions[..]);
+        assert_ne!(&sensor.nominal_directions[..], &sensor.true_directions[..]);
     }
 
     #[test]
@@ -102,7 +102,7 @@ mod tests {
         let before = scene();
         let mut after = before.clone();
         with_frame(0, |frame, draws| effect.on_cloud(&mut after, frame, draws));
-        // On the ground an angle e makes R * tan(incidence) * e; head-on next to nothing.
+        // An angular error e changes the range by R * tan(incidence) * e: almost nothing at normal incidence.
         let off = |object: u16, size: &dyn Fn(&crate::scan::Echo) -> f64| {
             let both = before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && a.object == object);
             both.map(|(a, b)| f64::from(b.range_m - a.range_m) / size(a)).collect::<Vec<_>>()

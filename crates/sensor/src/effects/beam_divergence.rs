@@ -62,7 +62,7 @@ mod tests {
     use super::super::testing::*;
     use super::*;
 
-    // What wide beams do to a post before a wall is tested with the scene.
+    // Mixed ranges at a post in front of a wall are tested with the scene.
     #[test]
     fn beams_get_their_width() {
         let mut beams = Beams::of(&rig());

@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 
 /// The true attitude of the ego vehicle differs from the reported one by roll `roll_deg + roll_std_deg * N(0, 1)` and
 /// pitch `pitch_deg + pitch_at_70mps_deg * (v / 70)^2 + pitch_std_deg * N(0, 1)`, v the ego speed, m/s. Positive pitch
-/// turns the nose down. The true height differs by `heave_std_m * N(0, 1)`. Values are drawn anew in every frame. The
-/// cloud is shifted as a whole against labels and world.
+/// turns the nose down. The true height differs by `heave_std_m * N(0, 1)`. Values are drawn anew in every frame.
+/// Points are computed with the reported pose, so the whole cloud is rotated and shifted relative to labels and world.
 ///
 /// Typical: 0.1 to 0.3 degrees of pitch from braking, aerodynamic load (with the square of the speed) and bumps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -77,7 +77,7 @@ mod tests {
         let droplets: Vec<f64> = after.echoes.iter().filter(|e| e.range_m != 60.0).map(|e| e.range_m.into()).collect();
         let share = droplets.len() as f64 / 40_000.0;
         assert!((share - 0.2 * (1.0 - (-120.0 * alpha).exp())).abs() < 0.01, "{share}");
-        // Exponential from 1 m on, with mean 1 / (2 alpha) behind it.
+        // Exponential from 1 m on: the mean is 1 / (2 alpha) beyond that.
         let (mean, _) = moments(&droplets);
         assert!((mean - 1.0 - 0.5 / alpha).abs() < 0.3, "{mean}");
         let mut sky = before;

@@ -49,7 +49,7 @@ impl SensorEffect for GroundError {
 mod tests {
     use super::*;
 
-    // That the mesh then has these waves is tested with the track.
+    // The undulation of the mesh is tested with the track.
     #[test]
     fn the_world_plan_gets_the_undulation() {
         let mut world = WorldPlan::default();

@@ -60,7 +60,7 @@ mod tests {
     #[test]
     fn the_deviation_follows_the_signal() {
         let effect = RangeNoiseBySignal { std_m: 0.02, exponent: 0.5, signal: 0.0, most_m: 0.1 };
-        // A hundredth of the light is ten times the noise at exponent 0.5; then comes the limit.
+        // At exponent 0.5, a hundredth of the light gives ten times the noise, up to the limit.
         for (range_m, reflectivity, want) in
             [(250.0, 0.1, 0.02), (25.0, 0.1, 0.002), (250.0, 0.01, 0.0632), (250.0, 1e-4, 0.1)]
         {

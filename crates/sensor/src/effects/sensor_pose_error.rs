@@ -78,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_true_mount_moves_and_the_believed_one_stays() {
+    fn the_true_mount_moves_and_the_nominal_one_stays() {
         let effect = SensorPoseError {
             translation_m: [0.1, 0.0, 0.0],
             rotation_deg: [0.0, 0.0, 1.0],
@@ -87,7 +87,7 @@ mod tests {
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let sensor = &beams.sensors[0];
-        assert!((sensor.true_mount.translation.x - 0.1).abs() < 1e-12 && sensor.believed_mount.translation.x == 0.0);
+        assert!((sensor.true_mount.translation.x - 0.1).abs() < 1e-12 && sensor.nominal_mount.translation.x == 0.0);
         assert!((geometry::yaw_rad(&sensor.true_mount).to_degrees() - 1.0).abs() < 1e-9);
     }
 
