@@ -93,7 +93,9 @@ mod tests {
         let beams = turned_in(0);
         assert_eq!(beams.sensors[0].true_directions, turned_in(5).sensors[0].true_directions);
         let sensor = &beams.sensors[0];
-        let up = |i: usize| f64::from(sensor.true_directions[i][2].asin() - sensor.nominal_directions[i][2].asin()).to_degrees();
+        let up = |i: usize| {
+            f64::from(sensor.true_directions[i][2].asin() - sensor.nominal_directions[i][2].asin()).to_degrees()
+        };
         let rows: Vec<f64> = (0..GRID.0).map(|r| up(r * GRID.1 + 100)).collect();
         for r in 0..GRID.0 {
             assert!((up(r * GRID.1 + 300) - rows[r]).abs() < 1e-3);

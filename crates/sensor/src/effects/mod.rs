@@ -183,7 +183,10 @@ impl EffectList {
             matches!(e, Effect::DualReturns(_))
                 && !self.effects[..i].iter().any(|e| matches!(e, Effect::BeamDivergence(_)))
         }) {
-            return Err(wrong("effect", "dual_returns needs a beam_divergence before it: without divergence a shot has one return"));
+            return Err(wrong(
+                "effect",
+                "dual_returns needs a beam_divergence before it: without divergence a shot has one return",
+            ));
         }
         Ok(())
     }

@@ -48,7 +48,9 @@ impl SensorEffect for Spray {
         let mut random = draws.of_frame();
         for echo in &mut scan.echoes {
             for plume in &plumes {
-                let Some([near, far]) = path_through(plume, echo.origin, echo.direction, echo.range_m) else { continue };
+                let Some([near, far]) = path_through(plume, echo.origin, echo.direction, echo.range_m) else {
+                    continue;
+                };
                 let passed = (-density * (far - near)).exp();
                 let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
                 if chance < 1.0 - passed {

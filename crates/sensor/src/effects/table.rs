@@ -24,7 +24,10 @@ pub(super) fn check_table(at: Column, values: Column) -> Result<(), KeyError> {
         let (places, numbers) = (at.1.len(), values.1.len());
         return Err(wrong(
             values.0,
-            format!("{places} values of {} and {numbers} of {}: a table needs as many of each, at least 1", at.0, values.0),
+            format!(
+                "{places} values of {} and {numbers} of {}: a table needs as many of each, at least 1",
+                at.0, values.0
+            ),
         ));
     }
     for (name, numbers, [low, high]) in [values, at] {

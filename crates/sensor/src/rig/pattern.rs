@@ -136,7 +136,8 @@ impl Pattern {
         }
         within("columns", self.columns.into(), 1.0, 65_535.0)?;
         let shots = f64::from(self.columns) * self.blocks.iter().map(|b| f64::from(b.rows)).sum::<f64>();
-        within("columns", shots, 1.0, 16e6).map_err(|_| wrong("columns", format!("{shots} shots per scan, more than 16 million")))
+        within("columns", shots, 1.0, 16e6)
+            .map_err(|_| wrong("columns", format!("{shots} shots per scan, more than 16 million")))
     }
 
     pub(super) fn load_shots(&mut self, folder: &Path, fov_deg: f64, rate_hz: f64) -> Result<(), DataError> {
@@ -206,7 +207,8 @@ fn read_shots(path: &Path) -> Result<Vec<Shot>, DataError> {
         let number = |e: &csv::Error| e.position().map_or(1, |p| p.line() as usize);
         let line: ShotLine = line.map_err(|e| DataError::line(path, number(&e), e.to_string()))?;
         let here = shots.len();
-        let bad = |what: &str, v: f64| DataError::file(path, format!("shot {here} (from 0): {what} = {v} is out of range"));
+        let bad =
+            |what: &str, v: f64| DataError::file(path, format!("shot {here} (from 0): {what} = {v} is out of range"));
         if !(-360.0..=360.0).contains(&line.azimuth_deg) {
             return Err(bad("azimuth_deg", line.azimuth_deg));
         }
