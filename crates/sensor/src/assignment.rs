@@ -1,16 +1,16 @@
-//! Which sensor of a rig a point of an unordered cloud belongs to.
+//! Assignment of the points of an unordered cloud to the sensors of a rig.
 
 use crate::rig::{Rig, Sensor};
 use geometry::Pose;
 use nalgebra::Point3;
 
-/// The sensors of a rig as seen from the cloud's frame, ready to be asked for many points.
+/// Assigns points to the sensors of a rig.
 ///
-/// A point belongs to the sensor in whose horizontal field of view it lies. Where several fields hold it, it belongs to
-/// the narrowest: a scan spreads its shots over its field, so that the narrower one has more returns a degree and a
-/// point is more probably its own. Where no field holds it, it belongs to the one whose edge is the fewest degrees
-/// away: points leave a field by motion or by a mount that is slightly off, and such angles do not grow with the width
-/// of the field. Among equal fields it is the one in which the point lies most centrally; of equals the first.
+/// A point is assigned to the sensor whose horizontal field of view contains it. If several contain it, it is assigned
+/// to the narrowest: a narrower field of view has more shots per degree, so the point is more probably from that
+/// sensor. If none contains it, it is assigned to the sensor whose edge is closest in degrees: points leave a field of
+/// view by motion or by a mount error, and such angles do not depend on the width of the field. Among fields of equal
+/// width it is assigned to the one in which it is most central; remaining ties go to the first sensor.
 #[derive(Clone, Debug)]
 pub struct Assignment {
     views: Vec<View>,
@@ -22,24 +22,23 @@ struct View {
     half_fov_rad: f64,
 }
 
-/// A point as its sensor sees it.
+/// A point in its sensor's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Assigned {
-    /// Number of the sensor in its rig.
+    /// Index of the sensor in its rig.
     pub sensor: usize,
-    /// Azimuth (counter-clockwise from the sensor's middle, rad), elevation (rad) and range (m) in the sensor's own
-    /// frame.
+    /// Azimuth (counter-clockwise from the sensor's x axis, rad), elevation (rad) and range (m) in the sensor's frame.
     pub spherical: [f64; 3],
 }
 
 impl Assignment {
-    /// For the sensors of a rig.
+    /// Assignment to the sensors of a rig.
     pub fn new(rig: &Rig) -> Assignment {
         let view = |s: &Sensor| View { sensor_from_cloud: s.pose().inverse(), half_fov_rad: s.half_fov_rad() };
         Assignment { views: rig.sensors.iter().map(view).collect() }
     }
 
-    /// The sensor of a point of the cloud's frame (m); `None` for a rig without sensors.
+    /// Sensor of a point in the cloud's frame (m); `None` for a rig without sensors.
     pub fn of_point(&self, point: Point3<f64>) -> Option<Assigned> {
         let mut best: Option<([f64; 3], Assigned)> = None;
         for (sensor, view) in self.views.iter().enumerate() {
@@ -69,7 +68,7 @@ mod tests {
         Point3::new(30.0 * c, 30.0 * s, 0.0)
     }
 
-    /// Azimuths off the middles and halves of the fields, rad.
+    /// Azimuth distance from the centre of each field of view, and half of its width, rad.
     fn off_and_half(rig: &Rig, point: Point3<f64>) -> Vec<(f64, f64)> {
         rig.sensors
             .iter()
@@ -77,13 +76,13 @@ mod tests {
             .collect()
     }
 
-    /// The place of the smallest number, of equals the first.
+    /// Index of the smallest value; the first of equal values.
     fn least(values: impl Iterator<Item = f64>) -> usize {
         values.enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap().0
     }
 
     #[test]
-    fn equal_fields_split_as_by_both_rules_that_there_were() {
+    fn for_equal_fields_the_nearest_centre_and_the_nearest_edge_agree() {
         let three = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/sensors/av21.toml"));
         for text in [three.unwrap(), "[[sensor]]\nname = \"one\"\n".to_owned()] {
             let rig = rig(&text);
@@ -101,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn unlike_fields_on_which_the_rules_disagreed() {
+    fn for_unequal_fields_the_narrower_or_nearer_one_wins() {
         let fields = |yaw_deg: f64| {
             rig(&format!(
                 "[[sensor]]\nname = \"wide\"\nhorizontal_fov_deg = 120\n\
@@ -112,18 +111,18 @@ mod tests {
         let by_margin = |rig: &Rig, p| least(off_and_half(rig, p).iter().map(|(off, half)| off - half));
         let of = |rig: &Rig, p| Assignment::new(rig).of_point(p).unwrap().sensor;
 
-        // In both fields, 1 degree off the middle of the narrow one: 12 times as many returns a degree are the narrow
-        // one's. The distance to the edge gave it to the wide one, as it did with every point that the narrow one sees.
+        // In both fields, 1 degree from the centre of the narrow one, which has 12 times as many shots per degree. The
+        // distance to the edge would assign every point in the narrow field to the wide one.
         let (both, point) = (fields(40.0), at(41.0));
         assert_eq!([by_share(&both, point), by_margin(&both, point), of(&both, point)], [1, 0, 1]);
-        // In the middle of both fields the share of the field gave it to the wide one as well.
+        // Near the centre of both fields, the distance relative to the width would assign it to the wide one as well.
         let (both, point) = (fields(0.0), at(1.0));
         assert_eq!([by_share(&both, point), by_margin(&both, point), of(&both, point)], [0, 0, 1]);
-        // In neither field, 6 degrees beyond the narrow one's edge, 15 beyond the wide one's: the share of the field
-        // gave it to the wide.
+        // In neither field, 6 degrees beyond the edge of the narrow one, 15 beyond that of the wide one: the distance
+        // relative to the width would assign it to the wide one.
         let (apart, point) = (fields(86.0), at(75.0));
         assert_eq!([by_share(&apart, point), by_margin(&apart, point), of(&apart, point)], [0, 1, 1]);
-        // In one field alone it is that one's, whatever the others are.
+        // In one field only: assigned to that sensor.
         assert_eq!([of(&apart, at(59.0)), of(&apart, at(90.5)), of(&both, at(5.5))], [0, 1, 0]);
     }
 }

@@ -1,4 +1,5 @@
-//! The shots of a scan before they are sent: where they really go, which need not be where the sensor believes.
+//! Directions and poses of the shots of a scan before ray casting. The true values can differ from those that the
+//! sensor reports.
 
 use crate::rig::{Rig, Shot};
 use geometry::Pose;
@@ -8,56 +9,56 @@ use std::sync::Arc;
 /// All shots of one scan.
 #[derive(Clone, Debug)]
 pub struct Beams {
-    /// A sensor each, in the order of the rig.
+    /// One entry per sensor, in the order of the rig.
     pub sensors: Vec<SensorBeams>,
-    /// How the car really stands, against how it is believed to stand: `believed_from_true` turned about the car's origin.
+    /// Attitude error of the ego vehicle: rotation `nominal_from_true` about the origin of the cloud's frame.
     pub ego_tilt: UnitQuaternion<f64>,
-    /// How much higher the car really is, m, along its own z.
+    /// Height of the ego vehicle above its reported pose, along its z axis, m.
     pub ego_heave_m: f64,
-    /// Shots are sent one after the other while everything moves; otherwise all at once.
+    /// Shots are sent one after the other while everything moves; `None`: all at the same time.
     pub shutter: Option<Shutter>,
-    /// Beams have a width; otherwise they are lines.
+    /// Divergence of the beams; `None`: each is a single ray.
     pub width: Option<BeamWidth>,
 }
 
 /// The shots of one sensor.
 #[derive(Clone, Debug)]
 pub struct SensorBeams {
-    /// `cloud_from_sensor` as the rig says.
-    pub believed_mount: Pose,
-    /// `cloud_from_sensor` as it is.
+    /// `cloud_from_sensor` of the rig.
+    pub nominal_mount: Pose,
+    /// True `cloud_from_sensor`.
     pub true_mount: Pose,
-    /// The pattern.
+    /// Shots of the pattern.
     pub shots: Arc<[Shot]>,
-    /// Columns of the pattern as a grid.
+    /// Number of columns of the pattern as a grid.
     pub columns: usize,
-    /// Directions of the pattern, sensor's frame, unit vectors.
-    pub believed: Arc<[[f32; 3]]>,
-    /// Directions in which the shots really go; the pattern's when empty.
+    /// Directions of the pattern, unit vectors in the sensor's frame.
+    pub nominal_directions: Arc<[[f32; 3]]>,
+    /// True directions, unit vectors in the sensor's frame; empty if they are those of the pattern.
     pub true_directions: Vec<[f32; 3]>,
-    /// Nearest and farthest measured range, m.
+    /// Minimum and maximum measured range, m.
     pub limits_m: [f32; 2],
 }
 
-/// How a scan that takes time is put together.
+/// Motion during a scan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shutter {
-    /// Points are moved to where they would be seen from at the middle of the scan, by the car's own motion.
+    /// Points are corrected for ego motion to the middle of the scan.
     pub deskewed: bool,
 }
 
-/// A beam as a bundle of rays.
+/// A divergent beam as a bundle of rays.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct BeamWidth {
-    /// Full angle within which the bundle lies, rad.
+    /// Full divergence angle, rad.
     pub divergence_rad: f32,
-    /// Rays of a bundle: 7 or 19.
+    /// Number of rays: 7 or 19.
     pub rays: usize,
-    /// Surfaces that are less than this apart along the beam make one return, m.
+    /// Range separation below which surfaces give one return, m.
     pub pulse_m: f32,
-    /// Which return counts.
+    /// Which of several returns is reported.
     pub pick: Pick,
-    /// Report a second return too.
+    /// Also report a second return.
     pub second: bool,
 }
 
@@ -65,7 +66,7 @@ pub struct BeamWidth {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Pick {
-    /// The one with the most light.
+    /// The one with the most returned light.
     #[default]
     Strongest,
     /// The nearest.
@@ -75,30 +76,30 @@ pub enum Pick {
 }
 
 impl SensorBeams {
-    /// The directions in which the shots really go, to be changed.
+    /// True directions of the shots, to be changed.
     pub fn true_directions_mut(&mut self) -> &mut Vec<[f32; 3]> {
         if self.true_directions.is_empty() {
-            self.true_directions = self.believed.to_vec();
+            self.true_directions = self.nominal_directions.to_vec();
         }
         &mut self.true_directions
     }
 
-    /// The directions in which the shots really go.
+    /// True directions of the shots.
     pub fn directions(&self) -> &[[f32; 3]] {
-        if self.true_directions.is_empty() { &self.believed } else { &self.true_directions }
+        if self.true_directions.is_empty() { &self.nominal_directions } else { &self.true_directions }
     }
 }
 
 impl Beams {
-    /// The shots of a rig as its patterns say; sensors without a pattern have none.
+    /// Nominal shots of a rig. Sensors without a pattern have none.
     pub fn of(rig: &Rig) -> Beams {
         let sensor = |sensor: &crate::Sensor| {
             let shots: Arc<[Shot]> = sensor.pattern.as_ref().map_or(&[][..], |p| p.shots()).into();
             SensorBeams {
-                believed_mount: sensor.pose(),
+                nominal_mount: sensor.pose(),
                 true_mount: sensor.pose(),
                 columns: sensor.pattern.as_ref().map_or(1, |p| p.grid_columns().max(1)),
-                believed: shots.iter().map(|s| s.direction().map(|v| v as f32)).collect(),
+                nominal_directions: shots.iter().map(|s| s.direction().map(|v| v as f32)).collect(),
                 shots,
                 true_directions: Vec::new(),
                 limits_m: [sensor.min_range_m as f32, sensor.max_range_m as f32],
@@ -113,13 +114,13 @@ impl Beams {
         }
     }
 
-    /// Number of shots.
+    /// Total number of shots.
     pub fn shots(&self) -> usize {
         self.sensors.iter().map(|s| s.shots.len()).sum()
     }
 }
 
-/// Turns a unit vector by small angles: to the left about the vertical, and up, rad.
+/// Rotates a unit vector by small angles, rad: `left_rad` about the vertical axis, `up_rad` upwards.
 pub fn turned(direction: [f32; 3], left_rad: f32, up_rad: f32) -> [f32; 3] {
     let [x, y, z] = direction;
     let flat = x.hypot(y).max(1e-6);

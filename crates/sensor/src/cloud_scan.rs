@@ -1,4 +1,4 @@
-//! A finished cloud as a scan: which sensor saw each point, where in its pattern, and under which angle of incidence.
+//! A finished cloud as a scan: sensor, place in the pattern and angle of incidence of each point.
 
 use crate::assignment::Assignment;
 use crate::effects::Need;
@@ -10,17 +10,18 @@ use geometry::Pose;
 use nalgebra::{Matrix3, Point3, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Side of the cells, seen from the sensor, in which a point looks for its neighbours, rad.
+/// Side of the angular cells in which neighbours of a point are searched, seen from the sensor, rad.
 const CELL_RAD: f32 = 0.01;
-/// Neighbours are at most this part of the range away.
-const NEIGHBOUR_REACH: f32 = 0.03;
-/// A plane through fewer points says nothing.
-const FEWEST: usize = 5;
+/// Maximum distance of neighbours relative to the range.
+const MAX_NEIGHBOUR_DISTANCE: f32 = 0.03;
+/// Minimum number of points of a plane fit.
+const MIN_PLANE_POINTS: usize = 5;
 
-/// The cloud as a scan, and what is known of it.
+/// The cloud as a scan, and the quantities known of it.
 ///
-/// [`Assignment`] says which sensor a point belongs to. Rows and columns are the nearest of the sensor's pattern, where it has one.
-/// Incidence comes from the plane through the neighbours of a point, seen from the sensor. Reflectivity is [`CLOUD_REFLECTIVITY`] everywhere; intensities, where there are, scale it.
+/// Points are assigned to sensors by [`Assignment`]. Row and column are the nearest ones of the sensor's pattern, if it
+/// has one. The angle of incidence is that of the plane through the neighbouring points of the same sensor.
+/// Reflectivity is the intensity over the cosine of incidence, or [`CLOUD_REFLECTIVITY`] in clouds without intensity.
 pub fn scan_of_cloud(cloud: &Cloud, rig: &Rig) -> (Scan, BTreeSet<Need>) {
     let assignment = Assignment::new(rig);
     let poses: Vec<Pose> = rig.sensors.iter().map(Sensor::pose).collect();
@@ -67,7 +68,7 @@ fn place_in_pattern(echo: &mut Echo, sensor: &Sensor, pose: &Pose) {
     echo.time_s = pattern.shots()[row * pattern.grid_columns() + column].time_s as f32;
 }
 
-/// Normals from the plane through the points around each one, in cells seen from its sensor.
+/// Sets normals and cosines of incidence from the plane through the neighbours of each point.
 fn estimate_normals(scan: &mut Scan) {
     let cell = |echo: &Echo| {
         let [x, y, z] = echo.direction;
@@ -83,7 +84,7 @@ fn estimate_normals(scan: &mut Scan) {
         .map(|echo| {
             let (column, row) = cell(echo);
             let here = Vector3::from(echo.point());
-            let reach = NEIGHBOUR_REACH * echo.range_m;
+            let reach = MAX_NEIGHBOUR_DISTANCE * echo.range_m;
             let mut near = Vec::new();
             for (c, r) in (column - 1..=column + 1).flat_map(|c| (row - 1..=row + 1).map(move |r| (c, r))) {
                 let found = cells.get(&(echo.sensor, (c, r))).into_iter().flatten();
@@ -101,9 +102,9 @@ fn estimate_normals(scan: &mut Scan) {
     }
 }
 
-/// The normal of the plane through these points; `None` where they lie on a line or spread in all directions.
+/// Unit normal of the plane through these points; `None` if they are collinear or not planar.
 fn plane(points: &[Vector3<f32>]) -> Option<[f32; 3]> {
-    if points.len() < FEWEST {
+    if points.len() < MIN_PLANE_POINTS {
         return None;
     }
     let mean = points.iter().sum::<Vector3<f32>>() / points.len() as f32;
@@ -139,7 +140,7 @@ mod tests {
     }
 
     #[test]
-    fn points_belong_to_the_sensor_that_looks_at_them() {
+    fn points_belong_to_the_sensor_whose_field_contains_them() {
         let text = "[[sensor]]\nname = \"front\"\nhorizontal_fov_deg = 120\n[[sensor]]\nname = \"left\"\nyaw_deg = 120\nhorizontal_fov_deg = 120\n\
                     [[sensor]]\nname = \"right\"\nyaw_deg = -120\nhorizontal_fov_deg = 120\n";
         let rig = Rig::parse(text, Path::new("r.toml")).unwrap();

@@ -1,9 +1,7 @@
-//! LiDAR sensors, whoever made the data: where they are mounted and what they see ([`rig`]), what came back of a scan
-//! ([`scan`]), which sensor a point belongs to ([`assignment`]), how strong a return is ([`signal`]), and the sensor
-//! model as a list of [`effects`].
+//! LiDAR sensors, independent of any simulator: sensor rigs ([`rig`]), the echoes of a scan ([`scan`]), assignment of
+//! points to sensors ([`assignment`]), the signal index ([`signal`]), and the sensor model as a list of [`effects`].
 //!
-//! Nothing here casts a ray. An effect that has to ask what another ray would meet asks a [`RayCaster`], which a
-//! simulator provides.
+//! This crate casts no rays. Effects that need additional rays use a [`RayCaster`], which a simulator provides.
 
 pub mod assignment;
 pub mod attributes;

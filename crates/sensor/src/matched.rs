@@ -1,5 +1,5 @@
-//! The paper's downsampling by distribution: range-dependent dropout that matches the range distribution of another
-//! data set.
+//! Range-dependent dropout that matches the range distribution of another data set: the "distribution-matched"
+//! downsampling of Huch et al. 2023.
 
 use crate::effects::RangeDropout;
 use data::{Cloud, DataError, Dataset};
@@ -44,8 +44,8 @@ impl RangeHistogram {
     }
 }
 
-/// The dropout by range that reduces `simulated` to the point counts of `measured`; 0 where `measured` has more. Both
-/// histograms are over the same frames.
+/// The range dropout that reduces `simulated` to the point counts of `measured`; 0 in bins where `measured` has more
+/// points. Both histograms must be over the same frames.
 pub fn fit_range_dropout(measured: &RangeHistogram, simulated: &RangeHistogram) -> RangeDropout {
     let share = |i: usize| {
         let (m, s) = (measured.counts.get(i).copied().unwrap_or(0) as f64, simulated.counts[i] as f64);
@@ -74,7 +74,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loss_makes_the_ranges_alike() {
+    fn the_dropout_matches_the_range_distribution() {
         let (simulated, measured) = clouds();
         let histogram = |scan: &Scan| {
             let mut histogram = RangeHistogram::default();

@@ -35,7 +35,7 @@ fn one() -> f64 {
 }
 
 impl Material {
-    /// Fraction of the light returned at this cosine of incidence.
+    /// Returned light at this cosine of incidence, relative to a white Lambertian plate at normal incidence.
     pub fn returned(&self, cos_incidence: f64) -> f64 {
         let c = cos_incidence.clamp(0.0, 1.0);
         self.reflectivity * ((1.0 - self.lobe) * c + self.lobe * c.powf(self.exponent))
@@ -91,7 +91,7 @@ impl Default for MaterialTable {
 }
 
 impl MaterialTable {
-    /// The built-in materials with changes and additions.
+    /// The built-in materials with changes and additions. Errors name the key.
     pub fn with(changes: &BTreeMap<String, Material>) -> Result<Self, KeyError> {
         let mut table = MaterialTable::default();
         for (name, material) in changes {
@@ -108,7 +108,7 @@ impl MaterialTable {
         Ok(table)
     }
 
-    /// A table of these names in this order, as in a data set's attributes. Names that are not built in get the
+    /// A table of these names in this order, as in a data set's attributes. Names without a built-in material get the
     /// reflectance of "unknown".
     pub fn named(names: &[String]) -> Self {
         let built_in = MaterialTable::default();

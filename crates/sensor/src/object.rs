@@ -1,18 +1,18 @@
-//! What a point may belong to: the numbers in the column `object` of attributes.
+//! Objects that points belong to: the values of the column `object` in attributes.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What a triangle of the static world belongs to; its number stands in the column `object` of attributes.
+/// Group of static objects that a triangle or point belongs to. Its number is the value of `object` in attributes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 #[repr(u16)]
 pub enum Group {
     /// The racing surface.
     Surface = 1,
-    /// The flatter strip inside of it.
+    /// The flatter strip along the inner edge of the surface.
     Apron = 2,
-    /// Ground inside of the track.
+    /// Ground inside the track.
     Infield = 3,
     /// The wall along the outer edge.
     OuterWall = 4,
@@ -22,11 +22,11 @@ pub enum Group {
     PitWall = 6,
     /// Rows of seats along the front stretch.
     Grandstand = 7,
-    /// Buildings, vehicles and poles inside of the track.
+    /// Buildings, vehicles and poles inside the track.
     InfieldObjects = 8,
-    /// Ground outside of the wall.
+    /// Ground outside the wall.
     OutsideGround = 9,
-    /// Buildings, vehicles and poles outside of the wall.
+    /// Buildings, vehicles and poles outside the wall.
     OutsideObjects = 10,
 }
 
@@ -46,5 +46,5 @@ impl Group {
     ];
 }
 
-/// Numbers of cars in the column `object` of attributes begin here; the car whose cloud it is has none.
+/// First number of cars in the column `object` of attributes. The ego vehicle has no number.
 pub const FIRST_CAR: u16 = 100;

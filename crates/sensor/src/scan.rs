@@ -1,51 +1,51 @@
-//! What comes back of one scan: a list of echoes, one a shot, that the sensor model works on.
+//! Echoes of one scan, which the sensor model changes: one per shot.
 
 use crate::material::MaterialId;
 use crate::object::FIRST_CAR;
 use crate::signal::returned_light_index;
 use data::Cloud;
 
-/// One shot and what came back of it. Positions and directions are what the sensor believes, in the cloud's frame; the true ray may
-/// have been another.
+/// One shot and its return. Origin and direction are those that the sensor reports, in the cloud's frame; the true ray
+/// can differ.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Echo {
-    /// Number of the sensor in its rig.
+    /// Index of the sensor in its rig.
     pub sensor: u8,
-    /// 0: the first return of its shot; 1: the second.
+    /// 0: first return of the shot; 1: second.
     pub number: u8,
-    /// Row of the sensor's pattern; [`Echo::UNKNOWN`] where it has none.
+    /// Row of the sensor's pattern; [`Echo::UNKNOWN`] if it is not known.
     pub row: u16,
-    /// Column of the sensor's pattern; [`Echo::UNKNOWN`] where it has none.
+    /// Column of the sensor's pattern; [`Echo::UNKNOWN`] if it is not known.
     pub column: u16,
-    /// Time of the shot from the middle of the scan, s.
+    /// Time of the shot relative to the middle of the scan, s.
     pub time_s: f32,
-    /// Where the shot starts, m.
+    /// Origin of the shot, m.
     pub origin: [f32; 3],
-    /// Where it goes, unit vector.
+    /// Direction of the shot, unit vector.
     pub direction: [f32; 3],
-    /// Measured distance, m; infinite when nothing came back.
+    /// Measured range, m; infinite if there is no return.
     pub range_m: f32,
-    /// Normal of the surface that was hit, towards the sensor; 0 where nothing is known of it.
+    /// Unit normal of the surface towards the sensor; 0 if it is not known.
     pub normal: [f32; 3],
     /// Cosine of the angle of incidence.
     pub cos_incidence: f32,
-    /// Reflectivity of the material, head-on, against a white plate.
+    /// Reflectivity of the material at normal incidence, relative to a white Lambertian plate.
     pub reflectivity: f32,
-    /// Part of the light that came back: reflectivity times the material's law of incidence, times what the way took of it.
+    /// Returned light: reflectivity times the material's incidence term times the transmission of the path.
     pub returned: f32,
-    /// Material that was hit; meaningful where there is a return.
+    /// Material of the surface; meaningful if there is a return.
     pub material: MaterialId,
-    /// What was hit: a group of the track, or a car; 0 where nothing is known of it.
+    /// Track group or car that was hit; 0 if it is not known.
     pub object: u16,
-    /// What the sensor reports, 0 to 1.
+    /// Reported intensity, 0 to 1.
     pub intensity: f32,
 }
 
 impl Echo {
-    /// Row or column of a shot of which nothing is known.
+    /// Row or column if it is not known.
     pub const UNKNOWN: u16 = u16::MAX;
 
-    /// A shot of which nothing came back.
+    /// A shot without a return.
     pub fn nothing(origin: [f32; 3], direction: [f32; 3]) -> Echo {
         Echo {
             sensor: 0,
@@ -66,37 +66,37 @@ impl Echo {
         }
     }
 
-    /// Whether anything came back.
+    /// Whether there is a return.
     pub fn is_return(&self) -> bool {
         self.range_m < f32::INFINITY
     }
 
-    /// Number of the car that was hit.
+    /// Number of the car that was hit, if any.
     pub fn car(&self) -> Option<usize> {
         self.object.checked_sub(FIRST_CAR).map(usize::from)
     }
 
-    /// Nothing comes back of it any more.
+    /// Removes the return.
     pub fn lose(&mut self) {
         self.range_m = f32::INFINITY;
     }
 
-    /// The measured point, cloud's frame, m.
+    /// Measured point, cloud's frame, m.
     pub fn point(&self) -> [f32; 3] {
         std::array::from_fn(|k| self.origin[k] + self.range_m * self.direction[k])
     }
 
-    /// Index of the signal, the logarithm of the light that comes back: `ln(returned / R^2) - ln(0.1 / 250^2)`.
+    /// Signal index `ln(returned / R^2) - ln(0.1 / 250^2)`, see [`crate::signal`].
     pub fn signal(&self) -> f32 {
         returned_light_index(self.returned, self.range_m)
     }
 
-    /// Moves the measured point; the shot then points at it.
+    /// Moves the measured point; range and direction change with it.
     pub fn move_point(&mut self, point: [f32; 3]) {
-        let way: [f32; 3] = std::array::from_fn(|k| point[k] - self.origin[k]);
-        let range_m = dot(way, way).sqrt();
+        let offset: [f32; 3] = std::array::from_fn(|k| point[k] - self.origin[k]);
+        let range_m = dot(offset, offset).sqrt();
         if range_m > 0.0 {
-            self.direction = way.map(|v| v / range_m);
+            self.direction = offset.map(|v| v / range_m);
             self.range_m = range_m;
         }
     }
@@ -107,25 +107,25 @@ pub fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// All shots of a scan, sensor after sensor.
+/// All shots of a scan, grouped by sensor.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Scan {
-    /// One a shot, in the order of the patterns; second returns behind all of them.
+    /// One echo per shot, in the order of the patterns; second returns after all of them.
     pub echoes: Vec<Echo>,
 }
 
 impl Scan {
-    /// The echoes that came back.
+    /// Echoes with a return.
     pub fn returns(&self) -> impl Iterator<Item = &Echo> {
         self.echoes.iter().filter(|e| e.is_return())
     }
 
-    /// The echoes that came back, to be changed.
+    /// Echoes with a return, to be changed.
     pub fn returns_mut(&mut self) -> impl Iterator<Item = &mut Echo> {
         self.echoes.iter_mut().filter(|e| e.is_return())
     }
 
-    /// Leaves out returns outside of the square of +-`half_m` around the origin, seen from above, and all shots without a return.
+    /// Removes shots without a return and returns outside of the square |x|, |y| <= `half_m`.
     pub fn crop(&mut self, half_m: f32) {
         self.echoes.retain(|echo| {
             let [x, y, _] = echo.point();
@@ -133,7 +133,7 @@ impl Scan {
         });
     }
 
-    /// The returns as points x, y, z, intensity.
+    /// The returns as a cloud with x, y, z, intensity.
     pub fn cloud(&self) -> Cloud {
         let mut cloud = Cloud::new(4);
         cloud.values.reserve(self.echoes.len() * 4);

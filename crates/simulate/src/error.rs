@@ -1,17 +1,17 @@
-//! Why nothing could be simulated.
+//! Errors of the simulator.
 
 use data::{DataError, KeyError};
 
-/// Why a data set could not be made.
+/// Error that prevents a data set from being generated.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulateError {
-    /// A file could not be read or written, or says something that cannot be.
+    /// A file could not be read or written, or its content is invalid.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// The file system refused; the message names the path.
+    /// Input or output error; the message names the path.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// A value cannot be.
+    /// A value is invalid; the message names the key.
     #[error(transparent)]
     Config(#[from] KeyError),
 }

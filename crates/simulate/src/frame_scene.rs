@@ -81,14 +81,14 @@ impl<'a> FrameScene<'a> {
 
     /// The shots of a sensor with their nominal directions, without returns.
     fn nominal_shots(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
-        let mount = &sensor.believed_mount;
+        let mount = &sensor.nominal_mount;
         let rotation: Matrix3<f32> = mount.rotation.to_rotation_matrix().matrix().map(|v| v as f32);
         let origin: Vector3<f32> = mount.translation.vector.map(|v| v as f32);
         let cloud_from_world = self.ego.pose.rotation.inverse();
         let velocity: Vector3<f32> = (cloud_from_world * self.ego.velocity).map(|v| v as f32);
         let turn_rate: Vector3<f32> = (cloud_from_world * self.ego.turn_rate).map(|v| v as f32);
         let deskewed = beams.shutter.is_some_and(|shutter| shutter.deskewed);
-        for (shot, direction) in sensor.shots.iter().zip(sensor.believed.iter()) {
+        for (shot, direction) in sensor.shots.iter().zip(sensor.nominal_directions.iter()) {
             let (mut origin, mut direction) = (origin, rotation * Vector3::from(*direction));
             if deskewed {
                 let t = shot.time_s as f32;

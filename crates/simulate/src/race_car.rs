@@ -125,7 +125,7 @@ mod tests {
     use sensor::car::car_box;
 
     #[test]
-    fn it_fills_its_box() {
+    fn the_mesh_fills_the_box_of_the_car() {
         let car = race_car();
         let [low, high] = car.bounds().unwrap();
         let bbox = car_box();

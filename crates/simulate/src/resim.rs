@@ -186,7 +186,8 @@ impl Resim<'_> {
                     "changes what rays meet, which a finished cloud does not tell: use it with `simulate`".to_owned()
                 }
                 Some(needs) => {
-                    let missing: Vec<&str> = needs.iter().filter(|n| !known.contains(n)).map(|n| n.words()).collect();
+                    let missing: Vec<&str> =
+                        needs.iter().filter(|n| !known.contains(n)).map(|n| n.description()).collect();
                     if missing.is_empty() {
                         continue;
                     }

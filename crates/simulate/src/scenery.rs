@@ -1,28 +1,29 @@
-//! A configuration of `simulate` by its name or its file, whatever it describes.
+//! A configuration of `simulate`, found by name or by file.
 
 use crate::race::{ConfigFiles, RaceConfig};
 use crate::{FrameCounts, RoadConfig, SimulateError};
 use data::toml_text::wrong;
 use std::path::Path;
 
-/// What a configuration describes.
+/// Configuration of a data set to simulate.
 pub enum Scenery {
-    /// Streets.
+    /// A street.
     Street(RoadConfig),
-    /// A race, and the files that it names.
+    /// A race and the files that its configuration names.
     Race(Box<(RaceConfig, ConfigFiles)>),
 }
 
 impl Scenery {
-    /// The configuration of a name (`race`, `race_small`, `street`, ...) or a TOML; `frames` and `seed` replace its own.
+    /// The configuration with a built-in name (`race`, `race_small`, `street`, ...) or in a TOML file. `frames` and
+    /// `seed` replace its values.
     ///
     /// # Errors
-    /// Neither a name nor a file, a file that is wrong, or a number of frames that it cannot have.
+    /// There is no configuration of this name, the file is invalid, or the number of frames is not possible.
     pub fn find(name_or_path: &str, frames: Option<usize>, seed: Option<u64>) -> Result<Self, SimulateError> {
         let path = Path::new(name_or_path);
         let is_street = if path.is_file() {
             let text = fs_err::read_to_string(path)?;
-            // A race names its sensors; a file that is no TOML at all is refused by line where it is read.
+            // A race names its sensors. Invalid TOML is treated as a race; its reader reports the line of the error.
             text.parse::<toml::Table>().is_ok_and(|table| !table.contains_key("rig"))
         } else {
             name_or_path == "street"
@@ -53,7 +54,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_win_over_the_configuration() {
+    fn arguments_replace_values_of_the_configuration() {
         let Scenery::Street(config) = Scenery::find("street", Some(36), Some(9)).unwrap() else { panic!("a street") };
         assert_eq!((config.frames.total(), config.seed), (36, 9));
         assert!(Scenery::find("street", Some(2), None).is_err());
@@ -65,7 +66,7 @@ mod tests {
     }
 
     #[test]
-    fn files_are_told_apart_by_their_sensors() {
+    fn files_with_a_rig_are_races_and_others_streets() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.toml");
         std::fs::write(&path, "[frames]\ntrain = 5\n").unwrap();

@@ -1,4 +1,4 @@
-//! Ghost points need a scene in which rays are cast again.
+//! Ghost returns in a scene in which additional rays can be cast.
 
 use lidarshift_simulate::frame_scene::FrameScene;
 use lidarshift_simulate::mesh::{Mesh, cuboid};
@@ -11,7 +11,7 @@ use sensor::material::MaterialTable;
 use sensor::scan::{Echo, Scan};
 
 #[test]
-fn points_lie_behind_the_mirror_as_far_as_what_it_shows() {
+fn the_range_of_a_ghost_includes_the_path_after_the_reflection() {
     // A metal wall ahead at 10 m, a concrete one behind at -5 m.
     let [metal, concrete] = ["metal", "concrete"].map(MaterialTable::built_in);
     let mut mesh = cuboid([10.0, -50.0, -50.0], [11.0, 50.0, 50.0], metal).of_object(4);

@@ -207,7 +207,7 @@ impl SensorPair<'_> {
                 a.range_m[i] = (a.range_m[i] - off).max(0.05);
             }
         }
-        let closes = self.sensors.rig.sensors[self.sensor].closes();
+        let closes = self.sensors.rig.sensors[self.sensor].is_full_circle();
         let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
         self.complete_measured(&mut measured, a, &own, &predictor);
         simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));

@@ -134,7 +134,7 @@ fn distance(
     for (k, (a, b)) in a.scans.iter().zip(&b.scans).enumerate() {
         let steps = sensors.patterns[k].steps;
         let window = Steps { azimuth_rad: 2.2 * steps.azimuth_rad, elevation_rad: 1.4 * steps.elevation_rad };
-        let index = DirectionIndex::new(b, window, sensors.rig.sensors[k].closes());
+        let index = DirectionIndex::new(b, window, sensors.rig.sensors[k].is_full_circle());
         let size = [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)];
         for i in (0..a.len()).step_by(stride) {
             let Some(s) = fit_surface(&index, size, a.azimuth_rad[i], a.elevation_rad[i], |_| true) else { continue };

@@ -37,7 +37,7 @@ impl<'a> Predictor<'a> {
             sensors,
             others: others(boxes, mount.pose().translation.vector.into()),
             cloud_from_sensor: mount.pose(),
-            index: DirectionIndex::new(simulated, window, mount.closes()),
+            index: DirectionIndex::new(simulated, window, mount.is_full_circle()),
             window: [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)],
             boxes,
         }

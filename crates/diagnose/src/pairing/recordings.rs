@@ -87,7 +87,7 @@ impl<'a> Recordings<'a> {
     pub fn matched(&self, frame: usize, sensors: &Sensors) -> Result<&[Matched], DiagnoseError> {
         let [measured, simulated] = [self.side(frame, PairSide::Measured)?, self.side(frame, PairSide::Simulated)?];
         let of_sensor = |k: usize| {
-            let closes = sensors.rig.sensors[k].closes();
+            let closes = sensors.rig.sensors[k].is_full_circle();
             match_directions(&measured.scans[k], &simulated.scans[k], &sensors.patterns[k], closes)
         };
         let all = || (0..sensors.rig.sensors.len()).map(of_sensor).collect();

@@ -1,4 +1,4 @@
-//! C1: shots that do not go quite where they should.
+//! C1: random direction errors of single shots.
 
 use super::local_plane::measure_along;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -11,17 +11,17 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every shot is turned by `azimuth_std_deg * N(0, 1)` and `elevation_std_deg * N(0, 1)`, but shown where it should have gone. A ray is cast
-/// along the true direction, so that points stay on what was hit in range, as in a sensor; on a finished cloud the plane around the point
-/// takes the place of the world.
+/// The true direction of every shot differs from the nominal one by `azimuth_std_deg * N(0, 1)` in azimuth and
+/// `elevation_std_deg * N(0, 1)` in elevation. The range is measured in the true direction and reported in the nominal
+/// one. On a finished cloud the range in the true direction is that of the plane through the neighbouring points.
 ///
 /// Typical: 0.01 to 0.03 degrees (Ouster OS1 +-0.01, NVIDIA Isaac 0.025, Robotec's GPU LiDAR 1 mrad).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AngularJitter {
-    /// Degrees.
+    /// Standard deviation of the azimuth error, degrees.
     pub azimuth_std_deg: f64,
-    /// Degrees.
+    /// Standard deviation of the elevation error, degrees.
     pub elevation_std_deg: f64,
 }
 
@@ -72,14 +72,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shots_are_turned_by_that_much() {
+    fn direction_errors_have_the_configured_deviation() {
         let effect = AngularJitter { azimuth_std_deg: 0.05, elevation_std_deg: 0.02 };
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let sensor = &beams.sensors[0];
         let angle = |d: &[f32; 3]| (f64::from(d[1].atan2(d[0])).to_degrees(), f64::from(d[2].asin()).to_degrees());
         let off: Vec<(f64, f64)> = sensor
-            .believed
+            .nominal_directions
             .iter()
             .zip(&sensor.true_directions)
             .map(|(a, b)| {
@@ -93,16 +93,16 @@ mod tests {
             mean.abs() < 3e-3 && (azimuth - 0.05).abs() < 3e-3 && (elevation - 0.02).abs() < 2e-3,
             "{azimuth} {elevation}"
         );
-        assert_ne!(&sensor.believed[..], &sensor.true_directions[..]);
+        assert_ne!(&sensor.nominal_directions[..], &sensor.true_directions[..]);
     }
 
     #[test]
-    fn on_a_cloud_it_follows_the_surface() {
+    fn ranges_of_a_finished_cloud_follow_the_local_plane() {
         let effect = AngularJitter { azimuth_std_deg: 0.0, elevation_std_deg: 0.02 };
         let before = scene();
         let mut after = before.clone();
         with_frame(0, |frame, draws| effect.on_cloud(&mut after, frame, draws));
-        // On the ground an angle e makes R * tan(incidence) * e; head-on next to nothing.
+        // An angular error e changes the range by R * tan(incidence) * e: almost nothing at normal incidence.
         let off = |object: u16, size: &dyn Fn(&crate::scan::Echo) -> f64| {
             let both = before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return() && a.object == object);
             both.map(|(a, b)| f64::from(b.range_m - a.range_m) / size(a)).collect::<Vec<_>>()

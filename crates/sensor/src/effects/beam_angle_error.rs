@@ -1,4 +1,4 @@
-//! C3: every beam has an error of its own in its angles.
+//! C3: constant direction errors of each beam (row).
 
 use super::local_plane::measure_along;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -10,18 +10,20 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// All shots of row b of a sensor really go `elevation_deg + elevation_std_deg * N(0, 1)` higher and `azimuth_std_deg * N(0, 1)` more to the left
-/// than they are shown; drawn once for each row of each sensor.
+/// The true directions of all shots of a row differ from the nominal ones by
+/// `elevation_deg + elevation_std_deg * N(0, 1)` upwards and `azimuth_std_deg * N(0, 1)` to the left. The random values
+/// are drawn once for each row of each sensor. Points are reported in the nominal directions.
 ///
-/// Typical: 0.2 degrees for all rows of KITTI's HDL-64E (corrected by KISS-ICP, CT-ICP and others); 0.01 to 0.05 between rows.
+/// Typical: 0.2 degrees for all rows of KITTI's HDL-64E (corrected by KISS-ICP, CT-ICP and others); 0.01 to 0.05
+/// between rows.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BeamAngleError {
-    /// Of all rows, degrees.
+    /// Elevation error common to all rows, degrees; positive upwards.
     pub elevation_deg: f64,
-    /// Between rows, degrees.
+    /// Standard deviation of the elevation error between rows, degrees.
     pub elevation_std_deg: f64,
-    /// Between rows, degrees.
+    /// Standard deviation of the azimuth error between rows, degrees.
     pub azimuth_std_deg: f64,
 }
 
@@ -32,7 +34,7 @@ impl Default for BeamAngleError {
 }
 
 impl BeamAngleError {
-    /// To the left and up, rad.
+    /// Azimuth error (to the left) and elevation error (upwards) of a row, rad.
     fn of_row(&self, sensor: usize, row: u16, draws: &Draws) -> [f32; 2] {
         let mut random = draws.of_set((sensor as u64) << 16 | u64::from(row));
         let [left, up]: [f64; 2] = [StandardNormal.sample(&mut random), StandardNormal.sample(&mut random)];
@@ -81,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn rows_are_turned_as_a_whole() {
+    fn all_shots_of_a_row_have_the_same_error() {
         let effect = BeamAngleError { elevation_deg: 0.2, elevation_std_deg: 0.05, azimuth_std_deg: 0.0 };
         let turned_in = |frame: u64| {
             let mut beams = Beams::of(&rig());
@@ -91,7 +93,9 @@ mod tests {
         let beams = turned_in(0);
         assert_eq!(beams.sensors[0].true_directions, turned_in(5).sensors[0].true_directions);
         let sensor = &beams.sensors[0];
-        let up = |i: usize| f64::from(sensor.true_directions[i][2].asin() - sensor.believed[i][2].asin()).to_degrees();
+        let up = |i: usize| {
+            f64::from(sensor.true_directions[i][2].asin() - sensor.nominal_directions[i][2].asin()).to_degrees()
+        };
         let rows: Vec<f64> = (0..GRID.0).map(|r| up(r * GRID.1 + 100)).collect();
         for r in 0..GRID.0 {
             assert!((up(r * GRID.1 + 300) - rows[r]).abs() < 1e-3);
@@ -101,7 +105,7 @@ mod tests {
     }
 
     #[test]
-    fn beams_that_go_higher_see_the_ground_farther() {
+    fn an_upward_error_lengthens_ranges_to_the_ground() {
         let effect = BeamAngleError { elevation_deg: 0.2, elevation_std_deg: 0.0, azimuth_std_deg: 0.0 };
         let before = scene();
         let mut after = before.clone();

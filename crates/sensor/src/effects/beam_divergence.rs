@@ -1,4 +1,4 @@
-//! D1: beams have a width, and at edges a range between near and far.
+//! D1: beam divergence, which gives mixed ranges at edges.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{BeamWidth, Beams, Pick};
@@ -7,20 +7,21 @@ use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A shot is a bundle of 7 or 19 rays within `divergence_rad`, weighted as a Gaussian beam. Surfaces less than `pulse_m` apart along the beam
-/// make one return at the mean of their ranges, weighted by their light; of several returns `pick` says which counts.
+/// A shot is a bundle of 7 or 19 rays within `divergence_rad`, weighted as a Gaussian beam. Surfaces less than
+/// `pulse_m` apart along the beam give one return at the mean of their ranges, weighted by returned light. If a shot
+/// has several returns, `pick` selects the one that is reported.
 ///
 /// Typical: 0.7 to 3 mrad; a pulse of 4 ns is 0.6 m long.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BeamDivergence {
-    /// Full angle, rad.
+    /// Full divergence angle, rad.
     pub divergence_rad: f64,
-    /// 7 or 19.
+    /// Number of rays per shot: 7 or 19.
     pub rays: u32,
-    /// m.
+    /// Range separation below which surfaces give one return, m (about the pulse length).
     pub pulse_m: f64,
-    /// The return that is reported.
+    /// Which of several returns is reported.
     pub pick: Pick,
 }
 
@@ -61,7 +62,7 @@ mod tests {
     use super::super::testing::*;
     use super::*;
 
-    // What wide beams do to a post before a wall is tested with the scene.
+    // Mixed ranges at a post in front of a wall are tested with the scene.
     #[test]
     fn beams_get_their_width() {
         let mut beams = Beams::of(&rig());

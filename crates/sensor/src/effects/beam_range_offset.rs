@@ -1,4 +1,4 @@
-//! A7: every beam has an offset of its own.
+//! A7: a constant range offset of each beam (row).
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -8,16 +8,18 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// All ranges of row b of a sensor get `offsets_m[b]`, or, without a table, `std_m * N(0, 1)` drawn once for each row of each sensor, m.
+/// All ranges of row b of a sensor are shifted by `offsets_m[b]`, m. If `offsets_m` is empty, the offset is
+/// `std_m * N(0, 1)`, drawn once for each row of each sensor.
 ///
-/// Typical: 1 to 5 cm between the lasers of a Velodyne HDL-64E as delivered; a third of that after a calibration of one's own (Glennie and
-/// Lichti 2010).
+/// Typical: 1 to 5 cm between the lasers of a Velodyne HDL-64E with the manufacturer's calibration; a third of that
+/// after recalibration (Glennie and Lichti 2010).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BeamRangeOffset {
-    /// Standard deviation between rows, m.
+    /// Standard deviation between rows, m. Used if `offsets_m` is empty.
     pub std_m: f64,
-    /// Offset of each row from the top, m, for every sensor; rows beyond have none. Takes the place of `std_m`.
+    /// Offset of each row from the top, m, the same for every sensor. Rows beyond the end of the list have offset 0.
+    /// Replaces `std_m`.
     pub offsets_m: Vec<f64>,
 }
 
@@ -86,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn a_table_is_taken_as_it_is() {
+    fn a_table_of_offsets_is_used_unchanged() {
         let before = plate(3000, 20.0, 0.5);
         let after = applied(&BeamRangeOffset { std_m: 0.0, offsets_m: vec![0.1, -0.2] }, &before);
         let off = residuals(&before, &after);

@@ -1,4 +1,4 @@
-//! D3: a bright target shines into its neighbours.
+//! D3: blooming, a halo of false returns around a bright target.
 
 use super::shot_grid::{ShotGrid, reach};
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -9,18 +9,19 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A shot at the angle psi from one that returns more than `returned_above` reports that one's range with probability
-/// `strength * exp(-psi / halo_deg)`, where it would have reported nothing or something farther away.
+/// A shot at angle psi from a bright return reports the range of the bright return with probability
+/// `strength * exp(-psi / halo_deg)`. A return is bright if its returned light exceeds `returned_above`. Only shots
+/// that are not bright themselves and have no return, or a farther one, are affected.
 ///
 /// Typical: a halo of 0.1 to 1 degree around retro-reflectors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Blooming {
-    /// Part of the light, against a white plate head-on.
+    /// Returned light above which a target is bright, relative to a white Lambertian plate at normal incidence (1).
     pub returned_above: f64,
-    /// Degrees.
+    /// Angle at which the probability has fallen to 1/e, degrees.
     pub halo_deg: f64,
-    /// 0 to 1.
+    /// Probability at angle 0, 0 to 1.
     pub strength: f64,
 }
 
@@ -82,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_board_grows_at_its_own_range() {
+    fn the_bright_board_gets_a_halo_at_its_range() {
         let mut before = scene();
         // Behind the board there is nothing.
         for echo in before.echoes.iter_mut().filter(|e| e.object == 4 && e.reflectivity < 5.0) {

@@ -1,4 +1,4 @@
-//! B10: a bright target blinds the receiver for its neighbours.
+//! B10: returns lost next to a bright target.
 
 use super::shot_grid::{ShotGrid, reach};
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -9,18 +9,19 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return within `radius_deg` of one from a surface that returns more than `returned_above` is lost with probability `share`: the
-/// suppression of blooming takes good returns too.
+/// A return within `radius_deg` of a bright return is lost with probability `share`. A return is bright if its returned
+/// light exceeds `returned_above`. Bright returns are not lost. Sensors that filter blooming artefacts also remove
+/// valid returns.
 ///
-/// Typical: 0.2 to 1 degree around signs and number plates (returned light above that of a white plate, 1).
+/// Typical: 0.2 to 1 degree around signs and number plates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BrightTargetDropout {
-    /// Part of the light, against a white plate head-on.
+    /// Returned light above which a target is bright, relative to a white Lambertian plate at normal incidence (1).
     pub returned_above: f64,
-    /// Degrees.
+    /// Radius of the affected region around a bright return, degrees.
     pub radius_deg: f64,
-    /// 0 to 1.
+    /// Probability that an affected return is lost, 0 to 1.
     pub share: f64,
 }
 
@@ -68,7 +69,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_the_neighbours_of_the_board_suffer() {
+    fn only_neighbours_of_the_bright_board_are_lost() {
         let before = scene();
         let effect = BrightTargetDropout { returned_above: 5.0, radius_deg: 3.0, share: 1.0 };
         let after = applied(&effect, &before);

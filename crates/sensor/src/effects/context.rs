@@ -1,4 +1,4 @@
-//! What effects are told of a frame, and where their random numbers come from.
+//! Context of a frame that effects are applied with, and their random number streams.
 
 use crate::material::MaterialTable;
 use crate::object::Group;
@@ -8,30 +8,30 @@ use data::{Stream, stream};
 use geometry::Box3;
 use std::collections::BTreeSet;
 
-/// Something that must be known of a finished cloud for an effect to act on it.
+/// A quantity that must be known of a finished cloud for an effect to be applied to it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Need {
     /// Normals and angles of incidence.
     Incidence,
-    /// How much the surfaces reflect.
+    /// Reflectivity of the surfaces.
     Reflectivity,
-    /// Which material was hit.
+    /// Material of the surfaces.
     Material,
-    /// Rows of the pattern.
+    /// Row of each point in the sensor's pattern.
     Row,
-    /// Rows and columns of the pattern.
+    /// Row and column of each point in the sensor's pattern.
     Grid,
-    /// Times of the shots.
+    /// Time of each shot.
     Time,
-    /// Where the other cars are.
+    /// Boxes of the other cars.
     Cars,
-    /// How the own car and the others move.
+    /// Velocities of the ego vehicle and of the other cars.
     Motion,
 }
 
 impl Need {
-    /// In words, for messages.
-    pub fn words(self) -> &'static str {
+    /// Description for error messages.
+    pub fn description(self) -> &'static str {
         match self {
             Need::Incidence => "the angle of incidence",
             Need::Reflectivity => "the reflectivity of surfaces",
@@ -45,47 +45,47 @@ impl Need {
     }
 }
 
-/// Another car in a frame, in the cloud's frame.
+/// Another car in a frame. All values are in the cloud's frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledCar {
-    /// Number of the car: the same in all frames of a run.
+    /// Number of the car, the same in all frames of a run.
     pub number: usize,
-    /// Where it is.
+    /// True box.
     pub true_box: Box3,
-    /// Where its label says that it is.
+    /// Box of its label.
     pub label: Box3,
-    /// Its velocity over the ground, m/s.
+    /// Velocity over ground, m/s.
     pub velocity: [f64; 3],
 }
 
-/// What is known of a frame besides its scan.
+/// A frame without its scan.
 #[derive(Clone, Copy)]
 pub struct FrameContext<'a> {
     /// Seed of the data set.
     pub seed: u64,
     /// Name of the data set.
     pub set: &'a str,
-    /// Number of the frame.
+    /// Number of the frame, a part of its random streams.
     pub index: u64,
-    /// Time since the beginning of the first run, s.
+    /// Time since the start of the first run, s.
     pub time_s: f64,
     /// The sensors.
     pub rig: &'a Rig,
     /// The materials.
     pub materials: &'a MaterialTable,
-    /// Velocity of the car that carries the sensors, m/s, cloud's frame.
+    /// Velocity of the ego vehicle, m/s, cloud's frame.
     pub ego_velocity: [f64; 3],
-    /// Its rate of turn, rad/s, cloud's frame.
+    /// Turn rate of the ego vehicle, rad/s, cloud's frame.
     pub ego_turn_rate: [f64; 3],
     /// The other cars.
     pub cars: &'a [LabelledCar],
-    /// To ask what further rays meet; `None` for a finished cloud.
+    /// Scene for additional rays; `None` for a finished cloud.
     pub scene: Option<&'a dyn RayCaster>,
-    /// Direction of the world's +x axis in the cloud's frame, rad, counter-clockwise from +x.
+    /// Direction of the world's +x axis in the cloud's frame, rad counter-clockwise from +x.
     pub world_x_rad: f64,
 }
 
-/// Where the random numbers of one effect come from.
+/// Random number streams of one effect.
 #[derive(Clone, Debug)]
 pub struct Draws {
     seed: u64,
@@ -94,46 +94,46 @@ pub struct Draws {
 }
 
 impl Draws {
-    /// The streams of an effect in a frame.
+    /// Streams of an effect for a frame.
     pub fn new(seed: u64, purpose: String, frame: u64) -> Draws {
         Draws { seed, purpose, frame }
     }
 
-    /// Numbers of this frame alone.
+    /// Stream of this frame.
     pub fn of_frame(&self) -> Stream {
         stream(self.seed, &self.purpose, 1, self.frame)
     }
 
-    /// Numbers that are the same in every frame; another `number`, other numbers.
+    /// Stream that is the same in every frame of the data set; each `number` has its own.
     pub fn of_set(&self, number: u64) -> Stream {
         stream(self.seed, &self.purpose, 0, number)
     }
 }
 
-/// A waviness of the ground that is not in the plans: `h(way) = amplitude * sin(2 pi way / length + phase)`, m, of the surface and all that
-/// stands on it.
+/// An unmodelled undulation of the ground and all static objects on it:
+/// `height = amplitude_m * sin(2 pi s / length_m + phase_rad)`, m, s the arc length along the centre line, m.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Undulation {
-    /// Greatest height, m.
+    /// Amplitude, m.
     pub amplitude_m: f64,
-    /// Length of a wave along the centre line, m; rounded so that whole waves fit into a lap.
+    /// Wavelength along the centre line, m; rounded so that a lap has a whole number of waves.
     pub length_m: f64,
-    /// Where it begins, rad.
+    /// Phase at the start of the centre line, rad.
     pub phase_rad: f64,
 }
 
-/// What stands where.
+/// Differences between the true world and its model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WorldPlan {
-    /// Groups of the track that are there.
+    /// Groups of the track that are present.
     pub groups: BTreeSet<Group>,
-    /// Waves of the ground that the plans do not have.
+    /// Unmodelled undulation of the ground.
     pub undulation: Option<Undulation>,
-    /// Stretches the cars about the middle of their box's bottom: length, width, height.
+    /// Scale of the other cars' bodies about the centre of the bottom of their box: length, width, height.
     pub car_scale: [f64; 3],
-    /// Moves the cars' bodies against where they are said to be, m: forward, left, up.
+    /// Shift of the other cars' bodies relative to their boxes, m: forward, left, up.
     pub car_shift_m: [f64; 3],
-    /// Turns the other cars against the road: mean and standard deviation of roll and pitch, rad.
+    /// Roll and pitch of the other cars relative to their modelled attitude, rad: mean and standard deviation of each.
     pub car_tilt: [[f64; 2]; 2],
 }
 

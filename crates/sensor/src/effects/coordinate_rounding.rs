@@ -1,4 +1,4 @@
-//! A9: coordinates in steps, as a file format has them.
+//! A9: coordinates rounded to a step, as by a file format.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -7,13 +7,14 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Each of x, y, z becomes `step_m * round(v / step_m)`, m. Unlike [`super::RangeQuantisation`] it leaves no comb in the ranges.
+/// Each of x, y, z becomes `step_m * round(v / step_m)`, m, in the cloud's frame. Unlike [`super::RangeQuantisation`],
+/// it does not quantise ranges.
 ///
 /// Typical: 1 mm (the files of KITTI).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoordinateRounding {
-    /// m.
+    /// Step, m.
     pub step_m: f64,
 }
 

@@ -10,9 +10,10 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Within a spot the window lets less light through: one way `T = 1 - (1 - transmission) * exp(-(psi / radius)^4)`, psi the angle from the
-/// middle of the spot. The light that comes back falls by `T^2`, a return is lost with probability `loss * (1 - T^2)`, and a range gets
-/// `noise_m * (1 / T - 1) * N(0, 1)`, m.
+/// The one-way transmission of the window is `T = 1 - (1 - transmission) * exp(-(psi / radius_deg)^4)` at angle psi
+/// from the centre of the spot. Returned light is multiplied by `T^2`. A return is lost with probability
+/// `loss * (1 - T^2)`. The range error is `noise_m * (1 / T - 1) * N(0, 1)`, m. Directions with T above 0.999 are not
+/// changed.
 ///
 /// Typical: transmission 0.1 to 0.7 in a spot of 2 to 10 degrees.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -20,17 +21,17 @@ use serde::{Deserialize, Serialize};
 pub struct DirtyWindow {
     /// Name of the sensor.
     pub sensor: String,
-    /// Middle of the spot, degrees, counter-clockwise from the sensor's middle.
+    /// Azimuth of the centre of the spot, degrees counter-clockwise from the sensor's x axis.
     pub azimuth_deg: f64,
-    /// Middle of the spot, degrees above the sensor's horizon.
+    /// Elevation of the centre of the spot in the sensor's frame, degrees.
     pub elevation_deg: f64,
-    /// Its radius, degrees.
+    /// Radius of the spot, degrees.
     pub radius_deg: f64,
-    /// Part of the light that passes in its middle, one way, above 0.
+    /// One-way transmission at the centre of the spot, 0.01 to 1.
     pub transmission: f64,
-    /// Returns lost where nothing passes, 0 to 1.
+    /// Probability of a loss in the limit T = 0, 0 to 1.
     pub loss: f64,
-    /// Noise where half of the light passes, m.
+    /// Standard deviation of the range error where T = 0.5, m.
     pub noise_m: f64,
 }
 
@@ -88,7 +89,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_soft_spot_in_the_sensor_s_frame() {
+    fn losses_are_limited_to_the_spot_in_the_sensor_s_frame() {
         let before = scene();
         let effect =
             DirtyWindow { transmission: 0.5, loss: 1.0, noise_m: 0.1, elevation_deg: -5.0, ..DirtyWindow::default() };
@@ -105,6 +106,6 @@ mod tests {
         let (inner, outer) = (share(0.0, 3.0), share(10.0, 20.0));
         assert!((inner - 0.75).abs() < 0.08 && outer == 0.0, "{inner} {outer}");
         let other = DirtyWindow { sensor: "rear".into(), ..effect };
-        assert_eq!(applied(&other, &before), before, "a sensor that is not there");
+        assert_eq!(applied(&other, &before), before, "a sensor that is not in the rig");
     }
 }

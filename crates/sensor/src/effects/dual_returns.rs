@@ -1,4 +1,4 @@
-//! D6: two returns a shot.
+//! D6: two returns per shot.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::Beams;
@@ -6,9 +6,10 @@ use data::KeyError;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The strongest of the returns that [`super::BeamDivergence`] (which must stand before it) does not report is reported too.
+/// The strongest of the returns that [`super::BeamDivergence`] does not select is reported as a second return.
+/// `beam_divergence` must be before this effect in the list, because a shot without divergence has one return.
 ///
-/// Typical: a mode of most sensors; two points a direction at edges and fences.
+/// Typical: a mode of most sensors; two points per direction at edges and fences.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DualReturns {}
@@ -34,13 +35,13 @@ mod tests {
     use super::super::{BeamDivergence, testing::*};
     use super::*;
 
-    // That seconds come back at edges alone is tested with the scene.
+    // That second returns occur at edges only is tested with the scene.
     #[test]
-    fn wide_beams_report_a_second() {
+    fn divergent_beams_report_a_second_return() {
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| {
             DualReturns {}.on_beams(&mut beams, frame, draws);
-            assert_eq!(beams.width, None, "a line has one return");
+            assert_eq!(beams.width, None, "a shot without divergence has one return");
             BeamDivergence::default().on_beams(&mut beams, frame, draws);
             DualReturns {}.on_beams(&mut beams, frame, draws);
         });

@@ -1,4 +1,4 @@
-//! C8: the own car stands otherwise on the road than it is believed to.
+//! C8: error of the ego vehicle's roll, pitch and height.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::Beams;
@@ -10,25 +10,26 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The car is really turned against its believed pose by roll `roll_deg + roll_std_deg * N(0, 1)` and pitch
-/// `pitch_deg + pitch_at_70mps_deg * (v / 70)^2 + pitch_std_deg * N(0, 1)` (positive: nose down), and lifted by `heave_std_m * N(0, 1)`; new
-/// in every frame. Clouds turn against labels and world as a whole.
+/// The true attitude of the ego vehicle differs from the reported one by roll `roll_deg + roll_std_deg * N(0, 1)` and
+/// pitch `pitch_deg + pitch_at_70mps_deg * (v / 70)^2 + pitch_std_deg * N(0, 1)`, v the ego speed, m/s. Positive pitch
+/// turns the nose down. The true height differs by `heave_std_m * N(0, 1)`. Values are drawn anew in every frame.
+/// Points are computed with the reported pose, so the whole cloud is rotated and shifted relative to labels and world.
 ///
 /// Typical: 0.1 to 0.3 degrees of pitch from braking, aerodynamic load (with the square of the speed) and bumps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoAttitude {
-    /// Degrees.
+    /// Mean roll error, degrees; positive turns the left side up.
     pub roll_deg: f64,
-    /// Degrees.
+    /// Mean pitch error at standstill, degrees; positive turns the nose down.
     pub pitch_deg: f64,
-    /// Aerodynamic load, degrees at 70 m/s.
+    /// Additional pitch error at 70 m/s from aerodynamic load, degrees; it grows with the square of the speed.
     pub pitch_at_70mps_deg: f64,
-    /// Degrees.
+    /// Standard deviation of roll between frames, degrees.
     pub roll_std_deg: f64,
-    /// Degrees.
+    /// Standard deviation of pitch between frames, degrees.
     pub pitch_std_deg: f64,
-    /// m.
+    /// Standard deviation of the height between frames, m.
     pub heave_std_m: f64,
 }
 
@@ -69,7 +70,7 @@ impl SensorEffect for EgoAttitude {
         beams.ego_heave_m += heave_m;
     }
 
-    /// The cloud moves as a whole, by what its sensors see unchanged.
+    /// The cloud is transformed as a whole; each sensor's visible surfaces are assumed to stay the same.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let (tilt, heave_m) = self.of_frame(frame, draws);
         for echo in scan.returns_mut() {
@@ -80,7 +81,7 @@ impl SensorEffect for EgoAttitude {
 }
 
 impl EgoAttitude {
-    /// How the car is turned in a frame, and lifted, m.
+    /// Attitude error of the ego vehicle in a frame, and its height error, m.
     fn of_frame(&self, frame: &FrameContext, draws: &Draws) -> (UnitQuaternion<f64>, f64) {
         let mut random = draws.of_frame();
         let [roll, pitch, heave]: [f64; 3] = std::array::from_fn(|_| StandardNormal.sample(&mut random));
@@ -98,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_nose_that_goes_down_lifts_what_lies_ahead() {
+    fn a_nose_down_error_raises_points_ahead() {
         let still = EgoAttitude { pitch_deg: 0.5, roll_std_deg: 0.0, pitch_std_deg: 0.0, ..EgoAttitude::default() };
         let before = scene();
         let mut after = before.clone();
@@ -114,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn the_car_is_tilted_by_that_much() {
+    fn attitude_errors_have_the_configured_moments() {
         let effect = EgoAttitude {
             roll_deg: 0.2,
             pitch_deg: -0.1,
@@ -131,7 +132,7 @@ mod tests {
                 [roll.to_degrees(), pitch.to_degrees(), beams.ego_heave_m]
             })
             .collect();
-        // At 50 m/s the load makes (50 / 70)^2 of its value: 0.25 degrees.
+        // At 50 m/s the aerodynamic term is (50 / 70)^2 of its value at 70 m/s: 0.25 degrees.
         for (k, mean, std) in [(0, 0.2, 0.05), (1, 0.15, 0.1), (2, 0.0, 0.02)] {
             let (m, s) = moments(&tilts.iter().map(|t| t[k]).collect::<Vec<_>>());
             assert!((m - mean).abs() < 0.1 * std && (s / std - 1.0).abs() < 0.05, "{k}: {m} {s}");

@@ -1,4 +1,4 @@
-//! B7: parts of the own car in the way.
+//! B7: directions hidden by parts of the ego vehicle.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::car::{CAR_SIZE_M, car_box};
@@ -8,13 +8,14 @@ use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A shot that passes through one of `boxes` within its range has no return.
+/// A shot that intersects one of `boxes` before its measured range has no return.
 ///
-/// The default is the rear wing of the AV-21: it shades a trapezoid of some 10 x 5 m behind the car (paper, section IV-A).
+/// The default is the rear wing of the AV-21, which hides a trapezoid of about 10 x 5 m behind the car (Huch et al.
+/// 2023, section IV-A).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoBodyMask {
-    /// Boxes in the cloud's frame: least x, y, z, greatest x, y, z, m.
+    /// Axis-aligned boxes in the cloud's frame, m: minimum x, y, z, then maximum x, y, z.
     pub boxes: Vec<[f64; 6]>,
 }
 
@@ -22,7 +23,7 @@ impl Default for EgoBodyMask {
     fn default() -> Self {
         let bbox = car_box();
         let (rear, top) = (bbox.center[0] - CAR_SIZE_M[0] / 2.0, bbox.z_range().1);
-        // Main plane and flap as one, and what holds them; the planes let shots pass above and below.
+        // Main plane and flap as one box, end plates, and support. Shots pass above and below the planes.
         EgoBodyMask {
             boxes: vec![
                 [rear, -0.54, top - 0.22, rear + 0.42, 0.54, top - 0.06],
@@ -41,7 +42,7 @@ impl SensorEffect for EgoBodyMask {
                 within(&format!("boxes[{i}][{k}]"), *v, -100.0, 100.0)?;
             }
             if (0..3).any(|k| b[k] >= b[k + 3]) {
-                return Err(wrong(format!("boxes[{i}]"), "a least coordinate is not less than the greatest"));
+                return Err(wrong(format!("boxes[{i}]"), "a minimum is not less than its maximum"));
             }
         }
         Ok(())
@@ -57,7 +58,7 @@ impl SensorEffect for EgoBodyMask {
     }
 }
 
-/// Whether a shot goes through a box before its return.
+/// Whether a shot intersects a box before its return.
 fn passes(echo: &Echo, b: &[f32; 6]) -> bool {
     let (mut near, mut far) = (0.0, echo.range_m);
     for k in 0..3 {
@@ -80,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_behind_the_box_is_gone_in_every_frame() {
+    fn returns_behind_the_box_are_lost_in_every_frame() {
         let before = scene();
         // A board 2 m ahead, 0.4 m wide, around the sensor's horizon.
         let effect = EgoBodyMask { boxes: vec![[2.0, -0.2, -0.1, 2.1, 0.2, 0.1]] };
@@ -100,7 +101,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_before_the_box_stays() {
+    fn returns_before_the_box_stay() {
         let before = plate(10, 1.5, 0.5);
         let effect = EgoBodyMask { boxes: vec![[2.0, -0.2, -0.1, 2.1, 0.2, 0.1]] };
         assert_eq!(lost(&before, &applied(&effect, &before)), 0.0);

@@ -1,4 +1,4 @@
-//! E4: what was seen of a sensor and has no cause: losses, offsets and noise as tables over one covariate.
+//! E4: lookup tables of loss, range offset and range noise over one covariate, without a physical model.
 
 use super::table::{check_table, interpolated};
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -10,43 +10,46 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What a table of [`Empirical`] depends on.
+/// Covariate of the tables of [`Empirical`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Covariate {
-    /// Distance, m.
+    /// Range, m.
     #[default]
     RangeM,
     /// Cosine of the angle of incidence.
     CosIncidence,
-    /// Index of the signal, `ln(returned / R^2) - ln(0.1 / 250^2)`.
+    /// Signal index `ln(returned / R^2) - ln(0.1 / 250^2)`, R the range, m; 0 at the data sheet's maximum range, 250 m
+    /// at 10 % reflectivity.
     Signal,
-    /// Azimuth in the sensor's own frame, degrees counter-clockwise from its middle.
+    /// Azimuth in the sensor's frame, degrees counter-clockwise from its x axis.
     AzimuthDeg,
-    /// Elevation in the sensor's own frame, degrees.
+    /// Elevation in the sensor's frame, degrees.
     ElevationDeg,
-    /// Row of the pattern, from the top.
+    /// Row of the pattern, counted from the top.
     Row,
 }
 
-/// At the value x of the covariate a return is lost with probability `loss(x)`, and its range gets `mean_m(x) + std_m(x) * N(0, 1)`, m; each
-/// lies on the lines through its points (`at`, value), beyond both ends at that of the end. An empty list is 0 everywhere.
+/// At value x of the covariate, a return is lost with probability `loss(x)`, and its range error is
+/// `mean_m(x) + std_m(x) * N(0, 1)`, m. Tables are interpolated linearly between the points (`at`, value) and constant
+/// beyond both ends. An empty list is 0 everywhere.
 ///
-/// No cause and no formula: a diagnosis writes it for what it sees and cannot name.
+/// This effect has no physical cause or formula. A diagnosis writes it for differences that it measures but cannot
+/// attribute to a cause.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Empirical {
-    /// Name of the sensor; empty: all of them.
+    /// Name of the sensor; empty for all sensors.
     pub sensor: String,
-    /// What the tables depend on.
+    /// Covariate of the tables.
     pub covariate: Covariate,
-    /// Values of the covariate, ascending.
+    /// Values of the covariate, strictly ascending.
     pub at: Vec<f64>,
-    /// Probability of a loss at each, 0 to 1.
+    /// Probability of a loss at each value of `at`, 0 to 1.
     pub loss: Vec<f64>,
-    /// Mean offset of range at each, m.
+    /// Mean range error at each value of `at`, m.
     pub mean_m: Vec<f64>,
-    /// Standard deviation of range at each, m.
+    /// Standard deviation of the range error at each value of `at`, m.
     pub std_m: Vec<f64>,
 }
 
@@ -134,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn tables_over_directions_are_in_the_sensors_own_frame() {
+    fn azimuth_and_elevation_are_in_the_sensor_s_frame() {
         let before = scene();
         let to_the_left = Empirical {
             covariate: Covariate::AzimuthDeg,
@@ -159,8 +162,8 @@ mod tests {
         let table =
             |at: &[f64], std_m: &[f64]| Empirical { at: at.into(), std_m: std_m.into(), ..Empirical::default() };
         for (effect, want) in [
-            (table(&[], &[0.1]), "no table"),
-            (table(&[1.0, 2.0], &[0.1]), "no table"),
+            (table(&[], &[0.1]), "as many of each"),
+            (table(&[1.0, 2.0], &[0.1]), "as many of each"),
             (table(&[1.0, 1.0], &[0.1, 0.2]), "at[1]: is not larger"),
             (table(&[1.0, 2.0], &[0.1, -1.2]), "std_m[1]: -1.2"),
         ] {

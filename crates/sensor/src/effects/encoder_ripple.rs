@@ -1,4 +1,4 @@
-//! E1: ranges that swing with azimuth.
+//! E1: a range error that is periodic in azimuth.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -7,17 +7,18 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A range gets `amplitude_m * sin(periods * a + phase_rad)`, m, a the azimuth in the cloud's frame. No effect of the usual catalogues.
+/// `amplitude_m * sin(periods * a + phase_rad)`, m, is added to each range, a the azimuth in the cloud's frame, rad.
+/// The effect is not in the usual catalogues; it tests a diagnosis on unknown causes.
 ///
 /// Typical: millimetres to centimetres.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EncoderRipple {
-    /// m.
+    /// Amplitude, m.
     pub amplitude_m: f64,
-    /// Swings a turn.
+    /// Periods per turn.
     pub periods: f64,
-    /// rad.
+    /// Phase at azimuth 0, rad.
     pub phase_rad: f64,
 }
 

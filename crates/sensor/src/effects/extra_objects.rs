@@ -1,4 +1,4 @@
-//! C10: a world with what another one lacks.
+//! C10: objects of the static world that are present.
 
 use super::{Need, SensorEffect, WorldPlan};
 use crate::object::Group;
@@ -7,11 +7,12 @@ use data::toml_text::wrong;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// `groups` of the static world are there, also when an effect before it, as [`super::MissingObjects`], left them out.
+/// `groups` of the static world are present, even if an effect before this one in the list, such as
+/// [`super::MissingObjects`], removed them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExtraObjects {
-    /// What is there.
+    /// Groups that are present.
     pub groups: Vec<Group>,
 }
 
@@ -23,7 +24,7 @@ impl Default for ExtraObjects {
 
 impl SensorEffect for ExtraObjects {
     fn check(&self) -> Result<(), KeyError> {
-        if self.groups.is_empty() { Err(wrong("groups", "names none")) } else { Ok(()) }
+        if self.groups.is_empty() { Err(wrong("groups", "is empty")) } else { Ok(()) }
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
@@ -40,7 +41,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_there_already_stays_once() {
+    fn groups_that_are_present_do_not_change() {
         let mut world = WorldPlan::default();
         ExtraObjects::default().on_world(&mut world);
         assert_eq!(world, WorldPlan::default());

@@ -1,4 +1,4 @@
-//! D5: returns of nothing: noise of the receiver, more of it towards the sun.
+//! D5: false returns from receiver noise and sunlight.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -8,22 +8,23 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A shot reports a range that is uniform between 0 and `reach_m` with probability `rate + sun_rate * exp(-(d / sun_width_deg)^2)`, d the angle
-/// from the azimuth of the sun; where it has a return, only when the false one is nearer.
+/// A shot gives a false return with probability `rate + sun_rate * exp(-(d / sun_width_deg)^2)`, d the azimuth
+/// difference to the sun. Its range is uniform between 0 and `reach_m`. It is reported only if it is beyond 0.1 m and
+/// nearer than the shot's true return, if there is one.
 ///
 /// Typical: 1e-4 (the rate to which Ouster's data sheet refers) to 1e-2 towards the sun.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct FalseAlarms {
-    /// 0 to 1.
+    /// Probability independent of direction, 0 to 1.
     pub rate: f64,
-    /// On top, straight towards the sun, 0 to 1.
+    /// Additional probability in the direction of the sun, 0 to 1.
     pub sun_rate: f64,
-    /// Azimuth of the sun in the world, degrees, counter-clockwise from +x (east).
+    /// Azimuth of the sun in the world's frame, degrees counter-clockwise from +x (east).
     pub sun_azimuth_deg: f64,
-    /// Degrees.
+    /// Azimuth difference at which the additional probability has fallen to 1/e, degrees.
     pub sun_width_deg: f64,
-    /// m.
+    /// Maximum range of false returns, m.
     pub reach_m: f64,
 }
 
@@ -75,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn uniform_in_range_where_nothing_is() {
+    fn false_returns_are_uniform_in_range() {
         let mut before = plate(40_000, 100.0, 0.5);
         before.echoes.iter_mut().for_each(|e| e.lose());
         let effect = FalseAlarms { rate: 0.05, reach_m: 200.0, ..FalseAlarms::default() };
@@ -87,7 +88,7 @@ mod tests {
     }
 
     #[test]
-    fn more_towards_the_sun() {
+    fn false_returns_concentrate_towards_the_sun() {
         let mut before = scene();
         before.echoes.iter_mut().for_each(|e| e.lose());
         let effect = FalseAlarms {

@@ -1,4 +1,4 @@
-//! D4: fog takes light and sends some back.
+//! D4: fog: attenuation and backscatter.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -8,20 +8,21 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// With the attenuation `alpha = ln(20) / visibility_m`, 1/m, the light of a return falls by `exp(-2 alpha R)`. A shot reports a droplet instead
-/// of its surface with probability `backscatter * (1 - exp(-2 alpha R))`, at a range with density proportional to `exp(-2 alpha r)` between
-/// 1 m and R; shots without a return see the fog up to `reach_m`.
+/// The extinction coefficient is `alpha = ln(20) / visibility_m`, 1/m. The light of a return at range R is multiplied
+/// by `exp(-2 alpha R)`. With probability `backscatter * (1 - exp(-2 alpha R))`, a shot reports a droplet instead of
+/// the surface. The range r of the droplet has a density proportional to `exp(-2 alpha r)` between 1 m and R. For shots
+/// without a return, R is `reach_m`.
 ///
-/// Typical: visibility 50 m (alpha 0.06, dense) to 1000 m (Hahner et al. 2021); backscatter 0.01 to 0.3. A detection threshold
-/// ([`super::SignalDropout`]) behind it makes the loss.
+/// Typical: visibility 50 m (alpha 0.06, dense) to 1000 m (Hahner et al. 2021); backscatter 0.01 to 0.3. Fog attenuates
+/// the light but does not remove returns: put a detection threshold ([`super::SignalDropout`]) behind it in the list.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Fog {
     /// Meteorological optical range, m.
     pub visibility_m: f64,
-    /// 0 to 1.
+    /// Probability factor of droplet returns, 0 to 1.
     pub backscatter: f64,
-    /// How far droplets are seen where there is no surface, m.
+    /// Maximum range of droplets for shots without a return, m.
     pub reach_m: f64,
 }
 
@@ -51,7 +52,7 @@ impl SensorEffect for Fog {
             let behind = (-2.0 * alpha * free_m).exp();
             let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
             if free_m > 1.0 && chance < self.backscatter as f32 * (1.0 - behind) {
-                // Inverse of the distribution between 1 m and the surface.
+                // Inverse of the cumulative distribution between 1 m and the surface.
                 let first = (-2.0 * alpha).exp();
                 echo.range_m = -(first - part * (first - behind)).ln() / (2.0 * alpha);
                 (echo.returned, echo.reflectivity, echo.object) = (0.02, 0.02, 0);
@@ -66,7 +67,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn light_falls_and_droplets_lie_near() {
+    fn light_is_attenuated_and_droplets_follow_the_density() {
         let before = plate(40_000, 60.0, 0.5);
         let effect = Fog { visibility_m: 60.0, backscatter: 0.2, reach_m: 30.0 };
         let after = applied(&effect, &before);
@@ -76,7 +77,7 @@ mod tests {
         let droplets: Vec<f64> = after.echoes.iter().filter(|e| e.range_m != 60.0).map(|e| e.range_m.into()).collect();
         let share = droplets.len() as f64 / 40_000.0;
         assert!((share - 0.2 * (1.0 - (-120.0 * alpha).exp())).abs() < 0.01, "{share}");
-        // Exponential from 1 m on, with mean 1 / (2 alpha) behind it.
+        // Exponential from 1 m on: the mean is 1 / (2 alpha) beyond that.
         let (mean, _) = moments(&droplets);
         assert!((mean - 1.0 - 0.5 / alpha).abs() < 0.3, "{mean}");
         let mut sky = before;

@@ -1,4 +1,4 @@
-//! D2: light that takes a way round by a mirror.
+//! D2: ghost returns by specular reflection.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::{Scan, dot};
@@ -8,17 +8,19 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// With probability `probability * lobe`, lobe the material's share of directed light, the return of a shot is not the surface's own but that of
-/// what the surface mirrors: the point then lies behind the surface, at the range `R + L`, L the way from the surface to what is mirrored, m,
-/// at most `longest_m`. Where the mirror shows nothing the return stays.
+/// With probability `probability * lobe`, lobe the specular fraction of the material, a shot reports the surface seen
+/// by specular reflection instead of the reflecting one. The point then is in the shot's direction at range `R + L`, R
+/// the range of the reflecting surface, L the distance from there to the reflected surface, m. If the reflected ray
+/// meets nothing within `longest_m`, the return stays as it is.
 ///
-/// Typical: rare on paint and metal, frequent at glass fronts and wet roads (Waymo's issue 387; the data set Ghost-FWL).
+/// Typical: rare on paint and metal, frequent at glass fronts and wet roads (issue 387 of the Waymo Open Dataset; the
+/// data set Ghost-FWL).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ghosts {
-    /// 0 to 1, for a surface that mirrors all of the light.
+    /// Probability for a fully specular surface (lobe 1), 0 to 1.
     pub probability: f64,
-    /// m.
+    /// Maximum L, m.
     pub longest_m: f64,
 }
 
@@ -60,7 +62,7 @@ impl SensorEffect for Ghosts {
     }
 }
 
-/// The mirrored ray: from just before the surface, about its normal.
+/// The reflected ray: it starts 1 cm in front of the surface and is mirrored about its normal.
 fn reflection(echo: &crate::scan::Echo) -> ([f32; 3], [f32; 3]) {
     let (point, n, d) = (echo.point(), echo.normal, echo.direction);
     let along = dot(n, d);

@@ -1,4 +1,4 @@
-//! C9: the ground is not as level as in the plans.
+//! C9: an unmodelled undulation of the ground.
 
 use super::{Need, SensorEffect, Undulation, WorldPlan};
 use data::KeyError;
@@ -6,18 +6,19 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The ground and all that stands on it is `amplitude_m * sin(2 pi s / length_m + phase_rad)` higher than believed, m, s the way along the track.
-/// Cars stay where their trajectories say, so that the ground under them moves against them.
+/// The ground and all static objects on it are `amplitude_m * sin(2 pi s / length_m + phase_rad)` higher than modelled,
+/// m, s the arc length along the track's centre line, m. Cars keep the heights of their trajectories, so that the
+/// ground moves relative to them.
 ///
-/// Typical: some centimetres to a decimetre over 50 to 200 m.
+/// Typical: a few centimetres to a decimetre over 50 to 200 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GroundError {
-    /// m.
+    /// Amplitude, m.
     pub amplitude_m: f64,
-    /// m.
+    /// Wavelength along the centre line, m; rounded so that a lap has a whole number of waves.
     pub length_m: f64,
-    /// rad.
+    /// Phase at the start of the centre line, rad.
     pub phase_rad: f64,
 }
 
@@ -48,9 +49,9 @@ impl SensorEffect for GroundError {
 mod tests {
     use super::*;
 
-    // That the mesh then has these waves is tested with the track.
+    // The undulation of the mesh is tested with the track.
     #[test]
-    fn the_world_gets_its_waves() {
+    fn the_world_plan_gets_the_undulation() {
         let mut world = WorldPlan::default();
         GroundError { amplitude_m: 0.1, length_m: 80.0, phase_rad: 1.0 }.on_world(&mut world);
         assert_eq!(world.undulation, Some(Undulation { amplitude_m: 0.1, length_m: 80.0, phase_rad: 1.0 }));

@@ -1,4 +1,4 @@
-//! A5: a few ranges that are off by much more than the rest.
+//! A5: outliers in range.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -9,15 +9,15 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// With `probability`, a range gets `std_m * N(0, 1)`, m, on top of everything else.
+/// With probability `probability`, `std_m * N(0, 1)`, m, is added to a range, in addition to other noise.
 ///
 /// Typical: 0.1 to 3 % of the returns, 5 to 30 cm.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct HeavyTails {
-    /// Share of the returns.
+    /// Fraction of the returns that are outliers, 0 to 1.
     pub probability: f64,
-    /// Standard deviation of these, m.
+    /// Standard deviation of the outliers' additional error, m.
     pub std_m: f64,
 }
 
@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn few_are_far_off() {
+    fn the_fraction_of_outliers_is_the_probability() {
         let before = plate(40_000, 30.0, 0.5);
         let off = residuals(&before, &applied(&HeavyTails { probability: 0.02, std_m: 0.2 }, &before));
         let touched: Vec<f64> = off.iter().copied().filter(|v| *v != 0.0).collect();

@@ -1,4 +1,4 @@
-//! B4: returns lost where a surface is met at a grazing angle.
+//! B4: returns lost at grazing incidence.
 
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -8,16 +8,17 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return under cosine of incidence c is lost with probability `1 / (1 + exp(steepness * (c - cos_half)))`, whatever its range.
+/// A return at cosine of incidence c is lost with probability `1 / (1 + exp(steepness * (c - cos_half)))`, independent
+/// of range.
 ///
-/// Typical: half at 85 to 88 degrees (cos 0.09 to 0.03) for diffuse surfaces, at 60 to 75 degrees for paint and metal (Muckenhuber et al. 2020
-/// measured nine materials of cars).
+/// Typical: half at 85 to 88 degrees (cos 0.09 to 0.03) for diffuse surfaces, at 60 to 75 degrees for paint and metal
+/// (Muckenhuber et al. 2020 measured nine automotive materials).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct IncidenceDropout {
-    /// Cosine of incidence at which half is lost.
+    /// Cosine of the angle of incidence at which half of the returns are lost.
     pub cos_half: f64,
-    /// How sharp that is.
+    /// Steepness of the logistic function, per unit of the cosine.
     pub steepness: f64,
 }
 

@@ -1,4 +1,4 @@
-//! D7: what the sensor reports as intensity.
+//! D7: intensity as a function of returned light and range.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -7,21 +7,23 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The intensity becomes `min(gain * (returned * (reference_m / R)^range_exponent)^gamma, 1)`, rounded to one of `levels`.
+/// The intensity becomes `min(gain * (returned * (reference_m / R)^range_exponent)^gamma, 1)`, R the range, m, rounded
+/// to a multiple of `1 / levels`.
 ///
-/// Typical: range_exponent 2 for raw power, 0 for sensors that calibrate it out; 100 levels (KITTI) or 256; saturation on reflectors.
+/// Typical: range_exponent 2 for raw power, 0 for sensors that correct for range; 100 levels (KITTI) or 255; saturation
+/// on retro-reflectors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct IntensityLaw {
-    /// Intensity of a white plate head-on at the reference.
+    /// Intensity of a white Lambertian plate at normal incidence and range `reference_m`, before saturation.
     pub gain: f64,
-    /// m.
+    /// Reference range, m.
     pub reference_m: f64,
-    /// How the light's fall with range is left in.
+    /// Exponent of the decrease with range: 0 for intensities corrected for range, 2 for raw power.
     pub range_exponent: f64,
-    /// Curve of the receiver.
+    /// Exponent of the receiver's response; 1 is linear.
     pub gamma: f64,
-    /// Steps between 0 and 1.
+    /// Number of steps between 0 and 1.
     pub levels: u32,
 }
 
@@ -60,7 +62,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_follows_the_law_and_saturates() {
+    fn intensity_follows_the_formula_and_saturates() {
         let effect = IntensityLaw { gain: 0.8, reference_m: 20.0, range_exponent: 2.0, gamma: 0.5, levels: 100 };
         for (range_m, reflectivity, want) in
             [(20.0, 0.25, 0.4), (40.0, 0.25, 0.2), (20.0, 0.0625, 0.2), (5.0, 0.5, 1.0), (100.0, 0.01, 0.02)]

@@ -1,4 +1,4 @@
-//! C7: labels that are off by another amount in every frame.
+//! C7: random label errors, new in every frame.
 
 use super::{Draws, FrameContext, LabelledCar, SensorEffect};
 use data::KeyError;
@@ -8,24 +8,24 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A label is moved by independent normal errors along, across and above its heading and turned by one; with `slip_probability` it slips
-/// `slip_m` forward or back on top.
+/// A label is shifted by independent normal errors along its heading, to the left and upwards, and its yaw by another.
+/// With probability `slip_probability` it is shifted by another `slip_m` forward or backward, with equal probability.
 ///
-/// Typical: 2 to 5 cm and 0.1 to 0.5 degrees (RTK); slips of about 0.8 m in some frames (paper, figure 8).
+/// Typical: 2 to 5 cm and 0.1 to 0.5 degrees (RTK); shifts of about 0.8 m in some frames (Huch et al. 2023, figure 8).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelNoise {
-    /// Along the heading, m.
+    /// Standard deviation along the heading, m.
     pub longitudinal_std_m: f64,
-    /// Across it, m.
+    /// Standard deviation across the heading, m.
     pub lateral_std_m: f64,
-    /// Up and down, m.
+    /// Standard deviation of the height, m.
     pub vertical_std_m: f64,
-    /// Degrees.
+    /// Standard deviation of the yaw, degrees.
     pub yaw_std_deg: f64,
-    /// Share of the labels that slip.
+    /// Fraction of the labels with an additional shift, 0 to 1.
     pub slip_probability: f64,
-    /// By how much, m.
+    /// Size of the additional shift along the heading, m.
     pub slip_m: f64,
 }
 
@@ -75,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_have_the_sizes_that_are_said() {
+    fn errors_have_the_configured_deviations() {
         let effect = LabelNoise {
             longitudinal_std_m: 0.3,
             lateral_std_m: 0.1,

@@ -1,4 +1,4 @@
-//! C6: labels that are off by the same amount in every car.
+//! C6: a constant label error in the object's frame.
 
 use super::{Draws, FrameContext, LabelledCar, SensorEffect};
 use data::KeyError;
@@ -6,19 +6,20 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A label is moved by `forward_m`, `left_m`, `up_m` in its own frame and turned by `yaw_deg`: the lever arm from antenna to middle is wrong.
+/// Every label is shifted by `forward_m`, `left_m`, `up_m` in its own frame and rotated by `yaw_deg`. Cause: a wrong
+/// lever arm from the GNSS antenna to the centre of the car.
 ///
 /// Typical: 0.1 to 1 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelOffset {
-    /// m.
+    /// Shift along the heading, m.
     pub forward_m: f64,
-    /// m.
+    /// Shift to the left, m.
     pub left_m: f64,
-    /// m.
+    /// Shift upwards, m.
     pub up_m: f64,
-    /// Degrees, counter-clockwise.
+    /// Rotation, degrees counter-clockwise.
     pub yaw_deg: f64,
 }
 

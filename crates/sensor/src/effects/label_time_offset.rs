@@ -1,4 +1,4 @@
-//! C5: labels and cloud are of different times.
+//! C5: a time offset between labels and cloud.
 
 use super::{Draws, FrameContext, LabelledCar, Need, SensorEffect};
 use data::KeyError;
@@ -6,28 +6,29 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Labels show the cars as they were `offset_s` before the cloud. When the other cars' own clocks are late (`clock = "cars"`), a label lies
-/// `v * offset_s` behind its car, v the car's velocity; when the cloud's clock is off (`clock = "cloud"`), own motion counts too: the label
-/// lies `(v - v_ego - w x r) * offset_s` behind, w the own rate of turn.
+/// Labels show the cars as they were `offset_s` before the cloud. With `clock = "cars"` the clocks of the other cars
+/// are wrong: the label is `v * offset_s` behind its car, v the velocity of the car over ground. With `clock = "cloud"`
+/// the clock of the cloud is wrong, and ego motion counts as well: the label is `(v - v_ego - w x r) * offset_s` behind
+/// its car, v_ego the ego velocity, w the ego turn rate, r the centre of the label, all in the cloud's frame.
 ///
-/// Typical: 5 to 20 ms; 0.8 m at 70 m/s are 11 ms (paper, section V).
+/// Typical: 5 to 20 ms; 0.8 m at 70 m/s are 11 ms (Huch et al. 2023, section V).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelTimeOffset {
-    /// s; negative for labels that are ahead.
+    /// Age of the labels relative to the cloud, s; negative for labels that are ahead.
     pub offset_s: f64,
-    /// Whose clock is off.
+    /// Which clock is wrong.
     pub clock: Clock,
 }
 
-/// Whose clock is off.
+/// Which clock is wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Clock {
     /// The clocks of the other cars.
     #[default]
     Cars,
-    /// The clock of the cloud, against all positions.
+    /// The clock of the cloud, relative to the positions of all cars, the ego vehicle included.
     Cloud,
 }
 

@@ -1,11 +1,12 @@
-//! What a slightly turned ray would have met, where no ray can be cast any more: the plane through the point that was hit.
+//! Range in a slightly different direction for clouds without a scene: intersection with the local plane through the
+//! point.
 
 use crate::scan::{Echo, dot};
 
-/// Measures along `true_direction` instead of the echo's own, and reports the range along its own.
+/// Sets the range of the echo to that of its local plane in `true_direction`. The direction of the echo stays the same.
 pub(super) fn measure_along(echo: &mut Echo, true_direction: [f32; 3]) {
     let (before, after) = (dot(echo.normal, echo.direction), dot(echo.normal, true_direction));
-    // Without a normal, and where the turned ray would graze the plane, the range stays.
+    // The range stays if there is no normal or if the ray in the true direction is almost parallel to the plane.
     if before < -1e-3 && after < 0.2 * before {
         echo.range_m *= before / after;
     }

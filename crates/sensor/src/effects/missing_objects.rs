@@ -1,4 +1,4 @@
-//! C10: a world that lacks what is there.
+//! C10: objects of the static world that are absent.
 
 use super::{Need, SensorEffect, WorldPlan};
 use crate::object::Group;
@@ -7,13 +7,13 @@ use data::toml_text::wrong;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// `groups` of the static world are not there.
+/// `groups` of the static world are absent.
 ///
-/// Typical: the paper's simulation has nothing behind the outer wall.
+/// Typical: the simulation of Huch et al. 2023 has nothing behind the outer wall.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MissingObjects {
-    /// What is left out.
+    /// Groups that are absent.
     pub groups: Vec<Group>,
 }
 
@@ -25,7 +25,7 @@ impl Default for MissingObjects {
 
 impl SensorEffect for MissingObjects {
     fn check(&self) -> Result<(), KeyError> {
-        if self.groups.is_empty() { Err(wrong("groups", "names none")) } else { Ok(()) }
+        if self.groups.is_empty() { Err(wrong("groups", "is empty")) } else { Ok(()) }
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
@@ -43,7 +43,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn groups_go_and_come_back() {
+    fn groups_are_removed_and_added_again() {
         let mut world = WorldPlan::default();
         MissingObjects::default().on_world(&mut world);
         assert_eq!(world.groups.len(), Group::ALL.len() - 2);

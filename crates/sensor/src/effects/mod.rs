@@ -1,16 +1,16 @@
 //! The sensor model: an ordered list of physical effects.
 //!
-//! Each effect is one file with one struct: its formula, units, source and typical values are said there. An effect may act in four places,
-//! and in each of them the effects of a list act in their order:
+//! Each effect is one file with one struct, which documents its formula, units, sources and typical values. An effect
+//! can act at four stages. At each stage the effects of a list are applied in their order:
 //!
-//! 1. on the **world**: what stands where, before any ray is cast;
-//! 2. on the **beams**: where shots really go, and when;
+//! 1. on the **world**: objects and their poses, before rays are cast;
+//! 2. on the **beams**: true directions and times of the shots;
 //! 3. on the **scan**: ranges, returns, intensities;
 //! 4. on the **labels**.
 //!
-//! Random numbers come from streams of their own: one for each (seed, data set, place in the list, kind, frame), and one without the frame
-//! for what stays the same in a whole data set, as the offset of a beam. So an effect changes neither when another is added behind it nor
-//! with the number of threads.
+//! Each effect has its own random number streams: one for each (seed, data set, index in the list, kind, frame), and one
+//! without the frame for values that are constant in a data set, such as the range offset of a beam. The result of an
+//! effect therefore depends neither on effects added behind it nor on the number of threads.
 //!
 //! The codes (A1, B2, ...) are those of the catalogue in `docs/src/reference/effects.md`.
 
@@ -33,28 +33,28 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// One physical effect. What it does not touch it leaves as it is.
+/// One physical effect. The default of each stage changes nothing.
 pub trait SensorEffect {
-    /// Refuses parameters that cannot be, naming the key.
+    /// Checks the parameters. Errors name the key.
     fn check(&self) -> Result<(), KeyError> {
         Ok(())
     }
 
-    /// What must be known for the effect to act on a finished cloud; `None` when it cannot.
+    /// Quantities that must be known for the effect to be applied to a finished cloud; `None` if it cannot be applied.
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[])
     }
 
-    /// Changes what stands where.
+    /// Changes the world, before rays are cast.
     fn on_world(&self, _world: &mut WorldPlan) {}
 
-    /// Changes where shots go.
+    /// Changes the directions and times of shots.
     fn on_beams(&self, _beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {}
 
-    /// Changes what came back.
+    /// Changes the echoes of a scan.
     fn on_scan(&self, _scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {}
 
-    /// Changes a finished cloud, of which no ray can be cast any more.
+    /// Changes a finished cloud, for which no rays can be cast.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         self.on_scan(scan, frame, draws);
     }
@@ -68,23 +68,23 @@ macro_rules! effects {
         $(mod $file;)*
         $(pub use $file::$name;)*
 
-        /// One entry of the list; `kind` says which.
+        /// One effect of the list, selected by `kind`.
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
         #[serde(tag = "kind", rename_all = "snake_case")]
-        #[allow(missing_docs, reason = "each variant is the struct of its name, which is documented")]
+        #[allow(missing_docs, reason = "each variant is the documented struct of the same name")]
         pub enum Effect {
             $($name($name),)*
         }
 
         impl Effect {
-            /// The model behind it.
+            /// The parameters and implementation of the effect.
             pub fn model(&self) -> &dyn SensorEffect {
                 match self {
                     $(Effect::$name(effect) => effect,)*
                 }
             }
 
-            /// Its name in a list.
+            /// Its `kind` in TOML.
             pub fn kind(&self) -> &'static str {
                 match self {
                     $(Effect::$name(_) => stringify!($file),)*
@@ -98,7 +98,7 @@ macro_rules! effects {
                 }
             }
 
-            /// Name and code of every effect.
+            /// Kind and code of every effect.
             pub const CATALOGUE: &'static [(&'static str, &'static str)] = &[$((stringify!($file), $code),)*];
         }
     };
@@ -154,27 +154,27 @@ effects! {
     empirical::Empirical "E4",
 }
 
-/// An ordered list of effects, as a TOML of `[[effect]]` tables.
+/// An ordered list of effects: `[[effect]]` tables in TOML.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EffectList {
-    /// The effects, in their order.
+    /// The effects, in the order in which they are applied.
     #[serde(rename = "effect", default)]
     pub effects: Vec<Effect>,
 }
 
 impl EffectList {
-    /// Reads a list.
+    /// Reads a list from a TOML file.
     pub fn read(path: &Path) -> Result<EffectList, DataError> {
         read_toml(path, EffectList::check)
     }
 
-    /// A list in memory; `path` is for messages.
+    /// Parses a list from TOML; `path` is for error messages.
     pub fn parse(text: &str, path: &Path) -> Result<EffectList, DataError> {
         parse_toml(text, path, EffectList::check)
     }
 
-    /// Refuses parameters that cannot be, naming the key.
+    /// Checks the parameters of all effects. Errors name the key.
     pub fn check(&self) -> Result<(), KeyError> {
         for (i, effect) in self.effects.iter().enumerate() {
             effect.model().check().map_err(|e| e.below(&format!("effect[{i}]")))?;
@@ -183,12 +183,15 @@ impl EffectList {
             matches!(e, Effect::DualReturns(_))
                 && !self.effects[..i].iter().any(|e| matches!(e, Effect::BeamDivergence(_)))
         }) {
-            return Err(wrong("effect", "dual_returns needs a beam_divergence before it: a line has one return"));
+            return Err(wrong(
+                "effect",
+                "dual_returns needs a beam_divergence before it: without divergence a shot has one return",
+            ));
         }
         Ok(())
     }
 
-    /// What each effect of the list draws from.
+    /// The effects of the list with their random number streams.
     fn each<'a>(&'a self, seed: u64, set: &'a str, frame: u64) -> impl Iterator<Item = (&'a Effect, Draws)> + 'a {
         let draws = move |(i, effect): (usize, &'a Effect)| {
             (effect, Draws::new(seed, format!("{set}/effect {i} {}", effect.kind()), frame))
@@ -196,33 +199,33 @@ impl EffectList {
         self.effects.iter().enumerate().map(draws)
     }
 
-    /// Lets the list act on the world.
+    /// Applies the list to the world.
     pub fn on_world(&self, world: &mut WorldPlan) {
         self.effects.iter().for_each(|effect| effect.model().on_world(world));
     }
 
-    /// Lets the list act on the shots of a frame.
+    /// Applies the list to the shots of a frame.
     pub fn on_beams(&self, beams: &mut Beams, frame: &FrameContext) {
         for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
             effect.model().on_beams(beams, frame, &draws);
         }
     }
 
-    /// Lets the list act on what came back.
+    /// Applies the list to the echoes of a scan.
     pub fn on_scan(&self, scan: &mut Scan, frame: &FrameContext) {
         for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
             effect.model().on_scan(scan, frame, &draws);
         }
     }
 
-    /// Lets the list act on a finished cloud.
+    /// Applies the list to a finished cloud.
     pub fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext) {
         for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
             effect.model().on_cloud(scan, frame, &draws);
         }
     }
 
-    /// Lets the list act on the labels.
+    /// Applies the list to the labels.
     pub fn on_labels(&self, cars: &mut [LabelledCar], frame: &FrameContext) {
         for (effect, draws) in self.each(frame.seed, frame.set, frame.index) {
             effect.model().on_labels(cars, frame, &draws);
@@ -269,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn the_catalogue_is_whole() {
+    fn the_catalogue_is_complete() {
         let kinds: Vec<&str> = Effect::CATALOGUE.iter().map(|(kind, _)| *kind).collect();
         assert!(kinds.len() >= 30);
         let mut sorted = kinds.clone();
@@ -277,7 +280,7 @@ mod tests {
         sorted.dedup();
         assert_eq!(sorted.len(), kinds.len());
         for kind in kinds {
-            // Every effect stands with its defaults, and its name in a list is that of its file.
+            // Every effect is valid with its defaults, and its kind is the name of its file.
             let text = format!("[[effect]]\nkind = \"beam_divergence\"\n[[effect]]\nkind = \"{kind}\"\n");
             let list = EffectList::parse(&text, Path::new("e.toml")).unwrap();
             assert_eq!(list.effects[1].kind(), kind);

@@ -1,4 +1,4 @@
-//! E2: the mounts of the sensors swing.
+//! E2: vibration of the sensor mounts.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::Beams;
@@ -8,16 +8,17 @@ use nalgebra::UnitQuaternion;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// All sensors are really pitched by `amplitude_deg * sin(2 pi * frequency_hz * t)`, t the time of the cloud, s: the same angle for all shots of a
-/// scan. No effect of the usual catalogues.
+/// The true pitch of all sensors differs from the rig by `amplitude_deg * sin(2 pi * frequency_hz * t)`, t the time of
+/// the cloud, s. The angle is the same for all shots of a scan. The effect is not in the usual catalogues; it tests a
+/// diagnosis on unknown causes.
 ///
 /// Typical: 0.05 to 0.3 degrees at 1 to 30 Hz.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MountVibration {
-    /// Degrees.
+    /// Amplitude of the pitch, degrees.
     pub amplitude_deg: f64,
-    /// Hz.
+    /// Frequency, Hz.
     pub frequency_hz: f64,
 }
 
@@ -52,14 +53,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_swings_with_time() {
+    fn the_pitch_is_a_sine_of_time() {
         let effect = MountVibration { amplitude_deg: 0.2, frequency_hz: 5.0 };
         let pitch = |index: u64| {
             let mut beams = Beams::of(&rig());
             with_frame(index, |frame, draws| effect.on_beams(&mut beams, frame, draws));
             beams.sensors[0].true_mount.rotation.euler_angles().1.to_degrees()
         };
-        // Frames are 50 ms apart: a quarter of the swing.
+        // Frames are 50 ms apart: a quarter of the period.
         for (index, want) in [(0, 0.0), (1, 0.2), (2, 0.0), (3, -0.2), (4, 0.0)] {
             assert!((pitch(index) - want).abs() < 1e-9, "{index}: {}", pitch(index));
         }

@@ -1,4 +1,4 @@
-//! B9: packets, and now and then a whole sensor, lost on the way.
+//! B9: lost packets and sensor outages.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -9,8 +9,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// The shots of a sensor travel in packets of `packet_ms`. A packet is lost with probability `loss`, and with `burst` when the one before it
-/// was (a Gilbert channel); with `outage` a sensor is missing in a whole frame.
+/// The shots of a sensor are transmitted in packets of `packet_ms`. A packet is lost with probability `loss` if the
+/// previous packet arrived, and with probability `burst` if the previous packet was lost (Gilbert channel). With
+/// probability `outage` all points of a sensor are missing in a frame.
 ///
 /// Typical: 0.1 to 5 % of the packets, in bursts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -18,11 +19,11 @@ use std::collections::BTreeMap;
 pub struct PacketLoss {
     /// Duration of a packet, ms.
     pub packet_ms: f64,
-    /// Probability that a packet is lost after one that was not.
+    /// Probability that a packet is lost if the previous one arrived, 0 to 1.
     pub loss: f64,
-    /// Probability that a packet is lost after one that was.
+    /// Probability that a packet is lost if the previous one was lost, 0 to 1.
     pub burst: f64,
-    /// Probability that a sensor is missing in a frame.
+    /// Probability that a sensor is missing in a frame, 0 to 1.
     pub outage: f64,
 }
 
@@ -95,15 +96,15 @@ mod tests {
                 was_lost = is_lost;
             }
         }
-        // The channel is bad for loss / (loss + 1 - burst) of the time, 1 / (1 - burst) packets of 23 shots long.
+        // A fraction loss / (loss + 1 - burst) of the packets is lost, in bursts of 1 / (1 - burst) packets of 23 shots.
         let share = gone as f64 / all as f64;
         assert!((share - 0.02 / 0.42).abs() < 0.012, "{share}");
         let length = gone as f64 / starts as f64;
-        assert!((30.0..80.0).contains(&length), "{length} shots a burst");
+        assert!((30.0..80.0).contains(&length), "{length} shots per burst");
     }
 
     #[test]
-    fn an_outage_takes_all_of_a_sensor() {
+    fn an_outage_removes_all_points_of_a_sensor() {
         let before = scene();
         let effect = PacketLoss { outage: 0.3, loss: 0.0, ..PacketLoss::default() };
         let shares: Vec<f64> = (0..200).map(|frame| lost(&before, &applied_in(frame, &effect, &before))).collect();

@@ -1,4 +1,4 @@
-//! E3: the order of the points.
+//! E3: random order of the points.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -7,7 +7,7 @@ use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The points of a cloud come in random order, as where the clouds of several sensors are put together by a network.
+/// The points of a cloud are in random order, as after merging the clouds of several sensors over a network.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PointOrder {}

@@ -1,4 +1,4 @@
-//! D4: rain takes some light, and single drops near the sensor send it back.
+//! D4: rain: attenuation and returns from drops near the sensor.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -8,16 +8,18 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// At a rate of q mm/h the light of a return falls by `exp(-2 alpha R)` with `alpha = 1e-3 * 0.2 * q^0.6`, 1/m, and a shot reports a drop with
-/// probability `drops * q / 10` at a range of `2 m * -ln(U)`, U uniform, before its surface: near drops alone are bright enough.
+/// At a rain rate of q mm/h, the light of a return at range R is multiplied by `exp(-2 alpha R)` with
+/// `alpha = 1e-3 * 0.2 * q^0.6`, 1/m. With probability `drops * q / 10`, a shot reports a drop at range
+/// `0.3 m - 2 m * ln(U)`, U uniform between 0 and 1, if that is nearer than its surface. Only near drops return enough
+/// light.
 ///
 /// Typical: 2 (light) to 50 mm/h (violent); 0.1 to 1 % of the shots at 10 mm/h.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rain {
-    /// mm/h.
+    /// Rain rate, mm/h.
     pub rate_mm_per_h: f64,
-    /// Share of the shots that meet a drop at 10 mm/h.
+    /// Probability that a shot reports a drop at 10 mm/h, 0 to 1.
     pub drops: f64,
 }
 
@@ -27,7 +29,7 @@ impl Default for Rain {
     }
 }
 
-/// Mean range of drops that are seen, m.
+/// Mean distance of reported drops beyond 0.3 m, m.
 const DROP_RANGE_M: f32 = 2.0;
 
 impl SensorEffect for Rain {

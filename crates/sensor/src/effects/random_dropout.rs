@@ -10,11 +10,12 @@ use serde::{Deserialize, Serialize};
 
 /// A return is lost with probability `share`.
 ///
-/// Typical: 0.20 is the paper's "sim downsampled"; CARLA's default is 0.45; what road data show on average is 0.05 to 0.15.
+/// Typical: 0.20 in the "sim downsampled" of Huch et al. 2023; 0.45 is the default of CARLA; recorded road data lose
+/// 0.05 to 0.15 on average.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RandomDropout {
-    /// 0 to 1.
+    /// Probability of a loss, 0 to 1.
     pub share: f64,
 }
 
@@ -34,7 +35,7 @@ impl SensorEffect for RandomDropout {
     }
 }
 
-/// Loses each return with the probability that `share` says for it.
+/// Removes each return with the probability `share` of its echo.
 pub(super) fn drop_some(scan: &mut Scan, draws: &Draws, share: impl Fn(&Echo) -> f32) {
     let mut random = draws.of_frame();
     for echo in scan.returns_mut() {
@@ -50,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_share_is_lost_everywhere() {
+    fn the_fraction_lost_is_the_share() {
         let before = scene();
         for share in [0.0, 0.2, 1.0] {
             let got = lost(&before, &applied(&RandomDropout { share }, &before));

@@ -1,4 +1,4 @@
-//! A6: all ranges off by the same amount and the same part.
+//! A6: an offset and a scale error of all ranges.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeBias {
-    /// m.
+    /// Offset, m.
     pub offset_m: f64,
-    /// m a metre.
+    /// Scale error, m per m of range.
     pub scale: f64,
 }
 
@@ -45,7 +45,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_in_the_range() {
+    fn the_error_is_linear_in_range() {
         for range_m in [5.0, 100.0] {
             let before = plate(10, range_m, 0.5);
             let off = residuals(&before, &applied(&RangeBias { offset_m: -0.05, scale: 0.001 }, &before));

@@ -1,4 +1,4 @@
-//! A10: ranges that drift with time, as the sensor warms up.
+//! A10: a range offset that changes with time, as by warm-up.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -7,15 +7,16 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A range gets `drift_m * (1 - exp(-t / time_constant_s))`, m, t the time since the beginning of the data set, s.
+/// `drift_m * (1 - exp(-t / time_constant_s))`, m, is added to each range, t the time since the start of the data set,
+/// s.
 ///
-/// Typical: some millimetres to centimetres within half an hour (Glennie and Lichti 2011 on the HDL-64E).
+/// Typical: a few millimetres to centimetres within half an hour (Glennie and Lichti 2011 on the HDL-64E).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeDrift {
-    /// Where it ends, m.
+    /// Final offset, m.
     pub drift_m: f64,
-    /// After this time 63 % of it are there, s.
+    /// Time after which 63 % of the final offset are reached, s.
     pub time_constant_s: f64,
 }
 
@@ -45,7 +46,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_begins_at_nothing_and_ends_where_it_is_said() {
+    fn the_offset_grows_from_0_to_the_final_value() {
         let (before, effect) = (plate(5, 30.0, 0.5), RangeDrift { drift_m: 0.05, time_constant_s: 10.0 });
         for (frame, want) in [(0, 0.0), (200, 0.05 * (1.0 - (-1.0_f64).exp())), (20_000, 0.05)] {
             let off = residuals(&before, &applied_in(frame, &effect, &before));

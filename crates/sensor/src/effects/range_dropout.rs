@@ -1,4 +1,4 @@
-//! B3: returns lost by their range alone, along a table.
+//! B3: returns lost by a lookup table over range.
 
 use super::random_dropout::drop_some;
 use super::table::{check_table, interpolated};
@@ -8,17 +8,17 @@ use data::KeyError;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return at range R is lost with the probability that lies on the line through the points (`range_m`, `share`); beyond both ends that of the
-/// end.
+/// A return at range R is lost with the probability of the table (`range_m`, `share`) at R. The table is interpolated
+/// linearly and constant beyond both ends.
 ///
-/// Typical: 0 near by to 0.3 at 100 m. The paper's "distribution-matched" downsampling is a table fitted to a pair of data sets:
-/// [`crate::matched::fit_range_dropout`].
+/// Typical: 0 at short range to 0.3 at 100 m. The "distribution-matched" downsampling of Huch et al. 2023 is a table
+/// fitted to a pair of data sets: [`crate::matched::fit_range_dropout`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeDropout {
-    /// Ranges, ascending, m.
+    /// Ranges, strictly ascending, m.
     pub range_m: Vec<f64>,
-    /// Probability of a loss at each, 0 to 1.
+    /// Probability of a loss at each range, 0 to 1.
     pub share: Vec<f64>,
 }
 
@@ -29,7 +29,7 @@ impl Default for RangeDropout {
 }
 
 impl RangeDropout {
-    /// The probability of a loss at a range.
+    /// Probability of a loss at a range.
     pub fn share_at(&self, range_m: f64) -> f64 {
         interpolated(&self.range_m, &self.share, range_m)
     }
@@ -64,8 +64,8 @@ mod tests {
     fn bad_tables_are_refused() {
         let table = |range_m: &[f64], share: &[f64]| RangeDropout { range_m: range_m.into(), share: share.into() };
         for (effect, want) in [
-            (table(&[], &[]), "no table"),
-            (table(&[1.0, 2.0], &[0.1]), "no table"),
+            (table(&[], &[]), "as many of each"),
+            (table(&[1.0, 2.0], &[0.1]), "as many of each"),
             (table(&[1.0, 1.0], &[0.1, 0.2]), "range_m[1]: is not larger"),
             (table(&[1.0, 2.0], &[0.1, 1.2]), "share[1]: 1.2"),
         ] {

@@ -1,4 +1,4 @@
-//! B6: nothing nearer, nothing farther.
+//! B6: minimum and maximum range.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -9,13 +9,13 @@ use serde::{Deserialize, Serialize};
 
 /// Returns outside of `min_m..=max_m` are lost.
 ///
-/// Typical: 0.3 to 1 m (dead zone; Ouster OS1 0.8 m) and 100 to 250 m.
+/// Typical: minimum 0.3 to 1 m (Ouster OS1 0.8 m), maximum 100 to 250 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeLimits {
-    /// m.
+    /// Minimum range, m.
     pub min_m: f64,
-    /// m.
+    /// Maximum range, m.
     pub max_m: f64,
 }
 
@@ -45,7 +45,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_step_at_both_ends() {
+    fn returns_outside_of_the_limits_are_lost() {
         let before = scene();
         let after = applied(&RangeLimits { min_m: 10.0, max_m: 30.0 }, &before);
         for (a, b) in before.echoes.iter().zip(&after.echoes) {

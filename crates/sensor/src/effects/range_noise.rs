@@ -1,4 +1,4 @@
-//! A1: noise of one size.
+//! A1: range noise with a constant standard deviation.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -8,9 +8,9 @@ use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every range gets `std_m * N(0, 1)`, m.
+/// `std_m * N(0, 1)`, m, is added to each range.
 ///
-/// Typical: 0.02 (the default of the simulator of Huch et al. 2023 and their "sim noise"), 0.01 to 0.03 in data sheets.
+/// Typical: 0.02 (default of the simulator of Huch et al. 2023 and their "sim noise"), 0.01 to 0.03 in data sheets.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoise {
@@ -34,7 +34,8 @@ impl SensorEffect for RangeNoise {
     }
 }
 
-/// Adds Gaussian noise of the deviation (m) that `std_m` says for each return. Ranges stay above 1 cm.
+/// Adds Gaussian noise to each range; `std_m` is its standard deviation as a function of the echo. Ranges stay at least
+/// 1 cm.
 pub(super) fn add_noise(scan: &mut Scan, draws: &Draws, std_m: impl Fn(&crate::scan::Echo) -> f32) {
     let mut random = draws.of_frame();
     for echo in scan.returns_mut() {
@@ -49,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn its_size_is_that_at_every_range() {
+    fn the_deviation_is_the_same_at_every_range() {
         for range_m in [5.0, 50.0, 200.0] {
             let before = plate(20_000, range_m, 0.5);
             let (mean, std) = moments(&residuals(&before, &applied(&RangeNoise { std_m: 0.03 }, &before)));

@@ -1,4 +1,4 @@
-//! A4: noise from the footprint of a beam that meets a surface at an angle.
+//! A4: range noise from the footprint on inclined surfaces.
 
 use super::range_noise::add_noise;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -8,18 +8,19 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every range R gets `s * N(0, 1)`, m, with `s = min(R * divergence_rad / 2 * tan(i) / sqrt(samples), most_m)`, i the angle of incidence:
-/// the surface is smeared along the beam, and the receiver averages over some samples of it.
+/// `s * N(0, 1)`, m, is added to a range R, with `s = min(R * divergence_rad / 2 * tan(i) / sqrt(samples), most_m)`, i
+/// the angle of incidence. An inclined footprint spreads the return over range, and the receiver averages over
+/// `samples` independent samples of it.
 ///
-/// Typical: 0.7 to 3 mrad (Velodyne VLP-16 3 mrad, Ouster OS1 0.13 to 0.18 degrees), some samples.
+/// Typical: 0.7 to 3 mrad (Velodyne VLP-16 3 mrad, Ouster OS1 0.13 to 0.18 degrees), a few samples.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoiseByIncidence {
-    /// Full divergence of the beam, rad.
+    /// Full divergence angle of the beam, rad.
     pub divergence_rad: f64,
-    /// Independent samples that the receiver averages.
+    /// Number of independent samples that the receiver averages.
     pub samples: f64,
-    /// It does not grow beyond, m.
+    /// Upper limit of the standard deviation, m.
     pub most_m: f64,
 }
 
@@ -56,14 +57,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn head_on_there_is_none() {
+    fn at_normal_incidence_there_is_no_noise() {
         let effect = RangeNoiseByIncidence { divergence_rad: 0.004, samples: 4.0, most_m: 0.5 };
         let before = plate(1000, 50.0, 0.5);
         assert_eq!(residuals(&before, &applied(&effect, &before)), vec![0.0; 1000]);
     }
 
     #[test]
-    fn it_follows_range_and_angle() {
+    fn the_deviation_follows_range_and_incidence() {
         let effect = RangeNoiseByIncidence { divergence_rad: 0.004, samples: 4.0, most_m: 0.5 };
         for (range_m, degrees) in [(20.0, 60.0_f32), (60.0, 80.0), (20.0, 89.9)] {
             let mut before = plate(20_000, range_m, 0.5);

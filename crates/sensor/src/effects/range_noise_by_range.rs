@@ -1,4 +1,4 @@
-//! A2: noise that grows with range.
+//! A2: range noise that grows with range.
 
 use super::range_noise::add_noise;
 use super::{Draws, FrameContext, SensorEffect};
@@ -8,17 +8,18 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every range R gets `s * N(0, 1)`, m, with `s = base_m + per_m * R`, or `s = hypot(base_m, per_m * R)` when `quadratic`.
+/// `s * N(0, 1)`, m, is added to a range R, with `s = base_m + per_m * R`, or `s = hypot(base_m, per_m * R)` if
+/// `quadratic` is true.
 ///
-/// Typical: base 0.005 to 0.03 m, 1e-4 to 1e-3 a metre (the form of the Unity plugin of Robotec's GPU LiDAR).
+/// Typical: base 0.005 to 0.03 m, 1e-4 to 1e-3 m per m (the form of the Unity plugin of Robotec's GPU LiDAR).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoiseByRange {
-    /// Standard deviation at no range, m.
+    /// Standard deviation at range 0, m.
     pub base_m: f64,
-    /// Growth a metre of range, m/m.
+    /// Growth of the standard deviation per metre of range, m/m.
     pub per_m: f64,
-    /// Add both as independent noises.
+    /// Add the two terms as independent noise, in quadrature.
     pub quadratic: bool,
 }
 
@@ -49,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn its_size_follows_the_range() {
+    fn the_deviation_follows_the_range() {
         for (quadratic, range_m, want) in
             [(false, 10.0, 0.02), (false, 100.0, 0.11), (true, 10.0, 0.014_142), (true, 100.0, 0.1005)]
         {

@@ -1,4 +1,4 @@
-//! A3: noise that grows where little light comes back.
+//! A3: range noise that grows as less light returns.
 
 use super::range_noise::add_noise;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -8,20 +8,23 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every range gets `s * N(0, 1)`, m, with `s = min(std_m * exp(-exponent * (u - signal)), most_m)`, u the echo's signal index
-/// `ln(returned / R^2) - ln(0.1 / 250^2)`: `std_m` where u is `signal`, more where less light comes back.
+/// `s * N(0, 1)`, m, is added to a range R, with `s = min(std_m * exp(-exponent * (u - signal)), most_m)`, u the signal
+/// index `ln(returned / R^2) - ln(0.1 / 250^2)`. The standard deviation is `std_m` where u equals `signal`, and larger
+/// where less light returns.
 ///
-/// Typical: exponent 0.5 to 0.8 (Ouster OS1's data sheet: 1.5 cm at a signal-to-noise ratio of 250, 3 cm at 100, 10 cm at 12).
+/// Typical: exponent 0.5 to 0.8 (Ouster OS1's data sheet: 1.5 cm at a signal-to-noise ratio of 250, 3 cm at 100, 10 cm
+/// at 12).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoiseBySignal {
-    /// Standard deviation at the reference, m.
+    /// Standard deviation at the reference signal index, m.
     pub std_m: f64,
-    /// How fast it grows when the light falls.
+    /// Growth exponent: s is proportional to the returned light to the power of `-exponent`.
     pub exponent: f64,
-    /// Signal index of the reference; 0 is the reach of the data sheet, 4.6 a hundred times that light.
+    /// Reference signal index. 0 is the light at the data sheet's maximum range (250 m at 10 % reflectivity), 4.6 a
+    /// hundred times that light.
     pub signal: f64,
-    /// It does not grow beyond, m.
+    /// Upper limit of the standard deviation, m.
     pub most_m: f64,
 }
 
@@ -55,9 +58,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn its_size_follows_the_light() {
+    fn the_deviation_follows_the_signal() {
         let effect = RangeNoiseBySignal { std_m: 0.02, exponent: 0.5, signal: 0.0, most_m: 0.1 };
-        // A hundredth of the light is ten times the noise at exponent 0.5; then comes the limit.
+        // At exponent 0.5, a hundredth of the light gives ten times the noise, up to the limit.
         for (range_m, reflectivity, want) in
             [(250.0, 0.1, 0.02), (25.0, 0.1, 0.002), (250.0, 0.01, 0.0632), (250.0, 1e-4, 0.1)]
         {

@@ -1,4 +1,4 @@
-//! A9: ranges in steps.
+//! A9: ranges rounded to a step.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::Scan;
@@ -7,13 +7,13 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A range R becomes `step_m * round(R / step_m)`, m.
+/// A range R becomes `step_m * round(R / step_m)`, m, at least one step.
 ///
 /// Typical: 2 mm (Velodyne HDL-64E), 1.2 cm (Ouster OS1 gen 1), 3 cm (ZVISION ML-30S).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeQuantisation {
-    /// m.
+    /// Step, m.
     pub step_m: f64,
 }
 
@@ -42,7 +42,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ranges_lie_on_a_comb() {
+    fn ranges_are_multiples_of_the_step() {
         let before = scene();
         let after = applied(&RangeQuantisation { step_m: 0.05 }, &before);
         let off = residuals(&before, &after);

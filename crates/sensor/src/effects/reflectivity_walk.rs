@@ -1,4 +1,4 @@
-//! A8: ranges that depend on how bright a surface is.
+//! A8: range walk, a range error that depends on reflectivity.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -7,16 +7,16 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A range gets `walk_m * ln(reflectivity / reference)`, m: the flank of a strong pulse crosses the threshold earlier, so `walk_m` is negative
-/// in a receiver that is not compensated.
+/// `walk_m * ln(reflectivity / reference)`, m, is added to each range. The edge of a strong pulse crosses the detection
+/// threshold earlier, so `walk_m` is negative for a receiver without compensation.
 ///
-/// Typical: 0.5 to 3 cm for a factor e; "slight bias for retro-reflectors" in data sheets.
+/// Typical: 0.5 to 3 cm per factor e of reflectivity; "slight bias for retro-reflectors" in data sheets.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReflectivityWalk {
-    /// m for each factor e of reflectivity.
+    /// Change of range per factor e of reflectivity, m.
     pub walk_m: f64,
-    /// Reflectivity whose range is right.
+    /// Reflectivity at which the error is 0.
     pub reference: f64,
 }
 
@@ -50,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bright_surfaces_come_nearer() {
+    fn bright_surfaces_appear_nearer() {
         for (reflectivity, want) in [(0.2, 0.0), (20.0, -0.0921), (0.02, 0.0461)] {
             let before = plate(5, 30.0, reflectivity);
             let off = residuals(&before, &applied(&ReflectivityWalk { walk_m: -0.02, reference: 0.2 }, &before));

@@ -1,4 +1,4 @@
-//! C4: a scan takes time, in which everything moves.
+//! C4: motion distortion within a scan.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, Shutter};
@@ -8,15 +8,16 @@ use nalgebra::Vector3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every shot is sent at its own time, and sees the cars where they are then, from where its own car is then. `deskewed` moves the points by
-/// the own car's motion to the middle of the scan, as drivers do: then what stands still is right, and other cars are smeared by their
-/// own motion; otherwise all is smeared by the relative motion.
+/// Every shot is sent at its own time. It meets other cars at their poses of that time and starts from the ego pose of
+/// that time. With `deskewed = true`, points are corrected for ego motion to the middle of the scan, as sensor drivers
+/// do: static surfaces are correct, and moving cars keep the distortion by their own velocity. With `deskewed = false`,
+/// all points are distorted by the velocity relative to the ego vehicle.
 ///
-/// Typical: 50 ms a scan; at 70 m/s that is +-1.75 m.
+/// Typical: 50 ms per scan; at 70 m/s that is +-1.75 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RollingShutter {
-    /// Points are moved to where they would be seen from at the middle of the scan.
+    /// Correct points for ego motion to the middle of the scan.
     pub deskewed: bool,
 }
 
@@ -39,7 +40,8 @@ impl SensorEffect for RollingShutter {
         beams.shutter = Some(Shutter { deskewed: self.deskewed });
     }
 
-    /// On a finished cloud: points in the boxes of cars move with their car, all others as the own car moves.
+    /// On a finished cloud, points within the boxes of cars move with the velocity of their car and all other points
+    /// are static. With `deskewed = false` the velocity of the ego vehicle at the point is subtracted.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
         let ego = Vector3::from(frame.ego_velocity);
         let turn = Vector3::from(frame.ego_turn_rate);
@@ -89,7 +91,7 @@ mod tests {
     }
 
     #[test]
-    fn raw_all_moves_against_the_own_car() {
+    fn without_deskewing_all_points_move_relative_to_the_ego_vehicle() {
         let mut scan = two();
         with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_cloud(&mut scan, frame, draws));
         let beside = scan.echoes[1].point();
@@ -102,7 +104,7 @@ mod tests {
     }
 
     #[test]
-    fn beams_are_told() {
+    fn the_shutter_is_set_on_the_beams() {
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_beams(&mut beams, frame, draws));
         assert_eq!(beams.shutter, Some(Shutter { deskewed: false }));

@@ -1,4 +1,4 @@
-//! C2: a sensor that is not mounted where it is said to be.
+//! C2: a wrong sensor pose (extrinsic calibration) in the rig.
 
 use super::{Draws, FrameContext, SensorEffect};
 use crate::beams::Beams;
@@ -10,18 +10,19 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The sensor really stands at its pose of the rig, moved by `translation_m` and turned by `rotation_deg` (roll, pitch, yaw), both in its own
-/// frame; its points are shown by the rig.
+/// The true pose of the sensor is its pose in the rig, shifted by `translation_m` and rotated by `rotation_deg`, both
+/// in the sensor's frame. Points are computed with the pose in the rig.
 ///
-/// Typical: 1 to 10 cm, 0.05 to 0.3 degrees. The published description of the AV-21 has two values for the front sensor, 10 cm apart in x.
+/// Typical: 1 to 10 cm, 0.05 to 0.3 degrees. The published description of the AV-21 has two values for the front
+/// sensor, 10 cm apart in x.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorPoseError {
     /// Name of the sensor.
     pub sensor: String,
-    /// Forward, left, up in the sensor's frame, m.
+    /// Shift forward, left, up in the sensor's frame, m.
     pub translation_m: [f64; 3],
-    /// Roll, pitch, yaw, degrees.
+    /// Roll, pitch, yaw, degrees: about x, then y, then z. Positive pitch turns the sensor down.
     pub rotation_deg: [f64; 3],
 }
 
@@ -32,7 +33,7 @@ impl Default for SensorPoseError {
 }
 
 impl SensorPoseError {
-    /// `believed_from_true`, sensor's frames.
+    /// `nominal_from_true` of the sensor's frame.
     fn error(&self) -> Pose {
         let [roll, pitch, yaw] = self.rotation_deg.map(f64::to_radians);
         Isometry3::from_parts(
@@ -57,8 +58,9 @@ impl SensorEffect for SensorPoseError {
         }
     }
 
-    /// A point that the sensor really saw at p, from where it is said to stand, is shown at `error^-1 * p`: the cloud of the sensor moves as a
-    /// whole, by what it sees unchanged.
+    /// With the nominal mount the sensor measured p, in its frame; with the true mount the same surface point is
+    /// measured at `error^-1 * p`. The cloud of the sensor is transformed as a whole: its visible surfaces are assumed
+    /// to stay the same.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
         let Some(number) = frame.rig.find(&self.sensor) else { return };
         let mount = frame.rig.sensors[number].pose();
@@ -76,7 +78,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_true_mount_moves_and_the_believed_one_stays() {
+    fn the_true_mount_moves_and_the_nominal_one_stays() {
         let effect = SensorPoseError {
             translation_m: [0.1, 0.0, 0.0],
             rotation_deg: [0.0, 0.0, 1.0],
@@ -85,12 +87,12 @@ mod tests {
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let sensor = &beams.sensors[0];
-        assert!((sensor.true_mount.translation.x - 0.1).abs() < 1e-12 && sensor.believed_mount.translation.x == 0.0);
+        assert!((sensor.true_mount.translation.x - 0.1).abs() < 1e-12 && sensor.nominal_mount.translation.x == 0.0);
         assert!((geometry::yaw_rad(&sensor.true_mount).to_degrees() - 1.0).abs() < 1e-9);
     }
 
     #[test]
-    fn a_sensor_turned_down_lifts_the_ground() {
+    fn a_sensor_pitched_down_raises_the_ground() {
         let before = scene();
         let effect = SensorPoseError { rotation_deg: [0.0, 0.5, 0.0], ..SensorPoseError::default() };
         let mut after = before.clone();

@@ -1,9 +1,9 @@
-//! Which shots are neighbours in the pattern of a sensor.
+//! Neighbours of a shot in the pattern of its sensor.
 
 use crate::scan::{Echo, Scan};
 use std::collections::BTreeMap;
 
-/// First returns by sensor, row and column.
+/// Index of the first return of each sensor, row and column.
 pub(super) struct ShotGrid {
     sensors: BTreeMap<u8, (usize, Vec<u32>)>,
 }
@@ -26,7 +26,7 @@ impl ShotGrid {
         ShotGrid { sensors }
     }
 
-    /// Indices of the shots within so many rows and columns of one, itself included.
+    /// Indices of the shots within `rows` rows and `columns` columns of a shot, itself included.
     pub(super) fn around(&self, echo: &Echo, rows: usize, columns: usize) -> impl Iterator<Item = usize> {
         let found = self.sensors.get(&echo.sensor);
         let (width, places) = found.map_or((1, &[][..]), |(width, places)| (*width, places.as_slice()));
@@ -39,7 +39,7 @@ impl ShotGrid {
     }
 }
 
-/// How many rows and columns reach an angle, from the steps of the grid around a shot; at most `most`.
+/// Numbers of rows and columns that cover an angle, from the angular steps of the grid around a shot; at most `most`.
 pub(super) fn reach(scan: &Scan, grid: &ShotGrid, echo: &Echo, angle_rad: f32, most: usize) -> (usize, usize) {
     let step = |rows: usize, columns: usize| {
         let other = grid.around(echo, rows, columns).map(|i| &scan.echoes[i]);

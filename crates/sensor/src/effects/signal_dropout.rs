@@ -1,4 +1,4 @@
-//! B2: returns lost where too little light comes back: the lidar equation.
+//! B2: detection probability by returned light (LiDAR equation).
 
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
@@ -8,20 +8,20 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return is detected with probability `most / (1 + exp(-steepness * (u - threshold)))`, u the echo's signal index
-/// `ln(returned / R^2) - ln(0.1 / 250^2)` less `2 * attenuation_per_m * R`.
+/// A return at range R, m, is detected with probability `most / (1 + exp(-steepness * (u - threshold)))`. The signal
+/// index u is `ln(returned / R^2) - ln(0.1 / 250^2) - 2 * attenuation_per_m * R`.
 ///
-/// Typical: threshold 0 is the reach of the data sheet (250 m at 10 %); -2 to 3; steepness 2 to 8.
+/// Typical: threshold 0 is the data sheet's maximum range (250 m at 10 % reflectivity); -2 to 3; steepness 2 to 8.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SignalDropout {
-    /// Probability of detection where there is light enough, 0 to 1.
+    /// Detection probability at strong signals, 0 to 1.
     pub most: f64,
-    /// Signal index at which half of that is detected.
+    /// Signal index at which the detection probability is half of `most`.
     pub threshold: f64,
-    /// How sharp the threshold is.
+    /// Steepness of the logistic function, per unit of the signal index.
     pub steepness: f64,
-    /// What the air takes of the light, one way, 1/m.
+    /// Extinction coefficient of the air, one way, 1/m.
     pub attenuation_per_m: f64,
 }
 
@@ -59,10 +59,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn half_is_lost_at_the_reach_whatever_makes_the_light_weak() {
+    fn detection_depends_on_the_signal_index_alone() {
         let effect = SignalDropout { most: 0.9, threshold: 0.0, steepness: 4.0, attenuation_per_m: 0.0 };
         let logistic = |u: f64| 1.0 - 0.9 / (1.0 + (-4.0 * u).exp());
-        // Twice the range is a quarter of the light.
+        // Twice the range returns a quarter of the light.
         for (range_m, reflectivity, u) in [
             (250.0, 0.1, 0.0),
             (125.0, 0.025, 0.0),

@@ -1,4 +1,4 @@
-//! D4: the plume of water or dust behind a car.
+//! D4: spray or dust behind other cars.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -9,19 +9,19 @@ use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Behind every other car lies a plume as wide as the car, `length_m` long and `height_m` high. A shot that passes through it for w m before its
-/// surface reports a droplet with probability `1 - exp(-density_per_m * w)`, at a range with density proportional to `exp(-density_per_m * r)`
-/// along that way.
+/// Behind every other car is a plume as wide as the car, `length_m` long and `height_m` high. A shot whose path within
+/// a plume is w long, m, before its surface, reports a droplet with probability `1 - exp(-density_per_m * w)`. The
+/// droplet's distance r from the point of entry has a density proportional to `exp(-density_per_m * r)`.
 ///
-/// Typical: 0.01 to 0.2 a metre on a wet road at speed.
+/// Typical: 0.01 to 0.2 per metre on a wet road at speed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Spray {
-    /// 1/m.
+    /// Probability density of a droplet return along the path, 1/m.
     pub density_per_m: f64,
-    /// m.
+    /// Length of the plume, m.
     pub length_m: f64,
-    /// m.
+    /// Height of the plume, m.
     pub height_m: f64,
 }
 
@@ -48,7 +48,9 @@ impl SensorEffect for Spray {
         let mut random = draws.of_frame();
         for echo in &mut scan.echoes {
             for plume in &plumes {
-                let Some([near, far]) = way_through(plume, echo.origin, echo.direction, echo.range_m) else { continue };
+                let Some([near, far]) = path_through(plume, echo.origin, echo.direction, echo.range_m) else {
+                    continue;
+                };
                 let passed = (-density * (far - near)).exp();
                 let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
                 if chance < 1.0 - passed {
@@ -69,8 +71,8 @@ impl Spray {
     }
 }
 
-/// Where a ray enters and leaves a box before `until_m`, m.
-fn way_through(b: &Box3, origin: [f32; 3], direction: [f32; 3], until_m: f32) -> Option<[f32; 2]> {
+/// Ranges at which a ray enters and leaves a box, limited to `until_m`, m.
+fn path_through(b: &Box3, origin: [f32; 3], direction: [f32; 3], until_m: f32) -> Option<[f32; 2]> {
     let start = b.to_local(origin.map(f64::from));
     let (s, c) = b.yaw_rad.sin_cos();
     let d = direction.map(f64::from);
@@ -97,7 +99,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn droplets_hang_behind_the_car() {
+    fn droplets_are_within_the_plume() {
         let effect = Spray { density_per_m: 0.2, length_m: 8.0, height_m: 2.0 };
         let before = scene();
         let after = applied(&effect, &before);
@@ -108,8 +110,8 @@ mod tests {
             let local = plume.to_local(b.point().map(f64::from));
             assert!((0..3).all(|k| local[k].abs() <= plume.size[k] / 2.0 + 1e-3), "{local:?}");
         }
-        // Of the shots that pass all of the plume, 1 - exp(-0.2 * 8) are stopped.
-        let through = |e: &crate::scan::Echo| way_through(&plume, e.origin, e.direction, e.range_m);
+        // A fraction 1 - exp(-0.2 w) of the shots with a path of w m within the plume report a droplet.
+        let through = |e: &crate::scan::Echo| path_through(&plume, e.origin, e.direction, e.range_m);
         let expected: f64 =
             before.echoes.iter().filter_map(through).map(|[n, f]| 1.0 - f64::from((-0.2 * (f - n)).exp())).sum();
         assert!((changed.len() as f64 / expected - 1.0).abs() < 0.15, "{} {expected}", changed.len());

@@ -1,4 +1,4 @@
-//! C8: the other cars stand otherwise on the road than they are believed to.
+//! C8: errors of the other cars' roll and pitch.
 
 use super::{Need, SensorEffect, WorldPlan};
 use data::KeyError;
@@ -6,20 +6,21 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Every other car is really turned against its believed pose by roll `roll_deg + roll_std_deg * N(0, 1)` and pitch
-/// `pitch_deg + pitch_std_deg * N(0, 1)` (positive: nose down) about the middle of its rear axle; new in every frame.
+/// The true attitude of every other car differs from the modelled one by roll `roll_deg + roll_std_deg * N(0, 1)` and
+/// pitch `pitch_deg + pitch_std_deg * N(0, 1)`, about the centre of its rear axle. Positive pitch turns the nose down.
+/// Values are drawn anew in every frame.
 ///
-/// Typical: 0.1 to 0.3 degrees. Labels have neither roll nor pitch (paper, section V).
+/// Typical: 0.1 to 0.3 degrees. Labels have neither roll nor pitch (Huch et al. 2023, section V).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetAttitude {
-    /// Degrees.
+    /// Mean roll, degrees; positive turns the left side up.
     pub roll_deg: f64,
-    /// Degrees.
+    /// Mean pitch, degrees; positive turns the nose down.
     pub pitch_deg: f64,
-    /// Degrees.
+    /// Standard deviation of roll between frames, degrees.
     pub roll_std_deg: f64,
-    /// Degrees.
+    /// Standard deviation of pitch between frames, degrees.
     pub pitch_std_deg: f64,
 }
 

@@ -1,4 +1,4 @@
-//! C11: the cars are not quite as they are modelled.
+//! C11: differences between the other cars and their model.
 
 use super::{Need, SensorEffect, WorldPlan};
 use data::KeyError;
@@ -6,16 +6,16 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The cars' bodies are really stretched by `scale` (length, width, height) about the middle of the bottom of their box, and moved by `shift_m`
-/// (forward, left, up) against it.
+/// The true bodies of the other cars are those of the model, scaled by `scale` about the centre of the bottom of their
+/// box and shifted by `shift_m`. Labels keep the box of the model.
 ///
 /// Typical: centimetres to a decimetre.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetShape {
-    /// Length, width, height, as a part of the modelled ones.
+    /// Scale of length, width, height.
     pub scale: [f64; 3],
-    /// Forward, left, up, m.
+    /// Shift forward, left, up in the car's frame, m.
     pub shift_m: [f64; 3],
 }
 
@@ -51,7 +51,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shapes_add_up() {
+    fn scales_multiply_and_shifts_add() {
         let mut world = WorldPlan::default();
         let effect = TargetShape { scale: [0.5, 1.0, 2.0], shift_m: [0.1, 0.0, -0.2] };
         effect.on_world(&mut world);

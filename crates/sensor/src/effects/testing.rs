@@ -1,4 +1,4 @@
-//! Scans and figures for the tests of effects.
+//! Scans and statistics for tests of effects.
 
 use super::{Draws, FrameContext, LabelledCar, SensorEffect};
 use crate::material::{MaterialId, MaterialTable};
@@ -7,7 +7,7 @@ use crate::scan::{Echo, Scan};
 use geometry::Box3;
 use std::path::Path;
 
-/// Rows and columns of the scans made here.
+/// Rows and columns of the test scans.
 pub(crate) const GRID: (usize, usize) = (32, 360);
 
 /// A rig of one sensor at the origin, 120 degrees wide.
@@ -18,7 +18,7 @@ pub(crate) fn rig() -> Rig {
     rig
 }
 
-/// A flat ground 2 m below the sensor, a wall across at 40 m, a bright board on it, nothing above 3 m.
+/// Flat ground 2 m below the sensor, a wall 40 m ahead and up to 3 m above the sensor, with a bright board on it.
 pub(crate) fn scene() -> Scan {
     let rig = rig();
     let echoes = rig.sensors[0].pattern.as_ref().unwrap().shots().iter().map(|shot| {
@@ -46,7 +46,7 @@ pub(crate) fn scene() -> Scan {
     Scan { echoes: echoes.collect() }
 }
 
-/// `n` echoes at one range, head-on, of one reflectivity.
+/// `n` echoes at one range and reflectivity, at normal incidence.
 pub(crate) fn plate(n: usize, range_m: f32, reflectivity: f32) -> Scan {
     let echo = Echo {
         range_m,
@@ -60,14 +60,14 @@ pub(crate) fn plate(n: usize, range_m: f32, reflectivity: f32) -> Scan {
     Scan { echoes: (0..n).map(place).collect() }
 }
 
-/// One other car 20 m ahead, coming along at 60 m/s.
+/// One other car 20 m ahead, with a velocity of 60 m/s.
 pub(crate) fn cars() -> Vec<LabelledCar> {
     let bbox = Box3::from_array([20.0, 2.0, -1.0, 4.88, 1.9, 1.18, 0.1]);
     let (s, c) = 0.1_f64.sin_cos();
     vec![LabelledCar { number: 0, true_box: bbox, label: bbox, velocity: [60.0 * c, 60.0 * s, 0.0] }]
 }
 
-/// Gives `work` a frame's context and draws.
+/// Calls `work` with the context of a frame and random streams.
 pub(crate) fn with_frame<T>(index: u64, work: impl FnOnce(&FrameContext, &Draws) -> T) -> T {
     let (rig, materials, cars) = (rig(), MaterialTable::default(), cars());
     let frame = FrameContext {
@@ -86,12 +86,12 @@ pub(crate) fn with_frame<T>(index: u64, work: impl FnOnce(&FrameContext, &Draws)
     work(&frame, &Draws::new(1, "test".into(), index))
 }
 
-/// What an effect makes of a scan in frame 0.
+/// The scan after an effect in frame 0.
 pub(crate) fn applied(effect: &dyn SensorEffect, scan: &Scan) -> Scan {
     applied_in(0, effect, scan)
 }
 
-/// What an effect makes of a scan in a frame.
+/// The scan after an effect in frame `index`.
 pub(crate) fn applied_in(index: u64, effect: &dyn SensorEffect, scan: &Scan) -> Scan {
     effect.check().unwrap();
     let mut scan = scan.clone();
@@ -99,7 +99,7 @@ pub(crate) fn applied_in(index: u64, effect: &dyn SensorEffect, scan: &Scan) -> 
     scan
 }
 
-/// Changes of range of what is a return in both, m.
+/// Changes of range of echoes that are returns in both scans, m.
 pub(crate) fn residuals(before: &Scan, after: &Scan) -> Vec<f64> {
     let both = before.echoes.iter().zip(&after.echoes).filter(|(a, b)| a.is_return() && b.is_return());
     both.map(|(a, b)| f64::from(b.range_m) - f64::from(a.range_m)).collect()
@@ -112,7 +112,7 @@ pub(crate) fn moments(values: &[f64]) -> (f64, f64) {
     (mean, (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / n).sqrt())
 }
 
-/// Share of the returns of `before` that are lost in `after`.
+/// Fraction of the returns of `before` that are lost in `after`.
 pub(crate) fn lost(before: &Scan, after: &Scan) -> f64 {
     let both = || before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return());
     both().filter(|(_, b)| !b.is_return()).count() as f64 / both().count() as f64

@@ -1,4 +1,4 @@
-//! Sensors: where they are mounted, what they see, and in which directions they shoot.
+//! Sensor rigs: mounts, fields of view and scan patterns.
 
 mod pattern;
 
@@ -13,11 +13,11 @@ use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 use std::path::Path;
 
-/// The sensors of a car; the frame of its clouds is the car's.
+/// The sensors of a vehicle. Their poses are relative to the frame of its clouds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Rig {
-    /// The sensors; their order is their number in attributes.
+    /// The sensors. Their index is the number in attributes.
     #[serde(rename = "sensor", default)]
     pub sensors: Vec<Sensor>,
 }
@@ -26,33 +26,33 @@ pub struct Rig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Sensor {
-    /// A name of its own.
+    /// Name, unique in the rig.
     pub name: String,
-    /// Where it is mounted, m, in the cloud's frame.
+    /// Position in the cloud's frame, m.
     #[serde(default)]
     pub position: [f64; 3],
-    /// Where its middle looks, degrees, counter-clockwise from +x.
+    /// Yaw of the sensor's x axis in the cloud's frame, degrees counter-clockwise from +x.
     #[serde(default)]
     pub yaw_deg: f64,
-    /// Positive turns its middle down, degrees.
+    /// Pitch, degrees; positive turns the x axis down.
     #[serde(default)]
     pub pitch_deg: f64,
-    /// Positive turns its left side up, degrees.
+    /// Roll, degrees; positive turns the left side up.
     #[serde(default)]
     pub roll_deg: f64,
-    /// Region that it measures, half of it to the left of the middle, degrees.
+    /// Horizontal field of view, symmetric about the sensor's x axis, degrees.
     #[serde(default = "all_around")]
     pub horizontal_fov_deg: f64,
-    /// Scans a second.
+    /// Scan rate, Hz.
     #[serde(default = "twenty")]
     pub rate_hz: f64,
-    /// Nothing nearer is measured, m.
+    /// Minimum measured range, m.
     #[serde(default = "half")]
     pub min_range_m: f64,
-    /// Nothing beyond is measured, m.
+    /// Maximum measured range, m.
     #[serde(default = "far")]
     pub max_range_m: f64,
-    /// In which directions it shoots; needed to simulate.
+    /// Scan pattern; needed for simulation.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pattern: Option<Pattern>,
 }
@@ -74,21 +74,21 @@ fn far() -> f64 {
 }
 
 impl Rig {
-    /// Reads a rig; the paths of patterns in CSV become relative to the working folder.
+    /// Reads a rig. Paths of CSV patterns are relative to its folder.
     pub fn read(path: &Path) -> Result<Rig, DataError> {
         let mut rig: Rig = read_toml(path, Rig::check)?;
         rig.resolve(path)?;
         Ok(rig)
     }
 
-    /// A rig in memory; `path` is where it lies, for messages and for patterns in CSV.
+    /// Parses a rig from TOML. `path` is used in error messages, and its folder for CSV patterns.
     pub fn parse(text: &str, path: &Path) -> Result<Rig, DataError> {
         let mut rig: Rig = parse_toml(text, path, Rig::check)?;
         rig.resolve(path)?;
         Ok(rig)
     }
 
-    /// One sensor at the origin that sees everything: what is assumed of a cloud about whose sensors nothing is known.
+    /// One sensor at the origin with a field of view of 360 degrees: the assumption for a cloud without a rig.
     pub fn single() -> Rig {
         let sensor: Sensor = toml::from_str("name = \"lidar\"").expect("a name is enough");
         Rig { sensors: vec![sensor] }
@@ -105,7 +105,7 @@ impl Rig {
         Ok(())
     }
 
-    /// Refuses what cannot be, naming the key.
+    /// Checks all values. Errors name the key.
     pub fn check(&self) -> Result<(), KeyError> {
         if self.sensors.is_empty() {
             return Err(wrong("sensor", "there is none; a rig has at least one [[sensor]]"));
@@ -116,19 +116,20 @@ impl Rig {
         for (i, sensor) in self.sensors.iter().enumerate() {
             let here = format!("sensor[{i}]");
             if sensor.name.is_empty() || self.sensors[..i].iter().any(|s| s.name == sensor.name) {
-                return Err(wrong(format!("{here}.name"), format!("{:?} is empty or there twice", sensor.name)));
+                return Err(wrong(format!("{here}.name"), format!("{:?} is empty or not unique", sensor.name)));
             }
             sensor.check().map_err(|e| e.below(&here))?;
         }
         Ok(())
     }
 
-    /// The number of a sensor.
+    /// Index of a sensor by name.
     pub fn find(&self, name: &str) -> Option<usize> {
         self.sensors.iter().position(|s| s.name == name)
     }
 
-    /// The same rig with `factor` as many rows and columns, at least one of each. Patterns in CSV keep every shot.
+    /// The rig with the numbers of rows and columns multiplied by `factor`, at least 1 each. CSV patterns do not
+    /// change.
     pub fn scaled(mut self, factor: f64) -> Rig {
         for sensor in &mut self.sensors {
             let (fov, rate) = (sensor.horizontal_fov_deg, sensor.rate_hz);
@@ -155,30 +156,32 @@ impl Sensor {
         self.pattern.as_ref().map_or(Ok(()), |pattern| pattern.check().map_err(|e| e.below("pattern")))
     }
 
-    /// `cloud_from_sensor`: roll about x, then pitch about y, then yaw about z, then the position.
+    /// `cloud_from_sensor`: rotation by roll about x, then pitch about y, then yaw about z, then translation.
     pub fn pose(&self) -> Pose {
         let [roll, pitch, yaw] = [self.roll_deg, self.pitch_deg, self.yaw_deg].map(f64::to_radians);
         Isometry3::from_parts(Translation3::from(self.position), UnitQuaternion::from_euler_angles(roll, pitch, yaw))
     }
 
-    /// Half of its field of view, rad.
+    /// Half of the horizontal field of view, rad.
     pub fn half_fov_rad(&self) -> f64 {
         (self.horizontal_fov_deg.to_radians() / 2.0).min(PI)
     }
 
-    /// Whether it sees all around, so that its azimuth closes.
-    pub fn closes(&self) -> bool {
+    /// Whether the field of view is a full circle (at least 98 % of it).
+    pub fn is_full_circle(&self) -> bool {
         self.half_fov_rad() > 0.98 * PI
     }
 
-    /// Rows that a scan finishes one after the other, from the top; empty where time runs along azimuth, as in sensors that spin.
-    pub fn rows_in_turn(&self) -> &[RowBlock] {
+    /// Rows that are scanned one after the other, from the top; empty if the scan runs along azimuth, as in spinning
+    /// sensors.
+    pub fn sequential_rows(&self) -> &[RowBlock] {
         self.pattern.as_ref().filter(|p| p.sweep == Sweep::Rows).map_or(&[], |p| &p.blocks)
     }
 
-    /// Place in the scan of a direction in its own frame, from +1/2 where a scan begins, on the left or at the top, to -1/2.
+    /// Time of a direction within the scan as a fraction: +1/2 at its start, -1/2 at its end. Scans start on the left
+    /// or at the top. Angles are in the sensor's frame.
     pub fn scan_phase(&self, azimuth_rad: f64, elevation_rad: f64) -> f64 {
-        let blocks = self.rows_in_turn();
+        let blocks = self.sequential_rows();
         let all: f64 = blocks.iter().map(|b| f64::from(b.rows)).sum();
         if all == 0.0 {
             return azimuth_rad / (2.0 * self.half_fov_rad());
@@ -191,14 +194,15 @@ impl Sensor {
         0.5 - blocks.iter().map(done).sum::<f64>() / all
     }
 
-    /// Azimuth (counter-clockwise from the middle), elevation, range of a point in a sensor's own frame: rad, rad, m.
+    /// Azimuth (counter-clockwise from x, rad), elevation (rad) and range (m) of a point in the sensor's frame.
     pub fn spherical(sensor_point: &Point3<f64>) -> [f64; 3] {
         let p = sensor_point.coords;
         let across = p.x.hypot(p.y);
         [p.y.atan2(p.x), p.z.atan2(across), p.norm()]
     }
 
-    /// Whether a direction of the sensor's own frame lies in its field of view, seen from above, with a margin in rad.
+    /// Whether an azimuth of the sensor's frame is within the horizontal field of view, extended by a margin on both
+    /// sides, rad.
     pub fn sees(&self, azimuth_rad: f64, margin_rad: f64) -> bool {
         let half = self.horizontal_fov_deg.to_radians() / 2.0 + margin_rad;
         geometry::limit_period(azimuth_rad, 0.5, std::f64::consts::TAU).abs() <= half
@@ -215,14 +219,14 @@ mod tests {
     }
 
     #[test]
-    fn the_racing_car_has_three() {
+    fn the_racing_car_has_three_sensors() {
         let rig = config("av21");
         let yaw: Vec<f64> = rig.sensors.iter().map(|s| s.yaw_deg).collect();
         assert_eq!(yaw, [0.0, 120.0, -120.0]);
         let shots: usize = rig.sensors.iter().map(|s| s.pattern.as_ref().unwrap().shots().len()).sum();
         assert!((78_000..90_000).contains(&shots), "{shots}");
         let left = rig.sensors[1].pose() * Vector3::x();
-        assert!((left.x + 0.5).abs() < 1e-9 && left.y > 0.8, "it looks to the left and back: {left}");
+        assert!((left.x + 0.5).abs() < 1e-9 && left.y > 0.8, "its x axis points left and back: {left}");
         let all = rig.scaled(0.5);
         assert!(
             (all.sensors[0].pattern.as_ref().unwrap().shots().len() as f64 * 12.0 / shots as f64 - 1.0).abs() < 0.05
@@ -230,7 +234,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spinning_one() {
+    fn a_spinning_sensor() {
         let rig = config("hdl64e");
         let shots = rig.sensors[0].pattern.as_ref().unwrap().shots();
         assert_eq!(shots.iter().map(|s| s.row).max(), Some(63));
@@ -240,14 +244,14 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_without_patterns_is_a_rig() {
+    fn patterns_are_optional() {
         let rig = Rig::parse("[[sensor]]\nname = \"a\"\nposition = [1, 0, 2]\n", Path::new("r.toml")).unwrap();
         assert_eq!((rig.sensors[0].horizontal_fov_deg, rig.sensors[0].pattern.as_ref()), (360.0, None));
         assert_eq!(rig.find("a"), Some(0));
     }
 
     #[test]
-    fn time_runs_along_azimuth_or_row_after_row() {
+    fn scans_run_along_azimuth_or_row_by_row() {
         let sensor = |pattern: &str| {
             let text = format!("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 120\n{pattern}");
             Rig::parse(&text, Path::new("rig.toml")).unwrap().sensors.remove(0)
@@ -257,7 +261,7 @@ mod tests {
         for sensor in [sensor(""), sensor(spins)] {
             assert!((sensor.scan_phase(30f64.to_radians(), 0.3) - 0.25).abs() < 1e-12);
         }
-        // Three quarters of the rows lie above the horizon.
+        // Three quarters of the rows are above the horizon.
         let blocks =
             "[{ rows = 30, top_deg = 10, bottom_deg = 0.0 }, { rows = 10, top_deg = -0.5, bottom_deg = -20.5 }]";
         let rows = sensor(&format!("pattern = {{ blocks = {blocks}, columns = 400 }}\n"));
@@ -269,17 +273,17 @@ mod tests {
     }
 
     #[test]
-    fn a_rig_on_disk_needs_only_places() {
+    fn a_rig_file_needs_only_poses() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("rig.toml");
         std::fs::write(&path, "[[sensor]]\nname = \"a\"\nposition = [1, 0, 2.5]\nyaw_deg = 90\n").unwrap();
         let rig = Rig::read(&path).unwrap();
         let at = rig.sensors[0].pose() * Point3::new(2.0, 0.0, 0.0);
-        assert!((at - Point3::new(1.0, 2.0, 2.5)).norm() < 1e-12 && rig.sensors[0].closes());
+        assert!((at - Point3::new(1.0, 2.0, 2.5)).norm() < 1e-12 && rig.sensors[0].is_full_circle());
     }
 
     #[test]
-    fn keys_without_their_unit_are_answered_with_the_right_one() {
+    fn keys_without_a_unit_are_refused_with_the_right_key() {
         for (line, want) in [
             ("yaw = 3", "unknown field `yaw`: did you mean `yaw_deg`?"),
             ("pitch = 3", "unknown field `pitch`: did you mean `pitch_deg`?"),
@@ -302,7 +306,7 @@ mod tests {
             ("".to_owned(), "r.toml: sensor: there is none"),
             (
                 "[[sensor]]\nname = \"a\"\n[[sensor]]\nname = \"a\"\n".into(),
-                "r.toml:4: sensor[1].name: \"a\" is empty or there twice",
+                "r.toml:4: sensor[1].name: \"a\" is empty or not unique",
             ),
             ("[[sensor]]\nname = \"a\"\ncolour = 1\n".into(), "r.toml:3: unknown field `colour`"),
             (
@@ -314,7 +318,7 @@ mod tests {
             ("[[sensor]]\nname = \"a\"\nposition = [nan, 0, 0]\n".into(), "r.toml:3: sensor[0].position[0]: NaN"),
             ("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 0\n".into(), "sensor[0].horizontal_fov_deg: 0"),
             ("[[sensor]]\nname = \"a\"\npattern = \"spiral\"\n".into(), "r.toml:3: invalid type"),
-            (pattern("blocks = []\ncolumns = 10"), "r.toml:4: sensor[0].pattern.blocks: there is no row"),
+            (pattern("blocks = []\ncolumns = 10"), "r.toml:4: sensor[0].pattern.blocks: is empty"),
             (
                 pattern("blocks = [{ rows = 0, top_deg = 1, bottom_deg = 0 }]\ncolumns = 10"),
                 "sensor[0].pattern.blocks[0].rows: 0",

@@ -1,4 +1,4 @@
-//! In which directions a sensor shoots, and when.
+//! Directions and times of a sensor's shots.
 
 use data::toml_text::{within, wrong};
 use data::{DataError, KeyError};
@@ -6,21 +6,22 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Rows and columns, or a CSV of single shots.
+/// Scan pattern: a grid of rows and columns, or a CSV file of single shots.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Pattern {
-    /// Rows at equal angles, block by block from the top.
+    /// Blocks of rows at equal angular steps, from the top.
     #[serde(default)]
     pub blocks: Vec<RowBlock>,
-    /// Shots a row, over the horizontal field of view, from left to right.
+    /// Shots per row, at equal angular steps over the horizontal field of view, from left to right.
     #[serde(default)]
     pub columns: u32,
-    /// In which order the grid is shot.
+    /// Order in which the grid is scanned.
     #[serde(default)]
     pub sweep: Sweep,
-    /// CSV with a line a shot, relative to this file, in the place of `blocks` and `columns`: `azimuth_deg` (counter-clockwise from the
-    /// sensor's middle), `elevation_deg` (up from its horizon), `time_s` (from the middle of the scan), and, if wanted, `row` and `column`.
+    /// CSV file with one line per shot, relative to this file. It replaces `blocks` and `columns`. Columns:
+    /// `azimuth_deg` (counter-clockwise from the sensor's x axis), `elevation_deg` (upwards from the sensor's
+    /// horizontal plane), `time_s` (relative to the middle of the scan), and optionally `row` and `column`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<PathBuf>,
     #[serde(skip)]
@@ -29,59 +30,59 @@ pub struct Pattern {
     grid_columns: usize,
 }
 
-/// Rows at equal angles.
+/// Rows at equal angular steps.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RowBlock {
     /// Number of rows.
     pub rows: u32,
-    /// Elevation of the first, degrees above the sensor's horizon.
+    /// Elevation of the first row in the sensor's frame, degrees.
     pub top_deg: f64,
-    /// Elevation of the last, degrees above the sensor's horizon.
+    /// Elevation of the last row in the sensor's frame, degrees.
     pub bottom_deg: f64,
 }
 
-/// What a scan finishes first.
+/// Order in which a grid is scanned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Sweep {
-    /// Row after row from the top, each from left to right: a raster.
+    /// Row by row from the top, each from left to right: raster scan.
     #[default]
     Rows,
-    /// Column after column from the left, all rows of one at once: a spinning sensor.
+    /// Column by column from the left, all rows of a column at the same time: spinning sensor.
     Columns,
 }
 
-/// One shot of a scan, in the sensor's own frame.
+/// One shot of a scan, in the sensor's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Shot {
-    /// Row, from the top.
+    /// Row, counted from the top.
     pub row: u16,
-    /// Column, from the left.
+    /// Column, counted from the left.
     pub column: u16,
-    /// Counter-clockwise from the sensor's middle, rad.
+    /// Azimuth, counter-clockwise from the sensor's x axis, rad.
     pub azimuth_rad: f64,
-    /// Up from the sensor's horizon, rad.
+    /// Elevation, upwards from the sensor's horizontal plane, rad.
     pub elevation_rad: f64,
-    /// From the middle of the scan, s.
+    /// Time relative to the middle of the scan, s.
     pub time_s: f64,
 }
 
 impl Shot {
-    /// The unit vector that it is sent along, in the sensor's frame.
+    /// Unit vector of the shot in the sensor's frame.
     pub fn direction(&self) -> [f64; 3] {
         direction(self.azimuth_rad, self.elevation_rad)
     }
 }
 
-/// The unit vector of an azimuth and an elevation.
+/// Unit vector of an azimuth and an elevation, rad.
 pub fn direction(azimuth_rad: f64, elevation_rad: f64) -> [f64; 3] {
     let ((sa, ca), (se, ce)) = (azimuth_rad.sin_cos(), elevation_rad.sin_cos());
     [ca * ce, sa * ce, se]
 }
 
 impl Pattern {
-    /// A grid of one block of rows, whose shots are made.
+    /// A grid of one block of rows, with its shots.
     pub fn grid(block: RowBlock, columns: u32, horizontal_fov_deg: f64, rate_hz: f64) -> Pattern {
         let mut pattern = Pattern {
             blocks: vec![block],
@@ -95,17 +96,17 @@ impl Pattern {
         pattern
     }
 
-    /// All shots of a scan, row after row where there are rows.
+    /// All shots of a scan; those of a grid row by row.
     pub fn shots(&self) -> &[Shot] {
         &self.shots
     }
 
-    /// Columns of [`Pattern::shots`] as a grid; all of them for a list.
+    /// Number of columns of [`Pattern::shots`] as a grid; all shots for a CSV pattern.
     pub fn grid_columns(&self) -> usize {
         self.grid_columns
     }
 
-    /// Elevation of each row, from the top, rad; empty for a pattern in CSV.
+    /// Elevation of each row, from the top, rad; empty for a CSV pattern.
     pub fn row_elevations_rad(&self) -> Vec<f64> {
         let of_block = |b: &RowBlock| {
             let (top, step) = (b.top_deg, (b.top_deg - b.bottom_deg) / f64::from((b.rows - 1).max(1)));
@@ -119,12 +120,12 @@ impl Pattern {
             if self.blocks.is_empty() && self.columns == 0 {
                 return Ok(());
             }
-            return Err(wrong("file", "a CSV stands in the place of blocks and columns: leave those out"));
+            return Err(wrong("file", "cannot be combined with blocks and columns: remove those"));
         }
         if self.blocks.is_empty() {
             return Err(wrong(
                 "blocks",
-                "there is no row; say for example blocks = [{ rows = 64, top_deg = 5, bottom_deg = -20 }]",
+                "is empty; for example blocks = [{ rows = 64, top_deg = 5, bottom_deg = -20 }]",
             ));
         }
         for (i, block) in self.blocks.iter().enumerate() {
@@ -135,7 +136,8 @@ impl Pattern {
         }
         within("columns", self.columns.into(), 1.0, 65_535.0)?;
         let shots = f64::from(self.columns) * self.blocks.iter().map(|b| f64::from(b.rows)).sum::<f64>();
-        within("columns", shots, 1.0, 16e6).map_err(|_| wrong("columns", format!("{shots} shots a scan are too many")))
+        within("columns", shots, 1.0, 16e6)
+            .map_err(|_| wrong("columns", format!("{shots} shots per scan, more than 16 million")))
     }
 
     pub(super) fn load_shots(&mut self, folder: &Path, fov_deg: f64, rate_hz: f64) -> Result<(), DataError> {
@@ -175,7 +177,7 @@ impl Pattern {
         self.grid_columns = self.columns as usize;
     }
 
-    /// `factor` as many rows and columns, over the same field and time.
+    /// Multiplies the numbers of rows and columns by `factor`, over the same field of view and time.
     pub(super) fn scale(&mut self, factor: f64, fov_deg: f64, rate_hz: f64) {
         if self.file.is_none() {
             let scaled = |n: u32| ((f64::from(n) * factor).round() as u32).max(1);
@@ -186,7 +188,7 @@ impl Pattern {
     }
 }
 
-/// A line of a pattern in CSV.
+/// A line of a CSV pattern.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ShotLine {
@@ -205,7 +207,8 @@ fn read_shots(path: &Path) -> Result<Vec<Shot>, DataError> {
         let number = |e: &csv::Error| e.position().map_or(1, |p| p.line() as usize);
         let line: ShotLine = line.map_err(|e| DataError::line(path, number(&e), e.to_string()))?;
         let here = shots.len();
-        let bad = |what: &str, v: f64| DataError::file(path, format!("shot {here} (from 0): {what} = {v} cannot be"));
+        let bad =
+            |what: &str, v: f64| DataError::file(path, format!("shot {here} (from 0): {what} = {v} is out of range"));
         if !(-360.0..=360.0).contains(&line.azimuth_deg) {
             return Err(bad("azimuth_deg", line.azimuth_deg));
         }
@@ -224,7 +227,7 @@ fn read_shots(path: &Path) -> Result<Vec<Shot>, DataError> {
         });
     }
     if shots.is_empty() {
-        return Err(DataError::file(path, "has no shot"));
+        return Err(DataError::file(path, "contains no shots"));
     }
     Ok(shots)
 }
@@ -236,7 +239,7 @@ mod tests {
     const BLOCK: RowBlock = RowBlock { rows: 4, top_deg: 3.0, bottom_deg: -3.0 };
 
     #[test]
-    fn a_grid_covers_its_field_and_its_time() {
+    fn a_grid_covers_the_field_of_view_and_the_scan_time() {
         let pattern = Pattern::grid(BLOCK, 6, 120.0, 20.0);
         let shots = pattern.shots();
         assert_eq!((shots.len(), pattern.grid_columns()), (24, 6));
@@ -250,7 +253,7 @@ mod tests {
         let mut spinning = pattern.clone();
         spinning.sweep = Sweep::Columns;
         spinning.make_grid(120.0, 20.0);
-        assert_eq!(spinning.shots()[0].time_s, spinning.shots()[6].time_s, "a column is one moment");
+        assert_eq!(spinning.shots()[0].time_s, spinning.shots()[6].time_s, "all rows of a column have the same time");
     }
 
     #[test]
@@ -267,7 +270,7 @@ mod tests {
             ("azimuth_deg,elevation_deg,time_s\n1,2,x\n", "p.csv:2"),
             ("azimuth_deg,elevation_deg,time_s\n1,2,0\n1,200,0\n", "shot 1 (from 0): elevation_deg = 200"),
             ("azimuth_deg,elevation_deg,time_s\n1,2,nan\n", "time_s = NaN"),
-            ("azimuth_deg,elevation_deg,time_s\n", "has no shot"),
+            ("azimuth_deg,elevation_deg,time_s\n", "contains no shots"),
         ] {
             std::fs::write(&path, text).unwrap();
             let error = read_shots(&path).unwrap_err().to_string();

@@ -101,7 +101,7 @@ fn a_deskewed_scan_shows_the_world_at_rest_and_smears_what_moves() {
 }
 
 #[test]
-fn the_true_mount_decides_what_is_hit_and_the_believed_one_where_it_is_shown() {
+fn the_true_mount_determines_the_surface_and_the_nominal_one_the_point() {
     let (world, car, materials) = (world(), CarShape::new(&race_car()), MaterialTable::default());
     let scene = FrameScene::new(&world, &car, &materials, motion(5000.0, 0.0, [0.0; 3]), &[]);
     let mut beams = Beams::of(&rig(20, 360));

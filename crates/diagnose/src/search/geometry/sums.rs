@@ -116,7 +116,7 @@ fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 
         }
         (median(deviations) / 0.6745).max(least[k])
     };
-    let by_rows = rig.sensors.iter().find(|s| !s.rows_in_turn().is_empty());
+    let by_rows = rig.sensors.iter().find(|s| !s.sequential_rows().is_empty());
     let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);
     SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide(k - 6) }.powi(2))
 }
