@@ -100,7 +100,7 @@ fn labels() {
         ("Car 0 0 0 0 0 0 0 1.5 1.6 3.9 5 0 -1", "has 15 values; this line has 14"),
         ("Car 0 0 0 0 0 0 0 tall 1.6 3.9 5 0 -1 0", "is 'tall', not a number"),
         ("Car 0 0 0 0 0 0 0 1.5 -1.6 3.9 5 0 -1 0", "a size cannot be negative"),
-        ("Car 0 0 0 0 0 0 0 1.5 0 3.9 5 0 -1 0", "is 0; a labelled object has a size"),
+        ("Car 0 0 0 0 0 0 0 1.5 0 3.9 5 0 -1 0", "is 0; the size of a labelled object must be positive"),
         ("Car 0 0 0 0 0 0 0 1.5 1.6 3.9 nan 0 -1 0", "not a finite number"),
         ("Car 0 0 0 0 0 0 0 1.5 1.6 3.9 50000 0 -1 0", "farther than 10 km"),
     ] {
@@ -113,7 +113,7 @@ fn labels() {
         }
     };
     check(no_box, TRAIN, &["nothing to learn", "Car"]);
-    check(no_box, "doctor .", &["not one box"]);
+    check(no_box, "doctor .", &["has no labelled box"]);
     let far = line("Car 0 0 0 0 0 0 0 1.5 1.6 3.9 500 0 -1 0");
     check(far, "doctor . --detector tiny.toml", &["outside", "range"]);
 }
@@ -121,7 +121,7 @@ fn labels() {
 #[test]
 fn splits() {
     let split = |text: &'static str| move |f: &Path| fs::write(f.join("ImageSets/train.txt"), text).unwrap();
-    check(split(""), TRAIN, &["ImageSets/train.txt", "no frame"]);
+    check(split(""), TRAIN, &["ImageSets/train.txt", "the split is empty"]);
     check(split("000000\n../000001\n"), TRAIN, &["ImageSets/train.txt:2:", "../000001"]);
     check(split("000000\n000099\n"), TRAIN, &["ImageSets/train.txt:2:", "000099"]);
     check(|f| fs::remove_file(f.join("ImageSets/train.txt")).unwrap(), TRAIN, &["no split \"train\""]);

@@ -1,4 +1,4 @@
-//! How long a frame takes from the disk to the trainer: 120,000 points, files in the page cache, one core.
+//! Time to read and to augment one frame of 120,000 points. Files are in the page cache; one core is used.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use geometry::Box3;
@@ -29,7 +29,7 @@ fn reading(c: &mut Criterion) {
     write_bin(&path("a.bin"), &frame.cloud).expect("writes");
     let encodings = [PcdEncoding::Ascii, PcdEncoding::Binary, PcdEncoding::BinaryCompressed];
     for encoding in encodings {
-        write_pcd(&path(&format!("{}.pcd", encoding.word())), &frame.cloud, encoding).expect("writes");
+        write_pcd(&path(&format!("{}.pcd", encoding.keyword())), &frame.cloud, encoding).expect("writes");
     }
     for name in ["a.bin", "binary.pcd", "binary_compressed.pcd", "ascii.pcd"] {
         let path = path(name);

@@ -1,8 +1,9 @@
-//! What a training sees of a frame: the frame, changed at random in ways that keep its labels true.
+//! Data augmentation for training: random changes of a frame's points together with its boxes.
 //!
-//! Each change is a pure function of the frame and a stream of random numbers. Defaults are those of OpenPCDet for PointPillars on KITTI
-//! (`pointpillar.yaml`), which has no translation and no noise of single objects; there is no road plane here, so pasted objects keep the
-//! height they were seen at. Image boxes stay as they were labelled: only the difficulty is taken from them.
+//! Each change is a pure function of the frame, its configuration and a random stream. The defaults are those of
+//! OpenPCDet for PointPillars on KITTI (`pointpillar.yaml`): no translation and no noise of single objects. Road planes
+//! are not supported, so pasted objects keep the height at which they were recorded. Image boxes are not changed,
+//! because they are used for KITTI's difficulty only.
 
 mod gt_sampling;
 mod object_noise;
@@ -19,25 +20,25 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_4;
 
-/// What is done to a frame, in the order of these fields.
+/// Configuration of the augmentation. The steps are applied in the order of these fields.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AugmentConfig {
-    /// Objects of other frames pasted in.
+    /// Ground-truth sampling: pastes objects of other frames.
     pub gt_sampling: GtSamplingConfig,
-    /// Objects moved and turned one by one.
+    /// Translation and rotation of single objects.
     pub object_noise: ObjectNoiseConfig,
     /// Probability of a flip along the x axis: y becomes -y.
     pub flip_along_x_probability: f64,
     /// Probability of a flip along the y axis: x becomes -x.
     pub flip_along_y_probability: f64,
-    /// Smallest and largest rotation about z, rad, uniform.
+    /// Smallest and largest rotation about z, rad. Drawn uniformly.
     pub rotation_rad: [f64; 2],
-    /// Smallest and largest scale, uniform.
+    /// Smallest and largest scale factor. Drawn uniformly.
     pub scaling: [f64; 2],
     /// Standard deviation of the translation along x, y and z, m.
     pub translation_std_m: [f64; 3],
-    /// Shuffle the points, so that which ones overflow a pillar is a matter of chance.
+    /// Shuffle the points, so that a pillar with too many points keeps a random subset.
     pub shuffle_points: bool,
 }
 
@@ -57,7 +58,7 @@ impl Default for AugmentConfig {
 }
 
 impl AugmentConfig {
-    /// Nothing at all is changed.
+    /// The configuration that changes nothing.
     pub fn none() -> Self {
         AugmentConfig {
             gt_sampling: GtSamplingConfig { enabled: false, ..GtSamplingConfig::default() },
@@ -71,12 +72,12 @@ impl AugmentConfig {
         }
     }
 
-    /// The first value that makes no sense, in words.
+    /// Checks the values. The error is a message for the first invalid one.
     pub fn check(&self) -> Result<(), String> {
         let interval = |v: [f64; 2]| v[0] <= v[1] && v.iter().all(|v| v.is_finite());
         let probability = |p: f64| (0.0..=1.0).contains(&p);
         let spread = |v: &[f64; 3]| v.iter().all(|v| *v >= 0.0 && v.is_finite());
-        let sound = [
+        let checks = [
             (probability(self.flip_along_x_probability), "flip_along_x_probability is not between 0 and 1"),
             (probability(self.flip_along_y_probability), "flip_along_y_probability is not between 0 and 1"),
             (interval(self.rotation_rad), "rotation_rad is not [smallest, largest]"),
@@ -85,11 +86,12 @@ impl AugmentConfig {
             (interval(self.object_noise.rotation_rad), "object_noise.rotation_rad is not [smallest, largest]"),
             (spread(&self.object_noise.translation_std_m), "object_noise.translation_std_m has a negative value"),
         ];
-        sound.into_iter().find(|(sound, _)| !sound).map_or(Ok(()), |(_, message)| Err(message.into()))
+        checks.into_iter().find(|(valid, _)| !valid).map_or(Ok(()), |(_, message)| Err(message.into()))
     }
 }
 
-/// The whole chain. Ground-truth sampling needs a database and is left out without one. Yaws come out in [-pi, pi).
+/// Applies all steps of `config`. Ground-truth sampling is skipped if there is no database. The resulting yaws are in
+/// [-pi, pi).
 pub fn augment(mut frame: Frame, config: &AugmentConfig, database: Option<&GtDatabase>, stream: &mut Stream) -> Frame {
     if let Some(database) = database.filter(|_| config.gt_sampling.enabled) {
         frame = sample_gt(frame, &config.gt_sampling, database, stream);
@@ -120,7 +122,7 @@ mod tests {
         Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None }
     }
 
-    /// Boxes in a row and points all over, none within 1 mm of a side.
+    /// Boxes in a row, each with points inside. No point is within 1 mm of a side of its box.
     pub(super) fn scene(seed: u64, objects: usize) -> Frame {
         use rand::RngExt;
         let mut rng = stream(seed, "scene", 0, 0);
@@ -177,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_changed_by_none_and_the_same_by_the_same_stream() {
+    fn none_changes_nothing_and_equal_streams_give_equal_results() {
         let frame = scene(3, 4);
         assert_eq!(augment(frame.clone(), &AugmentConfig::none(), None, &mut stream(1, "a", 0, 0)), frame);
         let noisy = AugmentConfig {
@@ -192,7 +194,7 @@ mod tests {
     }
 
     #[test]
-    fn flips_are_the_reference_s() {
+    fn flips_match_openpcdet() {
         let frame = Frame {
             id: "a".into(),
             cloud: Cloud { values: vec![1.0, 2.0, 3.0, 0.5], channels: 4 },
@@ -208,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn defaults_survive_a_toml_and_strangers_do_not() {
+    fn defaults_round_trip_through_toml_and_unknown_keys_are_refused() {
         assert_eq!(toml::from_str::<AugmentConfig>("").unwrap(), AugmentConfig::default());
         let text = toml::to_string(&AugmentConfig::default()).unwrap();
         assert_eq!(toml::from_str::<AugmentConfig>(&text).unwrap(), AugmentConfig::default());

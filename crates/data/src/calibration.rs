@@ -1,6 +1,7 @@
-//! KITTI's calibration of the left colour camera against the LiDAR, in f64.
+//! KITTI's calibration between the left colour camera and the LiDAR, in f64.
 //!
-//! The camera frame is KITTI's rectified one: x right, y down, z forward. Conventions as in OpenPCDet's `calibration_kitti.py` and `box_utils.py`.
+//! The camera frame is KITTI's rectified one: x right, y down, z forward. Conventions are those of OpenPCDet's
+//! `calibration_kitti.py` and `box_utils.py`.
 
 use crate::{DataError, LabelBox};
 use geometry::{Box3, limit_period};
@@ -9,12 +10,12 @@ use std::path::Path;
 
 type Rows3x4 = [[f64; 4]; 3];
 
-/// Camera and LiDAR of one frame.
+/// Calibration of one frame: camera intrinsics and the pose of the LiDAR in the camera frame.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Calibration {
-    /// Projection matrix `P2`: pixels from the rectified camera frame.
+    /// Projection matrix `P2`: from the rectified camera frame, m, to homogeneous pixel coordinates.
     pub image_from_cam: Rows3x4,
-    /// `R0_rect * Tr_velo_to_cam`.
+    /// `R0_rect * Tr_velo_to_cam`: from the LiDAR frame to the rectified camera frame, m.
     pub cam_from_lidar: Rows3x4,
     lidar_from_cam: Rows3x4,
 }
@@ -23,58 +24,60 @@ impl Calibration {
     /// Reads a file of KITTI's `calib` folder.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         let bytes = fs_err::read(path)?;
-        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not text"))?;
+        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not UTF-8 text"))?;
         Self::parse(text, path)
     }
 
-    /// `KEY: numbers` lines; `P2`, `R0_rect` and `Tr_velo_to_cam` are needed, others are passed over. `path` is for messages.
+    /// Parses lines of the form `KEY: numbers`. `P2`, `R0_rect` and `Tr_velo_to_cam` are required, other keys are
+    /// ignored. `path` is used in error messages.
     pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
         let p2 = entry::<12>(text, path, "P2")?;
         let r0 = entry::<9>(text, path, "R0_rect")?;
         let tr = entry::<12>(text, path, "Tr_velo_to_cam")?;
         let image_from_cam = rows(&p2);
         if image_from_cam[0][0] <= 0.0 || image_from_cam[1][1] <= 0.0 {
-            return Err(DataError::file(path, "P2 has a focal length that is not positive"));
+            return Err(DataError::file(path, "P2: both focal lengths must be positive"));
         }
         let tr = rows(&tr);
         let rect = [[r0[0], r0[1], r0[2]], [r0[3], r0[4], r0[5]], [r0[6], r0[7], r0[8]]];
         for (name, r) in [("R0_rect", rect), ("Tr_velo_to_cam", tr.map(|row| [row[0], row[1], row[2]]))] {
             if !is_rotation(&r) {
-                return Err(DataError::file(path, format!("{name} does not hold a rotation")));
+                return Err(DataError::file(path, format!("{name} is not a rotation matrix")));
             }
         }
         if tr.iter().any(|row| row[3].abs() > 100.0) {
-            return Err(DataError::file(path, "Tr_velo_to_cam puts the camera more than 100 m from the LiDAR"));
+            return Err(DataError::file(path, "Tr_velo_to_cam has a translation of more than 100 m"));
         }
         let cam_from_lidar = rect.map(|row| std::array::from_fn(|c| (0..3).map(|k| row[k] * tr[k][c]).sum()));
         let lidar_from_cam = inverse(&cam_from_lidar);
         Ok(Calibration { image_from_cam, cam_from_lidar, lidar_from_cam })
     }
 
-    /// A point of the LiDAR frame in the camera frame.
+    /// Transforms a point from the LiDAR frame to the camera frame, m.
     pub fn cam_point(&self, point_lidar: [f64; 3]) -> [f64; 3] {
         apply(&self.cam_from_lidar, point_lidar)
     }
 
-    /// A point of the camera frame in the LiDAR frame.
+    /// Transforms a point from the camera frame to the LiDAR frame, m.
     pub fn lidar_point(&self, point_cam: [f64; 3]) -> [f64; 3] {
         apply(&self.lidar_from_cam, point_cam)
     }
 
-    /// Pixel of a point of the camera frame; divided by the rectified depth, as the reference does.
+    /// Projects a point of the camera frame to pixel coordinates `[u, v]`. Divides by z of the rectified frame, as
+    /// OpenPCDet does.
     pub fn image_point(&self, point_cam: [f64; 3]) -> [f64; 2] {
         let [u, v, _] = apply(&self.image_from_cam, point_cam);
         [u / point_cam[2], v / point_cam[2]]
     }
 
-    /// Whether the camera sees this point of the LiDAR frame in an image of `[width, height]` px.
+    /// Whether a point of the LiDAR frame projects into an image of `[width, height]` px. Occlusion is not considered.
     pub fn sees(&self, point_lidar: [f64; 3], image_size: [u32; 2]) -> bool {
         let point_cam = self.cam_point(point_lidar);
         let [u, v] = self.image_point(point_cam);
         point_cam[2] >= 0.0 && u >= 0.0 && u < image_size[0].into() && v >= 0.0 && v < image_size[1].into()
     }
 
-    /// The LiDAR-frame box of a label in KITTI's own convention (location = bottom centre in the camera frame).
+    /// The box of a label in [`crate::LabelFrame::Camera`], converted to the LiDAR frame.
     pub fn lidar_box(&self, line: &LabelBox) -> Box3 {
         let [h, w, l] = line.size_hwl;
         let [x, y, z] = self.lidar_point(line.location);
@@ -82,8 +85,10 @@ impl Calibration {
         Box3 { center: [x, y, z + h / 2.0], size: [l, w, h], yaw_rad }
     }
 
-    /// The inverse of [`Calibration::lidar_box`]: a label in KITTI's own convention, with alpha and the image box projected and
-    /// clipped to an image of `[width, height]` px. Truncation and occlusion are -1 for a detection (with a score) and 0 for a label.
+    /// The inverse of [`Calibration::lidar_box`]: a label in [`crate::LabelFrame::Camera`].
+    ///
+    /// Alpha is computed; the image box is the projection clipped to an image of `[width, height]` px. Truncation and
+    /// occlusion are -1 for a detection (with a score) and 0 for a label.
     pub fn camera_from_lidar_box(
         &self,
         class: &str,
@@ -104,8 +109,8 @@ impl Calibration {
         line
     }
 
-    /// Left, top, right, bottom of the projected corners of a camera-frame box, clipped to the image. Corners behind the camera count as
-    /// 0.1 m in front of it.
+    /// Left, top, right, bottom of the projected corners of a camera-frame box, px, clipped to the image. The depth of
+    /// a corner is at least 0.1 m.
     fn image_box(&self, line: &LabelBox, image_size: [u32; 2]) -> [f64; 4] {
         let [h, w, l] = line.size_hwl;
         let (s, c) = line.rotation_y.sin_cos();
@@ -147,10 +152,10 @@ fn entry<const N: usize>(text: &str, path: &Path, key: &str) -> Result<[f64; N],
         let count = values.len();
         let values = values.try_into().map_err(|_| wrong(format!("{key} has {count} numbers, not {N}")))?;
         if found.replace(values).is_some() {
-            return Err(wrong(format!("{key} is there twice")));
+            return Err(wrong(format!("{key} occurs twice")));
         }
     }
-    found.ok_or_else(|| DataError::file(path, format!("has no entry {key} (needed: P2, R0_rect, Tr_velo_to_cam)")))
+    found.ok_or_else(|| DataError::file(path, format!("has no entry {key} (required: P2, R0_rect, Tr_velo_to_cam)")))
 }
 
 fn rows(v: &[f64; 12]) -> Rows3x4 {
@@ -171,7 +176,8 @@ fn determinant(r: &[[f64; 3]; 3]) -> f64 {
     (0..3).map(|c| r[0][c] * (r[1][(c + 1) % 3] * r[2][(c + 2) % 3] - r[1][(c + 2) % 3] * r[2][(c + 1) % 3])).sum()
 }
 
-/// Inverse of a transform whose left part is nearly a rotation; a true inverse, since printed rotations are not orthonormal to the last digit.
+/// Inverse of an affine transform. The left 3 x 3 part is inverted, not transposed: rotations with rounded digits are
+/// not exactly orthonormal.
 fn inverse(m: &Rows3x4) -> Rows3x4 {
     let a = m.map(|row| [row[0], row[1], row[2]]);
     let det = determinant(&a);
@@ -202,7 +208,7 @@ pub(crate) mod tests {
             (MADE_UP.replace("0.27", "zero"), "000003.txt:4: Tr_velo_to_cam: \"-zero\" is not a number"),
             (MADE_UP.replace("P2: 700 ", "P2: "), "000003.txt:2: P2 has 11 numbers, not 12"),
             (MADE_UP.replace("P2: 700", "P2: nan"), "is not a number"),
-            (MADE_UP.replace("R0_rect: 1", "R0_rect: 7"), "R0_rect does not hold a rotation"),
+            (MADE_UP.replace("R0_rect: 1", "R0_rect: 7"), "R0_rect is not a rotation matrix"),
             (format!("{MADE_UP}{MADE_UP}"), "twice"),
         ];
         for (text, want) in cases {
@@ -213,7 +219,7 @@ pub(crate) mod tests {
 
     proptest! {
         #[test]
-        fn boxes_go_to_the_camera_and_back(x in 2.0..70.0, y in -30.0..30.0, z in -2.0..2.0, yaw in -3.1..3.1) {
+        fn boxes_round_trip_through_the_camera_frame(x in 2.0..70.0, y in -30.0..30.0, z in -2.0..2.0, yaw in -3.1..3.1) {
             let calibration = Calibration::parse(MADE_UP, Path::new("c.txt")).unwrap();
             let bbox = Box3::from_array([x, y, z, 4.0, 1.7, 1.5, yaw]);
             let line = calibration.camera_from_lidar_box("Car", &bbox, Some(0.5), [1242, 375]);

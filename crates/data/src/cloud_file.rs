@@ -1,11 +1,11 @@
-//! Point clouds from disk, with the checks that every reader owes the rest of the program.
+//! Reads point clouds and checks them: not empty, values finite, points within 10 km.
 
 use crate::{Cloud, DataError, parse_pcd};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// What a point consists of.
+/// Columns of a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PointColumns {
@@ -17,7 +17,7 @@ pub enum PointColumns {
 }
 
 impl PointColumns {
-    /// Values a point.
+    /// Number of values per point.
     pub fn channels(self) -> usize {
         match self {
             PointColumns::Xyz => 3,
@@ -26,13 +26,13 @@ impl PointColumns {
     }
 }
 
-/// Farther than this from the sensor, m, no point and no box is believed.
+/// Largest absolute coordinate of a valid point, m.
 pub const FARTHEST_M: f32 = 10_000.0;
 
-/// Reads a `.bin` (KITTI: little-endian f32) or a `.pcd`, told apart by their ending.
+/// Reads a `.bin` (KITTI: little-endian f32) or a `.pcd`. The file name extension decides.
 ///
-/// `columns` says how wide the points of a `.bin` are; a `.pcd` says so itself, and `Xyz` then drops its intensity.
-/// A cloud without a point and points that are not finite or farther than [`FARTHEST_M`] are errors.
+/// `columns` gives the columns of a `.bin`. The columns of a `.pcd` are in its header; with [`PointColumns::Xyz`] its
+/// intensity is dropped. Errors: an empty cloud, values that are not finite, coordinates beyond [`FARTHEST_M`].
 pub fn read_cloud(path: &Path, columns: PointColumns) -> Result<Cloud, DataError> {
     let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     match ending.as_deref() {
@@ -45,14 +45,15 @@ pub fn read_cloud(path: &Path, columns: PointColumns) -> Result<Cloud, DataError
     }
 }
 
-/// A `.bin` in memory; `path` is for messages.
+/// Parses a `.bin`. `path` is used in error messages.
 pub fn parse_bin(bytes: &[u8], path: &Path, columns: PointColumns) -> Result<Cloud, DataError> {
     let channels = columns.channels();
     if !bytes.len().is_multiple_of(channels * 4) {
         return Err(DataError::file(
             path,
             format!(
-                "{} bytes are no whole number of points of {channels} x 4 bytes: the file is cut off, or `points` of the data set is wrong",
+                "{} bytes is not a multiple of the point size ({channels} x 4 bytes): the file is truncated, \
+                 or `points` in the data set's TOML is wrong",
                 bytes.len()
             ),
         ));
@@ -63,25 +64,24 @@ pub fn parse_bin(bytes: &[u8], path: &Path, columns: PointColumns) -> Result<Clo
     Ok(cloud)
 }
 
-/// An error for an empty cloud and for the first point that cannot be one.
+/// An error if the cloud is empty, or for the first invalid point.
 pub(crate) fn check_cloud(cloud: &Cloud, path: &Path) -> Result<(), DataError> {
     if cloud.is_empty() {
         return Err(DataError::file(path, "the cloud has no point"));
     }
-    // Branch-free over all values first: an intensity too must be finite, and none is ever beyond the limit by honest means.
-    let sound = |v: f32| v.abs() <= FARTHEST_M;
-    if cloud.values.chunks(1024).all(|chunk| chunk.iter().fold(true, |all, v| all & sound(*v))) {
+    // Fast test without branches over all values. An intensity beyond the limit is valid: the loop below decides then.
+    let in_range = |v: f32| v.abs() <= FARTHEST_M;
+    if cloud.values.chunks(1024).all(|chunk| chunk.iter().fold(true, |all, v| all & in_range(*v))) {
         return Ok(());
     }
     for (i, point) in cloud.points().enumerate() {
         for (name, v) in ["x", "y", "z", "intensity"].into_iter().zip(point) {
-            let bad = if name == "intensity" { !v.is_finite() } else { !sound(*v) };
+            let bad = if name == "intensity" { !v.is_finite() } else { !in_range(*v) };
             if bad {
-                let why =
-                    if v.is_finite() { "farther than 10 km from the sensor" } else { "not a number to measure with" };
+                let why = if v.is_finite() { "farther than 10 km from the sensor" } else { "not finite" };
                 return Err(DataError::file(
                     path,
-                    format!("point {i} (from 0): {name} = {v} is {why}; is `points` of the data set right?"),
+                    format!("point {i} (from 0): {name} = {v} is {why}; check `points` in the data set's TOML"),
                 ));
             }
         }
@@ -103,13 +103,13 @@ mod tests {
         let path = Path::new("velodyne/000007.bin");
         let fine = bytes(&[1.0, 2.0, 3.0, 0.5]);
         let cases: [(&[u8], &str); 7] = [
-            (&fine[..15], "cut off"),
+            (&fine[..15], "truncated"),
             (&[], "no point"),
             (&bytes(&[1.0, f32::NAN, 0.0, 0.0]), "point 0 (from 0): y = NaN"),
             (&bytes(&[0.0, 0.0, 0.0, 0.0, 1.0, 0.0, f32::INFINITY, 0.0]), "point 1 (from 0): z = inf"),
             (&bytes(&[-10_001.0, 0.0, 0.0, 0.0]), "10 km"),
             (&bytes(&[0.0, 0.0, 0.0, f32::NAN]), "intensity"),
-            (&bytes(&[1.0, 2.0, 3.0]), "no whole number of points"),
+            (&bytes(&[1.0, 2.0, 3.0]), "not a multiple of the point size"),
         ];
         for (bytes, want) in cases {
             let error = parse_bin(bytes, path, PointColumns::Xyzi).unwrap_err().to_string();
@@ -121,7 +121,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn bin_goes_round(values in prop::collection::vec(-9_999.0f32..9_999.0, 1..200)) {
+        fn bin_round_trips(values in prop::collection::vec(-9_999.0f32..9_999.0, 1..200)) {
             let columns = if values.len().is_multiple_of(2) { PointColumns::Xyz } else { PointColumns::Xyzi };
             let whole = values.len() / columns.channels() * columns.channels();
             prop_assume!(whole > 0);
@@ -133,7 +133,7 @@ mod tests {
         }
 
         #[test]
-        fn no_bytes_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
+        fn arbitrary_bytes_do_not_panic(bytes in prop::collection::vec(any::<u8>(), 0..200)) {
             let _ = parse_bin(&bytes, Path::new("x.bin"), PointColumns::Xyz);
         }
     }

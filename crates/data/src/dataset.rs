@@ -1,4 +1,4 @@
-//! A data set on disk: frames by id, in the LiDAR frame whatever the labels are written in.
+//! A data set on disk. Frames are read by id; their boxes are converted to the LiDAR frame.
 
 use crate::dataset_config::DatasetConfig;
 use crate::layout::PointDetails;
@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 /// A data set on disk.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Dataset {
-    /// Everything its TOML says, defaults filled in; `root` is relative to the working folder or absolute.
+    /// The contents of its TOML with all defaults filled in. `root` is absolute or relative to the working directory.
     pub config: DatasetConfig,
 }
 
 impl Dataset {
-    /// Opens a data set by its folder or its TOML. A folder is read by its `dataset.toml`, or without one by its layout.
+    /// Opens a data set by its folder or its TOML. Of a folder, `dataset.toml` is read; without that file the layout is
+    /// recognised from its folders.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let inside = path.join("dataset.toml");
         let config = if path.is_file() {
@@ -37,11 +38,11 @@ impl Dataset {
         Ok(dataset)
     }
 
-    /// The frame ids of a split, in its order. Every one has a cloud, and there is at least one.
+    /// The frame ids of a split, in its order. An error if the split is empty or a frame has no cloud.
     pub fn ids(&self, split: &str) -> Result<Vec<String>, DataError> {
         let path = self.split_path(split)?;
         let bytes = fs_err::read(&path)?;
-        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(&path, "is not text"))?;
+        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(&path, "is not UTF-8 text"))?;
         let mut ids = Vec::new();
         for (line, id) in parse_split(text, &path)? {
             if !self.config.layout.has_cloud(&self.config.root, id) {
@@ -53,7 +54,7 @@ impl Dataset {
         Ok(ids)
     }
 
-    /// The file of a split.
+    /// Path of the list of frames of a split. An error if the split is not known.
     pub fn split_path(&self, split: &str) -> Result<PathBuf, DataError> {
         match self.config.splits.get(split) {
             Some(list) => Ok(self.config.root.join(list)),
@@ -75,61 +76,61 @@ impl Dataset {
         self.config.layout.frame_ids(&self.config.root)
     }
 
-    /// The file of a cloud; where there is none, the one that the layout would have.
+    /// Path of a frame's cloud; if there is none, the path at which the layout writes it.
     pub fn cloud_path(&self, id: &str) -> PathBuf {
         self.config.layout.cloud_path(&self.config.root, id)
     }
 
-    /// The file of a frame's labels.
+    /// Path of a frame's labels, which need not exist.
     pub fn labels_path(&self, id: &str) -> PathBuf {
         self.config.layout.labels_path(&self.config.root, id)
     }
 
-    /// The file of a frame's calibration, in layouts that can have one.
+    /// Path of a frame's calibration, which need not exist; `None` if the layout has no calibration.
     pub fn calibration_path(&self, id: &str) -> Option<PathBuf> {
         self.config.layout.calibration_path(&self.config.root, id)
     }
 
-    /// There are labels. A data set without them (the testing part of KITTI) has frames without objects.
+    /// Whether there are labels. Frames of a data set without labels (such as KITTI's `testing`) have no objects.
     pub fn has_labels(&self) -> bool {
         self.config.layout.has_labels(&self.config.root)
     }
 
-    /// When the frame was taken, s from a start that all frames share; `None` where not known.
+    /// Time stamp of a frame, s since a start that all frames share; `None` if not known.
     pub fn stamp_s(&self, id: &str) -> Result<Option<f64>, DataError> {
         self.config.layout.stamp_s(&self.config.root, id)
     }
 
-    /// Pose of the LiDAR in a world that all frames share; `None` where not known.
+    /// Pose of the LiDAR in a world frame that all frames share; `None` if not known.
     pub fn world_from_lidar(&self, id: &str) -> Result<Option<Pose>, DataError> {
         self.config.layout.world_from_lidar(&self.config.root, id)
     }
 
-    /// What is known of the points of a frame's whole cloud beside place and intensity.
+    /// Per-point data besides position and intensity, for all points of a frame (not cropped to the image).
     pub fn point_details(&self, id: &str) -> Result<PointDetails, DataError> {
         self.config.layout.read_point_details(&self.config.root, id)
     }
 
-    /// Number of points of a frame's whole cloud.
+    /// Number of points of a frame (not cropped to the image).
     pub fn count_points(&self, id: &str) -> Result<usize, DataError> {
         self.config.layout.count_points(&self.config.root, id, self.config.points)
     }
 
-    /// Cloud and objects of a frame. DontCare and objects without a 3D box are left out.
+    /// Reads cloud and objects of a frame. DontCare and objects without a 3D box are left out.
     pub fn load(&self, id: &str) -> Result<Frame, DataError> {
         let cloud = self.load_cloud(id)?;
         let lines = if self.has_labels() { self.labels(id)? } else { Vec::new() };
         Ok(Frame { id: id.into(), cloud, objects: self.objects(id, &lines)? })
     }
 
-    /// The cloud of a frame alone, cropped to the camera's image where the data set says so.
+    /// Reads the cloud of a frame. With `fov_crop` it is cropped to the camera's image.
     pub fn load_cloud(&self, id: &str) -> Result<Cloud, DataError> {
         let mut cloud = self.load_whole_cloud(id)?;
         if self.config.fov_crop {
             let calibration = self.calibration(id)?;
             cloud.retain(|_, p| calibration.sees([p[0].into(), p[1].into(), p[2].into()], self.config.image_size));
             if cloud.is_empty() {
-                return Err(DataError::file(&self.cloud_path(id), "the camera sees none of its points (fov_crop)"));
+                return Err(DataError::file(&self.cloud_path(id), "no point is inside the camera's image (fov_crop)"));
             }
         }
         Ok(cloud)
@@ -141,23 +142,23 @@ impl Dataset {
         if cloud.channels != self.config.points.channels() {
             return Err(DataError::file(
                 &self.cloud_path(id),
-                "has no intensity, though other clouds of this data set do",
+                "has no intensity, but other clouds of this data set have one",
             ));
         }
         Ok(cloud)
     }
 
-    /// The labels of a frame in the label frame, DontCare included.
+    /// Reads the labels of a frame in the label frame, DontCare included.
     pub fn labels(&self, id: &str) -> Result<Vec<LabelBox>, DataError> {
         self.config.layout.read_labels(&self.config.root, id)
     }
 
-    /// The calibration of a frame.
+    /// Reads the calibration of a frame.
     pub fn calibration(&self, id: &str) -> Result<Calibration, DataError> {
         self.config.layout.read_calibration(&self.config.root, id)
     }
 
-    /// Labels of a frame as objects of the LiDAR frame. DontCare and labels without a 3D box are left out.
+    /// Converts labels of a frame to objects in the LiDAR frame. DontCare and labels without a 3D box are left out.
     pub fn objects(&self, id: &str, lines: &[LabelBox]) -> Result<Vec<Object>, DataError> {
         let mut lines = lines.iter().filter(|line| !line.is_dont_care() && line.has_box()).peekable();
         if lines.peek().is_none() {
@@ -177,7 +178,7 @@ impl Dataset {
         Ok(lines.map(object).collect())
     }
 
-    /// Labels of a frame's objects in the frame of this data set's labels, in their order.
+    /// Converts a frame's objects to labels in this data set's label frame, in their order.
     pub fn label_boxes(&self, frame: &Frame) -> Result<Vec<LabelBox>, DataError> {
         if self.config.label_frame == LabelFrame::Lidar {
             return Ok(crate::write::label_boxes(frame));
@@ -192,12 +193,12 @@ impl Dataset {
         Ok(frame.objects.iter().map(label).collect())
     }
 
-    /// A detection in the frame of this data set's labels.
+    /// Converts a detection to this data set's label frame.
     pub fn detection_box(&self, id: &str, detection: &Detection) -> Result<LabelBox, DataError> {
         Ok(self.detection_boxes(id, std::slice::from_ref(detection))?.remove(0))
     }
 
-    /// The detections of a frame in the frame of this data set's labels, in their order.
+    /// Converts the detections of a frame to this data set's label frame, in their order.
     pub fn detection_boxes(&self, id: &str, detections: &[Detection]) -> Result<Vec<LabelBox>, DataError> {
         let line: Box<dyn Fn(&Detection) -> LabelBox> = match self.config.label_frame {
             LabelFrame::Lidar => Box::new(|d| LabelBox::from_box(&d.class, &d.bbox, Some(d.score))),
@@ -216,7 +217,7 @@ impl Dataset {
         }
         let mut found = BTreeSet::new();
         for id in self.all_ids()? {
-            // A missing or bad file is an error of the frame it belongs to, when that is loaded.
+            // Missing and invalid label files are reported when their frame is loaded.
             let lines = self.labels(&id).unwrap_or_default();
             found.extend(lines.into_iter().filter(|line| !line.is_dont_care()).map(|line| line.class));
         }
@@ -224,7 +225,8 @@ impl Dataset {
     }
 }
 
-/// The frame ids of a split's text with their lines, from 1; blank lines are left out, a text without an id is an error. `path` is for messages.
+/// Parses a split: one frame id a line, returned with its line number (from 1). Blank lines are skipped. An error if
+/// there is no id. `path` is used in error messages.
 pub fn parse_split<'a>(text: &'a str, path: &Path) -> Result<Vec<(usize, &'a str)>, DataError> {
     let mut ids = Vec::new();
     for (i, line) in text.lines().enumerate() {
@@ -234,13 +236,13 @@ pub fn parse_split<'a>(text: &'a str, path: &Path) -> Result<Vec<(usize, &'a str
             ids.push((i + 1, id));
         }
     }
-    if ids.is_empty() { Err(DataError::file(path, "the split has no frame")) } else { Ok(ids) }
+    if ids.is_empty() { Err(DataError::file(path, "the split is empty")) } else { Ok(ids) }
 }
 
-/// A frame id is a file name without ending: it names no folder.
+/// An error unless the frame id is a file name: it must not contain a path.
 fn check_frame_id(id: &str) -> Result<(), String> {
     if id.is_empty() || id == "." || id == ".." || id.contains(['/', '\\', '\0']) {
-        return Err(format!("frame id {id:?} is no file name: it must not contain a path separator"));
+        return Err(format!("frame id {id:?} is not a file name: it must not be empty or contain a path separator"));
     }
     Ok(())
 }
@@ -265,14 +267,14 @@ mod tests {
     }
 
     /// A folder with two frames and a TOML.
-    fn made_up(layout: Layout, channels: usize) -> tempfile::TempDir {
+    fn synthetic(layout: Layout, channels: usize) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         for id in ["000000", "000001"] {
             layout.write_frame(folder.path(), &frame(id, channels)).unwrap();
         }
         write_split(&folder.path().join("ImageSets/train.txt"), &["000001", "000000"]).unwrap();
         let points = if channels == 4 { PointColumns::Xyzi } else { PointColumns::Xyz };
-        let config = DatasetConfig { name: "made up".into(), layout, points, ..DatasetConfig::default() };
+        let config = DatasetConfig { name: "synthetic".into(), layout, points, ..DatasetConfig::default() };
         write_dataset_toml(&folder.path().join("dataset.toml"), &config).unwrap();
         folder
     }
@@ -283,10 +285,10 @@ mod tests {
     }
 
     #[test]
-    fn both_layouts_read_what_they_wrote() {
+    fn data_sets_round_trip_in_all_layouts() {
         for layout in [Layout::Kitti, Layout::S2rDad] {
             for channels in [3, 4] {
-                let folder = made_up(layout, channels);
+                let folder = synthetic(layout, channels);
                 let dataset = Dataset::open(folder.path()).unwrap();
                 assert_eq!(dataset, Dataset::open(&folder.path().join("dataset.toml")).unwrap());
                 assert_eq!(dataset.config.points.channels(), channels);
@@ -299,8 +301,8 @@ mod tests {
     }
 
     #[test]
-    fn folders_without_a_toml_are_known_by_their_layout() {
-        let folder = made_up(Layout::Kitti, 4);
+    fn folders_without_a_toml_are_recognised_by_their_layout() {
+        let folder = synthetic(Layout::Kitti, 4);
         std::fs::remove_file(folder.path().join("dataset.toml")).unwrap();
         let dataset = Dataset::open(folder.path()).unwrap();
         assert_eq!((dataset.config.label_frame, dataset.config.splits.len()), (LabelFrame::Lidar, 1));
@@ -318,16 +320,16 @@ mod tests {
 
     #[test]
     fn a_bad_toml_is_refused_by_line() {
-        let folder = made_up(Layout::Kitti, 4);
+        let folder = synthetic(Layout::Kitti, 4);
         let cases = [
             ("name = \"a\"\nroat = \".\"\n", "dataset.toml:2: unknown field `roat`"),
             ("name = \"a\"\nclasses = \"Car\"\n", "dataset.toml:2: invalid type"),
             ("label_frame = \"world\"\n", "dataset.toml:1: unknown variant `world`"),
             ("a = = 1", "dataset.toml:1: "),
             ("root = \"elsewhere\"", "elsewhere/velodyne: does not exist"),
-            ("classes = [\"Car\", \"Car\"]", "there twice"),
+            ("classes = [\"Car\", \"Car\"]", "occurs twice"),
             ("layout = \"s2r_dad\"\nlabel_frame = \"camera\"", "needs a calibration"),
-            ("image_size = [0, 375]", "no pixel"),
+            ("image_size = [0, 375]", "must be positive"),
         ];
         for (text, want) in cases {
             let error = with_toml(folder.path(), text).unwrap_err();
@@ -337,11 +339,11 @@ mod tests {
 
     #[test]
     fn bad_splits_are_refused_by_line() {
-        let folder = made_up(Layout::Kitti, 4);
+        let folder = synthetic(Layout::Kitti, 4);
         let dataset = Dataset::open(folder.path()).unwrap();
         let cases = [
-            ("", "train.txt: the split has no frame"),
-            ("\n  \n", "has no frame"),
+            ("", "train.txt: the split is empty"),
+            ("\n  \n", "is empty"),
             ("000000\n../000001\n", "train.txt:2: frame id \"../000001\""),
             ("a\\b\n", "path separator"),
             ("000000\n\n000009\n", "train.txt:3: frame 000009 has no cloud"),
@@ -357,8 +359,8 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_crop_keeps_what_it_sees() {
-        let folder = made_up(Layout::Kitti, 3);
+    fn fov_crop_keeps_points_inside_the_image() {
+        let folder = synthetic(Layout::Kitti, 3);
         let cloud = Cloud { values: vec![10.0, 0.0, 0.0, -10.0, 0.0, 0.0, 10.0, 30.0, 0.0], channels: 3 };
         crate::write::write_bin(&folder.path().join("velodyne/000000.bin"), &cloud).unwrap();
         std::fs::create_dir(folder.path().join("calib")).unwrap();
@@ -370,7 +372,7 @@ mod tests {
 
     #[test]
     fn detections_are_written_in_the_frame_of_the_labels() {
-        let folder = made_up(Layout::Kitti, 4);
+        let folder = synthetic(Layout::Kitti, 4);
         std::fs::create_dir(folder.path().join("calib")).unwrap();
         std::fs::write(folder.path().join("calib/000000.txt"), crate::calibration::tests::MADE_UP).unwrap();
         let detection = Detection { class: "Car".into(), bbox: frame("", 3).objects[0].bbox, score: 0.75 };
@@ -414,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn the_camera_crop_is_the_reference_s() {
+    fn fov_crop_matches_openpcdet() {
         let shared = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared"));
         let golden = shared.join("golden/pointpillars_kitti/eval.safetensors");
         if !golden.exists() {

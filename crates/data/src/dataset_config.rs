@@ -1,4 +1,4 @@
-//! What a data set's TOML may say, and what holds where it says nothing.
+//! The TOML of a data set and its defaults.
 
 use crate::toml_text::{parse_toml, read_text};
 use crate::{DataError, LabelFrame, Layout, PointColumns};
@@ -7,37 +7,39 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A data set: files, frame of the labels, classes, splits.
+/// A data set: its files, label frame, classes and splits.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetConfig {
-    /// A name for tables and messages. Default: the name of the folder.
+    /// Name for tables and messages. Default: the name of the folder.
     #[serde(default)]
     pub name: String,
     /// Folder of the data, relative to this file.
-    #[serde(default = "here")]
+    #[serde(default = "this_folder")]
     pub root: PathBuf,
-    /// Where the files lie below the root.
+    /// Folders and files below the root.
     #[serde(default)]
     pub layout: Layout,
-    /// Columns of a `.bin`. A `.pcd` says so itself; `xyz` here then drops its intensity.
+    /// Columns of a `.bin`. Those of a `.pcd` are in its header; `xyz` drops its intensity.
     #[serde(default)]
     pub points: PointColumns,
-    /// Frame of the labels. Default: `camera` where the KITTI layout has a folder `calib`, else `lidar`.
+    /// Frame of the labels. Default: `camera` if the layout is KITTI's and there is a folder `calib`, else `lidar`.
     #[serde(default = "lidar")]
     pub label_frame: LabelFrame,
-    /// Classes to learn and to evaluate. Default: those found in the labels (of KITTI itself: Car, Pedestrian, Cyclist).
+    /// Classes to train and to evaluate. Default: Car, Pedestrian, Cyclist if the labels are in the camera frame, else
+    /// the classes found in the labels.
     #[serde(default)]
     pub classes: Vec<String>,
-    /// Name and file of each split, relative to the root. Default: those of train, val and test for which `ImageSets/NAME.txt` exists.
+    /// Name and file of each split; files are relative to the root. Default: those of train, val and test for which
+    /// `ImageSets/NAME.txt` exists.
     #[serde(default)]
     pub splits: BTreeMap<String, PathBuf>,
-    /// The sensors, relative to this file: a rig as those in `configs/sensors`. Without one, one sensor at the cloud's origin is assumed
-    /// wherever it matters.
+    /// File with the LiDAR sensors (a rig as in `configs/sensors`), relative to this file. Without it, one sensor at
+    /// the origin of the cloud is assumed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rig: Option<PathBuf>,
-    /// Keep only the points that the camera sees (needs `calib`). Default: where the labels are in the camera's frame, for only what the
-    /// camera sees is labelled there; the reference does so with KITTI in training and in test.
+    /// Keep only points inside the camera's image (needs `calib`). Default: true if the labels are in the camera frame,
+    /// because KITTI labels only objects in the image. OpenPCDet does the same in training and evaluation.
     #[serde(default)]
     pub fov_crop: bool,
     /// Width and height of the camera's image, px.
@@ -45,7 +47,7 @@ pub struct DatasetConfig {
     pub image_size: [u32; 2],
 }
 
-fn here() -> PathBuf {
+fn this_folder() -> PathBuf {
     ".".into()
 }
 
@@ -61,7 +63,7 @@ impl Default for DatasetConfig {
     fn default() -> Self {
         DatasetConfig {
             name: String::new(),
-            root: here(),
+            root: this_folder(),
             layout: Layout::default(),
             points: PointColumns::default(),
             label_frame: lidar(),
@@ -75,48 +77,52 @@ impl Default for DatasetConfig {
 }
 
 impl DatasetConfig {
-    /// Reads a data set's TOML; `root` and `rig` are then relative to the working folder and every default is filled in but the classes.
+    /// Reads a data set's TOML. `root` and `rig` become relative to the working directory. All defaults except the
+    /// classes are filled in.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         Self::parse(&read_text(path)?, path)
     }
 
-    /// A data set's TOML in memory; `path` is where it lies, for messages, `root` and `rig`.
+    /// Parses a data set's TOML. `root` and `rig` are resolved against the folder of `path`.
     pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
         let mut config: DatasetConfig = parse_toml(text, path, |_| Ok(()))?;
         let folder = path.parent().unwrap_or(Path::new(""));
         config.root = folder.join(&config.root);
         config.rig = config.rig.map(|rig| folder.join(rig));
-        let written: toml::Table = toml::from_str(text).expect("it was read above");
+        let written: toml::Table = toml::from_str(text).expect("it was parsed above");
         config.fill_in(!written.contains_key("label_frame"), !written.contains_key("fov_crop"));
         config.check(path)?;
         Ok(config)
     }
 
-    /// What a folder without a TOML is: the first layout that knows it.
+    /// The configuration of a folder without a TOML, from the first layout that recognises it.
     pub fn of_folder(folder: &Path) -> Result<Self, DataError> {
         let Some(mut config) = Layout::ALL.iter().find_map(|layout| layout.recognise(folder)) else {
             if !folder.is_dir() {
-                return Err(DataError::file(folder, "does not exist; a data set is a folder or its TOML"));
+                return Err(DataError::file(folder, "does not exist; give the folder or the TOML of a data set"));
             }
-            let signs: Vec<&str> = Layout::ALL.iter().flat_map(|layout| layout.signs()).copied().collect();
-            let signs = match &signs[..] {
+            let markers: Vec<&str> = Layout::ALL.iter().flat_map(|layout| layout.markers()).copied().collect();
+            let markers = match &markers[..] {
                 [others @ .., last] if !others.is_empty() => format!("{} or {last}", others.join(", ")),
-                signs => signs.concat(),
+                markers => markers.concat(),
             };
-            return Err(DataError::file(folder, format!("is no data set: it has neither dataset.toml nor {signs}")));
+            return Err(DataError::file(
+                folder,
+                format!("is not a data set: it has neither dataset.toml nor {markers}"),
+            ));
         };
         config.fill_in(true, true);
         Ok(config)
     }
 
-    fn fill_in(&mut self, label_frame_unsaid: bool, fov_crop_unsaid: bool) {
+    fn fill_in(&mut self, default_label_frame: bool, default_fov_crop: bool) {
         if self.name.is_empty() {
             self.name = folder_name(&self.root);
         }
-        if label_frame_unsaid {
-            self.label_frame = self.layout.usual_label_frame(&self.root);
+        if default_label_frame {
+            self.label_frame = self.layout.default_label_frame(&self.root);
         }
-        if fov_crop_unsaid {
+        if default_fov_crop {
             self.fov_crop = self.label_frame == LabelFrame::Camera;
         }
         if self.splits.is_empty() {
@@ -132,15 +138,15 @@ impl DatasetConfig {
     fn check(&self, path: &Path) -> Result<(), DataError> {
         let wrong = |message: String| Err(DataError::file(path, message));
         if self.image_size.contains(&0) {
-            return wrong(format!("image_size {:?} px has no pixel", self.image_size));
+            return wrong(format!("image_size {:?}: both sides must be positive, px", self.image_size));
         }
-        if !self.layout.knows_camera() {
-            let without = format!("needs a calibration, which the layout {} does not have", self.layout.name());
+        if !self.layout.supports_calibration() {
+            let reason = format!("needs a calibration, which the layout {} does not have", self.layout.name());
             if self.label_frame == LabelFrame::Camera {
-                return wrong(format!("label_frame = \"camera\" {without}"));
+                return wrong(format!("label_frame = \"camera\" {reason}"));
             }
             if self.fov_crop {
-                return wrong(format!("fov_crop {without}"));
+                return wrong(format!("fov_crop {reason}"));
             }
         }
         for (i, class) in self.classes.iter().enumerate() {
@@ -149,7 +155,7 @@ impl DatasetConfig {
                 || class == "DontCare"
                 || self.classes[..i].contains(class)
             {
-                return wrong(format!("classes: {class:?} is empty, has a space, is there twice or is DontCare"));
+                return wrong(format!("classes: {class:?} is empty, contains a space, occurs twice or is DontCare"));
             }
         }
         Ok(())

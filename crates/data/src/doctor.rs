@@ -1,9 +1,9 @@
-//! What is wrong with a data set: read every frame once, look at what a training would trip over, and say it in words.
+//! Checks of a data set: reads every frame once and reports what would break or distort a training or an evaluation.
 
 mod detector_fit;
 mod duplicates;
 mod ground;
-mod reading;
+mod interpretation;
 mod report;
 mod statistics;
 mod survey;
@@ -17,14 +17,14 @@ use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use survey::{FrameFacts, survey};
 
-/// What a detector expects of its data, in plain numbers.
+/// What a detector expects of its data.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DetectorFacts {
-    /// Classes that it tells apart.
+    /// Classes that it detects.
     pub classes: Vec<String>,
     /// `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame.
     pub range: [f64; 6],
-    /// Its anchors; none for a network without.
+    /// Its anchors; empty for a detector without anchors.
     pub anchors: Vec<AnchorFacts>,
 }
 
@@ -35,20 +35,21 @@ pub struct AnchorFacts {
     pub class: String,
     /// Length, width, height, m.
     pub size: [f64; 3],
-    /// Height of the underside, m, LiDAR frame.
+    /// z of the bottom face, m, LiDAR frame.
     pub bottom: f64,
 }
 
-/// Frames in which the readings of the labels are compared; more would not say more.
-const FRAMES_READ_IN_ALL_WAYS: usize = 300;
+/// Maximum number of frames on which interpretations of the labels are compared. More frames do not change the result.
+const MAX_INTERPRETED_FRAMES: usize = 300;
 
-/// Examines a data set, and how it fits a detector. An error only where the data set cannot be listed; everything else is a finding.
+/// Checks a data set and, if given, whether it fits a detector. An error only if the frames cannot be listed;
+/// everything else is a finding.
 pub fn doctor(dataset: &Dataset, detector: Option<&DetectorFacts>) -> Result<DoctorReport, DataError> {
     let ids = dataset.all_ids()?;
     let mut findings = Findings::default();
     let splits = splits(dataset, &ids, &mut findings);
 
-    let stride = ids.len().div_ceil(FRAMES_READ_IN_ALL_WAYS);
+    let stride = ids.len().div_ceil(MAX_INTERPRETED_FRAMES);
     let outcomes: Vec<Result<FrameFacts, DataError>> =
         ids.par_iter().enumerate().map(|(i, id)| survey(dataset, id, i % stride == 0)).collect();
     let mut frames = Vec::new();
@@ -68,7 +69,7 @@ pub fn doctor(dataset: &Dataset, detector: Option<&DetectorFacts>) -> Result<Doc
     let classes = statistics::classes(dataset, &frames, &mut findings);
     let points = statistics::points(&frames, &mut findings);
     statistics::ground(&frames, &mut findings);
-    let readings = reading::judge(dataset, &frames, &mut findings);
+    let readings = interpretation::compare(dataset, &frames, &mut findings);
     duplicates::compare(&frames, &splits, &mut findings);
     if let Some(detector) = detector {
         detector_fit::compare(dataset, detector, &frames, &mut findings);
@@ -76,7 +77,7 @@ pub fn doctor(dataset: &Dataset, detector: Option<&DetectorFacts>) -> Result<Doc
     Ok(DoctorReport::new(dataset, &ids, &frames, splits, points, classes, readings, findings))
 }
 
-/// The frames of every split that can be read; what is wrong with the lists becomes a finding.
+/// The frame ids of every split that can be read. Errors of the lists become findings.
 fn splits(dataset: &Dataset, all: &[String], findings: &mut Findings) -> BTreeMap<String, Vec<String>> {
     let mut splits = BTreeMap::new();
     for name in dataset.config.splits.keys() {

@@ -1,9 +1,9 @@
-//! One moment of a data set: a cloud and the objects in it.
+//! A frame of a data set: a point cloud and its labelled objects.
 
 use geometry::Box3;
 use serde::{Deserialize, Serialize};
 
-/// Points with `channels` values each (x, y, z in m, LiDAR frame; then intensity in [0, 1] where there is one), one point after the other.
+/// A point cloud: x, y, z (m, LiDAR frame) and optionally intensity (in [0, 1] for KITTI), one point after the other.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct Cloud {
     /// `len() * channels` values.
@@ -13,7 +13,7 @@ pub struct Cloud {
 }
 
 impl Cloud {
-    /// An empty cloud of points with that many values each.
+    /// An empty cloud with `channels` values per point.
     pub fn new(channels: usize) -> Self {
         Cloud { values: Vec::new(), channels }
     }
@@ -23,7 +23,7 @@ impl Cloud {
         self.values.len() / self.channels
     }
 
-    /// No point at all.
+    /// Whether there is no point.
     pub fn is_empty(&self) -> bool {
         self.values.is_empty()
     }
@@ -33,18 +33,18 @@ impl Cloud {
         self.values.chunks_exact(self.channels)
     }
 
-    /// The points, to be changed in place.
+    /// The points, `channels` values each, mutable.
     pub fn points_mut(&mut self) -> std::slice::ChunksExactMut<'_, f32> {
         self.values.chunks_exact_mut(self.channels)
     }
 
-    /// Position of point `i`, m.
+    /// Position of point `i`, m, LiDAR frame.
     pub fn xyz(&self, i: usize) -> [f32; 3] {
         let p = &self.values[i * self.channels..];
         [p[0], p[1], p[2]]
     }
 
-    /// Keeps the points for which `keep` holds, in order.
+    /// Keeps the points for which `keep` (called with index and values) is true, in order.
     pub fn retain(&mut self, mut keep: impl FnMut(usize, &[f32]) -> bool) {
         let (channels, mut to) = (self.channels, 0);
         for i in 0..self.len() {
@@ -57,7 +57,7 @@ impl Cloud {
         self.values.truncate(to);
     }
 
-    /// The same points with only the first `channels` values of each.
+    /// The same points with only their first `channels` values. Panics if there are fewer.
     pub fn with_channels(&self, channels: usize) -> Cloud {
         assert!(channels <= self.channels, "a cloud of {} channels has no {channels}", self.channels);
         Cloud { values: self.points().flat_map(|p| p[..channels].iter().copied()).collect(), channels }
@@ -67,36 +67,36 @@ impl Cloud {
 /// A labelled object.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Object {
-    /// Class as the label file writes it.
+    /// Class as in the label file.
     pub class: String,
-    /// In the LiDAR frame.
+    /// Box in the LiDAR frame, m and rad.
     pub bbox: Box3,
-    /// KITTI's truncation, 0 (none) to 1; `None` where the label does not say.
+    /// KITTI's truncation, 0 (none) to 1; `None` if not known.
     pub truncation: Option<f64>,
-    /// KITTI's occlusion level, 0 (visible) to 3 (unknown); `None` where the label does not say.
+    /// KITTI's occlusion level, 0 (visible) to 3 (unknown); `None` if not labelled.
     pub occlusion: Option<i32>,
     /// Left, top, right, bottom in the image, px.
     pub image_box: Option<[f64; 4]>,
 }
 
-/// One moment of a data set.
+/// A frame: one scan and its labelled objects.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// The file name without ending.
+    /// The file name without extension.
     pub id: String,
-    /// What the sensor saw.
+    /// The points, LiDAR frame.
     pub cloud: Cloud,
-    /// What is there. DontCare regions are not objects and are left out.
+    /// The labelled objects. DontCare regions are left out.
     pub objects: Vec<Object>,
 }
 
-/// A box that a network reports.
+/// A detected object.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Detection {
     /// Class name.
     pub class: String,
-    /// In the LiDAR frame.
+    /// Box in the LiDAR frame, m and rad.
     pub bbox: Box3,
-    /// Confidence; larger is surer.
+    /// Confidence; larger is more confident.
     pub score: f32,
 }

@@ -1,4 +1,4 @@
-//! The objects of a training split with their points, for ground-truth sampling; built once and cached.
+//! Database for ground-truth sampling: the objects of a training split with their points. Built once and cached.
 
 use crate::augment::GtSamplingConfig;
 use crate::{DataError, Dataset, Frame, Object, write_atomic};
@@ -12,9 +12,10 @@ use std::path::Path;
 /// An object and its points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GtSample {
-    /// Where it was, LiDAR frame.
+    /// Its box, LiDAR frame.
     pub bbox: Box3,
-    /// Its points, values as in the cloud, but x, y, z relative to the centre of the box.
+    /// Its points with the columns of the cloud. x, y, z are relative to the centre of the box, m, axes of the LiDAR
+    /// frame.
     pub points: Vec<f32>,
 }
 
@@ -25,21 +26,21 @@ pub struct GtDatabase {
     classes: BTreeMap<String, Vec<GtSample>>,
 }
 
-/// First bytes of a cache file; the number goes up when its form or what is put into it changes.
+/// First bytes of a cache file. The number is increased when the format or the contents change.
 const MAGIC: &[u8; 8] = b"LSGTDB01";
 
 impl GtDatabase {
-    /// Values a point.
+    /// Number of values per point.
     pub fn channels(&self) -> usize {
         self.channels
     }
 
-    /// The objects of a class; none for a class that there is not.
+    /// The objects of a class; empty for an unknown class.
     pub fn samples(&self, class: &str) -> &[GtSample] {
         self.classes.get(class).map_or(&[], Vec::as_slice)
     }
 
-    /// Collects the objects of `classes` from the frames `ids`, in their order, on all cores.
+    /// Collects the objects of `classes` from the frames `ids`, in their order. Frames are read in parallel.
     pub fn build(
         dataset: &Dataset,
         ids: &[String],
@@ -57,8 +58,9 @@ impl GtDatabase {
         Ok(database)
     }
 
-    /// The database from its file in `cache_folder`, or built and written there. The file's name is a hash of everything that it depends
-    /// on; one that is damaged is built again.
+    /// Reads the database from its file in `cache_folder`, or builds and writes it.
+    ///
+    /// The file name has a hash of everything that the contents depend on. A damaged file is built again.
     pub fn open_or_build(
         cache_folder: &Path,
         dataset: &Dataset,
@@ -95,7 +97,7 @@ impl GtDatabase {
         out
     }
 
-    /// `None` for anything that was not written by [`GtDatabase::to_bytes`], whole.
+    /// The inverse of [`GtDatabase::to_bytes`]; `None` if the bytes are damaged or of another version.
     fn from_bytes(bytes: &[u8]) -> Option<Self> {
         let (body, digest) = bytes.split_at_checked(bytes.len().checked_sub(32)?)?;
         if Sha256::digest(body)[..] != *digest {
@@ -150,7 +152,8 @@ fn samples_of(frame: &Frame, classes: &[String], config: &GtSamplingConfig) -> V
     objects.iter().zip(members).filter_map(sample).collect()
 }
 
-/// None of KITTI's three difficulties: lower than 25 px in the image, occlusion above 2 or truncation above 0.5. `false` where not known.
+/// Whether an object is in none of KITTI's difficulty levels: image box lower than 25 px, occlusion above 2 or
+/// truncation above 0.5. `false` if there is no image box.
 fn is_too_hard(object: &Object) -> bool {
     let low = object.image_box.is_some_and(|b| b[3] - b[1] + 1.0 < 25.0);
     let hidden = object.occlusion.is_some_and(|o| o > 2) || object.truncation.is_some_and(|t| t > 0.5);
@@ -163,10 +166,10 @@ fn cache_key(dataset: &Dataset, ids: &[String], classes: &[String], config: &GtS
     let mut text =
         format!("{MAGIC:?} {root:?} {:?} {classes:?} {} {}\n", dataset.config, config.min_points, config.drop_too_hard);
     for id in ids {
-        write!(text, "{id}").expect("a String takes all");
+        write!(text, "{id}").expect("writing to a String cannot fail");
         for path in [Some(dataset.cloud_path(id)), Some(dataset.labels_path(id)), dataset.calibration_path(id)] {
             let state = path.and_then(|path| std::fs::metadata(path).ok()).map(|m| (m.len(), m.modified().ok()));
-            write!(text, " {state:?}").expect("a String takes all");
+            write!(text, " {state:?}").expect("writing to a String cannot fail");
         }
         text.push('\n');
     }
@@ -181,7 +184,7 @@ mod tests {
     use crate::{Cloud, Layout, stream};
     use geometry::bev_intersection;
 
-    /// Cars of twelve points in a row; every frame has its row elsewhere.
+    /// A row of cars with twelve points each. The row is at another y in every frame.
     fn frame(row: usize, cars: usize) -> Frame {
         let mut frame = Frame { id: format!("{row:06}"), cloud: Cloud::new(4), objects: Vec::new() };
         for k in 0..cars {
@@ -214,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cached_is_what_was_built_and_damage_is_built_again() {
+    fn the_cache_equals_the_built_database_and_damaged_files_are_rebuilt() {
         let (folder, dataset, ids) = data_set();
         let (config, classes) = (GtSamplingConfig::default(), vec!["Car".to_string()]);
         let cache = folder.path().join("cache");
@@ -237,12 +240,12 @@ mod tests {
     }
 
     #[test]
-    fn pasted_objects_touch_nothing_and_own_their_space() {
+    fn pasted_objects_do_not_overlap_and_contain_only_their_points() {
         let (_folder, dataset, ids) = data_set();
         let (config, classes) = (GtSamplingConfig::default(), vec!["Car".to_string()]);
         let database = GtDatabase::build(&dataset, &ids, &classes, &config).unwrap();
         let mut scene = frame(2, 2);
-        scene.objects[1].class = "Truck".into(); // other classes block too
+        scene.objects[1].class = "Truck".into(); // objects of other classes also collide
         for x in 0..200 {
             scene.cloud.values.extend([0.3 * x as f32, -9.0, -1.0, 77.0]);
         }

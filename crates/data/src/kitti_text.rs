@@ -1,12 +1,13 @@
-//! KITTI's text for labels and detections: one object a line, fifteen values, for detections a score as the sixteenth.
+//! KITTI's text format for labels and detections: one object a line with 15 values; detections have a score as value
+//! 16.
 //!
-//! The same columns are read in two frames ([`crate::LabelFrame`]). Nothing here converts between them: the numbers are kept as written.
-//! The rest of the program holds boxes as [`LabelBox`]; this text exists where files are read and written.
+//! The same columns are used for both label frames ([`crate::LabelFrame`]). This module does not convert between them.
+//! The rest of the program uses [`LabelBox`].
 
 use crate::{DONT_CARE, DataError, LabelBox};
 use std::{fmt, path::Path};
 
-/// Locations beyond this are damage, m.
+/// Largest absolute coordinate of a valid location, m.
 const FARTHEST_M: f64 = 10_000.0;
 
 const FIELDS: [&str; 16] = [
@@ -28,12 +29,12 @@ const FIELDS: [&str; 16] = [
     "score",
 ];
 
-/// Which of the two kinds a text is.
+/// Kind of a KITTI text.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum KittiText {
-    /// Fifteen values a line.
+    /// Labels: 15 values a line.
     Labels,
-    /// Sixteen values a line, the last one is the score.
+    /// Detections: 16 values a line, the last one is the score.
     Detections,
 }
 
@@ -55,7 +56,7 @@ fn parse_line(text: &str, kind: KittiText) -> Result<LabelBox, String> {
         };
         return Err(format!("{what} has {wanted}; this line has {found}"));
     }
-    let mut v = [0.0; 16]; // v[0] is unused, so that the numbers stand where FIELDS has their names
+    let mut v = [0.0; 16]; // same indices as FIELDS; v[0] is unused
     for (i, field) in fields.iter().enumerate().skip(1) {
         v[i] = match field.parse::<f64>() {
             Ok(number) if number.is_finite() => number,
@@ -90,7 +91,7 @@ fn check_box(label: &LabelBox, kind: KittiText) -> Result<(), String> {
             return Err(format!("{name} (value {}) is {size}; a size cannot be negative", 9 + i));
         }
         if *size == 0.0 && kind == KittiText::Labels && !dont_care {
-            return Err(format!("{name} (value {}) is 0; a labelled object has a size", 9 + i));
+            return Err(format!("{name} (value {}) is 0; the size of a labelled object must be positive", 9 + i));
         }
     }
     if let Some(i) = label.location.iter().position(|v| v.abs() > FARTHEST_M) {
@@ -100,7 +101,8 @@ fn check_box(label: &LabelBox, kind: KittiText) -> Result<(), String> {
     Ok(())
 }
 
-/// Writes a box as a line of KITTI text, without a line end. Reading it gives the same numbers to the bit; tracks have no column.
+/// Formats a box as a line of KITTI text, without a line feed. Reading it gives bit-identical numbers. The track is not
+/// written, because the format has no column for it.
 pub struct KittiLine<'a>(pub &'a LabelBox);
 
 impl fmt::Display for KittiLine<'_> {
@@ -115,7 +117,7 @@ impl fmt::Display for KittiLine<'_> {
     }
 }
 
-/// Reads a text, line by line; blank lines are left out. `path` is for the messages.
+/// Parses a text, one box a line. Blank lines are skipped. `path` is used in error messages.
 pub fn parse_kitti_text(text: &str, path: &Path, kind: KittiText) -> Result<Vec<LabelBox>, DataError> {
     let lines = text.lines().enumerate().filter(|(_, line)| !line.trim_ascii().is_empty());
     lines.map(|(i, line)| parse_line(line, kind).map_err(|message| DataError::line(path, i + 1, message))).collect()
@@ -126,7 +128,7 @@ pub fn read_kitti_text(path: &Path, kind: KittiText) -> Result<Vec<LabelBox>, Da
     parse_kitti_text(&fs_err::read_to_string(path)?, path, kind)
 }
 
-/// The text of these boxes, one a line.
+/// Formats boxes as KITTI text, one a line.
 pub fn to_kitti_text<'a>(labels: impl IntoIterator<Item = &'a LabelBox>) -> String {
     labels.into_iter().map(|label| format!("{}\n", KittiLine(label))).collect()
 }
@@ -143,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_reads_back_the_same() {
+    fn texts_round_trip() {
         let text = format!("{LABEL}\n\nDontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\r\n");
         let lines = read(&text, KittiText::Labels).unwrap();
         assert_eq!(lines.len(), 2);
@@ -167,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn bad_lines_are_named() {
+    fn invalid_lines_are_reported_with_their_number() {
         let bad = [
             (LABEL.rsplit_once(' ').unwrap().0.to_string(), "15 values; this line has 14"),
             (format!("{LABEL} 0.5"), "15 values; this line has 16"),

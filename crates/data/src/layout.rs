@@ -1,4 +1,5 @@
-//! How the frames of a data set lie on disk. A layout is a file in this folder and a line in [`Layout`]'s list below.
+//! Layouts: how the frames of a data set are stored on disk. A new layout is a file in this folder and a line in
+//! `layouts!`.
 
 mod file_per_frame;
 
@@ -10,21 +11,23 @@ use serde::{Deserialize, Serialize};
 use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
-/// Declares the module of each layout and the enum that a data set's TOML spells in snake case. The module `m` of `Name = m` holds a
-/// unit type `Name`, which is a [`DataLayout`]. The text is what the reference of the configuration says of it.
+/// Declares the modules and the enum [`Layout`]. Each line is `Type = module: "documentation";`.
+///
+/// The module has a unit type of this name that implements [`DataLayout`]. A data set's TOML has the name in snake
+/// case. The documentation is shown in the reference of the configuration.
 macro_rules! layouts {
-    ($($name:ident = $module:ident: $says:tt;)+) => {
+    ($($name:ident = $module:ident: $doc:tt;)+) => {
         $(mod $module;)+
 
-        /// Where the files lie below the root.
+        /// Folders and files below the root of a data set.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
         #[serde(rename_all = "snake_case")]
         pub enum Layout {
-            $(#[doc = $says] $name,)+
+            $(#[doc = $doc] $name,)+
         }
 
         impl Layout {
-            /// All of them, in the order in which a folder without a TOML is compared with them.
+            /// All layouts, in the order in which they are tried on a folder without a TOML.
             pub const ALL: &[Layout] = &[$(Layout::$name),+];
         }
 
@@ -41,7 +44,7 @@ macro_rules! layouts {
 }
 
 layouts! {
-    Kitti = kitti: "`velodyne/*.bin`, `label_2/*.txt` and, where there is a camera, `calib/*.txt`.";
+    Kitti = kitti: "`velodyne/*.bin`, `label_2/*.txt` and, if there is a camera, `calib/*.txt`.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
 }
 
@@ -51,29 +54,30 @@ impl Default for Layout {
     }
 }
 
-/// Finds, reads and writes the frames of one layout. `root` is the root of a data set, `id` a frame of it.
+/// Finds, reads and writes the frames of one layout. `root` is the root folder of a data set, `id` the id of a frame.
 ///
-/// Methods with a body are what a format may not carry; their default says "not known" or "not there".
+/// Methods with a default are for optional data. The default is "not known" or "does not exist".
 pub trait DataLayout: Send + Sync {
-    /// The name as a data set's TOML spells it.
+    /// The name of the layout in a data set's TOML.
     fn name(&self) -> &'static str;
 
-    /// What a folder without a TOML is known by, for messages.
-    fn signs(&self) -> &'static [&'static str];
+    /// Folders by which the layout is recognised without a TOML, for error messages.
+    fn markers(&self) -> &'static [&'static str];
 
-    /// The data set in a folder without a TOML, if it is of this layout: root, and name and splits unless they are the usual ones.
+    /// The configuration of a folder without a TOML; `None` if the folder has another layout. Sets `root`; sets `name`
+    /// and `splits` only if they differ from the defaults.
     fn recognise(&self, folder: &Path) -> Option<DatasetConfig>;
 
-    /// An error that names what is missing, unless `root` holds data of this layout.
+    /// An error that names the missing folder if `root` has no data of this layout.
     fn check_root(&self, root: &Path) -> Result<(), DataError>;
 
-    /// All frames, sorted; at least one.
+    /// The ids of all frames, sorted. An error if there is none.
     fn frame_ids(&self, root: &Path) -> Result<Vec<String>, DataError>;
 
-    /// The file that holds the cloud of a frame, or would hold it.
+    /// Path of the cloud of a frame, which need not exist.
     fn cloud_path(&self, root: &Path, id: &str) -> PathBuf;
 
-    /// The file that holds the labels of a frame, or would hold them.
+    /// Path of the labels of a frame, which need not exist.
     fn labels_path(&self, root: &Path, id: &str) -> PathBuf;
 
     /// Whether the frame has a cloud.
@@ -81,59 +85,59 @@ pub trait DataLayout: Send + Sync {
         self.cloud_path(root, id).is_file()
     }
 
-    /// Whether the data set has labels at all; without, its frames have no objects.
+    /// Whether the data set has labels. Without labels its frames have no objects.
     fn has_labels(&self, root: &Path) -> bool;
 
-    /// Whether the clouds have an intensity, as far as the data say so.
+    /// Whether the clouds have an intensity; true if the files do not show it.
     fn has_intensity(&self, root: &Path) -> Result<bool, DataError>;
 
-    /// The cloud of a frame, checked as [`crate::read_cloud`] does.
+    /// Reads the cloud of a frame, with the checks of [`crate::read_cloud`].
     fn read_cloud(&self, root: &Path, id: &str, columns: PointColumns) -> Result<Cloud, DataError>;
 
-    /// Number of points of a frame. A layout that knows it without reading the points says so.
+    /// Number of points of a frame. Layouts override this if they need not read the points.
     fn count_points(&self, root: &Path, id: &str, columns: PointColumns) -> Result<usize, DataError> {
         Ok(self.read_cloud(root, id, columns)?.len())
     }
 
-    /// The labels of a frame in their label frame, DontCare included.
+    /// Reads the labels of a frame in the label frame, DontCare included.
     fn read_labels(&self, root: &Path, id: &str) -> Result<Vec<LabelBox>, DataError>;
 
-    /// Whether data of this layout can have a camera's calibration.
-    fn knows_camera(&self) -> bool {
+    /// Whether the layout supports a camera calibration.
+    fn supports_calibration(&self) -> bool {
         false
     }
 
-    /// The label frame of a data set that does not name one.
-    fn usual_label_frame(&self, _root: &Path) -> LabelFrame {
+    /// The label frame if the TOML does not give one.
+    fn default_label_frame(&self, _root: &Path) -> LabelFrame {
         LabelFrame::Lidar
     }
 
-    /// The file that holds the calibration of a frame, or would hold it.
+    /// Path of the calibration of a frame, which need not exist; `None` if the layout has no calibration.
     fn calibration_path(&self, _root: &Path, _id: &str) -> Option<PathBuf> {
         None
     }
 
-    /// The calibration of a frame.
+    /// Reads the calibration of a frame.
     fn read_calibration(&self, root: &Path, _id: &str) -> Result<Calibration, DataError> {
         Err(DataError::file(root, format!("the layout {} has no calibration", self.name())))
     }
 
-    /// When the frame was taken, s from a start that all frames of the data set share.
+    /// Time stamp of a frame, s since a start that all frames of the data set share; `None` if not known.
     fn stamp_s(&self, _root: &Path, _id: &str) -> Result<Option<f64>, DataError> {
         Ok(None)
     }
 
-    /// Pose of the LiDAR in a world that all frames of the data set share.
+    /// Pose of the LiDAR in a world frame that all frames of the data set share; `None` if not known.
     fn world_from_lidar(&self, _root: &Path, _id: &str) -> Result<Option<Pose>, DataError> {
         Ok(None)
     }
 
-    /// What is known of the points of a frame beside place and intensity.
+    /// Reads per-point data besides position and intensity.
     fn read_point_details(&self, _root: &Path, _id: &str) -> Result<PointDetails, DataError> {
         Ok(PointDetails::default())
     }
 
-    /// The folders that writing puts files into, relative to the root.
+    /// The folders into which frames are written, relative to the root.
     fn folders(&self) -> &'static [&'static str];
 
     /// Writes the cloud of a frame.
@@ -142,19 +146,19 @@ pub trait DataLayout: Send + Sync {
     /// Writes the labels of a frame, in the label frame of the data set.
     fn write_labels(&self, root: &Path, id: &str, labels: &[LabelBox]) -> Result<(), DataError>;
 
-    /// Writes a frame, its labels in the label frame "lidar".
+    /// Writes cloud and labels of a frame. Labels are written in [`LabelFrame::Lidar`].
     fn write_frame(&self, root: &Path, frame: &Frame) -> Result<(), DataError> {
         self.write_cloud(root, &frame.id, &frame.cloud)?;
         self.write_labels(root, &frame.id, &label_boxes(frame))
     }
 }
 
-/// What a recording may know of each point of a cloud, in the order of its points; `None`: not known.
+/// Optional data of each point of a cloud, in the order of its points; `None` if not known.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointDetails {
-    /// Number of the laser.
+    /// Ring (laser channel), from 0.
     pub ring: Option<Vec<u16>>,
-    /// Time of the shot after the frame's stamp, s.
+    /// Time of the point relative to the time stamp of the frame, s.
     pub time_s: Option<Vec<f32>>,
 }
 
@@ -165,16 +169,16 @@ mod tests {
     use geometry::Box3;
 
     #[test]
-    fn layouts_are_named_as_a_toml_spells_them() {
+    fn layout_names_are_those_of_the_toml() {
         for layout in Layout::ALL {
             assert_eq!(serde_json::to_value(layout).unwrap(), layout.name());
         }
         assert_eq!(Layout::default(), Layout::Kitti);
     }
 
-    /// Every layout has to pass this.
+    /// The contract of all layouts.
     #[test]
-    fn what_a_layout_writes_it_finds_and_reads() {
+    fn every_layout_reads_what_it_writes() {
         let object = Object {
             class: "Car".into(),
             bbox: Box3::from_array([10.5, -2.25, -0.9, 4.1, 1.7, 1.5, 0.3]),

@@ -1,6 +1,7 @@
-//! Frames and where they come from.
+//! Data sets: frames (point clouds with labelled boxes), their file formats, augmentation and checks.
 //!
-//! Everything here is in the LiDAR frame: x forward, y left, z up; yaw counter-clockwise from +x; the centre of a box is its geometric centre.
+//! Coordinates are in the LiDAR frame unless stated otherwise: x forward, y left, z up, m; yaw counter-clockwise from
+//! +x, rad. The centre of a box is its geometric centre.
 
 pub mod augment;
 mod calibration;

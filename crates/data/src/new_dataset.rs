@@ -1,4 +1,4 @@
-//! A data set in the making: its folder, its manifest, its frames and its description.
+//! Writes a new data set: folder, manifest, frames, splits and `dataset.toml`.
 
 use crate::write::{remove_unfinished, write_dataset_toml, write_split};
 use crate::{DataError, DatasetConfig, Layout, PointColumns, write_json};
@@ -8,36 +8,38 @@ use serde::de::DeserializeOwned;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// What the `manifest.json` of a data set that a program made says of it.
+/// The `manifest.json` of a generated data set.
 pub trait Manifest: Serialize + DeserializeOwned {
-    /// What differs where a folder holds another data set, after "was made".
-    const OTHERWISE: &'static str;
+    /// What differs if the folder has another data set. Completes the error message "was made ...".
+    const DIFFERENCE: &'static str;
 
-    /// Version of the manifest, and the hash of all that decides the frames.
+    /// Version of the manifest and hash of everything that determines the frames.
     fn identity(&self) -> [&str; 2];
 
-    /// Whether all frames are there.
+    /// Sets whether all frames are written.
     fn set_complete(&mut self, complete: bool);
 }
 
-/// A data set that is being written. What an earlier run with the same manifest finished is kept.
+/// A data set that is being written. Frames that an earlier run with the same manifest wrote are kept.
 pub struct NewDataset<'a> {
     root: &'a Path,
     layout: Layout,
 }
 
 impl<'a> NewDataset<'a> {
-    /// Takes the folder `root`: it must be empty, or begun with the same manifest. `beside` names further folders that the writer
-    /// puts files into.
+    /// Begins or resumes a data set in the folder `root`.
+    ///
+    /// `root` must be empty, not exist, or have a manifest with the same identity. `extra_folders` are further folders,
+    /// relative to `root`, into which the caller writes. Incomplete files in all these folders are removed.
     pub fn begin<M: Manifest>(
         root: &'a Path,
         layout: Layout,
-        beside: &[&str],
+        extra_folders: &[&str],
         manifest: &mut M,
     ) -> Result<Self, DataError> {
         let set = NewDataset { root, layout };
         set.check_folder(manifest)?;
-        for inside in ["", "ImageSets"].iter().chain(layout.folders()).chain(beside) {
+        for inside in ["", "ImageSets"].iter().chain(layout.folders()).chain(extra_folders) {
             remove_unfinished(&root.join(inside))?;
         }
         manifest.set_complete(false);
@@ -45,23 +47,24 @@ impl<'a> NewDataset<'a> {
         Ok(set)
     }
 
-    /// Writes the last state of the manifest: the data set is complete.
+    /// Marks the data set as complete and writes the manifest.
     pub fn finish<M: Manifest>(&self, manifest: &mut M) -> Result<(), DataError> {
         manifest.set_complete(true);
         write_json(&self.manifest_path(), manifest)
     }
 
-    /// The folder.
+    /// The root folder.
     pub fn root(&self) -> &Path {
         self.root
     }
 
-    /// Where the files lie in it.
+    /// The layout of the files.
     pub fn layout(&self) -> Layout {
         self.layout
     }
 
-    /// Writes the lists of frames and `dataset.toml`. Root, layout and splits of `config` are those of this data set.
+    /// Writes the splits and `dataset.toml`. Root, layout and splits of `config` are replaced by those of this data
+    /// set.
     pub fn describe<N: AsRef<str>>(
         &self,
         config: DatasetConfig,
@@ -76,8 +79,9 @@ impl<'a> NewDataset<'a> {
         write_dataset_toml(&self.root.join("dataset.toml"), &config)
     }
 
-    /// Makes all frames, in parallel; the results come in the order of the frames. `progress` hears how many of how many are there,
-    /// from several threads.
+    /// Calls `make` for all frames in parallel. Results are in the order of the frames.
+    ///
+    /// `progress` is called with the number of finished frames and of all frames, from several threads.
     pub fn make_frames<K: Sync, T: Send, E: Send>(
         &self,
         frames: &[K],
@@ -94,12 +98,12 @@ impl<'a> NewDataset<'a> {
         made.collect()
     }
 
-    /// Whether a frame is there, with its labels where `labelled`.
+    /// Whether a frame is written, with its labels if `labelled`.
     pub fn has_frame(&self, id: &str, labelled: bool) -> bool {
         self.layout.has_cloud(self.root, id) && (!labelled || self.layout.labels_path(self.root, id).is_file())
     }
 
-    /// Points and labels of a frame that is there.
+    /// Number of points and of labels of a written frame.
     pub fn count(&self, id: &str, columns: PointColumns) -> Result<[usize; 2], DataError> {
         let points = self.layout.count_points(self.root, id, columns)?;
         Ok([points, self.layout.read_labels(self.root, id)?.len()])
@@ -115,7 +119,7 @@ impl<'a> NewDataset<'a> {
             let text = fs_err::read_to_string(&path)?;
             let found: M = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
             if found.identity() != wanted.identity() {
-                let message = format!("was made {}; choose another folder, or remove this one", M::OTHERWISE);
+                let message = format!("was made {}; choose another folder, or remove this one", M::DIFFERENCE);
                 return Err(DataError::file(self.root, message));
             }
         } else if self.root.is_dir() && fs_err::read_dir(self.root)?.next().is_some() {
@@ -138,7 +142,7 @@ mod tests {
     }
 
     impl Manifest for Made {
-        const OTHERWISE: &'static str = "with another recipe";
+        const DIFFERENCE: &'static str = "with another recipe";
 
         fn identity(&self) -> [&str; 2] {
             ["made/1", &self.sha]
@@ -169,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stopped_run_goes_on_and_another_folder_is_refused() {
+    fn an_interrupted_run_is_resumed_and_other_folders_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join("set");
         assert_eq!(make(&root, "1").unwrap(), 2);

@@ -1,18 +1,20 @@
-//! Point Cloud Data files, version 0.7: ascii, binary and binary_compressed; fields in any order, size and type.
+//! PCD files (Point Cloud Data), version 0.7: ascii, binary and binary_compressed; fields in any order, size and type.
 //!
-//! x, y, z and, where there is one, intensity are taken; other fields are passed over. Memory is bounded by the size of the file: a header
-//! is believed only as far as there are bytes behind it.
+//! x, y, z and, if present, intensity are read; other fields are ignored. Memory use is bounded by the file size: the
+//! counts in the header are compared with the number of bytes before memory is allocated.
 
 use crate::cloud_file::check_cloud;
 use crate::pcd_header::{PcdEncoding, PcdField, PcdHeader, parse_pcd_header};
 use crate::{Cloud, DataError};
 use std::path::Path;
 
-/// No LZF stream gives more bytes than this for each of its own (three bytes stand for at most 264).
-const LZF_AT_MOST: u64 = 88;
+/// Largest compression ratio of LZF: three bytes encode at most 264 bytes.
+const LZF_MAX_RATIO: u64 = 88;
 
-/// A PCD file in memory; `path` is for messages. In an organised cloud (HEIGHT above 1) points whose x, y and z are all NaN are rays without
-/// a return, as the format says, and are left out; anywhere else a NaN is an error.
+/// Parses a PCD file. `path` is used in error messages.
+///
+/// In an organised cloud (HEIGHT above 1) points whose x, y and z are all NaN are rays without a return and are left
+/// out. Any other NaN is an error. The checks of [`crate::read_cloud`] apply.
 pub fn parse_pcd(bytes: &[u8], path: &Path) -> Result<Cloud, DataError> {
     let header = parse_pcd_header(bytes, path)?;
     let body = &bytes[header.body_start..];
@@ -31,8 +33,9 @@ pub fn parse_pcd(bytes: &[u8], path: &Path) -> Result<Cloud, DataError> {
 }
 
 fn ascii(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Path) -> Result<Vec<f32>, DataError> {
-    let text = std::str::from_utf8(body).map_err(|_| DataError::file(path, "says DATA ascii, but is not text"))?;
-    // A point takes six bytes at least, so that the text bounds what is reserved.
+    let text = std::str::from_utf8(body)
+        .map_err(|_| DataError::file(path, "has DATA ascii, but its points are not UTF-8 text"))?;
+    // A point has at least six bytes: the length of the text limits the reserved memory.
     let mut values = Vec::with_capacity(columns.len() * header.points.min(body.len() as u64 / 6 + 1) as usize);
     let (mut points, mut tokens) = (0, Vec::new());
     for (i, line) in text.lines().enumerate() {
@@ -44,7 +47,7 @@ fn ascii(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Path) ->
         tokens.extend(line.split_ascii_whitespace());
         if tokens.len() != header.numbers_per_point {
             return Err(wrong(format!(
-                "{} numbers, where FIELDS and COUNT ask for {}",
+                "{} numbers, but FIELDS and COUNT require {}",
                 tokens.len(),
                 header.numbers_per_point
             )));
@@ -89,31 +92,36 @@ fn binary(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Path) -
 fn compressed(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Path) -> Result<Vec<f32>, DataError> {
     let wrong = |message: String| DataError::file(path, message);
     let Some((sizes, stream)) = body.split_at_checked(8) else {
-        return Err(wrong("ends before the two sizes of its compressed points".into()));
+        return Err(wrong("ends before the two sizes of the compressed points".into()));
     };
     let size = |at: usize| u64::from(u32::from_le_bytes([sizes[at], sizes[at + 1], sizes[at + 2], sizes[at + 3]]));
     let (packed, unpacked, wanted) = (size(0), size(4), header.body_bytes(path)?);
     if stream.len() as u64 != packed {
-        return Err(wrong(format!("has {} bytes of compressed points, but says {packed}", stream.len())));
+        return Err(wrong(format!(
+            "has {} bytes of compressed points, but its compressed size is given as {packed}",
+            stream.len()
+        )));
     }
     if unpacked != wanted {
         return Err(wrong(format!(
-            "says that its points unpack to {unpacked} bytes, but its header says {} points of {} bytes",
+            "has an uncompressed size of {unpacked} bytes, but its header says {} points of {} bytes",
             header.points, header.point_bytes
         )));
     }
-    if unpacked > packed.saturating_mul(LZF_AT_MOST) {
-        return Err(wrong(format!("says that {packed} compressed bytes unpack to {unpacked}, which LZF cannot do")));
+    if unpacked > packed.saturating_mul(LZF_MAX_RATIO) {
+        return Err(wrong(format!(
+            "gives {packed} bytes as the compressed size of {unpacked} bytes, which LZF cannot reach"
+        )));
     }
     if unpacked == 0 {
         return Ok(Vec::new());
     }
     let bytes = lzf::decompress(stream, unpacked as usize)
-        .map_err(|e| wrong(format!("its compressed points do not unpack: {e}")))?;
+        .map_err(|e| wrong(format!("the compressed points cannot be decompressed: {e}")))?;
     if bytes.len() as u64 != unpacked {
-        return Err(wrong(format!("its compressed points unpack to {} bytes instead of {unpacked}", bytes.len())));
+        return Err(wrong(format!("the compressed points decompress to {} bytes instead of {unpacked}", bytes.len())));
     }
-    // All values of the first field, then all of the second, ...
+    // Column-major: all values of the first field, then all values of the second, and so on.
     let points = header.points as usize;
     let mut values = vec![0.0; columns.len() * points];
     for (channel, field) in columns.iter().enumerate() {
@@ -125,18 +133,18 @@ fn compressed(body: &[u8], header: &PcdHeader, columns: &[&PcdField], path: &Pat
     Ok(values)
 }
 
-/// A cloud as PCD v0.7 with the fields x, y, z and, for four channels, intensity, each an f32.
+/// Encodes a cloud as PCD v0.7 with the fields x, y, z and, with four channels, intensity, each an f32.
 pub fn encode_pcd(cloud: &Cloud, encoding: PcdEncoding) -> Vec<u8> {
     let (points, channels) = (cloud.len(), cloud.channels);
-    let four = |text: &str| vec![text; channels].join(" ");
+    let repeat = |text: &str| vec![text; channels].join(" ");
     let fields = ["x", "y", "z", "intensity"][..channels].join(" ");
     let mut out = format!(
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE {}\nTYPE {}\nCOUNT {}\nWIDTH {points}\nHEIGHT 1\n\
          VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {}\n",
-        four("4"),
-        four("F"),
-        four("1"),
-        encoding.word()
+        repeat("4"),
+        repeat("F"),
+        repeat("1"),
+        encoding.keyword()
     )
     .into_bytes();
     match encoding {
@@ -160,11 +168,11 @@ pub fn encode_pcd(cloud: &Cloud, encoding: PcdEncoding) -> Vec<u8> {
     out
 }
 
-/// LZF. The crate `lzf` has a compressor too, but it gives up on data that does not shrink, where a PCD must still be written, and
-/// indexes out of bounds on some of it.
+/// Compresses by LZF. The compressor of the crate `lzf` is not used: it fails on data that cannot be compressed and
+/// indexes out of bounds on some input.
 fn compress(plain: &[u8]) -> Vec<u8> {
-    const FARTHEST: usize = 1 << 13;
-    const LONGEST: usize = 264;
+    const MAX_DISTANCE: usize = 1 << 13;
+    const MAX_LENGTH: usize = 264;
     let mut out = Vec::with_capacity(plain.len() / 2);
     let mut last_seen = vec![usize::MAX; 1 << 14];
     let literals = |out: &mut Vec<u8>, run: &[u8]| {
@@ -178,11 +186,11 @@ fn compress(plain: &[u8]) -> Vec<u8> {
         let key = u32::from_le_bytes([plain[at], plain[at + 1], plain[at + 2], 0]);
         let slot = &mut last_seen[(key.wrapping_mul(0x9E37_79B1) >> 18) as usize];
         let from = std::mem::replace(slot, at);
-        if from == usize::MAX || at - from > FARTHEST || plain[from..from + 3] != plain[at..at + 3] {
+        if from == usize::MAX || at - from > MAX_DISTANCE || plain[from..from + 3] != plain[at..at + 3] {
             at += 1;
             continue;
         }
-        let longest = LONGEST.min(plain.len() - at);
+        let longest = MAX_LENGTH.min(plain.len() - at);
         let length = (3..longest).find(|k| plain[from + k] != plain[at + k]).unwrap_or(longest);
         literals(&mut out, &plain[run_start..at]);
         let (distance, extra) = (at - from - 1, length - 2);
@@ -250,7 +258,7 @@ mod tests {
             (&[("FIELDS x y z intensity", "FIELDS x y w intensity")], "12.pcd:3: FIELDS has no z"),
             (&[("FIELDS x y z intensity", "FIELDS x y z x")], "FIELDS has x twice"),
             (&[("DATA ascii", "DATA zip")], "12.pcd:11: DATA \"zip\""),
-            (&[("DATA ascii", "DATUM")], "12.pcd:11: \"DATUM\" is no entry"),
+            (&[("DATA ascii", "DATUM")], "12.pcd:11: \"DATUM\" is not a PCD header entry"),
             (&[("SIZE 4 4 4 4", "SIZE 4 4 4")], "12.pcd:4: SIZE has 3 values, but FIELDS has 4"),
             (&[("SIZE 4 4 4 4\n", "")], "has no SIZE"),
             (&[("TYPE F F F F", "TYPE F F F Q")], "TYPE Q of size 4"),
@@ -258,7 +266,7 @@ mod tests {
             (&[("COUNT 1 1 1 1", "COUNT 2 1 1 1")], "x has COUNT 2"),
             (&[("VERSION 0.7", "VERSION 9")], "VERSION 9"),
             (&[("WIDTH 2", "WIDTH -2")], "12.pcd:7: WIDTH \"-2\""),
-            (&[("WIDTH 2\n", "WIDTH 2\nWIDTH 2\n")], "WIDTH is there twice"),
+            (&[("WIDTH 2\n", "WIDTH 2\nWIDTH 2\n")], "WIDTH occurs twice"),
             (&[("6.5 0.25", "6.5")], "12.pcd:13: 3 numbers"),
             (&[("6.5", "6,5")], "12.pcd:13: z = \"6,5\" is not a number"),
             (&[("6.5", "nan")], "z = NaN"),
@@ -269,8 +277,8 @@ mod tests {
             let error = error_of(ascii_file(changes).as_bytes());
             assert!(error.contains("12.pcd") && error.contains(want), "{error}, not {want}");
         }
-        assert!(error_of(b"").contains("no line DATA"));
-        assert!(error_of(&fine.as_bytes()[..40]).contains("no line DATA"));
+        assert!(error_of(b"").contains("no DATA line"));
+        assert!(error_of(&fine.as_bytes()[..40]).contains("no DATA line"));
     }
 
     #[test]
@@ -294,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn compressed_sizes_that_lie_are_refused() {
+    fn wrong_compressed_sizes_are_refused() {
         let cloud = Cloud { values: vec![1.0; 3000], channels: 3 };
         let fine = encode_pcd(&cloud, PcdEncoding::BinaryCompressed);
         assert!(fine.len() < 600, "{}", fine.len());
@@ -304,8 +312,8 @@ mod tests {
             bytes[body + at..body + at + 4].copy_from_slice(&value.to_le_bytes());
             error_of(&bytes)
         };
-        assert!(with(0, 5).contains("but says 5"));
-        assert!(with(4, 11_999).contains("unpack to 11999"));
+        assert!(with(0, 5).contains("is given as 5"));
+        assert!(with(4, 11_999).contains("uncompressed size of 11999"));
         let text = String::from_utf8_lossy(&fine[..body]).replace("1000", "250000000");
         let mut bomb = text.into_bytes();
         bomb.extend(&fine[body..]);
@@ -327,7 +335,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn pcd_goes_round(channels in 3usize..5, seed in prop::collection::vec(-9_999.0f32..9_999.0, 4..400), repeat in 1usize..5) {
+        fn pcd_round_trips(channels in 3usize..5, seed in prop::collection::vec(-9_999.0f32..9_999.0, 4..400), repeat in 1usize..5) {
             let mut values = seed.repeat(repeat);
             values.truncate(values.len() / channels * channels);
             let cloud = Cloud { values, channels };
@@ -338,13 +346,13 @@ mod tests {
         }
 
         #[test]
-        fn what_is_compressed_unpacks(plain in prop::collection::vec(0u8..4, 1..3000), noise in prop::collection::vec(any::<u8>(), 0..300)) {
+        fn compression_round_trips(plain in prop::collection::vec(0u8..4, 1..3000), noise in prop::collection::vec(any::<u8>(), 0..300)) {
             let plain = [plain, noise].concat();
             prop_assert_eq!(lzf::decompress(&compress(&plain), plain.len()).unwrap(), plain);
         }
 
         #[test]
-        fn damage_never_panics(at in 0usize..1000, byte in any::<u8>(), cut in 0usize..1000, encoding in 0usize..3) {
+        fn damaged_files_do_not_panic(at in 0usize..1000, byte in any::<u8>(), cut in 0usize..1000, encoding in 0usize..3) {
             let cloud = Cloud { values: (0..120).map(|i| i as f32).collect(), channels: 4 };
             let mut bytes = encode_pcd(&cloud, ENCODINGS[encoding]);
             let (at, cut) = (at % bytes.len(), cut % bytes.len());

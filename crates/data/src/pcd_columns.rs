@@ -1,22 +1,22 @@
-//! PCD files with any columns: numbers beside a cloud, one row a point.
+//! PCD files with arbitrary columns: per-point data that are stored beside a cloud.
 
 use crate::pcd_header::{PcdEncoding, parse_pcd_header};
 use crate::{DataError, write_atomic};
 use std::path::Path;
 
-/// The numbers of a column.
+/// A column with one number per point.
 #[derive(Clone, Debug, PartialEq)]
 pub enum PcdColumn {
-    /// 4 bytes a number.
+    /// TYPE F, SIZE 4.
     F32(Vec<f32>),
-    /// 1 byte a number.
+    /// TYPE U, SIZE 1.
     U8(Vec<u8>),
-    /// 2 bytes a number.
+    /// TYPE U, SIZE 2.
     U16(Vec<u16>),
 }
 
 impl PcdColumn {
-    /// Size and type as a PCD's head names them.
+    /// SIZE and TYPE of the PCD header.
     fn kind(&self) -> (usize, char) {
         match self {
             PcdColumn::F32(_) => (4, 'F'),
@@ -42,18 +42,18 @@ impl PcdColumn {
     }
 }
 
-/// A PCD v0.7 in its binary form with these columns, all of one length.
+/// Encodes columns as PCD v0.7 with `DATA binary`. Panics if the columns differ in length.
 pub fn encode_pcd_columns(columns: &[(&str, PcdColumn)]) -> Vec<u8> {
     let rows = columns.first().map_or(0, |(_, column)| column.len());
-    assert!(columns.iter().all(|(_, column)| column.len() == rows), "columns of one file have one length");
-    let words = |word: &dyn Fn(&(&str, PcdColumn)) -> String| columns.iter().map(word).collect::<Vec<_>>().join(" ");
+    assert!(columns.iter().all(|(_, column)| column.len() == rows), "all columns of a file have the same length");
+    let entry = |value: &dyn Fn(&(&str, PcdColumn)) -> String| columns.iter().map(value).collect::<Vec<_>>().join(" ");
     let mut out = format!(
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {}\nSIZE {}\nTYPE {}\nCOUNT {}\nWIDTH {rows}\nHEIGHT 1\n\
          VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {rows}\nDATA binary\n",
-        words(&|(name, _)| name.to_string()),
-        words(&|(_, column)| column.kind().0.to_string()),
-        words(&|(_, column)| column.kind().1.to_string()),
-        words(&|_| "1".into()),
+        entry(&|(name, _)| name.to_string()),
+        entry(&|(_, column)| column.kind().0.to_string()),
+        entry(&|(_, column)| column.kind().1.to_string()),
+        entry(&|_| "1".into()),
     )
     .into_bytes();
     for row in 0..rows {
@@ -62,16 +62,16 @@ pub fn encode_pcd_columns(columns: &[(&str, PcdColumn)]) -> Vec<u8> {
     out
 }
 
-/// Writes [`encode_pcd_columns`] to a file.
+/// Writes columns to a PCD file, see [`encode_pcd_columns`].
 pub fn write_pcd_columns(path: &Path, columns: &[(&str, PcdColumn)]) -> Result<(), DataError> {
     write_atomic(path, &encode_pcd_columns(columns))
 }
 
-/// Columns of a PCD in its binary form by their names, as f32; a missing one is an error.
+/// Parses the columns `names` of a PCD with `DATA binary`, converted to f32. A missing column is an error.
 pub fn parse_pcd_columns(bytes: &[u8], path: &Path, names: &[&str]) -> Result<Vec<Vec<f32>>, DataError> {
     let header = parse_pcd_header(bytes, path)?;
     if header.encoding != PcdEncoding::Binary {
-        return Err(DataError::file(path, "is not in PCD's binary form (DATA binary)"));
+        return Err(DataError::file(path, "is not a PCD with DATA binary"));
     }
     let body = &bytes[header.body_start..];
     let wanted = header.body_bytes(path)?;
@@ -105,14 +105,14 @@ mod tests {
     }
 
     #[test]
-    fn columns_come_back_by_name() {
+    fn columns_are_read_by_name() {
         let read = parse_pcd_columns(&bytes(), Path::new("a.pcd"), &["sensor", "row", "x"]).unwrap();
         assert_eq!(read, [vec![0.0, 1.0, 255.0], vec![7.0, 65_535.0, 0.0], vec![1.5, -2.0, 3.0]]);
         assert_eq!(crate::parse_pcd(&bytes(), Path::new("a.pcd")).unwrap().len(), 3);
     }
 
     #[test]
-    fn what_is_missing_is_named() {
+    fn missing_columns_and_points_are_reported() {
         let error = parse_pcd_columns(&bytes(), Path::new("a.pcd"), &["ring"]).unwrap_err().to_string();
         assert_eq!(error, "a.pcd: has no field ring");
         let mut short = bytes();

@@ -1,22 +1,22 @@
-//! The text at the head of a PCD file.
+//! The header of a PCD file.
 
 use crate::DataError;
 use std::path::Path;
 
-/// How the points of a PCD are written.
+/// Encoding of the points of a PCD.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PcdEncoding {
-    /// A line of numbers each.
+    /// Text, one point a line.
     Ascii,
-    /// Point after point, little-endian.
+    /// Little-endian numbers, one point after the other.
     Binary,
-    /// Field after field, packed by LZF.
+    /// Little-endian numbers, one field after the other, compressed by LZF.
     BinaryCompressed,
 }
 
 impl PcdEncoding {
-    /// As the line DATA names it.
-    pub fn word(self) -> &'static str {
+    /// Its keyword in the DATA line.
+    pub fn keyword(self) -> &'static str {
         match self {
             PcdEncoding::Ascii => "ascii",
             PcdEncoding::Binary => "binary",
@@ -25,7 +25,7 @@ impl PcdEncoding {
     }
 }
 
-/// One number of a field.
+/// Number format of a field: TYPE and SIZE in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum PcdNumber {
     F4,
@@ -58,7 +58,7 @@ impl PcdNumber {
         })
     }
 
-    /// The first number of each of `cells`, as f32.
+    /// Reads the first number of each of `cells` and converts it to f32.
     pub(crate) fn read_all<'a>(self, cells: impl Iterator<Item = &'a [u8]>, to: impl Iterator<Item = &'a mut f32>) {
         macro_rules! read {
             ($number:ty) => {
@@ -91,9 +91,9 @@ pub(crate) struct PcdField {
     pub(crate) number: PcdNumber,
     size: u64,
     count: u64,
-    /// Bytes before it in a point.
+    /// Offset in a point, bytes.
     pub(crate) offset: usize,
-    /// Numbers before it in a point.
+    /// Index of its first number in a point.
     pub(crate) first_number: usize,
 }
 
@@ -103,7 +103,7 @@ impl PcdField {
     }
 }
 
-/// What the head of a PCD file says.
+/// The header of a PCD file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PcdHeader {
     pub(crate) fields: Vec<PcdField>,
@@ -112,39 +112,39 @@ pub struct PcdHeader {
     pub(crate) encoding: PcdEncoding,
     pub(crate) point_bytes: u64,
     pub(crate) numbers_per_point: usize,
-    /// Where the points begin.
+    /// Offset of the points in the file, bytes.
     pub(crate) body_start: usize,
-    /// The line of the first point, from 1.
+    /// Line of the first point, from 1.
     pub(crate) body_line: usize,
 }
 
 impl PcdHeader {
-    /// The points have an intensity.
+    /// Whether the points have an intensity.
     pub fn has_intensity(&self) -> bool {
         self.columns().len() == 4
     }
 
-    /// How the points are written.
+    /// Encoding of the points.
     pub fn encoding(&self) -> PcdEncoding {
         self.encoding
     }
 
-    /// x, y, z and, where there is one, intensity.
+    /// The fields x, y, z and, if present, intensity (named `intensity` or `i`).
     pub(crate) fn columns(&self) -> Vec<&PcdField> {
         let named = |name: &str| self.fields.iter().find(|f| f.name == name);
         ["x", "y", "z"].into_iter().filter_map(named).chain(named("intensity").or_else(|| named("i"))).collect()
     }
 
-    /// Bytes of all points, unpacked.
+    /// Size of all points without compression, bytes.
     pub(crate) fn body_bytes(&self, path: &Path) -> Result<u64, DataError> {
         let bytes = self.points.checked_mul(self.point_bytes).filter(|bytes| *bytes <= isize::MAX as u64);
         bytes.ok_or_else(|| {
-            DataError::file(path, format!("its header says {} points, which no file can hold", self.points))
+            DataError::file(path, format!("its header says {} points, which is too large for a file", self.points))
         })
     }
 }
 
-/// Reads the head of a PCD; `path` is for messages.
+/// Parses the header of a PCD. `path` is used in error messages.
 pub fn parse_pcd_header(bytes: &[u8], path: &Path) -> Result<PcdHeader, DataError> {
     let mut entries: Vec<(&str, Vec<&str>, usize)> = Vec::new();
     let (mut at, mut number) = (0, 0);
@@ -153,33 +153,33 @@ pub fn parse_pcd_header(bytes: &[u8], path: &Path) -> Result<PcdHeader, DataErro
         let wrong = |message: String| DataError::line(path, number, message);
         let rest = bytes.get(at..).unwrap_or_default();
         if rest.is_empty() {
-            return Err(DataError::file(path, "is no PCD: there is no line DATA"));
+            return Err(DataError::file(path, "is not a PCD: its header has no DATA line"));
         }
         let length = rest.iter().position(|b| *b == b'\n').unwrap_or(rest.len());
         at += length + 1;
-        let line =
-            std::str::from_utf8(&rest[..length]).map_err(|_| wrong("is no line of a PCD header: not text".into()))?;
-        let mut words = line.split_ascii_whitespace();
-        let key = match words.next() {
+        let line = std::str::from_utf8(&rest[..length])
+            .map_err(|_| wrong("is not a line of a PCD header: not UTF-8 text".into()))?;
+        let mut tokens = line.split_ascii_whitespace();
+        let key = match tokens.next() {
             Some(key) if !key.starts_with('#') => key,
             _ => continue,
         };
         if !["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"]
             .contains(&key)
         {
-            return Err(wrong(format!("{key:?} is no entry of a PCD header")));
+            return Err(wrong(format!("{key:?} is not a PCD header entry")));
         }
         if entries.iter().any(|(known, ..)| *known == key) {
-            return Err(wrong(format!("{key} is there twice")));
+            return Err(wrong(format!("{key} occurs twice")));
         }
-        let words: Vec<&str> = words.collect();
+        let values: Vec<&str> = tokens.collect();
         if key == "DATA" {
             let encodings = [PcdEncoding::Ascii, PcdEncoding::Binary, PcdEncoding::BinaryCompressed];
-            break encodings.into_iter().find(|e| words == [e.word()]).ok_or_else(|| {
-                wrong(format!("DATA {:?} is none of ascii, binary, binary_compressed", words.join(" ")))
+            break encodings.into_iter().find(|e| values == [e.keyword()]).ok_or_else(|| {
+                wrong(format!("DATA {:?} is not ascii, binary or binary_compressed", values.join(" ")))
             })?;
         }
-        entries.push((key, words, number));
+        entries.push((key, values, number));
     };
     let find = |key: &str| entries.iter().find(|(known, ..)| *known == key);
     let need = |key: &str| find(key).ok_or_else(|| DataError::file(path, format!("its PCD header has no {key}")));
@@ -193,7 +193,7 @@ pub fn parse_pcd_header(bytes: &[u8], path: &Path) -> Result<PcdHeader, DataErro
     let numbers_per_point = fields.iter().map(|f| f.count as usize).sum();
 
     let whole = |entry: &(&str, Vec<&str>, usize)| match entry.1[..] {
-        [word] if word.bytes().all(|b| b.is_ascii_digit()) => word.parse::<u64>().ok(),
+        [value] if value.bytes().all(|b| b.is_ascii_digit()) => value.parse::<u64>().ok(),
         _ => None,
     };
     let size = |key: &str| {
@@ -205,7 +205,7 @@ pub fn parse_pcd_header(bytes: &[u8], path: &Path) -> Result<PcdHeader, DataErro
     let (width, height) = (size("WIDTH")?, size("HEIGHT")?);
     let points = width
         .checked_mul(height)
-        .ok_or_else(|| DataError::file(path, format!("WIDTH {width} x HEIGHT {height} is absurd")))?;
+        .ok_or_else(|| DataError::file(path, format!("WIDTH {width} x HEIGHT {height} is too large")))?;
     if let Some(entry) = find("POINTS")
         && size("POINTS")? != points
     {
@@ -248,12 +248,16 @@ fn fields(
         }
         let size = sizes.1[i].parse().unwrap_or(0);
         let number = PcdNumber::of(types.1[i], size).ok_or_else(|| {
-            DataError::line(path, types.2, format!("{name}: TYPE {} of size {} does not exist", types.1[i], sizes.1[i]))
+            DataError::line(
+                path,
+                types.2,
+                format!("{name}: TYPE {} of size {} is not supported", types.1[i], sizes.1[i]),
+            )
         })?;
         let wanted = ["x", "y", "z", "intensity", "i"].contains(name);
         let count = match counts {
             None => 1,
-            // No point is wider than a megabyte: what follows cannot overflow.
+            // COUNT is limited, so that the sums below cannot overflow.
             Some((_, counts, line)) => match counts[i].parse::<u64>() {
                 Ok(count) if (1..=1 << 20).contains(&count) && (count == 1 || !wanted) => count,
                 _ => return Err(DataError::line(path, *line, format!("{name} has COUNT {}", counts[i]))),

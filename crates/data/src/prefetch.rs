@@ -1,4 +1,4 @@
-//! Work ahead of its consumer, on threads of its own, with bounded memory and in order.
+//! Prefetching: computes results on worker threads ahead of their consumer, in order and with bounded memory.
 
 use std::any::Any;
 use std::collections::BTreeMap;
@@ -7,10 +7,11 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// The results of `make` over `jobs`, in the order of the jobs whatever the number of workers.
+/// Iterates over the results of `make` for `jobs`, in the order of the jobs for any number of workers.
 ///
-/// At most `depth` results are made but not taken (one at least). Without workers each is made when it is asked for. A panic in `make` goes
-/// on in the consumer when that job's turn comes. Dropping the iterator stops the workers after the job they are at.
+/// At most `max(depth, 1)` results are computed or being computed but not taken. Without workers each result is
+/// computed in [`Iterator::next`]. A panic in `make` is resumed in the consumer at the position of that job. Dropping
+/// the iterator stops the workers after their current jobs.
 pub fn prefetch<J, T, F>(jobs: Vec<J>, workers: usize, depth: usize, make: F) -> Prefetch<T>
 where
     J: Send + Sync + 'static,
@@ -45,10 +46,11 @@ struct Shared<T> {
 }
 
 struct State<T> {
-    /// The next job that nobody has begun.
+    /// Index of the next job to begin.
     next: usize,
-    /// Results taken by the consumer.
+    /// Number of results taken by the consumer.
     taken: usize,
+    /// Results not yet taken, by the index of their job.
     ready: BTreeMap<usize, Outcome<T>>,
     stopped: bool,
 }
@@ -88,7 +90,7 @@ impl<T> Shared<T> {
 }
 
 impl<T> Prefetch<T> {
-    /// How long the consumer has waited for results so far.
+    /// Total time for which the consumer has waited for results.
     pub fn waited(&self) -> Duration {
         self.waited
     }
@@ -137,7 +139,7 @@ impl<T> Drop for Prefetch<T> {
         self.shared.lock().stopped = true;
         self.shared.changed.notify_all();
         for thread in self.threads.drain(..) {
-            // A worker catches the panics of its jobs: there is nothing to learn from it.
+            // Workers catch panics of their jobs, so `join` has no error to report.
             let _ = thread.join();
         }
     }
@@ -168,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn no_more_than_depth_results_lie_about() {
+    fn at_most_depth_results_are_computed_ahead() {
         let made = Arc::new(AtomicUsize::new(0));
         let count = made.clone();
         let results = prefetch((0..100).collect(), 8, 5, move |_: &usize| count.fetch_add(1, Ordering::SeqCst));
@@ -178,7 +180,7 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_reaches_the_consumer_in_its_turn() {
+    fn a_panic_is_resumed_at_the_position_of_its_job() {
         for workers in [0, 3] {
             let mut results = prefetch((0..10).collect(), workers, 4, |job: &i32| {
                 assert!(*job != 2, "frame {job} is bad");
@@ -191,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn dropping_it_half_way_ends_the_workers() {
+    fn dropping_the_iterator_stops_the_workers() {
         let alive = Arc::new(());
         let inside = alive.clone();
         let mut results = prefetch((0..1000).collect(), 4, 4, move |job: &i32| {

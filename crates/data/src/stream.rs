@@ -1,12 +1,13 @@
-//! One seed, named streams: no random number depends on how many workers there are or where a run was resumed.
+//! Named random streams from one seed. Random numbers depend neither on the number of workers nor on resuming a run.
 
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use sha2::{Digest, Sha256};
 
-/// A stream of random numbers.
+/// A random number generator.
 pub type Stream = ChaCha8Rng;
 
-/// The stream of (seed, purpose, epoch, sample): equal keys give equal numbers, different keys unrelated ones.
+/// The random stream of a key (seed, purpose, epoch, sample). Equal keys give equal numbers, different keys independent
+/// ones. The ChaCha8 key is the SHA-256 of these values.
 pub fn stream(seed: u64, purpose: &str, epoch: u64, sample: u64) -> Stream {
     let mut key = Sha256::new();
     key.update(seed.to_le_bytes());

@@ -1,29 +1,28 @@
-//! TOML files that people write: one typed reading for all of them, and errors that name the file, the line and the key
-//! that was meant.
+//! Reads TOML files into types. Errors have the file and the line and suggest the correct name for an unknown key.
 
 use crate::DataError;
 use serde::de::DeserializeOwned;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
 
-/// The value of a key cannot be used.
+/// A key of a TOML has an invalid value.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{field}: {message}")]
 pub struct KeyError {
-    /// The key with all tables above it, as `sensor[0].rows`; empty for the file as a whole.
+    /// Path of the key, such as `sensor[0].rows`; empty for the file as a whole.
     pub field: String,
-    /// What is wrong and what would be right.
+    /// What is invalid and what is allowed.
     pub message: String,
 }
 
 impl KeyError {
-    /// The same error with `prefix.` before the key.
+    /// The same error with `prefix.` before the path of the key.
     pub fn below(self, prefix: &str) -> Self {
         let field = if self.field.is_empty() { prefix.into() } else { format!("{prefix}.{}", self.field) };
         KeyError { field, message: self.message }
     }
 
-    /// As an error of the file `path` with this text, at the line of the key.
+    /// Converts to an error of the file `path` with the contents `text`, at the line of the key.
     pub fn in_file(self, text: &str, path: &Path) -> DataError {
         let message = if self.field.is_empty() { self.message } else { format!("{}: {}", self.field, self.message) };
         match line_of_key(text, &self.field) {
@@ -33,12 +32,12 @@ impl KeyError {
     }
 }
 
-/// The error of one key.
+/// Makes an error for one key.
 pub fn wrong(field: impl Into<String>, message: impl Into<String>) -> KeyError {
     KeyError { field: field.into(), message: message.into() }
 }
 
-/// Refuses a number outside of `low..=high`; not-a-number as well.
+/// An error if `value` is outside of `low..=high` or NaN.
 pub fn within(field: &str, value: f64, low: f64, high: f64) -> Result<(), KeyError> {
     if (low..=high).contains(&value) {
         Ok(())
@@ -47,7 +46,7 @@ pub fn within(field: &str, value: f64, low: f64, high: f64) -> Result<(), KeyErr
     }
 }
 
-/// Reads a TOML file; what `check` refuses is reported at the line of its key.
+/// Reads a TOML file. An error of `check` is reported at the line of its key.
 pub fn read_toml<T: DeserializeOwned>(
     path: &Path,
     check: impl FnOnce(&T) -> Result<(), KeyError>,
@@ -55,12 +54,12 @@ pub fn read_toml<T: DeserializeOwned>(
     parse_toml(&read_text(path)?, path, check)
 }
 
-/// The text of a file; bytes that are no UTF-8 are an error of the file.
+/// Reads a text file. An error if it is not UTF-8.
 pub fn read_text(path: &Path) -> Result<String, DataError> {
-    String::from_utf8(fs_err::read(path)?).map_err(|_| DataError::file(path, "is not text"))
+    String::from_utf8(fs_err::read(path)?).map_err(|_| DataError::file(path, "is not UTF-8 text"))
 }
 
-/// A TOML in memory; `path` is for messages. What `check` refuses is reported at the line of its key.
+/// Parses a TOML. `path` is used in error messages. An error of `check` is reported at the line of its key.
 pub fn parse_toml<T: DeserializeOwned>(
     text: &str,
     path: &Path,
@@ -71,20 +70,19 @@ pub fn parse_toml<T: DeserializeOwned>(
     Ok(value)
 }
 
-/// The message of a TOML error; of an unknown key or name with the known one that was probably meant.
+/// The message of a TOML error. For an unknown key or variant it suggests a known one with a similar name.
 pub fn message(error: &toml::de::Error) -> String {
     with_suggestion(error.message())
 }
 
-/// [`message`] and the table that it speaks of, in one line: for a table that was put together in memory and has no
-/// lines.
+/// [`message`] and the key concerned, in one line. For tables that were built in memory and have no line numbers.
 pub fn message_with_key(error: &toml::de::Error) -> String {
     let text = error.to_string();
     let place = text.strip_prefix(error.message()).unwrap_or_default().trim().replace('\n', " ");
     format!("{} {place}", message(error)).trim_end().to_owned()
 }
 
-/// Replaces the list of what is known by the name that was probably meant, where one is near enough.
+/// Replaces the list of known names by the most similar one, if it is similar enough to the unknown name.
 fn with_suggestion(message: &str) -> String {
     let suggested = || {
         let (found, expected) = message.split_once(", expected ")?;
@@ -92,17 +90,16 @@ fn with_suggestion(message: &str) -> String {
             return None;
         }
         let unknown = found.split('`').nth(1)?;
-        // Names stand between backticks: every second part.
+        // The names are between backticks: every second part.
         let known = expected.split('`').skip(1).step_by(2);
-        let (distance, meant) = known.map(|k| (distance_of_keys(unknown, k), k)).min()?;
-        (distance <= unknown.len().div_ceil(4)).then(|| format!("{found}: did you mean `{meant}`?"))
+        let (distance, nearest) = known.map(|k| (edit_distance(unknown, k), k)).min()?;
+        (distance <= unknown.len().div_ceil(4)).then(|| format!("{found}: did you mean `{nearest}`?"))
     };
     suggested().unwrap_or_else(|| message.to_owned())
 }
 
-/// Letters to change, add or take away between two keys; a key without its unit (`yaw` for `yaw_deg`), or with one too
-/// many, counts as 1.
-fn distance_of_keys(unknown: &str, known: &str) -> usize {
+/// Edit distance (Levenshtein) of two keys. A missing or additional unit (`yaw` for `yaw_deg`) counts as 1.
+fn edit_distance(unknown: &str, known: &str) -> usize {
     let without = |long: &str, short: &str| long.strip_prefix(short).is_some_and(|unit| unit.starts_with('_'));
     if !unknown.is_empty() && (without(known, unknown) || without(unknown, known)) {
         return 1;
@@ -120,8 +117,8 @@ fn distance_of_keys(unknown: &str, known: &str) -> usize {
     row[known.len()]
 }
 
-/// The line of a TOML error. Within tagged tables the parser knows the table alone; an unknown key is then looked for
-/// by its name.
+/// The line of a TOML error. In tables of tagged enums the parser reports the table, not the key: an unknown key is
+/// then searched by its name.
 fn line_of_error(text: &str, error: &toml::de::Error) -> usize {
     let at = error.span().map_or(0, |span| span.start);
     let unknown = error.message().strip_prefix("unknown field `").and_then(|m| m.split('`').next());
@@ -139,7 +136,7 @@ fn line_of_error(text: &str, error: &toml::de::Error) -> usize {
     line_of_byte(text, at)
 }
 
-/// Lines of all keys of a name, in this table and below.
+/// Adds the lines of all keys called `name` in a table and its subtables.
 fn lines_of_name(text: &str, table: &DeTable<'_>, name: &str, lines: &mut Vec<usize>) {
     fn below(text: &str, value: &DeValue<'_>, name: &str, lines: &mut Vec<usize>) {
         match value {
@@ -156,12 +153,13 @@ fn lines_of_name(text: &str, table: &DeTable<'_>, name: &str, lines: &mut Vec<us
     }
 }
 
+/// The line, from 1, of a byte offset.
 fn line_of_byte(text: &str, byte: usize) -> usize {
     1 + text.as_bytes()[..byte.min(text.len())].iter().filter(|b| **b == b'\n').count()
 }
 
-/// The line of a key as `effect[2].std_m`, or of the nearest table above it that is written down; `None` when nothing
-/// of it is.
+/// The line of a key with a path such as `effect[2].std_m`. If the key does not exist, the line of the innermost table
+/// of its path that does; `None` if there is none.
 fn line_of_key(text: &str, key: &str) -> Option<usize> {
     let root = DeTable::parse(text).ok()?;
     let mut line = None;
@@ -190,7 +188,7 @@ mod tests {
     use serde::Deserialize;
 
     #[test]
-    fn keys_have_lines() {
+    fn lines_of_keys_are_found() {
         let text = "a = 1\n[b]\nc = 2\n\n[[d]]\ne = 3\n[[d]]\ne = 4\nf = [1,\n 2]\n";
         for (key, line) in [
             ("a", Some(1)),
@@ -206,14 +204,14 @@ mod tests {
     }
 
     #[test]
-    fn a_check_is_reported_at_its_line() {
+    fn errors_of_a_check_have_the_line_of_their_key() {
         let check = |_: &toml::Table| Err(wrong("b.c", "is too large"));
         let error = parse_toml("a = 1\n[b]\nc = 9\n", Path::new("x.toml"), check).unwrap_err();
         assert_eq!(error.to_string(), "x.toml:3: b.c: is too large");
     }
 
     #[test]
-    fn unknown_keys_are_answered_with_the_one_that_was_meant() {
+    fn a_similar_name_is_suggested_for_an_unknown_key() {
         for (message, want) in [
             ("unknown field `yaw`, expected one of `name`, `yaw_deg`", "unknown field `yaw`: did you mean `yaw_deg`?"),
             ("unknown field `position_m`, expected `position`", "unknown field `position_m`: did you mean `position`?"),
@@ -227,7 +225,7 @@ mod tests {
     }
 
     #[test]
-    fn an_unknown_key_of_a_tagged_table_has_its_own_line() {
+    fn an_unknown_key_of_a_tagged_table_is_reported_at_its_line() {
         #[derive(Debug, Deserialize)]
         #[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
         enum Item {

@@ -1,4 +1,4 @@
-//! Files appear whole or not at all: temporary file in the same folder, sync, rename.
+//! Writes files atomically: temporary file in the same folder, sync, rename.
 
 use crate::kitti_text::to_kitti_text;
 use crate::{Cloud, DataError, DatasetConfig, Frame, LabelBox, PcdEncoding, encode_pcd};
@@ -6,15 +6,15 @@ use serde::Serialize;
 use std::io::Write as _;
 use std::path::Path;
 
-/// Begins the names of files that are not whole yet.
-const UNFINISHED: &str = ".writing-";
+/// Prefix of the names of temporary files.
+const TEMPORARY_PREFIX: &str = ".writing-";
 
-/// Removes what writers that were killed left in a folder, which need not exist. Nobody may be writing there.
+/// Removes temporary files of killed processes from a folder, which need not exist. No other process may write there.
 pub fn remove_unfinished(folder: &Path) -> Result<(), DataError> {
     if folder.is_dir() {
         for entry in fs_err::read_dir(folder)? {
             let entry = entry?;
-            if entry.file_name().to_string_lossy().starts_with(UNFINISHED) {
+            if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) {
                 fs_err::remove_file(entry.path())?;
             }
         }
@@ -22,7 +22,7 @@ pub fn remove_unfinished(folder: &Path) -> Result<(), DataError> {
     Ok(())
 }
 
-/// Writes `bytes` to `path`, making its folder where needed. A reader sees the old file or the new one, never a part of it.
+/// Writes `bytes` to `path` and creates its folder if needed. Readers see the old or the new file, never a part of it.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
     let folder = match path.parent() {
@@ -31,11 +31,11 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     };
     fs_err::create_dir_all(folder)?;
     let mut builder = tempfile::Builder::new();
-    builder.prefix(UNFINISHED);
+    builder.prefix(TEMPORARY_PREFIX);
     #[cfg(unix)]
     let permissions = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
     #[cfg(unix)]
-    builder.permissions(permissions); // the umask still applies; the default of temporary files is 0600
+    builder.permissions(permissions); // before the umask; temporary files have 0600 by default
     let mut file = builder.tempfile_in(folder).map_err(failed)?;
     file.write_all(bytes).map_err(failed)?;
     file.as_file().sync_all().map_err(failed)?;
@@ -43,25 +43,26 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     Ok(())
 }
 
-/// JSON that people can read, with an end of line.
+/// Writes a value as indented JSON with a final line feed.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), DataError> {
-    let mut text = serde_json::to_vec_pretty(value).map_err(|e| DataError::file(path, format!("is no JSON: {e}")))?;
+    let mut text = serde_json::to_vec_pretty(value)
+        .map_err(|e| DataError::file(path, format!("cannot be written as JSON: {e}")))?;
     text.push(b'\n');
     write_atomic(path, &text)
 }
 
-/// KITTI's `.bin`: the cloud's values as little-endian f32, point after point.
+/// Writes a cloud as KITTI's `.bin`: little-endian f32, one point after the other.
 pub fn write_bin(path: &Path, cloud: &Cloud) -> Result<(), DataError> {
     let bytes: Vec<u8> = cloud.values.iter().flat_map(|v| v.to_le_bytes()).collect();
     write_atomic(path, &bytes)
 }
 
-/// PCD v0.7 with the fields x, y, z and, for four channels, intensity.
+/// Writes a cloud as PCD v0.7, see [`encode_pcd`].
 pub fn write_pcd(path: &Path, cloud: &Cloud, encoding: PcdEncoding) -> Result<(), DataError> {
     write_atomic(path, &encode_pcd(cloud, encoding))
 }
 
-/// Labels of a frame in the label frame "lidar": location = box centre, rotation = yaw counter-clockwise from +x.
+/// The labels of a frame's objects in [`crate::LabelFrame::Lidar`].
 pub fn label_boxes(frame: &Frame) -> Vec<LabelBox> {
     let label = |object: &crate::Object| {
         let mut label = LabelBox::from_box(&object.class, &object.bbox, None);
@@ -73,18 +74,18 @@ pub fn label_boxes(frame: &Frame) -> Vec<LabelBox> {
     frame.objects.iter().map(label).collect()
 }
 
-/// KITTI text, a line a box.
+/// Writes labels as KITTI text.
 pub fn write_kitti_text(path: &Path, labels: &[LabelBox]) -> Result<(), DataError> {
     write_atomic(path, to_kitti_text(labels).as_bytes())
 }
 
-/// A data set's TOML; the file name that [`crate::Dataset::open`] looks for in a folder is `dataset.toml`.
+/// Writes a data set's TOML. [`crate::Dataset::open`] reads `dataset.toml` of a folder.
 pub fn write_dataset_toml(path: &Path, config: &DatasetConfig) -> Result<(), DataError> {
     let text = toml::to_string_pretty(config).map_err(|e| DataError::file(path, e.to_string()))?;
     write_atomic(path, text.as_bytes())
 }
 
-/// A split: frame ids, one a line.
+/// Writes a split: frame ids, one a line.
 pub fn write_split<S: AsRef<str>>(path: &Path, ids: &[S]) -> Result<(), DataError> {
     let text: String = ids.iter().flat_map(|id| [id.as_ref(), "\n"]).collect();
     write_atomic(path, text.as_bytes())
@@ -95,7 +96,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn writes_whole_files_and_leaves_nothing_else() {
+    fn files_are_replaced_and_temporary_files_removed() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a/b/split.txt");
         write_split(&path, &["000001", "000002"]).unwrap();
@@ -105,18 +106,18 @@ mod tests {
     }
 
     #[test]
-    fn json_ends_its_line_and_what_is_no_json_is_refused() {
+    fn json_ends_with_a_line_feed_and_errors_are_reported() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.json");
         write_json(&path, &[1, 2]).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "[\n  1,\n  2\n]\n");
-        let no_text = std::collections::BTreeMap::from([([1u8, 2], 3)]);
-        let error = write_json(&path, &no_text).unwrap_err().to_string();
-        assert!(error.contains("a.json") && error.contains("is no JSON"), "{error}");
+        let unsupported_keys = std::collections::BTreeMap::from([([1u8, 2], 3)]);
+        let error = write_json(&path, &unsupported_keys).unwrap_err().to_string();
+        assert!(error.contains("a.json") && error.contains("cannot be written as JSON"), "{error}");
     }
 
     #[test]
-    fn a_file_that_cannot_be_written_is_named() {
+    fn write_errors_name_the_file() {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("plain"), b"").unwrap();
         let error = write_atomic(&folder.path().join("plain/x.txt"), b"").unwrap_err();

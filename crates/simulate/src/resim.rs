@@ -39,7 +39,7 @@ pub struct ResimManifest {
 }
 
 impl Manifest for ResimManifest {
-    const OTHERWISE: &'static str = "with other effects, another seed or version";
+    const DIFFERENCE: &'static str = "with other effects, another seed or version";
 
     fn identity(&self) -> [&str; 2] {
         [&self.schema, &self.config_sha256]

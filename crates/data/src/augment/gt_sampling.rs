@@ -1,4 +1,4 @@
-//! Ground-truth sampling: objects of other frames are pasted in, with their points, where they touch nothing.
+//! Ground-truth sampling: pastes objects of other frames, with their points, where they do not collide.
 
 use crate::{Frame, GtDatabase, Object, Stream};
 use geometry::{Box3, bev_intersection, points_in_boxes};
@@ -6,19 +6,19 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// How much is pasted, and of what.
+/// Configuration of ground-truth sampling.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GtSamplingConfig {
     /// Paste objects of other frames.
     pub enabled: bool,
-    /// Objects drawn for a frame, by class; what collides is dropped.
+    /// Number of objects drawn for a frame, by class. Objects that collide are dropped.
     pub per_class: BTreeMap<String, usize>,
-    /// Count the objects that are there already: draw only what is missing to `per_class`.
+    /// Count the objects of the frame: draw only as many as are missing to `per_class`.
     pub limit_whole_scene: bool,
     /// Objects with fewer points are never pasted.
     pub min_points: usize,
-    /// Leave out objects that are harder than KITTI's "hard", as far as image boxes say so.
+    /// Leave out objects that are harder than KITTI's level "hard". Objects without an image box are kept.
     pub drop_too_hard: bool,
 }
 
@@ -34,17 +34,20 @@ impl Default for GtSamplingConfig {
     }
 }
 
-/// Margin of a pasted box when the points of the scene inside it are removed, m; the reference's CPU routine has the same.
+/// Margin around a pasted box within which points of the scene are removed, m. As in OpenPCDet's CPU routine.
 const REMOVE_MARGIN_M: f64 = 1e-2;
 
-/// Pastes objects of the database. A drawn object that touches an object of the frame, of whatever class, or another one of the same draw is
-/// dropped. Points of the scene inside pasted boxes go away, pasted points come first, pasted objects last.
+/// Pastes objects of the database into a frame.
 ///
-/// The reference walks through a shuffled list from frame to frame; here each frame draws without replacement, so that what it gets
-/// depends on its own stream alone.
+/// A drawn object is dropped if its box overlaps, seen from above, an object of the frame, an object already pasted,
+/// or another object drawn for the same class. Points of the scene inside pasted boxes are removed. Pasted points are
+/// inserted before the points of the scene, pasted objects after the objects of the scene.
+///
+/// Difference to OpenPCDet, which consumes one shuffled list over all frames: here each frame draws without replacement
+/// from the whole database, so the result depends on the frame's random stream only.
 pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatabase, stream: &mut Stream) -> Frame {
     let mut boxes: Vec<Box3> = frame.objects.iter().map(|o| o.bbox).collect();
-    let there = boxes.len();
+    let first_pasted = boxes.len();
     let mut pasted_values = Vec::new();
     for (class, wanted) in &config.per_class {
         let samples = database.samples(class);
@@ -75,8 +78,9 @@ pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatab
         }
     }
     let mut covered = vec![false; frame.cloud.len()];
-    for k in
-        points_in_boxes(&frame.cloud.values, frame.cloud.channels, &boxes[there..], REMOVE_MARGIN_M).iter().flatten()
+    for k in points_in_boxes(&frame.cloud.values, frame.cloud.channels, &boxes[first_pasted..], REMOVE_MARGIN_M)
+        .iter()
+        .flatten()
     {
         covered[*k as usize] = true;
     }

@@ -1,4 +1,5 @@
-//! Noise of single objects: each is moved and turned by itself, with its points, where that brings it into no other.
+//! Noise of single objects: each is translated and rotated with its points, unless that makes it overlap another
+//! object.
 
 use super::world::{normal, uniform};
 use crate::{Frame, Stream};
@@ -6,15 +7,15 @@ use geometry::{Box3, bev_intersection, points_in_boxes};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// How far single objects are moved; none by default, as in the reference.
+/// Configuration of the noise of single objects. Off by default, as in OpenPCDet.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ObjectNoiseConfig {
     /// Standard deviation of the translation along x, y and z, m.
     pub translation_std_m: [f64; 3],
-    /// Smallest and largest turn about the object's own z axis, rad, uniform.
+    /// Smallest and largest rotation about the z axis through the object's centre, rad. Drawn uniformly.
     pub rotation_rad: [f64; 2],
-    /// Attempts for an object until it touches no other; after the last one it stays where it was.
+    /// Maximum number of attempts to find a pose without overlap. After the last one the object keeps its pose.
     pub tries: usize,
 }
 
@@ -24,7 +25,7 @@ impl Default for ObjectNoiseConfig {
     }
 }
 
-/// Moves every object, one after the other; a point in two boxes goes with the first.
+/// Moves the objects one after the other, in their order. A point in two boxes moves with the first box.
 pub fn noise_objects(mut frame: Frame, config: &ObjectNoiseConfig, stream: &mut Stream) -> Frame {
     if config.translation_std_m == [0.0; 3] && config.rotation_rad == [0.0; 2] {
         return frame;
@@ -70,7 +71,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn objects_take_their_points_along_and_never_touch(seed in any::<u64>()) {
+        fn points_move_with_their_objects_and_objects_do_not_overlap(seed in any::<u64>()) {
             let config = ObjectNoiseConfig { translation_std_m: [1.0, 1.0, 0.5], rotation_rad: [-0.8, 0.8], tries: 100 };
             let frame = scene(seed, 5);
             let noisy = noise_objects(frame.clone(), &config, &mut stream(seed, "n", 0, 0));

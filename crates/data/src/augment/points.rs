@@ -1,4 +1,4 @@
-//! Changes of the points alone: order and range.
+//! Order and range of the points.
 
 use crate::{Frame, Stream};
 use rand::RngExt;
@@ -16,8 +16,10 @@ pub fn shuffle_points(mut frame: Frame, stream: &mut Stream) -> Frame {
     frame
 }
 
-/// Keeps the points whose x and y lie in `[x0, y0, z0, x1, y1, z1]` (the reference's mask does not look at z) and, for training, the objects
-/// whose centre lies in it, z included. All bounds count as inside.
+/// Crops a frame to `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, bounds included.
+///
+/// Points are tested in x and y only, as OpenPCDet's mask does. Objects are kept if their centre is inside in x, y and
+/// z.
 pub fn crop_to_range(mut frame: Frame, range: &[f64; 6]) -> Frame {
     let low = [range[0] as f32, range[1] as f32];
     let high = [range[3] as f32, range[4] as f32];
@@ -47,7 +49,7 @@ mod tests {
     }
 
     #[test]
-    fn the_range_cuts_points_in_x_and_y_and_boxes_in_z_too() {
+    fn points_are_cropped_in_x_and_y_and_boxes_in_x_y_and_z() {
         let frame = Frame {
             id: "a".into(),
             cloud: Cloud { values: vec![0.0, 0.0, 9.0, 10.0, 5.0, 0.0, 10.1, 0.0, 0.0, 1.0, -5.1, 0.0], channels: 3 },

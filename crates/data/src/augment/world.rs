@@ -4,7 +4,8 @@ use crate::{Frame, Stream};
 use rand::RngExt;
 use std::f64::consts::PI;
 
-/// Flips along x (y becomes -y, yaw becomes -yaw) and along y (x becomes -x, yaw becomes -(yaw + pi)), each with its probability.
+/// Flips along x (y becomes -y, yaw becomes -yaw) and along y (x becomes -x, yaw becomes -(yaw + pi)), each with its
+/// probability.
 pub fn flip(mut frame: Frame, along_x_probability: f64, along_y_probability: f64, stream: &mut Stream) -> Frame {
     if stream.random::<f64>() < along_x_probability {
         frame.cloud.points_mut().for_each(|p| p[1] = -p[1]);
@@ -23,7 +24,7 @@ pub fn flip(mut frame: Frame, along_x_probability: f64, along_y_probability: f64
     frame
 }
 
-/// Turns the scene about z by an angle from `[smallest, largest]`, rad.
+/// Rotates the scene about z by a random angle from `[smallest, largest]`, rad.
 pub fn rotate(mut frame: Frame, rotation_rad: [f64; 2], stream: &mut Stream) -> Frame {
     let angle = uniform(rotation_rad, stream);
     if angle == 0.0 {
@@ -43,7 +44,7 @@ pub fn rotate(mut frame: Frame, rotation_rad: [f64; 2], stream: &mut Stream) -> 
     frame
 }
 
-/// Stretches the scene about the origin by a factor from `[smallest, largest]`.
+/// Scales the scene about the origin by a random factor from `[smallest, largest]`.
 pub fn scale(mut frame: Frame, scaling: [f64; 2], stream: &mut Stream) -> Frame {
     let factor = uniform(scaling, stream);
     frame.cloud.points_mut().flat_map(|p| &mut p[..3]).for_each(|v| *v = (f64::from(*v) * factor) as f32);
@@ -53,7 +54,7 @@ pub fn scale(mut frame: Frame, scaling: [f64; 2], stream: &mut Stream) -> Frame 
     frame
 }
 
-/// Moves the scene by normal noise of these standard deviations, m.
+/// Translates the scene by a normally distributed vector with these standard deviations along x, y and z, m.
 pub fn translate(mut frame: Frame, std_m: [f64; 3], stream: &mut Stream) -> Frame {
     let by = std_m.map(|std| std * normal(stream));
     frame.cloud.points_mut().for_each(|p| (0..3).for_each(|i| p[i] = (f64::from(p[i]) + by[i]) as f32));
@@ -63,12 +64,12 @@ pub fn translate(mut frame: Frame, std_m: [f64; 3], stream: &mut Stream) -> Fram
     frame
 }
 
-/// A number from `[smallest, largest)`; the smallest where both are equal.
+/// A uniform random number from `[smallest, largest)`; `smallest` if both are equal.
 pub(super) fn uniform([smallest, largest]: [f64; 2], stream: &mut Stream) -> f64 {
     smallest + (largest - smallest) * stream.random::<f64>()
 }
 
-/// A standard normal number, by Box and Muller.
+/// A standard normal random number (Box-Muller transform).
 pub(super) fn normal(stream: &mut Stream) -> f64 {
     let (u, v): (f64, f64) = (stream.random(), stream.random());
     (-2.0 * (1.0 - u).ln()).sqrt() * (2.0 * PI * v).cos()

@@ -1,4 +1,4 @@
-//! Does the data fit the detector: classes, range, anchors.
+//! Checks whether the data fit the detector: classes, range, anchors.
 
 use super::report::{Findings, Spread, at_most};
 use super::statistics::at;
@@ -6,7 +6,8 @@ use super::survey::{FrameFacts, ObjectFacts};
 use super::{AnchorFacts, DetectorFacts};
 use crate::Dataset;
 
-/// With less overlap seen from above than this, even a perfectly placed anchor is hardly ever matched.
+/// Smallest useful IoU, seen from above, of an anchor and a box with the same centre and yaw. Below, anchors are rarely
+/// matched to boxes.
 const ANCHOR_OVERLAP: f64 = 0.5;
 
 pub(super) fn compare(dataset: &Dataset, detector: &DetectorFacts, frames: &[FrameFacts], findings: &mut Findings) {
@@ -29,7 +30,7 @@ pub(super) fn compare(dataset: &Dataset, detector: &DetectorFacts, frames: &[Fra
         |o: &ObjectFacts| (0..3).all(|i| (detector.range[i]..=detector.range[i + 3]).contains(&o.bbox.center[i]));
     let outside: Vec<_> = objects.iter().filter(|(_, o)| !inside(o)).map(|(id, o)| at(id, o)).collect();
     let message = format!(
-        "{} of {} boxes have their centre outside of the detector's range {:?} m and are not learnt: {}",
+        "{} of {} boxes have their centre outside of the detector's range {:?} m and are not used in training: {}",
         outside.len(),
         objects.len(),
         detector.range,
@@ -55,8 +56,8 @@ fn compare_anchor(anchor: &AnchorFacts, labels: &[&ObjectFacts], findings: &mut 
     let overlap = median(&overlap);
     if overlap < ANCHOR_OVERLAP {
         let message = format!(
-            "the anchor of {class} is {} x {} x {} m (length, width, height), but the labels' median is {:.2} x {:.2} x {:.2} m: laid over each \
-             other they overlap by {overlap:.2} seen from above, too little to be matched",
+            "the anchor of {class} is {} x {} x {} m (length, width, height), but the labels' median is {:.2} x {:.2} x {:.2} m: \
+             with equal centre and yaw their IoU seen from above is {overlap:.2} (median), too little to be matched",
             anchor.size[0], anchor.size[1], anchor.size[2], size[0], size[1], size[2]
         );
         findings.problem("anchors", message, []);
@@ -72,11 +73,12 @@ fn compare_anchor(anchor: &AnchorFacts, labels: &[&ObjectFacts], findings: &mut 
     let shared = (high - low).max(0.0) / anchor.size[2].min(size[2]);
     if shared < 0.7 {
         let message = format!(
-            "the anchor of {class} begins at {} m, but the labels' undersides lie at {bottom:.2} m (median): {:.0} % of the height is shared",
+            "the bottom of the anchor of {class} is at z = {} m, \
+             but the median bottom of the labels is at {bottom:.2} m: {:.0} % of the height is shared",
             anchor.bottom,
             shared * 100.0
         );
-        // The published network on KITTI has its anchors of pedestrians and cyclists 1 m too high, and learns the difference.
+        // OpenPCDet's PointPillars for KITTI has the anchors of pedestrians and cyclists 1 m too high and still works.
         let learnable = shared >= 0.3;
         let severity = if learnable { super::Severity::Note } else { super::Severity::Problem };
         findings.add(severity, "anchors", message, []);

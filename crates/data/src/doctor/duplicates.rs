@@ -1,4 +1,4 @@
-//! Frames that are there twice, or nearly: a test on what was trained on measures memory.
+//! Frames that are duplicates or nearly so. Duplicates across splits mean that an evaluation uses training data.
 
 use super::ground::Ground;
 use super::report::{Findings, at_most};
@@ -7,22 +7,22 @@ use crate::Cloud;
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
-/// Side of a voxel, m. Coarse, so that noise of some centimetres changes few of them.
+/// Side of a voxel, m. Large, so that noise of a few centimetres changes few occupied voxels.
 const VOXEL_M: f64 = 0.5;
-/// Voxels farther away are hit or missed by chance, m.
-const REACH_M: f64 = 40.0;
-/// Smallest hashes kept of a frame.
+/// Largest distance of points that are compared, m. Farther voxels are occupied at random.
+const MAX_DISTANCE_M: f64 = 40.0;
+/// Number of smallest hashes kept of a frame (MinHash sketch).
 const SKETCH: usize = 256;
-/// A frame with fewer occupied voxels says too little.
-const FEWEST_VOXELS: usize = 100;
-/// Two frames that share this part of their occupied voxels (Jaccard index) are the same scene. On KITTI, other scenes share below 0.1; the same
-/// scan with 5 cm of noise shares 0.9, moved by 10 cm 0.8, with half of its points 0.75.
+/// Smallest number of occupied voxels of a frame that is compared.
+const MIN_VOXELS: usize = 100;
+/// Jaccard index of the occupied voxels from which two frames show the same scene. On KITTI different scenes have less
+/// than 0.1. Copies of a scan have 0.9 with 5 cm of noise, 0.8 moved by 10 cm, 0.75 with half of the points.
 const NEAR_DUPLICATE: f64 = 0.7;
 
-/// A frame for comparison: a hash of its exact values, and a sketch of the space that is occupied above the ground.
+/// Fingerprint of a frame: a hash of its exact values and a MinHash sketch of the voxels occupied above the ground.
 pub(super) struct Signature {
     exact: [u8; 16],
-    /// The smallest hashes of occupied voxels, ascending; empty where there are too few.
+    /// The smallest hashes of occupied voxels, ascending; empty if there are too few voxels.
     sketch: Vec<u64>,
 }
 
@@ -34,11 +34,11 @@ impl Signature {
         }
         let mut exact = [0; 16];
         exact.copy_from_slice(&hash.finalize()[..16]);
-        let near = ground.standing().filter(|p| p[0].hypot(p[1]) < REACH_M);
+        let near = ground.standing().filter(|p| p[0].hypot(p[1]) < MAX_DISTANCE_M);
         let mut sketch: Vec<u64> = near.map(|p| voxel_hash(p.map(|v| (v / VOXEL_M).floor() as i64))).collect();
         sketch.sort_unstable();
         sketch.dedup();
-        if sketch.len() < FEWEST_VOXELS {
+        if sketch.len() < MIN_VOXELS {
             sketch.clear();
         }
         sketch.truncate(SKETCH);
@@ -46,7 +46,7 @@ impl Signature {
     }
 }
 
-/// splitmix64 over the three indices.
+/// Hash of the three indices by splitmix64.
 fn voxel_hash(voxel: [i64; 3]) -> u64 {
     voxel.into_iter().fold(0x9E37_79B9_7F4A_7C15, |hash: u64, v| {
         let mut z = (hash ^ v as u64).wrapping_add(0x9E37_79B9_7F4A_7C15);
@@ -56,7 +56,8 @@ fn voxel_hash(voxel: [i64; 3]) -> u64 {
     })
 }
 
-/// Estimate of the Jaccard index of two sets from the smallest hashes of each: the share that both have among the smallest of the union.
+/// Estimated Jaccard index of two sets from their MinHash sketches: the fraction of the smallest hashes of the union
+/// that both sets have.
 fn jaccard(a: &[u64], b: &[u64]) -> f64 {
     let (mut i, mut j, mut seen, mut shared) = (0, 0, 0, 0);
     let size = a.len().min(b.len());
@@ -69,11 +70,11 @@ fn jaccard(a: &[u64], b: &[u64]) -> f64 {
     if size == 0 { 0.0 } else { shared as f64 / size as f64 }
 }
 
-/// Objects of the same scene are at most that far apart, m.
+/// Largest distance between the centres of an object in two frames of the same scene, m.
 const SAME_PLACE_M: f64 = 1.0;
 
-/// Whether the labelled objects of two frames are at the same places: scenery alone looks alike wherever a road is straight, and again
-/// on every lap of a track. Frames without objects are told by their clouds.
+/// Whether the labelled objects of two frames are at the same places. Background alone is not enough: it looks alike on
+/// straight roads and on every lap of a race track. Frames without objects agree.
 fn objects_agree(a: &FrameFacts, b: &FrameFacts) -> bool {
     let near =
         |p: &[f64; 3], q: &[f64; 3]| p.iter().zip(q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt() <= SAME_PLACE_M;
@@ -92,10 +93,10 @@ pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<Strin
         findings.problem("duplicates", message, in_two);
     }
 
-    // Two frames count as in different splits when no split holds both.
+    // Two frames are in different splits if no split has both.
     let none = BTreeSet::new();
     let splits_of = |i: usize| split_of.get(frames[i].id.as_str()).unwrap_or(&none);
-    let apart = |i: usize, j: usize| {
+    let in_different_splits = |i: usize, j: usize| {
         let (a, b) = (splits_of(i), splits_of(j));
         !a.is_empty() && !b.is_empty() && a.is_disjoint(b)
     };
@@ -110,21 +111,21 @@ pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<Strin
     let mut by_exact: HashMap<[u8; 16], Vec<usize>> = HashMap::new();
     for (j, frame) in frames.iter().enumerate() {
         let same = by_exact.entry(frame.signature.exact).or_default();
-        if let Some(i) = same.iter().copied().find(|i| apart(*i, j)) {
+        if let Some(i) = same.iter().copied().find(|i| in_different_splits(*i, j)) {
             across.push((i, j));
         } else if let Some(i) = same.first() {
             within.push((*i, j));
         }
         same.push(j);
     }
-    // Sets that share most of their voxels share most of their smallest hashes: candidates are found through the first eight.
+    // Frames that share most voxels share most of their smallest hashes: candidates share one of the first eight.
     let mut by_hash: HashMap<u64, Vec<usize>> = HashMap::new();
     for (j, frame) in frames.iter().enumerate() {
         let first = &frame.signature.sketch[..frame.signature.sketch.len().min(8)];
         let candidates: BTreeSet<usize> = first.iter().filter_map(|h| by_hash.get(h)).flatten().copied().collect();
         let alike = |i: &usize| {
             let (a, b) = (&frames[*i].signature, &frame.signature);
-            apart(*i, j)
+            in_different_splits(*i, j)
                 && a.exact != b.exact
                 && objects_agree(&frames[*i], frame)
                 && jaccard(&a.sketch, &b.sketch) >= NEAR_DUPLICATE
@@ -134,7 +135,7 @@ pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<Strin
         }
         first.iter().for_each(|h| by_hash.entry(*h).or_default().push(j));
     }
-    let mut tell = |pairs: Vec<(usize, usize)>, problem: bool, what: &str| {
+    let mut report = |pairs: Vec<(usize, usize)>, problem: bool, what: &str| {
         if !pairs.is_empty() {
             let names: Vec<_> = pairs.iter().map(|(i, j)| name(*i, *j)).collect();
             let message = format!("{} frames {what}: {}", pairs.len(), at_most(5, &names, ", "));
@@ -143,7 +144,7 @@ pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<Strin
             findings.add(severity, "duplicates", message, ids);
         }
     };
-    tell(across, true, "have the very cloud of a frame of another split");
-    tell(near, true, "show nearly the same scene as a frame of another split");
-    tell(within, false, "have the very cloud of another frame");
+    report(across, true, "have exactly the cloud of a frame of another split");
+    report(near, true, "show nearly the same scene as a frame of another split");
+    report(within, false, "have exactly the cloud of another frame");
 }

@@ -1,20 +1,20 @@
-//! Where the ground is around a place, from the lowest points near it, and which points stand above it.
+//! Local ground height, from the lowest points near a position, and the points above the ground.
 
 use crate::Cloud;
 use std::collections::HashMap;
 
-/// Side of a cell, m.
+/// Side of a grid cell, m.
 const CELL_M: f64 = 2.0;
-/// Points lower than this above the ground are taken for ground, m.
-const ABOVE_M: f64 = 0.3;
+/// Points up to this height above the ground count as ground, m.
+const GROUND_THICKNESS_M: f64 = 0.3;
 
 type Cell = (i32, i32);
 
-/// Ground and standing points of a frame, by cells seen from above.
+/// Ground height and points above the ground of a frame, on a grid in x and y.
 pub(super) struct Ground {
-    /// The lowest z that three points of the cell confirm; single points far below the ground are echoes of echoes.
+    /// Third-lowest z of the points in a cell, m. One or two points below the ground are multipath returns.
     low: HashMap<Cell, f64>,
-    /// Points above the ground.
+    /// Points above the ground, m.
     standing: HashMap<Cell, Vec<[f64; 3]>>,
 }
 
@@ -37,19 +37,19 @@ impl Ground {
             let p = [p[0].into(), p[1].into(), p[2].into()];
             let at = cell(p[0], p[1]);
             let height = *heights.entry(at).or_insert_with(|| ground.at_cell(at));
-            if height.is_some_and(|ground| p[2] > ground + ABOVE_M) {
+            if height.is_some_and(|ground| p[2] > ground + GROUND_THICKNESS_M) {
                 ground.standing.entry(at).or_default().push(p);
             }
         }
         ground
     }
 
-    /// Height of the ground around a place, m; `None` where nothing near says so.
+    /// z of the ground around a position, m; `None` if there are too few points near it.
     pub(super) fn at(&self, x: f64, y: f64) -> Option<f64> {
         self.at_cell(cell(x, y))
     }
 
-    /// The lower quartile of the cells around: many of them show only what stands on them.
+    /// Lower quartile over the surrounding cells. Many cells have points on objects only, not on the ground.
     fn at_cell(&self, (cx, cy): Cell) -> Option<f64> {
         for reach in [1, 2, 4] {
             let around = (-reach..=reach).flat_map(|dx| (-reach..=reach).map(move |dy| (cx + dx, cy + dy)));
@@ -62,14 +62,14 @@ impl Ground {
         None
     }
 
-    /// Points above the ground in the cells that a circle touches.
+    /// Points above the ground in all cells that the bounding square of a circle touches.
     pub(super) fn standing_near(&self, x: f64, y: f64, radius: f64) -> impl Iterator<Item = &[f64; 3]> {
         let ((x0, y0), (x1, y1)) = (cell(x - radius, y - radius), cell(x + radius, y + radius));
         let cells = (x0..=x1).flat_map(move |cx| (y0..=y1).map(move |cy| (cx, cy)));
         cells.filter_map(|cell| self.standing.get(&cell)).flatten()
     }
 
-    /// All points above the ground, cell by cell in no order.
+    /// All points above the ground, in no defined order.
     pub(super) fn standing(&self) -> impl Iterator<Item = &[f64; 3]> {
         self.standing.values().flatten()
     }

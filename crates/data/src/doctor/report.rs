@@ -1,6 +1,6 @@
-//! The report: numbers, findings, and a verdict in words.
+//! The report: numbers, findings and a verdict.
 
-use super::reading::Reading;
+use super::interpretation::Interpretation;
 use super::survey::FrameFacts;
 use crate::{Dataset, LabelFrame, PointColumns};
 use serde::Serialize;
@@ -9,30 +9,30 @@ use std::collections::BTreeMap;
 use std::fmt;
 use std::path::PathBuf;
 
-/// How much a finding matters.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
-    /// A training or a test with this data would be wrong, or not run.
+    /// Training or evaluation with this data would fail or give wrong results.
     Problem,
-    /// Good to know.
+    /// Information that does not make the data unusable.
     Note,
 }
 
-/// One thing that was found.
+/// A result of a check.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
-    /// Which check it comes from.
+    /// Name of the check.
     pub check: String,
-    /// What is the matter, in words.
+    /// What was found.
     pub message: String,
-    /// The frames it is about, at most a hundred.
+    /// Ids of the frames concerned, at most 100.
     pub frames: Vec<String>,
 }
 
-/// Findings as they come in.
+/// Collects findings in the order of the checks.
 #[derive(Default)]
 pub(super) struct Findings(Vec<Finding>);
 
@@ -56,7 +56,7 @@ impl Findings {
         self.0.push(Finding { severity, check: check.into(), message, frames });
     }
 
-    /// A problem where it concerns more than one in twenty, else a note; nothing where there is none.
+    /// Adds a problem if more than 5 % of `of` are bad, a note if fewer are, nothing if none is.
     pub(super) fn by_share(&mut self, check: &str, message: String, bad: &[String], of: usize) {
         if !bad.is_empty() {
             let severity = if bad.len() * 20 > of { Severity::Problem } else { Severity::Note };
@@ -65,7 +65,7 @@ impl Findings {
     }
 }
 
-/// Smallest, median and largest of some numbers; all 0 where there are none.
+/// Smallest, median and largest of a set of values; all 0 if it is empty.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Spread {
     /// Smallest.
@@ -90,25 +90,25 @@ impl Spread {
     }
 }
 
-/// What the clouds hold.
+/// Statistics of the clouds.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct PointFacts {
-    /// Points in a frame.
+    /// Points per frame.
     pub per_frame: Spread,
     /// `[x_min, y_min, z_min, x_max, y_max, z_max]` over all frames, m.
     pub range_m: [f64; 6],
-    /// Smallest and largest intensity, where there is one.
+    /// Smallest and largest intensity; `None` without intensity.
     pub intensity: Option<[f64; 2]>,
 }
 
-/// What the labels of one class say.
+/// Statistics of the labels of one class.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ClassFacts {
     /// The class.
     pub class: String,
-    /// The data set lists it.
+    /// Whether the class is in the data set's list of classes.
     pub listed: bool,
-    /// Boxes.
+    /// Number of boxes.
     pub boxes: usize,
     /// Length, m.
     pub length_m: Spread,
@@ -116,51 +116,51 @@ pub struct ClassFacts {
     pub width_m: Spread,
     /// Height, m.
     pub height_m: Spread,
-    /// Height of the underside, m, LiDAR frame.
+    /// z of the bottom face, m, LiDAR frame.
     pub bottom_m: Spread,
-    /// Distance of the centre from the sensor, seen from above, m.
+    /// Horizontal distance of the centre from the origin of the LiDAR frame, m.
     pub range_m: Spread,
-    /// Points inside.
+    /// Points inside a box.
     pub points: Spread,
-    /// Boxes without a point.
+    /// Number of boxes without a point inside.
     pub without_points: usize,
 }
 
-/// What the doctor found.
+/// Report of the checks of a data set.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DoctorReport {
-    /// Form of this report.
+    /// Name and version of this JSON format.
     pub schema: &'static str,
     /// Name of the data set.
     pub dataset: String,
-    /// Its folder.
+    /// Root folder of the data set.
     pub root: PathBuf,
-    /// The frame in which its labels are declared.
+    /// The label frame that the data set declares.
     pub label_frame: LabelFrame,
-    /// The values of its points.
+    /// Columns of the points.
     pub points: PointColumns,
-    /// No problem was found; notes do not count.
+    /// Whether there is no problem; notes are allowed.
     pub sound: bool,
-    /// The outcome in a sentence.
+    /// Summary in one sentence.
     pub verdict: String,
-    /// What was found, problems first.
+    /// All findings, problems first.
     pub findings: Vec<Finding>,
-    /// Frames in the folder.
+    /// Number of frames in the folder.
     pub frames: usize,
-    /// Frames of each split that could be read.
+    /// Number of frames of each split that could be read.
     pub splits: BTreeMap<String, usize>,
-    /// Labelled boxes.
+    /// Number of labelled boxes.
     pub boxes: usize,
-    /// What the clouds hold.
+    /// Statistics of the clouds.
     pub clouds: PointFacts,
-    /// What the labels say, by class.
+    /// Statistics of the labels, by class.
     pub classes: Vec<ClassFacts>,
-    /// Ways to read the labels, the one that puts most points into the boxes first.
-    pub readings: Vec<Reading>,
+    /// Interpretations of the labels, the one with most points inside the boxes first.
+    pub readings: Vec<Interpretation>,
 }
 
 impl DoctorReport {
-    #[expect(clippy::too_many_arguments, reason = "the one place where the parts come together")]
+    #[expect(clippy::too_many_arguments, reason = "called once, with the result of each check")]
     pub(super) fn new(
         dataset: &Dataset,
         ids: &[String],
@@ -168,7 +168,7 @@ impl DoctorReport {
         splits: BTreeMap<String, Vec<String>>,
         clouds: PointFacts,
         classes: Vec<ClassFacts>,
-        readings: Vec<Reading>,
+        readings: Vec<Interpretation>,
         findings: Findings,
     ) -> Self {
         let mut findings = findings.0;
@@ -200,14 +200,14 @@ impl DoctorReport {
     }
 }
 
-/// The report for people.
+/// The report as text for the console.
 impl fmt::Display for DoctorReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} ({}): {} frames, {} boxes", self.dataset, self.root.display(), self.frames, self.boxes)?;
         let splits: Vec<_> = self.splits.iter().map(|(name, frames)| format!("{name} {frames}")).collect();
         writeln!(f, "  splits: {}", if splits.is_empty() { "none".into() } else { splits.join(", ") })?;
         let (per_frame, r) = (self.clouds.per_frame, self.clouds.range_m);
-        writeln!(f, "  points a frame: {} to {}, median {}", per_frame.min, per_frame.max, per_frame.median)?;
+        writeln!(f, "  points per frame: {} to {}, median {}", per_frame.min, per_frame.max, per_frame.median)?;
         writeln!(
             f,
             "  points span x {:.1}..{:.1}, y {:.1}..{:.1}, z {:.1}..{:.1} m",
@@ -240,14 +240,14 @@ impl fmt::Display for DoctorReport {
             )?;
         }
         for finding in &self.findings {
-            let word = if finding.severity == Severity::Problem { "PROBLEM" } else { "note" };
-            writeln!(f, "{word}: {}: {}", finding.check, finding.message)?;
+            let severity = if finding.severity == Severity::Problem { "PROBLEM" } else { "note" };
+            writeln!(f, "{severity}: {}: {}", finding.check, finding.message)?;
         }
         write!(f, "{}", self.verdict)
     }
 }
 
-/// The first of some texts, and how many more there are.
+/// Joins the first `shown` texts by `between` and adds the number of further texts.
 pub(super) fn at_most(shown: usize, texts: &[String], between: &str) -> String {
     let mut out = texts[..texts.len().min(shown)].join(between);
     if texts.len() > shown {

@@ -1,12 +1,12 @@
-//! Counts, sizes and ranges, and the boxes that have no points or do not stand on the ground.
+//! Counts, sizes and ranges; boxes without points, with implausible sizes or far from the ground.
 
 use super::report::{ClassFacts, Findings, PointFacts, Spread, at_most};
 use super::survey::{FrameFacts, ObjectFacts};
 use crate::Dataset;
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Underside and ground may differ by this much, m: far away the ground is seen in few places only.
-const FAR_FROM_GROUND_M: f64 = 1.0;
+/// Largest plausible distance between the bottom of a box and the ground, m. Far away the ground height is inaccurate.
+const MAX_GROUND_OFFSET_M: f64 = 1.0;
 
 pub(super) fn points(frames: &[FrameFacts], findings: &mut Findings) -> PointFacts {
     if frames.is_empty() {
@@ -28,7 +28,7 @@ pub(super) fn points(frames: &[FrameFacts], findings: &mut Findings) -> PointFac
     {
         findings.note(
             "intensity",
-            format!("intensities go from {low} to {high}; networks trained on KITTI know 0 to 1"),
+            format!("intensities are from {low} to {high}; networks trained on KITTI expect 0 to 1"),
             [],
         );
     }
@@ -45,7 +45,7 @@ pub(super) fn classes(dataset: &Dataset, frames: &[FrameFacts], findings: &mut F
     let listed = &dataset.config.classes;
     if by_class.is_empty() && !frames.is_empty() {
         let why = if dataset.has_labels() { "all label files are empty" } else { "there is no folder of labels" };
-        findings.problem("labels", format!("there is not one box in the whole data set: {why}"), []);
+        findings.problem("labels", format!("the data set has no labelled box: {why}"), []);
     } else if !frames.is_empty() && !listed.iter().any(|class| by_class.contains_key(class.as_str())) {
         let found: Vec<_> = by_class.keys().map(|c| c.to_string()).collect();
         let message =
@@ -54,28 +54,34 @@ pub(super) fn classes(dataset: &Dataset, frames: &[FrameFacts], findings: &mut F
     } else {
         let missing: Vec<_> = listed.iter().filter(|class| !by_class.contains_key(class.as_str())).cloned().collect();
         if !missing.is_empty() {
-            findings.note("classes", format!("no box of {}, though listed", missing.join(", ")), []);
+            findings.note("classes", format!("listed classes without a box: {}", missing.join(", ")), []);
         }
-        let strangers: Vec<_> = by_class
+        let unlisted: Vec<_> = by_class
             .iter()
             .filter(|(class, _)| !listed.iter().any(|l| l == *class))
             .map(|(class, boxes)| format!("{class} ({} boxes)", boxes.len()))
             .collect();
-        if !strangers.is_empty() {
-            findings.note("classes", format!("labelled but not listed, hence left out: {}", strangers.join(", ")), []);
+        if !unlisted.is_empty() {
+            findings.note(
+                "classes",
+                format!("labelled but not in the list of classes, therefore left out: {}", unlisted.join(", ")),
+                [],
+            );
         }
     }
-    let everything: Vec<_> = by_class.values().flatten().copied().collect();
-    let empty: Vec<_> = everything.iter().filter(|(_, o)| o.points == 0).map(|(id, o)| at(id, o)).collect();
-    let message =
-        format!("{} of {} boxes have no point inside: {}", empty.len(), everything.len(), at_most(5, &empty, ", "));
-    findings.by_share("boxes without points", message, &empty, everything.len());
-    let absurd = |o: &ObjectFacts| o.bbox.size.iter().any(|s| !(0.05..40.0).contains(s));
-    let absurd: Vec<_> = everything.iter().filter(|(_, o)| absurd(o)).map(|(id, o)| at(id, o)).collect();
-    if !absurd.is_empty() {
-        let message =
-            format!("{} boxes have a side below 5 cm or above 40 m: {}", absurd.len(), at_most(5, &absurd, ", "));
-        findings.problem("sizes", message, absurd);
+    let all: Vec<_> = by_class.values().flatten().copied().collect();
+    let empty: Vec<_> = all.iter().filter(|(_, o)| o.points == 0).map(|(id, o)| at(id, o)).collect();
+    let message = format!("{} of {} boxes have no point inside: {}", empty.len(), all.len(), at_most(5, &empty, ", "));
+    findings.by_share("boxes without points", message, &empty, all.len());
+    let implausible = |o: &ObjectFacts| o.bbox.size.iter().any(|s| !(0.05..40.0).contains(s));
+    let implausible: Vec<_> = all.iter().filter(|(_, o)| implausible(o)).map(|(id, o)| at(id, o)).collect();
+    if !implausible.is_empty() {
+        let message = format!(
+            "{} boxes have a side below 5 cm or above 40 m: {}",
+            implausible.len(),
+            at_most(5, &implausible, ", ")
+        );
+        findings.problem("sizes", message, implausible);
     }
     let facts = |(class, boxes): (&&str, &Vec<(&str, &ObjectFacts)>)| {
         let spread = |f: &dyn Fn(&ObjectFacts) -> f64| Spread::of(boxes.iter().map(|(_, o)| f(o)));
@@ -106,14 +112,15 @@ pub(super) fn ground(frames: &[FrameFacts], findings: &mut Findings) {
             known += 1;
             let offset = object.bbox.z_range().0 - ground;
             offsets.push(offset);
-            if offset.abs() > FAR_FROM_GROUND_M {
+            if offset.abs() > MAX_GROUND_OFFSET_M {
                 far.push(format!("{} ({offset:+.1} m)", at(&frame.id, object)));
                 frames_with_far.insert(frame.id.clone());
             }
         }
     }
     let message = format!(
-        "{} of {known} boxes have their underside more than {FAR_FROM_GROUND_M} m off the ground (median over all boxes {:+.2} m): {}",
+        "{} of {known} boxes have their bottom more than {MAX_GROUND_OFFSET_M} m above or below the ground \
+         (median over all boxes {:+.2} m): {}",
         far.len(),
         Spread::of(offsets).median,
         at_most(5, &far, ", ")
@@ -121,7 +128,7 @@ pub(super) fn ground(frames: &[FrameFacts], findings: &mut Findings) {
     findings.by_share("boxes far from the ground", message, &far, known);
 }
 
-/// A box, for messages.
+/// Frame id, class and centre of a box, for messages.
 pub(super) fn at(id: &str, object: &ObjectFacts) -> String {
     let [x, y, z] = object.bbox.center;
     format!("{id} {} at ({x:.1}, {y:.1}, {z:.1})", object.class)

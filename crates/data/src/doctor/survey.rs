@@ -1,12 +1,12 @@
-//! The one pass over the data: everything that later checks need of a frame, small enough to keep for all of them.
+//! Reads a frame once and extracts what the checks need. Clouds are not kept.
 
 use super::duplicates::Signature;
 use super::ground::Ground;
-use super::reading::{Evidence, evidence};
+use super::interpretation::{InsideCounts, inside_counts};
 use crate::{DataError, Dataset};
 use geometry::{Box3, points_in_boxes};
 
-/// A frame in numbers.
+/// What the checks need of a frame.
 pub(super) struct FrameFacts {
     pub(super) id: String,
     pub(super) points: usize,
@@ -15,20 +15,21 @@ pub(super) struct FrameFacts {
     pub(super) intensity: Option<[f64; 2]>,
     pub(super) signature: Signature,
     pub(super) objects: Vec<ObjectFacts>,
-    /// Points in the boxes under each reading of the labels, for frames that were read in all ways.
-    pub(super) evidence: Vec<Evidence>,
+    /// Points inside each label under all interpretations; empty if the frame was not interpreted.
+    pub(super) inside_counts: Vec<InsideCounts>,
 }
 
-/// An object in numbers.
+/// What the checks need of an object.
 pub(super) struct ObjectFacts {
     pub(super) class: String,
     pub(super) bbox: Box3,
     pub(super) points: usize,
-    /// Height of the ground around it, m.
+    /// z of the ground around the object, m, LiDAR frame; `None` if not known.
     pub(super) ground: Option<f64>,
 }
 
-pub(super) fn survey(dataset: &Dataset, id: &str, read_in_all_ways: bool) -> Result<FrameFacts, DataError> {
+/// Reads a frame. `interpret` also counts points under all interpretations of the labels.
+pub(super) fn survey(dataset: &Dataset, id: &str, interpret: bool) -> Result<FrameFacts, DataError> {
     let cloud = dataset.load_cloud(id)?;
     let lines = if dataset.has_labels() { dataset.labels(id)? } else { Vec::new() };
     let objects = dataset.objects(id, &lines)?;
@@ -61,6 +62,6 @@ pub(super) fn survey(dataset: &Dataset, id: &str, read_in_all_ways: bool) -> Res
         intensity: (cloud.channels > 3).then_some(intensity),
         signature: Signature::of(&cloud, &ground),
         objects: objects.iter().zip(members).map(facts).collect(),
-        evidence: if read_in_all_ways { evidence(dataset, id, &lines, &ground) } else { Vec::new() },
+        inside_counts: if interpret { inside_counts(dataset, id, &lines, &ground) } else { Vec::new() },
     })
 }

@@ -1,4 +1,4 @@
-//! Planted faults: each is found, by name, and nothing is found where nothing was planted.
+//! Each fault that is put into a synthetic data set is found; a data set without faults has no findings.
 
 use super::*;
 use crate::write::{write_bin, write_dataset_toml, write_kitti_text, write_split};
@@ -8,7 +8,7 @@ use rand::RngExt;
 use std::f64::consts::FRAC_PI_2;
 use std::path::{Path, PathBuf};
 
-/// Ground, some walls, and six cars that stand at all angles.
+/// Ground, walls and six cars with random yaw.
 fn scene(seed: u64) -> Frame {
     let mut rng = stream(seed, "scene", 0, 0);
     let mut values = Vec::new();
@@ -40,7 +40,7 @@ fn scene(seed: u64) -> Frame {
 
 const FRAMES: u64 = 6;
 
-/// A data set with nothing wrong in it: train 0 to 3, val 4 and 5; labels in either frame.
+/// A valid data set: train has frames 0 to 3, val 4 and 5.
 fn data_set(label_frame: LabelFrame) -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
@@ -85,9 +85,9 @@ fn examine(root: &Path) -> DoctorReport {
 }
 
 #[track_caller]
-fn finds(report: &DoctorReport, severity: Severity, check: &str, words: &str) {
-    let found = |f: &Finding| f.severity == severity && f.check == check && f.message.contains(words);
-    assert!(report.findings.iter().any(found), "no {check} with {words:?} in\n{report}");
+fn finds(report: &DoctorReport, severity: Severity, check: &str, text: &str) {
+    let found = |f: &Finding| f.severity == severity && f.check == check && f.message.contains(text);
+    assert!(report.findings.iter().any(found), "no {check} with {text:?} in\n{report}");
     assert!(severity == Severity::Note || !report.sound);
 }
 
@@ -100,7 +100,7 @@ fn car(range: [f64; 6], size: [f64; 3], bottom: f64) -> DetectorFacts {
 }
 
 #[test]
-fn sound_data_are_called_sound() {
+fn valid_data_have_no_findings() {
     for label_frame in [LabelFrame::Lidar, LabelFrame::Camera] {
         let folder = data_set(label_frame);
         let dataset = Dataset::open(folder.path()).unwrap();
@@ -115,7 +115,7 @@ fn sound_data_are_called_sound() {
 }
 
 #[test]
-fn wrong_conventions_are_told_from_the_points() {
+fn wrong_conventions_are_recognised_from_the_points() {
     type Change = (LabelFrame, fn(&mut LabelBox), &'static str);
     let changes: [Change; 8] = [
         (LabelFrame::Lidar, |l| l.rotation_y *= -1.0, "clockwise"),
@@ -127,29 +127,29 @@ fn wrong_conventions_are_told_from_the_points() {
         (LabelFrame::Camera, |l| l.location[1] -= l.size_hwl[0] / 2.0, "centre of the box in the camera's frame"),
         (LabelFrame::Camera, |l| l.rotation_y *= -1.0, "with the other sign"),
     ];
-    for (label_frame, change, words) in changes {
+    for (label_frame, change, text) in changes {
         let folder = data_set(label_frame);
         change_labels(folder.path(), change);
-        finds(&examine(folder.path()), Severity::Problem, "label frame", words);
+        finds(&examine(folder.path()), Severity::Problem, "label frame", text);
     }
     for label_frame in [LabelFrame::Lidar, LabelFrame::Camera] {
         let folder = data_set(label_frame);
         let mut dataset = Dataset::open(folder.path()).unwrap();
-        // With a calibration at hand both readings are possible.
+        // With a calibration both label frames are possible.
         for seed in 0..FRAMES {
             let path = folder.path().join(format!("calib/{seed:06}.txt"));
             crate::write_atomic(&path, crate::calibration::tests::MADE_UP.as_bytes()).unwrap();
         }
-        let (other, words) = match label_frame {
+        let (other, text) = match label_frame {
             LabelFrame::Lidar => (LabelFrame::Camera, "centre of the box in the cloud's frame"),
             LabelFrame::Camera => (LabelFrame::Lidar, "the box's bottom in the camera's frame"),
         };
         dataset.config.label_frame = other;
-        finds(&doctor(&dataset, None).unwrap(), Severity::Problem, "label frame", words);
+        finds(&doctor(&dataset, None).unwrap(), Severity::Problem, "label frame", text);
     }
     let folder = data_set(LabelFrame::Lidar);
     change_labels(folder.path(), |l| l.location[0] += 200.0);
-    finds(&examine(folder.path()), Severity::Problem, "label frame", "no reading");
+    finds(&examine(folder.path()), Severity::Problem, "label frame", "no known convention");
 }
 
 #[test]
@@ -179,13 +179,13 @@ fn boxes_in_the_wrong_place_are_found() {
 
     let folder = data_set(LabelFrame::Lidar);
     (0..FRAMES).for_each(|seed| std::fs::write(labels(folder.path(), seed), "").unwrap());
-    finds(&examine(folder.path()), Severity::Problem, "labels", "not one box in the whole data set");
+    finds(&examine(folder.path()), Severity::Problem, "labels", "has no labelled box");
     std::fs::remove_dir_all(folder.path().join("label_2")).unwrap();
     finds(&examine(folder.path()), Severity::Problem, "labels", "no folder of labels");
 }
 
 #[test]
-fn a_detector_that_does_not_fit_is_told_so() {
+fn a_detector_that_does_not_fit_is_reported() {
     let folder = data_set(LabelFrame::Lidar);
     let dataset = Dataset::open(folder.path()).unwrap();
     let wide = [0.0, -40.0, -3.0, 70.0, 40.0, 1.0];
@@ -205,7 +205,7 @@ fn a_detector_that_does_not_fit_is_told_so() {
 }
 
 #[test]
-fn frames_that_are_there_twice_are_found() {
+fn duplicate_frames_are_found() {
     let folder = data_set(LabelFrame::Lidar);
     let root = folder.path();
     let cloud = root.join("velodyne/000005.bin");
@@ -215,7 +215,7 @@ fn frames_that_are_there_twice_are_found() {
         &examine(root),
         Severity::Problem,
         "duplicates",
-        "the very cloud of a frame of another split: 000002 (train) and 000005 (val)",
+        "exactly the cloud of a frame of another split: 000002 (train) and 000005 (val)",
     );
 
     let mut noisy = scene(2).cloud;
@@ -236,7 +236,7 @@ fn frames_that_are_there_twice_are_found() {
         &examine(root),
         Severity::Note,
         "duplicates",
-        "the very cloud of another frame: 000002 (train) and 000003 (train)",
+        "exactly the cloud of another frame: 000002 (train) and 000003 (train)",
     );
 
     write_split(&root.join("ImageSets/val.txt"), &["000004", "000001", "000004"]).unwrap();
@@ -256,15 +256,15 @@ fn bad_files_are_named_and_the_rest_is_examined() {
     std::fs::write(root.join("ImageSets/val.txt"), "").unwrap();
     let report = examine(root);
     finds(&report, Severity::Problem, "bad files", "3 of 6 frames cannot be used");
-    for words in ["000001.bin", "000002.txt", "000003.txt:1"] {
-        finds(&report, Severity::Problem, "bad files", words);
+    for text in ["000001.bin", "000002.txt", "000003.txt:1"] {
+        finds(&report, Severity::Problem, "bad files", text);
     }
-    finds(&report, Severity::Problem, "splits", "val.txt: the split has no frame");
+    finds(&report, Severity::Problem, "splits", "val.txt: the split is empty");
     assert_eq!(report.boxes, 18);
 }
 
 #[test]
-fn real_scans_are_called_sound_and_planted_faults_are_not() {
+fn real_scans_have_no_problems_and_added_faults_are_found() {
     let root = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/kitti"));
     if !root.exists() {
         return eprintln!("skipped: {} is not there", root.display());

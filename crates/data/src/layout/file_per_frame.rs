@@ -1,4 +1,4 @@
-//! Layouts with a folder of clouds (`.bin` or `.pcd`) and a folder of labels (KITTI text), a file a frame in each.
+//! Layouts with one cloud file (`.bin` or `.pcd`) and one label file (KITTI text) per frame, in two folders.
 
 use super::DataLayout;
 use crate::kitti_text::{KittiText, read_kitti_text};
@@ -8,53 +8,53 @@ use crate::{Layout, parse_pcd_header, read_cloud};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// The form of a cloud's file.
+/// File format of a cloud.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum CloudForm {
-    /// Little-endian f32, as many a point as the data set says.
+pub(super) enum CloudFormat {
+    /// Little-endian f32. The number of values per point is given by the data set.
     Bin,
-    /// PCD, written in its binary form.
+    /// PCD, written with `DATA binary`.
     Pcd,
 }
 
-impl CloudForm {
-    fn ending(self) -> &'static str {
+impl CloudFormat {
+    fn extension(self) -> &'static str {
         match self {
-            CloudForm::Bin => "bin",
-            CloudForm::Pcd => "pcd",
+            CloudFormat::Bin => "bin",
+            CloudFormat::Pcd => "pcd",
         }
     }
 
     fn other(self) -> Self {
         match self {
-            CloudForm::Bin => CloudForm::Pcd,
-            CloudForm::Pcd => CloudForm::Bin,
+            CloudFormat::Bin => CloudFormat::Pcd,
+            CloudFormat::Pcd => CloudFormat::Bin,
         }
     }
 }
 
-/// Where such a layout has its files. All else follows: it is a [`DataLayout`].
+/// Folders and formats of such a layout. Every implementation is a [`DataLayout`].
 pub(super) trait FilePerFrame: Send + Sync {
-    /// Its entry in the list of layouts.
+    /// Its variant of [`Layout`].
     const LAYOUT: Layout;
-    /// The name as a data set's TOML spells it.
+    /// The name of the layout in a data set's TOML.
     const NAME: &'static str;
-    /// What a folder without a TOML is known by, for messages.
-    const SIGNS: &'static [&'static str];
+    /// Folders by which the layout is recognised without a TOML, for error messages.
+    const MARKERS: &'static [&'static str];
     /// Folder of the clouds and folder of the labels, relative to the root.
     const FOLDERS: [&'static str; 2];
-    /// How clouds are written. A cloud in the other form is read where there is none in this one.
-    const CLOUDS: CloudForm;
-    /// Folder of the cameras' calibrations, relative to the root, if the layout can have one.
+    /// Format in which clouds are written. A cloud in the other format is read if there is none in this one.
+    const CLOUDS: CloudFormat;
+    /// Folder of the camera calibrations, relative to the root; `None` if the layout has no calibration.
     const CALIBRATION: Option<&'static str> = None;
 
-    /// The data set in a folder whose root lies elsewhere than in the folder itself.
-    fn recognise_elsewhere(_folder: &Path) -> Option<DatasetConfig> {
+    /// The configuration of a folder that is not itself the root, such as the parent of the root.
+    fn recognise_other_root(_folder: &Path) -> Option<DatasetConfig> {
         None
     }
 }
 
-/// The data set at a root.
+/// The configuration of a data set with this root; `None` if the folder of clouds does not exist.
 pub(super) fn at_root<L: FilePerFrame>(root: &Path) -> Option<DatasetConfig> {
     let config = DatasetConfig { layout: L::LAYOUT, root: root.into(), ..DatasetConfig::default() };
     root.join(L::FOLDERS[0]).is_dir().then_some(config)
@@ -65,18 +65,18 @@ impl<L: FilePerFrame> DataLayout for L {
         L::NAME
     }
 
-    fn signs(&self) -> &'static [&'static str] {
-        L::SIGNS
+    fn markers(&self) -> &'static [&'static str] {
+        L::MARKERS
     }
 
     fn recognise(&self, folder: &Path) -> Option<DatasetConfig> {
-        at_root::<L>(folder).or_else(|| L::recognise_elsewhere(folder))
+        at_root::<L>(folder).or_else(|| L::recognise_other_root(folder))
     }
 
     fn check_root(&self, root: &Path) -> Result<(), DataError> {
         let clouds = root.join(L::FOLDERS[0]);
         if !clouds.is_dir() {
-            return Err(DataError::file(&clouds, "does not exist: check root and layout of the data set"));
+            return Err(DataError::file(&clouds, "does not exist: check `root` and `layout` of the data set"));
         }
         Ok(())
     }
@@ -86,19 +86,19 @@ impl<L: FilePerFrame> DataLayout for L {
         let mut ids = BTreeSet::new();
         for entry in fs_err::read_dir(&folder)? {
             let path = entry?.path();
-            let ending = path.extension().and_then(|e| e.to_str());
-            let (Some("bin" | "pcd"), Some(id)) = (ending, path.file_stem()) else { continue };
+            let extension = path.extension().and_then(|e| e.to_str());
+            let (Some("bin" | "pcd"), Some(id)) = (extension, path.file_stem()) else { continue };
             let id = id.to_str().ok_or_else(|| DataError::file(&path, "its name is not UTF-8"))?;
             ids.insert(id.to_string());
         }
         if ids.is_empty() {
-            return Err(DataError::file(&folder, "has no .bin and no .pcd"));
+            return Err(DataError::file(&folder, "has no .bin or .pcd file"));
         }
         Ok(ids.into_iter().collect())
     }
 
     fn cloud_path(&self, root: &Path, id: &str) -> PathBuf {
-        let path = |form: CloudForm| root.join(L::FOLDERS[0]).join(format!("{id}.{}", form.ending()));
+        let path = |format: CloudFormat| root.join(L::FOLDERS[0]).join(format!("{id}.{}", format.extension()));
         let (usual, other) = (path(L::CLOUDS), path(L::CLOUDS.other()));
         if !usual.is_file() && other.is_file() { other } else { usual }
     }
@@ -111,7 +111,7 @@ impl<L: FilePerFrame> DataLayout for L {
         root.join(L::FOLDERS[1]).is_dir()
     }
 
-    /// What the first cloud says, for a `.pcd`; a `.bin` says nothing and is believed.
+    /// From the header of the first cloud if it is a `.pcd`. A `.bin` has no header: true.
     fn has_intensity(&self, root: &Path) -> Result<bool, DataError> {
         let path = self.cloud_path(root, &self.frame_ids(root)?[0]);
         if is_bin(&path) {
@@ -124,7 +124,7 @@ impl<L: FilePerFrame> DataLayout for L {
         read_cloud(&self.cloud_path(root, id), columns)
     }
 
-    /// The size of a `.bin` says it.
+    /// For a `.bin` the number follows from the file size.
     fn count_points(&self, root: &Path, id: &str, columns: PointColumns) -> Result<usize, DataError> {
         let path = self.cloud_path(root, id);
         if is_bin(&path) {
@@ -137,11 +137,11 @@ impl<L: FilePerFrame> DataLayout for L {
         read_kitti_text(&self.labels_path(root, id), KittiText::Labels)
     }
 
-    fn knows_camera(&self) -> bool {
+    fn supports_calibration(&self) -> bool {
         L::CALIBRATION.is_some()
     }
 
-    fn usual_label_frame(&self, root: &Path) -> LabelFrame {
+    fn default_label_frame(&self, root: &Path) -> LabelFrame {
         match L::CALIBRATION {
             Some(folder) if root.join(folder).is_dir() => LabelFrame::Camera,
             _ => LabelFrame::Lidar,
@@ -164,10 +164,10 @@ impl<L: FilePerFrame> DataLayout for L {
     }
 
     fn write_cloud(&self, root: &Path, id: &str, cloud: &Cloud) -> Result<(), DataError> {
-        let path = root.join(L::FOLDERS[0]).join(format!("{id}.{}", L::CLOUDS.ending()));
+        let path = root.join(L::FOLDERS[0]).join(format!("{id}.{}", L::CLOUDS.extension()));
         match L::CLOUDS {
-            CloudForm::Bin => write_bin(&path, cloud),
-            CloudForm::Pcd => write_pcd(&path, cloud, PcdEncoding::Binary),
+            CloudFormat::Bin => write_bin(&path, cloud),
+            CloudFormat::Pcd => write_pcd(&path, cloud, PcdEncoding::Binary),
         }
     }
 
@@ -177,5 +177,5 @@ impl<L: FilePerFrame> DataLayout for L {
 }
 
 fn is_bin(path: &Path) -> bool {
-    path.extension().is_some_and(|ending| ending == "bin")
+    path.extension().is_some_and(|extension| extension == "bin")
 }

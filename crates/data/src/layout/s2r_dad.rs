@@ -1,6 +1,6 @@
 //! S2R-DAD's layout: `data/pcl/*.pcd` and `data/label/*.txt`, without calibration.
 
-use super::file_per_frame::{CloudForm, FilePerFrame};
+use super::file_per_frame::{CloudFormat, FilePerFrame};
 use crate::Layout;
 
 /// The layout of S2R-DAD.
@@ -9,7 +9,7 @@ pub(super) struct S2rDad;
 impl FilePerFrame for S2rDad {
     const LAYOUT: Layout = Layout::S2rDad;
     const NAME: &'static str = "s2r_dad";
-    const SIGNS: &'static [&'static str] = &["data/pcl/ (S2R-DAD)"];
+    const MARKERS: &'static [&'static str] = &["data/pcl/ (S2R-DAD)"];
     const FOLDERS: [&'static str; 2] = ["data/pcl", "data/label"];
-    const CLOUDS: CloudForm = CloudForm::Pcd;
+    const CLOUDS: CloudFormat = CloudFormat::Pcd;
 }

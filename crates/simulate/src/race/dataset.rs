@@ -47,7 +47,7 @@ pub struct RaceManifest {
 }
 
 impl Manifest for RaceManifest {
-    const OTHERWISE: &'static str = "from another configuration or version";
+    const DIFFERENCE: &'static str = "from another configuration or version";
 
     fn identity(&self) -> [&str; 2] {
         [&self.schema, &self.config_sha256]

@@ -35,7 +35,7 @@ pub struct Manifest {
 }
 
 impl data::Manifest for Manifest {
-    const OTHERWISE: &'static str = "from another configuration or version";
+    const DIFFERENCE: &'static str = "from another configuration or version";
 
     fn identity(&self) -> [&str; 2] {
         [&self.schema, &self.config_sha256]
