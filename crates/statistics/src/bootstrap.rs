@@ -1,30 +1,30 @@
-//! Draws with replacement: of single members, of runs that follow each other, and of blocks.
+//! Resampling with replacement for the bootstrap: of single members, of runs of consecutive members, of blocks.
 
 use rand::{Rng, RngExt};
 
-/// `n` draws out of `0..n`.
+/// Draws `n` indices from `0..n` with replacement.
 pub fn draw(n: usize, rng: &mut impl Rng) -> Vec<usize> {
     (0..n).map(|_| rng.random_range(0..n)).collect()
 }
 
-/// How often each of `n` members is drawn when runs of `run` members that follow each other are drawn, around the end where needed,
-/// until there are `n`. The last run is cut.
+/// Circular block bootstrap: draws runs of `run` consecutive members, with wrap-around, until `n` members are drawn.
+/// The last run is shortened. Returns how often each of the `n` members is drawn.
 pub fn draw_runs(n: usize, run: usize, rng: &mut impl Rng) -> Vec<u32> {
     let mut weights = vec![0; n];
     let run = run.clamp(1, n.max(1));
-    let mut left = n;
-    while left > 0 {
+    let mut remaining = n;
+    while remaining > 0 {
         let first = rng.random_range(0..n);
-        for i in 0..run.min(left) {
+        for i in 0..run.min(remaining) {
             weights[(first + i) % n] += 1;
         }
-        left -= run.min(left);
+        remaining -= run.min(remaining);
     }
     weights
 }
 
-/// The members of as many blocks as there are, drawn with replacement; `members[b]` lists the members of block b, which may be of
-/// different size. Unlike [`draw_runs`] it never cuts a block, so draws differ in their number of members.
+/// Block bootstrap: draws as many blocks as there are, with replacement, and returns their members. `members[b]` lists
+/// the members of block b. Blocks may differ in size and are never cut, so the number of drawn members varies.
 pub fn draw_blocks(members: &[Vec<usize>], rng: &mut impl Rng) -> Vec<usize> {
     let mut drawn = Vec::new();
     for _ in 0..members.len() {
@@ -33,7 +33,7 @@ pub fn draw_blocks(members: &[Vec<usize>], rng: &mut impl Rng) -> Vec<usize> {
     drawn
 }
 
-/// The blocks of members that follow each other with the same number: which members each block has.
+/// Groups consecutive members with equal block numbers. Returns the indices of the members of each block.
 pub fn blocks_of(numbers: &[usize]) -> Vec<Vec<usize>> {
     let mut members: Vec<Vec<usize>> = Vec::new();
     let mut last = None;
@@ -60,11 +60,11 @@ mod tests {
     }
 
     #[test]
-    fn every_draw_has_as_many_members() {
+    fn every_draw_has_n_members() {
         for run in [1, 7, 1000] {
             let weights = draw_runs(100, run, &mut rng(3));
             assert_eq!(weights.iter().sum::<u32>(), 100);
-            let all = run >= 100; // every draw is then all members, once
+            let all = run >= 100; // each draw then has every member once
             assert_eq!(weights == draw_runs(100, run, &mut rng(4)), all);
         }
         assert!(draw_runs(0, 1, &mut rng(0)).is_empty() && draw(0, &mut rng(0)).is_empty());

@@ -1,6 +1,6 @@
-//! Medians, quantiles, moments, and draws with replacement (the bootstrap). Pure: random numbers come from the caller's stream.
+//! Medians, quantiles, moments and resampling for the bootstrap. Random numbers come from the caller's generator.
 //!
-//! Where two definitions differ in their numbers, the name says which one it is.
+//! Some quantities exist in several definitions with different results. The function names state the definition.
 
 mod bootstrap;
 mod moments;

@@ -1,10 +1,10 @@
-//! Medians and quantiles. Values are ordered by `total_cmp`.
+//! Medians and quantiles. Values are sorted by `total_cmp`.
 
 use std::cmp::Ordering;
 
-/// A float that can be ordered.
+/// A floating-point number with a total order.
 pub trait Number: Copy {
-    /// The total order of IEEE 754.
+    /// Compares by the total order of IEEE 754.
     fn order(&self, other: &Self) -> Ordering;
 }
 
@@ -20,20 +20,21 @@ impl Number for f32 {
     }
 }
 
-/// The median; of an even number of values the upper one of the two in the middle. `None` of nothing.
+/// The median; for an even number of values the upper of the two middle values. `None` without values.
 pub fn median_upper<T: Number>(mut values: Vec<T>) -> Option<T> {
     values.sort_by(Number::order);
     median_upper_of_sorted(&values)
 }
 
-/// [`median_upper`] of values that are in ascending order.
+/// [`median_upper`] of values in ascending order.
 pub fn median_upper_of_sorted<T: Number>(sorted: &[T]) -> Option<T> {
     sorted.get(sorted.len() / 2).copied()
 }
 
-/// The first value, in ascending order, up to which at least half of the weight lies, of `(value, weight)`. `None` of nothing.
+/// Weighted median of `(value, weight)`: the smallest value whose cumulative weight is at least half of the total
+/// weight. `None` without values.
 ///
-/// With equal weights and an even number of values this is the lower one of the two in the middle.
+/// With equal weights and an even number of values this is the lower of the two middle values.
 pub fn weighted_median(mut values: Vec<(f64, f64)>) -> Option<f64> {
     values.sort_by(|a, b| a.0.total_cmp(&b.0));
     let half = values.iter().map(|v| v.1).sum::<f64>() / 2.0;
@@ -45,7 +46,8 @@ pub fn weighted_median(mut values: Vec<(f64, f64)>) -> Option<f64> {
     found.map(|v| v.0)
 }
 
-/// The value that a share of all does not exceed, linear between neighbours; NaN of nothing. For curves and intervals of reports.
+/// Quantile of values in ascending order with linear interpolation (NumPy's default method). `share` is clamped to
+/// `[0, 1]`. NaN without values.
 pub fn quantile_linear(sorted: &[f64], share: f64) -> f64 {
     let Some(last) = sorted.len().checked_sub(1) else { return f64::NAN };
     let at = share.clamp(0.0, 1.0) * last as f64;
@@ -53,9 +55,10 @@ pub fn quantile_linear(sorted: &[f64], share: f64) -> f64 {
     sorted[low] + part * (sorted[(low + 1).min(last)] - sorted[low])
 }
 
-/// The central 95 % of drawn values: the drawn values nearest to the shares 0.025 and 0.975. `None` of nothing.
+/// 95 % percentile interval of bootstrap replicates: the values nearest to the quantiles 0.025 and 0.975. `None`
+/// without values.
 ///
-/// The ends are values that were drawn, unlike those of [`quantile_linear`].
+/// Unlike [`quantile_linear`] it does not interpolate: both bounds are values of `drawn`.
 pub fn interval_nearest(mut drawn: Vec<f64>) -> Option<[f64; 2]> {
     drawn.sort_by(f64::total_cmp);
     let last = drawn.len().checked_sub(1)? as f64;
