@@ -3,7 +3,7 @@
 use crate::blocks::Segment;
 use crate::epilogue::Epilogue;
 use crate::output::Shared;
-use crate::registers::{ImageRow, deinterleave, get, interleave, load, prefetch, put, store};
+use crate::registers::{ImageRow, deinterleave, interleave, load, load_row, prefetch, store, store_row};
 use crate::tile::Row;
 use pulp::Simd;
 
@@ -72,7 +72,7 @@ impl Images<'_> {
                 for group in (0..s.len).step_by(S::F32_LANES) {
                     let pixels: [S::f32s; M] = self.every(simd, row, ((s.column + group) * M) as isize);
                     for (j, values) in pixels.into_iter().enumerate() {
-                        put(simd, &mut panel[i * M + j], s.at + group, values);
+                        store_row(simd, &mut panel[i * M + j], s.at + group, values);
                     }
                 }
             }
@@ -163,7 +163,7 @@ impl ImagesOut<'_> {
             for group in (0..segment.len).step_by(S::F32_LANES) {
                 let mut tiles = [[simd.splat_f32s(0.0); M]; M];
                 for (k, pixel) in tiles.as_flattened_mut().iter_mut().enumerate() {
-                    *pixel = get(simd, rows(k), segment.at + group);
+                    *pixel = load_row(simd, rows(k), segment.at + group);
                 }
                 // SAFETY: required of the caller.
                 unsafe { self.write_tiles(simd, (segment, group), channel, tiles) };

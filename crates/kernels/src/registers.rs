@@ -89,13 +89,13 @@ pub(crate) fn prefetch(place: *const f32) {
 
 /// The values of a panel's row from `at` on; zeros after its end.
 #[inline(always)]
-pub(crate) fn get<S: Simd>(simd: S, row: &Row, at: usize) -> S::f32s {
+pub(crate) fn load_row<S: Simd>(simd: S, row: &Row, at: usize) -> S::f32s {
     load(simd, row, ImageRow { start: 0, width: row.len() }, at as isize)
 }
 
 /// Writes values to a panel's row from `at` on, up to its end.
 #[inline(always)]
-pub(crate) fn put<S: Simd>(simd: S, row: &mut Row, at: usize, values: S::f32s) {
+pub(crate) fn store_row<S: Simd>(simd: S, row: &mut Row, at: usize, values: S::f32s) {
     match row.get_mut(at..at + S::F32_LANES) {
         Some(places) => S::as_mut_simd_f32s(places).0[0] = values,
         None => {
@@ -261,11 +261,11 @@ mod tests {
         let mut row = [0.0; 32];
         for at in 0..32 {
             row.fill(0.0);
-            put(simd, &mut row, at, simd.splat_f32s(1.0));
+            store_row(simd, &mut row, at, simd.splat_f32s(1.0));
             let want: Vec<f32> = (0..32).map(|i| if i >= at && i < at + S::F32_LANES { 1.0 } else { 0.0 }).collect();
             assert_eq!(row.to_vec(), want);
             row = std::array::from_fn(|i| i as f32);
-            assert_eq!(lanes::<S>(get(simd, &row, at))[0], at as f32);
+            assert_eq!(lanes::<S>(load_row(simd, &row, at))[0], at as f32);
         }
         let mut out = Vec::new();
         // SAFETY: all ten values are written, by one thread.

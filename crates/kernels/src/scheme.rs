@@ -50,7 +50,8 @@ pub struct PackedWeights {
 }
 
 impl PackedWeights {
-    /// `column(output, put)` gives the weights of an output by `put(row, weight)`; rows count through all products.
+    /// `column(output, insert)` calls `insert(row, weight)` for each weight of an output. Rows are numbered through all
+    /// products.
     pub(crate) fn new(outputs: usize, rows: usize, column: impl Fn(usize, &mut dyn FnMut(usize, f32)) + Sync) -> Self {
         let tile_rows = tile_rows();
         let mut values = vec![0.0; outputs.div_ceil(tile_rows) * rows * tile_rows];

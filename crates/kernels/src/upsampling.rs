@@ -23,10 +23,10 @@ pub(crate) fn pack_expand<const M: usize>(
     outputs: usize,
     weight: impl Fn(usize, usize, usize) -> f32 + Sync,
 ) -> PackedWeights {
-    PackedWeights::new(outputs, M * M * inputs, |output, put| {
+    PackedWeights::new(outputs, M * M * inputs, |output, insert| {
         for pixel in 0..M * M {
             for input in 0..inputs {
-                put(pixel * inputs + input, weight(output, input, pixel));
+                insert(pixel * inputs + input, weight(output, input, pixel));
             }
         }
     })
@@ -92,10 +92,10 @@ pub(crate) fn pack_gather<const M: usize>(
     dy_channels: usize,
     weight: impl Fn(usize, usize, usize) -> f32 + Sync,
 ) -> PackedWeights {
-    PackedWeights::new(dx_channels, dy_channels * M * M, |to, put| {
+    PackedWeights::new(dx_channels, dy_channels * M * M, |to, insert| {
         for from in 0..dy_channels {
             for pixel in 0..M * M {
-                put(from * M * M + pixel, weight(to, from, pixel));
+                insert(from * M * M + pixel, weight(to, from, pixel));
             }
         }
     })

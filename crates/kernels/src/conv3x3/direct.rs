@@ -2,7 +2,7 @@
 
 use crate::blocks::{Segment, TileGrid};
 use crate::images::{Images, ImagesOut};
-use crate::registers::{load, put};
+use crate::registers::{load, store_row};
 use crate::scheme::{PackedWeights, Scheme};
 use crate::tile::Row;
 use pulp::Simd;
@@ -17,10 +17,10 @@ pub(super) struct Direct<'a, const STRIDE: usize> {
 
 /// Weights in the order of [`read_neighbours`]; `kernel(output, input)` is the 3x3 kernel of one pair of channels.
 pub(super) fn pack(inputs: usize, outputs: usize, kernel: impl Fn(usize, usize) -> [f32; 9] + Sync) -> PackedWeights {
-    PackedWeights::new(outputs, inputs * 9, |output, put| {
+    PackedWeights::new(outputs, inputs * 9, |output, insert| {
         for input in 0..inputs {
             for (tap, weight) in kernel(output, input).into_iter().enumerate() {
-                put(input * 9 + tap, weight);
+                insert(input * 9 + tap, weight);
             }
         }
     })
@@ -51,7 +51,7 @@ pub(super) fn read_neighbours<S: Simd, const STRIDE: usize>(
                     }
                 }
                 for (kx, values) in neighbours.into_iter().enumerate() {
-                    put(simd, &mut panel[ky * 3 + kx], s.at + group, values);
+                    store_row(simd, &mut panel[ky * 3 + kx], s.at + group, values);
                 }
             }
         }

@@ -4,7 +4,7 @@
 use super::Conv3x3;
 use crate::blocks::{Segment, TileGrid};
 use crate::images::{Images, ImagesOut};
-use crate::registers::put;
+use crate::registers::store_row;
 use crate::scheme::{PackedWeights, Scheme};
 use crate::tile::Row;
 use pulp::Simd;
@@ -26,11 +26,11 @@ pub(super) struct StridedGradient<'a> {
 
 /// The weights `[outputs, inputs, 3, 3]` of `conv` for [`StridedGradient`].
 pub(super) fn pack(conv: &Conv3x3, weight: &[f32]) -> PackedWeights {
-    PackedWeights::new(conv.inputs, 9 * conv.outputs, |input, put| {
+    PackedWeights::new(conv.inputs, 9 * conv.outputs, |input, insert| {
         let taps = PRODUCTS.iter().flat_map(|(_, taps)| taps.iter());
         for (k, tap) in taps.enumerate() {
             for output in 0..conv.outputs {
-                put(k * conv.outputs + output, weight[(output * conv.inputs + input) * 9 + tap]);
+                insert(k * conv.outputs + output, weight[(output * conv.inputs + input) * 9 + tap]);
             }
         }
     })
@@ -74,7 +74,7 @@ impl Scheme for StridedGradient<'_> {
                 let row = self.dy.shape.row(s.image, channel, (s.row + down) as isize);
                 for group in (0..s.len).step_by(S::F32_LANES) {
                     let [values] = self.dy.every(simd, row, (s.column + group + right) as isize);
-                    put(simd, &mut panel[k * self.inputs() + channel], s.at + group, values);
+                    store_row(simd, &mut panel[k * self.inputs() + channel], s.at + group, values);
                 }
             }
         }

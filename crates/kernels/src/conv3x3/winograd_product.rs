@@ -4,7 +4,7 @@
 use super::winograd::{Winograd, transform_kernel};
 use crate::blocks::{Segment, TileGrid};
 use crate::images::{Images, ImagesOut};
-use crate::registers::{get, put};
+use crate::registers::{load_row, store_row};
 use crate::scheme::{PackedWeights, Scheme};
 use crate::simd::Lanes;
 use crate::tile::Row;
@@ -38,11 +38,11 @@ pub(super) fn pack<F: Winograd<M, A>, const M: usize, const A: usize>(
     outputs: usize,
     kernel: impl Fn(usize, usize) -> [f32; 9] + Sync,
 ) -> PackedWeights {
-    PackedWeights::new(outputs, A * A * inputs, |output, put| {
+    PackedWeights::new(outputs, A * A * inputs, |output, insert| {
         for input in 0..inputs {
             let u = transform_kernel::<F, M, A>(&kernel(output, input));
             for (position, &value) in u.as_flattened().iter().enumerate() {
-                put(position * inputs + input, value);
+                insert(position * inputs + input, value);
             }
         }
     })
@@ -79,7 +79,7 @@ pub(super) fn read_tiles<S: Simd, F: Winograd<M, A>, const M: usize, const A: us
                     column[i] = rows[i][j];
                 }
                 for (i, value) in F::input(column).into_iter().enumerate() {
-                    put(simd, &mut panel[(i * A + j) * stride], s.at + group, value.values);
+                    store_row(simd, &mut panel[(i * A + j) * stride], s.at + group, value.values);
                 }
             }
         }
@@ -133,7 +133,7 @@ impl<F: Winograd<M, A>, const M: usize, const A: usize> Scheme for WinogradProdu
                 for (j, to) in columns.iter_mut().enumerate() {
                     let mut column = [zero; A];
                     for (i, value) in column.iter_mut().enumerate() {
-                        value.values = get(simd, products(i * A + j), s.at + group);
+                        value.values = load_row(simd, products(i * A + j), s.at + group);
                     }
                     *to = F::output(column);
                 }

@@ -130,7 +130,8 @@ pub(super) fn backward(
     let Pooled { weight, norm, gradient, extremes, .. } = layer;
     let (inputs, outputs) = (input.channels(), norm.channels());
     let scaled: Vec<f32> = upstream.gradient.iter().enumerate().map(|(i, &g)| g * norm.scale[i % outputs]).collect();
-    let sloped: Vec<f32> = weight.iter().enumerate().map(|(i, &w)| w * gradient.slope[i / inputs] as f32).collect(); // diag(slope) W
+    // diag(slope) W
+    let sloped: Vec<f32> = weight.iter().enumerate().map(|(i, &w)| w * gradient.slope[i / inputs] as f32).collect();
     let mut square = vec![0.0; inputs * inputs]; // Q
     multiply(Matrix::new(weight, inputs).transposed(), Matrix::new(&sloped, inputs), &mut square, Then::Store);
     let shift = layer.shift();
