@@ -40,7 +40,7 @@ fn f32s(file: &SafeTensors, name: &str) -> Vec<f32> {
     bytes.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect()
 }
 
-fn words(file: &SafeTensors, name: &str) -> Vec<[u8; 8]> {
+fn eight_byte_values(file: &SafeTensors, name: &str) -> Vec<[u8; 8]> {
     let bytes = file.tensor(name).unwrap().data().to_vec();
     bytes.chunks_exact(8).map(|b| b.try_into().unwrap()).collect()
 }
@@ -56,7 +56,7 @@ fn rotated_iou_operator() {
     let file = SafeTensors::deserialize(&bytes).unwrap();
     let (a, b) = (boxes(&file, "boxes_a"), boxes(&file, "boxes_b"));
     assert_eq!(a.len(), 2000);
-    let columns = ["bev_overlap", "bev_iou", "iou3d"].map(|name| words(&file, name));
+    let columns = ["bev_overlap", "bev_iou", "iou3d"].map(|name| eight_byte_values(&file, name));
     for i in 0..a.len() {
         let got = [bev_intersection(&a[i], &b[i]), bev_iou(&a[i], &b[i]), iou_3d(&a[i], &b[i])];
         for (got, column) in got.iter().zip(&columns) {
@@ -72,7 +72,7 @@ fn rotated_nms_operator() {
     let file = SafeTensors::deserialize(&bytes).unwrap();
     let (boxes, scores) = (boxes(&file, "boxes"), f32s(&file, "scores"));
     for threshold in [0.01, 0.1, 0.5, 0.7, 0.8, 0.85] {
-        let want = words(&file, &format!("thresh{threshold}.keep"));
+        let want = eight_byte_values(&file, &format!("thresh{threshold}.keep"));
         let want: Vec<usize> = want.into_iter().map(|w| u64::from_le_bytes(w) as usize).collect();
         assert_eq!(rotated_nms(&boxes, &scores, threshold), want, "threshold {threshold}");
     }

@@ -222,13 +222,13 @@ impl<'a> Machine<'a> {
             }
             b'q' => {
                 let key = self.byte()?;
-                self.put(key.into())
+                self.memoize(key.into())
             }
             b'r' => {
                 let key = u32::from_le_bytes(self.array()?);
-                self.put(key)
+                self.memoize(key)
             }
-            0x94 => self.put(self.memo.len() as u32),
+            0x94 => self.memoize(self.memo.len() as u32),
             b'h' => {
                 let key = self.byte()?;
                 self.recall(key.into())
@@ -325,7 +325,7 @@ impl<'a> Machine<'a> {
         }
     }
 
-    fn put(&mut self, key: u32) -> Result<(), String> {
+    fn memoize(&mut self, key: u32) -> Result<(), String> {
         let id = self.pop()?;
         self.stack.push(id);
         self.memo.insert(key, id);
@@ -372,8 +372,7 @@ impl<'a> Machine<'a> {
     }
 
     fn array<const N: usize>(&mut self) -> Result<[u8; N], String> {
-        let bytes = self.take(N)?;
-        Ok(std::array::from_fn(|i| bytes[i]))
+        self.take(N).map(|bytes| std::array::from_fn(|i| bytes[i]))
     }
 
     fn take(&mut self, length: usize) -> Result<&'a [u8], String> {

@@ -122,7 +122,8 @@ pub fn decode_in_regions(reg: Tensor<2>, rois: &[[f32; 7]]) -> Tensor<2> {
     let diagonal = column(&|r| (r[3] * r[3] + r[4] * r[4]).sqrt());
     let (x, y, z) =
         (predicted(0, 1) * diagonal.clone(), predicted(1, 1) * diagonal, predicted(2, 1) * column(&|r| r[5])); // [n, 1]
-    let size = predicted(3, 3).exp() * rows(rois.iter().flat_map(|r| [r[3], r[4], r[5]]).collect(), [n, 3], &device); // [n, 3]
+    // [n, 3]
+    let size = predicted(3, 3).exp() * rows(rois.iter().flat_map(|r| [r[3], r[4], r[5]]).collect(), [n, 3], &device);
     let yaw = predicted(6, 1) + column(&|r| r[6]);
     let (sin, cos) = (column(&|r| r[6].sin()), column(&|r| r[6].cos()));
     let turned =
@@ -141,7 +142,8 @@ pub fn corner_loss(boxes: Tensor<2>, truth: &[[f32; 7]]) -> Tensor<1> {
     let n = truth.len();
     let block = |values: Vec<f32>, shape: [usize; 3]| Tensor::<3>::from_data(TensorData::new(values, shape), &device);
     let signs = block(CORNER_SIGNS.iter().flatten().map(|s| s / 2.0).collect(), [1, 8, 3]);
-    let part = |from: usize, length: usize| boxes.clone().narrow(1, from, length).reshape([n, 1, length]); // [n, 1, length]
+    // [n, 1, length]
+    let part = |from: usize, length: usize| boxes.clone().narrow(1, from, length).reshape([n, 1, length]);
     let local = part(3, 3) * signs; // [n, 8, 3]
     let axis = |i: usize| local.clone().narrow(2, i, 1); // [n, 8, 1]
     let (sin, cos) = (part(6, 1).sin(), part(6, 1).cos());
