@@ -1,5 +1,4 @@
-//! `lidarshift-checks bench-step`: where the time of one training step goes, and how much memory it takes; and the same of an inference, and of the
-//! layers that cost most.
+//! `cargo xtask bench-step`: time and memory of a training step by stage, of an inference, and of the slowest layers.
 
 mod layers;
 
@@ -21,19 +20,19 @@ use std::path::PathBuf;
 use std::time::Instant;
 use train::{Adam, GradientNorm};
 
-/// Times one training step by stage, on made-up road frames that are augmented anew for every step.
+/// Measure the time of each stage of a training step, on synthetic road frames with new augmentation in each step.
 #[derive(Args, Debug)]
 pub struct BenchStepArgs {
-    /// A name or a TOML
+    /// Detector: a name or a TOML
     #[arg(long, default_value = "pointpillars_small")]
     detector: String,
-    /// Frames a step
+    /// Batch size
     #[arg(long, default_value_t = 1)]
     batch: usize,
-    /// Timed steps; two before them warm up
+    /// Number of timed steps, after two warm-up steps
     #[arg(long, default_value_t = 7)]
     steps: usize,
-    /// What is timed
+    /// What to measure
     #[arg(long, value_enum, default_value_t)]
     work: Work,
     #[command(flatten)]
@@ -43,14 +42,14 @@ pub struct BenchStepArgs {
     json: Option<PathBuf>,
 }
 
-/// What is timed.
+/// What to measure.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
 #[serde(rename_all = "kebab-case")]
 enum Work {
     /// A whole training step
     #[default]
     Step,
-    /// From clouds in memory to final boxes
+    /// An inference, from clouds in memory to final boxes
     Inference,
     /// The backbone's 3x3 convolutions of stride 1, forward and both gradients (PointPillars, on the CPU)
     Convolutions,
@@ -66,19 +65,19 @@ struct Report {
     device: String,
     batch: usize,
     steps: usize,
-    /// What the detector reads of the last batch: points that are in pillars or are drawn, and pillars.
+    /// Points (in pillars, or sampled) and pillars of the last batch.
     read: [usize; 2],
-    /// The whole of each timed step, ms.
+    /// Duration of each timed step, ms.
     whole_ms: Vec<f64>,
-    /// Median of each stage and of the whole step, ms.
+    /// Median duration of each stage and of the whole step, ms.
     median_ms: Vec<(&'static str, f64)>,
-    /// Largest resident memory of the process, MiB.
+    /// Peak resident memory of the process, MiB.
     peak_mib: Option<u64>,
     config: DetectorConfig,
 }
 
 impl BenchStepArgs {
-    /// Prints a table.
+    /// Measures and prints a table.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let config = find_detector(&self.detector)?;
@@ -171,15 +170,15 @@ impl BenchStepArgs {
     }
 }
 
-/// Steps that are not timed.
+/// Number of warm-up steps.
 const WARM_UP: usize = 2;
 
-/// What was timed.
+/// Measured durations.
 #[derive(Default)]
 struct Timed {
     /// Points and pillars of the last batch.
     read: [usize; 2],
-    /// ms of each timed step, stage by stage, the whole last.
+    /// Durations of the stages of each timed step, the whole step last, ms.
     stages: Vec<(&'static str, Vec<f64>)>,
 }
 
@@ -199,12 +198,12 @@ impl Timed {
 
 fn pointpillars(config: &DetectorConfig) -> Result<&PointPillarsConfig> {
     let NetworkConfig::PointPillars(network) = &config.network else {
-        bail!("{} is no PointPillars: use --work step or inference", config.name);
+        bail!("{} is not a PointPillars; use --work step or --work inference", config.name);
     };
     Ok(network)
 }
 
-/// The batch of a step, augmented anew.
+/// The augmented batch of a step.
 fn samples(config: &DetectorConfig, frames: &[Frame], step: usize) -> Result<Vec<Sample>> {
     let preparer = Preparer::new(config);
     let sample = |(i, frame): (usize, &Frame)| {
@@ -216,12 +215,12 @@ fn samples(config: &DetectorConfig, frames: &[Frame], step: usize) -> Result<Vec
     frames.iter().enumerate().map(sample).collect()
 }
 
-/// Points and pillars of a batch.
+/// Numbers of points and pillars of a batch.
 fn read_of(batch: &[Sample]) -> [usize; 2] {
     batch.iter().map(Sample::size).fold([0, 0], |sum, sample| [0, 1].map(|i| sum[i] + sample[i]))
 }
 
-/// When each stage of a step ended, the device being done with it.
+/// End times of the stages of a step, after synchronisation with the device.
 struct Clock<'a> {
     device: &'a Device,
     marks: Vec<(&'static str, Instant)>,
@@ -238,7 +237,7 @@ impl<'a> Clock<'a> {
         Ok(())
     }
 
-    /// Each stage and the whole step, ms.
+    /// Durations of each stage and of the whole step, ms.
     fn stages(&self) -> Vec<(&'static str, f64)> {
         let ms = |from: Instant, to: Instant| 1e3 * (to - from).as_secs_f64();
         let (begin, end) = (self.marks[0].1, self.marks[self.marks.len() - 1].1);
@@ -251,7 +250,8 @@ fn median(values: Vec<f64>) -> f64 {
     statistics::median_upper(values).unwrap_or(f64::NAN)
 }
 
-/// The published grid on a cloud of the size of a whole KITTI scan, all in range; ms of some repetitions.
+/// Durations of pillarisation with the published grid, on a cloud with the size of a whole KITTI scan within the range,
+/// ms.
 fn pillarise_ms() -> Vec<f64> {
     let grid = PillarGrid {
         range: [0.0, -39.68, -3.0, 69.12, 39.68, 1.0],
@@ -261,7 +261,7 @@ fn pillarise_ms() -> Vec<f64> {
     };
     let mut random = stream(0, "bench", 0, 0);
     let point = |_| {
-        // As dense near the sensor as a scan is.
+        // Denser near the sensor, like a scan.
         let (range_m, azimuth) = (69.0 * random.random::<f32>().powi(2), random.random_range(-0.5..0.5f32));
         [range_m * azimuth.cos(), range_m * azimuth.sin(), random.random_range(-2.0..0.0), random.random()]
     };

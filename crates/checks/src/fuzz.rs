@@ -1,5 +1,5 @@
-//! `cargo xtask fuzz`: damaged files for every reader. A reader answers with data that keeps its promises or with an error; it never
-//! panics, hangs, or takes memory that the file cannot fill.
+//! `cargo xtask fuzz`: tests all file readers with damaged files. A reader must return valid data or an error. It must
+//! not panic, hang, or allocate far more memory than the file size justifies.
 
 mod targets;
 
@@ -15,30 +15,31 @@ use std::time::Duration;
 use targets::{Target, targets};
 use train::memory::{peak_mib, reset_peak_mib};
 
-/// The files are of a few kilobytes; a reader that takes this much more memory believes a size that it should have checked.
+/// Limit of the additional memory of a reader. The files have a few kilobytes; a reader that exceeds it trusts a size
+/// in the file without a check.
 const MEMORY_BOUND_MIB: u64 = 64;
-/// A reader that takes longer for one file hangs.
-const PATIENCE: Duration = Duration::from_secs(30);
+/// Limit of the time that a reader may take for one file.
+const TIME_LIMIT: Duration = Duration::from_secs(30);
 
-/// Feeds damaged files to every reader: no panic, no hanging, no more memory than the files need, no broken promise.
+/// Test all file readers with damaged files: no panic, no hang, no excessive memory, no invalid data.
 #[derive(Args, Debug)]
 pub struct FuzzArgs {
-    /// Damaged inputs for each reader
+    /// Number of damaged inputs per reader
     #[arg(long, default_value_t = 1000)]
     inputs: u64,
-    /// Of the damage
+    /// Random seed of the damage
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Only the readers whose name contains this
+    /// Only readers whose name contains this text
     #[arg(long, default_value = "", hide_default_value = true)]
     only: String,
 }
 
 impl FuzzArgs {
-    /// Whether every reader stood.
+    /// Runs the test; `true` if no reader failed.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
-        // In memory where the system offers it: the readers of run folders write millions of files.
+        // In memory if possible, since the readers of run folders write millions of files.
         let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir())?;
         let mut stood = true;
         let hook = std::panic::take_hook();
@@ -50,10 +51,10 @@ impl FuzzArgs {
             bail!("no reader's name contains {:?}: {}", self.only, names.join(", "));
         }
         for target in &targets {
-            let found = self.face(target)?;
+            let found = self.test(target)?;
             let memory = found.peak_mib.map_or("unknown".into(), |mib| format!("{mib} MiB"));
             println!(
-                "{:<18} {} inputs, {} taken as data, {} broken, memory {memory}",
+                "{:<18} {} inputs, {} accepted, {} broken, memory {memory}",
                 target.name,
                 self.inputs,
                 found.taken,
@@ -66,7 +67,7 @@ impl FuzzArgs {
         Ok(stood)
     }
 
-    fn face(&self, target: &Target) -> Result<Found> {
+    fn test(&self, target: &Target) -> Result<Found> {
         let bar = ProgressBar::new(self.inputs)
             .with_style(ProgressStyle::with_template("{msg} {bar:30} {pos}/{len}, {eta} left")?)
             .with_message(target.name);
@@ -74,7 +75,7 @@ impl FuzzArgs {
         let before = reset_peak_mib();
         let mut found = Found::default();
         for input in 0..self.inputs {
-            let bytes = damaged(&target.sound, self.seed, target.name, input);
+            let bytes = damaged(&target.valid, self.seed, target.name, input);
             watched.input(input);
             match catch_unwind(AssertUnwindSafe(|| (target.read)(&bytes))) {
                 Ok(Ok(was_taken)) => found.taken += u64::from(was_taken),
@@ -94,16 +95,16 @@ impl FuzzArgs {
     }
 }
 
-/// What a reader did with its inputs.
+/// Results of a reader.
 #[derive(Default)]
 struct Found {
     taken: u64,
     broken: Vec<String>,
-    /// Beyond what was in use before; `None` where the system does not say.
+    /// Memory in addition to what was in use before; `None` if the system does not report it.
     peak_mib: Option<u64>,
 }
 
-/// Ends the program when a reader does not come back.
+/// Ends the program if a reader exceeds the time limit.
 struct Watch {
     input: Arc<AtomicU64>,
 }
@@ -117,11 +118,11 @@ impl Watch {
         std::thread::spawn(move || {
             let mut last = 0;
             loop {
-                std::thread::sleep(PATIENCE);
+                std::thread::sleep(TIME_LIMIT);
                 match seen.load(Ordering::Relaxed) {
                     Watch::OVER => return,
                     now if now == last && now > 0 => {
-                        eprintln!("error: {name}: input {now} takes more than {} s", PATIENCE.as_secs());
+                        eprintln!("error: {name}: input {now} takes more than {} s", TIME_LIMIT.as_secs());
                         std::process::exit(1);
                     }
                     now => last = now,
@@ -142,10 +143,10 @@ impl Drop for Watch {
     }
 }
 
-/// One to four changes: a bit, a byte, a cut, a repeated piece, a swapped piece.
-fn damaged(sound: &[u8], seed: u64, name: &str, input: u64) -> Vec<u8> {
+/// Applies one to four random changes: a flipped bit, a changed byte, a cut, a repeated piece, a swapped piece.
+fn damaged(valid: &[u8], seed: u64, name: &str, input: u64) -> Vec<u8> {
     let mut random = stream(seed, &format!("fuzz/{name}"), 0, input);
-    let mut bytes = sound.to_vec();
+    let mut bytes = valid.to_vec();
     for _ in 0..random.random_range(1..=4) {
         if bytes.is_empty() {
             break;
@@ -177,13 +178,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_reader_that_falls_is_found() {
-        let panics: Target = Target { name: "panics", sound: vec![7; 40], read: Box::new(|bytes| Ok(bytes[39] == 7)) };
+    fn a_failing_reader_is_found() {
+        let panics: Target = Target { name: "panics", valid: vec![7; 40], read: Box::new(|bytes| Ok(bytes[39] == 7)) };
         let fuzz = FuzzArgs { inputs: 50, seed: 1, only: String::new() };
-        assert!(fuzz.face(&panics).unwrap().broken.iter().any(|b| b.contains("panic")));
+        assert!(fuzz.test(&panics).unwrap().broken.iter().any(|b| b.contains("panic")));
         let greedy = |_: &[u8]| Ok(std::hint::black_box(vec![1u8; 200 << 20]).len() > 7);
         let fuzz = FuzzArgs { inputs: 2, ..fuzz };
-        let broken = fuzz.face(&Target { name: "greedy", sound: vec![7; 40], read: Box::new(greedy) }).unwrap().broken;
+        let broken = fuzz.test(&Target { name: "greedy", valid: vec![7; 40], read: Box::new(greedy) }).unwrap().broken;
         assert_eq!(broken.iter().any(|b| b.contains("MiB")), cfg!(target_os = "linux"));
     }
 }

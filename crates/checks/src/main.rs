@@ -1,4 +1,4 @@
-//! The program `lidarshift-checks`: what `cargo xtask` runs to check the program `lidarshift` and its crates.
+//! The program `lidarshift-checks`: checks of `lidarshift` and its crates, started by `cargo xtask`.
 
 mod bench_step;
 mod fuzz;
@@ -9,7 +9,7 @@ use anyhow::Result;
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
 
-/// Checks of the program by who works on it.
+/// Checks for developers.
 #[derive(Parser, Debug)]
 #[command(name = "cargo xtask", bin_name = "cargo xtask", arg_required_else_help = true)]
 struct Program {
@@ -19,13 +19,13 @@ struct Program {
 
 #[derive(Subcommand, Debug)]
 enum Check {
-    /// Compare every tensor with a folder of reference numbers
+    /// Compare all tensors of a network with reference values
     Parity(parity::ParityArgs),
-    /// Feed damaged files to every reader
+    /// Test all file readers with damaged files
     Fuzz(fuzz::FuzzArgs),
-    /// Time a training step by stage
+    /// Measure the time of each stage of a training step
     BenchStep(bench_step::BenchStepArgs),
-    /// Write the JSON schema and the reference of the configuration files
+    /// Write the JSON schema and the Markdown reference of the configuration files
     Schema(schema::SchemaArgs),
 }
 

@@ -1,4 +1,4 @@
-//! `cargo xtask schema`: the JSON schema of the configuration files, and their reference in Markdown.
+//! `cargo xtask schema`: writes the JSON schema of the configuration files and their Markdown reference.
 
 use anyhow::Result;
 use clap::Args;
@@ -13,13 +13,13 @@ use std::fmt::Write;
 use std::path::PathBuf;
 use study::StudyConfig;
 
-/// Writes configs/schema.json and docs/src/reference/configuration.md from the Rust types.
+/// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
 #[derive(Args, Debug)]
 pub struct SchemaArgs {
-    /// The project's folder
+    /// Folder of the repository
     #[arg(default_value = ".")]
     root: PathBuf,
-    /// Only say whether the files are up to date
+    /// Only check that the files are up to date
     #[arg(long)]
     check: bool,
 }
@@ -34,14 +34,14 @@ impl SchemaArgs {
             if !self.check {
                 write_atomic(&path, text.as_bytes())?;
             } else if fs_err::read_to_string(&path)? != text {
-                anyhow::bail!("{} is stale: run `cargo xtask schema`", path.display());
+                anyhow::bail!("{} is not up to date; run `cargo xtask schema`", path.display());
             }
         }
         Ok(())
     }
 }
 
-/// The files that people write: title, where they live, schema.
+/// The configuration files: title, path, schema.
 fn files() -> [(&'static str, &'static str, Schema); 7] {
     fn of<T: JsonSchema>() -> Schema {
         schema_for!(T)
@@ -65,7 +65,7 @@ pub fn schema_json() -> Result<String> {
     Ok(serde_json::to_string_pretty(&schema)? + "\n")
 }
 
-/// The reference in Markdown: a table a type.
+/// The Markdown reference, with one table per type.
 pub fn reference() -> String {
     let mut text = String::from(
         "# Configuration reference\n\nGenerated from the Rust types by `cargo xtask schema`; do not edit. Units are in the keys' names; an unknown key is an error.\n",

@@ -1,16 +1,17 @@
-//! The reference numbers on every device that this build has and this machine offers, and on the CPU with every set of instructions.
+//! Comparison with reference values on every device of this build and this machine, and on the CPU with older
+//! instruction sets.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{golden, must, program, run, said};
+use program::{golden, must, program, run, output_text};
 
 #[test]
 fn reference_numbers_on_every_device() {
     let mut devices = Vec::new();
     for device in ["flex", "ndarray", "wgpu", "cuda"] {
         let output = run(&golden("synthetic/pointpillars_tiny"), &format!("parity . --device {device}"));
-        let text = said(&output);
+        let text = output_text(&output);
         if output.status.success() {
             devices.push(device);
             must(&golden("synthetic/pointrcnn_tiny"), &format!("parity . --device {device}"));
@@ -23,7 +24,7 @@ fn reference_numbers_on_every_device() {
     assert!(devices.starts_with(&["flex", "ndarray"]), "{devices:?}");
 }
 
-/// Processors without newer instructions, as far as a test can make this one such.
+/// Emulates processors without newer instructions by restricting the instruction set.
 #[test]
 fn reference_numbers_with_fewer_instructions() {
     for set in ["portable", "avx2"] {
@@ -32,11 +33,11 @@ fn reference_numbers_with_fewer_instructions() {
                 .env("LIDARSHIFT_SIMD", set)
                 .output()
                 .unwrap();
-            assert!(output.status.success(), "{set}, {network}: {}", said(&output));
+            assert!(output.status.success(), "{set}, {network}: {}", output_text(&output));
         }
     }
     let unknown =
         program(&golden("synthetic/pointpillars_tiny"), "parity .").env("LIDARSHIFT_SIMD", "avx9").output().unwrap();
     assert_eq!(unknown.status.code(), Some(1));
-    assert!(said(&unknown).contains("portable, neon, avx2 or avx512"), "{}", said(&unknown));
+    assert!(output_text(&unknown).contains("portable, neon, avx2 or avx512"), "{}", output_text(&unknown));
 }

@@ -1,9 +1,9 @@
-//! `parity` on the reference numbers that may be part of the repository, sound and spoiled.
+//! `parity` on the reference values in the repository, unchanged and modified.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{golden, must, run, said};
+use program::{golden, must, run, output_text};
 use std::fs;
 
 #[test]
@@ -18,7 +18,7 @@ fn equals_the_reference() {
 }
 
 #[test]
-fn a_wrong_value_and_a_tensor_without_counterpart_fail() {
+fn a_wrong_value_and_an_unknown_tensor_fail() {
     let dir = tempfile::tempdir().unwrap();
     let copy = dir.path().join("copy");
     fs::create_dir(&copy).unwrap();
@@ -38,7 +38,7 @@ fn a_wrong_value_and_a_tensor_without_counterpart_fail() {
     fs::write(&path, wrong).unwrap();
     let output = run(dir.path(), "parity copy");
     assert_eq!(output.status.code(), Some(1));
-    assert!(said(&output).contains("FAIL") && said(&output).contains("block0"), "{}", said(&output));
+    assert!(output_text(&output).contains("FAIL") && output_text(&output).contains("block0"), "{}", output_text(&output));
 
     let text = String::from_utf8_lossy(&sound[8..8 + header]).replacen("\"block1", "\"blockX", 1);
     let mut unknown = sound[..8].to_vec();
@@ -47,5 +47,5 @@ fn a_wrong_value_and_a_tensor_without_counterpart_fail() {
     fs::write(&path, unknown).unwrap();
     let output = run(dir.path(), "parity copy");
     assert_eq!(output.status.code(), Some(1));
-    assert!(said(&output).contains("blockX"), "{}", said(&output));
+    assert!(output_text(&output).contains("blockX"), "{}", output_text(&output));
 }

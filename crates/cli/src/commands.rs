@@ -1,15 +1,15 @@
-//! The table of commands: how a command gets into the program.
+//! How a command is added to the program, and how its result becomes an exit code.
 
 use std::process::ExitCode;
 
-/// How a command ended that could be carried out.
+/// Result of a command that ran without an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
-    /// All of it worked.
+    /// Success.
     Done,
-    /// It did not find what it should have found.
+    /// The command ran, but its check failed.
     Failed,
-    /// A diagnosis whose two sides do not show the same scenes.
+    /// The measured and the simulated data set of a diagnosis do not show the same scenes.
     NotTheSameScenes,
 }
 
@@ -35,8 +35,8 @@ impl From<End> for ExitCode {
     }
 }
 
-/// Declares an enum of commands and the file of each: `Name(file::Arguments) "one line of help";`. The arguments have a method `run`,
-/// whose result says how the command ended: nothing, `bool` or [`End`].
+/// Declares an enum of commands and the module of each: `Name(module::Arguments) "one line of help";`. The arguments
+/// have a method `run` that returns `()`, `bool` or [`End`].
 macro_rules! commands {
     ($(#[$of_table:meta])* $table:ident: $($(#[$of:meta])* $name:ident($file:ident::$arguments:ident) $help:tt;)*) => {
         $(pub mod $file;)*
@@ -52,7 +52,7 @@ macro_rules! commands {
         }
 
         impl $table {
-            /// Carries the command out.
+            /// Runs the command.
             pub(crate) fn run(self) -> anyhow::Result<$crate::commands::End> {
                 match self {
                     $($table::$name(arguments) => Ok(arguments.run()?.into()),)*

@@ -1,4 +1,4 @@
-//! `lidarshift detect`: boxes in one cloud, or in a whole split of a data set.
+//! `lidarshift detect`: detects objects in one point cloud or in all frames of a split.
 
 use crate::device::DeviceArgs;
 use anyhow::{Context, Result, bail};
@@ -15,7 +15,8 @@ use report::{BirdsEyeOptions, Style, birds_eye_png};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
-/// Boxes in a cloud (KITTI text in the cloud's own frame, and a picture), or in a whole split of a data set.
+/// Detect objects in a point cloud or in all frames of a split. For a point cloud, boxes are printed as KITTI text in
+/// the frame of the cloud, and a bird's eye view is written.
 ///
 /// Examples:
 ///   lidarshift detect 000007.bin --checkpoint runs/my-run/checkpoint/last.safetensors
@@ -23,27 +24,27 @@ use std::path::{Path, PathBuf};
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct DetectArgs {
-    /// A cloud (.bin or .pcd), or the folder or TOML of a data set
+    /// Point cloud (.bin or .pcd), or a data set (folder or TOML)
     input: PathBuf,
-    /// Weights: safetensors of a run, or OpenPCDet's .pth
+    /// Weights: safetensors of a run, or a .pth of OpenPCDet
     #[arg(long, value_name = "FILE")]
     checkpoint: PathBuf,
-    /// Detector of the weights: a name or a TOML; a run's own weights know theirs
+    /// Detector of the weights: a name or a TOML [default: from config.toml of the run that wrote the weights]
     #[arg(long, value_name = "NAME|TOML")]
     detector: Option<String>,
-    /// Columns of a .bin cloud
+    /// Columns of a .bin cloud [default: from the detector and the file size]
     #[arg(long, value_enum)]
     points: Option<Points>,
-    /// Split of the data set; all frames without it
+    /// Split of the data set [default: all frames]
     #[arg(long, requires = "out")]
     split: Option<String>,
-    /// Folder for the results; a cloud's picture goes to the present folder without it
+    /// Folder for the results; required for a data set [default for a point cloud: current folder]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Ground truth to draw beside the boxes of a cloud: KITTI text in the label frame "lidar"
+    /// Ground truth to draw into the picture of a point cloud: KITTI text in the label frame "lidar"
     #[arg(long, value_name = "FILE")]
     labels: Option<PathBuf>,
-    /// Also write the boxes of a cloud as JSON
+    /// Also write the boxes of a point cloud as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
     #[command(flatten)]
@@ -56,7 +57,7 @@ enum Points {
     Xyzi,
 }
 
-/// The boxes of one cloud, in its frame.
+/// The boxes of one point cloud, in its frame.
 #[derive(Serialize)]
 struct Found<'a> {
     schema: &'static str,
@@ -65,7 +66,7 @@ struct Found<'a> {
 }
 
 impl DetectArgs {
-    /// Finds, prints and draws.
+    /// Detects, prints and draws the boxes.
     pub fn run(self) -> Result<()> {
         let device = self.device.open()?;
         let config = detector_of(&self.checkpoint, self.detector.as_deref())?;
@@ -107,18 +108,18 @@ impl DetectArgs {
         };
         let picture = self.out.clone().unwrap_or_else(|| ".".into()).join(format!("{id}.png"));
         draw(&picture, &frame.cloud, &truth, &detections)?;
-        eprintln!("{} boxes; picture in {}", detections.len(), picture.display());
+        eprintln!("{} boxes, bird's eye view in {}", detections.len(), picture.display());
         Ok(())
     }
 
-    /// A .bin whose size fits three columns and not four.
+    /// Whether the file size is a multiple of three f32 columns but not of four.
     fn is_xyz_size(&self) -> Result<bool> {
         let bytes = fs_err::metadata(&self.input)?.len();
         Ok(bytes % 12 == 0 && bytes % 16 != 0)
     }
 
     fn split(&self, detector: &Detector) -> Result<()> {
-        let Some(out) = &self.out else { bail!("a data set needs --out DIR for its detections") };
+        let Some(out) = &self.out else { bail!("--out DIR is required to detect on a data set") };
         let dataset = Dataset::open(&self.input)?;
         let ids = match &self.split {
             Some(split) => dataset.ids(split)?,
@@ -138,14 +139,15 @@ impl DetectArgs {
             Ok::<(), anyhow::Error>(())
         })?;
         progress.finish_and_clear();
-        eprintln!("{boxes} boxes in {} frames, in {}", ids.len(), out.display());
+        eprintln!("{boxes} boxes in {} frames, written to {}", ids.len(), out.display());
         Ok(())
     }
 }
 
-/// The detector that weights belong to: as told, or as the run folder around them says.
-fn detector_of(checkpoint: &Path, told: Option<&str>) -> Result<DetectorConfig> {
-    if let Some(name) = told {
+/// The detector of the weights: the one `named` on the command line, else the one in config.toml of the run folder that
+/// contains them.
+fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<DetectorConfig> {
+    if let Some(name) = named {
         return Ok(find_detector(name)?);
     }
     for folder in checkpoint.ancestors().skip(1).take(3) {
@@ -158,10 +160,10 @@ fn detector_of(checkpoint: &Path, told: Option<&str>) -> Result<DetectorConfig> 
             return Ok(config);
         }
     }
-    bail!("{} does not say which detector it belongs to: name it with --detector", checkpoint.display())
+    bail!("{}: the detector of these weights is unknown; give it with --detector", checkpoint.display())
 }
 
-/// Points, ground truth and detections from above.
+/// Draws points, ground truth and detections in a bird's eye view.
 fn draw(path: &Path, cloud: &Cloud, truth: &[LabelBox], detections: &[Detection]) -> Result<()> {
     let mut boxes: Vec<_> = truth.iter().map(|label| (label.lidar_box(), Style::GroundTruth)).collect();
     boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));

@@ -1,4 +1,4 @@
-//! Where tensors live: a device by its name.
+//! Command line options that choose the device, its kernels and the precision.
 
 use anyhow::{Result, bail};
 use burn::tensor::Device;
@@ -7,35 +7,35 @@ use kernels::InstructionSet;
 use models::kernel_ops::{Kernels, choose_kernels};
 use models::layers::{Precision, choose_precision};
 
-/// Where the network computes, and how.
+/// The device on which the network runs, its kernels and the precision.
 #[derive(Args, Clone, Debug)]
 pub struct DeviceArgs {
-    /// Where the network computes: flex (the CPU), ndarray, wgpu or cuda
+    /// Device on which the network runs: flex (CPU), ndarray (CPU), wgpu or cuda
     #[arg(long, default_value = "flex")]
     pub device: String,
-    /// What computes on flex
+    /// Kernels of the device flex
     #[arg(long, value_enum, default_value = "auto")]
     pub kernels: KernelChoice,
-    /// What convolutions and linear layers multiply
+    /// Precision of convolutions and linear layers
     #[arg(long, value_enum, default_value = "f32")]
     pub precision: PrecisionChoice,
 }
 
-/// The floats of the hot operations.
+/// Floating point precision of convolutions and linear layers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum PrecisionChoice {
     /// Single precision
     F32,
-    /// Half precision, on wgpu and cuda; batch norms, losses, weights and optimiser stay f32
+    /// Half precision, on wgpu and cuda only; batch norms, losses, weights and optimiser stay f32
     F16,
 }
 
-/// The forms of the hot operations.
+/// Implementations of the operations that take most time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum KernelChoice {
-    /// This program's kernels, convolutions by Winograd's F(2x2, 3x3)
+    /// This program's kernels; convolutions use Winograd's F(2x2, 3x3)
     Auto,
-    /// The same with F(4x4, 3x3): a little faster, a digit less exact
+    /// As auto, but with F(4x4, 3x3): slightly faster, one digit less accurate
     F4,
     /// burn's own operations
     Burn,
@@ -48,10 +48,11 @@ impl Default for DeviceArgs {
 }
 
 impl DeviceArgs {
-    /// The device; the choice of kernels holds for this process from now on.
+    /// Opens the device. The choice of kernels and precision applies to the whole process from now on.
     ///
     /// # Errors
-    /// As [`parse_device`]; an instruction set named in the environment that does not exist; half precision where it does not run.
+    /// As [`parse_device`]; an unknown instruction set in the environment; half precision on a device that does not
+    /// support it.
     pub fn open(&self) -> Result<Device> {
         choose_kernels(match self.kernels {
             KernelChoice::Auto => Kernels::Auto,
@@ -65,26 +66,26 @@ impl DeviceArgs {
             PrecisionChoice::F16 => Precision::F16,
         };
         if precision == Precision::F16 && matches!(self.device.as_str(), "flex" | "ndarray") {
-            bail!("--precision f16 is for GPUs (--device wgpu or cuda): on the CPU it would only be slower");
+            bail!("--precision f16 is for GPUs (--device wgpu or cuda); on the CPU it would be slower");
         }
         if !precision.runs_on(&device) {
-            bail!("device {} does not compute in half precision: leave out --precision f16", self.device);
+            bail!("device {} does not compute in half precision; remove --precision f16", self.device);
         }
         choose_precision(precision);
         Ok(device)
     }
 
-    /// The words that say the same to another process.
-    pub fn words(&self) -> Vec<String> {
+    /// The command line arguments that give another process the same options.
+    pub fn arguments(&self) -> Vec<String> {
         let kernels = self.kernels.to_possible_value().map_or(String::new(), |value| value.get_name().to_string());
-        let mut words = ["--device", &self.device, "--kernels", &kernels].map(String::from).to_vec();
+        let mut arguments = ["--device", &self.device, "--kernels", &kernels].map(String::from).to_vec();
         if self.precision == PrecisionChoice::F16 {
-            words.extend(["--precision", "f16"].map(String::from));
+            arguments.extend(["--precision", "f16"].map(String::from));
         }
-        words
+        arguments
     }
 
-    /// Device and kernels in words.
+    /// Device, kernels and precision as text.
     pub fn describe(&self) -> String {
         match (self.device.as_str(), self.kernels) {
             ("flex", KernelChoice::Burn) => "flex, burn's operations".into(),
@@ -99,21 +100,21 @@ impl DeviceArgs {
     }
 }
 
-/// The device of that name: `flex` (the CPU, the default), `ndarray`, `wgpu` or `cuda`.
+/// The device with this name: `flex` (the CPU, the default), `ndarray`, `wgpu` or `cuda`.
 ///
 /// # Errors
-/// A name that does not exist, a device that is not built in, or one that this machine lacks.
+/// An unknown name, a device that is not compiled in, or one that this machine does not have.
 pub fn parse_device(name: &str) -> Result<Device> {
     match name {
         "flex" => Ok(Device::flex()),
         "ndarray" => Ok(ndarray()),
         "wgpu" => wgpu(),
         "cuda" => cuda(),
-        _ => bail!("there is no device {name:?}: flex, ndarray, wgpu or cuda"),
+        _ => bail!("there is no device {name:?}; choose flex, ndarray, wgpu or cuda"),
     }
 }
 
-#[expect(deprecated, reason = "offered as long as burn has it")]
+#[expect(deprecated, reason = "kept as long as burn has it")]
 fn ndarray() -> Device {
     Device::ndarray()
 }
@@ -121,7 +122,7 @@ fn ndarray() -> Device {
 #[cfg(feature = "wgpu")]
 fn wgpu() -> Result<Device> {
     use burn::tensor::{DeviceKind, DeviceType};
-    // Without an adapter the first tensor would panic on another thread.
+    // Without this check, a missing adapter would cause a panic on another thread at the first tensor.
     if Device::enumerate(DeviceType::Wgpu).is_empty() {
         bail!("no adapter for wgpu: no Vulkan, Metal or DirectX 12 driver was found; use --device flex");
     }

@@ -1,4 +1,4 @@
-//! `lidarshift diagnose`: what does the simulation get wrong, why, and what is gained by mending it.
+//! `lidarshift diagnose`: finds the differences between measured and simulated data, their causes and a correction.
 
 mod detectors;
 
@@ -9,18 +9,19 @@ use data::write::write_kitti_text;
 use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
-    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Verdict, diagnose, diagnose_scans, extended_toml,
+    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Status, Verdict, diagnose, diagnose_scans, extended_toml,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{finding_name, write_finding_pictures};
 use simulate::race::RaceConfig;
 use std::path::{Path, PathBuf};
 
-/// Compare measured data with their scenario-identical simulation: name what differs, with parameters and intervals, and measure what is
-/// gained by mending it. Or, with --scans, compare the scans of one spinning sensor with an ideal one where their scene is known: ground and walls.
+/// Compare measured data with a scenario-identical simulation. Each finding has its cause, its parameters with 95 %
+/// confidence intervals, and the gain of correcting it. With --scans, compare the scans of one spinning sensor with an
+/// ideal sensor on surfaces whose shape is known: ground and walls.
 ///
-/// Exit codes: 0 when the diagnosis could be made, whatever it says; 3 when the two do not show the same scenes (diagnosis.json says so); 1 when
-/// it could not be made; 2 when the words could not be understood.
+/// Exit codes: 0 the diagnosis was made, whatever its verdict; 1 it could not be made; 2 wrong arguments; 3 the two
+/// data sets do not show the same scenes (also the verdict in diagnosis.json).
 ///
 /// Examples:
 ///   lidarshift diagnose --measured datasets/measured --simulated datasets/sim --sensor configs/sensors/av21.toml
@@ -29,51 +30,52 @@ use std::path::{Path, PathBuf};
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct DiagnoseArgs {
-    /// Measured data set: its folder or its TOML
+    /// Measured data set: folder or TOML
     #[arg(long, value_name = "DATASET", required_unless_present = "scans", requires = "simulated")]
     measured: Option<PathBuf>,
-    /// Simulated data set with the same frame ids
+    /// Simulated data set with the same frame ids: folder or TOML
     #[arg(long, value_name = "DATASET", requires = "measured")]
     simulated: Option<PathBuf>,
-    /// Scans of one spinning sensor, as its files have them, to be diagnosed against an ideal sensor without a simulation of the scenes
+    /// Data set with raw scans of one spinning sensor, compared with an ideal sensor; needs no simulated data set
     #[arg(long, value_name = "DATASET", conflicts_with_all = ["measured", "simulated", "simulator"])]
     scans: Option<PathBuf>,
-    /// Places and directions of the sensors; without it one sensor at the origin of the clouds is assumed
+    /// TOML with the poses of the sensors [default: one sensor at the origin of the clouds]
     #[arg(long, value_name = "TOML")]
     sensor: Option<PathBuf>,
-    /// Configuration of the simulation, for the places of its sensors where --sensor is not given
+    /// Configuration of the simulation, to read the poses of the sensors from instead of --sensor
     #[arg(long, value_name = "CONFIG", conflicts_with = "sensor")]
     simulator: Option<String>,
-    /// Only the frames of this split; without it all frames that both have
+    /// Use only the frames of this split [default: all frames that both data sets have]
     #[arg(long, value_name = "NAME")]
     split: Option<String>,
-    /// Folder for diagnosis.json, extended.toml, a picture of each finding and, where labels are at fault, label_2/
+    /// Folder for diagnosis.json, extended.toml, a figure per finding and, if labels are wrong, corrected labels in
+    /// label_2/
     #[arg(long, value_name = "DIR", default_value = "runs/diagnosis")]
     out: PathBuf,
-    /// Train the detectors of this study, with its seeds and epochs, on measured, simulated and extended data, and test them on measured
-    /// frames; `gain` is one for it
+    /// Also train the detectors of this study, with its seeds and epochs, on measured, simulated and extended data, and
+    /// test them on measured frames; the study `gain` is made for this
     #[arg(long, value_name = "STUDY", requires = "measured")]
     detectors: Option<String>,
-    /// Write diagnosis.json here as well
+    /// Also write diagnosis.json to this file
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 impl DiagnoseArgs {
-    /// Diagnoses, writes the files and says what was found.
+    /// Makes the diagnosis, writes its files and prints verdict and findings.
     pub fn run(self) -> Result<End> {
         let rig = self.rig()?;
         if self.out.is_file() {
-            bail!("--out {}: is a file; a folder is wanted", self.out.display());
+            bail!("--out {}: is a file, but must be a folder", self.out.display());
         }
         let bar = ProgressBar::new(1).with_style(
             ProgressStyle::with_template("{msg:<20} {bar:30} {pos}/{len}, {eta} left").context("a template")?,
         );
-        let told = |stage: Stage, done: usize, of: usize| {
+        let show_progress = |stage: Stage, done: usize, of: usize| {
             bar.set_message(match stage {
                 Stage::Comparing => "comparing scenes",
                 Stage::Pairing => "pairing frames",
-                Stage::Weighing => "weighing causes",
+                Stage::Weighing => "testing causes",
             });
             bar.set_length(of as u64);
             bar.set_position(done as u64);
@@ -82,15 +84,15 @@ impl DiagnoseArgs {
         let (measured, mut outcome) = match (&self.scans, &self.measured, &self.simulated) {
             (Some(scans), ..) => {
                 let scans = Dataset::open(scans)?;
-                let outcome = diagnose_scans(&scans, &rig, &options, &told)?;
+                let outcome = diagnose_scans(&scans, &rig, &options, &show_progress)?;
                 (scans, outcome)
             }
             (None, Some(measured), Some(simulated)) => {
                 let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
-                let outcome = diagnose(&measured, &simulated, &rig, &options, &told)?;
+                let outcome = diagnose(&measured, &simulated, &rig, &options, &show_progress)?;
                 (measured, outcome)
             }
-            _ => bail!("--measured and --simulated, or --scans, are wanted"),
+            _ => bail!("give --measured and --simulated, or --scans"),
         };
         bar.finish_and_clear();
         self.write_json(&outcome.diagnosis)?;
@@ -99,13 +101,13 @@ impl DiagnoseArgs {
         for (id, boxes) in &outcome.corrected {
             write_labels(&self.out, &measured, id, boxes)?;
         }
-        say(&outcome.diagnosis, &self.out, outcome.corrected.len());
+        print_diagnosis(&outcome.diagnosis, &self.out, outcome.corrected.len());
         if let (Some(study), Some(measured), Some(simulated)) = (&self.detectors, &self.measured, &self.simulated)
             && !outcome.diagnosis.findings.is_empty()
         {
             let extended = self.out.join("extended.toml");
             let (gains, left_out) = gain_of_detectors(study, measured, simulated, &extended, &self.out)?;
-            say_gains(&gains, &left_out);
+            print_gains(&gains, &left_out);
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis)?;
@@ -137,7 +139,7 @@ impl DiagnoseArgs {
     }
 }
 
-/// Corrected labels, in the clouds' frame and of the data set's first class.
+/// Writes corrected labels in the frame of the clouds, with the first class of the data set.
 fn write_labels(out: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box3]) -> Result<()> {
     let class = measured.config.classes.first().map_or("Car", String::as_str);
     let lines: Vec<LabelBox> = boxes.iter().map(|b| LabelBox::from_box(class, b, None)).collect();
@@ -145,19 +147,17 @@ fn write_labels(out: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box
 }
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
-fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
+fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
     for note in &diagnosis.notes {
         eprintln!("note: {note}");
     }
-    match diagnosis.verdict {
-        Verdict::NotScenarioIdentical => println!("not scenario-identical: nothing else can be said"),
-        Verdict::NothingFound => {
-            println!("nothing found. The smallest effects that would have been seen:");
-            for (cause, m) in &diagnosis.minimum_detectable {
-                println!("  {cause}: {} {:.4} {}", m.parameter, m.value, m.unit);
-            }
+    let statuses: Vec<Status> = diagnosis.findings.iter().map(|f| f.status).collect();
+    println!("verdict: {}", verdict_text(diagnosis.verdict, &statuses));
+    if diagnosis.verdict == Verdict::NothingFound && !diagnosis.minimum_detectable.is_empty() {
+        println!("detectable effect sizes:");
+        for (cause, m) in &diagnosis.minimum_detectable {
+            println!("  {cause}: {} {:.4} {}", m.parameter, m.value, m.unit);
         }
-        _ => {}
     }
     for f in &diagnosis.findings {
         let name = finding_name(f);
@@ -166,30 +166,61 @@ fn say(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
             println!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
         }
         if let Some(how) = &f.separate_by {
-            println!("  to tell them apart: {how}");
+            println!("  to distinguish these causes: {how}");
         }
     }
     if let Some(closed) = diagnosis.gain.closed {
         println!(
-            "of what the simulation was off on frames held out, {:.0} % are gone with the extended model",
+            "on held-out frames, the extended model removes {:.0} % of the difference that a sensor model could remove",
             100.0 * closed
         );
     }
     if corrected > 0 {
-        println!("corrected labels of {corrected} frames in {}", out.join("label_2").display());
+        println!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());
     }
-    eprintln!("diagnosis.json and extended.toml in {}", out.display());
+    eprintln!("diagnosis.json and extended.toml written to {}", out.display());
+}
+
+/// The verdict in words, with the numbers of findings by status.
+fn verdict_text(verdict: Verdict, findings: &[Status]) -> String {
+    let count = |status: Status| findings.iter().filter(|s| **s == status).count();
+    let named = format!("{} of {} findings have a named cause", count(Status::Named), findings.len());
+    let (ambiguous, unexplained) = (count(Status::Ambiguous), count(Status::Unexplained));
+    match verdict {
+        Verdict::NothingFound => "nothing found: there is no significant difference".into(),
+        Verdict::Explained => format!("explained: {named}"),
+        Verdict::PartlyExplained => {
+            format!("partly explained: {named}; {ambiguous} ambiguous, {unexplained} unexplained")
+        }
+        Verdict::Unexplained => format!("unexplained: {named}; {ambiguous} ambiguous, {unexplained} unexplained"),
+        Verdict::NotScenarioIdentical => "not scenario-identical: the two data sets do not show the same scenes".into(),
+    }
 }
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
-fn say_gains(gains: &[DetectorGain], left_out: &[String]) {
+fn print_gains(gains: &[DetectorGain], left_out: &[String]) {
     left_out.iter().for_each(|note| println!("note: {note}"));
     for g in gains {
         let interval = g.ci95.map_or(String::new(), |[low, high]| format!(" ({low:.1} to {high:.1})"));
         println!(
-            "{}, {} at {}: AP on measured frames {:.1} when trained on the simulation, {:.1} on the extended one, {:.1} on measured data; \
+            "{}, {} at IoU {}: AP on measured frames is {:.1} when trained on simulated, {:.1} on extended, {:.1} on measured data; \
              gain {:+.1}{interval} over {} runs each",
             g.detector, g.class, g.overlap, g.before, g.after, g.ceiling, g.gain, g.runs
         );
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_verdict_counts_the_findings_by_status() {
+        use Status::{Ambiguous, Named, Unexplained};
+        assert_eq!(
+            verdict_text(Verdict::PartlyExplained, &[Named, Ambiguous, Named, Unexplained]),
+            "partly explained: 2 of 4 findings have a named cause; 1 ambiguous, 1 unexplained"
+        );
+        assert_eq!(verdict_text(Verdict::Explained, &[Named]), "explained: 1 of 1 findings have a named cause");
     }
 }

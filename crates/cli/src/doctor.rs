@@ -1,4 +1,4 @@
-//! `lidarshift doctor`: what is wrong with a data set, in words.
+//! `lidarshift doctor`: checks a data set for errors.
 
 use anyhow::Result;
 use clap::Args;
@@ -8,9 +8,10 @@ use models::config::DetectorConfig;
 use models::find_detector;
 use std::path::PathBuf;
 
-/// Examine a data set before anything is trained on it: files, splits, duplicates, boxes, and whether the labels mean what is declared.
+/// Check a data set before training: files, splits, duplicates, boxes, and whether the labels agree with the declared
+/// label frame.
 ///
-/// Exit code 0 only when nothing is wrong; notes do not count.
+/// Exit code 0 if no problem is found; notes are not problems.
 ///
 /// Examples:
 ///   lidarshift doctor datasets/road
@@ -21,16 +22,16 @@ pub struct DoctorArgs {
     /// Data set: its folder or its TOML
     #[arg(value_name = "DATASET")]
     dataset: PathBuf,
-    /// Also tell how the data fit this detector: its name or its TOML
-    #[arg(long, value_name = "T")]
+    /// Also check the data against the range and the anchors of this detector: a name or a TOML
+    #[arg(long, value_name = "NAME|TOML")]
     detector: Option<String>,
-    /// Write the report as JSON too
+    /// Also write the report as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 impl DoctorArgs {
-    /// Prints the report; `true` when nothing is wrong.
+    /// Prints the report; `true` if no problem is found.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
         let detector = self.detector.as_deref().map(find_detector).transpose()?;
@@ -44,9 +45,9 @@ impl DoctorArgs {
     }
 }
 
-/// What the doctor needs to know of a detector.
+/// Classes, range and anchors of a detector.
 fn facts(detector: &DetectorConfig) -> DetectorFacts {
-    // By way of the decimal text, so that an f32 of 3.9 does not print as 3.9000000953674316.
+    // Converted through decimal text, so that an f32 of 3.9 is not printed as 3.9000000953674316.
     let number = |v: f32| v.to_string().parse::<f64>().unwrap_or(v.into());
     let anchors = detector.network.anchors().iter().map(|anchor| AnchorFacts {
         class: anchor.class.clone(),
@@ -81,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_data_set_is_an_error() {
+    fn a_folder_without_a_data_set_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
         let error = args(folder.path().into(), None).run().unwrap_err().to_string();
         assert!(error.contains("neither dataset.toml nor velodyne/"), "{error}");

@@ -1,21 +1,21 @@
-//! `lidarshift eval`: numbers of detections, clouds and features.
+//! `lidarshift eval`: metrics of detections, point clouds, targets and features.
 
 use crate::commands::End;
 use anyhow::Result;
 use clap::Args;
 
 commands! {
-    /// What can be evaluated, in the order of the help.
+    /// The evaluations, in the order of the help.
     EvalCommand:
     Ap(ap::EvalApArgs) "Average precision and recall of detections in KITTI text";
-    Statistics(statistics::EvalStatisticsArgs) "Points and boxes of two data sets of the same frames";
-    Matrix(matrix::EvalMatrixArgs) "Train set x test set of a study";
-    Distances(distances::EvalDistancesArgs) "How far the clouds of two data sets are from each other";
-    Targets(targets::EvalTargetsArgs) "Targets of data sets";
-    Tsne(tsne::EvalTsneArgs) "What the networks of a study see";
+    Statistics(statistics::EvalStatisticsArgs) "Points and boxes of two data sets with the same frames";
+    Matrix(matrix::EvalMatrixArgs) "Matrix of a study: AP and recall by train set and test set";
+    Distances(distances::EvalDistancesArgs) "Distances between the point clouds of two data sets";
+    Targets(targets::EvalTargetsArgs) "Number, position and points of the labelled targets of data sets";
+    Tsne(tsne::EvalTsneArgs) "Features of the networks of a study: t-SNE, CKA, Fréchet distance";
 }
 
-/// Numbers of detections
+/// Evaluate detections, data sets and studies
 #[derive(Args, Debug)]
 pub struct EvalArgs {
     #[command(subcommand)]
@@ -23,10 +23,10 @@ pub struct EvalArgs {
 }
 
 impl EvalArgs {
-    /// Evaluates what was asked for.
+    /// Runs the chosen evaluation.
     ///
     /// # Errors
-    /// As the command that was named.
+    /// As the chosen command.
     pub fn run(self) -> Result<End> {
         self.command.run()
     }

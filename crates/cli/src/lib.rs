@@ -1,4 +1,4 @@
-//! The program `lidarshift`: detectors trained in simulation, measured on the road. A command is a file and a line of the table.
+//! The command line program `lidarshift`. A command is a file and a line of the table below.
 
 #[macro_use]
 mod commands;
@@ -11,20 +11,20 @@ use std::process::ExitCode;
 commands! {
     /// The commands, in the order of the help.
     Command:
-    Train(train::TrainArgs) "Train a detector; without options on data made on the spot";
-    Eval(eval::EvalArgs) "Numbers of detections";
-    Detect(detect::DetectArgs) "Boxes in a cloud, or in a whole split of a data set";
-    Simulate(simulate::SimulateArgs) "Make synthetic data sets: a race, or streets";
-    Study(study::StudyArgs) "A whole study: data sets, runs, matrix, report";
+    Train(train::TrainArgs) "Train a detector; without options on a synthetic data set that is generated first";
+    Eval(eval::EvalArgs) "Evaluate detections, data sets and studies";
+    Detect(detect::DetectArgs) "Detect objects in a point cloud or in all frames of a split";
+    Simulate(simulate::SimulateArgs) "Simulate data sets: a race, or streets";
+    Study(study::StudyArgs) "Run a study: data sets, training runs, evaluation, report";
     #[command(hide = true)]
-    StudyRun(study_run::StudyRunArgs) "One run of a study";
-    Report(report::ReportArgs) "The page of a study";
-    Resim(resim::ResimArgs) "Make a data set from another one with physical effects on top";
-    Diagnose(diagnose::DiagnoseArgs) "What a simulation gets wrong against measured data, why, and what mending it gains";
-    Doctor(doctor::DoctorArgs) "What is wrong with a data set, in words";
+    StudyRun(study_run::StudyRunArgs) "Execute one run of a study";
+    Report(report::ReportArgs) "Write the report of a study";
+    Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
+    Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
+    Doctor(doctor::DoctorArgs) "Check a data set for errors";
 }
 
-/// What will my detector, trained in simulation, lose on the road; why; and what must change in the simulator?
+/// How much does a LiDAR detector trained in simulation lose on real data, why, and what must change in the simulator?
 #[derive(Parser, Debug)]
 #[command(name = "lidarshift", version, about, arg_required_else_help = true)]
 struct Program {
@@ -32,7 +32,8 @@ struct Program {
     command: Command,
 }
 
-/// Runs the command line. 0 when all of it worked, 1 when it did not, 2 when it could not be understood; a diagnosis has a code of its own.
+/// Runs the command line. Exit codes: 0 success, 1 failure, 2 wrong arguments, 3 a diagnosis of data sets that do not
+/// show the same scenes.
 pub fn run() -> ExitCode {
     match Program::parse().command.run() {
         Ok(end) => end.into(),

@@ -1,14 +1,14 @@
-//! `lidarshift report`: the page of a study.
+//! `lidarshift report`: writes the report of a study.
 
-use crate::study::{StudyPlace, listener};
+use crate::study::{StudySelection, listener};
 use anyhow::Result;
 use clap::Args;
 use report::write_event_files;
 use std::path::PathBuf;
 use study::write_report;
 
-/// Write the report of a study from what its folder holds: one HTML page that needs nothing else, its figures as SVG and PNG, its tables as
-/// CSV. Nothing is trained; cells without a run say so.
+/// Write the report of a study from the results in its folder: one self-contained HTML page, its figures as SVG and
+/// PNG, and its tables as CSV. Nothing is trained; cells without a run are marked as missing.
 ///
 /// Examples:
 ///   lidarshift report quick
@@ -19,25 +19,25 @@ use study::write_report;
 #[command(verbatim_doc_comment)]
 pub struct ReportArgs {
     #[command(flatten)]
-    place: StudyPlace,
-    /// Write the curves of training as event files for TensorBoard, too: one for each run. With it, the folder of a run that belongs to no
-    /// study, or one of such folders, will do; then there is no page
+    study: StudySelection,
+    /// Also write the training curves as TensorBoard event files, one for each run. With this option, STUDY may also be
+    /// a run folder, or a folder that contains run folders; then no report is written
     #[arg(long, value_name = "DIR")]
     tensorboard: Option<PathBuf>,
 }
 
 impl ReportArgs {
-    /// Writes what was asked for and says where it is.
+    /// Writes the report and the event files and prints their paths.
     ///
     /// # Errors
-    /// Data sets that are not there, files that are damaged.
+    /// Missing data sets, damaged files.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
-        let alone = self.place.runs_alone().filter(|_| self.tensorboard.is_some());
-        let runs = match alone {
+        let without_study = self.study.folder_of_runs().filter(|_| self.tensorboard.is_some());
+        let runs = match without_study {
             Some(runs) => runs.to_path_buf(),
             None => {
-                let study = self.place.open()?;
+                let study = self.study.open()?;
                 let (_, files) = write_report(&study, &listener())?;
                 println!("report: {} ({:.1} MB)", files.page.display(), files.page_bytes as f64 / 1e6);
                 study.folder
@@ -45,7 +45,7 @@ impl ReportArgs {
         };
         if let Some(out) = &self.tensorboard {
             let n = write_event_files(&runs, out)?.len();
-            println!("curves of {n} runs: tensorboard --logdir {}", out.display());
+            println!("training curves of {n} runs: tensorboard --logdir {}", out.display());
         }
         Ok(())
     }

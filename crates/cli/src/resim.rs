@@ -1,4 +1,4 @@
-//! `lidarshift resim`: the sensor model on a finished data set.
+//! `lidarshift resim`: applies sensor effects to an existing data set.
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -8,10 +8,10 @@ use sensor::{EffectList, Rig};
 use simulate::resim::Resim;
 use std::path::PathBuf;
 
-/// Make a data set from another one with physical effects on top: noise, dropout, offsets, ... Effects that need rays to be cast anew are
-/// refused by name.
+/// Apply sensor effects to an existing data set and write the result as a new one: noise, dropout, offsets, ... An
+/// effect that needs new ray casting is an error.
 ///
-/// A run that was stopped goes on where it was when it is started again with the same words.
+/// Run the same command again to resume an interrupted run.
 ///
 /// Examples:
 ///   lidarshift resim --effects configs/simulate/sim_noise.toml datasets/race/sim --out datasets/noisy
@@ -22,22 +22,23 @@ pub struct ResimArgs {
     /// Data set: its folder or its TOML
     #[arg(value_name = "DATASET")]
     dataset: PathBuf,
-    /// TOML with the list of effects; docs/src/reference/effects.md has them all
+    /// TOML with the list of effects; see docs/src/reference/effects.md
     #[arg(long, value_name = "TOML")]
     effects: PathBuf,
-    /// Folder for the data set: new, empty, or begun with the same words
+    /// Folder for the new data set: new, empty, or of an interrupted run
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
-    /// TOML of the sensors [default: those of the data set's TOML, or one at the origin of the clouds]
+    /// TOML with the poses of the sensors [default: from the data set's TOML, else one sensor at the origin of the
+    /// clouds]
     #[arg(long, alias = "rig", value_name = "TOML")]
     sensor: Option<PathBuf>,
-    /// Another seed gives other noise
+    /// Random seed
     #[arg(long, value_name = "K", default_value_t = 0)]
     seed: u64,
 }
 
 impl ResimArgs {
-    /// Makes the data set and says what is in it.
+    /// Writes the data set and prints its size.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let dataset = Dataset::open(&self.dataset)?;
@@ -53,8 +54,8 @@ impl ResimArgs {
         let manifest = made.with_context(|| format!("{} on {}", self.effects.display(), self.dataset.display()))?;
         progress.finish_and_clear();
         let [before, after] = manifest.points.map(|n| n / manifest.frames.max(1));
-        println!("{} frames, {after} points a frame ({before} before)", manifest.frames);
-        eprintln!("data set in {}", self.out.display());
+        println!("{} frames, {after} points per frame ({before} before)", manifest.frames);
+        eprintln!("data set written to {}", self.out.display());
         Ok(())
     }
 }
@@ -65,7 +66,7 @@ mod tests {
     use simulate::{FrameCounts, RoadConfig, make_road_dataset};
 
     #[test]
-    fn what_does_not_fit_is_named() {
+    fn effects_that_cannot_be_applied_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let (street, effects) = (folder.path().join("street"), folder.path().join("e.toml"));
         let config = RoadConfig { frames: FrameCounts { train: 1, val: 1, test: 1 }, ..RoadConfig::default() };

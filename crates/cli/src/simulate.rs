@@ -1,4 +1,4 @@
-//! `lidarshift simulate`: synthetic data sets on disk.
+//! `lidarshift simulate`: simulates data sets and writes them to disk.
 
 use anyhow::Result;
 use clap::Args;
@@ -9,10 +9,10 @@ use simulate::race::{ConfigFiles, RaceConfig, RaceManifest, make_race_datasets};
 use simulate::{RoadConfig, Scenery, make_road_dataset};
 use std::path::{Path, PathBuf};
 
-/// Make data sets: a race on an oval as it stands for the road and as simulators show it, or streets with cars. The same seed gives the
-/// same bytes.
+/// Simulate data sets: a race on an oval, once as a stand-in for measured data and once as an ideal simulator would
+/// show it, or streets with cars. The same seed gives the same files, byte for byte.
 ///
-/// A run that was stopped goes on where it was when it is started again with the same words.
+/// Run the same command again to resume an interrupted run.
 ///
 /// Examples:
 ///   lidarshift simulate
@@ -21,25 +21,26 @@ use std::path::{Path, PathBuf};
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct SimulateArgs {
-    /// What to make: race, race_small, race_full, street, or a TOML; docs/src/reference/configuration.md lists the keys
+    /// Scenes to simulate: race, race_small, race_full, street, or a TOML; docs/src/reference/configuration.md lists
+    /// its keys
     #[arg(long, value_name = "CONFIG", default_value = "race")]
     config: String,
-    /// Folder for the data sets: new, empty, or begun with the same words [default: datasets/NAME]
+    /// Folder for the data sets: new, empty, or of an interrupted run [default: datasets/NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Frames of each data set
+    /// Number of frames of each data set [default: from the configuration]
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
-    /// Another seed gives other scenes
+    /// Random seed of the scenes [default: from the configuration]
     #[arg(long, value_name = "K")]
     seed: Option<u64>,
-    /// Of a race only these data sets, with commas between them
+    /// Only these data sets of a race, separated by commas [default: all]
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     dataset: Vec<String>,
 }
 
 impl SimulateArgs {
-    /// Makes the data sets and says what is in them.
+    /// Simulates the data sets and prints their sizes.
     pub fn run(self) -> Result<()> {
         match Scenery::find(&self.config, self.frames, self.seed)? {
             Scenery::Street(config) => self.street(&config),
@@ -57,9 +58,9 @@ impl SimulateArgs {
         for (split, _) in config.frames.splits() {
             let counts = manifest.splits[split];
             let points = counts.points / counts.frames;
-            println!("{split}: {} frames, {} cars, {points} points a frame", counts.frames, counts.cars);
+            println!("{split}: {} frames, {} cars, {points} points per frame", counts.frames, counts.cars);
         }
-        eprintln!("data set in {}", out.display());
+        eprintln!("data set written to {}", out.display());
         Ok(())
     }
 
@@ -67,16 +68,16 @@ impl SimulateArgs {
     fn race(&self, config: &RaceConfig, files: &ConfigFiles) -> Result<()> {
         let out = self.out.clone().unwrap_or_else(|| Path::new("datasets").join(&config.name));
         let progress = bar()?;
-        let hear = |name: &str, done: usize, total: usize| {
+        let show_progress = |name: &str, done: usize, total: usize| {
             progress.set_message(name.to_string());
             progress.set_length(total as u64);
             progress.set_position(done as u64);
         };
-        let manifests = make_race_datasets(config, files, &out, &self.dataset, &hear)?;
+        let manifests = make_race_datasets(config, files, &out, &self.dataset, &show_progress)?;
         progress.finish_and_clear();
         manifests.iter().for_each(|manifest| print!("{}", summary(manifest)));
         manifests.iter().try_for_each(|manifest| preview(&out.join(&manifest.name[1])))?;
-        eprintln!("data sets in {}", out.display());
+        eprintln!("data sets written to {}", out.display());
         Ok(())
     }
 }
@@ -86,7 +87,7 @@ fn bar() -> Result<ProgressBar> {
     Ok(ProgressBar::new(0).with_style(style))
 }
 
-/// The first frame of the test split from above: `preview.png`, the same frame in all data sets of a race.
+/// Writes `preview.png`, a bird's eye view of the first test frame. All data sets of a race show the same frame.
 fn preview(folder: &Path) -> Result<()> {
     let picture = folder.join("preview.png");
     if picture.is_file() {
@@ -100,19 +101,19 @@ fn preview(folder: &Path) -> Result<()> {
     Ok(write_atomic(&picture, &bytes)?)
 }
 
-/// A line a split, and how far labels are off where they are made as on the road.
+/// One line per split; for data sets with auto-labels, also the rms errors of the labels.
 fn summary(manifest: &RaceManifest) -> String {
     let name = &manifest.name[1];
     let mut text = String::new();
     for (split, counts) in &manifest.splits {
         let points = counts.points / counts.frames.max(1);
-        text += &format!("{name} {split}: {} frames, {} cars, {points} points a frame\n", counts.frames, counts.cars);
+        text += &format!("{name} {split}: {} frames, {} cars, {points} points per frame\n", counts.frames, counts.cars);
     }
     for error in manifest.label_errors.iter().filter(|e| e.labels > 0) {
         let [along, across, up] = error.rms_m;
         text += &format!(
-            "{name} labels at {:.0} to {:.0} m: off by {along:.2} m along, {across:.2} m across, {up:.2} m up (rms of {})\n",
-            error.range_m[0], error.range_m[1], error.labels
+            "{name}, {} labels at {:.0} to {:.0} m: rms error {along:.2} m longitudinal, {across:.2} m lateral, {up:.2} m vertical\n",
+            error.labels, error.range_m[0], error.range_m[1]
         );
     }
     text

@@ -1,4 +1,5 @@
-//! `lidarshift study`: everything about one study file: data sets, runs, detections, numbers, report. Whatever is there already is kept.
+//! `lidarshift study`: runs a whole study: data sets, training runs, detections, evaluation, report. Existing results
+//! are kept.
 
 mod output;
 
@@ -10,11 +11,11 @@ use clap::{Args, Subcommand, ValueEnum};
 use std::path::{Path, PathBuf};
 use study::{Launcher, RunOptions, Step, Study, status};
 
-/// A whole study: makes the data sets that are missing, trains the runs that are missing, detects every test set, compares, and writes one
-/// report. Before the first step it says what all will cost.
+/// Run a study: generate the missing data sets, train the missing runs, detect on every test set, evaluate, and write a
+/// report. The expected computing time is printed before training starts.
 ///
-/// It can be stopped at any moment, and goes on where it was when it is started again with the same words. What is there already is kept;
-/// what a change of the study's file makes invalid is said, and made anew with --replace.
+/// The study can be interrupted at any moment; run the same command again to resume it. Existing results are kept. Runs
+/// that are invalid after a change of the study's TOML are listed; --replace repeats them.
 ///
 /// Examples:
 ///   lidarshift study quick
@@ -33,24 +34,24 @@ pub struct StudyArgs {
     /// Folder of the study [default: runs/NAME]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Only these steps, with commas between them [default: all]
+    /// Only these steps, separated by commas [default: all]
     #[arg(long, value_enum, value_delimiter = ',', value_name = "STEPS")]
-    only: Vec<StepWord>,
+    only: Vec<StepArg>,
     #[command(flatten)]
-    how: HowToRun,
+    scheduling: SchedulingArgs,
     #[command(flatten)]
     device: DeviceArgs,
 }
 
 #[derive(Subcommand, Debug)]
 enum StudyCommand {
-    /// Where the runs of a study stand, and how long the rest will take
-    Status(StudyPlace),
+    /// State of each run and the remaining computing time
+    Status(StudySelection),
 }
 
-/// Which study.
+/// A study selected on the command line.
 #[derive(Args, Clone, Debug)]
-pub struct StudyPlace {
+pub struct StudySelection {
     /// A name (quick, cpu, gain, paper), a TOML, or the folder of a study
     #[arg(value_name = "STUDY")]
     study: String,
@@ -59,107 +60,107 @@ pub struct StudyPlace {
     out: Option<PathBuf>,
 }
 
-impl StudyPlace {
-    /// The study.
+impl StudySelection {
+    /// Opens the study.
     ///
     /// # Errors
-    /// Neither a name nor a file, or a file that is wrong.
+    /// Neither a known name nor a file, or an invalid file.
     pub fn open(&self) -> Result<Study> {
         Ok(Study::open(&self.study, self.out.as_deref())?)
     }
 
-    /// The folder that was named, if it is one and no study's.
-    pub fn runs_alone(&self) -> Option<&Path> {
+    /// The given path if it is a folder that is not the folder of a study.
+    pub fn folder_of_runs(&self) -> Option<&Path> {
         let folder = Path::new(&self.study);
         (folder.is_dir() && !Study::is_folder(folder)).then_some(folder)
     }
 }
 
-/// How the runs of a study are worked on.
+/// Options for executing the runs of a study.
 #[derive(Args, Clone, Debug)]
-pub struct HowToRun {
-    /// Who starts the runs of a study: this machine, or Slurm as job arrays
+pub struct SchedulingArgs {
+    /// Where the runs of a study are executed: local (this machine), or slurm (as job arrays)
     #[arg(long, value_enum, default_value = "local", requires = "study")]
-    launcher: LauncherWord,
-    /// Say what is missing and what it will cost, and stop
+    launcher: LauncherArg,
+    /// Print the missing runs and their expected computing time, then exit
     #[arg(long, requires = "study")]
     dry_run: bool,
-    /// Runs at once on this machine [default: by cores and memory]
+    /// Number of parallel runs on this machine [default: from cores and memory]
     #[arg(long, value_name = "N", requires = "study")]
     jobs: Option<usize>,
-    /// Remove runs that were made with other settings than the study's, and make them anew
+    /// Remove and repeat runs whose settings differ from those of the study
     #[arg(long, requires = "study")]
     replace: bool,
-    /// Words for sbatch, behind --
+    /// Options for sbatch, after --
     #[arg(last = true, value_name = "SBATCH", requires = "study")]
     sbatch: Vec<String>,
 }
 
-impl HowToRun {
-    /// The options of a study that takes these steps on this device.
+impl SchedulingArgs {
+    /// The options to run these steps of a study on this device.
     pub fn options(self, steps: Vec<Step>, device: &DeviceArgs) -> RunOptions {
         let launcher = match self.launcher {
-            LauncherWord::Local => Launcher::Local,
-            LauncherWord::Slurm => Launcher::Slurm,
+            LauncherArg::Local => Launcher::Local,
+            LauncherArg::Slurm => Launcher::Slurm,
         };
-        let HowToRun { dry_run, jobs, replace, sbatch, .. } = self;
-        RunOptions { steps, launcher, dry_run, jobs, replace, sbatch, device: device.words() }
+        let SchedulingArgs { dry_run, jobs, replace, sbatch, .. } = self;
+        RunOptions { steps, launcher, dry_run, jobs, replace, sbatch, device: device.arguments() }
     }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum LauncherWord {
+enum LauncherArg {
     Local,
     Slurm,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum StepWord {
-    /// Data sets
+enum StepArg {
+    /// Generate the data sets
     Data,
-    /// Training
+    /// Train the runs
     Train,
-    /// Detections of the test sets
+    /// Detect on the test sets
     Detect,
-    /// Numbers, figures and the page
+    /// Evaluate and write the report
     Report,
 }
 
-impl StepWord {
+impl StepArg {
     fn step(self) -> Step {
         match self {
-            StepWord::Data => Step::Data,
-            StepWord::Train => Step::Train,
-            StepWord::Detect => Step::Detect,
-            StepWord::Report => Step::Report,
+            StepArg::Data => Step::Data,
+            StepArg::Train => Step::Train,
+            StepArg::Detect => Step::Detect,
+            StepArg::Report => Step::Report,
         }
     }
 }
 
 impl StudyArgs {
-    /// Works on the study to its end, or says where it stands.
+    /// Runs the study, or prints its status.
     ///
     /// # Errors
-    /// What cannot be made; runs that failed, behind everything else.
+    /// A step that fails. Failed runs are reported after all other runs have ended.
     pub fn run(self) -> Result<()> {
-        if let Some(StudyCommand::Status(place)) = self.command {
-            let study = place.open()?;
+        if let Some(StudyCommand::Status(selection)) = self.command {
+            let study = selection.open()?;
             output::print_status(&study, &status(&study)?);
             return Ok(());
         }
-        let Some(named) = self.study else { bail!("which study? `lidarshift study quick`, for one") };
+        let Some(named) = self.study else { bail!("the study is missing; for example: `lidarshift study quick`") };
         let steps = match self.only.is_empty() {
             true => Step::ALL.to_vec(),
-            false => self.only.iter().map(|word| word.step()).collect(),
+            false => self.only.iter().map(|step| step.step()).collect(),
         };
-        run_study(&Study::open(&named, self.out.as_deref())?, &self.how.options(steps, &self.device))
+        run_study(&Study::open(&named, self.out.as_deref())?, &self.scheduling.options(steps, &self.device))
     }
 }
 
-/// Takes the steps of a study and prints its matrix and where its report lies.
+/// Runs the steps of a study and prints its matrix and the path of its report.
 ///
 /// # Errors
-/// What cannot be made; runs that failed, behind everything else.
+/// A step that fails. Failed runs are reported after all other runs have ended.
 pub fn run_study(study: &Study, options: &RunOptions) -> Result<()> {
     let outcome = study::run_study(study, options, &listener())?;
     if let Some((matrix, files)) = &outcome.report {

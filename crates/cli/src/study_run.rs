@@ -1,35 +1,35 @@
-//! `lidarshift study-run`: one run of a study in a process of its own.
+//! `lidarshift study-run`: executes one run of a study in a separate process.
 
 use crate::device::DeviceArgs;
 use anyhow::Result;
 use clap::{Args, ValueEnum};
 use std::io::Read as _;
 use std::time::{Duration, Instant};
-use study::{RunPart, RunWork, Study, measure, work_on_run};
+use study::{RunPart, RunWork, Study, execute_run, measure};
 use train::Event;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum PartWord {
+enum PartArg {
     /// Training.
     Train,
-    /// Detections and features of the test sets.
+    /// Detections on the test sets, and features.
     Detect,
-    /// Nothing but a few steps and detections, to see what they cost: JSON on stdout.
+    /// Only the time and memory of a few training steps and detections, as JSON on stdout.
     Measure,
 }
 
-/// One run of a study; the study itself, or a cluster, starts as many of these as there are runs.
+/// Execute one run of a study. `lidarshift study` or Slurm starts one such process per run.
 #[derive(Args, Debug)]
 pub struct StudyRunArgs {
     /// Folder of the study
     study: String,
-    /// The run: NETWORK/TRAIN SET/seed-K
+    /// Name of the run: NETWORK/TRAIN_SET/seed-K
     #[arg(long, value_name = "NAME")]
     run: String,
-    /// What to do
+    /// Parts of the run to execute
     #[arg(long, value_enum, value_delimiter = ',', default_values = ["train", "detect"])]
-    parts: Vec<PartWord>,
-    /// End when stdin ends: who started this is gone then
+    parts: Vec<PartArg>,
+    /// Exit when stdin is closed, that is, when the parent process has ended
     #[arg(long)]
     attached: bool,
     #[command(flatten)]
@@ -40,25 +40,25 @@ pub struct StudyRunArgs {
 }
 
 impl StudyRunArgs {
-    /// Does it; what goes wrong is left in the run's folder, too.
+    /// Executes the run. An error is also written to the run folder.
     ///
     /// # Errors
-    /// As [`work_on_run`].
+    /// As [`execute_run`].
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         if self.attached {
-            std::thread::spawn(end_with_stdin);
+            std::thread::spawn(exit_with_stdin);
         }
         let study = Study::open(&self.study, None)?;
         let run = study.run(&self.run)?;
-        if self.parts.contains(&PartWord::Measure) {
+        if self.parts.contains(&PartArg::Measure) {
             println!("{}", serde_json::to_string(&measure(&study, &run, &self.device.open()?)?)?);
             return Ok(());
         }
-        let part = |word: &PartWord| match word {
-            PartWord::Train => Some(RunPart::Train),
-            PartWord::Detect => Some(RunPart::Detect),
-            PartWord::Measure => None,
+        let part = |arg: &PartArg| match arg {
+            PartArg::Train => Some(RunPart::Train),
+            PartArg::Detect => Some(RunPart::Detect),
+            PartArg::Measure => None,
         };
         let parts: Vec<RunPart> = self.parts.iter().filter_map(part).collect();
         let work = RunWork {
@@ -68,7 +68,7 @@ impl StudyRunArgs {
             workers: self.workers,
         };
         let mut last = Instant::now();
-        work_on_run(&study, &run, &work, &mut |event| show(event, &mut last), &|what| eprintln!("{what}"))?;
+        execute_run(&study, &run, &work, &mut |event| show(event, &mut last), &|note| eprintln!("{note}"))?;
         Ok(())
     }
 }
@@ -76,7 +76,7 @@ impl StudyRunArgs {
 fn show(event: &Event<'_>, last: &mut Instant) {
     match event {
         Event::Begin { state, epochs, frames, .. } => {
-            eprintln!("{frames} frames, {epochs} epochs, step {} of {}", state.step, state.total_steps);
+            eprintln!("{frames} training frames, {epochs} epochs, step {} of {}", state.step, state.total_steps);
         }
         Event::Step { metrics, logged: true } if last.elapsed() > Duration::from_secs(10) => {
             eprintln!("step {}: loss {:.4}, {:.1} samples/s", metrics.step, metrics.loss, metrics.samples_per_s);
@@ -91,8 +91,8 @@ fn show(event: &Event<'_>, last: &mut Instant) {
     }
 }
 
-fn end_with_stdin() {
-    let mut nothing = [0; 64];
-    while std::io::stdin().read(&mut nothing).is_ok_and(|n| n > 0) {}
+fn exit_with_stdin() {
+    let mut ignored = [0; 64];
+    while std::io::stdin().read(&mut ignored).is_ok_and(|n| n > 0) {}
     std::process::exit(1);
 }

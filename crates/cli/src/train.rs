@@ -1,10 +1,10 @@
-//! `lidarshift train`: one run; without a data set on data made on the spot.
+//! `lidarshift train`: one training run, by default on a synthetic data set, or all runs of a study.
 
 mod progress;
 mod results;
 
 use crate::device::DeviceArgs;
-use crate::study::{HowToRun, run_study};
+use crate::study::{SchedulingArgs, run_study};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
@@ -18,10 +18,12 @@ use train::{RunConfig, Session, evaluate_detector, set_key, train};
 
 const DEFAULT_DETECTOR: &str = "pointpillars_small";
 
-/// Train a detector. Without a data set one is made on the spot: roads with cars, seen by a spinning LiDAR.
+/// Train a detector. Without --dataset, a synthetic data set is generated: roads with cars, scanned by a spinning
+/// LiDAR.
 ///
-/// A run folder holds config.toml, metrics.jsonl, provenance.json and checkpoint/; last.safetensors in there has OpenPCDet's names.
-/// A run that was stopped, whenever that was, goes on with --resume and ends with the same weights to the bit.
+/// A run folder contains config.toml, metrics.jsonl, provenance.json and checkpoint/. The parameters in
+/// last.safetensors have OpenPCDet's names. A run that was interrupted at any moment is resumed with --resume. Its
+/// final weights are bit-identical to those of an uninterrupted run.
 ///
 /// Examples:
 ///   lidarshift train
@@ -32,54 +34,56 @@ const DEFAULT_DETECTOR: &str = "pointpillars_small";
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct TrainArgs {
-    /// Folder or TOML of a data set; without it a synthetic one is made [default: runs/default/data]
+    /// Data set: folder or TOML [default: a synthetic one in runs/default/data]
     #[arg(long, value_name = "DIR|TOML")]
     dataset: Option<PathBuf>,
-    /// Detector: a name or a TOML [default: pointpillars_small]
+    /// Detector: a name of configs/detectors or a TOML [default: pointpillars_small]
     #[arg(long, value_name = "NAME|TOML")]
     detector: Option<String>,
-    /// Of the weights, the order of the frames and the augmentation [default: 0]
+    /// Random seed of the initial weights, the frame order and the augmentation [default: 0]
     #[arg(long, value_name = "K")]
     seed: Option<u64>,
-    /// Passes over the training set [default: the detector's own number]
+    /// Number of epochs [default: from the detector's TOML]
     #[arg(long, value_name = "N")]
     epochs: Option<u64>,
-    /// Run folder [default: runs/DETECTOR/DATASET/seed-K; without a data set runs/default/seed-K]
+    /// Run folder [default: runs/DETECTOR/DATASET/seed-K; runs/default/seed-K without --dataset]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
     device: DeviceArgs,
-    /// Changes a key of the detector's TOML (optimization.lr_max=0.001) or of the run (run.log_every_steps=1); may be given more than once
+    /// Override a key of the detector's TOML (optimization.lr_max=0.001) or of the run (run.log_every_steps=1); can be
+    /// repeated
     #[arg(long = "set", value_name = "A.B=C")]
     set: Vec<String>,
-    /// Weights to begin with: safetensors, or OpenPCDet's .pth
+    /// Initial weights: safetensors, or a .pth of OpenPCDet
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
-    /// Go on where a run was stopped, or begin it; what is not said again stays as it was
+    /// Resume the run in --out, or start it if there is none; options that are not repeated keep their values
     #[arg(long)]
     resume: bool,
-    /// Learn and evaluate on all frames, without augmentation: shows whether the network can learn the data at all [default: as many epochs as a network of this kind needs for it]
+    /// Train and evaluate on all frames without augmentation, to check that the network can fit the data; without
+    /// --epochs, the number of epochs is increased to what the network needs for this
     #[arg(long)]
     overfit: bool,
-    /// Threads that load and augment frames; any number gives the same weights
+    /// Threads that load and augment frames; the weights do not depend on it
     #[arg(long, default_value_t = 2, value_name = "N")]
     workers: usize,
-    /// A handful of frames and steps in a temporary folder: shows that everything runs, learns nothing
+    /// Only check that training runs: a few frames and steps in a temporary folder
     #[arg(long, conflicts_with_all = ["dataset", "resume"])]
     smoke: bool,
-    /// All runs of a study that are missing, instead of one run: a name (quick, cpu, paper) or a TOML
+    /// Train all missing runs of a study instead of one run: a name (quick, cpu, gain, paper) or a TOML
     #[arg(long, value_name = "STUDY", conflicts_with_all = ["dataset", "detector", "seed", "epochs", "set", "init", "resume", "overfit", "smoke"])]
     study: Option<String>,
     #[command(flatten)]
-    how: HowToRun,
+    scheduling: SchedulingArgs,
 }
 
 impl TrainArgs {
-    /// Trains, evaluates, and says where the results lie.
+    /// Trains, evaluates, and prints the paths of the results.
     pub fn run(mut self) -> Result<()> {
         if let Some(study) = &self.study {
             let study = Study::open(study, self.out.as_deref())?;
-            return run_study(&study, &self.how.options(vec![Step::Data, Step::Train], &self.device));
+            return run_study(&study, &self.scheduling.options(vec![Step::Data, Step::Train], &self.device));
         }
         let device = self.device.open()?;
         let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;
@@ -91,7 +95,7 @@ impl TrainArgs {
             None => self.fresh()?,
         };
         eprintln!("device: {}", self.device.describe());
-        // The default run has nothing to lose: a second call goes on with it.
+        // The default run is always resumed.
         let resume = self.resume || self.dataset.is_none();
         let session = Session { device, device_name: self.device.describe(), workers: self.workers, resume };
         let mut progress = Progress::default();
@@ -101,11 +105,11 @@ impl TrainArgs {
         let set = Dataset::open(&config.dataset)?;
         let named = ["test", config.run.val_split.as_str()].into_iter().find(|s| set.config.splits.contains_key(*s));
         let (ids, what) = match named {
-            _ if config.overfit => (set.all_ids()?, "all frames, which it has learned from".to_string()),
+            _ if config.overfit => (set.all_ids()?, "all frames, which are also the training frames".to_string()),
             Some(split) => (set.ids(split)?, format!("the split {split}")),
             None => {
-                eprintln!("the data set has neither a split test nor {}: not evaluated", config.run.val_split);
-                return results::say_where(&out, temporary.is_none());
+                eprintln!("not evaluated: the data set has neither the split test nor the split {}", config.run.val_split);
+                return results::write_curve_and_list(&out, temporary.is_none());
             }
         };
         let counter = progress::bar("{bar:30} {pos}/{len} frames evaluated, {eta} left", ids.len())?;
@@ -114,17 +118,17 @@ impl TrainArgs {
         counter.finish_and_clear();
         results::show(&found, &what)?;
         results::write(&found, &set, &out)?;
-        results::say_where(&out, temporary.is_none())
+        results::write_curve_and_list(&out, temporary.is_none())
     }
 
-    /// The run to go on with, if there is one: its own words need not be said again.
+    /// Configuration and folder of the run to resume, if there is one.
     fn stored(&self) -> Result<Option<(RunConfig, PathBuf)>> {
         let Some(out) = self.out.as_ref().filter(|_| self.resume) else { return Ok(None) };
         let path = out.join("config.toml");
         Ok(if path.is_file() { Some((RunConfig::read(&path)?, out.clone())) } else { None })
     }
 
-    /// A run from the command line alone, and its folder.
+    /// Configuration and folder of a new run.
     fn fresh(&self) -> Result<(RunConfig, PathBuf)> {
         let mut table = Table::new();
         table.insert("seed".into(), Value::Integer(0));
@@ -141,7 +145,7 @@ impl TrainArgs {
             let frames = Dataset::open(&config.dataset)?.all_ids()?.len();
             let least = config.detector.network.overfit_steps();
             let optimization = &mut config.detector.optimization;
-            // The statistics of one frame alone are not those of all of them, which evaluation takes.
+            // Evaluation uses running statistics, which differ from the batch statistics of a single frame.
             optimization.batch_size = optimization.batch_size.max(2);
             let steps = frames.div_ceil(optimization.batch_size);
             optimization.epochs = least.div_ceil(steps).max(optimization.epochs);
@@ -162,7 +166,7 @@ impl TrainArgs {
         Ok((config, out))
     }
 
-    /// What the command line says, merged into a run's table before the one typed parse.
+    /// Parses a run's table after the command line options have been merged into it.
     fn changed(&self, mut table: Table) -> Result<RunConfig> {
         if let Some(seed) = self.seed {
             table.insert("seed".into(), Value::Integer(i64::try_from(seed).context("--seed is too large")?));
@@ -195,22 +199,22 @@ fn detector_table(name_or_path: &str) -> Result<Table> {
     detector_text(name_or_path)?.parse().with_context(|| name_or_path.to_string())
 }
 
-/// Absolute, so that a run can be resumed from anywhere.
+/// The absolute path, so that a run can be resumed from any working directory.
 fn path_value(path: &Path) -> Result<Value> {
     let absolute = fs_err::canonicalize(path)?;
     match absolute.to_str() {
         Some(text) => Ok(Value::String(text.into())),
-        None => bail!("{} cannot be written into a TOML: its name is not UTF-8", path.display()),
+        None => bail!("{}: the path is not UTF-8 and cannot be written to a TOML", path.display()),
     }
 }
 
-/// The synthetic data set of the default run; frames that are there already are kept.
+/// Generates the synthetic data set of the default run; existing frames are kept.
 fn make_data(folder: &Path, smoke: bool) -> Result<PathBuf> {
     let mut road = RoadConfig::default();
     if smoke {
         road.frames = FrameCounts { train: 4, val: 1, test: 2 };
     }
-    let bar = progress::bar("{bar:30} {pos}/{len} frames made, {eta} left", road.frames.total())?;
+    let bar = progress::bar("{bar:30} {pos}/{len} frames generated, {eta} left", road.frames.total())?;
     make_road_dataset(&road, folder, &|done, _| bar.set_position(done as u64))?;
     bar.finish_and_clear();
     eprintln!("data set: {}", folder.display());

@@ -1,25 +1,26 @@
-//! What people hand in by mistake: the program says where it is wrong and what to do, and ends with a code other than 0.
+//! Invalid input: the error message names the file and the place, and the exit code is 1.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, program, run, said};
+use program::{data_set, must, output_text, program, run};
 use std::fs;
 use std::path::Path;
 
 const TRAIN: &str = "train --dataset . --detector tiny.toml --epochs 1 --out run";
 
-/// Spoils a fresh data set, runs the program on it, and looks for every piece of text in what it says.
-fn check(spoil: impl Fn(&Path), words: &str, wanted: &[&str]) {
+/// Applies `spoil` to a fresh data set, runs the program on it, and checks that its output contains each text of
+/// `wanted`.
+fn check(spoil: impl Fn(&Path), arguments: &str, wanted: &[&str]) {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     spoil(dir.path());
-    let output = run(dir.path(), words);
-    let text = said(&output);
-    assert_eq!(output.status.code(), Some(1), "{words}: {text}");
-    assert!(!text.contains("panicked"), "{words}: {text}");
+    let output = run(dir.path(), arguments);
+    let text = output_text(&output);
+    assert_eq!(output.status.code(), Some(1), "{arguments}: {text}");
+    assert!(!text.contains("panicked"), "{arguments}: {text}");
     for piece in wanted {
-        assert!(text.contains(piece), "{words}: no {piece:?} in: {text}");
+        assert!(text.contains(piece), "{arguments}: no {piece:?} in: {text}");
     }
 }
 
@@ -67,12 +68,12 @@ fn pcd_clouds() {
         ("no header".into(), "cloud.pcd"),
     ] {
         let train = "train --dataset . --detector tiny.toml --epochs 1 --out run --set channels=3";
-        must_have_weights(&|f| fs::write(f.join("cloud.pcd"), &text).unwrap(), train, &["cloud.pcd", wanted]);
+        check_detect(&|f| fs::write(f.join("cloud.pcd"), &text).unwrap(), train, &["cloud.pcd", wanted]);
     }
 }
 
-/// As `check`, of `detect` on `cloud.pcd` with weights that are sound.
-fn must_have_weights(spoil: &dyn Fn(&Path), train: &str, wanted: &[&str]) {
+/// As `check`, for `detect` on `cloud.pcd` with valid weights.
+fn check_detect(spoil: &dyn Fn(&Path), train: &str, wanted: &[&str]) {
     use std::sync::OnceLock;
     static WEIGHTS: OnceLock<Vec<u8>> = OnceLock::new();
     let weights = WEIGHTS.get_or_init(|| {
@@ -192,14 +193,14 @@ fn checkpoints() {
     must(dir.path(), TRAIN);
     let weights = dir.path().join("run/checkpoint/last.safetensors");
     let sound = fs::read(&weights).unwrap();
-    let detect = |words: &str, wanted: &[&str]| {
-        let output = run(dir.path(), words);
-        let text = said(&output);
+    let detect = |arguments: &str, wanted: &[&str]| {
+        let output = run(dir.path(), arguments);
+        let text = output_text(&output);
         assert_eq!(output.status.code(), Some(1), "{text}");
-        assert!(wanted.iter().all(|piece| text.contains(piece)), "{words}: no {wanted:?} in: {text}");
+        assert!(wanted.iter().all(|piece| text.contains(piece)), "{arguments}: no {wanted:?} in: {text}");
     };
-    let words = "detect velodyne/000001.bin --checkpoint";
-    detect(&format!("{words} run/checkpoint/last.safetensors --detector pointpillars_small"), &["does not fit"]);
+    let arguments = "detect velodyne/000001.bin --checkpoint";
+    detect(&format!("{arguments} run/checkpoint/last.safetensors --detector pointpillars_small"), &["does not fit"]);
     for (name, bytes) in [
         ("short.safetensors", &sound[..sound.len() / 2]),
         ("header.safetensors", &sound[..20]),
@@ -207,9 +208,9 @@ fn checkpoints() {
         ("text.pth", b"weights".as_slice()),
     ] {
         fs::write(dir.path().join(name), bytes).unwrap();
-        detect(&format!("{words} {name} --detector tiny.toml"), &[name]);
+        detect(&format!("{arguments} {name} --detector tiny.toml"), &[name]);
     }
-    // A damaged checkpoint does not let a run go on, and stays as it is.
+    // A run with a damaged checkpoint cannot be resumed, and the checkpoint is not changed.
     let state = dir.path().join("run/checkpoint/state.json");
     let text = fs::read_to_string(&state).unwrap();
     fs::write(&state, &text[..text.len() / 2]).unwrap();
@@ -217,7 +218,7 @@ fn checkpoints() {
     assert_eq!(fs::read_to_string(&state).unwrap(), text[..text.len() / 2]);
 }
 
-/// A file system that is full: no file may grow beyond 64 KiB.
+/// Simulates a full file system: no file may grow beyond 64 KiB.
 #[cfg(target_os = "linux")]
 #[test]
 fn full_disk() {
@@ -225,15 +226,15 @@ fn full_disk() {
     data_set(dir.path());
     must(dir.path(), TRAIN);
     let before = fs::read(dir.path().join("run/checkpoint/last.safetensors")).unwrap();
-    let limited = |words: &str| {
-        let shell = format!("trap '' XFSZ; ulimit -f 8; exec {} {words}", env!("CARGO_BIN_EXE_lidarshift"));
+    let limited = |arguments: &str| {
+        let shell = format!("trap '' XFSZ; ulimit -f 8; exec {} {arguments}", env!("CARGO_BIN_EXE_lidarshift"));
         std::process::Command::new("bash").args(["-c", &shell]).current_dir(dir.path()).output().unwrap()
     };
     let output = limited("train --dataset . --detector tiny.toml --epochs 2 --out second");
-    let text = said(&output);
+    let text = output_text(&output);
     assert_eq!(output.status.code(), Some(1), "{text}");
     assert!(text.contains("second") && text.to_lowercase().contains("file too large"), "{text}");
-    // With room again the same words go on to the end, and other runs have lost nothing.
+    // With enough space the same command resumes the run, and other runs are intact.
     must(dir.path(), "train --dataset . --detector tiny.toml --epochs 2 --out second --resume");
     assert_eq!(fs::read(dir.path().join("run/checkpoint/last.safetensors")).unwrap(), before);
 }
@@ -252,5 +253,5 @@ fn run_folder_in_use() {
     first.kill().unwrap();
     first.wait().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    assert!(said(&output).contains("in use by another process"), "{}", said(&output));
+    assert!(output_text(&output).contains("in use by another process"), "{}", output_text(&output));
 }

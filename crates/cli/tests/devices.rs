@@ -1,20 +1,20 @@
-//! Training and detection on every device that this build has and this machine offers; `crates/checks/tests/devices.rs` compares the
-//! reference numbers on them.
+//! Training and detection on every device of this build and this machine. `crates/checks/tests/devices.rs` compares the
+//! devices with the reference numbers.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, run, said};
+use program::{data_set, must, output_text, run};
 use std::path::Path;
 
-/// Devices that answer; of the others, why not. `folder` has a data set.
-fn present(folder: &Path) -> Vec<&'static str> {
+/// The devices that can be used; prints the reason for the others. `folder` contains a data set.
+fn available_devices(folder: &Path) -> Vec<&'static str> {
     let mut found = Vec::new();
     for device in ["flex", "ndarray", "wgpu", "cuda"] {
-        let words =
+        let arguments =
             format!("train --dataset . --detector tiny.toml --epochs 1 --device {device} --out present-{device}");
-        let output = run(folder, &words);
-        let text = said(&output);
+        let output = run(folder, &arguments);
+        let text = output_text(&output);
         if output.status.success() {
             found.push(device);
         } else {
@@ -30,15 +30,15 @@ fn present(folder: &Path) -> Vec<&'static str> {
 fn training_and_detection() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
-    let devices = present(dir.path());
+    let devices = available_devices(dir.path());
     assert!(devices.starts_with(&["flex", "ndarray"]), "{devices:?}");
     for detector in ["tiny", "tiny_pointrcnn"] {
         let mut losses = Vec::new();
         for device in &devices {
             let out = format!("{detector}-{device}");
-            let words =
+            let arguments =
                 format!("train --dataset . --detector {detector}.toml --epochs 1 --device {device} --out {out}");
-            must(dir.path(), &format!("{words} --set run.log_every_steps=1"));
+            must(dir.path(), &format!("{arguments} --set run.log_every_steps=1"));
             let metrics = std::fs::read_to_string(dir.path().join(&out).join("metrics.jsonl")).unwrap();
             let first: serde_json::Value = serde_json::from_str(metrics.lines().next().unwrap()).unwrap();
             losses.push((device, first["loss"].as_f64().unwrap()));
@@ -55,21 +55,23 @@ fn training_and_detection() {
     }
 }
 
-/// Half precision keeps the losses of a training within a few hundredths where a device computes in it, and is refused elsewhere.
+/// On devices with half precision, training losses differ by less than 5 % from single precision; other devices reject
+/// it.
 #[test]
 fn half_precision() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     let refused = run(dir.path(), "train --dataset . --detector tiny.toml --epochs 1 --precision f16 --out refused");
     assert_eq!(refused.status.code(), Some(1));
-    assert!(said(&refused).contains("--precision f16 is for GPUs"), "{}", said(&refused));
+    assert!(output_text(&refused).contains("--precision f16 is for GPUs"), "{}", output_text(&refused));
     for detector in ["tiny", "tiny_pointrcnn"] {
         let mut losses = Vec::new();
         for precision in ["f16", "f32"] {
             let out = format!("{detector}-{precision}");
-            let words = format!("train --dataset . --detector {detector}.toml --epochs 1 --device wgpu --out {out}");
-            let output = run(dir.path(), &format!("{words} --precision {precision} --set run.log_every_steps=1"));
-            let text = said(&output);
+            let arguments =
+                format!("train --dataset . --detector {detector}.toml --epochs 1 --device wgpu --out {out}");
+            let output = run(dir.path(), &format!("{arguments} --precision {precision} --set run.log_every_steps=1"));
+            let text = output_text(&output);
             let absent = ["was built without the feature", "no adapter", "does not compute in half precision"];
             if absent.iter().any(|reason| text.contains(reason)) {
                 eprintln!("not tested: {}", text.trim());
@@ -83,7 +85,7 @@ fn half_precision() {
         eprintln!("{detector}, losses step by step, f16 and f32: {losses:?}");
         let (half, single) = (&losses[0], &losses[1]);
         assert!(half.len() == single.len() && half != single);
-        // The regions of the second stage are chosen by scores: a few are others in half precision.
+        // The second stage selects regions by score; half precision changes a few of them.
         for (half, single) in half.iter().zip(single) {
             assert!((half / single - 1.0).abs() < 0.05, "{detector}: {half} in half precision, {single} in single");
         }

@@ -1,9 +1,10 @@
-//! One run through the program: killed and gone on with, on any number of threads, under one seed and under two.
+//! One training run through the program: killed and resumed, with different numbers of threads, with equal and
+//! different seeds.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, program, said};
+use program::{data_set, must, output_text, program};
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
@@ -17,7 +18,7 @@ fn weights(folder: &Path, run: &str) -> Vec<u8> {
     fs::read(folder.join(run).join("checkpoint/last.safetensors")).unwrap()
 }
 
-/// Steps that the run has written down.
+/// Number of lines in the metrics of the run.
 fn steps(folder: &Path, run: &str) -> usize {
     fs::read_to_string(folder.join(run).join("metrics.jsonl")).map_or(0, |text| text.lines().count())
 }
@@ -38,8 +39,8 @@ fn kill_and_resume(train: &str) {
     must(dir.path(), &format!("{train} --seed 1 --out whole"));
     let mut kills = 0;
     for patience_ms in [0, 15, 40, 90, 150, 300] {
-        let words = format!("{train} --seed 1 --out killed --resume");
-        let mut child = program(dir.path(), &words).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
+        let arguments = format!("{train} --seed 1 --out killed --resume");
+        let mut child = program(dir.path(), &arguments).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
         let before = steps(dir.path(), "killed");
         while steps(dir.path(), "killed") == before && child.try_wait().unwrap().is_none() {
             std::thread::sleep(Duration::from_millis(2));
@@ -63,7 +64,7 @@ fn the_number_of_threads_changes_no_bit() {
             let out = format!("{network}-{threads}");
             let mut child = program(dir.path(), &format!("{train} --out {out}"));
             let output = child.env("RAYON_NUM_THREADS", threads).output().unwrap();
-            assert!(output.status.success(), "{}", said(&output));
+            assert!(output.status.success(), "{}", output_text(&output));
             weights(dir.path(), &out)
         });
         assert!(one == two && two == three, "{network}: the weights depend on the number of threads");
@@ -84,7 +85,7 @@ fn workers_and_repetition_change_no_bit_and_the_seed_does() {
 }
 
 #[test]
-fn a_split_is_detected_and_evaluated_from_texts_alone() {
+fn a_split_is_detected_and_evaluated_from_kitti_text() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     must(dir.path(), &format!("{TRAIN} --out run"));
@@ -113,10 +114,10 @@ fn a_split_is_detected_and_evaluated_from_texts_alone() {
 }
 
 #[test]
-fn the_default_run_in_its_smallest_form() {
+fn the_smoke_run_writes_all_results() {
     let dir = tempfile::tempdir().unwrap();
     let output = must(dir.path(), "train --smoke --out smoke");
-    assert!(String::from_utf8_lossy(&output.stdout).contains("run folder"), "{}", program::said(&output));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("run folder"), "{}", program::output_text(&output));
     for file in ["checkpoint/last.safetensors", "eval.json", "curve.svg", "config.toml", "provenance.json"] {
         assert!(dir.path().join("smoke/seed-0").join(file).is_file(), "{file}");
     }

@@ -1,16 +1,17 @@
-//! The race through the program: the same bytes on any number of threads, gone on with after a kill, clear words for bad input.
+//! Simulation of a race through the program: the same bytes with any number of threads and after a kill; errors of
+//! invalid input.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{must, program, run, said};
+use program::{must, output_text, program, run};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
-/// A race of 18 frames at a twelfth of the resolution.
+/// A race of 18 frames with a reduced resolution.
 const RACE: &str = r#"
 name = "tiny"
 seed = 4
@@ -42,7 +43,7 @@ fn race(folder: &Path) {
     fs::write(folder.join("race.toml"), RACE).unwrap();
 }
 
-/// Every file below a folder with its content.
+/// Path and content of every file below a folder.
 fn content(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut files = BTreeMap::new();
     let mut open = vec![folder.to_path_buf()];
@@ -69,10 +70,10 @@ fn threads_and_kills_change_no_byte() {
     let clouds = |set: &str| whole.keys().filter(|name| name.starts_with(&format!("{set}/velodyne/"))).count();
     assert_eq!(["measured", "sim", "sim_noise"].map(clouds), [18; 3]);
 
-    let words = "simulate --config race.toml --out killed";
+    let arguments = "simulate --config race.toml --out killed";
     let mut kills = 0;
     for frames in [1, 14, 30] {
-        let mut child = program(dir.path(), words)
+        let mut child = program(dir.path(), arguments)
             .env("RAYON_NUM_THREADS", "1")
             .stdout(Stdio::null())
             .stderr(Stdio::null())
@@ -91,22 +92,22 @@ fn threads_and_kills_change_no_byte() {
         child.wait().unwrap();
     }
     assert!(kills >= 2, "only {kills} runs were killed before their end");
-    must(dir.path(), words);
+    must(dir.path(), arguments);
     let killed = content(&dir.path().join("killed"));
     assert_eq!(whole.keys().collect::<Vec<_>>(), killed.keys().collect::<Vec<_>>());
     let other: Vec<_> = whole.iter().filter(|(name, bytes)| killed[*name] != **bytes).map(|(name, _)| name).collect();
     assert!(other.is_empty(), "{other:?} differ");
 
-    must(dir.path(), words);
-    assert!(content(&dir.path().join("killed")) == killed, "a run that has nothing to do changes files");
+    must(dir.path(), arguments);
+    assert!(content(&dir.path().join("killed")) == killed, "a run without missing frames changes files");
 }
 
 #[test]
-fn pairs_are_counted_and_effects_put_on_a_finished_data_set() {
+fn pairs_are_compared_and_effects_applied_to_an_existing_data_set() {
     let dir = tempfile::tempdir().unwrap();
     race(dir.path());
     must(dir.path(), "simulate --config race.toml --out race --dataset measured,sim");
-    let table = said(&must(dir.path(), "eval statistics race/measured race/sim --json table.json"));
+    let table = output_text(&must(dir.path(), "eval statistics race/measured race/sim --json table.json"));
     assert!(table.contains("points a cloud, mean") && dir.path().join("table.json").is_file(), "{table}");
 
     must(dir.path(), "resim --effects sim_noise.toml race/sim --out noisy");
@@ -142,11 +143,15 @@ fn bad_input_is_named_by_file_and_line() {
         race(dir.path());
         fs::write(dir.path().join(name), text).unwrap();
         let output = run(dir.path(), &format!("simulate --config race.toml --out out{i}"));
-        let said = said(&output);
+        let said = output_text(&output);
         assert!(!output.status.success() && said.contains(want) && !said.contains("panicked"), "{want}: {said}");
     }
     race(dir.path());
     must(dir.path(), "simulate --config race.toml --out race --dataset sim");
     let other = run(dir.path(), "simulate --config race.toml --out race --dataset sim --seed 5");
-    assert!(!other.status.success() && said(&other).contains("another configuration"), "{}", said(&other));
+    assert!(
+        !other.status.success() && output_text(&other).contains("another configuration"),
+        "{}",
+        output_text(&other)
+    );
 }

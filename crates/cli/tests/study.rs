@@ -1,15 +1,16 @@
-//! A whole study through the program: killed and gone on with, with a run that fails, with a changed file, with frames that do not pair.
+//! A study through the program: killed and resumed, with a failing run, with a changed TOML, with data sets of
+//! different frames.
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, program, run, said};
+use program::{data_set, must, output_text, program, run};
 use std::fs;
 use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
-/// Two data sets of the same seven frames, two seeds of the tiny network, everything small.
+/// Two data sets with the same seven frames, two seeds of the tiny network.
 const STUDY: &str = r#"
 name = "tiny"
 about = ["A test."]
@@ -55,7 +56,7 @@ fn steps_done(folder: &Path) -> usize {
     runs.iter().filter_map(|run| lines(run).ok()).map(|text| text.lines().count()).sum()
 }
 
-/// Says where two pages part.
+/// Compares two pages; a failure shows the first difference.
 fn assert_same_page(page: &str, other: &str) {
     let at = page.bytes().zip(other.bytes()).position(|(a, b)| a != b).unwrap_or(page.len().min(other.len()));
     let around = |text: &str| {
@@ -65,11 +66,11 @@ fn assert_same_page(page: &str, other: &str) {
 }
 
 #[test]
-fn a_study_is_made_and_gone_on_with_after_kills() {
+fn a_killed_study_is_resumed_with_the_same_report() {
     let whole = tempfile::tempdir().unwrap();
     study(whole.path());
     let output = must(whole.path(), "study tiny-study.toml");
-    let text = said(&output);
+    let text = output_text(&output);
     assert!(text.contains("4 runs") && text.contains("steps of") && text.contains("| Car | trained on"), "{text}");
     let html = page(whole.path());
     for part in
@@ -87,10 +88,10 @@ fn a_study_is_made_and_gone_on_with_after_kills() {
     ] {
         assert!(whole.path().join("runs/tiny").join(file).is_file(), "{file}");
     }
-    let status = said(&must(whole.path(), "study status tiny-study.toml"));
+    let status = output_text(&must(whole.path(), "study status tiny-study.toml"));
     assert!(status.contains("4 runs, each tested on 2 data sets: 4 done"), "{status}");
 
-    // The same study in another folder, killed again and again, ends with the same page.
+    // The same study in another folder, killed several times, gives the same report.
     let killed = tempfile::tempdir().unwrap();
     study(killed.path());
     let mut kills = 0;
@@ -113,22 +114,22 @@ fn a_study_is_made_and_gone_on_with_after_kills() {
     must(killed.path(), "study tiny-study.toml");
     assert_same_page(&page(killed.path()), &html);
 
-    // A second call finds everything there; the parts are commands of their own.
-    let again = said(&must(whole.path(), "study tiny-study.toml"));
+    // A second call finds all results; other commands show parts of them.
+    let again = output_text(&must(whole.path(), "study tiny-study.toml"));
     assert!(again.contains("no run is missing"), "{again}");
     assert!(page(whole.path()) == html, "a second call changes the report");
-    let table = said(&must(whole.path(), "eval matrix tiny-study.toml --latex t.tex"));
+    let table = output_text(&must(whole.path(), "eval matrix tiny-study.toml --latex t.tex"));
     assert!(table.contains("| Car | trained on"), "{table}");
     must(whole.path(), "eval tsne runs/tiny --figures features");
     must(whole.path(), "eval targets . runs/tiny/data/noisy --out targets");
-    let distances = said(&must(whole.path(), "eval distances . runs/tiny/data/noisy --frames 2"));
+    let distances = output_text(&must(whole.path(), "eval distances . runs/tiny/data/noisy --frames 2"));
     assert!(distances.contains("Chamfer, sum") && distances.contains("of the Chamfer sum: targets"), "{distances}");
-    let said = said(&must(whole.path(), "report runs/tiny"));
+    let said = output_text(&must(whole.path(), "report runs/tiny"));
     assert!(said.contains("report.html") && page(whole.path()) == html, "{said}");
 }
 
 #[test]
-fn two_stages_leave_their_regions_and_curves_for_tensorboard() {
+fn regions_of_two_stages_and_tensorboard_files_are_written() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
     let two_stage = STUDY.replace("seeds = [1, 2]", "seeds = [1]").replace(
@@ -143,49 +144,53 @@ fn two_stages_leave_their_regions_and_curves_for_tensorboard() {
     let matrix = fs::read_to_string(dir.path().join("runs/tiny/matrix.json")).unwrap();
     assert!(matrix.contains("recall_final_boxes"), "{matrix}");
 
-    let text = said(&must(dir.path(), "report tiny-study.toml --tensorboard curves"));
-    assert!(text.contains("curves of 1 runs: tensorboard --logdir curves"), "{text}");
+    let text = output_text(&must(dir.path(), "report tiny-study.toml --tensorboard curves"));
+    assert!(text.contains("training curves of 1 runs: tensorboard --logdir curves"), "{text}");
     let events = fs::read(dir.path().join("curves/tiny/plain/seed-1/events.out.tfevents.0.lidarshift")).unwrap();
     assert!(events.windows(10).any(|w| w == b"train/loss"));
-    let text = said(&must(dir.path(), "report runs/tiny/tiny/plain/seed-1 --tensorboard alone"));
+    let text = output_text(&must(dir.path(), "report runs/tiny/tiny/plain/seed-1 --tensorboard alone"));
     assert!(!text.contains("report.html") && dir.path().join("alone/events.out.tfevents.0.lidarshift").is_file());
     let output = program(dir.path(), "report runs/tiny/data --tensorboard none").output().unwrap();
-    assert!(!output.status.success() && said(&output).contains("no metrics.jsonl below it"), "{}", said(&output));
+    assert!(
+        !output.status.success() && output_text(&output).contains("no metrics.jsonl below it"),
+        "{}",
+        output_text(&output)
+    );
 }
 
 #[test]
-fn a_failed_run_and_a_changed_file_are_told() {
+fn a_failed_run_and_a_changed_study_are_reported() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
     let one = STUDY.replace("seeds = [1, 2]", "seeds = [1]");
-    // A learning rate beyond all measure: the loss is not finite, in every run.
+    // With this learning rate the loss of every run becomes infinite or NaN.
     let wild = one.replace("config = \"tiny.toml\"", "config = \"tiny.toml\"\nset = { optimization.lr_max = 1e30 }");
     fs::write(dir.path().join("tiny-study.toml"), wild).unwrap();
     let output = run(dir.path(), "study tiny-study.toml");
-    let text = said(&output);
+    let text = output_text(&output);
     assert!(!output.status.success() && text.contains("tiny/plain/seed-1") && text.contains("not finite"), "{text}");
     assert!(page(dir.path()).contains("not finite"), "the report does not show the failure");
-    let status = said(&must(dir.path(), "study status tiny-study.toml"));
+    let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
     assert!(status.contains("2 failed"), "{status}");
 
-    // Another learning rate: the runs are no longer those of the study.
+    // With another learning rate the runs no longer belong to the study.
     fs::write(dir.path().join("tiny-study.toml"), &one).unwrap();
     let output = run(dir.path(), "study tiny-study.toml --only train");
-    let text = said(&output);
+    let text = output_text(&output);
     assert!(!output.status.success(), "{text}");
     assert!(text.contains("tiny/plain/seed-1 is no longer valid: set was"), "{text}");
-    assert!(text.contains("lr_max") && text.contains("--replace makes it anew"), "{text}");
-    let text = said(&must(dir.path(), "train --study tiny-study.toml --replace"));
-    assert!(text.contains("removed") && text.contains("is done"), "{text}");
-    let status = said(&must(dir.path(), "study status tiny-study.toml"));
-    assert!(status.contains("2 trained") && status.contains("to be tested on plain, noisy"), "{status}");
+    assert!(text.contains("lr_max") && text.contains("repeat it with --replace"), "{text}");
+    let text = output_text(&must(dir.path(), "train --study tiny-study.toml --replace"));
+    assert!(text.contains("removed") && text.contains("finished ("), "{text}");
+    let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("2 trained") && status.contains("not tested on plain, noisy"), "{status}");
 
-    // A detection that was lost is made again.
+    // A deleted detection is written again.
     must(dir.path(), "study tiny-study.toml --only detect");
     let lost = dir.path().join("runs/tiny/tiny/plain/seed-1/detections/noisy/000005.txt");
     fs::remove_file(&lost).unwrap();
-    let status = said(&must(dir.path(), "study status tiny-study.toml"));
-    assert!(status.contains("1 done, 1 trained") && status.contains("to be tested on noisy"), "{status}");
+    let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("1 done, 1 trained") && status.contains("not tested on noisy"), "{status}");
     must(dir.path(), "study tiny-study.toml --only detect");
     assert!(lost.is_file());
 
@@ -193,40 +198,45 @@ fn a_failed_run_and_a_changed_file_are_told() {
     let state = dir.path().join("runs/tiny/tiny/plain/seed-1/checkpoint/state.json");
     let other = dir.path().join("runs/tiny/tiny/noisy/seed-1/checkpoint/state.json");
     fs::copy(other, state).unwrap();
-    let text = said(&must(dir.path(), "report tiny-study.toml"));
+    let text = output_text(&must(dir.path(), "report tiny-study.toml"));
     assert!(text.contains("report.html"), "{text}");
     assert!(page(dir.path()).contains("belongs to another configuration"));
 }
 
 #[test]
-fn bad_studies_are_refused_in_words() {
+fn invalid_studies_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
-    for (from, to, words, want) in [
+    for (from, to, arguments, want) in [
         ("", "", "study none", "no study \"none\": neither a file nor one of quick, cpu, gain, paper"),
-        ("", "", "study", "which study?"),
-        ("", "", "report tiny-study.toml", "is not there: `lidarshift study tiny-study.toml --only data` makes it"),
+        ("", "", "study", "the study is missing"),
+        (
+            "",
+            "",
+            "report tiny-study.toml",
+            "does not exist; generate it with `lidarshift study tiny-study.toml --only data`",
+        ),
         ("config = \"tiny.toml\"", "config = \"no.toml\"", "study tiny-study.toml", "no.toml"),
         ("seeds = [1, 2]", "seeds = [1, 1]", "study tiny-study.toml", "have to be distinct"),
         ("path = \".\"", "path = \"nowhere\"", "study tiny-study.toml", "data set plain"),
     ] {
         fs::write(dir.path().join("tiny-study.toml"), STUDY.replacen(from, to, usize::from(!from.is_empty()))).unwrap();
-        let output = run(dir.path(), words);
-        let text = said(&output);
-        assert!(!output.status.success() && text.contains(want), "{words}: {text}");
+        let output = run(dir.path(), arguments);
+        let text = output_text(&output);
+        assert!(!output.status.success() && text.contains(want), "{arguments}: {text}");
     }
     fs::write(dir.path().join("tiny-study.toml"), STUDY).unwrap();
     // Without Slurm on the path.
     let output =
         program(dir.path(), "study tiny-study.toml --launcher slurm").env("PATH", dir.path()).output().unwrap();
-    let text = said(&output);
+    let text = output_text(&output);
     assert!(!output.status.success() && text.contains("there is no squeue on this machine"), "{text}");
     // A test frame that is missing.
     let val = dir.path().join("ImageSets/val.txt");
     let ids = fs::read_to_string(&val).unwrap();
     fs::write(&val, format!("{ids}000099\n")).unwrap();
     let output = run(dir.path(), "study tiny-study.toml");
-    let text = said(&output);
+    let text = output_text(&output);
     assert!(!output.status.success() && text.contains("000099"), "{text}");
     fs::write(&val, ids).unwrap();
     // Frames that the other data set does not have.
@@ -238,7 +248,7 @@ fn bad_studies_are_refused_in_words() {
     let ids = fs::read_to_string(other.join("ImageSets/train.txt")).unwrap().replace("000000", "000099");
     fs::write(other.join("ImageSets/train.txt"), ids).unwrap();
     let output = run(dir.path(), "eval distances . other");
-    let text = said(&output);
+    let text = output_text(&output);
     assert!(!output.status.success() && text.contains("do not pair") && text.contains("000000"), "{text}");
 }
 
@@ -251,9 +261,9 @@ fn waits_for(mut condition: impl FnMut() -> bool) -> bool {
 }
 
 /// What a command of Slurm says; `None` when it fails or is not there.
-fn slurm(words: &[&str]) -> Option<String> {
-    let output = std::process::Command::new(words[0]).args(&words[1..]).output().ok()?;
-    output.status.success().then(|| said(&output))
+fn slurm(arguments: &[&str]) -> Option<String> {
+    let output = std::process::Command::new(arguments[0]).args(&arguments[1..]).output().ok()?;
+    output.status.success().then(|| output_text(&output))
 }
 
 /// A node that takes no new task; it goes on with those that run, and takes new ones again when this is dropped.
@@ -288,18 +298,18 @@ fn on_slurm_the_numbers_are_the_same() {
     study(local.path());
     must(local.path(), "study tiny-study.toml");
     let matrix = |folder: &Path| fs::read_to_string(folder.join("runs/tiny/matrix.json")).unwrap();
-    let status = |folder: &Path| said(&must(folder, "study status tiny-study.toml"));
+    let status = |folder: &Path| output_text(&must(folder, "study status tiny-study.toml"));
 
     // One task is killed; what depends on it is dropped, and the report shows the gap.
     let killed = tempfile::tempdir().unwrap();
     study(killed.path());
-    let text = said(&must(killed.path(), "study tiny-study.toml --launcher slurm"));
+    let text = output_text(&must(killed.path(), "study tiny-study.toml --launcher slurm"));
     assert!(text.contains("train: job") && text.contains("4 tasks") && text.contains("report: job"), "{text}");
     slurm(&["scancel", &format!("{}_3", training_job(&text))]).unwrap();
     assert!(waits_for(|| killed.path().join("runs/tiny/report.html").is_file()), "no report");
     assert!(status(killed.path()).contains("3 done"), "{}", status(killed.path()));
     // A second submission fills the gap alone.
-    let text = said(&must(killed.path(), "study tiny-study.toml --launcher slurm"));
+    let text = output_text(&must(killed.path(), "study tiny-study.toml --launcher slurm"));
     assert!(text.contains("1 tasks"), "{text}");
     assert!(waits_for(|| matrix(killed.path()) == matrix(local.path())), "the numbers differ");
     assert!(waits_for(|| page(killed.path()) == page(local.path())), "the report differs");
@@ -307,13 +317,13 @@ fn on_slurm_the_numbers_are_the_same() {
     // The whole array is killed: nothing is lost but time.
     let array = tempfile::tempdir().unwrap();
     study(array.path());
-    let text = said(&must(array.path(), "study tiny-study.toml --launcher slurm --only data,train"));
+    let text = output_text(&must(array.path(), "study tiny-study.toml --launcher slurm --only data,train"));
     slurm(&["scancel", &training_job(&text)]).unwrap();
     assert!(waits_for(
         || slurm(&["squeue", "--noheader", "--jobs", &training_job(&text)]).is_none_or(|q| q.trim().is_empty())
     ));
-    let text = said(&must(array.path(), "study tiny-study.toml --launcher slurm"));
-    assert!(!text.contains("queue already"), "{text}");
+    let text = output_text(&must(array.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(!text.contains("already in the queue"), "{text}");
     assert!(waits_for(|| array.path().join("runs/tiny/report.html").is_file()), "no report");
     assert!(matrix(array.path()) == matrix(local.path()), "the numbers differ");
 
@@ -332,8 +342,8 @@ fn on_slurm_the_numbers_are_the_same() {
         || slurm(&["squeue", "--noheader", "--states=running", "--nodelist", node]).unwrap().trim().is_empty();
     assert!(waits_for(is_idle), "tasks go on for ever");
     assert!(!status(drained.path()).contains("4 done"), "{}", status(drained.path()));
-    let text = said(&must(drained.path(), "study tiny-study.toml --launcher slurm"));
-    assert!(text.contains("queue already"), "{text}");
+    let text = output_text(&must(drained.path(), "study tiny-study.toml --launcher slurm"));
+    assert!(text.contains("already in the queue"), "{text}");
     drop(guard);
     assert!(waits_for(|| drained.path().join("runs/tiny/report.html").is_file()), "no report");
     assert!(waits_for(|| matrix(drained.path()) == matrix(local.path())), "the numbers differ");

@@ -1,4 +1,4 @@
-//! Results that are kept with a hash of what they were made of, so that a second call makes only what changed.
+//! Results that are cached in files together with a hash of their inputs, and recomputed only if the inputs change.
 
 use crate::error::Result;
 use data::write_atomic;
@@ -7,7 +7,8 @@ use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
 use std::path::Path;
 
-/// What `make` gives, as JSON in the file; read from there when it was made of the same `parts` by the same version of the program.
+/// The result of `make`, cached as JSON in `path`. It is read from there if it was made from the same `parts` by the
+/// same version of the program.
 ///
 /// # Errors
 /// What `make` returns, and files that cannot be written.
@@ -27,7 +28,7 @@ pub fn cached<T: Serialize + DeserializeOwned>(
     {
         return Ok(value);
     }
-    // The key goes first and comes last: what lies between is never taken for the result.
+    // The key is removed before and written after the value, so that an interrupted update is never taken for a result.
     if key_path.is_file() {
         fs_err::remove_file(&key_path)?;
     }
@@ -36,7 +37,7 @@ pub fn cached<T: Serialize + DeserializeOwned>(
     text.push(b'\n');
     write_atomic(path, &text)?;
     write_atomic(&key_path, key.as_bytes())?;
-    // As it will be read: numbers that JSON does not hold are the same in the first report and in the next.
+    // Parsed from the JSON, so that the first call returns the same as later ones (JSON has no NaN, for example).
     Ok(serde_json::from_slice(&text)?)
 }
 

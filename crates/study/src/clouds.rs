@@ -1,9 +1,9 @@
-//! What the data sets of a study have in common and what not: distances and targets.
+//! Comparison of the data sets of a study: distances and targets.
 
 use crate::cache::cached;
 use crate::config::StudyDataset;
 use crate::data_sets::{labelled_sha256, open};
-use crate::detections::spread;
+use crate::detections::evenly_spaced;
 use crate::error::{Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
@@ -15,19 +15,19 @@ use eval::distance::{
 use eval::targets::{Targets, targets};
 use models::config::DetectorConfig;
 
-/// What the training loader of a detector does to a cloud.
+/// The training loader of a detector.
 pub struct Loader {
     range_m: [f64; 6],
     augmentation: AugmentConfig,
 }
 
 impl Loader {
-    /// That of a detector.
+    /// The loader of a detector.
     pub fn of(detector: &DetectorConfig) -> Loader {
         Loader { range_m: detector.range_m.map(f64::from), augmentation: detector.augmentation.clone() }
     }
 
-    /// The frame as it is compared. Ground-truth sampling, which puts targets of other frames in, is left out.
+    /// The frame as it is compared. Ground-truth sampling, which inserts targets of other frames, is left out.
     fn apply(&self, frame: Frame, compared: Compared) -> Frame {
         let mut random = stream(0, &format!("compared {}", frame.id), 0, 0);
         match compared {
@@ -38,10 +38,10 @@ impl Loader {
     }
 }
 
-/// Distances of two data sets over `most` frames of a split that both have.
+/// Distances between two data sets on at most `most` frames of a split, which both must have.
 ///
 /// # Errors
-/// Splits that do not pair, and frames that cannot be read.
+/// Splits with different frames, or frames that cannot be read.
 pub fn distances_of(
     names: [&str; 2],
     [a, b]: [&Dataset; 2],
@@ -51,7 +51,7 @@ pub fn distances_of(
     options: &DistanceOptions,
 ) -> Result<Distances> {
     let ids = paired_ids(&a.ids(split)?, &b.ids(split)?)?;
-    let ids = spread(&ids, most.unwrap_or(ids.len()));
+    let ids = evenly_spaced(&ids, most.unwrap_or(ids.len()));
     let load = |id: &str| -> Result<[Frame; 2], DistanceError> {
         let frames = [a.load(id)?, b.load(id)?];
         Ok(match loader {
@@ -62,7 +62,8 @@ pub fn distances_of(
     Ok(compare(names, &ids, load, Some(&Regions::of_scenery()), options)?)
 }
 
-/// The first data set of a study against each other one, kept in `distances/`; and a sentence for each pair that cannot be compared.
+/// Distances between the first data set of a study and each other one, cached in `distances/`; and a warning for each
+/// pair that cannot be compared.
 ///
 /// # Errors
 /// Frames that cannot be read.
@@ -86,7 +87,7 @@ pub(crate) fn all_distances(study: &Study, listener: Listener<'_>) -> Result<(Ve
             warnings.push(format!("no distances between {} and {}: {problem}", first.title, other.title));
             continue;
         }
-        listener(Event::Note(&format!("distances between {} and {}", first.name, other.name)));
+        listener(Event::Note(&format!("computing the distances between {} and {}", first.name, other.name)));
         let key = (
             DISTANCES_SCHEMA,
             [&a_key, &labelled_sha256(&b, &b_ids)?],
@@ -103,7 +104,7 @@ pub(crate) fn all_distances(study: &Study, listener: Listener<'_>) -> Result<(Ve
     Ok((out, warnings))
 }
 
-/// The targets of every data set of a study, kept in `targets/`.
+/// Target statistics of every data set of a study, cached in `targets/`.
 ///
 /// # Errors
 /// Frames that cannot be read.

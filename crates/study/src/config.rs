@@ -1,5 +1,5 @@
-//! A study as people write it: data sets, detectors, seeds, and what is evaluated. From it come the runs, their folders, the plan of the
-//! matrix, and what a change of the file makes invalid.
+//! Configuration of a study: data sets, detectors, seeds and evaluation. It defines the runs, their folders, the cells
+//! of the matrix, and which results a change of the TOML makes invalid.
 
 mod changes;
 mod problem;
@@ -23,9 +23,9 @@ use std::path::{Path, PathBuf};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StudyConfig {
-    /// Name of its folder.
+    /// Name of the study and of its folder.
     pub name: String,
-    /// What it is and what it scales down, for every report; a paragraph each.
+    /// Description for the report, one string per paragraph: purpose of the study and what it scales down.
     pub about: Vec<String>,
     /// Data sets, in the order of the tables. Every run is tested on each of them.
     #[serde(rename = "dataset")]
@@ -33,31 +33,31 @@ pub struct StudyConfig {
     /// Detectors, in the order of the tables.
     #[serde(rename = "detector")]
     pub detectors: Vec<StudyDetector>,
-    /// Settings to compare, each with every detector. Without any, the detectors are as they are.
+    /// Variants of the detectors to compare. Without variants, each detector is used unchanged.
     #[serde(rename = "variant", default)]
     pub variants: Vec<Variant>,
-    /// One run for each, unless a detector says otherwise.
+    /// Random seeds, one run each. A detector can override them.
     pub seeds: Vec<u64>,
-    /// Epochs of every run, unless a detector says otherwise. Default: as the detector's own file says.
+    /// Number of epochs of every run. A detector can override it. Default: from the detector's TOML.
     #[serde(default)]
     pub epochs: Option<u64>,
     /// Names of the splits.
     #[serde(default)]
     pub splits: Splits,
-    /// What is evaluated and how.
+    /// Options of the evaluation.
     #[serde(default)]
     pub evaluation: StudyEvaluation,
 }
 
-/// The splits that a study uses, of every data set.
+/// The splits that a study uses in every data set.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Splits {
-    /// Trained on, and compared by distances.
+    /// Split for training and for distances between data sets.
     pub train: String,
-    /// Watched during training.
+    /// Split for validation during training.
     pub val: String,
-    /// Tested on.
+    /// Split for testing.
     pub test: String,
 }
 
@@ -71,42 +71,43 @@ impl Default for Splits {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StudyDataset {
-    /// Name of its folders.
+    /// Name of the data set and of its folders.
     pub name: String,
-    /// As tables call it. Default: its name.
+    /// Title in tables and figures. Default: the name.
     #[serde(default)]
     pub title: String,
-    /// Real, Sim, Sim Noise or Sim Downsampled where it is the paper's: the paper's numbers then stand beside.
+    /// Data set of the paper that this one reproduces: Real, Sim, Sim Noise or Sim Downsampled. The paper's numbers are
+    /// then shown for comparison.
     #[serde(default)]
     pub paper: Option<String>,
-    /// Where it comes from.
+    /// Source of the data set.
     pub source: Source,
 }
 
-/// Where a data set comes from. Paths are relative to the study's file.
+/// Source of a data set. Paths are relative to the study's TOML.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Source {
-    /// Its folder or its TOML.
+    /// An existing data set: folder or TOML.
     Path(PathBuf),
-    /// Made by `simulate`.
+    /// Simulated as by `lidarshift simulate`.
     Simulate {
-        /// What `simulate --config` takes: a file, or a name (`race_small`, `street`, ...).
+        /// Value of `simulate --config`: a file, or a name (`race_small`, `street`, ...).
         config: PathBuf,
-        /// Which of its data sets; a street has but one.
+        /// Name of one of its data sets. Not given for streets, which have a single data set.
         #[serde(default)]
         dataset: Option<String>,
         /// Number of frames.
         frames: usize,
-        /// Seed of the scenes.
+        /// Random seed of the scenes.
         #[serde(default)]
         seed: u64,
     },
-    /// Another data set of the study, simulated again with other effects of the sensor: the same scenes.
+    /// An earlier data set of the study with additional sensor effects, as by `lidarshift resim`.
     Resim {
         /// Name of that data set.
         of: String,
-        /// The file of `resim --effects`.
+        /// TOML with the effects, as for `resim --effects`.
         effects: PathBuf,
     },
 }
@@ -115,118 +116,120 @@ pub enum Source {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct StudyDetector {
-    /// Name of its file in configs/detectors, and of its folders.
+    /// Name of its TOML in configs/detectors, and of its folders.
     pub name: String,
-    /// Its file, relative to the study's. Default: the one that comes with the program.
+    /// Its TOML, relative to the study's TOML. Default: the built-in one with this name.
     #[serde(default)]
     pub config: Option<PathBuf>,
-    /// As tables call it. Default: its name.
+    /// Title in tables and figures. Default: the name.
     #[serde(default)]
     pub title: String,
-    /// PointRCNN or PointPillars where it is the paper's: the paper's numbers then stand beside.
+    /// Detector of the paper that this one reproduces: PointRCNN or PointPillars. The paper's numbers are then shown
+    /// for comparison.
     #[serde(default)]
     pub paper: Option<String>,
-    /// Names of the data sets it is trained on. Default: all of them.
+    /// Names of the data sets for training. Default: all.
     #[serde(default)]
     pub train: Option<Vec<String>>,
-    /// Its own seeds.
+    /// Overrides the seeds of the study.
     #[serde(default)]
     pub seeds: Option<Vec<u64>>,
-    /// Its own number of epochs.
+    /// Overrides the number of epochs of the study.
     #[serde(default)]
     pub epochs: Option<u64>,
-    /// Keys to set, as with `--set`: nested, or with points in the key.
+    /// Keys of the detector's TOML to override, as with `train --set`: nested tables or dotted keys.
     #[serde(default)]
     pub set: BTreeMap<String, Value>,
 }
 
-/// Settings to compare: the paper tried the size of pillars, the number of sampled points and the filters.
+/// A variant of detectors. The paper varied the pillar size, the number of sampled points and the filters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Variant {
-    /// Stands in folders and tables behind the detector's name.
+    /// Name; appended to the detector's name in folders and tables.
     pub name: String,
-    /// The detectors it is for. Default: all.
+    /// Names of the detectors that have this variant. Default: all.
     #[serde(default)]
     pub detectors: Option<Vec<String>>,
-    /// Keys to set, as with `--set`: nested, or with points in the key. Empty: the detector as it is.
+    /// Keys of the detector's TOML to override, as with `train --set`: nested tables or dotted keys. Empty: the
+    /// unchanged detector.
     #[serde(default)]
     pub set: BTreeMap<String, Value>,
 }
 
-/// What is evaluated and how.
+/// Options of the evaluation.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct StudyEvaluation {
-    /// The matrix.
+    /// Matrix of train sets and test sets.
     pub matrix: MatrixOptions,
-    /// What is behind the average precision.
+    /// Error analysis of single runs.
     pub analysis: AnalysisOptions,
-    /// The picture of features.
+    /// t-SNE of the features.
     pub tsne: TsneOptions,
-    /// Test clouds for features; the paper takes 500.
+    /// Number of test clouds for features; 500 in the paper. Default: all.
     pub tsne_frames: Option<usize>,
-    /// The data set whose test clouds they are. Default: the first of the study.
+    /// Data set whose test clouds are used for features. Default: the first of the study.
     pub tsne_dataset: Option<String>,
     /// Distances between the data sets.
     pub distances: DistanceOptions,
-    /// Frames for distances. Default: all of the train split.
+    /// Number of frames for distances. Default: all of the train split.
     pub distance_frames: Option<usize>,
-    /// The targets.
+    /// Statistics of the targets.
     pub targets: TargetOptions,
 }
 
 /// One run of a study.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StudyRun {
-    /// Network (the detector, and behind a plus sign its variant), train set and seed.
+    /// Network (`DETECTOR` or `DETECTOR+VARIANT`), train set and seed.
     pub id: RunId,
     /// Name of the detector.
     pub detector: String,
-    /// Its own file.
+    /// TOML of the detector, if it is not a built-in one.
     pub config: Option<PathBuf>,
-    /// Epochs; `None`: as the detector's file says.
+    /// Number of epochs; `None`: from the detector's TOML.
     pub epochs: Option<u64>,
-    /// What to set, `key=value` each, in the order of the keys; the variant's behind the detector's.
+    /// Overridden keys as `key=value`, in the order of the keys; those of the variant after those of the detector.
     pub set: Vec<String>,
-    /// Where the train set comes from.
+    /// Source of the train set.
     pub source: Source,
 }
 
 impl fmt::Display for StudyRun {
-    /// Its folder below that of the study.
+    /// The run folder, relative to the folder of the study.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}/{}/seed-{}", self.id.network, self.id.train_set, self.id.seed)
     }
 }
 
 impl StudyRun {
-    /// The folder of the run below that of the study.
+    /// The run folder.
     pub fn folder(&self, study: &Path) -> PathBuf {
         study.join(self.to_string())
     }
 
-    /// Where its detections on a test set lie, a text a frame.
+    /// Folder of the detections on a test set, one KITTI text file per frame.
     pub fn detections(&self, study: &Path, test_set: &str) -> PathBuf {
         self.folder(study).join("detections").join(test_set)
     }
 
-    /// Where all refined regions of a two-stage network on a test set lie, likewise.
+    /// Folder of all refined regions of a two-stage network on a test set, one KITTI text file per frame.
     pub fn regions(&self, study: &Path, test_set: &str) -> PathBuf {
         self.folder(study).join("regions").join(test_set)
     }
 }
 
 impl StudyConfig {
-    /// Reads a study's file.
+    /// Reads a study's TOML.
     ///
     /// # Errors
-    /// A file that is no TOML, an unknown key, or a study without sense.
+    /// Invalid TOML, an unknown key, or invalid values.
     pub fn read(path: &Path) -> Result<Self, DataError> {
         Self::parse(&fs_err::read_to_string(path)?, path)
     }
 
-    /// Parses a study. `path` is for messages.
+    /// Parses a study. `path` is used in error messages.
     ///
     /// # Errors
     /// As [`StudyConfig::read`].
@@ -248,7 +251,7 @@ impl StudyConfig {
         }
     }
 
-    /// The detector in each of its variants: the network's name, its title, the detector, and what to set.
+    /// All detectors in all their variants: name and title of the network, the detector, and the overridden keys.
     fn networks(&self) -> Vec<(String, String, &StudyDetector, Vec<String>)> {
         let mut networks = Vec::new();
         for detector in &self.detectors {
@@ -273,7 +276,7 @@ impl StudyConfig {
         self.datasets.iter().filter(is_for).collect()
     }
 
-    /// All runs, by network, train set, seed.
+    /// All runs, ordered by network, train set and seed.
     pub fn runs(&self) -> Vec<StudyRun> {
         let mut runs = Vec::new();
         for (network, _, detector, set) in self.networks() {
@@ -293,7 +296,7 @@ impl StudyConfig {
         runs
     }
 
-    /// The cells that there should be.
+    /// All cells of the matrix.
     pub fn plan(&self) -> MatrixPlan {
         let place = |d: &StudyDataset| Place { name: d.name.clone(), title: d.title.clone(), paper: d.paper.clone() };
         let network = |(name, title, detector, _): (String, String, &StudyDetector, Vec<String>)| PlannedNetwork {
@@ -308,7 +311,7 @@ impl StudyConfig {
     }
 }
 
-/// Nested keys as `a.b=c`, in the order of the keys; values as TOML writes them.
+/// Nested keys as `a.b=c`, in the order of the keys, with values in TOML syntax.
 fn assignments(set: &BTreeMap<String, Value>) -> Vec<String> {
     fn collect(prefix: &str, value: &Value, out: &mut Vec<String>) {
         match value {
@@ -317,7 +320,7 @@ fn assignments(set: &BTreeMap<String, Value>) -> Vec<String> {
                     collect(&format!("{prefix}.{key}"), value, out);
                 }
             }
-            // JSON's lists, numbers, texts and truths are TOML's, too.
+            // JSON arrays, numbers, strings and booleans are valid TOML.
             value => out.push(format!("{prefix}={value}")),
         }
     }
@@ -400,7 +403,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
     }
 
     #[test]
-    fn mistakes_are_named() {
+    fn invalid_studies_are_refused() {
         for (from, to, message) in [
             ("epochs = 10", "epoch = 10", "small.toml:5: unknown field `epoch`"),
             ("epochs = 10", "epochs = 0", "epochs have to be 1 or more"),
@@ -408,11 +411,11 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             (
                 "train = [\"measured\", \"sim\"]",
                 "train = [\"real\"]",
-                "train names \"real\", which the study does not have",
+                "train contains \"real\", which is not in the study",
             ),
-            ("of = \"sim\"", "of = \"other\"", "resim.of names \"other\""),
+            ("of = \"sim\"", "of = \"other\"", "resim.of is \"other\""),
             ("frames = 100", "frames = 0", "frames is 0"),
-            ("name = \"sim\"", "name = \"measured\"", "dataset \"measured\" is there twice"),
+            ("name = \"sim\"", "name = \"measured\"", "dataset \"measured\" exists twice"),
             ("name = \"small\"", "name = \"../small\"", "has to be a file name"),
             ("path = \"measured\"", "folder = \"measured\"", "unknown variant `folder`"),
         ] {
@@ -423,7 +426,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
     }
 
     #[test]
-    fn a_change_says_which_runs_it_makes_invalid() {
+    fn a_change_makes_runs_invalid() {
         let before = parse(STUDY).unwrap();
         assert_eq!(before.changes_since(&before), StudyChanges::default());
         let after = |from: &str, to: &str| parse(&STUDY.replacen(from, to, 1)).unwrap().changes_since(&before);
@@ -432,7 +435,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
         let changes = after("epochs = 10", "epochs = 11");
         assert_eq!(changes.invalid.len(), 12);
         assert_eq!(changes.invalid[0].1, ["epochs was 10, is 11"]);
-        // More simulated frames: all that is trained on sim or on what is made of it, and both as test sets.
+        // More simulated frames: all runs trained on sim or on a data set derived from it, and both as test sets.
         let changes = after("frames = 100", "frames = 200");
         assert_eq!(
             (changes.invalid.len(), changes.tests.clone()),
@@ -442,7 +445,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
     }
 
     #[test]
-    fn the_studies_of_the_project_are_sound() {
+    fn the_built_in_studies_are_valid() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs/studies");
         let paper = StudyConfig::read(&folder.join("paper.toml")).unwrap();
         assert_eq!((paper.runs().len(), paper.epochs), (2 * 4 * 5, Some(75)));
@@ -452,7 +455,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             .iter()
             .flat_map(|n| std::iter::once(&n.network).chain(&n.train_sets))
             .all(|p| p.paper.is_some());
-        assert!(known, "the paper's numbers stand beside every cell");
+        assert!(known, "every cell has the paper's numbers");
         let quick = StudyConfig::read(&folder.join("quick.toml")).unwrap();
         assert_eq!(quick.runs().len(), 3 * 2 + 2);
         assert!(!StudyConfig::read(&folder.join("cpu.toml")).unwrap().about.is_empty());

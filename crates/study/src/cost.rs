@@ -1,11 +1,11 @@
-//! What a study will cost: the steps that are left, times a step measured on this machine.
+//! Expected computing time of a study: the number of remaining steps times the measured time of a step.
 
 use crate::config::StudyRun;
 use crate::data_sets::open;
 use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
-use crate::local::own_program;
-use crate::standing::{Standing, standing};
+use crate::local::current_program;
+use crate::run_state::{RunState, run_state};
 use crate::{Event, Listener};
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
@@ -18,33 +18,33 @@ use std::time::Instant;
 use train::memory::peak_mib;
 use train::{Adam, GradientNorm, TrainingFrames};
 
-/// Steps that are measured, behind one that warms up.
+/// Number of measured training steps, after one warm-up step.
 const MEASURED_STEPS: u64 = 5;
-/// Test frames that are measured.
+/// Number of measured test frames.
 const MEASURED_FRAMES: usize = 3;
 
-/// What a network costs on a machine.
+/// Time and memory of a network on a machine.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct NetworkCost {
-    /// A training step, s.
+    /// Time of a training step, s.
     pub step_s: f64,
-    /// A test frame, s.
+    /// Time of the detection on a test frame, s.
     pub detection_s: f64,
-    /// Largest resident memory of the process, MiB.
+    /// Peak resident memory of the process, MiB.
     pub peak_mib: u64,
-    /// Threads that computed.
+    /// Number of threads.
     pub threads: usize,
-    /// Words for the device that computed.
+    /// Command line arguments of the device.
     pub device: String,
 }
 
-/// What all networks of a study cost, by name: `costs.json`.
+/// Costs of the networks of a study by name, stored in `costs.json`.
 pub type Costs = BTreeMap<String, NetworkCost>;
 
-/// Measures a run's network in this process. The words for the device are left empty.
+/// Measures the network of a run in this process. The arguments of the device are left empty.
 ///
 /// # Errors
-/// Frames that cannot be read, a step that fails.
+/// Frames that cannot be read, a failing step.
 pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<NetworkCost> {
     let config = study.run_config(run)?;
     let set = Dataset::open(&config.dataset)?;
@@ -84,19 +84,19 @@ pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<Network
     })
 }
 
-/// A machine that pauses for a moment does not change it.
+/// Median, which is robust against short pauses of the machine.
 fn median(values: Vec<f64>) -> f64 {
     statistics::median_upper(values).unwrap_or(0.0)
 }
 
-/// The costs that are known of a study.
-pub fn known(study: &Study) -> Costs {
+/// The costs that have been measured for a study.
+pub fn known_costs(study: &Study) -> Costs {
     let bytes = fs_err::read(study.folder.join("costs.json")).unwrap_or_default();
     serde_json::from_slice(&bytes).unwrap_or_default()
 }
 
-/// The costs of the networks of these runs: known ones, and the others measured in a process each, with so many threads. A network that
-/// cannot be measured is left out, and said.
+/// The costs of the networks of these runs. Unknown costs are measured in one process per network with `threads`
+/// threads. A network that cannot be measured is left out with a note.
 ///
 /// # Errors
 /// A process that cannot be started, a file that cannot be written.
@@ -107,7 +107,7 @@ pub fn costs(
     device: &[String],
     listener: Listener<'_>,
 ) -> Result<Costs> {
-    let mut costs = known(study);
+    let mut costs = known_costs(study);
     let mut tried = BTreeSet::new();
     for run in runs {
         let network = &run.id.network;
@@ -115,8 +115,8 @@ pub fn costs(
         if !tried.insert(network) || costs.get(network).is_some_and(is_same) {
             continue;
         }
-        listener(Event::Note(&format!("measuring a step of {network}")));
-        let output = Command::new(own_program()?)
+        listener(Event::Note(&format!("measuring the step time of {network}")));
+        let output = Command::new(current_program()?)
             .arg("study-run")
             .arg(&study.folder)
             .args(["--run", &run.to_string(), "--parts", "measure"])
@@ -125,13 +125,13 @@ pub fn costs(
             .stdin(Stdio::null())
             .output()?;
         if !output.status.success() {
-            let said = String::from_utf8_lossy(&output.stderr);
-            let reason = said.trim().trim_start_matches("error: ");
+            let message = String::from_utf8_lossy(&output.stderr);
+            let reason = message.trim().trim_start_matches("error: ");
             listener(Event::Note(&format!("{network} could not be measured: {reason}")));
             continue;
         }
-        let mut cost: NetworkCost =
-            serde_json::from_slice(&output.stdout).in_part(|| format!("{network}: no measurement"))?;
+        let mut cost: NetworkCost = serde_json::from_slice(&output.stdout)
+            .in_part(|| format!("{network}: unexpected output of the measurement"))?;
         cost.device = device.join(" ");
         costs.insert(network.clone(), cost);
         write_json(&study.folder.join("costs.json"), &costs)?;
@@ -139,22 +139,22 @@ pub fn costs(
     Ok(costs)
 }
 
-/// What is left of a run, and what it takes on one process.
+/// Remaining work of a run, and its time in one process.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Left {
-    /// Training steps.
+pub struct Remaining {
+    /// Remaining training steps.
     pub steps: u64,
-    /// Frames to detect, those that are watched during training with them.
+    /// Remaining frames to detect, including those of the validation during training.
     pub frames: u64,
-    /// Of both together, where the cost is known, s.
+    /// Time of both, s, if the cost is known.
     pub seconds: Option<f64>,
 }
 
-/// What is left of a run that stands so.
+/// Remaining work of a run.
 ///
 /// # Errors
-/// A data set that is not there.
-pub fn left(study: &Study, run: &StudyRun, costs: &Costs) -> Result<Left> {
+/// A missing data set.
+pub fn remaining(study: &Study, run: &StudyRun, costs: &Costs) -> Result<Remaining> {
     let tests = |names: &[String]| -> Result<u64> {
         names.iter().map(|name| Ok(open(study, name)?.ids(&study.config.splits.test)?.len() as u64)).sum()
     };
@@ -165,16 +165,16 @@ pub fn left(study: &Study, run: &StudyRun, costs: &Costs) -> Result<Left> {
         let (optimization, every) = (&config.detector.optimization, config.run.evaluate_every_epochs);
         let steps = dataset.ids(&config.run.train_split)?.len().div_ceil(optimization.batch_size) * optimization.epochs;
         let watched = match dataset.config.splits.contains_key(&config.run.val_split) && every > 0 {
-            // Losses and boxes: the network runs twice.
+            // Validation runs the network twice: for losses and for boxes.
             true => 2 * dataset.ids(&config.run.val_split)?.len() as u64 * (optimization.epochs as u64).div_ceil(every),
             false => 0,
         };
         Ok((steps as u64, watched))
     };
-    let (steps, frames) = match standing(study, run)? {
-        Standing::Done => (0, 0),
-        Standing::Trained(missing) => (0, tests(&missing)?),
-        Standing::Running(step, total) | Standing::Stopped(step, total) if total > 0 => {
+    let (steps, frames) = match run_state(study, run)? {
+        RunState::Done => (0, 0),
+        RunState::Trained(missing) => (0, tests(&missing)?),
+        RunState::Running(step, total) | RunState::Stopped(step, total) if total > 0 => {
             let (steps, watched) = whole()?;
             (total - step, watched * (total - step) / steps.max(1) + tests(&all)?)
         }
@@ -184,10 +184,10 @@ pub fn left(study: &Study, run: &StudyRun, costs: &Costs) -> Result<Left> {
         }
     };
     let of = |cost: &NetworkCost| steps as f64 * cost.step_s + frames as f64 * cost.detection_s;
-    Ok(Left { steps, frames, seconds: costs.get(&run.id.network).map(of) })
+    Ok(Remaining { steps, frames, seconds: costs.get(&run.id.network).map(of) })
 }
 
-/// Hours, minutes or seconds, in words.
+/// Text with hours, minutes or seconds.
 pub fn duration(seconds: f64) -> String {
     match seconds {
         s if s >= 5400.0 => format!("{:.1} h", s / 3600.0),

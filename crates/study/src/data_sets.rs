@@ -1,4 +1,4 @@
-//! The data sets of a study: made where they are not there, opened, and told apart by what is in them.
+//! The data sets of a study: generated if missing, opened, and hashed.
 
 use crate::config::{Source, StudyDataset};
 use crate::error::{InPart, Result, refused};
@@ -12,10 +12,10 @@ use simulate::resim::Resim;
 use simulate::{Scenery, make_road_dataset};
 use std::path::Path;
 
-/// Makes what is missing of the data sets, in their order. What an earlier process began is gone on with.
+/// Generates the missing data sets in the order of the study, and completes unfinished ones.
 ///
 /// # Errors
-/// A source that does not exist or cannot be made.
+/// A missing source, or an error of the simulation.
 pub fn make_datasets(study: &Study, listener: Listener<'_>) -> Result<()> {
     for dataset in &study.config.datasets {
         make(study, dataset, listener).in_part(|| format!("data set {}", dataset.name))?;
@@ -41,12 +41,12 @@ fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result
                     make_race_datasets(&race.0, &race.1, &out, &only, &|_, done, total| show(done, total))?;
                 }
                 (Scenery::Street(_), Some(name)) => {
-                    return Err(refused(format!("a street has but one data set: leave dataset = {name:?} out")));
+                    return Err(refused(format!("a street has only one data set; remove dataset = {name:?}")));
                 }
                 (Scenery::Race(race), None) => {
                     let names: Vec<&str> = race.0.datasets.iter().map(|set| set.name.as_str()).collect();
                     return Err(refused(format!(
-                        "{} makes several data sets: say dataset = one of {}",
+                        "{} has several data sets; set dataset to one of {}",
                         config.display(),
                         names.join(", ")
                     )));
@@ -63,7 +63,7 @@ fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result
     Ok(())
 }
 
-/// A data set of a race, behind those whose frames decide its own.
+/// A data set of a race, preceded by the data sets that it needs.
 fn with_sources(race: &RaceConfig, name: &str) -> Vec<String> {
     let mut names = vec![name.to_string()];
     let set = race.datasets.iter().find(|set| set.name == name);
@@ -73,23 +73,23 @@ fn with_sources(race: &RaceConfig, name: &str) -> Vec<String> {
     names
 }
 
-/// A data set of the study, which is there already.
+/// Opens an existing data set of the study.
 ///
 /// # Errors
-/// A data set that is not there, or not whole.
+/// A missing or incomplete data set.
 pub fn open(study: &Study, name: &str) -> Result<Dataset> {
     let dataset = study.dataset(name)?;
     let path = study.dataset_path(dataset);
     Dataset::open(&path).in_part(|| match dataset.source {
         Source::Path(_) => format!("data set {name}"),
-        _ => format!("data set {name} is not there: `lidarshift study {} --only data` makes it", study.named),
+        _ => format!("data set {name} does not exist; generate it with `lidarshift study {} --only data`", study.named),
     })
 }
 
-/// A hash of the ids of frames and of the sizes of their clouds, in hexadecimal.
+/// Hash of frame ids and the file sizes of their clouds, in hexadecimal.
 ///
 /// # Errors
-/// A cloud that is missing.
+/// A missing cloud.
 pub fn frames_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     let mut hash = Sha256::new();
     for id in ids {
@@ -99,10 +99,10 @@ pub fn frames_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     Ok(hex(hash))
 }
 
-/// The same with the labels.
+/// Hash of frame ids, the file sizes of their clouds and the content of their labels, in hexadecimal.
 ///
 /// # Errors
-/// A cloud or a label that is missing.
+/// A missing cloud or label file.
 pub fn labelled_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     let mut hash = Sha256::new();
     hash.update(frames_sha256(dataset, ids)?);
@@ -112,7 +112,7 @@ pub fn labelled_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     Ok(hex(hash))
 }
 
-/// A hash of a file.
+/// Hash of a file, in hexadecimal.
 ///
 /// # Errors
 /// A file that cannot be read.

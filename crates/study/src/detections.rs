@@ -1,4 +1,4 @@
-//! What a trained run finds on the test sets, and what its layers make of them: texts and numbers in the run's folder.
+//! Detections of a trained run on the test sets, and features of its layers, stored in the run folder.
 
 use crate::config::StudyRun;
 use crate::data_sets::{file_sha256, frames_sha256, open};
@@ -10,7 +10,8 @@ use models::{Detector, LayerFeatures, inference_samples, predict_frames};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// What the detections of a run on a test set were made of, beside them: it is written last.
+/// Inputs of the detections of a run on a test set. Written to `cell.json` after the detections, so that it marks them
+/// as complete.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct DetectionCell {
     schema: String,
@@ -22,24 +23,24 @@ struct DetectionCell {
     weights_sha256: String,
 }
 
-/// Features of the layers of a run on test clouds.
+/// Features of all layers of a run on test clouds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RunFeatures {
     schema: String,
     frames_sha256: String,
     weights_sha256: String,
-    /// The test frames.
+    /// Ids of the test frames.
     pub frames: Vec<String>,
-    /// The layers, first to last.
+    /// Names of the layers, from first to last.
     pub layers: Vec<String>,
-    /// Of each layer the vectors of all frames, one after the other.
+    /// For each layer, the concatenated feature vectors of all frames.
     pub values: Vec<Vec<f32>>,
 }
 
-/// The hash of a run's weights.
+/// Hash of the weights of a run.
 ///
 /// # Errors
-/// A run that has none.
+/// A run without weights.
 pub fn weights_sha256(run_folder: &Path) -> Result<String> {
     file_sha256(&run_folder.join("checkpoint/last.safetensors"))
 }
@@ -52,8 +53,8 @@ fn features_path(study: &Study, run: &StudyRun) -> PathBuf {
     run.folder(&study.folder).join("features").join(format!("{}.json", study.feature_set()))
 }
 
-/// What the cell of a run and a test set has to be made of.
-fn wanted(
+/// The data set, the frame ids, and the `cell.json` that up-to-date detections have.
+fn expected_cell(
     study: &Study,
     run: &StudyRun,
     test_set: &str,
@@ -73,10 +74,10 @@ fn wanted(
     Ok((dataset, ids, cell))
 }
 
-/// Whether the detections of a run on a test set are there, all of them, made of these weights and of the frames as they are.
+/// Whether the detections of a run on a test set are complete and were made with these weights on the present frames.
 ///
 /// # Errors
-/// A test set that is not there.
+/// A missing test set.
 pub fn is_done(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> Result<bool> {
     let Ok(bytes) = fs_err::read(cell_path(study, run, test_set)) else { return Ok(false) };
     let Ok(found) = serde_json::from_slice::<DetectionCell>(&bytes) else { return Ok(false) };
@@ -84,31 +85,32 @@ pub fn is_done(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> 
         return Ok(false);
     }
     let feature_is_there = test_set != study.feature_set() || features_path(study, run).is_file();
-    let (_, ids, cell) = wanted(study, run, test_set, weights)?;
+    let (_, ids, cell) = expected_cell(study, run, test_set, weights)?;
     let folder = run.detections(&study.folder, test_set);
     Ok(feature_is_there && found == cell && ids.iter().all(|id| folder.join(format!("{id}.txt")).is_file()))
 }
 
-/// Detects every test set that is not done, and keeps the features of one of them. `say` hears what is being done.
+/// Detects on every test set without complete detections, and stores the features on one of them. `note` is called with
+/// the progress.
 ///
 /// # Errors
-/// A test set that is not there, a frame that cannot be read, scores that are not numbers.
+/// A missing test set, a frame that cannot be read, scores that are NaN.
 pub fn detect_all(
     study: &Study,
     run: &StudyRun,
     detector: &Detector,
     workers: usize,
-    say: &dyn Fn(&str),
+    note: &dyn Fn(&str),
 ) -> Result<()> {
     let weights = weights_sha256(&run.folder(&study.folder))?;
     for dataset in &study.config.datasets {
         if is_done(study, run, &dataset.name, &weights)? {
             continue;
         }
-        say(&format!("detecting {}", dataset.name));
-        let (set, ids, cell) = wanted(study, run, &dataset.name, &weights)?;
+        note(&format!("detecting on {}", dataset.name));
+        let (set, ids, cell) = expected_cell(study, run, &dataset.name, &weights)?;
         if dataset.name == study.feature_set() {
-            keep_features(study, run, detector, &set, &ids, &weights)?;
+            write_features(study, run, detector, &set, &ids, &weights)?;
         }
         let folders = [run.detections(&study.folder, &dataset.name), run.regions(&study.folder, &dataset.name)];
         detect(detector, &set, &ids, &folders, workers).in_part(|| format!("test set {}", dataset.name))?;
@@ -117,7 +119,8 @@ pub fn detect_all(
     Ok(())
 }
 
-/// The detections of a run on frames, a text a frame, and the regions of a two-stage network likewise.
+/// Writes the detections on all frames, one KITTI text file per frame, and the regions of a two-stage network in the
+/// same way.
 fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf; 2], workers: usize) -> Result<()> {
     let [of_detections, of_regions] = folders;
     let two_stage = detector.config().network.is_two_stage();
@@ -134,7 +137,7 @@ fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf
     })
 }
 
-fn keep_features(
+fn write_features(
     study: &Study,
     run: &StudyRun,
     detector: &Detector,
@@ -143,7 +146,7 @@ fn keep_features(
     weights: &str,
 ) -> Result<()> {
     let most = study.config.evaluation.tsne_frames.unwrap_or(ids.len());
-    let ids = spread(ids, most);
+    let ids = evenly_spaced(ids, most);
     let mut features = RunFeatures {
         schema: "lidarshift/run-features/1".into(),
         frames_sha256: frames_sha256(set, &ids)?,
@@ -154,7 +157,7 @@ fn keep_features(
     };
     for (sample, id) in inference_samples(detector, set, &ids, 1).zip(&ids) {
         let layers = detector.layer_features(&sample?)?;
-        // A frame without points has no features; it is left out.
+        // A frame without points has no features and is left out.
         if layers.is_empty() {
             continue;
         }
@@ -170,23 +173,23 @@ fn keep_features(
     Ok(write_atomic(&features_path(study, run), &serde_json::to_vec(&features)?)?)
 }
 
-/// At most `most` of them, evenly over all.
-pub fn spread(ids: &[String], most: usize) -> Vec<String> {
+/// At most `most` of the ids, evenly spaced.
+pub fn evenly_spaced(ids: &[String], most: usize) -> Vec<String> {
     let n = most.min(ids.len());
     (0..n).map(|i| ids[i * ids.len() / n].clone()).collect()
 }
 
-/// The features that a run has left; `None` where there are none of its present weights.
+/// The stored features of a run; `None` if there are none for its present weights.
 ///
 /// # Errors
-/// A file that is damaged.
+/// A damaged file.
 pub fn read_features(study: &Study, run: &StudyRun) -> Result<Option<RunFeatures>> {
     let path = features_path(study, run);
     if !path.is_file() {
         return Ok(None);
     }
     let features: RunFeatures = serde_json::from_slice(&fs_err::read(&path)?)
-        .in_part(|| format!("{}: is damaged; remove it and run the study again", path.display()))?;
+        .in_part(|| format!("{} is damaged; remove it and run the study again", path.display()))?;
     let weights = weights_sha256(&run.folder(&study.folder))?;
     Ok((features.weights_sha256 == weights && !features.frames.is_empty()).then_some(features))
 }
@@ -196,10 +199,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_are_spread_over_all() {
+    fn frames_are_evenly_spaced() {
         let ids: Vec<String> = (0..10).map(|i| i.to_string()).collect();
-        assert_eq!(spread(&ids, 4), ["0", "2", "5", "7"]);
-        assert_eq!(spread(&ids, 100), ids);
-        assert!(spread(&[], 3).is_empty());
+        assert_eq!(evenly_spaced(&ids, 4), ["0", "2", "5", "7"]);
+        assert_eq!(evenly_spaced(&ids, 100), ids);
+        assert!(evenly_spaced(&[], 3).is_empty());
     }
 }

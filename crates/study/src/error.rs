@@ -1,4 +1,4 @@
-//! Why a study cannot go on.
+//! Errors of a study.
 
 use data::DataError;
 use eval::distance::DistanceError;
@@ -8,19 +8,19 @@ use report::ReportError;
 use simulate::SimulateError;
 use train::TrainError;
 
-/// A study that cannot be read, made or shown.
+/// An error while reading, running or reporting a study.
 #[derive(Debug, thiserror::Error)]
 pub enum StudyError {
-    /// A file of a data set, or any file that cannot be read or written.
+    /// A data set, or a file that cannot be read or written.
     #[error(transparent)]
     Data(#[from] DataError),
-    /// A simulation that cannot be made.
+    /// A simulation that fails.
     #[error(transparent)]
     Simulate(#[from] SimulateError),
-    /// A network, its weights or a frame that it cannot take.
+    /// A network, its weights, or a frame that it cannot process.
     #[error(transparent)]
     Model(#[from] ModelError),
-    /// A run that cannot begin, go on or end.
+    /// A training run that fails.
     #[error(transparent)]
     Train(#[from] TrainError),
     /// Clouds that cannot be compared.
@@ -32,39 +32,39 @@ pub enum StudyError {
     /// A report that cannot be written.
     #[error(transparent)]
     Report(#[from] ReportError),
-    /// The file system or a process refused.
+    /// An error of the file system or of a process.
     #[error(transparent)]
     Io(#[from] std::io::Error),
-    /// A result that is no JSON of its kind.
+    /// A result file with invalid JSON.
     #[error(transparent)]
     Json(#[from] serde_json::Error),
-    /// A detector's file that is no TOML.
+    /// A detector file with invalid TOML.
     #[error(transparent)]
     Toml(#[from] toml::de::Error),
-    /// What was asked for cannot be.
+    /// A request that cannot be fulfilled; the text gives the reason.
     #[error("{0}")]
     Refused(String),
-    /// An error of a part of the study.
+    /// An error in a part of the study.
     #[error("{part}: {error}")]
     Part {
-        /// Which part.
+        /// Name of the part.
         part: String,
-        /// What went wrong in it.
+        /// The error.
         error: Box<StudyError>,
     },
 }
 
-/// What a function of this crate gives.
+/// Result with an error of this crate.
 pub type Result<T, E = StudyError> = std::result::Result<T, E>;
 
-/// The error of what cannot be.
+/// A [`StudyError::Refused`] with this text.
 pub(crate) fn refused(text: impl Into<String>) -> StudyError {
     StudyError::Refused(text.into())
 }
 
-/// Names the part in which an error occurred.
+/// Adds the name of a part to an error.
 pub(crate) trait InPart<T> {
-    /// The same result; an error says the part.
+    /// The same result; an error contains the name of the part.
     fn in_part(self, part: impl FnOnce() -> String) -> Result<T>;
 }
 

@@ -1,24 +1,24 @@
-//! What a study says while it works.
+//! Progress events of a study.
 
-/// One thing that happened.
+/// A progress event.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Event<'a> {
     /// A sentence about the progress.
     Note(&'a str),
     /// A line of the result.
     Result(&'a str),
-    /// So many frames of a data set are made.
+    /// A number of frames of a data set is finished.
     Frames {
         /// Name of the data set.
         dataset: &'a str,
-        /// Frames that are there.
+        /// Number of finished frames.
         done: usize,
-        /// Frames of the whole.
+        /// Number of all frames.
         total: usize,
     },
-    /// A data set is whole.
+    /// A data set is finished.
     DatasetMade,
 }
 
-/// Who is told what happens.
+/// Receives the events.
 pub type Listener<'a> = &'a (dyn Fn(Event<'_>) + Sync);

@@ -1,4 +1,4 @@
-//! What the networks of a study see: t-SNE, CKA and Fréchet distances of their features.
+//! Features of the networks of a study: t-SNE, CKA and Fréchet distances.
 
 use crate::cache::cached;
 use crate::config::StudyRun;
@@ -10,26 +10,26 @@ use eval::features::{CkaTable, Embedded, Embedding, Features, TSNE_SCHEMA, cka_t
 use report::FrechetRow;
 use serde::{Deserialize, Serialize};
 
-/// Everything about the features of a study.
+/// Results of the feature comparisons of a study.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FeatureResults {
-    /// A picture a network.
+    /// t-SNE of each network.
     pub embeddings: Vec<Embedding>,
-    /// Layers of two networks on the same clouds, by name.
+    /// CKA between the layers of two runs on the same clouds, by name.
     pub cka: Vec<(String, CkaTable)>,
-    /// Network, two train sets, distance, floor.
+    /// Fréchet distances between runs.
     pub frechet: Vec<FrechetRow>,
-    /// What could not be made, and why.
+    /// Comparisons that could not be made, with the reasons.
     pub warnings: Vec<String>,
 }
 
 /// A run with its features.
 type Seen = (StudyRun, RunFeatures);
 
-/// t-SNE, CKA and Fréchet distances of a study, kept in `features.json`.
+/// t-SNE, CKA and Fréchet distances of a study, cached in `features.json`.
 ///
 /// # Errors
-/// Features that are damaged.
+/// Damaged feature files.
 pub fn features(study: &Study) -> Result<FeatureResults> {
     let mut seen: Vec<Seen> = Vec::new();
     for run in study.config.runs() {
@@ -60,7 +60,7 @@ pub fn features(study: &Study) -> Result<FeatureResults> {
     })
 }
 
-/// The last layer: what the head reads.
+/// Features of the last layer, the input of the head.
 fn last(features: &RunFeatures) -> Result<Features> {
     layer(features, features.layers.len() - 1)
 }
@@ -95,7 +95,8 @@ fn embedding(study: &Study, runs: &[&Seen]) -> Result<Embedding> {
     })
 }
 
-/// Of the first seed: the first train set against each other one; and two seeds of the first train set, which differ by chance alone.
+/// CKA and Fréchet distances between the first run and runs with the same seed on other train sets. Runs with other
+/// seeds on the same train set are compared as well; they differ by chance only.
 fn similarities(study: &Study, runs: &[&Seen], out: &mut FeatureResults) -> Result<()> {
     let network = network_title(study, &runs[0].0.id.network);
     let (first, features) = runs[0];
@@ -134,7 +135,7 @@ fn similarities(study: &Study, runs: &[&Seen], out: &mut FeatureResults) -> Resu
     Ok(())
 }
 
-/// The distance of every second vector to the others of the same run.
+/// Fréchet distance between the even and the odd frames of the same run.
 fn frechet_floor(features: &RunFeatures) -> Result<Option<f64>> {
     let all = last(features)?;
     if all.len() < 4 {

@@ -1,4 +1,4 @@
-//! A study and its folder: what its file says, resolved to data sets, runs and files.
+//! A study with its folder: resolves its TOML to data sets, runs and files.
 
 use crate::config::{Source, StudyConfig, StudyDataset, StudyRun};
 use crate::error::{InPart, Result, refused};
@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 use train::{RunConfig, set_key};
 
-/// Studies that come with the program.
+/// Built-in studies.
 const BUILT_IN: [(&str, &str); 4] = [
     ("quick", include_str!("../../../configs/studies/quick.toml")),
     ("cpu", include_str!("../../../configs/studies/cpu.toml")),
@@ -17,8 +17,9 @@ const BUILT_IN: [(&str, &str); 4] = [
     ("paper", include_str!("../../../configs/studies/paper.toml")),
 ];
 
-/// The copy of a study's file in its folder, as it was when the folder was last worked on; and where the file came from.
+/// Copy of the study's TOML in its folder, from the last time the study was run.
 const COPY: &str = "study.toml";
+/// Path of the study's TOML and base of its relative paths.
 const ORIGIN: &str = "origin.json";
 
 #[derive(Serialize, Deserialize)]
@@ -30,24 +31,24 @@ struct Origin {
 /// A study with its folder.
 #[derive(Clone, Debug)]
 pub struct Study {
-    /// What its file says.
+    /// Its configuration.
     pub config: StudyConfig,
-    /// As it was named on the command line.
+    /// Its name or path on the command line.
     pub named: String,
-    /// The text of its file.
+    /// The text of its TOML.
     pub text: String,
-    /// The folder of its file; paths in it are relative to this one.
+    /// The folder of its TOML; paths in the TOML are relative to it.
     base: PathBuf,
-    /// Its folder, absolute.
+    /// The folder of its results, absolute.
     pub folder: PathBuf,
 }
 
 impl Study {
-    /// A study by the path of its TOML, by the name of one in configs/studies or in the program, or by its folder. Its folder is `out`, or
-    /// `runs/NAME`.
+    /// Opens a study by the path of its TOML, by its name in configs/studies, by the name of a built-in study, or by
+    /// its folder. Its folder is `out`, or `runs/NAME`.
     ///
     /// # Errors
-    /// Neither a file nor a name, or a file that is wrong.
+    /// Neither a file nor a known name, or an invalid file.
     pub fn open(named: &str, out: Option<&Path>) -> Result<Study> {
         if Self::is_folder(Path::new(named)) {
             return Self::of_folder(Path::new(named));
@@ -69,24 +70,24 @@ impl Study {
         Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
     }
 
-    /// Whether a folder is that of a study.
+    /// Whether a folder is the folder of a study.
     pub fn is_folder(folder: &Path) -> bool {
         folder.join(COPY).is_file()
     }
 
-    /// The study that made a folder, by the copy of its file.
+    /// Opens the study of a folder from the copy of its TOML.
     fn of_folder(folder: &Path) -> Result<Study> {
         let path = folder.join(COPY);
         let text = fs_err::read_to_string(&path)?;
         let config = StudyConfig::parse(&text, &path)?;
         let origin: Origin = serde_json::from_slice(&fs_err::read(folder.join(ORIGIN))?)
-            .in_part(|| format!("{}: is damaged", folder.join(ORIGIN).display()))?;
+            .in_part(|| format!("{} is damaged", folder.join(ORIGIN).display()))?;
         Ok(Study { config, named: origin.named, text, base: origin.base, folder: std::path::absolute(folder)? })
     }
 
-    /// A path that the study's file names.
+    /// Resolves a path of the study's TOML.
     pub fn path(&self, relative: &Path) -> PathBuf {
-        // Without `..` in the middle, so that the same file always has the same path.
+        // `..` is resolved, so that the same file always has the same path.
         let mut path = self.base.clone();
         for part in relative.components() {
             match part {
@@ -101,7 +102,7 @@ impl Study {
     /// A data set by its name.
     ///
     /// # Errors
-    /// A name that the study does not have.
+    /// An unknown name.
     pub fn dataset(&self, name: &str) -> Result<&StudyDataset> {
         self.config
             .datasets
@@ -115,7 +116,7 @@ impl Study {
         self.config.datasets.iter().find(|d| d.name == dataset).map_or(dataset, |d| &d.title)
     }
 
-    /// Where a data set lies, or will lie: a folder or a TOML.
+    /// Path of a data set, which may not exist yet: a folder or a TOML.
     pub fn dataset_path(&self, dataset: &StudyDataset) -> PathBuf {
         match &dataset.source {
             Source::Path(path) => self.path(path),
@@ -127,22 +128,22 @@ impl Study {
         }
     }
 
-    /// Where all data sets of one simulation lie: they share their scenes.
+    /// Folder of all data sets of one simulation, which share their scenes.
     pub fn scenes_folder(&self, config: &Path, frames: usize, seed: u64) -> PathBuf {
         let stem = config.file_stem().unwrap_or_default().to_string_lossy();
         self.folder.join("data").join(format!("{stem}-{frames}-seed-{seed}"))
     }
 
-    /// What `simulate --config` is given: a file beside the study's, or a name.
+    /// Value of `simulate --config`: a file relative to the study's TOML, or a name.
     pub fn scenes_config(&self, config: &Path) -> String {
         let path = self.path(config);
         if path.is_file() { path.display().to_string() } else { config.display().to_string() }
     }
 
-    /// The configuration of a run, from the study's file alone.
+    /// The configuration of a run.
     ///
     /// # Errors
-    /// A detector that does not exist, or settings that it does not take.
+    /// An unknown detector, or invalid settings.
     pub fn run_config(&self, run: &StudyRun) -> Result<RunConfig> {
         let named = run.config.as_ref().map_or(run.detector.clone(), |file| self.path(file).display().to_string());
         let mut table = Table::new();
@@ -154,7 +155,7 @@ impl Study {
         );
         let dataset = self.dataset_path(self.dataset(&run.id.train_set)?);
         let Some(dataset) = dataset.to_str() else {
-            return Err(refused(format!("{}: its name is not UTF-8", dataset.display())));
+            return Err(refused(format!("{}: the path is not UTF-8", dataset.display())));
         };
         table.insert("dataset".into(), Value::String(dataset.into()));
         let splits = &self.config.splits;
@@ -166,50 +167,53 @@ impl Study {
         RunConfig::from_table(table).in_part(|| format!("run {run}"))
     }
 
-    /// A run by its folder's name below that of the study.
+    /// A run by its name, the path of its folder relative to the folder of the study.
     ///
     /// # Errors
-    /// A name that the study does not have.
+    /// An unknown name.
     pub fn run(&self, name: &str) -> Result<StudyRun> {
         let runs = self.config.runs();
         let found = runs.into_iter().find(|run| run.to_string() == name);
         found.ok_or_else(|| refused(format!("the study has no run {name:?}; `lidarshift study status` lists them")))
     }
 
-    /// The data set whose test clouds show what the networks see.
+    /// The data set whose test clouds are used for features.
     pub fn feature_set(&self) -> &str {
         self.config.evaluation.tsne_dataset.as_ref().unwrap_or(&self.config.datasets[0].name)
     }
 
-    /// What changed in the study's file since its folder was last worked on, in sentences; then the new file takes the place of the old.
+    /// Describes the changes of the study's TOML since the study was last run, then replaces the copy in the folder.
     ///
     /// # Errors
     /// A copy that cannot be read or written.
-    pub fn note_changes(&self) -> Result<Vec<String>> {
+    pub fn update_copy(&self) -> Result<Vec<String>> {
         let copy = self.folder.join(COPY);
-        let mut said = Vec::new();
+        let mut texts = Vec::new();
         if copy.is_file() {
             let changes = self.config.changes_since(&StudyConfig::read(&copy)?);
-            said.extend(changes.invalid.iter().map(|(id, reasons)| {
+            texts.extend(changes.invalid.iter().map(|(id, reasons)| {
                 format!("{}/{}/seed-{} is no longer valid: {}", id.network, id.train_set, id.seed, reasons.join("; "))
             }));
-            said.extend(
-                changes.tests.iter().map(|set| format!("the detections on {set} are no longer valid: it changed")),
+            texts.extend(
+                changes
+                    .tests
+                    .iter()
+                    .map(|set| format!("the detections on {set} are no longer valid, since it has changed")),
             );
-            said.extend(
+            texts.extend(
                 changes.added.iter().map(|id| format!("{}/{}/seed-{} is new", id.network, id.train_set, id.seed)),
             );
             let removed = |id: &eval::matrix::RunId| {
                 format!(
-                    "{}/{}/seed-{} is no longer part of the study; its folder stays",
+                    "{}/{}/seed-{} is no longer part of the study; its folder is kept",
                     id.network, id.train_set, id.seed
                 )
             };
-            said.extend(changes.removed.iter().map(removed));
+            texts.extend(changes.removed.iter().map(removed));
         }
         let origin = Origin { named: self.named.clone(), base: self.base.clone() };
         write_json(&self.folder.join(ORIGIN), &origin)?;
         write_atomic(&copy, self.text.as_bytes())?;
-        Ok(said)
+        Ok(texts)
     }
 }

@@ -1,8 +1,8 @@
-//! A study from its file to its report: data sets, runs, detections, matrix, features, distances, targets.
+//! Studies: from the study TOML through data sets, training runs and detections to the evaluation and the report.
 //!
-//! Every run is a process of its own: the program that runs, started again with its hidden command `study-run`, by this machine
-//! ([`Launcher::Local`]) or by Slurm. The processes know of each other only what lies in the run folders. Nothing here prints: what happens
-//! is handed to a [`Listener`].
+//! Every run is a separate process: the current program with its hidden command `study-run`, started on this machine
+//! ([`Launcher::Local`]) or by Slurm. The processes communicate through the run folders only. This crate prints
+//! nothing; it passes events to a [`Listener`].
 
 mod cache;
 pub mod clouds;
@@ -17,8 +17,8 @@ mod folder;
 mod local;
 pub mod numbers;
 mod present;
+mod run_state;
 mod slurm;
-mod standing;
 mod status;
 mod steps;
 mod work;
@@ -29,7 +29,7 @@ pub use error::StudyError;
 pub use event::{Event, Listener};
 pub use folder::Study;
 pub use present::write_report;
-pub use standing::Standing;
+pub use run_state::RunState;
 pub use status::{RunStatus, status};
 pub use steps::{Launcher, Outcome, RunOptions, Step, run_study};
-pub use work::{RunPart, RunWork, work_on_run};
+pub use work::{RunPart, RunWork, execute_run};

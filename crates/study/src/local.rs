@@ -1,10 +1,10 @@
-//! The runs of a study on this machine: a process each, as many at once as cores and memory allow.
+//! Executes the runs of a study on this machine, one process per run, as many in parallel as cores and memory allow.
 
 use crate::config::StudyRun;
-use crate::cost::{Costs, duration, left};
+use crate::cost::{Costs, duration, remaining};
 use crate::error::{InPart, Result};
 use crate::folder::Study;
-use crate::standing::{AtWork, read_failure, write_failure};
+use crate::run_state::{RunLock, read_failure, write_failure};
 use crate::work::RunPart;
 use crate::{Event, Listener};
 use std::path::{Path, PathBuf};
@@ -12,31 +12,31 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 use train::read_run_state;
 
-/// How runs share this machine.
+/// How parallel runs share this machine.
 #[derive(Clone, Debug)]
 pub struct LocalJobs {
-    /// Processes at once.
+    /// Number of parallel processes.
     pub at_once: usize,
-    /// Threads of each.
+    /// Number of threads of each process.
     pub threads: usize,
-    /// Words for the device, for each process.
+    /// Command line arguments of the device for each process.
     pub device: Vec<String>,
 }
 
-/// Memory that stays free for the rest of the machine, MiB.
+/// Memory that is left free, MiB.
 const SPARE_MIB: u64 = 512;
 
 impl LocalJobs {
-    /// By cores alone: each run a core of its own, and all cores for a few runs.
+    /// Limits the number of parallel runs to the number of cores and divides the cores among them.
     pub fn by_cores(runs: usize, at_once: Option<usize>, device: &[String]) -> LocalJobs {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        // One accelerator is shared by none.
+        // An accelerator is used by one run at a time.
         let most = if device.iter().any(|word| word == "wgpu" || word == "cuda") { 1 } else { cores };
         let at_once = at_once.unwrap_or(most.min(runs)).max(1);
         LocalJobs { at_once, threads: (cores / at_once).max(1), device: device.to_vec() }
     }
 
-    /// No more at once than fit into the memory that is free.
+    /// Limits the number of parallel runs to what fits into the available memory.
     pub fn within_memory(mut self, costs: &Costs) -> LocalJobs {
         let largest = costs.values().map(|cost| cost.peak_mib).max().unwrap_or(0);
         if let (Some(free), true) = (free_mib(), largest > 0) {
@@ -47,24 +47,24 @@ impl LocalJobs {
     }
 }
 
-/// Memory that the system would give, MiB, where it says so (Linux).
+/// Available memory in MiB (Linux only).
 fn free_mib() -> Option<u64> {
     let text = fs_err::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib / 1024)
 }
 
-/// A run in its process.
+/// A run and its process.
 struct Job<'a> {
     run: &'a StudyRun,
     child: Child,
 }
 
-/// Works on the runs until none is left; returns those that failed, with the reason. A process ends when this one does.
+/// Executes all runs; returns the failed ones with the reasons. The processes exit when this process ends.
 ///
 /// # Errors
 /// A process that cannot be started.
-pub fn work_on(
+pub fn run_all(
     study: &Study,
     runs: &[StudyRun],
     parts: &[RunPart],
@@ -74,22 +74,22 @@ pub fn work_on(
 ) -> Result<Vec<(String, String)>> {
     let note = |text: String| listener(Event::Note(&text));
     let mut waiting: Vec<&StudyRun> = runs.iter().rev().collect();
-    let (mut at_work, mut failed, mut done) = (Vec::<Job>::new(), Vec::new(), 0);
+    let (mut running, mut failed, mut done) = (Vec::<Job>::new(), Vec::new(), 0);
     let mut progress = Progress::new(study, runs, costs, jobs.at_once)?;
-    while !(waiting.is_empty() && at_work.is_empty()) {
-        while at_work.len() < jobs.at_once {
-            // A run that another process works on is waited for.
-            let free = waiting.iter().rposition(|run| !AtWork::is_taken(&run.folder(&study.folder)));
+    while !(waiting.is_empty() && running.is_empty()) {
+        while running.len() < jobs.at_once {
+            // A run that is in use by another process waits.
+            let free = waiting.iter().rposition(|run| !RunLock::is_held(&run.folder(&study.folder)));
             let Some(free) = free else { break };
             let run = waiting.remove(free);
-            note(format!("{run} begins"));
-            at_work.push(Job { run, child: start(study, run, parts, jobs)? });
+            note(format!("{run} started"));
+            running.push(Job { run, child: start(study, run, parts, jobs)? });
         }
         std::thread::sleep(Duration::from_millis(100));
-        let mut still = Vec::new();
-        for mut job in at_work {
+        let mut unfinished = Vec::new();
+        for mut job in running {
             let Some(status) = job.child.try_wait()? else {
-                still.push(job);
+                unfinished.push(job);
                 continue;
             };
             done += 1;
@@ -98,12 +98,12 @@ pub fn work_on(
                     note(format!("{} failed: {reason}", job.run));
                     failed.push((job.run.to_string(), reason));
                 }
-                None => note(format!("{} is done ({done} of {})", job.run, runs.len())),
+                None => note(format!("{} finished ({done} of {})", job.run, runs.len())),
             }
         }
-        at_work = still;
-        let at_work: Vec<&StudyRun> = at_work.iter().map(|job| job.run).collect();
-        progress.line(study, &at_work, &waiting, costs)?.into_iter().for_each(&note);
+        running = unfinished;
+        let running: Vec<&StudyRun> = running.iter().map(|job| job.run).collect();
+        progress.line(study, &running, &waiting, costs)?.into_iter().for_each(&note);
     }
     Ok(failed)
 }
@@ -112,27 +112,27 @@ fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> 
     let folder = run.folder(&study.folder);
     fs_err::create_dir_all(&folder)?;
     let log = || fs_err::OpenOptions::new().create(true).append(true).open(folder.join("log.txt"));
-    let mut command = Command::new(own_program()?);
+    let mut command = Command::new(current_program()?);
     command.arg("study-run").arg(&study.folder).args(["--attached", "--run", &run.to_string()]);
-    command.args(["--parts", &words(parts)]).args(&jobs.device);
+    command.args(["--parts", &parts_argument(parts)]).args(&jobs.device);
     command.env("RAYON_NUM_THREADS", jobs.threads.to_string());
     command.stdin(Stdio::piped()).stdout(log()?.into_file()).stderr(log()?.into_file());
     command.spawn().in_part(|| format!("{run} could not be started"))
 }
 
-/// The program that is running, also where its file was replaced meanwhile: who builds while a study runs must not lose it.
-pub fn own_program() -> std::io::Result<PathBuf> {
+/// Path of the running program. It stays valid if the file is replaced by a new build while a study runs (Linux).
+pub fn current_program() -> std::io::Result<PathBuf> {
     let path = std::env::current_exe()?;
     let running = Path::new("/proc/self/exe");
     Ok(if !path.is_file() && running.exists() { running.to_path_buf() } else { path })
 }
 
-/// As the command line takes them.
-pub fn words(parts: &[RunPart]) -> String {
-    parts.iter().map(|part| part.word()).collect::<Vec<_>>().join(",")
+/// The value of the command line option `--parts`.
+pub fn parts_argument(parts: &[RunPart]) -> String {
+    parts.iter().map(|part| part.argument()).collect::<Vec<_>>().join(",")
 }
 
-/// Why a run failed; a process that could not say so itself leaves it to us.
+/// The error of a failed run. If its process has not written one, its exit status and the end of its log are used.
 fn failure(study: &Study, run: &StudyRun, status: ExitStatus) -> Result<Option<String>> {
     if status.success() {
         return Ok(None);
@@ -154,7 +154,7 @@ fn last_line(path: &Path) -> Option<String> {
     String::from_utf8_lossy(&bytes).lines().rev().find(|line| !line.trim().is_empty()).map(String::from)
 }
 
-/// How far all runs are, every half minute.
+/// Reports the progress of all runs every 30 s.
 struct Progress {
     began: Instant,
     last: Instant,
@@ -167,41 +167,41 @@ impl Progress {
     fn new(study: &Study, runs: &[StudyRun], costs: &Costs, at_once: usize) -> Result<Self> {
         let now = Instant::now();
         let whole_s =
-            runs.iter().map(|run| Ok(left(study, run, costs)?.seconds.unwrap_or(0.0))).sum::<Result<f64>>()?;
+            runs.iter().map(|run| Ok(remaining(study, run, costs)?.seconds.unwrap_or(0.0))).sum::<Result<f64>>()?;
         Ok(Progress { began: now, last: now, every: Duration::from_secs(30), at_once, whole_s })
     }
 
     fn line(
         &mut self,
         study: &Study,
-        at_work: &[&StudyRun],
+        running: &[&StudyRun],
         waiting: &[&StudyRun],
         costs: &Costs,
     ) -> Result<Option<String>> {
-        if self.last.elapsed() < self.every || at_work.is_empty() {
+        if self.last.elapsed() < self.every || running.is_empty() {
             return Ok(None);
         }
         self.last = Instant::now();
-        let mut left_s = 0.0;
-        for run in at_work.iter().chain(waiting) {
-            left_s += left(study, run, costs)?.seconds.unwrap_or(0.0);
+        let mut remaining_s = 0.0;
+        for run in running.iter().chain(waiting) {
+            remaining_s += remaining(study, run, costs)?.seconds.unwrap_or(0.0);
         }
-        // What was measured before the first step is corrected by what has been done since.
-        let done_s = self.whole_s - left_s;
+        // The step time measured in advance is corrected by the progress so far.
+        let done_s = self.whole_s - remaining_s;
         let pace = if done_s > 0.05 * self.whole_s {
             self.began.elapsed().as_secs_f64() / done_s
         } else {
             1.0 / self.at_once as f64
         };
-        let stands: Vec<String> = at_work
+        let positions: Vec<String> = running
             .iter()
             .map(|run| {
                 let state = read_run_state(&run.folder(&study.folder)).ok().flatten();
-                state.map_or(format!("{run} begins"), |s| format!("{run} step {} of {}", s.step, s.total_steps))
+                state.map_or(format!("{run} starting"), |s| format!("{run} step {} of {}", s.step, s.total_steps))
             })
             .collect();
-        let left = duration(left_s * pace);
-        Ok(Some(format!("{}; {} waiting; about {left} left", stands.join(", "), waiting.len())))
+        let left = duration(remaining_s * pace);
+        Ok(Some(format!("{}; {} waiting; about {left} remaining", positions.join(", "), waiting.len())))
     }
 }
 
@@ -211,7 +211,7 @@ mod tests {
     use crate::cost::NetworkCost;
 
     #[test]
-    fn memory_limits_how_many_run_at_once() {
+    fn memory_limits_the_number_of_parallel_runs() {
         let jobs = LocalJobs { at_once: 4, threads: 1, device: Vec::new() };
         let cost = |peak_mib| {
             let cost = NetworkCost { step_s: 1.0, detection_s: 1.0, peak_mib, threads: 1, device: "flex".into() };
@@ -224,7 +224,7 @@ mod tests {
     }
 
     #[test]
-    fn parts_are_words_of_the_command_line() {
-        assert_eq!(words(&[RunPart::Train, RunPart::Detect]), "train,detect");
+    fn parts_become_a_command_line_argument() {
+        assert_eq!(parts_argument(&[RunPart::Train, RunPart::Detect]), "train,detect");
     }
 }

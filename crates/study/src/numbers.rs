@@ -1,12 +1,12 @@
-//! What the detections of a study say: the matrix, and what is behind the average precision of single runs.
+//! Evaluation of the detections of a study: the matrix, and the error analyses of single runs.
 
 use crate::cache::cached;
 use crate::config::StudyRun;
 use crate::data_sets::{labelled_sha256, open};
-use crate::detections::{spread, weights_sha256};
+use crate::detections::{evenly_spaced, weights_sha256};
 use crate::error::Result;
 use crate::folder::Study;
-use crate::standing::{Standing, standing};
+use crate::run_state::{RunState, run_state};
 use data::{DataError, Dataset, LabelBox};
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
 use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
@@ -15,52 +15,52 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-/// The runs of a study that have detections on a test set, by their names; and why others have none.
-pub struct Found {
-    /// How each run stands.
-    pub standings: Vec<(StudyRun, Standing)>,
-    /// Test sets with a hash of their frames and labels.
+/// The state of all runs of a study, and hashes of its test sets.
+pub struct StudyState {
+    /// The state of each run.
+    pub run_states: Vec<(StudyRun, RunState)>,
+    /// Name of each test set and a hash of its frames and labels.
     pub tests: Vec<(String, String)>,
 }
 
-impl Found {
-    /// Looks at every run and test set.
+impl StudyState {
+    /// Reads the state of every run and test set.
     ///
     /// # Errors
-    /// A data set that is not there.
-    pub fn look(study: &Study) -> Result<Found> {
+    /// A missing data set.
+    pub fn read(study: &Study) -> Result<StudyState> {
         let runs = study.config.runs().into_iter();
-        let standings = runs.map(|run| Ok((run.clone(), standing(study, &run)?))).collect::<Result<_>>()?;
+        let run_states = runs.map(|run| Ok((run.clone(), run_state(study, &run)?))).collect::<Result<_>>()?;
         let test = |name: &String| {
             let dataset = open(study, name)?;
             let ids = dataset.ids(&study.config.splits.test)?;
             Ok((name.clone(), labelled_sha256(&dataset, &ids)?))
         };
         let names: Vec<String> = study.config.datasets.iter().map(|d| d.name.clone()).collect();
-        Ok(Found { standings, tests: names.iter().map(test).collect::<Result<_>>()? })
+        Ok(StudyState { run_states, tests: names.iter().map(test).collect::<Result<_>>()? })
     }
 
-    /// Whether a run has its detections on a test set.
-    pub fn has(standing: &Standing, test_set: &str) -> bool {
-        match standing {
-            Standing::Done => true,
-            Standing::Trained(missing) => !missing.iter().any(|name| name == test_set),
+    /// Whether a run in this state has detections on a test set.
+    pub fn has(run_state: &RunState, test_set: &str) -> bool {
+        match run_state {
+            RunState::Done => true,
+            RunState::Trained(missing) => !missing.iter().any(|name| name == test_set),
             _ => false,
         }
     }
 
-    /// Everything that decides the results: runs with their weights or why they have none, and test sets.
+    /// Everything that determines the results: the state and the weights of each run, and the test sets.
     ///
     /// # Errors
     /// Weights that cannot be read.
     pub fn key(&self, study: &Study) -> Result<String> {
         let mut key = String::new();
-        for (run, standing) in &self.standings {
-            let weights = match standing {
-                Standing::Done | Standing::Trained(_) => weights_sha256(&run.folder(&study.folder))?,
+        for (run, run_state) in &self.run_states {
+            let weights = match run_state {
+                RunState::Done | RunState::Trained(_) => weights_sha256(&run.folder(&study.folder))?,
                 _ => String::new(),
             };
-            let _ = writeln!(key, "{run} {standing:?} {weights}");
+            let _ = writeln!(key, "{run} {run_state:?} {weights}");
         }
         for (name, hash) in &self.tests {
             let _ = writeln!(key, "{name} {hash}");
@@ -69,33 +69,33 @@ impl Found {
     }
 }
 
-/// The matrix of a study, kept in `matrix.json`.
+/// The matrix of a study, cached in `matrix.json`.
 ///
 /// # Errors
 /// Labels that cannot be read.
-pub fn matrix(study: &Study, found: &Found) -> Result<Matrix> {
+pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
     let options = &study.config.evaluation.matrix;
     let path = study.folder.join("matrix.json");
-    cached(&path, &(found.key(study)?, study.config.plan(), options), || {
+    cached(&path, &(state.key(study)?, study.config.plan(), options), || {
         let mut results: BTreeMap<(RunId, String), RunResult> = BTreeMap::new();
-        for (test_set, _) in &found.tests {
+        for (test_set, _) in &state.tests {
             let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
-            let of_run = |(run, standing): &(StudyRun, Standing)| {
-                let result = if Found::has(standing, test_set) {
+            let of_run = |(run, run_state): &(StudyRun, RunState)| {
+                let result = if StudyState::has(run_state, test_set) {
                     let folders = [run.detections(&study.folder, test_set), run.regions(&study.folder, test_set)];
                     scores(&labels, &folders, options).map_err(|e| e.to_string())
                 } else {
-                    Err(reason(standing)?)
+                    Err(reason(run_state)?)
                 };
                 Some(((run.id.clone(), test_set.clone()), result))
             };
-            results.extend(found.standings.par_iter().filter_map(of_run).collect::<Vec<_>>());
+            results.extend(state.run_states.par_iter().filter_map(of_run).collect::<Vec<_>>());
         }
         Ok(build(&study.config.plan(), &results, options))
     })
 }
 
-/// Of the detections of a run, and of the regions of one with two stages.
+/// Scores of the detections of a run and, for a two-stage network, of its regions.
 fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> Result<RunScores, DataError> {
     let [detections, regions] = folders;
     let frames = labels.with_detections(detections)?;
@@ -103,33 +103,33 @@ fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> 
     Ok(RunScores::new(&frames, regions.as_deref(), labels.label_frame, options))
 }
 
-/// Why a run has no detections; `None`: it is only missing.
-fn reason(standing: &Standing) -> Option<String> {
-    match standing {
-        Standing::Failed(reason) => Some(reason.clone()),
-        Standing::Other(differences) => {
+/// Why a run has no detections; `None` if it has not been executed yet.
+fn reason(run_state: &RunState) -> Option<String> {
+    match run_state {
+        RunState::Failed(reason) => Some(reason.clone()),
+        RunState::Other(differences) => {
             Some(format!("its folder holds a run with other settings ({})", differences.join("; ")))
         }
-        Standing::Stopped(step, total) => Some(format!("it was stopped at step {step} of {total}")),
-        Standing::Running(step, total) => Some(format!("it is being worked on, step {step} of {total}")),
-        Standing::Done | Standing::Trained(_) | Standing::Missing => None,
+        RunState::Stopped(step, total) => Some(format!("it was stopped at step {step} of {total}")),
+        RunState::Running(step, total) => Some(format!("it is being worked on, step {step} of {total}")),
+        RunState::Done | RunState::Trained(_) | RunState::Missing => None,
     }
 }
 
-/// Analyses of the first run of every network and train set: on the test set of its own data, and on the first of the study. Kept in
-/// `analyses.json`.
+/// Error analyses of the first finished run of every network and train set: on the first test set of the study, and on
+/// the test set of its training data. Cached in `analyses.json`.
 ///
 /// # Errors
 /// Frames that cannot be read.
-pub fn analyses(study: &Study, found: &Found) -> Result<Vec<(String, RunAnalysis)>> {
-    let key = (found.key(study)?, &study.config.evaluation.analysis);
+pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAnalysis)>> {
+    let key = (state.key(study)?, &study.config.evaluation.analysis);
     cached(&study.folder.join("analyses.json"), &key, || {
         let first = &study.config.datasets[0].name;
         let mut seen = Vec::new();
         let mut out = Vec::new();
-        for (run, standing) in &found.standings {
+        for (run, run_state) in &state.run_states {
             let of = (run.id.network.clone(), run.id.train_set.clone());
-            if seen.contains(&of) || !matches!(standing, Standing::Done) {
+            if seen.contains(&of) || !matches!(run_state, RunState::Done) {
                 continue;
             }
             let mut tests = vec![first];
@@ -163,7 +163,8 @@ fn of_run(study: &Study, run: &StudyRun, test_set: &str) -> Result<RunAnalysis> 
     let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
     let label_frame = labels.label_frame;
     let options = AnalysisOptions { label_frame, ..study.config.evaluation.analysis.clone() };
-    // Boxes in the cloud's frame; labels in the camera's are tilted against it.
+    // Points are counted only if the boxes are in the frame of the cloud; boxes in the camera frame are tilted relative
+    // to it.
     let points = match label_frame {
         data::LabelFrame::Lidar => Some(points(&dataset, &frames)?),
         data::LabelFrame::Camera => None,
@@ -180,10 +181,10 @@ fn points(dataset: &Dataset, frames: &[eval::EvalFrame]) -> Result<Vec<BoxPoints
     frames.par_iter().map(of_frame).collect()
 }
 
-/// Some test frames, evenly over all.
+/// `n` test frames, evenly spaced over the split.
 ///
 /// # Errors
-/// A split that is not there.
+/// A missing split.
 pub fn some_test_frames(study: &Study, dataset: &Dataset, n: usize) -> Result<Vec<String>> {
-    Ok(spread(&dataset.ids(&study.config.splits.test)?, n))
+    Ok(evenly_spaced(&dataset.ids(&study.config.splits.test)?, n))
 }

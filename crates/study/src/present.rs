@@ -1,4 +1,4 @@
-//! The report of a study from what its folder holds.
+//! Writes the report of a study from the results in its folder.
 
 use crate::clouds::{all_distances, all_targets};
 use crate::config::{Source, StudyDataset, StudyRun};
@@ -6,36 +6,38 @@ use crate::data_sets::open;
 use crate::error::Result;
 use crate::features::features;
 use crate::folder::Study;
-use crate::numbers::{Found, analyses, matrix, network_title, some_test_frames};
+use crate::numbers::{StudyState, analyses, matrix, network_title, some_test_frames};
 use crate::{Event, Listener};
 use data::{KittiText, read_kitti_text};
 use eval::matrix::Matrix;
 use geometry::Box3;
 use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
 
-/// Test frames in the view of clouds.
+/// Number of test frames in the 3D view.
 const SCENES: usize = 3;
-/// Data sets whose clouds are in it.
+/// Number of data sets whose clouds are shown in it.
 const SCENE_SETS: usize = 2;
-/// Colours of the layers: clouds, labels, detections; of these as many as the paper's grid has networks and data sets.
+/// Colours of the layers of clouds, labels and detections. There are as many for detections as the paper has pairs of
+/// network and train set.
 const CLOUDS: [&str; SCENE_SETS] = ["#0072b2", "#d55e00"];
 const LABELS: &str = "#009e73";
 const DETECTIONS: [&str; 8] = ["#cc79a7", "#e69f00", "#56b4e9", "#f0e442", "#882255", "#44aa99", "#999933", "#8c6bb1"];
 
-/// Evaluates what there is and writes `report.html` with its figures and tables into the study's folder; and the matrix.
+/// Evaluates the existing results, writes `report.html` with its figures and tables into the folder of the study, and
+/// returns the matrix.
 ///
 /// # Errors
-/// Data sets that are not there, files that are damaged.
+/// Missing data sets, damaged files.
 pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, ReportFiles)> {
-    let found = Found::look(study)?;
-    listener(Event::Note("matrix"));
-    let matrix = matrix(study, &found)?;
-    listener(Event::Note("analyses"));
-    let analyses = analyses(study, &found)?;
-    listener(Event::Note("features"));
+    let state = StudyState::read(study)?;
+    listener(Event::Note("computing the matrix"));
+    let matrix = matrix(study, &state)?;
+    listener(Event::Note("analysing errors"));
+    let analyses = analyses(study, &state)?;
+    listener(Event::Note("comparing features"));
     let features = features(study)?;
     let (distances, mut warnings) = all_distances(study, listener)?;
-    listener(Event::Note("targets"));
+    listener(Event::Note("computing target statistics"));
     let targets = all_targets(study)?;
     warnings.extend(features.warnings);
     let report = StudyReport {
@@ -52,12 +54,12 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
         distances,
         targets,
         training: training(study)?,
-        scenes: scenes(study, &found)?,
+        scenes: scenes(study, &state)?,
     };
     Ok((matrix, report.write(&study.folder)?))
 }
 
-/// Name and value of what was run; nothing that differs between a study in one go and one that was interrupted.
+/// Settings of the study as names and values. They must not differ between an uninterrupted and a resumed study.
 fn facts(study: &Study) -> Result<Vec<(String, String)>> {
     let mut facts = Vec::new();
     let mut fact = |name: &str, value: String| facts.push((name.to_string(), value));
@@ -108,7 +110,7 @@ fn source(study: &Study, dataset: &StudyDataset) -> String {
     }
 }
 
-/// Curves of all runs that have begun.
+/// Training curves of all runs that have started.
 fn training(study: &Study) -> Result<Vec<TrainingRun>> {
     let mut out = Vec::new();
     for run in study.config.runs() {
@@ -122,8 +124,9 @@ fn training(study: &Study) -> Result<Vec<TrainingRun>> {
     Ok(out)
 }
 
-/// Some test frames of the first data sets with their labels, and what the first run of each network and train set found in the first.
-fn scenes(study: &Study, found: &Found) -> Result<Vec<Scene>> {
+/// Some test frames of the first data sets with labels, and the detections on the first data set by the first run of
+/// each network and train set.
+fn scenes(study: &Study, state: &StudyState) -> Result<Vec<Scene>> {
     let names: Vec<&str> = study.config.datasets.iter().map(|d| d.name.as_str()).take(SCENE_SETS).collect();
     let first = open(study, names[0])?;
     let mut scenes = Vec::new();
@@ -132,7 +135,7 @@ fn scenes(study: &Study, found: &Found) -> Result<Vec<Scene>> {
         let mut focus_m = None;
         for (name, color) in names.iter().zip(CLOUDS) {
             let set = open(study, name)?;
-            // Data sets of other scenes have other frames.
+            // A data set with other scenes does not have this frame.
             let Ok(frame) = set.load(&id) else { continue };
             if *name == names[0] {
                 focus_m = frame.objects.first().map(|object| object.bbox.center);
@@ -142,7 +145,7 @@ fn scenes(study: &Study, found: &Found) -> Result<Vec<Scene>> {
             layers.push(layer(study.title(name), color, LayerContent::Cloud(frame.cloud.with_channels(3))));
         }
         let mut seen = Vec::new();
-        for (run, _) in found.standings.iter().filter(|(_, standing)| Found::has(standing, names[0])) {
+        for (run, _) in state.run_states.iter().filter(|(_, run_state)| StudyState::has(run_state, names[0])) {
             let of = (&run.id.network, &run.id.train_set);
             if seen.contains(&of) || first.config.label_frame != data::LabelFrame::Lidar {
                 continue;

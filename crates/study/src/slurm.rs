@@ -1,4 +1,4 @@
-//! The runs of a study on a Slurm cluster: a job array to train, one to detect, and the report behind both.
+//! Submits the runs of a study to Slurm: one job array for training, one for detection, and one job for the report.
 
 use crate::config::StudyRun;
 use crate::error::{InPart, Result, refused};
@@ -10,18 +10,19 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Submits what is missing. Task K of the training works on run K of a list; task K of the detection begins when task K of the training has
-/// ended well; the report begins when all tasks have ended, however they did, and shows those that failed.
+/// Submits the missing runs. Task K of the training array executes run K of a list. Task K of the detection array
+/// starts after task K of the training array has succeeded. The report starts after all tasks have ended, with or
+/// without an error, and shows the failed ones.
 ///
 /// # Errors
-/// No Slurm on this machine, or a submission that it refuses.
+/// No Slurm on this machine, or a rejected submission.
 pub fn submit(study: &Study, missing: &[StudyRun], options: &RunOptions, listener: Listener<'_>) -> Result<()> {
     let RunOptions { steps, device, sbatch, .. } = options;
     let result = |text: String| listener(Event::Result(&text));
-    let waiting = queued(study)?;
-    let runs: Vec<&StudyRun> = missing.iter().filter(|run| !waiting.contains(&run.to_string())).collect();
+    let queued = queued(study)?;
+    let runs: Vec<&StudyRun> = missing.iter().filter(|run| !queued.contains(&run.to_string())).collect();
     if runs.len() < missing.len() {
-        result(format!("{} runs are in Slurm's queue already", missing.len() - runs.len()));
+        result(format!("{} runs are already in the queue of Slurm", missing.len() - runs.len()));
     }
     let submission = Submission::new(study, device, sbatch)?;
     let mut last = None;
@@ -39,14 +40,14 @@ pub fn submit(study: &Study, missing: &[StudyRun], options: &RunOptions, listene
                 submission.device
             )
         };
-        for (step, word) in [(Step::Train, "train"), (Step::Detect, "detect")] {
+        for (step, part) in [(Step::Train, "train"), (Step::Detect, "detect")] {
             if !steps.contains(&step) {
                 continue;
             }
-            let mut words = vec![array.clone()];
-            words.extend(last.as_ref().map(|id| format!("--dependency=aftercorr:{id}")));
-            let id = submission.submit(word, &task(word), &words)?;
-            result(format!("{word}: job {id}, {} tasks", names.len()));
+            let mut sbatch_options = vec![array.clone()];
+            sbatch_options.extend(last.as_ref().map(|id| format!("--dependency=aftercorr:{id}")));
+            let id = submission.submit(part, &task(part), &sbatch_options)?;
+            result(format!("{part}: job {id}, {} tasks", names.len()));
             last = Some(id);
         }
         record(study, last.as_deref().unwrap_or_default(), &list)?;
@@ -54,22 +55,22 @@ pub fn submit(study: &Study, missing: &[StudyRun], options: &RunOptions, listene
     if steps.contains(&Step::Report) {
         let text = format!("exec {} report {}", submission.program, quoted(&study.folder.display().to_string()));
         let ids = jobs(study)?;
-        let words: Vec<String> = match ids.is_empty() {
+        let sbatch_options: Vec<String> = match ids.is_empty() {
             true => Vec::new(),
             false => vec![format!("--dependency=afterany:{}", ids.join(":"))],
         };
-        let id = submission.submit("report", &text, &words)?;
+        let id = submission.submit("report", &text, &sbatch_options)?;
         result(format!("report: job {id}"));
     }
     result(format!(
-        "`lidarshift study status {}` says where they stand; logs lie in {}",
+        "`lidarshift study status {}` shows the state of the runs; logs are in {}",
         study.named,
         submission.folder.display()
     ));
     Ok(())
 }
 
-/// A folder of scripts and logs.
+/// Scripts, logs and common options of a submission.
 struct Submission<'a> {
     folder: PathBuf,
     program: String,
@@ -85,39 +86,39 @@ impl<'a> Submission<'a> {
         let folder = all.join(number.to_string());
         fs_err::create_dir_all(&folder)?;
         let program = quoted(&std::env::current_exe()?.display().to_string());
-        let device: Vec<String> = device.iter().map(|word| quoted(word)).collect();
+        let device: Vec<String> = device.iter().map(|argument| quoted(argument)).collect();
         Ok(Submission { folder, program, device: device.join(" "), name: &study.config.name, sbatch })
     }
 
-    /// Writes the script and gives it to Slurm; the number of the job.
-    fn submit(&self, word: &str, text: &str, words: &[String]) -> Result<String> {
-        let script = self.folder.join(format!("{word}.sh"));
-        let log = self.folder.join(if words.iter().any(|w| w.starts_with("--array")) {
-            format!("{word}-%A_%a.log")
+    /// Writes the script and submits it; returns the job id.
+    fn submit(&self, name: &str, text: &str, options: &[String]) -> Result<String> {
+        let script = self.folder.join(format!("{name}.sh"));
+        let log = self.folder.join(if options.iter().any(|o| o.starts_with("--array")) {
+            format!("{name}-%A_%a.log")
         } else {
-            format!("{word}-%j.log")
+            format!("{name}-%j.log")
         });
-        // As many threads as Slurm gives cores.
+        // One thread per core that Slurm assigns.
         let threads = "export RAYON_NUM_THREADS=\"${SLURM_CPUS_PER_TASK:-$(nproc)}\"";
         write_atomic(&script, format!("#!/bin/sh\n{threads}\n{text}\n").as_bytes())?;
         let mut command = Command::new("sbatch");
-        command.arg("--parsable").arg(format!("--job-name={}-{word}", self.name));
-        // A job whose dependency can no longer come true would wait for ever.
-        command.arg("--kill-on-invalid-dep=yes").arg("--output").arg(&log).args(words).args(self.sbatch).arg(&script);
-        let said = answer(&mut command)?;
+        command.arg("--parsable").arg(format!("--job-name={}-{name}", self.name));
+        // Otherwise a job whose dependency has failed would wait forever.
+        command.arg("--kill-on-invalid-dep=yes").arg("--output").arg(&log).args(options).args(self.sbatch).arg(&script);
+        let output = run_command(&mut command)?;
         // "123" or "123;cluster".
-        Ok(said.trim().split(';').next().unwrap_or_default().to_string())
+        Ok(output.trim().split(';').next().unwrap_or_default().to_string())
     }
 }
 
-/// What a command of Slurm says.
-fn answer(command: &mut Command) -> Result<String> {
+/// Runs a Slurm command and returns its stdout.
+fn run_command(command: &mut Command) -> Result<String> {
     let name = command.get_program().to_string_lossy().into_owned();
     let output = match command.output() {
         Ok(output) => output,
         Err(e) if e.kind() == ErrorKind::NotFound => {
             return Err(refused(format!(
-                "there is no {name} on this machine: --launcher slurm needs Slurm's client programs; --launcher local works without"
+                "there is no {name} on this machine; --launcher slurm needs Slurm's client programs, --launcher local does not"
             )));
         }
         Err(e) => return Err(e).in_part(|| format!("{name} could not be started")),
@@ -128,28 +129,28 @@ fn answer(command: &mut Command) -> Result<String> {
     Ok(String::from_utf8_lossy(&output.stdout).into_owned())
 }
 
-/// Jobs that were submitted for a study: number and list of runs, a line each.
-fn book(study: &Study) -> PathBuf {
+/// File with the submitted jobs of a study: job id and list of runs, one job per line.
+fn jobs_file(study: &Study) -> PathBuf {
     study.folder.join("slurm/jobs.txt")
 }
 
 fn record(study: &Study, job: &str, list: &Path) -> Result<()> {
-    let mut text = fs_err::read_to_string(book(study)).unwrap_or_default();
+    let mut text = fs_err::read_to_string(jobs_file(study)).unwrap_or_default();
     text += &format!("{job} {}\n", list.display());
-    Ok(write_atomic(&book(study), text.as_bytes())?)
+    Ok(write_atomic(&jobs_file(study), text.as_bytes())?)
 }
 
-/// Tasks of our jobs that wait or run: job and number of the task.
+/// Pending and running tasks of the jobs of a study: job id, task number and list of runs.
 fn tasks(study: &Study) -> Result<Vec<(String, usize, PathBuf)>> {
-    let text = fs_err::read_to_string(book(study)).unwrap_or_default();
-    // Also the question whether there is a Slurm at all.
-    let queue = answer(Command::new("squeue").args(["--noheader", "--array", "--format=%F %K"]))?;
+    let text = fs_err::read_to_string(jobs_file(study)).unwrap_or_default();
+    // This also fails if there is no Slurm.
+    let queue = run_command(Command::new("squeue").args(["--noheader", "--array", "--format=%F %K"]))?;
     let mut tasks = Vec::new();
     for (job, list) in text.lines().filter_map(|line| line.split_once(' ')) {
         for line in queue.lines() {
-            let mut words = line.split_whitespace();
-            if words.next() == Some(job)
-                && let Some(task) = words.next().and_then(|word| word.parse().ok())
+            let mut fields = line.split_whitespace();
+            if fields.next() == Some(job)
+                && let Some(task) = fields.next().and_then(|field| field.parse().ok())
             {
                 tasks.push((job.to_string(), task, PathBuf::from(list)));
             }
@@ -158,7 +159,7 @@ fn tasks(study: &Study) -> Result<Vec<(String, usize, PathBuf)>> {
     Ok(tasks)
 }
 
-/// Names of the runs that wait or run in Slurm's queue.
+/// Names of the pending and running runs.
 fn queued(study: &Study) -> Result<Vec<String>> {
     let mut names = Vec::new();
     for (_, task, list) in tasks(study)? {
@@ -167,16 +168,16 @@ fn queued(study: &Study) -> Result<Vec<String>> {
     Ok(names)
 }
 
-/// Our jobs of which a task waits or runs.
+/// Job ids with a pending or running task.
 fn jobs(study: &Study) -> Result<Vec<String>> {
     let mut jobs: Vec<String> = tasks(study)?.into_iter().map(|(job, ..)| job).collect();
     jobs.dedup();
     Ok(jobs)
 }
 
-/// A word as the shell reads it.
-fn quoted(word: &str) -> String {
-    format!("'{}'", word.replace('\'', "'\\''"))
+/// An argument quoted for the shell.
+fn quoted(argument: &str) -> String {
+    format!("'{}'", argument.replace('\'', "'\\''"))
 }
 
 #[cfg(test)]
@@ -184,15 +185,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_survive_the_shell() {
-        let word = "a b'c$d";
-        let output = Command::new("sh").arg("-c").arg(format!("printf %s {}", quoted(word))).output().unwrap();
-        assert_eq!(String::from_utf8(output.stdout).unwrap(), word);
+    fn quoted_arguments_pass_the_shell_unchanged() {
+        let argument = "a b'c$d";
+        let output = Command::new("sh").arg("-c").arg(format!("printf %s {}", quoted(argument))).output().unwrap();
+        assert_eq!(String::from_utf8(output.stdout).unwrap(), argument);
     }
 
     #[test]
     fn a_missing_program_is_named() {
-        let error = answer(&mut Command::new("no-such-sbatch")).unwrap_err().to_string();
+        let error = run_command(&mut Command::new("no-such-sbatch")).unwrap_err().to_string();
         assert!(error.contains("no-such-sbatch") && error.contains("--launcher local"), "{error}");
     }
 }

@@ -1,36 +1,36 @@
-//! Where the runs of a study stand.
+//! State and remaining computing time of the runs of a study.
 
 use crate::config::StudyRun;
-use crate::cost::{known, left};
+use crate::cost::{known_costs, remaining};
 use crate::error::Result;
 use crate::folder::Study;
-use crate::standing::{Standing, standing};
+use crate::run_state::{RunState, run_state};
 
-/// How one run stands.
+/// State and remaining computing time of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RunStatus {
     /// The run.
     pub run: StudyRun,
-    /// How it stands.
-    pub standing: Standing,
-    /// How long the rest of it takes, s, where that is known.
-    pub left_s: Option<f64>,
+    /// Its state.
+    pub run_state: RunState,
+    /// Remaining computing time in s, if it is known.
+    pub remaining_s: Option<f64>,
 }
 
-/// All runs of a study, in its order.
+/// The status of all runs of a study, in the order of the study.
 ///
 /// # Errors
-/// A study that does not make sense.
+/// An invalid configuration of a run.
 pub fn status(study: &Study) -> Result<Vec<RunStatus>> {
-    let costs = known(study);
+    let costs = known_costs(study);
     let of_run = |run: StudyRun| {
-        let standing = standing(study, &run)?;
-        // What cannot be known yet, as without data sets, stays unknown.
-        let left_s = match &standing {
-            Standing::Done => Some(0.0),
-            _ => left(study, &run, &costs).ok().and_then(|left| left.seconds),
+        let run_state = run_state(study, &run)?;
+        // Unknown as long as, for example, the data sets do not exist.
+        let remaining_s = match &run_state {
+            RunState::Done => Some(0.0),
+            _ => remaining(study, &run, &costs).ok().and_then(|remaining| remaining.seconds),
         };
-        Ok(RunStatus { run, standing, left_s })
+        Ok(RunStatus { run, run_state, remaining_s })
     };
     study.config.runs().into_iter().map(of_run).collect()
 }

@@ -1,14 +1,14 @@
-//! The steps of a study, in their order. What is there already is kept.
+//! Runs the steps of a study in order. Existing results are kept.
 
 use crate::config::StudyRun;
-use crate::cost::{Costs, costs, duration, left};
+use crate::cost::{Costs, costs, duration, remaining};
 use crate::data_sets::make_datasets;
 use crate::error::{Result, refused};
 use crate::folder::Study;
-use crate::local::{LocalJobs, work_on};
+use crate::local::{LocalJobs, run_all};
 use crate::present::write_report;
+use crate::run_state::{RunLock, RunState, run_state};
 use crate::slurm::submit;
-use crate::standing::{AtWork, Standing, standing};
 use crate::work::RunPart;
 use crate::{Event, Listener};
 use eval::matrix::Matrix;
@@ -17,52 +17,52 @@ use report::ReportFiles;
 /// A step of a study.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Step {
-    /// Data sets.
+    /// Generating the data sets.
     Data,
     /// Training.
     Train,
-    /// Detections of the test sets.
+    /// Detection on the test sets.
     Detect,
-    /// Numbers, figures and the page.
+    /// Evaluation and report.
     Report,
 }
 
 impl Step {
-    /// All of them, in their order.
+    /// All steps in order.
     pub const ALL: [Step; 4] = [Step::Data, Step::Train, Step::Detect, Step::Report];
 }
 
-/// Who starts the runs of a study.
+/// Where the runs of a study are executed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Launcher {
     /// This machine.
     #[default]
     Local,
-    /// Slurm, as job arrays.
+    /// A Slurm cluster, as job arrays.
     Slurm,
 }
 
-/// How a study is worked on.
+/// Options for running a study.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunOptions {
-    /// The steps to take.
+    /// The steps to run.
     pub steps: Vec<Step>,
-    /// Who starts the runs.
+    /// Where the runs are executed.
     pub launcher: Launcher,
-    /// Say what is missing and what it will cost, and stop.
+    /// Only report the missing runs and their expected computing time.
     pub dry_run: bool,
-    /// Runs at once on this machine; `None`: by cores and memory.
+    /// Number of parallel runs on this machine; `None`: from cores and memory.
     pub jobs: Option<usize>,
-    /// Remove runs that were made with other settings than the study's, and make them anew.
+    /// Remove and repeat runs whose settings differ from those of the study.
     pub replace: bool,
-    /// Words for sbatch.
+    /// Options for sbatch.
     pub sbatch: Vec<String>,
-    /// Words that name the device to the process of a run.
+    /// Command line arguments of the device for the process of a run.
     pub device: Vec<String>,
 }
 
 impl RunOptions {
-    /// All steps on this machine, as many runs at once as fit; runs with other settings are replaced.
+    /// All steps on this machine with as many parallel runs as fit; runs with other settings are replaced.
     pub fn here(device: Vec<String>) -> Self {
         RunOptions {
             steps: Step::ALL.to_vec(),
@@ -76,23 +76,23 @@ impl RunOptions {
     }
 }
 
-/// What came of a study.
+/// Result of a study.
 #[derive(Clone, Debug, Default)]
 pub struct Outcome {
-    /// The matrix and the files of the report, where one was written.
+    /// The matrix and the files of the report, if it was written.
     pub report: Option<(Matrix, ReportFiles)>,
-    /// Runs without a result, each with the reason.
+    /// Names of the runs without a result, with the reasons.
     pub failed: Vec<(String, String)>,
 }
 
-/// Takes the steps of a study.
+/// Runs the steps of a study.
 ///
 /// # Errors
-/// What cannot be made. Runs that fail are no error: they stand in [`Outcome::failed`].
+/// A step that fails. Failed runs are not an error; they are returned in [`Outcome::failed`].
 pub fn run_study(study: &Study, options: &RunOptions, listener: Listener<'_>) -> Result<Outcome> {
     let RunOptions { steps, device, .. } = options;
-    for line in study.note_changes()? {
-        listener(Event::Note(&format!("the study's file changed: {line}")));
+    for line in study.update_copy()? {
+        listener(Event::Note(&format!("the study has changed: {line}")));
     }
     if steps.contains(&Step::Data) {
         make_datasets(study, listener)?;
@@ -116,7 +116,7 @@ pub fn run_study(study: &Study, options: &RunOptions, listener: Listener<'_>) ->
             return Ok(outcome);
         }
         outcome.failed = invalid;
-        outcome.failed.extend(work_on(study, &missing, &parts, &jobs, &known, listener)?);
+        outcome.failed.extend(run_all(study, &missing, &parts, &jobs, &known, listener)?);
     }
     if steps.contains(&Step::Report) && !options.dry_run {
         outcome.report = Some(write_report(study, listener)?);
@@ -124,39 +124,39 @@ pub fn run_study(study: &Study, options: &RunOptions, listener: Listener<'_>) ->
     Ok(outcome)
 }
 
-/// Runs whose folders hold other settings; removed, when they are to be replaced.
+/// Runs with other settings than those of the study, with the reasons. If `replace` is set, their folders are removed
+/// instead.
 fn invalid_runs(study: &Study, replace: bool, listener: Listener<'_>) -> Result<Vec<(String, String)>> {
     let note = |text: String| listener(Event::Note(&text));
     let mut invalid = Vec::new();
     for run in study.config.runs() {
         let folder = run.folder(&study.folder);
-        let Standing::Other(differences) = standing(study, &run)? else { continue };
+        let RunState::Other(differences) = run_state(study, &run)? else { continue };
         let differences = differences.join("; ");
         if !replace {
-            note(format!("{run} was made with other settings ({differences}); --replace makes it anew"));
-            invalid
-                .push((run.to_string(), format!("made with other settings ({differences}); --replace makes it anew")));
+            note(format!("{run} has other settings ({differences}); repeat it with --replace"));
+            invalid.push((run.to_string(), format!("it has other settings ({differences}); repeat it with --replace")));
             continue;
         }
-        let Some(_at_work) = AtWork::take(&folder)? else {
-            return Err(refused(format!("another process is working on {run}; wait for it")));
+        let Some(_lock) = RunLock::acquire(&folder)? else {
+            return Err(refused(format!("{run} is in use by another process; wait until it ends")));
         };
-        note(format!("{run} was made with other settings ({differences}): removed"));
+        note(format!("{run} had other settings ({differences}) and was removed"));
         fs_err::remove_dir_all(&folder)?;
     }
     Ok(invalid)
 }
 
-/// Runs that have something left of these parts.
+/// Runs of which one of these parts is not finished.
 fn missing_runs(study: &Study, parts: &[RunPart]) -> Result<Vec<StudyRun>> {
     let mut missing = Vec::new();
     for run in study.config.runs() {
-        let left = match standing(study, &run)? {
-            Standing::Done | Standing::Other(_) => false,
-            Standing::Trained(_) => parts.contains(&RunPart::Detect),
+        let unfinished = match run_state(study, &run)? {
+            RunState::Done | RunState::Other(_) => false,
+            RunState::Trained(_) => parts.contains(&RunPart::Detect),
             _ => true,
         };
-        missing.extend(left.then_some(run));
+        missing.extend(unfinished.then_some(run));
     }
     Ok(missing)
 }
@@ -173,14 +173,14 @@ fn note_costs(
     let unknown = missing.iter().filter(|run| !costs.contains_key(&run.id.network)).count();
     for (network, cost) in costs {
         let of_network: Vec<_> = missing.iter().filter(|run| run.id.network == *network).collect();
-        let lefts = of_network.iter().map(|run| left(study, run, costs)).collect::<Result<Vec<_>>>()?;
-        let (steps, frames) = lefts.iter().fold((0, 0), |(s, f), left| (s + left.steps, f + left.frames));
-        let seconds: f64 = lefts.iter().filter_map(|left| left.seconds).sum();
+        let work = of_network.iter().map(|run| remaining(study, run, costs)).collect::<Result<Vec<_>>>()?;
+        let (steps, frames) = work.iter().fold((0, 0), |(s, f), run| (s + run.steps, f + run.frames));
+        let seconds: f64 = work.iter().filter_map(|run| run.seconds).sum();
         if of_network.is_empty() {
             continue;
         }
         note(&format!(
-            "{network}: {} runs, {steps} steps of {:.3} s and {frames} frames to detect of {:.3} s: {} on one process \
+            "{network}: {} runs with {steps} steps of {:.3} s and {frames} test frames of {:.3} s take {} in one process \
              ({} threads, {} MiB)",
             of_network.len(),
             cost.step_s,
@@ -193,10 +193,10 @@ fn note_costs(
     }
     match missing.len() {
         0 => note("no run is missing"),
-        _ if unknown > 0 => note(&format!("what {unknown} runs will take is not known")),
+        _ if unknown > 0 => note(&format!("the computing time of {unknown} runs is unknown")),
         n => {
             let all = duration(total_s / jobs.at_once.min(n) as f64);
-            note(&format!("{n} runs, {} at once: about {all}", jobs.at_once));
+            note(&format!("{n} runs, {} in parallel: about {all}", jobs.at_once));
         }
     }
     Ok(())

@@ -1,28 +1,28 @@
-//! One run of a study in this process, from its first step to its detections.
+//! Executes one run of a study in this process: training and detection.
 
 use crate::config::StudyRun;
 use crate::detections::detect_all;
 use crate::error::{Result, refused};
 use crate::folder::Study;
-use crate::standing::{AtWork, differences, forget_failure, write_failure};
+use crate::run_state::{RunLock, differences, remove_failure, write_failure};
 use burn::tensor::Device;
 use models::Detector;
 use models::checkpoint::read_checkpoint;
 use std::path::Path;
 use train::{RunConfig, Session, read_run_state, train};
 
-/// What is done of a run.
+/// A part of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum RunPart {
     /// Training.
     Train,
-    /// Detections and features of the test sets.
+    /// Detections on the test sets, and features.
     Detect,
 }
 
 impl RunPart {
-    /// As the command line takes it.
-    pub fn word(self) -> &'static str {
+    /// The value of the command line option `--parts`.
+    pub fn argument(self) -> &'static str {
         match self {
             RunPart::Train => "train",
             RunPart::Detect => "detect",
@@ -30,23 +30,24 @@ impl RunPart {
     }
 }
 
-/// How a run is worked on.
+/// Options for executing a run.
 pub struct RunWork<'a> {
-    /// What is done of it.
+    /// The parts to execute.
     pub parts: &'a [RunPart],
-    /// Opens the device that computes, or says why that cannot be.
+    /// Opens the device.
     pub device: &'a dyn Fn() -> Result<Device, String>,
-    /// The device in words.
+    /// Name of the device.
     pub device_name: String,
     /// Threads that load frames.
     pub workers: usize,
 }
 
-/// Does it. `on_training` hears of the training, `note` a sentence for each test set. What goes wrong is left in the run's folder, too.
+/// Executes a run. `on_training` is called with the events of the training, `note` with a message for each test set. An
+/// error is also written to the run folder.
 ///
 /// # Errors
-/// A run that another process works on or that was made with other settings; what cannot be trained or detected.
-pub fn work_on_run(
+/// A run that is in use by another process or has other settings; an error of training or detection.
+pub fn execute_run(
     study: &Study,
     run: &StudyRun,
     work: &RunWork<'_>,
@@ -54,10 +55,10 @@ pub fn work_on_run(
     note: &dyn Fn(&str),
 ) -> Result<()> {
     let folder = run.folder(&study.folder);
-    let Some(_at_work) = AtWork::take(&folder)? else {
-        return Err(refused(format!("another process is working on {run}; wait for it")));
+    let Some(_lock) = RunLock::acquire(&folder)? else {
+        return Err(refused(format!("{run} is in use by another process; wait until it ends")));
     };
-    forget_failure(&folder)?;
+    remove_failure(&folder)?;
     let done = train_and_detect(study, run, work, on_training, note);
     if let Err(error) = &done {
         write_failure(&folder, &error.to_string())?;
@@ -76,7 +77,7 @@ fn train_and_detect(
     let other = differences(study, run)?;
     if !other.is_empty() {
         return Err(refused(format!(
-            "its folder holds a run with other settings ({}); `--replace` makes it anew",
+            "the run folder contains a run with other settings ({}); repeat it with `--replace`",
             other.join("; ")
         )));
     }
@@ -93,7 +94,7 @@ fn train_and_detect(
     }
     if work.parts.contains(&RunPart::Detect) {
         if !is_trained(&folder, &config)? {
-            return Err(refused("it is not trained to its end; train it first"));
+            return Err(refused("the training of this run is not finished"));
         }
         let detector = match detector {
             Some(detector) => detector,
@@ -107,7 +108,7 @@ fn train_and_detect(
     Ok(())
 }
 
-/// Whether the run in a folder has come to its end, with this configuration.
+/// Whether the training in a run folder is finished and has this configuration.
 fn is_trained(folder: &Path, config: &RunConfig) -> Result<bool> {
     let state = read_run_state(folder)?;
     Ok(state.is_some_and(|s| s.step == s.total_steps && s.total_steps > 0 && s.config_sha256 == config.sha256()))

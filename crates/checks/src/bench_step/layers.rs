@@ -1,4 +1,4 @@
-//! The kernels of PointPillars' layers that cost most, alone.
+//! Durations of the slowest layers of PointPillars.
 
 use super::{Timed, WARM_UP};
 use anyhow::Result;
@@ -10,7 +10,8 @@ use rand::{Rng, RngExt};
 use std::hint::black_box;
 use std::time::Instant;
 
-/// Each of the backbone's 3x3 convolutions of stride 1: forward, gradient by data, gradient by weights.
+/// The backbone's 3x3 convolutions with stride 1: forward, gradient with respect to the input, gradient with respect to
+/// the weights.
 pub(super) fn convolutions(network: &PointPillarsConfig, config: &DetectorConfig, batch: usize, steps: usize) -> Timed {
     let mut random = data::stream(0, "bench convolutions", 0, 0);
     let extent = |i: usize| f64::from(config.range_m[3 + i] - config.range_m[i]) / f64::from(network.pillars.size_m[i]);
@@ -44,7 +45,7 @@ pub(super) fn convolutions(network: &PointPillarsConfig, config: &DetectorConfig
     timed
 }
 
-/// The pillar feature net on the pillars of a batch.
+/// The pillar feature net on the pillars of a batch, forward and backward.
 pub(super) fn pillar_net(network: &PointPillarsConfig, batch: &[Sample], steps: usize) -> Result<Timed> {
     let mut random = data::stream(0, "bench pillar net", 0, 0);
     let of_pillars = batch.iter().filter_map(|sample| match sample {

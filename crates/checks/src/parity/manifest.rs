@@ -1,4 +1,4 @@
-//! The manifest of a folder of reference numbers, and the detector that it describes.
+//! The manifest of a folder with reference values, and the detector that it describes.
 
 use super::DETECTORS;
 use super::network::DetectorChecks;
@@ -9,23 +9,23 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// What `manifest.json` says that a comparison needs.
+/// The parts of `manifest.json` that a comparison needs.
 #[derive(Debug, Deserialize)]
 pub struct Manifest {
     /// Seed of the weight recipe.
     pub seed: u64,
     /// Class names, in the head's order.
     pub classes: Vec<String>,
-    /// Values a point.
+    /// Number of values per point.
     pub point_dims: usize,
     /// OpenPCDet's model configuration.
     pub model_cfg: Value,
-    /// Range, m.
+    /// Range of the detector: minimum x, y, z, then maximum x, y, z, m.
     pub range: Vec<f64>,
     /// Pillar size, m.
     #[serde(default)]
     pub voxel_size: Vec<f64>,
-    /// Points a pillar.
+    /// Maximum number of points per pillar.
     #[serde(default = "default_points")]
     pub max_points_per_pillar: usize,
     /// Score threshold of PointPillars' `det`.
@@ -37,10 +37,10 @@ pub struct Manifest {
     losses_f32: BTreeMap<String, f64>,
     #[serde(default)]
     losses_f64: BTreeMap<String, f64>,
-    /// Points that PointRCNN reads.
+    /// Number of input points of PointRCNN.
     #[serde(default)]
     pub num_points: usize,
-    /// Natural differences.
+    /// Differences between single and double precision of the reference, by tensor.
     #[serde(default)]
     pub f32_minus_f64: BTreeMap<String, Natural>,
 }
@@ -49,10 +49,10 @@ fn default_points() -> usize {
     32
 }
 
-/// The reference's own difference between single and double precision.
+/// Difference between single and double precision of the reference.
 #[derive(Clone, Copy, Debug, Deserialize)]
 pub struct Natural {
-    /// Relative L2 of the whole tensor.
+    /// Relative L2 distance of the whole tensor.
     pub rel_l2: Option<f64>,
 }
 
@@ -62,16 +62,16 @@ impl Manifest {
         let path = folder.join("manifest.json");
         let text = fs_err::read_to_string(&path)?;
         serde_json::from_str(&text)
-            .with_context(|| format!("{}: not the manifest of a network's reference numbers", path.display()))
+            .with_context(|| format!("{}: not the manifest of reference values of a network", path.display()))
     }
 
-    /// Ten times the reference's own rounding for a tensor, at most `limit`.
+    /// Ten times the rounding error of the reference for a tensor, at most `limit`.
     pub fn tolerance(&self, key: &str, limit: f64) -> f64 {
         let natural = self.f32_minus_f64.get(key).and_then(|n| n.rel_l2);
         natural.map_or(limit, |rel| (10.0 * rel).min(limit))
     }
 
-    /// Ten times the reference's own rounding of the losses, within reason.
+    /// Ten times the rounding error of the losses of the reference, within fixed limits.
     pub fn loss_tolerance(&self) -> f64 {
         let natural = |(name, single): (&String, &f64)| {
             let double = self.losses_f64.get(name)?;
@@ -81,15 +81,15 @@ impl Manifest {
         (10.0 * natural).clamp(1e-5, 1e-3)
     }
 
-    /// The checks of the detector that the numbers belong to.
+    /// The comparisons of the detector of the manifest.
     pub fn checks(&self) -> Result<&'static DetectorChecks> {
         let kind = self.model_cfg["NAME"].as_str().unwrap_or_default();
         let names: Vec<&str> = DETECTORS.iter().map(|checks| checks.name).collect();
         let found = DETECTORS.iter().find(|checks| checks.name == kind);
-        found.with_context(|| format!("the folder holds numbers of {kind}; this program knows {}", names.join(" and ")))
+        found.with_context(|| format!("the folder has reference values of {kind}; this program supports {}", names.join(" and ")))
     }
 
-    /// Our configuration of the same network.
+    /// The configuration of the detector of the manifest.
     pub fn detector(&self) -> Result<DetectorConfig> {
         let checks = self.checks()?;
         let config = DetectorConfig {
@@ -106,17 +106,17 @@ impl Manifest {
     }
 }
 
-/// A number.
+/// Reads a number.
 pub fn float(value: &Value) -> Result<f32> {
     Ok(value.as_f64().with_context(|| format!("manifest.json: a number is needed, not {value}"))? as f32)
 }
 
-/// A list.
+/// Reads a list.
 pub fn list(value: &Value) -> Result<&Vec<Value>> {
     value.as_array().with_context(|| format!("manifest.json: a list is needed, not {value}"))
 }
 
-/// A list of numbers.
+/// Reads a list of numbers.
 pub fn floats(value: &Value) -> Result<Vec<f64>> {
     list(value)?
         .iter()
@@ -124,18 +124,18 @@ pub fn floats(value: &Value) -> Result<Vec<f64>> {
         .collect()
 }
 
-/// A list of counts.
+/// Reads a list of non-negative integers.
 pub fn usizes(value: &Value) -> Result<Vec<usize>> {
     Ok(floats(value)?.into_iter().map(|v| v as usize).collect())
 }
 
-/// The channels of two hidden layers.
+/// Reads the channels of two hidden layers.
 pub fn pair(value: &Value) -> Result<[usize; 2]> {
     let values = usizes(value)?;
     values.try_into().map_err(|v| anyhow::anyhow!("manifest.json: two hidden layers are supported, not {v:?}"))
 }
 
-/// Exactly `N` numbers.
+/// Converts exactly `N` numbers.
 pub fn array<const N: usize>(values: &[f64]) -> Result<[f32; N]> {
     let narrow: Vec<f32> = values.iter().map(|&v| v as f32).collect();
     narrow.try_into().map_err(|_| anyhow::anyhow!("manifest.json: {N} numbers are needed, not {values:?}"))

@@ -1,4 +1,4 @@
-//! `cargo xtask parity DIR`: our numbers against a folder of reference numbers, tensor by tensor.
+//! `cargo xtask parity DIR`: compares this program with reference values of OpenPCDet and PyTorch, tensor by tensor.
 
 mod manifest;
 mod network;
@@ -9,12 +9,12 @@ mod reference;
 mod rotations;
 mod toy_training;
 
-/// Declares the file of each detector and the table of their comparisons.
+/// Declares the module of each detector and the table of their comparisons.
 macro_rules! detectors {
     ($($file:ident),+ $(,)?) => {
         $(mod $file;)+
 
-        /// All detectors that reference numbers are compared for.
+        /// The comparisons of all detectors.
         const DETECTORS: &[network::DetectorChecks] = &[$($file::CHECKS),+];
     };
 }
@@ -28,19 +28,19 @@ use reference::Row;
 use serde::Serialize;
 use std::path::PathBuf;
 
-/// Compares this program's numbers with a folder of reference numbers of the same network, tensor by tensor.
+/// Compare all tensors of a network, or of single operations, with reference values.
 ///
 /// Example: cargo xtask parity ../shared/golden/pointpillars_tiny
 #[derive(Args, Debug)]
 pub struct ParityArgs {
-    /// Folder with manifest.json and safetensors files of a network, or of single operations
+    /// Folder with manifest.json and the safetensors files of a network or of single operations
     dir: PathBuf,
     #[command(flatten)]
     device: DeviceArgs,
     /// Also write the rows as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Print every row, not only those that fail and the largest of each file
+    /// Print every row, not only failures and the row closest to its tolerance in each file
     #[arg(long)]
     all: bool,
 }
@@ -52,13 +52,13 @@ struct Parity<'a> {
 }
 
 impl ParityArgs {
-    /// Whether every tensor passed.
+    /// Compares and prints; `true` if every tensor passes.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
         let device = self.device.open()?;
         let folder = fs_err::canonicalize(&self.dir)?;
         let manifest = fs_err::read_to_string(folder.join("manifest.json"))
-            .context("a folder of reference numbers has a manifest.json")?;
+            .context("a folder with reference values needs a manifest.json")?;
         let manifest: serde_json::Value = serde_json::from_str(&manifest).context("manifest.json is not JSON")?;
         let rows = match manifest.get("model_cfg") {
             Some(_) => network::compare(&folder, &device)?,
@@ -80,7 +80,7 @@ impl ParityArgs {
     }
 }
 
-/// Whether a row comes closest to its tolerance in its file.
+/// Whether a row is the closest to its tolerance in its file.
 fn is_largest(row: &Row, rows: &[Row]) -> bool {
     let share = |r: &Row| r.error.unwrap_or(0.0) / r.tolerance.max(f64::MIN_POSITIVE);
     rows.iter().filter(|r| r.file == row.file).all(|r| share(r) <= share(row)) && share(row) > 0.0

@@ -1,4 +1,5 @@
-//! A network against a folder of reference numbers: what all networks have in common. Their stages are in files of their own.
+//! Comparison of a network with reference values: the parts that all networks share. The stages of each network are in
+//! its own module.
 
 use super::manifest::Manifest;
 use super::recipe;
@@ -12,28 +13,30 @@ use models::layers::host;
 use models::{Detector, Losses, named};
 use std::path::Path;
 
-/// A stage may not differ by more than this, whatever the reference's own rounding.
+/// Upper limit of the tolerance of a stage, independent of the rounding errors of the reference.
 pub const STAGE_LIMIT: f64 = 1e-3;
 
-/// Gradients jump where a ReLU or a maximum changes sides. One that lies so close to such a place that rounding decides is compared again,
-/// with weights that are off by a few last digits (at most 1e-6 of themselves); it passes if one of these gives it. So often in small networks,
-/// whose gradients have a narrow limit, and in large ones.
+/// Number of repetitions of a failed gradient comparison, for small and for large networks. Gradients are discontinuous
+/// where a ReLU or a maximum switches, so that rounding can decide the result. A failed comparison is repeated with
+/// weights perturbed by a few units in the last place (relative change at most 1e-6) and passes if one repetition
+/// passes. Small networks have narrower tolerances and need more repetitions.
 const NUDGES: [u64; 2] = [64, 12];
+/// Largest perturbation of a weight, units in the last place.
 const NUDGED_DIGITS: u64 = 12;
 
 /// The comparisons of one kind of detector.
 pub struct DetectorChecks {
     /// `model_cfg.NAME` in the manifest.
     pub name: &'static str,
-    /// Our configuration of the network that the manifest describes.
+    /// The configuration of the network in the manifest.
     pub config: fn(&Manifest) -> Result<NetworkConfig>,
-    /// Every stage of a forward pass in evaluation mode, and the detections.
+    /// Compares every stage of a forward pass in evaluation mode, and the detections.
     pub eval: fn(&mut Case, &Detector) -> Result<()>,
-    /// Every stage of a forward pass in training mode; the losses still have their graph.
+    /// Compares every stage of a forward pass in training mode; returns the losses with their autodiff graph.
     pub train: fn(&mut Case, &Detector) -> Result<Losses>,
 }
 
-/// Compares every file of the folder.
+/// Compares all files of the folder.
 pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
     let manifest = Manifest::read(folder)?;
     let config = manifest.detector()?;
@@ -67,29 +70,29 @@ pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
     Ok(case.rows)
 }
 
-/// A folder, and what was found in it so far.
+/// A folder with reference values, and the comparisons so far.
 pub struct Case<'a> {
     folder: &'a Path,
-    /// What it says of itself.
+    /// Its manifest.
     pub manifest: &'a Manifest,
-    /// The same detector in our words.
+    /// The configuration of the detector.
     pub config: &'a DetectorConfig,
-    /// All comparisons.
+    /// All comparisons so far.
     pub rows: Vec<Row>,
 }
 
 impl Case<'_> {
-    /// `NAME.safetensors` of the folder.
+    /// Opens `NAME.safetensors` of the folder.
     pub fn file(&self, name: &str) -> Result<ReferenceFile> {
         ReferenceFile::read(self.folder, name)
     }
 
-    /// Tolerance of a stage, `eval/sa0.features`.
+    /// Tolerance of a stage, for example `eval/sa0.features`.
     pub fn tolerance(&self, stage: &str) -> f64 {
         self.manifest.tolerance(stage, STAGE_LIMIT)
     }
 
-    /// The ground truth of each frame, `[x, y, z, dx, dy, dz, yaw, class]`; rows of zeros fill up.
+    /// The ground truth of each frame, `[x, y, z, dx, dy, dz, yaw, class]`; padded with rows of zeros.
     pub fn ground_truth(&self, file: &mut ReferenceFile) -> Result<Vec<Vec<[f32; 8]>>> {
         let shape = file.input("in.gt_boxes")?.shape.clone();
         let rows = file.floats("in.gt_boxes")?.as_chunks::<8>().0.to_vec();
@@ -97,7 +100,7 @@ impl Case<'_> {
         Ok(frames.map(|rows| rows.iter().filter(|b| b[7] > 0.0).copied().collect()).collect())
     }
 
-    /// Compares the parts and their sum with `losses`.
+    /// Compares the partial losses and their sum with `losses`.
     pub fn losses(&self, file: &mut ReferenceFile, losses: &Losses) -> Result<()> {
         let mut values = Vec::new();
         for part in losses.parts.iter().map(|(_, part)| part).chain([&losses.total]) {
@@ -106,7 +109,8 @@ impl Case<'_> {
         file.compare("losses", &values, self.manifest.loss_tolerance())
     }
 
-    /// Running statistics are inputs of the recipe; checkpoints, where there are any, hold its result.
+    /// Compares the weights with the checkpoints of the folder, if there are any. Running statistics are inputs of the
+    /// weight recipe.
     fn checkpoints(&mut self, detector: &Detector) -> Result<()> {
         let ours = detector.to_named()?;
         let mut statistics = self.file("bn_running_stats")?;
@@ -136,8 +140,8 @@ impl Case<'_> {
         Ok(())
     }
 
-    /// Gradients carry noise by nature at full size, see the tolerances in the folder's description: a ReLU that changes
-    /// sides in the last bit moves whole sums.
+    /// Compares the gradients. In networks of full size they are noisy, since a ReLU that switches because of the last
+    /// bit changes whole sums; see the tolerances in the description of the folder.
     fn gradients(&self, detector: &Detector, total: Tensor<1>) -> Result<Vec<Row>> {
         let gradients = named::gradients(&detector.network, &total.backward())?;
         let limit: f64 = if self.is_noisy() { 5e-2 } else { 1e-3 };
@@ -145,7 +149,7 @@ impl Case<'_> {
         for name in ["train_grads", "train_grads_f64"] {
             let mut file = self.file(name)?;
             for (parameter, gradient) in &gradients {
-                // In some small networks the reference's own single precision changes sides.
+                // In some small networks a ReLU switches between single and double precision of the reference.
                 let natural = self.manifest.f32_minus_f64.get(&format!("grad/{parameter}")).and_then(|n| n.rel_l2);
                 let tolerance = limit.max(10.0 * natural.unwrap_or(0.0));
                 file.compare_stage(parameter, &numbers(gradient), &gradient.shape, tolerance)?;
@@ -155,7 +159,7 @@ impl Case<'_> {
         Ok(rows)
     }
 
-    /// Whether the reference's own gradients hang on rounding, as those of networks of published size do.
+    /// Whether rounding affects the gradients of the reference itself, as in networks of full size.
     fn is_noisy(&self) -> bool {
         let gradients = self.manifest.f32_minus_f64.iter().filter(|(k, _)| k.starts_with("grad/"));
         let natural: Vec<f64> = gradients.filter_map(|(_, n)| n.rel_l2).collect();
@@ -178,7 +182,7 @@ impl Case<'_> {
     }
 }
 
-/// A frame of points alone.
+/// A frame with points but without objects.
 pub fn frame(values: Vec<f32>, channels: usize) -> Frame {
     Frame { id: "reference".into(), cloud: Cloud { values, channels }, objects: Vec::new() }
 }

@@ -1,4 +1,4 @@
-//! Single operations, losses, coders, assigner and optimiser against their reference numbers.
+//! Comparison of single operations, losses, box coders, target assigner and optimiser with reference values.
 
 use super::reference::{ReferenceFile, Row, numbers};
 use super::{point_operators, toy_training};
@@ -16,13 +16,13 @@ use std::f32::consts::TAU;
 use std::path::Path;
 use train::OneCycle;
 
-/// Losses and coders, absolute values around one.
+/// Tolerance of losses and box coders, whose values are of order one.
 pub(super) const LOSS: f64 = 1e-6;
-/// KITTI's anchors' direction bins begin here.
-#[expect(clippy::approx_constant, reason = "the reference's own digits, not a quarter of pi")]
+/// `DIR_OFFSET` of OpenPCDet's KITTI configuration: start of the first direction bin.
+#[expect(clippy::approx_constant, reason = "OpenPCDet's rounded value, not exactly pi / 4")]
 const DIR_OFFSET_RAD: f32 = 0.78539;
 
-/// Compares the file of every operation.
+/// Compares all operations in a folder.
 pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
     let mut rows = Vec::new();
     let mut names: Vec<String> = Vec::new();
@@ -33,7 +33,7 @@ pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
     names.sort();
     for name in names {
         let mut file = ReferenceFile::read(folder, &name)?;
-        // A line by line copy of the reference's kernel, kept there for information: this program's overlap is exact.
+        // Results of a copy of the reference's CUDA kernel, for information only: this program computes exact overlaps.
         for tensor in file.names().filter(|t| t.contains("kernel_copy")).map(String::from).collect::<Vec<_>>() {
             file.input(&tensor)?;
         }
@@ -62,7 +62,7 @@ pub fn compare(folder: &Path, device: &Device) -> Result<Vec<Row>> {
             "batch_norm" => batch_norm(&mut file, device)?,
             "one_cycle" => one_cycle(&mut file)?,
             "adam_onecycle_toy" => toy_training::compare(&mut file, &learning)?,
-            // An operation that nobody here knows: its tensors count as not compared.
+            // The tensors of an unknown operation count as not compared.
             _ => {}
         }
         rows.extend(file.finish());
@@ -110,12 +110,12 @@ fn coders(file: &mut ReferenceFile) -> Result<()> {
     let decoded: Vec<[f32; 7]> = encoded.iter().zip(&anchors).map(|(&e, &a)| decode(e, a)).collect();
     file.compare("residual.encoded", &wide(&encoded), LOSS)?;
     file.compare("residual.decoded", &wide(&decoded), LOSS)?;
-    // The bins are an input here: what a direction classifier might say.
+    // The bins are an input: possible outputs of a direction classifier.
     let bins = file.ints("direction.bin")?;
     let angles = file.floats("limit_period.in")?;
     let heading = |(&yaw, &bin): (&f32, &i64)| f64::from(direction_decode(yaw, bin as usize, DIR_OFFSET_RAD, 0.0, 2));
     file.compare("direction.decoded_heading", &angles.iter().zip(&bins).map(heading).collect::<Vec<_>>(), LOSS)?;
-    // The second is the direction target's: measured from where the first bin begins.
+    // The second case is that of the direction target, whose angles are relative to the start of the first bin.
     for (tensor, offset, start) in
         [("limit_period.offset05_period_2pi", 0.5, 0.0), ("limit_period.offset0_period_2pi", 0.0, DIR_OFFSET_RAD)]
     {
@@ -159,7 +159,7 @@ fn pillars(file: &mut ReferenceFile) -> Result<()> {
     file.compare("augmented.first20", &augmented, LOSS)
 }
 
-/// KITTI's three classes on the grid that the file states.
+/// The three classes of KITTI on the grid of the file.
 fn assigner(file: &mut ReferenceFile) -> Result<()> {
     let class = |name: &str, size, bottom, matched, unmatched| AnchorClass {
         name: name.into(),
@@ -201,7 +201,7 @@ fn assigner(file: &mut ReferenceFile) -> Result<()> {
 
 fn losses(file: &mut ReferenceFile, device: &Device) -> Result<()> {
     let tensor = |values: Vec<f32>, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), device);
-    // Loss of each entry, and the gradient of its sum by `input`.
+    // Compares the loss of each entry and the gradient of the sum with respect to `input`.
     let check = |file: &mut ReferenceFile, name: &str, input: &Tensor<2>, loss: Tensor<2>| -> Result<()> {
         file.compare(&format!("{name}.loss"), &wide_host(loss.clone())?, LOSS)?;
         let gradients = loss.sum().backward();

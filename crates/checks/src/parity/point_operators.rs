@@ -1,4 +1,4 @@
-//! PointRCNN's operations, coder, targets and losses against their reference numbers.
+//! Comparison of PointRCNN's operations, box coder, targets and losses with reference values.
 
 use super::operators::{LOSS, rows, wide, wide_host};
 use super::reference::ReferenceFile;
@@ -12,9 +12,9 @@ use models::pointrcnn::loss::{corner_loss, roi_cross_entropy};
 use models::pointrcnn::point_targets::assign;
 use models::pointrcnn::roi_targets::{kind, overlaps};
 
-/// Of KITTI's classes, m.
+/// Mean box sizes of KITTI's classes, m.
 const MEAN_SIZES: [[f32; 3]; 3] = [[3.9, 1.6, 1.56], [0.8, 0.6, 1.73], [1.76, 0.6, 1.73]];
-/// What points around a box are left out of, in total, m.
+/// `GT_EXTRA_WIDTH`: total enlargement of ground truth boxes; points only in the enlarged box are ignored, m.
 const EXTRA_WIDTH_M: [f32; 3] = [0.2; 3];
 
 fn whole(values: &[u32]) -> Vec<f64> {
@@ -25,8 +25,8 @@ fn flags(values: impl Iterator<Item = bool>) -> Vec<f64> {
     values.map(|v| f64::from(u8::from(v))).collect()
 }
 
-/// `[C, N]` in a file is `[N, C]` here.
-fn turned(values: &[f32], channels: usize) -> Vec<f32> {
+/// Transposes `[C, N]` of a file to `[N, C]`.
+fn transposed(values: &[f32], channels: usize) -> Vec<f32> {
     let length = values.len() / channels.max(1);
     (0..length).flat_map(|i| (0..channels).map(move |c| values[c * length + i])).collect()
 }
@@ -46,7 +46,7 @@ pub(super) fn sampling(file: &mut ReferenceFile) -> Result<()> {
 
 pub(super) fn neighbours(file: &mut ReferenceFile) -> Result<()> {
     for tensor in file.names().filter(|n| n.ends_with(".index")).map(String::from).collect::<Vec<_>>() {
-        // `boundary.r1_n4`: the radius is in the name; others state it in a tensor.
+        // In `boundary.r1_n4` the radius is in the name; otherwise it is a tensor.
         let query = tensor.trim_end_matches(".index");
         let (prefix, name) = query.rsplit_once('.').map_or(("", query), |(p, _)| (p, query));
         let boundary = prefix.starts_with("boundary");
@@ -73,7 +73,7 @@ pub(super) fn interpolation(file: &mut ReferenceFile, device: &Device) -> Result
     })
 }
 
-/// A gather with gradients, channels first in the file.
+/// Compares a gather and its gradient; the file stores channels first.
 fn gathered(
     file: &mut ReferenceFile,
     device: &Device,
@@ -83,7 +83,7 @@ fn gathered(
     let [channels, points] = file.input(input)?.shape[..] else { anyhow::bail!("{input} needs two dimensions") };
     let tensor = |values: Vec<f32>| {
         let rows = values.len() / channels;
-        Tensor::<2>::from_data(TensorData::new(turned(&values, channels), [rows, channels]), device)
+        Tensor::<2>::from_data(TensorData::new(transposed(&values, channels), [rows, channels]), device)
     };
     let features = tensor(file.floats(input)?).require_grad();
     let ours = gather(features.clone());
@@ -102,11 +102,11 @@ pub(super) fn grouping(file: &mut ReferenceFile, device: &Device) -> Result<()> 
     })
 }
 
-/// Offsets and features of each slot, repetitions put back.
+/// Offsets and features of each slot, including repeated points.
 pub(super) fn query_and_group(file: &mut ReferenceFile) -> Result<()> {
     let (points, centers) = (rows::<3>(file, "xyz")?, rows::<3>(file, "new_xyz")?);
     let channels = file.input("features")?.shape[0];
-    let features = turned(&file.floats("features")?, channels);
+    let features = transposed(&file.floats("features")?, channels);
     let (radius_m, samples) = (file.floats("radius")?[0], file.input("out")?.shape[2]);
     let slots = ball_query(&points, &centers, radius_m, samples);
     let mut out = vec![0.0; (3 + channels) * slots.len()];

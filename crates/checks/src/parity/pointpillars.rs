@@ -1,4 +1,4 @@
-//! PointPillars' stages against reference numbers: forward, targets, detections.
+//! Comparison of PointPillars with reference values: forward pass, targets, detections.
 
 mod sizes;
 
@@ -18,11 +18,11 @@ pub const CHECKS: DetectorChecks = DetectorChecks { name: "PointPillar", config:
 fn parts<'a>(case: &Case<'a>, detector: &'a Detector) -> Result<(&'a PointPillarsConfig, &'a PointPillars)> {
     match (&case.config.network, &detector.network) {
         (NetworkConfig::PointPillars(net), Network::PointPillars(network)) => Ok((net, network)),
-        _ => bail!("{} is no PointPillars", case.config.name),
+        _ => bail!("{} is not a PointPillars", case.config.name),
     }
 }
 
-/// In evaluation mode.
+/// Comparison in evaluation mode.
 fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     let (net, network) = parts(case, detector)?;
     let mut file = case.file("eval")?;
@@ -37,7 +37,7 @@ fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     let cell = anchors.len() / (h * w);
     let flat: Vec<f64> = anchors.iter().flatten().map(|&v| f64::from(v)).collect();
     let rotations = net.anchors[0].rotations_rad.len();
-    // The reference takes y from `torch.arange`, up to one unit in the last place off the formula.
+    // The reference computes y with `torch.arange`, which differs from the formula by up to one unit in the last place.
     let ulp = f64::from(f32::EPSILON);
     file.compare_stage("anchors", &flat, &[1, h, w, net.anchors.len(), rotations, 7], ulp)?;
     let x: Vec<f32> = (0..w).map(|i| anchors[i * cell][0]).collect();
@@ -52,7 +52,7 @@ fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     let scores: Vec<f32> = cls.iter().map(|&x| 1.0 / (1.0 + (-x).exp())).collect();
     let tolerance = |stage: &str| case.tolerance(&format!("eval/{stage}"));
     file.compare_stage("scores", &wide(&scores), &[1, anchors.len(), classes], tolerance("scores"))?;
-    // Without threshold and suppression every anchor's box comes out, in the order of its score.
+    // Without score threshold and suppression the boxes of all anchors are returned in the order of their scores.
     let everything = DecodeOptions {
         score_threshold: 0.0,
         nms_iou: 1.0,
@@ -98,7 +98,7 @@ fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     Ok(())
 }
 
-/// In training mode; the losses still have their graph.
+/// Comparison in training mode. Returns the losses with their autodiff graph.
 fn train(case: &mut Case, detector: &Detector) -> Result<Losses> {
     let (net, network) = parts(case, detector)?;
     let mut file = case.file("train")?;

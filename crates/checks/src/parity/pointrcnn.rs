@@ -1,7 +1,7 @@
-//! PointRCNN's stages against reference numbers: levels and neighbours, both stages, targets, detections.
+//! Comparison of PointRCNN with reference values: sampled points and neighbours, both stages, targets, detections.
 //!
-//! Rows here are the reference's columns: a stage of shape `[B, C, N]` is compared with ours, `[B * N, C]`, turned round. Repeated points and
-//! centres, which are one row each in a region, are repeated again.
+//! A stage has the shape `[B, C, N]` in the reference and `[B * N, C]` in this program, and is transposed for the
+//! comparison. This program stores repeated points and centres of a region once; they are repeated for the comparison.
 
 mod sizes;
 
@@ -28,17 +28,17 @@ use models::{Detector, Losses, Network};
 /// The comparisons of PointRCNN.
 pub const CHECKS: DetectorChecks = DetectorChecks { name: "PointRCNN", config: sizes::config, eval, train };
 
-/// Squared distances, boxes and codes that hang on coordinates alone.
+/// Tolerance of squared distances, boxes and box codes, which depend on coordinates only.
 const EXACT: f64 = 1e-6;
 
 fn parts<'a>(case: &Case<'a>, detector: &'a Detector) -> Result<(&'a PointRcnnConfig, &'a PointRcnn)> {
     match (&case.config.network, &detector.network) {
         (NetworkConfig::PointRcnn(net), Network::PointRcnn(network)) => Ok((net, network)),
-        _ => bail!("{} is no PointRCNN", case.config.name),
+        _ => bail!("{} is not a PointRCNN", case.config.name),
     }
 }
 
-/// Which file, and how many frames are in a batch.
+/// The file to compare with, and the number of frames in a batch.
 struct View<'a> {
     case: &'a Case<'a>,
     mode: &'static str,
@@ -46,17 +46,18 @@ struct View<'a> {
 }
 
 impl View<'_> {
-    /// A stage whose values come in the reference's order.
+    /// Compares a stage whose values have the order of the reference.
     fn stage(&self, file: &mut ReferenceFile, name: &str, values: &[f64], shape: &[usize]) -> Result<()> {
         file.compare_stage(name, values, shape, self.case.tolerance(&format!("{}/{name}", self.mode)))
     }
 
-    /// Rows, in the reference's order.
+    /// Compares rows in the order of the reference.
     fn rows(&self, file: &mut ReferenceFile, name: &str, rows: &Tensor<2>) -> Result<()> {
         self.stage(file, name, &wide(&host(rows.clone())?), &rows.dims())
     }
 
-    /// Rows of frames (or regions) one after the other, channels first in the reference; `dense` says which rows they are.
+    /// Compares rows of consecutive frames or regions with a reference that stores channels first. `dense` maps the
+    /// rows of the reference to ours.
     fn columns(
         &self,
         file: &mut ReferenceFile,
@@ -82,7 +83,7 @@ impl View<'_> {
         self.stage(file, name, &turned, if last_axis { &shape } else { &shape[..3] })
     }
 
-    /// Everything up to the predictions of the points.
+    /// Compares the first stage up to the predictions of the points.
     fn points(&self, file: &mut ReferenceFile, clouds: &[&Hierarchy], stages: &PointStages) -> Result<()> {
         for i in 0..clouds[0].levels.len() {
             let points: Vec<[f32; 3]> = clouds.iter().flat_map(|c| c.levels[i].points.iter().copied()).collect();
@@ -98,7 +99,7 @@ impl View<'_> {
         self.rows(file, "point_box_preds", &stages.predictions.boxes)
     }
 
-    /// The second stage.
+    /// Compares the second stage.
     fn regions(&self, file: &mut ReferenceFile, input: &RoiInput, stages: &RoiStages) -> Result<()> {
         let regions = input.regions();
         self.columns(file, "rcnn_xyz_up", &stages.xyz_up, Some(&input.dense[0]), regions, true)?;
@@ -120,7 +121,7 @@ fn whole(values: impl IntoIterator<Item = u32>) -> Vec<f64> {
     values.into_iter().map(f64::from).collect()
 }
 
-/// All points of a cloud in the order of the file, as the reference read them.
+/// A sample with all points of a cloud in the order of the file, as in the reference.
 fn sample(
     preparation: &Preparation,
     case: &Case,
@@ -133,7 +134,7 @@ fn sample(
     Ok(preparation.of_points("reference", &cloud, &all, boxes, 0))
 }
 
-/// In evaluation mode.
+/// Comparison in evaluation mode.
 fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     let (net, network) = parts(case, detector)?;
     let mut file = case.file("eval")?;
@@ -154,7 +155,7 @@ fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
         compare_proposals(&view, &mut file, name, proposals(&boxes, &logits, classes, config), &logits)?;
     }
 
-    // From here on with the reference's regions.
+    // From here on, the regions of the reference are used.
     let rois = file.floats("proposals_test.rois")?.as_chunks::<7>().0.to_vec();
     let labels = file.ints("proposals_test.roi_labels")?;
     let scene = Scene { points: &sample.points, scores: &scores, first_row: 0 };
@@ -183,8 +184,8 @@ fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     Ok(())
 }
 
-/// Regions that stay. Those with equal scores (empty ones, and such whose sigmoid is 1 to the last digit) have no order of their own: they
-/// come in the reference's.
+/// Regions kept by non-maximum suppression. Regions with equal scores (empty ones, or with a sigmoid of exactly 1) are
+/// processed in the order of the reference.
 fn suppressed(
     file: &mut ReferenceFile,
     boxes: &[[f32; 7]],
@@ -192,7 +193,7 @@ fn suppressed(
     net: &PointRcnnConfig,
 ) -> Result<Vec<(usize, f32)>> {
     let mut order: Vec<usize> = file.ints("det.roi_index")?.into_iter().map(|i| i as usize).collect();
-    anyhow::ensure!(order.iter().all(|&i| i < boxes.len()), "det.roi_index names a region that does not exist");
+    anyhow::ensure!(order.iter().all(|&i| i < boxes.len()), "det.roi_index contains a region that does not exist");
     let others: Vec<usize> = (0..boxes.len()).filter(|i| !order.contains(i)).collect();
     order.extend(others);
     let boxes: Vec<[f32; 7]> = order.iter().map(|&i| boxes[i]).collect();
@@ -201,7 +202,7 @@ fn suppressed(
     Ok(kept.into_iter().map(|(i, score)| (order[i], score)).collect())
 }
 
-/// Sampling and neighbours, index for index.
+/// Compares the indices of sampled points and neighbours.
 fn neighbours(file: &mut ReferenceFile, sample: &Sample, net: &PointRcnnConfig) -> Result<()> {
     let mut above = &sample.points;
     for (i, (level, config)) in sample.hierarchy.levels.iter().zip(&net.levels).enumerate() {
@@ -221,14 +222,14 @@ fn neighbours(file: &mut ReferenceFile, sample: &Sample, net: &PointRcnnConfig) 
     Ok(())
 }
 
-/// Our regions in the order of the reference's, each beside the nearest one that is not taken yet.
+/// Our regions in the order of the reference: each reference region is matched with the nearest unmatched one of ours.
 fn in_order_of(file: &mut ReferenceFile, tensor: &str, mut ours: Proposals) -> Result<Proposals> {
     let reference = file.floats(tensor)?.as_chunks::<7>().0.to_vec();
     let mut sorted = Proposals::default();
     for want in reference.iter().take(ours.boxes.len()) {
         let apart = |b: &[f32; 7]| (0..7).map(|i| (b[i] - want[i]).abs()).sum::<f32>();
         let near = (0..ours.boxes.len()).min_by(|&a, &b| apart(&ours.boxes[a]).total_cmp(&apart(&ours.boxes[b])));
-        let near = near.context("no region is left")?;
+        let near = near.context("there are fewer regions than in the reference")?;
         sorted.boxes.push(ours.boxes.remove(near));
         sorted.scores.push(ours.scores.remove(near));
         sorted.labels.push(ours.labels.remove(near));
@@ -236,7 +237,8 @@ fn in_order_of(file: &mut ReferenceFile, tensor: &str, mut ours: Proposals) -> R
     Ok(sorted)
 }
 
-/// Neighbours with almost equal scores may change places. The scores are a few of all logits, and measured against the size of these.
+/// Compares proposals. Proposals with almost equal scores may be swapped. The tolerance of the scores is scaled with
+/// the magnitude of all logits.
 fn compare_proposals(view: &View, file: &mut ReferenceFile, name: &str, ours: Proposals, logits: &[f32]) -> Result<()> {
     let ours = in_order_of(file, &format!("{name}.rois"), ours)?;
     let boxes = view.case.tolerance("eval/point_boxes_decoded");
@@ -252,7 +254,7 @@ fn compare_proposals(view: &View, file: &mut ReferenceFile, name: &str, ours: Pr
     file.compare(&format!("{name}.roi_labels"), &labels, 0.0)
 }
 
-/// Position, score, distance and features of every pooled point.
+/// Compares position, score, distance and features of every pooled point.
 fn pooled(
     view: &View,
     file: &mut ReferenceFile,
@@ -274,7 +276,7 @@ fn pooled(
     file.compare_stage("pooled_features", &values, &shape, view.case.tolerance("eval/point_features"))
 }
 
-/// In training mode; the losses still have their graph. The regions are the reference's.
+/// Comparison in training mode with the regions of the reference. Returns the losses with their autodiff graph.
 fn train(case: &mut Case, detector: &Detector) -> Result<Losses> {
     let (net, network) = parts(case, detector)?;
     let mut file = case.file("train")?;

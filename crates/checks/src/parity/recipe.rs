@@ -1,7 +1,7 @@
-//! Weights made from tensor names, so that reference numbers of the published sizes need no checkpoint.
+//! Weights computed from tensor names, so that reference values of full-size networks need no checkpoint.
 //!
-//! FNV-1a of `seed/name` and splitmix64 give a uniform number for each element; layer kinds scale it. All arithmetic is in
-//! wrapping u64 and f64, with one final rounding to f32.
+//! FNV-1a of `seed/name` and splitmix64 give a uniform number for each element; layer kinds scale it. All arithmetic is
+//! in wrapping u64 and f64, with one final rounding to f32.
 
 use models::checkpoint::{HostTensor, HostValues, NamedTensors};
 
@@ -38,7 +38,7 @@ fn base(name: &str) -> f64 {
     }
 }
 
-/// The same tensors with every float off by at most so many last digits, by lot.
+/// The same tensors with every float changed at random by at most `digits` units in the last place.
 pub fn nudged(mut tensors: NamedTensors, trial: u64, digits: u64) -> NamedTensors {
     for (name, tensor) in &mut tensors {
         let key = fnv1a(&format!("{trial}/{name}"));
@@ -52,7 +52,7 @@ pub fn nudged(mut tensors: NamedTensors, trial: u64, digits: u64) -> NamedTensor
     tensors
 }
 
-/// The recipe's values for a tensor of that name and shape. `is_norm`: it belongs to a batch normalisation.
+/// The values for a tensor with this name and shape. `is_norm`: it belongs to a batch normalisation.
 pub fn values(seed: u64, name: &str, shape: &[usize], is_norm: bool) -> Vec<f32> {
     let key = fnv1a(&format!("{seed}/{name}"));
     let count: usize = shape.iter().product();
@@ -76,7 +76,7 @@ pub fn values(seed: u64, name: &str, shape: &[usize], is_norm: bool) -> Vec<f32>
     (0..count as u64).map(|i| value(i) as f32).collect()
 }
 
-/// The weights of a network with these tensors; `statistics` replace the running ones.
+/// The weights of a network with these tensors; `statistics` replace its running statistics.
 pub fn weights(seed: u64, shapes: &NamedTensors, statistics: &NamedTensors) -> NamedTensors {
     let fill = |(name, tensor): (&String, &HostTensor)| {
         if let Some(given) = statistics.get(name) {

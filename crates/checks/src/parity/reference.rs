@@ -1,4 +1,4 @@
-//! Files of reference numbers, and the account of what was compared.
+//! Files with reference values, and the list of comparisons.
 
 use anyhow::{Context, Result};
 use models::checkpoint::{HostTensor, HostValues, NamedTensors, read_safetensors};
@@ -6,22 +6,22 @@ use serde::Serialize;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// One comparison.
+/// Comparison of a tensor.
 #[derive(Clone, Debug, Serialize)]
 pub struct Row {
-    /// File of the folder, without its ending.
+    /// File name without extension.
     pub file: String,
-    /// Tensor of that file.
+    /// Name of the tensor.
     pub tensor: String,
-    /// Relative L2 distance; for whole numbers the share that differs; `null` where nothing could be compared.
+    /// Relative L2 distance, or the share of different values for integers; `null` if it was not compared.
     pub error: Option<f64>,
     /// Largest error that passes.
     pub tolerance: f64,
-    /// Whether it does.
+    /// Whether the error is within the tolerance.
     pub pass: bool,
 }
 
-/// One file of reference numbers, and what of it was compared so far.
+/// A file with reference values, and the comparisons so far.
 pub struct ReferenceFile {
     name: String,
     tensors: NamedTensors,
@@ -36,7 +36,7 @@ impl ReferenceFile {
         Ok(ReferenceFile { name: name.into(), tensors, seen: BTreeSet::new(), rows: Vec::new() })
     }
 
-    /// Whether there is such a tensor.
+    /// Whether the file has this tensor.
     pub fn has(&self, tensor: &str) -> bool {
         self.tensors.contains_key(tensor)
     }
@@ -46,7 +46,7 @@ impl ReferenceFile {
         self.tensors.keys().map(String::as_str)
     }
 
-    /// A tensor that is an input, or that says how others are stored.
+    /// A tensor that is an input or metadata, and need not be compared.
     pub fn input(&mut self, tensor: &str) -> Result<&HostTensor> {
         self.seen.insert(tensor.into());
         self.tensors.get(tensor).with_context(|| format!("{}.safetensors has no tensor {tensor}", self.name))
@@ -62,7 +62,7 @@ impl ReferenceFile {
         Ok(numbers(self.input(tensor)?).into_iter().map(|v| v as i64).collect())
     }
 
-    /// The values of a stage that the file holds, and how many of the whole tensor's lie from one to the next.
+    /// The stored samples of a stage, and their step in the whole tensor.
     pub fn sampled(&mut self, stage: &str) -> Result<(Vec<f32>, usize)> {
         if self.has(stage) {
             return Ok((self.floats(stage)?, 1));
@@ -79,7 +79,7 @@ impl ReferenceFile {
         Ok(())
     }
 
-    /// Compares a stage, in every form that the file holds it: whole, sampled, first rows, shape, sums, norm.
+    /// Compares a stage in every stored form: whole, sampled, first rows, shape, sums, norm.
     pub fn compare_stage(&mut self, stage: &str, ours: &[f64], shape: &[usize], tolerance: f64) -> Result<()> {
         let member = |form: &str| format!("{stage}.{form}");
         if self.has(stage) {
@@ -104,7 +104,7 @@ impl ReferenceFile {
         let magnitude: f64 = ours.iter().map(|v| v.abs()).sum();
         for (form, value) in [("sum", ours.iter().sum::<f64>()), ("abs_sum", magnitude)] {
             if self.has(&member(form)) {
-                // A sum of signed numbers is measured against the sum of their magnitudes.
+                // The error of a sum is relative to the sum of the absolute values.
                 let reference = numbers(self.input(&member(form))?)[0];
                 let error = (value - reference).abs() / magnitude.max(reference.abs()).max(f64::MIN_POSITIVE);
                 self.push(&member(form), Some(error), tolerance);
@@ -116,7 +116,8 @@ impl ReferenceFile {
         Ok(())
     }
 
-    /// A few values of a gradient may all be small: their largest error is measured against the gradient's rms.
+    /// Compares samples of a gradient. The largest error is relative to the rms of the gradient, since all samples may
+    /// be small.
     fn compare_gradient_sample(&mut self, parameter: &str, ours: &[f64], count: usize, tolerance: f64) -> Result<()> {
         let rms = numbers(self.input(&format!("{parameter}.l2"))?)[0] / (count as f64).sqrt();
         let name = format!("{parameter}.sample");
@@ -133,7 +134,7 @@ impl ReferenceFile {
         self.rows.push(Row { file: self.name.clone(), tensor: tensor.into(), error, tolerance, pass });
     }
 
-    /// All rows; a tensor that nothing was compared with is a failure.
+    /// All rows. A tensor that was not compared is a failure.
     pub fn finish(mut self) -> Vec<Row> {
         let missed: Vec<String> = self.tensors.keys().filter(|k| !self.seen.contains(*k)).cloned().collect();
         for tensor in missed {
@@ -152,7 +153,7 @@ pub fn numbers(tensor: &HostTensor) -> Vec<f64> {
     }
 }
 
-/// Relative L2 of floats, share of different whole numbers; nothing when the lengths differ.
+/// Relative L2 distance of floats, or the share of different integers; `None` if the lengths differ.
 fn distance(reference: &HostTensor, ours: &[f64]) -> Option<f64> {
     let truth = numbers(reference);
     if truth.len() != ours.len() {
@@ -165,7 +166,7 @@ fn distance(reference: &HostTensor, ours: &[f64]) -> Option<f64> {
     let square = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>();
     let difference = square(&mut truth.iter().zip(ours).map(|(a, b)| a - b));
     let size = square(&mut truth.iter().copied());
-    // Where the reference is zero throughout, the distance itself is the error.
+    // If all reference values are zero, the error is the absolute distance.
     let error = (difference / if size > 0.0 { size } else { 1.0 }).sqrt();
     error.is_finite().then_some(error)
 }

@@ -1,16 +1,17 @@
-//! How the reference rounded the sine and cosine of a region's yaw.
+//! Recovers how the reference rounded the sine and cosine of the yaw of each region.
 //!
-//! PyTorch's vectorised sine and cosine are off by one in the last digit for one argument in fourteen. The second stage samples points by
-//! distance in the region's frame, where that digit decides between points equally far apart: one region in some hundred gets another set of
-//! points. Nothing is wrong with either; to compare what comes after, the roundings are read off the reference's own coordinates.
+//! PyTorch's vectorised sine and cosine are wrong by one unit in the last place for one argument in fourteen. The
+//! second stage samples points by distance in the frame of the region, where this unit decides between points at equal
+//! distance. Therefore one region in some hundred has another set of points. Both sets are valid. To compare the
+//! following stages, the roundings are derived from the coordinates in the reference.
 
 use super::reference::ReferenceFile;
 use anyhow::Result;
 use models::pointrcnn::RoiHeadConfig;
 use models::pointrcnn::roi_input::{RoiInput, Scene};
 
-/// Positions of the second stage's centres, level by level, in the region's frame, m; regions one after the other, with repetitions as in
-/// the reference.
+/// Positions of the centres of the second stage for each level, in the frame of the region, m. The regions are
+/// concatenated, with repeated points as in the reference.
 pub fn centers(input: &RoiInput) -> Vec<Vec<[f32; 3]>> {
     let regions = input.regions();
     let position = |row: &u32| std::array::from_fn(|axis| input.prefix[*row as usize][axis]);
@@ -24,8 +25,8 @@ pub fn centers(input: &RoiInput) -> Vec<Vec<[f32; 3]>> {
     levels
 }
 
-/// Sine and cosine of each region's yaw, exact or off by one in the last digit, whichever gives most of the coordinates in `rcnn_sa0.xyz` to the
-/// last bit. `first` is the number of the first region in the file.
+/// Sine and cosine of the yaw of each region, exact or changed by one unit in the last place: the choice that
+/// reproduces most coordinates in `rcnn_sa0.xyz` exactly. `first` is the number of the first region in the file.
 pub fn reference_rotations(
     file: &mut ReferenceFile,
     scene: Scene<'_>,
@@ -43,7 +44,7 @@ pub fn reference_rotations(
         let values = ours.as_flattened();
         let of_region = values.len() / rois.len().max(1);
         for (r, best) in best.iter_mut().enumerate() {
-            // Numbers of this region's coordinates in the whole tensor that the file holds.
+            // Indices of the coordinates of this region in the whole tensor, as far as the file contains them.
             let (from, to) = ((first + r) * of_region, (first + r + 1) * of_region);
             let equal = (from.div_ceil(step)..to.div_ceil(step))
                 .filter(|k| reference.get(*k) == Some(&values[k * step - first * of_region]))
@@ -56,7 +57,7 @@ pub fn reference_rotations(
     Ok(best.into_iter().map(|(_, rotation)| rotation).collect())
 }
 
-/// The float `steps` places farther from zero.
+/// The float that is `steps` units in the last place farther from zero.
 fn next(value: f32, steps: i32) -> f32 {
     f32::from_bits(value.to_bits().wrapping_add_signed(steps))
 }

@@ -1,4 +1,5 @@
-//! Twenty steps of a small network: optimiser, schedule, clipping and batch normalisation together.
+//! Comparison of twenty training steps of a small network: optimiser, schedule, gradient clipping and batch
+//! normalisation together.
 
 use super::reference::ReferenceFile;
 use anyhow::Result;
@@ -12,10 +13,10 @@ use models::layers::{BatchNorm, Init};
 use models::named;
 use train::{Adam, GradientNorm, OneCycle};
 
-/// After twenty steps the reference's own single and double precision differ by 7e-7.
+/// After twenty steps, single and double precision of the reference differ by 7e-7.
 const TOLERANCE: f64 = 1e-5;
 
-/// Linear, norm, ReLU, linear, norm, ReLU, linear; numbered as in a torch `Sequential`.
+/// Linear, norm, ReLU, linear, norm, ReLU, linear, numbered as in a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 struct Toy {
     l0: Param<Tensor<2>>,
@@ -31,7 +32,7 @@ struct Last {
     bias: Param<Tensor<1>>,
 }
 
-/// `l0` is `0.weight`, `l1.bias` is `1.bias`.
+/// Converts a parameter name: `l0` to `0.weight`, `l1.bias` to `1.bias`.
 fn toy_name(path: &str) -> String {
     let name = path.trim_start_matches('l');
     if name.contains('.') { name.into() } else { format!("{name}.weight") }
@@ -80,7 +81,7 @@ fn data_of(tensor: &HostTensor) -> Result<TensorData> {
     Ok(TensorData::new(values.clone(), tensor.shape.clone()))
 }
 
-/// Trains as the reference did and compares weights, losses, norms and schedule.
+/// Repeats the training of the reference and compares weights, losses, gradient norms and schedule.
 pub fn compare(file: &mut ReferenceFile, device: &Device) -> Result<()> {
     let config = OptimizationConfig { lr_max: 0.01, ..Default::default() };
     let mut toy = Toy::new(file, device)?;

@@ -1,4 +1,5 @@
-//! `lidarshift diagnose --detectors STUDY`: are detectors trained on the extended simulation better on measured data?
+//! `lidarshift diagnose --detectors STUDY`: measures whether detectors trained on the extended simulation are better on
+//! measured data.
 
 use crate::device::DeviceArgs;
 use crate::study::run_study;
@@ -9,19 +10,19 @@ use eval::matrix::{Matrix, Quantity};
 use sensor::EffectList;
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
-use study::numbers::{Found, matrix};
+use study::numbers::{StudyState, matrix};
 use study::{RunOptions, Source, Study, StudyConfig, StudyDataset};
 
 const MEASURED: &str = "measured";
 const BEFORE: &str = "simulated";
 const AFTER: &str = "extended";
 
-/// Trains the detectors of the study `named`, with its seeds and epochs, on the measured data, on the simulation and on the extended one,
-/// and tests all of them on measured frames. The study of it lies in `out`, and goes on where it was stopped. Also says which effects of the
-/// extended simulation are left out, since they cannot act on the finished clouds of the simulation.
+/// Trains the detectors of the study `named`, with its seeds and epochs, on measured, simulated and extended data, and
+/// tests all of them on measured frames. The study is written to `out`; an interrupted one is resumed. Also returns a
+/// note for each effect of `extended` that is left out because it cannot be applied to existing point clouds.
 ///
 /// # Errors
-/// A study that is wrong, a simulation that cannot be simulated again, runs that failed.
+/// An invalid study, a simulated data set to which effects cannot be applied, failed runs.
 pub(super) fn gain_of_detectors(
     named: &str,
     measured: &Path,
@@ -35,11 +36,12 @@ pub(super) fn gain_of_detectors(
     let text = toml::to_string(&study_of(template, measured, simulated, &effects)?)?;
     write_atomic(&path, text.as_bytes())?;
     let study = Study::open(&path.to_string_lossy(), Some(&out.join("detectors")))?;
-    run_study(&study, &RunOptions::here(DeviceArgs::default().words()))?;
-    Ok((gains(&matrix(&study, &Found::look(&study)?)?)?, left_out))
+    run_study(&study, &RunOptions::here(DeviceArgs::default().arguments()))?;
+    Ok((gains(&matrix(&study, &StudyState::read(&study)?)?)?, left_out))
 }
 
-/// The file of effects that can act on the finished simulation, and what is left out: `extended` itself where nothing is.
+/// The file of the effects that can be applied to the simulated data set, and a note for each effect that is left out.
+/// It is `extended` itself if none is left out.
 fn applicable(simulated: &Path, extended: &Path, out: &Path) -> Result<(PathBuf, Vec<String>)> {
     let (dataset, mut effects) = (Dataset::open(simulated)?, EffectList::read(extended)?);
     let refused = Resim { dataset: &dataset, effects: &effects, rig: None, seed: 0 }.refused()?;
@@ -50,12 +52,12 @@ fn applicable(simulated: &Path, extended: &Path, out: &Path) -> Result<(PathBuf,
     effects.effects.retain(|_| place.next().is_some_and(|i| refused.iter().all(|(r, _)| *r != i)));
     let path = out.join("extended_detectors.toml");
     write_atomic(&path, toml::to_string(&effects)?.as_bytes())?;
-    let say =
+    let note =
         |(_, why): (usize, String)| format!("the detectors are trained without an effect of extended.toml: {why}");
-    Ok((path, refused.into_iter().map(say).collect()))
+    Ok((path, refused.into_iter().map(note).collect()))
 }
 
-/// The template with the data sets of a diagnosis in the place of its own.
+/// The template with its data sets replaced by those of a diagnosis.
 fn study_of(template: StudyConfig, measured: &Path, simulated: &Path, extended: &Path) -> Result<StudyConfig> {
     let absolute = |path: &Path| std::path::absolute(path).map(Source::Path);
     let set =
@@ -72,7 +74,7 @@ fn study_of(template: StudyConfig, measured: &Path, simulated: &Path, extended: 
         (detector.train, detector.paper) = (None, None);
         if let Some(config) = &detector.config {
             bail!(
-                "--detectors: {} has a file of its own ({}); only detectors of configs/detectors are known here",
+                "--detectors: {} uses the file {}; only the detectors of configs/detectors are supported",
                 detector.name,
                 config.display()
             );
@@ -81,7 +83,7 @@ fn study_of(template: StudyConfig, measured: &Path, simulated: &Path, extended: 
     Ok(study)
 }
 
-/// The area under the curve on measured frames, after and before, for every detector, class and overlap.
+/// AP (area under the curve) on measured frames with and without the extension, for every detector, class and overlap.
 fn gains(matrix: &Matrix) -> Result<Vec<DetectorGain>> {
     let found = matrix.gaps.iter().filter(|gap| {
         (&*gap.test_set, &*gap.compared_to, &*gap.train_set) == (MEASURED, AFTER, BEFORE)

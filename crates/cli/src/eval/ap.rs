@@ -7,10 +7,10 @@ use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, rea
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Average precision and recall of any detections in KITTI text.
+/// Average precision and recall of detections in KITTI text.
 ///
-/// Labels have 15 values a line, detections 16, the last one is the score. A frame without objects has an empty file.
-/// Boxes are compared in the frame they are written in.
+/// Label lines have 15 values. Detection lines have 16; the last one is the score. A frame without objects has an empty
+/// file. Boxes are compared in the frame in which the files give them.
 ///
 /// Examples:
 ///   lidarshift eval ap --labels tests/golden/evaluation/small/label_2 --detections tests/golden/evaluation/small/detections
@@ -21,51 +21,52 @@ pub struct EvalApArgs {
     /// Folder of label files
     #[arg(long, value_name = "DIR", required_unless_present = "dataset", conflicts_with = "dataset")]
     labels: Option<PathBuf>,
-    /// Folder of detection files, named as the label files
+    /// Folder of detection files with the same names as the label files
     #[arg(long, value_name = "DIR")]
     detections: PathBuf,
-    /// Frame of both texts: `camera` (KITTI's own) or `lidar` (location is the box centre, rotation the yaw).
-    /// A data set says it itself [default: camera]
+    /// Frame of labels and detections: `camera` (as in KITTI) or `lidar` (location is the box centre, rotation the
+    /// yaw). With --dataset, the data set defines it [default: camera]
     #[arg(long, value_name = "FRAME", value_parser = label_frame, conflicts_with = "dataset")]
     label_frame: Option<LabelFrame>,
-    /// List of the frames, one a line [default: every label file]
+    /// File with the frame ids, one per line [default: every label file]
     #[arg(long, value_name = "FILE", conflicts_with = "dataset")]
     ids: Option<PathBuf>,
-    /// Data set, its folder or its TOML, in the place of --labels, --label-frame and --ids
+    /// Data set (folder or TOML); replaces --labels, --label-frame and --ids
     #[arg(long, value_name = "DATASET")]
     dataset: Option<PathBuf>,
     /// Split of the data set
     #[arg(long, value_name = "NAME", default_value = "test", conflicts_with = "labels")]
     split: String,
-    /// Classes, with commas between them [default: those of the data set, or those found, without what KITTI does not evaluate]
+    /// Classes, separated by commas [default: those of the data set or of the files, without the classes that KITTI
+    /// does not evaluate]
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     classes: Vec<String>,
-    /// Overlap limits to report beside those of the reference, with commas between them
+    /// Additional IoU thresholds, separated by commas
     #[arg(long, value_name = "LIMITS", value_delimiter = ',', value_parser = overlap)]
     overlaps: Vec<f64>,
-    /// Ignore ground truth and detections that are farther away on the ground, m
+    /// Ignore ground truth and detections at a larger horizontal distance, m
     #[arg(long, value_name = "M", value_parser = range)]
     max_range: Option<f64>,
-    /// Write the result as JSON, too
+    /// Also write the result as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 impl EvalApArgs {
-    /// Reads the texts, prints the table and writes the JSON.
+    /// Reads the files, prints the table and writes the JSON.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let (frames, mut options) = match (&self.dataset, &self.labels) {
             (Some(dataset), _) => self.of_dataset(dataset)?,
             (None, Some(labels)) => self.of_folder(labels)?,
-            (None, None) => bail!("say where the labels are: --labels DIR or --dataset DATASET"),
+            (None, None) => bail!("the labels are missing: give --labels DIR or --dataset DATASET"),
         };
         options.max_range_m = self.max_range;
         options.more_overlaps = self.overlaps;
         if !self.classes.is_empty() {
             options.classes = self.classes;
         } else if options.classes.is_empty() && default_classes(&frames).is_empty() {
-            bail!("labels and detections hold no object of a class to evaluate; name the classes with --classes");
+            bail!("labels and detections contain no object of a class that KITTI evaluates; choose classes with --classes");
         }
         let report = evaluate(&frames, &options);
         if let Some(path) = &self.json {
@@ -82,7 +83,7 @@ impl EvalApArgs {
         };
         let frames = read_frames(labels, &self.detections, &ids)?;
         if self.ids.is_none() {
-            self.tell_of_files_without_labels(&ids);
+            self.warn_of_detections_without_labels(&ids);
         }
         let label_frame = self.label_frame.unwrap_or(LabelFrame::Camera);
         Ok((frames, EvalOptions { label_frame, ..EvalOptions::default() }))
@@ -98,14 +99,14 @@ impl EvalApArgs {
         Ok((frames, EvalOptions { label_frame: config.label_frame, classes: config.classes, ..EvalOptions::default() }))
     }
 
-    /// Without a list the labels say what the frames are. Detections of others are left out, but not in silence.
-    fn tell_of_files_without_labels(&self, ids: &[String]) {
+    /// Without --ids the label files define the frames. Warns about detections of other frames, which are ignored.
+    fn warn_of_detections_without_labels(&self, ids: &[String]) {
         let known: BTreeSet<&String> = ids.iter().collect();
         let detected = ids_of_folder(&self.detections).unwrap_or_default();
         let mut others = detected.iter().filter(|id| !known.contains(id));
         if let Some(first) = others.next() {
             let n = 1 + others.count();
-            eprintln!("left out: {n} detection files without a label file, {first}.txt first; --ids names the frames");
+            eprintln!("warning: {n} detection files have no label file and are ignored (first: {first}.txt); choose frames with --ids");
         }
     }
 }
@@ -132,13 +133,13 @@ mod tests {
     use clap::Parser;
 
     #[derive(Parser)]
-    struct Words {
+    struct Program {
         #[command(flatten)]
         args: EvalApArgs,
     }
 
-    fn run(words: &[&str]) -> Result<()> {
-        Words::try_parse_from(std::iter::once(&"ap").chain(words))?.args.run()
+    fn run(arguments: &[&str]) -> Result<()> {
+        Program::try_parse_from(std::iter::once(&"ap").chain(arguments))?.args.run()
     }
 
     fn golden(path: &str) -> String {
@@ -163,11 +164,11 @@ mod tests {
     }
 
     #[test]
-    fn wrong_words_are_refused() {
+    fn wrong_arguments_are_refused() {
         let (labels, detections) = (golden("small/label_2"), golden("small/detections"));
         let with = |more: &[&str]| {
-            let words = [&["--labels", &labels, "--detections", &detections], more].concat();
-            run(&words).unwrap_err().to_string()
+            let arguments = [&["--labels", &labels, "--detections", &detections], more].concat();
+            run(&arguments).unwrap_err().to_string()
         };
         assert!(with(&["--label-frame", "world"]).contains("must be camera or lidar"));
         assert!(with(&["--overlaps", "0.5,1"]).contains("from 0 to below 1"));

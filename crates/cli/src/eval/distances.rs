@@ -1,4 +1,4 @@
-//! `lidarshift eval distances`: how far the clouds of two data sets are from each other.
+//! `lidarshift eval distances`: distances between the point clouds of two data sets.
 
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
@@ -8,8 +8,9 @@ use models::find_detector;
 use std::path::PathBuf;
 use study::clouds::{Loader, distances_of};
 
-/// Chamfer, earth mover's and sliced Wasserstein distances of two data sets of the same frames, each with its floor: the whole clouds, the
-/// targets alone, by distance from the sensor; and which part of the Chamfer distance comes from where.
+/// Chamfer, earth mover's and sliced Wasserstein distances between two data sets with the same frames: for whole
+/// clouds, for the targets only and by range. Each distance comes with its floor, and the Chamfer distance with the
+/// share of each region of the scene.
 ///
 /// Examples:
 ///   lidarshift eval distances datasets/race/measured datasets/race/sim --frames 20
@@ -20,33 +21,33 @@ pub struct EvalDistancesArgs {
     /// First data set: its folder or its TOML
     #[arg(value_name = "A")]
     a: PathBuf,
-    /// Second data set, with the same frames under the same names
+    /// Second data set, with the same frame ids
     #[arg(value_name = "B")]
     b: PathBuf,
     /// Split whose frames are compared
     #[arg(long, value_name = "NAME", default_value = "train")]
     split: String,
-    /// At most so many frames, evenly over the split [default: all]
+    /// Maximum number of frames, spread evenly over the split [default: all]
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
-    /// What is compared
+    /// Which clouds are compared
     #[arg(long, value_enum, default_value = "raw")]
     compared: What,
-    /// Detector whose training loader it is
+    /// Detector whose training loader is used, for --compared loader and augmented
     #[arg(long, value_name = "NAME|TOML")]
     detector: Option<String>,
-    /// Write the result as JSON, too
+    /// Also write the result as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum What {
-    /// The clouds as the data sets hold them
+    /// The clouds as stored in the data sets
     Raw,
-    /// What the training loader gives before augmentation
+    /// The output of the training loader without augmentation
     Loader,
-    /// What the training loader gives after augmentation
+    /// The output of the training loader with augmentation
     Augmented,
 }
 
@@ -54,7 +55,7 @@ impl EvalDistancesArgs {
     /// Prints the table.
     ///
     /// # Errors
-    /// Frames that do not pair or cannot be read.
+    /// Frames that are not in both data sets or cannot be read.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let [a, b] = [Dataset::open(&self.a)?, Dataset::open(&self.b)?];
@@ -66,7 +67,7 @@ impl EvalDistancesArgs {
         let loader = match &self.detector {
             _ if compared == Compared::Raw => None,
             Some(name) => Some(Loader::of(&find_detector(name)?)),
-            None => bail!("--compared {compared}: name the --detector whose training loader it is"),
+            None => bail!("--compared {compared} needs --detector, the detector whose training loader is used"),
         };
         let options = DistanceOptions { compared, ..DistanceOptions::default() };
         let names = [a.config.name.as_str(), &b.config.name];

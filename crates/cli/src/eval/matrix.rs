@@ -1,14 +1,15 @@
-//! `lidarshift eval matrix`: train set x test set of a study.
+//! `lidarshift eval matrix`: AP and recall of a study by train set and test set.
 
-use crate::study::StudyPlace;
+use crate::study::StudySelection;
 use anyhow::Result;
 use clap::Args;
 use data::write_atomic;
 use std::path::{Path, PathBuf};
-use study::numbers::{Found, matrix};
+use study::numbers::{StudyState, matrix};
 
-/// Average precision and recall of every run of a study on every test set: means, deviations and intervals, in the layout of the paper's
-/// table. A cell without a run stays in the table and says why. Only what has been detected counts; nothing is trained.
+/// Average precision and recall of every run of a study on every test set: mean, standard deviation and confidence
+/// interval, in the layout of the paper's table. A cell without a run gives the reason. Only existing detections are
+/// evaluated; nothing is trained.
 ///
 /// Examples:
 ///   lidarshift eval matrix quick
@@ -17,14 +18,14 @@ use study::numbers::{Found, matrix};
 #[command(verbatim_doc_comment)]
 pub struct EvalMatrixArgs {
     #[command(flatten)]
-    place: StudyPlace,
-    /// Write the matrix as JSON, too
+    study: StudySelection,
+    /// Also write the matrix as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Write every number of every run as CSV
+    /// Also write all metrics of all runs as CSV
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
-    /// Write the paper's table in LaTeX
+    /// Also write the paper's table as LaTeX
     #[arg(long, value_name = "FILE")]
     latex: Option<PathBuf>,
 }
@@ -33,11 +34,11 @@ impl EvalMatrixArgs {
     /// Prints the tables in Markdown.
     ///
     /// # Errors
-    /// Data sets that are not there, labels that cannot be read.
+    /// Missing data sets, labels that cannot be read.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
-        let study = self.place.open()?;
-        let matrix = matrix(&study, &Found::look(&study)?)?;
+        let study = self.study.open()?;
+        let matrix = matrix(&study, &StudyState::read(&study)?)?;
         let write = |path: &Option<PathBuf>, text: &dyn Fn() -> String| -> Result<()> {
             path.as_deref().map_or(Ok(()), |path: &Path| Ok(write_atomic(path, text().as_bytes())?))
         };

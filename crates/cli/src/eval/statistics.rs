@@ -1,4 +1,4 @@
-//! `lidarshift eval statistics`: two data sets of the same frames beside each other.
+//! `lidarshift eval statistics`: point and box statistics of two data sets with the same frames.
 
 use anyhow::Result;
 use clap::Args;
@@ -6,7 +6,7 @@ use data::{Dataset, write_json};
 use eval::compare_statistics;
 use std::path::PathBuf;
 
-/// Points and boxes of two data sets of the same frames: the paper's Table I for any pair.
+/// Compare the numbers of points and boxes of two data sets with the same frames (the paper's Table I).
 ///
 /// Examples:
 ///   lidarshift eval statistics datasets/race/measured datasets/race/sim
@@ -17,16 +17,16 @@ pub struct EvalStatisticsArgs {
     /// First data set: its folder or its TOML
     #[arg(value_name = "A")]
     a: PathBuf,
-    /// Second data set, with the same frames under the same names
+    /// Second data set, with the same frame ids
     #[arg(value_name = "B")]
     b: PathBuf,
-    /// Split of the first whose frames are counted
+    /// Split of the first data set that gives the frames
     #[arg(long, value_name = "NAME", default_value = "train")]
     split: String,
-    /// Points farther than this along x or y do not count, nor do boxes farther away, m
+    /// Ignore points with a larger |x| or |y|, and boxes at a larger distance, m
     #[arg(long, value_name = "M", default_value_t = 100.0)]
     max_range: f64,
-    /// Write the result as JSON, too
+    /// Also write the result as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }

@@ -1,4 +1,4 @@
-//! `lidarshift eval targets`: the targets of data sets.
+//! `lidarshift eval targets`: statistics of the labelled targets of data sets.
 
 use anyhow::{Result, bail};
 use clap::Args;
@@ -7,8 +7,8 @@ use eval::targets::{Spread, TargetOptions, Targets, targets};
 use report::StudyReport;
 use std::path::PathBuf;
 
-/// Targets of one or more data sets: how many, where they are, how many points they have; laid over each other in the frame of their boxes by
-/// distance. With --out also as figures.
+/// Labelled targets of one or more data sets: their number, positions and numbers of points, and their points
+/// accumulated in the box frame, by range. --out also writes figures.
 ///
 /// Examples:
 ///   lidarshift eval targets datasets/race/measured datasets/race/sim
@@ -16,10 +16,10 @@ use std::path::PathBuf;
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct EvalTargetsArgs {
-    /// Data sets: their folders or their TOMLs
+    /// Data sets: folders or TOMLs
     #[arg(value_name = "DATASET", required = true)]
     datasets: Vec<PathBuf>,
-    /// Split whose frames are looked at
+    /// Split that gives the frames
     #[arg(long, value_name = "NAME", default_value = "train")]
     split: String,
     /// Class of the targets
@@ -28,16 +28,16 @@ pub struct EvalTargetsArgs {
     /// Folder for report.html, figures and tables
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Write the result as JSON, too
+    /// Also write the result as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
 
 impl EvalTargetsArgs {
-    /// Prints the numbers.
+    /// Prints the statistics.
     ///
     /// # Errors
-    /// Frames that cannot be read, or no target at all.
+    /// Frames that cannot be read; no target in any data set.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let options = TargetOptions { class: self.class.clone(), ..TargetOptions::default() };
@@ -70,14 +70,14 @@ fn table(found: &Targets) -> String {
         (Some(mean), Some(min), Some(max)) => format!("{mean:.1} ({min:.1} to {max:.1})"),
         _ => "-".into(),
     };
-    text += &format!("  points a cloud   {}\n", spread(&found.points_per_cloud));
-    text += &format!("  points a target  {}\n", spread(&found.points_per_target));
+    text += &format!("  points per cloud   {}\n", spread(&found.points_per_cloud));
+    text += &format!("  points per target  {}\n", spread(&found.points_per_target));
     if let Some([length, width, height]) = found.mean_size_m {
-        text += &format!("  mean size        {length:.2} x {width:.2} x {height:.2} m\n");
+        text += &format!("  mean size          {length:.2} x {width:.2} x {height:.2} m\n");
     }
     for section in &found.sections {
         text += &format!(
-            "  {:<16} {} targets, {} points\n",
+            "  {:<18} {} targets, {} points\n",
             section.section.to_string(),
             section.targets,
             section.n_points

@@ -1,6 +1,6 @@
-//! `lidarshift eval tsne`: what the networks of a study see.
+//! `lidarshift eval tsne`: features of the networks of a study.
 
-use crate::study::StudyPlace;
+use crate::study::StudySelection;
 use anyhow::{Result, bail};
 use clap::Args;
 use data::write_json;
@@ -8,8 +8,8 @@ use report::StudyReport;
 use std::path::PathBuf;
 use study::features::features;
 
-/// Features of every run of a study on the same test clouds: t-SNE of each network, linear CKA layer by layer, and the Fréchet distance
-/// between train sets. With --figures also as figures.
+/// Compare the features of the runs of a study on the same test clouds: t-SNE for each network, linear CKA for each
+/// layer, and the Fréchet distance between train sets. --figures also writes figures.
 ///
 /// Examples:
 ///   lidarshift eval tsne quick
@@ -18,11 +18,11 @@ use study::features::features;
 #[command(verbatim_doc_comment)]
 pub struct EvalTsneArgs {
     #[command(flatten)]
-    place: StudyPlace,
+    study: StudySelection,
     /// Folder for report.html, figures and tables
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
-    /// Write places, similarities and distances as JSON, too
+    /// Also write t-SNE coordinates, CKA and distances as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
@@ -31,13 +31,13 @@ impl EvalTsneArgs {
     /// Prints the numbers.
     ///
     /// # Errors
-    /// A study of which no run has been tested.
+    /// A study without a tested run.
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
-        let study = self.place.open()?;
+        let study = self.study.open()?;
         let found = features(&study)?;
         if found.embeddings.is_empty() && found.frechet.is_empty() && found.warnings.is_empty() {
-            bail!("no run of the study has been tested yet: `lidarshift study {}` does it", study.named);
+            bail!("no run of the study has been tested yet; run `lidarshift study {}`", study.named);
         }
         if let Some(path) = &self.json {
             write_json(path, &found)?;
@@ -53,11 +53,11 @@ impl EvalTsneArgs {
                     format!("{} {}", table.layers_a[i], value.map_or("-".into(), |v| format!("{v:.3}")))
                 })
                 .collect();
-            println!("{name}: CKA of equal layers: {}", same.join(", "));
+            println!("{name}: CKA of corresponding layers: {}", same.join(", "));
         }
         for row in &found.frechet {
             let floor = row.floor.map_or("-".into(), |f| format!("{f:.3}"));
-            println!("{}, {} and {}: Fréchet distance {:.3} (floor {floor})", row.network, row.a, row.b, row.distance);
+            println!("{}, {} and {}: Fréchet distance {:.3} (between halves of one run: {floor})", row.network, row.a, row.b, row.distance);
         }
         found.warnings.iter().for_each(|warning| println!("{warning}"));
         if let Some(out) = &self.figures {

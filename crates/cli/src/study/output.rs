@@ -1,13 +1,13 @@
-//! What `lidarshift study` prints: results on stdout, progress on stderr.
+//! Output of `lidarshift study`: results on stdout, progress on stderr.
 
 use eval::matrix::Matrix;
 use indicatif::{ProgressBar, ProgressStyle};
 use report::ReportFiles;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
-use study::{Event, RunStatus, Standing, Study, duration};
+use study::{Event, RunStatus, RunState, Study, duration};
 
-/// Prints what a study says while it works; the frames of a data set as a bar.
+/// Prints the events of a study; the frames of a data set as a progress bar.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 pub fn listener() -> impl Fn(Event<'_>) + Sync {
     let shown = Mutex::new(None::<ProgressBar>);
@@ -30,53 +30,53 @@ pub fn listener() -> impl Fn(Event<'_>) + Sync {
 
 fn frames_bar(dataset: &str) -> ProgressBar {
     let style = ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} frames, {eta} left");
-    ProgressBar::new(0).with_style(style.expect("the template is right")).with_message(dataset.to_string())
+    ProgressBar::new(0).with_style(style.expect("the template is valid")).with_message(dataset.to_string())
 }
 
-/// The matrix, and where the report lies.
+/// Prints the matrix and the path of the report.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 pub(super) fn print_results(matrix: &Matrix, files: &ReportFiles) {
     println!("{}", matrix.to_markdown());
     println!("report: {} ({:.1} MB)", files.page.display(), files.page_bytes as f64 / 1e6);
 }
 
-/// A line a run, how many stand how, and how long the rest will take where that is known.
+/// Prints one line per run, the number of runs in each state, and the remaining computing time if it is known.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 pub(super) fn print_status(study: &Study, runs: &[RunStatus]) {
     let width = runs.iter().map(|status| status.run.to_string().len()).max().unwrap_or(0);
-    let (mut counts, mut left_s, mut unknown) = (BTreeMap::<&str, usize>::new(), 0.0, 0);
+    let (mut counts, mut remaining_s, mut unknown) = (BTreeMap::<&str, usize>::new(), 0.0, 0);
     println!("{:<width$}  {:<8}  {:<10}  {:>9}", "run", "state", "step", "left");
     for status in runs {
-        let (word, step, note) = words(&status.standing);
-        *counts.entry(word).or_default() += 1;
-        match status.left_s {
-            Some(s) => left_s += s,
+        let (state, step, note) = state_texts(&status.run_state);
+        *counts.entry(state).or_default() += 1;
+        match status.remaining_s {
+            Some(s) => remaining_s += s,
             None => unknown += 1,
         }
-        let left = status.left_s.map_or("-".into(), |s| if s == 0.0 { String::new() } else { duration(s) });
-        println!("{:<width$}  {word:<8}  {step:<10}  {left:>9}  {note}", status.run.to_string());
+        let left = status.remaining_s.map_or("-".into(), |s| if s == 0.0 { String::new() } else { duration(s) });
+        println!("{:<width$}  {state:<8}  {step:<10}  {left:>9}  {note}", status.run.to_string());
     }
-    let counts: Vec<String> = counts.iter().map(|(word, n)| format!("{n} {word}")).collect();
+    let counts: Vec<String> = counts.iter().map(|(state, n)| format!("{n} {state}")).collect();
     print!("{} runs, each tested on {} data sets: {}", runs.len(), study.config.datasets.len(), counts.join(", "));
-    match (left_s > 0.0, unknown) {
-        (_, n) if n > 0 => println!("; what {n} of them take is not known before their steps are measured"),
-        (true, _) => println!("; about {} of computing left, one run after the other", duration(left_s)),
+    match (remaining_s > 0.0, unknown) {
+        (_, n) if n > 0 => println!("; the computing time of {n} runs is not measured yet"),
+        (true, _) => println!("; remaining computing time about {}, without parallel runs", duration(remaining_s)),
         _ => println!(),
     }
 }
 
-/// State, step and note.
-fn words(standing: &Standing) -> (&'static str, String, String) {
+/// State, step and note of a run.
+fn state_texts(run_state: &RunState) -> (&'static str, String, String) {
     let of = |step: &u64, total: &u64| if *total > 0 { format!("{step}/{total}") } else { String::new() };
-    match standing {
-        Standing::Done => ("done", String::new(), String::new()),
-        Standing::Trained(tests) => ("trained", String::new(), format!("to be tested on {}", tests.join(", "))),
-        Standing::Running(step, total) => ("running", of(step, total), String::new()),
-        Standing::Stopped(step, total) => ("stopped", of(step, total), String::new()),
-        Standing::Failed(reason) => ("failed", String::new(), reason.clone()),
-        Standing::Other(differences) => {
+    match run_state {
+        RunState::Done => ("done", String::new(), String::new()),
+        RunState::Trained(tests) => ("trained", String::new(), format!("not tested on {}", tests.join(", "))),
+        RunState::Running(step, total) => ("running", of(step, total), String::new()),
+        RunState::Stopped(step, total) => ("stopped", of(step, total), String::new()),
+        RunState::Failed(reason) => ("failed", String::new(), reason.clone()),
+        RunState::Other(differences) => {
             ("invalid", String::new(), format!("made with other settings: {}", differences.join("; ")))
         }
-        Standing::Missing => ("missing", String::new(), String::new()),
+        RunState::Missing => ("missing", String::new(), String::new()),
     }
 }

@@ -1,4 +1,4 @@
-//! What a training tells while it works: a bar on a terminal, plain lines elsewhere; on stderr.
+//! Progress of a training on stderr: a progress bar on a terminal, plain lines elsewhere.
 
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -6,10 +6,10 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 use train::{EpochMetrics, Event};
 
-/// Time between plain lines.
+/// Minimum time between plain lines.
 const PLAIN_EVERY: Duration = Duration::from_secs(5);
 
-/// A bar that is only seen on a terminal.
+/// A progress bar; hidden if stderr is not a terminal.
 pub(super) fn bar(template: &str, length: usize) -> Result<ProgressBar> {
     Ok(ProgressBar::new(length as u64).with_style(ProgressStyle::with_template(template)?))
 }
@@ -29,17 +29,17 @@ impl Progress {
             Event::Begin { state, epochs, frames, validation_frames } => {
                 (self.epochs, self.total_steps) = (*epochs, state.total_steps);
                 eprintln!(
-                    "{frames} frames to learn from, {validation_frames} to validate with; {epochs} epochs, {} steps",
+                    "{frames} training frames, {validation_frames} validation frames, {epochs} epochs, {} steps",
                     state.total_steps
                 );
                 if state.step > 0 {
-                    eprintln!("going on from step {} in epoch {}", state.step, state.epoch + 1);
+                    eprintln!("resuming at step {} in epoch {}", state.step, state.epoch + 1);
                 }
                 if std::io::stderr().is_terminal() && state.step < state.total_steps {
                     let style = ProgressStyle::with_template("{bar:30} step {pos}/{len}, {msg}, {eta} left");
                     let bar = ProgressBar::new(state.total_steps).with_position(state.step);
                     bar.reset_eta();
-                    self.bar = Some(bar.with_style(style.expect("the template is right")));
+                    self.bar = Some(bar.with_style(style.expect("the template is valid")));
                 }
             }
             Event::Step { metrics, logged } => {
@@ -51,7 +51,7 @@ impl Progress {
                     }
                 } else if *logged && self.last_line.is_none_or(|at| at.elapsed() >= PLAIN_EVERY) {
                     let wait = 100.0 * metrics.data_wait_share;
-                    eprintln!("step {}/{}: {message}, waits {wait:.1} % for data", metrics.step, self.total_steps);
+                    eprintln!("step {}/{}: {message}, {wait:.1} % of the time waiting for data", metrics.step, self.total_steps);
                     self.last_line = Some(Instant::now());
                 }
             }
@@ -87,7 +87,7 @@ fn epoch_line(metrics: &EpochMetrics, epochs: u64) -> String {
     if let Some(v) = &metrics.validation {
         let percent = |ap: Option<f64>| ap.map_or("undefined".into(), |ap| format!("{ap:.1}"));
         let (ap, loose) = (percent(v.ap), percent(v.ap_loose));
-        line += &format!("; validation {:.1} s: loss {:.4}, AP {ap}, at loose overlaps {loose}", v.seconds, v.loss);
+        line += &format!("; validation {:.1} s: loss {:.4}, AP {ap}, AP at loose overlaps {loose}", v.seconds, v.loss);
     }
     line
 }

@@ -1,4 +1,4 @@
-//! What a finished run leaves for people: a table, texts, pictures, a curve.
+//! Results of a finished run: the AP table, detections, pictures and the training curve.
 
 use anyhow::Result;
 use data::write::write_kitti_text;
@@ -8,13 +8,13 @@ use report::{BirdsEyeOptions, CurveOptions, Series, Style, birds_eye_png, curve_
 use std::path::Path;
 use train::Evaluation;
 
-/// Frames that are drawn.
+/// Number of frames for which a picture is written.
 const PICTURES: usize = 3;
 
-/// The lines in space without a filter for difficulty; the whole table is in `eval.json`.
+/// Prints the 3D AP for difficulty "all"; the whole table is in `eval.json`.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 pub(super) fn show(found: &Evaluation, what: &str) -> Result<()> {
-    println!("AP in percent, 3d, all difficulties, on {what} ({} frames)", found.frames.len());
+    println!("3D AP in percent, all difficulties, on {what} ({} frames)", found.frames.len());
     println!("class        overlap  exact area    AP40   n_gt    TP    FP");
     for row in found.report.rows.iter().filter(|r| r.metric == Metric::ThreeD && r.difficulty == Difficulty::All) {
         let percent = |ap: Option<f64>| ap.map_or("undef.".into(), |ap| format!("{ap:.2}"));
@@ -32,7 +32,7 @@ pub(super) fn show(found: &Evaluation, what: &str) -> Result<()> {
     Ok(())
 }
 
-/// `eval.json`, `detections/`, `pictures/` and `curve.svg` in the run folder.
+/// Writes `eval.json`, `detections/` and `pictures/` into the run folder.
 pub(super) fn write(found: &Evaluation, set: &Dataset, out: &Path) -> Result<()> {
     write_json(&out.join("eval.json"), &found.report)?;
     for frame in &found.frames {
@@ -49,20 +49,20 @@ pub(super) fn write(found: &Evaluation, set: &Dataset, out: &Path) -> Result<()>
     Ok(())
 }
 
-/// The training curve, and the files of the run that are worth a look.
+/// Writes the training curve and lists the result files of the run. A temporary run folder is not listed.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
-pub(super) fn say_where(out: &Path, stays: bool) -> Result<()> {
+pub(super) fn write_curve_and_list(out: &Path, keep: bool) -> Result<()> {
     write_atomic(&out.join("curve.svg"), curve(&fs_err::read_to_string(out.join("metrics.jsonl"))?).as_bytes())?;
-    if !stays {
+    if !keep {
         return Ok(());
     }
     println!("run folder: {}", out.display());
     for (file, what) in [
-        ("checkpoint/last.safetensors", "the weights, under OpenPCDet's names"),
-        ("checkpoint/best.safetensors", "the weights with the best AP on the validation split"),
-        ("eval.json", "all numbers"),
-        ("detections", "the boxes, as KITTI text"),
-        ("pictures", "some frames from above"),
+        ("checkpoint/last.safetensors", "weights, with OpenPCDet's parameter names"),
+        ("checkpoint/best.safetensors", "weights with the best AP on the validation split"),
+        ("eval.json", "all metrics"),
+        ("detections", "detected boxes as KITTI text"),
+        ("pictures", "bird's eye views of some frames"),
         ("curve.svg", "loss and AP over the steps"),
     ] {
         if out.join(file).exists() {
@@ -72,7 +72,7 @@ pub(super) fn say_where(out: &Path, stays: bool) -> Result<()> {
     Ok(())
 }
 
-/// Loss of the steps and of the validation, and its AP in tenths, over the steps.
+/// Training loss, validation loss and validation AP / 10 over the steps.
 fn curve(metrics: &str) -> String {
     let lines: Vec<serde_json::Value> = metrics.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
     let series = |name: &str, kind: &str, pointer: &str, factor: f64| {

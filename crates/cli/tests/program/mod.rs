@@ -1,4 +1,4 @@
-//! The program, and a data set small enough to train on in seconds.
+//! Runs the program, and writes a data set on which training takes seconds.
 
 use data::write::write_split;
 use data::{Cloud, Frame, Layout, Object, stream};
@@ -7,7 +7,7 @@ use rand::RngExt;
 use std::path::Path;
 use std::process::{Command, Output};
 
-/// A detector of a few thousand weights that reads 10 m ahead.
+/// A PointPillars with a few thousand weights and a range of 10 m.
 pub const TINY_DETECTOR: &str = r#"
 name = "tiny"
 classes = ["Car"]
@@ -38,7 +38,7 @@ epochs = 3
 batch_size = 2
 "#;
 
-/// The same for PointRCNN.
+/// A PointRCNN of similar size.
 pub const TINY_POINTRCNN: &str = r#"
 name = "tiny_pointrcnn"
 classes = ["Car"]
@@ -67,8 +67,8 @@ epochs = 3
 batch_size = 2
 "#;
 
-/// Seven frames with a car or two on a flat ground in KITTI's layout with labels in the LiDAR frame, and `tiny.toml` and
-/// `tiny_pointrcnn.toml` beside them.
+/// Writes seven frames with one or two cars on flat ground, in KITTI's layout with labels in the LiDAR frame, and the
+/// detectors `tiny.toml` and `tiny_pointrcnn.toml`.
 pub fn data_set(folder: &Path) {
     let mut ids = Vec::new();
     for i in 0..7u64 {
@@ -99,26 +99,26 @@ pub fn data_set(folder: &Path) {
     std::fs::write(folder.join("tiny_pointrcnn.toml"), TINY_POINTRCNN).unwrap();
 }
 
-/// The program with these words, in `folder`, in which relative paths are looked up.
-pub fn program(folder: &Path, words: &str) -> Command {
+/// The program with these arguments and the working directory `folder`.
+pub fn program(folder: &Path, arguments: &str) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_lidarshift"));
-    command.args(words.split_whitespace()).current_dir(folder);
+    command.args(arguments.split_whitespace()).current_dir(folder);
     command
 }
 
-/// Runs the program to its end.
-pub fn run(folder: &Path, words: &str) -> Output {
-    program(folder, words).output().expect("the program starts")
+/// Runs the program and waits for its end.
+pub fn run(folder: &Path, arguments: &str) -> Output {
+    program(folder, arguments).output().expect("the program starts")
 }
 
 /// Runs the program, which must succeed.
-pub fn must(folder: &Path, words: &str) -> Output {
-    let output = run(folder, words);
-    assert!(output.status.success(), "{words}: {}", said(&output));
+pub fn must(folder: &Path, arguments: &str) -> Output {
+    let output = run(folder, arguments);
+    assert!(output.status.success(), "{arguments}: {}", output_text(&output));
     output
 }
 
-/// What it said, on both streams.
-pub fn said(output: &Output) -> String {
+/// Stdout and stderr of the program.
+pub fn output_text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }

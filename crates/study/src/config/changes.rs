@@ -1,24 +1,24 @@
-//! What a changed study file does to what was made before.
+//! Effects of a change of the study TOML on existing results.
 
 use super::{Source, StudyConfig, StudyRun};
 use eval::matrix::RunId;
 use std::collections::BTreeMap;
 
-/// What a changed study file does to runs that were made before.
+/// Effects of a change of the study TOML on existing runs.
 #[derive(Clone, Debug, PartialEq, Default)]
 pub struct StudyChanges {
     /// Runs that are new.
     pub added: Vec<RunId>,
     /// Runs that are no longer part of the study.
     pub removed: Vec<RunId>,
-    /// Runs that have to be made anew, and why.
+    /// Runs that have to be repeated, with the reasons.
     pub invalid: Vec<(RunId, Vec<String>)>,
-    /// Test sets whose detections have to be made anew.
+    /// Test sets whose detections have to be repeated.
     pub tests: Vec<String>,
 }
 
 impl StudyConfig {
-    /// What becomes of the runs that `before` made.
+    /// Compares this configuration with an earlier one.
     pub fn changes_since(&self, before: &StudyConfig) -> StudyChanges {
         let by_id = |study: &StudyConfig| -> BTreeMap<RunId, StudyRun> {
             study.runs().into_iter().map(|run| (run.id.clone(), run)).collect()
@@ -57,7 +57,7 @@ impl StudyConfig {
         changes
     }
 
-    /// Where a data set comes from, with that of the one it is made of.
+    /// Source of a data set as text, including the source of the data set from which it is derived.
     fn source_text(&self, name: &str) -> String {
         let Some(dataset) = self.datasets.iter().find(|d| d.name == name) else { return "unknown".into() };
         match &dataset.source {

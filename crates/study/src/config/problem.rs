@@ -1,10 +1,10 @@
-//! What makes no sense in a study.
+//! Validation of a study.
 
 use super::{Source, StudyConfig};
 use std::collections::BTreeSet;
 
 impl StudyConfig {
-    /// The first thing that makes no sense, with its key.
+    /// The first problem of the study, with its key.
     pub(super) fn problem(&self) -> Option<String> {
         let names = [
             ("dataset", self.datasets.iter().map(|d| d.name.as_str()).collect::<Vec<_>>()),
@@ -23,7 +23,7 @@ impl StudyConfig {
             }
             let mut known = BTreeSet::new();
             if let Some(twice) = names.iter().find(|name| !known.insert(**name)) {
-                return Some(format!("{what} {twice:?} is there twice"));
+                return Some(format!("{what} {twice:?} exists twice"));
             }
         }
         let seeds =
@@ -31,7 +31,7 @@ impl StudyConfig {
         for (what, seeds) in std::iter::once(("seeds".to_string(), &self.seeds)).chain(seeds) {
             let distinct: BTreeSet<&u64> = seeds.iter().collect();
             if seeds.is_empty() || distinct.len() < seeds.len() {
-                return Some(format!("{what} {seeds:?} have to be distinct, at least one: equal seeds are one run"));
+                return Some(format!("{what} {seeds:?} have to be distinct and at least one"));
             }
         }
         let epochs = self.detectors.iter().filter_map(|d| d.epochs).chain(self.epochs);
@@ -40,8 +40,9 @@ impl StudyConfig {
         }
         let [datasets, detectors, _] = names.map(|(_, names)| names);
         let unknown = |what: String, name: &str, known: &[&str]| {
-            (!known.contains(&name))
-                .then(|| format!("{what} names {name:?}, which the study does not have; it has {}", known.join(", ")))
+            (!known.contains(&name)).then(|| {
+                format!("{what} contains {name:?}, which is not in the study; known names: {}", known.join(", "))
+            })
         };
         let of_train = self.detectors.iter().flat_map(|d| d.train.iter().flatten().map(move |t| (d, t)));
         let of_train = of_train.filter_map(|(d, name)| unknown(format!("detector {}: train", d.name), name, &datasets));
@@ -57,7 +58,7 @@ impl StudyConfig {
             match &dataset.source {
                 Source::Resim { of, .. } if !datasets[..i].contains(&of.as_str()) => {
                     return Some(format!(
-                        "dataset {}: resim.of names {of:?}, which has to stand before it",
+                        "dataset {}: resim.of is {of:?}, which is not the name of an earlier data set",
                         dataset.name
                     ));
                 }
@@ -66,7 +67,7 @@ impl StudyConfig {
             }
         }
         if self.evaluation.matrix.overlaps.iter().any(|o| !(0.0..1.0).contains(o)) {
-            return Some("evaluation.matrix.overlaps have to lie in [0, 1)".into());
+            return Some("evaluation.matrix.overlaps have to be in [0, 1)".into());
         }
         None
     }

@@ -1,4 +1,4 @@
-//! The sizes of a PointPillars out of OpenPCDet's configuration.
+//! Converts OpenPCDet's configuration of a PointPillars.
 
 use super::super::manifest::{Manifest, array, float, floats, usizes};
 use anyhow::{Context, Result, bail};
@@ -8,7 +8,7 @@ use models::pointpillars::{
 };
 use serde_json::Value;
 
-/// Our configuration of the network that the manifest describes.
+/// The configuration of the network in the manifest.
 pub fn config(manifest: &Manifest) -> Result<NetworkConfig> {
     let cfg = &manifest.model_cfg;
     let (backbone, head) = (&cfg["BACKBONE_2D"], &cfg["DENSE_HEAD"]);

@@ -1,4 +1,4 @@
-//! The sizes of a PointRCNN out of OpenPCDet's configuration.
+//! Converts OpenPCDet's configuration of a PointRCNN.
 
 use super::super::manifest::{Manifest, array, float, floats, list, pair, usizes};
 use anyhow::{Context, Result};
@@ -10,7 +10,7 @@ use models::pointrcnn::{
 };
 use serde_json::Value;
 
-/// Our configuration of the network that the manifest describes.
+/// The configuration of the network in the manifest.
 pub fn config(manifest: &Manifest) -> Result<NetworkConfig> {
     let cfg = &manifest.model_cfg;
     let (backbone, head, roi) = (&cfg["BACKBONE_3D"], &cfg["POINT_HEAD"], &cfg["ROI_HEAD"]);

@@ -1,4 +1,4 @@
-//! How the runs of a study stand, from their folders alone.
+//! State of the runs of a study, derived from the run folders.
 
 use crate::config::StudyRun;
 use crate::error::Result;
@@ -10,26 +10,26 @@ use std::path::Path;
 use std::time::Duration;
 use train::{RunConfig, read_run_state};
 
-/// How a run stands.
+/// State of a run.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Standing {
-    /// Trained, and its detections are there.
+pub enum RunState {
+    /// Trained and tested.
     Done,
-    /// Trained; its detections on these test sets are missing.
+    /// Trained, but not tested on these test sets.
     Trained(Vec<String>),
-    /// A process is working on it: steps done, steps of the whole.
+    /// In use by a process: finished steps, total steps.
     Running(u64, u64),
-    /// It was stopped on the way: steps done, steps of the whole.
+    /// Interrupted: finished steps, total steps.
     Stopped(u64, u64),
-    /// It ended with an error.
+    /// Ended with this error.
     Failed(String),
-    /// Its folder holds a run with other settings.
+    /// The run folder contains a run with other settings; the differences.
     Other(Vec<String>),
-    /// Nothing is there.
+    /// Not started.
     Missing,
 }
 
-/// What a failed run leaves.
+/// Content of `failed.json` in the folder of a failed run.
 #[derive(Serialize, Deserialize)]
 struct Failure {
     schema: String,
@@ -38,39 +38,39 @@ struct Failure {
 
 const FAILURE: &str = "failed.json";
 
-/// Says that a run has failed.
+/// Writes `failed.json`.
 pub fn write_failure(folder: &Path, reason: &str) -> Result<()> {
     let failure = Failure { schema: "lidarshift/failed-run/1".into(), reason: reason.into() };
     Ok(write_json(&folder.join(FAILURE), &failure)?)
 }
 
-/// Forgets a failure: the run is tried again.
-pub fn forget_failure(folder: &Path) -> Result<()> {
+/// Removes `failed.json`, so that the run is repeated.
+pub fn remove_failure(folder: &Path) -> Result<()> {
     match fs_err::remove_file(folder.join(FAILURE)) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(e.into()),
         _ => Ok(()),
     }
 }
 
-/// Why a run failed, if it did.
+/// The error of a failed run.
 pub fn read_failure(folder: &Path) -> Option<String> {
     let bytes = fs_err::read(folder.join(FAILURE)).ok()?;
     Some(serde_json::from_slice(&bytes).map_or_else(|e| format!("{FAILURE} is damaged: {e}"), |f: Failure| f.reason))
 }
 
-/// Held by the process that works on a run.
-pub struct AtWork(File);
+/// Lock on a run folder, held by the process that executes the run.
+pub struct RunLock(File);
 
-impl AtWork {
-    /// Takes the run; `None` when another process has it.
-    pub fn take(folder: &Path) -> Result<Option<AtWork>> {
+impl RunLock {
+    /// Locks a run folder; `None` if another process holds the lock.
+    pub fn acquire(folder: &Path) -> Result<Option<RunLock>> {
         fs_err::create_dir_all(folder)?;
         let path = folder.join(".working");
         let file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(path)?.into_file();
-        // Who only looks whether it is taken holds it for a moment.
+        // `is_held` of another process holds the lock for a moment.
         for _ in 0..20 {
             match file.try_lock() {
-                Ok(()) => return Ok(Some(AtWork(file))),
+                Ok(()) => return Ok(Some(RunLock(file))),
                 Err(TryLockError::WouldBlock) => std::thread::sleep(Duration::from_millis(10)),
                 Err(TryLockError::Error(e)) => return Err(e.into()),
             }
@@ -78,21 +78,21 @@ impl AtWork {
         Ok(None)
     }
 
-    /// Whether a process works on the run in a folder.
-    pub fn is_taken(folder: &Path) -> bool {
+    /// Whether a process holds the lock on a run folder.
+    pub fn is_held(folder: &Path) -> bool {
         let Ok(file) = File::options().write(true).open(folder.join(".working")) else { return false };
         matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
     }
 }
 
-impl Drop for AtWork {
+impl Drop for RunLock {
     fn drop(&mut self) {
-        // Closing the file does the same; nothing depends on the answer.
+        // An error can be ignored, since closing the file also releases the lock.
         self.0.unlock().ok();
     }
 }
 
-/// The settings in which the run in a folder differs from those of the study; empty without a run.
+/// Differences between the settings in the run folder and those of the study; empty if the run has not started.
 pub fn differences(study: &Study, run: &StudyRun) -> Result<Vec<String>> {
     let path = run.folder(&study.folder).join("config.toml");
     if !path.is_file() {
@@ -104,34 +104,34 @@ pub fn differences(study: &Study, run: &StudyRun) -> Result<Vec<String>> {
     })
 }
 
-/// How a run stands.
-pub fn standing(study: &Study, run: &StudyRun) -> Result<Standing> {
+/// The state of a run.
+pub fn run_state(study: &Study, run: &StudyRun) -> Result<RunState> {
     let folder = run.folder(&study.folder);
     if !folder.is_dir() {
-        return Ok(Standing::Missing);
+        return Ok(RunState::Missing);
     }
     let other = differences(study, run)?;
     if !other.is_empty() {
-        return Ok(Standing::Other(other));
+        return Ok(RunState::Other(other));
     }
     let state = match read_run_state(&folder) {
         Ok(state) => state,
-        Err(e) => return Ok(Standing::Failed(e.to_string())),
+        Err(e) => return Ok(RunState::Failed(e.to_string())),
     };
     let (step, total) = state.as_ref().map_or((0, 0), |s| (s.step, s.total_steps));
-    if AtWork::is_taken(&folder) {
-        return Ok(Standing::Running(step, total));
+    if RunLock::is_held(&folder) {
+        return Ok(RunState::Running(step, total));
     }
     if let Some(reason) = read_failure(&folder) {
-        return Ok(Standing::Failed(reason));
+        return Ok(RunState::Failed(reason));
     }
-    let Some(state) = state else { return Ok(Standing::Missing) };
+    let Some(state) = state else { return Ok(RunState::Missing) };
     if state.config_sha256 != study.run_config(run)?.sha256() {
-        let reason = "its checkpoint belongs to another configuration than the run folder's config.toml says";
-        return Ok(Standing::Failed(reason.into()));
+        let reason = "its checkpoint belongs to another configuration than config.toml in the run folder";
+        return Ok(RunState::Failed(reason.into()));
     }
     if step < total {
-        return Ok(Standing::Stopped(step, total));
+        return Ok(RunState::Stopped(step, total));
     }
     let weights = crate::detections::weights_sha256(&folder)?;
     let mut missing = Vec::new();
@@ -140,5 +140,5 @@ pub fn standing(study: &Study, run: &StudyRun) -> Result<Standing> {
             missing.push(dataset.name.clone());
         }
     }
-    Ok(if missing.is_empty() { Standing::Done } else { Standing::Trained(missing) })
+    Ok(if missing.is_empty() { RunState::Done } else { RunState::Trained(missing) })
 }
