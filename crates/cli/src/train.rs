@@ -108,7 +108,10 @@ impl TrainArgs {
             _ if config.overfit => (set.all_ids()?, "all frames, which are also the training frames".to_string()),
             Some(split) => (set.ids(split)?, format!("the split {split}")),
             None => {
-                eprintln!("not evaluated: the data set has neither the split test nor the split {}", config.run.val_split);
+                eprintln!(
+                    "not evaluated: the data set has neither the split test nor the split {}",
+                    config.run.val_split
+                );
                 return results::write_curve_and_list(&out, temporary.is_none());
             }
         };

@@ -296,7 +296,8 @@ fn leave_out_copies(frames: &mut Vec<FramePair>) -> Option<String> {
     (copies > 0).then(|| format!("{copies} frames are copies of others: each scene counts once"))
 }
 
-/// Standard deviation of the objects' speeds below which a late clock cannot be distinguished from a constant offset, m/s.
+/// Standard deviation of the objects' speeds, m/s, below which a late clock cannot be distinguished from a constant
+/// offset.
 const ONE_SPEED_M_S: f64 = 0.5;
 
 /// A note where all objects move at one speed.

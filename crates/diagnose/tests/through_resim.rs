@@ -1,4 +1,5 @@
-//! Effects that `resim` applies to a simulated data set are found, and the extension that is written corrects the simulation.
+//! Effects that `resim` applies to a simulated data set are found, and the extension that is written corrects the
+//! simulation.
 
 use data::Dataset;
 use lidarshift_diagnose::{

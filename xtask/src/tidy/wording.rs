@@ -4,27 +4,7 @@ use super::source::{Line, lines};
 use crate::pages;
 
 /// Folders and files that follow these rules. Empty: everything.
-const CLEAN: &[&str] = &[
-    "crates/diagnose",
-    "crates/eval",
-    "crates/report",
-    "crates/simulate/benches",
-    "crates/simulate/examples",
-    "crates/simulate/src/attributes.rs",
-    "crates/simulate/src/auto_label.rs",
-    "crates/simulate/src/frame_scene",
-    "crates/simulate/src/matched.rs",
-    "crates/simulate/src/mesh",
-    "crates/simulate/src/race",
-    "crates/simulate/src/raycast",
-    "crates/simulate/src/resim.rs",
-    "crates/simulate/src/scenario",
-    "crates/simulate/src/street",
-    "crates/simulate/src/track",
-    "crates/simulate/src/world.rs",
-    "tests",
-    "xtask",
-];
+const CLEAN: &[&str] = &[];
 
 /// Maximum length of a line with a comment, characters. For Markdown see [`crate::pages`].
 const MAX_COLUMNS: usize = 120;

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// file. Boxes are compared in the frame in which the files give them.
 ///
 /// Examples:
-///   lidarshift eval ap --labels tests/golden/evaluation/small/label_2 --detections tests/golden/evaluation/small/detections
+///   lidarshift eval ap --labels data/label_2 --detections runs/mine/detections
 ///   lidarshift eval ap --dataset datasets/road --split test --detections detections --json ap.json
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
@@ -66,7 +66,9 @@ impl EvalApArgs {
         if !self.classes.is_empty() {
             options.classes = self.classes;
         } else if options.classes.is_empty() && default_classes(&frames).is_empty() {
-            bail!("labels and detections contain no object of a class that KITTI evaluates; choose classes with --classes");
+            bail!(
+                "labels and detections contain no object of a class that KITTI evaluates; choose classes with --classes"
+            );
         }
         let report = evaluate(&frames, &options);
         if let Some(path) = &self.json {
@@ -106,7 +108,9 @@ impl EvalApArgs {
         let mut others = detected.iter().filter(|id| !known.contains(id));
         if let Some(first) = others.next() {
             let n = 1 + others.count();
-            eprintln!("warning: {n} detection files have no label file and are ignored (first: {first}.txt); choose frames with --ids");
+            eprintln!(
+                "warning: {n} detection files have no label file and are ignored (first: {first}.txt); choose frames with --ids"
+            );
         }
     }
 }

@@ -57,7 +57,10 @@ impl EvalTsneArgs {
         }
         for row in &found.frechet {
             let floor = row.floor.map_or("-".into(), |f| format!("{f:.3}"));
-            println!("{}, {} and {}: Fréchet distance {:.3} (between halves of one run: {floor})", row.network, row.a, row.b, row.distance);
+            println!(
+                "{}, {} and {}: Fréchet distance {:.3} (between halves of one run: {floor})",
+                row.network, row.a, row.b, row.distance
+            );
         }
         found.warnings.iter().for_each(|warning| println!("{warning}"));
         if let Some(out) = &self.figures {

@@ -5,7 +5,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use report::ReportFiles;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
-use study::{Event, RunStatus, RunState, Study, duration};
+use study::{Event, RunState, RunStatus, Study, duration};
 
 /// Prints the events of a study; the frames of a data set as a progress bar.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]

@@ -51,7 +51,10 @@ impl Progress {
                     }
                 } else if *logged && self.last_line.is_none_or(|at| at.elapsed() >= PLAIN_EVERY) {
                     let wait = 100.0 * metrics.data_wait_share;
-                    eprintln!("step {}/{}: {message}, {wait:.1} % of the time waiting for data", metrics.step, self.total_steps);
+                    eprintln!(
+                        "step {}/{}: {message}, {wait:.1} % of the time waiting for data",
+                        metrics.step, self.total_steps
+                    );
                     self.last_line = Some(Instant::now());
                 }
             }
