@@ -4,7 +4,7 @@
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{golden, must, program, run, output_text};
+use program::{golden, must, output_text, program, run};
 
 #[test]
 fn reference_numbers_on_every_device() {

@@ -3,7 +3,7 @@
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{golden, must, run, output_text};
+use program::{golden, must, output_text, run};
 use std::fs;
 
 #[test]
@@ -38,7 +38,11 @@ fn a_wrong_value_and_an_unknown_tensor_fail() {
     fs::write(&path, wrong).unwrap();
     let output = run(dir.path(), "parity copy");
     assert_eq!(output.status.code(), Some(1));
-    assert!(output_text(&output).contains("FAIL") && output_text(&output).contains("block0"), "{}", output_text(&output));
+    assert!(
+        output_text(&output).contains("FAIL") && output_text(&output).contains("block0"),
+        "{}",
+        output_text(&output)
+    );
 
     let text = String::from_utf8_lossy(&sound[8..8 + header]).replacen("\"block1", "\"blockX", 1);
     let mut unknown = sound[..8].to_vec();

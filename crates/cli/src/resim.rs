@@ -15,7 +15,7 @@ use std::path::PathBuf;
 ///
 /// Examples:
 ///   lidarshift resim --effects configs/simulate/sim_noise.toml datasets/race/sim --out datasets/noisy
-///   lidarshift resim --effects my-effects.toml --sensor configs/sensors/hdl64e.toml --seed 3 /data/kitti --out datasets/kitti-rain
+///   lidarshift resim --effects my-effects.toml --sensor hdl64e.toml --seed 3 /data/kitti --out datasets/kitti-noisy
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct ResimArgs {

@@ -86,7 +86,9 @@ impl Manifest {
         let kind = self.model_cfg["NAME"].as_str().unwrap_or_default();
         let names: Vec<&str> = DETECTORS.iter().map(|checks| checks.name).collect();
         let found = DETECTORS.iter().find(|checks| checks.name == kind);
-        found.with_context(|| format!("the folder has reference values of {kind}; this program supports {}", names.join(" and ")))
+        found.with_context(|| {
+            format!("the folder has reference values of {kind}; this program supports {}", names.join(" and "))
+        })
     }
 
     /// The configuration of the detector of the manifest.

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 /// file. Boxes are compared in the frame in which the files give them.
 ///
 /// Examples:
-///   lidarshift eval ap --labels tests/golden/evaluation/small/label_2 --detections tests/golden/evaluation/small/detections
+///   lidarshift eval ap --labels data/label_2 --detections runs/mine/detections
 ///   lidarshift eval ap --dataset datasets/road --split test --detections detections --json ap.json
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
