@@ -8,9 +8,9 @@
 //! 3. on the **scan**: ranges, returns, intensities;
 //! 4. on the **labels**.
 //!
-//! Each effect has its own random number streams: one for each (seed, data set, index in the list, kind, frame), and one
-//! without the frame for values that are constant in a data set, such as the range offset of a beam. The result of an
-//! effect therefore depends neither on effects added behind it nor on the number of threads.
+//! Each effect has its own random number streams: one for each (seed, data set, index in the list, kind, frame), and
+//! one without the frame for values that are constant in a data set, such as the range offset of a beam. The result of
+//! an effect therefore depends neither on effects added behind it nor on the number of threads.
 //!
 //! The codes (A1, B2, ...) are those of the catalogue in `docs/src/reference/effects.md`.
 
