@@ -96,8 +96,7 @@ mod tests {
                 was_lost = is_lost;
             }
         }
-        // A fraction loss / (loss + 1 - burst) of the packets is lost, in bursts of 1 / (1 - burst) packets of 23
-        // shots.
+        // The fraction lost is loss / (loss + 1 - burst), in bursts of 1 / (1 - burst) packets of 23 shots.
         let share = gone as f64 / all as f64;
         assert!((share - 0.02 / 0.42).abs() < 0.012, "{share}");
         let length = gone as f64 / starts as f64;
