@@ -93,7 +93,7 @@ fn only_mount(rig: &Rig) -> Result<&Sensor, DiagnoseError> {
     match rig.sensors.as_slice() {
         [one] if one.position == [0.0; 3] && [one.yaw_deg, one.pitch_deg, one.roll_deg] == [0.0; 3] => Ok(one),
         _ => Err(DiagnoseError::Pair(
-            "scans alone are diagnosed for one sensor that stands at the origin of its clouds, unturned: rings cannot be told in fused clouds"
+            "scans alone are diagnosed for one sensor at the origin of its clouds without rotation: the rows of several sensors cannot be separated in a fused cloud"
                 .into(),
         )),
     }
