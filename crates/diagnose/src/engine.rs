@@ -11,7 +11,7 @@ use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
-    Corrections, FramePair, ObjectPair, Ray, Recordings, Sensors, ShownShift, check_identity, common_ids, find_sensors,
+    Corrections, FramePair, ObjectPair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
     pair_all, with_points,
 };
 use crate::search::geometry::Displacement;
@@ -22,6 +22,7 @@ use data::Dataset;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
 use sensor::Rig;
+use sensor::directions::Sensors;
 use std::collections::BTreeSet;
 
 /// What to diagnose.

@@ -24,16 +24,6 @@ pub struct BoxShift {
     pub points: usize,
 }
 
-/// Height above the bottom of a box below which a return is of the ground, m.
-const FLOOR_M: f64 = 0.12;
-
-/// Whether a point lies in a box or within a margin beside it, above the ground.
-pub(super) fn in_or_beside(bbox: &Box3, point: [f64; 3], margin_m: f64) -> bool {
-    let local = bbox.to_local(point);
-    let near = (0..3).all(|k| local[k].abs() < bbox.size[k] / 2.0 + margin_m);
-    near && local[2] > -bbox.size[2] / 2.0 + FLOOR_M
-}
-
 /// Prior standard deviation of a shift, m.
 const PRIOR_M: f64 = 1.0;
 

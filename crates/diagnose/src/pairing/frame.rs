@@ -1,17 +1,14 @@
 //! One frame of both sides, return by return.
 
-use super::boxes::{BoxShift, SurfacePoint, fit_shift, in_or_beside};
+use super::boxes::{BoxShift, SurfacePoint, fit_shift};
 use super::gaps::{in_gap, mixed_per_rad};
-use super::pattern::ScanPattern;
 use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::{Matched, SideFrame};
-use super::scan::{DirectionIndex, Entry, SensorScan, Steps};
-use super::surface::fit_surface;
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
-use sensor::Rig;
+use sensor::directions::{DirectionIndex, Entry, SensorScan, Sensors, fit_surface, in_or_beside};
 use std::borrow::Cow;
 
 /// One frame of both sides.
@@ -45,19 +42,6 @@ pub struct ObjectPair {
     pub points: [usize; 2],
 }
 
-/// The sensors with their scan patterns.
-pub struct Sensors {
-    /// Mounts.
-    pub rig: Rig,
-    /// Scan pattern of each.
-    pub patterns: Vec<ScanPattern>,
-    /// Distance across a plane from which on a neighbour belongs to another surface, m.
-    pub edge_m: f64,
-}
-
-/// Half widths of the window of neighbours, in steps.
-const WINDOW: [f32; 2] = [2.2, 1.4];
-
 /// Of this many shots of a row one is tested, to count those without a return.
 const EVERY: usize = 3;
 
@@ -68,35 +52,23 @@ const LONE: u8 = 1;
 /// neighbours, m.
 const STRAY_M: f64 = 0.5;
 
-impl Sensors {
-    /// Row of a shot; `u16::MAX` where rows are not known.
-    pub(super) fn row(&self, sensor: usize, elevation_rad: f32) -> u16 {
-        self.patterns[sensor].row(elevation_rad).map_or(u16::MAX, |r| r as u16)
-    }
-
-    /// Shots of a scan, over the azimuths of its returns, around which a side has no return; `None` where rows are
-    /// not known.
-    fn open(&self, sensor: usize, scans: [&SensorScan; 2], side: &DirectionIndex) -> Option<f64> {
-        let pattern = &self.patterns[sensor];
-        let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
-        let [least, most] = [azimuths().fold(f32::MAX, f32::min), azimuths().fold(f32::MIN, f32::max)];
-        let columns = 1 + ((most - least).max(0.0) / pattern.steps.azimuth_rad).round() as usize;
-        let empty = |azimuth_rad: f32, elevation_rad: f32| {
-            let mut n = 0u32;
-            side.around(azimuth_rad, elevation_rad, |_, _, _| n += 1);
-            n == 0
-        };
-        let in_row = |el: &f32| {
-            let places = (0..columns).step_by(EVERY).map(|k| least + k as f32 * pattern.steps.azimuth_rad);
-            places.filter(|az| empty(*az, *el)).count() * EVERY
-        };
-        (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.iter().map(in_row).sum::<usize>() as f64)
-    }
-
-    pub(super) fn window(&self, sensor: usize) -> Steps {
-        let steps = self.patterns[sensor].steps;
-        Steps { azimuth_rad: WINDOW[0] * steps.azimuth_rad, elevation_rad: WINDOW[1] * steps.elevation_rad }
-    }
+/// Shots of a sensor's scan, over the azimuths of its returns, around which a side has no return; `None` where rows are
+/// not known.
+fn open(sensors: &Sensors, sensor: usize, scans: [&SensorScan; 2], side: &DirectionIndex) -> Option<f64> {
+    let pattern = &sensors.patterns[sensor];
+    let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
+    let [least, most] = [azimuths().fold(f32::MAX, f32::min), azimuths().fold(f32::MIN, f32::max)];
+    let columns = 1 + ((most - least).max(0.0) / pattern.steps.azimuth_rad).round() as usize;
+    let empty = |azimuth_rad: f32, elevation_rad: f32| {
+        let mut n = 0u32;
+        side.around(azimuth_rad, elevation_rad, |_, _, _| n += 1);
+        n == 0
+    };
+    let in_row = |el: &f32| {
+        let places = (0..columns).step_by(EVERY).map(|k| least + k as f32 * pattern.steps.azimuth_rad);
+        places.filter(|az| empty(*az, *el)).count() * EVERY
+    };
+    (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.iter().map(in_row).sum::<usize>() as f64)
 }
 
 /// Displacement of a point of a frame and a sensor, by their numbers, in the cloud's frame, m.
@@ -211,10 +183,10 @@ impl SensorPair<'_> {
         let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
         self.complete_measured(&mut measured, a, &own, &predictor);
         simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));
-        set_roughness(&mut measured, a, &own, predictor.window);
-        frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.index);
+        set_roughness(&mut measured, a, &own, predictor.around.window);
+        frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.around.index);
         let missing = measured.len() as f64 - simulated.len() as f64;
-        frame.open += self.sensors.open(self.sensor, [a, b], &predictor.index).unwrap_or(missing.max(0.0));
+        frame.open += open(self.sensors, self.sensor, [a, b], &predictor.around.index).unwrap_or(missing.max(0.0));
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }
@@ -225,7 +197,7 @@ impl SensorPair<'_> {
         let mut rays: Vec<Ray> = (0..scan.len()).map(|i| predictor.ray(scan, i, true)).collect();
         for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.1).enumerate() {
             ray.matched = *matched;
-            ray.company = company(&predictor.index, scan, i);
+            ray.company = company(&predictor.around.index, scan, i);
             (ray.roughness_m, ray.roughness_leverage) =
                 if ray.smooth && ray.company > LONE { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
         }
@@ -240,7 +212,7 @@ impl SensorPair<'_> {
             (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
             ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
             ray.company = company(own, scan, i);
-            ray.in_gap = in_gap(&predictor.index, scan, i);
+            ray.in_gap = in_gap(&predictor.around.index, scan, i);
         }
     }
 }

@@ -2,8 +2,8 @@
 //! number by the width of the beam.
 
 use super::ray::Ray;
-use super::scan::{DirectionIndex, SensorScan};
 use crate::inference::median;
+use sensor::directions::{DirectionIndex, SensorScan};
 use std::collections::BTreeMap;
 
 /// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a

@@ -1,14 +1,12 @@
 //! Scenario identity: each measured frame must match its own simulated frame better than other frames.
 
-use super::frame::Sensors;
 use super::recordings::{PairSide, Recordings};
-use super::scan::{DirectionIndex, SensorScan, Steps};
-use super::surface::fit_surface;
 use crate::error::DiagnoseError;
 use crate::inference::median;
 use data::Object;
 use nalgebra::Vector3;
 use rayon::prelude::*;
+use sensor::directions::{DirectionIndex, SensorScan, Sensors, Steps, fit_surface};
 
 /// Result of the comparison.
 #[derive(Clone, Debug, PartialEq)]

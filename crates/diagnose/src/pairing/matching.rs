@@ -1,7 +1,6 @@
 //! One-to-one matching of the returns of the two sides, by direction alone.
 
-use super::pattern::ScanPattern;
-use super::scan::{DirectionIndex, SensorScan, Steps};
+use sensor::directions::{DirectionIndex, ScanPattern, SensorScan, Steps};
 
 /// For each return of `a` whether it has a counterpart in `b`, and the other way round.
 ///

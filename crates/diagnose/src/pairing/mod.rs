@@ -5,39 +5,31 @@ mod frame;
 mod gaps;
 mod identical;
 mod matching;
-mod pattern;
 mod prediction;
 mod ray;
 mod recordings;
-mod scan;
-mod surface;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, Sensors, ShownShift, company_m, pair_frame};
+pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, ShownShift, company_m, pair_frame};
 pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::match_directions;
-pub use pattern::ScanPattern;
 pub use ray::{Lies, Ray, Surface};
 pub(crate) use recordings::load;
 pub use recordings::{Matched, PairSide, Recordings, SideFrame};
-pub use scan::{DirectionIndex, SensorScan, Steps, split_by_sensor};
-pub use surface::{LocalSurface, fit_surface};
 
 use crate::error::DiagnoseError;
 use data::Dataset;
 use rand::RngExt;
 use rayon::prelude::*;
 use sensor::Rig;
+use sensor::directions::{SensorScan, Sensors};
 use std::collections::BTreeSet;
 use std::io::Read;
 use std::path::Path;
 
 /// Returns that are kept of each side over all frames. More do not improve findings, and memory stays bounded.
 const KEPT: usize = 3_000_000;
-
-/// Distance across a plane from which on a neighbour belongs to another surface, m.
-const EDGE_M: f64 = 0.12;
 
 /// Frames that the scan patterns are estimated from.
 const PATTERN_FRAMES: usize = 10;
@@ -123,10 +115,8 @@ pub fn find_sensors(recordings: &Recordings, rig: &Rig) -> Result<Sensors, Diagn
         .par_iter()
         .flat_map_iter(|&i| [PairSide::Measured, PairSide::Simulated].map(|side| recordings.side(i, side)));
     let sides: Vec<&SideFrame> = in_order(sides)?;
-    let patterns = (0..rig.sensors.len())
-        .map(|k| ScanPattern::of_scans(&sides.iter().map(|s| &s.scans[k]).collect::<Vec<_>>()))
-        .collect();
-    Ok(Sensors { rig: rig.clone(), patterns, edge_m: EDGE_M })
+    let scans: Vec<&[SensorScan]> = sides.iter().map(|s| &s.scans[..]).collect();
+    Ok(Sensors::find(rig, &scans))
 }
 
 /// Pairs all frames. `done` receives the number of frames finished so far.

@@ -1,28 +1,19 @@
 //! Predictions of the simulation for a direction: the surface around it, its range, incidence and kind.
 
-use super::boxes::in_or_beside;
-use super::frame::Sensors;
 use super::ray::{Ray, Surface};
-use super::scan::{DirectionIndex, SensorScan};
-use super::surface::{LocalSurface, fit_surface};
 use geometry::Box3;
-use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use nalgebra::Vector3;
+use sensor::directions::{Kind, SensorScan, Sensors, Surroundings, in_or_beside, kind_of};
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
 const BESIDE_M: f64 = 0.5;
-
-/// Distance from a labelled object within which a simulated surface belongs to it, m.
-const OF_OBJECT_M: f64 = 0.2;
 
 /// Predictor of the simulated side of one sensor.
 pub(super) struct Predictor<'a> {
     sensor: usize,
     sensors: &'a Sensors,
-    cloud_from_sensor: Isometry3<f64>,
     /// Simulated returns by direction.
-    pub(super) index: DirectionIndex,
-    /// Half widths of the window of neighbours, rad.
-    pub(super) window: [f64; 2],
+    pub(super) around: Surroundings,
     boxes: &'a [Box3],
     others: Vec<Box3>,
 }
@@ -30,15 +21,12 @@ pub(super) struct Predictor<'a> {
 impl<'a> Predictor<'a> {
     /// For the number of a sensor, its simulated returns, and the simulated labels.
     pub(super) fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
-        let mount = &sensors.rig.sensors[sensor];
-        let window = sensors.window(sensor);
+        let origin = sensors.rig.sensors[sensor].pose().translation.vector;
         Predictor {
             sensor,
             sensors,
-            others: others(boxes, mount.pose().translation.vector.into()),
-            cloud_from_sensor: mount.pose(),
-            index: DirectionIndex::new(simulated, window, mount.is_full_circle()),
-            window: [f64::from(window.azimuth_rad), f64::from(window.elevation_rad)],
+            others: others(boxes, origin.into()),
+            around: Surroundings::new(sensors, sensor, simulated),
             boxes,
         }
     }
@@ -46,18 +34,17 @@ impl<'a> Predictor<'a> {
     /// A return of a scan of that sensor with the prediction for its direction.
     pub(super) fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
         let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
-        let direction = unit(&self.cloud_from_sensor.rotation, az, el);
-        let row = self.sensors.row(self.sensor, el);
+        let direction = self.around.direction(az, el);
         let mut ray = Ray {
             sensor: self.sensor as u8,
             surface: Surface::Open,
             smooth: false,
             corner: false,
-            at_object: at_object(&self.others, self.place(&direction, f64::from(range))),
+            at_object: at_object(&self.others, self.around.place(&direction, f64::from(range))),
             matched: false,
             company: 0,
             in_gap: false,
-            row,
+            row: self.sensors.row(self.sensor, el),
             object: u16::MAX,
             azimuth_rad: az,
             elevation_rad: el,
@@ -72,75 +59,36 @@ impl<'a> Predictor<'a> {
             roughness_leverage: 0.0,
             near_far_m: [0.0; 2],
         };
-        let others = |e: &super::scan::Entry| !without_itself || e.index != i as u32;
-        let Some(surface) = fit_surface(&self.index, self.window, az, el, others) else {
-            let mut near_far = [f32::INFINITY, 0.0f32];
-            self.index.around(az, el, |e, _, _| {
-                if others(e) {
-                    near_far = [near_far[0].min(e.range_m), near_far[1].max(e.range_m)];
-                }
-            });
-            if near_far[1] > 0.0 {
-                ray.near_far_m = near_far;
-                ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
+        let around = self.around.look(az, el, without_itself.then_some(i as u32));
+        ray.near_far_m = around.near_far_m;
+        match around.surface {
+            Some((surface, normal)) => {
+                ray.smooth = true;
+                ray.range_m = surface.range_m as f32;
+                ray.residual_m = (f64::from(range) - surface.range_m) as f32;
+                ray.cos_incidence = surface.cos_incidence as f32;
+                ray.leverage = surface.leverage as f32;
+                ray.bulge_m = surface.bulge_m as f32;
+                ray.normal = normal.cast::<f32>().into();
+                self.set_kind(&mut ray, &direction, surface.range_m, Some(normal.z));
             }
-            return ray;
-        };
-        ray.near_far_m = surface.near_far_m.map(|v| v as f32);
-        ray.smooth = surface.smooth(self.sensors.edge_m);
-        if !ray.smooth {
-            ray.surface = self.surface_at(&direction, f64::from(range), None, &mut ray);
-            return ray;
+            None if ray.near_far_m[1] > 0.0 => self.set_kind(&mut ray, &direction, f64::from(range), None),
+            None => {}
         }
-        let normal = self.normal(&surface, az, el);
-        ray.range_m = surface.range_m as f32;
-        ray.residual_m = (f64::from(range) - surface.range_m) as f32;
-        ray.cos_incidence = surface.cos_incidence as f32;
-        ray.leverage = surface.leverage as f32;
-        ray.bulge_m = surface.bulge_m as f32;
-        ray.normal = normal.cast::<f32>().into();
-        ray.surface = self.surface_at(&direction, surface.range_m, Some(&normal), &mut ray);
         ray
     }
 
-    /// The point in a direction at a range, in the cloud's frame, m.
-    fn place(&self, direction: &Vector3<f64>, range_m: f64) -> [f64; 3] {
-        (self.cloud_from_sensor.translation.vector + direction * range_m).into()
-    }
-
-    fn normal(&self, surface: &LocalSurface, az: f32, el: f32) -> Vector3<f64> {
-        let (az, el) = (f64::from(az), f64::from(el));
-        let [along, side, up] = surface.normal();
-        let u = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin());
-        let left = Vector3::new(-az.sin(), az.cos(), 0.0);
-        let n = u * along + left * side + u.cross(&left) * up;
-        self.cloud_from_sensor.rotation * n
-    }
-
-    fn surface_at(
-        &self,
-        direction: &Vector3<f64>,
-        range: f64,
-        normal: Option<&Vector3<f64>>,
-        ray: &mut Ray,
-    ) -> Surface {
-        let p = self.place(direction, range);
-        for (k, b) in self.boxes.iter().enumerate() {
-            if in_or_beside(b, p, OF_OBJECT_M) {
-                ray.object = k as u16;
-                let local = b.to_local(p);
-                let beyond = |axis: usize, share: f64| local[axis].abs() > share * b.size[axis];
-                ray.corner = beyond(0, 0.18) && beyond(1, 0.3) && local[2] < 0.06 * b.size[2];
-                return Surface::Object;
+    /// Sets the kind of the surface in a direction at a range.
+    fn set_kind(&self, ray: &mut Ray, direction: &Vector3<f64>, range_m: f64, normal_z: Option<f64>) {
+        ray.surface = match kind_of(self.boxes, self.around.place(direction, range_m), normal_z) {
+            Kind::Ground => Surface::Ground,
+            Kind::Standing => Surface::Standing,
+            Kind::Object { number, corner } => {
+                (ray.object, ray.corner) = (number, corner);
+                Surface::Object
             }
-        }
-        if normal.is_some_and(|n| n.z > 0.85) { Surface::Ground } else { Surface::Standing }
+        };
     }
-}
-
-fn unit(turn: &UnitQuaternion<f64>, az: f32, el: f32) -> Vector3<f64> {
-    let (az, el) = (f64::from(az), f64::from(el));
-    turn * Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin())
 }
 
 /// The labelled objects except the ego vehicle, whose box contains the sensor.

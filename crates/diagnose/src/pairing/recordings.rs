@@ -1,11 +1,10 @@
 //! The frames of both data sets, read once and held in memory for every pairing.
 
-use super::frame::Sensors;
 use super::matching::match_directions;
-use super::scan::{SensorScan, split_by_sensor};
 use crate::error::DiagnoseError;
 use data::{Cloud, Dataset, Object};
 use sensor::Rig;
+use sensor::directions::{SensorScan, Sensors, split_by_sensor};
 use std::sync::OnceLock;
 
 /// One side of a frame: its returns by sensor (12 bytes a return) and its labelled objects.

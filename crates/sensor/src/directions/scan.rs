@@ -2,8 +2,8 @@
 
 use data::Cloud;
 use nalgebra::Point3;
-use sensor::assignment::{Assigned, Assignment};
-use sensor::{Rig, Sensor};
+use crate::assignment::{Assigned, Assignment};
+use crate::rig::{Rig, Sensor};
 use std::f64::consts::TAU;
 
 /// The returns of one sensor in one frame, in its own frame.
@@ -45,9 +45,20 @@ const NEAREST_M: f64 = 0.05;
 /// Gives each point of an unordered cloud to a sensor, as [`Assignment`] says. Two clouds of the same scene are split
 /// alike.
 pub fn split_by_sensor(cloud: &Cloud, rig: &Rig) -> Vec<SensorScan> {
+    split(cloud, rig, |_, _| ())
+}
+
+/// The same, with the numbers of each sensor's points in the cloud.
+pub fn split_with_places(cloud: &Cloud, rig: &Rig) -> (Vec<SensorScan>, Vec<Vec<u32>>) {
+    let mut places = vec![Vec::new(); rig.sensors.len()];
+    let scans = split(cloud, rig, |sensor, point| places[sensor].push(point as u32));
+    (scans, places)
+}
+
+fn split(cloud: &Cloud, rig: &Rig, mut given: impl FnMut(usize, usize)) -> Vec<SensorScan> {
     let assignment = Assignment::new(rig);
     let mut scans = vec![SensorScan::default(); rig.sensors.len()];
-    for point in cloud.points() {
+    for (number, point) in cloud.points().enumerate() {
         let p = Point3::new(f64::from(point[0]), f64::from(point[1]), f64::from(point[2]));
         if let Some(Assigned { sensor, spherical: [az, el, range] }) = assignment.of_point(p)
             && range > NEAREST_M
@@ -55,6 +66,7 @@ pub fn split_by_sensor(cloud: &Cloud, rig: &Rig) -> Vec<SensorScan> {
             scans[sensor].azimuth_rad.push(az as f32);
             scans[sensor].elevation_rad.push(el as f32);
             scans[sensor].range_m.push(range as f32);
+            given(sensor, number);
         }
     }
     scans
