@@ -9,7 +9,7 @@ use simulate::resim::Resim;
 use std::path::PathBuf;
 
 /// Apply sensor effects to an existing data set and write the result as a new one: noise, dropout, offsets, ... An
-/// effect that needs new ray casting is an error.
+/// effect that needs new ray casting, or something that the data set does not tell, is an error.
 ///
 /// Run the same command again to resume an interrupted run.
 ///
@@ -35,6 +35,9 @@ pub struct ResimArgs {
     /// Random seed
     #[arg(long, value_name = "K", default_value_t = 0)]
     seed: u64,
+    /// Leave out effects that cannot be applied to this data set, and list them
+    #[arg(long)]
+    skip_inapplicable: bool,
 }
 
 impl ResimArgs {
@@ -42,10 +45,20 @@ impl ResimArgs {
     #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let dataset = Dataset::open(&self.dataset)?;
-        let effects = EffectList::read(&self.effects)?;
+        let mut effects = EffectList::read(&self.effects)?;
+        if effects.effects.is_empty() {
+            eprintln!("note: {} has no effect: the clouds are copied", self.effects.display());
+        }
         let rig = self.sensor.as_deref().map(Rig::read).transpose()?;
         let progress = ProgressBar::new(0)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
+        if self.skip_inapplicable {
+            let refused = Resim { dataset: &dataset, effects: &effects, rig: rig.clone(), seed: self.seed }.refused()?;
+            for refusal in &refused {
+                println!("left out: effect[{}]: {} {}", refusal.index, refusal.kind, refusal.why);
+            }
+            effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+        }
         let resim = Resim { dataset: &dataset, effects: &effects, rig, seed: self.seed };
         let made = resim.make(&self.out, &|done, total| {
             progress.set_length(total as u64);
@@ -77,6 +90,7 @@ mod tests {
             out: folder.path().join(out),
             sensor: None,
             seed: 1,
+            skip_inapplicable: false,
         };
         std::fs::write(&effects, "[[effect]]\nkind = \"range_noise\"\n").unwrap();
         args("noisy").run().unwrap();
@@ -84,5 +98,8 @@ mod tests {
         std::fs::write(&effects, "[[effect]]\nkind = \"ghosts\"\n").unwrap();
         let error = format!("{:#}", args("ghosts").run().unwrap_err());
         assert!(error.contains("e.toml on") && error.contains("effect[0]: ghosts"), "{error}");
+        ResimArgs { skip_inapplicable: true, ..args("copied") }.run().unwrap();
+        let cloud = |root: &str| std::fs::read(folder.path().join(root).join("velodyne/test_000000.bin")).unwrap();
+        assert!(cloud("copied") == cloud("street"));
     }
 }

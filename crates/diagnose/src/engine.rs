@@ -122,7 +122,7 @@ fn without_rows(sensors: &Sensors) -> Vec<String> {
 fn context<'a>(rig: &'a Rig, frames: &'a [FramePair], notes: &mut Vec<String>) -> Context<'a> {
     let ids: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
-    let times = labels::times_s(&ids, rate_hz);
+    let times = motion::times_s(&ids, rate_hz);
     if times.is_none() {
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }

@@ -34,7 +34,7 @@ pub fn extended_toml(diagnosis: &Diagnosis) -> String {
 
 /// An effect as the simulator reads it.
 fn one_table(effect: &Effect) -> String {
-    let list = EffectList { effects: vec![effect.clone()] };
+    let list = EffectList::of(vec![effect.clone()]);
     toml::to_string(&list).expect("an effect is plain data")
 }
 

@@ -112,6 +112,7 @@ pub fn read(path: &Path, rig: &Rig) -> Result<Scan, DataError> {
             sensor: v[14] as u8,
             material: MaterialId(v[15] as u8),
             number: v[16] as u8,
+            source: i as u32,
             ..Echo::nothing(origin, [1.0, 0.0, 0.0])
         };
         echo.move_point([v[0], v[1], v[2]]);

@@ -39,11 +39,16 @@ pub struct Echo {
     pub object: u16,
     /// Reported intensity, 0 to 1.
     pub intensity: f32,
+    /// Number of the point in the finished cloud that it was read from; [`Echo::NEW`] for others.
+    pub source: u32,
 }
 
 impl Echo {
     /// Row or column if it is not known.
     pub const UNKNOWN: u16 = u16::MAX;
+
+    /// Source of echoes that were not read from a finished cloud.
+    pub const NEW: u32 = u32::MAX;
 
     /// A shot without a return.
     pub fn nothing(origin: [f32; 3], direction: [f32; 3]) -> Echo {
@@ -63,6 +68,7 @@ impl Echo {
             material: MaterialId(0),
             object: 0,
             intensity: 0.0,
+            source: Echo::NEW,
         }
     }
 

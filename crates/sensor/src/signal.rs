@@ -12,10 +12,6 @@ pub const REFERENCE_RANGE_M: f64 = 250.0;
 /// Reflectivity that the diagnosis assumes for every surface. It equals the reference, so that the index depends on
 /// range and incidence only.
 pub const DIAGNOSIS_REFLECTIVITY: f64 = REFERENCE_REFLECTIVITY;
-/// Reflectivity assumed for every surface of a finished cloud without intensities: that of asphalt, the largest surface
-/// of a road.
-pub const CLOUD_REFLECTIVITY: f32 = 0.2;
-
 /// Signal index of a surface by reflectivity, cosine of incidence and range (m).
 pub fn signal_index(reflectivity: f64, cos_incidence: f64, range_m: f64) -> f64 {
     (reflectivity / REFERENCE_REFLECTIVITY).ln() + cos_incidence.ln() + 2.0 * (REFERENCE_RANGE_M / range_m).ln()

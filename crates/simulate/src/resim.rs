@@ -1,18 +1,14 @@
 //! Applies sensor effects to existing data sets, of this simulator or any other.
 
 use crate::SimulateError;
-use crate::scenario::FRAME_S;
 use data::toml_text::wrong;
-use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, PointColumns, write_atomic};
+use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, write_atomic};
 use sensor::attributes;
-use sensor::cloud_scan::scan_of_cloud;
-use sensor::effects::{EffectList, FrameContext, LabelledCar, Need};
-use sensor::material::MaterialTable;
+use sensor::effects::EffectList;
+use sensor::finished::{FinishedDataset, Refusal};
 use sensor::rig::Rig;
-use sensor::scan::Scan;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Schema version of the manifest.
@@ -70,32 +66,29 @@ impl Resim<'_> {
     /// on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
-        let source = &self.dataset.config;
-        let rig = self.rig()?;
-        let ids = self.dataset.all_ids()?;
-        let described = attributes::path(&source.root, &ids[0]).is_file();
-        let materials = if described { attributes::read_materials(&source.root)? } else { MaterialTable::default() };
-        if let Some((i, why)) = self.refusals(&known_of(self.dataset, &rig, &ids[0], described)?).into_iter().next() {
-            return Err(wrong(format!("effect[{i}]"), why).into());
+        let finished = self.finished()?;
+        if let Some(refusal) = finished.refusals(self.effects).into_iter().next() {
+            let why = format!("{} {}", refusal.kind, refusal.why);
+            return Err(wrong(format!("effect[{}]", refusal.index), why).into());
         }
-
+        self.check_source(finished.rig())?;
+        let source = &self.dataset.config;
         let mut manifest = ResimManifest {
             schema: RESIM_MANIFEST_SCHEMA.into(),
             complete: false,
             source: source.name.clone(),
             seed: self.seed,
-            config_sha256: self.fingerprint(&rig),
-            frames: ids.len(),
+            config_sha256: self.fingerprint(finished.rig()),
+            frames: finished.ids().len(),
             points: [0; 2],
         };
         let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER], &mut manifest)?;
-        self.write_descriptions(&new, &rig)?;
-        if described {
-            attributes::write_names(out, &rig, &materials)?;
+        self.write_descriptions(&new, finished.rig())?;
+        if finished.is_described() {
+            attributes::write_names(out, finished.rig(), finished.materials())?;
         }
-        let counts = new.make_frames(&ids, progress, |index, id| {
-            self.make_frame_file(&new, index, id, &rig, &materials, described)
-        })?;
+        let counts =
+            new.make_frames(finished.ids(), progress, |_, id| self.make_frame_file(&new, &finished, id))?;
         for [before, after] in counts {
             manifest.points[0] += before;
             manifest.points[1] += after;
@@ -104,120 +97,56 @@ impl Resim<'_> {
         Ok(manifest)
     }
 
-    fn rig(&self) -> Result<Rig, SimulateError> {
-        let rig = match (&self.rig, &self.dataset.config.rig) {
-            (Some(rig), _) => rig.clone(),
-            (None, Some(path)) => Rig::read(path)?,
-            (None, None) => Rig::single(),
-        };
-        rig.check()?;
-        Ok(rig)
-    }
-
-    /// Effects of the list that cannot be applied to this data set: index and reason.
-    pub fn refused(&self) -> Result<Vec<(usize, String)>, SimulateError> {
-        let ids = self.dataset.all_ids()?;
-        let described = attributes::path(&self.dataset.config.root, &ids[0]).is_file();
-        Ok(self.refusals(&known_of(self.dataset, &self.rig()?, &ids[0], described)?))
-    }
-
-    /// One frame with the effects applied; `index` is its position in name order. Returns its points and what is known
-    /// about them.
-    pub fn frame(
-        &self,
-        index: usize,
-        id: &str,
-        rig: &Rig,
-        materials: &MaterialTable,
-    ) -> Result<(Frame, Scan), SimulateError> {
-        let source = self.dataset.load(id)?;
-        let beside = attributes::path(&self.dataset.config.root, id);
-        let mut scan = if beside.is_file() {
-            let mut scan = attributes::read(&beside, rig)?;
-            if scan.echoes.len() != source.cloud.len() {
-                let message =
-                    format!("has {} rows, but the cloud has {} points", scan.echoes.len(), source.cloud.len());
-                return Err(DataError::file(&beside, message).into());
-            }
-            for (echo, point) in scan.echoes.iter_mut().zip(source.cloud.points()) {
-                echo.intensity = point.get(3).copied().unwrap_or(0.0);
-            }
-            scan
-        } else {
-            scan_of_cloud(&source.cloud, rig).0
-        };
-        let car = |(number, object): (usize, &data::Object)| LabelledCar {
-            number,
-            true_box: object.bbox,
-            label: object.bbox,
-            velocity: [0.0; 3],
-        };
-        let mut cars: Vec<LabelledCar> = source.objects.iter().enumerate().map(car).collect();
-        let before = cars.clone();
-        let context = FrameContext {
-            seed: self.seed,
-            set: "resim",
-            index: index as u64,
-            time_s: index as f64 * FRAME_S,
-            rig,
-            materials,
-            ego_velocity: [0.0; 3],
-            ego_turn_rate: [0.0; 3],
-            cars: &before,
-            scene: None,
-            world_x_rad: 0.0,
-        };
-        self.effects.on_cloud(&mut scan, &context);
-        self.effects.on_labels(&mut cars, &context);
-        let mut frame = source;
-        let channels = frame.cloud.channels;
-        frame.cloud = scan.cloud().with_channels(channels);
-        for (object, car) in frame.objects.iter_mut().zip(&cars) {
-            object.bbox = car.label;
+    fn finished(&self) -> Result<FinishedDataset<'_>, SimulateError> {
+        if let Some(rig) = &self.rig {
+            rig.check()?;
         }
-        Ok((frame, scan))
+        Ok(FinishedDataset::open(self.dataset, self.rig.as_ref(), self.effects)?)
     }
 
-    fn refusals(&self, known: &BTreeSet<Need>) -> Vec<(usize, String)> {
-        let mut refused = Vec::new();
-        for (i, effect) in self.effects.effects.iter().enumerate() {
-            let why = match effect.model().needs() {
-                None => {
-                    "changes what rays meet, which a finished cloud does not tell: use it with `simulate`".to_owned()
-                }
-                Some(needs) => {
-                    let missing: Vec<&str> =
-                        needs.iter().filter(|n| !known.contains(n)).map(|n| n.description()).collect();
-                    if missing.is_empty() {
-                        continue;
-                    }
-                    format!(
-                        "needs {}, of which this data set says nothing; name its sensors with their patterns (`rig` in its TOML), or write \
-                         attributes with `simulate`",
-                        missing.join(" and ")
-                    )
-                }
-            };
-            refused.push((i, format!("{} {why}", effect.kind())));
+    /// Effects of the list that cannot be applied to this data set.
+    pub fn refused(&self) -> Result<Vec<Refusal>, SimulateError> {
+        Ok(self.finished()?.refusals(self.effects))
+    }
+
+    /// Refuses a list on the measured data that it was made from, on data to which it was applied already, and for
+    /// another rig.
+    fn check_source(&self, rig: &Rig) -> Result<(), SimulateError> {
+        let Some(made) = &self.effects.made_from else { return Ok(()) };
+        let root = &self.dataset.config.root;
+        let same = |path: &Path| matches!((path.canonicalize(), root.canonicalize()), (Ok(a), Ok(b)) if a == b);
+        if same(&made.measured) && !same(&made.simulated) {
+            let why = "is the measured data set that the list was made from; it is for the simulated one";
+            return Err(DataError::file(root, format!("{why}: {}", made.simulated.display())).into());
         }
-        refused
+        let already = root.join("effects.toml");
+        if already.is_file() && EffectList::read(&already)? == *self.effects {
+            return Err(DataError::file(&already, "the data set was made with this list: it would act twice").into());
+        }
+        let own: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
+        if own != made.sensors {
+            let why = format!(
+                "the list was made for the sensors {}, but the rig has {}; give that rig (--sensor)",
+                made.sensors.join(", "),
+                own.join(", ")
+            );
+            return Err(wrong("made_from.sensors", why).into());
+        }
+        Ok(())
     }
 
     /// Writes one frame unless it exists; returns its number of points before and after.
     fn make_frame_file(
         &self,
         new: &NewDataset,
-        index: usize,
+        finished: &FinishedDataset,
         id: &str,
-        rig: &Rig,
-        materials: &MaterialTable,
-        described: bool,
     ) -> Result<[usize; 2], SimulateError> {
         let (layout, out) = (new.layout(), new.root());
         let beside = attributes::path(out, id);
-        let labelled = self.dataset.has_labels();
+        let (labelled, described) = (self.dataset.has_labels(), finished.is_described());
         if !(new.has_frame(id, labelled) && (!described || beside.is_file())) {
-            let (frame, scan) = self.frame(index, id, rig, materials)?;
+            let (frame, scan) = finished.frame(self.effects, self.seed, id)?;
             if frame.cloud.is_empty() {
                 let message = "would be empty: the effects leave no point";
                 return Err(DataError::file(&layout.cloud_path(out, id), message).into());
@@ -281,21 +210,6 @@ impl Resim<'_> {
         .expect("a configuration is plain data");
         Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect()
     }
-}
-
-/// What is known about the points of a data set.
-fn known_of(dataset: &Dataset, rig: &Rig, id: &str, described: bool) -> Result<BTreeSet<Need>, SimulateError> {
-    if described {
-        use Need::{Cars, Grid, Incidence, Material, Reflectivity, Row, Time};
-        return Ok([Cars, Grid, Incidence, Material, Reflectivity, Row, Time].into());
-    }
-    let mut cloud = dataset.load_cloud(id)?;
-    // What is known depends on the rig only; a few points are enough to check.
-    cloud.values.truncate(cloud.channels);
-    if dataset.config.points == PointColumns::Xyz {
-        cloud = cloud.with_channels(3);
-    }
-    Ok(scan_of_cloud(&cloud, rig).1)
 }
 
 #[cfg(test)]

@@ -8,6 +8,7 @@ use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
 use sensor::EffectList;
+use sensor::finished::Refusal;
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
 use study::numbers::{StudyState, matrix};
@@ -48,12 +49,12 @@ fn applicable(simulated: &Path, extended: &Path, out: &Path) -> Result<(PathBuf,
     if refused.is_empty() {
         return Ok((extended.to_path_buf(), vec![]));
     }
-    let mut place = 0..;
-    effects.effects.retain(|_| place.next().is_some_and(|i| refused.iter().all(|(r, _)| *r != i)));
+    effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
     let path = out.join("extended_detectors.toml");
     write_atomic(&path, toml::to_string(&effects)?.as_bytes())?;
-    let note =
-        |(_, why): (usize, String)| format!("the detectors are trained without an effect of extended.toml: {why}");
+    let note = |r: Refusal| {
+        format!("the detectors are trained without an effect of extended.toml: {} {}", r.kind, r.why)
+    };
     Ok((path, refused.into_iter().map(note).collect()))
 }
 

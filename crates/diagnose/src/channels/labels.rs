@@ -30,25 +30,6 @@ pub struct ObjectShift {
     pub points: usize,
 }
 
-/// Times of the frames from their ids: numbers of scans, or nanoseconds where neighbours differ by 1e6 or more.
-/// `None` unless ids are rising numbers.
-pub fn times_s(ids: &[String], rate_hz: f64) -> Option<Vec<f64>> {
-    let numbers: Vec<f64> = ids.iter().map(|id| id.parse::<f64>().ok()).collect::<Option<_>>()?;
-    if numbers.windows(2).any(|w| w[1] <= w[0]) {
-        return None;
-    }
-    let gaps: Vec<f64> = numbers.windows(2).map(|w| w[1] - w[0]).collect();
-    let usual = statistics::median_upper(gaps)?;
-    let unit = if usual >= 1e6 { 1e-9 } else { 1.0 / rate_hz };
-    Some(numbers.iter().map(|n| (n - numbers[0]) * unit).collect())
-}
-
-/// Longest time between frames from which a velocity is estimated, s.
-const LONGEST_S: f64 = 0.6;
-
-/// Largest relative speed of an object, m/s.
-const FASTEST_M_S: f64 = 60.0;
-
 /// Shifts of all objects.
 pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectShift> {
     let mut shifts = Vec::new();
@@ -74,44 +55,9 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectS
     shifts
 }
 
-/// Velocity of a simulated box of frame `f` relative to the ego vehicle, from the nearest boxes of the frames before
-/// and after, m/s, cloud's frame.
+/// Velocity of a simulated box of frame `f` relative to the ego vehicle, m/s, cloud's frame; see
+/// [`sensor::motion::seen_velocity`].
 pub fn seen_velocity(frames: &[FramePair], times: &[f64], f: usize, bbox: &Box3) -> Option<Vector3<f64>> {
-    let neighbour = |g: usize| -> Option<(f64, Vector3<f64>)> {
-        let dt = times[g] - times[f];
-        if dt.abs() > LONGEST_S {
-            return None;
-        }
-        let here = Vector3::from(bbox.center);
-        let boxes = frames[g].objects.iter().filter_map(|o| o.simulated);
-        let same_size = |b: &Box3| (0..3).all(|k| (b.size[k] - bbox.size[k]).abs() < 0.35 * bbox.size[k]);
-        let nearest = boxes
-            .filter(same_size)
-            .map(|b| Vector3::from(b.center) - here)
-            .min_by(|a, b| a.norm().total_cmp(&b.norm()))?;
-        (nearest.norm() < (FASTEST_M_S * dt.abs()).min(5.0)).then_some((dt, nearest))
-    };
-    let before = f.checked_sub(1).and_then(neighbour);
-    let after = if f + 1 < frames.len() { neighbour(f + 1) } else { None };
-    let v = match (before, after) {
-        (Some((t0, d0)), Some((t1, d1))) => (d1 - d0) / (t1 - t0),
-        (Some((t, d)), None) | (None, Some((t, d))) => d / t,
-        (None, None) => return None,
-    };
-    Some(v)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn ids_are_scans_or_nanoseconds() {
-        let ids = |v: &[&str]| v.iter().map(|s| s.to_string()).collect::<Vec<_>>();
-        assert_eq!(times_s(&ids(&["000005", "000010"]), 20.0), Some(vec![0.0, 0.25]));
-        let stamps = times_s(&ids(&["1650000000000000000", "1650000000050000000"]), 20.0).unwrap();
-        assert!((stamps[1] - 0.05).abs() < 1e-4);
-        assert_eq!(times_s(&ids(&["a", "b"]), 20.0), None);
-        assert_eq!(times_s(&ids(&["3", "3"]), 20.0), None);
-    }
+    let boxes = |g: usize| frames[g].objects.iter().filter_map(|o| o.simulated).collect();
+    sensor::motion::seen_velocity(&boxes, times, f, bbox)
 }

@@ -43,6 +43,27 @@ impl Need {
             Need::Motion => "the motion of the cars",
         }
     }
+
+    /// How to give it to a data set that does not tell it.
+    pub fn how_to_give(self) -> &'static str {
+        match self {
+            Need::Incidence | Need::Row | Need::Grid => {
+                "no rows stand out in its directions: give the sensors with their patterns (`--sensor`, or `rig` in its \
+                 TOML), or the rows' elevations in the effect where it has them"
+            }
+            Need::Time => "give the sensors with their patterns (`--sensor`, or `rig` in its TOML)",
+            Need::Reflectivity => {
+                "say what its intensities mean (`intensity = \"returned_light\"` or `\"reflectivity\"` at the top of the \
+                 list), or assume a value (`reflectivity = 0.1` there)"
+            }
+            Need::Material => "only attributes tell it, which `simulate` writes; name `surfaces` instead of materials",
+            Need::Cars => "add labels",
+            Need::Motion => {
+                "it needs frame ids that are rising numbers, labels, and standing edges from which the own speed can be \
+                 estimated"
+            }
+        }
+    }
 }
 
 /// Another car in a frame. All values are in the cloud's frame.

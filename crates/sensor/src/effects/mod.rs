@@ -26,12 +26,13 @@ pub use empirical::Covariate;
 pub use label_time_offset::Clock;
 
 use crate::beams::Beams;
+use crate::cloud_scan::{Intensity, Surfaces};
 use crate::scan::Scan;
-use data::toml_text::{parse_toml, read_toml, wrong};
+use data::toml_text::{parse_toml, read_toml, within, wrong};
 use data::{DataError, KeyError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// One physical effect. The default of each stage changes nothing.
 pub trait SensorEffect {
@@ -43,6 +44,11 @@ pub trait SensorEffect {
     /// Quantities that must be known for the effect to be applied to a finished cloud; `None` if it cannot be applied.
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[])
+    }
+
+    /// Names of the sensors that it acts on, where it does not act on all.
+    fn sensors(&self) -> Vec<&str> {
+        Vec::new()
     }
 
     /// Changes the world, before rays are cast.
@@ -158,12 +164,54 @@ effects! {
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct EffectList {
+    /// Meaning of the intensity column of finished clouds to which the list is applied.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub intensity: Intensity,
+    /// Reflectivity of all surfaces of finished clouds whose intensities do not tell it, 0 to 10.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub reflectivity: Option<f64>,
+    /// What the list was made from, where a diagnosis wrote it.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub made_from: Option<MadeFrom>,
     /// The effects, in the order in which they are applied.
     #[serde(rename = "effect", default)]
     pub effects: Vec<Effect>,
 }
 
+/// What a list of effects was made from: it corrects these simulated data, recorded with these sensors.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MadeFrom {
+    /// Folder of the measured data set.
+    pub measured: PathBuf,
+    /// Folder of the simulated data set.
+    pub simulated: PathBuf,
+    /// Names of the sensors.
+    pub sensors: Vec<String>,
+}
+
+/// Whether a value is that of a key that is left out.
+fn is_default<T: Default + PartialEq>(value: &T) -> bool {
+    *value == T::default()
+}
+
 impl EffectList {
+    /// A list of these effects alone.
+    pub fn of(effects: Vec<Effect>) -> EffectList {
+        EffectList { effects, ..EffectList::default() }
+    }
+
+    /// Takes out the effects at some places of the list.
+    pub fn remove(&mut self, places: &[usize]) {
+        let mut place = 0..;
+        self.effects.retain(|_| place.next().is_none_or(|at| !places.contains(&at)));
+    }
+
+    /// What the list says of the surfaces of finished clouds.
+    pub fn surfaces(&self) -> Surfaces {
+        Surfaces { intensity: self.intensity, reflectivity: self.reflectivity }
+    }
+
     /// Reads a list from a TOML file.
     pub fn read(path: &Path) -> Result<EffectList, DataError> {
         read_toml(path, EffectList::check)
@@ -176,6 +224,7 @@ impl EffectList {
 
     /// Checks the parameters of all effects. Errors name the key.
     pub fn check(&self) -> Result<(), KeyError> {
+        within("reflectivity", self.reflectivity.unwrap_or(1.0), 0.0, 10.0)?;
         for (i, effect) in self.effects.iter().enumerate() {
             effect.model().check().map_err(|e| e.below(&format!("effect[{i}]")))?;
         }

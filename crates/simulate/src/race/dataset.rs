@@ -93,7 +93,7 @@ fn make_set(
     let mut lists = simulator.config.effects_of(set, files)?;
     if let (Some(target), Some(from)) = (&set.matched_to, &set.from) {
         let effects = vec![Effect::RangeDropout(matched(&out.join(target), &out.join(from))?)];
-        lists.push((format!("{}/matched", set.name), EffectList { effects }));
+        lists.push((format!("{}/matched", set.name), EffectList::of(effects)));
     }
     let prepared = simulator.prepare(lists, set.auto_label);
     let root = out.join(&set.name);
@@ -169,7 +169,7 @@ fn write_descriptions(
     }
     if !set.hidden {
         let effects = prepared.lists.iter().flat_map(|(_, list)| list.effects.clone()).collect();
-        write_atomic(&root.join("effects.toml"), to_toml(&EffectList { effects })?.as_bytes())?;
+        write_atomic(&root.join("effects.toml"), to_toml(&EffectList::of(effects))?.as_bytes())?;
     }
     Ok(())
 }

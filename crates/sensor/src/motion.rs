@@ -1,0 +1,370 @@
+//! Motion from frame to frame: of the ego vehicle, from posts, ends of walls and other static edges; of labelled
+//! objects, from their labels.
+
+use geometry::Box3;
+use nalgebra::{Vector2, Vector3};
+use rayon::prelude::*;
+use statistics::median_upper;
+use std::collections::BTreeSet;
+
+/// Ego motion between two frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OwnMotion {
+    /// Along its heading, m/s.
+    pub speed_m_s: f64,
+    /// Counter-clockwise, rad/s.
+    pub yaw_rate_rad_s: f64,
+}
+
+/// Side of a cell in bird's-eye view, m.
+pub const CELL_M: f64 = 0.35;
+
+/// Number of speeds of the grid.
+const SPEEDS: usize = 160;
+
+/// Step of the grid of speeds, m/s.
+const SPEED_M_S: f64 = 0.6;
+
+/// Largest acceleration of a vehicle, m/s2.
+const HARDEST_M_S2: f64 = 15.0;
+
+/// Longest time between two frames that are compared, s.
+const LONGEST_S: f64 = 0.6;
+
+/// Fewest edges of a frame.
+const FEWEST: usize = 40;
+
+/// Shortest time between a frame and the reference frames that show matches by chance, s.
+const ELSEWHERE_S: f64 = 0.5;
+
+/// Edges of a frame that are compared, at most.
+const SOME: usize = 250;
+
+/// Ratio of the score of the best path of speeds to that of the best path by chance from which on it is significant.
+const STANDS_OUT: f64 = 1.25;
+
+/// Index of the smallest speed of the search, 4.8 m/s: the scan pattern is static in the frame of the vehicle and
+/// resembles standstill.
+const SLOWEST: usize = 8;
+
+/// The motion at each frame; `None` where it cannot be estimated.
+pub fn own_motion(edges: Vec<Vec<Vector2<f64>>>, times: &[f64]) -> Vec<Option<OwnMotion>> {
+    let frames = edges.len();
+    let seen: Vec<Seen> = edges.into_par_iter().map(|edges| Seen { taken: Cells::new(&edges), edges }).collect();
+    let pair = |i: usize| {
+        // References: of the frames far in time, those with the most edges at the same places.
+        let far = (0..frames).filter(|&j| (times[j] - times[i]).abs() > ELSEWHERE_S);
+        let mut far: Vec<&Seen> = far.map(|j| &seen[j]).collect();
+        far.sort_by_cached_key(|other| std::cmp::Reverse(hits(&seen[i].edges, other, 0.0, 0.0) as usize));
+        let [one, other, ..] = far[..] else { return None };
+        Some(Pair::new(&seen[i], &seen[i + 1], [one, other], times[i + 1] - times[i]))
+    };
+    let pairs: Option<Vec<Pair>> = (0..frames.saturating_sub(1)).into_par_iter().map(pair).collect();
+    let known = pairs.and_then(|pairs| speeds(&pairs).map(|speeds| (pairs, speeds)));
+    let Some((pairs, speeds)) = known else { return vec![None; frames] };
+    let steps: Vec<Option<OwnMotion>> = pairs.par_iter().zip(speeds).map(|(pair, k)| pair.motion(k)).collect();
+    let raw: Vec<Option<OwnMotion>> = (0..frames)
+        .map(|i| {
+            let before = i.checked_sub(1).and_then(|j| steps[j]);
+            let after = steps.get(i).copied().flatten();
+            match (before, after) {
+                (Some(a), Some(b)) => Some(OwnMotion {
+                    speed_m_s: 0.5 * (a.speed_m_s + b.speed_m_s),
+                    yaw_rate_rad_s: 0.5 * (a.yaw_rate_rad_s + b.yaw_rate_rad_s),
+                }),
+                (one, None) | (None, one) => one,
+            }
+        })
+        .collect();
+    smooth(&raw, times)
+}
+
+/// Smallest share of frames with a known motion.
+const KNOWN: f64 = 0.4;
+
+/// Median of the motions within 0.8 s, where at least two are known: speeds change slowly.
+fn smooth(raw: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
+    let known = raw.iter().flatten().count();
+    if (known as f64) < KNOWN * raw.len() as f64 || known < 3 {
+        return vec![None; raw.len()];
+    }
+    (0..raw.len())
+        .map(|i| {
+            let near: Vec<OwnMotion> =
+                (0..raw.len()).filter(|&j| (times[j] - times[i]).abs() < 0.8).filter_map(|j| raw[j]).collect();
+            (near.len() >= 2).then(|| OwnMotion {
+                speed_m_s: median(near.iter().map(|m| m.speed_m_s).collect()),
+                yaw_rate_rad_s: median(near.iter().map(|m| m.yaw_rate_rad_s).collect()),
+            })
+        })
+        .collect()
+}
+
+/// Largest range of an edge, m.
+const EDGES_M: f64 = 70.0;
+
+/// Distance from a labelled object within which an edge may be of it, m.
+const NEAR_OBJECT_M: f64 = 1.0;
+
+/// Places of static edges, one of a cell, from returns at edges of standing surfaces: place in the cloud's frame and
+/// range, m. Those near labelled objects are left out.
+pub fn static_edges(returns: impl IntoIterator<Item = (Vector3<f64>, f64)>, boxes: &[Box3]) -> Vec<Vector2<f64>> {
+    let near = |b: &Box3, p: [f64; 3]| {
+        let local = b.to_local(p);
+        (0..2).all(|k| local[k].abs() < b.size[k] / 2.0 + NEAR_OBJECT_M)
+    };
+    let mut cells = BTreeSet::new();
+    let mut points = Vec::new();
+    for (p, _) in returns.into_iter().filter(|(_, range_m)| *range_m <= EDGES_M) {
+        if !boxes.iter().any(|b| near(b, p.into())) && cells.insert(cell(&p.xy())) {
+            points.push(p.xy());
+        }
+    }
+    points
+}
+
+/// Times of the frames from their ids: numbers of scans, or nanoseconds where neighbours differ by 1e6 or more.
+/// `None` unless ids are rising numbers.
+pub fn times_s(ids: &[String], rate_hz: f64) -> Option<Vec<f64>> {
+    let numbers: Vec<f64> = ids.iter().map(|id| id.parse::<f64>().ok()).collect::<Option<_>>()?;
+    if numbers.windows(2).any(|w| w[1] <= w[0]) {
+        return None;
+    }
+    let gaps: Vec<f64> = numbers.windows(2).map(|w| w[1] - w[0]).collect();
+    let usual = median_upper(gaps)?;
+    let unit = if usual >= 1e6 { 1e-9 } else { 1.0 / rate_hz };
+    Some(numbers.iter().map(|n| (n - numbers[0]) * unit).collect())
+}
+
+/// Largest relative speed of an object, m/s.
+const FASTEST_M_S: f64 = 60.0;
+
+/// Velocity of a box of frame `f` relative to the ego vehicle, from the nearest boxes of the frames before and after,
+/// m/s, cloud's frame. `boxes` gives those of a frame.
+pub fn seen_velocity(
+    boxes: &dyn Fn(usize) -> Vec<Box3>,
+    times: &[f64],
+    f: usize,
+    bbox: &Box3,
+) -> Option<Vector3<f64>> {
+    let neighbour = |g: usize| -> Option<(f64, Vector3<f64>)> {
+        let dt = times[g] - times[f];
+        if dt.abs() > LONGEST_S {
+            return None;
+        }
+        let here = Vector3::from(bbox.center);
+        let same_size = |b: &Box3| (0..3).all(|k| (b.size[k] - bbox.size[k]).abs() < 0.35 * bbox.size[k]);
+        let nearest = boxes(g)
+            .iter()
+            .filter(|b| same_size(b))
+            .map(|b| Vector3::from(b.center) - here)
+            .min_by(|a, b| a.norm().total_cmp(&b.norm()))?;
+        (nearest.norm() < (FASTEST_M_S * dt.abs()).min(5.0)).then_some((dt, nearest))
+    };
+    let before = f.checked_sub(1).and_then(neighbour);
+    let after = if f + 1 < times.len() { neighbour(f + 1) } else { None };
+    match (before, after) {
+        (Some((t0, d0)), Some((t1, d1))) => Some((d1 - d0) / (t1 - t0)),
+        (Some((t, d)), None) | (None, Some((t, d))) => Some(d / t),
+        (None, None) => None,
+    }
+}
+
+/// The median; 0 without values.
+fn median(values: Vec<f64>) -> f64 {
+    median_upper(values).unwrap_or(0.0)
+}
+
+fn cell(p: &Vector2<f64>) -> (i32, i32) {
+    ((p.x / CELL_M).floor() as i32, (p.y / CELL_M).floor() as i32)
+}
+
+/// Cells of a square about the ego vehicle, in bird's-eye view.
+pub struct Cells {
+    taken: Vec<bool>,
+}
+
+impl Cells {
+    /// Cells along a side: 151 m. Edges lie within 70 m.
+    const SIDE: i32 = 432;
+
+    /// The cells that hold a point.
+    pub fn new<'a>(points: impl IntoIterator<Item = &'a Vector2<f64>>) -> Self {
+        let mut taken = vec![false; (Self::SIDE * Self::SIDE) as usize];
+        points.into_iter().filter_map(Self::place).for_each(|i| taken[i] = true);
+        Cells { taken }
+    }
+
+    fn place(p: &Vector2<f64>) -> Option<usize> {
+        let (x, y) = cell(p);
+        let [x, y] = [x, y].map(|v| v + Self::SIDE / 2);
+        ((0..Self::SIDE).contains(&x) && (0..Self::SIDE).contains(&y)).then_some((x * Self::SIDE + y) as usize)
+    }
+
+    /// Whether a point lies in a cell that holds one.
+    pub fn contains(&self, p: &Vector2<f64>) -> bool {
+        Self::place(p).is_some_and(|i| self.taken[i])
+    }
+}
+
+/// Edges in bird's-eye view, and the cells that they occupy.
+struct Seen {
+    edges: Vec<Vector2<f64>>,
+    taken: Cells,
+}
+
+/// Number of edges that match edges of another frame if the vehicle moves ahead by `d` and turns by `yaw`, along its
+/// mean heading.
+fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
+    let (s, c) = yaw.sin_cos();
+    let (ms, mc) = (0.5 * yaw).sin_cos();
+    let on = some.iter().filter(|p| {
+        let q = Vector2::new(p.x - d * mc, p.y - d * ms);
+        other.taken.contains(&Vector2::new(c * q.x + s * q.y, -s * q.x + c * q.y))
+    });
+    on.count() as f64
+}
+
+/// Two consecutive frames, and two reference frames from elsewhere. Matches with the references are due to the scan
+/// pattern, which is static in the frame of the vehicle, and to walls, which look alike along their length.
+struct Pair<'a> {
+    some: Vec<Vector2<f64>>,
+    second: &'a Seen,
+    elsewhere: [&'a Seen; 2],
+    dt: f64,
+    /// By speed: excess of matches with the second frame over the references at the best turn, that turn, and the
+    /// excess of one reference over the other, which is chance.
+    scores: Vec<[f64; 3]>,
+}
+
+impl<'a> Pair<'a> {
+    fn new(first: &Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
+        let stride = first.edges.len().div_ceil(SOME);
+        let some = first.edges.iter().step_by(stride.max(1)).copied().collect();
+        let mut pair = Pair { some, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
+        if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt < LONGEST_S {
+            let yaw_steps = (0.6 * dt / 0.009).ceil() as i32;
+            let yaws = (-yaw_steps..=yaw_steps).map(|k| 0.6 * dt * f64::from(k) / f64::from(yaw_steps.max(1)));
+            let at = |k: usize| {
+                let mut best = [f64::NEG_INFINITY, 0.0, f64::NEG_INFINITY];
+                for yaw in yaws.clone() {
+                    let [more, chance] = pair.more(SPEED_M_S * k as f64 * dt, yaw);
+                    if more > best[0] {
+                        (best[0], best[1]) = (more, yaw);
+                    }
+                    best[2] = best[2].max(chance);
+                }
+                best
+            };
+            pair.scores = (0..SPEEDS).map(at).collect();
+        }
+        pair
+    }
+
+    fn more(&self, d: f64, yaw: f64) -> [f64; 2] {
+        let [on, one, other] = [self.second, self.elsewhere[0], self.elsewhere[1]].map(|s| hits(&self.some, s, d, yaw));
+        [on - 0.5 * (one + other), one - other]
+    }
+
+    /// The motion about grid speed `k`; `None` without an excess of matches.
+    fn motion(&self, k: usize) -> Option<OwnMotion> {
+        let [best, yaw, _] = self.scores[k];
+        let mut sum = [0.0; 3];
+        for i in -6..=6 {
+            for j in -4..=4 {
+                let (d, yaw) = (SPEED_M_S * k as f64 * self.dt + 0.05 * f64::from(i), yaw + 0.0015 * f64::from(j));
+                let weight = (self.more(d, yaw)[0] - 0.7 * best).max(0.0).powi(2);
+                sum = [sum[0] + weight, sum[1] + weight * d, sum[2] + weight * yaw];
+            }
+        }
+        (best > 0.0 && sum[0] > 0.0)
+            .then(|| OwnMotion { speed_m_s: sum[1] / sum[0] / self.dt, yaw_rate_rad_s: sum[2] / sum[0] / self.dt })
+    }
+}
+
+/// Index of the speed of every pair: the path with the most matches whose accelerations are possible. `None` where a
+/// path by chance scores as well, or where speeds are at the lower end of the grid, which is due to parts that move
+/// with the vehicle.
+fn speeds(pairs: &[Pair]) -> Option<Vec<usize>> {
+    let (speeds, sum) = path(pairs, 0)?;
+    let (_, by_chance) = path(pairs, 2)?;
+    let usual = median(speeds.iter().map(|k| *k as f64).collect());
+    (sum > STANDS_OUT * by_chance.max(1.0) && usual > SLOWEST as f64 + 2.0).then_some(speeds)
+}
+
+/// The path of speeds on which one of the scores has the largest sum, and that sum.
+fn path(pairs: &[Pair], score: usize) -> Option<(Vec<usize>, f64)> {
+    // Best sum that ends at each speed, and from where.
+    let mut best: Vec<f64> = vec![0.0; SPEEDS];
+    let mut from: Vec<Vec<usize>> = Vec::new();
+    for pair in pairs {
+        let reach = (HARDEST_M_S2 * pair.dt.abs() / SPEED_M_S).ceil().min(SPEEDS as f64) as usize;
+        let before = |k: usize| {
+            let near = k.saturating_sub(reach).max(SLOWEST)..(k + reach + 1).min(SPEEDS);
+            near.max_by(|&a, &b| best[a].total_cmp(&best[b])).unwrap_or(SLOWEST)
+        };
+        let came: Vec<usize> = (0..SPEEDS).map(before).collect();
+        // The median over speeds is subtracted: only differences count.
+        let middle = median(pair.scores[SLOWEST..].iter().map(|s| s[score]).collect());
+        best = came.iter().zip(&pair.scores).map(|(&k, s)| best[k] + s[score] - middle).collect();
+        from.push(came);
+    }
+    let last = (SLOWEST..SPEEDS).max_by(|&a, &b| best[a].total_cmp(&best[b]))?;
+    let back = from.iter().rev().scan(last, |k, came| {
+        let here = *k;
+        *k = came[here];
+        Some(here)
+    });
+    let mut speeds: Vec<usize> = back.collect();
+    speeds.reverse();
+    Some((speeds, best[last]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::RngExt;
+
+    #[test]
+    fn posts_give_the_motion_and_walls_do_not() {
+        let posts: Vec<Vector2<f64>> = (0..60)
+            .map(|i| {
+                Vector2::new(-60.0 + 2.2 * f64::from(i) + f64::from(i * i % 7) * 0.23, f64::from(i % 5) * 2.1 - 9.3)
+            })
+            .collect();
+        let (d, yaw): (f64, f64) = (2.4, 0.012);
+        let moved: Vec<Vector2<f64>> = posts
+            .iter()
+            .map(|p| {
+                let (ms, mc) = (0.5 * yaw).sin_cos();
+                let q = Vector2::new(p.x - d * mc, p.y - d * ms);
+                Vector2::new(yaw.cos() * q.x + yaw.sin() * q.y, -yaw.sin() * q.x + yaw.cos() * q.y)
+            })
+            .collect();
+        let seen = |edges: Vec<Vector2<f64>>| Seen { taken: Cells::new(&edges), edges };
+        let mut rng = data::stream(0, "elsewhere", 0, 0);
+        let mut scattered = |n: usize, across_m: f64| {
+            let mut at = |half: f64| if half > 0.0 { rng.random_range(-half..half) } else { 8.0 };
+            seen((0..n).map(|_| Vector2::new(at(70.0), at(across_m))).collect())
+        };
+        let (first, second) = (seen(posts), seen(moved));
+        let [one, other] = [scattered(60, 10.0), scattered(60, 10.0)];
+        let pair = Pair::new(&first, &second, [&one, &other], 0.05);
+        let motion = pair.motion(speeds(std::slice::from_ref(&pair)).unwrap()[0]).unwrap();
+        assert!((motion.speed_m_s - 48.0).abs() < 3.0 && (motion.yaw_rate_rad_s - 0.24).abs() < 0.1, "{motion:?}");
+        // Each scan samples a wall at other places.
+        let walls: Vec<Seen> = (0..12).map(|_| scattered(400, 0.0)).collect();
+        let pair = |i: usize| Pair::new(&walls[i], &walls[i + 1], [&walls[(i + 5) % 12], &walls[(i + 7) % 12]], 0.25);
+        assert_eq!(speeds(&(0..11).map(pair).collect::<Vec<_>>()), None);
+    }
+
+    #[test]
+    fn ids_are_scans_or_nanoseconds() {
+        let ids = |v: &[&str]| v.iter().map(|s| s.to_string()).collect::<Vec<_>>();
+        assert_eq!(times_s(&ids(&["000005", "000010"]), 20.0), Some(vec![0.0, 0.25]));
+        let stamps = times_s(&ids(&["1650000000000000000", "1650000000050000000"]), 20.0).unwrap();
+        assert!((stamps[1] - 0.05).abs() < 1e-4);
+        assert_eq!(times_s(&ids(&["a", "b"]), 20.0), None);
+        assert_eq!(times_s(&ids(&["3", "3"]), 20.0), None);
+    }
+}
