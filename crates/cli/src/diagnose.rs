@@ -9,7 +9,7 @@ use data::write::write_kitti_text;
 use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
-    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Status, Verdict, diagnose, diagnose_scans, extended_toml,
+    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Status, Verdict, diagnose, diagnose_scans,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{finding_name, write_finding_pictures};
@@ -76,6 +76,7 @@ impl DiagnoseArgs {
                 Stage::Comparing => "comparing scenes",
                 Stage::Pairing => "pairing frames",
                 Stage::Weighing => "testing causes",
+                Stage::Verifying => "measuring the gain",
             });
             bar.set_length(of as u64);
             bar.set_position(done as u64);
@@ -96,7 +97,7 @@ impl DiagnoseArgs {
         };
         bar.finish_and_clear();
         self.write_json(&outcome.diagnosis)?;
-        write_atomic(&self.out.join("extended.toml"), extended_toml(&outcome.diagnosis).as_bytes())?;
+        write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {
             write_labels(&self.out, &measured, id, boxes)?;
@@ -194,6 +195,7 @@ fn verdict_text(verdict: Verdict, findings: &[Status]) -> String {
         }
         Verdict::Unexplained => format!("unexplained: {named}; {ambiguous} ambiguous, {unexplained} unexplained"),
         Verdict::NotScenarioIdentical => "not scenario-identical: the two data sets do not show the same scenes".into(),
+        Verdict::TooFewFrames => "too few frames: nothing can be found, fitted and tested on different frames".into(),
     }
 }
 

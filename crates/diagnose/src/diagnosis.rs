@@ -47,6 +47,8 @@ pub enum Verdict {
     Unexplained,
     /// The two sides do not show the same scenes; there is no other result.
     NotScenarioIdentical,
+    /// There are too few frames to find anything; there is no other result.
+    TooFewFrames,
 }
 
 impl Verdict {
@@ -96,6 +98,12 @@ pub struct Finding {
     pub covariate: Covariate,
     /// Its gain on held-out frames.
     pub gain: FindingGain,
+    /// Share of the difference in its channel that the fits of all findings there remove, 0 to 1.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub predicted: Option<f64>,
+    /// Share of the difference in its channel that is gone with the extended simulation, as it was measured.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub reached: Option<f64>,
     /// The finding in a sentence.
     pub says: String,
     /// What to record to tell the candidates apart.
@@ -166,23 +174,68 @@ pub struct Minimum {
 }
 
 /// Distance between measured and simulated held-out frames.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Gain {
-    /// `nats_per_ray`: Kullback-Leibler distance of what the channels see, by simulated return.
+    /// `nats_per_ray`: what lookup tables of the measured data, fitted on other frames, predict better than the
+    /// simulation, by simulated return (logarithm of the likelihood ratio). It is 0 where nothing differs.
     pub metric: String,
     /// With the simulation as it is.
     pub before: f64,
-    /// With the extended simulation.
+    /// With the frames that were made anew from `extended.toml`.
     pub after: f64,
-    /// With unconstrained lookup tables fitted on the same frames as the findings: the best any sensor model could
-    /// reach.
+    /// Of two draws of the extended simulation from each other.
     pub floor: f64,
-    /// (before - after) / (before - floor); null where before is not above the floor.
+    /// (before - after) / (before - floor); null where nothing was found, or before is not above the floor.
     pub closed: Option<f64>,
     /// Interval of `closed`, from a bootstrap over blocks of held-out frames.
     pub ci95: Option<[f64; 2]>,
     /// `before`, `after` and `floor` by channel.
     #[serde(default)]
+    pub channels: BTreeMap<Channel, [f64; 3]>,
+    /// `closed` with its interval by channel, for channels of which a significant part of the difference is.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub closed_by_channel: BTreeMap<Channel, Closed>,
+    /// Effects of `extended.toml` that were left out because the simulated data cannot be made anew with them. What
+    /// they would change counts as not closed.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub not_applied: Vec<NotApplied>,
+    /// What the fits in memory say that would be reached; nothing was made anew for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub predicted: Option<Predicted>,
+}
+
+/// Share of a channel's difference that is gone.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Closed {
+    /// (before - after) / (before - floor).
+    pub closed: f64,
+    /// From a bootstrap over blocks of held-out frames.
+    pub ci95: Option<[f64; 2]>,
+}
+
+/// An effect that could not be applied.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct NotApplied {
+    /// Its kind.
+    pub effect: String,
+    /// Why, and what would help.
+    pub why: String,
+}
+
+/// Distances as the fits predict them: Kullback-Leibler distance of what the channels see, nats by simulated return.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+pub struct Predicted {
+    /// With the simulation as it is.
+    pub before: f64,
+    /// With the fitted laws of the findings.
+    pub after: f64,
+    /// With unconstrained lookup tables fitted on the same frames as the findings.
+    pub floor: f64,
+    /// (before - after) / (before - floor).
+    pub closed: Option<f64>,
+    /// Its interval, from a bootstrap over blocks of held-out frames.
+    pub ci95: Option<[f64; 2]>,
+    /// `before`, `after` and `floor` by channel.
     pub channels: BTreeMap<Channel, [f64; 3]>,
 }
 
@@ -257,6 +310,7 @@ mod tests {
             (Verdict::PartlyExplained, "partly_explained"),
             (Verdict::Unexplained, "unexplained"),
             (Verdict::NotScenarioIdentical, "not_scenario_identical"),
+            (Verdict::TooFewFrames, "too_few_frames"),
         ] {
             assert_eq!(serde_json::to_value(verdict).unwrap(), name);
         }

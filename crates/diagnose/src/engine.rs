@@ -1,18 +1,24 @@
 //! The whole way from two data sets to a diagnosis.
 
 mod report;
+mod verification;
+
+pub use verification::{OnClouds, Remake, RemadeFrames};
 
 use self::report::{refused, report};
+use self::verification::{Verification, set_reached};
 use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::{labels, motion, returns};
-use crate::diagnosis::{Diagnosis, Verdict};
+use crate::catalogue::Channel;
+use crate::diagnosis::{Diagnosis, Gain, Verdict};
 use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
+use crate::extended::extended_toml;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     Corrections, FramePair, ObjectPair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
-    pair_all, with_points,
+    kept_of_frame, pair_all, with_points,
 };
 use crate::search::geometry::Displacement;
 use crate::search::labels::Side;
@@ -21,9 +27,11 @@ use crate::search::{self, ChannelResult, Context};
 use data::Dataset;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
-use sensor::Rig;
 use sensor::directions::Sensors;
+use sensor::effects::MadeFrom;
+use sensor::{EffectList, Rig};
 use std::collections::BTreeSet;
+use std::path::Path;
 
 /// What to diagnose.
 #[derive(Clone, Debug, Default)]
@@ -41,6 +49,8 @@ pub enum Stage {
     Pairing,
     /// Comparing hypotheses.
     Weighing,
+    /// Making frames anew with what was found.
+    Verifying,
 }
 
 /// Called with the stage, how much of it is finished and how much there is.
@@ -53,16 +63,20 @@ pub struct Outcome {
     pub diagnosis: Diagnosis,
     /// Corrected boxes of the measured labels, by frame id; empty where the labels are correct.
     pub corrected: Vec<(String, Vec<Box3>)>,
+    /// The text of `extended.toml`.
+    pub extended: String,
 }
 
 impl Outcome {
     /// A diagnosis without findings.
     fn without_findings(diagnosis: Diagnosis) -> Self {
-        Outcome { diagnosis, corrected: vec![] }
+        let extended = extended_toml(&diagnosis, None);
+        Outcome { diagnosis, corrected: vec![], extended }
     }
 }
 
-/// Diagnoses a pair of data sets.
+/// Diagnoses a pair of data sets. The gain is measured on frames that are made anew with the effects of the findings,
+/// as `lidarshift resim` makes them.
 ///
 /// # Errors
 /// Data sets without a common frame, and files that cannot be read.
@@ -73,6 +87,65 @@ pub fn diagnose(
     options: &Options,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
+    diagnose_with(measured, simulated, rig, options, &OnClouds { simulated, rig }, progress)
+}
+
+/// The same with frames that `remake` makes anew.
+///
+/// # Errors
+/// Data sets without a common frame, and files that cannot be read.
+pub fn diagnose_with(
+    measured: &Dataset,
+    simulated: &Dataset,
+    rig: &Rig,
+    options: &Options,
+    remake: &dyn Remake,
+    progress: Progress,
+) -> Result<Outcome, DiagnoseError> {
+    let made_from = MadeFrom {
+        measured: measured.config.root.clone(),
+        simulated: simulated.config.root.clone(),
+        sensors: rig.sensors.iter().map(|s| s.name.clone()).collect(),
+    };
+    let paired = with_pairs(measured, simulated, rig, options, progress, |engine, context, notes| {
+        engine.diagnose(context, notes, remake, &made_from)
+    })?;
+    Ok(paired.unwrap_or_else(Outcome::without_findings))
+}
+
+/// The gain of a list of effects on a pair of data sets: of one that was edited by hand, or made elsewhere. The frames
+/// are those that a diagnosis of the pair holds out. The error is the reason for which there is none.
+///
+/// # Errors
+/// Data sets without a common frame, and files that cannot be read.
+pub fn verify(
+    measured: &Dataset,
+    simulated: &Dataset,
+    rig: &Rig,
+    options: &Options,
+    effects: &EffectList,
+    remake: &dyn Remake,
+    progress: Progress,
+) -> Result<Result<Gain, Diagnosis>, DiagnoseError> {
+    with_pairs(measured, simulated, rig, options, progress, |engine, context, _| {
+        progress(Stage::Verifying, 0, 1);
+        let shutter = rolling_shutter::search(&context);
+        let gain = Verification::new(engine, &context, !matches!(shutter, rolling_shutter::Search::NotFound(_)))
+            .of(effects, remake)?;
+        progress(Stage::Verifying, 1, 1);
+        Ok(gain)
+    })
+}
+
+/// Pairs two data sets and hands the pairs to `work`. The error is a diagnosis that says why they cannot be compared.
+fn with_pairs<T>(
+    measured: &Dataset,
+    simulated: &Dataset,
+    rig: &Rig,
+    options: &Options,
+    progress: Progress,
+    work: impl FnOnce(&Engine, Context, Vec<String>) -> Result<T, DiagnoseError>,
+) -> Result<Result<T, Diagnosis>, DiagnoseError> {
     let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
     progress(Stage::Comparing, 0, 2);
     let (ids, empty) = with_points(measured, simulated, ids)?;
@@ -85,7 +158,7 @@ pub fn diagnose(
     progress(Stage::Comparing, 2, 2);
     if !identity.identical {
         notes.insert(0, identity.reason);
-        return Ok(Outcome::without_findings(refused(notes)));
+        return Ok(Err(refused(notes)));
     }
     for id in &identity.strangers {
         notes.push(format!("frame {id}: the two sides do not show the same scene"));
@@ -93,21 +166,20 @@ pub fn diagnose(
     recordings.retain(|id| identity.strangers.iter().all(|s| s != id));
     let all = recordings.len();
     let done = |finished| progress(Stage::Pairing, finished, all);
-    let mut frames = pair_all(&recordings, &sensors, Corrections::default(), &done)?;
+    let mut frames = pair_all(&recordings, &sensors, Corrections::default(), kept_of_frame(all), &done)?;
     notes.extend(leave_out_copies(&mut frames));
     if frames.len() < FEWEST_FRAMES {
         notes.push(format!(
             "{} frames can be used; with fewer than {FEWEST_FRAMES} nothing can be found, fitted and tested on different frames",
             frames.len()
         ));
-        let diagnosis = Diagnosis { verdict: Verdict::NothingFound, ..refused(notes) };
-        return Ok(Outcome::without_findings(diagnosis));
+        return Ok(Err(Diagnosis { verdict: Verdict::TooFewFrames, ..refused(notes) }));
     }
     let used: BTreeSet<&str> = frames.iter().map(|f| f.id.as_str()).collect();
     recordings.retain(|id| used.contains(id));
     let context = context(rig, &frames, &mut notes);
     let engine = Engine { recordings: &recordings, sensors: &sensors, origins: origins(rig), progress };
-    engine.diagnose(context, notes)
+    work(&engine, context, notes).map(Ok)
 }
 
 /// Notes about sensors whose rows are not known.
@@ -186,7 +258,7 @@ impl Known {
 impl Engine<'_> {
     /// Pairs all frames anew.
     fn pair(&self, corrections: Corrections) -> Result<Vec<FramePair>, DiagnoseError> {
-        pair_all(self.recordings, self.sensors, corrections, &|_| ())
+        pair_all(self.recordings, self.sensors, corrections, kept_of_frame(self.recordings.len()), &|_| ())
     }
 
     fn finished(&self, searches: usize) {
@@ -195,7 +267,14 @@ impl Engine<'_> {
 
     /// All searches in turn. Motion distortion is undone before anything else is compared, except for the ranges as
     /// they were measured.
-    fn diagnose(&self, context: Context, mut notes: Vec<String>) -> Result<Outcome, DiagnoseError> {
+    fn diagnose(
+        &self,
+        recorded: Context,
+        mut notes: Vec<String>,
+        remake: &dyn Remake,
+        made_from: &MadeFrom,
+    ) -> Result<Outcome, DiagnoseError> {
+        let context = recorded.clone();
         self.finished(0);
         let (sliding, slide) = self.rolling_shutter(&context)?;
         let (rounding, step_m) = search::quantisation::search(&context);
@@ -219,7 +298,30 @@ impl Engine<'_> {
         let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
         let mut diagnosis = report(&context, results, notes);
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
-        Ok(Outcome { diagnosis, corrected })
+        let extended = extended_toml(&diagnosis, Some(made_from));
+        self.measure_gain(&mut diagnosis, &recorded, &extended, remake)?;
+        Ok(Outcome { diagnosis, corrected, extended })
+    }
+
+    /// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded.
+    fn measure_gain(
+        &self,
+        diagnosis: &mut Diagnosis,
+        recorded: &Context,
+        extended: &str,
+        remake: &dyn Remake,
+    ) -> Result<(), DiagnoseError> {
+        (self.progress)(Stage::Verifying, 0, 1);
+        let slides = diagnosis.findings.iter().any(|f| f.channel == Channel::Slide);
+        let verification = Verification::new(self, recorded, slides);
+        let gain = match diagnosis.findings.is_empty() {
+            true => verification.without_extension(),
+            false => verification.of(&EffectList::parse(extended, Path::new("extended.toml"))?, remake)?,
+        };
+        diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
+        set_reached(&mut diagnosis.findings, &diagnosis.gain);
+        (self.progress)(Stage::Verifying, 1, 1);
+        Ok(())
     }
 
     /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on

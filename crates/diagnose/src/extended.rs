@@ -4,16 +4,23 @@
 use crate::catalogue::{Cause, Covariate, ParameterId, Quantity};
 use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::effects::cause_of;
+use sensor::effects::MadeFrom;
 use sensor::{Effect, EffectList};
 use std::collections::BTreeSet;
 use std::fmt::Write;
 
 /// The text of `extended.toml`, for a diagnosis whose findings carry their effects.
-pub fn extended_toml(diagnosis: &Diagnosis) -> String {
+pub fn extended_toml(diagnosis: &Diagnosis, made_from: Option<&MadeFrom>) -> String {
     let mut text = String::from(
         "# What the diagnosis adds to the simulation's sensor model: a list of effects.\n\
          # Intervals (95 %) stand above each effect.\n",
     );
+    if let Some(made_from) = made_from {
+        let head = EffectList { made_from: Some(made_from.clone()), ..EffectList::default() };
+        let table = toml::to_string(&head).expect("a list is plain data");
+        text.push_str("\n# The data that it was made from, so that it is not applied to others.\n");
+        text.push_str(table.strip_suffix("effect = []\n").unwrap_or(&table).trim_start_matches("effect = []\n\n"));
+    }
     let place = |f: &Finding| f.cause.unwrap_or(Cause::Unexplained).place();
     let mut findings: Vec<&Finding> = diagnosis.findings.iter().collect();
     findings.sort_by_key(|f| place(f));
@@ -120,6 +127,8 @@ mod tests {
             channel: Channel::Roughness,
             covariate: Covariate::None,
             gain: FindingGain::default(),
+            predicted: None,
+            reached: None,
             says: format!("says {cause}"),
             separate_by: None,
             curve: Curve::default(),
@@ -143,15 +152,7 @@ mod tests {
             frames: Default::default(),
             findings,
             minimum_detectable: Default::default(),
-            gain: Gain {
-                metric: "nats_per_ray".into(),
-                before: 1.0,
-                after: 0.1,
-                floor: 0.0,
-                closed: Some(0.9),
-                ci95: None,
-                channels: BTreeMap::new(),
-            },
+            gain: Gain::default(),
             detectors: vec![],
             considered: vec![],
             notes: vec![],
@@ -167,7 +168,7 @@ mod tests {
             finding(Cause::RandomDropout, &[(Quantity::Share, -0.2)]),
             finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
         ]);
-        let text = extended_toml(&diagnosis);
+        let text = extended_toml(&diagnosis, None);
         let table: toml::Table = toml::from_str(&text).unwrap();
         let kinds: Vec<&str> =
             table["effect"].as_array().unwrap().iter().map(|e| e["kind"].as_str().unwrap()).collect();
@@ -251,7 +252,7 @@ mod tests {
         for f in findings {
             let what = f.cause.map_or(f.channel.name(), Cause::name);
             let diagnosis = diagnosis(vec![f]);
-            let text = extended_toml(&diagnosis);
+            let text = extended_toml(&diagnosis, None);
             let read = EffectList::parse(&text, std::path::Path::new("extended.toml"));
             let effects = read.unwrap_or_else(|e| panic!("{what}: {e}\n{text}")).effects;
             assert_eq!(effects, diagnosis.findings[0].effects, "{what}: {text}");

@@ -181,14 +181,34 @@ impl<'a> FinishedDataset<'a> {
     /// # Errors
     /// An id that the data set does not have, files that cannot be read, attributes that do not fit the cloud.
     pub fn frame(&self, effects: &EffectList, seed: u64, id: &str) -> Result<(Frame, Scan), DataError> {
+        Ok(self.frames(effects, &[seed], id)?.remove(0))
+    }
+
+    /// The same for several random seeds.
+    ///
+    /// # Errors
+    /// As for one.
+    pub fn frames(&self, effects: &EffectList, seeds: &[u64], id: &str) -> Result<Vec<(Frame, Scan)>, DataError> {
         let index = self.ids.iter().position(|own| own == id).ok_or_else(|| {
             DataError::file(&self.dataset.config.root, format!("has no frame {id}"))
         })?;
-        let mut frame = self.dataset.load(id)?;
-        let mut scan = self.scan(&frame)?;
-        let before = scan.clone();
-        let mut cars = self.cars(index, &frame);
-        let shown = cars.clone();
+        let frame = self.dataset.load(id)?;
+        let before = self.scan(&frame)?;
+        let shown = self.cars(index, &frame);
+        Ok(seeds.iter().map(|seed| self.with_effects(effects, *seed, index, &frame, &before, &shown)).collect())
+    }
+
+    /// A frame with effects; `before` is its scan.
+    fn with_effects(
+        &self,
+        effects: &EffectList,
+        seed: u64,
+        index: usize,
+        frame: &Frame,
+        before: &Scan,
+        shown: &[LabelledCar],
+    ) -> (Frame, Scan) {
+        let (mut frame, mut scan, mut cars) = (frame.clone(), before.clone(), shown.to_vec());
         let own = self.motions.as_ref().map(|motions| motions[index].own);
         let context = FrameContext {
             seed,
@@ -199,17 +219,17 @@ impl<'a> FinishedDataset<'a> {
             materials: &self.materials,
             ego_velocity: [own.map_or(0.0, |m| m.speed_m_s), 0.0, 0.0],
             ego_turn_rate: [0.0, 0.0, own.map_or(0.0, |m| m.yaw_rate_rad_s)],
-            cars: &shown,
+            cars: shown,
             scene: None,
             world_x_rad: 0.0,
         };
         effects.on_cloud(&mut scan, &context);
         effects.on_labels(&mut cars, &context);
-        frame.cloud = cloud_of(&scan, &before, &frame.cloud);
+        frame.cloud = cloud_of(&scan, before, &frame.cloud);
         for (object, car) in frame.objects.iter_mut().zip(&cars) {
             object.bbox = car.label;
         }
-        Ok((frame, scan))
+        (frame, scan)
     }
 
     /// A frame as a scan.

@@ -1,11 +1,14 @@
 //! Puts the results of all channels together: the diagnosis.
 
 use crate::catalogue::Channel;
-use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, SCHEMA, Status, Verdict};
+use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, Predicted, SCHEMA, Status, Verdict};
 use crate::inference::roles::Role;
 use crate::search::{ChannelResult, Context, Found, REPETITIONS, mean_interval};
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 use std::collections::BTreeMap;
+
+/// Name of the metric of gains.
+pub const METRIC: &str = "nats_per_ray";
 
 /// A diagnosis of notes alone.
 pub(super) fn refused(notes: Vec<String>) -> Diagnosis {
@@ -15,15 +18,7 @@ pub(super) fn refused(notes: Vec<String>) -> Diagnosis {
         frames: FrameRoles::default(),
         findings: vec![],
         minimum_detectable: Default::default(),
-        gain: Gain {
-            metric: "nats_per_ray".into(),
-            before: 0.0,
-            after: 0.0,
-            floor: 0.0,
-            closed: None,
-            ci95: None,
-            channels: BTreeMap::new(),
-        },
+        gain: Gain { metric: METRIC.into(), ..Gain::default() },
         detectors: Vec::new(),
         considered: vec![],
         notes,
@@ -55,7 +50,11 @@ pub(super) fn report(context: &Context, results: Vec<ChannelResult>, notes: Vec<
         schema: SCHEMA.into(),
         verdict: Verdict::of(&findings),
         frames: FrameRoles { select: ids(Role::Select), estimate: ids(Role::Estimate), hold_out: ids(Role::HoldOut) },
-        gain: Gain { channels, ..gain(&distance, &blocks, returns, findings.is_empty()) },
+        gain: Gain {
+            metric: METRIC.into(),
+            predicted: (!findings.is_empty()).then(|| Predicted { channels, ..predicted(&distance, &blocks, returns) }),
+            ..Gain::default()
+        },
         findings,
         minimum_detectable,
         detectors: Vec::new(),
@@ -113,6 +112,8 @@ impl Report {
             channel: found.channel,
             covariate: found.covariate,
             gain,
+            predicted: None,
+            reached: None,
             says: found.says,
             separate_by: found.separate_by,
             curve: found.curve,
@@ -121,25 +122,22 @@ impl Report {
     }
 }
 
-/// Distance over all held-out frames, with the interval of the share that is closed. `sums` holds of every frame its
-/// distance, the gain of the findings, and the gain of unconstrained lookup tables.
-fn gain(sums: &[[f64; 3]], blocks: &[usize], returns: f64, nothing: bool) -> Gain {
+/// Distance over all held-out frames as the fits predict it, with the interval of the share that is closed. `sums`
+/// holds of every frame its distance, the gain of the findings, and the gain of unconstrained lookup tables.
+fn predicted(sums: &[[f64; 3]], blocks: &[usize], returns: f64) -> Predicted {
     let total = |which: &[usize]| {
         which.iter().fold([0.0; 3], |s, &i| [s[0] + sums[i][0], s[1] + sums[i][1], s[2] + sums[i][2]])
     };
-    let closed =
-        |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0 && !nothing).then(|| gained / gained.max(table));
+    let closed = |[_, gained, table]: [f64; 3]| (gained.max(table) > 0.0).then(|| gained / gained.max(table));
     let all = total(&(0..sums.len()).collect::<Vec<_>>());
     let members = blocks_of(blocks);
     let mut rng = data::stream(0, "diagnose closed", 0, 0);
     let drawn: Vec<f64> = (0..REPETITIONS).filter_map(|_| closed(total(&draw_blocks(&members, &mut rng)))).collect();
-    let gained = if nothing { 0.0 } else { all[1] };
-    let least = gained.max(if nothing { 0.0 } else { all[2] });
+    let least = all[1].max(all[2]);
     let before = all[0].max(least);
-    Gain {
-        metric: "nats_per_ray".into(),
+    Predicted {
         before: before / returns,
-        after: (before - gained) / returns,
+        after: (before - all[1]) / returns,
         floor: (before - least) / returns,
         closed: closed(all),
         ci95: closed(all).and_then(|_| interval_nearest(drawn)),

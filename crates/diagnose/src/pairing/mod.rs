@@ -119,14 +119,20 @@ pub fn find_sensors(recordings: &Recordings, rig: &Rig) -> Result<Sensors, Diagn
     Ok(Sensors::find(rig, &scans))
 }
 
-/// Pairs all frames. `done` receives the number of frames finished so far.
+/// Returns that are kept of each side of a frame, of so many frames.
+pub fn kept_of_frame(frames: usize) -> usize {
+    (KEPT / frames.max(1)).max(500)
+}
+
+/// Pairs all frames; keeps at most about `kept` returns of each side of a frame. `done` receives the number of frames
+/// finished so far.
 pub fn pair_all(
     recordings: &Recordings,
     sensors: &Sensors,
     corrections: Corrections,
+    kept: usize,
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<Vec<FramePair>, DiagnoseError> {
-    let kept = (KEPT / recordings.len().max(1)).max(500);
     let finished = std::sync::atomic::AtomicUsize::new(0);
     in_order((0..recordings.len()).into_par_iter().map(|i| {
         let recorded = RecordedFrame {

@@ -5,7 +5,7 @@ use crate::error::DiagnoseError;
 use data::{Cloud, Dataset, Object};
 use sensor::Rig;
 use sensor::directions::{SensorScan, Sensors, split_by_sensor};
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 /// One side of a frame: its returns by sensor (12 bytes a return) and its labelled objects.
 #[derive(Clone, Debug)]
@@ -38,8 +38,15 @@ pub struct Recordings<'a> {
 /// What is held of a frame, each part from its first use on.
 struct Held {
     id: String,
-    sides: [OnceLock<SideFrame>; 2],
+    sides: [OnceLock<Arc<SideFrame>>; 2],
     matched: OnceLock<Vec<Matched>>,
+}
+
+impl SideFrame {
+    /// From a cloud and its objects.
+    pub fn new(cloud: &Cloud, objects: Vec<Object>, rig: &Rig) -> Self {
+        SideFrame { scans: split_by_sensor(cloud, rig), objects }
+    }
 }
 
 impl<'a> Recordings<'a> {
@@ -47,6 +54,29 @@ impl<'a> Recordings<'a> {
     pub fn new(measured: &'a Dataset, simulated: &'a Dataset, rig: &'a Rig, ids: Vec<String>) -> Self {
         let held = |id| Held { id, sides: Default::default(), matched: OnceLock::new() };
         Recordings { datasets: [measured, simulated], rig, frames: ids.into_iter().map(held).collect() }
+    }
+
+    /// Some of the frames, by their numbers here, with another simulated side; and with another measured side, where
+    /// one is given.
+    pub fn with_sides(
+        &self,
+        which: &[usize],
+        measured: Option<&[Arc<SideFrame>]>,
+        simulated: &[Arc<SideFrame>],
+    ) -> Result<Recordings<'a>, DiagnoseError> {
+        let of_frame = |(at, &frame): (usize, &usize)| {
+            let measured = match measured {
+                Some(others) => OnceLock::from(others[at].clone()),
+                None => {
+                    self.side(frame, PairSide::Measured)?;
+                    self.frames[frame].sides[PairSide::Measured as usize].clone()
+                }
+            };
+            let sides = [measured, OnceLock::from(simulated[at].clone())];
+            Ok(Held { id: self.id(frame).into(), sides, matched: OnceLock::new() })
+        };
+        let frames = which.iter().enumerate().map(of_frame).collect::<Result<_, DiagnoseError>>()?;
+        Ok(Recordings { datasets: self.datasets, rig: self.rig, frames })
     }
 
     /// Number of frames.
@@ -77,8 +107,8 @@ impl<'a> Recordings<'a> {
             return Ok(side);
         }
         let (cloud, objects) = load(self.datasets[side as usize], &held.id)?;
-        let read = SideFrame { scans: split_by_sensor(&cloud, self.rig), objects };
-        Ok(cell.get_or_init(|| read))
+        let read = SideFrame::new(&cloud, objects, self.rig);
+        Ok(cell.get_or_init(|| Arc::new(read)))
     }
 
     /// Which returns of a frame have a counterpart, by sensor. Shots are matched by the directions in which they were

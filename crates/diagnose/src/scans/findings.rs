@@ -59,6 +59,8 @@ impl From<Named> for Finding {
             channel: named.channel,
             covariate: named.covariate,
             gain: named.gain,
+            predicted: None,
+            reached: None,
             says: named.says,
             separate_by: None,
             curve: named.curve,

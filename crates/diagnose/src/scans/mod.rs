@@ -15,8 +15,9 @@ mod scatter;
 mod tilt;
 
 use crate::catalogue::Cause;
-use crate::diagnosis::{Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, SCHEMA, Verdict};
+use crate::diagnosis::{Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, Predicted, SCHEMA, Verdict};
 use crate::effects::fill_effects;
+use crate::extended::extended_toml;
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
 use crate::pairing::load;
@@ -85,7 +86,8 @@ pub fn diagnose_scans(
     let mut diagnosis = report(&seen, found, minimum_detectable, considered, notes);
     let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
     fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
-    Ok(Outcome { diagnosis, corrected: vec![] })
+    let extended = extended_toml(&diagnosis, None);
+    Ok(Outcome { diagnosis, corrected: vec![], extended })
 }
 
 /// The one sensor of a rig that stands at the origin of its clouds, unturned.
@@ -159,11 +161,10 @@ fn report(
         gain: Gain {
             metric: "nats_per_ray".into(),
             before: together,
-            after: 0.0,
-            floor: 0.0,
-            closed: None,
-            ci95: None,
-            channels: BTreeMap::new(),
+            // No frame is made anew: there is no simulation.
+            after: together,
+            predicted: Some(Predicted { before: together, ..Predicted::default() }),
+            ..Gain::default()
         },
         detectors: Vec::new(),
         considered,

@@ -12,7 +12,7 @@ use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::cells::cell;
 use crate::channels::groups::{Group, Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
-use crate::channels::mask::Mask;
+use crate::channels::mask::{DirectionCell, Mask, direction_cell};
 use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
@@ -63,6 +63,36 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     result.minimum.push((Cause::RandomDropout, search.minimum()));
     search.report(selection, &mut result);
     result
+}
+
+/// Simulated returns of a cell of directions that count as the prior of its own share of losses.
+const PRIOR_OF_DIRECTION: f64 = 30.0;
+
+/// Gains of the `test` frames by the shares of matched returns of the `train` frames, nats: by cell of range,
+/// incidence and surface, times those by cell of directions.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let hits = hit_frames(context.frames, &Mask::default());
+    let unmatched = table(&hits, train).unmatched(&[]);
+    // Share of the returns of a ray's cell that have a counterpart: in these data, and without losses.
+    let expected = |ray: &Ray| cell(ray).map(|c| unmatched[c].map(|share| 1.0 - share));
+    let mut of_directions = BTreeMap::<DirectionCell, [f64; 2]>::new();
+    for ray in train.iter().flat_map(|&i| &context.frames[i].simulated) {
+        if let Some([kept, _]) = expected(ray) {
+            let sums = of_directions.entry(direction_cell(ray)).or_default();
+            sums[0] += f64::from(u8::from(ray.matched));
+            sums[1] += kept;
+        }
+    }
+    let ratio = |ray: &Ray| {
+        let [matched, kept] = of_directions.get(&direction_cell(ray)).copied().unwrap_or_default();
+        (matched + PRIOR_OF_DIRECTION) / (kept + PRIOR_OF_DIRECTION)
+    };
+    let of_ray = |ray: &Ray| {
+        let Some([kept, without]) = expected(ray) else { return 0.0 };
+        let [p, q] = [without, kept * ratio(ray)].map(|share| share.clamp(1e-3, 1.0 - 1e-3));
+        if ray.matched { (q / p).ln() } else { ((1.0 - q) / (1.0 - p)).ln() }
+    };
+    test.iter().map(|&i| context.frames[i].simulated.iter().map(of_ray).sum()).collect()
 }
 
 /// Counts of all frames, and the frames by role.

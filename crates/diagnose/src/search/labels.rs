@@ -103,6 +103,22 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     result
 }
 
+/// Gains of the `test` frames by all shifts fitted on the `train` frames, nats; zeros with too few objects.
+pub fn by_table(context: &Context, side: Side, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let shifts = object_shifts(context.frames, context.times.as_deref());
+    let in_place = Displacement::default();
+    let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, &in_place)).collect();
+    if rows.iter().filter(|r| train.contains(&r.frame)).count() < FEWEST {
+        return vec![0.0; test.len()];
+    }
+    let usable = keep_known(&mut rows);
+    set_noise(&mut rows, train, side);
+    let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
+    let linear: Vec<LinearFrame> = train.iter().map(|&f| sums(&rows, f)).collect();
+    let best = fit(&linear.iter().collect::<Vec<_>>(), &context.blocks(train), &known, &[1e-3; 8]);
+    test.iter().map(|&f| best.gain(&sums(&rows, f))).collect()
+}
+
 /// Objects of all frames, and what is known before the selection.
 struct Search<'a> {
     context: &'a Context<'a>,

@@ -44,6 +44,16 @@ pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
     result
 }
 
+/// Gains of the `test` frames by variances of each cell and of each row fitted on the `train` frames, nats.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let scales = scales(context.frames);
+    let rough = rough_frames(context.frames, &scales);
+    let table = |frames: &[usize]| NoiseTable::new(total(frames.iter().map(|&i| &rough[i])), 0.0);
+    let (on_train, on_test) = (table(train), table(test));
+    let gain = |i: &usize| on_test.likelihood_by_table(&rough[*i], &on_train) - on_test.likelihood(&rough[*i], &[]);
+    test.iter().map(gain).collect()
+}
+
 /// Roughness of all frames, and the frames by role.
 struct Search<'a> {
     context: &'a Context<'a>,

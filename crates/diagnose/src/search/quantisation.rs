@@ -38,12 +38,9 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     if a.len() < FEWEST || b.len() < FEWEST {
         return (result, None);
     }
-    let spectrum = [&a, &b].map(|r| spectrum(r));
-    let from = comb::frequency_of(LARGEST_M);
-    let first = (from..comb::FREQUENCIES).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
-    // The flank of a peak comes before its top. Scenes of near surfaces have wide peaks.
-    let peak = first.map(|k| top(&spectrum[0], k));
-    let strongest = spectrum[0][from..].iter().copied().fold(0.0, f64::max);
+    let sides = [a, b];
+    let (peak, strongest) = peak_of(&sides);
+    let [a, b] = sides;
     result.considered.push(Considered {
         cause: Cause::Quantisation.into(),
         channel: Channel::Ranges,
@@ -62,6 +59,25 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     }
     result.found.push(found(step, &on_estimate, &b, held));
     (result, Some(step))
+}
+
+/// Gains of the `test` frames by the comb of the `train` frames, nats; zeros without one.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let sides = [ranges(context, train, true), ranges(context, train, false)];
+    match sides.iter().all(|side| side.len() >= FEWEST).then(|| peak_of(&sides).0).flatten() {
+        Some(k) => held_out_gains(context, test, refine(&sides[0], comb::step_of(k), 1.5 / k as f64)),
+        None => vec![0.0; test.len()],
+    }
+}
+
+/// The frequency of the comb on which the first of two sides falls and the second does not; and the strongest one of
+/// the first.
+fn peak_of(sides: &[Vec<f64>; 2]) -> (Option<usize>, f64) {
+    let spectrum = sides.each_ref().map(|r| spectrum(r));
+    let from = comb::frequency_of(LARGEST_M);
+    let first = (from..comb::FREQUENCIES).find(|&k| spectrum[0][k] > COHERENT && spectrum[1][k] < 0.5 * COHERENT);
+    // The flank of a peak comes before its top. Scenes of near surfaces have wide peaks.
+    (first.map(|k| top(&spectrum[0], k)), spectrum[0][from..].iter().copied().fold(0.0, f64::max))
 }
 
 /// Ranges of one side, m, evenly thinned.

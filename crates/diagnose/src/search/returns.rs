@@ -41,6 +41,17 @@ pub fn search(context: &Context) -> ChannelResult {
     result
 }
 
+/// Gains of the `test` frames by the shares of odd returns of the `train` frames, nats.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
+    let rates = ODD.map(|kind| excess(train.iter().map(|&i| &odd[i]), kind as usize));
+    let of_frame = |i: &usize| ODD.map(|kind| {
+        let [base, more] = rates[kind as usize];
+        gain(&odd[*i], kind as usize, base, more)
+    });
+    test.iter().map(|i| of_frame(i).iter().sum()).collect()
+}
+
 /// Counts of all frames, and the frames by role.
 struct Search<'a> {
     context: &'a Context<'a>,

@@ -186,6 +186,18 @@ pub fn search(context: &Context) -> Search {
     if significant { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
 }
 
+/// Gains of the `test` frames by the displacement along the scan that fits the `train` frames best, nats.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let mut models = vec![Model::without_speed(context)];
+    models.extend(Model::with_speed(context));
+    let fits = models.iter().map(|model| (model, model.grid(train)));
+    let sum = |grid: &Grid| grid.gains.iter().sum::<f64>();
+    let Some((model, grid)) = fits.max_by(|a, b| sum(&a.1).total_cmp(&sum(&b.1))) else {
+        return vec![0.0; test.len()];
+    };
+    model.gains_of(&grid, grid.best, train, test)
+}
+
 /// The duration of a scan, fitted on the estimating frames.
 struct Fitted {
     /// Durations of a finer grid about the best of the selecting frames, and the counts of every frame.
@@ -322,13 +334,18 @@ impl Model {
     /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the
     /// best and the worst share is the gain of one more point.
     fn held_out_gains(&self, grid: &Grid, fitted: &Fitted, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
+        self.gains_of(grid, fitted.scan_s, select, hold_out)
+    }
+
+    /// The same by a duration of a scan.
+    fn gains_of(&self, grid: &Grid, scan_s: f64, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
         let points = self.points(select);
         let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
         let [chance, there] = [grid.least, grid.most].map(share);
         let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
         let gain = |&f: &usize| {
             let view = &self.frames[f];
-            (view.on(fitted.scan_s) - view.on(0.0)) * view.each * worth
+            (view.on(scan_s) - view.on(0.0)) * view.each * worth
         };
         hold_out.iter().map(gain).collect()
     }

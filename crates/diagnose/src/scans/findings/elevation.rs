@@ -76,6 +76,8 @@ pub(super) fn elevation_found(seen: &Seen, notes: &mut Vec<String>) -> Option<Fi
         channel: Channel::Residuals,
         covariate: Covariate::DistanceOnTheGround,
         gain: gain(seen, &grounds),
+        predicted: None,
+        reached: None,
         says: says((mean, ci), walls),
         separate_by: (!named)
             .then(|| "a level hall or a survey of the road under the car, and plumb walls on all sides".into()),

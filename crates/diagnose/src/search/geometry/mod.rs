@@ -17,13 +17,16 @@ use self::displacement::displacement;
 use self::floor::above_floor;
 use self::hypotheses::{Hypothesis, hypotheses, is_pose, may_join};
 use self::rows::drop_less_certain_rows;
-use self::sums::{Sums, sums};
+use self::sums::{Sums, group_fit, sums};
 use super::{ChannelResult, Context, Selected, causes_of, first_demands, record, rivals_and_confidence};
 use crate::catalogue::Channel;
+use crate::channels::groups::{GroupFrame, Grouping, total};
 use crate::diagnosis::Considered;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::grouped;
 use crate::inference::roles::Role;
 use rayon::prelude::*;
+use std::collections::BTreeMap;
 
 /// Share of the gain of the first pose that a second pose must bring.
 const SECOND_POSE_SHARE: f64 = 0.3;
@@ -45,6 +48,27 @@ struct Search<'a> {
 
 /// Chosen hypotheses, with what the selection says of each.
 type Chosen = (Vec<Hypothesis>, Vec<Selected>);
+
+/// Gains of the `test` frames by unconstrained tables fitted on the `train` frames, nats: all poses and biases
+/// together or offsets of strips of azimuth, whichever is more, and offsets of rows beyond those of their neighbours.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let sums = sums(context, train);
+    let (full, base) = sums.full_and_base(train, &context.blocks(train));
+    let linear: Vec<f64> =
+        test.iter().map(|&f| full.gain(&sums.linear[f]) - base.gain(&sums.linear[f])).collect();
+    let groups = |frames: &[GroupFrame], column: usize, rough: bool| -> Vec<f64> {
+        let (all, how) = (total(train.iter().map(|&i| &frames[i])), group_fit(column));
+        let offsets = grouped::offsets(&all, how);
+        let smooth = if rough { grouped::smooth(&all, &offsets, how) } else { BTreeMap::new() };
+        let gain = |f: &usize| grouped::gain(&frames[*f], column, &offsets) - grouped::gain(&frames[*f], column, &smooth);
+        test.iter().map(gain).collect()
+    };
+    let more = |a: Vec<f64>, b: Vec<f64>| if a.iter().sum::<f64>() >= b.iter().sum() { a } else { b };
+    let smooth = more(linear, groups(sums.groups_of(Grouping::Azimuth), 0, false));
+    let rows = sums.groups_of(Grouping::Row);
+    let rough = more(groups(rows, 0, true), groups(rows, 1, true));
+    smooth.iter().zip(rough).map(|(a, b)| a + b).collect()
+}
 
 /// The search, and the displacement that the other channels have to undo.
 pub fn search(context: &Context) -> (ChannelResult, Displacement) {

@@ -1,0 +1,249 @@
+//! The gain through the file: frames are made anew with the effects of `extended.toml`, paired with the measured ones
+//! again, and compared by the same distance.
+//!
+//! The distance of a channel is what lookup tables of the measured data, fitted on the estimating frames, predict better
+//! of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero where
+//! the two sides are two draws of the same sensor, and is the same number before and after.
+
+use super::Engine;
+use super::report::METRIC;
+use crate::catalogue::Channel;
+use crate::diagnosis::{Closed, Gain, NotApplied, Predicted};
+use crate::error::DiagnoseError;
+use crate::inference::roles::Role;
+use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
+use crate::search::labels::Side;
+use crate::search::{Context, REPETITIONS, geometry, hits, labels, noise, quantisation, returns, rolling_shutter};
+use data::{Cloud, DataError, Dataset, Object};
+use rayon::prelude::*;
+use sensor::finished::{FinishedDataset, Refusal};
+use sensor::{EffectList, Rig};
+use statistics::{blocks_of, draw_blocks, interval_nearest};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// Frames of a role that are made anew, at most.
+const FRAMES: usize = 60;
+
+/// Nats of a channel over all held-out frames from which on the share of it that is gone is told.
+const ENOUGH_NATS: f64 = 8.0;
+
+/// Makes frames of the simulation anew.
+pub trait Remake: Sync {
+    /// Effects that cannot be applied.
+    ///
+    /// # Errors
+    /// Files that cannot be read.
+    fn refusals(&self, effects: &EffectList) -> Result<Vec<Refusal>, DiagnoseError>;
+
+    /// Prepares frames with these effects.
+    ///
+    /// # Errors
+    /// Files that cannot be read.
+    fn with<'s>(&'s self, effects: &'s EffectList) -> Result<Box<dyn RemadeFrames + 's>, DiagnoseError>;
+}
+
+/// Frames of the simulation with effects.
+pub trait RemadeFrames: Sync {
+    /// Cloud and objects of a frame, once for each random seed.
+    ///
+    /// # Errors
+    /// Files that cannot be read, and frames that cannot be made.
+    fn frame(&self, id: &str, seeds: &[u64]) -> Result<Vec<(Cloud, Vec<Object>)>, DiagnoseError>;
+}
+
+/// Applies effects to the finished clouds, as `lidarshift resim` does.
+pub struct OnClouds<'a> {
+    /// The simulated data set.
+    pub simulated: &'a Dataset,
+    /// Its sensors.
+    pub rig: &'a Rig,
+}
+
+struct CloudsWith<'a> {
+    finished: FinishedDataset<'a>,
+    effects: &'a EffectList,
+}
+
+impl Remake for OnClouds<'_> {
+    fn refusals(&self, effects: &EffectList) -> Result<Vec<Refusal>, DiagnoseError> {
+        Ok(FinishedDataset::open(self.simulated, Some(self.rig), effects)?.refusals(effects))
+    }
+
+    fn with<'s>(&'s self, effects: &'s EffectList) -> Result<Box<dyn RemadeFrames + 's>, DiagnoseError> {
+        let finished = FinishedDataset::open(self.simulated, Some(self.rig), effects)?;
+        Ok(Box::new(CloudsWith { finished, effects }))
+    }
+}
+
+impl RemadeFrames for CloudsWith<'_> {
+    fn frame(&self, id: &str, seeds: &[u64]) -> Result<Vec<(Cloud, Vec<Object>)>, DiagnoseError> {
+        let frames = self.finished.frames(self.effects, seeds, id)?;
+        Ok(frames.into_iter().map(|(frame, _)| (frame.cloud, frame.objects)).collect())
+    }
+}
+
+/// Distances of the held-out frames by channel, nats, frame by frame.
+type Distances = BTreeMap<Channel, Vec<f64>>;
+
+/// The distances of some frames of a pair.
+fn distances(context: &Context, train: &[usize], test: &[usize], slide: bool) -> Distances {
+    let mut all = Distances::from([
+        (Channel::Residuals, geometry::by_table(context, train, test)),
+        (Channel::Hits, hits::by_table(context, train, test)),
+        (Channel::Roughness, noise::by_table(context, train, test)),
+        (Channel::Returns, returns::by_table(context, train, test)),
+        (Channel::Ranges, quantisation::by_table(context, train, test)),
+        (Channel::Labels, labels::by_table(context, Side::Labels, train, test)),
+        (Channel::Objects, labels::by_table(context, Side::Objects, train, test)),
+    ]);
+    if slide {
+        all.insert(Channel::Slide, rolling_shutter::by_table(context, train, test));
+    }
+    all
+}
+
+/// At most [`FRAMES`] of some frames, evenly spread.
+fn some(frames: Vec<usize>) -> Vec<usize> {
+    let n = frames.len();
+    if n <= FRAMES { frames } else { (0..FRAMES).map(|k| frames[k * n / FRAMES]).collect() }
+}
+
+/// Distances before, after and at the floor.
+pub(super) struct Verification<'a> {
+    engine: &'a Engine<'a>,
+    context: &'a Context<'a>,
+    train: Vec<usize>,
+    test: Vec<usize>,
+    slide: bool,
+    before: Distances,
+}
+
+impl<'a> Verification<'a> {
+    /// Of the pair as it is. `slide` says that the scene is displaced along the scan.
+    pub(super) fn new(engine: &'a Engine<'a>, context: &'a Context<'a>, slide: bool) -> Self {
+        let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role)));
+        let before = distances(context, &train, &test, slide);
+        Verification { engine, context, train, test, slide, before }
+    }
+
+    /// The gain without any extension.
+    pub(super) fn without_extension(&self) -> Gain {
+        self.gain(&self.before, &self.before, false)
+    }
+
+    /// The gain by a list of effects.
+    ///
+    /// # Errors
+    /// Files that cannot be read, and frames that cannot be made.
+    pub(super) fn of(&self, effects: &EffectList, remake: &dyn Remake) -> Result<Gain, DiagnoseError> {
+        let refused = remake.refusals(effects)?;
+        let mut applied = effects.clone();
+        applied.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+        let not_applied = refused.into_iter().map(|r| NotApplied { effect: r.kind.into(), why: r.why }).collect();
+        let zero: Distances = self.before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
+        if applied.effects.is_empty() {
+            return Ok(Gain { not_applied, ..self.gain(&self.before, &zero, true) });
+        }
+        let which: Vec<usize> = {
+            let mut all = [self.train.clone(), self.test.clone()].concat();
+            all.sort_unstable();
+            all
+        };
+        let made = remake.with(&applied)?;
+        let recordings = self.engine.recordings;
+        let two = |&frame: &usize| -> Result<[Arc<SideFrame>; 2], DiagnoseError> {
+            let frames = made.frame(recordings.id(frame), &[0, 1])?;
+            let side = |(cloud, objects): (Cloud, Vec<Object>)| {
+                Arc::new(SideFrame::new(&cloud, objects, self.context.rig))
+            };
+            let sides: Vec<Arc<SideFrame>> = frames.into_iter().map(side).collect();
+            <[Arc<SideFrame>; 2]>::try_from(sides)
+                .map_err(|_| DataError::file(recordings.id(frame).as_ref(), "was not made twice").into())
+        };
+        let sides: Vec<Result<[Arc<SideFrame>; 2], DiagnoseError>> = which.par_iter().map(two).collect();
+        let sides: Vec<[Arc<SideFrame>; 2]> = sides.into_iter().collect::<Result<_, _>>()?;
+        let [one, other]: [Vec<Arc<SideFrame>>; 2] =
+            [0, 1].map(|k: usize| sides.iter().map(|pair| pair[k].clone()).collect());
+        let after = self.distances_of(&which, &recordings.with_sides(&which, None, &one)?)?;
+        let floor = self.distances_of(&which, &recordings.with_sides(&which, Some(&other), &one)?)?;
+        Ok(Gain { not_applied, ..self.gain(&after, &floor, true) })
+    }
+
+    /// Distances of frames that were made anew.
+    fn distances_of(&self, which: &[usize], recordings: &Recordings) -> Result<Distances, DiagnoseError> {
+        let kept = kept_of_frame(self.context.frames.len());
+        let frames: Vec<FramePair> =
+            pair_all(recordings, self.engine.sensors, Corrections::default(), kept, &|_| ())?;
+        let context = Context {
+            rig: self.context.rig,
+            frames: &frames,
+            roles: which.iter().map(|&i| self.context.roles[i]).collect(),
+            times: self.context.times.as_ref().map(|t| which.iter().map(|&i| t[i]).collect()),
+            motion: self.context.motion.as_ref().map(|m| which.iter().map(|&i| m[i]).collect()),
+        };
+        let places = |frames: &[usize]| -> Vec<usize> {
+            frames.iter().filter_map(|frame| which.iter().position(|own| own == frame)).collect()
+        };
+        Ok(distances(&context, &places(&self.train), &places(&self.test), self.slide))
+    }
+
+    /// Sums of the distances over the held-out frames.
+    fn gain(&self, after: &Distances, floor: &Distances, extended: bool) -> Gain {
+        let returns = self.context.returns(&self.test).max(1.0);
+        let members = blocks_of(&self.context.blocks(&self.test));
+        // The distances of a channel over some frames. What tables predict worse than the simulation is no distance.
+        let sums = |channel: &Channel, which: &[usize]| {
+            [&self.before, after, floor]
+                .map(|d| which.iter().map(|&i| d[channel][i]).sum::<f64>().max(0.0))
+        };
+        let closed = |[before, after, floor]: [f64; 3]| {
+            (before > floor).then(|| (before - after) / (before - floor))
+        };
+        let over = |channels: &[Channel], which: &[usize]| {
+            channels.iter().map(|c| sums(c, which)).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
+        };
+        let all_frames: Vec<usize> = (0..self.test.len()).collect();
+        let interval = |channels: &[Channel]| {
+            let mut rng = data::stream(0, "diagnose closed", 1, 0);
+            let drawn = (0..REPETITIONS).filter_map(|_| closed(over(channels, &draw_blocks(&members, &mut rng))));
+            interval_nearest(drawn.collect())
+        };
+        let channels: Vec<Channel> = self.before.keys().copied().collect();
+        let [before, after_all, floor_all] = over(&channels, &all_frames);
+        let of_channel = |c: &Channel| (*c, sums(c, &all_frames).map(|v| v / returns));
+        let enough = |c: &&Channel| {
+            let [before, _, floor] = sums(c, &all_frames);
+            extended && before - floor > ENOUGH_NATS
+        };
+        let share = |c: &Channel| {
+            Some((*c, Closed { closed: closed(sums(c, &all_frames))?, ci95: interval(&[*c]) }))
+        };
+        let of_all = closed([before, after_all, floor_all]).filter(|_| extended);
+        Gain {
+            metric: METRIC.into(),
+            before: before / returns,
+            after: after_all / returns,
+            floor: floor_all / returns,
+            closed: of_all,
+            ci95: of_all.and_then(|_| interval(&channels)),
+            channels: channels.iter().map(of_channel).collect(),
+            closed_by_channel: channels.iter().filter(enough).filter_map(share).collect(),
+            ..Gain::default()
+        }
+    }
+}
+
+/// Writes to each finding what the fits promised of its channel and what was reached there.
+pub(super) fn set_reached(findings: &mut [crate::diagnosis::Finding], gain: &Gain) {
+    for finding in findings {
+        finding.reached = gain.closed_by_channel.get(&finding.channel).map(|c| c.closed);
+        finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
+    }
+}
+
+/// Share of a channel's difference that the fits remove.
+fn promised(predicted: &Predicted, channel: Channel) -> Option<f64> {
+    let [before, after, floor] = *predicted.channels.get(&channel)?;
+    (before > floor).then(|| (before - after) / (before - floor))
+}
