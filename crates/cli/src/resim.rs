@@ -92,10 +92,10 @@ mod tests {
             seed: 1,
             skip_inapplicable: false,
         };
-        std::fs::write(&effects, "[[effect]]\nkind = \"range_noise\"\n").unwrap();
+        std::fs::write(&effects, "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.02\n").unwrap();
         args("noisy").run().unwrap();
         assert_eq!(Dataset::open(&folder.path().join("noisy")).unwrap().ids("test").unwrap(), ["test_000000"]);
-        std::fs::write(&effects, "[[effect]]\nkind = \"ghosts\"\n").unwrap();
+        std::fs::write(&effects, "[[effect]]\nkind = \"ghosts\"\nprobability = 0.02\n").unwrap();
         let error = format!("{:#}", args("ghosts").run().unwrap_err());
         assert!(error.contains("e.toml on") && error.contains("effect[0]: ghosts"), "{error}");
         ResimArgs { skip_inapplicable: true, ..args("copied") }.run().unwrap();

@@ -1,7 +1,7 @@
 //! Findings as effects of the sensor model: what a simulation has to be given to show the same.
 //!
 //! Every parameter of an effect is written: one that the finding does not have takes the value at which it changes
-//! nothing, not the effect's default, which is a typical strength.
+//! nothing.
 
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity};
 use crate::curve::CurvePoint;

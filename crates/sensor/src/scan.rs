@@ -97,6 +97,13 @@ impl Echo {
         returned_light_index(self.returned, self.range_m)
     }
 
+    /// Adds an error to the measured range, m, which stays at least 1 cm. An error of 0 changes nothing.
+    pub fn add_range(&mut self, error_m: f32) {
+        if error_m != 0.0 {
+            self.range_m = (self.range_m + error_m).max(0.01);
+        }
+    }
+
     /// Moves the measured point; range and direction change with it.
     pub fn move_point(&mut self, point: [f32; 3]) {
         let offset: [f32; 3] = std::array::from_fn(|k| point[k] - self.origin[k]);

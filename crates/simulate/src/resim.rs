@@ -272,8 +272,10 @@ mod tests {
     fn the_same_bytes_again_and_after_a_stop() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = street(&folder.path().join("street"));
-        let list =
-            effects("[[effect]]\nkind = \"heavy_tails\"\n[[effect]]\nkind = \"label_offset\"\nforward_m = 0.5\n");
+        let list = effects(concat!(
+            "[[effect]]\nkind = \"heavy_tails\"\nprobability = 0.01\nstd_m = 0.15\n",
+            "[[effect]]\nkind = \"label_offset\"\nforward_m = 0.5\n"
+        ));
         let [one, two] = ["one", "two"].map(|n| folder.path().join(n));
         let manifest = make(&dataset, &list, None, &one).unwrap();
         make(&dataset, &list, None, &two).unwrap();
@@ -308,7 +310,7 @@ mod tests {
         // With the sensor's pattern, rows are known.
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/sensors/hdl64e.toml");
         let rig = Rig::read(Path::new(path)).unwrap();
-        let list = effects("[[effect]]\nkind = \"beam_range_offset\"\n");
+        let list = effects("[[effect]]\nkind = \"beam_range_offset\"\nstd_m = 0.015\n");
         make(&dataset, &list, Some(rig), &folder.path().join("rows")).unwrap();
         let made = Dataset::open(&folder.path().join("rows")).unwrap();
         assert!(made.config.rig.is_some());

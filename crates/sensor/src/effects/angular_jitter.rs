@@ -16,19 +16,13 @@ use serde::{Deserialize, Serialize};
 /// one. On a finished cloud the range in the true direction is that of the plane through the neighbouring points.
 ///
 /// Typical: 0.01 to 0.03 degrees (Ouster OS1 +-0.01, NVIDIA Isaac 0.025, Robotec's GPU LiDAR 1 mrad).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AngularJitter {
     /// Standard deviation of the azimuth error, degrees.
     pub azimuth_std_deg: f64,
     /// Standard deviation of the elevation error, degrees.
     pub elevation_std_deg: f64,
-}
-
-impl Default for AngularJitter {
-    fn default() -> Self {
-        AngularJitter { azimuth_std_deg: 0.02, elevation_std_deg: 0.02 }
-    }
 }
 
 impl AngularJitter {
@@ -50,6 +44,9 @@ impl SensorEffect for AngularJitter {
     }
 
     fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, draws: &Draws) {
+        if *self == AngularJitter::default() {
+            return;
+        }
         let mut random = draws.of_frame();
         for sensor in &mut beams.sensors {
             for direction in sensor.true_directions_mut() {
@@ -59,6 +56,9 @@ impl SensorEffect for AngularJitter {
     }
 
     fn on_cloud(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        if *self == AngularJitter::default() {
+            return;
+        }
         let mut random = draws.of_frame();
         for echo in scan.returns_mut() {
             measure_along(echo, self.turn(echo.direction, &mut random));

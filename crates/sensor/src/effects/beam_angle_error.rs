@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize};
 ///
 /// Typical: 0.2 degrees for all rows of KITTI's HDL-64E (corrected by KISS-ICP, CT-ICP and others); 0.01 to 0.05
 /// between rows.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BeamAngleError {
     /// Elevation error common to all rows, degrees; positive upwards.
@@ -25,12 +25,6 @@ pub struct BeamAngleError {
     pub elevation_std_deg: f64,
     /// Standard deviation of the azimuth error between rows, degrees.
     pub azimuth_std_deg: f64,
-}
-
-impl Default for BeamAngleError {
-    fn default() -> Self {
-        BeamAngleError { elevation_deg: 0.0, elevation_std_deg: 0.03, azimuth_std_deg: 0.03 }
-    }
 }
 
 impl BeamAngleError {
@@ -54,6 +48,9 @@ impl SensorEffect for BeamAngleError {
     }
 
     fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, draws: &Draws) {
+        if *self == BeamAngleError::default() {
+            return;
+        }
         for (number, sensor) in beams.sensors.iter_mut().enumerate() {
             let shots = sensor.shots.clone();
             let mut known = (u16::MAX, [0.0; 2]);
@@ -67,6 +64,9 @@ impl SensorEffect for BeamAngleError {
     }
 
     fn on_cloud(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        if *self == BeamAngleError::default() {
+            return;
+        }
         let mut known = (u8::MAX, u16::MAX, [0.0; 2]);
         for echo in scan.returns_mut() {
             if (known.0, known.1) != (echo.sensor, echo.row) {

@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BeamDivergence {
-    /// Full divergence angle, rad.
+    /// Full divergence angle, rad; 0 for a single ray.
     pub divergence_rad: f64,
     /// Number of rays per shot: 7 or 19.
     pub rays: u32,
@@ -27,13 +27,13 @@ pub struct BeamDivergence {
 
 impl Default for BeamDivergence {
     fn default() -> Self {
-        BeamDivergence { divergence_rad: 0.002, rays: 7, pulse_m: 0.6, pick: Pick::Strongest }
+        BeamDivergence { divergence_rad: 0.0, rays: 7, pulse_m: 0.6, pick: Pick::Strongest }
     }
 }
 
 impl SensorEffect for BeamDivergence {
     fn check(&self) -> Result<(), KeyError> {
-        within("divergence_rad", self.divergence_rad, 1e-6, 0.1)?;
+        within("divergence_rad", self.divergence_rad, 0.0, 0.1)?;
         within("pulse_m", self.pulse_m, 0.0, 100.0)?;
         if [7, 19].contains(&self.rays) {
             Ok(())
@@ -47,6 +47,9 @@ impl SensorEffect for BeamDivergence {
     }
 
     fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {
+        if self.divergence_rad == 0.0 {
+            return;
+        }
         beams.width = Some(BeamWidth {
             divergence_rad: self.divergence_rad as f32,
             rays: self.rays as usize,
@@ -66,7 +69,8 @@ mod tests {
     #[test]
     fn beams_get_their_width() {
         let mut beams = Beams::of(&rig());
-        with_frame(0, |frame, draws| BeamDivergence::default().on_beams(&mut beams, frame, draws));
+        let effect = BeamDivergence { divergence_rad: 0.002, ..BeamDivergence::default() };
+        with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let width = beams.width.unwrap();
         assert_eq!((width.rays, width.second, width.pick), (7, false, Pick::Strongest));
         assert!((width.divergence_rad - 0.002).abs() < 1e-9);

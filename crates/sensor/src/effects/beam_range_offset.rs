@@ -11,9 +11,9 @@ use serde::{Deserialize, Serialize};
 /// All ranges of row b of a sensor are shifted by `offsets_m[b]`, m. If `offsets_m` is empty, the offset is
 /// `std_m * N(0, 1)`, drawn once for each row of each sensor.
 ///
-/// Typical: 1 to 5 cm between the lasers of a Velodyne HDL-64E with the manufacturer's calibration; a third of that
-/// after recalibration (Glennie and Lichti 2010).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: 1 to 5 cm (0.015 m) between the lasers of a Velodyne HDL-64E with the manufacturer's calibration; a third
+/// of that after recalibration (Glennie and Lichti 2010).
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BeamRangeOffset {
     /// Standard deviation between rows, m. Used if `offsets_m` is empty.
@@ -21,12 +21,6 @@ pub struct BeamRangeOffset {
     /// Offset of each row from the top, m, the same for every sensor. Rows beyond the end of the list have offset 0.
     /// Replaces `std_m`.
     pub offsets_m: Vec<f64>,
-}
-
-impl Default for BeamRangeOffset {
-    fn default() -> Self {
-        BeamRangeOffset { std_m: 0.015, offsets_m: Vec::new() }
-    }
 }
 
 impl BeamRangeOffset {
@@ -55,7 +49,7 @@ impl SensorEffect for BeamRangeOffset {
             if (known.0, known.1) != (echo.sensor, echo.row) {
                 known = (echo.sensor, echo.row, self.offset_m(echo.sensor, echo.row, draws));
             }
-            echo.range_m = (echo.range_m + known.2).max(0.01);
+            echo.add_range(known.2);
         }
     }
 }
@@ -67,7 +61,7 @@ mod tests {
 
     #[test]
     fn rows_keep_their_offset_in_every_frame() {
-        let (before, effect) = (scene(), BeamRangeOffset::default());
+        let (before, effect) = (scene(), BeamRangeOffset { std_m: 0.015, ..BeamRangeOffset::default() });
         let (one, other) = (applied_in(1, &effect, &before), applied_in(2, &effect, &before));
         assert_eq!(one, other);
         let mut of_row = vec![Vec::new(); GRID.0];

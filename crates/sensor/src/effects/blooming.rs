@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 /// `strength * exp(-psi / halo_deg)`. A return is bright if its returned light exceeds `returned_above`. Only shots
 /// that are not bright themselves and have no return, or a farther one, are affected.
 ///
-/// Typical: a halo of 0.1 to 1 degree around retro-reflectors.
+/// Typical: a halo of 0.1 to 1 degree around retro-reflectors, strength 0.5.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Blooming {
@@ -27,7 +27,7 @@ pub struct Blooming {
 
 impl Default for Blooming {
     fn default() -> Self {
-        Blooming { returned_above: 2.0, halo_deg: 0.3, strength: 0.5 }
+        Blooming { returned_above: 2.0, halo_deg: 0.3, strength: 0.0 }
     }
 }
 

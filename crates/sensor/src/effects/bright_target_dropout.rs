@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 /// light exceeds `returned_above`. Bright returns are not lost. Sensors that filter blooming artefacts also remove
 /// valid returns.
 ///
-/// Typical: 0.2 to 1 degree around signs and number plates.
+/// Typical: 0.2 to 1 degree around signs and number plates, share 0.5.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct BrightTargetDropout {
@@ -27,7 +27,7 @@ pub struct BrightTargetDropout {
 
 impl Default for BrightTargetDropout {
     fn default() -> Self {
-        BrightTargetDropout { returned_above: 2.0, radius_deg: 0.6, share: 0.5 }
+        BrightTargetDropout { returned_above: 2.0, radius_deg: 0.6, share: 0.0 }
     }
 }
 

@@ -11,25 +11,22 @@ use serde::{Deserialize, Serialize};
 /// it does not quantise ranges.
 ///
 /// Typical: 1 mm (the files of KITTI).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct CoordinateRounding {
-    /// Step, m.
+    /// Step, m; 0 for no rounding.
     pub step_m: f64,
-}
-
-impl Default for CoordinateRounding {
-    fn default() -> Self {
-        CoordinateRounding { step_m: 0.001 }
-    }
 }
 
 impl SensorEffect for CoordinateRounding {
     fn check(&self) -> Result<(), KeyError> {
-        within("step_m", self.step_m, 1e-6, 10.0)
+        within("step_m", self.step_m, 0.0, 10.0)
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        if self.step_m == 0.0 {
+            return;
+        }
         for echo in scan.returns_mut() {
             let rounded = echo.point().map(|v| ((f64::from(v) / self.step_m).round() * self.step_m) as f32);
             echo.move_point(rounded);

@@ -15,11 +15,11 @@ use serde::{Deserialize, Serialize};
 /// `loss * (1 - T^2)`. The range error is `noise_m * (1 / T - 1) * N(0, 1)`, m. Directions with T above 0.999 are not
 /// changed.
 ///
-/// Typical: transmission 0.1 to 0.7 in a spot of 2 to 10 degrees.
+/// Typical: transmission 0.1 to 0.7 in a spot of 2 to 10 degrees, loss 0.8, noise_m 0.02.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DirtyWindow {
-    /// Name of the sensor.
+    /// Name of the sensor; empty for none.
     pub sensor: String,
     /// Azimuth of the centre of the spot, degrees counter-clockwise from the sensor's x axis.
     pub azimuth_deg: f64,
@@ -38,13 +38,13 @@ pub struct DirtyWindow {
 impl Default for DirtyWindow {
     fn default() -> Self {
         DirtyWindow {
-            sensor: "front".into(),
+            sensor: String::new(),
             azimuth_deg: 20.0,
             elevation_deg: -3.0,
             radius_deg: 6.0,
-            transmission: 0.4,
-            loss: 0.8,
-            noise_m: 0.02,
+            transmission: 1.0,
+            loss: 0.0,
+            noise_m: 0.0,
         }
     }
 }
@@ -75,7 +75,7 @@ impl SensorEffect for DirtyWindow {
             }
             echo.returned *= passes * passes;
             let noise: f32 = StandardNormal.sample(&mut random);
-            echo.range_m = (echo.range_m + self.noise_m as f32 * (1.0 / passes - 1.0) * noise).max(0.01);
+            echo.add_range(self.noise_m as f32 * (1.0 / passes - 1.0) * noise);
             if random.random_range(0.0..1.0_f32) < self.loss as f32 * (1.0 - passes * passes) {
                 echo.lose();
             }
@@ -91,8 +91,15 @@ mod tests {
     #[test]
     fn losses_are_limited_to_the_spot_in_the_sensor_s_frame() {
         let before = scene();
-        let effect =
-            DirtyWindow { transmission: 0.5, loss: 1.0, noise_m: 0.1, elevation_deg: -5.0, ..DirtyWindow::default() };
+        let effect = DirtyWindow {
+            sensor: "front".into(),
+            azimuth_deg: 20.0,
+            elevation_deg: -5.0,
+            radius_deg: 6.0,
+            transmission: 0.5,
+            loss: 1.0,
+            noise_m: 0.1,
+        };
         let after = applied(&effect, &before);
         let share = |low: f64, high: f64| {
             let inside = |d: [f32; 3]| {

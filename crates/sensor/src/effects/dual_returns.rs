@@ -42,7 +42,7 @@ mod tests {
         with_frame(0, |frame, draws| {
             DualReturns {}.on_beams(&mut beams, frame, draws);
             assert_eq!(beams.width, None, "a shot without divergence has one return");
-            BeamDivergence::default().on_beams(&mut beams, frame, draws);
+            BeamDivergence { divergence_rad: 0.002, ..BeamDivergence::default() }.on_beams(&mut beams, frame, draws);
             DualReturns {}.on_beams(&mut beams, frame, draws);
         });
         assert!(beams.width.unwrap().second);

@@ -15,8 +15,9 @@ use serde::{Deserialize, Serialize};
 /// turns the nose down. The true height differs by `heave_std_m * N(0, 1)`. Values are drawn anew in every frame.
 /// Points are computed with the reported pose, so the whole cloud is rotated and shifted relative to labels and world.
 ///
-/// Typical: 0.1 to 0.3 degrees of pitch from braking, aerodynamic load (with the square of the speed) and bumps.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: 0.1 to 0.3 degrees of pitch from braking, aerodynamic load (with the square of the speed) and bumps;
+/// standard deviations of 0.05 degrees.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoAttitude {
     /// Mean roll error, degrees; positive turns the left side up.
@@ -31,19 +32,6 @@ pub struct EgoAttitude {
     pub pitch_std_deg: f64,
     /// Standard deviation of the height between frames, m.
     pub heave_std_m: f64,
-}
-
-impl Default for EgoAttitude {
-    fn default() -> Self {
-        EgoAttitude {
-            roll_deg: 0.0,
-            pitch_deg: 0.1,
-            pitch_at_70mps_deg: 0.0,
-            roll_std_deg: 0.05,
-            pitch_std_deg: 0.05,
-            heave_std_m: 0.0,
-        }
-    }
 }
 
 impl SensorEffect for EgoAttitude {
@@ -73,6 +61,9 @@ impl SensorEffect for EgoAttitude {
     /// The cloud is transformed as a whole; each sensor's visible surfaces are assumed to stay the same.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let (tilt, heave_m) = self.of_frame(frame, draws);
+        if tilt == UnitQuaternion::identity() && heave_m == 0.0 {
+            return;
+        }
         for echo in scan.returns_mut() {
             let lowered = Vector3::from(echo.point().map(f64::from)) - Vector3::z() * heave_m;
             echo.move_point((tilt.inverse() * lowered).map(|v| v as f32).into());
@@ -100,7 +91,7 @@ mod tests {
 
     #[test]
     fn a_nose_down_error_raises_points_ahead() {
-        let still = EgoAttitude { pitch_deg: 0.5, roll_std_deg: 0.0, pitch_std_deg: 0.0, ..EgoAttitude::default() };
+        let still = EgoAttitude { pitch_deg: 0.5, ..EgoAttitude::default() };
         let before = scene();
         let mut after = before.clone();
         with_frame(0, |frame, draws| still.on_cloud(&mut after, frame, draws));

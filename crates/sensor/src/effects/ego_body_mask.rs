@@ -1,7 +1,6 @@
 //! B7: directions hidden by parts of the ego vehicle.
 
 use super::{Draws, FrameContext, SensorEffect};
-use crate::car::{CAR_SIZE_M, car_box};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
@@ -10,29 +9,13 @@ use serde::{Deserialize, Serialize};
 
 /// A shot that intersects one of `boxes` before its measured range has no return.
 ///
-/// The default is the rear wing of the AV-21, which hides a trapezoid of about 10 x 5 m behind the car (Huch et al.
-/// 2023, section IV-A).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: the rear wing of the AV-21, which hides a trapezoid of about 10 x 5 m behind the car (Huch et al. 2023,
+/// section IV-A). Its boxes are in `configs/simulate/measured.toml`.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoBodyMask {
     /// Axis-aligned boxes in the cloud's frame, m: minimum x, y, z, then maximum x, y, z.
     pub boxes: Vec<[f64; 6]>,
-}
-
-impl Default for EgoBodyMask {
-    fn default() -> Self {
-        let bbox = car_box();
-        let (rear, top) = (bbox.center[0] - CAR_SIZE_M[0] / 2.0, bbox.z_range().1);
-        // Main plane and flap as one box, end plates, and support. Shots pass above and below the planes.
-        EgoBodyMask {
-            boxes: vec![
-                [rear, -0.54, top - 0.22, rear + 0.42, 0.54, top - 0.06],
-                [rear, -0.54, top - 0.42, rear + 0.45, -0.50, top],
-                [rear, 0.50, top - 0.42, rear + 0.45, 0.54, top],
-                [rear + 0.1, -0.12, 0.1, rear + 0.3, 0.12, top - 0.2],
-            ],
-        }
-    }
 }
 
 impl SensorEffect for EgoBodyMask {

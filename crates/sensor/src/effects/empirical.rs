@@ -105,7 +105,7 @@ impl SensorEffect for Empirical {
             let lost = random.random_range(0.0..1.0_f64) < at(&self.loss, x);
             let noise: f64 = StandardNormal.sample(&mut random);
             let off = at(&self.mean_m, x) + at(&self.std_m, x) * noise;
-            echo.range_m = (echo.range_m + off as f32).max(0.01);
+            echo.add_range(off as f32);
             if lost {
                 echo.lose();
             }

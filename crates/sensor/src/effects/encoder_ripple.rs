@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// `amplitude_m * sin(periods * a + phase_rad)`, m, is added to each range, a the azimuth in the cloud's frame, rad.
 /// The effect is not in the usual catalogues; it tests a diagnosis on unknown causes.
 ///
-/// Typical: millimetres to centimetres.
+/// Typical: millimetres to centimetres (0.02 m).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EncoderRipple {
@@ -24,7 +24,7 @@ pub struct EncoderRipple {
 
 impl Default for EncoderRipple {
     fn default() -> Self {
-        EncoderRipple { amplitude_m: 0.02, periods: 6.0, phase_rad: 0.0 }
+        EncoderRipple { amplitude_m: 0.0, periods: 6.0, phase_rad: 0.0 }
     }
 }
 
@@ -39,7 +39,7 @@ impl SensorEffect for EncoderRipple {
         for echo in scan.returns_mut() {
             let azimuth = f64::from(echo.direction[1]).atan2(echo.direction[0].into());
             let off = self.amplitude_m * (self.periods * azimuth + self.phase_rad).sin();
-            echo.range_m = (echo.range_m + off as f32).max(0.01);
+            echo.add_range(off as f32);
         }
     }
 }

@@ -2,31 +2,19 @@
 
 use super::{Need, SensorEffect, WorldPlan};
 use crate::object::Group;
-use data::KeyError;
-use data::toml_text::wrong;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// `groups` of the static world are present, even if an effect before this one in the list, such as
 /// [`super::MissingObjects`], removed them.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ExtraObjects {
     /// Groups that are present.
     pub groups: Vec<Group>,
 }
 
-impl Default for ExtraObjects {
-    fn default() -> Self {
-        ExtraObjects { groups: vec![Group::OutsideGround, Group::OutsideObjects] }
-    }
-}
-
 impl SensorEffect for ExtraObjects {
-    fn check(&self) -> Result<(), KeyError> {
-        if self.groups.is_empty() { Err(wrong("groups", "is empty")) } else { Ok(()) }
-    }
-
     fn needs(&self) -> Option<&'static [Need]> {
         None
     }
@@ -43,7 +31,7 @@ mod tests {
     #[test]
     fn groups_that_are_present_do_not_change() {
         let mut world = WorldPlan::default();
-        ExtraObjects::default().on_world(&mut world);
+        ExtraObjects { groups: vec![Group::OutsideGround, Group::OutsideObjects] }.on_world(&mut world);
         assert_eq!(world, WorldPlan::default());
     }
 }

@@ -13,23 +13,24 @@ use serde::{Deserialize, Serialize};
 /// the surface. The range r of the droplet has a density proportional to `exp(-2 alpha r)` between 1 m and R. For shots
 /// without a return, R is `reach_m`.
 ///
-/// Typical: visibility 50 m (alpha 0.06, dense) to 1000 m (Hahner et al. 2021); backscatter 0.01 to 0.3. Fog attenuates
-/// the light but does not remove returns: put a detection threshold ([`super::SignalDropout`]) behind it in the list.
+/// Typical: visibility 50 m (alpha 0.06, dense) to 1000 m (Hahner et al. 2021); backscatter 0.01 to 0.3 (0.05). Fog
+/// attenuates the light but does not remove returns: put a detection threshold ([`super::SignalDropout`]) behind it in
+/// the list.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct Fog {
     /// Meteorological optical range, m.
     pub visibility_m: f64,
     /// Probability factor of droplet returns, 0 to 1.
+    #[serde(default)]
     pub backscatter: f64,
     /// Maximum range of droplets for shots without a return, m.
+    #[serde(default = "usual_reach_m")]
     pub reach_m: f64,
 }
 
-impl Default for Fog {
-    fn default() -> Self {
-        Fog { visibility_m: 300.0, backscatter: 0.05, reach_m: 50.0 }
-    }
+fn usual_reach_m() -> f64 {
+    50.0
 }
 
 impl SensorEffect for Fog {

@@ -13,8 +13,8 @@ use serde::{Deserialize, Serialize};
 /// the range of the reflecting surface, L the distance from there to the reflected surface, m. If the reflected ray
 /// meets nothing within `longest_m`, the return stays as it is.
 ///
-/// Typical: rare on paint and metal, frequent at glass fronts and wet roads (issue 387 of the Waymo Open Dataset; the
-/// data set Ghost-FWL).
+/// Typical: probability 0.02; rare on paint and metal, frequent at glass fronts and wet roads (issue 387 of the Waymo
+/// Open Dataset; the data set Ghost-FWL).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Ghosts {
@@ -26,7 +26,7 @@ pub struct Ghosts {
 
 impl Default for Ghosts {
     fn default() -> Self {
-        Ghosts { probability: 0.02, longest_m: 60.0 }
+        Ghosts { probability: 0.0, longest_m: 60.0 }
     }
 }
 

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// m, s the arc length along the track's centre line, m. Cars keep the heights of their trajectories, so that the
 /// ground moves relative to them.
 ///
-/// Typical: a few centimetres to a decimetre over 50 to 200 m.
+/// Typical: a few centimetres (0.05 m) to a decimetre over 50 to 200 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct GroundError {
@@ -24,7 +24,7 @@ pub struct GroundError {
 
 impl Default for GroundError {
     fn default() -> Self {
-        GroundError { amplitude_m: 0.05, length_m: 120.0, phase_rad: 0.0 }
+        GroundError { amplitude_m: 0.0, length_m: 120.0, phase_rad: 0.0 }
     }
 }
 
@@ -41,7 +41,9 @@ impl SensorEffect for GroundError {
 
     fn on_world(&self, world: &mut WorldPlan) {
         let GroundError { amplitude_m, length_m, phase_rad } = *self;
-        world.undulation = Some(Undulation { amplitude_m, length_m, phase_rad });
+        if amplitude_m != 0.0 {
+            world.undulation = Some(Undulation { amplitude_m, length_m, phase_rad });
+        }
     }
 }
 

@@ -12,19 +12,13 @@ use serde::{Deserialize, Serialize};
 /// With probability `probability`, `std_m * N(0, 1)`, m, is added to a range, in addition to other noise.
 ///
 /// Typical: 0.1 to 3 % of the returns, 5 to 30 cm.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct HeavyTails {
     /// Fraction of the returns that are outliers, 0 to 1.
     pub probability: f64,
     /// Standard deviation of the outliers' additional error, m.
     pub std_m: f64,
-}
-
-impl Default for HeavyTails {
-    fn default() -> Self {
-        HeavyTails { probability: 0.01, std_m: 0.15 }
-    }
 }
 
 impl SensorEffect for HeavyTails {
@@ -38,7 +32,7 @@ impl SensorEffect for HeavyTails {
         for echo in scan.returns_mut() {
             if random.random_bool(self.probability) {
                 let noise: f32 = StandardNormal.sample(&mut random);
-                echo.range_m = (echo.range_m + self.std_m as f32 * noise).max(0.01);
+                echo.add_range(self.std_m as f32 * noise);
             }
         }
     }

@@ -12,20 +12,14 @@ use serde::{Deserialize, Serialize};
 /// of range.
 ///
 /// Typical: half at 85 to 88 degrees (cos 0.09 to 0.03) for diffuse surfaces, at 60 to 75 degrees for paint and metal
-/// (Muckenhuber et al. 2020 measured nine automotive materials).
+/// (Muckenhuber et al. 2020 measured nine automotive materials); steepness 120.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct IncidenceDropout {
     /// Cosine of the angle of incidence at which half of the returns are lost.
     pub cos_half: f64,
     /// Steepness of the logistic function, per unit of the cosine.
     pub steepness: f64,
-}
-
-impl Default for IncidenceDropout {
-    fn default() -> Self {
-        IncidenceDropout { cos_half: 0.03, steepness: 120.0 }
-    }
 }
 
 impl SensorEffect for IncidenceDropout {

@@ -10,27 +10,37 @@ use serde::{Deserialize, Serialize};
 /// The intensity becomes `min(gain * (returned * (reference_m / R)^range_exponent)^gamma, 1)`, R the range, m, rounded
 /// to a multiple of `1 / levels`.
 ///
-/// Typical: range_exponent 2 for raw power, 0 for sensors that correct for range; 100 levels (KITTI) or 255; saturation
-/// on retro-reflectors.
+/// Typical: gain 1; range_exponent 2 for raw power, 0 for sensors that correct for range; 100 levels (KITTI) or 255;
+/// saturation on retro-reflectors.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct IntensityLaw {
     /// Intensity of a white Lambertian plate at normal incidence and range `reference_m`, before saturation.
     pub gain: f64,
     /// Reference range, m.
+    #[serde(default = "usual_reference_m")]
     pub reference_m: f64,
     /// Exponent of the decrease with range: 0 for intensities corrected for range, 2 for raw power.
+    #[serde(default)]
     pub range_exponent: f64,
     /// Exponent of the receiver's response; 1 is linear.
+    #[serde(default = "linear")]
     pub gamma: f64,
     /// Number of steps between 0 and 1.
+    #[serde(default = "levels_of_a_byte")]
     pub levels: u32,
 }
 
-impl Default for IntensityLaw {
-    fn default() -> Self {
-        IntensityLaw { gain: 1.0, reference_m: 20.0, range_exponent: 0.0, gamma: 1.0, levels: 255 }
-    }
+fn usual_reference_m() -> f64 {
+    20.0
+}
+
+fn linear() -> f64 {
+    1.0
+}
+
+fn levels_of_a_byte() -> u32 {
+    255
 }
 
 impl SensorEffect for IntensityLaw {

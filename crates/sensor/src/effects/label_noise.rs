@@ -11,8 +11,9 @@ use serde::{Deserialize, Serialize};
 /// A label is shifted by independent normal errors along its heading, to the left and upwards, and its yaw by another.
 /// With probability `slip_probability` it is shifted by another `slip_m` forward or backward, with equal probability.
 ///
-/// Typical: 2 to 5 cm and 0.1 to 0.5 degrees (RTK); shifts of about 0.8 m in some frames (Huch et al. 2023, figure 8).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: 2 to 5 cm and 0.1 to 0.5 degrees (RTK): 0.05, 0.03 and 0.03 m, 0.2 degrees; shifts of about 0.8 m in some
+/// frames (Huch et al. 2023, figure 8).
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelNoise {
     /// Standard deviation along the heading, m.
@@ -27,19 +28,6 @@ pub struct LabelNoise {
     pub slip_probability: f64,
     /// Size of the additional shift along the heading, m.
     pub slip_m: f64,
-}
-
-impl Default for LabelNoise {
-    fn default() -> Self {
-        LabelNoise {
-            longitudinal_std_m: 0.05,
-            lateral_std_m: 0.03,
-            vertical_std_m: 0.03,
-            yaw_std_deg: 0.2,
-            slip_probability: 0.0,
-            slip_m: 0.8,
-        }
-    }
 }
 
 impl SensorEffect for LabelNoise {

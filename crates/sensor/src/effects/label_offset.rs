@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// lever arm from the GNSS antenna to the centre of the car.
 ///
 /// Typical: 0.1 to 1 m.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelOffset {
     /// Shift along the heading, m.
@@ -21,12 +21,6 @@ pub struct LabelOffset {
     pub up_m: f64,
     /// Rotation, degrees counter-clockwise.
     pub yaw_deg: f64,
-}
-
-impl Default for LabelOffset {
-    fn default() -> Self {
-        LabelOffset { forward_m: 0.15, left_m: 0.0, up_m: 0.0, yaw_deg: 0.0 }
-    }
 }
 
 impl SensorEffect for LabelOffset {

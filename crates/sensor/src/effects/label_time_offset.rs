@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 /// its car, v_ego the ego velocity, w the ego turn rate, r the centre of the label, all in the cloud's frame.
 ///
 /// Typical: 5 to 20 ms; 0.8 m at 70 m/s are 11 ms (Huch et al. 2023, section V).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct LabelTimeOffset {
     /// Age of the labels relative to the cloud, s; negative for labels that are ahead.
@@ -30,12 +30,6 @@ pub enum Clock {
     Cars,
     /// The clock of the cloud, relative to the positions of all cars, the ego vehicle included.
     Cloud,
-}
-
-impl Default for LabelTimeOffset {
-    fn default() -> Self {
-        LabelTimeOffset { offset_s: 0.01, clock: Clock::Cars }
-    }
 }
 
 impl SensorEffect for LabelTimeOffset {

@@ -2,32 +2,21 @@
 
 use super::{Need, SensorEffect, WorldPlan};
 use crate::object::Group;
-use data::KeyError;
-use data::toml_text::wrong;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// `groups` of the static world are absent.
 ///
-/// Typical: the simulation of Huch et al. 2023 has nothing behind the outer wall.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: the simulation of Huch et al. 2023 has nothing behind the outer wall: groups `outside_ground` and
+/// `outside_objects`.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct MissingObjects {
     /// Groups that are absent.
     pub groups: Vec<Group>,
 }
 
-impl Default for MissingObjects {
-    fn default() -> Self {
-        MissingObjects { groups: vec![Group::OutsideGround, Group::OutsideObjects] }
-    }
-}
-
 impl SensorEffect for MissingObjects {
-    fn check(&self) -> Result<(), KeyError> {
-        if self.groups.is_empty() { Err(wrong("groups", "is empty")) } else { Ok(()) }
-    }
-
     fn needs(&self) -> Option<&'static [Need]> {
         None
     }
@@ -45,7 +34,7 @@ mod tests {
     #[test]
     fn groups_are_removed_and_added_again() {
         let mut world = WorldPlan::default();
-        MissingObjects::default().on_world(&mut world);
+        MissingObjects { groups: vec![Group::OutsideGround, Group::OutsideObjects] }.on_world(&mut world);
         assert_eq!(world.groups.len(), Group::ALL.len() - 2);
         assert!(!world.groups.contains(&Group::OutsideObjects));
         ExtraObjects { groups: vec![Group::OutsideObjects] }.on_world(&mut world);

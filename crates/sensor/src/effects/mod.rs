@@ -12,6 +12,9 @@
 //! one without the frame for values that are constant in a data set, such as the range offset of a beam. The result of
 //! an effect therefore depends neither on effects added behind it nor on the number of threads.
 //!
+//! A parameter that is left out changes nothing: strengths are 0, lists are empty, limits are none. A parameter without
+//! such a value is required. What matters only together with a strength has a typical default.
+//!
 //! The codes (A1, B2, ...) are those of the catalogue in `docs/src/reference/effects.md`.
 
 mod context;
@@ -285,6 +288,8 @@ impl EffectList {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::object::Group;
+    use crate::scan::Echo;
 
     #[test]
     fn lists_are_read_in_their_order() {
@@ -328,14 +333,95 @@ mod tests {
         sorted.sort_unstable();
         sorted.dedup();
         assert_eq!(sorted.len(), kinds.len());
-        for kind in kinds {
-            // Every effect is valid with its defaults, and its kind is the name of its file.
-            let text = format!("[[effect]]\nkind = \"beam_divergence\"\n[[effect]]\nkind = \"{kind}\"\n");
-            let list = EffectList::parse(&text, Path::new("e.toml")).unwrap();
-            assert_eq!(list.effects[1].kind(), kind);
-        }
         for code in ["A1", "A10", "B1", "B10", "C1", "C11", "D1", "D7"] {
             assert!(Effect::CATALOGUE.iter().any(|(_, c)| *c == code), "{code}");
+        }
+    }
+
+    /// Parameters without a neutral value: effect, the parameters before it, and its key.
+    const REQUIRED: [(&str, &str, &str); 8] = [
+        ("signal_dropout", "", "threshold"),
+        ("signal_dropout", "threshold = 0", "steepness"),
+        ("incidence_dropout", "", "cos_half"),
+        ("incidence_dropout", "cos_half = 0.03", "steepness"),
+        ("rolling_shutter", "", "deskewed"),
+        ("fog", "", "visibility_m"),
+        ("intensity_law", "", "gain"),
+        ("point_order", "", "shuffled"),
+    ];
+
+    #[test]
+    fn parameters_without_a_neutral_value_are_required() {
+        for (kind, parameters, key) in REQUIRED {
+            let text = format!("[[effect]]\nkind = \"{kind}\"\n{parameters}\n");
+            let error = EffectList::parse(&text, Path::new("e.toml")).unwrap_err().to_string();
+            assert!(error.contains(&format!("missing field `{key}`")), "{kind}: {error}");
+        }
+    }
+
+    #[test]
+    fn what_is_left_out_changes_nothing() {
+        let parsed = |text: &str| EffectList::parse(text, Path::new("e.toml")).unwrap();
+        for (kind, _) in Effect::CATALOGUE {
+            if REQUIRED.iter().any(|(required, ..)| required == kind) {
+                continue;
+            }
+            // The divergence is for `dual_returns`.
+            let list = parsed(&format!("[[effect]]\nkind = \"beam_divergence\"\n[[effect]]\nkind = \"{kind}\"\n"));
+            assert_eq!(list.effects[1].kind(), *kind);
+            assert_neutral(&list);
+        }
+        for names_alone in [
+            "kind = \"sensor_pose_error\"\nsensor = \"front\"",
+            "kind = \"dirty_window\"\nsensor = \"front\"",
+            "kind = \"empirical\"\nsensor = \"front\"\ncovariate = \"signal\"",
+            "kind = \"material_dropout\"\nmaterials = [\"wall\"]",
+            "kind = \"point_order\"\nshuffled = false",
+        ] {
+            assert_neutral(&parsed(&format!("[[effect]]\n{names_alone}\n")));
+        }
+    }
+
+    /// Asserts that a list changes nothing at any stage.
+    fn assert_neutral(list: &EffectList) {
+        let mut other = WorldPlan {
+            undulation: Some(Undulation { amplitude_m: 0.1, length_m: 80.0, phase_rad: 1.0 }),
+            car_scale: [0.9, 1.0, 1.1],
+            car_shift_m: [0.1, -0.2, 0.3],
+            car_tilt: [[0.01, 0.02], [-0.03, 0.04]],
+            ..WorldPlan::default()
+        };
+        other.groups.remove(&Group::Fence);
+        for before in [WorldPlan::default(), other] {
+            let mut after = before.clone();
+            list.on_world(&mut after);
+            assert_eq!(after, before, "{list:?}");
+        }
+        // With a return nearer than 1 cm, and one without light.
+        let mut before = testing::scene();
+        let wall = *before.returns().next().unwrap();
+        let dark = Echo { returned: 0.0, reflectivity: 0.0, ..wall };
+        before.echoes.extend([Echo { range_m: 0.005, ..wall }, dark]);
+        for index in [0, 7] {
+            testing::with_frame(index, |frame, _| {
+                let nominal = Beams { ego_heave_m: 0.1, ..Beams::of(frame.rig) };
+                let mut beams = nominal.clone();
+                list.on_beams(&mut beams, frame);
+                for (a, b) in beams.sensors.iter().zip(&nominal.sensors) {
+                    assert_eq!((a.true_mount, a.directions()), (b.true_mount, b.directions()), "{list:?}");
+                    assert_eq!((a.nominal_mount, a.limits_m), (b.nominal_mount, b.limits_m), "{list:?}");
+                }
+                assert_eq!((beams.ego_tilt, beams.ego_heave_m), (nominal.ego_tilt, nominal.ego_heave_m), "{list:?}");
+                assert_eq!((beams.shutter, beams.width), (None, None), "{list:?}");
+                let mut after = before.clone();
+                list.on_scan(&mut after, frame);
+                assert!(after == before, "on_scan: {list:?}");
+                list.on_cloud(&mut after, frame);
+                assert!(after == before, "on_cloud: {list:?}");
+                let mut cars = testing::cars();
+                list.on_labels(&mut cars, frame);
+                assert_eq!(cars, testing::cars(), "{list:?}");
+            });
         }
     }
 }

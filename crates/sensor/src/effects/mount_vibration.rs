@@ -24,7 +24,7 @@ pub struct MountVibration {
 
 impl Default for MountVibration {
     fn default() -> Self {
-        MountVibration { amplitude_deg: 0.1, frequency_hz: 1.7 }
+        MountVibration { amplitude_deg: 0.0, frequency_hz: 1.7 }
     }
 }
 

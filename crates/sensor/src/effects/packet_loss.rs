@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 /// previous packet arrived, and with probability `burst` if the previous packet was lost (Gilbert channel). With
 /// probability `outage` all points of a sensor are missing in a frame.
 ///
-/// Typical: 0.1 to 5 % of the packets, in bursts.
+/// Typical: 0.1 to 5 % of the packets, in bursts: loss 0.002, burst 0.5.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PacketLoss {
@@ -29,7 +29,7 @@ pub struct PacketLoss {
 
 impl Default for PacketLoss {
     fn default() -> Self {
-        PacketLoss { packet_ms: 0.5, loss: 0.002, burst: 0.5, outage: 0.0 }
+        PacketLoss { packet_ms: 0.5, loss: 0.0, burst: 0.0, outage: 0.0 }
     }
 }
 
@@ -106,7 +106,7 @@ mod tests {
     #[test]
     fn an_outage_removes_all_points_of_a_sensor() {
         let before = scene();
-        let effect = PacketLoss { outage: 0.3, loss: 0.0, ..PacketLoss::default() };
+        let effect = PacketLoss { outage: 0.3, ..PacketLoss::default() };
         let shares: Vec<f64> = (0..200).map(|frame| lost(&before, &applied_in(frame, &effect, &before))).collect();
         assert!(shares.iter().all(|s| *s == 0.0 || *s == 1.0));
         let (mean, _) = moments(&shares);

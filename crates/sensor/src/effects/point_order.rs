@@ -7,10 +7,14 @@ use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The points of a cloud are in random order, as after merging the clouds of several sensors over a network.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct PointOrder {}
+/// If `shuffled` is true, the points of a cloud are in random order, as after merging the clouds of several sensors
+/// over a network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct PointOrder {
+    /// Put the points in random order.
+    pub shuffled: bool,
+}
 
 impl SensorEffect for PointOrder {
     fn check(&self) -> Result<(), KeyError> {
@@ -18,7 +22,9 @@ impl SensorEffect for PointOrder {
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
-        scan.echoes.shuffle(&mut draws.of_frame());
+        if self.shuffled {
+            scan.echoes.shuffle(&mut draws.of_frame());
+        }
     }
 }
 
@@ -30,8 +36,9 @@ mod tests {
     #[test]
     fn the_same_points_in_another_order() {
         let before = scene();
-        let after = applied(&PointOrder {}, &before);
+        let after = applied(&PointOrder { shuffled: true }, &before);
         assert_ne!(before, after);
+        assert_eq!(applied(&PointOrder { shuffled: false }, &before), before);
         let sorted = |scan: &Scan| {
             let mut keys: Vec<_> = scan.echoes.iter().map(|e| (e.row, e.column, e.range_m.to_bits())).collect();
             keys.sort_unstable();

@@ -13,20 +13,14 @@ use serde::{Deserialize, Serialize};
 /// `0.3 m - 2 m * ln(U)`, U uniform between 0 and 1, if that is nearer than its surface. Only near drops return enough
 /// light.
 ///
-/// Typical: 2 (light) to 50 mm/h (violent); 0.1 to 1 % of the shots at 10 mm/h.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: 2 (light) to 50 mm/h (violent); 0.1 to 1 % of the shots at 10 mm/h (drops 0.003).
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct Rain {
     /// Rain rate, mm/h.
     pub rate_mm_per_h: f64,
     /// Probability that a shot reports a drop at 10 mm/h, 0 to 1.
     pub drops: f64,
-}
-
-impl Default for Rain {
-    fn default() -> Self {
-        Rain { rate_mm_per_h: 10.0, drops: 0.003 }
-    }
 }
 
 /// Mean distance of reported drops beyond 0.3 m, m.

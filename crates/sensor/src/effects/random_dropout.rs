@@ -12,17 +12,11 @@ use serde::{Deserialize, Serialize};
 ///
 /// Typical: 0.20 in the "sim downsampled" of Huch et al. 2023; 0.45 is the default of CARLA; recorded road data lose
 /// 0.05 to 0.15 on average.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RandomDropout {
     /// Probability of a loss, 0 to 1.
     pub share: f64,
-}
-
-impl Default for RandomDropout {
-    fn default() -> Self {
-        RandomDropout { share: 0.2 }
-    }
 }
 
 impl SensorEffect for RandomDropout {

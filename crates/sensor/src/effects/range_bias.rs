@@ -9,20 +9,14 @@ use serde::{Deserialize, Serialize};
 
 /// A range R becomes `R * (1 + scale) + offset_m`, m.
 ///
-/// Typical: millimetres to centimetres; scale 1e-4 to 1e-3.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: offset of millimetres to centimetres (0.02); scale 1e-4 to 1e-3.
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeBias {
     /// Offset, m.
     pub offset_m: f64,
     /// Scale error, m per m of range.
     pub scale: f64,
-}
-
-impl Default for RangeBias {
-    fn default() -> Self {
-        RangeBias { offset_m: 0.02, scale: 0.0 }
-    }
 }
 
 impl SensorEffect for RangeBias {
@@ -32,6 +26,9 @@ impl SensorEffect for RangeBias {
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        if *self == RangeBias::default() {
+            return;
+        }
         for echo in scan.returns_mut() {
             let range_m = f64::from(echo.range_m);
             echo.range_m = (range_m * (1.0 + self.scale) + self.offset_m).max(0.01) as f32;

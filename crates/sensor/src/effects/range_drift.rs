@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// `drift_m * (1 - exp(-t / time_constant_s))`, m, is added to each range, t the time since the start of the data set,
 /// s.
 ///
-/// Typical: a few millimetres to centimetres within half an hour (Glennie and Lichti 2011 on the HDL-64E).
+/// Typical: a few millimetres to centimetres (0.02 m) within half an hour (Glennie and Lichti 2011 on the HDL-64E).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeDrift {
@@ -22,7 +22,7 @@ pub struct RangeDrift {
 
 impl Default for RangeDrift {
     fn default() -> Self {
-        RangeDrift { drift_m: 0.02, time_constant_s: 600.0 }
+        RangeDrift { drift_m: 0.0, time_constant_s: 600.0 }
     }
 }
 
@@ -35,7 +35,7 @@ impl SensorEffect for RangeDrift {
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
         let drift = (self.drift_m * (1.0 - (-frame.time_s / self.time_constant_s).exp())) as f32;
         for echo in scan.returns_mut() {
-            echo.range_m = (echo.range_m + drift).max(0.01);
+            echo.add_range(drift);
         }
     }
 }

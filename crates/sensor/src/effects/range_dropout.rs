@@ -9,11 +9,11 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A return at range R is lost with the probability of the table (`range_m`, `share`) at R. The table is interpolated
-/// linearly and constant beyond both ends.
+/// linearly and constant beyond both ends. An empty table loses nothing.
 ///
 /// Typical: 0 at short range to 0.3 at 100 m. The "distribution-matched" downsampling of Huch et al. 2023 is a table
 /// fitted to a pair of data sets: [`crate::matched::fit_range_dropout`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeDropout {
     /// Ranges, strictly ascending, m.
@@ -22,21 +22,18 @@ pub struct RangeDropout {
     pub share: Vec<f64>,
 }
 
-impl Default for RangeDropout {
-    fn default() -> Self {
-        RangeDropout { range_m: vec![0.0, 100.0], share: vec![0.0, 0.3] }
-    }
-}
-
 impl RangeDropout {
     /// Probability of a loss at a range.
     pub fn share_at(&self, range_m: f64) -> f64 {
-        interpolated(&self.range_m, &self.share, range_m)
+        if self.range_m.is_empty() { 0.0 } else { interpolated(&self.range_m, &self.share, range_m) }
     }
 }
 
 impl SensorEffect for RangeDropout {
     fn check(&self) -> Result<(), KeyError> {
+        if self.range_m.is_empty() && self.share.is_empty() {
+            return Ok(());
+        }
         check_table(("range_m", &self.range_m, [0.0, 1e4]), ("share", &self.share, [0.0, 1.0]))
     }
 
@@ -64,7 +61,8 @@ mod tests {
     fn bad_tables_are_refused() {
         let table = |range_m: &[f64], share: &[f64]| RangeDropout { range_m: range_m.into(), share: share.into() };
         for (effect, want) in [
-            (table(&[], &[]), "as many of each"),
+            (table(&[1.0], &[]), "as many of each"),
+            (table(&[], &[0.1]), "as many of each"),
             (table(&[1.0, 2.0], &[0.1]), "as many of each"),
             (table(&[1.0, 1.0], &[0.1, 0.2]), "range_m[1]: is not larger"),
             (table(&[1.0, 2.0], &[0.1, 1.2]), "share[1]: 1.2"),

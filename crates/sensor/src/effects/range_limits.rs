@@ -21,7 +21,7 @@ pub struct RangeLimits {
 
 impl Default for RangeLimits {
     fn default() -> Self {
-        RangeLimits { min_m: 0.8, max_m: 250.0 }
+        RangeLimits { min_m: 0.0, max_m: 1e4 }
     }
 }
 

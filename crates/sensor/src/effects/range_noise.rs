@@ -11,17 +11,11 @@ use serde::{Deserialize, Serialize};
 /// `std_m * N(0, 1)`, m, is added to each range.
 ///
 /// Typical: 0.02 (default of the simulator of Huch et al. 2023 and their "sim noise"), 0.01 to 0.03 in data sheets.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoise {
     /// Standard deviation, m.
     pub std_m: f64,
-}
-
-impl Default for RangeNoise {
-    fn default() -> Self {
-        RangeNoise { std_m: 0.02 }
-    }
 }
 
 impl SensorEffect for RangeNoise {
@@ -40,7 +34,7 @@ pub(super) fn add_noise(scan: &mut Scan, draws: &Draws, std_m: impl Fn(&crate::s
     let mut random = draws.of_frame();
     for echo in scan.returns_mut() {
         let noise: f32 = StandardNormal.sample(&mut random);
-        echo.range_m = (echo.range_m + std_m(echo) * noise).max(0.01);
+        echo.add_range(std_m(echo) * noise);
     }
 }
 
@@ -60,7 +54,7 @@ mod tests {
 
     #[test]
     fn frames_differ_and_repeat() {
-        let (before, effect) = (plate(100, 20.0, 0.5), RangeNoise::default());
+        let (before, effect) = (plate(100, 20.0, 0.5), RangeNoise { std_m: 0.02 });
         assert_eq!(applied_in(3, &effect, &before), applied_in(3, &effect, &before));
         assert_ne!(applied_in(3, &effect, &before), applied_in(4, &effect, &before));
     }

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 /// the angle of incidence. An inclined footprint spreads the return over range, and the receiver averages over
 /// `samples` independent samples of it.
 ///
-/// Typical: 0.7 to 3 mrad (Velodyne VLP-16 3 mrad, Ouster OS1 0.13 to 0.18 degrees), a few samples.
+/// Typical: 0.7 to 3 mrad (Velodyne VLP-16 3 mrad, Ouster OS1 0.13 to 0.18 degrees), a few samples, most_m 0.5.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoiseByIncidence {
@@ -26,7 +26,7 @@ pub struct RangeNoiseByIncidence {
 
 impl Default for RangeNoiseByIncidence {
     fn default() -> Self {
-        RangeNoiseByIncidence { divergence_rad: 0.002, samples: 4.0, most_m: 0.5 }
+        RangeNoiseByIncidence { divergence_rad: 0.0, samples: 4.0, most_m: 10.0 }
     }
 }
 

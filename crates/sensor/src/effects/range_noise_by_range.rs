@@ -11,8 +11,9 @@ use serde::{Deserialize, Serialize};
 /// `s * N(0, 1)`, m, is added to a range R, with `s = base_m + per_m * R`, or `s = hypot(base_m, per_m * R)` if
 /// `quadratic` is true.
 ///
-/// Typical: base 0.005 to 0.03 m, 1e-4 to 1e-3 m per m (the form of the Unity plugin of Robotec's GPU LiDAR).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: base 0.005 to 0.03 m (0.01), 1e-4 to 1e-3 m per m (5e-4; the form of the Unity plugin of Robotec's GPU
+/// LiDAR).
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoiseByRange {
     /// Standard deviation at range 0, m.
@@ -21,12 +22,6 @@ pub struct RangeNoiseByRange {
     pub per_m: f64,
     /// Add the two terms as independent noise, in quadrature.
     pub quadratic: bool,
-}
-
-impl Default for RangeNoiseByRange {
-    fn default() -> Self {
-        RangeNoiseByRange { base_m: 0.01, per_m: 0.0005, quadratic: false }
-    }
 }
 
 impl SensorEffect for RangeNoiseByRange {

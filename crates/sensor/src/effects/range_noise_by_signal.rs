@@ -12,8 +12,8 @@ use serde::{Deserialize, Serialize};
 /// index `ln(returned / R^2) - ln(0.1 / 250^2)`. The standard deviation is `std_m` where u equals `signal`, and larger
 /// where less light returns.
 ///
-/// Typical: exponent 0.5 to 0.8 (Ouster OS1's data sheet: 1.5 cm at a signal-to-noise ratio of 250, 3 cm at 100, 10 cm
-/// at 12).
+/// Typical: std_m 0.02 at signal 3, exponent 0.5 to 0.8, most_m 0.3 (Ouster OS1's data sheet: 1.5 cm at a
+/// signal-to-noise ratio of 250, 3 cm at 100, 10 cm at 12).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeNoiseBySignal {
@@ -30,7 +30,7 @@ pub struct RangeNoiseBySignal {
 
 impl Default for RangeNoiseBySignal {
     fn default() -> Self {
-        RangeNoiseBySignal { std_m: 0.02, exponent: 0.57, signal: 3.0, most_m: 0.3 }
+        RangeNoiseBySignal { std_m: 0.0, exponent: 0.57, signal: 3.0, most_m: 10.0 }
     }
 }
 

@@ -10,25 +10,22 @@ use serde::{Deserialize, Serialize};
 /// A range R becomes `step_m * round(R / step_m)`, m, at least one step.
 ///
 /// Typical: 2 mm (Velodyne HDL-64E), 1.2 cm (Ouster OS1 gen 1), 3 cm (ZVISION ML-30S).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct RangeQuantisation {
-    /// Step, m.
+    /// Step, m; 0 for no rounding.
     pub step_m: f64,
-}
-
-impl Default for RangeQuantisation {
-    fn default() -> Self {
-        RangeQuantisation { step_m: 0.01 }
-    }
 }
 
 impl SensorEffect for RangeQuantisation {
     fn check(&self) -> Result<(), KeyError> {
-        within("step_m", self.step_m, 1e-6, 10.0)
+        within("step_m", self.step_m, 0.0, 10.0)
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+        if self.step_m == 0.0 {
+            return;
+        }
         for echo in scan.returns_mut() {
             let steps = (f64::from(echo.range_m) / self.step_m).round().max(1.0);
             echo.range_m = (steps * self.step_m) as f32;

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// `walk_m * ln(reflectivity / reference)`, m, is added to each range. The edge of a strong pulse crosses the detection
 /// threshold earlier, so `walk_m` is negative for a receiver without compensation.
 ///
-/// Typical: 0.5 to 3 cm per factor e of reflectivity; "slight bias for retro-reflectors" in data sheets.
+/// Typical: -0.5 to -3 cm per factor e of reflectivity; "slight bias for retro-reflectors" in data sheets.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct ReflectivityWalk {
@@ -22,7 +22,7 @@ pub struct ReflectivityWalk {
 
 impl Default for ReflectivityWalk {
     fn default() -> Self {
-        ReflectivityWalk { walk_m: -0.01, reference: 0.3 }
+        ReflectivityWalk { walk_m: 0.0, reference: 0.3 }
     }
 }
 
@@ -39,7 +39,7 @@ impl SensorEffect for ReflectivityWalk {
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
         for echo in scan.returns_mut().filter(|e| e.reflectivity > 0.0) {
             let walk = self.walk_m * (f64::from(echo.reflectivity) / self.reference).ln();
-            echo.range_m = (echo.range_m + walk as f32).max(0.01);
+            echo.add_range(walk as f32);
         }
     }
 }

@@ -15,16 +15,10 @@ use serde::{Deserialize, Serialize};
 ///
 /// Typical: 50 ms per scan; at 70 m/s that is +-1.75 m.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct RollingShutter {
     /// Correct points for ego motion to the middle of the scan.
     pub deskewed: bool,
-}
-
-impl Default for RollingShutter {
-    fn default() -> Self {
-        RollingShutter { deskewed: true }
-    }
 }
 
 impl SensorEffect for RollingShutter {

@@ -15,21 +15,15 @@ use serde::{Deserialize, Serialize};
 ///
 /// Typical: 1 to 10 cm, 0.05 to 0.3 degrees. The published description of the AV-21 has two values for the front
 /// sensor, 10 cm apart in x.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SensorPoseError {
-    /// Name of the sensor.
+    /// Name of the sensor; empty for none.
     pub sensor: String,
     /// Shift forward, left, up in the sensor's frame, m.
     pub translation_m: [f64; 3],
     /// Roll, pitch, yaw, degrees: about x, then y, then z. Positive pitch turns the sensor down.
     pub rotation_deg: [f64; 3],
-}
-
-impl Default for SensorPoseError {
-    fn default() -> Self {
-        SensorPoseError { sensor: "front".into(), translation_m: [0.0; 3], rotation_deg: [0.0, 0.1, 0.0] }
-    }
 }
 
 impl SensorPoseError {
@@ -62,6 +56,9 @@ impl SensorEffect for SensorPoseError {
     /// measured at `error^-1 * p`. The cloud of the sensor is transformed as a whole: its visible surfaces are assumed
     /// to stay the same.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+        if (self.translation_m, self.rotation_deg) == ([0.0; 3], [0.0; 3]) {
+            return;
+        }
         let Some(number) = frame.rig.find(&self.sensor) else { return };
         let mount = frame.rig.sensors[number].pose();
         let shown_from_seen = mount * self.error().inverse() * mount.inverse();
@@ -79,11 +76,8 @@ mod tests {
 
     #[test]
     fn the_true_mount_moves_and_the_nominal_one_stays() {
-        let effect = SensorPoseError {
-            translation_m: [0.1, 0.0, 0.0],
-            rotation_deg: [0.0, 0.0, 1.0],
-            ..SensorPoseError::default()
-        };
+        let effect =
+            SensorPoseError { sensor: "front".into(), translation_m: [0.1, 0.0, 0.0], rotation_deg: [0.0, 0.0, 1.0] };
         let mut beams = Beams::of(&rig());
         with_frame(0, |frame, draws| effect.on_beams(&mut beams, frame, draws));
         let sensor = &beams.sensors[0];
@@ -94,7 +88,7 @@ mod tests {
     #[test]
     fn a_sensor_pitched_down_raises_the_ground() {
         let before = scene();
-        let effect = SensorPoseError { rotation_deg: [0.0, 0.5, 0.0], ..SensorPoseError::default() };
+        let effect = SensorPoseError { sensor: "front".into(), translation_m: [0.0; 3], rotation_deg: [0.0, 0.5, 0.0] };
         let mut after = before.clone();
         with_frame(0, |frame, draws| effect.on_cloud(&mut after, frame, draws));
         let slope = 0.5_f32.to_radians().tan();

@@ -13,22 +13,22 @@ use serde::{Deserialize, Serialize};
 ///
 /// Typical: threshold 0 is the data sheet's maximum range (250 m at 10 % reflectivity); -2 to 3; steepness 2 to 8.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct SignalDropout {
     /// Detection probability at strong signals, 0 to 1.
+    #[serde(default = "all_detected")]
     pub most: f64,
     /// Signal index at which the detection probability is half of `most`.
     pub threshold: f64,
     /// Steepness of the logistic function, per unit of the signal index.
     pub steepness: f64,
     /// Extinction coefficient of the air, one way, 1/m.
+    #[serde(default)]
     pub attenuation_per_m: f64,
 }
 
-impl Default for SignalDropout {
-    fn default() -> Self {
-        SignalDropout { most: 1.0, threshold: 0.0, steepness: 3.0, attenuation_per_m: 0.0 }
-    }
+fn all_detected() -> f64 {
+    1.0
 }
 
 impl SensorEffect for SignalDropout {

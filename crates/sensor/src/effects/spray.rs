@@ -27,13 +27,13 @@ pub struct Spray {
 
 impl Default for Spray {
     fn default() -> Self {
-        Spray { density_per_m: 0.05, length_m: 12.0, height_m: 1.5 }
+        Spray { density_per_m: 0.0, length_m: 12.0, height_m: 1.5 }
     }
 }
 
 impl SensorEffect for Spray {
     fn check(&self) -> Result<(), KeyError> {
-        within("density_per_m", self.density_per_m, 1e-6, 100.0)?;
+        within("density_per_m", self.density_per_m, 0.0, 100.0)?;
         within("length_m", self.length_m, 0.01, 200.0)?;
         within("height_m", self.height_m, 0.01, 20.0)
     }

@@ -10,8 +10,9 @@ use serde::{Deserialize, Serialize};
 /// pitch `pitch_deg + pitch_std_deg * N(0, 1)`, about the centre of its rear axle. Positive pitch turns the nose down.
 /// Values are drawn anew in every frame.
 ///
-/// Typical: 0.1 to 0.3 degrees. Labels have neither roll nor pitch (Huch et al. 2023, section V).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// Typical: standard deviations of 0.1 to 0.3 degrees. Labels have neither roll nor pitch (Huch et al. 2023, section
+/// V).
+#[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetAttitude {
     /// Mean roll, degrees; positive turns the left side up.
@@ -22,12 +23,6 @@ pub struct TargetAttitude {
     pub roll_std_deg: f64,
     /// Standard deviation of pitch between frames, degrees.
     pub pitch_std_deg: f64,
-}
-
-impl Default for TargetAttitude {
-    fn default() -> Self {
-        TargetAttitude { roll_deg: 0.0, pitch_deg: 0.0, roll_std_deg: 0.2, pitch_std_deg: 0.2 }
-    }
 }
 
 impl SensorEffect for TargetAttitude {

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// The true bodies of the other cars are those of the model, scaled by `scale` about the centre of the bottom of their
 /// box and shifted by `shift_m`. Labels keep the box of the model.
 ///
-/// Typical: centimetres to a decimetre.
+/// Typical: centimetres to a decimetre: scale [0.98, 1.0, 0.96].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetShape {
@@ -21,7 +21,7 @@ pub struct TargetShape {
 
 impl Default for TargetShape {
     fn default() -> Self {
-        TargetShape { scale: [0.98, 1.0, 0.96], shift_m: [0.0; 3] }
+        TargetShape { scale: [1.0; 3], shift_m: [0.0; 3] }
     }
 }
 
