@@ -8,24 +8,22 @@ use crate::curve::CurvePoint;
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
 use crate::pairing::GAP_M;
-use nalgebra::Point3;
 use sensor::beams::Pick;
 use sensor::effects::{
-    AngularJitter, BeamAngleError, BeamDivergence, BeamRangeOffset, Clock, Covariate as TableCovariate, DirtyWindow,
-    Effect, EgoAttitude, EgoBodyMask, Empirical, FalseAlarms, IncidenceDropout, LabelOffset, LabelTimeOffset,
-    MaterialDropout, RandomDropout, RangeBias, RangeDropout, RangeLimits, RangeNoise, RangeNoiseByIncidence,
-    RangeNoiseByRange, RangeNoiseBySignal, RangeQuantisation, RollingShutter, SensorPoseError, SignalDropout,
+    AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamRangeOffset, Clock,
+    Covariate as TableCovariate, DirtyWindow, Effect, EgoAttitude, Empirical, LabelOffset, LabelTimeOffset, RangeBias,
+    RangeLimits, RangeNoise, RangeNoiseByIncidence, RangeNoiseByRange, RangeNoiseBySignal, RangeQuantisation,
+    RollingShutter, SensorPoseError,
 };
+use sensor::signal::DIAGNOSIS_REFLECTIVITY;
 use sensor::{Rig, Sensor};
 
 /// A standard deviation of range that no finding reaches, m: the limit of an effect that has to be given one.
 const NO_LIMIT_M: f64 = 10.0;
-/// How far false points reach where a finding does not tell, m.
-const USUAL_REACH_M: f64 = 200.0;
 
 /// Gives every finding its effects. `rows_deg` holds the elevations of the rows of every sensor.
 pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<f64>]) {
-    for finding in findings {
+    for finding in findings.iter_mut().filter(|f| f.effects.is_empty()) {
         finding.effects = effects_of(finding, rig, rows_deg);
     }
 }
@@ -38,7 +36,7 @@ pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) ->
             dirty_window(finding, rig).into_iter().collect()
         }
         Status::Unexplained => tables(finding, rig, rows_deg),
-        _ => named(finding, rig),
+        _ => named(finding, rig, rows_deg),
     }
 }
 
@@ -50,22 +48,13 @@ pub(crate) fn cause_of(finding: &Finding) -> Cause {
 
 /// A parameter's best value; 0 where the finding does not have it.
 fn value(f: &Finding, quantity: Quantity) -> f64 {
-    value_or(f, quantity, 0.0)
-}
-
-fn value_or(f: &Finding, quantity: Quantity, otherwise: f64) -> f64 {
-    f.parameter(quantity).map_or(otherwise, |p| rounded(p.estimate, 7))
+    f.parameter(quantity).map_or(0.0, |p| rounded(p.estimate, 7))
 }
 
 /// As many places behind the point as a file needs.
-fn rounded(v: f64, places: i32) -> f64 {
+pub(crate) fn rounded(v: f64, places: i32) -> f64 {
     let scale = 10f64.powi(places);
     (v * scale).round() / scale
-}
-
-/// Share of the returns that are lost where the law has no effect.
-fn lost_anyway(f: &Finding) -> f64 {
-    f.parameter(Quantity::Most).map_or(0.0, |most| (1.0 - most.estimate).max(0.0))
 }
 
 /// A negative strength is no effect: the simulation has too much of it.
@@ -75,7 +64,7 @@ fn positive(strength: f64, effect: impl Into<Option<Effect>>) -> Vec<Effect> {
 
 /// The effects of a named cause.
 #[expect(clippy::too_many_lines, reason = "a table: one arm for each cause")]
-fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
+fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
     let value = |quantity: Quantity| value(f, quantity);
     let effect = match cause_of(f) {
         Cause::RangeNoise => return range_noise(f),
@@ -84,6 +73,7 @@ fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
             exponent: value(Quantity::Exponent),
             signal: USUAL_SIGNAL,
             most_m: NO_LIMIT_M,
+            assumed: Some(AssumedReflectivity::even(DIAGNOSIS_REFLECTIVITY)),
         }),
         Cause::IncidenceNoise => Effect::RangeNoiseByIncidence(RangeNoiseByIncidence {
             divergence_rad: rounded(2.0 * value(Quantity::AngleRad), 7),
@@ -94,13 +84,12 @@ fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
             Effect::RangeBias(RangeBias { offset_m: value(Quantity::OffsetM), scale: value(Quantity::Scale) })
         }
         Cause::BeamRangeOffset => {
-            Effect::BeamRangeOffset(BeamRangeOffset { std_m: 0.0, offsets_m: row_offsets_m(f, rig) })
+            let of_sensor = |(sensor, rows_deg, offsets_m)| {
+                Effect::BeamRangeOffset(BeamRangeOffset { std_m: 0.0, offsets_m, sensor, rows_deg })
+            };
+            return row_tables(f, rig, rows_deg, 4).into_iter().map(of_sensor).collect();
         }
-        Cause::BeamElevationOffset => Effect::BeamAngleError(BeamAngleError {
-            elevation_deg: value(Quantity::MeanDeg),
-            elevation_std_deg: value(Quantity::StdDeg),
-            azimuth_std_deg: 0.0,
-        }),
+        Cause::BeamElevationOffset => return row_elevations(f, rig, rows_deg),
         Cause::Quantisation => Effect::RangeQuantisation(RangeQuantisation { step_m: value(Quantity::StepM) }),
         Cause::AngularJitter => {
             let std_deg = value(Quantity::StdDeg);
@@ -108,7 +97,6 @@ fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
             return positive(std_deg, Effect::AngularJitter(jitter));
         }
         Cause::RangeCut => Effect::RangeLimits(RangeLimits { min_m: 0.0, max_m: value(Quantity::MaxM) }),
-        Cause::EgoOcclusion => Effect::EgoBodyMask(EgoBodyMask { boxes: vec![blocked_box(f, rig)] }),
         Cause::SensorExtrinsics => Effect::SensorPoseError(SensorPoseError {
             sensor: sensor_of(f, rig).name.clone(),
             translation_m: [Quantity::ForwardM, Quantity::LeftM, Quantity::UpM].map(value),
@@ -122,13 +110,7 @@ fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
             pitch_std_deg: 0.0,
             heave_std_m: 0.0,
         }),
-        Cause::RollingShutter => Effect::RollingShutter(RollingShutter { deskewed: false }),
-        Cause::Outliers => Effect::FalseAlarms(FalseAlarms {
-            rate: value(Quantity::Rate),
-            sun_rate: 0.0,
-            reach_m: value_or(f, Quantity::ReachM, USUAL_REACH_M),
-            ..FalseAlarms::default()
-        }),
+        Cause::RollingShutter => return vec![rolling_shutter(f)],
         // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
         Cause::MixedPixels if f.parameter(Quantity::DivergenceRad).is_some() => {
             Effect::BeamDivergence(BeamDivergence {
@@ -148,7 +130,7 @@ fn named(f: &Finding, rig: &Rig) -> Vec<Effect> {
             offset_s: value(Quantity::OffsetS),
             clock: if f.covariate == Covariate::SeenVelocity { Clock::Cloud } else { Clock::Cars },
         }),
-        _ => return losses(f),
+        _ => return Vec::new(),
     };
     vec![effect]
 }
@@ -162,94 +144,54 @@ fn range_noise(f: &Finding) -> Vec<Effect> {
     positive(std_m, Effect::RangeNoise(RangeNoise { std_m }))
 }
 
-/// Causes by which returns are lost; none for what changes the world.
-fn losses(f: &Finding) -> Vec<Effect> {
-    let random = |share: f64| Effect::RandomDropout(RandomDropout { share });
-    match cause_of(f) {
-        Cause::RandomDropout => positive(value(f, Quantity::Share), random(value(f, Quantity::Share))),
-        Cause::SignalDropout => vec![Effect::SignalDropout(SignalDropout {
-            most: value_or(f, Quantity::Most, 1.0),
-            threshold: value(f, Quantity::Threshold),
-            steepness: value(f, Quantity::Steepness),
-            attenuation_per_m: 0.0,
-        })],
-        Cause::IncidenceDropout => {
-            let cos_half = value(f, Quantity::CosHalf);
-            // The simulator's step is one over the cosine, the finding's one over its logarithm: as steep at one half.
-            let steepness = rounded(value(f, Quantity::Steepness) / cos_half.max(1e-3), 7);
-            let dropout = Effect::IncidenceDropout(IncidenceDropout { cos_half, steepness });
-            let anyway = (lost_anyway(f) > 0.0).then(|| random(rounded(lost_anyway(f), 7)));
-            std::iter::once(dropout).chain(anyway).collect()
-        }
-        Cause::RangeDropout => vec![Effect::RangeDropout(range_dropout(f))],
-        Cause::MaterialDropout => {
-            let material = match f.covariate {
-                Covariate::SurfaceGround => "asphalt",
-                Covariate::SurfaceStanding => "concrete",
-                Covariate::SurfaceObjectCorner => "rubber",
-                _ => "paint",
-            };
-            let share = value(f, Quantity::Share);
-            positive(share, Effect::MaterialDropout(MaterialDropout { materials: vec![material.into()], share }))
-        }
-        _ => Vec::new(),
-    }
+/// Motion distortion: where what stands still slides as well, points are not de-skewed. Its extent is the duration of a
+/// scan, where the own motion is known, else the displacement.
+fn rolling_shutter(f: &Finding) -> Effect {
+    let scan_s = f.parameter(Quantity::ScanS).map(|_| value(f, Quantity::ScanS));
+    let slide = [Quantity::ShearXM, Quantity::ShearYM, Quantity::ShearYawDeg].map(|quantity| value(f, quantity));
+    let slide = scan_s.is_none().then_some(slide);
+    Effect::RollingShutter(RollingShutter { deskewed: f.channel == Channel::Objects, scan_s, slide })
 }
 
-/// The law over range as a table.
-fn range_dropout(f: &Finding) -> RangeDropout {
-    let (half, steepness) = (value(f, Quantity::HalfAtM).max(1e-3), value(f, Quantity::Steepness));
-    let most = 1.0 - lost_anyway(f);
-    let kept = |r: f64| if r > 0.0 { most / (1.0 + (r / half).powf(steepness)) } else { most };
-    let range_m: Vec<f64> = (0..=24).map(|i| 5.0 * f64::from(i)).collect();
-    let share = range_m.iter().map(|r| rounded(1.0 - kept(*r), 4)).collect();
-    RangeDropout { range_m, share }
-}
-
-/// Offsets of rows from the top, the mean of all sensors.
-fn row_offsets_m(f: &Finding, rig: &Rig) -> Vec<f64> {
-    let mut rows: Vec<Vec<f64>> = Vec::new();
-    for sensor in &rig.sensors {
+/// Name, elevations of the rows and values of each sensor of which the finding has rows; rows without a value have 0.
+fn row_tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>], places: i32) -> Vec<(String, Vec<f64>, Vec<f64>)> {
+    let of_sensor = |(sensor, rows_deg): (&Sensor, &Vec<f64>)| {
+        let mut values = vec![0.0; rows_deg.len()];
         for (id, p) in &f.parameters {
-            let row = match id {
-                ParameterId::Row { sensor: of, row } if *of == sensor.name => *row,
-                _ => continue,
-            };
-            if rows.len() <= row {
-                rows.resize(row + 1, Vec::new());
+            match id {
+                ParameterId::Row { sensor: of, row } if *of == sensor.name && *row < values.len() => {
+                    values[*row] = rounded(p.estimate, places);
+                }
+                _ => {}
             }
-            rows[row].push(p.estimate);
         }
-    }
-    let mean = |v: &Vec<f64>| if v.is_empty() { 0.0 } else { v.iter().sum::<f64>() / v.len() as f64 };
-    rows.iter().rev().map(|v| rounded(mean(v), 4)).collect()
+        let rows_deg: Vec<f64> = rows_deg.iter().map(|deg| rounded(*deg, 5)).collect();
+        let known = rows_deg.len() > 1 && values.iter().any(|v| *v != 0.0);
+        known.then(|| (sensor.name.clone(), rows_deg, values))
+    };
+    rig.sensors.iter().zip(rows_deg).filter_map(of_sensor).collect()
+}
+
+/// Errors of the rows' elevations as tables; for all rows alike where the finding has no rows.
+fn row_elevations(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
+    let error = |(sensor, rows_deg, elevations_deg)| BeamAngleError {
+        elevation_deg: value(f, Quantity::MeanDeg),
+        sensor,
+        rows_deg,
+        elevations_deg,
+        ..BeamAngleError::default()
+    };
+    let tables = row_tables(f, rig, rows_deg, 5);
+    let effects: Vec<BeamAngleError> = match tables.is_empty() {
+        true => vec![error((String::new(), vec![], vec![]))],
+        false => tables.into_iter().map(error).collect(),
+    };
+    effects.into_iter().map(Effect::BeamAngleError).collect()
 }
 
 /// The sensor of a finding.
 fn sensor_of<'a>(f: &Finding, rig: &'a Rig) -> &'a Sensor {
     &rig.sensors[(value(f, Quantity::Sensor) as usize).min(rig.sensors.len() - 1)]
-}
-
-/// A thin box a metre before the sensor that fills the blocked directions.
-fn blocked_box(f: &Finding, rig: &Rig) -> [f64; 6] {
-    let radians = |quantity: Quantity| f.parameter(quantity).map_or(0.0, |p| p.estimate.to_radians());
-    let pose = sensor_of(f, rig).pose();
-    let (mut low, mut high) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
-    for azimuth in [Quantity::AzimuthFromDeg, Quantity::AzimuthToDeg] {
-        for elevation in [Quantity::ElevationFromDeg, Quantity::ElevationToDeg] {
-            for distance in [1.0, 1.05] {
-                let (a, e) = (radians(azimuth), radians(elevation));
-                let p = Point3::new(e.cos() * a.cos(), e.cos() * a.sin(), e.sin()) * distance;
-                let p = pose * p;
-                for k in 0..3 {
-                    low[k] = f64::min(low[k], p[k]);
-                    high[k] = f64::max(high[k], p[k]);
-                }
-            }
-        }
-    }
-    let [low, high] = [low, high].map(|corner| corner.map(|v| rounded(v, 3)));
-    [low[0], low[1], low[2], high[0], high[1], high[2]]
 }
 
 /// A patch of directions that loses more than others: the table over directions is a spot.

@@ -6,7 +6,6 @@ use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::effects::cause_of;
 use sensor::effects::MadeFrom;
 use sensor::{Effect, EffectList};
-use std::collections::BTreeSet;
 use std::fmt::Write;
 
 /// The text of `extended.toml`, for a diagnosis whose findings carry their effects.
@@ -57,17 +56,12 @@ fn comments(f: &Finding) -> Vec<String> {
         lines.push(why_none(f));
         return lines;
     }
-    let mut sensors = BTreeSet::new();
     for (id, p) in &f.parameters {
         let [low, high] = p.ci95.map(short);
         match id {
-            ParameterId::Of(Quantity::Sensor) => {}
+            ParameterId::Of(Quantity::Sensor) | ParameterId::Row { .. } => {}
             ParameterId::Of(quantity) => lines.push(format!("{quantity}: {low} to {high}")),
-            ParameterId::Row { sensor, .. } => drop(sensors.insert(sensor)),
         }
-    }
-    if sensors.len() > 1 {
-        lines.push("One table serves for all sensors: the mean over them.".into());
     }
     if f.status == Status::Unexplained && f.covariate != Covariate::Direction {
         let errors = || f.curve.points.iter().map(|p| p.error);

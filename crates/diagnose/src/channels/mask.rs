@@ -14,6 +14,8 @@ pub struct Mask {
     pub cut_m: Option<f64>,
     /// Hidden cells of directions.
     pub blocked: BTreeSet<DirectionCell>,
+    /// Cells at their edge, which are hidden in part.
+    pub partly: BTreeSet<DirectionCell>,
     /// Those and the cells around them, which may be hidden in part.
     pub around: BTreeSet<DirectionCell>,
 }

@@ -117,7 +117,7 @@ impl Report {
             says: found.says,
             separate_by: found.separate_by,
             curve: found.curve,
-            effects: vec![],
+            effects: found.effects,
         });
     }
 }

@@ -299,6 +299,7 @@ mod tests {
 
     fn found(cause: Option<Cause>, channel: Channel, gain: f64, parameters: Vec<NamedParameter>) -> Found {
         Found {
+            effects: Vec::new(),
             status: if cause.is_none() { Status::Unexplained } else { Status::Named },
             causes: cause.into_iter().collect(),
             parameters,

@@ -12,11 +12,13 @@ use crate::channels::mask::{
 };
 use crate::channels::returns::OWN_CAR_M;
 use crate::curve::{Curve, CurvePoint};
+use crate::effects::rounded;
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::law::Law;
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
+use sensor::effects::{Effect, EgoBodyMask};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Smallest azimuth range of a part of the ego vehicle that would be detected, cells.
@@ -81,6 +83,7 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let edge = edge_cells(&mask.blocked, &counts, expected);
     let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
     mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
+    mask.partly = edge;
     let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
     (mask, spots)
 }
@@ -135,6 +138,7 @@ fn cut_found(context: &Context, on_select: f64) -> Found {
         }
     });
     Found {
+        effects: Vec::new(),
         status: Status::Named,
         causes: vec![Cause::RangeCut],
         parameters: vec![parameter(Quantity::MaxM, cut, 0.004 * cut)],
@@ -207,6 +211,42 @@ impl Occlusion {
     }
 }
 
+/// The hidden directions of every sensor with the share of their returns that is lost: neighbouring cells of one
+/// elevation that lose alike are one entry.
+fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Effect> {
+    let counts = direction_counts(context.frames, frames);
+    let lost = |cell: &DirectionCell| {
+        let [n, seen, ..] = counts.get(cell).copied().unwrap_or_default();
+        (((1.0 - seen / n.max(1.0)).clamp(0.0, 1.0)) * 20.0).round() / 20.0
+    };
+    let mut of_sensors: BTreeMap<u8, Vec<(DirectionCell, i32, f64)>> = BTreeMap::new();
+    // In the order of sensor, elevation and azimuth, so that neighbours follow each other.
+    let mut cells: Vec<(DirectionCell, f64)> = mask.blocked.iter().map(|c| (*c, lost(c).max(0.9))).collect();
+    cells.extend(mask.partly.difference(&mask.blocked).map(|c| (*c, lost(c))).filter(|(_, lost)| *lost > 0.0));
+    cells.sort_by_key(|((sensor, azimuth, elevation), _)| (*sensor, *elevation, *azimuth));
+    for (cell, lost) in cells {
+        let runs = of_sensors.entry(cell.0).or_default();
+        match runs.last_mut() {
+            Some((first, end, as_many)) if first.2 == cell.2 && *end == cell.1 && *as_many == lost => *end += 1,
+            _ => runs.push((cell, cell.1 + 1, lost)),
+        }
+    }
+    let degrees = |k: i32, step: f64| rounded((f64::from(k) * step).to_degrees(), 4);
+    let effect = |(sensor, runs): (u8, Vec<(DirectionCell, i32, f64)>)| {
+        let direction = |((_, azimuth, elevation), end, lost): (DirectionCell, i32, f64)| {
+            let [from, to] = [azimuth, end].map(|k| degrees(k, AZIMUTH_RAD));
+            let [low, high] = [elevation, elevation + 1].map(|k| degrees(k, ELEVATION_RAD));
+            [from, to, low, high, lost]
+        };
+        Effect::EgoBodyMask(EgoBodyMask {
+            sensor: context.rig.sensors[usize::from(sensor)].name.clone(),
+            boxes: vec![],
+            directions: runs.into_iter().map(direction).collect(),
+        })
+    };
+    of_sensors.into_iter().map(effect).collect()
+}
+
 /// The finding of a part of the ego vehicle in the field of view. The sensor with the most hidden cells is described.
 fn blocked_found(context: &Context, mask: &Mask) -> Found {
     let [estimate, hold_out] = [Role::Estimate, Role::HoldOut].map(|r| context.of(r));
@@ -224,6 +264,7 @@ fn blocked_found(context: &Context, mask: &Mask) -> Found {
     let hidden = estimate.iter().flat_map(|&i| &context.frames[i].simulated).filter(|r| inside(r)).count() as f64;
     let (az, el) = (occlusion.azimuth, occlusion.elevation);
     Found {
+        effects: hidden_directions(context, &estimate, mask),
         status: Status::Named,
         causes: vec![Cause::EgoOcclusion],
         parameters: occlusion.parameters(hidden, all),

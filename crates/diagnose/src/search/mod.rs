@@ -79,6 +79,8 @@ pub struct Found {
     pub separate_by: Option<String>,
     /// Plot.
     pub curve: Curve,
+    /// Its effects as they were fitted, where the parameters alone do not give them; else none.
+    pub effects: Vec<sensor::Effect>,
 }
 
 impl Found {

@@ -87,6 +87,7 @@ fn describe(
     let name = &context.rig.sensors[sensor].name;
     let [azimuth, elevation, radius] = [0, 1, 2].map(|k| spot[k].to_degrees());
     Found {
+        effects: Vec::new(),
         status: Status::Unexplained,
         causes: vec![],
         parameters: parameters(patch, blocks, of_estimate, sensor, spot),

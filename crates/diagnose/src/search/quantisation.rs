@@ -121,6 +121,7 @@ fn found(step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64
         error: (after[i] / n).sqrt(),
     });
     Found {
+        effects: Vec::new(),
         status: Status::Named,
         causes: vec![Cause::Quantisation],
         parameters: vec![

@@ -243,6 +243,7 @@ impl Fitted {
             String::new()
         };
         Found {
+            effects: Vec::new(),
             status: Status::Named,
             causes: vec![Cause::RollingShutter],
             parameters: duration.into_iter().chain([shear]).collect(),

@@ -56,6 +56,7 @@ impl Unexplained {
         });
         let gain = |frame: &PartedFrame| frame.iter().map(|part| grouped::gain(part, how.column, &offsets)).sum();
         Found {
+            effects: Vec::new(),
             status: Status::Unexplained,
             causes: vec![],
             parameters: self.parameters,

@@ -1,10 +1,13 @@
 //! C3: constant direction errors of each beam (row).
 
 use super::local_plane::measure_along;
+use super::row_table::{Rows, check_rows};
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, turned};
 use crate::scan::Scan;
 use data::KeyError;
+use geometry::Pose;
+use nalgebra::Vector3;
 use data::toml_text::within;
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
@@ -25,6 +28,15 @@ pub struct BeamAngleError {
     pub elevation_std_deg: f64,
     /// Standard deviation of the azimuth error between rows, degrees.
     pub azimuth_std_deg: f64,
+    /// Name of the sensor whose rows are told by `rows_deg`; the effect is then of that sensor alone.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub sensor: String,
+    /// Elevations of that sensor's rows, ascending, degrees.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub rows_deg: Vec<f64>,
+    /// Elevation error of each of them, degrees; it is added to `elevation_deg` in place of a random value.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub elevations_deg: Vec<f64>,
 }
 
 impl BeamAngleError {
@@ -36,19 +48,43 @@ impl BeamAngleError {
     }
 }
 
+impl BeamAngleError {
+    /// Elevation error of a row of the table, upwards, rad.
+    fn up_rad(&self, row: Option<usize>) -> f32 {
+        let own = row.and_then(|row| self.elevations_deg.get(row)).copied().unwrap_or(0.0);
+        (self.elevation_deg + own).to_radians() as f32
+    }
+}
+
 impl SensorEffect for BeamAngleError {
     fn check(&self) -> Result<(), KeyError> {
         within("elevation_deg", self.elevation_deg, -5.0, 5.0)?;
         within("elevation_std_deg", self.elevation_std_deg, 0.0, 5.0)?;
+        check_rows(&self.sensor, &self.rows_deg, ("elevations_deg", &self.elevations_deg), 5.0)?;
         within("azimuth_std_deg", self.azimuth_std_deg, 0.0, 5.0)
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Incidence, Need::Row])
+        Some(if self.rows_deg.is_empty() { &[Need::Incidence, Need::Row] } else { &[Need::Incidence] })
     }
 
-    fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, draws: &Draws) {
+    fn sensors(&self) -> Vec<&str> {
+        if self.rows_deg.is_empty() { vec![] } else { vec![&self.sensor] }
+    }
+
+    fn on_beams(&self, beams: &mut Beams, frame: &FrameContext, draws: &Draws) {
         if *self == BeamAngleError::default() {
+            return;
+        }
+        if !self.rows_deg.is_empty() {
+            let number = frame.rig.find(&self.sensor);
+            let Some(sensor) = number.and_then(|number| beams.sensors.get_mut(number)) else { return };
+            let rows = Rows::new(0, Pose::identity(), &self.rows_deg);
+            let nominal = sensor.nominal_directions.clone();
+            for (direction, nominal) in sensor.true_directions_mut().iter_mut().zip(nominal.iter()) {
+                let row = rows.of_direction(Vector3::from(nominal.map(f64::from)));
+                *direction = turned(*direction, 0.0, self.up_rad(row));
+            }
             return;
         }
         for (number, sensor) in beams.sensors.iter_mut().enumerate() {
@@ -63,8 +99,17 @@ impl SensorEffect for BeamAngleError {
         }
     }
 
-    fn on_cloud(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if *self == BeamAngleError::default() {
+            return;
+        }
+        if !self.rows_deg.is_empty() {
+            let Some(rows) = Rows::of(&self.sensor, &self.rows_deg, frame) else { return };
+            for echo in scan.returns_mut() {
+                if let Some(row) = rows.row(echo) {
+                    measure_along(echo, turned(echo.direction, 0.0, self.up_rad(Some(row))));
+                }
+            }
             return;
         }
         let mut known = (u8::MAX, u16::MAX, [0.0; 2]);

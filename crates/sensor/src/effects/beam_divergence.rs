@@ -1,8 +1,11 @@
 //! D1: beam divergence, which gives mixed ranges at edges.
 
+use super::shot_grid::ShotGrid;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{BeamWidth, Beams, Pick};
+use crate::scan::{Echo, Scan, dot};
 use data::KeyError;
+use rand::RngExt;
 use data::toml_text::{within, wrong};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -43,7 +46,41 @@ impl SensorEffect for BeamDivergence {
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        None
+        Some(&[Need::Grid, Need::Incidence])
+    }
+
+    /// On a finished cloud the edge between two neighbouring shots lies at a random place between them. A shot that
+    /// covers it reports the mean of both ranges, weighted by the area of the beam on either side.
+    fn on_cloud(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+        if self.divergence_rad == 0.0 {
+            return;
+        }
+        let grid = ShotGrid::new(scan);
+        let half = 0.5 * self.divergence_rad as f32;
+        let mut random = draws.of_frame();
+        let mut mixed = Vec::new();
+        for (i, echo) in scan.echoes.iter().enumerate().filter(|(_, e)| e.is_return()) {
+            for k in grid.around(echo, 1, 1).filter(|k| *k != i) {
+                let other = &scan.echoes[k];
+                let apart = dot(echo.direction, other.direction).clamp(-1.0, 1.0).acos().max(1e-5);
+                let beside = echo.row == other.row || echo.column == other.column;
+                let gap_m = (echo.range_m - other.range_m).abs();
+                if !beside || !other.is_return() || gap_m >= self.pulse_m as f32 || on_one_surface(echo, other) {
+                    continue;
+                }
+                let edge = random.random_range(0.0..1.0_f32) * apart;
+                if edge < half {
+                    // Area of a unit disc beyond an edge at a distance from its middle, as a share.
+                    let d = edge / half;
+                    let beyond = 0.5 - (d * (1.0 - d * d).max(0.0).sqrt() + d.asin()) / std::f32::consts::PI;
+                    mixed.push((i, (1.0 - beyond) * echo.range_m + beyond * other.range_m));
+                    break;
+                }
+            }
+        }
+        for (i, range_m) in mixed {
+            scan.echoes[i].range_m = range_m;
+        }
     }
 
     fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {
@@ -58,6 +95,16 @@ impl SensorEffect for BeamDivergence {
             second: false,
         });
     }
+}
+
+/// Distance across a surface within which another return lies on it, m.
+const ON_SURFACE_M: f32 = 0.15;
+
+/// Whether two returns lie on one surface.
+fn on_one_surface(a: &Echo, b: &Echo) -> bool {
+    let (p, q) = (a.point(), b.point());
+    let between: [f32; 3] = std::array::from_fn(|k| q[k] - p[k]);
+    [a, b].into_iter().any(|e| e.normal != [0.0; 3] && dot(e.normal, between).abs() < ON_SURFACE_M)
 }
 
 #[cfg(test)]

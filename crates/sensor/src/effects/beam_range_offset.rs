@@ -1,5 +1,6 @@
 //! A7: a constant range offset of each beam (row).
 
+use super::row_table::{Rows, check_rows};
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
@@ -18,9 +19,15 @@ use serde::{Deserialize, Serialize};
 pub struct BeamRangeOffset {
     /// Standard deviation between rows, m. Used if `offsets_m` is empty.
     pub std_m: f64,
-    /// Offset of each row from the top, m, the same for every sensor. Rows beyond the end of the list have offset 0.
-    /// Replaces `std_m`.
+    /// Offset of each row, m; replaces `std_m`. Of the rows of `rows_deg` where that is given; else of the rows from
+    /// the top, the same for every sensor, and 0 for rows beyond the end of the list.
     pub offsets_m: Vec<f64>,
+    /// Name of the sensor whose rows are told by `rows_deg`.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub sensor: String,
+    /// Elevations of that sensor's rows, ascending, degrees.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub rows_deg: Vec<f64>,
 }
 
 impl BeamRangeOffset {
@@ -36,14 +43,28 @@ impl BeamRangeOffset {
 impl SensorEffect for BeamRangeOffset {
     fn check(&self) -> Result<(), KeyError> {
         within("std_m", self.std_m, 0.0, 10.0)?;
+        check_rows(&self.sensor, &self.rows_deg, ("offsets_m", &self.offsets_m), 10.0)?;
         self.offsets_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("offsets_m[{i}]"), *v, -10.0, 10.0))
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Row])
+        Some(if self.rows_deg.is_empty() { &[Need::Row] } else { &[] })
     }
 
-    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+    fn sensors(&self) -> Vec<&str> {
+        if self.rows_deg.is_empty() { vec![] } else { vec![&self.sensor] }
+    }
+
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        if !self.rows_deg.is_empty() {
+            let Some(rows) = Rows::of(&self.sensor, &self.rows_deg, frame) else { return };
+            for echo in scan.returns_mut() {
+                if let Some(row) = rows.row(echo) {
+                    echo.add_range(self.offsets_m[row] as f32);
+                }
+            }
+            return;
+        }
         let mut known = (u8::MAX, u16::MAX, 0.0);
         for echo in scan.returns_mut() {
             if (known.0, known.1) != (echo.sensor, echo.row) {

@@ -50,6 +50,10 @@ impl Default for DirtyWindow {
 }
 
 impl SensorEffect for DirtyWindow {
+    fn sensors(&self) -> Vec<&str> {
+        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    }
+
     fn check(&self) -> Result<(), KeyError> {
         within("azimuth_deg", self.azimuth_deg, -180.0, 180.0)?;
         within("elevation_deg", self.elevation_deg, -90.0, 90.0)?;

@@ -4,18 +4,26 @@ use super::{Draws, FrameContext, SensorEffect};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
+use nalgebra::Vector3;
+use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A shot that intersects one of `boxes` before its measured range has no return.
+/// A shot of the sensor that intersects one of `boxes` before its measured range has no return. A shot in one of the
+/// `directions` loses its return with the share that stands there.
 ///
 /// Typical: the rear wing of the AV-21, which hides a trapezoid of about 10 x 5 m behind the car (Huch et al. 2023,
 /// section IV-A). Its boxes are in `configs/simulate/measured.toml`.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct EgoBodyMask {
+    /// Name of the sensor from which the parts hide; empty for all.
+    pub sensor: String,
     /// Axis-aligned boxes in the cloud's frame, m: minimum x, y, z, then maximum x, y, z.
     pub boxes: Vec<[f64; 6]>,
+    /// Hidden directions in the frame of the named sensor: azimuth from and to, elevation from and to, degrees, and the
+    /// share of their returns that is lost, 0 to 1.
+    pub directions: Vec<[f64; 5]>,
 }
 
 impl SensorEffect for EgoBodyMask {
@@ -28,17 +36,54 @@ impl SensorEffect for EgoBodyMask {
                 return Err(wrong(format!("boxes[{i}]"), "a minimum is not less than its maximum"));
             }
         }
+        if self.sensor.is_empty() && !self.directions.is_empty() {
+            return Err(wrong("sensor", "is missing: directions are those of one sensor"));
+        }
+        for (i, d) in self.directions.iter().enumerate() {
+            let limits = [180.0, 180.0, 90.0, 90.0].map(|most| [-most - 2.0, most + 2.0]);
+            for (k, [low, high]) in limits.into_iter().chain([[0.0, 1.0]]).enumerate() {
+                within(&format!("directions[{i}][{k}]"), d[k], low, high)?;
+            }
+        }
         Ok(())
     }
 
-    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {
+    fn sensors(&self) -> Vec<&str> {
+        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    }
+
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let only = frame.rig.find(&self.sensor);
+        if only.is_none() && !self.sensor.is_empty() {
+            return;
+        }
         let boxes: Vec<[f32; 6]> = self.boxes.iter().map(|b| b.map(|v| v as f32)).collect();
-        for echo in scan.returns_mut() {
-            if boxes.iter().any(|b| passes(echo, b)) {
+        let sensor_from_cloud = only.map(|number| frame.rig.sensors[number].pose().inverse());
+        let mut random = draws.of_frame();
+        for echo in scan.returns_mut().filter(|e| only.is_none_or(|number| usize::from(e.sensor) == number)) {
+            let share = sensor_from_cloud.map_or(0.0, |pose| self.hidden_share(pose.rotation * own_direction(echo)));
+            let hidden = share > 0.0 && random.random_range(0.0..1.0_f64) < share;
+            if hidden || boxes.iter().any(|b| passes(echo, b)) {
                 echo.lose();
             }
         }
     }
+}
+
+impl EgoBodyMask {
+    /// Share that is lost in a direction of the sensor's frame.
+    fn hidden_share(&self, own: Vector3<f64>) -> f64 {
+        if self.directions.is_empty() {
+            return 0.0;
+        }
+        let [azimuth, elevation] = [own.y.atan2(own.x), own.z.atan2(own.x.hypot(own.y))].map(f64::to_degrees);
+        let inside = |d: &&[f64; 5]| (d[0]..d[1]).contains(&azimuth) && (d[2]..d[3]).contains(&elevation);
+        self.directions.iter().find(inside).map_or(0.0, |d| d[4])
+    }
+}
+
+fn own_direction(echo: &Echo) -> Vector3<f64> {
+    Vector3::from(echo.direction.map(f64::from))
 }
 
 /// Whether a shot intersects a box before its return.

@@ -84,6 +84,10 @@ impl SensorEffect for Empirical {
         Ok(())
     }
 
+    fn sensors(&self) -> Vec<&str> {
+        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    }
+
     fn needs(&self) -> Option<&'static [Need]> {
         Some(match self.covariate {
             Covariate::RangeM | Covariate::AzimuthDeg | Covariate::ElevationDeg => &[],

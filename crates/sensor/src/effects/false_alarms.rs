@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 
 /// A shot gives a false return with probability `rate + sun_rate * exp(-(d / sun_width_deg)^2)`, d the azimuth
 /// difference to the sun. Its range is uniform between 0 and `reach_m`. It is reported only if it is beyond 0.1 m and
-/// nearer than the shot's true return, if there is one.
+/// nearer than the shot's true return, if there is one, or `instead` of it.
 ///
 /// Typical: 1e-4 (the rate to which Ouster's data sheet refers) to 1e-2 towards the sun.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -26,11 +26,13 @@ pub struct FalseAlarms {
     pub sun_width_deg: f64,
     /// Maximum range of false returns, m.
     pub reach_m: f64,
+    /// Whether a false return takes the place of a nearer true one as well.
+    pub instead: bool,
 }
 
 impl Default for FalseAlarms {
     fn default() -> Self {
-        FalseAlarms { rate: 0.0, sun_rate: 0.0, sun_azimuth_deg: -60.0, sun_width_deg: 15.0, reach_m: 200.0 }
+        FalseAlarms { rate: 0.0, sun_rate: 0.0, sun_azimuth_deg: -60.0, sun_width_deg: 15.0, reach_m: 200.0, instead: false }
     }
 }
 
@@ -56,7 +58,7 @@ impl SensorEffect for FalseAlarms {
             }
             let (chance, part) = (random.random_range(0.0..1.0_f32), random.random_range(0.0..1.0_f32));
             let range_m = self.reach_m as f32 * part;
-            if chance < rate && range_m < echo.range_m && range_m > 0.1 {
+            if chance < rate && (self.instead || range_m < echo.range_m) && range_m > 0.1 {
                 *echo = crate::scan::Echo {
                     range_m,
                     normal: [0.0; 3],

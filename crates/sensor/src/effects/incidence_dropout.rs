@@ -8,8 +8,8 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return at cosine of incidence c is lost with probability `1 / (1 + exp(steepness * (c - cos_half)))`, independent
-/// of range.
+/// A return at cosine of incidence c is kept with probability `most * (1 + exp(-steepness * (x - x0)))^-skew`,
+/// independent of range, x the cosine or its logarithm (`scale`). It is half of `most` at `cos_half`, which gives x0.
 ///
 /// Typical: half at 85 to 88 degrees (cos 0.09 to 0.03) for diffuse surfaces, at 60 to 75 degrees for paint and metal
 /// (Muckenhuber et al. 2020 measured nine automotive materials); steepness 120.
@@ -18,14 +18,42 @@ use serde::{Deserialize, Serialize};
 pub struct IncidenceDropout {
     /// Cosine of the angle of incidence at which half of the returns are lost.
     pub cos_half: f64,
-    /// Steepness of the logistic function, per unit of the cosine.
+    /// Steepness of the logistic function, per unit of x.
     pub steepness: f64,
+    /// What x is.
+    #[serde(default)]
+    pub scale: CosineScale,
+    /// Exponent of the logistic function, which lets its two tails differ; 1 for none.
+    #[serde(default = "one")]
+    pub skew: f64,
+    /// Share that is kept where the law has no effect, 0 to 1.
+    #[serde(default = "one")]
+    pub most: f64,
+}
+
+/// Scale of the cosine in [`IncidenceDropout`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum CosineScale {
+    /// The cosine.
+    #[default]
+    Linear,
+    /// Its natural logarithm.
+    Log,
+}
+
+fn one() -> f64 {
+    1.0
 }
 
 impl SensorEffect for IncidenceDropout {
     fn check(&self) -> Result<(), KeyError> {
-        within("cos_half", self.cos_half, -1.0, 1.0)?;
-        within("steepness", self.steepness, 0.1, 1e4)
+        let least = if self.scale == CosineScale::Log { 1e-9 } else { -1.0 };
+        let largest = if self.scale == CosineScale::Log { 1e9 } else { 1.0 };
+        within("cos_half", self.cos_half, least, largest)?;
+        within("steepness", self.steepness, 0.01, 1e4)?;
+        within("skew", self.skew, 0.01, 100.0)?;
+        within("most", self.most, 0.0, 1.0)
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
@@ -33,8 +61,14 @@ impl SensorEffect for IncidenceDropout {
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
-        let (half, steepness) = (self.cos_half as f32, self.steepness as f32);
-        drop_some(scan, draws, |echo| 1.0 / (1.0 + (steepness * (echo.cos_incidence - half)).exp()));
+        let x = |cos: f64| if self.scale == CosineScale::Log { cos.max(1e-4).ln() } else { cos };
+        let half = if self.scale == CosineScale::Log { self.cos_half.ln() } else { self.cos_half };
+        // The logistic function to the power of the skew is one half at `cos_half`.
+        let middle = half + (0.5f64.powf(-1.0 / self.skew) - 1.0).ln() / self.steepness;
+        drop_some(scan, draws, |echo| {
+            let off = x(echo.cos_incidence.into()) - middle;
+            (1.0 - self.most * (1.0 + (-self.steepness * off).exp()).powf(-self.skew)) as f32
+        });
     }
 }
 

@@ -1,15 +1,17 @@
 //! B5: returns lost on some materials.
 
+use super::assumed::{boxes, kind};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::material::MaterialId;
-use crate::scan::Scan;
+use crate::directions::Kind;
+use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return from one of `materials` is lost with probability `share`.
+/// A return from one of `materials`, or from one of the kinds of `surfaces`, is lost with probability `share`.
 ///
 /// Typical: 0.3 to 0.8 on tyres (`rubber`), on which Huch et al. 2023 see few points. Tyres reflect a few per cent,
 /// carbon and black paint 5 to 10 %.
@@ -18,8 +20,35 @@ use serde::{Deserialize, Serialize};
 pub struct MaterialDropout {
     /// Names of materials. Names that the data set does not have are ignored.
     pub materials: Vec<String>,
+    /// Kinds of surfaces, beside the materials.
+    pub surfaces: Vec<SurfaceKind>,
     /// Probability of a loss, 0 to 1.
     pub share: f64,
+}
+
+/// Kind of a surface, by its direction and the labelled boxes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SurfaceKind {
+    /// Level surfaces.
+    Ground,
+    /// Walls, posts and all else that is not level.
+    Standing,
+    /// Labelled objects without their lower corners.
+    Bodies,
+    /// Lower corners of labelled objects, where vehicles have wheels.
+    Wheels,
+}
+
+impl SurfaceKind {
+    fn of(kind: Kind) -> SurfaceKind {
+        match kind {
+            Kind::Ground => SurfaceKind::Ground,
+            Kind::Standing => SurfaceKind::Standing,
+            Kind::Object { corner: false, .. } => SurfaceKind::Bodies,
+            Kind::Object { corner: true, .. } => SurfaceKind::Wheels,
+        }
+    }
 }
 
 impl SensorEffect for MaterialDropout {
@@ -28,12 +57,17 @@ impl SensorEffect for MaterialDropout {
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Material])
+        Some(if self.materials.is_empty() { &[Need::Incidence, Need::Cars] } else { &[Need::Material] })
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let named: Vec<MaterialId> = self.materials.iter().filter_map(|name| frame.materials.find(name)).collect();
-        drop_some(scan, draws, |echo| if named.contains(&echo.material) { self.share as f32 } else { 0.0 });
+        let boxes = boxes(frame);
+        let of_kind = |echo: &Echo| {
+            !self.surfaces.is_empty() && self.surfaces.contains(&SurfaceKind::of(kind(echo, &boxes)))
+        };
+        let loses = |echo: &Echo| named.contains(&echo.material) || of_kind(echo);
+        drop_some(scan, draws, |echo| if loses(echo) { self.share as f32 } else { 0.0 });
     }
 }
 

@@ -17,16 +17,21 @@
 //!
 //! The codes (A1, B2, ...) are those of the catalogue in `docs/src/reference/effects.md`.
 
+mod assumed;
 mod context;
 mod local_plane;
+mod row_table;
 mod shot_grid;
 mod table;
 #[cfg(test)]
 pub(crate) mod testing;
 
+pub use assumed::AssumedReflectivity;
 pub use context::{Draws, FrameContext, LabelledCar, Need, Undulation, WorldPlan};
 pub use empirical::Covariate;
+pub use incidence_dropout::CosineScale;
 pub use label_time_offset::Clock;
+pub use material_dropout::SurfaceKind;
 
 use crate::beams::Beams;
 use crate::cloud_scan::{Intensity, Surfaces};

@@ -1,8 +1,9 @@
 //! A3: range noise that grows as less light returns.
 
+use super::assumed::{AssumedReflectivity, boxes, signal as own_signal};
 use super::range_noise::add_noise;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::scan::Scan;
+use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
 use schemars::JsonSchema;
@@ -26,11 +27,14 @@ pub struct RangeNoiseBySignal {
     pub signal: f64,
     /// Upper limit of the standard deviation, m.
     pub most_m: f64,
+    /// Reflectivities that are assumed in place of the surfaces' own; without them the surfaces' own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub assumed: Option<AssumedReflectivity>,
 }
 
 impl Default for RangeNoiseBySignal {
     fn default() -> Self {
-        RangeNoiseBySignal { std_m: 0.0, exponent: 0.57, signal: 3.0, most_m: 10.0 }
+        RangeNoiseBySignal { std_m: 0.0, exponent: 0.57, signal: 3.0, most_m: 10.0, assumed: None }
     }
 }
 
@@ -39,16 +43,19 @@ impl SensorEffect for RangeNoiseBySignal {
         within("std_m", self.std_m, 0.0, 10.0)?;
         within("exponent", self.exponent, 0.0, 5.0)?;
         within("signal", self.signal, -20.0, 20.0)?;
+        self.assumed.map_or(Ok(()), |assumed| assumed.check())?;
         within("most_m", self.most_m, self.std_m, 10.0)
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Incidence, Need::Reflectivity])
+        Some(if self.assumed.is_some() { &[Need::Incidence] } else { &[Need::Incidence, Need::Reflectivity] })
     }
 
-    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let [std, exponent, signal, most] = [self.std_m, self.exponent, self.signal, self.most_m].map(|v| v as f32);
-        add_noise(scan, draws, |echo| (std * (-exponent * (echo.signal() - signal)).exp()).min(most));
+        let boxes = boxes(frame);
+        let index = |echo: &Echo| own_signal(self.assumed.as_ref(), echo, &boxes);
+        add_noise(scan, draws, |echo| (std * (-exponent * (index(echo) - signal)).exp()).min(most));
     }
 }
 

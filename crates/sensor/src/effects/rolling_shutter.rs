@@ -2,8 +2,9 @@
 
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, Shutter};
-use crate::scan::Scan;
+use crate::scan::{Echo, Scan};
 use data::KeyError;
+use data::toml_text::within;
 use nalgebra::Vector3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -19,15 +20,29 @@ use serde::{Deserialize, Serialize};
 pub struct RollingShutter {
     /// Correct points for ego motion to the middle of the scan.
     pub deskewed: bool,
+    /// Duration of a scan on finished clouds, s: shots are sent along the sensor's scan, clockwise where it is positive.
+    /// Without it the times of the shots are taken.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scan_s: Option<f64>,
+    /// Displacement of all that stands still over a scan of a finished cloud, in place of that by the own motion:
+    /// forward and to the left, m, and turn, degrees counter-clockwise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub slide: Option<[f64; 3]>,
 }
 
 impl SensorEffect for RollingShutter {
     fn check(&self) -> Result<(), KeyError> {
-        Ok(())
+        within("scan_s", self.scan_s.unwrap_or(0.0), -1.0, 1.0)?;
+        let slide = self.slide.unwrap_or_default();
+        slide.iter().enumerate().try_for_each(|(k, v)| within(&format!("slide[{k}]"), *v, -100.0, 100.0))
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Time, Need::Cars, Need::Motion])
+        Some(match (self.slide, self.scan_s) {
+            (Some(_), _) => &[],
+            (None, Some(_)) => &[Need::Cars, Need::Motion],
+            (None, None) => &[Need::Time, Need::Cars, Need::Motion],
+        })
     }
 
     fn on_beams(&self, beams: &mut Beams, _frame: &FrameContext, _draws: &Draws) {
@@ -37,6 +52,21 @@ impl SensorEffect for RollingShutter {
     /// On a finished cloud, points within the boxes of cars move with the velocity of their car and all other points
     /// are static. With `deskewed = false` the velocity of the ego vehicle at the point is subtracted.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+        let mounts: Vec<_> = frame.rig.sensors.iter().map(|s| (s, s.pose().inverse())).collect();
+        let phase = |echo: &Echo| {
+            let (sensor, sensor_from_cloud) = &mounts[usize::from(echo.sensor)];
+            let own = sensor_from_cloud.rotation * Vector3::from(echo.direction.map(f64::from));
+            sensor.scan_phase(own.y.atan2(own.x), own.z.atan2(own.x.hypot(own.y)))
+        };
+        if let Some([forward_m, left_m, turn_deg]) = self.slide {
+            for echo in scan.returns_mut() {
+                let point = Vector3::from(echo.point().map(f64::from));
+                let turn = Vector3::new(0.0, 0.0, turn_deg.to_radians());
+                let moved = point + (Vector3::new(forward_m, left_m, 0.0) + turn.cross(&point)) * phase(echo);
+                echo.move_point(moved.map(|v| v as f32).into());
+            }
+            return;
+        }
         let ego = Vector3::from(frame.ego_velocity);
         let turn = Vector3::from(frame.ego_turn_rate);
         for echo in scan.returns_mut() {
@@ -51,7 +81,8 @@ impl SensorEffect for RollingShutter {
                 velocity -= ego + turn.cross(&Vector3::from(point));
             }
             if velocity != Vector3::zeros() {
-                let moved = Vector3::from(point) + velocity * f64::from(echo.time_s);
+                let time_s = self.scan_s.map_or(f64::from(echo.time_s), |scan_s| -scan_s * phase(echo));
+                let moved = Vector3::from(point) + velocity * time_s;
                 echo.move_point(moved.map(|v| v as f32).into());
             }
         }

@@ -38,6 +38,10 @@ impl SensorPoseError {
 }
 
 impl SensorEffect for SensorPoseError {
+    fn sensors(&self) -> Vec<&str> {
+        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    }
+
     fn check(&self) -> Result<(), KeyError> {
         for k in 0..3 {
             within(&format!("translation_m[{k}]"), self.translation_m[k], -5.0, 5.0)?;

@@ -1,5 +1,6 @@
 //! B2: detection probability by returned light (LiDAR equation).
 
+use super::assumed::{AssumedReflectivity, boxes, signal};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -8,8 +9,8 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A return at range R, m, is detected with probability `most / (1 + exp(-steepness * (u - threshold)))`. The signal
-/// index u is `ln(returned / R^2) - ln(0.1 / 250^2) - 2 * attenuation_per_m * R`.
+/// A return at range R, m, is detected with probability `most * (1 + exp(-steepness * (u - u0)))^-skew`. It is half of
+/// `most` at the index `threshold`, which gives u0. The signal index u is `ln(returned / R^2) - ln(0.1 / 250^2) - 2 * attenuation_per_m * R`.
 ///
 /// Typical: threshold 0 is the data sheet's maximum range (250 m at 10 % reflectivity); -2 to 3; steepness 2 to 8.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -22,9 +23,15 @@ pub struct SignalDropout {
     pub threshold: f64,
     /// Steepness of the logistic function, per unit of the signal index.
     pub steepness: f64,
+    /// Exponent of the logistic function, which lets its two tails differ; 1 for none.
+    #[serde(default = "all_detected")]
+    pub skew: f64,
     /// Extinction coefficient of the air, one way, 1/m.
     #[serde(default)]
     pub attenuation_per_m: f64,
+    /// Reflectivities that are assumed in place of the surfaces' own; without them the surfaces' own.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub assumed: Option<AssumedReflectivity>,
 }
 
 fn all_detected() -> f64 {
@@ -36,19 +43,24 @@ impl SensorEffect for SignalDropout {
         within("most", self.most, 0.0, 1.0)?;
         within("threshold", self.threshold, -20.0, 20.0)?;
         within("steepness", self.steepness, 0.01, 100.0)?;
+        within("skew", self.skew, 0.01, 100.0)?;
+        self.assumed.map_or(Ok(()), |assumed| assumed.check())?;
         within("attenuation_per_m", self.attenuation_per_m, 0.0, 1.0)
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Incidence, Need::Reflectivity])
+        Some(if self.assumed.is_some() { &[Need::Incidence] } else { &[Need::Incidence, Need::Reflectivity] })
     }
 
-    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
-        let [most, threshold, steepness, attenuation] =
-            [self.most, self.threshold, self.steepness, self.attenuation_per_m].map(|v| v as f32);
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let boxes = boxes(frame);
+        // The logistic function to the power of the skew is one half at the threshold.
+        let middle = self.threshold + (0.5f64.powf(-1.0 / self.skew) - 1.0).ln() / self.steepness;
+        let [most, middle, steepness, skew, attenuation] =
+            [self.most, middle, self.steepness, self.skew, self.attenuation_per_m].map(|v| v as f32);
         drop_some(scan, draws, |echo| {
-            let signal = echo.signal() - 2.0 * attenuation * echo.range_m;
-            1.0 - most / (1.0 + (-steepness * (signal - threshold)).exp())
+            let signal = signal(self.assumed.as_ref(), echo, &boxes) - 2.0 * attenuation * echo.range_m;
+            1.0 - most * (1.0 + (-steepness * (signal - middle)).exp()).powf(-skew)
         });
     }
 }

@@ -49,6 +49,7 @@ pub(super) fn found(
     let separate_by = (status == Status::Ambiguous)
         .then(|| "surfaces on all sides at many ranges, and a second sensor that sees the same ones".to_owned());
     Found {
+        effects: Vec::new(),
         status,
         causes,
         parameters,

@@ -20,13 +20,12 @@ use self::rows::drop_less_certain_rows;
 use self::sums::{Sums, group_fit, sums};
 use super::{ChannelResult, Context, Selected, causes_of, first_demands, record, rivals_and_confidence};
 use crate::catalogue::Channel;
-use crate::channels::groups::{GroupFrame, Grouping, total};
+use crate::channels::groups::PartedFrame;
 use crate::diagnosis::Considered;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped;
 use crate::inference::roles::Role;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 
 /// Share of the gain of the first pose that a second pose must bring.
 const SECOND_POSE_SHARE: f64 = 0.3;
@@ -56,17 +55,19 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     let (full, base) = sums.full_and_base(train, &context.blocks(train));
     let linear: Vec<f64> =
         test.iter().map(|&f| full.gain(&sums.linear[f]) - base.gain(&sums.linear[f])).collect();
-    let groups = |frames: &[GroupFrame], column: usize, rough: bool| -> Vec<f64> {
-        let (all, how) = (total(train.iter().map(|&i| &frames[i])), group_fit(column));
-        let offsets = grouped::offsets(&all, how);
-        let smooth = if rough { grouped::smooth(&all, &offsets, how) } else { BTreeMap::new() };
-        let gain = |f: &usize| grouped::gain(&frames[*f], column, &offsets) - grouped::gain(&frames[*f], column, &smooth);
-        test.iter().map(gain).collect()
+    // Offsets that one part of the rays of a row or strip predicts for the other parts: those of the sensor, not of
+    // surfaces.
+    let mut all = [train, test].concat();
+    all.sort_unstable();
+    let blocks = context.blocks(&all);
+    let groups = |frames: &[PartedFrame], column: usize, rough: bool| -> Vec<f64> {
+        let gains = grouped::cross_part_gains(frames, &all, &blocks, group_fit(column), rough);
+        test.iter().map(|f| all.iter().position(|own| own == f).map_or(0.0, |at| gains[at])).collect()
     };
     let more = |a: Vec<f64>, b: Vec<f64>| if a.iter().sum::<f64>() >= b.iter().sum() { a } else { b };
-    let smooth = more(linear, groups(sums.groups_of(Grouping::Azimuth), 0, false));
-    let rows = sums.groups_of(Grouping::Row);
-    let rough = more(groups(rows, 0, true), groups(rows, 1, true));
+    let smooth = more(linear, groups(&sums.strips.parted, 0, false));
+    let rough = more(groups(&sums.rows.parted, 0, true), groups(&sums.rows.parted, 1, true));
+    let rough = more(rough, vec![0.0; test.len()]);
     smooth.iter().zip(rough).map(|(a, b)| a + b).collect()
 }
 

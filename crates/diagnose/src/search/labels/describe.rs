@@ -47,6 +47,7 @@ impl Description<'_> {
             format!("{frames}targets at very different speeds: a constant offset does not change with speed, a late clock's does")
         });
         Found {
+            effects: Vec::new(),
             status: selected.status(),
             confidence: selected.confidence,
             causes: selected.causes(cause),

@@ -25,6 +25,7 @@ pub(super) fn found(
             .to_owned()
     });
     Found {
+        effects: Vec::new(),
         status: selected.status(),
         confidence: selected.confidence,
         causes: selected.causes(law.cause()),

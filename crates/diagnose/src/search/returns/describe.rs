@@ -2,6 +2,8 @@
 
 use super::false_alarms::{FalseAlarms, false_alarms};
 use super::{NamedParameter, Search, cause};
+use crate::effects::rounded;
+use sensor::Effect;
 use crate::catalogue::{Channel, Covariate, Quantity};
 use crate::channels::returns::{self, Odd, OddFrame};
 use crate::curve::{Curve, CurvePoint};
@@ -17,6 +19,7 @@ const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
 
 /// What is said of one kind of returns.
 struct Description {
+    effects: Vec<Effect>,
     covariate: Covariate,
     says: String,
     parameters: Vec<NamedParameter>,
@@ -25,10 +28,11 @@ struct Description {
 /// The finding of an excess of one kind of returns; `share` is the excess, `z` its significance on the selecting
 /// frames.
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
-    let Description { covariate, says, parameters } = match kind {
+    let Description { effects, covariate, says, parameters } = match kind {
         Odd::Alone => of_false_alarms(search, &share),
         Odd::Between => mixed(search, share),
         Odd::GroupInFront => Description {
+            effects: vec![],
             covariate: Covariate::Place,
             says: format!(
                 "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
@@ -39,6 +43,7 @@ pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains
         Odd::GroupBehind => behind(share),
     };
     Found {
+        effects,
         status: Status::Named,
         causes: vec![cause(kind)],
         parameters,
@@ -55,9 +60,16 @@ pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains
 /// Describes lone returns.
 fn of_false_alarms(search: &Search, share: &Parameter) -> Description {
     let (more, error) = (share.estimate, (share.ci95[1] - share.ci95[0]) / 2.0 / 1.96);
-    let FalseAlarms { rate, reach_m } = false_alarms(search.context, &search.estimate, search.end_m);
+    let FalseAlarms { rate, reach_m, instead } = false_alarms(search.context, &search.estimate, search.end_m);
     let form = (error / more.abs().max(1e-9)).hypot(0.06);
+    let alarms = sensor::effects::FalseAlarms {
+        rate: rounded(rate, 7),
+        reach_m: rounded(reach_m.max(1.0), 3),
+        instead,
+        ..Default::default()
+    };
     Description {
+        effects: vec![Effect::FalseAlarms(alarms)],
         covariate: Covariate::None,
         says: format!(
             "{:.2} % of the measured returns stand alone where nothing is: false alarms, of {:.2} % of the shots, that your simulator does not make",
@@ -87,6 +99,7 @@ fn mixed(search: &Search, share: Parameter) -> Description {
         String::new()
     };
     Description {
+        effects: vec![],
         covariate: Covariate::Edge,
         says: format!(
             "{:.2} % of the measured returns lie between the two surfaces of an edge: beams have a width{so_wide}, your simulator's are lines",
@@ -101,6 +114,7 @@ fn mixed(search: &Search, share: Parameter) -> Description {
 fn behind(share: Parameter) -> Description {
     let [low, high] = share.ci95;
     Description {
+        effects: vec![],
         covariate: Covariate::Place,
         says: format!(
             "{:.2} % of the measured returns lie together behind what the simulation has there: it has things that are not on the road",

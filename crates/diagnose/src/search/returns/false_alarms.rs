@@ -13,6 +13,8 @@ pub(super) struct FalseAlarms {
     pub(super) rate: f64,
     /// Farthest range, m.
     pub(super) reach_m: f64,
+    /// Whether they take the place of nearer true returns as well.
+    pub(super) instead: bool,
 }
 
 /// Lone returns, and the lengths of ray on which they could be seen, between the ego vehicle and a range.
@@ -25,11 +27,22 @@ struct Seen {
 }
 
 impl Seen {
+    /// False alarms for each metre in front of surfaces and behind them.
+    fn rates(&self) -> [f64; 2] {
+        [0, 1].map(|k| self.returns[k] / self.lengths_m[k].max(1.0))
+    }
+
+    /// Whether there are about as many behind surfaces as in front of them.
+    fn behind_as_well(&self) -> bool {
+        let [front, behind] = self.rates();
+        behind > 0.5 * front
+    }
+
     /// False alarms for each metre of ray. Sensors whose false alarms replace the true return show them behind
     /// surfaces as well; others only in front of them.
     fn per_metre(&self) -> f64 {
-        let [front, behind] = [0, 1].map(|k| self.returns[k] / self.lengths_m[k].max(1.0));
-        if behind > 0.5 * front {
+        let [front, _] = self.rates();
+        if self.behind_as_well() {
             (self.returns[0] + self.returns[1]) / (self.lengths_m[0] + self.lengths_m[1]).max(1.0)
         } else {
             front
@@ -49,7 +62,8 @@ pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64) -> F
             reach_m = end_m;
         }
     }
-    FalseAlarms { rate: (within.per_metre() * reach_m).clamp(0.0, 1.0), reach_m }
+    let rate = (within.per_metre() * reach_m).clamp(0.0, 1.0);
+    FalseAlarms { rate, reach_m, instead: within.behind_as_well() }
 }
 
 /// Measured returns for each simulated one.

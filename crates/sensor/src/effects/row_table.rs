@@ -1,0 +1,65 @@
+//! Tables by row of one sensor, whose rows are told apart by their elevations.
+
+use super::FrameContext;
+use crate::directions::{ScanPattern, Steps};
+use crate::scan::Echo;
+use data::KeyError;
+use data::toml_text::{within, wrong};
+use geometry::Pose;
+use nalgebra::Vector3;
+
+/// Rows of a sensor of the rig.
+pub(super) struct Rows {
+    sensor: usize,
+    sensor_from_cloud: Pose,
+    pattern: ScanPattern,
+}
+
+impl Rows {
+    /// Rows with ascending elevations, degrees; `None` where the rig does not have the sensor.
+    pub(super) fn of(sensor: &str, rows_deg: &[f64], frame: &FrameContext) -> Option<Rows> {
+        let number = frame.rig.find(sensor)?;
+        Some(Rows::new(number, frame.rig.sensors[number].pose().inverse(), rows_deg))
+    }
+
+    /// Rows of the sensor with this number.
+    pub(super) fn new(sensor: usize, sensor_from_cloud: Pose, rows_deg: &[f64]) -> Rows {
+        let steps = Steps { azimuth_rad: 0.01, elevation_rad: 0.01 };
+        let rows_rad = rows_deg.iter().map(|deg| deg.to_radians() as f32).collect();
+        Rows { sensor, sensor_from_cloud, pattern: ScanPattern { rows_rad, steps } }
+    }
+
+    /// The row of an echo; `None` for echoes of other sensors and between rows.
+    pub(super) fn row(&self, echo: &Echo) -> Option<usize> {
+        if usize::from(echo.sensor) != self.sensor {
+            return None;
+        }
+        let own = self.sensor_from_cloud.rotation * Vector3::from(echo.direction.map(f64::from));
+        self.of_direction(own)
+    }
+
+    /// The row of a direction in the sensor's frame.
+    pub(super) fn of_direction(&self, own: Vector3<f64>) -> Option<usize> {
+        self.pattern.row(own.z.atan2(own.x.hypot(own.y)) as f32)
+    }
+}
+
+/// Checks a table: the sensor is named, rows ascend, there are at least two and as many values.
+pub(super) fn check_rows(sensor: &str, rows_deg: &[f64], values: (&str, &[f64]), most: f64) -> Result<(), KeyError> {
+    if rows_deg.is_empty() {
+        return Ok(());
+    }
+    if sensor.is_empty() {
+        return Err(wrong("sensor", "is missing: a table by row belongs to one sensor"));
+    }
+    let (name, values) = values;
+    if rows_deg.len() < 2 || rows_deg.len() != values.len() {
+        let why = format!("{} values for {} rows: a table has as many of each, at least 2", values.len(), rows_deg.len());
+        return Err(wrong(name, why));
+    }
+    if let Some(i) = rows_deg.windows(2).position(|w| w[0] >= w[1]) {
+        return Err(wrong(format!("rows_deg[{}]", i + 1), "is not larger than the previous value"));
+    }
+    rows_deg.iter().enumerate().try_for_each(|(i, v)| within(&format!("rows_deg[{i}]"), *v, -90.0, 90.0))?;
+    values.iter().enumerate().try_for_each(|(i, v)| within(&format!("{name}[{i}]"), *v, -most, most))
+}
