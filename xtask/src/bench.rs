@@ -2,13 +2,14 @@
 
 use crate::bench_mutants::bench_mutants;
 use crate::bench_train::bench_train;
-use crate::{cargo, tidy::manifests};
+use crate::cargo;
+use crate::tidy::{Manifest, manifests};
 use anyhow::{Result, bail};
 use std::path::Path;
 
 /// Runs the benchmark `name`, the benchmarks of the crate folder `name`, the comparison of training steps with PyTorch
 /// (`train`; `args` are parts of the row ids), the blind cases with mutated diagnosis code (`mutants`), or all
-/// benchmarks of the crates.
+/// benchmarks of the crates. The blind cases (`blind`, `loop`) run only by name.
 pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     if name == Some("train") {
         return bench_train(root, args);
@@ -18,9 +19,15 @@ pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     }
     let mut known = Vec::new();
     let mut ran = false;
-    for manifest in manifests(root)? {
+    let mut all = manifests(root)?;
+    if name.is_some() {
+        all.push(Manifest::read(root.join("tests/blind/Cargo.toml"))?);
+    }
+    for manifest in all {
         for bench in manifest.benches() {
-            let wanted = name.is_none_or(|name| name == bench || name == manifest.folder);
+            // The folder of the blind cases has the name of one of its benchmarks.
+            let of_folder = name == Some(&manifest.folder) && manifest.folder != "blind";
+            let wanted = name.is_none_or(|name| name == bench) || of_folder;
             known.push(bench.clone());
             if !wanted {
                 continue;

@@ -48,7 +48,8 @@ enum Task {
     /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
     /// Run the benchmarks. NAME is a benchmark or a crate; further arguments go to Criterion. `bench train` compares
-    /// training steps with PyTorch; `bench mutants` runs the blind cases against a diagnosis with deliberate defects.
+    /// training steps with PyTorch; `bench mutants` runs the blind cases against a diagnosis with deliberate defects;
+    /// `bench loop -- --help` applies diagnoses to the simulated data and diagnoses again.
     Bench {
         /// A benchmark (`crates/*/benches/NAME.rs`), a crate folder, `train` or `mutants`; default: all benchmarks of
         /// crates.

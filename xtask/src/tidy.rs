@@ -58,7 +58,8 @@ pub struct Manifest {
 }
 
 impl Manifest {
-    fn read(path: PathBuf) -> Result<Self> {
+    /// Reads a `Cargo.toml`.
+    pub fn read(path: PathBuf) -> Result<Self> {
         let toml: toml::Table = fs::read_to_string(&path)?.parse().with_context(|| path.display().to_string())?;
         let package = toml.get("package").and_then(|p| p.get("name")).and_then(|n| n.as_str());
         let package = package.with_context(|| format!("{}: no package.name", path.display()))?.to_owned();

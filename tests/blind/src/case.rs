@@ -1,8 +1,10 @@
 //! Cases: a seed, a size, and the hidden effects.
 
 use crate::effect::{Clock, Effect};
+use crate::variant::Variant;
 use data::Stream;
 use rand::RngExt;
+use std::ops::Range;
 
 /// Amount of data in a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,6 +50,8 @@ pub struct Case {
     pub effects: Vec<Effect>,
     /// Time between frames, s.
     pub step_s: f64,
+    /// Number of sensors, intensity column and content of the rig file.
+    pub variant: Variant,
 }
 
 /// Causes that a case can hide.
@@ -79,17 +83,35 @@ pub const CAUSES: [&str; 22] = [
 /// Number of effects that are in no catalogue.
 pub const OFF_CATALOGUE: usize = 4;
 
+/// Sizes of the hidden effects.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sizes {
+    /// The whole range of each parameter.
+    All,
+    /// The stronger half of the range (in the logarithm, where it is log-uniform).
+    Strong,
+}
+
 /// Draws the case of a seed.
 pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
+    draw(seed, kind, size, Sizes::All, Variant::default())
+}
+
+/// Draws a case with an effect of medium to strong size, in a variant.
+pub fn draw_strong_case(seed: u64, kind: Kind, size: CaseSize, variant: Variant) -> Case {
+    draw(seed, kind, size, Sizes::Strong, variant)
+}
+
+fn draw(seed: u64, kind: Kind, size: CaseSize, sizes: Sizes, variant: Variant) -> Case {
     let mut rng = data::stream(seed, "blind case", 0, 0);
     let step_s = if rng.random_bool(0.5) { 0.25 } else { 0.05 };
     let effects = match kind {
         Kind::Null | Kind::Shuffled => vec![],
-        Kind::Single(i) => vec![draw_effect(i, &mut rng)],
-        Kind::Pair(i, j) => vec![draw_effect(i, &mut rng), draw_effect(j, &mut rng)],
+        Kind::Single(i) => vec![draw_effect(i, sizes, &mut rng)],
+        Kind::Pair(i, j) => vec![draw_effect(i, sizes, &mut rng), draw_effect(j, sizes, &mut rng)],
         Kind::OffCatalogue(i) => vec![draw_off_catalogue(i, &mut rng)],
     };
-    Case { seed, size, kind, effects, step_s }
+    Case { seed, size, kind, effects, step_s, variant }
 }
 
 /// Log-uniform random number.
@@ -101,67 +123,78 @@ fn sign(rng: &mut Stream) -> f64 {
     if rng.random_bool(0.5) { 1.0 } else { -1.0 }
 }
 
-fn draw_effect(i: usize, rng: &mut Stream) -> Effect {
+fn draw_effect(i: usize, sizes: Sizes, rng: &mut Stream) -> Effect {
     let deg = f64::to_radians;
+    let strong = sizes == Sizes::Strong;
+    // Strong effects have parameters in the upper part of a range, or in the lower one where less is stronger.
+    let log =
+        |rng: &mut Stream, low: f64, high: f64| log_uniform(rng, if strong { (low * high).sqrt() } else { low }, high);
+    let upper = |low: f64, high: f64| -> Range<f64> { (if strong { 0.5 * (low + high) } else { low })..high };
+    let lower = |low: f64, high: f64| -> Range<f64> { low..(if strong { 0.5 * (low + high) } else { high }) };
     match CAUSES[i] {
         "range_noise" => Effect::RangeNoise {
-            sigma_m: log_uniform(rng, 0.01, 0.06),
+            sigma_m: log(rng, 0.01, 0.06),
             growth_per_m: if rng.random_bool(0.3) { rng.random_range(0.01..0.05) } else { 0.0 },
         },
         "range_bias" => Effect::RangeBias {
-            offset_m: sign(rng) * log_uniform(rng, 0.05, 0.25),
-            scale: if rng.random_bool(0.3) { sign(rng) * log_uniform(rng, 1e-3, 4e-3) } else { 0.0 },
+            offset_m: sign(rng) * log(rng, 0.05, 0.25),
+            scale: if rng.random_bool(0.3) { sign(rng) * log(rng, 1e-3, 4e-3) } else { 0.0 },
         },
-        "beam_range_offset" => Effect::BeamRangeOffset { std_m: log_uniform(rng, 0.015, 0.08) },
-        "beam_elevation_offset" => Effect::BeamElevationOffset { std_rad: deg(log_uniform(rng, 0.04, 0.2)) },
-        "quantisation" => Effect::Quantisation { step_m: log_uniform(rng, 0.04, 0.2) },
-        "angular_jitter" => Effect::AngularJitter { sigma_rad: deg(log_uniform(rng, 0.02, 0.1)) },
-        "random_dropout" => Effect::RandomDropout { share: log_uniform(rng, 0.02, 0.3) },
+        "beam_range_offset" => Effect::BeamRangeOffset { std_m: log(rng, 0.015, 0.08) },
+        "beam_elevation_offset" => Effect::BeamElevationOffset { std_rad: deg(log(rng, 0.04, 0.2)) },
+        "quantisation" => Effect::Quantisation { step_m: log(rng, 0.04, 0.2) },
+        "angular_jitter" => Effect::AngularJitter { sigma_rad: deg(log(rng, 0.02, 0.1)) },
+        "random_dropout" => Effect::RandomDropout { share: log(rng, 0.02, 0.3) },
         "signal_dropout" => {
-            Effect::SignalDropout { half_at: rng.random_range(-11.5..-9.0), speckle: rng.random_range(0.2..0.7) }
+            Effect::SignalDropout { half_at: rng.random_range(upper(-11.5, -9.0)), speckle: rng.random_range(0.2..0.7) }
         }
-        "range_dropout" => {
-            Effect::RangeDropout { half_at_m: rng.random_range(30.0..75.0), softness_m: rng.random_range(5.0..20.0) }
-        }
+        "range_dropout" => Effect::RangeDropout {
+            half_at_m: rng.random_range(lower(30.0, 75.0)),
+            softness_m: rng.random_range(5.0..20.0),
+        },
         "incidence_dropout" => {
-            Effect::IncidenceDropout { half_at_cos: log_uniform(rng, 0.03, 0.15), power: rng.random_range(1.5..3.5) }
+            Effect::IncidenceDropout { half_at_cos: log(rng, 0.03, 0.15), power: rng.random_range(1.5..3.5) }
         }
         "material_dropout" => {
-            Effect::MaterialDropout { tyres: rng.random_bool(0.5), share: rng.random_range(0.3..0.9) }
+            Effect::MaterialDropout { tyres: rng.random_bool(0.5), share: rng.random_range(upper(0.3, 0.9)) }
         }
-        "range_cut" => Effect::RangeCut { max_m: rng.random_range(35.0..90.0) },
+        "range_cut" => Effect::RangeCut { max_m: rng.random_range(lower(35.0, 90.0)) },
         "ego_occlusion" => {
             let side = sign(rng);
-            let size_m = [rng.random_range(0.2..0.6), rng.random_range(0.5..1.1), rng.random_range(0.1..0.3)];
+            let size_m =
+                [rng.random_range(0.2..0.6), rng.random_range(upper(0.5, 1.1)), rng.random_range(upper(0.1, 0.3))];
             Effect::EgoOcclusion {
                 center_m: [-1.9, side * rng.random_range(0.0..0.5), rng.random_range(0.5..0.9)],
                 size_m,
             }
         }
         "time_offset" => Effect::TimeOffset {
-            seconds: sign(rng) * log_uniform(rng, 0.006, 0.04),
+            seconds: sign(rng) * log(rng, 0.006, 0.04),
             clock: if rng.random_bool(0.7) { Clock::Targets } else { Clock::Cloud },
         },
         "label_offset" => {
             let axis = rng.random_range(0..3usize);
             let mut offset_m = [0.0; 3];
-            offset_m[axis] = sign(rng) * log_uniform(rng, 0.08, 0.6);
+            offset_m[axis] = sign(rng) * log(rng, 0.08, 0.6);
             Effect::LabelOffset { offset_m }
         }
         "sensor_extrinsics" => {
             let mut turn_rad = [0.0; 3];
-            turn_rad[rng.random_range(0..3usize)] = sign(rng) * deg(log_uniform(rng, 0.15, 0.8));
+            turn_rad[rng.random_range(0..3usize)] = sign(rng) * deg(log(rng, 0.15, 0.8));
             Effect::SensorExtrinsics { sensor: 0, turn_rad, shift_m: [0.0; 3] }
         }
         "pitch_roll" => Effect::PitchRoll {
-            pitch_rad: sign(rng) * deg(log_uniform(rng, 0.1, 0.5)),
-            roll_rad: sign(rng) * deg(log_uniform(rng, 0.05, 0.4)),
+            pitch_rad: sign(rng) * deg(log(rng, 0.1, 0.5)),
+            roll_rad: sign(rng) * deg(log(rng, 0.05, 0.4)),
         },
-        "rolling_shutter" => Effect::RollingShutter { scan_s: rng.random_range(0.03..0.1) },
-        "outliers" => Effect::Outliers { share: log_uniform(rng, 0.003, 0.03) },
-        "mixed_pixels" => Effect::MixedPixels { divergence_rad: log_uniform(rng, 2e-3, 8e-3) },
-        "missing_object" => Effect::MissingObject { things: rng.random_range(6..20) },
-        _ => Effect::WrongShape { length: rng.random_range(0.05..0.15), height: rng.random_range(0.05..0.2) },
+        "rolling_shutter" => Effect::RollingShutter { scan_s: rng.random_range(upper(0.03, 0.1)) },
+        "outliers" => Effect::Outliers { share: log(rng, 0.003, 0.03) },
+        "mixed_pixels" => Effect::MixedPixels { divergence_rad: log(rng, 2e-3, 8e-3) },
+        "missing_object" => Effect::MissingObject { things: rng.random_range(if strong { 13 } else { 6 }..20) },
+        _ => Effect::WrongShape {
+            length: rng.random_range(upper(0.05, 0.15)),
+            height: rng.random_range(upper(0.05, 0.2)),
+        },
     }
 }
 

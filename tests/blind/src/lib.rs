@@ -7,15 +7,19 @@
 
 mod car;
 mod case;
+mod cell;
 mod effect;
 mod rig;
 mod scan;
 pub mod score;
 mod solid;
 mod track;
+mod variant;
 mod world;
 mod write;
 
-pub use case::{CAUSES, Case, CaseSize, Kind, OFF_CATALOGUE, draw_case};
+pub use case::{CAUSES, Case, CaseSize, Kind, OFF_CATALOGUE, draw_case, draw_strong_case};
+pub use cell::{FIRST_NULL_SEED, FIRST_SEED, loop_cell};
 pub use effect::{Clock, Effect, Hidden, Truth};
+pub use variant::{Intensity, Variant};
 pub use write::write_case;

@@ -38,9 +38,17 @@ impl Mount {
     }
 }
 
-/// Draws a rig with about `shots` shots per scan, and the height of the vehicle origin above the road, m.
-pub fn draw_rig(rng: &mut Stream, shots: usize) -> (Vec<Mount>, f64) {
-    let kind = rng.random_range(0..4);
+/// Draws a rig with about `shots` shots per scan, and the height of the vehicle origin above the road, m. `sensors`
+/// fixes their number (1 to 4).
+pub fn draw_rig(rng: &mut Stream, shots: usize, sensors: Option<usize>) -> (Vec<Mount>, f64) {
+    let drawn = rng.random_range(0..4);
+    let kind = match sensors {
+        None => drawn,
+        Some(1) => 1,
+        Some(2) => 3,
+        Some(3) => 0,
+        Some(_) => 2,
+    };
     let rows = if shots > 12_000 { rng.random_range(28..44) } else { rng.random_range(20..26) };
     let (top, bottom) = (rng.random_range(3.0..7.0f64).to_radians(), rng.random_range(-20.0..-14.0f64).to_radians());
     let uneven = rng.random_bool(0.3);
@@ -85,17 +93,33 @@ pub fn draw_rig(rng: &mut Stream, shots: usize) -> (Vec<Mount>, f64) {
     }
 }
 
-/// The rig file a user would write: names, positions, fields of view.
-pub fn rig_toml(mounts: &[Mount]) -> String {
+/// The rig file a user would write: names, positions, fields of view, and the scan patterns if `with_pattern`.
+pub fn rig_toml(mounts: &[Mount], with_pattern: bool) -> String {
     let mut text = String::new();
     for (i, m) in mounts.iter().enumerate() {
         let _ = writeln!(
             text,
             "[[sensor]]\nname = \"s{i}\"\nposition = {:?}\nyaw_deg = {:?}\nhorizontal_fov_deg = {:?}\n",
             m.position_m.map(|v| (v * 1e4).round() / 1e4),
-            (m.yaw_rad.to_degrees() * 1e6).round() / 1e6,
-            (m.fov_rad.to_degrees() * 1e6).round() / 1e6,
+            micro_deg(m.yaw_rad),
+            micro_deg(m.fov_rad),
         );
+        if with_pattern {
+            // A block for each row, because rows may be uneven.
+            let block = |row: &f64| format!("{{ rows = 1, top_deg = {0:?}, bottom_deg = {0:?} }}", micro_deg(*row));
+            let blocks: Vec<String> = m.rows_rad.iter().map(block).collect();
+            let _ = writeln!(
+                text,
+                "[sensor.pattern]\nblocks = [{}]\ncolumns = {}\nsweep = \"columns\"\n",
+                blocks.join(", "),
+                m.columns
+            );
+        }
     }
     text
+}
+
+/// Degrees, rounded to a millionth.
+fn micro_deg(rad: f64) -> f64 {
+    (rad.to_degrees() * 1e6).round() / 1e6
 }

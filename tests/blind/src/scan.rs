@@ -3,6 +3,7 @@
 use crate::effect::{Clock, Effect};
 use crate::rig::Mount;
 use crate::solid::{Form, Hit, Material, Solid};
+use crate::variant::Light;
 use crate::world::{REACH_M, World};
 use data::Stream;
 use geometry::Box3;
@@ -54,6 +55,8 @@ pub struct Side<'a> {
 pub struct Scan {
     /// Points in the ego frame, m, unordered.
     pub points: Vec<[f32; 3]>,
+    /// What each point's intensity depends on.
+    pub lights: Vec<Light>,
     /// Labels in the ego frame.
     pub boxes: Vec<Box3>,
     /// Sums for the Cramér-Rao bounds.
@@ -72,6 +75,9 @@ pub struct Sums {
     /// Number of boxes with at least five points, and the sum of their squared speeds.
     pub boxes: [f64; 2],
 }
+
+/// Distance from the surface beyond which a point does not get its intensity, m.
+const FALSE_BEYOND_M: f64 = 2.0;
 
 fn normal(rng: &mut Stream) -> f64 {
     StandardNormal.sample(rng)
@@ -127,7 +133,7 @@ impl Side<'_> {
             }),
             _ => None,
         });
-        let mut scan = Scan { points: Vec::new(), boxes: Vec::new(), sums: Sums::default() };
+        let mut scan = Scan { points: Vec::new(), lights: Vec::new(), boxes: Vec::new(), sums: Sums::default() };
         let reshaped = self.effects.iter().any(|e| matches!(e, Effect::WrongShape { .. }));
         let mut on_car = vec![0usize; self.world.drivers.len()];
         for (k, mount) in self.rig.iter().enumerate() {
@@ -203,12 +209,21 @@ impl Side<'_> {
                     if let Some(range) = self.returned(hit, &ray, k, row, angles, mount, lost, rng) {
                         let p = believed_pose * Point3::from(reported * range);
                         scan.points.push([p.x as f32, p.y as f32, p.z as f32]);
+                        // A point elsewhere than its surface is a false return.
+                        let seen = hit.filter(|hit| (hit.range_m - range).abs() < FALSE_BEYOND_M);
+                        scan.lights.push(seen.map_or_else(Light::default, |hit| Light {
+                            reflectivity: self.world.reflectivity(&hit),
+                            cos_incidence: hit.cos_incidence(&ray),
+                            range_m: hit.range_m,
+                        }));
                     }
                 }
             }
         }
         for i in (1..scan.points.len()).rev() {
-            scan.points.swap(i, rng.random_range(0..=i));
+            let j = rng.random_range(0..=i);
+            scan.points.swap(i, j);
+            scan.lights.swap(i, j);
         }
         self.label(t, &believed, &on_car, rng, &mut scan);
         scan

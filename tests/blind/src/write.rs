@@ -5,6 +5,7 @@ use crate::effect::{Effect, Hidden, Truth};
 use crate::rig::{draw_rig, rig_toml};
 use crate::scan::{Nuisances, Scan, Side, SideErrors, Sums};
 use crate::solid::{Form, Material, Solid};
+use crate::variant::Intensity;
 use crate::world::{World, draw_world};
 use data::{Cloud, DataError, Frame, Layout, Object, write_atomic};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
@@ -16,7 +17,7 @@ use std::path::Path;
 /// Writes both sides and the rig into `folder`; returns the truth.
 pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
     let mut rng = data::stream(case.seed, "blind world", 0, 0);
-    let (rig, above_m) = draw_rig(&mut rng, case.size.shots);
+    let (rig, above_m) = draw_rig(&mut rng, case.size.shots, case.variant.sensors);
     let simulated_world = draw_world(&mut rng, above_m);
     let mut measured_world = simulated_world.clone();
     for wall in &mut measured_world.walls {
@@ -58,20 +59,21 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
     let measured = Side { world: &measured_world, rig: &rig, nuisances, own, effects: &case.effects, beams: &beams };
     let simulated =
         Side { world: &simulated_world, rig: &rig, nuisances, own: SideErrors::default(), effects: &[], beams: &level };
-    write_atomic(&folder.join("sensor.toml"), rig_toml(&rig).as_bytes())?;
+    write_atomic(&folder.join("sensor.toml"), rig_toml(&rig, case.variant.rig_has_pattern).as_bytes())?;
     let sums: Vec<Result<Sums, DataError>> = (0..case.size.frames)
         .into_par_iter()
         .map(|i| {
             let t = i as f64 * case.step_s;
+            let column = |side: &str| (case.variant.intensity, data::stream(case.seed, side, 0, i as u64));
             let scan = measured.scan(t, &mut data::stream(case.seed, "blind measured", 0, i as u64));
             let shown =
                 if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
             let sums = scan.sums;
             // Frame ids count scans at 20 Hz, including those that are not kept.
             let every = (case.step_s * 20.0).round() as usize;
-            write_scan(&folder.join("measured"), shown * every, scan)?;
+            write_scan(&folder.join("measured"), shown * every, scan, column("blind measured intensity"))?;
             let scan = simulated.scan(t, &mut data::stream(case.seed, "blind simulated", 0, i as u64));
-            write_scan(&folder.join("simulated"), i * every, scan)?;
+            write_scan(&folder.join("simulated"), i * every, scan, column("blind simulated intensity"))?;
             Ok(sums)
         })
         .collect();
@@ -86,16 +88,27 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
     Ok(truth(case, &nuisances, &own, beams.iter().flatten().count(), &total))
 }
 
-fn write_scan(root: &Path, id: usize, scan: Scan) -> Result<(), DataError> {
-    let values = scan.points.into_iter().flatten().collect();
+fn write_scan(
+    root: &Path,
+    id: usize,
+    scan: Scan,
+    (intensity, mut rng): (Intensity, data::Stream),
+) -> Result<(), DataError> {
+    let mut values = Vec::new();
+    for (point, light) in scan.points.iter().zip(&scan.lights) {
+        values.extend(point);
+        values.extend(intensity.value(light, &mut rng));
+    }
     let object = |bbox| Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None };
     let frame = Frame {
         id: format!("{id:06}"),
-        cloud: Cloud { values, channels: 3 },
+        cloud: Cloud { values, channels: intensity.channels() },
         objects: scan.boxes.into_iter().map(object).collect(),
     };
     Layout::Kitti.write_frame(root, &frame)?;
-    write_atomic(&root.join("dataset.toml"), b"points = \"xyz\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\"]\n")
+    let columns = if intensity.channels() == 3 { "xyz" } else { "xyzi" };
+    let text = format!("points = \"{columns}\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\"]\n");
+    write_atomic(&root.join("dataset.toml"), text.as_bytes())
 }
 
 fn scale_parts(parts: &mut [Solid], by: [f64; 3]) {
