@@ -144,13 +144,14 @@ fn range_noise(f: &Finding) -> Vec<Effect> {
     positive(std_m, Effect::RangeNoise(RangeNoise { std_m }))
 }
 
-/// Motion distortion: where what stands still slides as well, points are not de-skewed. Its extent is the duration of a
-/// scan, where the own motion is known, else the displacement.
+/// Motion distortion, of all that stands still or of labelled objects alone. Its extent is the duration of a scan, where
+/// the own motion is known, else the displacement.
 fn rolling_shutter(f: &Finding) -> Effect {
     let scan_s = f.parameter(Quantity::ScanS).map(|_| value(f, Quantity::ScanS));
     let slide = [Quantity::ShearXM, Quantity::ShearYM, Quantity::ShearYawDeg].map(|quantity| value(f, quantity));
     let slide = scan_s.is_none().then_some(slide);
-    Effect::RollingShutter(RollingShutter { deskewed: f.channel == Channel::Objects, scan_s, slide })
+    let only_objects = f.channel == Channel::Objects;
+    Effect::RollingShutter(RollingShutter { deskewed: false, scan_s, only_objects, slide })
 }
 
 /// Name, elevations of the rows and values of each sensor of which the finding has rows; rows without a value have 0.

@@ -51,6 +51,7 @@ pub struct Refusal {
 #[derive(Clone, Debug)]
 struct FrameMotion {
     own: OwnMotion,
+    own_is_known: bool,
     /// Velocities of the labelled objects relative to the ego vehicle, m/s.
     seen: Vec<Option<Vector3<f64>>>,
 }
@@ -98,7 +99,8 @@ impl<'a> FinishedDataset<'a> {
             times,
             motions: None,
         };
-        let moves = |e: &crate::Effect| e.model().needs().is_some_and(|needs| needs.contains(&Need::Motion));
+        let of_motion = |n: &Need| matches!(n, Need::Motion | Need::SeenMotion);
+        let moves = |e: &crate::Effect| e.model().needs().is_some_and(|needs| needs.iter().any(of_motion));
         if effects.effects.iter().any(moves) {
             set.motions = set.find_motions()?;
         }
@@ -162,15 +164,16 @@ impl<'a> FinishedDataset<'a> {
     }
 
     fn known(&self) -> BTreeSet<Need> {
-        use Need::{Cars, Grid, Incidence, Material, Motion, Reflectivity, Row, Time};
+        use Need::{Cars, Grid, Incidence, Material, Motion, Reflectivity, Row, SeenMotion, Time};
         let mut known = if self.described {
             [Cars, Grid, Incidence, Material, Reflectivity, Row, Time].into()
         } else {
             let channels = if self.dataset.config.points == PointColumns::Xyz { 3 } else { 4 };
             self.reader.known(channels, &self.surfaces)
         };
-        if self.motions.is_some() {
-            known.insert(Motion);
+        if let Some(motions) = &self.motions {
+            known.insert(SeenMotion);
+            known.extend(motions.iter().any(|m| m.own_is_known).then_some(Motion));
         }
         known
     }
@@ -220,6 +223,7 @@ impl<'a> FinishedDataset<'a> {
             ego_velocity: [own.map_or(0.0, |m| m.speed_m_s), 0.0, 0.0],
             ego_turn_rate: [0.0, 0.0, own.map_or(0.0, |m| m.yaw_rate_rad_s)],
             cars: shown,
+            sensors: Some(self.reader.sensors()),
             scene: None,
             world_x_rad: 0.0,
         };
@@ -254,7 +258,7 @@ impl<'a> FinishedDataset<'a> {
     fn cars(&self, index: usize, frame: &Frame) -> Vec<LabelledCar> {
         let motion = self.motions.as_ref().map(|motions| &motions[index]);
         let velocity = |number: usize, bbox: &Box3| {
-            let Some(FrameMotion { own, seen }) = motion else { return [0.0; 3] };
+            let Some(FrameMotion { own, seen, .. }) = motion else { return [0.0; 3] };
             let Some(Some(seen)) = seen.get(number) else { return [0.0; 3] };
             let turn = Vector3::new(0.0, 0.0, own.yaw_rate_rad_s).cross(&Vector3::from(bbox.center));
             (seen + Vector3::new(own.speed_m_s, 0.0, 0.0) + turn).into()
@@ -279,11 +283,9 @@ impl<'a> FinishedDataset<'a> {
         let frames: Vec<_> = self.ids.par_iter().map(read).collect::<Result<_, DataError>>()?;
         let (edges, boxes): (Vec<_>, Vec<Vec<Box3>>) = frames.into_iter().unzip();
         let own = own_motion(edges, times);
-        if own.iter().all(Option::is_none) {
-            return Ok(None);
-        }
         let of_frame = |g: usize| boxes[g].clone();
         let motion = |(f, own): (usize, Option<OwnMotion>)| FrameMotion {
+            own_is_known: own.is_some(),
             own: own.unwrap_or(OwnMotion { speed_m_s: 0.0, yaw_rate_rad_s: 0.0 }),
             seen: boxes[f].iter().map(|b| seen_velocity(&of_frame, times, f, b)).collect(),
         };

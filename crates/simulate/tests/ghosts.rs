@@ -1,6 +1,7 @@
 //! Ghost returns in a scene in which additional rays can be cast.
 
-use lidarshift_simulate::frame_scene::FrameScene;
+use lidarshift_simulate::frame_sensors: None,
+        scene::FrameScene;
 use lidarshift_simulate::mesh::{Mesh, cuboid};
 use lidarshift_simulate::scenario::Motion;
 use lidarshift_simulate::world::{CarShape, World};

@@ -1,5 +1,6 @@
 //! Context of a frame that effects are applied with, and their random number streams.
 
+use crate::directions::Sensors;
 use crate::material::MaterialTable;
 use crate::object::Group;
 use crate::ray_caster::RayCaster;
@@ -25,6 +26,8 @@ pub enum Need {
     Time,
     /// Boxes of the other cars.
     Cars,
+    /// Velocities of the other cars relative to the ego vehicle.
+    SeenMotion,
     /// Velocities of the ego vehicle and of the other cars.
     Motion,
 }
@@ -40,6 +43,7 @@ impl Need {
             Need::Grid => "the row and column of each point in the sensor's pattern",
             Need::Time => "the time of each shot",
             Need::Cars => "boxes of the cars",
+            Need::SeenMotion => "the relative motion of the cars",
             Need::Motion => "the motion of the cars",
         }
     }
@@ -58,6 +62,7 @@ impl Need {
             }
             Need::Material => "only attributes tell it, which `simulate` writes; name `surfaces` instead of materials",
             Need::Cars => "add labels",
+            Need::SeenMotion => "it needs frame ids that are rising numbers, and labels",
             Need::Motion => {
                 "it needs frame ids that are rising numbers, labels, and standing edges from which the own speed can be \
                  estimated"
@@ -100,6 +105,8 @@ pub struct FrameContext<'a> {
     pub ego_turn_rate: [f64; 3],
     /// The other cars.
     pub cars: &'a [LabelledCar],
+    /// Scan patterns of the sensors as they were recovered from finished clouds; `None` in simulation.
+    pub sensors: Option<&'a Sensors>,
     /// Scene for additional rays; `None` for a finished cloud.
     pub scene: Option<&'a dyn RayCaster>,
     /// Direction of the world's +x axis in the cloud's frame, rad counter-clockwise from +x.

@@ -1,11 +1,13 @@
 //! C8: error of the ego vehicle's roll, pitch and height.
 
+use super::reshoot::reshoot;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::Beams;
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
-use nalgebra::{UnitQuaternion, Vector3};
+use geometry::Pose;
+use nalgebra::{Translation3, UnitQuaternion};
 use rand_distr::{Distribution, StandardNormal};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -58,16 +60,14 @@ impl SensorEffect for EgoAttitude {
         beams.ego_heave_m += heave_m;
     }
 
-    /// The cloud is transformed as a whole; each sensor's visible surfaces are assumed to stay the same.
+    /// Ranges are those of the true rays, looked up in the cloud.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let (tilt, heave_m) = self.of_frame(frame, draws);
         if tilt == UnitQuaternion::identity() && heave_m == 0.0 {
             return;
         }
-        for echo in scan.returns_mut() {
-            let lowered = Vector3::from(echo.point().map(f64::from)) - Vector3::z() * heave_m;
-            echo.move_point((tilt.inverse() * lowered).map(|v| v as f32).into());
-        }
+        let true_from_reported = Pose::from_parts(Translation3::new(0.0, 0.0, heave_m), tilt);
+        reshoot(scan, frame, |_| true, &true_from_reported);
     }
 }
 

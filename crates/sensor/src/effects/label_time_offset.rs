@@ -38,7 +38,7 @@ impl SensorEffect for LabelTimeOffset {
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Motion])
+        Some(if self.clock == Clock::Cloud { &[Need::SeenMotion] } else { &[Need::Motion] })
     }
 
     fn on_labels(&self, cars: &mut [LabelledCar], frame: &FrameContext, _draws: &Draws) {

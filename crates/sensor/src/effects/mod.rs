@@ -20,6 +20,7 @@
 mod assumed;
 mod context;
 mod local_plane;
+mod reshoot;
 mod row_table;
 mod shot_grid;
 mod table;

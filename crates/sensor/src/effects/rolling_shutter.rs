@@ -24,6 +24,9 @@ pub struct RollingShutter {
     /// Without it the times of the shots are taken.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scan_s: Option<f64>,
+    /// On finished clouds, displace labelled objects alone, by their velocities relative to the ego vehicle.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub only_objects: bool,
     /// Displacement of all that stands still over a scan of a finished cloud, in place of that by the own motion:
     /// forward and to the left, m, and turn, degrees counter-clockwise.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -40,6 +43,7 @@ impl SensorEffect for RollingShutter {
     fn needs(&self) -> Option<&'static [Need]> {
         Some(match (self.slide, self.scan_s) {
             (Some(_), _) => &[],
+            (None, Some(_)) if self.only_objects => &[Need::Cars, Need::SeenMotion],
             (None, Some(_)) => &[Need::Cars, Need::Motion],
             (None, None) => &[Need::Time, Need::Cars, Need::Motion],
         })
@@ -77,6 +81,9 @@ impl SensorEffect for RollingShutter {
             };
             let car = frame.cars.iter().find(|car| inside(&car.true_box));
             let mut velocity = car.map_or(Vector3::zeros(), |car| Vector3::from(car.velocity));
+            if self.only_objects && car.is_none() {
+                continue;
+            }
             if !self.deskewed {
                 velocity -= ego + turn.cross(&Vector3::from(point));
             }

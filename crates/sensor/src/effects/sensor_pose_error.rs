@@ -1,12 +1,13 @@
 //! C2: a wrong sensor pose (extrinsic calibration) in the rig.
 
+use super::reshoot::reshoot;
 use super::{Draws, FrameContext, SensorEffect};
 use crate::beams::Beams;
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
 use geometry::Pose;
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -56,20 +57,15 @@ impl SensorEffect for SensorPoseError {
         }
     }
 
-    /// With the nominal mount the sensor measured p, in its frame; with the true mount the same surface point is
-    /// measured at `error^-1 * p`. The cloud of the sensor is transformed as a whole: its visible surfaces are assumed
-    /// to stay the same.
+    /// Ranges are those of the true rays, looked up in the cloud.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
         if (self.translation_m, self.rotation_deg) == ([0.0; 3], [0.0; 3]) {
             return;
         }
         let Some(number) = frame.rig.find(&self.sensor) else { return };
         let mount = frame.rig.sensors[number].pose();
-        let shown_from_seen = mount * self.error().inverse() * mount.inverse();
-        for echo in scan.returns_mut().filter(|e| usize::from(e.sensor) == number) {
-            let point = shown_from_seen * Point3::from(echo.point().map(f64::from));
-            echo.move_point(point.coords.map(|v| v as f32).into());
-        }
+        let true_from_reported = mount * self.error() * mount.inverse();
+        reshoot(scan, frame, |sensor| sensor == number, &true_from_reported);
     }
 }
 

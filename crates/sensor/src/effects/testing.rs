@@ -80,6 +80,7 @@ pub(crate) fn with_frame<T>(index: u64, work: impl FnOnce(&FrameContext, &Draws)
         ego_velocity: [50.0, 0.0, 0.0],
         ego_turn_rate: [0.0, 0.0, 0.2],
         cars: &cars,
+        sensors: None,
         scene: None,
         world_x_rad: 0.0,
     };

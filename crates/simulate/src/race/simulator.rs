@@ -224,6 +224,7 @@ impl Simulator {
             ego_velocity: (cloud_from_world * ego.velocity).into(),
             ego_turn_rate: (cloud_from_world * ego.turn_rate).into(),
             cars: &exact,
+            sensors: None,
             scene: Some(&scene),
             world_x_rad: -yaw_rad(&ego.pose),
         };

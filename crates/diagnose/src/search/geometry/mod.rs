@@ -18,11 +18,11 @@ use self::floor::above_floor;
 use self::hypotheses::{Hypothesis, hypotheses, is_pose, may_join};
 use self::rows::drop_less_certain_rows;
 use self::sums::{Sums, group_fit, sums};
-use super::{ChannelResult, Context, Selected, causes_of, first_demands, record, rivals_and_confidence};
-use crate::catalogue::Channel;
-use crate::channels::groups::PartedFrame;
+use super::{ChannelResult, Context, Selected, Z_STAR, causes_of, first_demands, record, rivals_and_confidence};
+use crate::catalogue::{Cause, Channel};
+use crate::channels::groups::Grouping;
 use crate::diagnosis::Considered;
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::{Demands, Trial, choose, significant, total_and_z};
 use crate::inference::grouped;
 use crate::inference::roles::Role;
 use rayon::prelude::*;
@@ -60,14 +60,19 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     let mut all = [train, test].concat();
     all.sort_unstable();
     let blocks = context.blocks(&all);
-    let groups = |frames: &[PartedFrame], column: usize, rough: bool| -> Vec<f64> {
-        let gains = grouped::cross_part_gains(frames, &all, &blocks, group_fit(column), rough);
+    let groups = |grouping: Grouping, column: usize| -> Vec<f64> {
+        let (rows, cause) = (grouping == Grouping::Row, Cause::Unexplained);
+        let frames = if rows { &sums.rows.parted } else { &sums.strips.parted };
+        let gains = grouped::cross_part_gains(frames, &all, &blocks, group_fit(column), rows);
+        let large = || above_floor(&sums, &all, &blocks, &[Hypothesis::Groups { cause, grouping, column }]);
+        if !significant(&gains, Z_STAR) || !large() {
+            return vec![0.0; test.len()];
+        }
         test.iter().map(|f| all.iter().position(|own| own == f).map_or(0.0, |at| gains[at])).collect()
     };
     let more = |a: Vec<f64>, b: Vec<f64>| if a.iter().sum::<f64>() >= b.iter().sum() { a } else { b };
-    let smooth = more(linear, groups(&sums.strips.parted, 0, false));
-    let rough = more(groups(&sums.rows.parted, 0, true), groups(&sums.rows.parted, 1, true));
-    let rough = more(rough, vec![0.0; test.len()]);
+    let smooth = more(linear, groups(Grouping::Azimuth, 0));
+    let rough = more(groups(Grouping::Row, 0), groups(Grouping::Row, 1));
     smooth.iter().zip(rough).map(|(a, b)| a + b).collect()
 }
 

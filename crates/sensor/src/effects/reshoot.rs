@@ -1,0 +1,157 @@
+//! Shots of a finished cloud that truly went elsewhere: their ranges are looked up in the cloud itself, and they keep
+//! the directions that the sensor reports.
+
+use super::FrameContext;
+use super::local_plane::measure_along;
+use crate::directions::{SensorScan, Sensors, Surroundings};
+use crate::rig::Sensor;
+use crate::scan::{Echo, Scan, dot};
+use geometry::Pose;
+use nalgebra::{Point3, Vector3};
+
+/// Distance across a surface within which the surface around the true direction is the shot's own, m.
+const SAME_SURFACE_M: f64 = 0.12;
+
+/// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
+const REACH_STEPS: [f32; 2] = [0.6, 0.5];
+
+/// Gives the shots of some sensors the ranges of their true rays: `true_from_reported` moves a reported ray to the true
+/// one, in the cloud's frame. Without scan patterns the points are moved as a whole.
+pub(super) fn reshoot(
+    scan: &mut Scan,
+    frame: &FrameContext,
+    of_sensor: impl Fn(usize) -> bool,
+    true_from_reported: &Pose,
+) {
+    let Some(sensors) = frame.sensors else {
+        let reported_from_true = true_from_reported.inverse();
+        for echo in scan.returns_mut().filter(|e| of_sensor(usize::from(e.sensor))) {
+            let point = reported_from_true * Point3::from(echo.point().map(f64::from));
+            echo.move_point(point.coords.map(|v| v as f32).into());
+        }
+        return;
+    };
+    for (number, mount) in sensors.rig.sensors.iter().enumerate().filter(|(number, _)| of_sensor(*number)) {
+        let seen = Seen::new(scan, sensors, number);
+        let pose = mount.pose();
+        // The true ray in the frame of the sensor as it is reported.
+        let error = pose.inverse() * true_from_reported * pose;
+        let before = scan.echoes.clone();
+        for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| usize::from(e.sensor) == number) {
+            let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
+            let hit = seen.meet(&(error.rotation * own), &error.translation.vector, &before[i], &pose);
+            match hit {
+                Some((range_m, of)) if echo.is_return() || of != i => {
+                    let surface = before[of];
+                    if !echo.is_return() {
+                        (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
+                        (echo.returned, echo.material, echo.object) =
+                            (surface.returned, surface.material, surface.object);
+                        (echo.normal, echo.cos_incidence) = (surface.normal, surface.cos_incidence);
+                    }
+                    echo.range_m = range_m;
+                }
+                _ => echo.lose(),
+            }
+        }
+    }
+}
+
+/// The returns of a sensor by direction.
+struct Seen {
+    scan: SensorScan,
+    /// Places of the returns among the echoes.
+    places: Vec<usize>,
+    around: Surroundings,
+    steps: [f32; 2],
+}
+
+impl Seen {
+    fn new(scan: &Scan, sensors: &Sensors, number: usize) -> Seen {
+        let sensor_from_cloud = sensors.rig.sensors[number].pose().inverse();
+        let (mut own, mut places) = (SensorScan::default(), Vec::new());
+        for (i, echo) in scan.echoes.iter().enumerate() {
+            if usize::from(echo.sensor) == number && echo.is_return() {
+                let point = sensor_from_cloud * Point3::from(echo.point().map(f64::from));
+                let [azimuth, elevation, range] = Sensor::spherical(&point);
+                own.azimuth_rad.push(azimuth as f32);
+                own.elevation_rad.push(elevation as f32);
+                own.range_m.push(range as f32);
+                places.push(i);
+            }
+        }
+        let steps = sensors.patterns[number].steps;
+        Seen {
+            around: Surroundings::new(sensors, number, &own),
+            scan: own,
+            places,
+            steps: [steps.azimuth_rad, steps.elevation_rad],
+        }
+    }
+
+    /// Range of what a true ray meets, and the place of the return that is nearest to it. The ray starts at `shift` and
+    /// has a direction, both in the sensor's frame; `echo` is the shot as it is reported.
+    fn meet(&self, direction: &Vector3<f64>, shift: &Vector3<f64>, echo: &Echo, pose: &Pose) -> Option<(f32, usize)> {
+        // Where the ray is at the range of what it meets, seen from the reported origin. Twice, since that range is
+        // not known before.
+        let mut range_m = if echo.is_return() { f64::from(echo.range_m) } else { 50.0 };
+        let mut met = None;
+        for _ in 0..2 {
+            let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(shift + direction * range_m));
+            met = self.at(azimuth as f32, elevation as f32, direction, shift, echo, pose);
+            range_m = f64::from(met?.0);
+        }
+        met
+    }
+
+    fn at(
+        &self,
+        azimuth: f32,
+        elevation: f32,
+        direction: &Vector3<f64>,
+        shift: &Vector3<f64>,
+        echo: &Echo,
+        pose: &Pose,
+    ) -> Option<(f32, usize)> {
+        let mut nearest: Option<(f32, usize)> = None;
+        let window = self.around.window.map(|v| v as f32);
+        self.around.index.around(azimuth, elevation, |e, dx, dy| {
+            let (x, y) = (dx * window[0] / self.steps[0], dy * window[1] / self.steps[1]);
+            let distance = x * x + y * y;
+            let near = x.abs() <= REACH_STEPS[0] && y.abs() <= REACH_STEPS[1];
+            if near && nearest.is_none_or(|(least, _)| distance < least) {
+                nearest = Some((distance, e.index as usize));
+            }
+        });
+        let nearest = nearest?.1;
+        let place = self.places[nearest];
+        let true_direction: [f32; 3] = (pose.rotation * direction).map(|v| v as f32).into();
+        let Some((surface, normal)) = self.around.look(azimuth, elevation, None).surface else {
+            // At an edge: the nearest return, at its distance from the true origin.
+            let reported = f64::from(self.scan.range_m[nearest]);
+            return Some(((reported - shift.dot(direction)).max(0.01) as f32, place));
+        };
+        let normal: Vector3<f64> = normal;
+        let meets = pose.rotation.inverse() * normal;
+        // The plane around the true direction, met from the true origin.
+        let [az, el] = [azimuth, elevation].map(f64::from);
+        let seen = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin()) * surface.range_m;
+        let along = meets.dot(direction);
+        if along > -1e-3 {
+            return Some((self.scan.range_m[nearest], place));
+        }
+        let range_m = meets.dot(&(seen - shift)) / along;
+        // On the shot's own surface its own error of range is kept.
+        let mut own = *echo;
+        if own.is_return() && own.normal != [0.0; 3] {
+            measure_along(&mut own, true_direction);
+            let normal: [f32; 3] = own.normal;
+            let shift: [f32; 3] = (pose.rotation * shift).map(|v| v as f32).into();
+            own.range_m -= dot(normal, shift) / dot(normal, true_direction).min(-1e-3);
+            if ((f64::from(own.range_m) - range_m) * along).abs() < SAME_SURFACE_M {
+                return Some((own.range_m.max(0.01), place));
+            }
+        }
+        Some((range_m.max(0.01) as f32, place))
+    }
+}
