@@ -1,6 +1,7 @@
 //! `lidarshift diagnose`: finds the differences between measured and simulated data, their causes and a correction.
 
 mod detectors;
+mod simulator;
 
 use crate::commands::End;
 use anyhow::{Context, Result, bail};
@@ -8,12 +9,17 @@ use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
+use simulator::RaceSimulator;
+use study::Study;
 use diagnose::{
-    DetectorGain, Diagnosis, Options, ParameterId, Rig, Stage, Status, Verdict, diagnose, diagnose_scans,
+    DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage, Status, Verdict,
+    diagnose_scans, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
+use sensor::EffectList;
 use report::{finding_name, write_finding_pictures};
 use simulate::race::RaceConfig;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Compare measured data with a scenario-identical simulation. Each finding has its cause, its parameters with 95 %
@@ -42,9 +48,14 @@ pub struct DiagnoseArgs {
     /// TOML with the poses of the sensors [default: one sensor at the origin of the clouds]
     #[arg(long, value_name = "TOML")]
     sensor: Option<PathBuf>,
-    /// Configuration of the simulation, to read the poses of the sensors from instead of --sensor
+    /// Configuration of the simulation that made the simulated data: the poses of the sensors are read from it, and the
+    /// gain is measured on frames that it simulates anew [default: the finished clouds are changed, as by `resim`]
     #[arg(long, value_name = "CONFIG", conflicts_with = "sensor")]
     simulator: Option<String>,
+    /// Measure only what this list of effects gains, one that was edited by hand or made elsewhere: the frames that a
+    /// diagnosis holds out are made anew with it. Writes verification.json
+    #[arg(long, value_name = "TOML", requires = "measured", conflicts_with = "detectors")]
+    verify: Option<PathBuf>,
     /// Use only the frames of this split [default: all frames that both data sets have]
     #[arg(long, value_name = "NAME")]
     split: Option<String>,
@@ -81,7 +92,12 @@ impl DiagnoseArgs {
             bar.set_length(of as u64);
             bar.set_position(done as u64);
         };
-        let options = Options { split: self.split.clone() };
+        let options = self.options()?;
+        if let (Some(list), Some(measured), Some(simulated)) = (&self.verify, &self.measured, &self.simulated) {
+            let end = self.verify(list, measured, simulated, &rig, &options, &show_progress)?;
+            bar.finish_and_clear();
+            return Ok(end);
+        }
         let (measured, mut outcome) = match (&self.scans, &self.measured, &self.simulated) {
             (Some(scans), ..) => {
                 let scans = Dataset::open(scans)?;
@@ -90,7 +106,9 @@ impl DiagnoseArgs {
             }
             (None, Some(measured), Some(simulated)) => {
                 let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
-                let outcome = diagnose(&measured, &simulated, &rig, &options, &show_progress)?;
+                let remake = self.remake(&simulated, &rig);
+                let outcome =
+                    diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
                 (measured, outcome)
             }
             _ => bail!("give --measured and --simulated, or --scans"),
@@ -113,10 +131,86 @@ impl DiagnoseArgs {
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis)?;
         }
-        Ok(match outcome.diagnosis.verdict {
-            Verdict::NotScenarioIdentical => End::NotTheSameScenes,
-            _ => End::Done,
-        })
+        Ok(end_of(&outcome.diagnosis))
+    }
+
+    /// What the diagnosis leaves out: the frames on which detectors are tested.
+    fn options(&self) -> Result<Options> {
+        let mut options = Options { split: self.split.clone(), ..Options::default() };
+        let (Some(study), Some(measured)) = (&self.detectors, &self.measured) else { return Ok(options) };
+        let test = Study::open(study, None)?.config.splits.test;
+        let dataset = Dataset::open(measured)?;
+        let tested: BTreeSet<String> = dataset
+            .ids(&test)
+            .with_context(|| format!("--detectors tests on the split {test:?} of the measured data"))?
+            .into_iter()
+            .collect();
+        if let Some(split) = &self.split {
+            let used = dataset.ids(split)?;
+            if let Some(id) = used.iter().find(|id| tested.contains(*id)) {
+                bail!(
+                    "--split {split}: its frame {id} is also in the split {test:?}, on which --detectors tests: leave \
+                     --split out, and the diagnosis uses all other frames"
+                );
+            }
+        }
+        options.leave_out = tested;
+        Ok(options)
+    }
+
+    /// How frames of the simulation are made anew.
+    fn remake<'s>(&self, simulated: &'s Dataset, rig: &'s Rig) -> Box<dyn Remake + 's> {
+        let Some(config) = &self.simulator else { return Box::new(OnClouds { simulated, rig }) };
+        match RaceSimulator::open(config, simulated) {
+            Ok(simulator) => Box::new(simulator),
+            Err(error) => {
+                eprintln!("note: the gain is measured on changed clouds, not by the simulator: {error:#}");
+                Box::new(OnClouds { simulated, rig })
+            }
+        }
+    }
+
+    /// Measures the gain of a list of effects, writes verification.json and prints it.
+    fn verify(
+        &self,
+        list: &Path,
+        measured: &Path,
+        simulated: &Path,
+        rig: &Rig,
+        options: &Options,
+        progress: Progress,
+    ) -> Result<End> {
+        let effects = EffectList::read(list)?;
+        if effects.effects.is_empty() {
+            bail!("{}: has no effect, and so no gain", list.display());
+        }
+        let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
+        if let Some(made) = &effects.made_from {
+            let own: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
+            if own != made.sensors {
+                bail!(
+                    "{}: was made for the sensors {}, but the rig has {}: give that rig (--sensor)",
+                    list.display(),
+                    made.sensors.join(", "),
+                    own.join(", ")
+                );
+            }
+        }
+        let remake = self.remake(&simulated, rig);
+        match verify(&measured, &simulated, rig, options, &effects, remake.as_ref(), progress)? {
+            Ok(gain) => {
+                write_json(&self.out.join("verification.json"), &gain)?;
+                if let Some(path) = &self.json {
+                    write_json(path, &gain)?;
+                }
+                print_gain(&gain, &list.display().to_string());
+                Ok(End::Done)
+            }
+            Err(diagnosis) => {
+                print_diagnosis(&diagnosis, &self.out, 0);
+                Ok(end_of(&diagnosis))
+            }
+        }
     }
 
     fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {
@@ -137,6 +231,13 @@ impl DiagnoseArgs {
             }
             (None, None) => Ok(Rig::single()),
         }
+    }
+}
+
+fn end_of(diagnosis: &Diagnosis) -> End {
+    match diagnosis.verdict {
+        Verdict::NotScenarioIdentical => End::NotTheSameScenes,
+        _ => End::Done,
     }
 }
 
@@ -170,16 +271,33 @@ fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
             println!("  to distinguish these causes: {how}");
         }
     }
-    if let Some(closed) = diagnosis.gain.closed {
-        println!(
-            "on held-out frames, the extended model removes {:.0} % of the difference that a sensor model could remove",
-            100.0 * closed
-        );
-    }
+    print_gain(&diagnosis.gain, "extended.toml");
     if corrected > 0 {
         println!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());
     }
     eprintln!("diagnosis.json and extended.toml written to {}", out.display());
+}
+
+/// What is gone with a list of effects, by channel, and what could not be applied.
+#[expect(clippy::print_stdout, reason = "results go to stdout")]
+fn print_gain(gain: &Gain, list: &str) {
+    let percent = |share: f64| format!("{:.0}", 100.0 * share);
+    let between = |ci95: Option<[f64; 2]>| {
+        ci95.map_or(String::new(), |[low, high]| format!(" ({} to {} %)", percent(low), percent(high)))
+    };
+    if let Some(closed) = gain.closed {
+        println!(
+            "measured on held-out frames that were made anew with {list}: {} % of the difference is gone{}",
+            percent(closed),
+            between(gain.ci95)
+        );
+        for (channel, c) in &gain.closed_by_channel {
+            println!("  {channel}: {} %{}", percent(c.closed), between(c.ci95));
+        }
+    }
+    for left in &gain.not_applied {
+        println!("not applied, and counted as not gone: {} {}", left.effect, left.why);
+    }
 }
 
 /// The verdict in words, with the numbers of findings by status.

@@ -38,6 +38,8 @@ use std::path::Path;
 pub struct Options {
     /// A split of both data sets; all frames without one.
     pub split: Option<String>,
+    /// Frames that are not used, such as those on which something else is tested.
+    pub leave_out: BTreeSet<String>,
 }
 
 /// Stages, for the display of progress.
@@ -146,7 +148,12 @@ fn with_pairs<T>(
     progress: Progress,
     work: impl FnOnce(&Engine, Context, Vec<String>) -> Result<T, DiagnoseError>,
 ) -> Result<Result<T, Diagnosis>, DiagnoseError> {
-    let (ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
+    let (mut ids, mut notes) = common_ids(measured, simulated, options.split.as_deref())?;
+    let all = ids.len();
+    ids.retain(|id| !options.leave_out.contains(id));
+    if ids.len() < all {
+        notes.push(format!("{} frames are kept for the test of detectors; the diagnosis does not use them", all - ids.len()));
+    }
     progress(Stage::Comparing, 0, 2);
     let (ids, empty) = with_points(measured, simulated, ids)?;
     notes.extend(empty);
