@@ -23,8 +23,12 @@ const NO_LIMIT_M: f64 = 10.0;
 
 /// Gives every finding its effects. `rows_deg` holds the elevations of the rows of every sensor.
 pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<f64>]) {
-    for finding in findings.iter_mut().filter(|f| f.effects.is_empty()) {
-        finding.effects = effects_of(finding, rig, rows_deg);
+    for finding in findings.iter_mut() {
+        if finding.effects.is_empty() {
+            finding.effects = effects_of(finding, rig, rows_deg);
+        }
+        // What the simulator would refuse is no effect of it.
+        finding.effects.retain(|effect| effect.model().check().is_ok());
     }
 }
 
@@ -239,7 +243,7 @@ fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
 
 /// Place and value of the points of one sensor's curve, ascending.
 fn table_of_sensor(f: &Finding, sensor: usize, rows_deg: &[Vec<f64>]) -> Vec<[f64; 2]> {
-    let usual = f.parameter(Quantity::SimulatedStdM).map_or(0.0, |p| p.estimate);
+    let usual = f.parameter(Quantity::SimulatedStdM).map_or(0.0, |p| p.estimate.max(0.0));
     let own = f.curve.points.iter().filter(|p| p.sensor == sensor);
     let point = |p: &CurvePoint| {
         let at = if f.covariate == Covariate::Row { *rows_deg.get(sensor)?.get(p.x as usize)? } else { p.x };

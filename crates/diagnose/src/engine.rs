@@ -10,11 +10,10 @@ use self::verification::{Verification, set_reached};
 use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::{labels, motion, returns};
-use crate::catalogue::Channel;
-use crate::diagnosis::{Diagnosis, Gain, Verdict};
-use crate::effects::fill_effects;
+use crate::diagnosis::{Diagnosis, Gain, NotApplied, Verdict};
+use crate::effects::{cause_of, fill_effects};
 use crate::error::DiagnoseError;
-use crate::extended::extended_toml;
+use crate::extended::{extended_toml, why_none};
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     Corrections, FramePair, ObjectPair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
@@ -110,7 +109,7 @@ pub fn diagnose_with(
         sensors: rig.sensors.iter().map(|s| s.name.clone()).collect(),
     };
     let paired = with_pairs(measured, simulated, rig, options, progress, |engine, context, notes| {
-        engine.diagnose(context, notes, remake, &made_from)
+        engine.diagnose(context, notes, remake, Extension::Found(&made_from))
     })?;
     Ok(paired.unwrap_or_else(Outcome::without_findings))
 }
@@ -129,14 +128,18 @@ pub fn verify(
     remake: &dyn Remake,
     progress: Progress,
 ) -> Result<Result<Gain, Diagnosis>, DiagnoseError> {
-    with_pairs(measured, simulated, rig, options, progress, |engine, context, _| {
-        progress(Stage::Verifying, 0, 1);
-        let shutter = rolling_shutter::search(&context);
-        let gain = Verification::new(engine, &context, !matches!(shutter, rolling_shutter::Search::NotFound(_)))
-            .of(effects, remake)?;
-        progress(Stage::Verifying, 1, 1);
-        Ok(gain)
+    with_pairs(measured, simulated, rig, options, progress, |engine, context, notes| {
+        Ok(engine.diagnose(context, notes, remake, Extension::Given(effects))?.diagnosis.gain)
     })
+}
+
+/// The list of effects whose gain is measured.
+#[derive(Clone, Copy)]
+enum Extension<'a> {
+    /// That of the findings; what it is made from.
+    Found(&'a MadeFrom),
+    /// Another one.
+    Given(&'a EffectList),
 }
 
 /// Pairs two data sets and hands the pairs to `work`. The error is a diagnosis that says why they cannot be compared.
@@ -279,7 +282,7 @@ impl Engine<'_> {
         recorded: Context,
         mut notes: Vec<String>,
         remake: &dyn Remake,
-        made_from: &MadeFrom,
+        extension: Extension,
     ) -> Result<Outcome, DiagnoseError> {
         let context = recorded.clone();
         self.finished(0);
@@ -305,30 +308,17 @@ impl Engine<'_> {
         let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
         let mut diagnosis = report(&context, results, notes);
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
-        let extended = extended_toml(&diagnosis, Some(made_from));
-        self.measure_gain(&mut diagnosis, &recorded, &extended, remake)?;
-        Ok(Outcome { diagnosis, corrected, extended })
-    }
-
-    /// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded.
-    fn measure_gain(
-        &self,
-        diagnosis: &mut Diagnosis,
-        recorded: &Context,
-        extended: &str,
-        remake: &dyn Remake,
-    ) -> Result<(), DiagnoseError> {
+        let made_from = if let Extension::Found(made_from) = extension { Some(made_from) } else { None };
+        let extended = extended_toml(&diagnosis, made_from);
         (self.progress)(Stage::Verifying, 0, 1);
-        let slides = diagnosis.findings.iter().any(|f| f.channel == Channel::Slide);
-        let verification = Verification::new(self, recorded, slides);
-        let gain = match diagnosis.findings.is_empty() {
-            true => verification.without_extension(),
-            false => verification.of(&EffectList::parse(extended, Path::new("extended.toml"))?, remake)?,
-        };
-        diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-        set_reached(&mut diagnosis.findings, &diagnosis.gain);
+        let found = diagnosis.findings.iter().map(|f| f.channel).collect();
+        let verification = Verification::new(self, &recorded, found);
+        match extension {
+            Extension::Given(effects) => diagnosis.gain = verification.of(effects, remake)?,
+            Extension::Found(_) => measure_gain(&mut diagnosis, &verification, &extended, remake)?,
+        }
         (self.progress)(Stage::Verifying, 1, 1);
-        Ok(())
+        Ok(Outcome { diagnosis, corrected, extended })
     }
 
     /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on
@@ -390,6 +380,27 @@ impl Engine<'_> {
         results.push(search::noise::search(&context, if uneven { LEAST_COS } else { 0.0 }));
         Ok(results)
     }
+}
+
+/// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded.
+fn measure_gain(
+    diagnosis: &mut Diagnosis,
+    verification: &Verification,
+    extended: &str,
+    remake: &dyn Remake,
+) -> Result<(), DiagnoseError> {
+    let gain = match diagnosis.findings.is_empty() {
+        true => verification.without_extension(),
+        false => verification.of(&EffectList::parse(extended, Path::new("extended.toml"))?, remake)?,
+    };
+    diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
+    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
+    diagnosis
+        .gain
+        .not_applied
+        .extend(without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) }));
+    set_reached(diagnosis);
+    Ok(())
 }
 
 /// Keeps the first of frames that are identical to the bit; each scene counts once. Returns a note where there are

@@ -72,7 +72,7 @@ fn comments(f: &Finding) -> Vec<String> {
 }
 
 /// Why no effect stands for a finding.
-fn why_none(f: &Finding) -> String {
+pub(crate) fn why_none(f: &Finding) -> String {
     let negative = [Quantity::StdM, Quantity::StdDeg, Quantity::Share].into_iter().find_map(|quantity| {
         let p = f.parameter(quantity)?;
         (p.estimate < 0.0).then_some((quantity, p.estimate))

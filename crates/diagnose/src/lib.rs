@@ -7,7 +7,6 @@
 
 #![warn(clippy::too_many_lines)]
 
-mod angle;
 pub mod catalogue;
 pub mod channels;
 mod curve;

@@ -4,8 +4,8 @@
 //! `cargo xtask bench loop -- --help` lists the options. [`loop_cell`] says which case a seed stands for.
 
 use data::Dataset;
-use diagnose::{Diagnosis, Options, Rig, diagnose, extended_toml};
-use lidarshift_blind::score::{Outcome, score};
+use diagnose::{Diagnosis, Options, Outcome, Rig, diagnose};
+use lidarshift_blind::score::{Outcome as Scored, score};
 use lidarshift_blind::{
     CAUSES, CaseSize, FIRST_NULL_SEED, FIRST_SEED, Kind, Truth, Variant, draw_strong_case, loop_cell, write_case,
 };
@@ -107,7 +107,7 @@ fn seeds(arguments: &Arguments) -> Vec<u64> {
 struct Run {
     kind: Kind,
     variant: Variant,
-    outcome: Outcome,
+    outcome: Scored,
     first: Value,
     /// The second diagnosis, or why there is none.
     second: Result<Value, String>,
@@ -122,9 +122,9 @@ fn open(folder: &Path, side: &str) -> Dataset {
     Dataset::open(&folder.join(side)).expect("a data set")
 }
 
-fn diagnosis_of(folder: &Path, side: &str, rig: &Rig) -> Result<Diagnosis, String> {
-    let found = diagnose(&open(folder, "measured"), &open(folder, side), rig, &Options::default(), &|_, _, _| ());
-    found.map(|o| o.diagnosis).map_err(|e| e.to_string())
+fn outcome_of(folder: &Path, side: &str, rig: &Rig) -> Result<Outcome, String> {
+    diagnose(&open(folder, "measured"), &open(folder, side), rig, &Options::default(), &|_, _, _| ())
+        .map_err(|e| e.to_string())
 }
 
 fn run(seed: u64, size: CaseSize, folder: &Path) -> Run {
@@ -134,20 +134,20 @@ fn run(seed: u64, size: CaseSize, folder: &Path) -> Run {
     let truth: Truth = write_case(&draw_strong_case(seed, kind, size, variant), folder).expect("a case can be written");
     let rig = Rig::read(&folder.join("sensor.toml")).expect("a rig");
     let drawn = lap();
-    let found = diagnosis_of(folder, "simulated", &rig);
-    let first = found.as_ref().map_or_else(|e| json!({ "verdict": format!("error: {e}") }), json_of);
+    let found = outcome_of(folder, "simulated", &rig);
+    let first = found.as_ref().map_or_else(|e| json!({ "verdict": format!("error: {e}") }), |o| json_of(&o.diagnosis));
     let diagnosed = lap();
     write_json(&folder.join("truth.json"), &serde_json::to_value(&truth).expect("JSON"));
     write_json(&folder.join("diagnosis.json"), &first);
     let (applied, left_out, made) = match &found {
-        Ok(diagnosis) => apply(diagnosis, &rig, folder),
+        Ok(outcome) => apply(outcome, &rig, folder),
         Err(e) => (vec![], vec![], Err(e.clone())),
     };
     let extended = lap();
     // Without an effect the extended clouds are the simulated ones.
     let second = match made {
         Ok(()) if applied.is_empty() => Ok(first.clone()),
-        Ok(()) => diagnosis_of(folder, "extended", &rig).map(|d| json_of(&d)),
+        Ok(()) => outcome_of(folder, "extended", &rig).map(|o| json_of(&o.diagnosis)),
         Err(e) => Err(e),
     };
     if let Ok(value) = &second {
@@ -167,32 +167,23 @@ fn write_json(path: &Path, value: &Value) {
 
 /// Applies the file of a diagnosis to the simulated clouds: kinds of the applied effects, what was left out, and
 /// whether it could be done.
-fn apply(diagnosis: &Diagnosis, rig: &Rig, folder: &Path) -> (Vec<String>, Vec<String>, Result<(), String>) {
-    let text = extended_toml(diagnosis);
+fn apply(outcome: &Outcome, rig: &Rig, folder: &Path) -> (Vec<String>, Vec<String>, Result<(), String>) {
     let path = folder.join("extended.toml");
-    data::write_atomic(&path, text.as_bytes()).expect("a file can be written");
-    let mut left_out: Vec<String> = diagnosis
-        .findings
-        .iter()
-        .filter(|f| f.effects.is_empty())
-        .map(|f| format!("{} (no effect)", f.cause.map_or("unexplained", |c| c.name())))
-        .collect();
-    let mut effects = match EffectList::parse(&text, &path) {
+    data::write_atomic(&path, outcome.extended.as_bytes()).expect("a file can be written");
+    let without = outcome.diagnosis.findings.iter().filter(|f| f.effects.is_empty());
+    let mut left_out: Vec<String> =
+        without.map(|f| format!("{} (no effect)", f.cause.map_or("unexplained", |c| c.name()))).collect();
+    let mut effects = match EffectList::parse(&outcome.extended, &path) {
         Ok(effects) => effects,
         Err(e) => return (vec![], left_out, Err(e.to_string())),
     };
     let dataset = open(folder, "simulated");
-    loop {
-        let resim = Resim { dataset: &dataset, effects: &effects, rig: Some(rig.clone()), seed: 1 };
-        match resim.refused() {
-            Ok(refused) => {
-                let Some((i, why)) = refused.into_iter().next() else { break };
-                effects.effects.remove(i);
-                left_out.push(why);
-            }
-            Err(e) => return (vec![], left_out, Err(e.to_string())),
-        }
-    }
+    let refused = match (Resim { dataset: &dataset, effects: &effects, rig: Some(rig.clone()), seed: 1 }).refused() {
+        Ok(refused) => refused,
+        Err(e) => return (vec![], left_out, Err(e.to_string())),
+    };
+    effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+    left_out.extend(refused.into_iter().map(|r| format!("{} {}", r.kind, r.why)));
     let applied: Vec<String> = effects.effects.iter().map(|e| e.kind().to_owned()).collect();
     if applied.is_empty() {
         return (applied, left_out, Ok(()));

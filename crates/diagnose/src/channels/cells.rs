@@ -32,6 +32,12 @@ fn cos_of(ray: &Ray) -> Option<f64> {
     }
 }
 
+/// Range, m, cosine of incidence and zone of a ray; `None` where its incidence is not known.
+pub fn place_of(ray: &Ray) -> Option<(f64, f64, usize)> {
+    cell(ray)?;
+    Some((f64::from(ray.range_m), cos_of(ray)?.max(1e-4), zone(ray)?))
+}
+
 /// The cell of a ray; `None` where its incidence is not known.
 pub fn cell(ray: &Ray) -> Option<usize> {
     let (zone, cos) = (zone(ray)?, cos_of(ray)?);

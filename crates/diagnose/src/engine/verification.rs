@@ -7,19 +7,21 @@
 
 use super::Engine;
 use super::report::METRIC;
-use crate::catalogue::Channel;
-use crate::diagnosis::{Closed, Gain, NotApplied, Predicted};
+use crate::catalogue::{Cause, Channel};
+use crate::diagnosis::{
+    Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict,
+};
 use crate::error::DiagnoseError;
 use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
-use crate::search::{Context, REPETITIONS, geometry, hits, labels, noise, quantisation, returns, rolling_shutter};
+use crate::search::{Context, REPETITIONS, Z_STAR, geometry, hits, labels, noise, quantisation, returns, rolling_shutter};
 use data::{Cloud, DataError, Dataset, Object};
 use rayon::prelude::*;
 use sensor::finished::{FinishedDataset, Refusal};
 use sensor::{EffectList, Rig};
 use statistics::{blocks_of, draw_blocks, interval_nearest};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Frames of a role that are made anew, at most.
@@ -116,15 +118,18 @@ pub(super) struct Verification<'a> {
     train: Vec<usize>,
     test: Vec<usize>,
     slide: bool,
+    /// Channels in which something was found; empty for all.
+    found: BTreeSet<Channel>,
     before: Distances,
 }
 
 impl<'a> Verification<'a> {
-    /// Of the pair as it is. `slide` says that the scene is displaced along the scan.
-    pub(super) fn new(engine: &'a Engine<'a>, context: &'a Context<'a>, slide: bool) -> Self {
+    /// Of the pair as it is, with the channels in which something was found; without any, all channels count.
+    pub(super) fn new(engine: &'a Engine<'a>, context: &'a Context<'a>, found: BTreeSet<Channel>) -> Self {
+        let slide = found.contains(&Channel::Slide);
         let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role)));
         let before = distances(context, &train, &test, slide);
-        Verification { engine, context, train, test, slide, before }
+        Verification { engine, context, train, test, slide, found, before }
     }
 
     /// The gain without any extension.
@@ -188,7 +193,8 @@ impl<'a> Verification<'a> {
         Ok(distances(&context, &places(&self.train), &places(&self.test), self.slide))
     }
 
-    /// Sums of the distances over the held-out frames.
+    /// Sums of the distances over the held-out frames. The totals are those of the channels in which something was
+    /// found, and of those that the extension made worse.
     fn gain(&self, after: &Distances, floor: &Distances, extended: bool) -> Gain {
         let returns = self.context.returns(&self.test).max(1.0);
         let members = blocks_of(&self.context.blocks(&self.test));
@@ -210,7 +216,13 @@ impl<'a> Verification<'a> {
             interval_nearest(drawn.collect())
         };
         let channels: Vec<Channel> = self.before.keys().copied().collect();
-        let [before, after_all, floor_all] = over(&channels, &all_frames);
+        let worse = |c: &Channel| {
+            let [before, after, _] = sums(c, &all_frames);
+            after - before > ENOUGH_NATS
+        };
+        let found = |c: &Channel| self.found.is_empty() || self.found.contains(c);
+        let counted: Vec<Channel> = channels.iter().copied().filter(|c| found(c) || worse(c)).collect();
+        let [before, after_all, floor_all] = over(&counted, &all_frames);
         let of_channel = |c: &Channel| (*c, sums(c, &all_frames).map(|v| v / returns));
         let enough = |c: &&Channel| {
             let [before, _, floor] = sums(c, &all_frames);
@@ -226,7 +238,7 @@ impl<'a> Verification<'a> {
             after: after_all / returns,
             floor: floor_all / returns,
             closed: of_all,
-            ci95: of_all.and_then(|_| interval(&channels)),
+            ci95: of_all.and_then(|_| interval(&counted)),
             channels: channels.iter().map(of_channel).collect(),
             closed_by_channel: channels.iter().filter(enough).filter_map(share).collect(),
             ..Gain::default()
@@ -234,11 +246,47 @@ impl<'a> Verification<'a> {
     }
 }
 
-/// Writes to each finding what the fits promised of its channel and what was reached there.
-pub(super) fn set_reached(findings: &mut [crate::diagnosis::Finding], gain: &Gain) {
-    for finding in findings {
-        finding.reached = gain.closed_by_channel.get(&finding.channel).map(|c| c.closed);
+/// Difference of what was promised and what was reached from which on the form of a cause does not fit.
+const FORM: f64 = 0.05;
+
+/// Writes to each finding what the fits promised of its channel and what was reached there. A named cause whose effect
+/// was applied and surely reaches less than it promised, by more than 5 points, does not have the form of the
+/// difference: it is ambiguous where another cause was significant as well, else without a name.
+pub(super) fn set_reached(diagnosis: &mut Diagnosis) {
+    let Diagnosis { findings, gain, considered, .. } = diagnosis;
+    for finding in findings.iter_mut() {
+        let measured = gain.closed_by_channel.get(&finding.channel);
+        finding.reached = measured.map(|c| c.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
+        let (Some(promised), Some(measured)) = (finding.predicted, measured) else { continue };
+        let applied = !finding.effects.is_empty()
+            && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
+        let surely_less = measured.ci95.is_some_and(|[_, high]| high < promised - FORM);
+        if finding.status == Status::Named && applied && surely_less && measured.closed < promised - FORM {
+            finding.says.push_str(&format!(
+                "; with the extended simulation {:.0} % of the difference is gone where the fit says {:.0} %: the form of \
+                 this cause does not fit",
+                100.0 * measured.closed.max(0.0),
+                100.0 * promised
+            ));
+            lose_name(finding, considered);
+        }
+    }
+    diagnosis.verdict = Verdict::of(&diagnosis.findings);
+}
+
+/// Takes the name of a finding's cause back.
+fn lose_name(finding: &mut Finding, considered: &[Considered]) {
+    let cause = finding.cause.take();
+    let rivals = considered.iter().filter(|c| c.channel == finding.channel && c.z > Z_STAR && c.nats_per_ray > 0.0);
+    let named = rivals.map(|c| (c.nats_per_ray, c.cause.cause));
+    let rival = named.filter(|(_, rival)| Some(*rival) != cause && *rival != Cause::Unexplained);
+    let rival = rival.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, rival)| rival);
+    match (cause, rival) {
+        (Some(cause), Some(rival)) => {
+            (finding.status, finding.candidates) = (Status::Ambiguous, Some(vec![cause, rival]));
+        }
+        _ => finding.status = Status::Unexplained,
     }
 }
 

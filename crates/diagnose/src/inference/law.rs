@@ -154,6 +154,19 @@ impl FittedLaw {
         2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
     }
 
+    /// Covariate of the law, and the share that it keeps, of a surface of a kind at a range and a cosine: ln(m) for
+    /// range, ln(cos) for incidence, ln(cos / R^2) at the brightness of the ground for signal.
+    pub fn at(&self, range_m: f64, cos_incidence: f64, zone: usize) -> (f64, f64) {
+        let at = Where { ln_range: range_m.ln(), ln_cos: cos_incidence.ln(), zone };
+        let brighter = [0.0, self.numbers[4], self.numbers[5], self.numbers[5]][zone];
+        let x = match self.law {
+            Law::Incidence => at.ln_cos,
+            Law::Signal => at.ln_cos - 2.0 * at.ln_range + brighter,
+            _ => at.ln_range,
+        };
+        (x, self.kept(&at))
+    }
+
     /// Share that a law of range or of incidence keeps at a range and a cosine.
     pub fn kept_there(&self, range_m: f64, cos_incidence: f64) -> f64 {
         self.kept(&Where { ln_range: range_m.ln(), ln_cos: cos_incidence.ln(), zone: 0 })

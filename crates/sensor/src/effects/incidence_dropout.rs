@@ -1,5 +1,6 @@
 //! B4: returns lost at grazing incidence.
 
+use super::form::{Form, factor};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -29,6 +30,9 @@ pub struct IncidenceDropout {
     /// Share that is kept where the law has no effect, 0 to 1.
     #[serde(default = "one")]
     pub most: f64,
+    /// Correction of the form over x.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub form: Option<Form>,
 }
 
 /// Scale of the cosine in [`IncidenceDropout`].
@@ -53,7 +57,8 @@ impl SensorEffect for IncidenceDropout {
         within("cos_half", self.cos_half, least, largest)?;
         within("steepness", self.steepness, 0.01, 1e4)?;
         within("skew", self.skew, 0.01, 100.0)?;
-        within("most", self.most, 0.0, 1.0)
+        within("most", self.most, 0.0, 1.0)?;
+        self.form.as_ref().map_or(Ok(()), Form::check)
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
@@ -66,8 +71,9 @@ impl SensorEffect for IncidenceDropout {
         // The logistic function to the power of the skew is one half at `cos_half`.
         let middle = half + (0.5f64.powf(-1.0 / self.skew) - 1.0).ln() / self.steepness;
         drop_some(scan, draws, |echo| {
-            let off = x(echo.cos_incidence.into()) - middle;
-            (1.0 - self.most * (1.0 + (-self.steepness * off).exp()).powf(-self.skew)) as f32
+            let x = x(echo.cos_incidence.into());
+            let (off, form) = (x - middle, factor(self.form.as_ref(), x));
+            (1.0 - form * self.most * (1.0 + (-self.steepness * off).exp()).powf(-self.skew)) as f32
         });
     }
 }

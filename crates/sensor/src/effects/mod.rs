@@ -19,6 +19,7 @@
 
 mod assumed;
 mod context;
+mod form;
 mod local_plane;
 mod reshoot;
 mod row_table;
@@ -30,8 +31,10 @@ pub(crate) mod testing;
 pub use assumed::AssumedReflectivity;
 pub use context::{Draws, FrameContext, LabelledCar, Need, Undulation, WorldPlan};
 pub use empirical::Covariate;
+pub use form::Form;
 pub use incidence_dropout::CosineScale;
 pub use label_time_offset::Clock;
+pub use table::interpolated;
 pub use material_dropout::SurfaceKind;
 
 use crate::beams::Beams;

@@ -1,6 +1,7 @@
 //! B2: detection probability by returned light (LiDAR equation).
 
 use super::assumed::{AssumedReflectivity, boxes, signal};
+use super::form::{Form, factor};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
@@ -32,6 +33,9 @@ pub struct SignalDropout {
     /// Reflectivities that are assumed in place of the surfaces' own; without them the surfaces' own.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub assumed: Option<AssumedReflectivity>,
+    /// Correction of the form over the signal index.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub form: Option<Form>,
 }
 
 fn all_detected() -> f64 {
@@ -45,6 +49,7 @@ impl SensorEffect for SignalDropout {
         within("steepness", self.steepness, 0.01, 100.0)?;
         within("skew", self.skew, 0.01, 100.0)?;
         self.assumed.map_or(Ok(()), |assumed| assumed.check())?;
+        self.form.as_ref().map_or(Ok(()), Form::check)?;
         within("attenuation_per_m", self.attenuation_per_m, 0.0, 1.0)
     }
 
@@ -60,7 +65,8 @@ impl SensorEffect for SignalDropout {
             [self.most, middle, self.steepness, self.skew, self.attenuation_per_m].map(|v| v as f32);
         drop_some(scan, draws, |echo| {
             let signal = signal(self.assumed.as_ref(), echo, &boxes) - 2.0 * attenuation * echo.range_m;
-            1.0 - most * (1.0 + (-steepness * (signal - middle)).exp()).powf(-skew)
+            let form = factor(self.form.as_ref(), signal.into()) as f32;
+            1.0 - form * most * (1.0 + (-steepness * (signal - middle)).exp()).powf(-skew)
         });
     }
 }

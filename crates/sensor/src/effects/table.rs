@@ -5,7 +5,7 @@ use data::toml_text::{within, wrong};
 
 /// Linear interpolation of the points (`at`, `values`) at `x`, constant beyond both ends. The table must have been
 /// checked.
-pub(super) fn interpolated(at: &[f64], values: &[f64], x: f64) -> f64 {
+pub fn interpolated(at: &[f64], values: &[f64], x: f64) -> f64 {
     let after = at.partition_point(|a| *a <= x);
     if after == 0 || after == at.len() {
         return values[after.min(values.len() - 1)];

@@ -36,7 +36,10 @@ pub(super) fn found(
     let cause = hypothesis.cause();
     let Description { covariate, says, curve, parameters } = match hypothesis {
         Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
-        Hypothesis::Groups { cause, grouping, column } => groups(search, *cause, *grouping, *column),
+        Hypothesis::Groups { cause, grouping, column } => {
+            let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
+            groups(search, *cause, *grouping, *column, biased)
+        }
     };
     let named = cause != Cause::Unexplained;
     let rivals = selected.rivals.iter().copied().filter(|r| named && *r != Cause::Unexplained);
@@ -96,8 +99,8 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     }
 }
 
-/// Describes offsets of groups of rays.
-fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize) -> Description {
+/// Describes offsets of groups of rays; `biased` says that a bias of all ranges was found beside them.
+fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, biased: bool) -> Description {
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
     let (std, n) = match grouping {
@@ -109,7 +112,9 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize) -> D
     let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
     let precision = std.max(least).powi(-2).max(group_fit(column).precision);
     let fit = GroupFit { precision, ..group_fit(column) };
-    let offsets = grouped::offsets(&all, fit);
+    // The mean of all rows is theirs unless a bias of all ranges was found.
+    let centred = fit.centred && (column != 0 || grouping != Grouping::Row || biased);
+    let offsets = grouped::offsets(&all, GroupFit { centred, ..fit });
     let (scale, unit) = if column == 0 { (1.0, Unit::Metre) } else { (1f64.to_degrees(), Unit::Degree) };
     let mut parameters: Vec<NamedParameter> = Vec::new();
     if cause != Cause::Unexplained {

@@ -9,8 +9,8 @@ use crate::inference::losses::LossTable;
 use crate::search::{Found, NamedParameter, Selected};
 use crate::effects::rounded;
 use sensor::effects::{
-    AssumedReflectivity, CosineScale, Effect, IncidenceDropout, MaterialDropout, RandomDropout, RangeDropout,
-    SignalDropout, SurfaceKind,
+    AssumedReflectivity, CosineScale, Effect, Form, IncidenceDropout, MaterialDropout, RandomDropout, RangeDropout,
+    SignalDropout, SurfaceKind, interpolated,
 };
 use sensor::signal::{DIAGNOSIS_REFLECTIVITY, index_offset};
 
@@ -34,7 +34,15 @@ fn values(law: &FittedLaw) -> Vec<(Quantity, f64)> {
 }
 
 /// The law as the simulator has it; none where the simulation loses more.
-fn effects(law: &FittedLaw) -> Vec<Effect> {
+fn effects(law: &FittedLaw, form: &[[f64; 2]]) -> Vec<Effect> {
+    let factor_at = |x: f64| {
+        let [at, factor] = [0, 1].map(|k: usize| form.iter().map(|p| p[k]).collect::<Vec<f64>>());
+        if form.is_empty() { 1.0 } else { interpolated(&at, &factor, x) }
+    };
+    let table = |offset: f64| {
+        let at = form.iter().map(|p| rounded(p[0] + offset, 5)).collect();
+        (!form.is_empty()).then(|| Form { at, factor: form.iter().map(|p| rounded(p[1], 4)).collect() })
+    };
     let [place, ln_steepness, ln_skew, _, standing, objects] = law.numbers;
     let (share, most) = (law.numbers[0], rounded(law.most(), 7));
     let [steepness, skew] = [ln_steepness.exp(), ln_skew.exp()].map(|v| rounded(v.clamp(0.02, 99.0), 7));
@@ -49,9 +57,9 @@ fn effects(law: &FittedLaw) -> Vec<Effect> {
             vec![Effect::MaterialDropout(MaterialDropout { materials: vec![], surfaces, share })]
         }
         Law::Range => {
-            let at = |k: u32| 2f64 * (0.08 * f64::from(k)).exp();
-            let range_m: Vec<f64> = (0..64).map(|k| rounded(at(k), 3)).collect();
-            let share = range_m.iter().map(|r| rounded((1.0 - law.kept_there(*r, 1.0)).clamp(0.0, 1.0), 5)).collect();
+            let at = |k: u32| 2f64 * (0.05 * f64::from(k)).exp();
+            let range_m: Vec<f64> = (0..100).map(|k| rounded(at(k), 3)).collect();
+            let share = range_m.iter().map(|r| rounded((1.0 - factor_at(r.ln()) * law.kept_there(*r, 1.0)).clamp(0.0, 1.0), 5)).collect();
             vec![Effect::RangeDropout(RangeDropout { range_m, share })]
         }
         Law::Incidence => vec![Effect::IncidenceDropout(IncidenceDropout {
@@ -60,6 +68,7 @@ fn effects(law: &FittedLaw) -> Vec<Effect> {
             scale: CosineScale::Log,
             skew,
             most,
+            form: table(0.0),
         })],
         Law::Signal => {
             let than_ground = |ln: f64| rounded((DIAGNOSIS_REFLECTIVITY * ln.exp()).clamp(1e-5, 1e5), 7);
@@ -73,6 +82,7 @@ fn effects(law: &FittedLaw) -> Vec<Effect> {
                 skew,
                 attenuation_per_m: 0.0,
                 assumed: Some(assumed),
+                form: table(index_offset()),
             })]
         }
     }
@@ -81,20 +91,21 @@ fn effects(law: &FittedLaw) -> Vec<Effect> {
     .collect()
 }
 
-/// The finding of one law. `draws` are its bootstrap fits, `all` are all laws that were fitted together.
+/// The finding of one law. `draws` are its bootstrap fits, `all` are all laws that were fitted together, with the
+/// correction of the form of this one.
 pub(super) fn found(
     law: &FittedLaw,
     draws: &[FittedLaw],
     selected: Selected,
     held_out_gains: Vec<f64>,
     table: &LossTable,
-    all: &[FittedLaw],
+    (all, form): (&[FittedLaw], Vec<[f64; 2]>),
 ) -> Found {
     let separate_by = (!selected.rivals.is_empty()).then(|| {
         "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
     });
     Found {
-        effects: effects(law),
+        effects: effects(law, &form),
         status: selected.status(),
         confidence: selected.confidence,
         causes: selected.causes(law.law.cause()),

@@ -1,7 +1,6 @@
 //! Objects with their shifts and the covariates that may explain them.
 
 use super::Side;
-use crate::angle::wrapped;
 use crate::channels::labels::ObjectShift;
 use crate::channels::mean::origins;
 use crate::channels::motion::OwnMotion;
@@ -10,6 +9,7 @@ use crate::search::Context;
 use crate::search::geometry::Displacement;
 use nalgebra::{DMatrix, DVector, Vector3};
 use sensor::Sensor;
+use sensor::assignment::Assignment;
 
 /// A linear effect on the shift of an object, in the object's own frame: one column of the fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,7 +95,7 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
     let (sin, cos) = object.yaw_rad.sin_cos();
     let axes = |v: Vector3<f64>| [v.x * cos + v.y * sin, -v.x * sin + v.y * cos, v.z];
     let center = Vector3::from(object.center);
-    let sensor = nearest_sensor(context, s.azimuth_rad);
+    let sensor = Assignment::new(context.rig).of_point(center.into()).map_or(0, |assigned| assigned.sensor);
     if side == Side::Objects {
         let origin = origins(context.rig)[sensor];
         let known = axes(displaced.of_point(&center, sensor, &origin));
@@ -125,18 +125,6 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
         speed,
         known,
     })
-}
-
-/// The sensor in whose field of view an azimuth of the cloud's frame lies most centrally.
-fn nearest_sensor(context: &Context, azimuth_rad: f64) -> usize {
-    let nearest = (0..context.rig.sensors.len()).min_by(|&a, &b| {
-        let off = |k: usize| {
-            let mount = &context.rig.sensors[k];
-            wrapped(azimuth_rad - mount.yaw_deg.to_radians()).abs() / mount.half_fov_rad()
-        };
-        off(a).total_cmp(&off(b))
-    });
-    nearest.unwrap_or(0)
 }
 
 /// Fills the columns of velocities. Returns the velocity over the ground along the heading, and which columns are
