@@ -45,7 +45,8 @@ pub struct DiagnoseArgs {
     /// Data set with raw scans of one spinning sensor, compared with an ideal sensor; needs no simulated data set
     #[arg(long, value_name = "DATASET", conflicts_with_all = ["measured", "simulated", "simulator"])]
     scans: Option<PathBuf>,
-    /// TOML with the poses of the sensors [default: one sensor at the origin of the clouds]
+    /// TOML with the poses of the sensors [default: from the TOML of the simulated data set, else one sensor at the origin
+    /// of the clouds]
     #[arg(long, value_name = "TOML")]
     sensor: Option<PathBuf>,
     /// Configuration of the simulation that made the simulated data: the poses of the sensors are read from it, and the
@@ -125,7 +126,7 @@ impl DiagnoseArgs {
             && !outcome.diagnosis.findings.is_empty()
         {
             let extended = self.out.join("extended.toml");
-            let (gains, left_out) = gain_of_detectors(study, measured, simulated, &extended, &self.out)?;
+            let (gains, left_out) = gain_of_detectors(study, measured, simulated, (&extended, self.sensor.as_deref()), &self.out)?;
             print_gains(&gains, &left_out);
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
@@ -229,7 +230,10 @@ impl DiagnoseArgs {
                 let (text, path) = files.text(&race.rig)?;
                 Ok(Rig::parse(&text, &path)?)
             }
-            (None, None) => Ok(Rig::single()),
+            (None, None) => match self.simulated.as_deref().map(Dataset::open).transpose()?.map(|set| set.config.rig) {
+                Some(Some(path)) => Ok(Rig::read(&path)?),
+                _ => Ok(Rig::single()),
+            },
         }
     }
 }

@@ -173,7 +173,8 @@ pub struct Minimum {
     pub unit: Unit,
 }
 
-/// Distance between measured and simulated held-out frames.
+/// Distance between measured and simulated held-out frames. The totals are over the channels in which something was
+/// found, and over those that the extension made worse; they are zero where nothing was found. `channels` has all.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Gain {
     /// `nats_per_ray`: what lookup tables of the measured data, fitted on other frames, predict better than the

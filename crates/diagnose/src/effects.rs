@@ -148,8 +148,8 @@ fn range_noise(f: &Finding) -> Vec<Effect> {
     positive(std_m, Effect::RangeNoise(RangeNoise { std_m }))
 }
 
-/// Motion distortion, of all that stands still or of labelled objects alone. Its extent is the duration of a scan, where
-/// the own motion is known, else the displacement.
+/// Motion distortion, of all that stands still or of labelled objects alone. Its extent is the duration of a scan where
+/// the ego motion is known, else the displacement.
 fn rolling_shutter(f: &Finding) -> Effect {
     let scan_s = f.parameter(Quantity::ScanS).map(|_| value(f, Quantity::ScanS));
     let slide = [Quantity::ShearXM, Quantity::ShearYM, Quantity::ShearYawDeg].map(|quantity| value(f, quantity));

@@ -105,8 +105,7 @@ mod tests {
     use crate::diagnosis::{FindingGain, Gain, Parameter, SCHEMA, Verdict};
     use crate::effects::fill_effects;
     use sensor::Rig;
-    use sensor::effects::{BeamAngleError, EgoAttitude, RangeBias, SignalDropout};
-    use std::collections::BTreeMap;
+    use sensor::effects::{BeamAngleError, EgoAttitude, RandomDropout, RangeBias};
 
     fn finding(cause: Cause, parameters: &[(Quantity, f64)]) -> Finding {
         let parameter =
@@ -158,7 +157,10 @@ mod tests {
         let diagnosis = diagnosis(vec![
             finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.3)]),
             finding(Cause::RangeNoise, &[(Quantity::StdM, 0.02), (Quantity::PerM, 0.0)]),
-            finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)]),
+            Finding {
+                effects: vec![Effect::RandomDropout(RandomDropout { share: 0.2 })],
+                ..finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)])
+            },
             finding(Cause::RandomDropout, &[(Quantity::Share, -0.2)]),
             finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
         ]);
@@ -201,25 +203,10 @@ mod tests {
             finding(Cause::BeamElevationOffset, &[(Quantity::StdDeg, 0.1)]),
             finding(Cause::Quantisation, &[(Quantity::StepM, 0.02)]),
             finding(Cause::AngularJitter, &[(Quantity::StdDeg, 0.05)]),
-            finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)]),
-            finding(Cause::SignalDropout, &[(Quantity::Threshold, 1.0), (Quantity::Steepness, 3.0)]),
-            finding(Cause::IncidenceDropout, &[(Quantity::CosHalf, 0.1), (Quantity::Steepness, 3.0)]),
-            finding(Cause::RangeDropout, &[(Quantity::HalfAtM, 50.0), (Quantity::Steepness, 6.0)]),
-            finding(Cause::MaterialDropout, &[(Quantity::Share, 0.5)]),
             finding(Cause::RangeCut, &[(Quantity::MaxM, 80.0)]),
-            finding(
-                Cause::EgoOcclusion,
-                &[
-                    (Quantity::AzimuthFromDeg, -10.0),
-                    (Quantity::AzimuthToDeg, 10.0),
-                    (Quantity::ElevationFromDeg, -4.0),
-                    (Quantity::ElevationToDeg, 1.0),
-                ],
-            ),
             finding(Cause::SensorExtrinsics, &[(Quantity::Sensor, 0.0), (Quantity::YawDeg, 0.2)]),
             finding(Cause::PitchRoll, &[(Quantity::PitchDeg, 0.2)]),
             finding(Cause::RollingShutter, &[(Quantity::ScanS, 0.1)]),
-            finding(Cause::Outliers, &[(Quantity::Rate, 0.01), (Quantity::ReachM, 90.0)]),
             finding(Cause::MixedPixels, &[(Quantity::Share, 0.01), (Quantity::DivergenceRad, 0.004)]),
             finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.2)]),
             finding(Cause::TimeOffset, &[(Quantity::OffsetS, 0.02)]),
@@ -269,17 +256,7 @@ mod tests {
             effect(Cause::BeamElevationOffset, &[(Quantity::MeanDeg, 0.2)]),
             [Effect::BeamAngleError(BeamAngleError {
                 elevation_deg: 0.2,
-                elevation_std_deg: 0.0,
-                azimuth_std_deg: 0.0
-            })]
-        );
-        assert_eq!(
-            effect(Cause::SignalDropout, &[(Quantity::Threshold, 1.0), (Quantity::Steepness, 3.0)]),
-            [Effect::SignalDropout(SignalDropout {
-                most: 1.0,
-                threshold: 1.0,
-                steepness: 3.0,
-                attenuation_per_m: 0.0
+                ..BeamAngleError::default()
             })]
         );
         let [Effect::EgoAttitude(attitude)] = &effect(Cause::PitchRoll, &[(Quantity::RollDeg, 0.2)])[..] else {

@@ -12,11 +12,17 @@ use std::path::Path;
 
 /// A small race without any effect.
 fn race(folder: &Path) -> Dataset {
+    race_with(folder, false)
+}
+
+/// The same, with attributes of the points on request.
+fn race_with(folder: &Path, attributes: bool) -> Dataset {
     let text = "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 30\nresolution = 0.3\nlabel_points = 1\nrace = { runs = 1, frames = 1500 }\n\
                 [[dataset]]\nname = \"sim\"\neffects = \"none.toml\"\n";
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
     fs_err::copy(configs.join("sensors/av21.toml"), folder.join("rig.toml")).unwrap();
     fs_err::write(folder.join("none.toml"), "").unwrap();
+    let text = format!("attributes = {attributes}\n{text}");
     fs_err::write(folder.join("r.toml"), text).unwrap();
     let (config, files) = RaceConfig::find(&folder.join("r.toml").display().to_string()).unwrap();
     make_race_datasets(&config, &files, folder, &[], &|_, _, _| ()).unwrap();
@@ -108,7 +114,7 @@ fn foreign(sim: &Dataset, folder: &Path) -> Dataset {
 #[test]
 fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
     let folder = tempfile::tempdir().unwrap();
-    let sim = race(folder.path());
+    let sim = race_with(folder.path(), true);
     let foreign = foreign(&sim, folder.path());
     let rig = Rig::read(&foreign.config.root.join("rig.toml")).unwrap();
     for (cause, hidden) in [
@@ -123,10 +129,11 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
         let d = &outcome.diagnosis;
         assert_eq!(named(d), [cause], "{:?}", d.findings);
         let closed = d.gain.closed.unwrap();
-        assert!(closed > 0.9 && d.gain.not_applied.is_empty(), "{cause}: {:?}", d.gain);
+        assert!(closed > 0.85 && d.gain.not_applied.is_empty(), "{cause}: {:?}", d.gain);
         let again = with_effects(&foreign, &outcome.extended, &folder.path().join(cause), 12);
         let second = diagnose(&measured, &again, &rig, &Options::default(), &|_, _, _| ()).unwrap().diagnosis;
-        let reached = (d.gain.before - second.gain.before) / (d.gain.before - d.gain.floor);
+        let left: f64 = d.gain.closed_by_channel.keys().map(|channel| second.gain.channels[channel][0]).sum();
+        let reached = (d.gain.before - left) / (d.gain.before - d.gain.floor);
         assert!((reached - closed).abs() < 0.05, "{cause}: {reached} of {closed}");
         assert!(second.findings.is_empty(), "{cause}: {:?}", second.findings);
     }

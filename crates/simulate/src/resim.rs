@@ -297,16 +297,20 @@ mod tests {
     fn what_a_cloud_does_not_tell_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = street(&folder.path().join("street"));
-        for (kind, want) in [
-            ("beam_divergence", "effect[0]: beam_divergence changes what rays meet"),
-            ("beam_range_offset", "needs the row of each point"),
-            ("material_dropout", "needs the material of surfaces"),
-            ("label_time_offset", "needs the motion of the cars"),
+        for (effect, want) in [
+            ("kind = \"ghosts\"", "effect[0]: ghosts changes what rays meet"),
+            ("kind = \"packet_loss\"", "packet_loss needs the time of each shot, which this data set does not tell; give"),
+            ("kind = \"material_dropout\"\nmaterials = [\"rubber\"]", "needs the material of surfaces"),
+            ("kind = \"label_time_offset\"", "needs the motion of the cars"),
+            ("kind = \"rain\"", "say what its intensities mean (`intensity = \"returned_light\"`"),
+            ("kind = \"sensor_pose_error\"\nsensor = \"left\"", "acts on the sensor \"left\", but the rig has lidar"),
         ] {
-            let list = effects(&format!("[[effect]]\nkind = \"{kind}\"\n"));
-            let error = make(&dataset, &list, None, &folder.path().join(kind)).unwrap_err();
+            let list = effects(&format!("[[effect]]\n{effect}\n"));
+            let error = make(&dataset, &list, None, &folder.path().join("refused")).unwrap_err();
             assert!(error.contains(want), "{error}");
         }
+        let list = effects("intensity = \"returned_light\"\n[[effect]]\nkind = \"rain\"\nrate_mm_per_h = 5.0\n");
+        make(&dataset, &list, None, &folder.path().join("rain")).unwrap();
         // With the sensor's pattern, rows are known.
         let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../configs/sensors/hdl64e.toml");
         let rig = Rig::read(Path::new(path)).unwrap();
@@ -317,5 +321,43 @@ mod tests {
         let all = effects("[[effect]]\nkind = \"random_dropout\"\nshare = 1.0\n");
         let error = make(&dataset, &all, None, &folder.path().join("empty")).unwrap_err();
         assert!(error.contains("leave no point"), "{error}");
+    }
+
+    #[test]
+    fn points_that_no_effect_touches_keep_their_bytes() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = street(&folder.path().join("street"));
+        let out = folder.path().join("out");
+        let list = "[[effect]]\nkind = \"range_noise\"\n[[effect]]\nkind = \"range_limits\"\nmax_m = 30.0\n";
+        make(&dataset, &effects(list), None, &out).unwrap();
+        let (before, after) =
+            (dataset.load_cloud("train_000000").unwrap(), Dataset::open(&out).unwrap().load_cloud("train_000000").unwrap());
+        let near = before.points().filter(|p| p[0].hypot(p[1]).hypot(p[2]) <= 30.0);
+        assert!(near.flatten().copied().map(f32::to_bits).eq(after.values.iter().map(|v| v.to_bits())));
+        assert!(after.len() < before.len());
+    }
+
+    #[test]
+    fn a_list_of_a_diagnosis_is_for_its_simulated_data_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let [sim, real] = ["sim", "real"].map(|name| street(&folder.path().join(name)));
+        let of = |sensors: &[&str]| {
+            let made = sensor::effects::MadeFrom {
+                measured: real.config.root.clone(),
+                simulated: sim.config.root.clone(),
+                sensors: sensors.iter().map(|s| (*s).to_owned()).collect(),
+            };
+            let noise = effects("[[effect]]\nkind = \"range_noise\"\nstd_m = 0.02\n").effects;
+            EffectList { made_from: Some(made), ..EffectList::of(noise) }
+        };
+        let list = of(&["lidar"]);
+        let error = make(&real, &list, None, &folder.path().join("a")).unwrap_err();
+        assert!(error.contains("is the measured data set that the list was made from"), "{error}");
+        let error = make(&sim, &of(&["front", "left"]), None, &folder.path().join("b")).unwrap_err();
+        assert!(error.contains("made for the sensors front, left, but the rig has lidar"), "{error}");
+        let once = folder.path().join("once");
+        make(&sim, &list, None, &once).unwrap();
+        let error = make(&Dataset::open(&once).unwrap(), &list, None, &folder.path().join("c")).unwrap_err();
+        assert!(error.contains("it would act twice"), "{error}");
     }
 }

@@ -1,7 +1,6 @@
 //! Ghost returns in a scene in which additional rays can be cast.
 
-use lidarshift_simulate::frame_sensors: None,
-        scene::FrameScene;
+use lidarshift_simulate::frame_scene::FrameScene;
 use lidarshift_simulate::mesh::{Mesh, cuboid};
 use lidarshift_simulate::scenario::Motion;
 use lidarshift_simulate::world::{CarShape, World};
@@ -40,6 +39,7 @@ fn the_range_of_a_ghost_includes_the_path_after_the_reflection() {
         ego_velocity: [0.0; 3],
         ego_turn_rate: [0.0; 3],
         cars: &[],
+        sensors: None,
         scene: Some(&scene),
         world_x_rad: 0.0,
     };

@@ -109,6 +109,9 @@ pub enum Source {
         of: String,
         /// TOML with the effects, as for `resim --effects`.
         effects: PathBuf,
+        /// TOML with the sensors, as for `resim --sensor`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        sensor: Option<PathBuf>,
     },
 }
 

@@ -5,7 +5,7 @@ use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
 use data::Dataset;
-use sensor::EffectList;
+use sensor::{EffectList, Rig};
 use sha2::{Digest, Sha256};
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
@@ -53,10 +53,11 @@ fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result
                 }
             }
         }
-        Source::Resim { of, effects } => {
+        Source::Resim { of, effects, sensor } => {
             let source = Dataset::open(&study.dataset_path(study.dataset(of)?))?;
             let effects = EffectList::read(&study.path(effects))?;
-            Resim { dataset: &source, effects: &effects, rig: None, seed: 0 }.make(&path, &show)?;
+            let rig = sensor.as_ref().map(|path| Rig::read(&study.path(path))).transpose()?;
+            Resim { dataset: &source, effects: &effects, rig, seed: 0 }.make(&path, &show)?;
         }
     }
     listener(Event::DatasetMade);

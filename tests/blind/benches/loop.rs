@@ -216,10 +216,13 @@ impl Run {
         self.first["gain"]["closed"].as_f64()
     }
 
-    /// Share of the gap that the second diagnosis finds closed.
+    /// Share of the gap that the second diagnosis finds closed, in the channels in which the first one found something.
     fn reached(&self) -> Option<f64> {
-        let (first, second) = (&self.first["gain"], &self.second.as_ref().ok()?["gain"]);
-        share(first["before"].as_f64()?, second["before"].as_f64()?, first["floor"].as_f64()?)
+        let (first, second) = (&self.first["gain"]["channels"], &self.second.as_ref().ok()?["gain"]["channels"]);
+        let found: std::collections::BTreeSet<&str> =
+            self.first["findings"].as_array()?.iter().filter_map(|f| f["channel"].as_str()).collect();
+        let sum = |gain: &Value, k: usize| found.iter().filter_map(|c| gain[*c][k].as_f64()).sum::<f64>();
+        share(sum(first, 0), sum(second, 0), sum(first, 2))
     }
 
     /// By channel: its share of the whole gap, before and floor of the first diagnosis, before of the second, and the

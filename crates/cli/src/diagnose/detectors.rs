@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
-use sensor::EffectList;
+use sensor::{EffectList, Rig};
 use sensor::finished::Refusal;
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
@@ -28,13 +28,13 @@ pub(super) fn gain_of_detectors(
     named: &str,
     measured: &Path,
     simulated: &Path,
-    extended: &Path,
+    (extended, sensor): (&Path, Option<&Path>),
     out: &Path,
 ) -> Result<(Vec<DetectorGain>, Vec<String>)> {
     let template = Study::open(named, None)?.config;
-    let (effects, left_out) = applicable(simulated, extended, out)?;
+    let (effects, left_out) = applicable(simulated, extended, sensor, out)?;
     let path = out.join("detectors.toml");
-    let text = toml::to_string(&study_of(template, measured, simulated, &effects)?)?;
+    let text = toml::to_string(&study_of(template, measured, simulated, (&effects, sensor))?)?;
     write_atomic(&path, text.as_bytes())?;
     let study = Study::open(&path.to_string_lossy(), Some(&out.join("detectors")))?;
     run_study(&study, &RunOptions::here(DeviceArgs::default().arguments()))?;
@@ -43,9 +43,15 @@ pub(super) fn gain_of_detectors(
 
 /// The file of the effects that can be applied to the simulated data set, and a note for each effect that is left out.
 /// It is `extended` itself if none is left out.
-fn applicable(simulated: &Path, extended: &Path, out: &Path) -> Result<(PathBuf, Vec<String>)> {
+fn applicable(
+    simulated: &Path,
+    extended: &Path,
+    sensor: Option<&Path>,
+    out: &Path,
+) -> Result<(PathBuf, Vec<String>)> {
+    let rig = sensor.map(Rig::read).transpose()?;
     let (dataset, mut effects) = (Dataset::open(simulated)?, EffectList::read(extended)?);
-    let refused = Resim { dataset: &dataset, effects: &effects, rig: None, seed: 0 }.refused()?;
+    let refused = Resim { dataset: &dataset, effects: &effects, rig, seed: 0 }.refused()?;
     if refused.is_empty() {
         return Ok((extended.to_path_buf(), vec![]));
     }
@@ -59,16 +65,26 @@ fn applicable(simulated: &Path, extended: &Path, out: &Path) -> Result<(PathBuf,
 }
 
 /// The template with its data sets replaced by those of a diagnosis.
-fn study_of(template: StudyConfig, measured: &Path, simulated: &Path, extended: &Path) -> Result<StudyConfig> {
+fn study_of(
+    template: StudyConfig,
+    measured: &Path,
+    simulated: &Path,
+    (extended, sensor): (&Path, Option<&Path>),
+) -> Result<StudyConfig> {
     let absolute = |path: &Path| std::path::absolute(path).map(Source::Path);
     let set =
         |name: &str, title: &str, source| StudyDataset { name: name.into(), title: title.into(), paper: None, source };
+    let made_anew = Source::Resim {
+        of: BEFORE.into(),
+        effects: std::path::absolute(extended)?,
+        sensor: sensor.map(std::path::absolute).transpose()?,
+    };
     let mut study = template;
     study.name = "detectors".into();
     study.datasets = vec![
         set(MEASURED, "Measured", absolute(measured)?),
         set(BEFORE, "Simulated", absolute(simulated)?),
-        set(AFTER, "Extended", Source::Resim { of: BEFORE.into(), effects: std::path::absolute(extended)? }),
+        set(AFTER, "Extended", made_anew),
     ];
     study.evaluation.tsne_dataset = None;
     for detector in &mut study.detectors {
@@ -127,12 +143,12 @@ mod tests {
         let template = Study::open("gain", None).unwrap().config;
         assert_eq!(template.seeds.len(), 5);
         let study =
-            study_of(template, Path::new("/a/real"), Path::new("/a/sim"), Path::new("/a/extended.toml")).unwrap();
+            study_of(template, Path::new("/a/real"), Path::new("/a/sim"), (Path::new("/a/extended.toml"), None)).unwrap();
         let text = toml::to_string(&study).unwrap();
         let again = StudyConfig::parse(&text, Path::new("detectors.toml")).unwrap();
         assert_eq!(again, study);
         assert_eq!(again.datasets[0].source, Source::Path("/a/real".into()));
-        let of_the_simulation = Source::Resim { of: BEFORE.into(), effects: "/a/extended.toml".into() };
+        let of_the_simulation = Source::Resim { of: BEFORE.into(), effects: "/a/extended.toml".into(), sensor: None };
         assert_eq!(again.datasets[2].source, of_the_simulation);
     }
 }

@@ -19,7 +19,8 @@ pub(super) struct RaceSimulator {
 }
 
 impl RaceSimulator {
-    /// The simulation `named` that made the data set `simulated`, with the seed and the number of frames of its manifest.
+    /// The simulation `named` that made the data set `simulated`, with the seed and the number of frames of its
+    /// manifest.
     ///
     /// # Errors
     /// A configuration that cannot be read, and one that does not make these frames.

@@ -1,8 +1,8 @@
 //! The gain through the file: frames are made anew with the effects of `extended.toml`, paired with the measured ones
 //! again, and compared by the same distance.
 //!
-//! The distance of a channel is what lookup tables of the measured data, fitted on the estimating frames, predict better
-//! of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero where
+//! The distance of a channel is what lookup tables of the measured data, fitted on the estimating frames, predict
+//! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero where
 //! the two sides are two draws of the same sensor, and is the same number before and after.
 
 use super::Engine;
@@ -27,7 +27,7 @@ use std::sync::Arc;
 /// Frames of a role that are made anew, at most.
 const FRAMES: usize = 60;
 
-/// Nats of a channel over all held-out frames from which on the share of it that is gone is told.
+/// Nats of a channel over all held-out frames from which on the share of it that is gone is reported.
 const ENOUGH_NATS: f64 = 8.0;
 
 /// Makes frames of the simulation anew.
@@ -132,9 +132,9 @@ impl<'a> Verification<'a> {
         Verification { engine, context, train, test, slide, found, before }
     }
 
-    /// The gain without any extension.
+    /// The distances by channel where nothing was found. The totals are of what was found: zero.
     pub(super) fn without_extension(&self) -> Gain {
-        self.gain(&self.before, &self.before, false)
+        Gain { before: 0.0, after: 0.0, floor: 0.0, ..self.gain(&self.before, &self.before, false) }
     }
 
     /// The gain by a list of effects.

@@ -323,6 +323,8 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use sensor::Rig;
+    use sensor::directions::{ScanPattern, Steps};
 
     #[test]
     fn shots_without_a_return_are_counted_except_beside_returns() {
@@ -340,10 +342,10 @@ mod tests {
         };
         let (measured, simulated) = (scan_up_to(300), scan_up_to(100));
         let index = DirectionIndex::new(&simulated, sensors.window(0), false);
-        let open = sensors.open(0, [&measured, &simulated], &index).unwrap();
+        let opened = open(&sensors, 0, [&measured, &simulated], &index).unwrap();
         // Two columns beside the last return are seen together with it.
-        assert!((open - 4.0 * 198.0).abs() < 4.0 * EVERY as f64, "{open}");
+        assert!((opened - 4.0 * 198.0).abs() < 4.0 * EVERY as f64, "{opened}");
         let whole = DirectionIndex::new(&measured, sensors.window(0), false);
-        assert_eq!(sensors.open(0, [&measured, &simulated], &whole), Some(0.0));
+        assert_eq!(open(&sensors, 0, [&measured, &simulated], &whole), Some(0.0));
     }
 }

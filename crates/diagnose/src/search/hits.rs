@@ -1,6 +1,10 @@
 //! Lost returns: which simulated returns have no measured counterpart, and on what that depends.
 
+mod by_table;
 mod describe;
+mod form;
+
+pub use self::by_table::by_table;
 
 use self::describe::found;
 use super::unexplained::{Unexplained, mean_by_group};
@@ -9,10 +13,10 @@ use super::{
     rivals_and_confidence, trimmed,
 };
 use crate::catalogue::{Cause, Channel, Quantity};
-use crate::channels::cells::{cell, place_of};
+use crate::channels::cells::cell;
 use crate::channels::groups::{Group, Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
-use crate::channels::mask::{DirectionCell, Mask, direction_cell};
+use crate::channels::mask::Mask;
 use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
@@ -64,64 +68,6 @@ pub fn search(context: &Context, mask: &Mask, displaced: bool) -> ChannelResult 
     search.report(selection, &mut result);
     result
 }
-
-/// Simulated returns of a cell of directions that count as the prior of its own share of losses.
-const PRIOR_OF_DIRECTION: f64 = 30.0;
-
-/// Gains of the `test` frames by the shares of matched returns of the `train` frames, nats: by cell of range,
-/// incidence and surface, times those by cell of directions.
-pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
-    let hits = hit_frames(context.frames, &Mask::default());
-    let unmatched = table(&hits, train).unmatched(&[]);
-    // Returns whose incidence is not known, and those with a counterpart, of both sides by range.
-    let mut at_edges = BTreeMap::<i32, [[f64; 2]; 2]>::new();
-    let bin = |ray: &Ray| (f64::from(ray.range_m).max(0.5).ln() / 0.25) as i32;
-    for frame in train.iter().map(|&i| &context.frames[i]) {
-        for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
-            for ray in rays.iter().filter(|ray| cell(ray).is_none()) {
-                let [n, matched] = &mut at_edges.entry(bin(ray)).or_default()[side];
-                (*n, *matched) = (*n + 1.0, *matched + f64::from(u8::from(ray.matched)));
-            }
-        }
-    }
-    let usual = at_edges.values().fold([0.0; 2], |s, [_, [n, matched]]| [s[0] + n, s[1] + matched]);
-    let usual = (usual[1] + 1.0) / (usual[0] + 1.0);
-    let edge = |ray: &Ray| {
-        let [simulated, measured] = at_edges.get(&bin(ray)).copied().unwrap_or_default();
-        let share = |[n, matched]: [f64; 2], towards: f64| {
-            (matched + PRIOR_OF_DIRECTION * towards) / (n + PRIOR_OF_DIRECTION)
-        };
-        let without = share(measured, usual);
-        [share(simulated, without), without]
-    };
-    // Share of the returns like a ray that have a counterpart: in these data, and without losses.
-    let expected = |ray: &Ray| cell(ray).map_or_else(|| edge(ray), |c| unmatched[c].map(|share| 1.0 - share));
-    let mut of_directions = BTreeMap::<DirectionCell, [f64; 2]>::new();
-    for ray in train.iter().flat_map(|&i| &context.frames[i].simulated) {
-        let sums = of_directions.entry(direction_cell(ray)).or_default();
-        sums[0] += f64::from(u8::from(ray.matched));
-        sums[1] += expected(ray)[0];
-    }
-    let ratio = |ray: &Ray| {
-        let [matched, kept] = of_directions.get(&direction_cell(ray)).copied().unwrap_or_default();
-        (matched + PRIOR_OF_DIRECTION) / (kept + PRIOR_OF_DIRECTION)
-    };
-    let of_ray = |ray: &Ray| {
-        let [kept, without] = expected(ray);
-        let [p, q] = [without, kept * ratio(ray)].map(|share| share.clamp(1e-3, 1.0 - 1e-3));
-        if ray.matched { (q / p).ln() } else { ((1.0 - q) / (1.0 - p)).ln() }
-    };
-    test.iter().map(|&i| context.frames[i].simulated.iter().map(of_ray).sum()).collect()
-}
-
-/// Number of points of the correction of a law's form.
-const FORM_BINS: f64 = 24.0;
-
-/// Fewest returns, weighted by what they tell, of a point of the correction.
-const FEWEST_OF_FORM: f64 = 40.0;
-
-/// Expected returns that count as the prior of a factor of 1.
-const FORM_PRIOR: f64 = 20.0;
 
 /// Counts of all frames, and the frames by role.
 struct Search<'a> {
@@ -326,43 +272,6 @@ impl<'a> Search<'a> {
             }
             result.found.push(found);
         }
-    }
-
-    /// Ratio of the measured share to that of the laws along the covariate of law `k`, on the estimating frames, return
-    /// by return: the correction of its form.
-    fn form(&self, k: usize, laws: &[FittedLaw], table: &LossTable) -> Vec<[f64; 2]> {
-        let unmatched = table.unmatched(&[]);
-        let rays = self.estimate.iter().flat_map(|&i| &self.context.frames[i].simulated);
-        // Covariate, expected share and whether there is a counterpart.
-        let mut seen: Vec<[f64; 3]> = rays
-            .filter(|ray| !self.mask.hides(ray))
-            .filter_map(|ray| {
-                let (range_m, cos, zone) = place_of(ray)?;
-                let kept: f64 = laws.iter().map(|law| law.at(range_m, cos, zone).1).product();
-                let expected = (kept * (1.0 - unmatched[cell(ray)?][1])).clamp(0.0, 1.0);
-                Some([laws[k].at(range_m, cos, zone).0, expected, f64::from(u8::from(ray.matched))])
-            })
-            .collect();
-        seen.sort_by(|a, b| a[0].total_cmp(&b[0]));
-        // As many bins as the counts determine to a few per cent, where the law changes.
-        let worth = |[_, expected, _]: &[f64; 3]| expected * (1.0 - expected) + 0.02 * expected;
-        let per = (seen.iter().map(worth).sum::<f64>() / FORM_BINS).max(FEWEST_OF_FORM);
-        let (mut points, mut bin) = (Vec::<[f64; 2]>::new(), [0.0f64; 4]);
-        for ray in &seen {
-            let [x, expected, matched] = *ray;
-            for (sum, v) in bin.iter_mut().zip([expected * x, expected, matched, worth(ray)]) {
-                *sum += v;
-            }
-            if bin[3] >= per {
-                let factor = (bin[2] + FORM_PRIOR) / (bin[1] + FORM_PRIOR);
-                let x = bin[0] / bin[1];
-                if points.last().is_none_or(|last| x > last[0] + 1e-6) {
-                    points.push([x, factor]);
-                }
-                bin = [0.0; 4];
-            }
-        }
-        points
     }
 
     /// Fits of the laws on estimating frames whose blocks are drawn with replacement.

@@ -77,6 +77,8 @@ mod tests {
             channel: Channel::Hits,
             covariate: Covariate::Row,
             gain: FindingGain::default(),
+            predicted: None,
+            reached: None,
             says: String::new(),
             separate_by: None,
             curve: Curve {

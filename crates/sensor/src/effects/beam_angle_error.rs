@@ -28,7 +28,7 @@ pub struct BeamAngleError {
     pub elevation_std_deg: f64,
     /// Standard deviation of the azimuth error between rows, degrees.
     pub azimuth_std_deg: f64,
-    /// Name of the sensor whose rows are told by `rows_deg`; the effect is then of that sensor alone.
+    /// Name of the sensor whose rows `rows_deg` gives; the effect is then of that sensor alone.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub sensor: String,
     /// Elevations of that sensor's rows, ascending, degrees.
@@ -129,7 +129,7 @@ mod tests {
 
     #[test]
     fn all_shots_of_a_row_have_the_same_error() {
-        let effect = BeamAngleError { elevation_deg: 0.2, elevation_std_deg: 0.05, azimuth_std_deg: 0.0 };
+        let effect = BeamAngleError { elevation_deg: 0.2, elevation_std_deg: 0.05, ..BeamAngleError::default() };
         let turned_in = |frame: u64| {
             let mut beams = Beams::of(&rig());
             with_frame(frame, |frame, draws| effect.on_beams(&mut beams, frame, draws));
@@ -151,7 +151,7 @@ mod tests {
 
     #[test]
     fn an_upward_error_lengthens_ranges_to_the_ground() {
-        let effect = BeamAngleError { elevation_deg: 0.2, elevation_std_deg: 0.0, azimuth_std_deg: 0.0 };
+        let effect = BeamAngleError { elevation_deg: 0.2, elevation_std_deg: 0.0, ..BeamAngleError::default() };
         let before = scene();
         let mut after = before.clone();
         with_frame(0, |frame, draws| effect.on_cloud(&mut after, frame, draws));

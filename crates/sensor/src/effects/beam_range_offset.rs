@@ -22,7 +22,7 @@ pub struct BeamRangeOffset {
     /// Offset of each row, m; replaces `std_m`. Of the rows of `rows_deg` where that is given; else of the rows from
     /// the top, the same for every sensor, and 0 for rows beyond the end of the list.
     pub offsets_m: Vec<f64>,
-    /// Name of the sensor whose rows are told by `rows_deg`.
+    /// Name of the sensor whose rows `rows_deg` gives.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub sensor: String,
     /// Elevations of that sensor's rows, ascending, degrees.
@@ -105,8 +105,37 @@ mod tests {
     #[test]
     fn a_table_of_offsets_is_used_unchanged() {
         let before = plate(3000, 20.0, 0.5);
-        let after = applied(&BeamRangeOffset { std_m: 0.0, offsets_m: vec![0.1, -0.2] }, &before);
+        let after = applied(&BeamRangeOffset { std_m: 0.0, offsets_m: vec![0.1, -0.2], ..BeamRangeOffset::default() }, &before);
         let off = residuals(&before, &after);
         assert!((off[0] - 0.1).abs() < 1e-5 && (off[1000] + 0.2).abs() < 1e-5 && off[2000] == 0.0);
+    }
+
+    #[test]
+    fn a_table_by_elevation_belongs_to_one_sensor() {
+        let before = scene();
+        // The rows of the test scans, from the lowest.
+        let rows_deg: Vec<f64> = (0..32).map(|row| -15.0 + 25.0 / 31.0 * f64::from(row)).collect();
+        let offsets_m: Vec<f64> = (0..32).map(|row| 0.01 * f64::from(row)).collect();
+        let table = |sensor: &str| BeamRangeOffset {
+            std_m: 0.0,
+            offsets_m: offsets_m.clone(),
+            sensor: sensor.into(),
+            rows_deg: rows_deg.clone(),
+        };
+        assert_eq!(table("front").needs(), Some(&[][..]));
+        let after = applied(&table("front"), &before);
+        for (a, b) in after.returns().zip(before.returns()) {
+            let want = 0.01 * (31.0 - f32::from(b.row));
+            assert!((a.range_m - b.range_m - want).abs() < 1e-4, "row {}: {}", b.row, a.range_m - b.range_m);
+        }
+        assert_eq!(applied(&table("left"), &before), before, "another sensor's rows");
+        for (effect, want) in [
+            (BeamRangeOffset { sensor: String::new(), ..table("") }, "belongs to one sensor"),
+            (BeamRangeOffset { offsets_m: vec![0.1], ..table("front") }, "1 values for 32 rows"),
+            (BeamRangeOffset { rows_deg: rows_deg.iter().rev().copied().collect(), ..table("front") }, "is not larger"),
+        ] {
+            let error = effect.check().unwrap_err().to_string();
+            assert!(error.contains(want), "{error}");
+        }
     }
 }

@@ -112,7 +112,7 @@ mod tests {
     fn returns_behind_the_box_are_lost_in_every_frame() {
         let before = scene();
         // A board 2 m ahead, 0.4 m wide, around the sensor's horizon.
-        let effect = EgoBodyMask { boxes: vec![[2.0, -0.2, -0.1, 2.1, 0.2, 0.1]] };
+        let effect = EgoBodyMask { boxes: vec![[2.0, -0.2, -0.1, 2.1, 0.2, 0.1]], ..EgoBodyMask::default() };
         let after = applied_in(9, &effect, &before);
         assert_eq!(after, applied(&effect, &before));
         for (a, b) in before.echoes.iter().zip(&after.echoes).filter(|(a, _)| a.is_return()) {
@@ -131,8 +131,28 @@ mod tests {
     #[test]
     fn returns_before_the_box_stay() {
         let before = plate(10, 1.5, 0.5);
-        let effect = EgoBodyMask { boxes: vec![[2.0, -0.2, -0.1, 2.1, 0.2, 0.1]] };
+        let effect = EgoBodyMask { boxes: vec![[2.0, -0.2, -0.1, 2.1, 0.2, 0.1]], ..EgoBodyMask::default() };
         assert_eq!(lost(&before, &applied(&effect, &before)), 0.0);
-        assert!(EgoBodyMask { boxes: vec![[1.0, 0.0, 0.0, 0.5, 1.0, 1.0]] }.check().is_err());
+        assert!(EgoBodyMask { boxes: vec![[1.0, 0.0, 0.0, 0.5, 1.0, 1.0]], ..EgoBodyMask::default() }.check().is_err());
+    }
+
+    #[test]
+    fn directions_hide_from_their_sensor_alone() {
+        let before = crate::effects::testing::scene();
+        let mask = |sensor: &str| EgoBodyMask {
+            sensor: sensor.into(),
+            directions: vec![[-10.0, 20.0, -15.5, -5.0, 1.0]],
+            ..EgoBodyMask::default()
+        };
+        let hidden = |e: &Echo| {
+            let [x, y, z] = e.direction.map(f64::from);
+            let (azimuth, elevation) = (y.atan2(x).to_degrees(), z.atan2(x.hypot(y)).to_degrees());
+            (-10.0..20.0).contains(&azimuth) && (-15.5..-5.0).contains(&elevation)
+        };
+        let after = applied(&mask("front"), &before);
+        assert_eq!(after.returns().count(), before.returns().filter(|e| !hidden(e)).count());
+        assert!(after.returns().all(|e| !hidden(e)));
+        assert_eq!(applied(&mask("left"), &before), before);
+        assert!(mask("").check().unwrap_err().to_string().contains("those of one sensor"));
     }
 }

@@ -83,8 +83,19 @@ mod tests {
         for (i, echo) in before.echoes.iter_mut().enumerate() {
             echo.material = MaterialTable::built_in(if i % 2 == 0 { "rubber" } else { "paint" });
         }
-        let after = applied(&MaterialDropout { materials: vec!["rubber".into(), "lead".into()], share: 0.6 }, &before);
+        let after = applied(&MaterialDropout { materials: vec!["rubber".into(), "lead".into()], surfaces: vec![], share: 0.6 }, &before);
         assert!((lost(&before, &after) - 0.3).abs() < 0.01);
         assert!(after.echoes.iter().skip(1).step_by(2).all(|e| e.is_return()));
+    }
+
+    #[test]
+    fn kinds_of_surfaces_lose_by_themselves() {
+        let before = crate::effects::testing::scene();
+        let ground = MaterialDropout { surfaces: vec![SurfaceKind::Ground], share: 1.0, ..MaterialDropout::default() };
+        assert_eq!(ground.needs(), Some(&[Need::Incidence, Need::Cars][..]));
+        let after = applied(&ground, &before);
+        assert!(after.returns().all(|e| e.normal[2] < 0.9) && after.returns().count() > 1000);
+        let standing = MaterialDropout { surfaces: vec![SurfaceKind::Standing], ..ground };
+        assert!(applied(&standing, &before).returns().any(|e| e.normal[2] > 0.9));
     }
 }

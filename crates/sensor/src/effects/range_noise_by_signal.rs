@@ -66,7 +66,7 @@ mod tests {
 
     #[test]
     fn the_deviation_follows_the_signal() {
-        let effect = RangeNoiseBySignal { std_m: 0.02, exponent: 0.5, signal: 0.0, most_m: 0.1 };
+        let effect = RangeNoiseBySignal { std_m: 0.02, exponent: 0.5, signal: 0.0, most_m: 0.1, assumed: None };
         // At exponent 0.5, a hundredth of the light gives ten times the noise, up to the limit.
         for (range_m, reflectivity, want) in
             [(250.0, 0.1, 0.02), (25.0, 0.1, 0.002), (250.0, 0.01, 0.0632), (250.0, 1e-4, 0.1)]
@@ -75,5 +75,19 @@ mod tests {
             let (_, std) = moments(&residuals(&before, &applied(&effect, &before)));
             assert!((std / want - 1.0).abs() < 0.04, "{range_m} {reflectivity}: {std} {want}");
         }
+    }
+
+    #[test]
+    fn what_is_assumed_replaces_the_surfaces_own_light() {
+        let noise = |assumed| RangeNoiseBySignal { std_m: 0.02, exponent: 0.5, signal: 0.0, most_m: 1.0, assumed };
+        let before = plate(20_000, 50.0, 0.8);
+        let of = |effect: &RangeNoiseBySignal| {
+            let after = applied(effect, &before);
+            let squares: f32 = after.echoes.iter().map(|e| (e.range_m - 50.0).powi(2)).sum();
+            (squares / after.echoes.len() as f32).sqrt()
+        };
+        let (own, dark) = (of(&noise(None)), of(&noise(Some(AssumedReflectivity::even(0.1)))));
+        assert!((dark / own - 8f32.sqrt()).abs() < 0.05, "{dark} {own}");
+        assert_eq!(noise(Some(AssumedReflectivity::even(0.1))).needs(), Some(&[Need::Incidence][..]));
     }
 }

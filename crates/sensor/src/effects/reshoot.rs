@@ -41,9 +41,12 @@ pub(super) fn reshoot(
             let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
             let hit = seen.meet(&(error.rotation * own), &error.translation.vector, &before[i], &pose);
             match hit {
-                Some((range_m, of)) if echo.is_return() || of != i => {
-                    let surface = before[of];
-                    if !echo.is_return() {
+                Some((range_m, of)) => {
+                    // A shot that was lost on a surface stays lost.
+                    if !echo.is_return() && seen.is_hole(&own) {
+                        continue;
+                    }
+                    if let (false, Some(surface)) = (echo.is_return(), before.get(of).copied()) {
                         (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
                         (echo.returned, echo.material, echo.object) =
                             (surface.returned, surface.material, surface.object);
@@ -64,6 +67,8 @@ struct Seen {
     places: Vec<usize>,
     around: Surroundings,
     steps: [f32; 2],
+    /// Lowest and highest elevation of a return, rad.
+    elevations: [f32; 2],
 }
 
 impl Seen {
@@ -81,12 +86,21 @@ impl Seen {
             }
         }
         let steps = sensors.patterns[number].steps;
+        let least = own.elevation_rad.iter().copied().fold(f32::INFINITY, f32::min);
+        let most = own.elevation_rad.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         Seen {
+            elevations: [least, most],
             around: Surroundings::new(sensors, number, &own),
             scan: own,
             places,
             steps: [steps.azimuth_rad, steps.elevation_rad],
         }
+    }
+
+    /// Whether a surface lies around a direction of the sensor's frame.
+    fn is_hole(&self, own: &Vector3<f64>) -> bool {
+        let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(*own));
+        self.around.look(azimuth as f32, elevation as f32, None).surface.is_some()
     }
 
     /// Range of what a true ray meets, and the place of the return that is nearest to it. The ray starts at `shift` and
@@ -113,25 +127,30 @@ impl Seen {
         echo: &Echo,
         pose: &Pose,
     ) -> Option<(f32, usize)> {
-        let mut nearest: Option<(f32, usize)> = None;
-        let window = self.around.window.map(|v| v as f32);
-        self.around.index.around(azimuth, elevation, |e, dx, dy| {
-            let (x, y) = (dx * window[0] / self.steps[0], dy * window[1] / self.steps[1]);
-            let distance = x * x + y * y;
-            let near = x.abs() <= REACH_STEPS[0] && y.abs() <= REACH_STEPS[1];
-            if near && nearest.is_none_or(|(least, _)| distance < least) {
-                nearest = Some((distance, e.index as usize));
-            }
-        });
-        let nearest = nearest?.1;
-        let place = self.places[nearest];
         let true_direction: [f32; 3] = (pose.rotation * direction).map(|v| v as f32).into();
+        // The shot's own surface, met by the true ray: its own error of range is kept.
+        let own_m = || {
+            let mut own = *echo;
+            measure_along(&mut own, true_direction);
+            let shift: [f32; 3] = (pose.rotation * shift).map(|v| v as f32).into();
+            own.range_m -= dot(own.normal, shift) / dot(own.normal, true_direction).min(-1e-3);
+            own.range_m.max(0.01)
+        };
+        let on_surface = echo.is_return() && echo.normal != [0.0; 3];
+        let outside = elevation < self.elevations[0] || elevation > self.elevations[1];
+        let Some((nearest, near)) = self.nearest(azimuth, elevation) else {
+            // Beyond the lowest and the highest row surfaces go on as they are there.
+            return (outside && on_surface).then(|| (own_m(), echo.source as usize));
+        };
+        let place = self.places[nearest];
         let Some((surface, normal)) = self.around.look(azimuth, elevation, None).surface else {
+            if outside && on_surface {
+                return Some((own_m(), place));
+            }
             // At an edge: the nearest return, at its distance from the true origin.
             let reported = f64::from(self.scan.range_m[nearest]);
-            return Some(((reported - shift.dot(direction)).max(0.01) as f32, place));
+            return near.then_some(((reported - shift.dot(direction)).max(0.01) as f32, place));
         };
-        let normal: Vector3<f64> = normal;
         let meets = pose.rotation.inverse() * normal;
         // The plane around the true direction, met from the true origin.
         let [az, el] = [azimuth, elevation].map(f64::from);
@@ -141,17 +160,79 @@ impl Seen {
             return Some((self.scan.range_m[nearest], place));
         }
         let range_m = meets.dot(&(seen - shift)) / along;
-        // On the shot's own surface its own error of range is kept.
-        let mut own = *echo;
-        if own.is_return() && own.normal != [0.0; 3] {
-            measure_along(&mut own, true_direction);
-            let normal: [f32; 3] = own.normal;
-            let shift: [f32; 3] = (pose.rotation * shift).map(|v| v as f32).into();
-            own.range_m -= dot(normal, shift) / dot(normal, true_direction).min(-1e-3);
-            if ((f64::from(own.range_m) - range_m) * along).abs() < SAME_SURFACE_M {
-                return Some((own.range_m.max(0.01), place));
-            }
+        if on_surface && ((f64::from(own_m()) - range_m) * along).abs() < SAME_SURFACE_M {
+            return Some((own_m(), place));
         }
         Some((range_m.max(0.01) as f32, place))
+    }
+
+    /// The return nearest to a direction, and whether it is so near that a shot there meets what it met.
+    fn nearest(&self, azimuth: f32, elevation: f32) -> Option<(usize, bool)> {
+        let mut nearest: Option<(f32, usize, bool)> = None;
+        let window = self.around.window.map(|v| v as f32);
+        self.around.index.around(azimuth, elevation, |e, dx, dy| {
+            let (x, y) = (dx * window[0] / self.steps[0], dy * window[1] / self.steps[1]);
+            let distance = x * x + y * y;
+            if nearest.is_none_or(|(least, ..)| distance < least) {
+                let near = x.abs() <= REACH_STEPS[0] && y.abs() <= REACH_STEPS[1];
+                nearest = Some((distance, e.index as usize, near));
+            }
+        });
+        nearest.map(|(_, index, near)| (index, near))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cloud_scan::{CloudReader, Surfaces};
+    use crate::effects::testing::{rig, scene, with_frame};
+    use nalgebra::{Translation3, UnitQuaternion};
+
+    /// A sensor that truly looks 0.5 degrees further down and stands 10 cm further back meets the ground nearer and the
+    /// wall farther; what it reports keeps its rows.
+    #[test]
+    fn ranges_are_those_of_the_true_rays() {
+        let cloud = scene().cloud();
+        let reader = CloudReader::new(&rig(), std::slice::from_ref(&cloud));
+        let before = reader.scan(&cloud, &Surfaces::default());
+        let error = Pose::from_parts(
+            Translation3::new(-0.1, 0.0, 0.0),
+            UnitQuaternion::from_euler_angles(0.0, 0.5f64.to_radians(), 0.0),
+        );
+        let after = with_frame(0, |frame, _| {
+            let mut scan = before.clone();
+            reshoot(&mut scan, &FrameContext { sensors: Some(reader.sensors()), ..*frame }, |_| true, &error);
+            scan
+        });
+        let (mut right, mut all) = (0, 0);
+        for (a, b) in after.echoes.iter().zip(&before.echoes) {
+            assert_eq!((a.direction, a.row), (b.direction, b.row));
+            let ray = error.rotation * Vector3::from(b.direction.map(f64::from));
+            let ground = if ray.z < 0.0 { -2.0 / ray.z } else { f64::INFINITY };
+            let wall = 40.1 / ray.x;
+            let met = ground.min(wall);
+            // Away from the foot and from the top of the wall.
+            if (ground / wall - 1.0).abs() > 0.1 && (wall * ray.z - 3.0).abs() > 0.6 {
+                let want = if ground < wall || wall * ray.z < 3.0 { met } else { f64::INFINITY };
+                all += 1;
+                right += usize::from(want == f64::from(a.range_m) || (want / f64::from(a.range_m) - 1.0).abs() < 5e-3);
+            }
+        }
+        assert!(right * 100 > all * 97, "{right} of {all}");
+    }
+
+    #[test]
+    fn without_patterns_the_points_are_moved() {
+        let before = scene();
+        let shift = Pose::from_parts(Translation3::new(0.0, 0.0, 0.2), UnitQuaternion::identity());
+        let after = with_frame(0, |frame, _| {
+            let mut scan = before.clone();
+            reshoot(&mut scan, frame, |_| true, &shift);
+            scan
+        });
+        for (a, b) in after.returns().zip(before.returns()) {
+            assert!((a.point()[2] - b.point()[2] + 0.2).abs() < 1e-4);
+        }
     }
 }

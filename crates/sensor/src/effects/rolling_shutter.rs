@@ -20,14 +20,14 @@ use serde::{Deserialize, Serialize};
 pub struct RollingShutter {
     /// Correct points for ego motion to the middle of the scan.
     pub deskewed: bool,
-    /// Duration of a scan on finished clouds, s: shots are sent along the sensor's scan, clockwise where it is positive.
-    /// Without it the times of the shots are taken.
+    /// Duration of a scan on finished clouds, s: shots are sent along the sensor's scan, clockwise where it is
+    /// positive. Without it the times of the shots are taken.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scan_s: Option<f64>,
     /// On finished clouds, displace labelled objects alone, by their velocities relative to the ego vehicle.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub only_objects: bool,
-    /// Displacement of all that stands still over a scan of a finished cloud, in place of that by the own motion:
+    /// Displacement of all that stands still over a scan of a finished cloud, in place of that by the ego motion:
     /// forward and to the left, m, and turn, degrees counter-clockwise.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub slide: Option<[f64; 3]>,
@@ -112,10 +112,41 @@ mod tests {
         Scan { echoes: vec![at([19.0, 2.0, -1.0]), at([30.0, -8.0, 0.0])] }
     }
 
+    fn shutter(deskewed: bool) -> RollingShutter {
+        RollingShutter { deskewed, scan_s: None, only_objects: false, slide: None }
+    }
+
+    #[test]
+    fn a_slide_needs_no_motion_and_a_duration_no_times() {
+        let before = scene();
+        let slid = RollingShutter { slide: Some([1.2, 0.0, 0.0]), ..shutter(false) };
+        assert_eq!(slid.needs(), Some(&[][..]));
+        let mut after = before.clone();
+        with_frame(0, |frame, draws| slid.on_cloud(&mut after, frame, draws));
+        let rig = rig();
+        let phase = |e: &Echo| {
+            let [x, y, z] = e.direction.map(f64::from);
+            rig.sensors[0].scan_phase(y.atan2(x), z.atan2(x.hypot(y)))
+        };
+        for (a, b) in after.returns().zip(before.returns()) {
+            assert!((f64::from(a.point()[0] - b.point()[0]) - 1.2 * phase(b)).abs() < 1e-3);
+        }
+        // 50 m/s and 0.1 s: what stands still comes nearer by 5 m over a scan, from its begin at phase 1/2 on.
+        let timed = RollingShutter { scan_s: Some(0.1), ..shutter(false) };
+        let still = before.returns().map(|e| e.object != 1).collect::<Vec<_>>();
+        let mut after = before.clone();
+        with_frame(0, |frame, draws| timed.on_cloud(&mut after, frame, draws));
+        for ((a, b), _) in after.returns().zip(before.returns()).zip(still).filter(|(_, wall)| *wall) {
+            // The turn of 0.2 rad/s adds up to 0.5 m at the ends of the wall.
+            let moved = f64::from(a.point()[0] - b.point()[0]);
+            assert!((moved - 5.0 * phase(b)).abs() < 0.8, "{moved} at phase {}", phase(b));
+        }
+    }
+
     #[test]
     fn deskewed_only_cars_move() {
         let mut scan = two();
-        with_frame(0, |frame, draws| RollingShutter { deskewed: true }.on_cloud(&mut scan, frame, draws));
+        with_frame(0, |frame, draws| shutter(true).on_cloud(&mut scan, frame, draws));
         let (s, c) = 0.1_f32.sin_cos();
         let (on_car, beside) = (scan.echoes[0].point(), scan.echoes[1].point());
         assert!((on_car[0] - 19.0 - 1.2 * c).abs() < 1e-4 && (on_car[1] - 2.0 - 1.2 * s).abs() < 1e-4);
@@ -125,7 +156,7 @@ mod tests {
     #[test]
     fn without_deskewing_all_points_move_relative_to_the_ego_vehicle() {
         let mut scan = two();
-        with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_cloud(&mut scan, frame, draws));
+        with_frame(0, |frame, draws| shutter(false).on_cloud(&mut scan, frame, draws));
         let beside = scan.echoes[1].point();
         // 50 m/s forward and 0.2 rad/s to the left for 20 ms.
         assert!(
@@ -138,7 +169,7 @@ mod tests {
     #[test]
     fn the_shutter_is_set_on_the_beams() {
         let mut beams = Beams::of(&rig());
-        with_frame(0, |frame, draws| RollingShutter { deskewed: false }.on_beams(&mut beams, frame, draws));
+        with_frame(0, |frame, draws| shutter(false).on_beams(&mut beams, frame, draws));
         assert_eq!(beams.shutter, Some(Shutter { deskewed: false }));
     }
 }

@@ -1,4 +1,4 @@
-//! Tables by row of one sensor, whose rows are told apart by their elevations.
+//! Tables by row of one sensor, whose rows are distinguished by their elevations.
 
 use super::FrameContext;
 use crate::directions::{ScanPattern, Steps};

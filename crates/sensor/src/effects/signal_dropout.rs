@@ -11,7 +11,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A return at range R, m, is detected with probability `most * (1 + exp(-steepness * (u - u0)))^-skew`. It is half of
-/// `most` at the index `threshold`, which gives u0. The signal index u is `ln(returned / R^2) - ln(0.1 / 250^2) - 2 * attenuation_per_m * R`.
+/// `most` at the index `threshold`, which gives u0. The signal index u is
+/// `ln(returned / R^2) - ln(0.1 / 250^2) - 2 * attenuation_per_m * R`.
 ///
 /// Typical: threshold 0 is the data sheet's maximum range (250 m at 10 % reflectivity); -2 to 3; steepness 2 to 8.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -78,7 +79,7 @@ mod tests {
 
     #[test]
     fn detection_depends_on_the_signal_index_alone() {
-        let effect = SignalDropout { most: 0.9, threshold: 0.0, steepness: 4.0, attenuation_per_m: 0.0 };
+        let effect = SignalDropout { most: 0.9, threshold: 0.0, steepness: 4.0, attenuation_per_m: 0.0, skew: 1.0, assumed: None, form: None };
         let logistic = |u: f64| 1.0 - 0.9 / (1.0 + (-4.0 * u).exp());
         // Twice the range returns a quarter of the light.
         for (range_m, reflectivity, u) in [
@@ -95,5 +96,33 @@ mod tests {
         let hazy = SignalDropout { attenuation_per_m: 0.01, ..effect };
         let before = plate(20_000, 250.0, 0.1);
         assert!((lost(&before, &applied(&hazy, &before)) - logistic(-5.0)).abs() < 0.01);
+    }
+
+    #[test]
+    fn skew_form_and_assumed_light() {
+        let kept = |effect: &SignalDropout, reflectivity: f32| {
+            applied(effect, &plate(20_000, 100.0, reflectivity)).returns().count() as f64 / 20_000.0
+        };
+        let plain = SignalDropout {
+            most: 0.9,
+            threshold: 2.0,
+            steepness: 3.0,
+            attenuation_per_m: 0.0,
+            skew: 0.4,
+            assumed: None,
+            form: None,
+        };
+        // The reflectivity at which the index is 2: half of `most`, whatever the skew.
+        let half = (0.1 * (2f64).exp() * (100.0f64 / 250.0).powi(2)) as f32;
+        assert!((kept(&plain, half) - 0.45).abs() < 0.01, "{}", kept(&plain, half));
+        let assumed = AssumedReflectivity { ground: 0.9, standing: half.into(), objects: 0.9 };
+        let assumed = SignalDropout { assumed: Some(assumed), ..plain.clone() };
+        assert!((kept(&assumed, 5.0) - 0.45).abs() < 0.01, "a plate stands, whatever its own light");
+        let form = Form { at: vec![1.0, 3.0], factor: vec![0.4, 0.8] };
+        let formed = SignalDropout { form: Some(form), ..plain };
+        assert!((kept(&formed, half) - 0.45 * 0.6).abs() < 0.01);
+        let unsorted = Form { at: vec![3.0, 1.0], factor: vec![0.4, 0.8] };
+        let error = SignalDropout { form: Some(unsorted), ..formed }.check().unwrap_err().to_string();
+        assert!(error.contains("form.at[1]"), "{error}");
     }
 }

@@ -61,7 +61,7 @@ impl StudyConfig {
     fn source_text(&self, name: &str) -> String {
         let Some(dataset) = self.datasets.iter().find(|d| d.name == name) else { return "unknown".into() };
         match &dataset.source {
-            Source::Resim { of, effects } => format!("{} with {}", self.source_text(of), effects.display()),
+            Source::Resim { of, effects, .. } => format!("{} with {}", self.source_text(of), effects.display()),
             source => serde_json::to_string(source).unwrap_or_default(),
         }
     }
