@@ -1,5 +1,6 @@
 //! The whole way from two data sets to a diagnosis.
 
+mod curves;
 mod notes;
 mod report;
 mod verification;
@@ -308,7 +309,7 @@ impl Engine<'_> {
         let found = diagnosis.findings.iter().map(|f| f.channel).collect();
         let verification = Verification::new(self, &recorded, found);
         match extension {
-            Extension::Given(effects) => diagnosis.gain = verification.of(effects, remake)?,
+            Extension::Given(effects) => diagnosis.gain = verification.of(effects, remake)?.gain,
             Extension::Found(_) => measure_gain(&mut diagnosis, &verification, &extended, remake)?,
         }
         (self.progress)(Stage::Verifying, 1, 1);
@@ -385,7 +386,12 @@ fn measure_gain(
 ) -> Result<(), DiagnoseError> {
     let gain = match diagnosis.findings.is_empty() {
         true => verification.without_extension(),
-        false => verification.of(&EffectList::parse(extended, Path::new("extended.toml"))?, remake)?,
+        false => {
+            let effects = EffectList::parse(extended, Path::new("extended.toml"))?;
+            let extended = verification.of(&effects, remake)?;
+            verification.measure_curves(&mut diagnosis.findings, &extended);
+            extended.gain
+        }
     };
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
     let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());

@@ -5,7 +5,7 @@
 //! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero where
 //! the two sides are two draws of the same sensor, and is the same number before and after.
 
-use super::Engine;
+use super::{Engine, curves};
 use super::report::METRIC;
 use crate::catalogue::{Cause, Channel};
 use crate::diagnosis::{
@@ -111,6 +111,12 @@ fn some(frames: Vec<usize>) -> Vec<usize> {
     if n <= FRAMES { frames } else { (0..FRAMES).map(|k| frames[k * n / FRAMES]).collect() }
 }
 
+/// A gain with the pairs of the extended simulation; no pairs where no effect could be applied.
+pub(super) struct Extended {
+    pub(super) gain: Gain,
+    frames: Vec<FramePair>,
+}
+
 /// Distances before, after and at the floor.
 pub(super) struct Verification<'a> {
     engine: &'a Engine<'a>,
@@ -141,20 +147,17 @@ impl<'a> Verification<'a> {
     ///
     /// # Errors
     /// Files that cannot be read, and frames that cannot be made.
-    pub(super) fn of(&self, effects: &EffectList, remake: &dyn Remake) -> Result<Gain, DiagnoseError> {
+    pub(super) fn of(&self, effects: &EffectList, remake: &dyn Remake) -> Result<Extended, DiagnoseError> {
         let refused = remake.refusals(effects)?;
         let mut applied = effects.clone();
         applied.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
         let not_applied = refused.into_iter().map(|r| NotApplied { effect: r.kind.into(), why: r.why }).collect();
         let zero: Distances = self.before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
         if applied.effects.is_empty() {
-            return Ok(Gain { not_applied, ..self.gain(&self.before, &zero, true) });
+            let gain = Gain { not_applied, ..self.gain(&self.before, &zero, true) };
+            return Ok(Extended { gain, frames: vec![] });
         }
-        let which: Vec<usize> = {
-            let mut all = [self.train.clone(), self.test.clone()].concat();
-            all.sort_unstable();
-            all
-        };
+        let which = self.used();
         let made = remake.with(&applied)?;
         let recordings = self.engine.recordings;
         let two = |&frame: &usize| -> Result<[Arc<SideFrame>; 2], DiagnoseError> {
@@ -170,13 +173,36 @@ impl<'a> Verification<'a> {
         let sides: Vec<[Arc<SideFrame>; 2]> = sides.into_iter().collect::<Result<_, _>>()?;
         let [one, other]: [Vec<Arc<SideFrame>>; 2] =
             [0, 1].map(|k: usize| sides.iter().map(|pair| pair[k].clone()).collect());
-        let after = self.distances_of(&which, &recordings.with_sides(&which, None, &one)?)?;
-        let floor = self.distances_of(&which, &recordings.with_sides(&which, Some(&other), &one)?)?;
-        Ok(Gain { not_applied, ..self.gain(&after, &floor, true) })
+        let (after, frames) = self.distances_of(&which, &recordings.with_sides(&which, None, &one)?)?;
+        let (floor, _) = self.distances_of(&which, &recordings.with_sides(&which, Some(&other), &one)?)?;
+        Ok(Extended { gain: Gain { not_applied, ..self.gain(&after, &floor, true) }, frames })
+    }
+
+    /// The frames that are made anew, in order.
+    fn used(&self) -> Vec<usize> {
+        let mut all = [self.train.clone(), self.test.clone()].concat();
+        all.sort_unstable();
+        all
+    }
+
+    /// Measures the curves of findings on the frames that were made anew.
+    pub(super) fn measure_curves(&self, findings: &mut [Finding], extended: &Extended) {
+        if extended.frames.is_empty() {
+            return;
+        }
+        let recorded: Vec<&FramePair> = self.used().into_iter().map(|i| &self.context.frames[i]).collect();
+        for finding in findings.iter_mut().filter(|f| !f.effects.is_empty()) {
+            let closed = extended.gain.closed_by_channel.get(&finding.channel).map_or(0.0, |c| c.closed);
+            curves::measure(finding, &recorded, &extended.frames, closed);
+        }
     }
 
     /// Distances of frames that were made anew.
-    fn distances_of(&self, which: &[usize], recordings: &Recordings) -> Result<Distances, DiagnoseError> {
+    fn distances_of(
+        &self,
+        which: &[usize],
+        recordings: &Recordings,
+    ) -> Result<(Distances, Vec<FramePair>), DiagnoseError> {
         let kept = kept_of_frame(self.context.frames.len());
         let frames: Vec<FramePair> =
             pair_all(recordings, self.engine.sensors, Corrections::default(), kept, &|_| ())?;
@@ -190,7 +216,8 @@ impl<'a> Verification<'a> {
         let places = |frames: &[usize]| -> Vec<usize> {
             frames.iter().filter_map(|frame| which.iter().position(|own| own == frame)).collect()
         };
-        Ok(distances(&context, &places(&self.train), &places(&self.test), self.slide))
+        let distances = distances(&context, &places(&self.train), &places(&self.test), self.slide);
+        Ok((distances, frames))
     }
 
     /// Sums of the distances over the held-out frames. The totals are those of the channels in which something was

@@ -112,9 +112,13 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, bias
     let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
     let precision = std.max(least).powi(-2).max(group_fit(column).precision);
     let fit = GroupFit { precision, ..group_fit(column) };
-    // The mean of all rows is theirs unless a bias of all ranges was found.
-    let centred = fit.centred && (column != 0 || grouping != Grouping::Row || biased);
-    let offsets = grouped::offsets(&all, GroupFit { centred, ..fit });
+    let mut offsets = grouped::offsets(&all, fit);
+    // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
+    // of the surfaces, which would take it up.
+    if column == 0 && grouping == Grouping::Row && !biased {
+        let mean_m = mean_offset_m(search);
+        offsets.values_mut().for_each(|v| *v += mean_m);
+    }
     let (scale, unit) = if column == 0 { (1.0, Unit::Metre) } else { (1f64.to_degrees(), Unit::Degree) };
     let mut parameters: Vec<NamedParameter> = Vec::new();
     if cause != Cause::Unexplained {
@@ -143,6 +147,16 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, bias
         curve: group_curve(&all, &offsets, grouping, fit, scale),
         parameters,
     }
+}
+
+/// Offset of all ranges, m; 0 where it is not known to three standard errors.
+fn mean_offset_m(search: &Search) -> f64 {
+    let Some(k) = search.sums.columns.iter().position(|c| *c == Column::RangeOffset) else { return 0.0 };
+    let frames: Vec<&LinearFrame> = search.estimate.iter().map(|&i| &search.sums.linear[i]).collect();
+    let with: Vec<usize> = search.sums.base.iter().copied().chain([k]).collect();
+    let fitted = fit(&frames, &search.estimate_blocks, &with, &search.sums.precision);
+    let (mean_m, error) = (fitted.theta[with.len() - 1], fitted.error(with.len() - 1));
+    if mean_m.abs() > 3.0 * error { mean_m } else { 0.0 }
 }
 
 /// Pose errors that the same fit attributes to sensors that are mounted correctly, beyond chance: three turns, rad,
