@@ -211,6 +211,17 @@ impl Occlusion {
     }
 }
 
+/// Neighbouring cells of one elevation that are hidden alike.
+struct Run {
+    first: DirectionCell,
+    /// The azimuth after the last cell.
+    end: i32,
+    /// Share of the returns that is lost.
+    lost: f64,
+    /// Range of the part's own returns, m; 0 without.
+    shown_m: f64,
+}
+
 /// The hidden directions of every sensor with the share of their returns that is lost: neighbouring cells of one
 /// elevation that lose alike are one entry.
 fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Effect> {
@@ -219,29 +230,49 @@ fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Ef
         let [n, seen, ..] = counts.get(cell).copied().unwrap_or_default();
         (((1.0 - seen / n.max(1.0)).clamp(0.0, 1.0)) * 20.0).round() / 20.0
     };
-    let mut of_sensors: BTreeMap<u8, Vec<(DirectionCell, i32, f64)>> = BTreeMap::new();
+    // Near returns of the part itself, in place of those that it hides.
+    let mut near = BTreeMap::<DirectionCell, Vec<f64>>::new();
+    for ray in frames.iter().flat_map(|&i| &context.frames[i].measured) {
+        if ray.own_range_m() < OWN_CAR_M && mask.blocked.contains(&direction_cell(ray)) {
+            near.entry(direction_cell(ray)).or_default().push(ray.own_range_m());
+        }
+    }
+    let shown_m = |cell: &DirectionCell| {
+        let (n, ranges) = (counts.get(cell).map_or(0.0, |c| c[0]), near.get(cell));
+        let enough = ranges.filter(|ranges| 2.0 * ranges.len() as f64 > n);
+        enough.and_then(|ranges| statistics::median_upper(ranges.clone())).map_or(0.0, |m| (m * 20.0).round() / 20.0)
+    };
+    let mut of_sensors: BTreeMap<u8, Vec<Run>> = BTreeMap::new();
     // In the order of sensor, elevation and azimuth, so that neighbours follow each other.
     let mut cells: Vec<(DirectionCell, f64)> = mask.blocked.iter().map(|c| (*c, lost(c).max(0.9))).collect();
     cells.extend(mask.partly.difference(&mask.blocked).map(|c| (*c, lost(c))).filter(|(_, lost)| *lost > 0.0));
     cells.sort_by_key(|((sensor, azimuth, elevation), _)| (*sensor, *elevation, *azimuth));
-    for (cell, lost) in cells {
-        let runs = of_sensors.entry(cell.0).or_default();
-        match runs.last_mut() {
-            Some((first, end, as_many)) if first.2 == cell.2 && *end == cell.1 && *as_many == lost => *end += 1,
-            _ => runs.push((cell, cell.1 + 1, lost)),
+    for (first, lost) in cells {
+        let (runs, shown_m) = (of_sensors.entry(first.0).or_default(), shown_m(&first));
+        let joins = |run: &Run| {
+            run.first.2 == first.2 && run.end == first.1 && run.lost == lost && run.shown_m == shown_m
+        };
+        match runs.last_mut().filter(|run| joins(run)) {
+            Some(run) => run.end += 1,
+            None => runs.push(Run { first, end: first.1 + 1, lost, shown_m }),
         }
     }
     let degrees = |k: i32, step: f64| rounded((f64::from(k) * step).to_degrees(), 4);
-    let effect = |(sensor, runs): (u8, Vec<(DirectionCell, i32, f64)>)| {
-        let direction = |((_, azimuth, elevation), end, lost): (DirectionCell, i32, f64)| {
-            let [from, to] = [azimuth, end].map(|k| degrees(k, AZIMUTH_RAD));
+    let effect = |(sensor, runs): (u8, Vec<Run>)| {
+        let direction = |run: &Run| {
+            let (_, azimuth, elevation) = run.first;
+            let [from, to] = [azimuth, run.end].map(|k| degrees(k, AZIMUTH_RAD));
             let [low, high] = [elevation, elevation + 1].map(|k| degrees(k, ELEVATION_RAD));
-            [from, to, low, high, lost]
+            [from, to, low, high, run.lost]
         };
         Effect::EgoBodyMask(EgoBodyMask {
             sensor: context.rig.sensors[usize::from(sensor)].name.clone(),
             boxes: vec![],
-            directions: runs.into_iter().map(direction).collect(),
+            directions: runs.iter().map(direction).collect(),
+            returns_m: match runs.iter().any(|run| run.shown_m > 0.0) {
+                true => runs.iter().map(|run| run.shown_m).collect(),
+                false => vec![],
+            },
         })
     };
     of_sensors.into_iter().map(effect).collect()

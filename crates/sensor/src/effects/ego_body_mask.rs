@@ -24,6 +24,9 @@ pub struct EgoBodyMask {
     /// Hidden directions in the frame of the named sensor: azimuth from and to, elevation from and to, degrees, and the
     /// share of their returns that is lost, 0 to 1.
     pub directions: Vec<[f64; 5]>,
+    /// Range of the return of the part itself in each of the directions, m; 0 where there is none, and beyond the end of
+    /// the list.
+    pub returns_m: Vec<f64>,
 }
 
 impl SensorEffect for EgoBodyMask {
@@ -45,7 +48,7 @@ impl SensorEffect for EgoBodyMask {
                 within(&format!("directions[{i}][{k}]"), d[k], low, high)?;
             }
         }
-        Ok(())
+        self.returns_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("returns_m[{i}]"), *v, 0.0, 100.0))
     }
 
     fn sensors(&self) -> Vec<&str> {
@@ -60,10 +63,14 @@ impl SensorEffect for EgoBodyMask {
         let boxes: Vec<[f32; 6]> = self.boxes.iter().map(|b| b.map(|v| v as f32)).collect();
         let sensor_from_cloud = only.map(|number| frame.rig.sensors[number].pose().inverse());
         let mut random = draws.of_frame();
-        for echo in scan.returns_mut().filter(|e| only.is_none_or(|number| usize::from(e.sensor) == number)) {
-            let share = sensor_from_cloud.map_or(0.0, |pose| self.hidden_share(pose.rotation * own_direction(echo)));
+        for echo in scan.echoes.iter_mut().filter(|e| only.is_none_or(|number| usize::from(e.sensor) == number)) {
+            let at = sensor_from_cloud.and_then(|pose| self.direction_of(pose.rotation * own_direction(echo)));
+            let share = at.map_or(0.0, |k| self.directions[k][4]);
             let hidden = share > 0.0 && random.random_range(0.0..1.0_f64) < share;
-            if hidden || boxes.iter().any(|b| passes(echo, b)) {
+            let own_m = at.and_then(|k| self.returns_m.get(k)).copied().unwrap_or(0.0);
+            if hidden && own_m > 0.0 {
+                (echo.range_m, echo.normal, echo.object) = (own_m as f32, [0.0; 3], 0);
+            } else if hidden || boxes.iter().any(|b| passes(echo, b)) {
                 echo.lose();
             }
         }
@@ -71,14 +78,14 @@ impl SensorEffect for EgoBodyMask {
 }
 
 impl EgoBodyMask {
-    /// Share that is lost in a direction of the sensor's frame.
-    fn hidden_share(&self, own: Vector3<f64>) -> f64 {
+    /// The entry of a direction of the sensor's frame.
+    fn direction_of(&self, own: Vector3<f64>) -> Option<usize> {
         if self.directions.is_empty() {
-            return 0.0;
+            return None;
         }
         let [azimuth, elevation] = [own.y.atan2(own.x), own.z.atan2(own.x.hypot(own.y))].map(f64::to_degrees);
-        let inside = |d: &&[f64; 5]| (d[0]..d[1]).contains(&azimuth) && (d[2]..d[3]).contains(&elevation);
-        self.directions.iter().find(inside).map_or(0.0, |d| d[4])
+        let inside = |d: &[f64; 5]| (d[0]..d[1]).contains(&azimuth) && (d[2]..d[3]).contains(&elevation);
+        self.directions.iter().position(inside)
     }
 }
 

@@ -15,29 +15,30 @@ const SAME_SURFACE_M: f64 = 0.12;
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
-/// Gives the shots of some sensors the ranges of their true rays: `true_from_reported` moves a reported ray to the true
-/// one, in the cloud's frame. Without scan patterns the points are moved as a whole.
-pub(super) fn reshoot(
-    scan: &mut Scan,
-    frame: &FrameContext,
-    of_sensor: impl Fn(usize) -> bool,
-    true_from_reported: &Pose,
-) {
+/// Gives shots the ranges of their true rays: the pose of an echo moves its reported ray to the true one, in the cloud's
+/// frame. Shots without a pose stay as they are. Without scan patterns points are moved instead.
+pub(super) fn reshoot(scan: &mut Scan, frame: &FrameContext, true_from_reported: impl Fn(&Echo) -> Option<Pose>) {
     let Some(sensors) = frame.sensors else {
-        let reported_from_true = true_from_reported.inverse();
-        for echo in scan.returns_mut().filter(|e| of_sensor(usize::from(e.sensor))) {
-            let point = reported_from_true * Point3::from(echo.point().map(f64::from));
-            echo.move_point(point.coords.map(|v| v as f32).into());
+        for echo in scan.returns_mut() {
+            if let Some(pose) = true_from_reported(echo) {
+                let point = pose.inverse() * Point3::from(echo.point().map(f64::from));
+                echo.move_point(point.coords.map(|v| v as f32).into());
+            }
         }
         return;
     };
-    for (number, mount) in sensors.rig.sensors.iter().enumerate().filter(|(number, _)| of_sensor(*number)) {
+    for (number, mount) in sensors.rig.sensors.iter().enumerate() {
+        let of_sensor = |e: &Echo| usize::from(e.sensor) == number;
+        if !scan.echoes.iter().any(|e| of_sensor(e) && true_from_reported(e).is_some()) {
+            continue;
+        }
         let seen = Seen::new(scan, sensors, number);
         let pose = mount.pose();
-        // The true ray in the frame of the sensor as it is reported.
-        let error = pose.inverse() * true_from_reported * pose;
         let before = scan.echoes.clone();
-        for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| usize::from(e.sensor) == number) {
+        for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| of_sensor(e)) {
+            let Some(true_from_reported) = true_from_reported(&before[i]) else { continue };
+            // The true ray in the frame of the sensor as it is reported.
+            let error = pose.inverse() * true_from_reported * pose;
             let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
             let hit = seen.meet(&(error.rotation * own), &error.translation.vector, &before[i], &pose);
             match hit {
@@ -202,7 +203,7 @@ mod tests {
         );
         let after = with_frame(0, |frame, _| {
             let mut scan = before.clone();
-            reshoot(&mut scan, &FrameContext { sensors: Some(reader.sensors()), ..*frame }, |_| true, &error);
+            reshoot(&mut scan, &FrameContext { sensors: Some(reader.sensors()), ..*frame }, |_| Some(error));
             scan
         });
         let (mut right, mut all) = (0, 0);
@@ -228,7 +229,7 @@ mod tests {
         let shift = Pose::from_parts(Translation3::new(0.0, 0.0, 0.2), UnitQuaternion::identity());
         let after = with_frame(0, |frame, _| {
             let mut scan = before.clone();
-            reshoot(&mut scan, frame, |_| true, &shift);
+            reshoot(&mut scan, frame, |_| Some(shift));
             scan
         });
         for (a, b) in after.returns().zip(before.returns()) {

@@ -1,11 +1,13 @@
 //! C4: motion distortion within a scan.
 
+use super::reshoot::reshoot;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, Shutter};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
-use nalgebra::Vector3;
+use geometry::Pose;
+use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -53,8 +55,9 @@ impl SensorEffect for RollingShutter {
         beams.shutter = Some(Shutter { deskewed: self.deskewed });
     }
 
-    /// On a finished cloud, points within the boxes of cars move with the velocity of their car and all other points
-    /// are static. With `deskewed = false` the velocity of the ego vehicle at the point is subtracted.
+    /// On a finished cloud, points within the boxes of cars move with the velocity of their car. With `deskewed = false`
+    /// the velocity of the ego vehicle at the point is subtracted, and shots at all that stands still start where the
+    /// ego vehicle is at their time.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
         let mounts: Vec<_> = frame.rig.sensors.iter().map(|s| (s, s.pose().inverse())).collect();
         let phase = |echo: &Echo| {
@@ -62,36 +65,43 @@ impl SensorEffect for RollingShutter {
             let own = sensor_from_cloud.rotation * Vector3::from(echo.direction.map(f64::from));
             sensor.scan_phase(own.y.atan2(own.x), own.z.atan2(own.x.hypot(own.y)))
         };
+        let moved_by = |way: Vector3<f64>, turn: Vector3<f64>| {
+            Pose::from_parts(Translation3::from(way), UnitQuaternion::from_scaled_axis(turn))
+        };
         if let Some([forward_m, left_m, turn_deg]) = self.slide {
-            for echo in scan.returns_mut() {
-                let point = Vector3::from(echo.point().map(f64::from));
-                let turn = Vector3::new(0.0, 0.0, turn_deg.to_radians());
-                let moved = point + (Vector3::new(forward_m, left_m, 0.0) + turn.cross(&point)) * phase(echo);
-                echo.move_point(moved.map(|v| v as f32).into());
-            }
+            let (way, turn) = (Vector3::new(forward_m, left_m, 0.0), Vector3::z() * turn_deg.to_radians());
+            // The scene slides one way, the origins of the shots the other.
+            reshoot(scan, frame, |echo| Some(moved_by(-way * phase(echo), -turn * phase(echo))));
             return;
         }
-        let ego = Vector3::from(frame.ego_velocity);
-        let turn = Vector3::from(frame.ego_turn_rate);
-        for echo in scan.returns_mut() {
+        let time_s = |echo: &Echo| self.scan_s.map_or(f64::from(echo.time_s), |scan_s| -scan_s * phase(echo));
+        let (ego, turn) = (Vector3::from(frame.ego_velocity), Vector3::from(frame.ego_turn_rate));
+        let car_at = |echo: &Echo| {
             let point = echo.point().map(f64::from);
             let inside = |b: &geometry::Box3| {
                 let local = b.to_local(point);
                 (0..3).all(|k| local[k].abs() <= b.size[k] / 2.0 + 0.1)
             };
-            let car = frame.cars.iter().find(|car| inside(&car.true_box));
-            let mut velocity = car.map_or(Vector3::zeros(), |car| Vector3::from(car.velocity));
-            if self.only_objects && car.is_none() {
-                continue;
+            frame.cars.iter().find(|car| echo.is_return() && inside(&car.true_box))
+        };
+        // Cars first: afterwards their points are no longer in their boxes.
+        let of_car: Vec<bool> = scan.echoes.iter().map(|echo| car_at(echo).is_some()).collect();
+        for echo in scan.echoes.iter_mut() {
+            let Some(car) = car_at(echo) else { continue };
+            let point = Vector3::from(echo.point().map(f64::from));
+            let own = if self.deskewed { Vector3::zeros() } else { ego + turn.cross(&point) };
+            let way = (Vector3::from(car.velocity) - own) * time_s(echo);
+            if way != Vector3::zeros() {
+                echo.move_point((point + way).map(|v| v as f32).into());
             }
-            if !self.deskewed {
-                velocity -= ego + turn.cross(&Vector3::from(point));
-            }
-            if velocity != Vector3::zeros() {
-                let time_s = self.scan_s.map_or(f64::from(echo.time_s), |scan_s| -scan_s * phase(echo));
-                let moved = Vector3::from(point) + velocity * time_s;
-                echo.move_point(moved.map(|v| v as f32).into());
-            }
+        }
+        if !self.deskewed && !self.only_objects && (ego != Vector3::zeros() || turn != Vector3::zeros()) {
+            // Points of cars keep their place: they are no longer looked at.
+            let cars: Vec<Echo> = scan.echoes.iter().zip(&of_car).filter(|(_, car)| **car).map(|(e, _)| *e).collect();
+            let mut at = of_car.iter();
+            scan.echoes.retain(|_| at.next() != Some(&true));
+            reshoot(scan, frame, |echo| Some(moved_by(ego * time_s(echo), turn * time_s(echo))));
+            scan.echoes.extend(cars);
         }
     }
 }

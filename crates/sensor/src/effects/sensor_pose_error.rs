@@ -65,7 +65,7 @@ impl SensorEffect for SensorPoseError {
         let Some(number) = frame.rig.find(&self.sensor) else { return };
         let mount = frame.rig.sensors[number].pose();
         let true_from_reported = mount * self.error() * mount.inverse();
-        reshoot(scan, frame, |sensor| sensor == number, &true_from_reported);
+        reshoot(scan, frame, |echo| (usize::from(echo.sensor) == number).then_some(true_from_reported));
     }
 }
 

@@ -4,6 +4,7 @@ use super::table;
 use crate::channels::cells::cell;
 use crate::channels::hits::hit_frames;
 use crate::channels::mask::{DirectionCell, Mask, direction_cell};
+use crate::channels::returns::OWN_CAR_M;
 use crate::pairing::Ray;
 use crate::search::Context;
 use std::collections::BTreeMap;
@@ -54,5 +55,35 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
         let [p, q] = [without, kept * ratio(ray)].map(|share| share.clamp(1e-3, 1.0 - 1e-3));
         if ray.matched { (q / p).ln() } else { ((1.0 - q) / (1.0 - p)).ln() }
     };
-    test.iter().map(|&i| context.frames[i].simulated.iter().map(of_ray).sum()).collect()
+    let of_frame = |&i: &usize| context.frames[i].simulated.iter().map(of_ray).sum::<f64>();
+    test.iter().map(of_frame).zip(of_near_returns(context, train, test)).map(|(a, b)| a + b).collect()
+}
+
+/// Gains of the `test` frames by the numbers of near returns of the `train` frames in each cell of directions, nats:
+/// returns of the ego vehicle in place of those behind it.
+fn of_near_returns(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let count = |rays: &[Ray]| {
+        let mut counts = BTreeMap::<DirectionCell, f64>::new();
+        for ray in rays.iter().filter(|ray| ray.own_range_m() < OWN_CAR_M) {
+            *counts.entry(direction_cell(ray)).or_default() += 1.0;
+        }
+        counts
+    };
+    // Near returns of a frame in each cell: measured and simulated.
+    let mut rates = BTreeMap::<DirectionCell, [f64; 2]>::new();
+    for frame in train.iter().map(|&i| &context.frames[i]) {
+        for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
+            count(rays).into_iter().for_each(|(cell, n)| rates.entry(cell).or_default()[side] += n);
+        }
+    }
+    let frames = train.len() as f64;
+    rates.values_mut().for_each(|rates| *rates = rates.map(|n| (n + 0.5) / (frames + 1.0)));
+    let of_frame = |i: &usize| {
+        let counts = count(&context.frames[*i].measured);
+        let of_cell = |(cell, [measured, simulated]): (&DirectionCell, &[f64; 2])| {
+            counts.get(cell).copied().unwrap_or(0.0) * (measured / simulated).ln() - (measured - simulated)
+        };
+        rates.iter().map(of_cell).sum::<f64>()
+    };
+    test.iter().map(of_frame).collect()
 }
