@@ -12,6 +12,9 @@ use nalgebra::{Point3, Vector3};
 /// Distance across a surface within which the surface around the true direction is the shot's own, m.
 const SAME_SURFACE_M: f64 = 0.12;
 
+/// Distance of a true direction from the reported one up to which the shot's own plane serves, in steps of the pattern.
+const BESIDE_STEPS: f32 = 2.5;
+
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
@@ -68,8 +71,8 @@ struct Seen {
     places: Vec<usize>,
     around: Surroundings,
     steps: [f32; 2],
-    /// Lowest and highest elevation of a return, rad.
-    elevations: [f32; 2],
+    /// Least and largest azimuth and elevation of a return, rad.
+    field: [[f32; 2]; 2],
 }
 
 impl Seen {
@@ -87,10 +90,11 @@ impl Seen {
             }
         }
         let steps = sensors.patterns[number].steps;
-        let least = own.elevation_rad.iter().copied().fold(f32::INFINITY, f32::min);
-        let most = own.elevation_rad.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let ends = |angles: &[f32]| {
+            angles.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[low, high], v| [low.min(*v), high.max(*v)])
+        };
         Seen {
-            elevations: [least, most],
+            field: [ends(&own.azimuth_rad), ends(&own.elevation_rad)],
             around: Surroundings::new(sensors, number, &own),
             scan: own,
             places,
@@ -138,9 +142,9 @@ impl Seen {
             own.range_m.max(0.01)
         };
         let on_surface = echo.is_return() && echo.normal != [0.0; 3];
-        let outside = elevation < self.elevations[0] || elevation > self.elevations[1];
+        let outside = [azimuth, elevation].iter().zip(&self.field).any(|(v, [low, high])| v < low || v > high);
         let Some((nearest, near)) = self.nearest(azimuth, elevation) else {
-            // Beyond the lowest and the highest row surfaces go on as they are there.
+            // Beyond the field of view surfaces go on as they are at its end.
             return (outside && on_surface).then(|| (own_m(), echo.source as usize));
         };
         let place = self.places[nearest];
@@ -161,8 +165,19 @@ impl Seen {
             return Some((self.scan.range_m[nearest], place));
         }
         let range_m = meets.dot(&(seen - shift)) / along;
-        if on_surface && ((f64::from(own_m()) - range_m) * along).abs() < SAME_SURFACE_M {
-            return Some((own_m(), place));
+        // Beside the shot its own plane serves, and its own error of range is kept. Farther away that plane is known too
+        // badly: the error is what the shot lies off the surface around it.
+        let [own_azimuth, own_elevation, _] = {
+            let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
+            Sensor::spherical(&Point3::from(own)).map(|v| v as f32)
+        };
+        let apart = [(azimuth - own_azimuth) / self.steps[0], (elevation - own_elevation) / self.steps[1]];
+        if on_surface && apart.iter().all(|steps| steps.abs() < BESIDE_STEPS) {
+            if ((f64::from(own_m()) - range_m) * along).abs() < SAME_SURFACE_M {
+                return Some((own_m(), place));
+            }
+        } else if on_surface && let Some((own, _)) = self.around.look(own_azimuth, own_elevation, None).surface {
+            return Some(((range_m + f64::from(echo.range_m) - own.range_m).max(0.01) as f32, place));
         }
         Some((range_m.max(0.01) as f32, place))
     }
