@@ -9,18 +9,18 @@ use clap::Args;
 use data::write::write_kitti_text;
 use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
-use simulator::RaceSimulator;
-use study::Study;
 use diagnose::{
     DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage, Status, Verdict,
     diagnose_scans, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
-use sensor::EffectList;
 use report::{finding_name, write_finding_pictures};
+use sensor::EffectList;
 use simulate::race::RaceConfig;
+use simulator::RaceSimulator;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use study::Study;
 
 /// Compare measured data with a scenario-identical simulation. Each finding has its cause, its parameters with 95 %
 /// confidence intervals, and the gain of correcting it. With --scans, compare the scans of one spinning sensor with an
@@ -45,8 +45,8 @@ pub struct DiagnoseArgs {
     /// Data set with raw scans of one spinning sensor, compared with an ideal sensor; needs no simulated data set
     #[arg(long, value_name = "DATASET", conflicts_with_all = ["measured", "simulated", "simulator"])]
     scans: Option<PathBuf>,
-    /// TOML with the poses of the sensors [default: from the TOML of the simulated data set, else one sensor at the origin
-    /// of the clouds]
+    /// TOML with the poses of the sensors [default: from the TOML of the simulated data set, else one sensor at the
+    /// origin of the clouds]
     #[arg(long, value_name = "TOML")]
     sensor: Option<PathBuf>,
     /// Configuration of the simulation that made the simulated data: the poses of the sensors are read from it, and the
@@ -108,8 +108,7 @@ impl DiagnoseArgs {
             (None, Some(measured), Some(simulated)) => {
                 let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
                 let remake = self.remake(&simulated, &rig);
-                let outcome =
-                    diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
+                let outcome = diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
                 (measured, outcome)
             }
             _ => bail!("give --measured and --simulated, or --scans"),
@@ -126,7 +125,8 @@ impl DiagnoseArgs {
             && !outcome.diagnosis.findings.is_empty()
         {
             let extended = self.out.join("extended.toml");
-            let (gains, left_out) = gain_of_detectors(study, measured, simulated, (&extended, self.sensor.as_deref()), &self.out)?;
+            let (gains, left_out) =
+                gain_of_detectors(study, measured, simulated, (&extended, self.sensor.as_deref()), &self.out)?;
             print_gains(&gains, &left_out);
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);

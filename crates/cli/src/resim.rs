@@ -53,7 +53,8 @@ impl ResimArgs {
         let progress = ProgressBar::new(0)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
         if self.skip_inapplicable {
-            let refused = Resim { dataset: &dataset, effects: &effects, rig: rig.clone(), seed: self.seed }.refused()?;
+            let refused =
+                Resim { dataset: &dataset, effects: &effects, rig: rig.clone(), seed: self.seed }.refused()?;
             for refusal in &refused {
                 println!("left out: effect[{}]: {} {}", refusal.index, refusal.kind, refusal.why);
             }

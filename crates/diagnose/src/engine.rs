@@ -5,22 +5,22 @@ mod notes;
 mod report;
 mod verification;
 
-pub use verification::{OnClouds, Remake, RemadeFrames};
+pub use verification::{OnClouds, RemadeFrames, Remake};
 
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
-use self::report::{refused, report};
-use self::verification::{Verification, set_reached};
+use self::report::{corrected, refused, report};
+use self::verification::{Verification, measure_gain};
 use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::motion;
-use crate::diagnosis::{Diagnosis, Gain, NotApplied, Verdict};
-use crate::effects::{cause_of, fill_effects};
+use crate::diagnosis::{Diagnosis, Gain, Verdict};
+use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
-use crate::extended::{extended_toml, why_none};
+use crate::extended::extended_toml;
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
-    Corrections, FramePair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
-    kept_of_frame, pair_all, with_points,
+    Corrections, FramePair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors, kept_of_frame,
+    pair_all, with_points,
 };
 use crate::search::geometry::Displacement;
 use crate::search::labels::Side;
@@ -33,7 +33,6 @@ use sensor::directions::Sensors;
 use sensor::effects::MadeFrom;
 use sensor::{EffectList, Rig};
 use std::collections::BTreeSet;
-use std::path::Path;
 
 /// What to diagnose.
 #[derive(Clone, Debug, Default)]
@@ -158,7 +157,10 @@ fn with_pairs<T>(
     let all = ids.len();
     ids.retain(|id| !options.leave_out.contains(id));
     if ids.len() < all {
-        notes.push(format!("{} frames are kept for the test of detectors; the diagnosis does not use them", all - ids.len()));
+        notes.push(format!(
+            "{} frames are kept for the test of detectors; the diagnosis does not use them",
+            all - ids.len()
+        ));
     }
     progress(Stage::Comparing, 0, 2);
     let (ids, empty) = with_points(measured, simulated, ids)?;
@@ -375,49 +377,4 @@ impl Engine<'_> {
         results.push(search::noise::search(&context, if uneven { LEAST_COS } else { 0.0 }));
         Ok(results)
     }
-}
-
-/// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded.
-fn measure_gain(
-    diagnosis: &mut Diagnosis,
-    verification: &Verification,
-    extended: &str,
-    remake: &dyn Remake,
-) -> Result<(), DiagnoseError> {
-    let gain = match diagnosis.findings.is_empty() {
-        true => verification.without_extension(),
-        false => {
-            let effects = EffectList::parse(extended, Path::new("extended.toml"))?;
-            let extended = verification.of(&effects, remake)?;
-            verification.measure_curves(&mut diagnosis.findings, &extended);
-            extended.gain
-        }
-    };
-    diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
-    diagnosis
-        .gain
-        .not_applied
-        .extend(without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) }));
-    set_reached(diagnosis);
-    Ok(())
-}
-
-/// Measured boxes after all corrections; empty where there is none.
-fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
-    let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
-    if repairs.is_empty() {
-        return vec![];
-    }
-    let boxes = |(f, frame): (usize, &FramePair)| {
-        let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
-            let mut b = o.measured?;
-            for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {
-                (0..3).for_each(|axis| b.center[axis] += r.shift_m[axis]);
-            }
-            Some(b)
-        });
-        (frame.id.clone(), moved.collect())
-    };
-    context.frames.iter().enumerate().map(boxes).collect()
 }

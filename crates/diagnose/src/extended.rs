@@ -254,10 +254,7 @@ mod tests {
         );
         assert_eq!(
             effect(Cause::BeamElevationOffset, &[(Quantity::MeanDeg, 0.2)]),
-            [Effect::BeamAngleError(BeamAngleError {
-                elevation_deg: 0.2,
-                ..BeamAngleError::default()
-            })]
+            [Effect::BeamAngleError(BeamAngleError { elevation_deg: 0.2, ..BeamAngleError::default() })]
         );
         let [Effect::EgoAttitude(attitude)] = &effect(Cause::PitchRoll, &[(Quantity::RollDeg, 0.2)])[..] else {
             panic!()

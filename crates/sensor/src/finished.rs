@@ -192,9 +192,11 @@ impl<'a> FinishedDataset<'a> {
     /// # Errors
     /// As for one.
     pub fn frames(&self, effects: &EffectList, seeds: &[u64], id: &str) -> Result<Vec<(Frame, Scan)>, DataError> {
-        let index = self.ids.iter().position(|own| own == id).ok_or_else(|| {
-            DataError::file(&self.dataset.config.root, format!("has no frame {id}"))
-        })?;
+        let index = self
+            .ids
+            .iter()
+            .position(|own| own == id)
+            .ok_or_else(|| DataError::file(&self.dataset.config.root, format!("has no frame {id}")))?;
         let frame = self.dataset.load(id)?;
         let before = self.scan(&frame)?;
         let shown = self.cars(index, &frame);

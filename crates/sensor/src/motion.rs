@@ -141,12 +141,7 @@ const FASTEST_M_S: f64 = 60.0;
 
 /// Velocity of a box of frame `f` relative to the ego vehicle, from the nearest boxes of the frames before and after,
 /// m/s, cloud's frame. `boxes` gives those of a frame.
-pub fn seen_velocity(
-    boxes: &dyn Fn(usize) -> Vec<Box3>,
-    times: &[f64],
-    f: usize,
-    bbox: &Box3,
-) -> Option<Vector3<f64>> {
+pub fn seen_velocity(boxes: &dyn Fn(usize) -> Vec<Box3>, times: &[f64], f: usize, bbox: &Box3) -> Option<Vector3<f64>> {
     let neighbour = |g: usize| -> Option<(f64, Vector3<f64>)> {
         let dt = times[g] - times[f];
         if dt.abs() > LONGEST_S {

@@ -87,8 +87,7 @@ impl Resim<'_> {
         if finished.is_described() {
             attributes::write_names(out, finished.rig(), finished.materials())?;
         }
-        let counts =
-            new.make_frames(finished.ids(), progress, |_, id| self.make_frame_file(&new, &finished, id))?;
+        let counts = new.make_frames(finished.ids(), progress, |_, id| self.make_frame_file(&new, &finished, id))?;
         for [before, after] in counts {
             manifest.points[0] += before;
             manifest.points[1] += after;
@@ -299,7 +298,10 @@ mod tests {
         let dataset = street(&folder.path().join("street"));
         for (effect, want) in [
             ("kind = \"ghosts\"", "effect[0]: ghosts changes what rays meet"),
-            ("kind = \"packet_loss\"", "packet_loss needs the time of each shot, which this data set does not tell; give"),
+            (
+                "kind = \"packet_loss\"",
+                "packet_loss needs the time of each shot, which this data set does not tell; give",
+            ),
             ("kind = \"material_dropout\"\nmaterials = [\"rubber\"]", "needs the material of surfaces"),
             ("kind = \"label_time_offset\"", "needs the motion of the cars"),
             ("kind = \"rain\"", "say what its intensities mean (`intensity = \"returned_light\"`"),
@@ -330,8 +332,10 @@ mod tests {
         let out = folder.path().join("out");
         let list = "[[effect]]\nkind = \"range_noise\"\n[[effect]]\nkind = \"range_limits\"\nmax_m = 30.0\n";
         make(&dataset, &effects(list), None, &out).unwrap();
-        let (before, after) =
-            (dataset.load_cloud("train_000000").unwrap(), Dataset::open(&out).unwrap().load_cloud("train_000000").unwrap());
+        let (before, after) = (
+            dataset.load_cloud("train_000000").unwrap(),
+            Dataset::open(&out).unwrap().load_cloud("train_000000").unwrap(),
+        );
         let near = before.points().filter(|p| p[0].hypot(p[1]).hypot(p[2]) <= 30.0);
         assert!(near.flatten().copied().map(f32::to_bits).eq(after.values.iter().map(|v| v.to_bits())));
         assert!(after.len() < before.len());

@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use data::{Dataset, write_atomic};
 use diagnose::DetectorGain;
 use eval::matrix::{Matrix, Quantity};
-use sensor::{EffectList, Rig};
 use sensor::finished::Refusal;
+use sensor::{EffectList, Rig};
 use simulate::resim::Resim;
 use std::path::{Path, PathBuf};
 use study::numbers::{StudyState, matrix};
@@ -43,12 +43,7 @@ pub(super) fn gain_of_detectors(
 
 /// The file of the effects that can be applied to the simulated data set, and a note for each effect that is left out.
 /// It is `extended` itself if none is left out.
-fn applicable(
-    simulated: &Path,
-    extended: &Path,
-    sensor: Option<&Path>,
-    out: &Path,
-) -> Result<(PathBuf, Vec<String>)> {
+fn applicable(simulated: &Path, extended: &Path, sensor: Option<&Path>, out: &Path) -> Result<(PathBuf, Vec<String>)> {
     let rig = sensor.map(Rig::read).transpose()?;
     let (dataset, mut effects) = (Dataset::open(simulated)?, EffectList::read(extended)?);
     let refused = Resim { dataset: &dataset, effects: &effects, rig, seed: 0 }.refused()?;
@@ -58,9 +53,8 @@ fn applicable(
     effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
     let path = out.join("extended_detectors.toml");
     write_atomic(&path, toml::to_string(&effects)?.as_bytes())?;
-    let note = |r: Refusal| {
-        format!("the detectors are trained without an effect of extended.toml: {} {}", r.kind, r.why)
-    };
+    let note =
+        |r: Refusal| format!("the detectors are trained without an effect of extended.toml: {} {}", r.kind, r.why);
     Ok((path, refused.into_iter().map(note).collect()))
 }
 
@@ -143,7 +137,8 @@ mod tests {
         let template = Study::open("gain", None).unwrap().config;
         assert_eq!(template.seeds.len(), 5);
         let study =
-            study_of(template, Path::new("/a/real"), Path::new("/a/sim"), (Path::new("/a/extended.toml"), None)).unwrap();
+            study_of(template, Path::new("/a/real"), Path::new("/a/sim"), (Path::new("/a/extended.toml"), None))
+                .unwrap();
         let text = toml::to_string(&study).unwrap();
         let again = StudyConfig::parse(&text, Path::new("detectors.toml")).unwrap();
         assert_eq!(again, study);

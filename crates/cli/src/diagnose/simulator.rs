@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result, bail};
 use data::{Cloud, DataError, Dataset, Object};
-use diagnose::{DiagnoseError, Remake, RemadeFrames};
+use diagnose::{DiagnoseError, RemadeFrames, Remake};
 use sensor::EffectList;
 use sensor::finished::Refusal;
 use simulate::SimulateError;
@@ -30,9 +30,8 @@ impl RaceSimulator {
         let manifest = root.join("manifest.json");
         let text = fs_err::read_to_string(&manifest)
             .with_context(|| format!("{} was not made by `lidarshift simulate`: it has no manifest", root.display()))?;
-        let made: RaceManifest = serde_json::from_str(&text).map_err(|e| {
-            DataError::line(&manifest, e.line(), format!("is not the manifest of a race: {e}"))
-        })?;
+        let made: RaceManifest = serde_json::from_str(&text)
+            .map_err(|e| DataError::line(&manifest, e.line(), format!("is not the manifest of a race: {e}")))?;
         let [_, name] = &made.name;
         let Some(set) = race.datasets.iter().find(|set| set.name == *name).cloned() else {
             bail!("{named} has no data set {name:?}, which {} is", root.display());

@@ -3,7 +3,9 @@
 use crate::catalogue::Channel;
 use crate::diagnosis::{Diagnosis, Finding, FrameRoles, Gain, Predicted, SCHEMA, Status, Verdict};
 use crate::inference::roles::Role;
+use crate::pairing::FramePair;
 use crate::search::{ChannelResult, Context, Found, REPETITIONS, mean_interval};
+use geometry::Box3;
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 use std::collections::BTreeMap;
 
@@ -143,4 +145,23 @@ fn predicted(sums: &[[f64; 3]], blocks: &[usize], returns: f64) -> Predicted {
         ci95: closed(all).and_then(|_| interval_nearest(drawn)),
         channels: BTreeMap::new(),
     }
+}
+
+/// Measured boxes after all corrections; empty where there is none.
+pub(super) fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
+    let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
+    if repairs.is_empty() {
+        return vec![];
+    }
+    let boxes = |(f, frame): (usize, &FramePair)| {
+        let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
+            let mut b = o.measured?;
+            for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {
+                (0..3).for_each(|axis| b.center[axis] += r.shift_m[axis]);
+            }
+            Some(b)
+        });
+        (frame.id.clone(), moved.collect())
+    };
+    context.frames.iter().enumerate().map(boxes).collect()
 }

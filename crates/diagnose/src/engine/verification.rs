@@ -2,26 +2,29 @@
 //! again, and compared by the same distance.
 //!
 //! The distance of a channel is what lookup tables of the measured data, fitted on the estimating frames, predict
-//! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero where
-//! the two sides are two draws of the same sensor, and is the same number before and after.
+//! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero
+//! where the two sides are two draws of the same sensor, and is the same number before and after.
 
-use super::{Engine, curves};
 use super::report::METRIC;
+use super::{Engine, curves};
 use crate::catalogue::{Cause, Channel};
-use crate::diagnosis::{
-    Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict,
-};
+use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict};
+use crate::effects::cause_of;
 use crate::error::DiagnoseError;
+use crate::extended::why_none;
 use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
-use crate::search::{Context, REPETITIONS, Z_STAR, geometry, hits, labels, noise, quantisation, returns, rolling_shutter};
+use crate::search::{
+    Context, REPETITIONS, Z_STAR, geometry, hits, labels, noise, quantisation, returns, rolling_shutter,
+};
 use data::{Cloud, DataError, Dataset, Object};
 use rayon::prelude::*;
 use sensor::finished::{FinishedDataset, Refusal};
 use sensor::{EffectList, Rig};
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::sync::Arc;
 
 /// Frames of a role that are made anew, at most.
@@ -162,9 +165,8 @@ impl<'a> Verification<'a> {
         let recordings = self.engine.recordings;
         let two = |&frame: &usize| -> Result<[Arc<SideFrame>; 2], DiagnoseError> {
             let frames = made.frame(recordings.id(frame), &[0, 1])?;
-            let side = |(cloud, objects): (Cloud, Vec<Object>)| {
-                Arc::new(SideFrame::new(&cloud, objects, self.context.rig))
-            };
+            let side =
+                |(cloud, objects): (Cloud, Vec<Object>)| Arc::new(SideFrame::new(&cloud, objects, self.context.rig));
             let sides: Vec<Arc<SideFrame>> = frames.into_iter().map(side).collect();
             <[Arc<SideFrame>; 2]>::try_from(sides)
                 .map_err(|_| DataError::file(recordings.id(frame).as_ref(), "was not made twice").into())
@@ -204,8 +206,7 @@ impl<'a> Verification<'a> {
         recordings: &Recordings,
     ) -> Result<(Distances, Vec<FramePair>), DiagnoseError> {
         let kept = kept_of_frame(self.context.frames.len());
-        let frames: Vec<FramePair> =
-            pair_all(recordings, self.engine.sensors, Corrections::default(), kept, &|_| ())?;
+        let frames: Vec<FramePair> = pair_all(recordings, self.engine.sensors, Corrections::default(), kept, &|_| ())?;
         let context = Context {
             rig: self.context.rig,
             frames: &frames,
@@ -227,12 +228,9 @@ impl<'a> Verification<'a> {
         let members = blocks_of(&self.context.blocks(&self.test));
         // The distances of a channel over some frames. What tables predict worse than the simulation is no distance.
         let sums = |channel: &Channel, which: &[usize]| {
-            [&self.before, after, floor]
-                .map(|d| which.iter().map(|&i| d[channel][i]).sum::<f64>().max(0.0))
+            [&self.before, after, floor].map(|d| which.iter().map(|&i| d[channel][i]).sum::<f64>().max(0.0))
         };
-        let closed = |[before, after, floor]: [f64; 3]| {
-            (before > floor).then(|| (before - after) / (before - floor))
-        };
+        let closed = |[before, after, floor]: [f64; 3]| (before > floor).then(|| (before - after) / (before - floor));
         let over = |channels: &[Channel], which: &[usize]| {
             channels.iter().map(|c| sums(c, which)).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
         };
@@ -255,9 +253,7 @@ impl<'a> Verification<'a> {
             let [before, _, floor] = sums(c, &all_frames);
             extended && before - floor > ENOUGH_NATS
         };
-        let share = |c: &Channel| {
-            Some((*c, Closed { closed: closed(sums(c, &all_frames))?, ci95: interval(&[*c]) }))
-        };
+        let share = |c: &Channel| Some((*c, Closed { closed: closed(sums(c, &all_frames))?, ci95: interval(&[*c]) }));
         let of_all = closed([before, after_all, floor_all]).filter(|_| extended);
         Gain {
             metric: METRIC.into(),
@@ -273,13 +269,39 @@ impl<'a> Verification<'a> {
     }
 }
 
+/// Measures the gain of what was found through the text of `extended.toml`, on the pair as it was recorded.
+pub(super) fn measure_gain(
+    diagnosis: &mut Diagnosis,
+    verification: &Verification,
+    extended: &str,
+    remake: &dyn Remake,
+) -> Result<(), DiagnoseError> {
+    let gain = match diagnosis.findings.is_empty() {
+        true => verification.without_extension(),
+        false => {
+            let effects = EffectList::parse(extended, Path::new("extended.toml"))?;
+            let extended = verification.of(&effects, remake)?;
+            verification.measure_curves(&mut diagnosis.findings, &extended);
+            extended.gain
+        }
+    };
+    diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
+    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
+    diagnosis
+        .gain
+        .not_applied
+        .extend(without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) }));
+    set_reached(diagnosis);
+    Ok(())
+}
+
 /// Difference of what was promised and what was reached from which on the form of a cause does not fit.
 const FORM: f64 = 0.05;
 
 /// Writes to each finding what the fits promised of its channel and what was reached there. A named cause whose effect
 /// was applied and surely reaches less than it promised, by more than 5 points, does not have the form of the
 /// difference: it is ambiguous where another cause was significant as well, else without a name.
-pub(super) fn set_reached(diagnosis: &mut Diagnosis) {
+fn set_reached(diagnosis: &mut Diagnosis) {
     let Diagnosis { findings, gain, considered, .. } = diagnosis;
     for finding in findings.iter_mut() {
         let measured = gain.closed_by_channel.get(&finding.channel);

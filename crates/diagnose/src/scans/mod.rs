@@ -15,11 +15,13 @@ mod scatter;
 mod tilt;
 
 use crate::catalogue::Cause;
-use crate::diagnosis::{Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, Predicted, SCHEMA, Verdict};
+use crate::diagnosis::{
+    Considered, Diagnosis, Finding, FindingGain, FrameRoles, Gain, Minimum, Predicted, SCHEMA, Verdict,
+};
 use crate::effects::fill_effects;
-use crate::extended::extended_toml;
 use crate::engine::{Options, Outcome, Progress, Stage};
 use crate::error::DiagnoseError;
+use crate::extended::extended_toml;
 use crate::pairing::load;
 use crate::search::REPETITIONS;
 use data::{Cloud, Dataset, Object};

@@ -12,8 +12,8 @@ use crate::channels::mask::{
 };
 use crate::channels::returns::OWN_CAR_M;
 use crate::curve::{Curve, CurvePoint};
-use crate::effects::rounded;
 use crate::diagnosis::{Considered, Minimum, Status};
+use crate::effects::rounded;
 use crate::inference::law::Law;
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
@@ -249,9 +249,8 @@ fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Ef
     cells.sort_by_key(|((sensor, azimuth, elevation), _)| (*sensor, *elevation, *azimuth));
     for (first, lost) in cells {
         let (runs, shown_m) = (of_sensors.entry(first.0).or_default(), shown_m(&first));
-        let joins = |run: &Run| {
-            run.first.2 == first.2 && run.end == first.1 && run.lost == lost && run.shown_m == shown_m
-        };
+        let joins =
+            |run: &Run| run.first.2 == first.2 && run.end == first.1 && run.lost == lost && run.shown_m == shown_m;
         match runs.last_mut().filter(|run| joins(run)) {
             Some(run) => run.end += 1,
             None => runs.push(Run { first, end: first.1 + 1, lost, shown_m }),

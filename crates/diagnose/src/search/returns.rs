@@ -45,10 +45,12 @@ pub fn search(context: &Context) -> ChannelResult {
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
     let rates = ODD.map(|kind| excess(train.iter().map(|&i| &odd[i]), kind as usize));
-    let of_frame = |i: &usize| ODD.map(|kind| {
-        let [base, more] = rates[kind as usize];
-        gain(&odd[*i], kind as usize, base, more)
-    });
+    let of_frame = |i: &usize| {
+        ODD.map(|kind| {
+            let [base, more] = rates[kind as usize];
+            gain(&odd[*i], kind as usize, base, more)
+        })
+    };
     test.iter().map(|i| of_frame(i).iter().sum()).collect()
 }
 

@@ -1,8 +1,8 @@
 //! The surface around a direction: its range, incidence, normal and kind.
 
+use super::Sensors;
 use super::scan::{DirectionIndex, Entry, SensorScan};
 use super::surface::{LocalSurface, fit_surface};
-use super::Sensors;
 use geometry::Box3;
 use nalgebra::{Isometry3, Vector3};
 

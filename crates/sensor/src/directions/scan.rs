@@ -1,9 +1,9 @@
 //! The points of one sensor by direction, and an index to find the neighbours of a direction.
 
-use data::Cloud;
-use nalgebra::Point3;
 use crate::assignment::{Assigned, Assignment};
 use crate::rig::{Rig, Sensor};
+use data::Cloud;
+use nalgebra::Point3;
 use std::f64::consts::TAU;
 
 /// The returns of one sensor in one frame, in its own frame.

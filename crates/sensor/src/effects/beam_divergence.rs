@@ -5,8 +5,8 @@ use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{BeamWidth, Beams, Pick};
 use crate::scan::{Echo, Scan, dot};
 use data::KeyError;
-use rand::RngExt;
 use data::toml_text::{within, wrong};
+use rand::RngExt;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

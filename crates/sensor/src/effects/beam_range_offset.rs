@@ -105,7 +105,8 @@ mod tests {
     #[test]
     fn a_table_of_offsets_is_used_unchanged() {
         let before = plate(3000, 20.0, 0.5);
-        let after = applied(&BeamRangeOffset { std_m: 0.0, offsets_m: vec![0.1, -0.2], ..BeamRangeOffset::default() }, &before);
+        let after =
+            applied(&BeamRangeOffset { std_m: 0.0, offsets_m: vec![0.1, -0.2], ..BeamRangeOffset::default() }, &before);
         let off = residuals(&before, &after);
         assert!((off[0] - 0.1).abs() < 1e-5 && (off[1000] + 0.2).abs() < 1e-5 && off[2000] == 0.0);
     }

@@ -24,8 +24,8 @@ pub struct EgoBodyMask {
     /// Hidden directions in the frame of the named sensor: azimuth from and to, elevation from and to, degrees, and the
     /// share of their returns that is lost, 0 to 1.
     pub directions: Vec<[f64; 5]>,
-    /// Range of the return of the part itself in each of the directions, m; 0 where there is none, and beyond the end of
-    /// the list.
+    /// Range of the return of the part itself in each of the directions, m; 0 where there is none. Directions beyond
+    /// the end of the list have none.
     pub returns_m: Vec<f64>,
 }
 

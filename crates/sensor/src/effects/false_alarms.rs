@@ -32,7 +32,14 @@ pub struct FalseAlarms {
 
 impl Default for FalseAlarms {
     fn default() -> Self {
-        FalseAlarms { rate: 0.0, sun_rate: 0.0, sun_azimuth_deg: -60.0, sun_width_deg: 15.0, reach_m: 200.0, instead: false }
+        FalseAlarms {
+            rate: 0.0,
+            sun_rate: 0.0,
+            sun_azimuth_deg: -60.0,
+            sun_width_deg: 15.0,
+            reach_m: 200.0,
+            instead: false,
+        }
     }
 }
 

@@ -85,7 +85,14 @@ mod tests {
 
     #[test]
     fn it_depends_on_the_angle_alone() {
-        let effect = IncidenceDropout { cos_half: 0.2, steepness: 20.0, scale: CosineScale::Linear, skew: 1.0, most: 1.0, form: None };
+        let effect = IncidenceDropout {
+            cos_half: 0.2,
+            steepness: 20.0,
+            scale: CosineScale::Linear,
+            skew: 1.0,
+            most: 1.0,
+            form: None,
+        };
         for (range_m, c) in [(10.0, 0.2), (90.0, 0.2), (10.0, 0.1), (10.0, 0.4)] {
             let mut before = plate(20_000, range_m, 0.5);
             before.echoes.iter_mut().for_each(|e| e.cos_incidence = c);

@@ -3,8 +3,8 @@
 use super::assumed::{boxes, kind};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::material::MaterialId;
 use crate::directions::Kind;
+use crate::material::MaterialId;
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
@@ -63,9 +63,8 @@ impl SensorEffect for MaterialDropout {
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let named: Vec<MaterialId> = self.materials.iter().filter_map(|name| frame.materials.find(name)).collect();
         let boxes = boxes(frame);
-        let of_kind = |echo: &Echo| {
-            !self.surfaces.is_empty() && self.surfaces.contains(&SurfaceKind::of(kind(echo, &boxes)))
-        };
+        let of_kind =
+            |echo: &Echo| !self.surfaces.is_empty() && self.surfaces.contains(&SurfaceKind::of(kind(echo, &boxes)));
         let loses = |echo: &Echo| named.contains(&echo.material) || of_kind(echo);
         drop_some(scan, draws, |echo| if loses(echo) { self.share as f32 } else { 0.0 });
     }
@@ -83,7 +82,10 @@ mod tests {
         for (i, echo) in before.echoes.iter_mut().enumerate() {
             echo.material = MaterialTable::built_in(if i % 2 == 0 { "rubber" } else { "paint" });
         }
-        let after = applied(&MaterialDropout { materials: vec!["rubber".into(), "lead".into()], surfaces: vec![], share: 0.6 }, &before);
+        let after = applied(
+            &MaterialDropout { materials: vec!["rubber".into(), "lead".into()], surfaces: vec![], share: 0.6 },
+            &before,
+        );
         assert!((lost(&before, &after) - 0.3).abs() < 0.01);
         assert!(after.echoes.iter().skip(1).step_by(2).all(|e| e.is_return()));
     }

@@ -34,8 +34,8 @@ pub use empirical::Covariate;
 pub use form::Form;
 pub use incidence_dropout::CosineScale;
 pub use label_time_offset::Clock;
-pub use table::interpolated;
 pub use material_dropout::SurfaceKind;
+pub use table::interpolated;
 
 use crate::beams::Beams;
 use crate::cloud_scan::{Intensity, Surfaces};

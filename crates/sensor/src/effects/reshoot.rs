@@ -12,14 +12,15 @@ use nalgebra::{Point3, Vector3};
 /// Distance across a surface within which the surface around the true direction is the shot's own, m.
 const SAME_SURFACE_M: f64 = 0.12;
 
-/// Distance of a true direction from the reported one up to which the shot's own plane serves, in steps of the pattern.
+/// Distance of a true direction from the reported one up to which the shot's own plane serves, in steps of the
+/// pattern.
 const BESIDE_STEPS: f32 = 2.5;
 
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
-/// Gives shots the ranges of their true rays: the pose of an echo moves its reported ray to the true one, in the cloud's
-/// frame. Shots without a pose stay as they are. Without scan patterns points are moved instead.
+/// Gives shots the ranges of their true rays: the pose of an echo moves its reported ray to the true one, in the
+/// cloud's frame. Shots without a pose stay as they are. Without scan patterns points are moved instead.
 pub(super) fn reshoot(scan: &mut Scan, frame: &FrameContext, true_from_reported: impl Fn(&Echo) -> Option<Pose>) {
     let Some(sensors) = frame.sensors else {
         for echo in scan.returns_mut() {
@@ -165,8 +166,8 @@ impl Seen {
             return Some((self.scan.range_m[nearest], place));
         }
         let range_m = meets.dot(&(seen - shift)) / along;
-        // Beside the shot its own plane serves, and its own error of range is kept. Farther away that plane is known too
-        // badly: the error is what the shot lies off the surface around it.
+        // Beside the shot its own plane serves, and its own error of range is kept. Farther away that plane is known
+        // too badly: the error is what the shot lies off the surface around it.
         let [own_azimuth, own_elevation, _] = {
             let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
             Sensor::spherical(&Point3::from(own)).map(|v| v as f32)

@@ -55,9 +55,9 @@ impl SensorEffect for RollingShutter {
         beams.shutter = Some(Shutter { deskewed: self.deskewed });
     }
 
-    /// On a finished cloud, points within the boxes of cars move with the velocity of their car. With `deskewed = false`
-    /// the velocity of the ego vehicle at the point is subtracted, and shots at all that stands still start where the
-    /// ego vehicle is at their time.
+    /// On a finished cloud, points within the boxes of cars move with the velocity of their car. With
+    /// `deskewed = false` the velocity of the ego vehicle at the point is subtracted, and shots at all that stands
+    /// still start where the ego vehicle is at their time.
     fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
         let mounts: Vec<_> = frame.rig.sensors.iter().map(|s| (s, s.pose().inverse())).collect();
         let phase = |echo: &Echo| {

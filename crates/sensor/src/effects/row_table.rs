@@ -54,7 +54,8 @@ pub(super) fn check_rows(sensor: &str, rows_deg: &[f64], values: (&str, &[f64]),
     }
     let (name, values) = values;
     if rows_deg.len() < 2 || rows_deg.len() != values.len() {
-        let why = format!("{} values for {} rows: a table has as many of each, at least 2", values.len(), rows_deg.len());
+        let why =
+            format!("{} values for {} rows: a table has as many of each, at least 2", values.len(), rows_deg.len());
         return Err(wrong(name, why));
     }
     if let Some(i) = rows_deg.windows(2).position(|w| w[0] >= w[1]) {

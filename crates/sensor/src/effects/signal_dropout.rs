@@ -79,7 +79,15 @@ mod tests {
 
     #[test]
     fn detection_depends_on_the_signal_index_alone() {
-        let effect = SignalDropout { most: 0.9, threshold: 0.0, steepness: 4.0, attenuation_per_m: 0.0, skew: 1.0, assumed: None, form: None };
+        let effect = SignalDropout {
+            most: 0.9,
+            threshold: 0.0,
+            steepness: 4.0,
+            attenuation_per_m: 0.0,
+            skew: 1.0,
+            assumed: None,
+            form: None,
+        };
         let logistic = |u: f64| 1.0 - 0.9 / (1.0 + (-4.0 * u).exp());
         // Twice the range returns a quarter of the light.
         for (range_m, reflectivity, u) in [

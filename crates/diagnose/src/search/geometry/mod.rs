@@ -53,8 +53,7 @@ type Chosen = (Vec<Hypothesis>, Vec<Selected>);
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let sums = sums(context, train);
     let (full, base) = sums.full_and_base(train, &context.blocks(train));
-    let linear: Vec<f64> =
-        test.iter().map(|&f| full.gain(&sums.linear[f]) - base.gain(&sums.linear[f])).collect();
+    let linear: Vec<f64> = test.iter().map(|&f| full.gain(&sums.linear[f]) - base.gain(&sums.linear[f])).collect();
     // Offsets that one part of the rays of a row or strip predicts for the other parts: those of the sensor, not of
     // surfaces.
     let mut all = [train, test].concat();

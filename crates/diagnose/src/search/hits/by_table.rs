@@ -32,9 +32,8 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     let usual = (usual[1] + 1.0) / (usual[0] + 1.0);
     let edge = |ray: &Ray| {
         let [simulated, measured] = at_edges.get(&bin(ray)).copied().unwrap_or_default();
-        let share = |[n, matched]: [f64; 2], towards: f64| {
-            (matched + PRIOR_OF_DIRECTION * towards) / (n + PRIOR_OF_DIRECTION)
-        };
+        let share =
+            |[n, matched]: [f64; 2], towards: f64| (matched + PRIOR_OF_DIRECTION * towards) / (n + PRIOR_OF_DIRECTION);
         let without = share(measured, usual);
         [share(simulated, without), without]
     };

@@ -4,10 +4,10 @@ use crate::catalogue::{Channel, Covariate, Quantity};
 use crate::channels::cells::OBJECT;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::Parameter;
+use crate::effects::rounded;
 use crate::inference::law::{FittedLaw, Law, in_zone};
 use crate::inference::losses::LossTable;
 use crate::search::{Found, NamedParameter, Selected};
-use crate::effects::rounded;
 use sensor::effects::{
     AssumedReflectivity, CosineScale, Effect, Form, IncidenceDropout, MaterialDropout, RandomDropout, RangeDropout,
     SignalDropout, SurfaceKind, interpolated,
@@ -59,7 +59,10 @@ fn effects(law: &FittedLaw, form: &[[f64; 2]]) -> Vec<Effect> {
         Law::Range => {
             let at = |k: u32| 2f64 * (0.05 * f64::from(k)).exp();
             let range_m: Vec<f64> = (0..100).map(|k| rounded(at(k), 3)).collect();
-            let share = range_m.iter().map(|r| rounded((1.0 - factor_at(r.ln()) * law.kept_there(*r, 1.0)).clamp(0.0, 1.0), 5)).collect();
+            let share = range_m
+                .iter()
+                .map(|r| rounded((1.0 - factor_at(r.ln()) * law.kept_there(*r, 1.0)).clamp(0.0, 1.0), 5))
+                .collect();
             vec![Effect::RangeDropout(RangeDropout { range_m, share })]
         }
         Law::Incidence => vec![Effect::IncidenceDropout(IncidenceDropout {

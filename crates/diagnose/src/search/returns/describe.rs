@@ -2,14 +2,14 @@
 
 use super::false_alarms::{FalseAlarms, false_alarms};
 use super::{NamedParameter, Search, cause};
-use crate::effects::rounded;
-use sensor::Effect;
 use crate::catalogue::{Channel, Covariate, Quantity};
 use crate::channels::returns::{self, Odd, OddFrame};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Parameter, Status};
+use crate::effects::rounded;
 use crate::pairing::Ray;
 use crate::search::{Context, Found, parameter};
+use sensor::Effect;
 
 /// Factor by which the true width of a beam may differ from that of a uniform disc that mixes as many ranges.
 const WIDTH_FACTOR: f64 = 5.0;
