@@ -131,12 +131,13 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
         let outcome = diagnose(&measured, &foreign, &rig, &Options::default(), &|_, _, _| ()).unwrap();
         let d = &outcome.diagnosis;
         assert_eq!(named(d), [cause], "{:?}", d.findings);
-        let closed = d.gain.closed.unwrap();
+        let closed = d.findings[0].reached.unwrap();
         assert!(closed > 0.85 && d.gain.not_applied.is_empty(), "{cause}: {:?}", d.gain);
         let again = with_effects(&foreign, &outcome.extended, &folder.path().join(cause), 12);
         let second = diagnose(&measured, &again, &rig, &Options::default(), &|_, _, _| ()).unwrap().diagnosis;
-        let left: f64 = d.gain.closed_by_channel.keys().map(|channel| second.gain.channels[channel][0]).sum();
-        let reached = (d.gain.before - left) / (d.gain.before - d.gain.floor);
+        let channel = d.findings[0].channel;
+        let [before, _, floor] = d.gain.channels[&channel];
+        let reached = (before - second.gain.channels[&channel][0]) / (before - floor);
         assert!((reached - closed).abs() < 0.05, "{cause}: {reached} of {closed}");
         assert!(second.findings.is_empty(), "{cause}: {:?}", second.findings);
     }

@@ -4,7 +4,7 @@
 //! `cargo run --release -p lidarshift-report --example diagnose_scans -- DATASET SENSOR.toml OUT`
 
 use data::{Dataset, write_atomic};
-use diagnose::{Options, Rig, diagnose_scans, extended_toml};
+use diagnose::{Options, Rig, diagnose_scans};
 use std::path::PathBuf;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let rig = Rig::read(sensor)?;
     let outcome = diagnose_scans(&Dataset::open(dataset)?, &rig, &Options::default(), &|_, _, _| ())?;
     write_atomic(&out.join("diagnosis.json"), &serde_json::to_vec_pretty(&outcome.diagnosis)?)?;
-    let extended = extended_toml(&outcome.diagnosis);
+    let extended = &outcome.extended;
     write_atomic(&out.join("extended.toml"), extended.as_bytes())?;
     Ok(lidarshift_report::write_finding_pictures(&outcome.diagnosis, out)?)
 }

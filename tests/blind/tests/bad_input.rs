@@ -112,7 +112,7 @@ fn ids_without_overlap_are_an_error() {
 #[test]
 fn one_frame_is_too_few() {
     let d = Pair::new(4, 1).diagnosis().unwrap();
-    assert_eq!(d.verdict, Verdict::NothingFound);
+    assert_eq!(d.verdict, Verdict::TooFewFrames);
     assert!(notes(&d).contains("1 frames can be used; with fewer than 5"), "{:?}", d.notes);
 }
 
@@ -167,7 +167,7 @@ fn copies_of_one_frame_are_one_frame() {
     }
     let d = pair.diagnosis().unwrap();
     assert!(notes(&d).contains("9 frames are copies of others"), "{:?}", d.notes);
-    assert!(d.findings.is_empty() && d.verdict == Verdict::NothingFound, "{:?}", d.findings);
+    assert!(d.findings.is_empty() && d.verdict == Verdict::TooFewFrames, "{:?}", d.findings);
 }
 
 #[test]
