@@ -178,7 +178,6 @@ mod tests {
     }
 
     #[test]
-    #[expect(clippy::too_many_lines, reason = "a table: one finding for each cause")]
     fn the_simulator_reads_every_cause() {
         let unexplained = |channel: Channel, covariate: Covariate, at: &[f64]| Finding {
             status: Status::Unexplained,

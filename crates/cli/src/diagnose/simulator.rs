@@ -40,7 +40,7 @@ impl RaceSimulator {
         (race.seed, race.frames) = (made.seed, ids.len());
         let lists = race.effects_of(&set, &files)?;
         let simulator = Simulator::new(race, &files)?;
-        let again = RaceSimulator { simulator, set: set.name.clone(), lists, auto_label: set.auto_label.clone() };
+        let again = RaceSimulator { simulator, set: set.name.clone(), lists, auto_label: set.auto_label };
         let id = &ids[0];
         let cloud = again.frame_of(&again.prepared(None, 0), id)?.0;
         if cloud.values != simulated.load_cloud(id)?.values {
@@ -55,7 +55,7 @@ impl RaceSimulator {
 
     fn prepared(&self, effects: Option<&EffectList>, seed: u64) -> PreparedSet {
         let more = effects.map(|list| (format!("{}/extended {seed}", self.set), list.clone()));
-        self.simulator.prepare(self.lists.iter().cloned().chain(more).collect(), self.auto_label.clone())
+        self.simulator.prepare(self.lists.iter().cloned().chain(more).collect(), self.auto_label)
     }
 
     fn frame_of(&self, set: &PreparedSet, id: &str) -> Result<(Cloud, Vec<Object>), DiagnoseError> {
