@@ -120,7 +120,7 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
     for (cause, hidden) in [
         ("range_bias", "kind = \"range_bias\"\nscale = 0.004\n"),
         ("beam_range_offset", "kind = \"beam_range_offset\"\nstd_m = 0.03\n"),
-        ("incidence_dropout", "kind = \"incidence_dropout\"\ncos_half = 0.04\nsteepness = 60.0\n"),
+        ("range_noise", "kind = \"range_noise\"\nstd_m = 0.03\n"),
         (
             "ego_occlusion",
             "kind = \"ego_body_mask\"\nsensor = \"left\"\ndirections = [[-20.0, 14.0, -12.0, -3.0, 1.0]]\n",
