@@ -121,10 +121,7 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
         ("range_bias", "kind = \"range_bias\"\nscale = 0.004\n"),
         ("beam_range_offset", "kind = \"beam_range_offset\"\nstd_m = 0.03\n"),
         ("range_noise", "kind = \"range_noise\"\nstd_m = 0.03\n"),
-        (
-            "ego_occlusion",
-            "kind = \"ego_body_mask\"\nsensor = \"left\"\ndirections = [[-20.0, 14.0, -12.0, -3.0, 1.0]]\n",
-        ),
+        ("random_dropout", "kind = \"random_dropout\"\nshare = 0.2\n"),
     ] {
         let measured = folder.path().join(format!("{cause} measured"));
         let measured = with_effects(&sim, &format!("[[effect]]\n{hidden}"), &measured, 11);
