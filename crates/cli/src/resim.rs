@@ -58,7 +58,7 @@ impl ResimArgs {
             for refusal in &refused {
                 println!("left out: effect[{}]: {} {}", refusal.index, refusal.kind, refusal.why);
             }
-            effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+            effects = effects.without(&refused);
         }
         let resim = Resim { dataset: &dataset, effects: &effects, rig, seed: self.seed };
         let made = resim.make(&self.out, &|done, total| {

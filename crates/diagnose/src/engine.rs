@@ -5,7 +5,7 @@ mod notes;
 mod report;
 mod verification;
 
-pub use verification::{OnClouds, RemadeFrames, Remake};
+pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
 use self::report::{corrected, refused, report};

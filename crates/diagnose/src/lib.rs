@@ -23,7 +23,9 @@ pub mod search;
 pub use catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
 pub use curve::{Curve, CurvePoint};
 pub use diagnosis::{DetectorGain, Diagnosis, Finding, FindingGain, Gain, SCHEMA, Status, Verdict};
-pub use engine::{OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, Stage, diagnose, diagnose_with, verify};
+pub use engine::{
+    OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
+};
 pub use error::DiagnoseError;
 pub use extended::extended_toml;
 pub use scans::diagnose_scans;

@@ -58,12 +58,7 @@ impl CloudReader {
     pub fn new(rig: &Rig, some: &[Cloud]) -> CloudReader {
         let scans: Vec<Vec<SensorScan>> = some.iter().map(|cloud| split_by_sensor(cloud, rig)).collect();
         let frames: Vec<&[SensorScan]> = scans.iter().map(Vec::as_slice).collect();
-        CloudReader::with(Sensors::find(rig, &frames))
-    }
-
-    /// With scan patterns that are known already.
-    pub fn with(sensors: Sensors) -> CloudReader {
-        CloudReader { sensors }
+        CloudReader { sensors: Sensors::find(rig, &frames) }
     }
 
     /// The sensors.

@@ -73,16 +73,6 @@ impl<'a> FinishedDataset<'a> {
         let some: Vec<&String> = ids.iter().step_by(step).collect();
         let clouds: Vec<Cloud> = some.par_iter().map(|id| dataset.load_cloud(id)).collect::<Result<_, _>>()?;
         let reader = CloudReader::new(&rig, &clouds);
-        FinishedDataset::with(dataset, reader, effects)
-    }
-
-    /// The same where the sensors' scan patterns are known already.
-    ///
-    /// # Errors
-    /// Files that cannot be read, and a data set without frames.
-    pub fn with(dataset: &'a Dataset, reader: CloudReader, effects: &EffectList) -> Result<Self, DataError> {
-        let rig = reader.sensors().rig.clone();
-        let ids = dataset.all_ids()?;
         let described = ids.first().is_some_and(|id| attributes::path(&dataset.config.root, id).is_file());
         let materials =
             if described { attributes::read_materials(&dataset.config.root)? } else { MaterialTable::default() };
@@ -138,7 +128,7 @@ impl<'a> FinishedDataset<'a> {
                 ),
                 Some(needs) => self.why_not(needs.iter().filter(|n| !known.contains(n)).copied().collect()),
             };
-            let why = why.or_else(|| self.strange_sensor(effect.model().sensors()));
+            let why = why.or_else(|| effect.strange_to(&self.rig));
             refused.extend(why.map(|why| Refusal { index, kind: effect.kind(), why }));
         }
         refused
@@ -151,16 +141,6 @@ impl<'a> FinishedDataset<'a> {
         how.dedup();
         (!missing.is_empty())
             .then(|| format!("needs {}, which this data set does not tell; {}", lacks.join(" and "), how.join("; ")))
-    }
-
-    /// Why an effect of a sensor that the rig does not have is refused.
-    fn strange_sensor(&self, named: Vec<&str>) -> Option<String> {
-        let strange = named.into_iter().find(|name| self.rig.find(name).is_none())?;
-        let own: Vec<&str> = self.rig.sensors.iter().map(|s| s.name.as_str()).collect();
-        Some(format!(
-            "acts on the sensor {strange:?}, but the rig has {}; give the rig that the list was made for (--sensor)",
-            own.join(", ")
-        ))
     }
 
     fn known(&self) -> BTreeSet<Need> {
@@ -184,14 +164,20 @@ impl<'a> FinishedDataset<'a> {
     /// # Errors
     /// An id that the data set does not have, files that cannot be read, attributes that do not fit the cloud.
     pub fn frame(&self, effects: &EffectList, seed: u64, id: &str) -> Result<(Frame, Scan), DataError> {
-        Ok(self.frames(effects, &[seed], id)?.remove(0))
+        let [made] = self.frames(effects, [seed], id)?;
+        Ok(made)
     }
 
     /// The same for several random seeds.
     ///
     /// # Errors
     /// As for one.
-    pub fn frames(&self, effects: &EffectList, seeds: &[u64], id: &str) -> Result<Vec<(Frame, Scan)>, DataError> {
+    pub fn frames<const N: usize>(
+        &self,
+        effects: &EffectList,
+        seeds: [u64; N],
+        id: &str,
+    ) -> Result<[(Frame, Scan); N], DataError> {
         let index = self
             .ids
             .iter()
@@ -200,7 +186,7 @@ impl<'a> FinishedDataset<'a> {
         let frame = self.dataset.load(id)?;
         let before = self.scan(&frame)?;
         let shown = self.cars(index, &frame);
-        Ok(seeds.iter().map(|seed| self.with_effects(effects, *seed, index, &frame, &before, &shown)).collect())
+        Ok(seeds.map(|seed| self.with_effects(effects, seed, index, &frame, &before, &shown)))
     }
 
     /// A frame with effects; `before` is its scan.

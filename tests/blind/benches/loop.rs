@@ -182,7 +182,7 @@ fn apply(outcome: &Outcome, rig: &Rig, folder: &Path) -> (Vec<String>, Vec<Strin
         Ok(refused) => refused,
         Err(e) => return (vec![], left_out, Err(e.to_string())),
     };
-    effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+    effects = effects.without(&refused);
     left_out.extend(refused.into_iter().map(|r| format!("{} {}", r.kind, r.why)));
     let applied: Vec<String> = effects.effects.iter().map(|e| e.kind().to_owned()).collect();
     if applied.is_empty() {

@@ -45,12 +45,12 @@ pub(super) fn gain_of_detectors(
 /// It is `extended` itself if none is left out.
 fn applicable(simulated: &Path, extended: &Path, sensor: Option<&Path>, out: &Path) -> Result<(PathBuf, Vec<String>)> {
     let rig = sensor.map(Rig::read).transpose()?;
-    let (dataset, mut effects) = (Dataset::open(simulated)?, EffectList::read(extended)?);
+    let (dataset, effects) = (Dataset::open(simulated)?, EffectList::read(extended)?);
     let refused = Resim { dataset: &dataset, effects: &effects, rig, seed: 0 }.refused()?;
     if refused.is_empty() {
         return Ok((extended.to_path_buf(), vec![]));
     }
-    effects.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+    let effects = effects.without(&refused);
     let path = out.join("extended_detectors.toml");
     write_atomic(&path, toml::to_string(&effects)?.as_bytes())?;
     let note =

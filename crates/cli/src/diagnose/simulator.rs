@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result, bail};
 use data::{Cloud, DataError, Dataset, Object};
-use diagnose::{DiagnoseError, RemadeFrames, Remake};
+use diagnose::{DiagnoseError, RemadeFrames, Remake, SEEDS};
 use sensor::EffectList;
 use sensor::finished::Refusal;
 use simulate::SimulateError;
@@ -69,19 +69,15 @@ impl RaceSimulator {
 }
 
 impl Remake for RaceSimulator {
-    fn refusals(&self, effects: &EffectList) -> Result<Vec<Refusal>, DiagnoseError> {
-        let strange = |name: &&str| self.simulator.rig.find(name).is_none();
+    fn with<'s>(&'s self, effects: &EffectList) -> Result<(Box<dyn RemadeFrames + 's>, Vec<Refusal>), DiagnoseError> {
         let refused = effects.effects.iter().enumerate().filter_map(|(index, effect)| {
-            let name = effect.model().sensors().into_iter().find(strange)?.to_owned();
-            let why = format!("acts on the sensor {name:?}, which the simulation does not have");
+            let why = effect.strange_to(&self.simulator.rig)?;
             Some(Refusal { index, kind: effect.kind(), why })
         });
-        Ok(refused.collect())
-    }
-
-    fn with<'s>(&'s self, effects: &'s EffectList) -> Result<Box<dyn RemadeFrames + 's>, DiagnoseError> {
-        let draws = [0, 1].map(|seed| self.prepared(Some(effects), seed));
-        Ok(Box::new(Extended { simulator: self, draws }))
+        let refused: Vec<Refusal> = refused.collect();
+        let applied = effects.without(&refused);
+        let draws = SEEDS.map(|seed| self.prepared(Some(&applied), seed));
+        Ok((Box::new(Extended { simulator: self, draws }), refused))
     }
 }
 
@@ -92,7 +88,8 @@ struct Extended<'a> {
 }
 
 impl RemadeFrames for Extended<'_> {
-    fn frame(&self, id: &str, seeds: &[u64]) -> Result<Vec<(Cloud, Vec<Object>)>, DiagnoseError> {
-        seeds.iter().map(|seed| self.simulator.frame_of(&self.draws[(*seed as usize) % 2], id)).collect()
+    fn frame(&self, id: &str) -> Result<[(Cloud, Vec<Object>); 2], DiagnoseError> {
+        let [one, other] = &self.draws;
+        Ok([self.simulator.frame_of(one, id)?, self.simulator.frame_of(other, id)?])
     }
 }

@@ -18,7 +18,7 @@ use crate::search::labels::Side;
 use crate::search::{
     Context, REPETITIONS, Z_STAR, geometry, hits, labels, noise, quantisation, returns, rolling_shutter,
 };
-use data::{Cloud, DataError, Dataset, Object};
+use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
 use sensor::finished::{FinishedDataset, Refusal};
 use sensor::{EffectList, Rig};
@@ -33,28 +33,25 @@ const FRAMES: usize = 60;
 /// Nats of a channel over all held-out frames from which on the share of it that is gone is reported.
 const ENOUGH_NATS: f64 = 8.0;
 
+/// Random seeds of the two draws of the extended simulation.
+pub const SEEDS: [u64; 2] = [0, 1];
+
 /// Makes frames of the simulation anew.
 pub trait Remake: Sync {
-    /// Effects that cannot be applied.
+    /// Prepares frames with those of the effects that can be applied, and says which cannot.
     ///
     /// # Errors
     /// Files that cannot be read.
-    fn refusals(&self, effects: &EffectList) -> Result<Vec<Refusal>, DiagnoseError>;
-
-    /// Prepares frames with these effects.
-    ///
-    /// # Errors
-    /// Files that cannot be read.
-    fn with<'s>(&'s self, effects: &'s EffectList) -> Result<Box<dyn RemadeFrames + 's>, DiagnoseError>;
+    fn with<'s>(&'s self, effects: &EffectList) -> Result<(Box<dyn RemadeFrames + 's>, Vec<Refusal>), DiagnoseError>;
 }
 
 /// Frames of the simulation with effects.
 pub trait RemadeFrames: Sync {
-    /// Cloud and objects of a frame, once for each random seed.
+    /// Cloud and objects of a frame, once for each of [`SEEDS`].
     ///
     /// # Errors
     /// Files that cannot be read, and frames that cannot be made.
-    fn frame(&self, id: &str, seeds: &[u64]) -> Result<Vec<(Cloud, Vec<Object>)>, DiagnoseError>;
+    fn frame(&self, id: &str) -> Result<[(Cloud, Vec<Object>); 2], DiagnoseError>;
 }
 
 /// Applies effects to the finished clouds, as `lidarshift resim` does.
@@ -67,24 +64,22 @@ pub struct OnClouds<'a> {
 
 struct CloudsWith<'a> {
     finished: FinishedDataset<'a>,
-    effects: &'a EffectList,
+    effects: EffectList,
 }
 
 impl Remake for OnClouds<'_> {
-    fn refusals(&self, effects: &EffectList) -> Result<Vec<Refusal>, DiagnoseError> {
-        Ok(FinishedDataset::open(self.simulated, Some(self.rig), effects)?.refusals(effects))
-    }
-
-    fn with<'s>(&'s self, effects: &'s EffectList) -> Result<Box<dyn RemadeFrames + 's>, DiagnoseError> {
+    fn with<'s>(&'s self, effects: &EffectList) -> Result<(Box<dyn RemadeFrames + 's>, Vec<Refusal>), DiagnoseError> {
         let finished = FinishedDataset::open(self.simulated, Some(self.rig), effects)?;
-        Ok(Box::new(CloudsWith { finished, effects }))
+        let refused = finished.refusals(effects);
+        let effects = effects.without(&refused);
+        Ok((Box::new(CloudsWith { finished, effects }), refused))
     }
 }
 
 impl RemadeFrames for CloudsWith<'_> {
-    fn frame(&self, id: &str, seeds: &[u64]) -> Result<Vec<(Cloud, Vec<Object>)>, DiagnoseError> {
-        let frames = self.finished.frames(self.effects, seeds, id)?;
-        Ok(frames.into_iter().map(|(frame, _)| (frame.cloud, frame.objects)).collect())
+    fn frame(&self, id: &str) -> Result<[(Cloud, Vec<Object>); 2], DiagnoseError> {
+        let frames = self.finished.frames(&self.effects, SEEDS, id)?;
+        Ok(frames.map(|(frame, _)| (frame.cloud, frame.objects)))
     }
 }
 
@@ -151,25 +146,19 @@ impl<'a> Verification<'a> {
     /// # Errors
     /// Files that cannot be read, and frames that cannot be made.
     pub(super) fn of(&self, effects: &EffectList, remake: &dyn Remake) -> Result<Extended, DiagnoseError> {
-        let refused = remake.refusals(effects)?;
-        let mut applied = effects.clone();
-        applied.remove(&refused.iter().map(|r| r.index).collect::<Vec<_>>());
+        let (made, refused) = remake.with(effects)?;
+        let none_applied = refused.len() == effects.effects.len();
         let not_applied = refused.into_iter().map(|r| NotApplied { effect: r.kind.into(), why: r.why }).collect();
         let zero: Distances = self.before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
-        if applied.effects.is_empty() {
+        if none_applied {
             let gain = Gain { not_applied, ..self.gain(&self.before, &zero, true) };
             return Ok(Extended { gain, frames: vec![] });
         }
         let which = self.used();
-        let made = remake.with(&applied)?;
         let recordings = self.engine.recordings;
         let two = |&frame: &usize| -> Result<[Arc<SideFrame>; 2], DiagnoseError> {
-            let frames = made.frame(recordings.id(frame), &[0, 1])?;
-            let side =
-                |(cloud, objects): (Cloud, Vec<Object>)| Arc::new(SideFrame::new(&cloud, objects, self.context.rig));
-            let sides: Vec<Arc<SideFrame>> = frames.into_iter().map(side).collect();
-            <[Arc<SideFrame>; 2]>::try_from(sides)
-                .map_err(|_| DataError::file(recordings.id(frame).as_ref(), "was not made twice").into())
+            let frames = made.frame(recordings.id(frame))?;
+            Ok(frames.map(|(cloud, objects)| Arc::new(SideFrame::new(&cloud, objects, self.context.rig))))
         };
         let sides: Vec<Result<[Arc<SideFrame>; 2], DiagnoseError>> = which.par_iter().map(two).collect();
         let sides: Vec<[Arc<SideFrame>; 2]> = sides.into_iter().collect::<Result<_, _>>()?;

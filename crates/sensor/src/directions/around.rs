@@ -23,7 +23,7 @@ pub enum Kind {
 }
 
 /// Height above the bottom of a box below which a return is of the ground, m.
-pub const FLOOR_M: f64 = 0.12;
+const FLOOR_M: f64 = 0.12;
 
 /// Distance from a labelled object within which a surface belongs to it, m.
 const OF_OBJECT_M: f64 = 0.2;

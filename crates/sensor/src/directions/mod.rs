@@ -8,7 +8,7 @@ mod pattern;
 mod scan;
 mod surface;
 
-pub use around::{Around, FLOOR_M, Kind, Surroundings, in_or_beside, kind_of};
+pub use around::{Around, Kind, Surroundings, in_or_beside, kind_of};
 pub use pattern::ScanPattern;
 pub use scan::{DirectionIndex, Entry, SensorScan, Steps, split_by_sensor, split_with_places};
 pub use surface::{LocalSurface, fit_surface};

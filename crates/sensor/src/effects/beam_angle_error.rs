@@ -68,8 +68,8 @@ impl SensorEffect for BeamAngleError {
         Some(if self.rows_deg.is_empty() { &[Need::Incidence, Need::Row] } else { &[Need::Incidence] })
     }
 
-    fn sensors(&self) -> Vec<&str> {
-        if self.rows_deg.is_empty() { vec![] } else { vec![&self.sensor] }
+    fn sensor(&self) -> &str {
+        if self.rows_deg.is_empty() { "" } else { &self.sensor }
     }
 
     fn on_beams(&self, beams: &mut Beams, frame: &FrameContext, draws: &Draws) {

@@ -51,8 +51,8 @@ impl SensorEffect for BeamRangeOffset {
         Some(if self.rows_deg.is_empty() { &[Need::Row] } else { &[] })
     }
 
-    fn sensors(&self) -> Vec<&str> {
-        if self.rows_deg.is_empty() { vec![] } else { vec![&self.sensor] }
+    fn sensor(&self) -> &str {
+        if self.rows_deg.is_empty() { "" } else { &self.sensor }
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

@@ -50,8 +50,8 @@ impl Default for DirtyWindow {
 }
 
 impl SensorEffect for DirtyWindow {
-    fn sensors(&self) -> Vec<&str> {
-        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    fn sensor(&self) -> &str {
+        &self.sensor
     }
 
     fn check(&self) -> Result<(), KeyError> {

@@ -51,8 +51,8 @@ impl SensorEffect for EgoBodyMask {
         self.returns_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("returns_m[{i}]"), *v, 0.0, 100.0))
     }
 
-    fn sensors(&self) -> Vec<&str> {
-        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    fn sensor(&self) -> &str {
+        &self.sensor
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

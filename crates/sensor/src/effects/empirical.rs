@@ -84,8 +84,8 @@ impl SensorEffect for Empirical {
         Ok(())
     }
 
-    fn sensors(&self) -> Vec<&str> {
-        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    fn sensor(&self) -> &str {
+        &self.sensor
     }
 
     fn needs(&self) -> Option<&'static [Need]> {

@@ -39,6 +39,8 @@ pub use table::interpolated;
 
 use crate::beams::Beams;
 use crate::cloud_scan::{Intensity, Surfaces};
+use crate::finished::Refusal;
+use crate::rig::Rig;
 use crate::scan::Scan;
 use data::toml_text::{parse_toml, read_toml, within, wrong};
 use data::{DataError, KeyError};
@@ -58,9 +60,9 @@ pub trait SensorEffect {
         Some(&[])
     }
 
-    /// Names of the sensors that it acts on, where it does not act on all.
-    fn sensors(&self) -> Vec<&str> {
-        Vec::new()
+    /// Name of the sensor that it acts on; empty where it acts on all.
+    fn sensor(&self) -> &str {
+        ""
     }
 
     /// Changes the world, before rays are cast.
@@ -114,6 +116,19 @@ macro_rules! effects {
                 match self {
                     $(Effect::$name(_) => $code,)*
                 }
+            }
+
+            /// Why it cannot act on data of a rig: it names a sensor that the rig does not have.
+            pub fn strange_to(&self, rig: &Rig) -> Option<String> {
+                let name = self.model().sensor();
+                let own: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
+                (!name.is_empty() && rig.find(name).is_none()).then(|| {
+                    format!(
+                        "acts on the sensor {name:?}, but the rig has {}; give the rig that the list was made for \
+                         (--sensor)",
+                        own.join(", ")
+                    )
+                })
             }
 
             /// Kind and code of every effect.
@@ -213,10 +228,11 @@ impl EffectList {
         EffectList { effects, ..EffectList::default() }
     }
 
-    /// Takes out the effects at some places of the list.
-    pub fn remove(&mut self, places: &[usize]) {
-        let mut place = 0..;
-        self.effects.retain(|_| place.next().is_none_or(|at| !places.contains(&at)));
+    /// The list without the effects that were refused.
+    pub fn without(&self, refused: &[Refusal]) -> EffectList {
+        let kept = |(at, _): &(usize, &Effect)| refused.iter().all(|r| r.index != *at);
+        let effects = self.effects.iter().enumerate().filter(kept).map(|(_, effect)| effect.clone()).collect();
+        EffectList { effects, ..self.clone() }
     }
 
     /// What the list says of the surfaces of finished clouds.

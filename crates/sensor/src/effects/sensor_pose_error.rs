@@ -39,8 +39,8 @@ impl SensorPoseError {
 }
 
 impl SensorEffect for SensorPoseError {
-    fn sensors(&self) -> Vec<&str> {
-        if self.sensor.is_empty() { vec![] } else { vec![&self.sensor] }
+    fn sensor(&self) -> &str {
+        &self.sensor
     }
 
     fn check(&self) -> Result<(), KeyError> {
