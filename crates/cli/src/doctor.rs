@@ -1,12 +1,13 @@
 //! `lidarshift doctor`: checks a data set for errors.
 
-use anyhow::Result;
+use anyhow::{Result, anyhow};
 use clap::Args;
 use data::Dataset;
 use data::doctor::{AnchorFacts, DetectorFacts, doctor};
 use models::config::DetectorConfig;
 use models::find_detector;
-use std::path::PathBuf;
+use models::suggest::{Change, LabelledBoxes, suggest};
+use std::path::{Path, PathBuf};
 
 /// Check a data set before training: files, splits, duplicates, boxes, and whether the labels agree with the declared
 /// label frame.
@@ -16,6 +17,7 @@ use std::path::PathBuf;
 /// Examples:
 ///   lidarshift doctor datasets/road
 ///   lidarshift doctor /data/kitti --detector pointpillars --json doctor.json
+///   lidarshift doctor datasets/road --detector pointpillars_small --suggest mine.toml
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct DoctorArgs {
@@ -25,6 +27,10 @@ pub struct DoctorArgs {
     /// Also check the data against the range and the anchors of this detector: a name or a TOML
     #[arg(long, value_name = "NAME|TOML")]
     detector: Option<String>,
+    /// Write a detector of the same kind to this TOML, fitted to the labels: range, grid and anchors, with the reason
+    /// for each change
+    #[arg(long, value_name = "TOML", requires = "detector")]
+    suggest: Option<PathBuf>,
     /// Also write the report as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -41,7 +47,35 @@ impl DoctorArgs {
             data::write_json(path, &report)?;
         }
         println!("{report}");
+        if let (Some(path), Some(detector)) = (&self.suggest, &detector) {
+            println!("{}", self.write_suggestion(path, detector, &dataset)?);
+        }
         Ok(report.sound)
+    }
+
+    /// Writes a fitted detector; what was changed and why, as text.
+    fn write_suggestion(&self, path: &Path, detector: &DetectorConfig, dataset: &Dataset) -> Result<String> {
+        let ids = dataset.ids("train").or_else(|_| dataset.all_ids())?;
+        let boxes = LabelledBoxes::read(dataset, &ids, usize::MAX)?;
+        let name = path.file_stem().map_or(detector.name.clone(), |stem| stem.to_string_lossy().into_owned());
+        let mut suggestion =
+            suggest(detector, &boxes).map_err(|message| anyhow!("{}: {message}", dataset.config.root.display()))?;
+        suggestion.detector.name = name;
+        let text = suggestion.to_toml(&detector.name, &dataset.config.name)?;
+        data::write_atomic(path, text.as_bytes())?;
+        let mut out = format!("{} fitted to {} frames: {}\n", detector.name, boxes.frames.len(), path.display());
+        for Change { key, was, is, why } in &suggestion.changes {
+            out += &format!("  {key}: {was} -> {is}\n    {why}\n");
+        }
+        if suggestion.changes.is_empty() {
+            out += "  nothing had to be changed\n";
+        }
+        if let (Some(forced), Some(positives)) = (suggestion.forced, suggestion.positives) {
+            let [before, after] = forced.map(|share| format!("{:.1} %", 100.0 * share));
+            out += &format!("  boxes with nothing but a forced match: {before} -> {after}\n");
+            out += &format!("  positive anchors a box: {:.2} -> {:.2}\n", positives[0], positives[1]);
+        }
+        Ok(out)
     }
 }
 
@@ -65,7 +99,7 @@ mod tests {
     use data::{Cloud, write_atomic};
 
     fn args(dataset: PathBuf, json: Option<PathBuf>) -> DoctorArgs {
-        DoctorArgs { dataset, detector: Some("pointpillars".into()), json }
+        DoctorArgs { dataset, detector: Some("pointpillars".into()), suggest: None, json }
     }
 
     #[test]

@@ -9,7 +9,7 @@ use crate::device::DeviceArgs;
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
 use std::path::{Path, PathBuf};
-use study::{Launcher, RunOptions, Step, Study, status};
+use study::{Launcher, RunOptions, Step, Study, plan, status};
 
 /// Run a study: generate the missing data sets, train the missing runs, detect on every test set, evaluate, and write a
 /// report. The expected computing time is printed before training starts.
@@ -21,6 +21,7 @@ use study::{Launcher, RunOptions, Step, Study, status};
 ///   lidarshift study quick
 ///   lidarshift study quick --dry-run
 ///   lidarshift study status quick
+///   lidarshift study plan cpu --pilot runs/quick
 ///   lidarshift study my-study.toml --out runs/mine --only data,train
 ///   lidarshift study paper --launcher slurm -- --gres=gpu:1 --time=24:00:00
 #[derive(Args, Debug)]
@@ -47,6 +48,15 @@ pub struct StudyArgs {
 enum StudyCommand {
     /// State of each run and the remaining computing time
     Status(StudySelection),
+    /// The differences that a study will be able to see with 80 % power, and what it costs; nothing is run
+    Plan {
+        #[command(flatten)]
+        selection: StudySelection,
+        /// Folder of a study whose results say how much differences scatter [default: the study's own results, else
+        /// stored values]
+        #[arg(long, value_name = "DIR")]
+        pilot: Option<PathBuf>,
+    },
 }
 
 /// A study selected on the command line.
@@ -143,10 +153,18 @@ impl StudyArgs {
     /// # Errors
     /// A step that fails. Failed runs are reported after all other runs have ended.
     pub fn run(self) -> Result<()> {
-        if let Some(StudyCommand::Status(selection)) = self.command {
-            let study = selection.open()?;
-            output::print_status(&study, &status(&study)?);
-            return Ok(());
+        match self.command {
+            Some(StudyCommand::Status(selection)) => {
+                let study = selection.open()?;
+                output::print_status(&study, &status(&study)?);
+                return Ok(());
+            }
+            Some(StudyCommand::Plan { selection, pilot }) => {
+                let study = selection.open()?;
+                output::print_plan(&study, &plan(&study, pilot.as_deref())?, &status(&study)?);
+                return Ok(());
+            }
+            None => {}
         }
         let Some(named) = self.study else { bail!("the study is missing; for example: `lidarshift study quick`") };
         let steps = match self.only.is_empty() {

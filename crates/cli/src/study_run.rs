@@ -78,6 +78,7 @@ fn show(event: &Event<'_>, last: &mut Instant) {
         Event::Begin { state, epochs, frames, .. } => {
             eprintln!("{frames} training frames, {epochs} epochs, step {} of {}", state.step, state.total_steps);
         }
+        Event::Warning(text) => eprintln!("warning: {text}"),
         Event::Step { metrics, logged: true } if last.elapsed() > Duration::from_secs(10) => {
             eprintln!("step {}: loss {:.4}, {:.1} samples/s", metrics.step, metrics.loss, metrics.samples_per_s);
             *last = Instant::now();

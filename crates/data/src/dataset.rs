@@ -2,6 +2,7 @@
 
 use crate::dataset_config::DatasetConfig;
 use crate::layout::PointDetails;
+use crate::kitti_text::{KittiText, read_kitti_text};
 use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
 use geometry::Pose;
 use std::collections::BTreeSet;
@@ -83,7 +84,15 @@ impl Dataset {
 
     /// Path of a frame's labels, which need not exist.
     pub fn labels_path(&self, id: &str) -> PathBuf {
-        self.config.layout.labels_path(&self.config.root, id)
+        match &self.config.labels {
+            Some(folder) => text_path(&self.config.root.join(folder), id),
+            None => self.config.layout.labels_path(&self.config.root, id),
+        }
+    }
+
+    /// Path of a frame's true boxes; `None` where the truth beside the labels is not known.
+    pub fn true_labels_path(&self, id: &str) -> Option<PathBuf> {
+        self.config.true_labels.as_ref().map(|folder| text_path(&self.config.root.join(folder), id))
     }
 
     /// Path of a frame's calibration, which need not exist; `None` if the layout has no calibration.
@@ -93,7 +102,7 @@ impl Dataset {
 
     /// Whether there are labels. Frames of a data set without labels (such as KITTI's `testing`) have no objects.
     pub fn has_labels(&self) -> bool {
-        self.config.layout.has_labels(&self.config.root)
+        self.config.labels.is_some() || self.config.layout.has_labels(&self.config.root)
     }
 
     /// Time stamp of a frame, s since a start that all frames share; `None` if not known.
@@ -150,7 +159,15 @@ impl Dataset {
 
     /// Reads the labels of a frame in the label frame, DontCare included.
     pub fn labels(&self, id: &str) -> Result<Vec<LabelBox>, DataError> {
-        self.config.layout.read_labels(&self.config.root, id)
+        match &self.config.labels {
+            Some(_) => read_kitti_text(&self.labels_path(id), KittiText::Labels),
+            None => self.config.layout.read_labels(&self.config.root, id),
+        }
+    }
+
+    /// Reads the true boxes of a frame in the label frame; `None` where the truth beside the labels is not known.
+    pub fn true_labels(&self, id: &str) -> Result<Option<Vec<LabelBox>>, DataError> {
+        self.true_labels_path(id).map(|path| read_kitti_text(&path, KittiText::Labels)).transpose()
     }
 
     /// Reads the calibration of a frame.
@@ -223,6 +240,10 @@ impl Dataset {
         }
         Ok(if found.is_empty() { kitti } else { found.into_iter().collect() })
     }
+}
+
+fn text_path(folder: &Path, id: &str) -> PathBuf {
+    folder.join(format!("{id}.txt"))
 }
 
 /// Parses a split: one frame id a line, returned with its line number (from 1). Blank lines are skipped. An error if
@@ -316,6 +337,22 @@ mod tests {
         std::fs::rename(folder.path(), above.path().join("training")).unwrap();
         write_split(&above.path().join("ImageSets/val.txt"), &["000000"]).unwrap();
         assert_eq!(Dataset::open(above.path()).unwrap().ids("val").unwrap(), ["000000"]);
+    }
+
+    #[test]
+    fn labels_of_another_folder_replace_those_of_the_layout() {
+        let folder = synthetic(Layout::Kitti, 4);
+        let other = folder.path().join("label_other");
+        std::fs::create_dir(&other).unwrap();
+        std::fs::write(other.join("000000.txt"), "").unwrap();
+        let dataset = with_toml(folder.path(), "labels = \"label_other\"\ntrue_labels = \"label_2\"").unwrap();
+        assert!(dataset.load("000000").unwrap().objects.is_empty());
+        assert_eq!(dataset.true_labels("000000").unwrap().unwrap().len(), 1);
+        assert!(dataset.labels("000001").unwrap_err().to_string().contains("label_other/000001.txt"));
+        let plain = with_toml(folder.path(), "").unwrap();
+        assert_eq!((plain.true_labels("000000").unwrap(), plain.labels("000000").unwrap().len()), (None, 1));
+        let error = with_toml(folder.path(), "true_labels = \"truth\"").unwrap_err();
+        assert!(error.contains("dataset.toml: true_labels: ") && error.contains("truth is not a folder"), "{error}");
     }
 
     #[test]

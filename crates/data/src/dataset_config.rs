@@ -30,6 +30,13 @@ pub struct DatasetConfig {
     /// the classes found in the labels.
     #[serde(default)]
     pub classes: Vec<String>,
+    /// Folder of the label files, relative to the root, in the place of the layout's: KITTI text, a file a frame.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub labels: Option<PathBuf>,
+    /// Folder of label files with the true boxes, relative to the root, if the labels were made automatically and the
+    /// truth is known (simulated data). Only the evaluation reads it: it scores detections against both.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub true_labels: Option<PathBuf>,
     /// Name and file of each split; files are relative to the root. Default: those of train, val and test for which
     /// `ImageSets/NAME.txt` exists.
     #[serde(default)]
@@ -68,6 +75,8 @@ impl Default for DatasetConfig {
             points: PointColumns::default(),
             label_frame: lidar(),
             classes: Vec::new(),
+            labels: None,
+            true_labels: None,
             splits: BTreeMap::new(),
             rig: None,
             fov_crop: false,
@@ -137,6 +146,11 @@ impl DatasetConfig {
 
     fn check(&self, path: &Path) -> Result<(), DataError> {
         let wrong = |message: String| Err(DataError::file(path, message));
+        for (key, folder) in [("labels", &self.labels), ("true_labels", &self.true_labels)] {
+            if let Some(missing) = folder.as_ref().map(|f| self.root.join(f)).filter(|f| !f.is_dir()) {
+                return wrong(format!("{key}: {} is not a folder", missing.display()));
+            }
+        }
         if self.image_size.contains(&0) {
             return wrong(format!("image_size {:?}: both sides must be positive, px", self.image_size));
         }

@@ -74,6 +74,9 @@ pub fn label_boxes(frame: &Frame) -> Vec<LabelBox> {
     frame.objects.iter().map(label).collect()
 }
 
+/// Folder of the true boxes in a made data set with automatic labels.
+pub const TRUE_LABELS: &str = "true_labels";
+
 /// Writes labels as KITTI text.
 pub fn write_kitti_text(path: &Path, labels: &[LabelBox]) -> Result<(), DataError> {
     write_atomic(path, to_kitti_text(labels).as_bytes())

@@ -92,7 +92,7 @@ fn vectors() -> Vec<f32> {
 fn matrix() -> usize {
     let places: Vec<Place> = (0..4).map(|i| Place::new(&format!("set {i}"))).collect();
     let network = PlannedNetwork { network: Place::new("network"), train_sets: places.clone(), seeds: vec![1] };
-    let plan = MatrixPlan { networks: vec![network], test_sets: places.clone() };
+    let plan = MatrixPlan { networks: vec![network], test_sets: places.clone(), ..MatrixPlan::default() };
     let options = MatrixOptions::default();
     let mut results = BTreeMap::new();
     for (i, train) in places.iter().enumerate() {

@@ -42,6 +42,14 @@ impl BootstrapOptions {
         draw_runs(n_frames, self.block_frames, &mut stream(self.seed, purpose, 0, replicate as u64))
     }
 
+    /// Draws `n - 1` of `n` seeds with replacement (one if there is one). With `n` draws the variance of the mean of few
+    /// seeds would come out too small by `(n - 1) / n`: half of it with two seeds (Rao and Wu 1988).
+    pub(crate) fn seed_draws(&self, purpose: &str, replicate: usize, n: usize) -> Vec<usize> {
+        let mut drawn = self.draws(purpose, replicate, n);
+        drawn.truncate(n.saturating_sub(1).max(1));
+        drawn
+    }
+
     /// Resamples `n` indices with replacement.
     pub(crate) fn draws(&self, purpose: &str, replicate: usize, n: usize) -> Vec<usize> {
         draw(n, &mut stream(self.seed, purpose, 0, replicate as u64))
@@ -89,6 +97,20 @@ mod tests {
             covered += usize::from(interval.low <= 0.5 && 0.5 <= interval.high);
         }
         assert!((165..=195).contains(&covered), "{covered} of 200 at 90 %");
+    }
+
+    #[test]
+    fn few_seeds_have_the_variance_of_their_mean() {
+        let options = BootstrapOptions { replicates: 4000, ..BootstrapOptions::default() };
+        let values = [1.0, 4.0, 4.0];
+        let means: Vec<f64> = (0..options.replicates)
+            .map(|r| mean(&options.seed_draws("seeds", r, 3).iter().map(|i| values[*i]).collect::<Vec<_>>()))
+            .collect();
+        let center = mean(&means);
+        let variance = mean(&means.iter().map(|m| (m - center).powi(2)).collect::<Vec<_>>());
+        // Deviation with divisor n - 1, over the square root of n: 3 / 3 = 1.
+        assert!((variance - 1.0).abs() < 0.06, "{variance}");
+        assert_eq!(options.seed_draws("seeds", 0, 1), [0]);
     }
 
     #[test]

@@ -12,14 +12,18 @@ mod build;
 mod csv_lines;
 mod latex;
 mod markdown;
+mod power;
 mod published;
 mod run_values;
 mod scores;
+mod split;
 
 pub use build::{RunResult, build};
+pub use power::{Power, Scatter};
 pub use published::{Published, published};
 pub use run_values::{RunValue, from_run_values};
 pub use scores::{RunScores, TestSet};
+pub use split::{Part, Split};
 
 use crate::bootstrap::Interval;
 use crate::{BootstrapOptions, Difficulty, RangeSection};
@@ -66,6 +70,39 @@ pub struct MatrixPlan {
     pub networks: Vec<PlannedNetwork>,
     /// Test sets of every run, in table order.
     pub test_sets: Vec<Place>,
+    /// Test sets that stand between two others.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub between: Vec<Between>,
+}
+
+/// A test set with the scenes of one data set and the sensor of another, which tells the sensor's share of a gap from
+/// the scene's.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Between {
+    /// [`Place::name`] of the test set.
+    pub test_set: String,
+    /// [`Place::name`] of the data set whose scenes it has.
+    pub scene_of: String,
+    /// [`Place::name`] of the data set whose sensor it has.
+    pub sensor_of: String,
+}
+
+/// The boxes that detections were scored against.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Reference {
+    /// The labels of the test set.
+    #[default]
+    Labels,
+    /// The true boxes, where the labels were made automatically and the truth is known.
+    TrueBoxes,
+}
+
+impl Reference {
+    /// Its name in files.
+    pub fn key(self) -> &'static str {
+        ["labels", "true_boxes"][self as usize]
+    }
 }
 
 /// Evaluation settings.
@@ -115,15 +152,24 @@ pub enum Quantity {
     RecallMatched,
     /// As [`Quantity::RecallAnyBox`], but for the final boxes of any network.
     RecallFinalBoxes,
+    /// KITTI AP over 40 recall positions by the overlap seen from above: heights do not matter.
+    BevAp40,
 }
 
 impl Quantity {
     /// In the order of [`RunScores`].
-    pub const ALL: [Quantity; 5] =
-        [Quantity::Ap40, Quantity::ApArea, Quantity::RecallAnyBox, Quantity::RecallMatched, Quantity::RecallFinalBoxes];
+    pub const ALL: [Quantity; 6] = [
+        Quantity::Ap40,
+        Quantity::ApArea,
+        Quantity::RecallAnyBox,
+        Quantity::RecallMatched,
+        Quantity::RecallFinalBoxes,
+        Quantity::BevAp40,
+    ];
+
     /// Its key in files.
     pub fn key(self) -> &'static str {
-        ["ap40", "ap_area", "recall_any_box", "recall_matched", "recall_final_boxes"][self as usize]
+        ["ap40", "ap_area", "recall_any_box", "recall_matched", "recall_final_boxes", "bev_ap40"][self as usize]
     }
 
     /// The metrics in the paper's table.
@@ -138,6 +184,7 @@ impl fmt::Display for Quantity {
             Quantity::RecallAnyBox => "Recall",
             Quantity::RecallMatched => "Recall, matched",
             Quantity::RecallFinalBoxes => "Recall, final boxes",
+            Quantity::BevAp40 => "BEV AP",
         })
     }
 }
@@ -226,6 +273,10 @@ pub struct Cell {
     pub runs: Vec<CellRun>,
     /// By class, section, overlap and metric; empty without a run.
     pub numbers: Vec<CellNumber>,
+    /// The same against the true boxes, where the labels of the test set were made automatically and the truth is
+    /// known.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub of_true_boxes: Vec<CellNumber>,
 }
 
 impl Cell {
@@ -242,9 +293,35 @@ impl Cell {
         quantity: Quantity,
         overlap: f64,
     ) -> Option<&CellNumber> {
-        self.numbers
+        self.number_of(Reference::Labels, class, section, quantity, overlap)
+    }
+
+    /// The value against labels or true boxes for a class, section, metric and overlap.
+    pub fn number_of(
+        &self,
+        reference: Reference,
+        class: &str,
+        section: Option<RangeSection>,
+        quantity: Quantity,
+        overlap: f64,
+    ) -> Option<&CellNumber> {
+        self.numbers_of(reference)
             .iter()
             .find(|n| n.class == class && n.section == section && n.quantity == quantity && n.overlap == overlap)
+    }
+
+    /// All values against labels or true boxes.
+    pub fn numbers_of(&self, reference: Reference) -> &[CellNumber] {
+        match reference {
+            Reference::Labels => &self.numbers,
+            Reference::TrueBoxes => &self.of_true_boxes,
+        }
+    }
+
+    /// The references of this cell: labels, and true boxes where they are known.
+    pub fn references(&self) -> impl Iterator<Item = Reference> {
+        let truth = (!self.of_true_boxes.is_empty()).then_some(Reference::TrueBoxes);
+        std::iter::once(Reference::Labels).chain(truth)
     }
 }
 
@@ -260,6 +337,9 @@ pub struct Gap {
     pub train_set: String,
     /// [`Place::name`] of the reference train set: that of the test set's domain, or a later one of the study.
     pub compared_to: String,
+    /// What both were scored against.
+    #[serde(default)]
+    pub reference: Reference,
     /// Class name.
     pub class: String,
     /// Range section; `None`: full range.
@@ -270,7 +350,8 @@ pub struct Gap {
     pub overlap: f64,
     /// Difference of the means, percentage points.
     pub gap: f64,
-    /// Bootstrap interval: the same frame resamples for both cells, seeds resampled for each.
+    /// Bootstrap interval of the difference: both cells with the same resamples of frames and of seeds, since runs of
+    /// one seed begin with the same weights and see their frames in the same order.
     pub interval: Option<Interval>,
 }
 
@@ -287,6 +368,12 @@ pub struct Matrix {
     pub cells: Vec<Cell>,
     /// By network, test set, train set.
     pub gaps: Vec<Gap>,
+    /// Gaps of a network between its own data and another test set, split into label, sensor and scene.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub splits: Vec<Split>,
+    /// What the study could see of each gap of 3D AP over the full range.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub power: Vec<Power>,
     /// Warnings to consider before using the numbers.
     pub warnings: Vec<String>,
 }
@@ -304,6 +391,14 @@ impl Matrix {
         places.find(|place| place.name == name).map_or(name, |place| &place.title)
     }
 
+    /// The title of a test set scored against labels or true boxes.
+    pub fn test_title(&self, name: &str, reference: Reference) -> String {
+        match reference {
+            Reference::Labels => self.title(name).into(),
+            Reference::TrueBoxes => format!("{}, true boxes", self.title(name)),
+        }
+    }
+
     /// The matrix as JSON.
     ///
     /// # Panics
@@ -314,8 +409,8 @@ impl Matrix {
         text
     }
 
-    /// Table columns: those of the paper, and the recall of the final boxes if a network has a separate any-box
-    /// recall.
+    /// Table columns: those of the paper, the recall of the final boxes if a network has a separate any-box recall, and
+    /// AP seen from above.
     pub fn columns(&self) -> Vec<(Quantity, f64)> {
         let mean = |cell: &Cell, class: &str, quantity, overlap| cell.number(class, None, quantity, overlap)?.mean;
         let differs = |cell: &Cell, class: &str, overlap: f64| {
@@ -326,7 +421,8 @@ impl Matrix {
         let two_stage =
             self.cells.iter().any(|cell| classes.iter().any(|class| overlaps.iter().any(|o| differs(cell, class, *o))));
         let of_final = overlaps.iter().filter(|_| two_stage).map(|overlap| (Quantity::RecallFinalBoxes, *overlap));
-        self.paper_columns().into_iter().chain(of_final).collect()
+        let bev = overlaps.iter().map(|overlap| (Quantity::BevAp40, *overlap));
+        self.paper_columns().into_iter().chain(of_final).chain(bev).collect()
     }
 
     /// Columns of the paper's table: AP at each overlap, then recall at each.

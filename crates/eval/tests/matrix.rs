@@ -2,7 +2,7 @@
 
 use data::{LabelBox, LabelFrame, stream};
 use lidarshift_eval::matrix::{
-    Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity, RunId, RunResult, RunScores, RunState,
+    Between, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity, RunId, RunResult, RunScores, RunState,
     RunValue, build, from_run_values, published,
 };
 use lidarshift_eval::{BootstrapOptions, Difficulty, EvalFrame, EvalOptions, Metric, RecallDefinition, evaluate};
@@ -26,6 +26,7 @@ fn paper_plan() -> MatrixPlan {
     MatrixPlan {
         networks: NETWORKS.iter().map(network).collect(),
         test_sets: SETS.iter().map(|set| place(set)).collect(),
+        ..MatrixPlan::default()
     }
 }
 
@@ -189,7 +190,7 @@ fn scores(frames: &[EvalFrame]) -> RunScores {
 fn plan(seeds: &[u64]) -> MatrixPlan {
     let sets = ["real", "sim"].map(Place::new).to_vec();
     let network = PlannedNetwork { network: Place::new("pp"), train_sets: sets.clone(), seeds: seeds.into() };
-    MatrixPlan { networks: vec![network], test_sets: sets }
+    MatrixPlan { networks: vec![network], test_sets: sets, ..MatrixPlan::default() }
 }
 
 fn key(train: &str, seed: u64, test: &str) -> (RunId, String) {
@@ -258,7 +259,7 @@ fn recall_of_regions_stands_beside_that_of_final_boxes() {
     assert_eq!(mean(&two_stage, Quantity::RecallFinalBoxes), of_final);
     assert!(mean(&two_stage, Quantity::RecallAnyBox) > of_final + 10.0);
     assert_eq!(mean(&two_stage, Quantity::Ap40), mean(&one_stage, Quantity::Ap40));
-    assert_eq!((one_stage.columns().len(), two_stage.columns().len()), (4, 6));
+    assert_eq!((one_stage.columns().len(), two_stage.columns().len()), (6, 8));
     assert!(two_stage.to_markdown().contains("Recall, final boxes (0.7)"));
     assert!(!two_stage.to_latex().contains("final boxes"), "the paper's table has its own columns");
 }
@@ -341,4 +342,61 @@ fn the_same_bits_for_any_number_of_threads_and_back_from_json() {
     let matrix: Matrix = serde_json::from_str(&text).unwrap();
     assert_eq!((matrix.schema.as_str(), matrix.cells.len()), ("lidarshift.matrix/1", 4));
     assert_eq!(matrix.to_markdown(), build(&plan(&[1, 2]), &results, &options()).to_markdown());
+}
+
+/// Frames whose labels are shifted along by `shift_m`, with the true boxes as the other reference.
+fn mislabelled(seed: u64, noise: f64, shift_m: f64) -> RunScores {
+    let truth = frames(seed, noise, 120);
+    let mut labelled = truth.clone();
+    for label in labelled.iter_mut().flat_map(|frame| &mut frame.labels) {
+        let mut bbox = label.lidar_box();
+        bbox.center[0] += shift_m;
+        *label = LabelBox::from_box(&label.class, &bbox, None);
+    }
+    scores(&labelled).with_true_boxes(scores(&truth))
+}
+
+#[test]
+fn a_gap_that_labels_make_is_told_from_one_of_the_sensor() {
+    let with = |shift_m: f64| {
+        let mut results = results(&[("sim", 1, "real"), ("sim", 2, "real")]);
+        for seed in [1, 2] {
+            results.insert(key("sim", seed, "real"), Ok(mislabelled(seed, 0.3, shift_m)));
+        }
+        build(&plan(&[1, 2]), &results, &options())
+    };
+    let split = |m: &Matrix| {
+        let found = m.splits.iter().find(|s| s.is_shown("Car") && s.test_set == "real" && s.overlap == 0.7);
+        found.unwrap().clone()
+    };
+    let shifted = split(&with(0.8));
+    let label = shifted.label.unwrap();
+    assert!(label.points > 5.0 && label.interval.unwrap().low > 0.0, "{shifted:?}");
+    let sum = label.points + shifted.sensor_and_scene.points;
+    assert!((sum - shifted.total.points).abs() < 1e-9 && shifted.same_frames, "{shifted:?}");
+    // Exact labels take nothing, and the sensor's part is the same.
+    let exact = split(&with(0.0));
+    assert_eq!(exact.label.unwrap().points, 0.0);
+    assert!((exact.sensor_and_scene.points - shifted.sensor_and_scene.points).abs() < 1e-9);
+    // Without the truth there is no part of the labels.
+    let unknown = split(&build(&plan(&[1, 2]), &results(&[]), &options()));
+    assert!(unknown.label.is_none() && unknown.sensor.is_none());
+    let text = with(0.8).to_markdown();
+    assert!(text.contains("| pp | sim | real, true boxes |") && text.contains("sensor and scene"), "{text}");
+}
+
+#[test]
+fn a_test_set_between_two_tells_sensor_from_scene() {
+    let mut plan = plan(&[1, 2]);
+    plan.test_sets.push(Place::new("middle"));
+    plan.between.push(Between { test_set: "middle".into(), scene_of: "sim".into(), sensor_of: "real".into() });
+    let mut results = results(&[]);
+    for seed in [1, 2] {
+        results.insert(key("sim", seed, "middle"), Ok(scores(&frames(seed, 0.5, 120))));
+    }
+    let matrix = build(&plan, &results, &options());
+    let split = matrix.splits.iter().find(|s| s.is_shown("Car") && s.test_set == "real" && s.train_set == "sim");
+    let split = split.unwrap();
+    let (sensor, scene) = (split.sensor.unwrap().points, split.scene.unwrap().points);
+    assert!(sensor > 0.0 && scene > 0.0 && (sensor + scene - split.sensor_and_scene.points).abs() < 1e-9, "{split:?}");
 }

@@ -2,10 +2,11 @@
 
 use crate::config::{AnchorConfig, DetectorConfig};
 use crate::layers::Mode;
+use crate::suggest::{BoxMatch, Change, LabelledBoxes};
 use crate::{LayerFeatures, Losses, ModelError, Prediction};
 use burn::module::Module;
 use burn::tensor::Device;
-use data::{Frame, Stream};
+use data::{Frame, Object, Stream};
 
 /// A kind of detector. The type that implements it is the network, a burn module whose field names are OpenPCDet's.
 ///
@@ -34,6 +35,20 @@ pub trait Architecture: Module {
     /// The anchors, one entry a class; none where boxes do not start from anchors.
     fn anchors(_net: &Self::Config) -> &[AnchorConfig] {
         &[]
+    }
+
+    /// Fits range, grid and anchors to labelled boxes; every change is recorded with its reason.
+    fn fit(
+        net: &mut Self::Config,
+        range: &mut [f32; 6],
+        classes: &[String],
+        boxes: &LabelledBoxes,
+        changes: &mut Vec<Change>,
+    );
+
+    /// How the anchors are assigned to the boxes of a frame; none where boxes do not start from anchors.
+    fn box_matches(_preparation: &Self::Preparation, _objects: &[Object]) -> Vec<BoxMatch> {
+        Vec::new()
     }
 
     /// What samples are made with.

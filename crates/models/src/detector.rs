@@ -3,10 +3,11 @@
 use crate::checkpoint::NamedTensors;
 use crate::config::DetectorConfig;
 use crate::layers::Mode;
+use crate::suggest::BoxMatch;
 use crate::{LayerFeatures, ModelError, Network, Preparation, Sample, named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use data::{Detection, Frame, Stream, stream};
+use data::{Detection, Frame, Object, Stream, stream};
 
 /// Makes samples of frames; needs no device, so that loader threads can do it ahead of the trainer.
 #[derive(Clone, Debug)]
@@ -26,6 +27,12 @@ impl Preparer {
     /// A cloud with too few values a point.
     pub fn training(&self, frame: &Frame, stream: &mut Stream) -> Result<Sample, ModelError> {
         self.preparation.sample(frame, true, stream)
+    }
+
+    /// How the anchors are assigned to the boxes of a frame; none where boxes do not start from anchors. Boxes of other
+    /// classes and outside of the range are left out.
+    pub fn box_matches(&self, objects: &[Object]) -> Vec<BoxMatch> {
+        self.preparation.box_matches(objects)
     }
 
     /// Without targets; the same cloud always gives the same sample.

@@ -65,6 +65,18 @@ macro_rules! detectors {
                 }
             }
 
+            pub(crate) fn fit(
+                &mut self,
+                range: &mut [f32; 6],
+                classes: &[String],
+                boxes: &suggest::LabelledBoxes,
+                changes: &mut Vec<suggest::Change>,
+            ) {
+                match self {
+                    $(NetworkConfig::$kind(net) => $folder::$network::fit(net, range, classes, boxes, changes),)+
+                }
+            }
+
             /// Whether a second stage refines regions of interest. Only then [`Prediction::regions`] is filled.
             pub fn is_two_stage(&self) -> bool {
                 match self {
@@ -94,6 +106,12 @@ macro_rules! detectors {
                     $(NetworkConfig::$kind(net) => {
                         Preparation::$kind(Box::new($folder::$network::preparation(detector, net)))
                     })+
+                }
+            }
+
+            pub(crate) fn box_matches(&self, objects: &[data::Object]) -> Vec<suggest::BoxMatch> {
+                match self {
+                    $(Preparation::$kind(preparation) => $folder::$network::box_matches(preparation, objects),)+
                 }
             }
 

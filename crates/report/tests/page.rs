@@ -87,6 +87,7 @@ fn report() -> StudyReport {
     let plan = MatrixPlan {
         networks: vec![network("PointPillars", 3), network("PointRCNN", 2)],
         test_sets: places.map(place).to_vec(),
+        ..MatrixPlan::default()
     };
     let options = MatrixOptions { bootstrap: bootstrap.clone(), ..MatrixOptions::default() };
     let mut results = BTreeMap::new();

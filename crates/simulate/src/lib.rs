@@ -9,6 +9,7 @@ pub mod race_car;
 pub mod raycast;
 pub mod resim;
 pub mod scenario;
+pub mod shape_field;
 mod scenery;
 pub mod street;
 pub mod track;

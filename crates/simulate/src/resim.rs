@@ -2,6 +2,7 @@
 
 use crate::SimulateError;
 use data::toml_text::wrong;
+use data::write::TRUE_LABELS;
 use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, write_atomic};
 use sensor::attributes;
 use sensor::effects::EffectList;
@@ -82,7 +83,7 @@ impl Resim<'_> {
             frames: finished.ids().len(),
             points: [0; 2],
         };
-        let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER], &mut manifest)?;
+        let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER, TRUE_LABELS], &mut manifest)?;
         self.write_descriptions(&new, finished.rig())?;
         if finished.is_described() {
             attributes::write_names(out, finished.rig(), finished.materials())?;
@@ -153,6 +154,9 @@ impl Resim<'_> {
             if labelled {
                 self.write_labels(new, &frame)?;
             }
+            if let Some(truth) = self.dataset.true_labels_path(id) {
+                write_atomic(&out.join(TRUE_LABELS).join(format!("{id}.txt")), &fs_err::read(truth)?)?;
+            }
             if let (Some(from), Some(to)) = (self.dataset.calibration_path(id), layout.calibration_path(out, id))
                 && from.is_file()
             {
@@ -188,6 +192,8 @@ impl Resim<'_> {
             rig: rig_path.clone(),
             // Clouds were already cropped when they were read.
             fov_crop: false,
+            labels: None,
+            true_labels: source.true_labels.as_ref().map(|_| TRUE_LABELS.into()),
             ..source.clone()
         };
         new.describe(config, splits.collect::<Result<Vec<_>, DataError>>()?)?;

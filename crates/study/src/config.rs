@@ -10,7 +10,7 @@ use data::DataError;
 use eval::analysis::AnalysisOptions;
 use eval::distance::DistanceOptions;
 use eval::features::TsneOptions;
-use eval::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId};
+use eval::matrix::{Between, MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId};
 use eval::targets::TargetOptions;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -80,6 +80,13 @@ pub struct StudyDataset {
     /// then shown for comparison.
     #[serde(default)]
     pub paper: Option<String>,
+    /// Name of the data set whose scenes it shows, and of the one whose sensor it has. The test set then tells the
+    /// sensor's part of a gap between the two from the scene's. Both or neither.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene_of: Option<String>,
+    /// See `scene_of`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor_of: Option<String>,
     /// Source of the data set.
     pub source: Source,
 }
@@ -112,6 +119,12 @@ pub enum Source {
         /// TOML with the sensors, as for `resim --sensor`.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         sensor: Option<PathBuf>,
+    },
+    /// The clouds of an earlier data set of the study with its true boxes as labels, in the place of labels that were
+    /// made automatically.
+    TrueLabels {
+        /// Name of that data set.
+        of: String,
     },
 }
 
@@ -302,6 +315,10 @@ impl StudyConfig {
     /// All cells of the matrix.
     pub fn plan(&self) -> MatrixPlan {
         let place = |d: &StudyDataset| Place { name: d.name.clone(), title: d.title.clone(), paper: d.paper.clone() };
+        let between = |d: &StudyDataset| {
+            let (scene_of, sensor_of) = (d.scene_of.clone()?, d.sensor_of.clone()?);
+            Some(Between { test_set: d.name.clone(), scene_of, sensor_of })
+        };
         let network = |(name, title, detector, _): (String, String, &StudyDetector, Vec<String>)| PlannedNetwork {
             network: Place { name, title, paper: detector.paper.clone() },
             train_sets: self.train_sets(detector).into_iter().map(place).collect(),
@@ -310,6 +327,7 @@ impl StudyConfig {
         MatrixPlan {
             networks: self.networks().into_iter().map(network).collect(),
             test_sets: self.datasets.iter().map(place).collect(),
+            between: self.datasets.iter().filter_map(between).collect(),
         }
     }
 }
@@ -417,6 +435,13 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
                 "train contains \"real\", which is not in the study",
             ),
             ("of = \"sim\"", "of = \"other\"", "resim.of is \"other\""),
+            ("{ resim = { of = \"sim\", effects = \"noise.toml\" } }", "{ true_labels = { of = \"x\" } }", "true_labels.of is \"x\""),
+            ("name = \"sim-noise\"", "name = \"sim-noise\"\nscene_of = \"sim\"", "scene_of and sensor_of"),
+            (
+                "name = \"sim-noise\"",
+                "name = \"sim-noise\"\nscene_of = \"sim\"\nsensor_of = \"real\"",
+                "dataset sim-noise: sensor_of contains \"real\"",
+            ),
             ("frames = 100", "frames = 0", "frames is 0"),
             ("name = \"sim\"", "name = \"measured\"", "dataset \"measured\" exists twice"),
             ("name = \"small\"", "name = \"../small\"", "has to be a file name"),
@@ -460,7 +485,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             .all(|p| p.paper.is_some());
         assert!(known, "every cell has the paper's numbers");
         let quick = StudyConfig::read(&folder.join("quick.toml")).unwrap();
-        assert_eq!(quick.runs().len(), 3 * 2 + 2);
+        assert_eq!(quick.runs().len(), 2 * 3);
         assert!(!StudyConfig::read(&folder.join("cpu.toml")).unwrap().about.is_empty());
     }
 }

@@ -4,7 +4,8 @@ use crate::config::{Source, StudyDataset};
 use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
-use data::Dataset;
+use data::write::write_dataset_toml;
+use data::{Dataset, DatasetConfig};
 use sensor::{EffectList, Rig};
 use sha2::{Digest, Sha256};
 use simulate::race::{RaceConfig, make_race_datasets};
@@ -59,6 +60,21 @@ fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result
             let rig = sensor.as_ref().map(|path| Rig::read(&study.path(path))).transpose()?;
             Resim { dataset: &source, effects: &effects, rig, seed: 0 }.make(&path, &show)?;
         }
+        Source::TrueLabels { of } => {
+            let source = Dataset::open(&study.dataset_path(study.dataset(of)?))?.config;
+            let Some(labels) = source.true_labels else {
+                return Err(refused(format!(
+                    "{of} has no true boxes beside its labels (`true_labels` in its TOML); they are known of simulated data \
+                     sets with automatic labels"
+                )));
+            };
+            // Absolute, since the folder of a study may be given by another relative path later.
+            let root = std::path::absolute(&source.root)?;
+            let rig = source.rig.map(std::path::absolute).transpose()?;
+            let name = format!("{}-true-labels", source.name);
+            let config = DatasetConfig { name, root, rig, labels: Some(labels), true_labels: None, ..source };
+            write_dataset_toml(&path.join("dataset.toml"), &config)?;
+        }
     }
     listener(Event::DatasetMade);
     Ok(())
@@ -100,7 +116,7 @@ pub fn frames_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     Ok(hex(hash))
 }
 
-/// Hash of frame ids, the file sizes of their clouds and the content of their labels, in hexadecimal.
+/// Hash of frame ids, the file sizes of their clouds and the content of their labels and true boxes, in hexadecimal.
 ///
 /// # Errors
 /// A missing cloud or label file.
@@ -109,6 +125,9 @@ pub fn labelled_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     hash.update(frames_sha256(dataset, ids)?);
     for id in ids {
         hash.update(fs_err::read(dataset.labels_path(id))?);
+        if let Some(truth) = dataset.true_labels_path(id) {
+            hash.update(fs_err::read(truth)?);
+        }
     }
     Ok(hex(hash))
 }

@@ -124,7 +124,7 @@ impl Study {
                 let scenes = self.scenes_folder(config, *frames, *seed);
                 dataset.as_ref().map_or(scenes.clone(), |name| scenes.join(name))
             }
-            Source::Resim { .. } => self.folder.join("data").join(&dataset.name),
+            Source::Resim { .. } | Source::TrueLabels { .. } => self.folder.join("data").join(&dataset.name),
         }
     }
 

@@ -8,6 +8,7 @@ use crate::error::Result;
 use crate::folder::Study;
 use crate::run_state::{RunState, run_state};
 use data::{DataError, Dataset, LabelBox};
+use eval::EvalFrame;
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
 use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
 use rayon::prelude::*;
@@ -100,7 +101,13 @@ fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> 
     let [detections, regions] = folders;
     let frames = labels.with_detections(detections)?;
     let regions = if regions.is_dir() { Some(labels.with_detections(regions)?) } else { None };
-    Ok(RunScores::new(&frames, regions.as_deref(), labels.label_frame, options))
+    let scores = |frames: &[EvalFrame], regions: Option<&[EvalFrame]>| {
+        RunScores::new(frames, regions, labels.label_frame, options)
+    };
+    let of_labels = scores(&frames, regions.as_deref());
+    let Some(truth) = labels.of_true_boxes() else { return Ok(of_labels) };
+    let regions = regions.map(|regions| truth.labelling(regions));
+    Ok(of_labels.with_true_boxes(scores(&truth.labelling(frames), regions.as_deref())))
 }
 
 /// Why a run has no detections; `None` if it has not been executed yet.
@@ -117,7 +124,7 @@ fn reason(run_state: &RunState) -> Option<String> {
 }
 
 /// Error analyses of the first finished run of every network and train set: on the first test set of the study, and on
-/// the test set of its training data. Cached in `analyses.json`.
+/// the test set of its training data, against labels and, where they are known, against the true boxes. Cached in `analyses.json`.
 ///
 /// # Errors
 /// Frames that cannot be read.
@@ -143,7 +150,11 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
                     study.title(&run.id.train_set),
                     study.title(test_set)
                 );
-                out.push((title, of_run(study, run, test_set)?));
+                let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
+                if let Some(truth) = labels.of_true_boxes() {
+                    out.push((format!("{title}, true boxes"), of_run(study, run, test_set, &truth)?));
+                }
+                out.push((title, of_run(study, run, test_set, &labels)?));
             }
             seen.push(of);
         }
@@ -157,9 +168,8 @@ pub fn network_title(study: &Study, network: &str) -> String {
     plan.networks.into_iter().find(|n| n.network.name == network).map_or(network.into(), |n| n.network.title)
 }
 
-fn of_run(study: &Study, run: &StudyRun, test_set: &str) -> Result<RunAnalysis> {
+fn of_run(study: &Study, run: &StudyRun, test_set: &str, labels: &TestSet) -> Result<RunAnalysis> {
     let dataset = open(study, test_set)?;
-    let labels = TestSet::read(&dataset, &study.config.splits.test)?;
     let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
     let label_frame = labels.label_frame;
     let options = AnalysisOptions { label_frame, ..study.config.evaluation.analysis.clone() };

@@ -106,6 +106,7 @@ fn source(study: &Study, dataset: &StudyDataset) -> String {
             let set = dataset.as_ref().map_or(String::new(), |name| format!(" {name} of"));
             format!("simulated:{set} {}, {frames} frames, seed {seed}", config.display())
         }
+        Source::TrueLabels { of } => format!("the clouds of {} with the true boxes as labels", study.title(of)),
         Source::Resim { of, effects, .. } => format!("{} with the effects of {}", study.title(of), effects.display()),
     }
 }

@@ -13,6 +13,7 @@ use burn::tensor::Device;
 use data::{Dataset, write_atomic};
 use models::checkpoint::read_checkpoint;
 use models::layers::Precision;
+use models::suggest::{FORCED_SHARE, LabelledBoxes, forced_share};
 use models::{Detector, ModelError, Sample, reference_name};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -46,6 +47,8 @@ pub enum Event<'a> {
         /// Number of validation frames; 0 without a validation split.
         validation_frames: usize,
     },
+    /// Something about the data or the configuration that the user should know; sent before the first step.
+    Warning(&'a str),
     /// Sent after each step.
     Step {
         /// Metrics since the last line of `metrics.jsonl`.
@@ -87,6 +90,9 @@ pub fn train(
     let mut log = MetricsFile::open(&folder.metrics_path(), run.state.step)?;
     let (state, validation_frames) = (&run.state, run.validation_ids.len());
     report(Event::Begin { state, epochs, frames: frames.ids().len(), validation_frames });
+    if let Some(warning) = anchor_warning(config, &run.dataset, frames.ids())? {
+        report(Event::Warning(&warning));
+    }
 
     let mut validation = None;
     while run.state.epoch < epochs {
@@ -120,6 +126,25 @@ pub fn train(
         validation = metrics.validation.or(validation);
     }
     Ok(Trained { detector: run.detector, state: run.state, validation })
+}
+
+/// Training frames whose boxes are looked at for [`anchor_warning`], at most.
+const LOOKED_AT: usize = 1000;
+
+/// Says if more than 5 % of the training boxes have nothing but a forced match: anchors that are too far apart, or of
+/// another size.
+fn anchor_warning(config: &RunConfig, dataset: &Dataset, ids: &[String]) -> Result<Option<String>, TrainError> {
+    let boxes = LabelledBoxes::read(dataset, ids, LOOKED_AT)?;
+    let share = forced_share(&config.detector, &boxes).filter(|share| *share > FORCED_SHARE);
+    Ok(share.map(|share| {
+        format!(
+            "{:.0} % of the training boxes are matched by force: no anchor of {} reaches the overlap `matched` with them, so that \
+             they are learnt from one poor anchor each; `lidarshift doctor DATASET --detector {} --suggest FILE` fits the anchors",
+            100.0 * share,
+            config.detector.name,
+            config.detector.name
+        )
+    }))
 }
 
 /// The mutable state of a run.

@@ -42,6 +42,7 @@ impl Progress {
                     self.bar = Some(bar.with_style(style.expect("the template is valid")));
                 }
             }
+            Event::Warning(text) => eprintln!("warning: {text}"),
             Event::Step { metrics, logged } => {
                 let message = format!("loss {:.4}, {:.1} samples/s", metrics.loss, metrics.samples_per_s);
                 if let Some(bar) = &self.bar {

@@ -1,9 +1,11 @@
 //! Builds cells, gaps and warnings from the scores of runs.
 
-use super::scores::RunScores;
+use super::power::power;
+use super::scores::{RunCurve, RunScores};
+use super::split::splits;
 use super::{
     Cell, CellNumber, CellRun, Gap, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity,
-    RunId, RunNumber, RunState, published,
+    Reference, RunId, RunNumber, RunState, published,
 };
 use crate::{RangeSection, ceiling_ap40};
 use rayon::prelude::*;
@@ -17,10 +19,24 @@ pub type RunResult = Result<RunScores, String>;
 const UNDERTRAINED_AP: f64 = 60.0;
 
 /// A cell with the bootstrap replicates behind its intervals.
-struct Drawn {
-    cell: Cell,
+pub(super) struct Drawn {
+    pub cell: Cell,
     /// Per value of the cell, in its order: the mean over seeds and frames of each bootstrap replicate.
     draws: Vec<Vec<f64>>,
+    /// The same against the true boxes.
+    draws_of_true_boxes: Vec<Vec<f64>>,
+    /// Hash of the frame ids.
+    pub frames_key: String,
+}
+
+impl Drawn {
+    /// The replicates of the values against labels or true boxes.
+    pub fn draws_of(&self, reference: Reference) -> &[Vec<f64>] {
+        match reference {
+            Reference::Labels => &self.draws,
+            Reference::TrueBoxes => &self.draws_of_true_boxes,
+        }
+    }
 }
 
 /// Builds the matrix. `results` is keyed by run and [`Place::name`] of the test set. Planned runs without a result are
@@ -34,17 +50,22 @@ pub fn build(plan: &MatrixPlan, results: &BTreeMap<(RunId, String), RunResult>, 
     }
     let drawn: Vec<Drawn> = keys.into_par_iter().map(|key| draw(key, results, options)).collect();
     let gaps = gaps(plan, &drawn, options);
+    let splits = splits(plan, &drawn, options);
     let mut warnings = plan_warnings(plan);
     warnings.extend(drawn.iter().flat_map(|d| cell_warnings(&d.cell, results)));
     warnings.extend(plan.test_sets.iter().flat_map(|test_set| ceiling_warnings(test_set, &drawn)));
-    Matrix {
+    let mut matrix = Matrix {
         schema: MATRIX_SCHEMA.into(),
         plan: plan.clone(),
         options: options.clone(),
         cells: drawn.into_iter().map(|d| d.cell).collect(),
         gaps,
+        splits,
+        power: Vec::new(),
         warnings,
-    }
+    };
+    matrix.power = power(&matrix);
+    matrix
 }
 
 fn draw(
@@ -75,37 +96,62 @@ fn draw(
         }
         done.retain(|(_, scores)| scores.frames == first);
     }
-    let frames = done.first().map(|(_, scores)| scores.frames);
-    let mut out = Drawn {
-        cell: Cell {
-            network: network.network.name.clone(),
-            train_set: train_set.name.clone(),
-            test_set: test_set.name.clone(),
-            frames,
-            runs,
-            numbers: Vec::new(),
-        },
-        draws: Vec::new(),
+    let first = done.first().map(|(_, scores)| *scores);
+    let frames_key = first.map_or(String::new(), |scores| scores.frames_key.clone());
+    let places = [&network.network, train_set, test_set];
+    let resamples = Resamples::new(&network.network.name, &frames_key, first.map_or(0, |s| s.frames), done.len(), options);
+    let [(numbers, draws), (of_true_boxes, draws_of_true_boxes)] = [Reference::Labels, Reference::TrueBoxes]
+        .map(|reference| numbers_of(reference, &done, places, &resamples, options));
+    let cell = Cell {
+        network: network.network.name.clone(),
+        train_set: train_set.name.clone(),
+        test_set: test_set.name.clone(),
+        frames: first.map(|scores| scores.frames),
+        runs,
+        numbers,
+        of_true_boxes,
     };
-    let n_curves = done.first().map_or(0, |(_, scores)| scores.curves.len());
-    let weights: Vec<Vec<u32>> = (0..options.bootstrap.replicates)
-        .map(|r| {
-            let purpose = format!("matrix frames {}", test_set.name);
-            options.bootstrap.frame_weights(&purpose, r, frames.unwrap_or(0))
-        })
-        .collect();
-    let seeds: Vec<Vec<usize>> = (0..options.bootstrap.replicates)
-        .map(|r| {
-            let purpose = format!("matrix seeds {} {}", network.network.name, train_set.name);
-            options.bootstrap.draws(&purpose, r, done.len())
-        })
-        .collect();
+    Drawn { cell, draws, draws_of_true_boxes, frames_key }
+}
+
+/// How often each frame and which seeds are drawn, by replicate.
+struct Resamples {
+    frames: Vec<Vec<u32>>,
+    seeds: Vec<Vec<usize>>,
+}
+
+impl Resamples {
+    /// Equal for all cells of a network with the same frames and the same number of seeds, so that differences of
+    /// cells are paired.
+    fn new(network: &str, frames_key: &str, frames: usize, seeds: usize, options: &MatrixOptions) -> Self {
+        let replicates = 0..options.bootstrap.replicates;
+        let of_frames = format!("matrix frames {frames_key}");
+        let of_seeds = format!("matrix seeds {network}");
+        Resamples {
+            frames: replicates.clone().map(|r| options.bootstrap.frame_weights(&of_frames, r, frames)).collect(),
+            seeds: replicates.map(|r| options.bootstrap.seed_draws(&of_seeds, r, seeds)).collect(),
+        }
+    }
+}
+
+/// The values of a cell against labels or true boxes, with their bootstrap replicates.
+fn numbers_of(
+    reference: Reference,
+    done: &[(u64, &RunScores)],
+    places: [&Place; 3],
+    resamples: &Resamples,
+    options: &MatrixOptions,
+) -> (Vec<CellNumber>, Vec<Vec<f64>>) {
+    let of_runs: Vec<&[RunCurve]> = done.iter().map(|(_, scores)| scores.curves_of(reference)).collect();
+    let n_curves = of_runs.iter().map(|curves| curves.len()).min().unwrap_or(0);
+    let (mut numbers, mut all_draws) = (Vec::new(), Vec::new());
     for k in 0..n_curves {
-        let curves: Vec<_> = done.iter().map(|(_, scores)| &scores.curves[k]).collect();
+        let curves: Vec<_> = of_runs.iter().map(|curves| &curves[k]).collect();
         let whole: Vec<_> = curves.iter().map(|curve| curve.numbers(None)).collect();
-        let draws: Vec<[f64; Quantity::ALL.len()]> = weights
+        let draws: Vec<[f64; Quantity::ALL.len()]> = resamples
+            .frames
             .par_iter()
-            .zip(&seeds)
+            .zip(&resamples.seeds)
             .map(|(weights, seeds)| {
                 let mut known: Vec<Option<[f64; Quantity::ALL.len()]>> = vec![None; curves.len()];
                 let mut sum = [0.0; Quantity::ALL.len()];
@@ -122,15 +168,15 @@ fn draw(
             let curve = curves[0];
             let key =
                 NumberKey { class: curve.class.clone(), section: curve.section, quantity, overlap: curve.overlap };
-            let mut number = CellNumber::of_runs(key, values, [&network.network, train_set, test_set]);
+            let mut number = CellNumber::of_runs(key, values, places);
             number.n_gt = Some(whole[0].1);
             number.ceiling = (quantity == Quantity::Ap40).then(|| ceiling_ap40(whole[0].1)).flatten();
             number.interval = options.bootstrap.interval(draws.clone());
-            out.cell.numbers.push(number);
-            out.draws.push(draws);
+            numbers.push(number);
+            all_draws.push(draws);
         }
     }
-    out
+    (numbers, all_draws)
 }
 
 /// Identifies a value of a cell.
@@ -189,22 +235,25 @@ fn gaps(plan: &MatrixPlan, drawn: &[Drawn], options: &MatrixOptions) -> Vec<Gap>
                 else {
                     continue;
                 };
-                let numbers = one.cell.numbers.iter().zip(&other.cell.numbers);
-                for (i, (a, b)) in numbers.enumerate() {
-                    let (Some(one_mean), Some(other_mean)) = (a.mean, b.mean) else { continue };
-                    let draws = one.draws[i].iter().zip(&other.draws[i]).map(|(a, b)| a - b).collect();
-                    gaps.push(Gap {
-                        network: network.clone(),
-                        test_set: test_set.into(),
-                        train_set: train_set.into(),
-                        compared_to: compared_to.into(),
-                        class: a.class.clone(),
-                        section: a.section,
-                        quantity: a.quantity,
-                        overlap: a.overlap,
-                        gap: one_mean - other_mean,
-                        interval: options.bootstrap.interval(draws),
-                    });
+                for reference in one.cell.references() {
+                    let [own, others] = [one, other].map(|d| (d.cell.numbers_of(reference), d.draws_of(reference)));
+                    for (i, (a, b)) in own.0.iter().zip(others.0).enumerate() {
+                        let (Some(one_mean), Some(other_mean)) = (a.mean, b.mean) else { continue };
+                        let draws = own.1[i].iter().zip(&others.1[i]).map(|(a, b)| a - b).collect();
+                        gaps.push(Gap {
+                            network: network.clone(),
+                            test_set: test_set.into(),
+                            train_set: train_set.into(),
+                            compared_to: compared_to.into(),
+                            reference,
+                            class: a.class.clone(),
+                            section: a.section,
+                            quantity: a.quantity,
+                            overlap: a.overlap,
+                            gap: one_mean - other_mean,
+                            interval: options.bootstrap.interval(draws),
+                        });
+                    }
                 }
             }
         }

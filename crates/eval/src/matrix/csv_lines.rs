@@ -3,12 +3,13 @@
 use super::{Matrix, markdown::runs};
 use crate::csv_text;
 
-const COLUMNS: [&str; 19] = [
+const COLUMNS: [&str; 20] = [
     "network",
     "train_set",
     "test_set",
     "runs",
     "frames",
+    "reference",
     "class",
     "from_m",
     "to_m",
@@ -38,10 +39,11 @@ impl Matrix {
                 let empty = std::iter::repeat_n(String::new(), COLUMNS.len() - head.len());
                 lines.push(head.iter().cloned().chain(empty).collect());
             }
-            for n in &cell.numbers {
+            for (reference, n) in cell.references().flat_map(|r| cell.numbers_of(r).iter().map(move |n| (r, n))) {
                 let of_runs = n.of_runs.iter().map(|run| format!("{}:{}", run.seed, number(run.value)));
                 let fields = [
                     frames.clone(),
+                    reference.key().into(),
                     n.class.clone(),
                     number(n.section.map(|s| s.from_m)),
                     number(n.section.map(|s| s.to_m)),

@@ -1,6 +1,6 @@
 //! The matrix as Markdown, with intervals and the paper's numbers.
 
-use super::{Cell, CellNumber, Matrix, Quantity, RunState, paper_cell, paper_number};
+use super::{Cell, CellNumber, Matrix, Part, Quantity, Reference, RunState, paper_cell, paper_number};
 use crate::RangeSection;
 use std::fmt::{self, Write};
 
@@ -14,6 +14,7 @@ impl Matrix {
                 self.table_of_sections(&mut out, class);
             }
             self.table_of_gaps(&mut out, class);
+            self.table_of_splits(&mut out, class);
         }
         let _ = writeln!(out, "{}", self.rules());
         if !self.warnings.is_empty() {
@@ -33,8 +34,8 @@ impl Matrix {
         let interval = match o.bootstrap.replicates {
             0 => "No intervals were drawn".into(),
             n => format!(
-                "In square brackets the {:.0} % interval of the mean, {n} draws of seeds and frames together (of frames alone where \
-                 there is one run), frames in blocks of {}, seed {}",
+                "In square brackets the {:.0} % interval of the mean, {n} draws of seeds (n - 1 of n) and frames together (of \
+                 frames alone where there is one run), frames in blocks of {}, seed {}",
                 100.0 * o.bootstrap.level,
                 o.bootstrap.block_frames,
                 o.bootstrap.seed
@@ -62,10 +63,10 @@ impl Matrix {
         }
         let n = columns.len() * if paper { 2 } else { 1 };
         let _ = writeln!(out, "\n|---|---|---|---|{}", "---|".repeat(n));
-        for cell in &self.cells {
-            let _ = write!(out, "{}", self.head(cell));
+        for (cell, reference) in self.rows() {
+            let _ = write!(out, "{}", self.head(cell, reference));
             for (quantity, overlap) in &columns {
-                let number = cell.number(class, None, *quantity, *overlap);
+                let number = cell.number_of(reference, class, None, *quantity, *overlap);
                 let _ = write!(out, " {} |", number.map_or("-".into(), with_interval));
                 if paper {
                     let published = number.and_then(|n| n.published);
@@ -85,10 +86,10 @@ impl Matrix {
             let _ = write!(out, " ({overlap}) {section} |");
         }
         let _ = writeln!(out, "\n|---|---|---|---|{}", "---|".repeat(sections.len() * self.options.overlaps.len()));
-        for cell in &self.cells {
-            let _ = write!(out, "{}", self.head(cell));
+        for (cell, reference) in self.rows() {
+            let _ = write!(out, "{}", self.head(cell, reference));
             for (overlap, section) in self.options.overlaps.iter().flat_map(|o| sections.iter().map(move |s| (o, s))) {
-                let number = cell.number(class, Some(*section), Quantity::Ap40, *overlap);
+                let number = cell.number_of(reference, class, Some(*section), Quantity::Ap40, *overlap);
                 let n_gt = number.and_then(|n| n.n_gt).map_or("unknown".into(), |n| n.to_string());
                 let text = number.map_or("-".into(), |n| match n.ceiling {
                     Some(most) if most < 100.0 => format!("{}, n_gt {n_gt}, at most {most:.1}", with_interval(n)),
@@ -120,7 +121,7 @@ impl Matrix {
                 out,
                 "| {} | {} | {} in the place of {} | {} | {}{interval} |",
                 self.title(&gap.network),
-                self.title(&gap.test_set),
+                self.test_title(&gap.test_set, gap.reference),
                 self.title(&gap.train_set),
                 self.title(&gap.test_set),
                 gap.overlap,
@@ -130,8 +131,39 @@ impl Matrix {
         out.push('\n');
     }
 
-    fn head(&self, cell: &Cell) -> String {
-        let [network, train, test] = [&cell.network, &cell.train_set, &cell.test_set].map(|name| self.title(name));
+    fn table_of_splits(&self, out: &mut String, class: &str) {
+        let mut splits = self.splits.iter().filter(|s| s.is_shown(class)).peekable();
+        if splits.peek().is_none() {
+            return;
+        }
+        let _ = writeln!(
+            out,
+            "| {class}, lost from its own data to other data | trained on | tested on | overlap | all | labels | sensor and scene | \
+             sensor | scene |"
+        );
+        let _ = writeln!(out, "|---|---|---|---|---|---|---|---|---|");
+        let text = |part: Option<Part>| {
+            part.map_or("-".into(), |p| {
+                let interval = p.interval.map(|i| format!(" [{}, {}]", paper_number(i.low), paper_number(i.high)));
+                format!("{}{}", paper_number(p.points), interval.unwrap_or_default())
+            })
+        };
+        for s in splits {
+            let [network, train, test] = [&s.network, &s.train_set, &s.test_set].map(|name| self.title(name));
+            let parts = [Some(s.total), s.label, Some(s.sensor_and_scene), s.sensor, s.scene].map(text);
+            let _ = writeln!(out, "| {network} | {train} | {test} | {} | {} |", s.overlap, parts.join(" | "));
+        }
+        out.push('\n');
+    }
+
+    /// Rows of a table: every cell, and below it the same against the true boxes where they are known.
+    pub fn rows(&self) -> impl Iterator<Item = (&Cell, Reference)> {
+        self.cells.iter().flat_map(|cell| cell.references().map(move |reference| (cell, reference)))
+    }
+
+    fn head(&self, cell: &Cell, reference: Reference) -> String {
+        let [network, train] = [&cell.network, &cell.train_set].map(|name| self.title(name));
+        let test = self.test_title(&cell.test_set, reference);
         format!("| {network} | {train} | {test} | {} |", runs(cell))
     }
 }

@@ -54,6 +54,7 @@ pub fn from_run_values(plan: &MatrixPlan, values: &[RunValue], options: &MatrixO
                 frames: None,
                 runs: planned.seeds.iter().map(run).collect(),
                 numbers,
+                of_true_boxes: Vec::new(),
             });
         }
     }
@@ -65,6 +66,8 @@ pub fn from_run_values(plan: &MatrixPlan, values: &[RunValue], options: &MatrixO
         options: options.clone(),
         cells,
         gaps: Vec::new(),
+        splits: Vec::new(),
+        power: Vec::new(),
         warnings,
     }
 }

@@ -1,12 +1,13 @@
 //! Scores of one run on one test set.
 
-use super::{MatrixOptions, Quantity};
+use super::{MatrixOptions, Quantity, Reference};
 use crate::evidence::{Evidence, FrameEvidence};
 use crate::matching::{BoxIndex, CurveKey};
 use crate::overlaps::{FrameOverlaps, range_m};
 use crate::{EvalFrame, Metric, RangeSection};
-use data::{DataError, Dataset, KittiText, LabelFrame, read_kitti_text};
+use data::{DataError, Dataset, KittiText, LabelBox, LabelFrame, read_kitti_text};
 use rayon::prelude::*;
+use sha2::{Digest, Sha256};
 use std::path::Path;
 
 /// The labels of a test set, read once for all runs.
@@ -15,6 +16,8 @@ pub struct TestSet {
     /// The frame of labels and detections.
     pub label_frame: LabelFrame,
     frames: Vec<EvalFrame>,
+    /// True boxes of the frames, where they are known.
+    truth: Option<Vec<Vec<LabelBox>>>,
 }
 
 impl TestSet {
@@ -28,13 +31,28 @@ impl TestSet {
         // Collects all results first, so that the first bad frame is reported for any number of threads.
         let frames: Vec<Result<EvalFrame, DataError>> = ids.par_iter().map(read).collect();
         let frames = frames.into_iter().collect::<Result<_, _>>()?;
-        Ok(TestSet { label_frame: dataset.config.label_frame, frames })
+        let truth: Vec<_> = ids.par_iter().map(|id| dataset.true_labels(id)).collect();
+        let truth: Option<Vec<_>> = truth.into_iter().collect::<Result<Option<_>, _>>()?;
+        Ok(TestSet { label_frame: dataset.config.label_frame, frames, truth })
+    }
+
+    /// The same frames with the true boxes as their labels; `None` where the truth beside the labels is not known.
+    pub fn of_true_boxes(&self) -> Option<TestSet> {
+        let frame = |(frame, labels): (&EvalFrame, &Vec<LabelBox>)| EvalFrame { labels: labels.clone(), ..frame.clone() };
+        let frames = self.frames.iter().zip(self.truth.as_ref()?).map(frame).collect();
+        Some(TestSet { label_frame: self.label_frame, frames, truth: None })
+    }
+
+    /// These detections with the labels of this test set. Frames are in the order of the test set.
+    pub fn labelling(&self, mut frames: Vec<EvalFrame>) -> Vec<EvalFrame> {
+        frames.iter_mut().zip(&self.frames).for_each(|(frame, own)| frame.labels.clone_from(&own.labels));
+        frames
     }
 
     /// From labels in memory; detections in the frames are dropped.
     pub fn new(label_frame: LabelFrame, mut frames: Vec<EvalFrame>) -> Self {
         frames.iter_mut().for_each(|frame| frame.detections.clear());
-        TestSet { label_frame, frames }
+        TestSet { label_frame, frames, truth: None }
     }
 
     /// Number of frames.
@@ -72,7 +90,11 @@ impl TestSet {
 #[derive(Clone, Debug)]
 pub struct RunScores {
     pub(super) frames: usize,
+    /// Hash of the frame ids. Test sets with the same frames are resampled alike.
+    pub(super) frames_key: String,
     pub(super) curves: Vec<RunCurve>,
+    /// The same curves against the true boxes.
+    pub(super) of_true_boxes: Vec<RunCurve>,
 }
 
 /// One class, range section and overlap of a run.
@@ -82,6 +104,7 @@ pub(super) struct RunCurve {
     pub section: Option<RangeSection>,
     pub overlap: f64,
     evidence: Evidence,
+    bev: Evidence,
     /// Per frame: ground truths, those covered by any region, and those covered by any detection.
     covered: Vec<[u32; 3]>,
 }
@@ -111,13 +134,15 @@ impl RunScores {
             let whole = options.max_range_m.map(RangeSection::up_to);
             let looked_at = section.or(whole);
             let inside = |line| looked_at.is_none_or(|s| s.contains(range_m(line, label_frame)));
-            let key = CurveKey { class: &class, metric: Metric::ThreeD, overlap, difficulty: options.difficulty };
-            let evidence = Evidence::new(frames.iter().zip(&overlaps).map(|(frame, overlaps)| {
-                FrameEvidence::collect((frame, overlaps), &key, |index| match index {
-                    BoxIndex::Label(i) => inside(&frame.labels[i]),
-                    BoxIndex::Detection(j) => inside(&frame.detections[j]),
-                })
-            }));
+            let [evidence, bev] = [Metric::ThreeD, Metric::Bev].map(|metric| {
+                let key = CurveKey { class: &class, metric, overlap, difficulty: options.difficulty };
+                Evidence::new(frames.iter().zip(&overlaps).map(|(frame, overlaps)| {
+                    FrameEvidence::collect((frame, overlaps), &key, |index| match index {
+                        BoxIndex::Label(i) => inside(&frame.labels[i]),
+                        BoxIndex::Detection(j) => inside(&frame.detections[j]),
+                    })
+                }))
+            });
             let covered = frames
                 .iter()
                 .zip(recall_overlaps.iter().zip(&overlaps))
@@ -131,9 +156,26 @@ impl RunScores {
                     })
                 })
                 .collect();
-            RunCurve { class, section, overlap, evidence, covered }
+            RunCurve { class, section, overlap, evidence, bev, covered }
         };
-        RunScores { frames: frames.len(), curves: keys.into_par_iter().map(curve).collect() }
+        let ids: String = frames.iter().flat_map(|frame| [frame.id.as_str(), "\n"]).collect();
+        let frames_key = Sha256::digest(ids).iter().map(|byte| format!("{byte:02x}")).collect();
+        let curves = keys.into_par_iter().map(curve).collect();
+        RunScores { frames: frames.len(), frames_key, curves, of_true_boxes: Vec::new() }
+    }
+
+    /// Adds the scores of the same detections against the true boxes.
+    #[must_use]
+    pub fn with_true_boxes(self, of_true_boxes: RunScores) -> Self {
+        RunScores { of_true_boxes: of_true_boxes.curves, ..self }
+    }
+
+    /// The curves against labels or true boxes; none where the truth is not known.
+    pub(super) fn curves_of(&self, reference: Reference) -> &[RunCurve] {
+        match reference {
+            Reference::Labels => &self.curves,
+            Reference::TrueBoxes => &self.of_true_boxes,
+        }
     }
 
     /// Whether two runs give the same result on every frame. Two seeds that do were the same run, unless they detect
@@ -172,6 +214,7 @@ impl RunCurve {
             share(any, n),
             share(p.n_tp as f64, p.n_gt as f64),
             share(found, n),
+            or_undefined(self.bev.precisions(weights).ap40),
         ];
         (numbers, p.n_gt)
     }

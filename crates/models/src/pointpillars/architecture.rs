@@ -6,9 +6,10 @@ use super::{PointPillars, Preparation, Sample, losses};
 use crate::architecture::{Architecture, NetworkInput};
 use crate::config::{AnchorConfig, DetectorConfig};
 use crate::layers::{Mode, host};
+use crate::suggest::{BoxMatch, Change, LabelledBoxes, fit_anchors, fit_grid};
 use crate::{LayerFeatures, Losses, ModelError, Prediction};
 use burn::tensor::Device;
-use data::{Frame, Stream};
+use data::{Frame, Object, Stream};
 
 impl Architecture for PointPillars {
     type Config = PointPillarsConfig;
@@ -23,6 +24,22 @@ impl Architecture for PointPillars {
 
     fn anchors(net: &PointPillarsConfig) -> &[AnchorConfig] {
         &net.anchors
+    }
+
+    fn fit(
+        net: &mut PointPillarsConfig,
+        range: &mut [f32; 6],
+        classes: &[String],
+        boxes: &LabelledBoxes,
+        changes: &mut Vec<Change>,
+    ) {
+        let stride = net.backbone.strides[0] / net.backbone.upsample_strides[0];
+        fit_grid(&mut net.pillars.size_m, range, stride, &net.backbone.strides, classes, boxes, changes);
+        fit_anchors(&mut net.anchors, boxes, changes);
+    }
+
+    fn box_matches(preparation: &Preparation, objects: &[Object]) -> Vec<BoxMatch> {
+        preparation.box_matches(objects)
     }
 
     fn preparation(detector: &DetectorConfig, net: &PointPillarsConfig) -> Preparation {

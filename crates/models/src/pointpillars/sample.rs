@@ -5,8 +5,9 @@ use super::config::{LossConfig, PointPillarsConfig};
 use super::decode::{DecodeOptions, RawBox, decode};
 use super::head::Predictions;
 use super::pillars::{PillarGrid, Pillars, decorate, pillarise};
-use super::target_assigner::{Targets, assign};
+use super::target_assigner::{NearestBev, Targets, assign};
 use crate::config::DetectorConfig;
+use crate::suggest::BoxMatch;
 use crate::{ModelError, layers};
 use data::{Detection, Frame, Object};
 use geometry::Box3;
@@ -128,6 +129,21 @@ impl Preparation {
     /// Targets of boxes `[x, y, z, dx, dy, dz, yaw, class]`, classes from 1.
     pub fn targets(&self, boxes: &[[f32; 8]]) -> Targets {
         assign(&self.anchors, &self.anchor_classes, self.map, boxes, self.decode.dir_offset)
+    }
+
+    /// How the anchors are assigned to the boxes of a frame that lie within the range.
+    pub fn box_matches(&self, objects: &[Object]) -> Vec<BoxMatch> {
+        let boxes = self.ground_truth(objects);
+        let targets = self.targets(&boxes);
+        let of_box = |(i, bbox): (usize, &[f32; 8])| {
+            let class = bbox[7] as usize - 1;
+            let own = targets.positive.iter().filter(|(_, truth)| *truth == i).map(|(anchor, _)| *anchor);
+            let overlap = |anchor: usize| NearestBev::new(&self.anchors[anchor]).iou(&NearestBev::new(bbox));
+            let overlaps: Vec<f32> = own.map(overlap).collect();
+            let forced = overlaps.iter().all(|iou| *iou < self.anchor_classes[class].matched);
+            BoxMatch { class, positive: overlaps.len(), forced }
+        };
+        boxes.iter().enumerate().map(of_box).collect()
     }
 
     /// Boxes of the detector's classes whose centre lies within the range, with classes counted from 1.

@@ -5,6 +5,7 @@ use super::{PointRcnn, Preparation, Sample, detections, losses};
 use crate::architecture::{Architecture, NetworkInput};
 use crate::config::DetectorConfig;
 use crate::layers::{Mode, host};
+use crate::suggest::{Change, LabelledBoxes, change, fit_range};
 use crate::{LayerFeatures, Losses, ModelError, Prediction};
 use burn::tensor::Device;
 use data::{Frame, Stream};
@@ -21,6 +22,22 @@ impl Architecture for PointRcnn {
 
     fn check(net: &PointRcnnConfig, detector: &DetectorConfig) -> Result<(), String> {
         net.check(detector)
+    }
+
+    fn fit(
+        net: &mut PointRcnnConfig,
+        range: &mut [f32; 6],
+        classes: &[String],
+        boxes: &LabelledBoxes,
+        changes: &mut Vec<Change>,
+    ) {
+        fit_range(range, &boxes.of_classes(classes), None, changes);
+        for mean in net.point_head.mean_sizes.iter_mut() {
+            let key = format!("network.point_head.mean_sizes ({}).size_m", mean.class);
+            if let Some((size, n)) = boxes.median_size(&mean.class) {
+                change(changes, &key, &mut mean.size_m, size, format!("median of {n} boxes"));
+            }
+        }
     }
 
     fn preparation(detector: &DetectorConfig, net: &PointRcnnConfig) -> Preparation {

@@ -235,6 +235,20 @@ impl EffectList {
         EffectList { effects, ..self.clone() }
     }
 
+    /// The list with those effects alone that act on beams and scans: the sensor without the scene and the labels. The
+    /// others are replaced by one that changes nothing, so that the random numbers of the rest stay the same.
+    pub fn of_sensor(&self) -> EffectList {
+        let ideal = WorldPlan::default();
+        let acts_elsewhere = |effect: &Effect| {
+            let mut world = WorldPlan::default();
+            effect.model().on_world(&mut world);
+            world != ideal || matches!(effect, Effect::LabelNoise(_) | Effect::LabelOffset(_) | Effect::LabelTimeOffset(_))
+        };
+        let neutral = || Effect::RangeBias(RangeBias::default());
+        let effect = |effect: &Effect| if acts_elsewhere(effect) { neutral() } else { effect.clone() };
+        EffectList { effects: self.effects.iter().map(effect).collect(), ..self.clone() }
+    }
+
     /// What the list says of the surfaces of finished clouds.
     pub fn surfaces(&self) -> Surfaces {
         Surfaces { intensity: self.intensity, reflectivity: self.reflectivity }

@@ -112,6 +112,10 @@ pub struct SetConfig {
     /// effects.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub matched_to: Option<String>,
+    /// Another data set, listed before this one, whose effects on beams and scans are added: its sensor, without its
+    /// scene and its labels.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sensor_of: Option<String>,
     /// Make labels as from road recordings; default: exact labels.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub auto_label: Option<AutoLabel>,
@@ -183,7 +187,7 @@ impl RaceConfig {
         if named(&set.name) {
             return Err(wrong("name", format!("{:?} is there twice", set.name)));
         }
-        for (key, other) in [("from", &set.from), ("matched_to", &set.matched_to)] {
+        for (key, other) in [("from", &set.from), ("sensor_of", &set.sensor_of), ("matched_to", &set.matched_to)] {
             if let Some(other) = other.as_ref().filter(|other| !named(other)) {
                 return Err(wrong(key, format!("{other:?} is no data set that is named before this one")));
             }
@@ -200,6 +204,10 @@ impl RaceConfig {
             Some(from) => self.effects_of(from, files)?,
             None => Vec::new(),
         };
+        if let Some(other) = set.sensor_of.as_ref().and_then(|other| self.datasets.iter().find(|s| s.name == *other)) {
+            let of_sensor = self.effects_of(other, files)?.into_iter().map(|(name, list)| (name, list.of_sensor()));
+            lists.extend(of_sensor);
+        }
         if let Some(file) = &set.effects {
             let (text, path) = files.text(file)?;
             lists.push((set.name.clone(), EffectList::parse(&text, &path)?));
@@ -259,6 +267,7 @@ mod tests {
             ("name = \"r\"", "name = \"../r\"", "c.toml:1: name: \"../r\" is no name of a folder"),
             ("name = \"b\"", "name = \"a\"", "c.toml:7: dataset[1].name: \"a\" is there twice"),
             ("from = \"a\"", "from = \"c\"", "c.toml:8: dataset[1].from: \"c\" is no data set"),
+            ("from = \"a\"", "sensor_of = \"c\"", "c.toml:8: dataset[1].sensor_of: \"c\" is no data set"),
             ("from = \"a\"", "matched_to = \"a\"", "c.toml:8: dataset[1].matched_to: needs `from`"),
             (
                 "from = \"a\"",

@@ -8,6 +8,7 @@ use crate::SimulateError;
 use crate::auto_label::{LabelError, label_errors};
 use crate::street::SplitCounts;
 use data::toml_text::wrong;
+use data::write::{TRUE_LABELS, label_boxes, write_kitti_text};
 use data::{DataError, Dataset, DatasetConfig, LabelFrame, Manifest, NewDataset, PointColumns, write_atomic};
 use rayon::prelude::*;
 use sensor::attributes;
@@ -106,7 +107,11 @@ fn make_set(
         splits: BTreeMap::new(),
         label_errors: Vec::new(),
     };
-    let new = NewDataset::begin(&root, simulator.config.layout, &[attributes::FOLDER], &mut manifest)?;
+    let extra = [attributes::FOLDER, TRUE_LABELS];
+    let new = NewDataset::begin(&root, simulator.config.layout, &extra, &mut manifest)?;
+    if set.auto_label.is_some() {
+        fs_err::create_dir_all(root.join(TRUE_LABELS))?;
+    }
     write_descriptions(simulator, &new, set, &prepared)?;
     let progress = |done: usize, all: usize| progress(&set.name, done, all);
     let counts = new.make_frames(simulator.keys(), &progress, |_, key| {
@@ -129,7 +134,9 @@ fn make_frame_file(
 ) -> Result<SplitCounts, SimulateError> {
     let (config, id) = (&simulator.config, key.id());
     let beside = attributes::path(new.root(), &id);
-    if !(new.has_frame(&id, true) && (!config.attributes || beside.is_file())) {
+    let truth = set.auto_label.map(|_| new.root().join(TRUE_LABELS).join(format!("{id}.txt")));
+    let has_truth = truth.as_ref().is_none_or(|path| path.is_file());
+    if !(new.has_frame(&id, true) && has_truth && (!config.attributes || beside.is_file())) {
         let made = simulator.make(set, key)?;
         if made.frame.cloud.is_empty() {
             let message = "would be empty: no shot has a return within the crop; check rig, effects and crop_m";
@@ -137,6 +144,9 @@ fn make_frame_file(
         }
         if config.attributes {
             write_atomic(&beside, &attributes::encode(&made.scan))?;
+        }
+        if let Some(path) = truth {
+            write_kitti_text(&path, &label_boxes(&made.with_true_boxes()))?;
         }
         new.layout().write_frame(new.root(), &made.frame)?;
     }
@@ -160,6 +170,7 @@ fn write_descriptions(
         label_frame: LabelFrame::Lidar,
         classes: vec![config.class.clone()],
         rig: Some("rig.toml".into()),
+        true_labels: set.auto_label.map(|_| TRUE_LABELS.into()),
         ..DatasetConfig::default()
     };
     new.describe(dataset, splits)?;

@@ -12,10 +12,11 @@ pub struct ConfigFiles {
 }
 
 /// Built-in files, by their path below `configs/`.
-const BUILT_IN: [(&str, &str); 8] = [
+const BUILT_IN: [(&str, &str); 9] = [
     ("simulate/race.toml", include_str!("../../../../configs/simulate/race.toml")),
     ("simulate/race_small.toml", include_str!("../../../../configs/simulate/race_small.toml")),
     ("simulate/race_full.toml", include_str!("../../../../configs/simulate/race_full.toml")),
+    ("simulate/race_study.toml", include_str!("../../../../configs/simulate/race_study.toml")),
     ("simulate/measured.toml", include_str!("../../../../configs/simulate/measured.toml")),
     ("simulate/sim.toml", include_str!("../../../../configs/simulate/sim.toml")),
     ("simulate/sim_noise.toml", include_str!("../../../../configs/simulate/sim_noise.toml")),
@@ -25,7 +26,7 @@ const BUILT_IN: [(&str, &str); 8] = [
 
 impl ConfigFiles {
     /// Names of the built-in configurations.
-    pub const NAMES: [&str; 3] = ["race", "race_small", "race_full"];
+    pub const NAMES: [&str; 4] = ["race", "race_small", "race_full", "race_study"];
 
     /// Files in a folder.
     pub fn in_folder(folder: &Path) -> ConfigFiles {

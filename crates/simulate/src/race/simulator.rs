@@ -4,14 +4,15 @@ use super::config::{RaceConfig, SetConfig};
 use super::files::ConfigFiles;
 use super::frames::{FrameKey, choose};
 use crate::SimulateError;
-use crate::auto_label::{AutoLabel, refine};
+use crate::auto_label::{AutoLabel, Refine, refine_to_faces, refine_to_shape};
 use crate::frame_scene::FrameScene;
 use crate::mesh::Mesh;
 use crate::race_car::race_car;
 use crate::scenario::{FRAME_S, Motion, Run};
+use crate::shape_field::ShapeField;
 use crate::track::{CentreLine, Track, las_vegas};
 use crate::world::{CarShape, World};
-use data::{DataError, Frame, Object, stream};
+use data::{Cloud, DataError, Frame, Object, stream};
 use geometry::{Box3, move_box, yaw_rad};
 use nalgebra::UnitQuaternion;
 use rand_distr::{Distribution, StandardNormal};
@@ -22,6 +23,7 @@ use sensor::material::MaterialTable;
 use sensor::rig::Rig;
 use sensor::scan::Scan;
 use std::path::Path;
+use std::sync::OnceLock;
 
 /// State shared by all data sets of a race.
 #[derive(Clone, Debug)]
@@ -40,6 +42,8 @@ pub struct Simulator {
     pub(super) car: Mesh,
     beams: Beams,
     ideal: Surroundings,
+    /// Surface of the car as modelled, for automatic labels; made when it is needed.
+    shape: OnceLock<ShapeField>,
 }
 
 /// Static surroundings.
@@ -83,6 +87,15 @@ pub struct SimulatedFrame {
     pub true_boxes: Vec<Box3>,
 }
 
+impl SimulatedFrame {
+    /// Its objects with the true boxes in the place of the labels.
+    pub fn with_true_boxes(&self) -> Frame {
+        let labelled = self.frame.objects.iter().zip(&self.true_boxes);
+        let objects = labelled.map(|(object, bbox)| Object { bbox: rounded(bbox), ..object.clone() }).collect();
+        Frame { id: self.frame.id.clone(), cloud: Cloud::default(), objects }
+    }
+}
+
 impl Simulator {
     /// Reads all files of the configuration and generates the race.
     pub fn new(config: RaceConfig, files: &ConfigFiles) -> Result<Simulator, SimulateError> {
@@ -111,7 +124,11 @@ impl Simulator {
         let keys = choose(&runs, config.frames, config.split, config.seed)?;
         let beams = Beams::of(&rig);
         let ideal = Surroundings::new(&track, &car, &WorldPlan::default());
-        Ok(Simulator { config, rig, materials, track, runs, keys, car, beams, ideal })
+        Ok(Simulator { config, rig, materials, track, runs, keys, car, beams, ideal, shape: OnceLock::new() })
+    }
+
+    fn shape(&self) -> &ShapeField {
+        self.shape.get_or_init(|| ShapeField::new(&self.car, car_box().center))
     }
 
     /// The selected frames, in ascending order.
@@ -241,8 +258,14 @@ impl Simulator {
         set.lists.iter().for_each(|(name, list)| list.on_labels(&mut cars, &FrameContext { set: name, ..context }));
         let labelled = self.labelled(key)?;
         cars.retain(|car| labelled[car.number]);
-        if set.auto_label.is_some_and(|auto| auto.refine) {
-            cars.iter_mut().for_each(|car| car.label = refine(&cloud, &car.label));
+        if let Some(auto) = &set.auto_label {
+            for car in &mut cars {
+                car.label = match auto.refine {
+                    Refine::None => car.label,
+                    Refine::Faces => refine_to_faces(&cloud, &car.label),
+                    Refine::Shape => refine_to_shape(&cloud, &car.label, self.shape(), auto.position_std_m),
+                };
+            }
         }
         let object = |car: &LabelledCar| Object {
             class: self.config.class.clone(),

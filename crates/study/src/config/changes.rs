@@ -62,6 +62,7 @@ impl StudyConfig {
         let Some(dataset) = self.datasets.iter().find(|d| d.name == name) else { return "unknown".into() };
         match &dataset.source {
             Source::Resim { of, effects, .. } => format!("{} with {}", self.source_text(of), effects.display()),
+            Source::TrueLabels { of } => format!("{} with its true boxes", self.source_text(of)),
             source => serde_json::to_string(source).unwrap_or_default(),
         }
     }

@@ -51,14 +51,24 @@ impl StudyConfig {
             of_variant.filter_map(|(v, name)| unknown(format!("variant {}: detectors", v.name), name, &detectors));
         let of_tsne = self.evaluation.tsne_dataset.iter();
         let of_tsne = of_tsne.filter_map(|name| unknown("evaluation.tsne_dataset".into(), name, &datasets));
-        if let Some(problem) = of_train.chain(of_variant).chain(of_tsne).next() {
+        let of_between = self.datasets.iter().flat_map(|d| {
+            let named = [("scene_of", &d.scene_of), ("sensor_of", &d.sensor_of)];
+            named.into_iter().filter_map(move |(key, name)| Some((d, key, name.as_ref()?)))
+        });
+        let of_between =
+            of_between.filter_map(|(d, key, name)| unknown(format!("dataset {}: {key}", d.name), name, &datasets));
+        if let Some(problem) = of_train.chain(of_variant).chain(of_tsne).chain(of_between).next() {
             return Some(problem);
         }
         for (i, dataset) in self.datasets.iter().enumerate() {
+            if dataset.scene_of.is_some() != dataset.sensor_of.is_some() {
+                return Some(format!("dataset {}: scene_of and sensor_of are given together", dataset.name));
+            }
             match &dataset.source {
-                Source::Resim { of, .. } if !datasets[..i].contains(&of.as_str()) => {
+                Source::Resim { of, .. } | Source::TrueLabels { of } if !datasets[..i].contains(&of.as_str()) => {
+                    let key = if matches!(dataset.source, Source::Resim { .. }) { "resim" } else { "true_labels" };
                     return Some(format!(
-                        "dataset {}: resim.of is {of:?}, which is not the name of an earlier data set",
+                        "dataset {}: {key}.of is {of:?}, which is not the name of an earlier data set",
                         dataset.name
                     ));
                 }
