@@ -1,8 +1,8 @@
 //! A data set on disk. Frames are read by id; their boxes are converted to the LiDAR frame.
 
 use crate::dataset_config::DatasetConfig;
-use crate::layout::PointDetails;
 use crate::kitti_text::{KittiText, read_kitti_text};
+use crate::layout::PointDetails;
 use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
 use geometry::Pose;
 use std::collections::BTreeSet;

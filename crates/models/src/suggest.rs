@@ -2,7 +2,7 @@
 
 use crate::Preparer;
 use crate::config::{AnchorConfig, DetectorConfig};
-use data::{DataError, Dataset, Object};
+use data::{AugmentConfig, DataError, Dataset, Object};
 use geometry::{Box3, limit_period};
 use rayon::prelude::*;
 use statistics::{median_upper, quantile_linear};
@@ -33,6 +33,8 @@ pub const FORCED_SHARE: f64 = 0.05;
 pub struct LabelledBoxes {
     /// The objects of each frame.
     pub frames: Vec<Vec<Object>>,
+    /// Largest rotation about z that training adds to headings, rad.
+    pub turned_rad: f64,
 }
 
 impl LabelledBoxes {
@@ -47,7 +49,25 @@ impl LabelledBoxes {
             dataset.objects(id, &dataset.labels(id)?)
         };
         let frames: Vec<Result<_, DataError>> = (0..n).into_par_iter().map(frame).collect();
-        Ok(LabelledBoxes { frames: frames.into_iter().collect::<Result<_, _>>()? })
+        Ok(LabelledBoxes { frames: frames.into_iter().collect::<Result<_, _>>()?, turned_rad: 0.0 })
+    }
+
+    /// The boxes as training shows them: flips double the frames, rotations turn the headings. The range is fitted to
+    /// the places where boxes are, not to those to which a rotation about the sensor carries them.
+    fn augmented(&self, augmentation: &AugmentConfig) -> Self {
+        let mut frames = self.frames.clone();
+        let flips = [augmentation.flip_along_x_probability, augmentation.flip_along_y_probability];
+        for (axis, _) in flips.iter().enumerate().filter(|(_, probability)| **probability > 0.0) {
+            let flipped = |object: &Object| {
+                let mut object = object.clone();
+                object.bbox.center[1 - axis] *= -1.0;
+                object.bbox.yaw_rad = if axis == 0 { -object.bbox.yaw_rad } else { PI - object.bbox.yaw_rad };
+                object
+            };
+            frames.extend(frames.clone().iter().map(|objects| objects.iter().map(flipped).collect()));
+        }
+        let turned_rad = augmentation.rotation_rad.iter().fold(0.0f64, |most, r| most.max(r.abs()));
+        LabelledBoxes { frames, turned_rad }
     }
 
     /// All boxes of a class.
@@ -55,10 +75,10 @@ impl LabelledBoxes {
         self.frames.iter().flatten().filter(move |o| o.class == class).map(|o| &o.bbox)
     }
 
-    /// Median size of the boxes of a class in whole centimetres, and their number; `None` without boxes.
-    pub(crate) fn median_size(&self, class: &str) -> Option<([f32; 3], usize)> {
-        let n = self.of_class(class).count();
-        (n > 0).then(|| ([0, 1, 2].map(|i| centimetres(median(self.of_class(class).map(|b| b.size[i])))), n))
+    /// Median size of the boxes of a class in whole centimetres; `None` without boxes.
+    pub(crate) fn median_size(&self, class: &str) -> Option<[f32; 3]> {
+        self.of_class(class).next()?;
+        Some([0, 1, 2].map(|i| centimetres(median(self.of_class(class).map(|b| b.size[i])))))
     }
 
     /// All boxes of some classes.
@@ -133,9 +153,11 @@ pub fn suggest(detector: &DetectorConfig, boxes: &LabelledBoxes) -> Result<Sugge
     }
     let mut fitted = detector.clone();
     let mut changes = Vec::new();
-    fitted.network.fit(&mut fitted.range_m, &fitted.classes, boxes, &mut changes);
+    let shown = boxes.augmented(&detector.augmentation);
+    fitted.network.fit(&mut fitted.range_m, &fitted.classes, &shown, &mut changes);
     fitted.check().map_err(|message| format!("the fitted detector does not hold together: {message}"))?;
-    let both = |of: fn(&DetectorConfig, &LabelledBoxes) -> Option<f64>| Some([of(detector, boxes)?, of(&fitted, boxes)?]);
+    let both =
+        |of: fn(&DetectorConfig, &LabelledBoxes) -> Option<f64>| Some([of(detector, boxes)?, of(&fitted, boxes)?]);
     Ok(Suggestion { changes, forced: both(forced_share), positives: both(positives_a_box), detector: fitted })
 }
 
@@ -185,12 +207,7 @@ fn centimetres(v: f64) -> f32 {
 
 /// Fits the range: around the centres of all boxes with a margin, horizontally in whole multiples of `unit_m`, the side
 /// of a cell of the coarsest map; without one in whole metres.
-pub(crate) fn fit_range(
-    range: &mut [f32; 6],
-    boxes: &[Box3],
-    unit_m: Option<[f64; 2]>,
-    changes: &mut Vec<Change>,
-) {
+pub(crate) fn fit_range(range: &mut [f32; 6], boxes: &[Box3], unit_m: Option<[f64; 2]>, changes: &mut Vec<Change>) {
     let mut is = *range;
     let mut reasons = Vec::new();
     let half = median(boxes.iter().map(|b| b.size[0])) / 2.0;
@@ -266,16 +283,18 @@ pub(crate) fn fit_grid(
 /// Fits sizes, heights and headings of anchors to the boxes of their classes.
 pub(crate) fn fit_anchors(anchors: &mut [AnchorConfig], boxes: &LabelledBoxes, changes: &mut Vec<Change>) {
     for anchor in anchors.iter_mut() {
-        let Some((size, n)) = boxes.median_size(&anchor.class) else { continue };
+        let Some(size) = boxes.median_size(&anchor.class) else { continue };
+        let n = boxes.of_class(&anchor.class).count();
         let key = |name: &str| format!("network.anchors ({}).{name}", anchor.class);
         let bottom = centimetres(median(boxes.of_class(&anchor.class).map(|b| b.z_range().0)));
-        let turned = boxes.of_class(&anchor.class).filter(|b| limit_period(b.yaw_rad, 0.5, PI).abs() > FRAC_PI_8).count();
+        let turn = |b: &&Box3| limit_period(b.yaw_rad, 0.5, PI).abs() + boxes.turned_rad;
+        let turned = boxes.of_class(&anchor.class).filter(|b| turn(b) > FRAC_PI_8).count();
         let (size_key, bottom_key, rotations_key) = (key("size_m"), key("bottom_m"), key("rotations_rad"));
-        change(changes, &size_key, &mut anchor.size_m, size, format!("median of {n} boxes"));
-        change(changes, &bottom_key, &mut anchor.bottom_m, bottom, format!("median bottom of {n} boxes"));
+        change(changes, &size_key, &mut anchor.size_m, size, "median of the boxes".into());
+        change(changes, &bottom_key, &mut anchor.bottom_m, bottom, "median bottom of the boxes".into());
         let share = 1.0 - turned as f64 / n as f64;
         let rotations = if share >= SAME_HEADING { vec![0.0] } else { vec![0.0, 1.57] };
-        let why = format!("{:.1} % of the boxes stand within 22.5 degrees of the x axis", 100.0 * share);
+        let why = format!("{:.1} % of the boxes stand within 22.5 degrees of the x axis in training", 100.0 * share);
         change(changes, &rotations_key, &mut anchor.rotations_rad, rotations, why);
     }
     // Every class needs the same number of headings.
@@ -296,17 +315,20 @@ mod tests {
     fn cars(n: usize) -> LabelledBoxes {
         let car = |i: usize| {
             let t = i as f64 / n as f64;
-            let bbox = Box3::from_array([160.0 * t - 80.0, 40.0 * (7.0 * t).fract() - 20.0, 0.7, 4.9, 1.9, 1.2, 0.1 * t]);
+            let bbox =
+                Box3::from_array([160.0 * t - 80.0, 40.0 * (7.0 * t).fract() - 20.0, 0.7, 4.9, 1.9, 1.2, 0.1 * t]);
             Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None }
         };
-        LabelledBoxes { frames: (0..n).map(|i| vec![car(i)]).collect() }
+        LabelledBoxes { frames: (0..n).map(|i| vec![car(i)]).collect(), turned_rad: 0.0 }
     }
 
     #[test]
     fn the_coarse_network_gets_anchors_that_match() {
         let mut coarse = find_detector("pointpillars_race").unwrap();
+        coarse.augmentation.rotation_rad = [-0.1, 0.1];
         let NetworkConfig::PointPillars(net) = &mut coarse.network else { unreachable!() };
-        net.pillars.size_m = [0.8, 0.8, 16.0];
+        net.pillars.size_m = [0.8, 0.8, 13.0];
+        coarse.range_m = [-102.4, -102.4, -3.0, 102.4, 102.4, 10.0];
         let suggestion = suggest(&coarse, &cars(400)).unwrap();
         let [before, after] = suggestion.forced.unwrap();
         assert!(before > 0.2 && after < 0.01, "{before} {after}");

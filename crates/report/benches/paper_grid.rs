@@ -88,7 +88,8 @@ fn scores() -> Scores {
 fn matrix(scores: &Scores) -> Matrix {
     let network =
         |name: &&str| PlannedNetwork { network: Place::new(name), train_sets: places(), seeds: (1..=SEEDS).collect() };
-    let plan = MatrixPlan { networks: NETWORKS.iter().map(network).collect(), test_sets: places(), ..MatrixPlan::default() };
+    let plan =
+        MatrixPlan { networks: NETWORKS.iter().map(network).collect(), test_sets: places(), ..MatrixPlan::default() };
     build(&plan, scores, &MatrixOptions::default())
 }
 

@@ -79,6 +79,27 @@ impl<'a> FrameScene<'a> {
         scan
     }
 
+    /// Number of returns from each of `cars` cars, for thin beams that are fired at the same time. Equal to counting them
+    /// in the scan, but casts those rays alone that come near a car.
+    pub fn returns_of_cars(&self, beams: &Beams, cars: usize) -> Vec<usize> {
+        let mut returns = vec![0; cars];
+        for sensor in &beams.sensors {
+            let transform = RayTransform::new(&self.ego.pose, &sensor.true_mount, self.world.origin, None);
+            let rays = sensor.directions().iter().map(|direction| transform.ray(*direction, 0.0));
+            let rays: Vec<Ray> = rays.filter(|ray| self.scene.may_hit_instance(ray)).collect();
+            if rays.is_empty() {
+                continue;
+            }
+            let mut hits = vec![Hit::MISS; rays.len()];
+            self.scene.cast(&rays, rays.len(), &mut hits);
+            let limits = sensor.limits_m[0]..=sensor.limits_m[1];
+            for hit in hits.iter().filter(|hit| hit.is_hit() && hit.object > 0 && limits.contains(&hit.range_m)) {
+                returns[hit.object as usize - 1] += 1;
+            }
+        }
+        returns
+    }
+
     /// The shots of a sensor with their nominal directions, without returns.
     fn nominal_shots(&self, number: usize, sensor: &SensorBeams, beams: &Beams, echoes: &mut Vec<Echo>) {
         let mount = &sensor.nominal_mount;

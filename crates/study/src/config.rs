@@ -435,7 +435,11 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
                 "train contains \"real\", which is not in the study",
             ),
             ("of = \"sim\"", "of = \"other\"", "resim.of is \"other\""),
-            ("{ resim = { of = \"sim\", effects = \"noise.toml\" } }", "{ true_labels = { of = \"x\" } }", "true_labels.of is \"x\""),
+            (
+                "{ resim = { of = \"sim\", effects = \"noise.toml\" } }",
+                "{ true_labels = { of = \"x\" } }",
+                "true_labels.of is \"x\"",
+            ),
             ("name = \"sim-noise\"", "name = \"sim-noise\"\nscene_of = \"sim\"", "scene_of and sensor_of"),
             (
                 "name = \"sim-noise\"",

@@ -94,8 +94,7 @@ fn scatter(powers: &[Power], network: &str, test_set: &str, overlap: f64) -> (Sc
     let nearest = STORED.iter().min_by(|a, b| (a.0 - overlap).abs().total_cmp(&(b.0 - overlap).abs()));
     let stored = nearest.map_or(STORED[0].1, |(_, scatter)| *scatter);
     let at: Vec<&Power> = powers.iter().filter(|p| p.overlap == overlap).collect();
-    let own: Vec<&Power> =
-        at.iter().copied().filter(|p| p.network == network && p.test_set == test_set).collect();
+    let own: Vec<&Power> = at.iter().copied().filter(|p| p.network == network && p.test_set == test_set).collect();
     let known = if own.is_empty() { at } else { own };
     let of_frames = known.iter().map(|p| p.scatter.of_frames).max_by(f64::total_cmp);
     let of_seeds = known.iter().filter(|p| p.seeds > 1).map(|p| p.scatter.of_seeds).max_by(f64::total_cmp);

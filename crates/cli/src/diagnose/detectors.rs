@@ -66,15 +66,14 @@ fn study_of(
     (extended, sensor): (&Path, Option<&Path>),
 ) -> Result<StudyConfig> {
     let absolute = |path: &Path| std::path::absolute(path).map(Source::Path);
-    let set =
-        |name: &str, title: &str, source| StudyDataset {
-            name: name.into(),
-            title: title.into(),
-            paper: None,
-            scene_of: None,
-            sensor_of: None,
-            source,
-        };
+    let set = |name: &str, title: &str, source| StudyDataset {
+        name: name.into(),
+        title: title.into(),
+        paper: None,
+        scene_of: None,
+        sensor_of: None,
+        source,
+    };
     let made_anew = Source::Resim {
         of: BEFORE.into(),
         effects: std::path::absolute(extended)?,

@@ -99,7 +99,8 @@ fn draw(
     let first = done.first().map(|(_, scores)| *scores);
     let frames_key = first.map_or(String::new(), |scores| scores.frames_key.clone());
     let places = [&network.network, train_set, test_set];
-    let resamples = Resamples::new(&network.network.name, &frames_key, first.map_or(0, |s| s.frames), done.len(), options);
+    let resamples =
+        Resamples::new(&network.network.name, &frames_key, first.map_or(0, |s| s.frames), done.len(), options);
     let [(numbers, draws), (of_true_boxes, draws_of_true_boxes)] = [Reference::Labels, Reference::TrueBoxes]
         .map(|reference| numbers_of(reference, &done, places, &resamples, options));
     let cell = Cell {

@@ -73,9 +73,7 @@ fn of_gap(matrix: &Matrix, gap: &Gap) -> Option<Power> {
     let interval = gap.interval?;
     let cell = |train: &str| matrix.cell(&gap.network, train, &gap.test_set);
     let (own, other) = (cell(&gap.compared_to)?, cell(&gap.train_set)?);
-    let runs = |cell: &super::Cell| {
-        Some(cell.number(&gap.class, None, gap.quantity, gap.overlap)?.of_runs.clone())
-    };
+    let runs = |cell: &super::Cell| Some(cell.number(&gap.class, None, gap.quantity, gap.overlap)?.of_runs.clone());
     let (of_own, of_other) = (runs(own)?, runs(other)?);
     let difference = |run: &super::RunNumber| {
         let same = of_other.iter().find(|o| o.seed == run.seed)?;

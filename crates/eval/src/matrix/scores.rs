@@ -38,7 +38,8 @@ impl TestSet {
 
     /// The same frames with the true boxes as their labels; `None` where the truth beside the labels is not known.
     pub fn of_true_boxes(&self) -> Option<TestSet> {
-        let frame = |(frame, labels): (&EvalFrame, &Vec<LabelBox>)| EvalFrame { labels: labels.clone(), ..frame.clone() };
+        let frame =
+            |(frame, labels): (&EvalFrame, &Vec<LabelBox>)| EvalFrame { labels: labels.clone(), ..frame.clone() };
         let frames = self.frames.iter().zip(self.truth.as_ref()?).map(frame).collect();
         Some(TestSet { label_frame: self.label_frame, frames, truth: None })
     }

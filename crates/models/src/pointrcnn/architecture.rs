@@ -34,8 +34,8 @@ impl Architecture for PointRcnn {
         fit_range(range, &boxes.of_classes(classes), None, changes);
         for mean in net.point_head.mean_sizes.iter_mut() {
             let key = format!("network.point_head.mean_sizes ({}).size_m", mean.class);
-            if let Some((size, n)) = boxes.median_size(&mean.class) {
-                change(changes, &key, &mut mean.size_m, size, format!("median of {n} boxes"));
+            if let Some(size) = boxes.median_size(&mean.class) {
+                change(changes, &key, &mut mean.size_m, size, "median of the boxes".into());
             }
         }
     }

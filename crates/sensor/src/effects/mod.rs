@@ -242,7 +242,8 @@ impl EffectList {
         let acts_elsewhere = |effect: &Effect| {
             let mut world = WorldPlan::default();
             effect.model().on_world(&mut world);
-            world != ideal || matches!(effect, Effect::LabelNoise(_) | Effect::LabelOffset(_) | Effect::LabelTimeOffset(_))
+            world != ideal
+                || matches!(effect, Effect::LabelNoise(_) | Effect::LabelOffset(_) | Effect::LabelTimeOffset(_))
         };
         let neutral = || Effect::RangeBias(RangeBias::default());
         let effect = |effect: &Effect| if acts_elsewhere(effect) { neutral() } else { effect.clone() };

@@ -27,6 +27,21 @@ fn rig(rows: u32, columns: u32) -> Rig {
 }
 
 #[test]
+fn returns_of_cars_are_those_of_the_scan() {
+    let (world, car, materials) = (world(), CarShape::new(&race_car()), MaterialTable::default());
+    // One car hides another; one is out of the field of view behind the sensor's limits.
+    let cars = [(5020.0, 3.0), (5027.0, 4.0), (4985.0, -6.0), (5190.0, 0.0)].map(|(x, y)| motion(x, y, [0.0; 3]));
+    let scene = FrameScene::new(&world, &car, &materials, motion(5000.0, 0.0, [0.0; 3]), &cars);
+    let beams = Beams::of(&rig(64, 1440));
+    let mut counted = vec![0; cars.len()];
+    for car in scene.scan(&beams).returns().filter_map(Echo::car) {
+        counted[car] += 1;
+    }
+    assert_eq!(scene.returns_of_cars(&beams, cars.len()), counted);
+    assert!(counted[0] > 100 && counted[2] > 100, "{counted:?}");
+}
+
+#[test]
 fn points_lie_where_the_world_is() {
     let (world, car, materials) = (world(), CarShape::new(&race_car()), MaterialTable::default());
     let scene =

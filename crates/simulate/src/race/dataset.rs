@@ -9,7 +9,10 @@ use crate::auto_label::{LabelError, label_errors};
 use crate::street::SplitCounts;
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, label_boxes, write_kitti_text};
-use data::{DataError, Dataset, DatasetConfig, LabelFrame, Manifest, NewDataset, PointColumns, write_atomic};
+use data::{
+    DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Manifest, NewDataset, PointColumns, read_kitti_text,
+    write_atomic,
+};
 use rayon::prelude::*;
 use sensor::attributes;
 use sensor::effects::{Effect, EffectList};
@@ -17,7 +20,7 @@ use sensor::matched::{RangeHistogram, fit_range_dropout};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Schema version of the manifest.
 pub const RACE_MANIFEST_SCHEMA: &str = "lidarshift/race-dataset/1";
@@ -134,7 +137,7 @@ fn make_frame_file(
 ) -> Result<SplitCounts, SimulateError> {
     let (config, id) = (&simulator.config, key.id());
     let beside = attributes::path(new.root(), &id);
-    let truth = set.auto_label.map(|_| new.root().join(TRUE_LABELS).join(format!("{id}.txt")));
+    let truth = set.auto_label.map(|_| true_labels_path(new.root(), &id));
     let has_truth = truth.as_ref().is_none_or(|path| path.is_file());
     if !(new.has_frame(&id, true) && has_truth && (!config.attributes || beside.is_file())) {
         let made = simulator.make(set, key)?;
@@ -152,6 +155,10 @@ fn make_frame_file(
     }
     let [points, cars] = new.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
+}
+
+fn true_labels_path(root: &Path, id: &str) -> PathBuf {
+    root.join(TRUE_LABELS).join(format!("{id}.txt"))
 }
 
 /// Writes all files of a data set except the frames.
@@ -203,9 +210,8 @@ fn matched(target: &Path, from: &Path) -> Result<sensor::effects::RangeDropout, 
 fn errors_of_labels(simulator: &Simulator, new: &NewDataset) -> Result<Vec<LabelError>, SimulateError> {
     let of_frame = |key: &FrameKey| {
         let labels = new.layout().read_labels(new.root(), &key.id())?;
-        let cars = simulator.cars(key)?.into_iter().zip(simulator.labelled(key)?);
-        let truth = cars.filter(|(_, labelled)| *labelled).map(|(car, _)| car.true_box);
-        Ok(labels.iter().map(|label| label.lidar_box()).zip(truth).collect())
+        let truth = read_kitti_text(&true_labels_path(new.root(), &key.id()), KittiText::Labels)?;
+        Ok(labels.iter().zip(&truth).map(|(label, truth)| (label.lidar_box(), truth.lidar_box())).collect())
     };
     let pairs: Result<Vec<Vec<_>>, SimulateError> = simulator.keys().par_iter().map(of_frame).collect();
     Ok(label_errors(pairs?.into_iter().flatten()))

@@ -211,12 +211,7 @@ impl Simulator {
     pub fn labelled(&self, key: &FrameKey) -> Result<Vec<bool>, SimulateError> {
         let (ego, motions) = self.motions(key)?;
         let scene = self.scene_of(&self.ideal, ego, &motions);
-        let mut returns = vec![0; motions.len()];
-        for echo in scene.scan(&self.beams).echoes.iter().filter(|echo| echo.is_return()) {
-            if let Some(car) = echo.car() {
-                returns[car] += 1;
-            }
-        }
+        let returns = scene.returns_of_cars(&self.beams, motions.len());
         let in_range =
             |car: &LabelledCar| car.true_box.center[0].hypot(car.true_box.center[1]) <= self.config.label_range_m;
         let cars = self.cars(key)?;

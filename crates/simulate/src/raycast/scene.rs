@@ -115,6 +115,20 @@ impl Scene {
         }
     }
 
+    /// Whether a ray at time 0 meets the bounds of an instance. A ray that does not cannot hit one.
+    pub fn may_hit_instance(&self, ray: &Ray) -> bool {
+        self.instances.iter().any(|placed| {
+            let (mut near, mut far) = (0.0f32, f32::INFINITY);
+            for k in 0..3 {
+                let inverse = 1.0 / ray.direction[k];
+                let [a, b] = [placed.bounds[k], placed.bounds[k + 3]].map(|bound| (bound - ray.origin[k]) * inverse);
+                // A ray within a face of the bounds gives NaN, which neither maximum nor minimum takes.
+                (near, far) = (near.max(a.min(b)), far.min(a.max(b)));
+            }
+            near <= far
+        })
+    }
+
     /// As [`Scene::cast`], on all threads of the pool; identical results.
     pub fn cast_parallel(&self, rays: &[Ray], columns: usize, hits: &mut [Hit]) {
         let rows = (RAYS_PER_JOB / columns).next_multiple_of(PACKET_ROWS).max(PACKET_ROWS);

@@ -81,7 +81,8 @@ fn gaps(m: &Matrix, class: &str) -> Option<Item> {
         };
         let interval = g.interval.map_or(String::new(), |i| format!("{:.2} to {:.2}", i.low, i.high));
         let could_see = m.power.iter().find(|p| {
-            (&p.network, &p.test_set, &p.train_set, &p.compared_to) == (&g.network, &g.test_set, &g.train_set, &g.compared_to)
+            (&p.network, &p.test_set, &p.train_set, &p.compared_to)
+                == (&g.network, &g.test_set, &g.train_set, &g.compared_to)
                 && (&p.class, p.overlap) == (&g.class, g.overlap)
         });
         let could_see = number(could_see.filter(|_| g.reference == Reference::Labels).map(|p| p.detectable), 1);
