@@ -8,87 +8,27 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from bev import INPUTS_BESIDE_CHANNELS, Encoder, PillarNet, make_cells, make_points
+
 POSITIVES = 60  # anchors of a frame that have a box
-INPUTS_BESIDE_CHANNELS = 6  # offsets of a point from its pillar's mean and centre
 
 
-class PillarNet(nn.Module):
-    def __init__(self, inputs, filters, max_points):
-        super().__init__()
-        self.linear = nn.Linear(inputs, filters, bias=False)
-        self.norm = nn.BatchNorm1d(filters, eps=1e-3, momentum=0.01)
-        self.max_points = max_points
-
-    def padded(self, x):  # [P, M, F] -> [P, C]
-        y = self.linear(x)
-        y = self.norm(y.permute(0, 2, 1)).permute(0, 2, 1)
-        return F.relu(y).max(dim=1)[0]
-
-    def of_points(self, x, pillar, pillars):  # [N, F] -> [P, C]
-        y = self.linear(x)
-        rows = pillars * self.max_points
-        mean = y.sum(0) / rows
-        variance = (y.square().sum(0) / rows - mean.square()).clamp(min=0)
-        with torch.no_grad():
-            self.norm.running_mean.lerp_(mean, 0.01)
-            self.norm.running_var.lerp_(variance * rows / (rows - 1), 0.01)
-        scale = self.norm.weight * torch.rsqrt(variance + self.norm.eps)
-        y = F.relu(torch.addcmul(self.norm.bias - mean * scale, y, scale))
-        empty = F.relu(self.norm.bias - mean * scale)
-        out = empty.expand(pillars, -1).clone()
-        return out.scatter_reduce(0, pillar[:, None].expand(-1, y.shape[1]), y, "amax", include_self=True)
-
-
-class Network(nn.Module):
+class Network(Encoder):
     def __init__(self, config):
-        super().__init__()
         net = config["network"]
-        size, extent = net["pillars"]["size_m"], config["range_m"]
-        self.nx, self.ny = (round((extent[3 + i] - extent[i]) / size[i]) for i in range(2))
+        super().__init__(config, net["vfe_filters"])
         self.vfe = PillarNet(config["channels"] + INPUTS_BESIDE_CHANNELS, net["vfe_filters"], net["pillars"]["max_points"])
-        norm = lambda channels: nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
-        backbone = net["backbone"]
-        self.blocks, self.deblocks = nn.ModuleList(), nn.ModuleList()
-        before = net["vfe_filters"]
-        for i, filters in enumerate(backbone["filters"]):
-            strides = [backbone["strides"][i]] + [1] * backbone["layers"][i]
-            layers = []
-            for stride in strides:
-                layers += [nn.Conv2d(before, filters, 3, stride, 1, bias=False), norm(filters), nn.ReLU()]
-                before = filters
-            self.blocks.append(nn.Sequential(*layers))
-            up, up_filters = backbone["upsample_strides"][i], backbone["upsample_filters"][i]
-            deconv = nn.ConvTranspose2d(filters, up_filters, up, up, bias=False)
-            self.deblocks.append(nn.Sequential(deconv, norm(up_filters), nn.ReLU()))
-        neck = sum(backbone["upsample_filters"])
         self.classes = len(config["classes"])
         self.bins = net["head"]["dir_bins"]
         self.anchors = sum(len(anchor["rotations_rad"]) for anchor in net["anchors"])
-        self.conv_cls = nn.Conv2d(neck, self.anchors * self.classes, 1)
-        self.conv_box = nn.Conv2d(neck, self.anchors * 7, 1)
-        self.conv_dir_cls = nn.Conv2d(neck, self.anchors * self.bins, 1)
+        self.conv_cls = nn.Conv2d(self.neck, self.anchors * self.classes, 1)
+        self.conv_box = nn.Conv2d(self.neck, self.anchors * 7, 1)
+        self.conv_dir_cls = nn.Conv2d(self.neck, self.anchors * self.bins, 1)
         nn.init.constant_(self.conv_cls.bias, -4.595)
         nn.init.normal_(self.conv_box.weight, std=0.001)
 
-    def canvas(self, features, cells, batch, best):
-        channels = features.shape[1]
-        if best:
-            canvas = features.new_zeros(batch * self.ny * self.nx, channels).index_put((cells,), features)
-            return canvas.view(batch, self.ny, self.nx, channels).permute(0, 3, 1, 2)
-        frames = []
-        for frame in range(batch):
-            of_frame = cells // (self.ny * self.nx) == frame
-            canvas = features.new_zeros(channels, self.ny * self.nx)
-            canvas[:, cells[of_frame] - frame * self.ny * self.nx] = features[of_frame].t()
-            frames.append(canvas)
-        return torch.stack(frames).view(batch, channels, self.ny, self.nx)
-
     def heads(self, x):
-        batch, ups = x.shape[0], []
-        for block, deblock in zip(self.blocks, self.deblocks):
-            x = block(x)
-            ups.append(deblock(x))
-        x = torch.cat(ups, dim=1)
+        batch, x = x.shape[0], self.features(x)
         heads = [(self.conv_cls, self.classes), (self.conv_box, 7), (self.conv_dir_cls, self.bins)]
         return [conv(x).permute(0, 2, 3, 1).reshape(batch, -1, k) for conv, k in heads]
 
@@ -107,25 +47,6 @@ def box_loss(said, truth):
     truth = torch.cat([truth[..., :6], torch.cos(heading) * torch.sin(true_heading)], dim=-1)
     n = (said - truth).abs()
     return torch.where(n < 1 / 9, 4.5 * n.square(), n - 0.5 / 9)
-
-
-def make_points(config, points, pillars):
-    """As many points in each pillar as the total allows, at least one: padded pillars, points alone, the pillar of each."""
-    max_points = config["network"]["pillars"]["max_points"]
-    inputs = config["channels"] + INPUTS_BESIDE_CHANNELS
-    num_points = torch.ones(pillars, dtype=torch.long)
-    share = torch.rand(pillars).pow(4)
-    num_points += (share / share.sum() * (points - pillars)).long().clamp(max=max_points - 1)
-    is_point = torch.arange(max_points)[None] < num_points[:, None]
-    padded = torch.randn(pillars, max_points, inputs) * is_point[..., None]
-    return padded, padded[is_point], torch.repeat_interleave(torch.arange(pillars), num_points)
-
-
-def make_cells(batch, pillars, area):
-    """Cells of the pillars, about as many in each frame, in the canvases laid end to end."""
-    each = pillars // batch
-    sizes = [each] * (batch - 1) + [pillars - each * (batch - 1)]
-    return torch.cat([torch.randperm(area)[:n] + frame * area for frame, n in enumerate(sizes)])
 
 
 def make_inference(config, batch, points, pillars, best):

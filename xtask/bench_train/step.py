@@ -1,4 +1,4 @@
-"""Times training steps of the two networks, inference and the costliest layers in PyTorch on the CPU, on made-up inputs of given sizes.
+"""Times training steps of the networks, inference and the costliest layers in PyTorch on the CPU, on made-up inputs of given sizes.
 
 Reads the report of `lidarshift-checks bench-step --json` and builds the same network from the configuration in it, so that both sides have the
 same layers, the same number of points and the same number of pillars. Prints one line of JSON.
@@ -41,6 +41,10 @@ def main():
             "pillar-net": pointpillars.make_pillar_net,
         }[report["work"]]
         step = make(config, report["batch"], points, pillars, best)
+    elif config["network"]["kind"] == "centerpoint":
+        import centerpoint
+
+        step = centerpoint.make_step(config, report["batch"], *report["read"])
     else:
         import pointrcnn
 

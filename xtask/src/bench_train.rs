@@ -47,6 +47,11 @@ const NETWORKS: &[Network] = &[
         detectors: &[["published", "pointrcnn"], ["small", "pointrcnn_small"]],
         works: &[("step", "step", &[["torch", "openpcdet"]])],
     },
+    Network {
+        name: "centerpoint",
+        detectors: &[["published", "centerpoint"], ["small", "centerpoint_small"]],
+        works: &[("step", "step", &[["torch_as_openpcdet", "openpcdet"]])],
+    },
 ];
 
 /// Timing compared with one reference.
@@ -250,7 +255,7 @@ mod tests {
             let filters: Vec<String> = filters.iter().map(|&w| w.into()).collect();
             cases(&filters).into_iter().flat_map(|case| case.references).map(|(id, _)| id).collect()
         };
-        assert_eq!(ids(&[]).len(), 72);
+        assert_eq!(ids(&[]).len(), 80);
         assert_eq!(
             ids(&["pointrcnn/published", "batch1/threads2"]),
             ["pointrcnn/published/step/batch1/threads2/torch"]

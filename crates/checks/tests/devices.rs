@@ -14,7 +14,9 @@ fn reference_numbers_on_every_device() {
         let text = output_text(&output);
         if output.status.success() {
             devices.push(device);
-            must(&golden("synthetic/pointrcnn_tiny"), &format!("parity . --device {device}"));
+            for network in ["pointrcnn_tiny", "centerpoint_tiny"] {
+                must(&golden(&format!("synthetic/{network}")), &format!("parity . --device {device}"));
+            }
         } else {
             let absent = ["was built without the feature", "no adapter"].iter().any(|reason| text.contains(reason));
             assert!(absent, "{device}: {text}");
@@ -28,7 +30,7 @@ fn reference_numbers_on_every_device() {
 #[test]
 fn reference_numbers_with_fewer_instructions() {
     for set in ["portable", "avx2"] {
-        for network in ["pointpillars_tiny", "pointrcnn_tiny"] {
+        for network in ["pointpillars_tiny", "pointrcnn_tiny", "centerpoint_tiny"] {
             let output = program(&golden(&format!("synthetic/{network}")), "parity .")
                 .env("LIDARSHIFT_SIMD", set)
                 .output()

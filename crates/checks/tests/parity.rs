@@ -9,7 +9,7 @@ use std::fs;
 #[test]
 fn equals_the_reference() {
     let dir = tempfile::tempdir().unwrap();
-    for name in ["synthetic/pointpillars_tiny", "operators"] {
+    for name in ["synthetic/pointpillars_tiny", "synthetic/centerpoint_tiny", "operators"] {
         must(dir.path(), &format!("parity {} --json rows.json", golden(name).display()));
         let rows: serde_json::Value = serde_json::from_slice(&fs::read(dir.path().join("rows.json")).unwrap()).unwrap();
         let rows = rows["rows"].as_array().unwrap();

@@ -32,7 +32,7 @@ fn training_and_detection() {
     data_set(dir.path());
     let devices = available_devices(dir.path());
     assert!(devices.starts_with(&["flex", "ndarray"]), "{devices:?}");
-    for detector in ["tiny", "tiny_pointrcnn"] {
+    for detector in ["tiny", "tiny_pointrcnn", "tiny_centerpoint"] {
         let mut losses = Vec::new();
         for device in &devices {
             let out = format!("{detector}-{device}");
@@ -64,7 +64,7 @@ fn half_precision() {
     let refused = run(dir.path(), "train --dataset . --detector tiny.toml --epochs 1 --precision f16 --out refused");
     assert_eq!(refused.status.code(), Some(1));
     assert!(output_text(&refused).contains("--precision f16 is for GPUs"), "{}", output_text(&refused));
-    for detector in ["tiny", "tiny_pointrcnn"] {
+    for detector in ["tiny", "tiny_pointrcnn", "tiny_centerpoint"] {
         let mut losses = Vec::new();
         for precision in ["f16", "f32"] {
             let out = format!("{detector}-{precision}");

@@ -14,6 +14,9 @@ const TRAIN: &str = "train --dataset . --detector tiny.toml --epochs 4 --set run
 const TRAIN_POINTRCNN: &str =
     "train --dataset . --detector tiny_pointrcnn.toml --epochs 4 --set run.checkpoint_every_steps=2";
 
+const TRAIN_CENTERPOINT: &str =
+    "train --dataset . --detector tiny_centerpoint.toml --epochs 4 --set run.checkpoint_every_steps=2";
+
 fn weights(folder: &Path, run: &str) -> Vec<u8> {
     fs::read(folder.join(run).join("checkpoint/last.safetensors")).unwrap()
 }
@@ -31,6 +34,11 @@ fn killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
 #[test]
 fn pointrcnn_killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
     kill_and_resume(TRAIN_POINTRCNN);
+}
+
+#[test]
+fn centerpoint_killed_at_any_moment_and_resumed_ends_with_the_same_bits() {
+    kill_and_resume(TRAIN_CENTERPOINT);
 }
 
 fn kill_and_resume(train: &str) {
@@ -59,7 +67,8 @@ fn kill_and_resume(train: &str) {
 fn the_number_of_threads_changes_no_bit() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
-    for (train, network) in [(TRAIN, "pointpillars"), (TRAIN_POINTRCNN, "pointrcnn")] {
+    let networks = [(TRAIN, "pointpillars"), (TRAIN_POINTRCNN, "pointrcnn"), (TRAIN_CENTERPOINT, "centerpoint")];
+    for (train, network) in networks {
         let [one, two, three] = ["1", "2", "3"].map(|threads| {
             let out = format!("{network}-{threads}");
             let mut child = program(dir.path(), &format!("{train} --out {out}"));

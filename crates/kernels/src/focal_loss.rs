@@ -78,7 +78,7 @@ fn loss_and_gradient(logits: &[f32], targets: &[f32], scales: &[f32], gradient: 
 /// e^x for x <= 0 to about 1 ulp; x is clamped to -87. Cody and Waite's range reduction and a polynomial, without
 /// branches for vectorisation.
 #[inline(always)]
-fn exp_of_negative(x: f32) -> f32 {
+pub(crate) fn exp_of_negative(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0; // 1.5 * 2^23: adding it rounds to whole numbers
     let x = if x < -87.0 { -87.0 } else { x };
     let shifted = x * std::f32::consts::LOG2_E + ROUND;
@@ -92,7 +92,7 @@ fn exp_of_negative(x: f32) -> f32 {
 
 /// ln(1 + e) for e in [0, 1], to about 2 ulp, also for small e: 2 artanh(e / (2 + e)).
 #[inline(always)]
-fn ln_1p_of_unit(e: f32) -> f32 {
+pub(crate) fn ln_1p_of_unit(e: f32) -> f32 {
     let s = e / (2.0 + e);
     let z = s * s;
     let series = [1.0 / 15.0, 1.0 / 13.0, 1.0 / 11.0, 1.0 / 9.0, 1.0 / 7.0, 1.0 / 5.0, 1.0 / 3.0, 1.0];

@@ -7,6 +7,7 @@
 //! Arguments are checked by assertions, because shapes come from code and not from users.
 
 pub mod adam;
+pub mod append_maximum;
 pub mod batch_norm;
 mod blocks;
 pub mod canvas;
@@ -14,6 +15,7 @@ pub mod conv3x3;
 pub mod epilogue;
 pub mod focal_loss;
 pub mod fold;
+pub mod gaussian_focal_loss;
 mod images;
 mod matrix;
 mod output;
@@ -32,12 +34,14 @@ mod upsampling;
 mod weight_gradient;
 
 pub use adam::{AdamStep, GradientNorm, Parameter};
+pub use append_maximum::GroupedRows;
 pub use batch_norm::{BatchNorm, Statistics};
 pub use canvas::Canvas;
 pub use conv3x3::{Algorithm, Conv3x3};
 pub use epilogue::Epilogue;
 pub use focal_loss::sigmoid_focal_loss;
 pub use fold::{Folded, NormParameters};
+pub use gaussian_focal_loss::gaussian_focal_loss;
 pub use pillar_net::{PillarGradients, PillarNet, PillarParameters, PillarState, Pillars};
 pub use pixel_heads::{PixelHeadGradients, PixelHeads};
 pub use scheme::PackedWeights;

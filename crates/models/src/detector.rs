@@ -136,8 +136,9 @@ impl Detector {
     /// The feature vector of each frame, for t-SNE and for distances between data sets: the input of the head, averaged
     /// over all places.
     ///
-    /// PointPillars: the neck's output, mean over the cells of the BEV map (384 values as published). PointRCNN: the
-    /// finest feature propagation, mean over the sampled points (128 values); zeros for a frame without points.
+    /// PointPillars and CenterPoint: the neck's output, mean over the cells of the BEV map (384 values as published).
+    /// PointRCNN: the finest feature propagation, mean over the sampled points (128 values); zeros for a frame without
+    /// points.
     ///
     /// # Errors
     /// Samples of another kind of network.
@@ -148,8 +149,8 @@ impl Detector {
     /// The outputs of all layers for one frame, first to last; the last is the input of the head. Empty for a frame
     /// without points.
     ///
-    /// PointPillars: the pillar feature net (mean over pillars), each block and the neck (mean over cells). PointRCNN:
-    /// each level of set abstraction and of feature propagation (mean over points).
+    /// PointPillars and CenterPoint: the pillar feature net (mean over pillars), each block and the neck (mean over
+    /// cells). PointRCNN: each level of set abstraction and of feature propagation (mean over points).
     ///
     /// # Errors
     /// A sample of another kind of network.

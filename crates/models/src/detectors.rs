@@ -31,6 +31,7 @@ macro_rules! detectors {
 
         /// The trainable part of a detector.
         #[derive(burn::module::Module, Debug)]
+        #[expect(clippy::large_enum_variant, reason = "a process has one or two")]
         pub enum Network {
             $($(#[$doc])* $kind($folder::$network),)+
         }

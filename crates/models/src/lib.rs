@@ -4,6 +4,7 @@
 #[macro_use]
 mod detectors;
 
+pub mod bev;
 pub mod checkpoint;
 pub mod config;
 pub mod kernel_ops;
@@ -33,4 +34,6 @@ detectors! {
     PointPillars(pointpillars::PointPillars),
     /// PointRCNN (Shi et al. 2019) as OpenPCDet builds it.
     PointRcnn(pointrcnn::PointRcnn),
+    /// CenterPoint with pillars (Yin et al. 2021) as OpenPCDet builds it, one stage.
+    CenterPoint(centerpoint::CenterPoint),
 }

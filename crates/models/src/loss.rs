@@ -1,6 +1,6 @@
 //! Losses of the detectors, as OpenPCDet computes them.
 
-use crate::kernel_ops::focal_loss_sum;
+use crate::kernel_ops::{self, focal_loss_sum};
 use burn::tensor::activation::{log_softmax, sigmoid};
 use burn::tensor::{Int, Tensor, TensorData};
 
@@ -30,6 +30,24 @@ pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: Vec<i32>, weights: Vec<f32>)
         }
         let tensor = |values, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
         (sigmoid_focal(logits, tensor(one_hot, [rows, classes])) * tensor(weights, [rows, 1])).sum()
+    })
+}
+
+/// `scale` times the sum over all cells of the focal loss of heat maps: with p the sigmoid of the logit, clamped to
+/// [1e-4, 1 - 1e-4], `-(1 - p)^2 ln p` where the heat map is 1, else `-(1 - h)^4 p^2 ln(1 - p)`.
+///
+/// # Shapes
+/// `logits`: `[B, C, H, W]`; `heat_map`: as many values, row-major; result `[1]`.
+pub fn gaussian_focal_sum(logits: Tensor<4>, heat_map: Vec<f32>, scale: f32) -> Tensor<1> {
+    kernel_ops::gaussian_focal_loss(&logits, &heat_map, scale).unwrap_or_else(|| {
+        let heat_map = Tensor::<4>::from_data(TensorData::new(heat_map, logits.dims()), &logits.device());
+        let p = sigmoid(logits).clamp(1e-4, 1.0 - 1e-4);
+        let q = -p.clone() + 1.0;
+        let far = (-heat_map.clone() + 1.0).powi_scalar(4);
+        let peak = p.clone().log() * q.clone().powi_scalar(2);
+        let other = q.log() * p.powi_scalar(2) * far;
+        let is_peak = heat_map.equal_elem(1.0);
+        other.mask_where(is_peak, peak).sum() * -scale
     })
 }
 

@@ -6,7 +6,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 use std::collections::BTreeMap;
 
-/// OpenPCDet's name of the tensor at a path of field names, `PointPillars.vfe.weight`.
+/// OpenPCDet's name of the tensor at a path of field names, `PointPillars.encoder.backbone_2d.deblocks.0.weight`.
 pub fn reference_name(path: &str) -> String {
     crate::tensor_name(&path.split('.').collect::<Vec<_>>())
 }

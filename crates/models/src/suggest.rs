@@ -1,6 +1,7 @@
 //! Fits a detector's range, grid and anchors to labelled boxes, with the reason for each change.
 
 use crate::Preparer;
+use crate::bev::{BackboneConfig, PillarsConfig};
 use crate::config::{AnchorConfig, DetectorConfig};
 use data::{AugmentConfig, DataError, Dataset, Object};
 use geometry::{Box3, limit_period};
@@ -259,20 +260,19 @@ pub(crate) fn fit_pillars(
     change(changes, "network.pillars.size_m", size_m, [side, side, size_m[2]], why);
 }
 
-/// Fits pillars and range of a network on a grid. `stride` is the number of pillars a cell of the output map, `strides`
-/// those of the backbone.
+/// Fits pillars and range of a network on a grid.
 pub(crate) fn fit_grid(
-    size_m: &mut [f32; 3],
+    pillars: &mut PillarsConfig,
+    backbone: &BackboneConfig,
     range: &mut [f32; 6],
-    stride: usize,
-    strides: &[usize],
     classes: &[String],
     boxes: &LabelledBoxes,
     changes: &mut Vec<Change>,
 ) {
-    fit_pillars(size_m, stride, classes, boxes, changes);
+    let size_m = &mut pillars.size_m;
+    fit_pillars(size_m, backbone.output_stride(), classes, boxes, changes);
     let found = boxes.of_classes(classes);
-    let coarsest = strides.iter().product::<usize>() as f64;
+    let coarsest = backbone.strides.iter().product::<usize>() as f64;
     // Through decimal text, so that 0.4 stays 0.4.
     let side = |axis: usize| size_m[axis].to_string().parse::<f64>().unwrap_or(size_m[axis].into()) * coarsest;
     fit_range(range, &found, Some([side(0), side(1)]), changes);

@@ -1,11 +1,11 @@
 //! Pillars, anchors, box coder, target assigner and decoding against reference values of OpenPCDet.
 
 use lidarshift_models as models;
+use models::bev::pillars::{PillarGrid, Pillars, decorate, pillarise};
 use models::checkpoint::{HostTensor, HostValues, NamedTensors, read_safetensors};
 use models::pointpillars::anchors::{AnchorClass, anchors};
 use models::pointpillars::box_coder::{self, DIRECTION_OFFSET_RAD, limit_period};
 use models::pointpillars::decode::{DecodeOptions, RawBox, decode, decode_boxes};
-use models::pointpillars::pillars::{PillarGrid, Pillars, decorate, pillarise};
 use models::pointpillars::target_assigner::{NearestBev, Targets, assign};
 use std::path::{Path, PathBuf};
 

@@ -52,8 +52,8 @@ pub(super) fn pillar_net(network: &PointPillarsConfig, batch: &[Sample], steps: 
         Sample::PointPillars(sample) => Some(sample),
         _ => None,
     });
-    let features: Vec<f32> = of_pillars.clone().flat_map(|s| s.features.iter().copied()).collect();
-    let num_points: Vec<u32> = of_pillars.flat_map(|s| s.pillars.num_points.iter().copied()).collect();
+    let features: Vec<f32> = of_pillars.clone().flat_map(|s| s.input.features.iter().copied()).collect();
+    let num_points: Vec<u32> = of_pillars.flat_map(|s| s.input.pillars.num_points.iter().copied()).collect();
     let points = num_points.iter().sum::<u32>() as usize;
     let outputs = network.vfe_filters;
     let inputs = features.len() / points.max(1);

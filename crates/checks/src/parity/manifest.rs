@@ -28,6 +28,8 @@ pub struct Manifest {
     /// Maximum number of points per pillar.
     #[serde(default = "default_points")]
     pub max_points_per_pillar: usize,
+    /// Maximum number of pillars, if the folder limits it.
+    pub max_pillars: Option<usize>,
     /// Score threshold of PointPillars' `det`.
     pub score_thresh: Option<f32>,
     /// Score threshold of `det2`.
@@ -40,6 +42,9 @@ pub struct Manifest {
     /// Number of input points of PointRCNN.
     #[serde(default)]
     pub num_points: usize,
+    /// Name and shape of every tensor of the network, if the folder lists them.
+    #[serde(default)]
+    pub names: BTreeMap<String, Vec<usize>>,
     /// Differences between single and double precision of the reference, by tensor.
     #[serde(default)]
     pub f32_minus_f64: BTreeMap<String, Natural>,
@@ -54,6 +59,9 @@ fn default_points() -> usize {
 pub struct Natural {
     /// Relative L2 distance of the whole tensor.
     pub rel_l2: Option<f64>,
+    /// Whether the tensor is zero in double precision, so that single precision gives rounding errors alone.
+    #[serde(default)]
+    pub zero: bool,
 }
 
 impl Manifest {
@@ -73,6 +81,9 @@ impl Manifest {
 
     /// Ten times the rounding error of the losses of the reference, within fixed limits.
     pub fn loss_tolerance(&self) -> f64 {
+        if let Some(rel) = self.f32_minus_f64.get("train/losses").and_then(|n| n.rel_l2) {
+            return (10.0 * rel).clamp(1e-6, 1e-3);
+        }
         let natural = |(name, single): (&String, &f64)| {
             let double = self.losses_f64.get(name)?;
             (*double != 0.0).then(|| (single / double - 1.0).abs())
@@ -129,6 +140,12 @@ pub fn floats(value: &Value) -> Result<Vec<f64>> {
 /// Reads a list of non-negative integers.
 pub fn usizes(value: &Value) -> Result<Vec<usize>> {
     Ok(floats(value)?.into_iter().map(|v| v as usize).collect())
+}
+
+/// Reads a list of names.
+pub fn names(value: &Value) -> Result<Vec<String>> {
+    let name = |v: &Value| v.as_str().map(String::from);
+    list(value)?.iter().map(|v| name(v).with_context(|| format!("manifest.json: a name is needed, not {v}"))).collect()
 }
 
 /// Reads the channels of two hidden layers.

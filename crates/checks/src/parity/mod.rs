@@ -1,5 +1,6 @@
 //! `cargo xtask parity DIR`: compares this program with reference values of OpenPCDet and PyTorch, tensor by tensor.
 
+mod bev;
 mod manifest;
 mod network;
 mod operators;
@@ -19,7 +20,7 @@ macro_rules! detectors {
     };
 }
 
-detectors!(pointpillars, pointrcnn);
+detectors!(pointpillars, pointrcnn, centerpoint);
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -97,7 +98,9 @@ mod tests {
 
     #[test]
     fn operations_and_small_networks_equal_the_reference() {
-        for folder in ["operators", "synthetic/pointpillars_tiny", "synthetic/pointrcnn_tiny"] {
+        for folder in
+            ["operators", "synthetic/pointpillars_tiny", "synthetic/pointrcnn_tiny", "synthetic/centerpoint_tiny"]
+        {
             assert!(passes(folder), "{folder}");
         }
     }

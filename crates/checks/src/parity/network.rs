@@ -3,18 +3,22 @@
 
 use super::manifest::Manifest;
 use super::recipe;
-use super::reference::{ReferenceFile, Row, numbers};
+use super::reference::{ReferenceFile, Row, Samples, numbers};
 use anyhow::{Context, Result};
 use burn::tensor::{Device, Tensor};
 use data::{Cloud, Frame};
-use models::checkpoint::{HostValues, read_checkpoint, read_safetensors};
+use models::checkpoint::{HostTensor, HostValues, NamedTensors, read_checkpoint, read_safetensors};
 use models::config::{DetectorConfig, NetworkConfig};
 use models::layers::host;
 use models::{Detector, Losses, named};
+use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Upper limit of the tolerance of a stage, independent of the rounding errors of the reference.
 pub const STAGE_LIMIT: f64 = 1e-3;
+
+/// Largest value of a gradient that is zero in exact arithmetic, as a share of the largest gradient of the network.
+const ZERO_GRADIENT: f64 = 1e-5;
 
 /// Number of repetitions of a failed gradient comparison, for small and for large networks. Gradients are discontinuous
 /// where a ReLU or a maximum switches, so that rounding can decide the result. A failed comparison is repeated with
@@ -34,6 +38,22 @@ pub struct DetectorChecks {
     pub eval: fn(&mut Case, &Detector) -> Result<()>,
     /// Compares every stage of a forward pass in training mode; returns the losses with their autodiff graph.
     pub train: fn(&mut Case, &Detector) -> Result<Losses>,
+    /// How gradients are compared.
+    pub gradients: Gradients,
+}
+
+/// Tolerance of a gradient: ten times its own rounding error in the reference, at least a limit.
+#[derive(Clone, Copy, Debug)]
+pub struct Gradients {
+    /// The limit for small and for large networks.
+    pub least: [f64; 2],
+    /// How the samples of a gradient are compared.
+    pub samples: Samples,
+}
+
+impl Gradients {
+    /// For references whose gradients depend on ReLUs that switch.
+    pub const WIDE: Gradients = Gradients { least: [1e-3, 5e-2], samples: Samples::Largest };
 }
 
 /// Compares all files of the folder.
@@ -113,6 +133,9 @@ impl Case<'_> {
     /// weight recipe.
     fn checkpoints(&mut self, detector: &Detector) -> Result<()> {
         let ours = detector.to_named()?;
+        if !self.manifest.names.is_empty() {
+            self.names(&ours);
+        }
         let mut statistics = self.file("bn_running_stats")?;
         for name in statistics.names().map(String::from).collect::<Vec<_>>() {
             let tensor = ours.get(&name).with_context(|| format!("the network has no tensor {name}"))?;
@@ -125,7 +148,7 @@ impl Case<'_> {
                 let read = read_checkpoint(&path)?;
                 detector.clone().load_named(&read)?;
                 for (tensor, reference) in &read {
-                    let error = ours.get(tensor).map(|t| f64::from(u8::from(t != reference)));
+                    let error = ours.get(tensor).map(|t| f64::from(u8::from(!same(t, reference))));
                     let row = Row {
                         file: name.into(),
                         tensor: tensor.clone(),
@@ -140,19 +163,37 @@ impl Case<'_> {
         Ok(())
     }
 
+    /// Compares the names and shapes of all tensors with the list of the manifest.
+    fn names(&mut self, ours: &NamedTensors) {
+        let names: BTreeSet<&String> = ours.keys().chain(self.manifest.names.keys()).collect();
+        for name in names.into_iter().filter(|name| *name != "global_step") {
+            let shapes = [ours.get(name).map(|t| &t.shape), self.manifest.names.get(name)];
+            let pass = shapes[0] == shapes[1];
+            let error = shapes.iter().all(Option::is_some).then_some(f64::from(u8::from(!pass)));
+            self.rows.push(Row { file: "manifest".into(), tensor: name.clone(), error, tolerance: 0.0, pass });
+        }
+    }
+
     /// Compares the gradients. In networks of full size they are noisy, since a ReLU that switches because of the last
     /// bit changes whole sums; see the tolerances in the description of the folder.
     fn gradients(&self, detector: &Detector, total: Tensor<1>) -> Result<Vec<Row>> {
         let gradients = named::gradients(&detector.network, &total.backward())?;
-        let limit: f64 = if self.is_noisy() { 5e-2 } else { 1e-3 };
+        let rule = self.manifest.checks()?.gradients;
+        let limit = rule.least[usize::from(self.is_noisy())];
+        let magnitude = |values: Vec<f64>| values.into_iter().map(f64::abs).fold(0.0, f64::max);
+        let largest = gradients.values().map(|gradient| magnitude(numbers(gradient))).fold(0.0, f64::max);
         let mut rows = Vec::new();
         for name in ["train_grads", "train_grads_f64"] {
             let mut file = self.file(name)?;
             for (parameter, gradient) in &gradients {
                 // In some small networks a ReLU switches between single and double precision of the reference.
-                let natural = self.manifest.f32_minus_f64.get(&format!("grad/{parameter}")).and_then(|n| n.rel_l2);
-                let tolerance = limit.max(10.0 * natural.unwrap_or(0.0));
-                file.compare_stage(parameter, &numbers(gradient), &gradient.shape, tolerance)?;
+                let natural = self.manifest.f32_minus_f64.get(&format!("grad/{parameter}"));
+                if natural.is_some_and(|natural| natural.zero) {
+                    file.compare_zero_gradient(parameter, &numbers(gradient), largest, ZERO_GRADIENT)?;
+                    continue;
+                }
+                let tolerance = limit.max(10.0 * natural.and_then(|n| n.rel_l2).unwrap_or(0.0));
+                file.compare_gradient(parameter, &numbers(gradient), tolerance, rule.samples)?;
             }
             rows.extend(file.finish());
         }
@@ -179,6 +220,14 @@ impl Case<'_> {
         }
         self.rows.extend(file.finish());
         Ok(())
+    }
+}
+
+/// Whether two tensors are equal. A counter may be stored with or without a dimension.
+fn same(ours: &HostTensor, reference: &HostTensor) -> bool {
+    match (&ours.values, &reference.values) {
+        (HostValues::I64(a), HostValues::I64(b)) if a.len() == 1 => a == b,
+        _ => ours == reference,
     }
 }
 

@@ -2,18 +2,19 @@
 
 mod sizes;
 
-use super::network::{Case, DetectorChecks, frame, wide};
+use super::bev;
+use super::network::{Case, DetectorChecks, Gradients, frame, wide};
 use super::reference::ReferenceFile;
 use anyhow::{Context, Result, bail};
 use models::config::NetworkConfig;
 use models::layers::{Mode, host};
 use models::pointpillars::decode::{DecodeOptions, decode};
-use models::pointpillars::pillars::Pillars;
 use models::pointpillars::{PointPillars, PointPillarsConfig, Preparation, Sample, Stages};
 use models::{Detector, Losses, Network};
 
 /// The comparisons of PointPillars.
-pub const CHECKS: DetectorChecks = DetectorChecks { name: "PointPillar", config: sizes::config, eval, train };
+pub const CHECKS: DetectorChecks =
+    DetectorChecks { name: "PointPillar", config: sizes::config, eval, train, gradients: Gradients::WIDE };
 
 fn parts<'a>(case: &Case<'a>, detector: &'a Detector) -> Result<(&'a PointPillarsConfig, &'a PointPillars)> {
     match (&case.config.network, &detector.network) {
@@ -28,7 +29,7 @@ fn eval(case: &mut Case, detector: &Detector) -> Result<()> {
     let mut file = case.file("eval")?;
     let preparation = Preparation::new(case.config, net);
     let sample = preparation.sample(&frame(file.floats("in.points")?, case.config.channels), false)?;
-    pillars(&mut file, &[&sample.pillars])?;
+    bev::pillars(&mut file, &[&sample.input.pillars])?;
     let stages = network.forward(&[&sample], Mode::Eval);
     compare_stages(case, &mut file, "eval", &stages)?;
 
@@ -109,7 +110,7 @@ fn train(case: &mut Case, detector: &Detector) -> Result<Losses> {
         let sample = preparation.sample(&frame(points, case.config.channels), true)?;
         batch.push(Sample { targets: Some(preparation.targets(truth)), ..sample });
     }
-    pillars(&mut file, &batch.iter().map(|s| &s.pillars).collect::<Vec<_>>())?;
+    bev::pillars(&mut file, &batch.iter().map(|s| &s.input.pillars).collect::<Vec<_>>())?;
     targets(&mut file, &batch)?;
     let batch: Vec<&Sample> = batch.iter().collect();
     let stages = network.forward(&batch, Mode::Train);
@@ -121,38 +122,18 @@ fn train(case: &mut Case, detector: &Detector) -> Result<Losses> {
 }
 
 fn compare_stages(case: &Case, file: &mut ReferenceFile, mode: &str, stages: &Stages) -> Result<()> {
-    let stage = |file: &mut ReferenceFile, name: &str, values: Vec<f32>, shape: &[usize]| {
-        let tolerance = case.tolerance(&format!("{mode}/{name}"));
-        file.compare_stage(name, &wide(&values), shape, tolerance)
-    };
-    let p = &stages.pillar_features;
-    stage(file, "pillar_features", host(p.clone())?, &p.dims())?;
-    let mut maps = vec![("spatial_features".to_string(), &stages.spatial_features)];
-    maps.extend(stages.backbone.blocks.iter().enumerate().map(|(i, t)| (format!("block{i}"), t)));
-    maps.extend(stages.backbone.deblocks.iter().enumerate().map(|(i, t)| (format!("deblock{i}"), t)));
-    maps.push(("spatial_features_2d".to_string(), &stages.backbone.spatial_features_2d));
-    for (name, tensor) in maps {
-        stage(file, &name, host(tensor.clone())?, &tensor.dims())?;
-    }
+    bev::stages(case, file, mode, &stages.bev)?;
     let predictions = &stages.predictions;
     let [h, w] = predictions.map;
     for (name, tensor) in
         [("cls_preds", &predictions.cls), ("box_preds", &predictions.boxes), ("dir_cls_preds", &predictions.dir)]
     {
         let [b, anchors, k] = tensor.dims();
-        stage(file, name, host(tensor.clone())?, &[b, h, w, anchors * k / (h * w)])?;
+        let tolerance = case.tolerance(&format!("{mode}/{name}"));
+        let shape = [b, h, w, anchors * k / (h * w)];
+        file.compare_stage(name, &wide(&host(tensor.clone())?), &shape, tolerance)?;
     }
     Ok(())
-}
-
-fn pillars(file: &mut ReferenceFile, frames: &[&Pillars]) -> Result<()> {
-    let mut coords = Vec::new();
-    for (b, pillars) in frames.iter().enumerate() {
-        coords.extend(pillars.coords_zyx.iter().flat_map(|&[z, y, x]| [b as u32, z, y, x]).map(f64::from));
-    }
-    file.compare("pillar.coords_bzyx", &coords, 0.0)?;
-    let counts: Vec<f64> = frames.iter().flat_map(|p| p.num_points.iter().map(|&n| f64::from(n))).collect();
-    file.compare("pillar.num_points", &counts, 0.0)
 }
 
 fn targets(file: &mut ReferenceFile, batch: &[Sample]) -> Result<()> {

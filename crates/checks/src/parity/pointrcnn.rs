@@ -5,7 +5,7 @@
 
 mod sizes;
 
-use super::network::{Case, DetectorChecks, frame, wide};
+use super::network::{Case, DetectorChecks, Gradients, frame, wide};
 use super::reference::ReferenceFile;
 use super::rotations::{centers, reference_rotations};
 use anyhow::{Context, Result, bail};
@@ -26,7 +26,8 @@ use models::pointrcnn::{
 use models::{Detector, Losses, Network};
 
 /// The comparisons of PointRCNN.
-pub const CHECKS: DetectorChecks = DetectorChecks { name: "PointRCNN", config: sizes::config, eval, train };
+pub const CHECKS: DetectorChecks =
+    DetectorChecks { name: "PointRCNN", config: sizes::config, eval, train, gradients: Gradients::WIDE };
 
 /// Tolerance of squared distances, boxes and box codes, which depend on coordinates only.
 const EXACT: f64 = 1e-6;

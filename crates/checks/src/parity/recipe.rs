@@ -16,7 +16,21 @@ fn splitmix64(x: u64) -> u64 {
     z ^ (z >> 31)
 }
 
+/// The branch of a head of CenterPoint whose output layer has this tensor.
+fn branch_of_output(name: &str) -> Option<&str> {
+    match name.split('.').collect::<Vec<_>>()[..] {
+        ["dense_head", "heads_list", _, branch, _, _] => Some(branch),
+        _ => None,
+    }
+}
+
 fn gain(name: &str) -> f64 {
+    match branch_of_output(name) {
+        Some("hm" | "rot") => return 0.4,
+        Some("center" | "center_z") => return 0.2,
+        Some("dim") => return 0.1,
+        _ => {}
+    }
     const GAINS: [(&str, f64); 8] = [
         ("vfe.", 1.0 / 16.0),
         ("dense_head.conv_cls.", 0.25),
@@ -32,6 +46,7 @@ fn gain(name: &str) -> f64 {
 
 fn base(name: &str) -> f64 {
     match name {
+        _ if branch_of_output(name) == Some("hm") => -2.19,
         _ if name.starts_with("dense_head.conv_cls.") => -3.0,
         _ if name.starts_with("point_head.cls_layers.6.") => -2.0,
         _ => 0.0,

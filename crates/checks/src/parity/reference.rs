@@ -21,6 +21,16 @@ pub struct Row {
     pub pass: bool,
 }
 
+/// How the samples of a gradient are compared. Errors are relative to the rms of the gradient, since all samples may be
+/// small.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Samples {
+    /// The largest error.
+    Largest,
+    /// The rms of the errors, an estimate of the relative L2 distance of the whole gradient.
+    Rms,
+}
+
 /// A file with reference values, and the comparisons so far.
 pub struct ReferenceFile {
     name: String,
@@ -88,10 +98,7 @@ impl ReferenceFile {
         if self.has(&member("sample")) {
             let step = self.ints(&member("step"))?[0].max(1) as usize;
             let sampled: Vec<f64> = ours.iter().step_by(step).copied().collect();
-            match self.has(&member("l2")) {
-                true => self.compare_gradient_sample(stage, &sampled, ours.len(), tolerance)?,
-                false => self.compare(&member("sample"), &sampled, tolerance)?,
-            }
+            self.compare(&member("sample"), &sampled, tolerance)?;
         }
         if self.has(&member("first8")) {
             let count = numbers(self.input(&member("first8"))?).len();
@@ -101,6 +108,11 @@ impl ReferenceFile {
             let shape: Vec<f64> = shape.iter().map(|&d| d as f64).collect();
             self.compare(&member("shape"), &shape, 0.0)?;
         }
+        self.compare_sums(stage, ours, tolerance)
+    }
+
+    fn compare_sums(&mut self, stage: &str, ours: &[f64], tolerance: f64) -> Result<()> {
+        let member = |form: &str| format!("{stage}.{form}");
         let magnitude: f64 = ours.iter().map(|v| v.abs()).sum();
         for (form, value) in [("sum", ours.iter().sum::<f64>()), ("abs_sum", magnitude)] {
             if self.has(&member(form)) {
@@ -110,22 +122,48 @@ impl ReferenceFile {
                 self.push(&member(form), Some(error), tolerance);
             }
         }
-        if self.has(&member("l2")) {
-            self.compare(&member("l2"), &[ours.iter().map(|v| v * v).sum::<f64>().sqrt()], tolerance)?;
+        Ok(())
+    }
+
+    /// Compares a gradient by its samples, sum and norm.
+    pub fn compare_gradient(&mut self, parameter: &str, ours: &[f64], tolerance: f64, samples: Samples) -> Result<()> {
+        let norm = numbers(self.input(&format!("{parameter}.l2"))?)[0];
+        let rms = norm / (ours.len() as f64).sqrt();
+        let errors = self.sample_errors(parameter, ours)?;
+        let error = errors.map(|errors| match samples {
+            Samples::Largest => errors.iter().copied().fold(0.0, f64::max),
+            Samples::Rms => (errors.iter().map(|e| e * e).sum::<f64>() / errors.len().max(1) as f64).sqrt(),
+        });
+        let error = error.map(|error| error / if rms > 0.0 { rms } else { 1.0 }).filter(|e| e.is_finite());
+        self.push(&format!("{parameter}.sample"), error, tolerance);
+        self.compare_sums(parameter, ours, tolerance)?;
+        self.compare(&format!("{parameter}.l2"), &[ours.iter().map(|v| v * v).sum::<f64>().sqrt()], tolerance)
+    }
+
+    /// Compares a gradient that is zero in exact arithmetic: samples, sum and norm of both sides are rounding errors,
+    /// relative to `largest`, the largest gradient of the network.
+    pub fn compare_zero_gradient(&mut self, parameter: &str, ours: &[f64], largest: f64, tolerance: f64) -> Result<()> {
+        let largest = largest.max(f64::MIN_POSITIVE);
+        let errors = self.sample_errors(parameter, ours)?;
+        let error = errors.map(|errors| errors.into_iter().fold(0.0, f64::max) / largest).filter(|e| e.is_finite());
+        self.push(&format!("{parameter}.sample"), error, tolerance);
+        let n = ours.len() as f64;
+        for (form, value, size) in
+            [("sum", ours.iter().sum::<f64>(), n), ("l2", ours.iter().map(|v| v * v).sum::<f64>().sqrt(), n.sqrt())]
+        {
+            let reference = numbers(self.input(&format!("{parameter}.{form}"))?)[0];
+            self.push(&format!("{parameter}.{form}"), Some((value - reference).abs() / (size * largest)), tolerance);
         }
         Ok(())
     }
 
-    /// Compares samples of a gradient. The largest error is relative to the rms of the gradient, since all samples may
-    /// be small.
-    fn compare_gradient_sample(&mut self, parameter: &str, ours: &[f64], count: usize, tolerance: f64) -> Result<()> {
-        let rms = numbers(self.input(&format!("{parameter}.l2"))?)[0] / (count as f64).sqrt();
-        let name = format!("{parameter}.sample");
-        let truth = numbers(self.input(&name)?);
-        let largest = truth.iter().zip(ours).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        let error = largest / if rms > 0.0 { rms } else { 1.0 };
-        self.push(&name, (truth.len() == ours.len() && error.is_finite()).then_some(error), tolerance);
-        Ok(())
+    /// The distance of each sample of a gradient; `None` if their numbers differ.
+    fn sample_errors(&mut self, parameter: &str, ours: &[f64]) -> Result<Option<Vec<f64>>> {
+        let step = self.ints(&format!("{parameter}.step"))?[0].max(1) as usize;
+        let truth = numbers(self.input(&format!("{parameter}.sample"))?);
+        let ours: Vec<f64> = ours.iter().step_by(step).copied().collect();
+        let distances = truth.iter().zip(&ours).map(|(a, b)| (a - b).abs());
+        Ok((truth.len() == ours.len()).then(|| distances.collect()))
     }
 
     fn push(&mut self, tensor: &str, error: Option<f64>, tolerance: f64) {

@@ -67,8 +67,35 @@ epochs = 3
 batch_size = 2
 "#;
 
+/// A CenterPoint of similar size, with two layers of the pillar feature net.
+pub const TINY_CENTERPOINT: &str = r#"
+name = "tiny_centerpoint"
+classes = ["Car"]
+channels = 4
+range_m = [0.0, -5.12, -3.0, 10.24, 5.12, 1.0]
+[network]
+kind = "centerpoint"
+vfe_filters = [8, 8]
+[network.pillars]
+size_m = [0.32, 0.32, 4.0]
+max_points = 8
+max_train = 1000
+max_test = 1000
+[network.backbone]
+layers = [0, 1]
+strides = [2, 2]
+filters = [8, 16]
+upsample_strides = [1, 2]
+upsample_filters = [8, 8]
+[network.head]
+filters = 8
+[optimization]
+epochs = 3
+batch_size = 2
+"#;
+
 /// Writes seven frames with one or two cars on flat ground, in KITTI's layout with labels in the LiDAR frame, and the
-/// detectors `tiny.toml` and `tiny_pointrcnn.toml`.
+/// detectors `tiny.toml`, `tiny_pointrcnn.toml` and `tiny_centerpoint.toml`.
 pub fn data_set(folder: &Path) {
     let mut ids = Vec::new();
     for i in 0..7u64 {
@@ -97,6 +124,7 @@ pub fn data_set(folder: &Path) {
     write_split(&folder.join("ImageSets/val.txt"), &ids[5..]).unwrap();
     std::fs::write(folder.join("tiny.toml"), TINY_DETECTOR).unwrap();
     std::fs::write(folder.join("tiny_pointrcnn.toml"), TINY_POINTRCNN).unwrap();
+    std::fs::write(folder.join("tiny_centerpoint.toml"), TINY_CENTERPOINT).unwrap();
 }
 
 /// The program with these arguments and the working directory `folder`.

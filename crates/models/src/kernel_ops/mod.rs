@@ -2,22 +2,26 @@
 //!
 //! The functions return `None` if the tensors are not on the CPU device `flex`. The layers then use burn's operations.
 
+mod append_maximum;
 mod canvas;
 mod convolution;
 mod focal_loss;
+mod gaussian_focal_loss;
 mod norm_relu;
 mod pillar_net;
 mod pixel_heads;
 mod shared_mlp;
 mod values;
 
+pub use append_maximum::append_maximum;
 pub use canvas::scatter;
 pub use convolution::{conv3x3, folded_conv3x3, folded_transposed, transposed};
 pub use focal_loss::focal_loss_sum;
+pub use gaussian_focal_loss::gaussian_focal_loss;
 pub use norm_relu::norm_relu;
 pub use pillar_net::{pillar_net, pillar_net_inference};
 pub use pixel_heads::pixel_heads;
-pub use shared_mlp::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
+pub use shared_mlp::{MlpGroups, MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
 pub use values::FlexValues;
 
 use burn::backend::autodiff::checkpoint::base::Checkpointer;

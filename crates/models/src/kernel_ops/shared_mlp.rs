@@ -25,6 +25,32 @@ impl MlpRows {
     }
 }
 
+/// Groups of the rows, and what they are for.
+#[derive(Clone, Copy, Debug)]
+pub enum MlpGroups<'a> {
+    /// Each row counts once and is an output.
+    None,
+    /// Rows have the multiplicities of the groups, and each is an output.
+    Counted(&'a Arc<Groups>),
+    /// The same, and the maximum over each group is an output.
+    Maximum(&'a Arc<Groups>),
+}
+
+impl<'a> From<Option<&'a Arc<Groups>>> for MlpGroups<'a> {
+    fn from(groups: Option<&'a Arc<Groups>>) -> Self {
+        groups.map_or(MlpGroups::None, MlpGroups::Maximum)
+    }
+}
+
+impl<'a> MlpGroups<'a> {
+    fn groups(self) -> Option<&'a Arc<Groups>> {
+        match self {
+            MlpGroups::None => None,
+            MlpGroups::Counted(groups) | MlpGroups::Maximum(groups) => Some(groups),
+        }
+    }
+}
+
 /// Learned parameters of a layer.
 #[derive(Clone, Debug)]
 pub struct MlpParameters {
@@ -49,6 +75,8 @@ struct MlpKernel {
     mlp: SharedMlp,
     form: Form,
     groups: Option<Arc<Groups>>,
+    /// Whether the maximum over each group is the output.
+    maximum: bool,
     /// Running statistics, for inference.
     statistics: Option<Vec<Statistics>>,
 }
@@ -66,7 +94,7 @@ impl MlpKernel {
 
     fn groups(&self) -> RowGroups<'_> {
         self.groups.as_deref().map_or_else(RowGroups::default, |groups| RowGroups {
-            ends: Some(&groups.ends),
+            ends: self.maximum.then_some(&groups.ends[..]),
             counts: Some(&groups.count),
         })
     }
@@ -117,19 +145,20 @@ impl<const N: usize> Kernel<N> for MlpKernel {
     }
 
     fn shape(&self) -> Vec<usize> {
-        let groups = self.groups.as_ref().map_or(self.mlp.rows, |groups| groups.ends.len());
-        vec![groups, self.mlp.channels[self.mlp.channels.len() - 1]]
+        let groups = self.groups.as_ref().filter(|_| self.maximum);
+        let outputs = groups.map_or(self.mlp.rows, |groups| groups.ends.len());
+        vec![outputs, self.mlp.channels[self.mlp.channels.len() - 1]]
     }
 }
 
-/// Layers of linear, batch norm and ReLU, followed by the maximum over `groups` if given. Also returns the statistics
-/// of each layer and the number of rows.
+/// Layers of linear, batch norm and ReLU, followed by the maximum over groups if wanted. Also returns the statistics of
+/// each layer and the number of rows.
 ///
 /// # Shapes
-/// `rows`: see [`MlpRows`]; result `[G, C]`, or `[N, C]` without groups.
+/// `rows`: see [`MlpRows`]; result `[G, C]`, or `[N, C]` without a maximum.
 pub fn shared_mlp(
     rows: &MlpRows,
-    groups: Option<&Arc<Groups>>,
+    groups: MlpGroups<'_>,
     layers: &[MlpParameters],
     epsilon: f64,
 ) -> Option<(Tensor<2>, Vec<Statistics>, usize)> {
@@ -141,7 +170,7 @@ pub fn shared_mlp(
 /// The same with running statistics, for tensors without autodiff graph.
 pub fn shared_mlp_inference(
     rows: &MlpRows,
-    groups: Option<&Arc<Groups>>,
+    groups: MlpGroups<'_>,
     layers: &[MlpParameters],
     epsilon: f64,
     statistics: impl FnOnce() -> Vec<Statistics>,
@@ -152,11 +181,12 @@ pub fn shared_mlp_inference(
 
 fn kernel(
     rows: &MlpRows,
-    groups: Option<&Arc<Groups>>,
+    groups: MlpGroups<'_>,
     layers: &[MlpParameters],
     epsilon: f64,
     statistics: Option<Vec<Statistics>>,
 ) -> Option<MlpKernel> {
+    let (maximum, groups) = (matches!(groups, MlpGroups::Maximum(_)), groups.groups());
     let [n, channels] = rows.tensor().dims();
     let (form, rows, first) = match rows {
         MlpRows::Rows(_) => (Form::Rows, n, channels),
@@ -166,7 +196,7 @@ fn kernel(
         MlpRows::Gathered(_) => (Form::Gathered, groups?.source.len(), 3),
     };
     let channels = std::iter::once(first).chain(layers.iter().map(|layer| layer.gamma.dims()[0])).collect();
-    Some(MlpKernel { mlp: SharedMlp { rows, channels, epsilon }, form, groups: groups.cloned(), statistics })
+    Some(MlpKernel { mlp: SharedMlp { rows, channels, epsilon }, form, groups: groups.cloned(), maximum, statistics })
 }
 
 type Ran = (Tensor<2>, Option<Arc<MlpState>>);

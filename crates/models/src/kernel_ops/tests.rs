@@ -261,6 +261,40 @@ fn focal_loss_of_all_anchors() {
 }
 
 #[test]
+fn focal_loss_of_heat_maps() {
+    let logits = Tensor::<4>::from_data(TensorData::new(values(120, 17), [2, 3, 4, 5]), &device()) * 11.0;
+    let logits = logits.detach().require_grad();
+    let heat_map: Vec<f32> = values(120, 18).iter().map(|&v| if v > 0.7 { 1.0 } else { v.max(0.0) }).collect();
+    let ours = gaussian_focal_loss(&logits, &heat_map, 0.25).unwrap();
+    let theirs = {
+        let p = burn::tensor::activation::sigmoid(logits.clone()).clamp(1e-4, 1.0 - 1e-4);
+        let h = Tensor::<4>::from_data(TensorData::new(heat_map, [2, 3, 4, 5]), &device());
+        let q = -p.clone() + 1.0;
+        let is_peak = h.clone().equal_elem(1.0).float();
+        let peak = p.clone().log() * q.clone().powi_scalar(2) * is_peak.clone();
+        let other = q.log() * p.powi_scalar(2) * (-h + 1.0).powi_scalar(4) * (-is_peak + 1.0);
+        (peak + other).sum() * -0.25
+    };
+    check!("focal loss of heat maps", [logits], ours, theirs);
+}
+
+#[test]
+fn appended_maximum() {
+    let groups = Arc::new(groups(9, 7, 11));
+    let x = random([groups.source.len(), 5], 19);
+    let on_device = groups.to_device(&device());
+    let of_row: Vec<i32> = {
+        let mut begin = 0;
+        let of_group = |(g, &end): (usize, &u32)| vec![g as i32; (end - std::mem::replace(&mut begin, end)) as usize];
+        groups.ends.iter().enumerate().flat_map(of_group).collect()
+    };
+    let rows = of_row.len();
+    let of_row = Tensor::<1, burn::tensor::Int>::from_data(TensorData::new(of_row, [rows]), &device());
+    let theirs = Tensor::cat(vec![x.clone(), group_max(x.clone(), &on_device).select(0, of_row)], 1);
+    check!("appended maximum", [x], append_maximum(&x, &groups).unwrap(), theirs);
+}
+
+#[test]
 fn nan_propagates() {
     let mut x = values(2 * 3 * 4 * 4, 13);
     x[20] = f32::NAN;

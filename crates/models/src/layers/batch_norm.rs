@@ -3,7 +3,7 @@
 //! burn's layer accumulates the biased variance of a batch; PyTorch, and thus every published checkpoint, the unbiased
 //! one.
 
-use super::{Init, RowCounts, host};
+use super::{Init, Mode, RowCounts, host};
 use crate::kernel_ops::norm_relu;
 use burn::module::{Module, Param, RunningState};
 use burn::tensor::activation::relu;
@@ -38,6 +38,16 @@ pub struct Moments {
     pub count: usize,
 }
 
+impl Moments {
+    /// Those of the same values with `bias` added to each.
+    fn shifted(self, bias: Option<Tensor<1>>) -> Self {
+        match bias {
+            Some(bias) => Moments { mean: self.mean.detach() + bias.detach(), ..self },
+            None => self,
+        }
+    }
+}
+
 impl BatchNorm {
     /// Scale 1, shift 0, running mean 0 and variance 1.
     pub fn new(channels: usize, momentum: f64, epsilon: f64, init: &Init<'_>) -> Self {
@@ -57,6 +67,11 @@ impl BatchNorm {
     /// # Shapes
     /// `x` and result: `[B, C, ...]`.
     pub fn forward_train<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        self.forward_train_with_bias(x, None)
+    }
+
+    /// The same for `x` with `bias` added, which changes nothing but the running mean.
+    fn forward_train_with_bias<const D: usize>(&self, x: Tensor<D>, bias: Option<Tensor<1>>) -> Tensor<D> {
         let shape = x.dims();
         let [batch, channels] = [shape[0], shape[1]];
         let values = shape[2..].iter().product();
@@ -67,22 +82,32 @@ impl BatchNorm {
         let variance = sum_per_channel(centred.clone().square()) / count as f64; // [1, C, 1]
         let scale = self.weight.val().reshape([1, channels, 1]) / (variance.clone() + self.epsilon).sqrt();
         let out = centred * scale + self.bias.val().reshape([1, channels, 1]); // [B, C, L]
-        self.update(Moments { mean: mean.reshape([channels]), variance: variance.reshape([channels]), count });
+        let moments = Moments { mean: mean.reshape([channels]), variance: variance.reshape([channels]), count };
+        self.update(moments.shifted(bias));
         out.reshape(shape)
     }
 
-    /// [`BatchNorm::forward_train`] followed by a ReLU; one operation if there is a kernel.
+    /// Normalises and applies a ReLU; in training one operation if there is a kernel. `bias` is that of the layer
+    /// before and has not been added to `x`.
     ///
     /// # Shapes
-    /// `x` and result: `[B, C, ...]`.
-    pub fn forward_train_relu<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+    /// `x` and result: `[B, C, H, W]`; `bias`: `[C]`.
+    pub fn forward_relu(&self, x: Tensor<4>, bias: Option<Tensor<1>>, mode: Mode) -> Tensor<4> {
+        let channels = x.dims()[1];
+        if mode == Mode::Eval {
+            let x = match bias {
+                Some(bias) => x + bias.reshape([1, channels, 1, 1]),
+                None => x,
+            };
+            return relu(self.forward_eval(x));
+        }
         match norm_relu(&x, &self.weight.val(), &self.bias.val(), self.epsilon, true) {
             Some((y, statistics)) => {
-                let count = x.shape().num_elements() / x.dims()[1];
-                self.update(self.moments(&statistics, count));
+                let count = x.shape().num_elements() / channels;
+                self.update(self.moments(&statistics, count).shifted(bias));
                 y
             }
-            None => relu(self.forward_train(x)),
+            None => relu(self.forward_train_with_bias(x, bias)),
         }
     }
 
@@ -107,13 +132,18 @@ impl BatchNorm {
         Statistics { mean: of(&self.running_mean), variance: of(&self.running_var) }
     }
 
-    /// Applies `fold` to this norm with its running statistics, to fold it into the weights of the preceding layer.
+    /// Applies `fold` to this norm with its running statistics, to fold it into the weights of the preceding layer,
+    /// whose bias is `bias`.
     ///
     /// # Panics
     /// When the parameters are not f32.
-    pub fn folded(&self, fold: impl FnOnce(&NormParameters<'_>) -> Folded) -> Folded {
+    pub fn folded(&self, bias: Option<Tensor<1>>, fold: impl FnOnce(&NormParameters<'_>) -> Folded) -> Folded {
         let [gamma, beta] = [&self.weight, &self.bias].map(|p| host(p.val()).expect("parameters are f32"));
-        let statistics = self.running_statistics();
+        let mut statistics = self.running_statistics();
+        let bias = bias.map_or_else(Vec::new, |bias| host(bias).expect("parameters are f32"));
+        for (mean, bias) in statistics.mean.iter_mut().zip(bias) {
+            *mean -= f64::from(bias);
+        }
         fold(&NormParameters { gamma: &gamma, beta: &beta, statistics: &statistics, epsilon: self.epsilon })
     }
 

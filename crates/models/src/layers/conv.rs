@@ -2,92 +2,95 @@
 
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode, host};
-use crate::kernel_ops::{conv3x3, folded_conv3x3, folded_transposed, pixel_heads, transposed};
+use crate::kernel_ops::{conv3x3, folded_conv3x3, pixel_heads};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::activation::relu;
-use burn::tensor::module::{conv_transpose2d, conv2d};
-use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
+use burn::tensor::module::conv2d;
+use burn::tensor::ops::ConvOptions;
 
-/// 3x3 convolution with padding 1 and no bias, batch normalisation, ReLU.
+/// 3x3 convolution with padding 1, batch normalisation, ReLU.
+///
+/// A bias before a batch norm changes only the running mean: the norm subtracts it again. It is therefore never added
+/// to the image in training, and it has no gradient.
 #[derive(Module, Debug)]
 pub struct ConvBnRelu {
     /// `[C_out, C_in, 3, 3]`.
     pub weight: Param<Tensor<4>>,
+    /// `[C_out]`, if the convolution has a bias.
+    pub bias: Option<Param<Tensor<1>>>,
     /// The batch norm after the convolution.
     pub norm: BatchNorm,
     stride: usize,
 }
 
 impl ConvBnRelu {
-    /// A layer of the given channels and stride; `name` keys its initial weights.
+    /// A layer of the given channels and stride, without bias; `name` keys its initial weights.
     pub fn new(name: &str, channels: [usize; 2], stride: usize, norm: BatchNorm, init: &Init<'_>) -> Self {
         let [input, output] = channels;
-        ConvBnRelu { weight: init.uniform(name, [output, input, 3, 3], input * 9), norm, stride }
+        ConvBnRelu { weight: init.uniform(name, [output, input, 3, 3], input * 9), bias: None, norm, stride }
     }
 
     /// # Shapes
     /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H / stride, W / stride]`.
     pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
         let (weight, stride) = (self.weight.val(), self.stride);
+        let bias = self.bias.as_ref().map(Param::val);
+        let fold = || self.norm.folded(bias.clone(), |n| n.fold_into_conv(&values(&weight)));
         if mode == Mode::Eval
-            && let Some(y) = folded_conv3x3(&x, stride, || self.norm.folded(|n| n.fold_into_conv(&values(&weight))))
+            && let Some(y) = folded_conv3x3(&x, stride, fold)
         {
             return y;
         }
-        let y = conv3x3(&x, &weight, stride).unwrap_or_else(|| {
-            let options = ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
-            multiply(x, weight, |x, weight| conv2d(x, weight, None, options))
-        });
-        norm_relu(&self.norm, y, mode)
+        let y = conv(x, weight, stride);
+        self.norm.forward_relu(y, bias, mode)
     }
 }
 
-/// Transposed convolution with kernel = stride and no bias, batch normalisation, ReLU.
-#[derive(Module, Debug)]
-pub struct DeconvBnRelu {
-    /// `[C_in, C_out, stride, stride]`.
-    pub weight: Param<Tensor<4>>,
-    /// The batch norm after the convolution.
-    pub norm: BatchNorm,
-    stride: usize,
+/// 3x3 convolution with padding 1 and without bias, by a kernel if there is one.
+///
+/// # Shapes
+/// `x`: `[B, C_in, H, W]`; `weight`: `[C_out, C_in, 3, 3]`; result `[B, C_out, H / stride, W / stride]`.
+fn conv(x: Tensor<4>, weight: Tensor<4>, stride: usize) -> Tensor<4> {
+    conv3x3(&x, &weight, stride).unwrap_or_else(|| {
+        let options = ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
+        multiply(x, weight, |x, weight| conv2d(x, weight, None, options))
+    })
 }
 
-impl DeconvBnRelu {
-    /// A layer of the given channels and stride; `name` keys its initial weights.
-    pub fn new(name: &str, channels: [usize; 2], stride: usize, norm: BatchNorm, init: &Init<'_>) -> Self {
+/// The values of a weight on the host.
+///
+/// # Panics
+/// When they are not f32.
+pub(super) fn values(weight: &Tensor<4>) -> Vec<f32> {
+    host(weight.clone()).expect("weights are f32")
+}
+
+/// 3x3 convolution with padding 1 and bias.
+#[derive(Module, Debug)]
+pub struct Conv {
+    /// `[C_out, C_in, 3, 3]`.
+    pub weight: Param<Tensor<4>>,
+    /// `[C_out]`.
+    pub bias: Param<Tensor<1>>,
+}
+
+impl Conv {
+    /// PyTorch's default weights and biases; `name` keys them.
+    pub fn new(name: &str, channels: [usize; 2], init: &Init<'_>) -> Self {
         let [input, output] = channels;
-        let fan = output * stride * stride;
-        DeconvBnRelu { weight: init.uniform(name, [input, output, stride, stride], fan), norm, stride }
+        Conv {
+            weight: init.uniform(&format!("{name}.weight"), [output, input, 3, 3], input * 9),
+            bias: init.uniform(&format!("{name}.bias"), [output], input * 9),
+        }
     }
 
     /// # Shapes
-    /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H * stride, W * stride]`.
-    pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
-        let (weight, stride) = (self.weight.val(), self.stride);
-        let fold = || self.norm.folded(|n| n.fold_into_transposed(&values(&weight), stride));
-        if mode == Mode::Eval
-            && let Some(y) = folded_transposed(&x, stride, fold)
-        {
-            return y;
-        }
-        let y = transposed(&x, &weight, stride).unwrap_or_else(|| {
-            let options = ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1);
-            multiply(x, weight, |x, weight| conv_transpose2d(x, weight, None, options))
-        });
-        norm_relu(&self.norm, y, mode)
+    /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H, W]`.
+    pub fn forward(&self, x: Tensor<4>) -> Tensor<4> {
+        let bias = self.bias.val();
+        let channels = bias.dims()[0];
+        conv(x, self.weight.val(), 1) + bias.reshape([1, channels, 1, 1])
     }
-}
-
-fn norm_relu(norm: &BatchNorm, x: Tensor<4>, mode: Mode) -> Tensor<4> {
-    match mode {
-        Mode::Train => norm.forward_train_relu(x),
-        Mode::Eval => relu(norm.forward_eval(x)),
-    }
-}
-
-fn values(weight: &Tensor<4>) -> Vec<f32> {
-    host(weight.clone()).expect("weights are f32")
 }
 
 /// 1x1 convolution with bias.

@@ -2,12 +2,10 @@
 
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode};
-use crate::kernel_ops::{MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
-use crate::point_ops::Groups;
+use crate::kernel_ops::{MlpGroups, MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
 use burn::module::{Module, Param};
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
-use std::sync::Arc;
 
 /// Largest number of terms of a sequential sum: a sequential f32 sum over tens of thousands of rows would lose
 /// precision.
@@ -121,11 +119,11 @@ impl<const D: usize> RowsBnRelu<D> {
 /// Consecutive layers and the maximum over groups as one operation; `None` without a kernel.
 ///
 /// # Shapes
-/// `rows`: see [`MlpRows`]; result `[G, C]`, or `[N, C]` without groups.
-pub fn rows_kernel<const D: usize>(
+/// `rows`: see [`MlpRows`]; result `[G, C]`, or `[N, C]` without a maximum.
+pub fn rows_kernel<'a, const D: usize>(
     layers: &[RowsBnRelu<D>],
     rows: &MlpRows,
-    groups: Option<&Arc<Groups>>,
+    groups: impl Into<MlpGroups<'a>>,
     mode: Mode,
 ) -> Option<Tensor<2>> {
     let first_columns = if matches!(rows, MlpRows::Gathered(_)) { 3 } else { usize::MAX };
@@ -137,6 +135,7 @@ pub fn rows_kernel<const D: usize>(
     };
     let parameters: Vec<_> = layers.iter().enumerate().map(parameters).collect();
     let epsilon = layers.first()?.norm.epsilon();
+    let groups = groups.into();
     match mode {
         Mode::Train => {
             let (out, statistics, count) = shared_mlp(rows, groups, &parameters, epsilon)?;

@@ -1,8 +1,10 @@
 //! Sizes of PointPillars.
 
+use crate::bev::{BackboneConfig, EncoderConfig, PillarsConfig};
 use crate::config::{AnchorConfig, DetectorConfig};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::slice;
 
 /// Sizes of PointPillars; the defaults are the published KITTI network.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -32,55 +34,6 @@ pub struct PointPillarsConfig {
 
 fn default_vfe_filters() -> usize {
     64
-}
-
-/// Size and number of the pillars.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct PillarsConfig {
-    /// Extent of a pillar along x, y and z, m.
-    pub size_m: [f32; 3],
-    /// Largest number of points of a pillar; the first points in the order of the cloud are kept.
-    pub max_points: usize,
-    /// Largest number of pillars of a training frame.
-    pub max_train: usize,
-    /// Largest number of pillars of other frames.
-    pub max_test: usize,
-}
-
-impl Default for PillarsConfig {
-    fn default() -> Self {
-        PillarsConfig { size_m: [0.16, 0.16, 4.0], max_points: 32, max_train: 16_000, max_test: 40_000 }
-    }
-}
-
-/// Blocks of convolutions on the BEV canvas, and transposed convolutions that upsample their outputs to a common
-/// resolution.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct BackboneConfig {
-    /// Convolutions of a block after its first.
-    pub layers: Vec<usize>,
-    /// Stride of a block's first convolution.
-    pub strides: Vec<usize>,
-    /// Channels of a block.
-    pub filters: Vec<usize>,
-    /// Stride and kernel size of the transposed convolution after each block.
-    pub upsample_strides: Vec<usize>,
-    /// Channels of the transposed convolutions.
-    pub upsample_filters: Vec<usize>,
-}
-
-impl Default for BackboneConfig {
-    fn default() -> Self {
-        BackboneConfig {
-            layers: vec![3, 5, 5],
-            strides: vec![2, 2, 2],
-            filters: vec![64, 128, 256],
-            upsample_strides: vec![1, 2, 4],
-            upsample_filters: vec![128, 128, 128],
-        }
-    }
 }
 
 /// Constants of the direction classifier.
@@ -167,57 +120,16 @@ impl PointPillarsConfig {
                 return fail("network.anchors: every class needs the same number of rotations".into());
             }
         }
-        let b = &net.backbone;
-        let blocks = b.layers.len();
-        if blocks == 0
-            || [b.strides.len(), b.filters.len(), b.upsample_strides.len(), b.upsample_filters.len()]
-                .iter()
-                .any(|&n| n != blocks)
-        {
-            return fail("network.backbone: layers, strides, filters, upsample_strides and upsample_filters need one entry a block".into());
-        }
-        if b.strides.iter().chain(&b.filters).chain(&b.upsample_strides).chain(&b.upsample_filters).any(|&n| n == 0) {
-            return fail("network.backbone: strides and filters must be above 0".into());
-        }
-        let mut scale = 1;
-        let mut scales = Vec::new();
-        for (stride, up) in b.strides.iter().zip(&b.upsample_strides) {
-            scale *= stride;
-            scales.push((scale, *up));
-        }
-        if scales.iter().any(|(scale, up)| scale % up != 0 || scale / up != scales[0].0 / scales[0].1) {
-            return fail(
-                "network.backbone: strides and upsample_strides give the blocks different output sizes".into(),
-            );
-        }
-        let p = &net.pillars;
-        if p.size_m.iter().any(|&s| !(s > 0.0 && s.is_finite()))
-            || p.max_points == 0
-            || p.max_train == 0
-            || p.max_test == 0
-        {
-            return fail("network.pillars: sizes and limits must be above 0".into());
-        }
-        let [nx, ny, nz] = self.grid_size(detector);
-        if nz != 1 {
-            return fail(format!(
-                "network.pillars.size_m: {nz} pillars along z; the pillar must span the whole z range"
-            ));
-        }
-        if nx % scale != 0 || ny % scale != 0 || nx == 0 || ny == 0 {
-            return fail(format!(
-                "range_m and network.pillars.size_m give {nx} x {ny} pillars; both must be multiples of {scale}, the product of the strides"
-            ));
-        }
-        if net.vfe_filters == 0 || net.head.dir_bins < 2 {
-            return fail("network.vfe_filters must be above 0, network.head.dir_bins at least 2".into());
+        net.encoder().check(detector)?;
+        if net.head.dir_bins < 2 {
+            return fail("network.head.dir_bins must be at least 2".into());
         }
         Ok(())
     }
 
-    /// Pillars along x, y and z.
-    pub fn grid_size(&self, detector: &DetectorConfig) -> [usize; 3] {
-        let range = detector.range_m;
-        [0, 1, 2].map(|i| ((range[i + 3] - range[i]) as f64 / self.pillars.size_m[i] as f64).round() as usize)
+    /// The sizes of the network in front of the head.
+    pub fn encoder(&self) -> EncoderConfig<'_> {
+        let vfe_filters = slice::from_ref(&self.vfe_filters);
+        EncoderConfig { pillars: &self.pillars, vfe_filters, backbone: &self.backbone }
     }
 }

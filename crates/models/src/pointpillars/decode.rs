@@ -2,7 +2,7 @@
 //! `class_agnostic_nms`).
 
 use super::box_coder;
-use geometry::{Box3, rotated_nms};
+use crate::bev::suppress;
 
 /// Score threshold, NMS and direction constants.
 #[derive(Clone, Debug, PartialEq)]
@@ -95,10 +95,9 @@ pub fn decode(
         let class = logits.iter().position(|&logit| sigmoid(logit) == score).unwrap_or(0);
         found.push(RawBox { anchor, class, bbox, score });
     }
-    let solid: Vec<Box3> = found.iter().map(|raw| Box3::from_array(raw.bbox.map(f64::from))).collect();
     let scores: Vec<f32> = found.iter().map(|raw| raw.score).collect();
-    let kept = rotated_nms(&solid, &scores, options.nms_iou);
-    Ok(kept.into_iter().take(options.nms_post).map(|i| found[i].clone()).collect())
+    let kept = suppress(found.iter().map(|raw| raw.bbox), &scores, options.nms_iou, options.nms_post);
+    Ok(kept.into_iter().map(|i| found[i].clone()).collect())
 }
 
 /// The box of every anchor, before any threshold.

@@ -4,8 +4,8 @@ use super::anchors::{AnchorClass, anchors};
 use super::config::{LossConfig, PointPillarsConfig};
 use super::decode::{DecodeOptions, RawBox, decode};
 use super::head::Predictions;
-use super::pillars::{PillarGrid, Pillars, decorate, pillarise};
 use super::target_assigner::{NearestBev, Targets, assign};
+use crate::bev::{PillarPreparation, PillarSample};
 use crate::config::DetectorConfig;
 use crate::suggest::BoxMatch;
 use crate::{ModelError, layers};
@@ -13,25 +13,12 @@ use data::{Detection, Frame, Object};
 use geometry::Box3;
 
 /// One frame, ready for the network.
-#[derive(Clone, Debug)]
-pub struct Sample {
-    /// Id of the frame.
-    pub id: String,
-    /// Cells and point counts of its pillars.
-    pub pillars: Pillars,
-    /// Decorated points, sorted by pillar, `[N, F]`.
-    pub features: Vec<f32>,
-    /// Targets of the anchors; only in training.
-    pub targets: Option<Targets>,
-}
+pub type Sample = PillarSample<Targets>;
 
-/// Grid, anchors, classes and decoding options.
+/// Pillars, anchors and decoding options.
 #[derive(Clone, Debug)]
 pub struct Preparation {
-    classes: Vec<String>,
-    channels: usize,
-    grid: PillarGrid,
-    max_train: usize,
+    pillars: PillarPreparation,
     anchor_classes: Vec<AnchorClass>,
     anchors: Vec<[f32; 7]>,
     map: [usize; 2],
@@ -42,10 +29,7 @@ pub struct Preparation {
 impl Preparation {
     /// From the configuration of a detector.
     pub fn new(config: &DetectorConfig, net: &PointPillarsConfig) -> Self {
-        let range = config.range_m;
-        let stride = net.backbone.strides[0] / net.backbone.upsample_strides[0];
-        let [nx, ny, _] = net.grid_size(config);
-        let map = [ny / stride, nx / stride];
+        let map = net.encoder().map(config);
         let anchor_classes: Vec<AnchorClass> = net
             .anchors
             .iter()
@@ -59,16 +43,8 @@ impl Preparation {
             })
             .collect();
         Preparation {
-            classes: config.classes.clone(),
-            channels: config.channels,
-            grid: PillarGrid {
-                range,
-                size: net.pillars.size_m,
-                max_points: net.pillars.max_points,
-                max_pillars: net.pillars.max_test,
-            },
-            max_train: net.pillars.max_train,
-            anchors: anchors(range, map, &anchor_classes),
+            pillars: PillarPreparation::new(config, &net.pillars),
+            anchors: anchors(config.range_m, map, &anchor_classes),
             anchor_classes,
             map,
             decode: DecodeOptions {
@@ -103,27 +79,9 @@ impl Preparation {
     /// # Errors
     /// A cloud with too few values a point.
     pub fn sample(&self, frame: &Frame, training: bool) -> Result<Sample, ModelError> {
-        let id = frame.id.clone();
-        if frame.cloud.channels < self.channels {
-            let message =
-                format!("its points have {} values, the detector reads {}", frame.cloud.channels, self.channels);
-            return Err(ModelError::Frame { id, message });
-        }
-        let narrowed;
-        let cloud = if frame.cloud.channels == self.channels {
-            &frame.cloud
-        } else {
-            narrowed = frame.cloud.with_channels(self.channels);
-            &narrowed
-        };
-        let mut grid = self.grid.clone();
-        if training {
-            grid.max_pillars = self.max_train;
-        }
-        let pillars = pillarise(&cloud.values, self.channels, &grid);
-        let features = decorate(&pillars, &grid);
-        let targets = training.then(|| self.targets(&self.ground_truth(&frame.objects)));
-        Ok(Sample { id, pillars, features, targets })
+        let input = self.pillars.input(frame, training)?;
+        let targets = training.then(|| self.targets(&self.pillars.ground_truth(&frame.objects)));
+        Ok(Sample { input, targets })
     }
 
     /// Targets of boxes `[x, y, z, dx, dy, dz, yaw, class]`, classes from 1.
@@ -133,7 +91,7 @@ impl Preparation {
 
     /// How the anchors are assigned to the boxes of a frame that lie within the range.
     pub fn box_matches(&self, objects: &[Object]) -> Vec<BoxMatch> {
-        let boxes = self.ground_truth(objects);
+        let boxes = self.pillars.ground_truth(objects);
         let targets = self.targets(&boxes);
         let of_box = |(i, bbox): (usize, &[f32; 8])| {
             let class = bbox[7] as usize - 1;
@@ -144,22 +102,6 @@ impl Preparation {
             BoxMatch { class, positive: overlaps.len(), forced }
         };
         boxes.iter().enumerate().map(of_box).collect()
-    }
-
-    /// Boxes of the detector's classes whose centre lies within the range, with classes counted from 1.
-    pub fn ground_truth(&self, objects: &[Object]) -> Vec<[f32; 8]> {
-        let inside = |b: &Box3| {
-            (0..3).all(|i| {
-                let (low, high) = (self.grid.range[i], self.grid.range[i + 3]);
-                b.center[i] as f32 >= low && b.center[i] as f32 <= high
-            })
-        };
-        let with_class = |o: &Object| {
-            let class = self.classes.iter().position(|c| *c == o.class)?;
-            let b = o.bbox.with_wrapped_yaw().to_array().map(|v| v as f32);
-            inside(&o.bbox).then(|| [b[0], b[1], b[2], b[3], b[4], b[5], b[6], class as f32 + 1.0])
-        };
-        objects.iter().filter_map(with_class).collect()
     }
 
     /// Detections of a batch.
@@ -181,7 +123,7 @@ impl Preparation {
                     .map_err(|_| {
                         ModelError::NonFinite(format!(
                             "frame {}: the network gives scores that are not numbers; its weights are damaged or its training diverged",
-                            batch[f].id
+                            batch[f].input.id
                         ))
                     })?;
                 Ok(raw.iter().map(|r| self.named(r)).collect())
@@ -191,7 +133,7 @@ impl Preparation {
 
     fn named(&self, raw: &RawBox) -> Detection {
         Detection {
-            class: self.classes[raw.class].clone(),
+            class: self.pillars.classes[raw.class].clone(),
             bbox: Box3::from_array(raw.bbox.map(f64::from)),
             score: raw.score,
         }

@@ -1,38 +1,27 @@
 //! Converts OpenPCDet's configuration of a PointPillars.
 
-use super::super::manifest::{Manifest, array, float, floats, usizes};
+use super::super::bev;
+use super::super::manifest::{Manifest, array, float, floats};
 use anyhow::{Context, Result, bail};
 use models::config::{AnchorConfig, NetworkConfig};
-use models::pointpillars::{
-    BackboneConfig, DetectionConfig, HeadConfig, LossConfig, PillarsConfig, PointPillarsConfig,
-};
+use models::pointpillars::{DetectionConfig, HeadConfig, LossConfig, PointPillarsConfig};
 use serde_json::Value;
 
 /// The configuration of the network in the manifest.
 pub fn config(manifest: &Manifest) -> Result<NetworkConfig> {
     let cfg = &manifest.model_cfg;
-    let (backbone, head) = (&cfg["BACKBONE_2D"], &cfg["DENSE_HEAD"]);
+    let head = &cfg["DENSE_HEAD"];
     let anchors =
         head["ANCHOR_GENERATOR_CONFIG"].as_array().context("DENSE_HEAD.ANCHOR_GENERATOR_CONFIG is missing")?;
     let anchors = anchors.iter().map(anchor).collect::<Result<Vec<_>>>()?;
     let weights = &head["LOSS_CONFIG"]["LOSS_WEIGHTS"];
     let nms = &cfg["POST_PROCESSING"]["NMS_CONFIG"];
-    let filters = usizes(&cfg["VFE"]["NUM_FILTERS"])?;
+    let filters = bev::vfe_filters(manifest)?;
     let [vfe_filters] = filters[..] else { bail!("VFE.NUM_FILTERS = {filters:?}: one layer is supported") };
     Ok(NetworkConfig::PointPillars(PointPillarsConfig {
-        pillars: PillarsConfig {
-            size_m: array(&manifest.voxel_size)?,
-            max_points: manifest.max_points_per_pillar,
-            ..PillarsConfig::default()
-        },
+        pillars: bev::pillar_sizes(manifest)?,
         vfe_filters,
-        backbone: BackboneConfig {
-            layers: usizes(&backbone["LAYER_NUMS"])?,
-            strides: usizes(&backbone["LAYER_STRIDES"])?,
-            filters: usizes(&backbone["NUM_FILTERS"])?,
-            upsample_strides: usizes(&backbone["UPSAMPLE_STRIDES"])?,
-            upsample_filters: usizes(&backbone["NUM_UPSAMPLE_FILTERS"])?,
-        },
+        backbone: bev::backbone(manifest)?,
         anchors,
         head: HeadConfig {
             dir_offset_rad: float(&head["DIR_OFFSET"])?,

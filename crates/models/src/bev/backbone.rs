@@ -1,17 +1,18 @@
 //! The 2D backbone and neck (OpenPCDet: `BaseBEVBackbone`).
 
 use super::config::BackboneConfig;
-use crate::layers::{BatchNorm, ConvBnRelu, DeconvBnRelu, Init, Mode};
+use crate::layers::{BatchNorm, ConvBnRelu, Init, Mode, ResampleBnRelu, Resampling};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Blocks of 3x3 convolutions, the first of each with a stride, and a transposed convolution after each block.
+/// Blocks of 3x3 convolutions, the first of each with a stride, and a transposed convolution (or one with a stride)
+/// after each block.
 #[derive(Module, Debug)]
 pub struct BaseBevBackbone {
     /// The blocks, finest first.
     pub blocks: Vec<Block>,
-    /// The transposed convolution of each block.
-    pub deblocks: Vec<DeconvBnRelu>,
+    /// The transposed convolution of each block, or its convolution with a stride.
+    pub deblocks: Vec<ResampleBnRelu>,
 }
 
 /// Convolutions at one resolution.
@@ -48,17 +49,18 @@ impl BaseBevBackbone {
             let mut convs = vec![conv(0, from, config.strides[i])];
             convs.extend((1..=config.layers[i]).map(|j| conv(j, filters, 1)));
             blocks.push(Block { convs });
-            let (stride, up) = (config.upsample_strides[i], config.upsample_filters[i]);
+            let up = config.upsample_filters[i];
+            let resampling = Resampling::of(config.upsample_strides[i]).unwrap_or(Resampling::Up(1));
             let name = format!("backbone_2d.deblocks.{i}.0.weight");
-            deblocks.push(DeconvBnRelu::new(&name, [filters, up], stride, norm(up), init));
+            deblocks.push(ResampleBnRelu::new(&name, [filters, up], resampling, norm(up), init));
             from = filters;
         }
         BaseBevBackbone { blocks, deblocks }
     }
 
     /// # Shapes
-    /// `x`: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s = first stride
-    /// over its upsampling stride.
+    /// `x`: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s =
+    /// [`BackboneConfig::output_stride`].
     pub fn forward(&self, mut x: Tensor<4>, mode: Mode) -> BackboneStages {
         let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
         for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
