@@ -11,6 +11,7 @@ pub mod layers;
 pub mod loss;
 pub mod named;
 pub mod point_ops;
+pub mod results;
 
 mod architecture;
 mod built_in;
