@@ -9,7 +9,7 @@ use crate::device::DeviceArgs;
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
 use std::path::{Path, PathBuf};
-use study::{Launcher, RunOptions, Step, Study, status};
+use study::{FrozenState, Launcher, RunOptions, Step, Study, status};
 
 /// Run a study: generate the missing data sets, train the missing runs, detect on every test set, evaluate, and write a
 /// report. The expected computing time is printed before training starts.
@@ -146,6 +146,9 @@ impl StudyArgs {
         if let Some(StudyCommand::Status(selection)) = self.command {
             let study = selection.open()?;
             output::print_status(&study, &status(&study)?);
+            if !study.config.frozen.is_empty() {
+                output::print_frozen(&FrozenState::read(&study)?);
+            }
             return Ok(());
         }
         let Some(named) = self.study else { bail!("the study is missing; for example: `lidarshift study quick`") };

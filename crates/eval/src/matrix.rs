@@ -12,11 +12,13 @@ mod build;
 mod csv_lines;
 mod latex;
 mod markdown;
+mod paired;
 mod published;
 mod run_values;
 mod scores;
 
 pub use build::{RunResult, build};
+pub use paired::{PairedDifference, PairedValues, ScoredFrames, paired_differences, paired_values, shared_ids};
 pub use published::{Published, published};
 pub use run_values::{RunValue, from_run_values};
 pub use scores::{RunScores, TestSet};

@@ -37,6 +37,11 @@ impl TestSet {
         TestSet { label_frame, frames }
     }
 
+    /// The frames with their labels, without detections.
+    pub fn frames(&self) -> &[EvalFrame] {
+        &self.frames
+    }
+
     /// Number of frames.
     pub fn len(&self) -> usize {
         self.frames.len()

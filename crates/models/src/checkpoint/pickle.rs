@@ -1,10 +1,10 @@
 //! Reader of Python's pickle format that builds plain values and calls nothing.
 //!
 //! A pickle is a program for a stack machine. Its values are stored in one list and refer to each other by index, so
-//! that sharing and nesting need neither copies nor recursion. Calls of the names that [`Contents`] accepts become inert
-//! values; any other name is refused. [`Contents`] limits the number of instructions and of values, and with them the
-//! memory: to about 150 MB for a checkpoint, to about 1.2 GB for detections, and to about 100 n bytes for a file of n
-//! bytes.
+//! that sharing and nesting need neither copies nor recursion. Calls of the names that [`Contents`] accepts become
+//! inert values; any other name is refused. [`Contents`] limits the number of instructions and of values, and with them
+//! the memory: to about 150 MB for a checkpoint, to about 1.2 GB for detections, and to about 100 n bytes for a file of
+//! n bytes.
 
 mod machine;
 
