@@ -18,6 +18,7 @@ commands! {
     Study(study::StudyArgs) "Run a study: data sets, training runs, evaluation, report";
     #[command(hide = true)]
     StudyRun(study_run::StudyRunArgs) "Execute one run of a study";
+    Compare(compare::CompareArgs) "Rank several simulations of the same recordings by their distance from measured data";
     Report(report::ReportArgs) "Write the report of a study";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";

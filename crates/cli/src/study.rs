@@ -9,7 +9,7 @@ use crate::device::DeviceArgs;
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
 use std::path::{Path, PathBuf};
-use study::{Launcher, RunOptions, Step, Study, plan, status};
+use study::{FrozenState, Launcher, RunOptions, Step, Study, plan, status};
 
 /// Run a study: generate the missing data sets, train the missing runs, detect on every test set, evaluate, and write a
 /// report. The expected computing time is printed before training starts.
@@ -157,6 +157,9 @@ impl StudyArgs {
             Some(StudyCommand::Status(selection)) => {
                 let study = selection.open()?;
                 output::print_status(&study, &status(&study)?);
+                if !study.config.frozen.is_empty() {
+                    output::print_frozen(&FrozenState::read(&study)?);
+                }
                 return Ok(());
             }
             Some(StudyCommand::Plan { selection, pilot }) => {

@@ -5,7 +5,7 @@ use anyhow::Result;
 use clap::{Args, ValueEnum};
 use std::io::Read as _;
 use std::time::{Duration, Instant};
-use study::{RunPart, RunWork, Study, execute_run, measure};
+use study::{RunPart, RunWork, Study, detect_frozen, execute_run, measure};
 use train::Event;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -24,8 +24,11 @@ pub struct StudyRunArgs {
     /// Folder of the study
     study: String,
     /// Name of the run: NETWORK/TRAIN_SET/seed-K
-    #[arg(long, value_name = "NAME")]
-    run: String,
+    #[arg(long, value_name = "NAME", required_unless_present = "frozen")]
+    run: Option<String>,
+    /// Instead of a run: detect with the checkpoint of this frozen detector
+    #[arg(long, value_name = "NAME", conflicts_with = "run")]
+    frozen: Option<String>,
     /// Parts of the run to execute
     #[arg(long, value_enum, value_delimiter = ',', default_values = ["train", "detect"])]
     parts: Vec<PartArg>,
@@ -50,7 +53,10 @@ impl StudyRunArgs {
             std::thread::spawn(exit_with_stdin);
         }
         let study = Study::open(&self.study, None)?;
-        let run = study.run(&self.run)?;
+        if let Some(name) = &self.frozen {
+            return Ok(detect_frozen(&study, name, &self.device.open()?, self.workers, &|note| eprintln!("{note}"))?);
+        }
+        let run = study.run(self.run.as_deref().unwrap_or_default())?;
         if self.parts.contains(&PartArg::Measure) {
             println!("{}", serde_json::to_string(&measure(&study, &run, &self.device.open()?)?)?);
             return Ok(());

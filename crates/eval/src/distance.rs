@@ -7,17 +7,21 @@
 mod chamfer;
 mod compare;
 mod emd;
+mod frames;
 mod nearest;
+mod part;
 mod regions;
 mod sinkhorn;
 mod sliced;
 
 pub use chamfer::{Chamfer, chamfer};
 pub use compare::{
-    Compared, DISTANCES_SCHEMA, DistanceOptions, Distances, Measure, MeasureRow, Part, compare, paired_ids,
+    Compared, DISTANCES_SCHEMA, DistanceOptions, Distances, Measure, MeasureRow, compare, compare_by_frame, paired_ids,
 };
 pub use emd::emd;
+pub use frames::FrameDistances;
 pub use nearest::{Nearest, nearest};
+pub use part::Part;
 pub use regions::{RegionRow, Regions};
 pub use sinkhorn::sinkhorn;
 pub use sliced::sliced_wasserstein;

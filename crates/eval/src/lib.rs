@@ -6,6 +6,8 @@
 
 pub mod analysis;
 mod bootstrap;
+mod box_transform;
+pub mod comparison;
 mod csv_text;
 mod curve;
 mod dataset_statistics;
@@ -23,6 +25,7 @@ mod report;
 pub mod targets;
 
 pub use bootstrap::{BootstrapOptions, Interval};
+pub use box_transform::{BoxTransform, TRANSFORM_OVERLAP, TransformFit};
 pub use csv_text::csv_text;
 pub use curve::{PrecisionCurve, ceiling_ap40};
 pub use dataset_statistics::{

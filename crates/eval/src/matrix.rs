@@ -12,6 +12,7 @@ mod build;
 mod csv_lines;
 mod latex;
 mod markdown;
+mod paired;
 mod power;
 mod published;
 mod run_values;
@@ -19,6 +20,7 @@ mod scores;
 mod split;
 
 pub use build::{RunResult, build};
+pub use paired::{PairedDifference, PairedValues, ScoredFrames, paired_differences, paired_values, shared_ids};
 pub use power::{Power, Scatter};
 pub use published::{Published, published};
 pub use run_values::{RunValue, from_run_values};

@@ -11,6 +11,7 @@ figures! {
     bars,
     dots,
     heat,
+    intervals,
     marginals,
     scatter,
     target_views,

@@ -69,7 +69,7 @@ pub fn distances_of(
 /// Frames that cannot be read.
 pub(crate) fn all_distances(study: &Study, listener: Listener<'_>) -> Result<(Vec<Distances>, Vec<String>)> {
     let evaluation = &study.config.evaluation;
-    let split = &study.config.splits.train;
+    let split = study.config.compared_split();
     let loader = match study.config.runs().first() {
         Some(run) if evaluation.distances.compared != Compared::Raw => {
             Some(Loader::of(&study.run_config(run)?.detector))
@@ -109,7 +109,7 @@ pub(crate) fn all_distances(study: &Study, listener: Listener<'_>) -> Result<(Ve
 /// # Errors
 /// Frames that cannot be read.
 pub(crate) fn all_targets(study: &Study) -> Result<Vec<Targets>> {
-    let (split, options) = (&study.config.splits.train, &study.config.evaluation.targets);
+    let (split, options) = (study.config.compared_split(), &study.config.evaluation.targets);
     let of_set = |dataset: &StudyDataset| {
         let set = open(study, &dataset.name)?;
         let ids = set.ids(split)?;

@@ -2,9 +2,11 @@
 //! of the matrix, and which results a change of the TOML makes invalid.
 
 mod changes;
+mod frozen;
 mod problem;
 
 pub use changes::StudyChanges;
+pub use frozen::{ELSEWHERE, FrozenDetector};
 
 use data::DataError;
 use eval::analysis::AnalysisOptions;
@@ -30,13 +32,18 @@ pub struct StudyConfig {
     /// Data sets, in the order of the tables. Every run is tested on each of them.
     #[serde(rename = "dataset")]
     pub datasets: Vec<StudyDataset>,
-    /// Detectors, in the order of the tables.
-    #[serde(rename = "detector")]
+    /// Detectors, in the order of the tables. Without any, nothing is trained: `frozen` detectors are evaluated, and
+    /// the data sets are compared.
+    #[serde(rename = "detector", default)]
     pub detectors: Vec<StudyDetector>,
+    /// Detectors that were trained elsewhere and are only evaluated, after the others in the tables.
+    #[serde(rename = "frozen", default, skip_serializing_if = "Vec::is_empty")]
+    pub frozen: Vec<FrozenDetector>,
     /// Variants of the detectors to compare. Without variants, each detector is used unchanged.
     #[serde(rename = "variant", default)]
     pub variants: Vec<Variant>,
-    /// Random seeds, one run each. A detector can override them.
+    /// Random seeds, one run each. A detector can override them. Not needed if nothing is trained.
+    #[serde(default)]
     pub seeds: Vec<u64>,
     /// Number of epochs of every run. A detector can override it. Default: from the detector's TOML.
     #[serde(default)]
@@ -256,7 +263,8 @@ impl StudyConfig {
                 title.clone_from(name);
             }
         }
-        for (name, title) in study.detectors.iter_mut().map(|d| (&d.name, &mut d.title)) {
+        let detectors = study.detectors.iter_mut().map(|d| (&d.name, &mut d.title));
+        for (name, title) in detectors.chain(study.frozen.iter_mut().map(|f| (&f.name, &mut f.title))) {
             if title.is_empty() {
                 title.clone_from(name);
             }
@@ -325,7 +333,12 @@ impl StudyConfig {
             seeds: detector.seeds.clone().unwrap_or_else(|| self.seeds.clone()),
         };
         MatrixPlan {
-            networks: self.networks().into_iter().map(network).collect(),
+            networks: self
+                .networks()
+                .into_iter()
+                .map(network)
+                .chain(self.frozen.iter().map(FrozenDetector::planned))
+                .collect(),
             test_sets: self.datasets.iter().map(place).collect(),
             between: self.datasets.iter().filter_map(between).collect(),
         }
@@ -450,11 +463,48 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             ("name = \"sim\"", "name = \"measured\"", "dataset \"measured\" exists twice"),
             ("name = \"small\"", "name = \"../small\"", "has to be a file name"),
             ("path = \"measured\"", "folder = \"measured\"", "unknown variant `folder`"),
+            ("seeds = [7]", "seeds = []", "detector pointrcnn_race_small: seeds [] have to be distinct"),
+            ("[[variant]]", "[[frozen]]\nname = \"a\"\n[[variant]]", "frozen a has neither detections"),
+            (
+                "[[variant]]",
+                "[[frozen]]\nname = \"a\"\ndetections = { real = \"d\" }\n[[variant]]",
+                "frozen a: detections contains \"real\", which is not a data set of the study",
+            ),
+            (
+                "[[variant]]",
+                "[[frozen]]\nname = \"a\"\ncheckpoint = \"a.pth\"\n[[variant]]",
+                "frozen a has a checkpoint without detector",
+            ),
+            (
+                "[[variant]]",
+                "[[frozen]]\nname = \"pointrcnn_race_small\"\ndetections = { sim = \"d\" }\n[[variant]]",
+                "has the name of a trained detector",
+            ),
+            (
+                "[[variant]]",
+                "[[frozen]]\nname = \"a\"\ndetections = { sim = \"d\" }\nclasses = { b = \"Car\" }\nignored_classes = [\"b\"]\n[[variant]]",
+                "class \"b\" is renamed by classes and left out",
+            ),
         ] {
             assert!(STUDY.contains(from), "{from}");
             let error = parse(&STUDY.replacen(from, to, 1)).unwrap_err().to_string();
             assert!(error.contains(message), "{to}: {error}");
         }
+    }
+
+    #[test]
+    fn a_study_of_frozen_detectors_trains_nothing() {
+        let text = "name = \"f\"\nabout = []\n[[dataset]]\nname = \"real\"\nsource = { path = \"r\" }\n\
+                    [[frozen]]\nname = \"ours\"\ndetections = { real = \"d\" }\n";
+        let study = parse(text).unwrap();
+        assert!(study.runs().is_empty() && !study.trains() && study.compared_split() == "test");
+        let plan = study.plan();
+        let planned = &plan.networks[0];
+        assert_eq!((planned.network.title.as_str(), planned.train_sets[0].name.as_str()), ("ours", ELSEWHERE));
+        let alone = text.split("[[frozen]]").next().unwrap();
+        assert!(parse(alone).unwrap_err().to_string().contains("nor a second [[dataset]]"));
+        let loader = format!("{text}[evaluation]\ndistances = {{ compared = \"loader\" }}\n");
+        assert!(parse(&loader).unwrap_err().to_string().contains("needs a [[detector]]"));
     }
 
     #[test]

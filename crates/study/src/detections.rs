@@ -121,7 +121,16 @@ pub fn detect_all(
 
 /// Writes the detections on all frames, one KITTI text file per frame, and the regions of a two-stage network in the
 /// same way.
-fn detect(detector: &Detector, set: &Dataset, ids: &[String], folders: &[PathBuf; 2], workers: usize) -> Result<()> {
+///
+/// # Errors
+/// As [`detect_all`].
+pub fn detect(
+    detector: &Detector,
+    set: &Dataset,
+    ids: &[String],
+    folders: &[PathBuf; 2],
+    workers: usize,
+) -> Result<()> {
     let [of_detections, of_regions] = folders;
     let two_stage = detector.config().network.is_two_stage();
     let samples = inference_samples(detector, set, ids, workers).zip(ids).map(|(sample, id)| Ok((sample?, id)));

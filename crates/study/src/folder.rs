@@ -70,6 +70,17 @@ impl Study {
         Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
     }
 
+    /// A study that a command makes instead of a TOML. Paths in `config` are relative to `base`; its folder is `out`.
+    ///
+    /// # Errors
+    /// An invalid configuration.
+    pub fn from_config(config: &StudyConfig, base: &Path, out: &Path) -> Result<Study> {
+        let text = toml::to_string(config).map_err(|e| refused(format!("the study cannot be written: {e}")))?;
+        let config = StudyConfig::parse(&text, &out.join(COPY))?;
+        let (base, folder) = (std::path::absolute(base)?, std::path::absolute(out)?);
+        Ok(Study { config, named: out.display().to_string(), text, base, folder })
+    }
+
     /// Whether a folder is the folder of a study.
     pub fn is_folder(folder: &Path) -> bool {
         folder.join(COPY).is_file()

@@ -6,6 +6,7 @@
 
 mod cache;
 pub mod clouds;
+pub mod compare;
 pub mod config;
 mod cost;
 mod data_sets;
@@ -14,6 +15,7 @@ mod error;
 mod event;
 pub mod features;
 mod folder;
+mod frozen;
 mod local;
 pub mod numbers;
 mod plan;
@@ -24,11 +26,12 @@ mod status;
 mod steps;
 mod work;
 
-pub use config::{Source, StudyConfig, StudyDataset, StudyRun};
+pub use config::{FrozenDetector, Source, StudyConfig, StudyDataset, StudyEvaluation, StudyRun};
 pub use cost::{NetworkCost, duration, measure};
 pub use error::StudyError;
 pub use event::{Event, Listener};
 pub use folder::Study;
+pub use frozen::{FrozenState, detect_frozen};
 pub use plan::{Planned, ScatterFrom, plan};
 pub use present::write_report;
 pub use run_state::RunState;

@@ -6,6 +6,7 @@ use crate::data_sets::{labelled_sha256, open};
 use crate::detections::{evenly_spaced, weights_sha256};
 use crate::error::Result;
 use crate::folder::Study;
+use crate::frozen::FrozenState;
 use crate::run_state::{RunState, run_state};
 use data::{DataError, Dataset, LabelBox};
 use eval::EvalFrame;
@@ -22,6 +23,8 @@ pub struct StudyState {
     pub run_states: Vec<(StudyRun, RunState)>,
     /// Name of each test set and a hash of its frames and labels.
     pub tests: Vec<(String, String)>,
+    /// The detectors that were trained elsewhere.
+    pub frozen: FrozenState,
 }
 
 impl StudyState {
@@ -38,7 +41,8 @@ impl StudyState {
             Ok((name.clone(), labelled_sha256(&dataset, &ids)?))
         };
         let names: Vec<String> = study.config.datasets.iter().map(|d| d.name.clone()).collect();
-        Ok(StudyState { run_states, tests: names.iter().map(test).collect::<Result<_>>()? })
+        let frozen = FrozenState::read(study)?;
+        Ok(StudyState { run_states, tests: names.iter().map(test).collect::<Result<_>>()?, frozen })
     }
 
     /// Whether a run in this state has detections on a test set.
@@ -66,7 +70,7 @@ impl StudyState {
         for (name, hash) in &self.tests {
             let _ = writeln!(key, "{name} {hash}");
         }
-        Ok(key)
+        Ok(key + &self.frozen.key())
     }
 }
 
@@ -91,6 +95,7 @@ pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
                 Some(((run.id.clone(), test_set.clone()), result))
             };
             results.extend(state.run_states.par_iter().filter_map(of_run).collect::<Vec<_>>());
+            results.extend(state.frozen.results(study, &labels, test_set));
         }
         Ok(build(&study.config.plan(), &results, options))
     })
@@ -124,7 +129,8 @@ fn reason(run_state: &RunState) -> Option<String> {
 }
 
 /// Error analyses of the first finished run of every network and train set: on the first test set of the study, and on
-/// the test set of its training data, against labels and, where they are known, against the true boxes. Cached in `analyses.json`.
+/// the test set of its training data, against labels and, where they are known, against the true boxes; and of every
+/// detector that was trained elsewhere, on each data set. Cached in `analyses.json`.
 ///
 /// # Errors
 /// Frames that cannot be read.
@@ -158,6 +164,16 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
             }
             seen.push(of);
         }
+        for (frozen, test_set) in
+            study.config.frozen.iter().flat_map(|f| study.config.datasets.iter().map(move |d| (f, &d.name)))
+        {
+            let dataset = open(study, test_set)?;
+            let labels = TestSet::read(&dataset, &study.config.splits.test)?;
+            if let Some(frames) = state.frozen.frames(study, frozen, test_set, &labels)? {
+                let title = format!("{}, trained elsewhere, to {}", frozen.title, study.title(test_set));
+                out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
+            }
+        }
         Ok(out)
     })
 }
@@ -171,15 +187,23 @@ pub fn network_title(study: &Study, network: &str) -> String {
 fn of_run(study: &Study, run: &StudyRun, test_set: &str, labels: &TestSet) -> Result<RunAnalysis> {
     let dataset = open(study, test_set)?;
     let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
-    let label_frame = labels.label_frame;
+    analysis(study, &dataset, labels.label_frame, &frames)
+}
+
+fn analysis(
+    study: &Study,
+    dataset: &Dataset,
+    label_frame: data::LabelFrame,
+    frames: &[eval::EvalFrame],
+) -> Result<RunAnalysis> {
     let options = AnalysisOptions { label_frame, ..study.config.evaluation.analysis.clone() };
     // Points are counted only if the boxes are in the frame of the cloud; boxes in the camera frame are tilted relative
     // to it.
     let points = match label_frame {
-        data::LabelFrame::Lidar => Some(points(&dataset, &frames)?),
+        data::LabelFrame::Lidar => Some(points(dataset, frames)?),
         data::LabelFrame::Camera => None,
     };
-    Ok(analyse(&frames, points.as_deref(), &options))
+    Ok(analyse(frames, points.as_deref(), &options))
 }
 
 fn points(dataset: &Dataset, frames: &[eval::EvalFrame]) -> Result<Vec<BoxPoints>> {

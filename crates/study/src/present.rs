@@ -1,7 +1,7 @@
 //! Writes the report of a study from the results in its folder.
 
 use crate::clouds::{all_distances, all_targets};
-use crate::config::{Source, StudyDataset, StudyRun};
+use crate::config::{FrozenDetector, Source, StudyDataset, StudyRun};
 use crate::data_sets::open;
 use crate::error::Result;
 use crate::features::features;
@@ -9,9 +9,10 @@ use crate::folder::Study;
 use crate::numbers::{StudyState, analyses, matrix, network_title, some_test_frames};
 use crate::{Event, Listener};
 use data::{KittiText, read_kitti_text};
-use eval::matrix::Matrix;
+use eval::matrix::{Matrix, PairedDifference, Quantity, TestSet};
 use geometry::Box3;
 use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
+use std::path::PathBuf;
 
 /// Number of test frames in the 3D view.
 const SCENES: usize = 3;
@@ -36,10 +37,13 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
     let analyses = analyses(study, &state)?;
     listener(Event::Note("comparing features"));
     let features = features(study)?;
+    let (paired, paired_warnings) = state.frozen.paired(study, &state.key(study)?)?;
     let (distances, mut warnings) = all_distances(study, listener)?;
     listener(Event::Note("computing target statistics"));
     let targets = all_targets(study)?;
     warnings.extend(features.warnings);
+    warnings.extend(paired_warnings);
+    note_differences(study, &paired, listener);
     let report = StudyReport {
         title: format!("lidarshift study: {}", study.config.name),
         about: study.config.about.clone(),
@@ -47,6 +51,7 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
         facts: facts(study)?,
         warnings,
         matrix: Some(matrix.clone()),
+        paired,
         analyses,
         embeddings: features.embeddings,
         cka: features.cka,
@@ -57,6 +62,26 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
         scenes: scenes(study, &state)?,
     };
     Ok((matrix, report.write(&study.folder)?))
+}
+
+/// Passes the differences of average precision over all distances as results.
+fn note_differences(study: &Study, paired: &[PairedDifference], listener: Listener<'_>) {
+    for d in paired.iter().filter(|d| d.section.is_none() && d.quantity == Quantity::Ap40) {
+        let number = |v: Option<f64>| v.map_or("undefined".to_string(), |v| format!("{v:.2}"));
+        let difference = d.difference.map_or("undefined".to_string(), |v| format!("{v:+.2}"));
+        let interval = d.interval.map_or(String::new(), |i| format!(" [{:+.2}, {:+.2}]", i.low, i.high));
+        listener(Event::Result(&format!(
+            "{}, {} 3D AP ({}): {} {} minus {} {} = {difference}{interval} over {} frames",
+            network_title(study, &d.network),
+            d.class,
+            d.overlap,
+            study.title(&d.test_set),
+            number(d.value),
+            study.title(&d.compared_to),
+            number(d.other),
+            d.frames
+        )));
+    }
 }
 
 /// Settings of the study as names and values. They must not differ between an uninterrupted and a resumed study.
@@ -76,6 +101,10 @@ fn facts(study: &Study) -> Result<Vec<(String, String)>> {
         );
     }
     for planned in study.config.plan().networks {
+        if let Some(frozen) = study.config.frozen_detector(&planned.network.name) {
+            fact(&format!("detector {}", frozen.title), frozen_text(frozen));
+            continue;
+        }
         let of_network: Vec<StudyRun> =
             study.config.runs().into_iter().filter(|run| run.id.network == planned.network.name).collect();
         let seeds: Vec<String> = planned.seeds.iter().map(u64::to_string).collect();
@@ -97,6 +126,27 @@ fn facts(study: &Study) -> Result<Vec<(String, String)>> {
     let recall = "OpenPCDet's: of all refined regions of a two-stage network, of the final boxes otherwise";
     fact("recall", recall.into());
     Ok(facts)
+}
+
+/// Where the detections of a frozen detector come from.
+fn frozen_text(frozen: &FrozenDetector) -> String {
+    let mut text = match (&frozen.checkpoint, &frozen.detector) {
+        (Some(checkpoint), Some(detector)) => {
+            format!("trained elsewhere: checkpoint {} of {}", checkpoint.display(), detector.display())
+        }
+        _ => {
+            let of_set = |(set, path): (&String, &PathBuf)| format!("{} on {set}", path.display());
+            let sets: Vec<String> = frozen.detections.iter().map(of_set).collect();
+            format!("trained elsewhere: detections {}", sets.join(", "))
+        }
+    };
+    for (from, to) in &frozen.classes {
+        text += &format!("; class {from} is {to}");
+    }
+    if !frozen.ignored_classes.is_empty() {
+        text += &format!("; without class {}", frozen.ignored_classes.join(", "));
+    }
+    text
 }
 
 fn source(study: &Study, dataset: &StudyDataset) -> String {
@@ -130,6 +180,14 @@ fn training(study: &Study) -> Result<Vec<TrainingRun>> {
 fn scenes(study: &Study, state: &StudyState) -> Result<Vec<Scene>> {
     let names: Vec<&str> = study.config.datasets.iter().map(|d| d.name.as_str()).take(SCENE_SETS).collect();
     let first = open(study, names[0])?;
+    let mut frozen = Vec::new();
+    if first.config.label_frame == data::LabelFrame::Lidar && !study.config.frozen.is_empty() {
+        let labels = TestSet::read(&first, &study.config.splits.test)?;
+        for detector in &study.config.frozen {
+            let frames = state.frozen.frames(study, detector, names[0], &labels)?;
+            frozen.extend(frames.map(|frames| (detector, frames)));
+        }
+    }
     let mut scenes = Vec::new();
     for id in some_test_frames(study, &first, SCENES)? {
         let mut layers = Vec::new();
@@ -157,6 +215,14 @@ fn scenes(study: &Study, state: &StudyState) -> Result<Vec<Scene>> {
             let boxes = read_kitti_text(&path, KittiText::Detections)?.iter().map(|line| line.lidar_box()).collect();
             let name = format!("{} trained on {}", network_title(study, of.0), study.title(of.1));
             layers.push(layer(&name, color, LayerContent::Boxes(boxes)));
+        }
+        for (frozen, frames) in &frozen {
+            let color = DETECTIONS[(seen.len() + layers.len()) % DETECTIONS.len()];
+            if let Some(frame) = frames.iter().find(|frame| frame.id == id) {
+                let boxes = frame.detections.iter().map(|line| line.lidar_box()).collect();
+                let name = format!("{}, trained elsewhere", frozen.title);
+                layers.push(layer(&name, color, LayerContent::Boxes(boxes)));
+            }
         }
         scenes.push(Scene { name: format!("{}, frame {id}", study.title(names[0])), layers, focus_m });
     }

@@ -94,14 +94,20 @@ pub fn run_study(study: &Study, options: &RunOptions, listener: Listener<'_>) ->
     for line in study.update_copy()? {
         listener(Event::Note(&format!("the study has changed: {line}")));
     }
+    if study.config.plan().networks.is_empty() {
+        listener(Event::Note("the study has no detector; only its data sets are compared"));
+    }
     if steps.contains(&Step::Data) {
         make_datasets(study, listener)?;
+    }
+    if !options.dry_run && steps.contains(&Step::Detect) {
+        crate::frozen::prepare(study, device, listener)?;
     }
     let wanted = |step, part| steps.contains(&step).then_some(part);
     let parts: Vec<RunPart> =
         [wanted(Step::Train, RunPart::Train), wanted(Step::Detect, RunPart::Detect)].into_iter().flatten().collect();
     let mut outcome = Outcome::default();
-    if !parts.is_empty() {
+    if !parts.is_empty() && study.config.trains() {
         let invalid = invalid_runs(study, options.replace && !options.dry_run, listener)?;
         let missing = missing_runs(study, &parts)?;
         let jobs = LocalJobs::by_cores(missing.len(), options.jobs, device);

@@ -7,6 +7,7 @@ use data::{
 use data::{parse_kitti_text, parse_pcd, parse_split};
 use models::checkpoint::{HostTensor, HostValues, NamedTensors, parse_checkpoint, write_safetensors};
 use models::config::DetectorConfig;
+use models::results::parse_results;
 use std::collections::BTreeMap;
 use std::path::Path;
 use train::{RunFolder, RunState};
@@ -92,6 +93,18 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
         };
         targets.push(Target { name, valid, read: Box::new(read) });
     }
+    for (name, valid) in [
+        ("result.pkl old", include_bytes!("../../../../tests/golden/results/numpy1_protocol2.pkl").to_vec()),
+        ("result.pkl new", include_bytes!("../../../../tests/golden/results/numpy2_protocol5.pkl").to_vec()),
+        ("result.pkl forms", include_bytes!("../../../../tests/golden/results/numpy2_other_forms.pkl").to_vec()),
+    ] {
+        let read = |bytes: &[u8]| match parse_results(Path::new("fuzz.pkl"), bytes) {
+            Err(_) => Ok(false),
+            Ok(frames) if frames.iter().flat_map(|f| &f.detections).all(is_finite) => Ok(true),
+            Ok(_) => Err("a detection that is not finite".into()),
+        };
+        targets.push(Target { name, valid, read: Box::new(read) });
+    }
     targets.extend(run_folder(&folder.join("run"))?);
     Ok(targets)
 }
@@ -143,6 +156,10 @@ fn run_folder(path: &Path) -> Result<Vec<Target>> {
 fn weights() -> NamedTensors {
     let tensor = HostTensor { shape: vec![2, 3], values: HostValues::F32(vec![0.5; 6]) };
     [("a.weight".to_string(), tensor.clone()), ("b.weight".to_string(), tensor)].into()
+}
+
+fn is_finite(detection: &data::Detection) -> bool {
+    detection.bbox.to_array().iter().all(|v| v.is_finite()) && detection.score.is_finite()
 }
 
 fn fills_its_shape(tensor: &HostTensor) -> bool {

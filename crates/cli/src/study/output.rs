@@ -5,7 +5,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use report::ReportFiles;
 use std::collections::BTreeMap;
 use std::sync::Mutex;
-use study::{Event, Planned, RunState, RunStatus, ScatterFrom, Study, duration};
+use study::{Event, FrozenState, Planned, RunState, RunStatus, ScatterFrom, Study, duration};
 
 /// Prints the events of a study; the frames of a data set as a progress bar.
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
@@ -88,6 +88,14 @@ pub(super) fn print_status(study: &Study, runs: &[RunStatus]) {
         (_, n) if n > 0 => println!("; the computing time of {n} runs is not measured yet"),
         (true, _) => println!("; remaining computing time about {}, without parallel runs", duration(remaining_s)),
         _ => println!(),
+    }
+}
+
+/// Prints one line for each frozen detector and data set.
+#[expect(clippy::print_stdout, reason = "results go to stdout")]
+pub(super) fn print_frozen(state: &FrozenState) {
+    for (name, test_set, missing) in state.lines() {
+        println!("frozen {name} on {test_set}: {}", missing.unwrap_or("read"));
     }
 }
 

@@ -1,7 +1,7 @@
 //! Runs the program, and writes a data set on which training takes seconds.
 
 use data::write::write_split;
-use data::{Cloud, Frame, Layout, Object, stream};
+use data::{Cloud, Detection, Frame, Layout, Object, stream};
 use geometry::Box3;
 use rand::RngExt;
 use std::path::Path;
@@ -125,6 +125,39 @@ pub fn data_set(folder: &Path) {
     std::fs::write(folder.join("tiny.toml"), TINY_DETECTOR).unwrap();
     std::fs::write(folder.join("tiny_pointrcnn.toml"), TINY_POINTRCNN).unwrap();
     std::fs::write(folder.join("tiny_centerpoint.toml"), TINY_CENTERPOINT).unwrap();
+}
+
+/// OpenPCDet's `result.pkl` with these detections by frame, as Python writes arrays of numpy 2 with protocol 3.
+pub fn result_pkl(frames: &[(String, Vec<Detection>)]) -> Vec<u8> {
+    let text = |s: &str| [&b"X"[..], &(s.len() as u32).to_le_bytes(), s.as_bytes()].concat();
+    let array = |kind: &str, shape: &[usize], size: i32, content: &[u8]| {
+        let mut out = b"cnumpy._core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85C\x01b\x87R(K\x01(".to_vec();
+        shape.iter().for_each(|n| out.extend([&b"J"[..], &(*n as i32).to_le_bytes()].concat()));
+        out.extend(b"tcnumpy\ndtype\n");
+        out.extend([text(kind), b"\x89\x88\x87R(K\x03".to_vec(), text("<"), b"NNN".to_vec()].concat());
+        out.extend([&b"J"[..], &size.to_le_bytes(), b"J", &size.to_le_bytes(), b"K\x00tb\x89"].concat());
+        out.extend([&b"B"[..], &(content.len() as u32).to_le_bytes(), content, b"tb"].concat());
+        out
+    };
+    let mut out = b"\x80\x03](".to_vec();
+    for (id, detections) in frames {
+        let n = detections.len();
+        let name = |d: &Detection| -> Vec<u8> {
+            let mut codes: Vec<u32> = d.class.chars().map(u32::from).collect();
+            codes.resize(10, 0);
+            codes.iter().flat_map(|c| c.to_le_bytes()).collect()
+        };
+        let names: Vec<u8> = detections.iter().flat_map(name).collect();
+        let scores: Vec<u8> = detections.iter().flat_map(|d| d.score.to_le_bytes()).collect();
+        let boxes = |d: &Detection| d.bbox.to_array().map(|v| v as f32).into_iter().flat_map(f32::to_le_bytes);
+        let boxes: Vec<u8> = detections.iter().flat_map(boxes).collect();
+        out.extend([b"}(".to_vec(), text("frame_id"), text(id)].concat());
+        out.extend([text("name"), array("U10", &[n], 40, &names)].concat());
+        out.extend([text("score"), array("f4", &[n], -1, &scores)].concat());
+        out.extend([text("boxes_lidar"), array("f4", &[n, 7], -1, &boxes), b"u".to_vec()].concat());
+    }
+    out.extend(b"e.");
+    out
 }
 
 /// The program with these arguments and the working directory `folder`.

@@ -1,10 +1,11 @@
 //! Distances between two data sets, frame by frame.
 
+use super::frames::{FrameDistances, by_frame};
+use super::part::select;
 use super::regions::RegionSums;
-use super::{Chamfer, DistanceError, Point, RegionRow, Regions, emd, nearest, sinkhorn, sliced_wasserstein};
+use super::{Chamfer, DistanceError, Part, Point, RegionRow, Regions, emd, nearest, sinkhorn, sliced_wasserstein};
 use crate::{BootstrapOptions, Interval, RangeSection};
 use data::{Frame, stream};
-use geometry::{Box3, points_in_boxes};
 use rand::seq::SliceRandom;
 use rayon::prelude::*;
 use schemars::JsonSchema;
@@ -71,28 +72,6 @@ impl fmt::Display for Measure {
             Measure::SinkhornM => "EMD, Sinkhorn (m)",
             Measure::SlicedWassersteinM => "Sliced Wasserstein (m)",
         })
-    }
-}
-
-/// The subset of points that is compared.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Part {
-    /// All points within the maximum range.
-    Whole,
-    /// Points in the labelled boxes of their frame.
-    Targets,
-    /// Points in this range section (ground-plane distance).
-    Section(RangeSection),
-}
-
-impl fmt::Display for Part {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Part::Whole => f.write_str("whole cloud"),
-            Part::Targets => f.write_str("targets"),
-            Part::Section(section) => section.fmt(f),
-        }
     }
 }
 
@@ -238,6 +217,20 @@ pub fn compare(
     regions: Option<&Regions>,
     options: &DistanceOptions,
 ) -> Result<Distances, DistanceError> {
+    compare_by_frame(names, ids, load, regions, options).map(|(distances, _)| distances)
+}
+
+/// As [`compare`], with the distances of every frame.
+///
+/// # Errors
+/// As [`compare`].
+pub fn compare_by_frame(
+    names: [&str; 2],
+    ids: &[String],
+    load: impl Fn(&str) -> Result<[Frame; 2], DistanceError> + Sync,
+    regions: Option<&Regions>,
+    options: &DistanceOptions,
+) -> Result<(Distances, Vec<FrameDistances>), DistanceError> {
     let parts: Vec<Part> =
         [Part::Whole, Part::Targets].into_iter().chain(options.sections.iter().copied().map(Part::Section)).collect();
     let of_id = |(i, id): (usize, &String)| {
@@ -284,7 +277,10 @@ pub fn compare(
     }
     let mut sums = RegionSums::default();
     found.iter().for_each(|(_, of_frame)| sums.add(of_frame));
-    Ok(Distances {
+    let values: Vec<Vec<_>> =
+        found.iter().map(|(parts, _)| parts.iter().map(|part| part.as_ref().map(|(d, _)| *d)).collect()).collect();
+    let by_frame = by_frame(&rows, &values);
+    let distances = Distances {
         schema: DISTANCES_SCHEMA.into(),
         a: names[0].into(),
         b: names[1].into(),
@@ -292,7 +288,8 @@ pub fn compare(
         frames: ids.len(),
         rows,
         regions: regions.map_or(Vec::new(), |regions| sums.rows(&regions.names)),
-    })
+    };
+    Ok((distances, by_frame))
 }
 
 fn interval(values: &[f64], bootstrap: &BootstrapOptions) -> Option<Interval> {
@@ -304,26 +301,6 @@ fn interval(values: &[f64], bootstrap: &BootstrapOptions) -> Option<Interval> {
         values.iter().zip(weights).map(|(v, n)| v * f64::from(n)).sum::<f64>() / values.len() as f64
     };
     bootstrap.interval((0..bootstrap.replicates).map(draw).collect())
-}
-
-/// Points of a part, in cloud order.
-fn select(frame: &Frame, part: Part, max_range_m: f64) -> Vec<Point> {
-    let cloud = &frame.cloud;
-    let range_m = |p: &Point| f64::from(p[0]).hypot(f64::from(p[1]));
-    // A non-finite position has no range. It is kept here so that it is reported as an error later.
-    let whole = |p: &Point| !(range_m(p) > max_range_m);
-    match part {
-        Part::Whole => (0..cloud.len()).map(|i| cloud.xyz(i)).filter(whole).collect(),
-        Part::Section(section) => {
-            (0..cloud.len()).map(|i| cloud.xyz(i)).filter(|p| section.contains(range_m(p))).collect()
-        }
-        Part::Targets => {
-            let boxes: Vec<Box3> = frame.objects.iter().map(|object| object.bbox).collect();
-            let inside = points_in_boxes(&cloud.values, cloud.channels, &boxes, 0.0);
-            let inside: BTreeSet<u32> = inside.into_iter().flatten().collect();
-            inside.into_iter().map(|i| cloud.xyz(i as usize)).filter(whole).collect()
-        }
-    }
 }
 
 /// In the order of [`Measure::ALL`].
@@ -395,6 +372,7 @@ fn shuffled(cloud: &[Point], n: usize, purpose: &str, sample: usize, options: &D
 mod tests {
     use super::*;
     use data::{Cloud, Object};
+    use geometry::Box3;
     use rand::RngExt;
 
     /// A ground and a car; B also has a wall 60 m away.

@@ -56,6 +56,11 @@ impl TestSet {
         TestSet { label_frame, frames, truth: None }
     }
 
+    /// The frames with their labels, without detections.
+    pub fn frames(&self) -> &[EvalFrame] {
+        &self.frames
+    }
+
     /// Number of frames.
     pub fn len(&self) -> usize {
         self.frames.len()

@@ -4,7 +4,7 @@
 //! in a file is never run. Limitation: neither torch's legacy format nor safetensors has checksums, so a changed byte
 //! **inside a weight** is not detected there. torch's zip format has checksums, which are verified.
 
-mod pickle;
+pub(crate) mod pickle;
 mod pth;
 mod safetensors;
 

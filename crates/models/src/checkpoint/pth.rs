@@ -7,7 +7,7 @@
 //!
 //! Only `model_state` is read. The device of a storage (`cuda:0`) is ignored.
 
-use super::pickle::{Id, Pickle, Value, storage_width};
+use super::pickle::{Contents, Id, Pickle, Value, storage_width};
 use super::{HostTensor, NamedTensors, NumberType};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -75,7 +75,7 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
         return Err("was written on a big-endian machine, which is not supported".into());
     }
     let content = entry("data.pkl", None)?;
-    let pickle = Pickle::parse(&content)?;
+    let pickle = Pickle::parse(&content, Contents::Checkpoint)?;
     if pickle.length != content.len() {
         return Err(format!("{} bytes follow the pickle in data.pkl", content.len() - pickle.length));
     }
@@ -87,8 +87,8 @@ pub fn parse_zip(bytes: &[u8]) -> Result<NamedTensors, String> {
 pub fn parse_legacy(bytes: &[u8]) -> Result<NamedTensors, String> {
     let mut at = 0;
     let mut next = || -> Result<Pickle, String> {
-        let pickle =
-            Pickle::parse(&bytes[at..]).map_err(|e| format!("is damaged or truncated: from byte {at}: {e}"))?;
+        let pickle = Pickle::parse(&bytes[at..], Contents::Checkpoint)
+            .map_err(|e| format!("is damaged or truncated: from byte {at}: {e}"))?;
         at += pickle.length;
         Ok(pickle)
     };
@@ -224,7 +224,7 @@ impl<'p> View<'p> {
     /// `_rebuild_tensor_v2(storage, offset, shape, strides, ..)`, or a parameter of it.
     fn of(pickle: &'p Pickle, id: Id) -> Result<Self, String> {
         let call = |id: Id| match pickle.get(id) {
-            Value::Call { callable, arguments } => match (pickle.get(*callable), pickle.get(*arguments)) {
+            Value::Call { callable, arguments, .. } => match (pickle.get(*callable), pickle.get(*arguments)) {
                 (Value::Global("torch._utils", name), Value::Tuple(arguments)) => Some((*name, arguments.as_slice())),
                 _ => None,
             },

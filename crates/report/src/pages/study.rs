@@ -4,6 +4,7 @@ mod analyses;
 mod clouds;
 mod features;
 mod matrix;
+mod paired;
 mod training;
 
 pub(crate) use training::metrics_lines;
@@ -16,7 +17,7 @@ use data::write_atomic;
 use eval::analysis::RunAnalysis;
 use eval::distance::Distances;
 use eval::features::{CkaTable, Embedding};
-use eval::matrix::Matrix;
+use eval::matrix::{Matrix, PairedDifference};
 use eval::targets::Targets;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -37,6 +38,8 @@ pub struct StudyReport {
     pub warnings: Vec<String>,
     /// Matrix of train and test sets.
     pub matrix: Option<Matrix>,
+    /// Differences of detectors that were trained elsewhere between data sets of the same frames.
+    pub paired: Vec<PairedDifference>,
     /// Analyses of single runs, by name.
     pub analyses: Vec<(String, RunAnalysis)>,
     /// t-SNE embeddings of features.
@@ -153,6 +156,7 @@ impl StudyReport {
             sections.push(matrix::matrix_section(m));
             sections.push(matrix::range_section(m));
         }
+        sections.push(paired::section(&self.paired, self.matrix.as_ref()));
         sections.push(analyses::section(&self.analyses));
         sections.push(features::section(self));
         sections.push(clouds::distance_section(&self.distances));

@@ -1,6 +1,7 @@
 //! Validation of a study.
 
 use super::{Source, StudyConfig};
+use eval::distance::Compared;
 use std::collections::BTreeSet;
 
 impl StudyConfig {
@@ -9,14 +10,22 @@ impl StudyConfig {
         let names = [
             ("dataset", self.datasets.iter().map(|d| d.name.as_str()).collect::<Vec<_>>()),
             ("detector", self.detectors.iter().map(|d| d.name.as_str()).collect()),
+            ("frozen", self.frozen.iter().map(|f| f.name.as_str()).collect()),
             ("variant", self.variants.iter().map(|v| v.name.as_str()).collect()),
         ];
         if !is_name(&self.name) {
             return Some(format!("name {:?} has to be a file name", self.name));
         }
         for (what, names) in &names {
-            if names.is_empty() && *what != "variant" {
-                return Some(format!("there is no [[{what}]]"));
+            if names.is_empty() && *what == "dataset" {
+                return Some("there is no [[dataset]]".into());
+            }
+            if names.is_empty() && *what == "detector" && self.frozen.is_empty() && self.datasets.len() < 2 {
+                return Some(
+                    "there is neither a [[detector]] to train, nor a [[frozen]] detector, nor a second [[dataset]] to \
+                     compare with"
+                        .into(),
+                );
             }
             if let Some(bad) = names.iter().find(|name| !is_name(name)) {
                 return Some(format!("{what}.name {bad:?} has to be a file name of letters, digits, '-', '_' and '.'"));
@@ -28,7 +37,8 @@ impl StudyConfig {
         }
         let seeds =
             self.detectors.iter().filter_map(|d| Some((format!("detector {}: seeds", d.name), d.seeds.as_ref()?)));
-        for (what, seeds) in std::iter::once(("seeds".to_string(), &self.seeds)).chain(seeds) {
+        let common = self.trains().then(|| ("seeds".to_string(), &self.seeds));
+        for (what, seeds) in common.into_iter().chain(seeds) {
             let distinct: BTreeSet<&u64> = seeds.iter().collect();
             if seeds.is_empty() || distinct.len() < seeds.len() {
                 return Some(format!("{what} {seeds:?} have to be distinct and at least one"));
@@ -38,7 +48,7 @@ impl StudyConfig {
         if epochs.min() == Some(0) {
             return Some("epochs have to be 1 or more".into());
         }
-        let [datasets, detectors, _] = names.map(|(_, names)| names);
+        let [datasets, detectors, _, _] = names.map(|(_, names)| names);
         let unknown = |what: String, name: &str, known: &[&str]| {
             (!known.contains(&name)).then(|| {
                 format!("{what} contains {name:?}, which is not in the study; known names: {}", known.join(", "))
@@ -60,6 +70,10 @@ impl StudyConfig {
         if let Some(problem) = of_train.chain(of_variant).chain(of_tsne).chain(of_between).next() {
             return Some(problem);
         }
+        let networks: Vec<String> = self.networks().into_iter().map(|(name, ..)| name).collect();
+        if let Some(problem) = self.frozen_problem(&datasets, &networks) {
+            return Some(problem);
+        }
         for (i, dataset) in self.datasets.iter().enumerate() {
             if dataset.scene_of.is_some() != dataset.sensor_of.is_some() {
                 return Some(format!("dataset {}: scene_of and sensor_of are given together", dataset.name));
@@ -75,6 +89,9 @@ impl StudyConfig {
                 Source::Simulate { frames: 0, .. } => return Some(format!("dataset {}: frames is 0", dataset.name)),
                 _ => {}
             }
+        }
+        if !self.trains() && self.evaluation.distances.compared != Compared::Raw {
+            return Some("evaluation.distances.compared needs a [[detector]], whose training loader is used".into());
         }
         if self.evaluation.matrix.overlaps.iter().any(|o| !(0.0..1.0).contains(o)) {
             return Some("evaluation.matrix.overlaps have to be in [0, 1)".into());

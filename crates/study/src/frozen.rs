@@ -1,0 +1,382 @@
+//! Detectors that were trained elsewhere: their detections are read or made, checked, scored, and compared between data
+//! sets of the same frames.
+
+mod axes;
+mod checkpoint;
+mod source;
+
+pub use checkpoint::detect_frozen;
+
+use crate::cache::cached;
+use crate::config::{ELSEWHERE, FrozenDetector};
+use crate::data_sets::{labelled_sha256, open};
+use crate::error::{InPart, Result, refused};
+use crate::folder::Study;
+use crate::{Event, Listener};
+use axes::check_axes;
+use data::write_json;
+use eval::EvalFrame;
+use eval::matrix::{
+    PairedDifference, PairedValues, RunId, RunResult, RunScores, ScoredFrames, TestSet, paired_differences,
+    paired_values, shared_ids,
+};
+use serde::{Deserialize, Serialize};
+use source::Source;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// Inputs of the checked detections of a frozen detector on a data set. Written to `cell.json` after the check.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct FrozenCell {
+    schema: String,
+    detector: FrozenDetectorKey,
+    test_set: String,
+    split: String,
+    frames: usize,
+    labels_sha256: String,
+    source_sha256: String,
+}
+
+/// What of a frozen detector changes its detections, besides their files.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct FrozenDetectorKey {
+    name: String,
+    classes: BTreeMap<String, String>,
+    ignored_classes: Vec<String>,
+}
+
+impl FrozenCell {
+    fn path(study: &Study, frozen: &FrozenDetector, test_set: &str) -> PathBuf {
+        frozen.detections_folder(study, test_set).join("cell.json")
+    }
+}
+
+impl FrozenDetector {
+    /// Its folder in the folder of the study.
+    pub fn folder(&self, study: &Study) -> PathBuf {
+        study.folder.join("frozen").join(&self.name)
+    }
+
+    /// Folder of `cell.json` and, for a checkpoint, of the detections on a data set.
+    fn detections_folder(&self, study: &Study, test_set: &str) -> PathBuf {
+        self.folder(study).join("detections").join(test_set)
+    }
+
+    /// Folder of all refined regions of a two-stage network on a data set.
+    fn regions_folder(&self, study: &Study, test_set: &str) -> PathBuf {
+        self.folder(study).join("regions").join(test_set)
+    }
+
+    /// Its run in the matrix.
+    pub fn run_id(&self) -> RunId {
+        RunId { network: self.name.clone(), train_set: ELSEWHERE.into(), seed: 0 }
+    }
+}
+
+/// The `cell.json` that up-to-date detections have.
+fn expected_cell(study: &Study, frozen: &FrozenDetector, test_set: &str) -> Result<FrozenCell> {
+    let dataset = open(study, test_set)?;
+    let ids = dataset.ids(&study.config.splits.test)?;
+    let source_sha256 = match (&frozen.checkpoint, frozen.detections.get(test_set)) {
+        (Some(checkpoint), _) => checkpoint::checkpoint_sha256(study, frozen, checkpoint)?,
+        (None, Some(path)) => source::source_sha256(&study.path(path))
+            .in_part(|| format!("frozen {}: detections on {test_set}", frozen.name))?,
+        (None, None) => return Err(refused(format!("frozen {} has no detections on {test_set}", frozen.name))),
+    };
+    Ok(FrozenCell {
+        schema: "lidarshift/frozen-cell/1".into(),
+        detector: FrozenDetectorKey {
+            name: frozen.name.clone(),
+            classes: frozen.classes.clone(),
+            ignored_classes: frozen.ignored_classes.clone(),
+        },
+        test_set: test_set.into(),
+        split: study.config.splits.test.clone(),
+        frames: ids.len(),
+        labels_sha256: labelled_sha256(&dataset, &ids)?,
+        source_sha256,
+    })
+}
+
+/// Whether the detections on a data set have been checked, or made, with the present files.
+fn is_done(study: &Study, frozen: &FrozenDetector, test_set: &str) -> Result<bool> {
+    let Ok(bytes) = fs_err::read(FrozenCell::path(study, frozen, test_set)) else { return Ok(false) };
+    let Ok(found) = serde_json::from_slice::<FrozenCell>(&bytes) else { return Ok(false) };
+    if found != expected_cell(study, frozen, test_set)? {
+        return Ok(false);
+    }
+    if frozen.checkpoint.is_none() {
+        return Ok(true);
+    }
+    let folder = frozen.detections_folder(study, test_set);
+    let ids = open(study, test_set)?.ids(&study.config.splits.test)?;
+    Ok(ids.iter().all(|id| folder.join(format!("{id}.txt")).is_file()))
+}
+
+/// The test frames of a data set with labels and the detections of a frozen detector, in the label frame.
+fn read_frames(study: &Study, frozen: &FrozenDetector, test_set: &str, labels: &TestSet) -> Result<Vec<EvalFrame>> {
+    let Some(path) = frozen.detections.get(test_set) else {
+        let mut frames = labels.with_detections(&frozen.detections_folder(study, test_set))?;
+        for frame in &mut frames {
+            frame.detections = frozen.in_classes_of_labels(std::mem::take(&mut frame.detections));
+        }
+        return Ok(frames);
+    };
+    let dataset = open(study, test_set)?;
+    let source = Source { frozen, path: study.path(path), dataset: &dataset, test_set, labels };
+    source.read(&evaluated_classes(study))
+}
+
+fn evaluated_classes(study: &Study) -> Vec<String> {
+    let mut classes = study.config.evaluation.matrix.classes.clone();
+    classes.push(study.config.evaluation.analysis.class.clone());
+    classes
+}
+
+/// Reads and checks the detections of all frozen detectors, and makes those of checkpoints, unless they are up to date.
+/// `device` are the command line arguments of the device.
+///
+/// # Errors
+/// Data sets without shared frames; detections that cannot be read, do not fit the frames or classes of their data set,
+/// or are in another frame than its labels; a checkpoint that cannot be used.
+pub(crate) fn prepare(study: &Study, device: &[String], listener: Listener<'_>) -> Result<()> {
+    for frozen in &study.config.frozen {
+        check_shared_frames(study, frozen)?;
+    }
+    for frozen in &study.config.frozen {
+        let mut missing = Vec::new();
+        for dataset in study.config.datasets.iter().filter(|d| frozen.is_tested_on(&d.name)) {
+            if !is_done(study, frozen, &dataset.name)? {
+                missing.push(&dataset.name);
+            }
+        }
+        if frozen.checkpoint.is_some() {
+            if !missing.is_empty() {
+                checkpoint::run_process(study, frozen, device, listener)?;
+            }
+            continue;
+        }
+        for test_set in missing {
+            listener(Event::Note(&format!("frozen {}: reading its detections on {test_set}", frozen.name)));
+            let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
+            let frames = read_frames(study, frozen, test_set, &labels)?;
+            check_axes(study, frozen, test_set, &labels, &frames)?;
+            let cell = expected_cell(study, frozen, test_set)?;
+            write_json(&FrozenCell::path(study, frozen, test_set), &cell)?;
+        }
+    }
+    Ok(())
+}
+
+/// The data sets that are compared with the first one by the same frames.
+fn compared<'a>(study: &'a Study, frozen: &FrozenDetector) -> Option<(&'a str, Vec<&'a str>)> {
+    let mut names = study.config.datasets.iter().map(|d| d.name.as_str());
+    let first = names.next().filter(|name| frozen.is_tested_on(name))?;
+    Some((first, names.filter(|name| frozen.is_tested_on(name)).collect()))
+}
+
+fn check_shared_frames(study: &Study, frozen: &FrozenDetector) -> Result<()> {
+    let Some((first, others)) = compared(study, frozen) else { return Ok(()) };
+    let split = &study.config.splits.test;
+    let a = open(study, first)?;
+    for other in others {
+        let b = open(study, other)?;
+        let (a_ids, b_ids) = (a.ids(split)?, b.ids(split)?);
+        if shared_ids(&[&a_ids, &b_ids]).is_empty() {
+            return Err(refused(format!(
+                "{}: none of its {} frames is among the {} of {}; measured minus simulated is compared over the same \
+                 frames. Give both data sets the same frame ids and test splits, or evaluate {other} in a study of its \
+                 own",
+                b.split_path(split)?.display(),
+                b_ids.len(),
+                a_ids.len(),
+                a.split_path(split)?.display()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// A frozen detector on a data set: the hash of its inputs, or why there are no detections.
+pub(crate) struct FrozenCellState {
+    name: String,
+    test_set: String,
+    state: Result<String, String>,
+}
+
+/// The state of all frozen detectors.
+#[derive(Default)]
+pub struct FrozenState {
+    cells: Vec<FrozenCellState>,
+    /// Scores that have been computed in this process, by detector and data set.
+    scores: Mutex<BTreeMap<(String, String), Arc<RunScores>>>,
+}
+
+impl FrozenState {
+    /// Reads the state of every frozen detector on every data set.
+    ///
+    /// # Errors
+    /// A missing data set.
+    pub fn read(study: &Study) -> Result<FrozenState> {
+        let mut cells = Vec::new();
+        for frozen in &study.config.frozen {
+            for dataset in &study.config.datasets {
+                let state = if !frozen.is_tested_on(&dataset.name) {
+                    Err("the study has no detections of it on this data set".to_string())
+                } else {
+                    match is_done(study, frozen, &dataset.name) {
+                        Ok(true) => {
+                            let cell = expected_cell(study, frozen, &dataset.name)?;
+                            Ok(format!("{} {:?}", cell.source_sha256, cell.detector))
+                        }
+                        Ok(false) => Err("its detections have not been read yet, or have changed since".to_string()),
+                        Err(error) => Err(error.to_string()),
+                    }
+                };
+                cells.push(FrozenCellState { name: frozen.name.clone(), test_set: dataset.name.clone(), state });
+            }
+        }
+        Ok(FrozenState { cells, ..FrozenState::default() })
+    }
+
+    /// Name of each detector and data set, and why there are no detections.
+    pub fn lines(&self) -> impl Iterator<Item = (&str, &str, Option<&str>)> {
+        self.cells.iter().map(|c| (c.name.as_str(), c.test_set.as_str(), c.state.as_ref().err().map(String::as_str)))
+    }
+
+    /// Everything that determines the results.
+    pub(crate) fn key(&self) -> String {
+        self.cells.iter().map(|c| format!("{} {} {:?}\n", c.name, c.test_set, c.state)).collect()
+    }
+
+    /// Whether there are detections.
+    pub(crate) fn has(&self, name: &str, test_set: &str) -> bool {
+        self.cells.iter().any(|c| c.name == name && c.test_set == test_set && c.state.is_ok())
+    }
+
+    /// The results for the matrix on a data set, by run and data set.
+    pub(crate) fn results(&self, study: &Study, labels: &TestSet, test_set: &str) -> Vec<((RunId, String), RunResult)> {
+        let of_cell = |cell: &FrozenCellState| {
+            let frozen = study.config.frozen_detector(&cell.name)?;
+            let result = match &cell.state {
+                Ok(_) => self.scores(study, frozen, test_set, labels).map_err(|e| e.to_string()),
+                Err(reason) => Err(reason.clone()),
+            };
+            Some(((frozen.run_id(), test_set.to_string()), result.map(|scores| (*scores).clone())))
+        };
+        self.cells.iter().filter(|cell| cell.test_set == test_set).filter_map(of_cell).collect()
+    }
+
+    fn scores(
+        &self,
+        study: &Study,
+        frozen: &FrozenDetector,
+        test_set: &str,
+        labels: &TestSet,
+    ) -> Result<Arc<RunScores>> {
+        let key = (frozen.name.clone(), test_set.to_string());
+        let known = |scores: &BTreeMap<_, Arc<RunScores>>| scores.get(&key).cloned();
+        if let Some(scores) = known(&self.scores.lock().unwrap_or_else(PoisonError::into_inner)) {
+            return Ok(scores);
+        }
+        let frames = read_frames(study, frozen, test_set, labels)?;
+        let folder = frozen.regions_folder(study, test_set);
+        let regions =
+            if frozen.checkpoint.is_some() && folder.is_dir() { Some(labels.with_detections(&folder)?) } else { None };
+        let options = &study.config.evaluation.matrix;
+        let scores = Arc::new(RunScores::new(&frames, regions.as_deref(), labels.label_frame, options));
+        self.scores.lock().unwrap_or_else(PoisonError::into_inner).insert(key, scores.clone());
+        Ok(scores)
+    }
+
+    /// All values of a frozen detector on these data sets over the frames that all of them have, and the number of
+    /// these frames.
+    ///
+    /// # Errors
+    /// Labels or detections that cannot be read or have changed.
+    pub(crate) fn values(
+        &self,
+        study: &Study,
+        frozen: &FrozenDetector,
+        names: &[&str],
+    ) -> Result<(usize, Vec<PairedValues>)> {
+        let mut sets = Vec::new();
+        for name in names {
+            if !self.has(&frozen.name, name) {
+                return Err(refused(format!(
+                    "frozen {}: its detections on {name} changed while they were read",
+                    frozen.name
+                )));
+            }
+            sets.push(self.scored(study, frozen, name)?);
+        }
+        let sets: Vec<ScoredFrames> = sets.iter().map(|(ids, scores)| (&**scores, ids.as_slice())).collect();
+        Ok(paired_values(&sets, &study.config.evaluation.matrix))
+    }
+
+    /// The test frames of a data set and the scores on them.
+    fn scored(&self, study: &Study, frozen: &FrozenDetector, name: &str) -> Result<(Vec<String>, Arc<RunScores>)> {
+        let labels = TestSet::read(&open(study, name)?, &study.config.splits.test)?;
+        let ids = labels.frames().iter().map(|frame| frame.id.clone()).collect();
+        Ok((ids, self.scores(study, frozen, name, &labels)?))
+    }
+
+    /// Differences of every frozen detector between the first data set and each other one over their shared frames,
+    /// cached in `paired.json`; and a warning for data sets that share only a part of their frames.
+    ///
+    /// # Errors
+    /// Labels or detections that cannot be read.
+    pub(crate) fn paired(&self, study: &Study, key: &str) -> Result<(Vec<PairedDifference>, Vec<String>)> {
+        if self.cells.is_empty() {
+            return Ok((Vec::new(), Vec::new()));
+        }
+        let options = &study.config.evaluation.matrix;
+        cached(&study.folder.join("paired.json"), &("lidarshift.paired/1", key, options), || {
+            let (mut out, mut warnings) = (Vec::new(), Vec::new());
+            for frozen in &study.config.frozen {
+                let Some((first, others)) = compared(study, frozen) else { continue };
+                let others: Vec<&str> = others.into_iter().filter(|name| self.has(&frozen.name, name)).collect();
+                if !self.has(&frozen.name, first) || others.is_empty() {
+                    continue;
+                }
+                let (a_ids, a) = self.scored(study, frozen, first)?;
+                for other in others {
+                    let (b_ids, b) = self.scored(study, frozen, other)?;
+                    let names = [frozen.name.as_str(), first, other];
+                    let found = paired_differences(names, [(&a, &a_ids), (&b, &b_ids)], options);
+                    let shared = found.first().map_or(0, |d| d.frames);
+                    if shared < a_ids.len().max(b_ids.len()) {
+                        warnings.push(format!(
+                            "{}: {} minus {} is over the {shared} frames that both have, of {} and {}",
+                            frozen.title,
+                            study.title(first),
+                            study.title(other),
+                            a_ids.len(),
+                            b_ids.len()
+                        ));
+                    }
+                    out.extend(found);
+                }
+            }
+            Ok((out, warnings))
+        })
+    }
+
+    /// The test frames of a data set with labels and the detections of a frozen detector; `None` without detections.
+    ///
+    /// # Errors
+    /// Labels or detections that cannot be read.
+    pub(crate) fn frames(
+        &self,
+        study: &Study,
+        frozen: &FrozenDetector,
+        test_set: &str,
+        labels: &TestSet,
+    ) -> Result<Option<Vec<EvalFrame>>> {
+        match self.has(&frozen.name, test_set) {
+            true => read_frames(study, frozen, test_set, labels).map(Some),
+            false => Ok(None),
+        }
+    }
+}
