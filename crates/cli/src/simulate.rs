@@ -21,7 +21,8 @@ use std::path::{Path, PathBuf};
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct SimulateArgs {
-    /// Scenes to simulate: race, race_small, race_full, race_study, street, or a TOML; docs/src/reference/configuration.md lists
+    /// Scenes to simulate: race, race_small, race_full, race_study, street, or a TOML;
+    /// docs/src/reference/configuration.md lists
     /// its keys
     #[arg(long, value_name = "CONFIG", default_value = "race")]
     config: String,

@@ -42,8 +42,8 @@ impl BootstrapOptions {
         draw_runs(n_frames, self.block_frames, &mut stream(self.seed, purpose, 0, replicate as u64))
     }
 
-    /// Draws `n - 1` of `n` seeds with replacement (one if there is one). With `n` draws the variance of the mean of few
-    /// seeds would come out too small by `(n - 1) / n`: half of it with two seeds (Rao and Wu 1988).
+    /// Draws `n - 1` of `n` seeds with replacement (one if there is one). With `n` draws the variance of the mean of
+    /// few seeds would come out too small by `(n - 1) / n`: half of it with two seeds (Rao and Wu 1988).
     pub(crate) fn seed_draws(&self, purpose: &str, replicate: usize, n: usize) -> Vec<usize> {
         let mut drawn = self.draws(purpose, replicate, n);
         drawn.truncate(n.saturating_sub(1).max(1));

@@ -357,7 +357,7 @@ fn mislabelled(seed: u64, noise: f64, shift_m: f64) -> RunScores {
 }
 
 #[test]
-fn a_gap_that_labels_make_is_told_from_one_of_the_sensor() {
+fn a_gap_that_labels_make_is_distinguished_from_one_of_the_sensor() {
     let with = |shift_m: f64| {
         let mut results = results(&[("sim", 1, "real"), ("sim", 2, "real")]);
         for seed in [1, 2] {

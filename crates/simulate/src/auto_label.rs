@@ -38,8 +38,8 @@ pub enum Refine {
     /// They stay where the records place them.
     None,
     /// The outermost points touch the faces of the box that the sensor sees, as in the paper. A car does not fill its
-    /// box: the outermost points that a LiDAR sees are not at its faces, so that labels are biased by 0.2 to 0.3 m along
-    /// the car.
+    /// box: the outermost points that a LiDAR sees are not at its faces, so that labels of near cars are biased by 0.2
+    /// to 0.3 m along the car.
     Faces,
     /// The points lie on the surface of the car's model; the shift is weighed against the errors of the records.
     #[default]
@@ -150,7 +150,7 @@ pub fn refine_to_shape(cloud: &Cloud, bbox: &Box3, shape: &ShapeField, position_
         return *bbox;
     }
     let weight = (MOST_COUNTED / local.len() as f64).min(1.0) / SURFACE_STD_M.powi(2);
-    // Two records, that of the own car and that of the other.
+    // Two records, that of the ego vehicle and that of the other car.
     let record = 1.0 / (2.0 * position_std_m.powi(2) + RECORD_STD_M.powi(2));
     let cost = |by: [f64; 2]| {
         let off = |p: &[f64; 3]| shape.at([p[0] - by[0], p[1] - by[1], p[2]]).powi(2);

@@ -79,8 +79,8 @@ impl<'a> FrameScene<'a> {
         scan
     }
 
-    /// Number of returns from each of `cars` cars, for thin beams that are fired at the same time. Equal to counting them
-    /// in the scan, but casts those rays alone that come near a car.
+    /// Number of returns from each of `cars` cars, for thin beams that are fired at the same time. Equal to counting
+    /// them in the scan, but casts those rays alone that come near a car.
     pub fn returns_of_cars(&self, beams: &Beams, cars: usize) -> Vec<usize> {
         let mut returns = vec![0; cars];
         for sensor in &beams.sensors {

@@ -4,7 +4,7 @@ use crate::mesh::Mesh;
 
 /// Side of a cell, m.
 const CELL_M: f64 = 0.05;
-/// Largest distance that is told from larger ones, m.
+/// Largest distance that is distinguished from larger ones, m.
 pub const REACH_M: f64 = 0.2;
 /// Largest distance of neighbouring samples of the surface, m.
 const SPACING_M: f64 = 0.03;

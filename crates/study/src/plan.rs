@@ -11,7 +11,7 @@ use std::path::Path;
 /// Parts of a simulated data set of which one is tested on.
 const TEST_PART: usize = 6;
 
-/// Scatter of paired differences measured in the study `quick` (PointPillars; measured against sim, tested on measured):
+/// Scatter of paired differences in the study `quick` (PointPillars; measured against sim, tested on measured):
 /// overlap, deviation over seeds, standard error of the frames times the square root of their number.
 const STORED: [(f64, Scatter); 2] =
     [(0.5, Scatter { of_seeds: 4.0, of_frames: 28.0 }), (0.7, Scatter { of_seeds: 4.0, of_frames: 29.0 })];
