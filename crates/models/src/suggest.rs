@@ -331,7 +331,7 @@ mod tests {
         coarse.range_m = [-102.4, -102.4, -3.0, 102.4, 102.4, 10.0];
         let suggestion = suggest(&coarse, &cars(400)).unwrap();
         let [before, after] = suggestion.forced.unwrap();
-        assert!(before > 0.2 && after < 0.01, "{before} {after}");
+        assert!(before > 0.5 && after < FORCED_SHARE, "{before} {after}");
         let NetworkConfig::PointPillars(net) = &suggestion.detector.network else { unreachable!() };
         assert_eq!((net.pillars.size_m[0], net.anchors[0].rotations_rad.as_slice()), (0.4, &[0.0][..]));
         let range = suggestion.detector.range_m;
