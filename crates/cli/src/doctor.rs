@@ -70,10 +70,10 @@ impl DoctorArgs {
         if suggestion.changes.is_empty() {
             out += "  nothing had to be changed\n";
         }
-        if let (Some(forced), Some(positives)) = (suggestion.forced, suggestion.positives) {
-            let [before, after] = forced.map(|share| format!("{:.1} %", 100.0 * share));
-            out += &format!("  boxes with nothing but a forced match: {before} -> {after}\n");
-            out += &format!("  positive anchors a box: {:.2} -> {:.2}\n", positives[0], positives[1]);
+        if let Some([before, after]) = suggestion.assignment {
+            let [forced, then] = [before, after].map(|a| format!("{:.1} %", 100.0 * a.forced));
+            out += &format!("  boxes with nothing but a forced match: {forced} -> {then}\n");
+            out += &format!("  positive anchors a box: {:.2} -> {:.2}\n", before.positives, after.positives);
         }
         Ok(out)
     }

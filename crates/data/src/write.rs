@@ -4,7 +4,7 @@ use crate::kitti_text::to_kitti_text;
 use crate::{Cloud, DataError, DatasetConfig, Frame, LabelBox, PcdEncoding, encode_pcd};
 use serde::Serialize;
 use std::io::Write as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Prefix of the names of temporary files.
 const TEMPORARY_PREFIX: &str = ".writing-";
@@ -76,6 +76,11 @@ pub fn label_boxes(frame: &Frame) -> Vec<LabelBox> {
 
 /// Folder of the true boxes in a made data set with automatic labels.
 pub const TRUE_LABELS: &str = "true_labels";
+
+/// Path of a frame's true boxes in a made data set.
+pub fn true_labels_path(root: &Path, id: &str) -> PathBuf {
+    root.join(TRUE_LABELS).join(format!("{id}.txt"))
+}
 
 /// Writes labels as KITTI text.
 pub fn write_kitti_text(path: &Path, labels: &[LabelBox]) -> Result<(), DataError> {

@@ -3,7 +3,8 @@
 use crate::Preparer;
 use crate::bev::{BackboneConfig, PillarsConfig};
 use crate::config::{AnchorConfig, DetectorConfig};
-use data::{AugmentConfig, DataError, Dataset, Object};
+use data::augment::flip;
+use data::{AugmentConfig, Cloud, DataError, Dataset, Frame, Object, stream};
 use geometry::{Box3, limit_period};
 use rayon::prelude::*;
 use statistics::{median_upper, quantile_linear};
@@ -57,15 +58,17 @@ impl LabelledBoxes {
     /// the places where boxes are, not to those to which a rotation about the sensor carries them.
     fn augmented(&self, augmentation: &AugmentConfig) -> Self {
         let mut frames = self.frames.clone();
-        let flips = [augmentation.flip_along_x_probability, augmentation.flip_along_y_probability];
-        for (axis, _) in flips.iter().enumerate().filter(|(_, probability)| **probability > 0.0) {
-            let flipped = |object: &Object| {
-                let mut object = object.clone();
-                object.bbox.center[1 - axis] *= -1.0;
-                object.bbox.yaw_rad = if axis == 0 { -object.bbox.yaw_rad } else { PI - object.bbox.yaw_rad };
-                object
-            };
-            frames.extend(frames.clone().iter().map(|objects| objects.iter().map(flipped).collect()));
+        let (x, y) = (augmentation.flip_along_x_probability, augmentation.flip_along_y_probability);
+        for [along_x, along_y] in [[x, 0.0], [0.0, y]].map(|flips| flips.map(f64::ceil)) {
+            if along_x + along_y > 0.0 {
+                let flipped = |objects: &Vec<Object>| {
+                    let cloud = Cloud { values: Vec::new(), channels: 3 };
+                    let frame = Frame { id: String::new(), cloud, objects: objects.clone() };
+                    // A probability of 1 leaves nothing to chance.
+                    flip(frame, along_x, along_y, &mut stream(0, "flips of boxes", 0, 0)).objects
+                };
+                frames.extend(frames.iter().map(flipped).collect::<Vec<_>>());
+            }
         }
         let turned_rad = augmentation.rotation_rad.iter().fold(0.0f64, |most, r| most.max(r.abs()));
         LabelledBoxes { frames, turned_rad }
@@ -112,18 +115,25 @@ pub struct BoxMatch {
     pub forced: bool,
 }
 
-/// Share of the boxes with nothing but a forced match; `None` without anchors or boxes.
-pub fn forced_share(detector: &DetectorConfig, boxes: &LabelledBoxes) -> Option<f64> {
-    let preparer = Preparer::new(detector);
-    let matches: Vec<BoxMatch> = boxes.frames.iter().flat_map(|objects| preparer.box_matches(objects)).collect();
-    (!matches.is_empty()).then(|| matches.iter().filter(|m| m.forced).count() as f64 / matches.len() as f64)
+/// How the anchors of a detector are assigned to all boxes of some frames.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Assignment {
+    /// Share of the boxes with nothing but a forced match.
+    pub forced: f64,
+    /// Positive anchors a box, on average.
+    pub positives: f64,
 }
 
-/// Positive anchors a box, on average; `None` without anchors or boxes.
-pub fn positives_a_box(detector: &DetectorConfig, boxes: &LabelledBoxes) -> Option<f64> {
-    let preparer = Preparer::new(detector);
-    let matches: Vec<BoxMatch> = boxes.frames.iter().flat_map(|objects| preparer.box_matches(objects)).collect();
-    (!matches.is_empty()).then(|| matches.iter().map(|m| m.positive as f64).sum::<f64>() / matches.len() as f64)
+impl Assignment {
+    /// Of a detector; `None` without anchors or boxes.
+    pub fn of(detector: &DetectorConfig, boxes: &LabelledBoxes) -> Option<Self> {
+        let preparer = Preparer::new(detector);
+        let matches: Vec<BoxMatch> = boxes.frames.iter().flat_map(|objects| preparer.box_matches(objects)).collect();
+        let n = matches.len() as f64;
+        let forced = matches.iter().filter(|m| m.forced).count() as f64 / n;
+        let positives = matches.iter().map(|m| m.positive as f64).sum::<f64>() / n;
+        (n > 0.0).then_some(Assignment { forced, positives })
+    }
 }
 
 /// A detector fitted to labelled boxes.
@@ -133,10 +143,8 @@ pub struct Suggestion {
     pub detector: DetectorConfig,
     /// What was changed, and why.
     pub changes: Vec<Change>,
-    /// Share of the boxes with nothing but a forced match, before and after; `None` without anchors.
-    pub forced: Option<[f64; 2]>,
-    /// Positive anchors a box, before and after.
-    pub positives: Option<[f64; 2]>,
+    /// How the anchors are assigned to the boxes, before and after; `None` without anchors.
+    pub assignment: Option<[Assignment; 2]>,
 }
 
 /// Fits a detector to labelled boxes.
@@ -157,9 +165,8 @@ pub fn suggest(detector: &DetectorConfig, boxes: &LabelledBoxes) -> Result<Sugge
     let shown = boxes.augmented(&detector.augmentation);
     fitted.network.fit(&mut fitted.range_m, &fitted.classes, &shown, &mut changes);
     fitted.check().map_err(|message| format!("the fitted detector does not hold together: {message}"))?;
-    let both =
-        |of: fn(&DetectorConfig, &LabelledBoxes) -> Option<f64>| Some([of(detector, boxes)?, of(&fitted, boxes)?]);
-    Ok(Suggestion { changes, forced: both(forced_share), positives: both(positives_a_box), detector: fitted })
+    let assignment = Assignment::of(detector, boxes).zip(Assignment::of(&fitted, boxes)).map(|(a, b)| [a, b]);
+    Ok(Suggestion { changes, assignment, detector: fitted })
 }
 
 impl Suggestion {
@@ -330,7 +337,7 @@ mod tests {
         net.pillars.size_m = [0.8, 0.8, 13.0];
         coarse.range_m = [-102.4, -102.4, -3.0, 102.4, 102.4, 10.0];
         let suggestion = suggest(&coarse, &cars(400)).unwrap();
-        let [before, after] = suggestion.forced.unwrap();
+        let [before, after] = suggestion.assignment.unwrap().map(|a| a.forced);
         assert!(before > 0.5 && after < FORCED_SHARE, "{before} {after}");
         let NetworkConfig::PointPillars(net) = &suggestion.detector.network else { unreachable!() };
         assert_eq!((net.pillars.size_m[0], net.anchors[0].rotations_rad.as_slice()), (0.4, &[0.0][..]));
@@ -355,7 +362,7 @@ mod tests {
     #[test]
     fn a_network_without_anchors_gets_mean_sizes() {
         let suggestion = suggest(&find_detector("pointrcnn_race_small").unwrap(), &cars(100)).unwrap();
-        assert_eq!(suggestion.forced, None);
+        assert_eq!(suggestion.assignment, None);
         let NetworkConfig::PointRcnn(net) = &suggestion.detector.network else { unreachable!() };
         assert_eq!(net.point_head.mean_sizes[0].size_m, [4.9, 1.9, 1.2]);
     }

@@ -2,7 +2,7 @@
 
 use crate::SimulateError;
 use data::toml_text::wrong;
-use data::write::TRUE_LABELS;
+use data::write::{TRUE_LABELS, true_labels_path};
 use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, write_atomic};
 use sensor::attributes;
 use sensor::effects::EffectList;
@@ -155,7 +155,7 @@ impl Resim<'_> {
                 self.write_labels(new, &frame)?;
             }
             if let Some(truth) = self.dataset.true_labels_path(id) {
-                write_atomic(&out.join(TRUE_LABELS).join(format!("{id}.txt")), &fs_err::read(truth)?)?;
+                write_atomic(&true_labels_path(out, id), &fs_err::read(truth)?)?;
             }
             if let (Some(from), Some(to)) = (self.dataset.calibration_path(id), layout.calibration_path(out, id))
                 && from.is_file()

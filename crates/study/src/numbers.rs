@@ -85,10 +85,11 @@ pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
         let mut results: BTreeMap<(RunId, String), RunResult> = BTreeMap::new();
         for (test_set, _) in &state.tests {
             let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
+            let truth = labels.of_true_boxes();
             let of_run = |(run, run_state): &(StudyRun, RunState)| {
                 let result = if StudyState::has(run_state, test_set) {
                     let folders = [run.detections(&study.folder, test_set), run.regions(&study.folder, test_set)];
-                    scores(&labels, &folders, options).map_err(|e| e.to_string())
+                    scores(&labels, truth.as_ref(), &folders, options).map_err(|e| e.to_string())
                 } else {
                     Err(reason(run_state)?)
                 };
@@ -101,8 +102,14 @@ pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
     })
 }
 
-/// Scores of the detections of a run and, for a two-stage network, of its regions.
-fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> Result<RunScores, DataError> {
+/// Scores of the detections of a run and, for a two-stage network, of its regions, against the labels and, where they
+/// are known, against the true boxes.
+fn scores(
+    labels: &TestSet,
+    truth: Option<&TestSet>,
+    folders: &[PathBuf; 2],
+    options: &MatrixOptions,
+) -> Result<RunScores, DataError> {
     let [detections, regions] = folders;
     let frames = labels.with_detections(detections)?;
     let regions = if regions.is_dir() { Some(labels.with_detections(regions)?) } else { None };
@@ -110,7 +117,7 @@ fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> 
         RunScores::new(frames, regions, labels.label_frame, options)
     };
     let of_labels = scores(&frames, regions.as_deref());
-    let Some(truth) = labels.of_true_boxes() else { return Ok(of_labels) };
+    let Some(truth) = truth else { return Ok(of_labels) };
     let regions = regions.map(|regions| truth.labelling(regions));
     Ok(of_labels.with_true_boxes(scores(&truth.labelling(frames), regions.as_deref())))
 }
@@ -156,11 +163,15 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
                     study.title(&run.id.train_set),
                     study.title(test_set)
                 );
-                let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
+                let dataset = open(study, test_set)?;
+                let labels = TestSet::read(&dataset, &study.config.splits.test)?;
+                let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
                 if let Some(truth) = labels.of_true_boxes() {
-                    out.push((format!("{title}, true boxes"), of_run(study, run, test_set, &truth)?));
+                    let frames = truth.labelling(frames.clone());
+                    let title = format!("{title}, true boxes");
+                    out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
                 }
-                out.push((title, of_run(study, run, test_set, &labels)?));
+                out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
             }
             seen.push(of);
         }
@@ -182,12 +193,6 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
 pub fn network_title(study: &Study, network: &str) -> String {
     let plan = study.config.plan();
     plan.networks.into_iter().find(|n| n.network.name == network).map_or(network.into(), |n| n.network.title)
-}
-
-fn of_run(study: &Study, run: &StudyRun, test_set: &str, labels: &TestSet) -> Result<RunAnalysis> {
-    let dataset = open(study, test_set)?;
-    let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
-    analysis(study, &dataset, labels.label_frame, &frames)
 }
 
 fn analysis(

@@ -13,7 +13,7 @@ use burn::tensor::Device;
 use data::{Dataset, write_atomic};
 use models::checkpoint::read_checkpoint;
 use models::layers::Precision;
-use models::suggest::{FORCED_SHARE, LabelledBoxes, forced_share};
+use models::suggest::{Assignment, FORCED_SHARE, LabelledBoxes};
 use models::{Detector, ModelError, Sample, reference_name};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -134,8 +134,11 @@ const LOOKED_AT: usize = 1000;
 /// Says if more than 5 % of the training boxes have nothing but a forced match: anchors that are too far apart, or of
 /// another size.
 fn anchor_warning(config: &RunConfig, dataset: &Dataset, ids: &[String]) -> Result<Option<String>, TrainError> {
+    if config.detector.network.anchors().is_empty() {
+        return Ok(None);
+    }
     let boxes = LabelledBoxes::read(dataset, ids, LOOKED_AT)?;
-    let share = forced_share(&config.detector, &boxes).filter(|share| *share > FORCED_SHARE);
+    let share = Assignment::of(&config.detector, &boxes).map(|a| a.forced).filter(|share| *share > FORCED_SHARE);
     Ok(share.map(|share| {
         format!(
             "{:.0} % of the training boxes are matched by force: no anchor of {} reaches the overlap `matched` with them, so that \

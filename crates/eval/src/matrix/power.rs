@@ -4,6 +4,7 @@ use super::{Gap, Matrix, Quantity, Reference};
 use crate::bootstrap::Interval;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use statistics::deviation;
 
 /// Standard errors that a difference must have to be seen with 80 % power at the level of 5 %: its interval then
 /// excludes zero in 80 of 100 repetitions. 1.960 + 0.842.
@@ -81,9 +82,8 @@ fn of_gap(matrix: &Matrix, gap: &Gap) -> Option<Power> {
     };
     let differences: Vec<f64> = of_own.iter().filter_map(difference).collect();
     let (seeds, frames) = (differences.len(), own.frames?);
-    let mean = differences.iter().sum::<f64>() / seeds.max(1) as f64;
-    let squares: f64 = differences.iter().map(|d| (d - mean).powi(2)).sum();
-    let of_seeds = if seeds > 1 { (squares / (seeds - 1) as f64).sqrt() } else { 0.0 };
+    let unbiased = (seeds as f64 / (seeds as f64 - 1.0)).sqrt();
+    let of_seeds = if seeds > 1 { deviation(&differences) * unbiased } else { 0.0 };
     // The interval holds both; what the seeds take is known.
     let both = (interval.high - interval.low) / 2.0 / HALF_INTERVAL;
     let of_frames = (both.powi(2) - of_seeds.powi(2) / seeds.max(1) as f64).max((0.3 * both).powi(2)).sqrt();

@@ -8,7 +8,7 @@ use crate::SimulateError;
 use crate::auto_label::{LabelError, label_errors};
 use crate::street::SplitCounts;
 use data::toml_text::wrong;
-use data::write::{TRUE_LABELS, label_boxes, write_kitti_text};
+use data::write::{TRUE_LABELS, label_boxes, true_labels_path, write_kitti_text};
 use data::{
     DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Manifest, NewDataset, PointColumns, read_kitti_text,
     write_atomic,
@@ -20,7 +20,7 @@ use sensor::matched::{RangeHistogram, fit_range_dropout};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Schema version of the manifest.
 pub const RACE_MANIFEST_SCHEMA: &str = "lidarshift/race-dataset/1";
@@ -155,10 +155,6 @@ fn make_frame_file(
     }
     let [points, cars] = new.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
-}
-
-fn true_labels_path(root: &Path, id: &str) -> PathBuf {
-    root.join(TRUE_LABELS).join(format!("{id}.txt"))
 }
 
 /// Writes all files of a data set except the frames.
