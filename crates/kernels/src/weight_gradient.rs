@@ -7,6 +7,7 @@
 use crate::blocks::{Segment, TileGrid};
 use crate::images::Images;
 use crate::output::{Shared, fill};
+use crate::scheme::is_zero;
 use crate::scratch;
 use crate::tile::{PIXELS, Row, TileWork, dispatch_tiles, outer, tile_rows, zeros};
 use pulp::Simd;
@@ -160,6 +161,7 @@ impl<P: Panels> TileWork for Part<'_, P> {
         let Sums { rows, columns, .. } = self.sums;
         let dy_step = (PIXELS + 1) * columns;
         let x_step = if P::X_SHARED { 0 } else { rows + 1 };
+        let mut begun = false;
         for block in self.blocks.clone() {
             let segments = self.panels.grid().segments(block);
             let tiles = segments.tiles();
@@ -168,6 +170,9 @@ impl<P: Panels> TileWork for Part<'_, P> {
                 self.panels.prefetch_x(next.list(), input);
                 let panel = &mut self.x_panel[input * P::ROWS..];
                 self.panels.read_x(simd, segments.list(), input, panel, rows + 1);
+            }
+            if is_zero(self.x_panel) {
+                continue;
             }
             self.read_dy(simd, segments.list(), next.list());
             for (t, pixels) in self.pixels.chunks_exact(P::TILE * P::TILE * columns).take(tiles).enumerate() {
@@ -181,7 +186,7 @@ impl<P: Panels> TileWork for Part<'_, P> {
                     for at in (0..columns).step_by(V * S::F32_LANES) {
                         let place = |r: usize| r * columns + at..r * columns + at + V * S::F32_LANES;
                         let mut tile = zeros::<S, R, V>(simd);
-                        if block != self.blocks.start {
+                        if begun {
                             for r in 0..R {
                                 tile[r] = S::as_simd_f32s(&sums[place(r)]).0.as_chunks::<V>().0[0];
                             }
@@ -193,6 +198,10 @@ impl<P: Panels> TileWork for Part<'_, P> {
                     }
                 }
             }
+            begun = true;
+        }
+        if !begun {
+            self.memory.fill(0.0);
         }
     }
 }

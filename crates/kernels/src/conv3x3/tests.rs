@@ -72,6 +72,33 @@ fn equals_the_definition() {
     }
 }
 
+/// Blocks of zeros are skipped, and others of the same image are not.
+#[test]
+fn images_that_are_mostly_zero() {
+    for (height, width, few) in [(40, 70, 3), (9, 200, 1), (33, 33, 0)] {
+        for (stride, algorithm) in
+            [(1, Algorithm::WinogradF2), (1, Algorithm::WinogradF4), (1, Algorithm::Direct), (2, Algorithm::default())]
+        {
+            let conv = Conv3x3 { batch: 2, inputs: 3, outputs: 9, height, width, stride, algorithm };
+            let mut x = vec![0.0; conv.x_len()];
+            for k in 0..few {
+                x[conv.x_len() / (k + 2) + 5] = 1.5 + k as f32;
+            }
+            let (w, dy) = (random(conv.weight_len(), 2), random(conv.y_len(), 3));
+            let tolerance = if conv.algorithm == Algorithm::WinogradF4 { 2e-5 } else { 2e-6 };
+            let [y, _, dw] = all_three(&conv, &x, &w, &dy);
+            let [want_y, _, want_dw] = reference(&conv, &x, &w, &dy);
+            if few == 0 {
+                assert!(y.iter().chain(&dw).all(|v| *v == 0.0), "{conv:?}");
+                continue;
+            }
+            assert_close(&y, &want_y, tolerance, &format!("y of {conv:?}"));
+            assert_close(&dw, &want_dw, tolerance, &format!("dw of {conv:?}"));
+            assert!(want_y.iter().filter(|v| **v == 0.0).count() > want_y.len() / 2);
+        }
+    }
+}
+
 #[test]
 fn the_result_is_bit_equal_for_any_number_of_threads() {
     for algorithm in [Algorithm::WinogradF2, Algorithm::WinogradF4, Algorithm::Direct] {
