@@ -6,10 +6,8 @@ use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use data::Dataset;
 use eval::matrix::{Matrix, Power, Scatter};
+use simulate::Scenery;
 use std::path::Path;
-
-/// Parts of a simulated data set of which one is tested on.
-const TEST_PART: usize = 6;
 
 /// Scatter of paired differences in the study `quick` (PointPillars; measured against sim, tested on measured):
 /// overlap, deviation over seeds, standard error of the frames times the square root of their number.
@@ -113,7 +111,12 @@ fn test_frames(study: &Study, config: &StudyConfig, name: &str) -> Option<usize>
     }
     match &dataset.source {
         Source::Path(_) => None,
-        Source::Simulate { frames, .. } => Some(frames / TEST_PART),
+        Source::Simulate { config, frames, seed, .. } => {
+            Some(match Scenery::find(&study.scenes_config(config), Some(*frames), Some(*seed)).ok()? {
+                Scenery::Street(street) => street.frames.test,
+                Scenery::Race(race) => race.0.test_frames(),
+            })
+        }
         Source::Resim { of, .. } | Source::TrueLabels { of } => test_frames(study, config, of),
     }
 }

@@ -4,6 +4,7 @@ use crate::SimulateError;
 use crate::auto_label::AutoLabel;
 use crate::mesh::MeshFile;
 use crate::race::files::ConfigFiles;
+use crate::race::frames::split_sizes;
 use crate::scenario::{RaceModel, RunFiles};
 use data::KeyError;
 use data::Layout;
@@ -35,6 +36,9 @@ pub struct RaceConfig {
     /// How frames are assigned to train, val and test.
     #[serde(default)]
     pub split: SplitKind,
+    /// Proportions of train, val and test, each above 0.
+    #[serde(default = "four_to_one")]
+    pub split_shares: [usize; 3],
     /// Points with |x| or |y| above this are cropped, m.
     #[serde(default = "hundred")]
     pub crop_m: f64,
@@ -85,7 +89,7 @@ pub struct TrackConfig {
     pub seed: u64,
 }
 
-/// How frames are assigned to train, val and test, in the ratio 4 : 1 : 1.
+/// How frames are assigned to train, val and test.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SplitKind {
@@ -136,6 +140,10 @@ fn five() -> usize {
     5
 }
 
+fn four_to_one() -> [usize; 3] {
+    [4, 1, 1]
+}
+
 fn car() -> String {
     "Car".into()
 }
@@ -171,6 +179,9 @@ impl RaceConfig {
                 format!("{} are not between {least} (6 a run) and {most} (those of the race)", self.frames),
             ));
         }
+        if self.split_shares.iter().any(|share| !(1..=1000).contains(share)) {
+            return Err(wrong("split_shares", format!("{:?} are not between 1 and 1000", self.split_shares)));
+        }
         if self.datasets.is_empty() {
             return Err(wrong("dataset", "there is none; say at least [[dataset]] with a name"));
         }
@@ -196,6 +207,11 @@ impl RaceConfig {
             return Err(wrong("matched_to", "needs `from`: the data set whose points are lost"));
         }
         set.auto_label.as_ref().map_or(Ok(()), |auto| auto.check().map_err(|e| e.below("auto_label")))
+    }
+
+    /// Number of test frames of each data set.
+    pub fn test_frames(&self) -> usize {
+        split_sizes(self.frames, self.split_shares)[2]
     }
 
     /// The effect lists of a data set, with the name of the random stream of each; those of `from` come first.
@@ -275,6 +291,11 @@ mod tests {
                 "c.toml:9: dataset[1].auto_label.rate_hz: 0 is not between",
             ),
             ("frames = 100", "frames = 100\nsplit = \"lot\"", "c.toml:4: unknown variant `lot`"),
+            (
+                "frames = 100",
+                "frames = 100\nsplit_shares = [4, 0, 1]",
+                "c.toml:4: split_shares: [4, 0, 1] are not between 1 and 1000",
+            ),
             ("frames = 100", "frames = 100\nrace = { rivals = 9 }", "c.toml:4: race.rivals: 9 is not between"),
             ("frames = 100", "frames = 100\ncolour = 1", "c.toml:4: unknown field `colour`"),
         ] {

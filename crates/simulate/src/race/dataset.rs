@@ -166,7 +166,7 @@ fn write_descriptions(
 ) -> Result<(), SimulateError> {
     let (config, root) = (&simulator.config, new.root());
     let ids = |split: usize| simulator.keys().iter().filter(move |k| k.split == split).map(FrameKey::id);
-    let splits = SPLITS.iter().enumerate().map(|(split, (name, _))| (*name, ids(split).collect()));
+    let splits = SPLITS.iter().enumerate().map(|(split, name)| (*name, ids(split).collect()));
     let dataset = DatasetConfig {
         name: format!("{}-{}", config.name, set.name),
         points: PointColumns::Xyzi,

@@ -6,8 +6,8 @@ use data::{DataError, stream};
 use rand::seq::SliceRandom;
 use std::path::Path;
 
-/// Names and proportions of the splits.
-pub const SPLITS: [(&str, usize); 3] = [("train", 4), ("val", 1), ("test", 1)];
+/// Names of the splits.
+pub const SPLITS: [&str; 3] = ["train", "val", "test"];
 
 /// A selected frame.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -30,15 +30,25 @@ impl FrameKey {
 
     /// Name of the split.
     pub fn split_name(&self) -> &'static str {
-        SPLITS[self.split].0
+        SPLITS[self.split]
     }
+}
+
+/// Numbers of frames of the splits when `kept` frames are split in the proportions `shares`.
+pub(super) fn split_sizes(kept: usize, shares: [usize; 3]) -> Vec<usize> {
+    shared(kept, &shares)
 }
 
 /// Selects `kept` frames at an even stride over all runs, in ascending order.
 ///
 /// With blocks, each run contributes its share of every split as one block. Unused frames are placed between the
 /// blocks, so that the end of one block and the start of the next do not show the same moment.
-pub fn choose(runs: &[Run], kept: usize, kind: SplitKind, seed: u64) -> Result<Vec<FrameKey>, DataError> {
+pub fn choose(
+    runs: &[Run],
+    kept: usize,
+    (kind, shares): (SplitKind, [usize; 3]),
+    seed: u64,
+) -> Result<Vec<FrameKey>, DataError> {
     let total: usize = runs.iter().map(|r| r.frames).sum();
     if kept > total || kept < SPLITS.len() * runs.len() {
         let message = format!("{kept} are not between {} and the {total} of the runs", SPLITS.len() * runs.len());
@@ -51,7 +61,7 @@ pub fn choose(runs: &[Run], kept: usize, kind: SplitKind, seed: u64) -> Result<V
         stride -= 1;
     }
     let candidates = candidates_at(stride);
-    let split_sizes = shared(kept, &SPLITS.map(|(_, share)| share));
+    let split_sizes = split_sizes(kept, shares);
     let mut keys = Vec::with_capacity(kept);
     let mut first = 0;
     for (run, own) in over_runs(&split_sizes, &candidates).into_iter().enumerate() {
@@ -119,7 +129,7 @@ mod tests {
     fn the_paper_s_numbers() {
         // 32,951 frames, every fifth, 6,000 kept.
         let runs = runs(3295);
-        let keys = choose(&runs, 600, SplitKind::Blocks, 1).unwrap();
+        let keys = choose(&runs, 600, (SplitKind::Blocks, [4, 1, 1]), 1).unwrap();
         assert_eq!((keys.len(), count(&keys)), (600, vec![400, 100, 100]));
         assert!(keys.windows(2).all(|w| w[0].number < w[1].number));
         assert!(keys.iter().all(|k| k.frame % 5 == 0 && k.frame < runs[k.run].frames));
@@ -132,21 +142,28 @@ mod tests {
     }
 
     #[test]
+    fn more_frames_may_be_tested_on() {
+        let keys = choose(&runs(3295), 1600, (SplitKind::Blocks, [10, 1, 5]), 1).unwrap();
+        assert_eq!(count(&keys), [1000, 100, 500]);
+        assert_eq!(split_sizes(1601, [10, 1, 5]), [1001, 100, 500]);
+    }
+
+    #[test]
     fn by_lot_the_numbers_are_the_same() {
         let runs = runs(900);
-        let keys = choose(&runs, 61, SplitKind::Random, 1).unwrap();
+        let keys = choose(&runs, 61, (SplitKind::Random, [4, 1, 1]), 1).unwrap();
         assert_eq!((keys.len(), count(&keys)), (61, vec![41, 10, 10]));
         let mixed = keys.windows(2).filter(|w| w[0].split != w[1].split).count();
         assert!(mixed > 15, "{mixed}");
-        assert_eq!(keys, choose(&runs, 61, SplitKind::Random, 1).unwrap());
-        assert_ne!(keys, choose(&runs, 61, SplitKind::Random, 2).unwrap());
+        assert_eq!(keys, choose(&runs, 61, (SplitKind::Random, [4, 1, 1]), 1).unwrap());
+        assert_ne!(keys, choose(&runs, 61, (SplitKind::Random, [4, 1, 1]), 2).unwrap());
     }
 
     #[test]
     fn more_than_there_are_is_refused() {
-        assert!(choose(&runs(100), 101, SplitKind::Blocks, 1).is_err());
+        assert!(choose(&runs(100), 101, (SplitKind::Blocks, [4, 1, 1]), 1).is_err());
         for kept in [18, 19, 50, 99, 100] {
-            assert_eq!(choose(&runs(100), kept, SplitKind::Blocks, 1).unwrap().len(), kept, "{kept}");
+            assert_eq!(choose(&runs(100), kept, (SplitKind::Blocks, [4, 1, 1]), 1).unwrap().len(), kept, "{kept}");
         }
     }
 }

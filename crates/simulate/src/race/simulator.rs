@@ -121,7 +121,7 @@ impl Simulator {
             Some(file) => file.read(&files.folder(), &materials)?,
             None => race_car(),
         };
-        let keys = choose(&runs, config.frames, config.split, config.seed)?;
+        let keys = choose(&runs, config.frames, (config.split, config.split_shares), config.seed)?;
         let beams = Beams::of(&rig);
         let ideal = Surroundings::new(&track, &car, &WorldPlan::default());
         Ok(Simulator { config, rig, materials, track, runs, keys, car, beams, ideal, shape: OnceLock::new() })
