@@ -6,7 +6,7 @@ mod simulator;
 use crate::commands::End;
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use data::write::write_kitti_text;
+use data::write::{REPAIRED_ENDINGS, write_kitti_text};
 use data::{Dataset, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
@@ -118,7 +118,9 @@ impl DiagnoseArgs {
         write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {
-            write_labels(&self.out, &measured, id, boxes)?;
+            for (ending, boxes) in REPAIRED_ENDINGS.iter().zip(boxes) {
+                write_labels(&self.out.join(format!("label_2{ending}")), &measured, id, boxes)?;
+            }
         }
         print_diagnosis(&outcome.diagnosis, &self.out, outcome.corrected.len());
         if let (Some(study), Some(measured), Some(simulated)) = (&self.detectors, &self.measured, &self.simulated)
@@ -245,11 +247,12 @@ fn end_of(diagnosis: &Diagnosis) -> End {
     }
 }
 
-/// Writes corrected labels in the frame of the clouds, with the first class of the data set.
-fn write_labels(out: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box3]) -> Result<()> {
+/// Writes the corrected labels of a frame into a folder, in the frame of the clouds, with the first class of the data
+/// set.
+fn write_labels(folder: &Path, measured: &Dataset, id: &str, boxes: &[geometry::Box3]) -> Result<()> {
     let class = measured.config.classes.first().map_or("Car", String::as_str);
     let lines: Vec<LabelBox> = boxes.iter().map(|b| LabelBox::from_box(class, b, None)).collect();
-    Ok(write_kitti_text(&out.join(format!("label_2/{id}.txt")), &lines)?)
+    Ok(write_kitti_text(&folder.join(format!("{id}.txt")), &lines)?)
 }
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]

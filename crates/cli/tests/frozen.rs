@@ -131,6 +131,59 @@ fn detections_made_elsewhere_are_a_study_without_training() {
     assert!(page(dir.path()) != html);
 }
 
+/// The labels of `measured` are made wrong; the true boxes lie beside them.
+#[test]
+fn the_difference_is_split_where_the_truth_is_known() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    let measured = dir.path().join("measured");
+    let frames = frames(&measured);
+    for folder in ["true", "repaired", "repaired_low", "repaired_high"] {
+        fs::create_dir(measured.join(folder)).unwrap();
+        for frame in &frames {
+            let name = format!("{}.txt", frame.id);
+            fs::copy(measured.join("label_2").join(&name), measured.join(folder).join(&name)).unwrap();
+        }
+    }
+    for frame in &frames {
+        let path = measured.join(format!("label_2/{}.txt", frame.id));
+        let moved = |object: &data::Object| {
+            let mut bbox = object.bbox;
+            bbox.center[0] += 1.2;
+            LabelBox::from_box(&object.class, &bbox, None)
+        };
+        fs::write(path, to_kitti_text(&frame.objects.iter().map(moved).collect::<Vec<_>>())).unwrap();
+    }
+    let toml = |keys: &str| {
+        let text = format!("layout = \"kitti\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\"]\n{keys}");
+        fs::write(measured.join("dataset.toml"), text).unwrap();
+    };
+    for (keys, title) in
+        [("true_labels = \"true\"\n", "true boxes"), ("repaired_labels = \"repaired\"\n", "repaired labels")]
+    {
+        toml(keys);
+        let text = output_text(&must(dir.path(), "study frozen.toml"));
+        assert!(text.contains(&format!("| Ours 7 | elsewhere | Measured, {title} | 1 of 1 |")), "{text}");
+        let html = page(dir.path());
+        assert!(html.contains("What makes the differences"), "{title}");
+        assert!(html.contains(&format!("trained elsewhere, to Measured, {title}")), "{title}");
+        let paired: serde_json::Value =
+            serde_json::from_slice(&fs::read(dir.path().join("runs/frozen/paired.json")).unwrap()).unwrap();
+        let is =
+            |d: &&serde_json::Value| d["overlap"] == 0.5 && d["quantity"] == "recall_matched" && d["section"].is_null();
+        let found = paired[0].as_array().unwrap().iter().find(is).unwrap();
+        // All cars are found on both, but none of the measured ones at its label.
+        assert_eq!((found["value"].as_f64(), found["other"].as_f64()), (Some(0.0), Some(100.0)), "{found}");
+        let part = |name: &str| found["parts"][name]["points"].as_f64();
+        assert_eq!((part("label"), part("sensor_and_scene")), (Some(-100.0), Some(0.0)), "{found}");
+    }
+    // A frame that the diagnosis did not see is an error that names it.
+    fs::remove_file(measured.join("repaired_low/000001.txt")).unwrap();
+    let output = run(dir.path(), "study frozen.toml");
+    let text = output_text(&output);
+    assert!(output.status.code() == Some(1) && text.contains("repaired_low/000001.txt"), "{text}");
+}
+
 #[test]
 fn a_checkpoint_made_elsewhere_is_evaluated_on_every_data_set() {
     let dir = tempfile::tempdir().unwrap();

@@ -95,6 +95,11 @@ impl Dataset {
         self.config.true_labels.as_ref().map(|folder| text_path(&self.config.root.join(folder), id))
     }
 
+    /// Paths of a frame's repaired labels: the estimate, and both ends of the correction; `None` without any.
+    pub fn repaired_labels_paths(&self, id: &str) -> Option<[PathBuf; 3]> {
+        self.config.repaired_folders().map(|folders| folders.map(|folder| text_path(&folder, id)))
+    }
+
     /// Path of a frame's calibration, which need not exist; `None` if the layout has no calibration.
     pub fn calibration_path(&self, id: &str) -> Option<PathBuf> {
         self.config.layout.calibration_path(&self.config.root, id)
@@ -168,6 +173,19 @@ impl Dataset {
     /// Reads the true boxes of a frame in the label frame; `None` where the truth beside the labels is not known.
     pub fn true_labels(&self, id: &str) -> Result<Option<Vec<LabelBox>>, DataError> {
         self.true_labels_path(id).map(|path| read_kitti_text(&path, KittiText::Labels)).transpose()
+    }
+
+    /// Reads the repaired labels of a frame in the label frame: the estimate, and both ends of the correction; `None`
+    /// without any.
+    pub fn repaired_labels(&self, id: &str) -> Result<Option<[Vec<LabelBox>; 3]>, DataError> {
+        let Some(paths) = self.repaired_labels_paths(id) else { return Ok(None) };
+        if let Some(missing) = paths.iter().find(|path| !path.is_file()) {
+            let message = "does not exist: the diagnosis that repaired the labels did not see this frame; diagnose all \
+                           frames, or test on those that it saw";
+            return Err(DataError::file(missing, message));
+        }
+        let [estimate, low, high] = paths.map(|path| read_kitti_text(&path, KittiText::Labels));
+        Ok(Some([estimate?, low?, high?]))
     }
 
     /// Reads the calibration of a frame.
@@ -351,6 +369,19 @@ mod tests {
         assert!(dataset.labels("000001").unwrap_err().to_string().contains("label_other/000001.txt"));
         let plain = with_toml(folder.path(), "").unwrap();
         assert_eq!((plain.true_labels("000000").unwrap(), plain.labels("000000").unwrap().len()), (None, 1));
+        let repaired = |toml: &str| with_toml(folder.path(), toml);
+        let error = repaired("repaired_labels = \"label_2\"").unwrap_err();
+        assert!(error.contains("repaired_labels: ") && error.contains("label_2_low is not a folder"), "{error}");
+        for ending in ["low", "high"] {
+            let end = folder.path().join(format!("label_2_{ending}"));
+            std::fs::create_dir(&end).unwrap();
+            std::fs::write(end.join("000000.txt"), "").unwrap();
+        }
+        let dataset = repaired("repaired_labels = \"label_2\"").unwrap();
+        let counts = dataset.repaired_labels("000000").unwrap().unwrap().map(|boxes| boxes.len());
+        assert_eq!((counts, plain.repaired_labels("000000").unwrap()), ([1, 0, 0], None));
+        let error = dataset.repaired_labels("000001").unwrap_err().to_string();
+        assert!(error.contains("label_2_low/000001.txt") && error.contains("did not see this frame"), "{error}");
         let error = with_toml(folder.path(), "true_labels = \"truth\"").unwrap_err();
         assert!(error.contains("dataset.toml: true_labels: ") && error.contains("truth is not a folder"), "{error}");
     }

@@ -1,6 +1,7 @@
 //! The TOML of a data set and its defaults.
 
 use crate::toml_text::{parse_toml, read_text};
+use crate::write::REPAIRED_ENDINGS;
 use crate::{DataError, LabelFrame, Layout, PointColumns};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -37,6 +38,11 @@ pub struct DatasetConfig {
     /// truth is known (simulated data). Only the evaluation reads it: it scores detections against both.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub true_labels: Option<PathBuf>,
+    /// Folder of labels that `lidarshift diagnose` corrected, relative to the root: `label_2` of its results. Beside it
+    /// are the folders with `_low` and `_high` at the end of their names, for the interval of the correction. Only the
+    /// evaluation reads them: it scores detections against the labels and against these.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub repaired_labels: Option<PathBuf>,
     /// Name and file of each split; files are relative to the root. Default: those of train, val and test for which
     /// `ImageSets/NAME.txt` exists.
     #[serde(default)]
@@ -77,6 +83,7 @@ impl Default for DatasetConfig {
             classes: Vec::new(),
             labels: None,
             true_labels: None,
+            repaired_labels: None,
             splits: BTreeMap::new(),
             rig: None,
             fov_crop: false,
@@ -144,12 +151,24 @@ impl DatasetConfig {
         }
     }
 
+    /// Folders of the repaired labels: the estimate, and both ends of the correction.
+    pub(crate) fn repaired_folders(&self) -> Option<[PathBuf; 3]> {
+        let folder = self.root.join(self.repaired_labels.as_ref()?);
+        Some(REPAIRED_ENDINGS.map(|ending| {
+            let mut name = folder.file_name().unwrap_or_default().to_os_string();
+            name.push(ending);
+            folder.with_file_name(name)
+        }))
+    }
+
     fn check(&self, path: &Path) -> Result<(), DataError> {
         let wrong = |message: String| Err(DataError::file(path, message));
-        for (key, folder) in [("labels", &self.labels), ("true_labels", &self.true_labels)] {
-            if let Some(missing) = folder.as_ref().map(|f| self.root.join(f)).filter(|f| !f.is_dir()) {
-                return wrong(format!("{key}: {} is not a folder", missing.display()));
-            }
+        let repaired = self.repaired_folders();
+        let repaired = repaired.iter().flatten().map(|folder| ("repaired_labels", folder.clone()));
+        let others = [("labels", &self.labels), ("true_labels", &self.true_labels)];
+        let others = others.into_iter().filter_map(|(key, folder)| Some((key, self.root.join(folder.as_ref()?))));
+        if let Some((key, missing)) = others.chain(repaired).find(|(_, folder)| !folder.is_dir()) {
+            return wrong(format!("{key}: {} is not a folder", missing.display()));
         }
         if self.image_size.contains(&0) {
             return wrong(format!("image_size {:?}: both sides must be positive, px", self.image_size));

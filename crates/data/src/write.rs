@@ -77,6 +77,11 @@ pub fn label_boxes(frame: &Frame) -> Vec<LabelBox> {
 /// Folder of the true boxes in a made data set with automatic labels.
 pub const TRUE_LABELS: &str = "true_labels";
 
+/// Endings of the names of the folders with repaired labels: the estimate, and the correction at both ends, the square
+/// root of three standard errors below and above. The estimate with a weight of 2/3 and each end with 1/6 have the mean
+/// and the variance of the correction.
+pub const REPAIRED_ENDINGS: [&str; 3] = ["", "_low", "_high"];
+
 /// Path of a frame's true boxes in a made data set.
 pub fn true_labels_path(root: &Path, id: &str) -> PathBuf {
     root.join(TRUE_LABELS).join(format!("{id}.txt"))

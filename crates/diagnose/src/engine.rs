@@ -64,8 +64,9 @@ pub type Progress<'a> = &'a (dyn Fn(Stage, usize, usize) + Sync);
 pub struct Outcome {
     /// The diagnosis.
     pub diagnosis: Diagnosis,
-    /// Corrected boxes of the measured labels, by frame id; empty where the labels are correct.
-    pub corrected: Vec<(String, Vec<Box3>)>,
+    /// Corrected boxes of the measured labels, by frame id; empty where the labels are correct. The estimate, and the
+    /// boxes with the correction at both ends of its interval (see [`data::write::REPAIRED_ENDINGS`]).
+    pub corrected: Vec<(String, [Vec<Box3>; 3])>,
     /// The text of `extended.toml`.
     pub extended: String,
 }

@@ -22,7 +22,9 @@ mod split;
 
 pub use build::{RunResult, build};
 pub use cell::{Cell, CellNumber, CellRun, RunId, RunNumber, RunState};
-pub use paired::{PairedDifference, PairedValues, ScoredFrames, paired_differences, paired_values, shared_ids};
+pub use paired::{
+    PairedDifference, PairedParts, PairedValues, ScoredFrames, Standing, paired_differences, paired_values, shared_ids,
+};
 pub use power::{Power, Scatter};
 pub use published::{Published, published};
 pub use run_values::{RunValue, from_run_values};
@@ -98,14 +100,24 @@ pub enum Reference {
     /// The labels of the test set.
     #[default]
     Labels,
+    /// The labels with the corrections of a diagnosis.
+    RepairedLabels,
     /// The true boxes, where the labels were made automatically and the truth is known.
     TrueBoxes,
 }
 
 impl Reference {
+    /// From the labels to what comes closest to the truth.
+    pub const ALL: [Reference; 3] = [Reference::Labels, Reference::RepairedLabels, Reference::TrueBoxes];
+
+    /// What is written behind the title of a test set.
+    pub fn suffix(self) -> &'static str {
+        ["", ", repaired labels", ", true boxes"][self as usize]
+    }
+
     /// Its name in files.
     pub fn key(self) -> &'static str {
-        ["labels", "true_boxes"][self as usize]
+        ["labels", "repaired_labels", "true_boxes"][self as usize]
     }
 }
 
@@ -259,12 +271,9 @@ impl Matrix {
         places.find(|place| place.name == name).map_or(name, |place| &place.title)
     }
 
-    /// The title of a test set scored against labels or true boxes.
+    /// The title of a test set scored against a reference.
     pub fn test_title(&self, name: &str, reference: Reference) -> String {
-        match reference {
-            Reference::Labels => self.title(name).into(),
-            Reference::TrueBoxes => format!("{}, true boxes", self.title(name)),
-        }
+        format!("{}{}", self.title(name), reference.suffix())
     }
 
     /// The matrix as JSON.

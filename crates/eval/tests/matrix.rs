@@ -2,8 +2,8 @@
 
 use data::{LabelBox, LabelFrame, stream};
 use lidarshift_eval::matrix::{
-    Between, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity, RunId, RunResult, RunScores, RunState,
-    RunValue, build, from_run_values, published,
+    Between, CellNumber, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity, Reference, RunId,
+    RunResult, RunScores, RunState, RunValue, TestSet, build, from_run_values, published,
 };
 use lidarshift_eval::{BootstrapOptions, Difficulty, EvalFrame, EvalOptions, Metric, RecallDefinition, evaluate};
 use rand::RngExt;
@@ -344,6 +344,10 @@ fn the_same_bits_for_any_number_of_threads_and_back_from_json() {
     assert_eq!(matrix.to_markdown(), build(&plan(&[1, 2]), &results, &options()).to_markdown());
 }
 
+fn labels_of(frames: &[EvalFrame]) -> Vec<Vec<LabelBox>> {
+    frames.iter().map(|frame| frame.labels.clone()).collect()
+}
+
 /// Frames whose labels are shifted along by `shift_m`, with the true boxes as the other reference.
 fn mislabelled(seed: u64, noise: f64, shift_m: f64) -> RunScores {
     let truth = frames(seed, noise, 120);
@@ -353,7 +357,8 @@ fn mislabelled(seed: u64, noise: f64, shift_m: f64) -> RunScores {
         bbox.center[0] += shift_m;
         *label = LabelBox::from_box(&label.class, &bbox, None);
     }
-    scores(&labelled).with_true_boxes(scores(&truth))
+    let set = TestSet::new(LabelFrame::Lidar, labelled.clone());
+    set.with_beside(Reference::TrueBoxes, vec![labels_of(&truth)]).scores(&labelled, None, &options())
 }
 
 #[test]
@@ -383,6 +388,44 @@ fn a_gap_that_labels_make_is_distinguished_from_one_of_the_sensor() {
     assert!(unknown.label.is_none() && unknown.sensor.is_none());
     let text = with(0.8).to_markdown();
     assert!(text.contains("| pp | sim | real, true boxes |") && text.contains("sensor and scene"), "{text}");
+}
+
+/// Labels that are shifted along and were repaired: the estimate is right, its ends are off by `off_m`.
+#[test]
+fn repaired_labels_are_a_reference_whose_uncertainty_is_in_the_intervals() {
+    let shifted = |frames: &[EvalFrame], by_m: f64| {
+        let mut frames = frames.to_vec();
+        for label in frames.iter_mut().flat_map(|frame| &mut frame.labels) {
+            let mut bbox = label.lidar_box();
+            bbox.center[0] += by_m;
+            *label = LabelBox::from_box(&label.class, &bbox, None);
+        }
+        frames
+    };
+    let cell = |off_m: f64| {
+        let mut results = results(&[("sim", 1, "real"), ("sim", 2, "real")]);
+        for seed in [1, 2] {
+            let truth = frames(seed, 0.3, 120);
+            let labelled = shifted(&truth, 0.8);
+            let versions = [0.0, -off_m, off_m].map(|by_m| labels_of(&shifted(&truth, by_m)));
+            let set = TestSet::new(LabelFrame::Lidar, labelled.clone());
+            let set = set.with_beside(Reference::RepairedLabels, versions.into());
+            results.insert(key("sim", seed, "real"), Ok(set.scores(&labelled, None, &options())));
+        }
+        let matrix = build(&plan(&[1, 2]), &results, &options());
+        let of = |reference| {
+            let cell = matrix.cell("pp", "sim", "real").unwrap();
+            cell.number_of(reference, "Car", None, Quantity::Ap40, 0.7).unwrap().clone()
+        };
+        let split = matrix.splits.iter().find(|s| s.is_shown("Car") && s.test_set == "real" && s.overlap == 0.7);
+        assert!(split.unwrap().label.unwrap().points > 5.0);
+        assert!(matrix.to_markdown().contains("| pp | sim | real, repaired labels |"));
+        (of(Reference::Labels), of(Reference::RepairedLabels))
+    };
+    let width = |n: &CellNumber| n.interval.map(|i| i.high - i.low).unwrap();
+    let ((labels, exact), (_, unsure)) = (cell(0.0), cell(1.2));
+    assert!(exact.mean.unwrap() > labels.mean.unwrap() + 5.0 && exact.mean == unsure.mean, "{labels:?} {exact:?}");
+    assert!(width(&unsure) > 1.5 * width(&exact), "{unsure:?} {exact:?}");
 }
 
 #[test]

@@ -4,7 +4,9 @@ use data::{Cloud, Detection, Frame, LabelBox, LabelFrame, Object, stream};
 use eval::analysis::{AnalysisOptions, BoxPoints, analyse};
 use eval::distance::{DistanceOptions, Regions, compare};
 use eval::features::{CkaTable, Embedded, Embedding, TSNE_SCHEMA, TsneOptions};
-use eval::matrix::{MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId, RunScores, build, paired_differences};
+use eval::matrix::{
+    MatrixOptions, MatrixPlan, Place, PlannedNetwork, RunId, RunScores, ScoredFrames, build, paired_differences,
+};
 use eval::targets::{TargetOptions, targets};
 use eval::{BootstrapOptions, EvalFrame};
 use geometry::Box3;
@@ -113,7 +115,12 @@ fn report() -> StudyReport {
     let ids: Vec<String> = frames.iter().map(|f| f.id.clone()).collect();
     let scores = |noise: f64| RunScores::new(&eval_frames(&frames, 7, noise), None, LabelFrame::Lidar, &options);
     let (on_real, on_sim) = (scores(0.9), scores(0.3));
-    let paired = paired_differences(["pointpillars", "real", "sim"], [(&on_real, &ids), (&on_sim, &ids)], &options);
+    let paired = paired_differences(
+        ["pointpillars", "real", "sim"],
+        [&on_real, &on_sim].map(|scores| ScoredFrames::new(scores, &ids)),
+        None,
+        &options,
+    );
     let analysis = |name: &str, noise: f64| {
         let of_run = eval_frames(&frames, 1, noise);
         let boxes = |lines: &[LabelBox]| lines.iter().map(LabelBox::lidar_box).collect::<Vec<_>>();

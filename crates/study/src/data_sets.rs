@@ -72,7 +72,15 @@ fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result
             let root = std::path::absolute(&source.root)?;
             let rig = source.rig.map(std::path::absolute).transpose()?;
             let name = format!("{}-true-labels", source.name);
-            let config = DatasetConfig { name, root, rig, labels: Some(labels), true_labels: None, ..source };
+            let config = DatasetConfig {
+                name,
+                root,
+                rig,
+                labels: Some(labels),
+                true_labels: None,
+                repaired_labels: None,
+                ..source
+            };
             write_dataset_toml(&path.join("dataset.toml"), &config)?;
         }
     }
@@ -125,8 +133,9 @@ pub fn labelled_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     hash.update(frames_sha256(dataset, ids)?);
     for id in ids {
         hash.update(fs_err::read(dataset.labels_path(id))?);
-        if let Some(truth) = dataset.true_labels_path(id) {
-            hash.update(fs_err::read(truth)?);
+        let repaired = dataset.repaired_labels_paths(id).into_iter().flatten();
+        for beside in repaired.chain(dataset.true_labels_path(id)) {
+            hash.update(fs_err::read(beside)?);
         }
     }
     Ok(hex(hash))

@@ -3,11 +3,11 @@
 
 mod axes;
 mod checkpoint;
+mod paired;
 mod source;
 
 pub use checkpoint::detect_frozen;
 
-use crate::cache::cached;
 use crate::config::{ELSEWHERE, FrozenDetector};
 use crate::data_sets::{labelled_sha256, open};
 use crate::error::{InPart, Result, refused};
@@ -16,10 +16,8 @@ use crate::{Event, Listener};
 use axes::check_axes;
 use data::write_json;
 use eval::EvalFrame;
-use eval::matrix::{
-    PairedDifference, PairedValues, RunId, RunResult, RunScores, ScoredFrames, TestSet, paired_differences,
-    paired_values, shared_ids,
-};
+use eval::matrix::{PairedValues, RunId, RunResult, RunScores, ScoredFrames, TestSet, paired_values};
+use paired::check_shared_frames;
 use serde::{Deserialize, Serialize};
 use source::Source;
 use std::collections::BTreeMap;
@@ -169,35 +167,6 @@ pub(crate) fn prepare(study: &Study, device: &[String], listener: Listener<'_>) 
     Ok(())
 }
 
-/// The data sets that are compared with the first one by the same frames.
-fn compared<'a>(study: &'a Study, frozen: &FrozenDetector) -> Option<(&'a str, Vec<&'a str>)> {
-    let mut names = study.config.datasets.iter().map(|d| d.name.as_str());
-    let first = names.next().filter(|name| frozen.is_tested_on(name))?;
-    Some((first, names.filter(|name| frozen.is_tested_on(name)).collect()))
-}
-
-fn check_shared_frames(study: &Study, frozen: &FrozenDetector) -> Result<()> {
-    let Some((first, others)) = compared(study, frozen) else { return Ok(()) };
-    let split = &study.config.splits.test;
-    let a = open(study, first)?;
-    for other in others {
-        let b = open(study, other)?;
-        let (a_ids, b_ids) = (a.ids(split)?, b.ids(split)?);
-        if shared_ids(&[&a_ids, &b_ids]).is_empty() {
-            return Err(refused(format!(
-                "{}: none of its {} frames is among the {} of {}; measured minus simulated is compared over the same \
-                 frames. Give both data sets the same frame ids and test splits, or evaluate {other} in a study of its \
-                 own",
-                b.split_path(split)?.display(),
-                b_ids.len(),
-                a_ids.len(),
-                a.split_path(split)?.display()
-            )));
-        }
-    }
-    Ok(())
-}
-
 /// A frozen detector on a data set: the hash of its inputs, or why there are no detections.
 pub(crate) struct FrozenCellState {
     name: String,
@@ -285,7 +254,7 @@ impl FrozenState {
         let regions =
             if frozen.checkpoint.is_some() && folder.is_dir() { Some(labels.with_detections(&folder)?) } else { None };
         let options = &study.config.evaluation.matrix;
-        let scores = Arc::new(RunScores::new(&frames, regions.as_deref(), labels.label_frame, options));
+        let scores = Arc::new(labels.scores(&frames, regions.as_deref(), options));
         self.scores.lock().unwrap_or_else(PoisonError::into_inner).insert(key, scores.clone());
         Ok(scores)
     }
@@ -311,7 +280,7 @@ impl FrozenState {
             }
             sets.push(self.scored(study, frozen, name)?);
         }
-        let sets: Vec<ScoredFrames> = sets.iter().map(|(ids, scores)| (&**scores, ids.as_slice())).collect();
+        let sets: Vec<ScoredFrames> = sets.iter().map(|(ids, scores)| ScoredFrames::new(scores, ids)).collect();
         Ok(paired_values(&sets, &study.config.evaluation.matrix))
     }
 
@@ -320,47 +289,6 @@ impl FrozenState {
         let labels = TestSet::read(&open(study, name)?, &study.config.splits.test)?;
         let ids = labels.frames().iter().map(|frame| frame.id.clone()).collect();
         Ok((ids, self.scores(study, frozen, name, &labels)?))
-    }
-
-    /// Differences of every frozen detector between the first data set and each other one over their shared frames,
-    /// cached in `paired.json`; and a warning for data sets that share only a part of their frames.
-    ///
-    /// # Errors
-    /// Labels or detections that cannot be read.
-    pub(crate) fn paired(&self, study: &Study, key: &str) -> Result<(Vec<PairedDifference>, Vec<String>)> {
-        if self.cells.is_empty() {
-            return Ok((Vec::new(), Vec::new()));
-        }
-        let options = &study.config.evaluation.matrix;
-        cached(&study.folder.join("paired.json"), &("lidarshift.paired/1", key, options), || {
-            let (mut out, mut warnings) = (Vec::new(), Vec::new());
-            for frozen in &study.config.frozen {
-                let Some((first, others)) = compared(study, frozen) else { continue };
-                let others: Vec<&str> = others.into_iter().filter(|name| self.has(&frozen.name, name)).collect();
-                if !self.has(&frozen.name, first) || others.is_empty() {
-                    continue;
-                }
-                let (a_ids, a) = self.scored(study, frozen, first)?;
-                for other in others {
-                    let (b_ids, b) = self.scored(study, frozen, other)?;
-                    let names = [frozen.name.as_str(), first, other];
-                    let found = paired_differences(names, [(&a, &a_ids), (&b, &b_ids)], options);
-                    let shared = found.first().map_or(0, |d| d.frames);
-                    if shared < a_ids.len().max(b_ids.len()) {
-                        warnings.push(format!(
-                            "{}: {} minus {} is over the {shared} frames that both have, of {} and {}",
-                            frozen.title,
-                            study.title(first),
-                            study.title(other),
-                            a_ids.len(),
-                            b_ids.len()
-                        ));
-                    }
-                    out.extend(found);
-                }
-            }
-            Ok((out, warnings))
-        })
     }
 
     /// The test frames of a data set with labels and the detections of a frozen detector; `None` without detections.

@@ -9,7 +9,6 @@ use crate::folder::Study;
 use crate::frozen::FrozenState;
 use crate::run_state::{RunState, run_state};
 use data::{DataError, Dataset, LabelBox};
-use eval::EvalFrame;
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
 use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
 use rayon::prelude::*;
@@ -85,11 +84,10 @@ pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
         let mut results: BTreeMap<(RunId, String), RunResult> = BTreeMap::new();
         for (test_set, _) in &state.tests {
             let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
-            let truth = labels.of_true_boxes();
             let of_run = |(run, run_state): &(StudyRun, RunState)| {
                 let result = if StudyState::has(run_state, test_set) {
                     let folders = [run.detections(&study.folder, test_set), run.regions(&study.folder, test_set)];
-                    scores(&labels, truth.as_ref(), &folders, options).map_err(|e| e.to_string())
+                    scores(&labels, &folders, options).map_err(|e| e.to_string())
                 } else {
                     Err(reason(run_state)?)
                 };
@@ -102,24 +100,12 @@ pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
     })
 }
 
-/// Scores of the detections of a run and, for a two-stage network, of its regions, against the labels and, where they
-/// are known, against the true boxes.
-fn scores(
-    labels: &TestSet,
-    truth: Option<&TestSet>,
-    folders: &[PathBuf; 2],
-    options: &MatrixOptions,
-) -> Result<RunScores, DataError> {
+/// Scores of the detections of a run and, for a two-stage network, of its regions.
+fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> Result<RunScores, DataError> {
     let [detections, regions] = folders;
     let frames = labels.with_detections(detections)?;
     let regions = if regions.is_dir() { Some(labels.with_detections(regions)?) } else { None };
-    let scores = |frames: &[EvalFrame], regions: Option<&[EvalFrame]>| {
-        RunScores::new(frames, regions, labels.label_frame, options)
-    };
-    let of_labels = scores(&frames, regions.as_deref());
-    let Some(truth) = truth else { return Ok(of_labels) };
-    let regions = regions.map(|regions| truth.labelling(regions));
-    Ok(of_labels.with_true_boxes(scores(&truth.labelling(frames), regions.as_deref())))
+    Ok(labels.scores(&frames, regions.as_deref(), options))
 }
 
 /// Why a run has no detections; `None` if it has not been executed yet.
@@ -166,9 +152,9 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
                 let dataset = open(study, test_set)?;
                 let labels = TestSet::read(&dataset, &study.config.splits.test)?;
                 let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
-                if let Some(truth) = labels.of_true_boxes() {
-                    let frames = truth.labelling(frames.clone());
-                    let title = format!("{title}, true boxes");
+                for reference in labels.known_beside() {
+                    let frames = labels.labelled_by(reference, &frames);
+                    let title = format!("{title}{}", reference.suffix());
                     out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
                 }
                 out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
@@ -182,6 +168,11 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
             let labels = TestSet::read(&dataset, &study.config.splits.test)?;
             if let Some(frames) = state.frozen.frames(study, frozen, test_set, &labels)? {
                 let title = format!("{}, trained elsewhere, to {}", frozen.title, study.title(test_set));
+                for reference in labels.known_beside() {
+                    let frames = labels.labelled_by(reference, &frames);
+                    let title = format!("{title}{}", reference.suffix());
+                    out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
+                }
                 out.push((title, analysis(study, &dataset, labels.label_frame, &frames)?));
             }
         }

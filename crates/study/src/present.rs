@@ -9,7 +9,7 @@ use crate::folder::Study;
 use crate::numbers::{StudyState, analyses, matrix, network_title, some_test_frames};
 use crate::{Event, Listener};
 use data::{KittiText, read_kitti_text};
-use eval::matrix::{Matrix, PairedDifference, Quantity, TestSet};
+use eval::matrix::{Matrix, PairedDifference, Quantity, TestSet, shared_ids};
 use geometry::Box3;
 use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
 use std::path::PathBuf;
@@ -43,6 +43,10 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
     let targets = all_targets(study)?;
     warnings.extend(features.warnings);
     warnings.extend(paired_warnings);
+    warnings.extend(frames_of_between(study)?);
+    for warning in &warnings {
+        listener(Event::Note(&format!("warning: {warning}")));
+    }
     note_differences(study, &paired, listener);
     let report = StudyReport {
         title: format!("lidarshift study: {}", study.config.name),
@@ -62,6 +66,30 @@ pub fn write_report(study: &Study, listener: Listener<'_>) -> Result<(Matrix, Re
         scenes: scenes(study, &state)?,
     };
     Ok((matrix, report.write(&study.folder)?))
+}
+
+/// Warnings for data sets that are to tell sensor from scene, but have other test frames than the two they stand
+/// between.
+fn frames_of_between(study: &Study) -> Result<Vec<String>> {
+    let ids = |name: &str| -> Result<Vec<String>> { Ok(open(study, name)?.ids(&study.config.splits.test)?) };
+    let mut warnings = Vec::new();
+    for between in study.config.plan().between {
+        let own = ids(&between.test_set)?;
+        for name in [&between.scene_of, &between.sensor_of] {
+            let others = ids(name)?;
+            if own != others {
+                warnings.push(format!(
+                    "{} has other test frames than {} ({} of {} are shared): the parts of the sensor and of the scene hold \
+                     the difference of the frames",
+                    study.title(&between.test_set),
+                    study.title(name),
+                    shared_ids(&[&own, &others]).len(),
+                    own.len()
+                ));
+            }
+        }
+    }
+    Ok(warnings)
 }
 
 /// Passes the differences of average precision over all distances as results.

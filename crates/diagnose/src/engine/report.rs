@@ -147,21 +147,24 @@ fn predicted(sums: &[[f64; 3]], blocks: &[usize], returns: f64) -> Predicted {
     }
 }
 
-/// Measured boxes after all corrections; empty where there is none.
-pub(super) fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, Vec<Box3>)> {
+/// Measured boxes after all corrections, as [`super::Outcome::corrected`]; empty where there is none.
+pub(super) fn corrected(context: &Context, results: &[ChannelResult]) -> Vec<(String, [Vec<Box3>; 3])> {
     let repairs: Vec<_> = results.iter().flat_map(|r| &r.repairs).collect();
     if repairs.is_empty() {
         return vec![];
     }
     let boxes = |(f, frame): (usize, &FramePair)| {
-        let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
-            let mut b = o.measured?;
-            for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {
-                (0..3).for_each(|axis| b.center[axis] += r.shift_m[axis]);
-            }
-            Some(b)
-        });
-        (frame.id.clone(), moved.collect())
+        let version = |version: usize| {
+            let moved = frame.objects.iter().enumerate().filter_map(|(k, o)| {
+                let mut b = o.measured?;
+                for r in repairs.iter().filter(|r| (r.frame, r.object) == (f, k)) {
+                    (0..3).for_each(|axis| b.center[axis] += r.shifts_m[version][axis]);
+                }
+                Some(b)
+            });
+            moved.collect()
+        };
+        (frame.id.clone(), [0, 1, 2].map(version))
     };
     context.frames.iter().enumerate().map(boxes).collect()
 }

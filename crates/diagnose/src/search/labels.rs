@@ -296,9 +296,14 @@ impl Search<'_> {
 /// The correction of a measured label that places it on its returns: displaced labels are moved back, displaced
 /// objects take their labels along.
 fn repair(r: &Row, fitted: &LinearFit, side: Side) -> Repair {
-    let shift = [0, 1, 2].map(|axis: usize| r.expected(axis, &fitted.columns, fitted.theta.iter()));
     let sign = if side == Side::Labels { -1.0 } else { 1.0 };
     let (s, c) = r.yaw_rad.sin_cos();
-    let shift = Vector3::new(shift[0] * c - shift[1] * s, shift[0] * s + shift[1] * c, shift[2]) * sign;
-    Repair { frame: r.frame, object: r.object, shift_m: shift.into() }
+    let shifts_m = [0.0, -1.0, 1.0].map(|end: f64| {
+        let coefficient = |(i, theta): (usize, &f64)| theta + end * 3f64.sqrt() * fitted.error(i) * theta.signum();
+        let theta: Vec<f64> = fitted.theta.iter().enumerate().map(coefficient).collect();
+        let shift = [0, 1, 2].map(|axis: usize| r.expected(axis, &fitted.columns, theta.iter()));
+        let shift = Vector3::new(shift[0] * c - shift[1] * s, shift[0] * s + shift[1] * c, shift[2]) * sign;
+        shift.into()
+    });
+    Repair { frame: r.frame, object: r.object, shifts_m }
 }

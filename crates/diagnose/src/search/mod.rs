@@ -139,8 +139,9 @@ pub struct Repair {
     pub frame: usize,
     /// Number of the object in the frame.
     pub object: usize,
-    /// Shift to apply, in the cloud's frame, m.
-    pub shift_m: [f64; 3],
+    /// Shift to apply, in the cloud's frame, m: the estimate, and that with all coefficients the square root of three
+    /// standard errors closer to zero and farther from it.
+    pub shifts_m: [[f64; 3]; 3],
 }
 
 /// Mean gain over its standard error that a finding must exceed. No null case of the blind set reached it.

@@ -1,7 +1,7 @@
 //! Builds cells, gaps and warnings from the scores of runs.
 
 use super::power::power;
-use super::scores::{RunCurve, RunScores};
+use super::scores::{Curves, RunScores};
 use super::split::splits;
 use super::{
     Cell, CellNumber, CellRun, Gap, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity,
@@ -21,21 +21,17 @@ const UNDERTRAINED_AP: f64 = 60.0;
 /// A cell with the bootstrap replicates behind its intervals.
 pub(super) struct Drawn {
     pub cell: Cell,
-    /// Per value of the cell, in its order: the mean over seeds and frames of each bootstrap replicate.
-    draws: Vec<Vec<f64>>,
-    /// The same against the true boxes.
-    draws_of_true_boxes: Vec<Vec<f64>>,
+    /// By reference and per value of the cell, in its order: the mean over seeds and frames of each bootstrap
+    /// replicate.
+    draws: [Vec<Vec<f64>>; 3],
     /// Hash of the frame ids.
     pub frames_key: String,
 }
 
 impl Drawn {
-    /// The replicates of the values against labels or true boxes.
+    /// The replicates of the values against a reference.
     pub fn draws_of(&self, reference: Reference) -> &[Vec<f64>] {
-        match reference {
-            Reference::Labels => &self.draws,
-            Reference::TrueBoxes => &self.draws_of_true_boxes,
-        }
+        &self.draws[reference as usize]
     }
 }
 
@@ -101,8 +97,8 @@ fn draw(
     let places = [&network.network, train_set, test_set];
     let resamples =
         Resamples::new(&network.network.name, &frames_key, first.map_or(0, |s| s.frames), done.len(), options);
-    let [(numbers, draws), (of_true_boxes, draws_of_true_boxes)] = [Reference::Labels, Reference::TrueBoxes]
-        .map(|reference| numbers_of(reference, &done, places, &resamples, options));
+    let [(numbers, of_labels), (of_repaired_labels, of_repaired), (of_true_boxes, of_truth)] =
+        Reference::ALL.map(|reference| numbers_of(reference, &done, places, &resamples, options));
     let cell = Cell {
         network: network.network.name.clone(),
         train_set: train_set.name.clone(),
@@ -110,15 +106,17 @@ fn draw(
         frames: first.map(|scores| scores.frames),
         runs,
         numbers,
+        of_repaired_labels,
         of_true_boxes,
     };
-    Drawn { cell, draws, draws_of_true_boxes, frames_key }
+    Drawn { cell, draws: [of_labels, of_repaired, of_truth], frames_key }
 }
 
-/// How often each frame and which seeds are drawn, by replicate.
+/// How often each frame, which seeds and which version of the boxes are drawn, by replicate.
 struct Resamples {
     frames: Vec<Vec<u32>>,
     seeds: Vec<Vec<usize>>,
+    versions: Vec<usize>,
 }
 
 impl Resamples {
@@ -130,12 +128,13 @@ impl Resamples {
         let of_seeds = format!("matrix seeds {network}");
         Resamples {
             frames: replicates.clone().map(|r| options.bootstrap.frame_weights(&of_frames, r, frames)).collect(),
-            seeds: replicates.map(|r| options.bootstrap.seed_draws(&of_seeds, r, seeds)).collect(),
+            seeds: replicates.clone().map(|r| options.bootstrap.seed_draws(&of_seeds, r, seeds)).collect(),
+            versions: replicates.map(|r| options.bootstrap.version_draw(r)).collect(),
         }
     }
 }
 
-/// The values of a cell against labels or true boxes, with their bootstrap replicates.
+/// The values of a cell against a reference, with their bootstrap replicates.
 fn numbers_of(
     reference: Reference,
     done: &[(u64, &RunScores)],
@@ -143,21 +142,22 @@ fn numbers_of(
     resamples: &Resamples,
     options: &MatrixOptions,
 ) -> (Vec<CellNumber>, Vec<Vec<f64>>) {
-    let of_runs: Vec<&[RunCurve]> = done.iter().map(|(_, scores)| scores.curves_of(reference)).collect();
-    let n_curves = of_runs.iter().map(|curves| curves.len()).min().unwrap_or(0);
+    let of_runs: Vec<Curves> = done.iter().map(|(_, scores)| scores.curves_of(reference)).collect();
+    let n_curves = of_runs.iter().map(|curves| curves.estimate.len()).min().unwrap_or(0);
     let (mut numbers, mut all_draws) = (Vec::new(), Vec::new());
     for k in 0..n_curves {
-        let curves: Vec<_> = of_runs.iter().map(|curves| &curves[k]).collect();
-        let whole: Vec<_> = curves.iter().map(|curve| curve.numbers(None)).collect();
+        let whole: Vec<_> = of_runs.iter().map(|curves| curves.estimate[k].numbers(None)).collect();
         let draws: Vec<[f64; Quantity::ALL.len()]> = resamples
             .frames
             .par_iter()
             .zip(&resamples.seeds)
-            .map(|(weights, seeds)| {
-                let mut known: Vec<Option<[f64; Quantity::ALL.len()]>> = vec![None; curves.len()];
+            .zip(&resamples.versions)
+            .map(|((weights, seeds), &version)| {
+                let mut known: Vec<Option<[f64; Quantity::ALL.len()]>> = vec![None; of_runs.len()];
                 let mut sum = [0.0; Quantity::ALL.len()];
                 for &i in seeds {
-                    let numbers = known[i].get_or_insert_with(|| curves[i].numbers(Some(weights)).0);
+                    let numbers =
+                        known[i].get_or_insert_with(|| of_runs[i].version(version)[k].numbers(Some(weights)).0);
                     sum.iter_mut().zip(numbers).for_each(|(sum, v)| *sum += *v);
                 }
                 sum.map(|sum| sum / seeds.len() as f64)
@@ -166,7 +166,7 @@ fn numbers_of(
         for (q, quantity) in Quantity::ALL.into_iter().enumerate() {
             let values = done.iter().zip(&whole).map(|((seed, _), (numbers, _))| (*seed, numbers[q])).collect();
             let draws: Vec<f64> = draws.iter().map(|d| d[q]).collect();
-            let curve = curves[0];
+            let curve = &of_runs[0].estimate[k];
             let key =
                 NumberKey { class: curve.class.clone(), section: curve.section, quantity, overlap: curve.overlap };
             let mut number = CellNumber::of_runs(key, values, places);

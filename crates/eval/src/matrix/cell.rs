@@ -90,6 +90,10 @@ pub struct Cell {
     pub runs: Vec<CellRun>,
     /// By class, section, overlap and metric; empty without a run.
     pub numbers: Vec<CellNumber>,
+    /// The same against repaired labels, where a diagnosis corrected the labels of the test set. The intervals hold the
+    /// uncertainty of the correction as well.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub of_repaired_labels: Vec<CellNumber>,
     /// The same against the true boxes, where the labels of the test set were made automatically and the truth is
     /// known.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -113,7 +117,7 @@ impl Cell {
         self.number_of(Reference::Labels, class, section, quantity, overlap)
     }
 
-    /// The value against labels or true boxes for a class, section, metric and overlap.
+    /// The value against a reference for a class, section, metric and overlap.
     pub fn number_of(
         &self,
         reference: Reference,
@@ -127,17 +131,18 @@ impl Cell {
             .find(|n| n.class == class && n.section == section && n.quantity == quantity && n.overlap == overlap)
     }
 
-    /// All values against labels or true boxes.
+    /// All values against a reference.
     pub fn numbers_of(&self, reference: Reference) -> &[CellNumber] {
         match reference {
             Reference::Labels => &self.numbers,
+            Reference::RepairedLabels => &self.of_repaired_labels,
             Reference::TrueBoxes => &self.of_true_boxes,
         }
     }
 
-    /// The references of this cell: labels, and true boxes where they are known.
+    /// The references of this cell: labels, and what is known to be closer to the truth.
     pub fn references(&self) -> impl Iterator<Item = Reference> {
-        let truth = (!self.of_true_boxes.is_empty()).then_some(Reference::TrueBoxes);
-        std::iter::once(Reference::Labels).chain(truth)
+        let has = |reference: &Reference| *reference == Reference::Labels || !self.numbers_of(*reference).is_empty();
+        Reference::ALL.into_iter().filter(has)
     }
 }

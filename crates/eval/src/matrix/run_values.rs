@@ -54,6 +54,7 @@ pub fn from_run_values(plan: &MatrixPlan, values: &[RunValue], options: &MatrixO
                 frames: None,
                 runs: planned.seeds.iter().map(run).collect(),
                 numbers,
+                of_repaired_labels: Vec::new(),
                 of_true_boxes: Vec::new(),
             });
         }

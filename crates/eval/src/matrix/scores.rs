@@ -16,9 +16,12 @@ pub struct TestSet {
     /// The frame of labels and detections.
     pub label_frame: LabelFrame,
     frames: Vec<EvalFrame>,
-    /// True boxes of the frames, where they are known.
-    truth: Option<Vec<Vec<LabelBox>>>,
+    /// What is known beside the labels, with its versions.
+    beside: Vec<(Reference, Versions)>,
 }
+
+/// Versions of the boxes of all frames: the estimate, and if its uncertainty is known both ends.
+pub type Versions = Vec<Vec<Vec<LabelBox>>>;
 
 impl TestSet {
     /// Reads the labels of a data set's split.
@@ -31,29 +34,58 @@ impl TestSet {
         // Collects all results first, so that the first bad frame is reported for any number of threads.
         let frames: Vec<Result<EvalFrame, DataError>> = ids.par_iter().map(read).collect();
         let frames = frames.into_iter().collect::<Result<_, _>>()?;
+        let mut beside = Vec::new();
+        let repaired: Vec<_> = ids.par_iter().map(|id| dataset.repaired_labels(id)).collect();
+        if let Some(repaired) = repaired.into_iter().collect::<Result<Option<Vec<_>>, _>>()?.filter(|r| !r.is_empty()) {
+            let version = |k: usize| repaired.iter().map(|versions| versions[k].clone()).collect();
+            beside.push((Reference::RepairedLabels, (0..3).map(version).collect()));
+        }
         let truth: Vec<_> = ids.par_iter().map(|id| dataset.true_labels(id)).collect();
-        let truth: Option<Vec<_>> = truth.into_iter().collect::<Result<Option<_>, _>>()?;
-        Ok(TestSet { label_frame: dataset.config.label_frame, frames, truth })
+        if let Some(truth) = truth.into_iter().collect::<Result<Option<Vec<_>>, _>>()? {
+            beside.push((Reference::TrueBoxes, vec![truth]));
+        }
+        Ok(TestSet { label_frame: dataset.config.label_frame, frames, beside })
     }
 
-    /// The same frames with the true boxes as their labels; `None` where the truth beside the labels is not known.
-    pub fn of_true_boxes(&self) -> Option<TestSet> {
-        let frame =
-            |(frame, labels): (&EvalFrame, &Vec<LabelBox>)| EvalFrame { labels: labels.clone(), ..frame.clone() };
-        let frames = self.frames.iter().zip(self.truth.as_ref()?).map(frame).collect();
-        Some(TestSet { label_frame: self.label_frame, frames, truth: None })
+    /// What is known beside the labels, from what is farther from the truth to what is closer.
+    pub fn known_beside(&self) -> impl Iterator<Item = Reference> {
+        self.beside.iter().map(|(reference, _)| *reference)
     }
 
-    /// These detections with the labels of this test set. Frames are in the order of the test set.
-    pub fn labelling(&self, mut frames: Vec<EvalFrame>) -> Vec<EvalFrame> {
-        frames.iter_mut().zip(&self.frames).for_each(|(frame, own)| frame.labels.clone_from(&own.labels));
-        frames
+    /// These detections, in the order of the test set, with the boxes of a reference as their labels; unchanged if it
+    /// is not known.
+    pub fn labelled_by(&self, reference: Reference, frames: &[EvalFrame]) -> Vec<EvalFrame> {
+        let versions = self.beside.iter().find(|(known, _)| *known == reference).map(|(_, versions)| versions);
+        versions.map_or_else(|| frames.to_vec(), |versions| with_labels(frames, &versions[0]))
+    }
+
+    /// Scores of detections of this test set, and of the regions of a two-stage network, against the labels that they
+    /// have and against all that is known beside.
+    pub fn scores(&self, frames: &[EvalFrame], regions: Option<&[EvalFrame]>, options: &MatrixOptions) -> RunScores {
+        let mut scores = RunScores::new(frames, regions, self.label_frame, options);
+        for (reference, versions) in &self.beside {
+            let of_version = |boxes: &Vec<Vec<LabelBox>>| {
+                let regions = regions.map(|regions| with_labels(regions, boxes));
+                let frames = with_labels(frames, boxes);
+                RunScores::new(&frames, regions.as_deref(), self.label_frame, options).curves
+            };
+            scores.beside.push((*reference, versions.iter().map(of_version).collect()));
+        }
+        scores
     }
 
     /// From labels in memory; detections in the frames are dropped.
     pub fn new(label_frame: LabelFrame, mut frames: Vec<EvalFrame>) -> Self {
         frames.iter_mut().for_each(|frame| frame.detections.clear());
-        TestSet { label_frame, frames, truth: None }
+        TestSet { label_frame, frames, beside: Vec::new() }
+    }
+
+    /// With boxes in memory that are known beside the labels: the estimate and, if its uncertainty is known, both ends,
+    /// each frame by frame. Call it in the order of [`Reference::ALL`].
+    #[must_use]
+    pub fn with_beside(mut self, reference: Reference, versions: Versions) -> Self {
+        self.beside.push((reference, versions));
+        self
     }
 
     /// The frames with their labels, without detections.
@@ -99,8 +131,34 @@ pub struct RunScores {
     /// Hash of the frame ids. Test sets with the same frames are resampled alike.
     pub(super) frames_key: String,
     pub(super) curves: Vec<RunCurve>,
-    /// The same curves against the true boxes.
-    pub(super) of_true_boxes: Vec<RunCurve>,
+    /// The same against what is known beside the labels, in versions.
+    beside: Vec<(Reference, Vec<Vec<RunCurve>>)>,
+}
+
+/// The curves of a run against a reference.
+#[derive(Clone, Copy)]
+pub(super) struct Curves<'a> {
+    /// Against the estimate of the boxes; empty if the reference is not known.
+    pub estimate: &'a [RunCurve],
+    /// Against the ends of their interval.
+    ends: &'a [Vec<RunCurve>],
+}
+
+impl<'a> Curves<'a> {
+    /// Against a version of the boxes, 0 the estimate, then the ends; the estimate if there are no ends.
+    pub fn version(self, k: usize) -> &'a [RunCurve] {
+        k.checked_sub(1).and_then(|end| self.ends.get(end)).map_or(self.estimate, Vec::as_slice)
+    }
+}
+
+/// These frames with other labels.
+fn with_labels(frames: &[EvalFrame], labels: &[Vec<LabelBox>]) -> Vec<EvalFrame> {
+    let frame = |(frame, labels): (&EvalFrame, &Vec<LabelBox>)| EvalFrame {
+        id: frame.id.clone(),
+        labels: labels.clone(),
+        detections: frame.detections.clone(),
+    };
+    frames.iter().zip(labels).map(frame).collect()
 }
 
 /// One class, range section and overlap of a run.
@@ -167,21 +225,23 @@ impl RunScores {
         let ids: String = frames.iter().flat_map(|frame| [frame.id.as_str(), "\n"]).collect();
         let frames_key = Sha256::digest(ids).iter().map(|byte| format!("{byte:02x}")).collect();
         let curves = keys.into_par_iter().map(curve).collect();
-        RunScores { frames: frames.len(), frames_key, curves, of_true_boxes: Vec::new() }
+        RunScores { frames: frames.len(), frames_key, curves, beside: Vec::new() }
     }
 
-    /// Adds the scores of the same detections against the true boxes.
-    #[must_use]
-    pub fn with_true_boxes(self, of_true_boxes: RunScores) -> Self {
-        RunScores { of_true_boxes: of_true_boxes.curves, ..self }
-    }
-
-    /// The curves against labels or true boxes; none where the truth is not known.
-    pub(super) fn curves_of(&self, reference: Reference) -> &[RunCurve] {
-        match reference {
-            Reference::Labels => &self.curves,
-            Reference::TrueBoxes => &self.of_true_boxes,
+    /// The curves against a reference; none where it is not known.
+    pub(super) fn curves_of(&self, reference: Reference) -> Curves<'_> {
+        if reference == Reference::Labels {
+            return Curves { estimate: &self.curves, ends: &[] };
         }
+        let versions = self.beside.iter().find(|(known, _)| *known == reference);
+        versions
+            .and_then(|(_, versions)| versions.split_first())
+            .map_or(Curves { estimate: &[], ends: &[] }, |(estimate, ends)| Curves { estimate, ends })
+    }
+
+    /// What comes closest to the truth.
+    pub(super) fn closest(&self) -> Reference {
+        self.beside.last().map_or(Reference::Labels, |(reference, _)| *reference)
     }
 
     /// Whether two runs give the same result on every frame. Two seeds that do were the same run, unless they detect

@@ -41,7 +41,8 @@ pub struct Split {
     pub overlap: f64,
     /// AP on its own data less AP on the other test set against its labels.
     pub total: Part,
-    /// AP against the true boxes less AP against the labels; `None` where the truth beside the labels is not known.
+    /// AP against the true boxes, or else the repaired labels, less AP against the labels; `None` where neither is
+    /// known.
     pub label: Option<Part>,
     /// AP on its own data less AP against the best boxes that are known of the other test set.
     pub sensor_and_scene: Part,
@@ -88,14 +89,14 @@ pub(super) fn splits(plan: &MatrixPlan, drawn: &[Drawn], options: &MatrixOptions
         let Some(own) = find(network, train, train) else { continue };
         let stands_between = plan.between.iter().find(|b| b.scene_of == train && b.sensor_of == test);
         let middle = stands_between.and_then(|b| find(network, train, &b.test_set));
-        let has_truth = !other.cell.of_true_boxes.is_empty();
+        let closest = best(other);
         for (i, number) in other.cell.numbers.iter().enumerate() {
             if !matches!(number.quantity, Quantity::Ap40 | Quantity::BevAp40) {
                 continue;
             }
-            let (labels, truth) = ((other, Reference::Labels), (other, Reference::TrueBoxes));
+            let labels = (other, Reference::Labels);
             let (Some(total), Some(sensor_and_scene)) =
-                (part(best(own), labels, i, options), part(best(own), best(other), i, options))
+                (part(best(own), labels, i, options), part(best(own), closest, i, options))
             else {
                 continue;
             };
@@ -108,10 +109,10 @@ pub(super) fn splits(plan: &MatrixPlan, drawn: &[Drawn], options: &MatrixOptions
                 quantity: number.quantity,
                 overlap: number.overlap,
                 total,
-                label: has_truth.then(|| part(truth, labels, i, options)).flatten(),
+                label: (closest.1 != Reference::Labels).then(|| part(closest, labels, i, options)).flatten(),
                 sensor_and_scene,
                 sensor: middle.and_then(|middle| part(best(own), best(middle), i, options)),
-                scene: middle.and_then(|middle| part(best(middle), best(other), i, options)),
+                scene: middle.and_then(|middle| part(best(middle), closest, i, options)),
                 same_frames: own.frames_key == other.frames_key,
             });
         }

@@ -99,21 +99,25 @@ fn gaps(m: &Matrix, class: &str) -> Option<Item> {
     (!rows.is_empty()).then(|| Item::table(format!("gaps-{}", slug(class)), caption, (&columns, 3), rows, None))
 }
 
-/// What labels, sensor and scene take of the gap between a network's own data and other data.
-fn splits(m: &Matrix, class: &str) -> Option<Item> {
-    let of_class = m.splits.iter().filter(|s| s.is_shown(class));
-    let part = |part: Option<Part>| match part {
+/// A part of a gap with its interval below.
+pub(super) fn part_cell(part: Option<Part>) -> TableCell {
+    match part {
         Some(p) => {
             let interval = p.interval.map_or(String::new(), |i| format!("{:.1} to {:.1}", i.low, i.high));
             TableCell::with_small(format!("{:.1}", p.points), interval)
         }
         None => TableCell::new("–"),
-    };
+    }
+}
+
+/// What labels, sensor and scene take of the gap between a network's own data and other data.
+fn splits(m: &Matrix, class: &str) -> Option<Item> {
+    let of_class = m.splits.iter().filter(|s| s.is_shown(class));
     let (mut rows, mut last) = (Vec::new(), None);
     for s in of_class {
         let begins = last.replace((&s.network, &s.train_set)) != Some((&s.network, &s.train_set));
         let names = [&s.network, &s.train_set, &s.test_set].map(|name| TableCell::new(m.title(name)));
-        let parts = [Some(s.total), s.label, Some(s.sensor_and_scene), s.sensor, s.scene].map(part);
+        let parts = [Some(s.total), s.label, Some(s.sensor_and_scene), s.sensor, s.scene].map(part_cell);
         let frames = if s.same_frames { "the same" } else { "others" };
         let cells = names.into_iter().chain([TableCell::new(s.overlap.to_string())]).chain(parts);
         rows.push(TableRow::new(begins, cells.chain([TableCell::new(frames)])));

@@ -1,10 +1,11 @@
 //! Section with the differences of detectors that were trained elsewhere between data sets of the same frames.
 
+use super::matrix::part_cell;
 use super::{csv_number, number, slug};
 use crate::figure::{IntervalRow, intervals};
 use crate::html::{Item, Section, TableCell, TableRow};
 use eval::csv_text;
-use eval::matrix::{Matrix, PairedDifference, Quantity};
+use eval::matrix::{Matrix, PairedDifference, Part, Quantity};
 
 /// For each class: a figure of the AP differences by range, and a table of all differences over the full range.
 pub(super) fn section(paired: &[PairedDifference], matrix: Option<&Matrix>) -> Section {
@@ -15,8 +16,11 @@ pub(super) fn section(paired: &[PairedDifference], matrix: Option<&Matrix>) -> S
         }
     }
     let title = |name: &str| matrix.map_or(name.to_string(), |m| m.title(name).to_string());
-    let items =
-        classes.iter().flat_map(|class| [figure(paired, class, &title), table(paired, class, &title)]).collect();
+    let items = classes.iter().flat_map(|class| {
+        let shown = [figure(paired, class, &title), table(paired, class, &title)];
+        shown.into_iter().chain(parts_table(paired, class, &title))
+    });
+    let items = items.collect();
     let text = vec![
         "Each detector is scored as it is on data sets that hold the same moments. Both values of a difference are over the frames that \
          both data sets have, and a resample of the bootstrap draws the same frames for both."
@@ -90,7 +94,39 @@ fn table(paired: &[PairedDifference], class: &str, title: &dyn Fn(&str) -> Strin
     Item::table(format!("paired-table-{}", slug(class)), caption, (&columns, 4), rows, Some(csv))
 }
 
-const CSV_COLUMNS: [&str; 13] = [
+/// What labels, sensor and scene make of the differences of AP; none where nothing tells them from each other.
+fn parts_table(paired: &[PairedDifference], class: &str, title: &dyn Fn(&str) -> String) -> Option<Item> {
+    let (mut rows, mut last) = (Vec::new(), None);
+    let shown = |d: &&PairedDifference| {
+        d.class == class && d.section.is_none() && matches!(d.quantity, Quantity::Ap40 | Quantity::BevAp40)
+    };
+    for d in paired.iter().filter(shown) {
+        let Some(parts) = d.parts else { continue };
+        let begins = last.replace((&d.network, &d.compared_to)) != Some((&d.network, &d.compared_to));
+        let all = d.difference.map(|points| Part { points, interval: d.interval });
+        let names = [title(&d.network), title(&d.test_set), title(&d.compared_to)];
+        let quantity = TableCell::new(format!("{} ({})", d.quantity, d.overlap));
+        let cells = [all, parts.label, Some(parts.sensor_and_scene), parts.sensor, parts.scene].map(part_cell);
+        rows.push(TableRow::new(begins, names.into_iter().map(TableCell::new).chain([quantity]).chain(cells)));
+    }
+    let columns = [
+        "detector",
+        "first",
+        "other",
+        "value",
+        "difference",
+        "by labels",
+        "by sensor and scene",
+        "by the sensor",
+        "by the scene",
+    ];
+    let caption = format!(
+        "What makes the differences, {class}, in percentage points with the interval below. By labels: AP against the labels less AP against          the true boxes, on the first data set less on the other, where the labels were made automatically and the truth is known. By          sensor and scene: what remains against the true boxes. Sensor and scene are told from each other where a data set has the scenes          of the one and the sensor of the other (`scene_of`, `sensor_of`)."
+    );
+    (!rows.is_empty()).then(|| Item::table(format!("paired-parts-{}", slug(class)), caption, (&columns, 4), rows, None))
+}
+
+const CSV_COLUMNS: [&str; 17] = [
     "detector",
     "first",
     "other",
@@ -104,6 +140,10 @@ const CSV_COLUMNS: [&str; 13] = [
     "difference",
     "low",
     "high",
+    "by_labels",
+    "by_sensor_and_scene",
+    "by_sensor",
+    "by_scene",
 ];
 
 fn line(d: &PairedDifference) -> Vec<String> {
@@ -121,5 +161,9 @@ fn line(d: &PairedDifference) -> Vec<String> {
         csv_number(d.difference),
         csv_number(d.interval.map(|i| i.low)),
         csv_number(d.interval.map(|i| i.high)),
+        csv_number(d.parts.and_then(|p| p.label).map(|p| p.points)),
+        csv_number(d.parts.map(|p| p.sensor_and_scene.points)),
+        csv_number(d.parts.and_then(|p| p.sensor).map(|p| p.points)),
+        csv_number(d.parts.and_then(|p| p.scene).map(|p| p.points)),
     ]
 }
