@@ -85,19 +85,21 @@ impl CenterHead {
     /// `x`: `[B, C, H, W]`; first result `[B, filters, H, W]`.
     pub fn forward(&self, x: Tensor<4>, mode: Mode) -> (Tensor<4>, Vec<HeadOutputs>) {
         let shared = self.shared_conv.forward(x, mode);
-        let of = |head: &SeparateHead| HeadOutputs {
-            center: head.center.forward(shared.clone(), mode),
-            center_z: head.center_z.forward(shared.clone(), mode),
-            dim: head.dim.forward(shared.clone(), mode),
-            rot: head.rot.forward(shared.clone(), mode),
-            hm: head.hm.forward(shared.clone(), mode),
-        };
-        let heads = self.heads_list.iter().map(of).collect();
+        let heads = self.heads_list.iter().map(|head| head.forward(&shared, mode)).collect();
         (shared, heads)
     }
 }
 
 impl SeparateHead {
+    /// # Shapes
+    /// `shared`: `[B, filters, H, W]`.
+    fn forward(&self, shared: &Tensor<4>, mode: Mode) -> HeadOutputs {
+        let branches = [&self.center, &self.center_z, &self.dim, &self.rot, &self.hm];
+        let [center, center_z, dim, rot, hm] = Branch::forward_together(branches, shared, mode)
+            .unwrap_or_else(|| branches.map(|branch| branch.forward(shared.clone(), mode)));
+        HeadOutputs { center, center_z, dim, rot, hm }
+    }
+
     fn new(name: &str, config: &CenterHeadConfig, classes: usize, init: &Init<'_>) -> Self {
         let BranchLayersConfig { hm, center, center_z, dim, rot } = config.layers;
         let branch =
@@ -148,6 +150,27 @@ impl Branch {
                 *bias = init.constant([shape[0]], 0.0);
             }
         }
+    }
+
+    /// Branches of two layers, as published, as two convolutions for all of them; `None` for other branches, or without
+    /// a kernel.
+    ///
+    /// # Shapes
+    /// `x`: `[B, filters, H, W]`; results `[B, outputs, H, W]`.
+    fn forward_together<const N: usize>(branches: [&Branch; N], x: &Tensor<4>, mode: Mode) -> Option<[Tensor<4>; N]> {
+        let (mut hidden, mut outputs) = (Vec::with_capacity(N), Vec::with_capacity(N));
+        for branch in branches {
+            let [BranchLayer::Hidden(first), BranchLayer::Output(last)] = branch.layers.as_slice() else { return None };
+            hidden.push(first);
+            outputs.push(last);
+        }
+        let y = Conv::forward_together(&outputs, ConvBnRelu::forward_together(&hidden, x, mode)?);
+        let mut from = 0;
+        Some(std::array::from_fn(|k| {
+            let channels = outputs[k].bias.dims()[0];
+            from += channels;
+            y.clone().narrow(1, from - channels, channels)
+        }))
     }
 
     /// # Shapes

@@ -111,6 +111,32 @@ impl BatchNorm {
         }
     }
 
+    /// Several norms side by side as one operation, on an image that has their channels one after the other. `None`
+    /// without a kernel. `biases` are those of the layers before, which have not been added to `x`.
+    ///
+    /// # Shapes
+    /// `x` and result: `[B, sum of C, H, W]`.
+    pub fn forward_relu_together(
+        norms: &[&BatchNorm],
+        x: &Tensor<4>,
+        biases: &[Option<Tensor<1>>],
+    ) -> Option<Tensor<4>> {
+        let epsilon = norms.first()?.epsilon;
+        let gamma = Tensor::cat(norms.iter().map(|norm| norm.weight.val()).collect(), 0);
+        let beta = Tensor::cat(norms.iter().map(|norm| norm.bias.val()).collect(), 0);
+        let (y, statistics) = norm_relu(x, &gamma, &beta, epsilon, true)?;
+        let [batch, _, height, width] = x.dims();
+        let mut from = 0;
+        for (norm, bias) in norms.iter().zip(biases) {
+            let own = from..from + norm.weight.val().dims()[0];
+            from = own.end;
+            let of = |values: &[f64]| values[own.clone()].to_vec();
+            let own = Statistics { mean: of(&statistics.mean), variance: of(&statistics.variance) };
+            norm.update(norm.moments(&own, batch * height * width).shifted(bias.clone()));
+        }
+        Some(y)
+    }
+
     /// Statistics of a batch from host values.
     pub fn moments(&self, statistics: &Statistics, count: usize) -> Moments {
         let device = self.running_mean.value().device();

@@ -7,6 +7,7 @@ use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use burn::tensor::module::conv2d;
 use burn::tensor::ops::ConvOptions;
+use kernels::Folded;
 
 /// 3x3 convolution with padding 1, batch normalisation, ReLU.
 ///
@@ -43,6 +44,36 @@ impl ConvBnRelu {
         }
         let y = conv(x, weight, stride);
         self.norm.forward_relu(y, bias, mode)
+    }
+}
+
+impl ConvBnRelu {
+    /// Several layers of stride 1 with the same input as one convolution and one norm, whose channels are theirs one
+    /// after the other. The same numbers as one layer after the other. `None` without a kernel.
+    ///
+    /// # Shapes
+    /// `x`: `[B, C_in, H, W]`; result `[B, sum of C_out, H, W]`.
+    pub fn forward_together(layers: &[&ConvBnRelu], x: &Tensor<4>, mode: Mode) -> Option<Tensor<4>> {
+        let epsilon = layers.first()?.norm.epsilon();
+        if layers.iter().any(|layer| layer.stride != 1 || layer.norm.epsilon() != epsilon) {
+            return None;
+        }
+        if mode == Mode::Eval {
+            return folded_conv3x3(x, 1, || {
+                let mut all = Folded { weight: Vec::new(), bias: Vec::new() };
+                for layer in layers {
+                    let bias = layer.bias.as_ref().map(Param::val);
+                    let folded = layer.norm.folded(bias, |n| n.fold_into_conv(&values(&layer.weight.val())));
+                    all.weight.extend(folded.weight);
+                    all.bias.extend(folded.bias);
+                }
+                all
+            });
+        }
+        let weight = Tensor::cat(layers.iter().map(|layer| layer.weight.val()).collect(), 0);
+        let norms: Vec<&BatchNorm> = layers.iter().map(|layer| &layer.norm).collect();
+        let biases: Vec<_> = layers.iter().map(|layer| layer.bias.as_ref().map(Param::val)).collect();
+        BatchNorm::forward_relu_together(&norms, &conv3x3(x, &weight, 1)?, &biases)
     }
 }
 
@@ -90,6 +121,30 @@ impl Conv {
         let bias = self.bias.val();
         let channels = bias.dims()[0];
         conv(x, self.weight.val(), 1) + bias.reshape([1, channels, 1, 1])
+    }
+
+    /// Several convolutions as one, each of which reads its own part of the channels: the inputs are one after the
+    /// other in `x`, and so are the outputs in the result. A weight between a convolution and another one's input is
+    /// zero.
+    ///
+    /// # Shapes
+    /// `x`: `[B, sum of C_in, H, W]`; result `[B, sum of C_out, H, W]`.
+    pub fn forward_together(convs: &[&Conv], x: Tensor<4>) -> Tensor<4> {
+        let inputs: Vec<usize> = convs.iter().map(|conv| conv.weight.dims()[1]).collect();
+        let device = x.device();
+        let rows = convs.iter().enumerate().map(|(k, conv)| {
+            let outputs = conv.weight.dims()[0];
+            let zeros = |from: &[usize]| {
+                let inputs: usize = from.iter().sum();
+                (inputs > 0).then(|| Tensor::zeros([outputs, inputs, 3, 3], &device))
+            };
+            let parts = [zeros(&inputs[..k]), Some(conv.weight.val()), zeros(&inputs[k + 1..])];
+            Tensor::cat(parts.into_iter().flatten().collect(), 1) // [C_out, sum of C_in, 3, 3]
+        });
+        let weight = Tensor::cat(rows.collect(), 0);
+        let bias = Tensor::cat(convs.iter().map(|conv| conv.bias.val()).collect(), 0);
+        let channels = bias.dims()[0];
+        conv(x, weight, 1) + bias.reshape([1, channels, 1, 1])
     }
 }
 
