@@ -56,7 +56,7 @@ impl DoctorArgs {
     /// Writes a fitted detector; what was changed and why, as text.
     fn write_suggestion(&self, path: &Path, detector: &DetectorConfig, dataset: &Dataset) -> Result<String> {
         let ids = dataset.ids("train").or_else(|_| dataset.all_ids())?;
-        let boxes = LabelledBoxes::read(dataset, &ids, usize::MAX)?;
+        let boxes = LabelledBoxes::read(dataset, &ids, usize::MAX, detector.ground.as_ref())?;
         let name = path.file_stem().map_or(detector.name.clone(), |stem| stem.to_string_lossy().into_owned());
         let mut suggestion =
             suggest(detector, &boxes).map_err(|message| anyhow!("{}: {message}", dataset.config.root.display()))?;

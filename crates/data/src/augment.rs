@@ -1,9 +1,9 @@
 //! Data augmentation for training: random changes of a frame's points together with its boxes.
 //!
 //! Each change is a pure function of the frame, its configuration and a random stream. The defaults are those of
-//! OpenPCDet for PointPillars on KITTI (`pointpillar.yaml`): no translation and no noise of single objects. Road planes
-//! are not supported, so pasted objects keep the height at which they were recorded. Image boxes are not changed,
-//! because they are used for KITTI's difficulty only.
+//! OpenPCDet for PointPillars on KITTI (`pointpillar.yaml`): no translation and no noise of single objects. Pasted
+//! objects keep the z at which they were recorded, or with `gt_sampling.ground` their height above the ground. Image
+//! boxes are not changed, because they are used for KITTI's difficulty only.
 
 mod gt_sampling;
 mod object_noise;
@@ -86,6 +86,9 @@ impl AugmentConfig {
             (interval(self.object_noise.rotation_rad), "object_noise.rotation_rad is not [smallest, largest]"),
             (spread(&self.object_noise.translation_std_m), "object_noise.translation_std_m has a negative value"),
         ];
+        if let Some(ground) = &self.gt_sampling.ground {
+            ground.check().map_err(|message| format!("gt_sampling.{message}"))?;
+        }
         checks.into_iter().find(|(valid, _)| !valid).map_or(Ok(()), |(_, message)| Err(message.into()))
     }
 }

@@ -1,7 +1,7 @@
 //! Database for ground-truth sampling: the objects of a training split with their points. Built once and cached.
 
 use crate::augment::GtSamplingConfig;
-use crate::{DataError, Dataset, Frame, Object, write_atomic};
+use crate::{DataError, Dataset, Frame, GroundHeight, Object, write_atomic};
 use geometry::{Box3, points_in_boxes};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -12,7 +12,7 @@ use std::path::Path;
 /// An object and its points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GtSample {
-    /// Its box, LiDAR frame.
+    /// Its box, LiDAR frame; its height above the ground if the objects are pasted so.
     pub bbox: Box3,
     /// Its points with the columns of the cloud. x, y, z are relative to the centre of the box, m, axes of the LiDAR
     /// frame.
@@ -139,6 +139,7 @@ fn samples_of(frame: &Frame, classes: &[String], config: &GtSamplingConfig) -> V
     let objects: Vec<&Object> = frame.objects.iter().filter(wanted).collect();
     let boxes: Vec<Box3> = objects.iter().map(|o| o.bbox).collect();
     let members = points_in_boxes(&frame.cloud.values, frame.cloud.channels, &boxes, 1e-2);
+    let ground = config.ground.as_ref().filter(|_| !objects.is_empty()).map(|g| GroundHeight::of(&frame.cloud, g));
     let sample = |(object, members): (&&Object, Vec<u32>)| {
         let mut points = Vec::with_capacity(members.len() * frame.cloud.channels);
         for k in &members {
@@ -146,8 +147,10 @@ fn samples_of(frame: &Frame, classes: &[String], config: &GtSamplingConfig) -> V
             points.extend((0..3).map(|i| (f64::from(p[i]) - object.bbox.center[i]) as f32));
             points.extend(&p[3..]);
         }
-        (members.len() >= config.min_points.max(1))
-            .then(|| (object.class.clone(), GtSample { bbox: object.bbox, points }))
+        let mut bbox = object.bbox;
+        let [x, y, z] = &mut bbox.center;
+        *z -= ground.as_ref().map_or(0.0, |ground| ground.at(*x, *y));
+        (members.len() >= config.min_points.max(1)).then(|| (object.class.clone(), GtSample { bbox, points }))
     };
     objects.iter().zip(members).filter_map(sample).collect()
 }
@@ -165,6 +168,9 @@ fn cache_key(dataset: &Dataset, ids: &[String], classes: &[String], config: &GtS
     let root = dataset.config.root.canonicalize().unwrap_or_else(|_| dataset.config.root.clone());
     let mut text =
         format!("{MAGIC:?} {root:?} {:?} {classes:?} {} {}\n", dataset.config, config.min_points, config.drop_too_hard);
+    if let Some(ground) = &config.ground {
+        writeln!(text, "{ground:?}").expect("writing to a String cannot fail");
+    }
     for id in ids {
         write!(text, "{id}").expect("writing to a String cannot fail");
         for path in [Some(dataset.cloud_path(id)), Some(dataset.labels_path(id)), dataset.calibration_path(id)] {
@@ -273,5 +279,39 @@ mod tests {
         let limited = GtSamplingConfig { limit_whole_scene: true, per_class: [("Car".into(), 1)].into(), ..config };
         let out = sample_gt(scene.clone(), &limited, &database, &mut stream(1, "gt", 0, 0));
         assert_eq!(out, scene);
+    }
+
+    /// The cars of the data set are 0.1 m above level ground, the scene is banked.
+    #[test]
+    fn pasted_objects_stand_on_the_ground() {
+        let banked = |x: f64, y: f64| 3.0 + 0.02 * x + 0.2 * y;
+        let with_ground = |mut frame: Frame, z: &dyn Fn(f64, f64) -> f64| {
+            for i in 0..6000 {
+                let (x, y) = (f64::from(i % 100) * 0.8 - 20.0, f64::from(i / 100) - 30.0);
+                frame.cloud.values.extend([x as f32, y as f32, z(x, y) as f32, 0.0]);
+            }
+            frame
+        };
+        let folder = tempfile::tempdir().unwrap();
+        for row in 0..5 {
+            let frame = with_ground(frame(row, 6), &|_, _| -1.85);
+            Layout::Kitti.write_frame(folder.path(), &frame).unwrap();
+        }
+        let dataset = Dataset::open(folder.path()).unwrap();
+        let (ids, classes) = (dataset.all_ids().unwrap(), vec!["Car".to_string()]);
+        let above = |ground: Option<crate::GroundConfig>| {
+            let config = GtSamplingConfig { ground, ..GtSamplingConfig::default() };
+            let database = GtDatabase::build(&dataset, &ids, &classes, &config).unwrap();
+            let scene = with_ground(Frame { id: "s".into(), cloud: Cloud::new(4), objects: Vec::new() }, &banked);
+            let out = sample_gt(scene, &config, &database, &mut stream(1, "gt", 0, 0));
+            assert!(out.objects.len() > 3);
+            let boxes: Vec<Box3> = out.objects.iter().map(|o| o.bbox).collect();
+            let inside = points_in_boxes(&out.cloud.values, 4, &boxes, 1e-3);
+            assert!(inside.iter().all(|members| members.len() == 12), "the points move with their boxes");
+            boxes.iter().map(|b| b.z_range().0 - banked(b.center[0], b.center[1])).collect::<Vec<_>>()
+        };
+        assert!(above(None).iter().any(|z| z.abs() > 2.0));
+        let on_ground = above(Some(crate::GroundConfig::default()));
+        assert!(on_ground.iter().all(|z| (z - 0.1).abs() < 0.05), "{on_ground:?}");
     }
 }

@@ -3,6 +3,7 @@
 pub use crate::NetworkConfig;
 
 use crate::ModelError;
+use data::GroundConfig;
 use data::augment::AugmentConfig;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -20,6 +21,11 @@ pub struct DetectorConfig {
     pub channels: usize,
     /// `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame. Points and training boxes outside are dropped.
     pub range_m: [f32; 6],
+    /// Heights of points and boxes count from the ground of the frame, in the network's input, its targets and the z of
+    /// `range_m` for points; detections are moved back. For banked or hilly ground. Default: z of the LiDAR frame, as
+    /// in OpenPCDet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ground: Option<GroundConfig>,
     /// The network and its sizes.
     pub network: NetworkConfig,
     /// How the network is trained.
@@ -130,6 +136,9 @@ impl DetectorConfig {
             || !(o.weight_decay >= 0.0)
         {
             return fail("optimization: pct_start in [0, 1], momentum in [0, 1), weight_decay not negative".into());
+        }
+        if let Some(ground) = &self.ground {
+            ground.check()?;
         }
         self.network.check(self)
     }

@@ -4,21 +4,58 @@ use crate::checkpoint::NamedTensors;
 use crate::config::DetectorConfig;
 use crate::layers::Mode;
 use crate::suggest::BoxMatch;
-use crate::{LayerFeatures, ModelError, Network, Preparation, Sample, named};
+use crate::{LayerFeatures, ModelError, Network, NetworkSample, Preparation, named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
-use data::{Detection, Frame, Object, Stream, stream};
+use data::{Detection, Frame, GroundConfig, GroundHeight, Object, Stream, stream};
+
+/// One frame, ready for the network.
+#[derive(Clone, Debug)]
+pub struct Sample {
+    /// What its network reads.
+    pub network: NetworkSample,
+    /// The ground from which its heights count; `None`: from z = 0 of the LiDAR frame.
+    ground: Option<GroundHeight>,
+}
+
+impl Sample {
+    /// Id of the frame.
+    pub fn id(&self) -> &str {
+        self.network.input().id()
+    }
+
+    /// Whether no point lies within the range.
+    pub fn is_empty(&self) -> bool {
+        self.network.input().is_empty()
+    }
+
+    /// Number of points and number of pillars that the network reads; 0 pillars where it reads points.
+    pub fn size(&self) -> [usize; 2] {
+        self.network.input().size()
+    }
+
+    /// Boxes of the network in the LiDAR frame.
+    fn in_lidar_frame(&self, mut found: Vec<Detection>) -> Vec<Detection> {
+        if let Some(ground) = &self.ground {
+            for [x, y, z] in found.iter_mut().map(|detection| &mut detection.bbox.center) {
+                *z += ground.at(*x, *y);
+            }
+        }
+        found
+    }
+}
 
 /// Makes samples of frames; needs no device, so that loader threads can do it ahead of the trainer.
 #[derive(Clone, Debug)]
 pub struct Preparer {
     preparation: Preparation,
+    ground: Option<GroundConfig>,
 }
 
 impl Preparer {
     /// For a detector's configuration.
     pub fn new(config: &DetectorConfig) -> Self {
-        Preparer { preparation: Preparation::new(config) }
+        Preparer { preparation: Preparation::new(config), ground: config.ground.clone() }
     }
 
     /// With targets. All random choices, such as the points that a network reads, come from `stream`.
@@ -26,7 +63,7 @@ impl Preparer {
     /// # Errors
     /// A cloud with too few values a point.
     pub fn training(&self, frame: &Frame, stream: &mut Stream) -> Result<Sample, ModelError> {
-        self.preparation.sample(frame, true, stream)
+        self.sample(frame, true, stream)
     }
 
     /// How the anchors are assigned to the boxes of a frame; none where boxes do not start from anchors. Boxes of other
@@ -40,7 +77,16 @@ impl Preparer {
     /// # Errors
     /// A cloud with too few values a point.
     pub fn inference(&self, frame: &Frame) -> Result<Sample, ModelError> {
-        self.preparation.sample(frame, false, &mut stream(0, "points", 0, 0))
+        self.sample(frame, false, &mut stream(0, "points", 0, 0))
+    }
+
+    fn sample(&self, frame: &Frame, training: bool, stream: &mut Stream) -> Result<Sample, ModelError> {
+        let ground = self.ground.as_ref().map(|config| GroundHeight::of(&frame.cloud, config));
+        let network = match &ground {
+            Some(ground) => self.preparation.sample(&ground.level(frame), training, stream)?,
+            None => self.preparation.sample(frame, training, stream)?,
+        };
+        Ok(Sample { network, ground })
     }
 }
 
@@ -130,7 +176,12 @@ impl Detector {
     /// # Errors
     /// As [`Detector::predict`].
     pub fn predict_with_regions(&self, batch: &[Sample]) -> Result<Vec<Prediction>, ModelError> {
-        self.network.valid().predictions(&self.preparation, batch)
+        let found = self.network.valid().predictions(&self.preparation, batch)?;
+        let of_sample = |(found, sample): (Prediction, &Sample)| Prediction {
+            detections: sample.in_lidar_frame(found.detections),
+            regions: sample.in_lidar_frame(found.regions),
+        };
+        Ok(found.into_iter().zip(batch).map(of_sample).collect())
     }
 
     /// The feature vector of each frame, for t-SNE and for distances between data sets: the input of the head, averaged

@@ -1,14 +1,14 @@
 //! The registry of detectors: the macro that makes the list of detectors in `lib.rs` into types.
 
-use crate::{ModelError, Sample};
+use crate::ModelError;
 
 /// The samples of one kind in a batch; an error if there is another kind in it.
 macro_rules! of_kind {
     ($batch:expr, $kind:ident) => {
         $batch
             .iter()
-            .map(|sample| match sample {
-                Sample::$kind(sample) => Ok(sample),
+            .map(|sample| match &sample.network {
+                NetworkSample::$kind(sample) => Ok(sample),
                 _ => Err(detectors::other_kind()),
             })
             .collect::<Result<Vec<_>, ModelError>>()
@@ -36,9 +36,9 @@ macro_rules! detectors {
             $($(#[$doc])* $kind($folder::$network),)+
         }
 
-        /// One frame, ready for the network.
+        /// One frame as its network reads it.
         #[derive(Clone, Debug)]
-        pub enum Sample {
+        pub enum NetworkSample {
             $($(#[$doc])* $kind(<$folder::$network as Architecture>::Sample),)+
         }
 
@@ -93,10 +93,10 @@ macro_rules! detectors {
             }
         }
 
-        impl Sample {
+        impl NetworkSample {
             pub(crate) fn input(&self) -> &dyn NetworkInput {
                 match self {
-                    $(Sample::$kind(sample) => sample,)+
+                    $(NetworkSample::$kind(sample) => sample,)+
                 }
             }
         }
@@ -121,10 +121,10 @@ macro_rules! detectors {
                 frame: &data::Frame,
                 training: bool,
                 stream: &mut data::Stream,
-            ) -> Result<Sample, ModelError> {
+            ) -> Result<NetworkSample, ModelError> {
                 Ok(match self {
                     $(Preparation::$kind(preparation) => {
-                        Sample::$kind($folder::$network::sample(preparation, frame, training, stream)?)
+                        NetworkSample::$kind($folder::$network::sample(preparation, frame, training, stream)?)
                     })+
                 })
             }
@@ -178,8 +178,8 @@ macro_rules! detectors {
             }
 
             pub(crate) fn layer_features(&self, sample: &Sample) -> Result<Vec<LayerFeatures>, ModelError> {
-                match (self, sample) {
-                    $((Network::$kind(network), Sample::$kind(sample)) => network.layer_features(sample),)+
+                match (self, &sample.network) {
+                    $((Network::$kind(network), NetworkSample::$kind(sample)) => network.layer_features(sample),)+
                     _ => Err(detectors::other_kind()),
                 }
             }
@@ -199,21 +199,4 @@ macro_rules! detectors {
 /// The error of samples or networks of different kinds.
 pub(crate) fn other_kind() -> ModelError {
     ModelError::Tensor("the samples were prepared for another kind of network".into())
-}
-
-impl Sample {
-    /// Id of the frame.
-    pub fn id(&self) -> &str {
-        self.input().id()
-    }
-
-    /// Whether no point lies within the range.
-    pub fn is_empty(&self) -> bool {
-        self.input().is_empty()
-    }
-
-    /// Number of points and number of pillars that the network reads; 0 pillars where it reads points.
-    pub fn size(&self) -> [usize; 2] {
-        self.input().size()
-    }
 }

@@ -24,7 +24,7 @@ mod layer_features;
 
 pub use architecture::{Architecture, NetworkInput};
 pub use built_in::{detector_text, find_detector};
-pub use detector::{Detector, Losses, Prediction, Preparer, parameter_count};
+pub use detector::{Detector, Losses, Prediction, Preparer, Sample, parameter_count};
 pub use error::ModelError;
 pub use inference::{inference_samples, predict_frames, predict_samples};
 pub use layer_features::LayerFeatures;

@@ -4,7 +4,7 @@ use crate::Preparer;
 use crate::bev::{BackboneConfig, PillarsConfig};
 use crate::config::{AnchorConfig, DetectorConfig};
 use data::augment::flip;
-use data::{AugmentConfig, Cloud, DataError, Dataset, Frame, Object, stream};
+use data::{AugmentConfig, Cloud, DataError, Dataset, Frame, GroundConfig, GroundHeight, Object, stream};
 use geometry::{Box3, limit_period};
 use rayon::prelude::*;
 use statistics::{median_upper, quantile_linear};
@@ -40,15 +40,23 @@ pub struct LabelledBoxes {
 }
 
 impl LabelledBoxes {
-    /// The boxes of at most `most` frames, evenly spread. Clouds are not read.
+    /// The boxes of at most `most` frames, evenly spread. With `ground` their heights count from the ground; only then
+    /// clouds are read.
     ///
     /// # Errors
-    /// Labels or calibrations that cannot be read.
-    pub fn read(dataset: &Dataset, ids: &[String], most: usize) -> Result<Self, DataError> {
+    /// Labels, calibrations or clouds that cannot be read.
+    pub fn read(
+        dataset: &Dataset,
+        ids: &[String],
+        most: usize,
+        ground: Option<&GroundConfig>,
+    ) -> Result<Self, DataError> {
         let n = most.min(ids.len());
         let frame = |k: usize| {
             let id = &ids[k * ids.len() / n];
-            dataset.objects(id, &dataset.labels(id)?)
+            let Some(ground) = ground else { return dataset.objects(id, &dataset.labels(id)?) };
+            let frame = dataset.load(id)?;
+            Ok(GroundHeight::of(&frame.cloud, ground).level(&frame).objects)
         };
         let frames: Vec<Result<_, DataError>> = (0..n).into_par_iter().map(frame).collect();
         Ok(LabelledBoxes { frames: frames.into_iter().collect::<Result<_, _>>()?, turned_rad: 0.0 })

@@ -6,7 +6,7 @@ use geometry::Box3;
 use lidarshift_models as models;
 use models::checkpoint::HostValues;
 use models::config::{DetectorConfig, NetworkConfig};
-use models::{Detector, Preparer, Sample, named, parameter_count};
+use models::{Detector, NetworkSample, Preparer, Sample, named, parameter_count};
 use rand::RngExt;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -217,8 +217,8 @@ fn no_proposal_left() {
 fn the_same_stream_draws_the_same_points() {
     let config = tiny();
     let frame = frame(1, 900, vec![car(10.0, 2.0)]);
-    let points = |sample: Sample| match sample {
-        Sample::PointRcnn(sample) => sample.points,
+    let points = |sample: Sample| match sample.network {
+        NetworkSample::PointRcnn(sample) => sample.points,
         other => panic!("{other:?}"),
     };
     let drawn = |seed| points(Preparer::new(&config).training(&frame, &mut stream(seed, "augment", 0, 0)).unwrap());

@@ -4,6 +4,7 @@
 use crate::{RunConfig, TrainError};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Dataset, Frame, GtDatabase, Prefetch, Stream, prefetch, stream};
+use models::config::DetectorConfig;
 use models::{Preparer, Sample};
 use rand::seq::SliceRandom;
 use sha2::{Digest, Sha256};
@@ -48,7 +49,7 @@ impl TrainingFrames {
             seed: config.seed,
             augmentation,
             classes: detector.classes.clone(),
-            range_m: detector.range_m.map(f64::from),
+            range_m: range_of_boxes(detector),
             preparer: Preparer::new(detector),
         })
     }
@@ -125,6 +126,16 @@ pub fn samples(
     let jobs: Vec<(u64, usize)> = (epoch..epochs).flat_map(in_epoch).collect();
     let frames = frames.clone();
     prefetch(jobs, workers, depth, move |&(epoch, index)| frames.sample(epoch, index))
+}
+
+/// The range in which training boxes are kept, `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame. If heights
+/// count from the ground, the z of the range does as well and is tested by the preparation.
+fn range_of_boxes(detector: &DetectorConfig) -> [f64; 6] {
+    let mut range = detector.range_m.map(f64::from);
+    if detector.ground.is_some() {
+        (range[2], range[5]) = (f64::NEG_INFINITY, f64::INFINITY);
+    }
+    range
 }
 
 /// Whether the data set has the classes, channels and labels that the detector needs.

@@ -132,12 +132,12 @@ pub fn train(
 const LOOKED_AT: usize = 1000;
 
 /// Says if more than 5 % of the training boxes have nothing but a forced match: anchors that are too far apart, or of
-/// another size.
+/// another size. Anchors are assigned from above, so no cloud is read for the height of the ground.
 fn anchor_warning(config: &RunConfig, dataset: &Dataset, ids: &[String]) -> Result<Option<String>, TrainError> {
     if config.detector.network.anchors().is_empty() {
         return Ok(None);
     }
-    let boxes = LabelledBoxes::read(dataset, ids, LOOKED_AT)?;
+    let boxes = LabelledBoxes::read(dataset, ids, LOOKED_AT, None)?;
     let share = Assignment::of(&config.detector, &boxes).map(|a| a.forced).filter(|share| *share > FORCED_SHARE);
     Ok(share.map(|share| {
         format!(

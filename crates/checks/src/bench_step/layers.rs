@@ -3,9 +3,9 @@
 use super::{Timed, WARM_UP};
 use anyhow::Result;
 use kernels::{Algorithm, Conv3x3, Epilogue, PillarNet, PillarParameters, Pillars};
-use models::Sample;
 use models::config::DetectorConfig;
 use models::pointpillars::PointPillarsConfig;
+use models::{NetworkSample, Sample};
 use rand::{Rng, RngExt};
 use std::hint::black_box;
 use std::time::Instant;
@@ -48,8 +48,8 @@ pub(super) fn convolutions(network: &PointPillarsConfig, config: &DetectorConfig
 /// The pillar feature net on the pillars of a batch, forward and backward.
 pub(super) fn pillar_net(network: &PointPillarsConfig, batch: &[Sample], steps: usize) -> Result<Timed> {
     let mut random = data::stream(0, "bench pillar net", 0, 0);
-    let of_pillars = batch.iter().filter_map(|sample| match sample {
-        Sample::PointPillars(sample) => Some(sample),
+    let of_pillars = batch.iter().filter_map(|sample| match &sample.network {
+        NetworkSample::PointPillars(sample) => Some(sample),
         _ => None,
     });
     let features: Vec<f32> = of_pillars.clone().flat_map(|s| s.input.features.iter().copied()).collect();

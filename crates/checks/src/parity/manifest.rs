@@ -110,6 +110,7 @@ impl Manifest {
             classes: self.classes.clone(),
             channels: self.point_dims,
             range_m: array(&self.range)?,
+            ground: None,
             network: (checks.config)(self)?,
             optimization: Default::default(),
             augmentation: Default::default(),

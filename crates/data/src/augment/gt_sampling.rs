@@ -1,6 +1,6 @@
 //! Ground-truth sampling: pastes objects of other frames, with their points, where they do not collide.
 
-use crate::{Frame, GtDatabase, Object, Stream};
+use crate::{Frame, GroundConfig, GroundHeight, GtDatabase, Object, Stream};
 use geometry::{Box3, bev_intersection, points_in_boxes};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -20,6 +20,10 @@ pub struct GtSamplingConfig {
     pub min_points: usize,
     /// Leave out objects that are harder than KITTI's level "hard". Objects without an image box are kept.
     pub drop_too_hard: bool,
+    /// Paste objects at the height above the ground that they had, as OpenPCDet does with road planes. Without it they
+    /// keep their z, which suits level ground.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ground: Option<GroundConfig>,
 }
 
 impl Default for GtSamplingConfig {
@@ -30,6 +34,7 @@ impl Default for GtSamplingConfig {
             limit_whole_scene: false,
             min_points: 5,
             drop_too_hard: true,
+            ground: None,
         }
     }
 }
@@ -43,12 +48,15 @@ const REMOVE_MARGIN_M: f64 = 1e-2;
 /// or another object drawn for the same class. Points of the scene inside pasted boxes are removed. Pasted points are
 /// inserted before the points of the scene, pasted objects after the objects of the scene.
 ///
+/// With `ground` the database holds heights above the ground, and the ground of this frame is added.
+///
 /// Difference to OpenPCDet, which consumes one shuffled list over all frames: here each frame draws without replacement
 /// from the whole database, so the result depends on the frame's random stream only.
 pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatabase, stream: &mut Stream) -> Frame {
     let mut boxes: Vec<Box3> = frame.objects.iter().map(|o| o.bbox).collect();
     let first_pasted = boxes.len();
     let mut pasted_values = Vec::new();
+    let ground = config.ground.as_ref().map(|ground| GroundHeight::of(&frame.cloud, ground));
     for (class, wanted) in &config.per_class {
         let samples = database.samples(class);
         let present = frame.objects.iter().filter(|o| o.class == *class).count();
@@ -63,14 +71,17 @@ pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatab
         };
         let free: Vec<_> = (0..drawn.len()).filter(|i| free(*i)).map(|i| drawn[i]).collect();
         for sample in free {
-            boxes.push(sample.bbox);
+            let mut bbox = sample.bbox;
+            let [x, y, z] = &mut bbox.center;
+            *z += ground.as_ref().map_or(0.0, |ground| ground.at(*x, *y));
+            boxes.push(bbox);
             for p in sample.points.chunks_exact(database.channels()) {
-                pasted_values.extend((0..3).map(|i| (f64::from(p[i]) + sample.bbox.center[i]) as f32));
+                pasted_values.extend((0..3).map(|i| (f64::from(p[i]) + bbox.center[i]) as f32));
                 pasted_values.extend(&p[3..]);
             }
             frame.objects.push(Object {
                 class: class.clone(),
-                bbox: sample.bbox,
+                bbox,
                 truncation: None,
                 occlusion: None,
                 image_box: None,
