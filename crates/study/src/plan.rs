@@ -10,9 +10,10 @@ use simulate::Scenery;
 use std::path::Path;
 
 /// Scatter of paired differences in the study `quick` (PointPillars; measured against sim, tested on measured):
-/// overlap, deviation over seeds, standard error of the frames times the square root of their number.
+/// overlap, deviation over seeds, standard error of the frames times the square root of their number. At 0.5 the
+/// deviation over seeds is that of an earlier form: four seeds happened to agree within 0.6.
 const STORED: [(f64, Scatter); 2] =
-    [(0.5, Scatter { of_seeds: 1.9, of_frames: 17.7 }), (0.7, Scatter { of_seeds: 2.9, of_frames: 28.4 })];
+    [(0.5, Scatter { of_seeds: 1.9, of_frames: 20.8 }), (0.7, Scatter { of_seeds: 3.2, of_frames: 31.8 })];
 
 /// Origin of the scatter behind a plan.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
