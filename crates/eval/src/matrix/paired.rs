@@ -336,7 +336,7 @@ mod tests {
     fn a_difference_is_split_into_label_sensor_and_scene() {
         let names: Vec<String> = (0..120).map(|i| format!("{i:06}")).collect();
         let ids: Vec<&str> = names.iter().map(String::as_str).collect();
-        let sensor = |i: usize| i % 3 > 0;
+        let sensor = |i: usize| !i.is_multiple_of(3);
         let truth = frames(&ids, sensor);
         let mut labelled = truth.clone();
         let elsewhere = Box3::from_array([90.0, 9.0, 0.0, 4.0, 2.0, 1.5, 0.0]);

@@ -42,6 +42,21 @@ pub(super) fn check_shared_frames(study: &Study, frozen: &FrozenDetector) -> Res
     Ok(())
 }
 
+/// Scores on a data set that has the scenes of one of two data sets and the sensor of the other.
+struct ScoredBetween {
+    ids: Vec<String>,
+    scores: Arc<RunScores>,
+    /// Whether the sensor is that of the first.
+    sensor_of_first: bool,
+}
+
+impl ScoredBetween {
+    fn standing(&self) -> Standing<'_> {
+        let frames = ScoredFrames::new(&self.scores, &self.ids);
+        if self.sensor_of_first { Standing::SensorOfFirst(frames) } else { Standing::SceneOfFirst(frames) }
+    }
+}
+
 impl FrozenState {
     /// Differences of every frozen detector between the first data set and each other one over their shared frames,
     /// cached in `paired.json`; and a warning for data sets that share only a part of their frames.
@@ -66,10 +81,7 @@ impl FrozenState {
                     let (b_ids, b) = self.scored(study, frozen, other)?;
                     let names = [frozen.name.as_str(), first, other];
                     let between = self.between(study, frozen, first, other)?;
-                    let standing = between.as_ref().map(|(ids, scores, sensor_of_first)| {
-                        let frames = ScoredFrames::new(scores, ids);
-                        if *sensor_of_first { Standing::SensorOfFirst(frames) } else { Standing::SceneOfFirst(frames) }
-                    });
+                    let standing = between.as_ref().map(ScoredBetween::standing);
                     let sets = [ScoredFrames::new(&a, &a_ids), ScoredFrames::new(&b, &b_ids)];
                     let found = paired_differences(names, sets, standing, options);
                     let shared = found.first().map_or(0, |d| d.frames);
@@ -90,15 +102,14 @@ impl FrozenState {
         })
     }
 
-    /// Frames and scores on the data set that has the scenes of one of two data sets and the sensor of the other, and
-    /// whether the sensor is that of `first`.
+    /// The scores on the data set that has the scenes of one of two data sets and the sensor of the other.
     fn between(
         &self,
         study: &Study,
         frozen: &FrozenDetector,
         first: &str,
         other: &str,
-    ) -> Result<Option<(Vec<String>, Arc<RunScores>, bool)>> {
+    ) -> Result<Option<ScoredBetween>> {
         let between = study.config.plan().between;
         let stands = |b: &&Between| {
             let of = (b.sensor_of.as_str(), b.scene_of.as_str());
@@ -106,6 +117,6 @@ impl FrozenState {
         };
         let Some(between) = between.iter().find(stands) else { return Ok(None) };
         let (ids, scores) = self.scored(study, frozen, &between.test_set)?;
-        Ok(Some((ids, scores, between.sensor_of == first)))
+        Ok(Some(ScoredBetween { ids, scores, sensor_of_first: between.sensor_of == first }))
     }
 }
