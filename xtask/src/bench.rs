@@ -7,9 +7,12 @@ use crate::tidy::{Manifest, manifests};
 use anyhow::{Result, bail};
 use std::path::Path;
 
+/// Folders in `tests` whose benchmarks draw pairs with hidden differences and diagnose them.
+const GENERATORS: &[&str] = &["blind", "town"];
+
 /// Runs the benchmark `name`, the benchmarks of the crate folder `name`, the comparison of training steps with PyTorch
 /// (`train`; `args` are parts of the row ids), the blind cases with mutated diagnosis code (`mutants`), or all
-/// benchmarks of the crates. The blind cases (`blind`, `loop`) run only by name.
+/// benchmarks of the crates. Pairs with hidden differences (`blind`, `loop`, `town`) run only by name.
 pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     if name == Some("train") {
         return bench_train(root, args);
@@ -21,12 +24,14 @@ pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     let mut ran = false;
     let mut all = manifests(root)?;
     if name.is_some() {
-        all.push(Manifest::read(root.join("tests/blind/Cargo.toml"))?);
+        for folder in GENERATORS {
+            all.push(Manifest::read(root.join("tests").join(folder).join("Cargo.toml"))?);
+        }
     }
     for manifest in all {
         for bench in manifest.benches() {
-            // The folder of the blind cases has the name of one of its benchmarks.
-            let of_folder = name == Some(&manifest.folder) && manifest.folder != "blind";
+            // The folders of the generators have the names of some of their benchmarks.
+            let of_folder = name == Some(&manifest.folder) && !GENERATORS.contains(&manifest.folder.as_str());
             let wanted = name.is_none_or(|name| name == bench) || of_folder;
             known.push(bench.clone());
             if !wanted {

@@ -9,9 +9,9 @@
 
 use data::Dataset;
 use diagnose::{Options, Rig, diagnose};
-use lidarshift_blind::score::{Outcome, score, summarise};
-use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, Truth, draw_case, write_case};
+use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
 use rand::RngExt;
+use score::{Outcome, Truth, score, summarise};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 

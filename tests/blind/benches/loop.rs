@@ -5,10 +5,10 @@
 
 use data::Dataset;
 use diagnose::{Diagnosis, Options, Outcome, Rig, diagnose};
-use lidarshift_blind::score::{Outcome as Scored, score};
 use lidarshift_blind::{
-    CAUSES, CaseSize, FIRST_NULL_SEED, FIRST_SEED, Kind, Truth, Variant, draw_strong_case, loop_cell, write_case,
+    CAUSES, CaseSize, FIRST_NULL_SEED, FIRST_SEED, Kind, Variant, draw_strong_case, loop_cell, write_case,
 };
+use score::{Outcome as Scored, Truth, score};
 use sensor::EffectList;
 use serde_json::{Value, json};
 use simulate::resim::Resim;

@@ -1,6 +1,5 @@
-//! Effects that can be hidden in the measured side, and the truth file.
+//! Effects that can be hidden in the measured side.
 
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// The clock that is wrong.
@@ -104,34 +103,6 @@ impl Effect {
             | Effect::Smear { .. } => return None,
         })
     }
-}
-
-/// A hidden effect in the truth file.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Hidden {
-    /// Name in the catalogue; otherwise a description.
-    pub cause: String,
-    /// Whether it is in the catalogue.
-    pub in_catalogue: bool,
-    /// True values; units are part of the names.
-    pub parameters: BTreeMap<String, f64>,
-    /// Standard errors of an efficient estimator that knows the functional form (Cramér-Rao bound), for some
-    /// parameters.
-    pub bound: BTreeMap<String, f64>,
-    /// Number of returns over all frames that the effect removes, adds, or moves by more than 0.35 m; 0 for effects
-    /// that change all returns slightly.
-    pub touched: f64,
-}
-
-/// Truth of a case.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Truth {
-    /// Seed of the case.
-    pub seed: u64,
-    /// `null`, `single`, `pair`, `off_catalogue` or `shuffled`.
-    pub kind: String,
-    /// All hidden effects.
-    pub hidden: Vec<Hidden>,
 }
 
 impl Effect {

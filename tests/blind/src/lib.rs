@@ -11,7 +11,6 @@ mod cell;
 mod effect;
 mod rig;
 mod scan;
-pub mod score;
 mod solid;
 mod track;
 mod variant;
@@ -20,6 +19,6 @@ mod write;
 
 pub use case::{CAUSES, Case, CaseSize, Kind, OFF_CATALOGUE, draw_case, draw_strong_case};
 pub use cell::{FIRST_NULL_SEED, FIRST_SEED, loop_cell};
-pub use effect::{Clock, Effect, Hidden, Truth};
+pub use effect::{Clock, Effect};
 pub use variant::{Intensity, Variant};
 pub use write::write_case;

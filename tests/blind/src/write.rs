@@ -1,7 +1,7 @@
 //! Writes a case: `measured/`, `simulated/`, `sensor.toml`. The truth is returned and not written next to them.
 
 use crate::case::{Case, Kind};
-use crate::effect::{Effect, Hidden, Truth};
+use crate::effect::Effect;
 use crate::rig::{draw_rig, rig_toml};
 use crate::scan::{Nuisances, Scan, Side, SideErrors, Sums};
 use crate::solid::{Form, Material, Solid};
@@ -11,6 +11,7 @@ use data::{Cloud, DataError, Frame, Layout, Object, write_atomic};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rayon::prelude::*;
+use score::{Hidden, Truth};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -170,6 +171,7 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums
         parameters: effect.parameters(),
         bound: bound(effect),
         touched: sums.touched,
+        ..Hidden::default()
     });
     let kind = match case.kind {
         Kind::Null => "null",
@@ -178,7 +180,7 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums
         Kind::OffCatalogue(_) => "off_catalogue",
         Kind::Shuffled => "shuffled",
     };
-    Truth { seed: case.seed, kind: kind.into(), hidden: hidden.collect() }
+    Truth { seed: case.seed, kind: kind.into(), setting: String::new(), hidden: hidden.collect() }
 }
 
 #[cfg(test)]

@@ -4,9 +4,9 @@
 
 use data::Dataset;
 use diagnose::{Options, Rig, diagnose};
-use lidarshift_blind::score::{Outcome, score};
 use lidarshift_blind::{CAUSES, CaseSize, Kind, draw_case, write_case};
 use rayon::prelude::*;
+use score::{Outcome, score};
 
 fn outcome(seed: u64, kind: Kind) -> Outcome {
     let folder = tempfile::tempdir().unwrap();

@@ -1,10 +1,9 @@
 //! Scores a diagnosis against the truth. Reads `diagnosis.json` only.
 
-use crate::effect::Truth;
+use crate::truth::{Hidden, Level, Truth};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use statistics::median_upper;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 
 /// Result of one case.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -92,11 +91,43 @@ pub fn score(truth: &Truth, diagnosis: &Value, seconds: f64) -> Outcome {
 }
 
 impl Outcome {
+    /// Whether a cause is named.
+    pub fn names(&self, cause: &str) -> bool {
+        self.named.iter().any(|n| n == cause)
+    }
+
+    /// Whether a cause is a candidate of an ambiguous finding.
+    pub fn mentions(&self, cause: &str) -> bool {
+        self.ambiguous.iter().any(|candidates| candidates.iter().any(|n| n == cause))
+    }
+
+    /// Named causes, each once, that are not hidden.
+    pub fn false_names(&self) -> BTreeSet<&str> {
+        let is_hidden = |n: &str| self.truth.hidden.iter().any(|h| h.in_catalogue && h.cause == n);
+        self.named.iter().map(String::as_str).filter(|n| !is_hidden(n)).collect()
+    }
+
+    /// Kind of the case in tables: effects that the diagnosis cannot name are apart from those that it can.
+    pub fn kind(&self) -> String {
+        let hidden = &self.truth.hidden;
+        let nameless = !hidden.is_empty() && !hidden.iter().any(|h| h.in_catalogue);
+        match self.truth.kind.as_str() {
+            kind if nameless && kind != "off_catalogue" => format!("{kind}, no name"),
+            kind => kind.to_owned(),
+        }
+    }
+
+    /// The highest level of a hidden effect; `-` where nothing is hidden or strengths are not known.
+    pub fn level(&self) -> &'static str {
+        self.truth.hidden.iter().filter_map(|h: &Hidden| h.level).max().map_or("-", Level::name)
+    }
+
     /// Grade of the result.
     pub fn grade(&self) -> &'static str {
-        let hidden: Vec<&str> = self.truth.hidden.iter().filter(|h| h.in_catalogue).map(|h| h.cause.as_str()).collect();
+        let nameable = self.truth.hidden.iter().filter(|h| h.in_catalogue);
+        let hidden: Vec<&str> = nameable.map(|h| h.cause.as_str()).collect();
         let nothing = self.named.is_empty() && self.ambiguous.is_empty() && self.unexplained == 0;
-        let wrong = self.named.iter().any(|n| !hidden.contains(&n.as_str()));
+        let wrong = !self.false_names().is_empty();
         match self.truth.kind.as_str() {
             "shuffled" => {
                 if self.verdict == "not_scenario_identical" {
@@ -106,84 +137,24 @@ impl Outcome {
                 }
             }
             _ if self.verdict == "not_scenario_identical" => "refused wrongly",
-            "null" => {
+            _ if self.truth.hidden.is_empty() => {
                 if nothing {
                     "clean"
                 } else {
                     "false alarm"
                 }
             }
-            "off_catalogue" => match (nothing, wrong) {
+            _ if hidden.is_empty() => match (nothing, wrong) {
                 (true, _) => "missed",
                 (_, true) => "wrong name",
                 _ => "unexplained",
             },
             _ if wrong => "wrong name",
             _ if nothing => "missed",
-            _ if hidden.iter().all(|h| self.named.iter().any(|n| n == h)) => "right",
-            _ if hidden.iter().all(|h| {
-                self.named.iter().any(|n| n == h) || self.ambiguous.iter().any(|a| a.iter().any(|n| n == h))
-            }) =>
-            {
-                "ambiguous"
-            }
+            _ if hidden.iter().all(|h| self.names(h)) => "right",
+            _ if hidden.iter().all(|h| self.names(h) || self.mentions(h)) => "ambiguous",
             _ if !self.named.is_empty() => "partly",
             _ => "unexplained",
         }
     }
-}
-
-/// Summary of a set of cases.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Summary {
-    /// Number of cases by kind and grade.
-    pub grades: BTreeMap<String, BTreeMap<String, usize>>,
-    /// For single cases, by hidden cause and reported cause: `confusion[hidden][reported]`.
-    pub confusion: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By parameter: number of cases, fraction inside the interval, median of |error| / |truth|, RMS of error / bound
-    /// where known, fraction meeting the accuracy target.
-    pub parameters: BTreeMap<String, [f64; 5]>,
-    /// Median fraction of the gap closed over the cases graded "right".
-    pub closed: Option<f64>,
-    /// Median and maximum run time of the diagnosis, s.
-    pub seconds: [f64; 2],
-}
-
-/// Summarises results.
-pub fn summarise(outcomes: &[Outcome]) -> Summary {
-    let mut summary = Summary::default();
-    let mut judged: BTreeMap<String, Vec<ParameterScore>> = BTreeMap::new();
-    for o in outcomes {
-        *summary.grades.entry(o.truth.kind.clone()).or_default().entry(o.grade().into()).or_default() += 1;
-        if o.truth.kind == "single" || o.truth.kind == "off_catalogue" {
-            let hidden = o.truth.hidden[0].cause.split(' ').next().unwrap_or_default().to_owned();
-            let mut reported: Vec<String> = o.named.clone();
-            reported.extend(o.ambiguous.iter().map(|a| format!("ambiguous({})", a.join("|"))));
-            reported.extend((0..o.unexplained).map(|_| "unexplained".to_owned()));
-            if reported.is_empty() {
-                reported.push("nothing".into());
-            }
-            for s in reported {
-                *summary.confusion.entry(hidden.clone()).or_default().entry(s).or_default() += 1;
-            }
-        }
-        for p in &o.parameters {
-            judged.entry(p.name.clone()).or_default().push(p.clone());
-        }
-    }
-    for (name, list) in judged {
-        let n = list.len() as f64;
-        let inside = list.iter().filter(|p| p.inside()).count() as f64 / n;
-        let close = list.iter().filter(|p| p.close()).count() as f64 / n;
-        let relative =
-            median_upper(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
-        let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
-        let rms =
-            if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
-        summary.parameters.insert(name, [n, inside, relative.unwrap_or(f64::NAN), rms, close]);
-    }
-    summary.closed = median_upper(outcomes.iter().filter(|o| o.grade() == "right").filter_map(|o| o.closed).collect());
-    let times: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
-    summary.seconds = [median_upper(times.clone()).unwrap_or(0.0), times.into_iter().fold(0.0, f64::max)];
-    summary
 }

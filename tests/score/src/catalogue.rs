@@ -1,0 +1,46 @@
+//! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
+
+/// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
+pub const CATALOGUE: [&str; 26] = [
+    "angular_jitter",
+    "beam_elevation_offset",
+    "beam_intensity",
+    "beam_range_offset",
+    "ego_occlusion",
+    "ground_error",
+    "incidence_dropout",
+    "incidence_noise",
+    "label_offset",
+    "material_dropout",
+    "missing_object",
+    "mixed_pixels",
+    "outliers",
+    "pitch_roll",
+    "quantisation",
+    "random_dropout",
+    "range_bias",
+    "range_cut",
+    "range_dropout",
+    "range_noise",
+    "rolling_shutter",
+    "sensor_extrinsics",
+    "signal_dropout",
+    "signal_noise",
+    "time_offset",
+    "wrong_shape",
+];
+
+/// Whether the present diagnosis can name a cause.
+pub fn in_catalogue(cause: &str) -> bool {
+    CATALOGUE.binary_search(&cause).is_ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_list_is_sorted() {
+        assert!(CATALOGUE.is_sorted() && in_catalogue("wrong_shape") && !in_catalogue("fog"));
+    }
+}

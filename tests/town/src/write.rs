@@ -1,0 +1,80 @@
+//! Writes a case: `measured/`, `simulated/`, `sensor.toml`. The truth is returned and not written next to them.
+
+use crate::case::Case;
+use crate::effect::Effect;
+use crate::frame::Frame;
+use crate::oracle::judge;
+use crate::sensor::rig_toml;
+use crate::side::Side;
+use data::{Cloud, DataError, Layout, write_atomic};
+use rayon::prelude::*;
+use score::{Hidden, Truth};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Writes both sides and the rig into `folder`; returns the truth.
+pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
+    let setting = &case.measured.setting;
+    let rig = rig_toml(&case.measured.mounts, setting.rate_hz, setting.pattern_known);
+    write_atomic(&folder.join("sensor.toml"), rig.as_bytes())?;
+    for side in [&case.measured, &case.simulated] {
+        let root = folder.join(side.name);
+        let written = (0..case.size.frames).into_par_iter().map(|i| write_frame(side, i, &root));
+        written.collect::<Vec<_>>().into_iter().collect::<Result<(), DataError>>()?;
+        let columns = if setting.intensity.channels() == 3 { "xyz" } else { "xyzi" };
+        let text = format!("points = \"{columns}\"\nlabel_frame = \"lidar\"\nclasses = [\"Car\", \"Pedestrian\"]\n");
+        write_atomic(&root.join("dataset.toml"), text.as_bytes())?;
+    }
+    Ok(truth(case))
+}
+
+fn write_frame(side: &Side, index: usize, root: &Path) -> Result<(), DataError> {
+    let scan = Frame::new(side, index).scan();
+    let intensity = side.setting.intensity;
+    let rng = &mut side.stream("intensity", index);
+    let mut values = Vec::with_capacity(scan.points.len() * intensity.channels());
+    for (point, light) in scan.points.iter().zip(&scan.lights) {
+        values.extend(point);
+        values.extend(intensity.value(light.reflectivity, light.cos_incidence, light.range_m, light.gain, rng));
+    }
+    // Ids count scans, including those that are not kept.
+    let frame = data::Frame {
+        id: format!("{:06}", index * side.setting.every),
+        cloud: Cloud { values, channels: intensity.channels() },
+        objects: scan.labels,
+    };
+    Layout::Kitti.write_frame(root, &frame)
+}
+
+/// The truth of a case.
+pub fn truth(case: &Case) -> Truth {
+    let hidden = case.measured.effects.iter().zip(judge(case)).map(|(effect, judgement)| {
+        let mut parameters = effect.parameters();
+        parameters.extend(grown(case, effect));
+        Hidden {
+            cause: effect.cause().into(),
+            in_catalogue: effect.in_catalogue(),
+            parameters,
+            bound: judgement.bound,
+            touched: judgement.touched,
+            ..Hidden::default()
+        }
+        .with_strength(judgement.strength)
+    });
+    Truth {
+        seed: case.seed,
+        kind: case.kind.name().into(),
+        setting: case.measured.setting.describe(),
+        hidden: hidden.collect(),
+    }
+}
+
+/// By how much the labelled cars are larger, on average, m.
+fn grown(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
+    let Effect::WrongShape { length, height } = *effect else { return BTreeMap::new() };
+    let world = &case.measured.world;
+    let labelled = world.vehicles.iter().filter(|v| v.labelled && world.models[v.model].class == "Car");
+    let sizes: Vec<[f64; 3]> = labelled.map(|v| world.models[v.model].size_m).collect();
+    let mean = |k: usize| sizes.iter().map(|s| s[k]).sum::<f64>() / sizes.len().max(1) as f64;
+    [("longer_m", length * mean(0)), ("higher_m", height * mean(2))].map(|(k, v)| (k.to_owned(), v)).into()
+}
