@@ -1,8 +1,8 @@
 //! The large blind set: many cases with or without a hidden difference. Each result is written as soon as it is
 //! available, so an interrupted run can be resumed.
 //!
-//! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|CAUSE]... [--cases N] [--first SEED] [--frames N]
-//! [--shots N] [--out DIR] [--keep DIR] [--draw-only]`
+//! `cargo xtask bench blind -- [--kind null|single|pair|off|shuffled|swarm|CAUSE]... [--cases N] [--first SEED]
+//! [--frames N] [--shots N] [--out DIR] [--keep DIR] [--draw-only]`
 //!
 //! `--keep` stores the generated pairs in a folder and reuses those already there; `--draw-only` generates pairs
 //! without diagnosing them.
@@ -11,7 +11,7 @@ use data::Dataset;
 use diagnose::{Options, Rig, diagnose};
 use lidarshift_blind::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
 use rand::RngExt;
-use score::{Outcome, Truth, score, summarise};
+use score::{GROUPS, Outcome, Truth, markdown, score, summarise};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -77,6 +77,10 @@ fn kind_of(seed: u64, kinds: &[String]) -> Kind {
         }
         "off" => Kind::OffCatalogue(rng.random_range(0..OFF_CATALOGUE)),
         "shuffled" => Kind::Shuffled,
+        "swarm" => {
+            let [first, last] = GROUPS[rng.random_range(0..GROUPS.len())];
+            Kind::Swarm(rng.random_range(first..=last))
+        }
         other => Kind::Single(cause(other).unwrap_or_else(|| panic!("no such kind or cause: {other}"))),
     }
 }
@@ -150,5 +154,5 @@ fn main() {
     let summary = summarise(&outcomes);
     let text = serde_json::to_vec_pretty(&summary).expect("JSON");
     data::write_atomic(&arguments.out.join("summary.json"), &text).expect("a summary");
-    println!("{}", String::from_utf8_lossy(&text));
+    println!("{}\n{}", String::from_utf8_lossy(&text), markdown(&summary));
 }

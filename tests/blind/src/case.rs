@@ -1,7 +1,7 @@
 //! Cases: a seed, a size, and the hidden effects.
 
 use crate::effect::{Clock, Effect};
-use crate::variant::Variant;
+use crate::variant::{Intensity, Variant};
 use data::Stream;
 use rand::RngExt;
 use std::ops::Range;
@@ -35,6 +35,8 @@ pub enum Kind {
     OffCatalogue(usize),
     /// No hidden effect, but frames are paired wrongly.
     Shuffled,
+    /// So many effects at once (2 to 20), all different, up to two of them not in the catalogue.
+    Swarm(usize),
 }
 
 /// A blind case.
@@ -102,7 +104,7 @@ pub fn draw_strong_case(seed: u64, kind: Kind, size: CaseSize, variant: Variant)
     draw(seed, kind, size, Sizes::Strong, variant)
 }
 
-fn draw(seed: u64, kind: Kind, size: CaseSize, sizes: Sizes, variant: Variant) -> Case {
+fn draw(seed: u64, kind: Kind, size: CaseSize, sizes: Sizes, mut variant: Variant) -> Case {
     let mut rng = data::stream(seed, "blind case", 0, 0);
     let step_s = if rng.random_bool(0.5) { 0.25 } else { 0.05 };
     let effects = match kind {
@@ -110,8 +112,33 @@ fn draw(seed: u64, kind: Kind, size: CaseSize, sizes: Sizes, variant: Variant) -
         Kind::Single(i) => vec![draw_effect(i, sizes, &mut rng)],
         Kind::Pair(i, j) => vec![draw_effect(i, sizes, &mut rng), draw_effect(j, sizes, &mut rng)],
         Kind::OffCatalogue(i) => vec![draw_off_catalogue(i, &mut rng)],
+        Kind::Swarm(number) => {
+            variant = Variant {
+                sensors: Some(rng.random_range(1..5)),
+                intensity: Intensity::ALL[rng.random_range(0..Intensity::ALL.len())],
+                rig_has_pattern: rng.random_bool(0.5),
+            };
+            draw_swarm(number, variant.sensors == Some(1), &mut rng)
+        }
     };
     Case { seed, size, kind, effects, step_s, variant }
+}
+
+/// Different effects at once. A single sensor's pose is that of the vehicle, so that only one of the two is hidden.
+fn draw_swarm(number: usize, one_sensor: bool, rng: &mut Stream) -> Vec<Effect> {
+    let possible = |i: &usize| !(one_sensor && CAUSES[*i] == "sensor_extrinsics");
+    let mut nameable: Vec<usize> = (0..CAUSES.len()).filter(possible).collect();
+    let mut foreign: Vec<usize> = (0..OFF_CATALOGUE).collect();
+    let off = rng.random_range(0..3usize).min(number / 2);
+    let take = |list: &mut Vec<usize>, rng: &mut Stream| list.swap_remove(rng.random_range(0..list.len()));
+    let draw_one = |k: usize| {
+        if k < off {
+            draw_off_catalogue(take(&mut foreign, rng), rng)
+        } else {
+            draw_effect(take(&mut nameable, rng), Sizes::All, rng)
+        }
+    };
+    (0..number.min(CAUSES.len() - 2)).map(draw_one).collect()
 }
 
 /// Log-uniform random number.

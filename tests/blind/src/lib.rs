@@ -8,10 +8,12 @@
 mod car;
 mod case;
 mod cell;
+mod detection;
 mod effect;
 mod rig;
 mod scan;
 mod solid;
+mod strength;
 mod track;
 mod variant;
 mod world;

@@ -1,8 +1,10 @@
 //! Simulation of one scan: shot directions, ray casting, detection, and the reported points.
 
+use crate::detection::Incidence;
 use crate::effect::{Clock, Effect};
 use crate::rig::Mount;
 use crate::solid::{Form, Hit, Material, Solid};
+use crate::strength::Observation;
 use crate::variant::Light;
 use crate::world::{REACH_M, World};
 use data::Stream;
@@ -10,6 +12,7 @@ use geometry::Box3;
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
+use score::FrameEvidence;
 
 /// Nuisances that are equal on both sides.
 #[derive(Clone, Copy, Debug)]
@@ -61,6 +64,8 @@ pub struct Scan {
     pub boxes: Vec<Box3>,
     /// Sums for the Cramér-Rao bounds.
     pub sums: Sums,
+    /// What an oracle sees of the effects.
+    pub evidence: FrameEvidence,
 }
 
 /// Sums over shots that hit something.
@@ -133,9 +138,16 @@ impl Side<'_> {
             }),
             _ => None,
         });
-        let mut scan = Scan { points: Vec::new(), lights: Vec::new(), boxes: Vec::new(), sums: Sums::default() };
+        let mut scan = Scan {
+            points: Vec::new(),
+            lights: Vec::new(),
+            boxes: Vec::new(),
+            sums: Sums::default(),
+            evidence: self.no_evidence(),
+        };
         let reshaped = self.effects.iter().any(|e| matches!(e, Effect::WrongShape { .. }));
         let mut on_car = vec![0usize; self.world.drivers.len()];
+        let every = self.looks_at_every();
         for (k, mount) in self.rig.iter().enumerate() {
             let believed_pose = mount.pose();
             let mut true_pose = believed_pose;
@@ -184,13 +196,15 @@ impl Side<'_> {
                     });
                     scan.sums.touched += f64::from(u8::from(met.is_some()));
                     let met = met.or_else(|| moment.cast(&origin, &ray));
+                    let mut mixed_m = 0.0;
                     let hit = met.map(|mut hit| {
                         if divergence > 0.0 && hit.range_m > 1.0 {
                             let sharp = hit.range_m;
                             hit.range_m = blurred(&hit, divergence, &shot, |d| {
                                 moment.cast(&origin, &(true_pose.rotation * d)).map(|h| h.range_m)
                             });
-                            scan.sums.touched += f64::from(u8::from((hit.range_m - sharp).abs() > 0.35));
+                            mixed_m = hit.range_m - sharp;
+                            scan.sums.touched += f64::from(u8::from(mixed_m.abs() > 0.35));
                         }
                         hit
                     });
@@ -205,6 +219,14 @@ impl Side<'_> {
                         scan.sums.touched += f64::from(u8::from(other));
                     }
                     let angles = [az, el];
+                    if let Some(hit) = hit.as_ref().filter(|_| (row + column).is_multiple_of(every)) {
+                        let cos = hit.cos_incidence(&ray).clamp(1e-4, 1.0);
+                        let at = Incidence { hit, cos, sensor: k, angles, mount };
+                        let energy = (self.world.reflectivity(hit) * cos / (hit.range_m * hit.range_m)).ln();
+                        let phase = column as f64 / mount.columns as f64 - 0.5;
+                        let o = Observation { at, origin, ray, row, phase, energy, mixed_m };
+                        self.observe(&o, t, &mut scan.evidence);
+                    }
                     let lost = &mut scan.sums.touched;
                     if let Some(range) = self.returned(hit, &ray, k, row, angles, mount, lost, rng) {
                         let p = believed_pose * Point3::from(reported * range);
@@ -225,6 +247,7 @@ impl Side<'_> {
             scan.points.swap(i, j);
             scan.lights.swap(i, j);
         }
+        self.observe_shots(&mut scan.evidence);
         self.label(t, &believed, &on_car, rng, &mut scan);
         scan
     }
@@ -256,38 +279,15 @@ impl Side<'_> {
         if rng.random::<f64>() < self.nuisances.lost || energy < self.nuisances.weakest {
             return None;
         }
+        let at = Incidence { hit: &hit, cos: c, sensor, angles: [az, el], mount };
         let mut reported = range + normal(rng) * self.nuisances.noise_m + self.beams[sensor][row][0];
         for effect in self.effects {
             let kept = match effect {
-                Effect::RandomDropout { share } => 1.0 - share,
                 Effect::SignalDropout { half_at, speckle } => {
                     let received = energy + speckle * normal(rng);
                     if received > *half_at { 1.0 } else { 0.0 }
                 }
-                Effect::RangeDropout { half_at_m, softness_m } => {
-                    0.5 - (range - half_at_m) / (2.0 * (softness_m.powi(2) + (range - half_at_m).powi(2)).sqrt())
-                }
-                Effect::IncidenceDropout { half_at_cos, power } => {
-                    let u = (c / half_at_cos).powf(*power);
-                    u / (1.0 + u)
-                }
-                Effect::MaterialDropout { tyres, share } => {
-                    let dark = if *tyres { hit.material == Material::Rubber } else { hit.material == Material::Paint };
-                    if dark { 1.0 - share } else { 1.0 }
-                }
-                Effect::RangeCut { max_m } => f64::from(u8::from(range <= *max_m)),
-                Effect::StripedLoss { share, stripes } => {
-                    let u = (el - mount.rows_rad[mount.rows_rad.len() - 1])
-                        / (mount.rows_rad[0] - mount.rows_rad[mount.rows_rad.len() - 1]);
-                    1.0 - share * (1.0 + (std::f64::consts::TAU * stripes * u).sin()) / 2.0
-                }
-                Effect::Smear { share, middle, half_rad } if sensor == 0 => {
-                    let (high, low) = (mount.rows_rad[0], mount.rows_rad[mount.rows_rad.len() - 1]);
-                    let off = [az - middle[0] * mount.fov_rad, el - (low + middle[1] * (high - low))];
-                    let from_middle = (off[0] / half_rad[0]).hypot(off[1] / half_rad[1]);
-                    1.0 - share * ((1.25 - from_middle) / 0.5).clamp(0.0, 1.0)
-                }
-                _ => 1.0,
+                other => other.kept(&at),
             };
             if rng.random::<f64>() >= kept {
                 *touched += 1.0;
@@ -343,6 +343,7 @@ impl Side<'_> {
                     yaw_rad: cm(ahead.y.atan2(ahead.x)),
                 });
                 if on_car[driver] >= 5 {
+                    self.observe_label(driver, t, &mut scan.evidence);
                     let v = self.world.drivers[driver].speed_m_s(t);
                     scan.sums.boxes[0] += 1.0;
                     scan.sums.boxes[1] += v * v;

@@ -11,7 +11,7 @@ use data::{Cloud, DataError, Frame, Layout, Object, write_atomic};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rayon::prelude::*;
-use score::{Hidden, Truth};
+use score::{FrameEvidence, Hidden, Truth, Verdicts, in_catalogue};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -61,32 +61,35 @@ pub fn write_case(case: &Case, folder: &Path) -> Result<Truth, DataError> {
     let simulated =
         Side { world: &simulated_world, rig: &rig, nuisances, own: SideErrors::default(), effects: &[], beams: &level };
     write_atomic(&folder.join("sensor.toml"), rig_toml(&rig, case.variant.rig_has_pattern).as_bytes())?;
-    let sums: Vec<Result<Sums, DataError>> = (0..case.size.frames)
+    let frames: Vec<Result<(Sums, FrameEvidence), DataError>> = (0..case.size.frames)
         .into_par_iter()
         .map(|i| {
             let t = i as f64 * case.step_s;
             let column = |side: &str| (case.variant.intensity, data::stream(case.seed, side, 0, i as u64));
-            let scan = measured.scan(t, &mut data::stream(case.seed, "blind measured", 0, i as u64));
+            let mut scan = measured.scan(t, &mut data::stream(case.seed, "blind measured", 0, i as u64));
             let shown =
                 if case.kind == Kind::Shuffled { (i + 37 * case.size.frames / 97) % case.size.frames } else { i };
-            let sums = scan.sums;
+            let frame = (scan.sums, std::mem::take(&mut scan.evidence));
             // Frame ids count scans at 20 Hz, including those that are not kept.
             let every = (case.step_s * 20.0).round() as usize;
             write_scan(&folder.join("measured"), shown * every, scan, column("blind measured intensity"))?;
             let scan = simulated.scan(t, &mut data::stream(case.seed, "blind simulated", 0, i as u64));
             write_scan(&folder.join("simulated"), i * every, scan, column("blind simulated intensity"))?;
-            Ok(sums)
+            Ok(frame)
         })
         .collect();
     let mut total = Sums::default();
-    for s in sums {
-        let s = s?;
+    let mut evidence = Vec::new();
+    for frame in frames {
+        let (s, e) = frame?;
+        evidence.push(e);
         total.returns += s.returns;
         total.lever += s.lever;
         total.touched += s.touched;
         total.boxes = [total.boxes[0] + s.boxes[0], total.boxes[1] + s.boxes[1]];
     }
-    Ok(truth(case, &nuisances, &own, beams.iter().flatten().count(), &total))
+    let verdicts = measured.judge(&evidence);
+    Ok(truth(case, &nuisances, &own, beams.iter().flatten().count(), &total, &verdicts))
 }
 
 fn write_scan(
@@ -139,7 +142,7 @@ fn add_things(world: &mut World, n: usize, rng: &mut data::Stream) {
 /// The truth with Cramér-Rao bounds from the Fisher information of the frames' returns. For per-row offsets each
 /// offset may be known exactly; the standard deviation of their (uniform) distribution is limited by the number of
 /// rows.
-fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums: &Sums) -> Truth {
+fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums: &Sums, verdicts: &Verdicts) -> Truth {
     let bound = |effect: &Effect| -> BTreeMap<String, f64> {
         let own_variance = 2.0 * nuisances.noise_m.powi(2);
         let n = sums.returns.max(1.0);
@@ -165,13 +168,16 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums
         };
         list.into_iter().map(|(k, v)| (k.to_owned(), v)).collect()
     };
-    let hidden = case.effects.iter().map(|effect| Hidden {
-        cause: effect.cause().map_or_else(|| format!("{effect:?}"), str::to_owned),
-        in_catalogue: effect.cause().is_some(),
-        parameters: effect.parameters(),
-        bound: bound(effect),
-        touched: sums.touched,
-        ..Hidden::default()
+    let hidden = case.effects.iter().enumerate().map(|(k, effect)| {
+        let hidden = Hidden {
+            cause: effect.cause().map_or_else(|| format!("{effect:?}"), str::to_owned),
+            in_catalogue: effect.cause().is_some_and(in_catalogue),
+            parameters: effect.parameters(),
+            bound: bound(effect),
+            touched: if case.effects.len() > 2 { verdicts.touched(k) } else { sums.touched },
+            ..Hidden::default()
+        };
+        hidden.with_strength(verdicts.strength(k))
     });
     let kind = match case.kind {
         Kind::Null => "null",
@@ -179,6 +185,7 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums
         Kind::Pair(..) => "pair",
         Kind::OffCatalogue(_) => "off_catalogue",
         Kind::Shuffled => "shuffled",
+        Kind::Swarm(_) => "swarm",
     };
     Truth { seed: case.seed, kind: kind.into(), setting: String::new(), hidden: hidden.collect() }
 }

@@ -228,7 +228,7 @@ pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
         rows: crate::side::draw_rows(&mounts, &[], seed),
         mounts: Arc::new(mounts),
         nuisances,
-        own: Arc::new(OwnErrors::none(size.frames)),
+        own: Arc::new(OwnErrors::none(rng, size.frames, setting.step_s())),
         effects: vec![],
         duration_s,
     };

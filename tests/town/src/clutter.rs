@@ -71,7 +71,7 @@ impl Law {
 impl Frame<'_> {
     /// Returns from elsewhere that are present on both sides.
     pub fn usual_clutter(&self) -> Clutter {
-        Clutter { rate: self.side.nuisances.false_returns, law: Law::Uniform(REACH_M) }
+        Clutter { rate: self.side.nuisances.false_returns * self.unsteady()[4].exp(), law: Law::Uniform(REACH_M) }
     }
 
     /// Ways in which the effects return a shot from elsewhere.

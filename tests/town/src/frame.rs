@@ -3,7 +3,7 @@
 use crate::effect::Effect;
 use crate::footprint::{Spread, mixed};
 use crate::sensor::{Shot, direction};
-use crate::side::{Side, isometry, normal};
+use crate::side::{Side, UNSTEADY_STD, Unsteady, isometry, normal};
 use crate::solid::{Block, Material, Ray};
 use crate::world::{Hit, Moment, Object};
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
@@ -51,8 +51,8 @@ pub struct Frame<'a> {
     pub stripes: f64,
     /// Bright signs by sensor; empty without an effect that needs them.
     pub bright: Vec<Vec<Bright>>,
-    /// Factor on a random loss in this frame.
-    pub unsteady: f64,
+    /// Factor on the random loss that is hidden.
+    pub loss_factor: f64,
     rack: Option<(Block, bool)>,
 }
 
@@ -165,7 +165,7 @@ impl<'a> Frame<'a> {
             burst: None,
             stripes: 0.0,
             bright: vec![Vec::new(); side.mounts.len()],
-            unsteady: 1.0,
+            loss_factor: 1.0,
             rack,
         };
         frame.draw();
@@ -196,7 +196,7 @@ impl<'a> Frame<'a> {
                     self.burst = Some((sensor, fov * rng.random_range(-0.4..0.4), half));
                 }
                 Effect::Interference { .. } => self.stripes = rng.random_range(0.0..TAU),
-                Effect::RandomDropout { .. } => self.unsteady = (0.06 * normal(rng)).exp(),
+                Effect::RandomDropout { .. } => self.loss_factor = (0.06 * normal(rng)).exp(),
                 Effect::Blooming { .. } | Effect::BrightTargetDropout { .. } if self.bright[0].is_empty() => {
                     self.bright = (0..side.mounts.len()).map(|k| self.signs(k)).collect();
                 }
@@ -320,6 +320,12 @@ impl<'a> Frame<'a> {
             }
         }
         None
+    }
+
+    /// What varies from frame to frame: see [`UNSTEADY_STD`], with its units.
+    pub fn unsteady(&self) -> Unsteady {
+        let state = self.side.own.unsteady[self.index];
+        [0, 1, 2, 3, 4].map(|k| state[k] * UNSTEADY_STD[k])
     }
 
     /// The true pose of a sensor in the world in the middle of the scan.

@@ -10,7 +10,6 @@ mod case;
 mod clutter;
 mod draw;
 mod effect;
-mod evidence;
 mod facade;
 mod footprint;
 mod frame;
@@ -31,6 +30,9 @@ mod traffic;
 mod vehicle;
 mod world;
 mod write;
+
+#[cfg(test)]
+mod tests;
 
 pub use case::{Case, CaseSize, Kind, draw_case};
 pub use draw::{CAUSES, OFF_CATALOGUE};

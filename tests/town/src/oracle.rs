@@ -1,20 +1,18 @@
-//! Strength of hidden effects: by how many standard errors an oracle that knows all forms tells each from its absence.
+//! What an oracle that knows all forms would see of the hidden effects of a case.
 //!
 //! Every frame is compared with the same frame without one effect (or a part of one), shot by shot, in what is
-//! expected: mean range, variance, probability of a return, returns from elsewhere, labels. Poses of frames and offsets
-//! of surfaces are unknown to the oracle within their nuisances, so that correlated frames count less. Some shots of
-//! each frame stand for all.
+//! expected. Some shots of each frame stand for all.
 
 use crate::case::Case;
 use crate::effect::Effect;
-use crate::evidence::{Products, Residual, Residuals, bernoulli_divergence, poisson_squared_errors};
 use crate::frame::{Echo, Frame, Met};
-use crate::parts::{Part, Scaling};
+use crate::parts::{Part, SMALLER, Scaling};
 use crate::sensor::Shot;
-use crate::side::{POSE_STD, Side};
+use crate::side::{MEMORY_S, POSE_STD, Side, TRACK_SHARE, UNSTEADY_STD};
 use crate::world::{Object, REACH_M};
 use nalgebra::Vector3;
 use rayon::prelude::*;
+use score::{Counts, FrameEvidence, FrameStds, Oracle, Row, bernoulli_divergence};
 use std::collections::BTreeMap;
 
 /// What an oracle knows of a hidden effect.
@@ -43,43 +41,21 @@ const LEAST_COS: f64 = 0.05;
 /// Standard deviations of the offsets of houses, of ground and of other surfaces along their normals, m.
 const SURFACE_STD_M: [f64; 3] = [0.0115, 0.002, 0.01];
 
-/// Time over which small errors of edges and poses are common to frames, s.
-const MEMORY_S: f64 = 0.7;
-
 /// Relative scatter of the intensity of returns: speckle and errors of reflectivities.
 const INTENSITY_STD: f64 = 0.06;
 
 /// Resolution of a range in which no rounding is seen, m.
 const RESOLUTION_M: f64 = 1.5e-3;
 
-/// A part of an effect, and the side without it.
+/// Probability that a shot meets something else than in the model, away from edges.
+const SURPRISE: f64 = 0.003;
+
+/// A part of an effect, the side without it, and the side with the part a little smaller if it turns or shifts rays.
 struct Variant {
     effect: usize,
     part: Part,
     side: Side,
-}
-
-/// Sums of one effect beside the linear models.
-#[derive(Clone, Debug, Default)]
-struct Counts {
-    divergence: f64,
-    moved: f64,
-    moved_usual: f64,
-    clutter: f64,
-    clutter_usual: f64,
-    touched: f64,
-    other: f64,
-}
-
-/// Sums of a frame or of several.
-struct Sums {
-    residuals: Vec<Residual>,
-    variances: Vec<(Vec<f64>, f64)>,
-    losses: Vec<(Vec<f64>, f64)>,
-    labels: Vec<(Vec<[f64; 3]>, f64)>,
-    counts: Vec<Counts>,
-    returns: f64,
-    shots: f64,
+    nearly: Option<Side>,
 }
 
 /// Judges the hidden effects of a case, in their order.
@@ -88,84 +64,64 @@ pub fn judge(case: &Case) -> Vec<Judgement> {
     if side.effects.is_empty() {
         return vec![];
     }
-    let without = |k: usize, remaining: Option<Effect>| {
+    let variants = variants(case);
+    let plain = side.with_effects(&case.real_world, vec![]);
+    let every = case.size.frames.div_ceil(FRAMES);
+    let chosen: Vec<usize> = (0..case.size.frames).step_by(every).collect();
+    let frames: Vec<FrameEvidence> =
+        chosen.par_iter().map(|&i| compare(case, &variants, &plain, i, every as f64)).collect();
+    // Nuisances that last longer than the time between frames are averaged less well.
+    let keep = (-side.setting.step_s() * every as f64 / MEMORY_S).exp();
+    let independent = (1.0 - keep) / (1.0 + keep);
+    let slow = |std: f64| std / independent.sqrt();
+    let [noise, lost, threshold, range, false_returns] = UNSTEADY_STD.map(slow);
+    let [shift, turn] = POSE_STD.map(slow);
+    let stds = FrameStds {
+        means: vec![shift, shift, shift, turn, turn, turn, range],
+        variances: vec![noise],
+        losses: vec![lost, threshold],
+        false_returns,
+        independent,
+    };
+    let mut oracle = Oracle::new(side.effects.len(), variants.iter().map(|v| v.effect).collect(), stds);
+    frames.iter().for_each(|frame| oracle.add(frame));
+    let verdicts = oracle.judge();
+    let judgement = |k: usize| {
+        let mut bound = BTreeMap::new();
+        for (column, Variant { part, .. }) in variants.iter().enumerate().filter(|(_, v)| v.effect == k) {
+            let relative = match part.scaling {
+                Scaling::Shift => verdicts.shift_error(column),
+                Scaling::Deviation => verdicts.deviation_error(column),
+                Scaling::LostShare => Some(verdicts.lost_error(column, part.value)),
+                Scaling::ClutterShare => Some(verdicts.clutter_error(part.value)),
+                Scaling::Other => None,
+            };
+            bound.extend(relative.map(|relative| (part.name.to_owned(), part.value.abs() * relative)));
+        }
+        Judgement { strength: verdicts.strength(k), touched: verdicts.touched(k), bound }
+    };
+    (0..side.effects.len()).map(judgement).collect()
+}
+
+/// The measured side without each part of each effect.
+fn variants(case: &Case) -> Vec<Variant> {
+    let side = &case.measured;
+    let replaced = |k: usize, by: Option<Effect>| {
         let mut effects = side.effects.clone();
-        match remaining {
+        match by {
             Some(effect) => effects[k] = effect,
             None => drop(effects.remove(k)),
         }
         side.with_effects(&case.real_world, effects)
     };
-    let variants: Vec<Variant> = side
-        .effects
-        .iter()
-        .enumerate()
-        .flat_map(|(k, effect)| effect.parts().into_iter().map(move |part| (k, part)))
-        .map(|(effect, part)| Variant { effect, side: without(effect, part.remaining.clone()), part })
-        .collect();
-    let plain = side.with_effects(&case.real_world, vec![]);
-    let every = case.size.frames.div_ceil(FRAMES);
-    let chosen: Vec<usize> = (0..case.size.frames).step_by(every).collect();
-    let frames: Vec<Sums> = chosen.par_iter().map(|&i| compare(case, &variants, &plain, i, every as f64)).collect();
-    let keep = (-side.setting.step_s() * every as f64 / MEMORY_S).exp();
-    let independent = (1.0 - keep) / (1.0 + keep);
-    let columns = variants.len();
-    let mut residuals = Residuals::new(columns);
-    let (mut variances, mut losses, mut labels) =
-        (Products::new(columns), Products::new(columns), Products::new(columns));
-    let mut counts = vec![Counts::default(); side.effects.len()];
-    let (mut returns, mut shots) = (0.0, 0.0);
-    for frame in &frames {
-        residuals.add_frame(&frame.residuals, POSE_STD.map(|std| std / independent.sqrt()));
-        frame.variances.iter().for_each(|(row, weight)| variances.add(row, *weight));
-        frame.losses.iter().for_each(|(row, weight)| losses.add(row, *weight));
-        for (shifts, weight) in &frame.labels {
-            (0..3).for_each(|k| labels.add(&shifts.iter().map(|s| s[k]).collect::<Vec<_>>(), *weight));
-        }
-        for (sum, of_frame) in counts.iter_mut().zip(&frame.counts) {
-            sum.add(of_frame);
-        }
-        (returns, shots) = (returns + frame.returns, shots + frame.shots);
-    }
-    let [means, variances, labels] = [residuals.products(), variances, labels].map(|products| products.covariance());
-    let judgement = |k: usize| {
-        let own: Vec<usize> = (0..columns).filter(|&v| variants[v].effect == k).collect();
-        let c = &counts[k];
-        let lost = own.iter().map(|&v| losses.own_share(v)).fold(1.0, f64::min);
-        let squared = means.squared_errors(&own)
-            + variances.squared_errors(&own)
-            + labels.squared_errors(&own)
-            + 2.0 * c.divergence * lost
-            + independent * poisson_squared_errors(c.moved, c.moved_usual)
-            + poisson_squared_errors(c.clutter + c.clutter_usual, c.clutter_usual)
-            + c.other;
-        let mut bound = BTreeMap::new();
-        for &v in &own {
-            let part = &variants[v].part;
-            let variance = match part.scaling {
-                Scaling::Shift => means.variance(v).or(labels.variance(v)),
-                Scaling::Deviation => variances.variance(v).map(|variance| variance / 4.0),
-                Scaling::LostShare => Some((1.0 - part.value) / (part.value * returns)),
-                Scaling::ClutterShare => Some(1.0 / (part.value * shots)),
-                Scaling::Other => None,
-            };
-            bound.extend(variance.map(|variance| (part.name.to_owned(), part.value.abs() * variance.sqrt())));
-        }
-        Judgement { strength: squared.max(0.0).sqrt(), touched: c.touched, bound }
+    let parts = side.effects.iter().enumerate().flat_map(|(k, e)| e.parts().into_iter().map(move |part| (k, part)));
+    let variant = |(effect, part): (usize, Part)| Variant {
+        effect,
+        side: replaced(effect, part.remaining.clone()),
+        nearly: part.nearly.clone().map(|nearly| replaced(effect, Some(nearly))),
+        part,
     };
-    (0..side.effects.len()).map(judgement).collect()
-}
-
-impl Counts {
-    fn add(&mut self, other: &Counts) {
-        self.divergence += other.divergence;
-        self.moved += other.moved;
-        self.moved_usual += other.moved_usual;
-        self.clutter += other.clutter;
-        self.clutter_usual += other.clutter_usual;
-        self.touched += other.touched;
-        self.other += other.other;
-    }
+    parts.map(variant).collect()
 }
 
 /// What is expected of a shot.
@@ -201,109 +157,131 @@ fn expected(frame: &Frame, shot: &Shot, met: &Met) -> Expected {
     }
 }
 
-/// Whether two shots met the same thing at nearly the same place.
-fn is_same(a: &Expected, b: &Expected) -> bool {
-    match (&a.echo, &b.echo) {
-        (Some(x), Some(y)) => x.object == y.object && (a.mean_m - b.mean_m).abs() < ELSEWHERE_M,
-        (None, None) => true,
-        _ => false,
+/// Displacement between two expectations along the ray, m; `None` if something else is met. If the ray itself differs,
+/// that is the displacement on the plane of the surface, as it is for a small change of a pose.
+fn displacement_m(a: &Expected, b: &Expected) -> Option<f64> {
+    let (Some(x), Some(y)) = (&a.echo, &b.echo) else { return None };
+    if x.object != y.object {
+        return None;
     }
+    let (turned, shifted) = (x.ray - y.ray, x.origin - y.origin);
+    if turned.norm_squared() + shifted.norm_squared() < 1e-16 {
+        return Some(a.mean_m - b.mean_m).filter(|d| d.abs() < ELSEWHERE_M);
+    }
+    let along = x.normal.dot(&x.ray);
+    Some(-x.normal.dot(&(shifted + turned * x.range_m)) / along)
+}
+
+/// Displacement by a part, as if it were small, from the frame in which it is a little smaller, m.
+fn derivative_m(nearly: &Frame, shot: &Shot, all: &Expected) -> Option<f64> {
+    let one = expected(nearly, shot, &nearly.trace(shot, [0.0; 2]));
+    displacement_m(all, &one).map(|displacement| displacement / SMALLER)
 }
 
 /// Compares a frame with the frames without each part. A frame counts `weight` times.
-fn compare(case: &Case, variants: &[Variant], plain: &Side, index: usize, weight: f64) -> Sums {
+fn compare(case: &Case, variants: &[Variant], plain: &Side, index: usize, weight: f64) -> FrameEvidence {
     let side = &case.measured;
     let frame = Frame::new(side, index);
     let others: Vec<Frame> = variants.iter().map(|v| Frame::new(&v.side, index)).collect();
+    let nearly: Vec<Option<Frame>> =
+        variants.iter().map(|v| v.nearly.as_ref().map(|side| Frame::new(side, index))).collect();
     let [real, model] = [plain, &case.simulated].map(|side| Frame::new(side, index));
-    let mut sums = Sums {
-        residuals: vec![],
-        variances: vec![],
-        losses: vec![],
-        labels: vec![],
-        counts: vec![Counts::default(); side.effects.len()],
-        returns: 0.0,
-        shots: 0.0,
-    };
+    let counts = vec![Counts::default(); side.effects.len()];
+    let mut sums = FrameEvidence { counts, ..FrameEvidence::default() };
     let mut on_vehicle: BTreeMap<u32, f64> = BTreeMap::new();
-    let usual = side.nuisances.false_returns;
     for (sensor, mount) in side.mounts.iter().enumerate() {
         let shots = mount.shots(sensor, &side.nuisances.dither, &mut side.stream(&format!("shots {sensor}"), index));
-        // A step that is coprime to the number of rows visits all of them.
+        // An odd step visits all rows.
         let stride = (shots.len() * side.mounts.len()).div_ceil(SHOTS) | 1;
         let each = weight * stride as f64;
         for shot in shots.iter().step_by(stride) {
             let met = frame.trace(shot, [0.0; 2]);
             let all = expected(&frame, shot, &met);
-            let is_edge = !is_same(
-                &expected(&real, shot, &real.trace(shot, [0.0; 2])),
-                &expected(&model, shot, &model.trace(shot, [0.0; 2])),
-            );
+            let [a, b] = [&real, &model].map(|f| expected(f, shot, &f.trace(shot, [0.0; 2])));
+            let is_edge = displacement_m(&a, &b).is_none_or(|d| d.abs() > ELSEWHERE_M) && a.echo.is_some();
             sums.shots += each;
             sums.returns += each * all.kept;
             if let Some(Object::Vehicle(number)) = all.echo.map(|e| e.object) {
                 *on_vehicle.entry(number).or_default() += all.kept * stride as f64;
             }
             let columns = variants.len();
-            let (mut mean, mut variance, mut loss) = (vec![0.0; columns], vec![0.0; columns], vec![0.0; columns]);
+            let [mut mean, mut variance, mut loss] = [(); 3].map(|()| vec![0.0; columns]);
             for (v, variant) in variants.iter().enumerate() {
                 let effect = &side.effects[variant.effect];
                 let met = if effect.changes_rays() { others[v].trace(shot, [0.0; 2]) } else { met };
                 let one = expected(&others[v], shot, &met);
-                let c = &mut sums.counts[variant.effect];
                 // Parts share the counts of their effect.
+                let mut nothing = Counts::default();
                 let first = v == 0 || variants[v - 1].effect != variant.effect;
-                if !is_same(&all, &one) {
-                    if first {
+                let c = if first { &mut sums.counts[variant.effect] } else { &mut nothing };
+                match displacement_m(&all, &one) {
+                    Some(displacement) => {
+                        mean[v] = displacement;
+                        variance[v] = all.variance_m2 - one.variance_m2;
+                        loss[v] = all.kept - one.kept;
+                        c.divergence += each * bernoulli_divergence(all.kept, one.kept);
+                        let moved = if displacement.abs() > ELSEWHERE_M { all.kept } else { 0.0 };
+                        c.touched += each * (one.kept - all.kept).max(moved);
+                    }
+                    None if all.echo.is_some() || one.echo.is_some() => {
                         c.moved += each;
-                        c.moved_usual += each * if is_edge { 1.0 } else { 0.003 };
+                        c.moved_usual += each * if is_edge { 1.0 } else { SURPRISE };
                         c.touched += each * all.kept.max(one.kept);
                     }
-                } else if all.echo.is_some() {
-                    mean[v] = all.mean_m - one.mean_m;
-                    variance[v] = all.variance_m2 - one.variance_m2;
-                    loss[v] = all.kept - one.kept;
-                    if first {
-                        c.divergence += each * bernoulli_divergence(all.kept, one.kept);
-                        c.touched += each * (one.kept - all.kept).max(0.0);
-                    }
+                    None => {}
+                }
+                if let Some(nearly) = &nearly[v] {
+                    mean[v] = derivative_m(nearly, shot, &all).unwrap_or(0.0);
                 }
                 let more = (all.clutter[0] - one.clutter[0]).max(0.0);
-                if first && more > 0.0 {
-                    c.clutter += each * more;
-                    c.clutter_usual += each * (usual + one.clutter[0]) * (all.clutter[1] / REACH_M).min(1.0);
-                    c.touched += each * more;
+                let usual = frame.usual_clutter().rate + one.clutter[0];
+                c.clutter += each * more;
+                c.touched += each * more;
+                if more > 0.0 {
+                    c.clutter_usual += each * usual * (all.clutter[1] / REACH_M).min(1.0);
                 }
-                if first && all.echo.is_some() {
-                    c.other += each * all.kept * other_information(effect, side, shot);
-                }
+                c.other += each * all.kept * other_information(effect, side, shot);
             }
             if let Some(echo) = all.echo.filter(|e| e.normal.dot(&e.ray).abs() > LEAST_COS) {
-                let total = all.variance_m2 + side.nuisances.noise_m.powi(2);
-                let info = each * all.kept / total;
-                sums.residuals.push(residual(&frame, shot, &echo, mean, info));
-                let info = 0.5 * each * all.kept / (total * total);
-                sums.variances.push((variance, info));
+                let (noise_m2, counted) = (side.nuisances.noise_m.powi(2), each * all.kept);
+                let total = all.variance_m2 + noise_m2;
+                sums.means.push(mean_row(&frame, shot, &echo, mean, counted / total));
+                let weight = 0.5 * counted / (total * total);
+                sums.variances.push(Row { columns: variance, frame: vec![2.0 * noise_m2], patch: None, weight });
+                let signal = echo.signal() - frame.attenuation(echo.range_m);
+                let usual = frame.usually_kept(signal);
+                let by_threshold = all.kept * (frame.usually_kept(signal - 0.05) / usual.max(1e-9) - 1.0) / 0.05;
                 let p = all.kept.clamp(2e-3, 1.0 - 2e-3);
-                sums.losses.push((loss, each / (p * (1.0 - p))));
+                sums.losses.push(Row {
+                    columns: loss,
+                    frame: vec![-side.nuisances.lost * all.kept, by_threshold.max(-1.0)],
+                    patch: None,
+                    weight: each / (p * (1.0 - p)),
+                });
             }
         }
     }
     if side.setting.labels {
-        let info = weight / side.own.labels_m.powi(2);
-        for (&number, _) in on_vehicle.iter().filter(|(_, points)| **points >= 5.0) {
-            let number = number as usize;
-            if side.world.vehicles[number].labelled {
-                let here = frame.label_box(number).center;
-                let shift = |other: &Frame| {
-                    let there = other.label_box(number).center;
-                    [0, 1, 2].map(|k| here[k] - there[k])
-                };
-                sums.labels.push((others.iter().map(shift).collect(), info));
-            }
+        let seen = on_vehicle.iter().filter(|(_, points)| **points >= 5.0).map(|(number, _)| *number as usize);
+        for number in seen.filter(|number| side.world.vehicles[*number].labelled) {
+            sums.labels.extend(label_rows(&frame, &others, number, weight));
         }
     }
     sums
+}
+
+/// The label of a vehicle: its error has a part that is the same in all frames.
+fn label_rows(frame: &Frame, others: &[Frame], vehicle: usize, weight: f64) -> [Row; 3] {
+    let std = frame.side.own.labels_m;
+    let here = frame.label_box(vehicle, [0.0; 3]);
+    let shifts: Vec<[f64; 3]> =
+        others.iter().map(|other| here.to_local(other.label_box(vehicle, [0.0; 3]).center)).collect();
+    [0, 1, 2].map(|k| Row {
+        columns: shifts.iter().map(|s| -s[k]).collect(),
+        frame: vec![],
+        patch: Some(((vehicle * 3 + k) as u64, 1.0, TRACK_SHARE * std)),
+        weight: weight / ((1.0 - TRACK_SHARE * TRACK_SHARE) * std * std),
+    })
 }
 
 /// Squared standard errors that a return adds by what is in no other sum.
@@ -318,13 +296,13 @@ fn other_information(effect: &Effect, side: &Side, shot: &Shot) -> f64 {
     }
 }
 
-/// A residual with its derivatives.
-fn residual(frame: &Frame, shot: &Shot, echo: &Echo, columns: Vec<f64>, weight: f64) -> Residual {
+/// The range of a return with its derivatives.
+fn mean_row(frame: &Frame, shot: &Shot, echo: &Echo, columns: Vec<f64>, weight: f64) -> Row {
     let pose = frame.sensor_pose(shot.sensor);
     let [normal, ray] = [echo.normal, echo.ray].map(|v| pose.inverse_transform_vector(&v));
-    let (along, turn): (f64, Vector3<f64>) = (normal.dot(&ray), ray.cross(&normal));
+    let along = normal.dot(&ray);
     let shift = -normal / along;
-    let turn = -turn * (echo.range_m / along);
+    let turn: Vector3<f64> = -ray.cross(&normal) * (echo.range_m / along);
     let at = echo.origin + echo.ray * echo.range_m;
     let (patch, std) = match echo.object {
         Object::House(number) => ((1 << 40) + u64::from(number) * 4 + side_of(&echo.normal), SURFACE_STD_M[0]),
@@ -336,10 +314,10 @@ fn residual(frame: &Frame, shot: &Shot, echo: &Echo, columns: Vec<f64>, weight: 
         Object::Vehicle(number) => ((4 << 40) + u64::from(number) * 4 + side_of(&echo.normal), SURFACE_STD_M[2]),
         Object::Ego => (5 << 40, SURFACE_STD_M[2]),
     };
-    Residual {
+    Row {
         columns,
-        pose: [shift.x, shift.y, shift.z, turn.x, turn.y, turn.z],
-        patch: (patch, 1.0 / along, std),
+        frame: vec![shift.x, shift.y, shift.z, turn.x, turn.y, turn.z, 1.0],
+        patch: Some((patch, 1.0 / along, std)),
         weight,
     }
 }

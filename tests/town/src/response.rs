@@ -115,6 +115,13 @@ impl Frame<'_> {
         2.0 * range_m * self.side.effects.iter().map(per_m).sum::<f64>()
     }
 
+    /// Probability that a surface with a signal returns without any effect.
+    pub fn usually_kept(&self, signal: f64) -> f64 {
+        let (usual, [_, ln_lost, threshold, ..]) = (&self.side.nuisances, self.unsteady());
+        let seen = 0.5 * (1.0 + (4.0 * (signal - usual.weakest - threshold)).tanh());
+        (1.0 - usual.lost * ln_lost.exp()) * seen
+    }
+
     /// Probability that a surface returns.
     pub fn kept(&self, shot: &Shot, echo: &Echo) -> f64 {
         let side = self.side;
@@ -122,11 +129,10 @@ impl Frame<'_> {
             return 0.0;
         }
         let signal = echo.signal() - self.attenuation(echo.range_m);
-        let seen = 0.5 * (1.0 + (4.0 * (signal - side.nuisances.weakest)).tanh());
-        let mut kept = (1.0 - side.nuisances.lost) * seen;
+        let mut kept = self.usually_kept(signal);
         for effect in &side.effects {
             kept *= match *effect {
-                Effect::RandomDropout { share } => 1.0 - (share * self.unsteady).min(0.98),
+                Effect::RandomDropout { share } => 1.0 - (share * self.loss_factor).min(0.98),
                 Effect::SignalDropout { half_at, steepness } => {
                     // Gompertz: one half where the inner exponential is ln 2.
                     (-LN_2 * (-steepness * (signal - half_at)).exp()).exp()
@@ -176,7 +182,7 @@ impl Frame<'_> {
     pub fn shift_m(&self, shot: &Shot, echo: &Echo) -> f64 {
         let side = self.side;
         let range = echo.range_m;
-        let mut shift = side.rows[shot.sensor][shot.row].offset_m;
+        let mut shift = side.rows[shot.sensor][shot.row].offset_m + self.unsteady()[3];
         let aged = (1.0 - (-2.5 * self.time_s / side.duration_s.max(1e-9)).exp()) / (1.0 - (-2.5f64).exp());
         for effect in &side.effects {
             shift += match *effect {
@@ -194,7 +200,8 @@ impl Frame<'_> {
     /// Scatter of the reported range.
     pub fn scatter(&self, shot: &Shot, echo: &Echo) -> Scatter {
         let side = self.side;
-        let mut scatter = Scatter { logistic_m: side.nuisances.noise_m, ..Scatter::default() };
+        let mut scatter =
+            Scatter { logistic_m: side.nuisances.noise_m * self.unsteady()[0].exp(), ..Scatter::default() };
         if echo.material == Material::Leaves {
             scatter.depth_m = side.nuisances.leaves_m;
         }

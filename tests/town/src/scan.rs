@@ -5,7 +5,7 @@ use crate::effect::{Clock, Effect};
 use crate::frame::{Echo, Frame};
 use crate::response::triangular;
 use crate::sensor::{Shot, direction};
-use crate::side::normal;
+use crate::side::{TRACK_SHARE, normal};
 use crate::world::{Object, REACH_M};
 use data::{Object as Label, Stream};
 use geometry::Box3;
@@ -164,9 +164,10 @@ impl Frame<'_> {
         (times, shift)
     }
 
-    /// Box of a vehicle in the frame of the ego vehicle without random errors.
-    pub fn label_box(&self, vehicle: usize) -> Box3 {
-        let (times, shift) = self.label_error();
+    /// Box of a vehicle in the frame of the ego vehicle, with an additional error in its own frame, m.
+    pub fn label_box(&self, vehicle: usize, error_m: [f64; 3]) -> Box3 {
+        let (times, offset) = self.label_error();
+        let shift = [0, 1, 2].map(|k| offset[k] + error_m[k]);
         let world = &self.side.world;
         let place = world.place(vehicle, times[0]);
         let ego = if times[1] == self.time_s {
@@ -191,12 +192,16 @@ impl Frame<'_> {
         let std = self.side.own.labels_m;
         for (number, vehicle) in world.vehicles.iter().enumerate() {
             // Drawn for every vehicle, so that a lost point changes one label alone.
-            let error = [(); 4].map(|()| normal(rng));
+            let own = [(); 4].map(|()| normal(rng));
+            let track = &mut self.side.stream("track", number);
+            let fixed = [(); 4].map(|()| normal(track));
+            let mix = [TRACK_SHARE, (1.0 - TRACK_SHARE * TRACK_SHARE).sqrt()];
+            let error = [0, 1, 2, 3].map(|k| std * (mix[0] * fixed[k] + mix[1] * own[k]));
             if !vehicle.labelled || on_vehicle[number] < FEWEST_POINTS {
                 continue;
             }
-            let exact = self.label_box(number);
-            let center = [0, 1, 2].map(|k| exact.center[k] + std * error[k]);
+            let exact = self.label_box(number, [error[0], error[1], error[2]]);
+            let center = exact.center;
             if center.iter().map(|v| v * v).sum::<f64>().sqrt() > LABELS_M {
                 continue;
             }
@@ -204,7 +209,7 @@ impl Frame<'_> {
             let bbox = Box3 {
                 center: center.map(rounded),
                 size: exact.size.map(rounded),
-                yaw_rad: rounded(exact.yaw_rad + 0.1 * std * error[3]),
+                yaw_rad: rounded(exact.yaw_rad + 0.1 * error[3]),
             };
             let class = world.models[vehicle.model].class.to_owned();
             scan.labels.push(Label { class, bbox, truncation: None, occlusion: None, image_box: None });

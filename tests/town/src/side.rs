@@ -57,12 +57,25 @@ pub struct OwnErrors {
     pub pose: Vec<Isometry3<f64>>,
     /// Displacement of each frame against the log, in the vehicle frame. Labels move with it.
     pub displacement: Vec<Isometry3<f64>>,
-    /// Standard deviation of the error of each label, m.
+    /// What varies from frame to frame.
+    pub unsteady: Vec<Unsteady>,
+    /// Standard deviation of the error of each label, m. Most of it belongs to the frame, [`TRACK_SHARE`] of it to the
+    /// vehicle.
     pub labels_m: f64,
 }
 
-/// Time in which the small pose errors of a side forget their value, s.
-const POSE_MEMORY_S: f64 = 0.7;
+/// What varies from frame to frame on both sides, in standard deviations of [`UNSTEADY_STD`].
+pub type Unsteady = [f64; 5];
+
+/// Standard deviations of what varies from frame to frame: logarithm of the range noise, logarithm of the random loss,
+/// threshold of the signal (in its logarithm), range offset (m), logarithm of the rate of false returns.
+pub const UNSTEADY_STD: [f64; 5] = [0.04, 0.2, 0.08, 0.001, 0.25];
+
+/// Standard deviation of the part of a label error that a vehicle has in all frames, as a share of the whole.
+pub const TRACK_SHARE: f64 = 0.6;
+
+/// Time in which slow errors forget their value, s.
+pub const MEMORY_S: f64 = 0.7;
 
 /// Standard deviation of the small pose errors, m and rad.
 pub const POSE_STD: [f64; 2] = [0.003, 1e-4];
@@ -70,24 +83,33 @@ pub const POSE_STD: [f64; 2] = [0.003, 1e-4];
 impl OwnErrors {
     /// The small errors of a measured side: poses that change slowly, and labels.
     pub fn small(rng: &mut Stream, frames: usize, step_s: f64) -> OwnErrors {
-        let keep = (-step_s / POSE_MEMORY_S).exp();
-        let mut state = [0.0; 6].map(|_: f64| normal(rng));
-        let pose = (0..frames).map(|_| {
-            for value in &mut state {
-                *value = keep * *value + (1.0 - keep * keep).sqrt() * normal(rng);
-            }
-            let [a, b] = POSE_STD;
-            isometry([a * state[0], a * state[1], a * state[2]], [b * state[3], b * state[4], b * state[5]])
-        });
-        let pose = pose.collect();
-        OwnErrors { pose, displacement: vec![Isometry3::identity(); frames], labels_m: rng.random_range(0.02..0.05) }
+        let [a, b] = POSE_STD;
+        let pose = |s: [f64; 6]| isometry([a * s[0], a * s[1], a * s[2]], [b * s[3], b * s[4], b * s[5]]);
+        OwnErrors {
+            pose: slow(rng, frames, step_s).into_iter().map(pose).collect(),
+            displacement: vec![Isometry3::identity(); frames],
+            unsteady: slow(rng, frames, step_s),
+            labels_m: rng.random_range(0.02..0.05),
+        }
     }
 
-    /// No errors.
-    pub fn none(frames: usize) -> OwnErrors {
+    /// The errors of a simulated side: none of poses and labels.
+    pub fn none(rng: &mut Stream, frames: usize, step_s: f64) -> OwnErrors {
         let still = vec![Isometry3::identity(); frames];
-        OwnErrors { pose: still.clone(), displacement: still, labels_m: 0.0 }
+        let unsteady = slow(rng, frames, step_s);
+        OwnErrors { pose: still.clone(), displacement: still, unsteady, labels_m: 0.0 }
     }
+}
+
+/// Numbers with mean 0 and variance 1 that change slowly from frame to frame.
+fn slow<const N: usize>(rng: &mut Stream, frames: usize, step_s: f64) -> Vec<[f64; N]> {
+    let keep = (-step_s / MEMORY_S).exp();
+    let mut state = [0.0; N].map(|_: f64| normal(rng));
+    let mut next = || {
+        state = state.map(|value| keep * value + (1.0 - keep * keep).sqrt() * normal(rng));
+        state
+    };
+    (0..frames).map(|_| next()).collect()
 }
 
 /// A standard normal random number.
