@@ -91,18 +91,18 @@ pub fn draw_effect(cause: &str, mounts: &[Mount], scan_s: f64, rng: &mut Stream)
     let deg = f64::to_radians;
     match cause {
         "range_noise" => Effect::RangeNoise {
-            std_m: log(rng, 0.006, 0.06),
+            std_m: log(rng, 0.004, 0.06),
             growth: if rng.random_bool(0.3) { log(rng, 4e-4, 2e-3) } else { 0.0 },
         },
         "range_bias" => Effect::RangeBias {
-            offset_m: sign(rng) * log(rng, 0.015, 0.2),
+            offset_m: sign(rng) * log(rng, 0.006, 0.2),
             scale: if rng.random_bool(0.3) { sign(rng) * log(rng, 5e-4, 4e-3) } else { 0.0 },
         },
-        "beam_range_offset" => Effect::BeamRangeOffset { std_m: log(rng, 0.006, 0.07) },
+        "beam_range_offset" => Effect::BeamRangeOffset { std_m: log(rng, 0.004, 0.07) },
         "beam_elevation_offset" => Effect::BeamElevationOffset { std_rad: deg(log(rng, 0.03, 0.2)) },
         "quantisation" => Effect::Quantisation { step_m: log(rng, 0.02, 0.2) },
-        "angular_jitter" => Effect::AngularJitter { std_rad: deg(log(rng, 0.015, 0.12)) },
-        "random_dropout" => Effect::RandomDropout { share: log(rng, 0.008, 0.3) },
+        "angular_jitter" => Effect::AngularJitter { std_rad: deg(log(rng, 0.01, 0.12)) },
+        "random_dropout" => Effect::RandomDropout { share: log(rng, 0.004, 0.3) },
         "signal_dropout" => {
             Effect::SignalDropout { half_at: rng.random_range(-12.0..-8.5), steepness: rng.random_range(1.0..3.0) }
         }
@@ -119,54 +119,54 @@ pub fn draw_effect(cause: &str, mounts: &[Mount], scan_s: f64, rng: &mut Stream)
         "range_cut" => Effect::RangeCut { max_m: rng.random_range(25.0..75.0) },
         "ego_occlusion" => draw_occlusion(mounts, rng),
         "time_offset" => Effect::TimeOffset {
-            seconds: sign(rng) * log(rng, 0.008, 0.08),
+            seconds: sign(rng) * log(rng, 0.003, 0.08),
             clock: if rng.random_bool(0.7) { Clock::Objects } else { Clock::Cloud },
         },
         "label_offset" => {
             let mut offset_m = [0.0; 3];
-            offset_m[rng.random_range(0..3usize)] = sign(rng) * log(rng, 0.03, 0.4);
+            offset_m[rng.random_range(0..3usize)] = sign(rng) * log(rng, 0.015, 0.4);
             Effect::LabelOffset { offset_m }
         }
         "sensor_extrinsics" => {
             let (mut turn_rad, mut shift_m) = ([0.0; 3], [0.0; 3]);
-            turn_rad[rng.random_range(0..3usize)] = sign(rng) * deg(log(rng, 0.05, 0.6));
+            turn_rad[rng.random_range(0..3usize)] = sign(rng) * deg(log(rng, 0.03, 0.6));
             if rng.random_bool(0.3) {
                 shift_m[rng.random_range(0..3usize)] = sign(rng) * log(rng, 0.02, 0.1);
             }
             Effect::SensorExtrinsics { sensor: rng.random_range(0..mounts.len()), turn_rad, shift_m }
         }
         "pitch_roll" => Effect::PitchRoll {
-            pitch_rad: sign(rng) * deg(log(rng, 0.04, 0.5)),
-            roll_rad: sign(rng) * deg(log(rng, 0.03, 0.4)),
+            pitch_rad: sign(rng) * deg(log(rng, 0.02, 0.5)),
+            roll_rad: sign(rng) * deg(log(rng, 0.015, 0.4)),
         },
         "rolling_shutter" => Effect::RollingShutter { scan_s: scan_s * rng.random_range(0.4..1.0) },
-        "outliers" => Effect::Outliers { share: log(rng, 0.001, 0.03), reach_m: rng.random_range(60.0..118.0) },
+        "outliers" => Effect::Outliers { share: log(rng, 4e-4, 0.03), reach_m: rng.random_range(60.0..118.0) },
         "mixed_pixels" => Effect::MixedPixels { divergence_rad: log(rng, 1.5e-3, 8e-3), pulse_m: log(rng, 0.4, 4.0) },
-        "missing_object" => Effect::MissingObject { things: rng.random_range(3..14), surplus: rng.random_bool(0.4) },
+        "missing_object" => Effect::MissingObject { things: rng.random_range(2..14), surplus: rng.random_bool(0.4) },
         "wrong_shape" => {
             Effect::WrongShape { length: rng.random_range(0.02..0.15), height: rng.random_range(0.02..0.2) }
         }
-        "heavy_tails" => Effect::HeavyTails { share: log(rng, 0.003, 0.05), std_m: log(rng, 0.08, 0.4) },
+        "heavy_tails" => Effect::HeavyTails { share: log(rng, 0.001, 0.05), std_m: log(rng, 0.08, 0.4) },
         "signal_noise" => Effect::SignalNoise { std_m: log(rng, 0.006, 0.04), growth: rng.random_range(0.3..1.0) },
-        "reflectivity_walk" => Effect::ReflectivityWalk { walk_m: sign(rng) * log(rng, 0.006, 0.05) },
+        "reflectivity_walk" => Effect::ReflectivityWalk { walk_m: sign(rng) * log(rng, 0.004, 0.05) },
         "beam_intensity" => Effect::BeamIntensity { std: log(rng, 0.02, 0.3) },
         "incidence_noise" => Effect::IncidenceNoise { angle_rad: log(rng, 3e-4, 2e-3) },
         "ground_error" => Effect::GroundError { amplitude_m: log(rng, 0.015, 0.08) },
-        "packet_loss" => Effect::PacketLoss { loss: log(rng, 0.004, 0.06), burst: rng.random_range(0.2..0.8) },
+        "packet_loss" => Effect::PacketLoss { loss: log(rng, 0.002, 0.06), burst: rng.random_range(0.2..0.8) },
         "dirty_window" => draw_dirt(mounts, rng),
         "blooming" => Effect::Blooming { strength: rng.random_range(0.2..0.9), halo_rad: deg(log(rng, 0.3, 2.0)) },
         "bright_target_dropout" => {
             Effect::BrightTargetDropout { share: rng.random_range(0.3..1.0), halo_rad: deg(log(rng, 0.6, 4.0)) }
         }
-        "ghosts" => Effect::Ghosts { probability: log(rng, 0.02, 0.4) },
+        "ghosts" => Effect::Ghosts { probability: log(rng, 0.01, 0.4) },
         "dual_returns" => {
             Effect::DualReturns { divergence_rad: log(rng, 2e-3, 6e-3), share: rng.random_range(0.5..1.0) }
         }
-        "rain" => Effect::Rain { drops: log(rng, 0.001, 0.02), per_m: log(rng, 5e-4, 4e-3) },
-        "fog" => Effect::Fog { visibility_m: log(rng, 120.0, 800.0), backscatter: log(rng, 0.002, 0.05) },
+        "rain" => Effect::Rain { drops: log(rng, 4e-4, 0.02), per_m: log(rng, 5e-4, 4e-3) },
+        "fog" => Effect::Fog { visibility_m: log(rng, 120.0, 1_500.0), backscatter: log(rng, 0.001, 0.05) },
         "spray" => Effect::Spray { per_m: log(rng, 0.02, 0.3) },
-        "range_drift" => Effect::RangeDrift { drift_m: sign(rng) * log(rng, 0.01, 0.12) },
-        "ego_attitude" => Effect::EgoAttitude { pitch_rad: sign(rng) * deg(log(rng, 0.05, 0.5)) },
+        "range_drift" => Effect::RangeDrift { drift_m: sign(rng) * log(rng, 0.005, 0.12) },
+        "ego_attitude" => Effect::EgoAttitude { pitch_rad: sign(rng) * deg(log(rng, 0.03, 0.5)) },
         "range_limits" => Effect::RangeLimits { min_m: rng.random_range(3.5..9.0) },
         "thermal_rows" => Effect::ThermalRows { drift_m: sign(rng) * log(rng, 0.02, 0.1) },
         "bursts" => Effect::Bursts { frames: rng.random_range(0.2..0.6), std_m: log(rng, 0.04, 0.2) },

@@ -95,9 +95,9 @@ impl Scenario {
     }
 
     fn draw_cars(&mut self, rng: &mut Stream, number: usize, duration_s: f64) {
-        let times: Vec<f64> = (0..=(duration_s / 0.25) as usize).map(|i| 0.25 * i as f64).collect();
+        let times = quarter_seconds(duration_s);
         let mut places: Vec<Vec<[f64; 2]>> = Vec::new();
-        for _ in 0..60 * number {
+        for _ in 0..400 * number {
             if places.len() == number {
                 break;
             }
@@ -137,7 +137,7 @@ impl Scenario {
     }
 
     fn draw_with_ego(&self, rng: &mut Stream) -> Option<Motion> {
-        let at_m = rng.random_range(10.0..60.0) * if rng.random_bool(0.6) { 1.0 } else { -1.0 };
+        let at_m = rng.random_range(10.0..75.0) * if rng.random_bool(0.6) { 1.0 } else { -1.0 };
         Some(Motion::Route {
             route: self.route.clone(),
             drive: self.drive.clone(),
@@ -170,14 +170,14 @@ impl Scenario {
         let streets = &self.world.streets;
         let lines = if rng.random_bool(0.5) { (&streets.at_x, 0) } else { (&streets.at_y, 1) };
         let here = [x, y];
-        let close: Vec<f64> = lines.0.iter().copied().filter(|l| (l - here[lines.1]).abs() < 70.0).collect();
+        let close: Vec<f64> = lines.0.iter().copied().filter(|l| (l - here[lines.1]).abs() < 85.0).collect();
         if close.is_empty() {
             return None;
         }
         let line = close[rng.random_range(0..close.len())];
         let onward = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
         let speed_m_s = rng.random_range(3.0..11.0);
-        let along = here[1 - lines.1] + rng.random_range(-50.0..50.0) - onward * speed_m_s * near_s;
+        let along = here[1 - lines.1] + rng.random_range(-70.0..70.0) - onward * speed_m_s * near_s;
         // Traffic keeps to the right: east of the middle when driving north, south of it when driving east.
         let (start, heading_rad) = if lines.1 == 0 {
             ([line + onward * LANE_M, along], onward * FRAC_PI_2)
@@ -201,14 +201,22 @@ impl Scenario {
             let speed_m_s = rng.random_range(0.6..1.7);
             let (sin, cos) = heading_rad.sin_cos();
             let start = [place[0] - cos * speed_m_s * near_s, place[1] - sin * speed_m_s * near_s];
-            self.world.vehicles.push(Vehicle {
-                model: models + rng.random_range(0..3usize),
-                reflectivity: rng.random_range(0.08..0.6),
-                motion: Motion::Line { start, heading_rad, speed_m_s, surge: [0.0; 3] },
-                labelled: true,
-            });
+            let motion = Motion::Line { start, heading_rad, speed_m_s, surge: [0.0; 3] };
+            let (model, reflectivity) = (models + rng.random_range(0..3usize), rng.random_range(0.08..0.6));
+            let apart = |t: &f64| {
+                let [x, y, _] = motion.place(*t, 0.0, &self.world.streets).center;
+                self.ego_distance_m(*t, [x, y]) > 3.0
+            };
+            if quarter_seconds(duration_s).iter().all(apart) {
+                self.world.vehicles.push(Vehicle { model, reflectivity, motion, labelled: true });
+            }
         }
     }
+}
+
+/// Times at which places are compared, s.
+fn quarter_seconds(duration_s: f64) -> Vec<f64> {
+    (0..=(duration_s / 0.25) as usize).map(|i| 0.25 * i as f64).collect()
 }
 
 /// A route along the right lanes of the streets, of at least some length, m. It stays away from the outermost streets.
@@ -291,6 +299,16 @@ mod tests {
                     assert!((x - p.x).hypot(y - p.y) > 2.2, "{seed} {t} vehicle {v}: {:.1}", (x - p.x).hypot(y - p.y));
                 }
             }
+        }
+    }
+
+    #[test]
+    fn thirty_cars_find_their_place() {
+        for seed in 0..6 {
+            let mut rng = data::stream(seed, "scenario", 0, 0);
+            let scenario = Scenario::draw(&mut rng, &setting(Scene::Town, 30), 12.0, 0.2);
+            let is_moving_car = |v: &&Vehicle| v.model < CAR_MODELS && !matches!(v.motion, Motion::Parked(_));
+            assert_eq!(scenario.world.vehicles.iter().filter(is_moving_car).count(), 30, "{seed}");
         }
     }
 
