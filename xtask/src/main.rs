@@ -49,7 +49,8 @@ enum Task {
     Schema,
     /// Run the benchmarks. NAME is a benchmark or a crate; further arguments go to Criterion. `bench train` compares
     /// training steps with PyTorch; `bench mutants` runs the blind cases against a diagnosis with deliberate defects;
-    /// `bench loop -- --help` applies diagnoses to the simulated data and diagnoses again.
+    /// `bench loop -- --help` applies diagnoses to the simulated data and diagnoses again; `bench town -- --help`
+    /// diagnoses pairs of the second generator.
     Bench {
         /// A benchmark (`crates/*/benches/NAME.rs`), a crate folder, `train` or `mutants`; default: all benchmarks of
         /// crates.
