@@ -54,12 +54,13 @@ fn parameters(summary: &Summary) -> String {
     let mut text =
         head(&["parameter", "cases", "inside `ci95`", "median error", "error over bound (RMS)", "within the target"]);
     for (name, [n, inside, relative, rms, close]) in &summary.parameters {
-        let rms = if rms.is_finite() { format!("{rms:.1}") } else { String::new() };
+        let known = |v: f64, unit: &str| if v.is_finite() { format!("{v:.1}{unit}") } else { String::new() };
         let _ = writeln!(
             text,
-            "| `{name}` | {n:.0} | {} | {:.1} % | {rms} | {} |",
+            "| `{name}` | {n:.0} | {} | {} | {} | {} |",
             of(inside * n, *n),
-            100.0 * relative,
+            known(100.0 * relative, " %"),
+            known(*rms, ""),
             of(close * n, *n)
         );
     }

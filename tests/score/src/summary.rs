@@ -16,8 +16,8 @@ pub struct Summary {
     pub levels: BTreeMap<String, BTreeMap<String, BTreeMap<String, usize>>>,
     /// For cases with one hidden effect, by hidden cause and reported cause: `confusion[hidden][reported]`.
     pub confusion: BTreeMap<String, BTreeMap<String, usize>>,
-    /// By parameter: number of cases, fraction inside the interval, median of |error| / |truth|, RMS of error / bound
-    /// where known, fraction meeting the accuracy target.
+    /// By parameter: number of cases, fraction inside the interval, median of |error| / |truth| over true values other
+    /// than zero, RMS of error / bound where known, fraction meeting the accuracy target.
     pub parameters: BTreeMap<String, [f64; 5]>,
     /// Sets of several effects, by their number.
     #[serde(default)]
@@ -56,8 +56,9 @@ pub fn summarise(outcomes: &[Outcome]) -> Summary {
         let n = list.len() as f64;
         let inside = list.iter().filter(|p| p.inside()).count() as f64 / n;
         let close = list.iter().filter(|p| p.close()).count() as f64 / n;
-        let relative =
-            median_upper(list.iter().map(|p| (p.estimate - p.truth).abs() / p.truth.abs().max(1e-9)).collect());
+        // A parameter whose true value is zero has no relative error.
+        let differs = list.iter().filter(|p| p.truth.abs() > 1e-9);
+        let relative = median_upper(differs.map(|p| (p.estimate / p.truth - 1.0).abs()).collect());
         let bounded: Vec<f64> = list.iter().filter_map(|p| Some(((p.estimate - p.truth) / p.bound?).powi(2))).collect();
         let rms =
             if bounded.is_empty() { f64::NAN } else { (bounded.iter().sum::<f64>() / bounded.len() as f64).sqrt() };
