@@ -20,9 +20,8 @@ pub fn extended_toml(diagnosis: &Diagnosis, made_from: Option<&MadeFrom>) -> Str
         text.push_str("\n# The data that it was made from, so that it is not applied to others.\n");
         text.push_str(table.strip_suffix("effect = []\n").unwrap_or(&table).trim_start_matches("effect = []\n\n"));
     }
-    let place = |f: &Finding| f.cause.unwrap_or(Cause::Unexplained).place();
     let mut findings: Vec<&Finding> = diagnosis.findings.iter().collect();
-    findings.sort_by_key(|f| place(f));
+    findings.sort_by_key(|f| cause_of(f).place());
     if findings.is_empty() {
         text.push_str("# Nothing was found: the list is empty.\n");
     }
@@ -162,13 +161,42 @@ mod tests {
                 ..finding(Cause::RandomDropout, &[(Quantity::Share, 0.2)])
             },
             finding(Cause::RandomDropout, &[(Quantity::Share, -0.2)]),
+            finding(Cause::Quantisation, &[(Quantity::StepM, 0.004)]),
+            Finding {
+                status: Status::Ambiguous,
+                cause: None,
+                candidates: Some(vec![Cause::RangeBias, Cause::RollingShutter]),
+                ..finding(Cause::RangeBias, &[(Quantity::OffsetM, 0.1)])
+            },
+            Finding {
+                status: Status::Unexplained,
+                cause: None,
+                covariate: Covariate::Row,
+                curve: Curve {
+                    points: vec![CurvePoint {
+                        sensor: 0,
+                        x: 0.0,
+                        measured: 0.02,
+                        before: 0.01,
+                        after: 0.02,
+                        error: 0.001,
+                    }],
+                    ..Curve::default()
+                },
+                ..finding(Cause::Unexplained, &[(Quantity::SimulatedStdM, 0.01)])
+            },
             finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),
         ]);
         let text = extended_toml(&diagnosis, None);
         let table: toml::Table = toml::from_str(&text).unwrap();
         let kinds: Vec<&str> =
             table["effect"].as_array().unwrap().iter().map(|e| e["kind"].as_str().unwrap()).collect();
-        assert_eq!(kinds, ["random_dropout", "range_noise", "label_offset"]);
+        // A table without a name and the first candidate of an ambiguous finding stand before rounding: a sensor rounds
+        // what it measured.
+        assert_eq!(
+            kinds,
+            ["random_dropout", "range_bias", "range_noise", "empirical", "range_quantisation", "label_offset"]
+        );
         assert!(
             text.contains("# share: 0.18 to 0.22\n[[effect]]\nkind = \"random_dropout\"\nshare = 0.2\n")
                 && text.contains("take it out there"),

@@ -89,13 +89,13 @@ impl Cause {
             Cause::RangeNoise => (Family::RangeError, 180),
             Cause::SignalNoise => (Family::RangeError, 190),
             Cause::RangeCut => (Family::Detection, 200),
+            Cause::Unexplained => (Family::Unknown, 205),
             Cause::Quantisation => (Family::RangeError, 210),
             Cause::LabelOffset => (Family::Labels, 220),
             Cause::TimeOffset => (Family::Timing, 230),
             Cause::BeamIntensity => (Family::Returns, LAST),
             Cause::GroundError => (Family::Geometry, LAST),
             Cause::IncidenceNoise => (Family::RangeError, LAST),
-            Cause::Unexplained => (Family::Unknown, LAST),
         }
     }
 
