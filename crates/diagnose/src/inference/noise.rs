@@ -84,11 +84,6 @@ pub struct NoiseTable {
 /// Fewest returns of either side in a cell.
 const FEWEST: f64 = 40.0;
 
-/// Smallest variance of a side, m2: 2 mm, squared. Ranges are stored with about that resolution, and smaller
-/// differences matter to nothing; without it a surface that a simulator rounds or repeats would have a likelihood
-/// without bound.
-const LEAST_VARIANCE: f64 = 4e-6;
-
 /// Returns that count as one: neighbouring returns share neighbours.
 const SHARED: f64 = 2.0;
 
@@ -103,7 +98,7 @@ impl NoiseTable {
 
     /// Variances of a cell, measured and simulated, m2; `None` where there are too few returns.
     pub fn variances(&self, cell: usize) -> Option<[f64; 2]> {
-        self.used[cell].then(|| self.cells[cell].variances().map(|v| v.max(LEAST_VARIANCE)))
+        self.used[cell].then(|| self.cells[cell].variances().map(|v| v.max(1e-8)))
     }
 
     /// Linear sums of one frame: differences of the two sides' mean squares over the laws.
