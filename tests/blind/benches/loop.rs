@@ -4,11 +4,9 @@
 //! `cargo xtask bench loop -- --help` lists the options. [`loop_cell`] says which case a seed stands for.
 
 use data::Dataset;
-use diagnose::{Diagnosis, Options, Outcome, Rig, diagnose};
-use lidarshift_blind::{
-    CAUSES, CaseSize, FIRST_NULL_SEED, FIRST_SEED, Kind, Variant, draw_strong_case, loop_cell, write_case,
-};
-use score::{Outcome as Scored, Truth, score};
+use diagnose::{Diagnosis, Outcome, Rig};
+use lidarshift_blind::{CAUSES, FIRST_NULL_SEED, FIRST_SEED, Kind, Variant, draw_strong_case, loop_cell, write_case};
+use score::{CaseSize, Outcome as Scored, Truth, score};
 use sensor::EffectList;
 use serde_json::{Value, json};
 use simulate::resim::Resim;
@@ -16,6 +14,7 @@ use statistics::median_upper;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use trials::diagnosed;
 
 const HELP: &str = "\
 Hides an effect in a generated pair, diagnoses it, applies extended.toml to the simulated side and diagnoses again.
@@ -118,15 +117,6 @@ struct Run {
     seconds: [f64; 4],
 }
 
-fn open(folder: &Path, side: &str) -> Dataset {
-    Dataset::open(&folder.join(side)).expect("a data set")
-}
-
-fn outcome_of(folder: &Path, side: &str, rig: &Rig) -> Result<Outcome, String> {
-    diagnose(&open(folder, "measured"), &open(folder, side), rig, &Options::default(), &|_, _, _| ())
-        .map_err(|e| e.to_string())
-}
-
 fn run(seed: u64, size: CaseSize, folder: &Path) -> Run {
     let (kind, variant) = loop_cell(seed);
     let mut clock = Instant::now();
@@ -134,9 +124,9 @@ fn run(seed: u64, size: CaseSize, folder: &Path) -> Run {
     let truth: Truth = write_case(&draw_strong_case(seed, kind, size, variant), folder).expect("a case can be written");
     let rig = Rig::read(&folder.join("sensor.toml")).expect("a rig");
     let drawn = lap();
-    let found = outcome_of(folder, "simulated", &rig);
+    let found = diagnosed(folder, "simulated").map_err(|e| e.to_string());
     let first = found.as_ref().map_or_else(|e| json!({ "verdict": format!("error: {e}") }), |o| json_of(&o.diagnosis));
-    let diagnosed = lap();
+    let diagnosing = lap();
     write_json(&folder.join("truth.json"), &serde_json::to_value(&truth).expect("JSON"));
     write_json(&folder.join("diagnosis.json"), &first);
     let (applied, left_out, made) = match &found {
@@ -147,14 +137,14 @@ fn run(seed: u64, size: CaseSize, folder: &Path) -> Run {
     // Without an effect the extended clouds are the simulated ones.
     let second = match made {
         Ok(()) if applied.is_empty() => Ok(first.clone()),
-        Ok(()) => outcome_of(folder, "extended", &rig).map(|o| json_of(&o.diagnosis)),
+        Ok(()) => diagnosed(folder, "extended").map(|o| json_of(&o.diagnosis)).map_err(|e| e.to_string()),
         Err(e) => Err(e),
     };
     if let Ok(value) = &second {
         write_json(&folder.join("second.json"), value);
     }
-    let outcome = score(&truth, &first, diagnosed);
-    Run { kind, variant, outcome, first, second, left_out, applied, seconds: [drawn, diagnosed, extended, lap()] }
+    let outcome = score(&truth, &first, diagnosing);
+    Run { kind, variant, outcome, first, second, left_out, applied, seconds: [drawn, diagnosing, extended, lap()] }
 }
 
 fn json_of(diagnosis: &Diagnosis) -> Value {
@@ -177,7 +167,7 @@ fn apply(outcome: &Outcome, rig: &Rig, folder: &Path) -> (Vec<String>, Vec<Strin
         Ok(effects) => effects,
         Err(e) => return (vec![], left_out, Err(e.to_string())),
     };
-    let dataset = open(folder, "simulated");
+    let dataset = Dataset::open(&folder.join("simulated")).expect("a data set");
     let refused = match (Resim { dataset: &dataset, effects: &effects, rig: Some(rig.clone()), seed: 1 }).refused() {
         Ok(refused) => refused,
         Err(e) => return (vec![], left_out, Err(e.to_string())),

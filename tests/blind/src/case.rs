@@ -4,23 +4,8 @@ use crate::effect::{Clock, Effect};
 use crate::variant::{Intensity, Variant};
 use data::Stream;
 use rand::RngExt;
+use score::CaseSize;
 use std::ops::Range;
-
-/// Amount of data in a case.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct CaseSize {
-    /// Frames per side.
-    pub frames: usize,
-    /// Shots per scan.
-    pub shots: usize,
-}
-
-impl CaseSize {
-    /// Size used in the large set.
-    pub const USUAL: CaseSize = CaseSize { frames: 40, shots: 25_000 };
-    /// Size of real recordings.
-    pub const FULL: CaseSize = CaseSize { frames: 200, shots: 75_000 };
-}
 
 /// Kind of a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

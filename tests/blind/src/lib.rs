@@ -19,7 +19,7 @@ mod variant;
 mod world;
 mod write;
 
-pub use case::{CAUSES, Case, CaseSize, Kind, OFF_CATALOGUE, draw_case, draw_strong_case};
+pub use case::{CAUSES, Case, Kind, OFF_CATALOGUE, draw_case, draw_strong_case};
 pub use cell::{FIRST_NULL_SEED, FIRST_SEED, loop_cell};
 pub use effect::{Clock, Effect};
 pub use variant::{Intensity, Variant};

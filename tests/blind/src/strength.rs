@@ -251,8 +251,9 @@ fn patch(hit: &Hit) -> Option<(u64, f64)> {
 
 #[cfg(test)]
 mod tests {
-    use crate::case::{CAUSES, CaseSize, Kind, draw_case};
+    use crate::case::{CAUSES, Kind, draw_case};
     use crate::write::write_case;
+    use score::CaseSize;
 
     #[test]
     fn strong_effects_are_strong_and_weak_ones_weak() {

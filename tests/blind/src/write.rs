@@ -193,7 +193,8 @@ fn truth(case: &Case, nuisances: &Nuisances, own: &SideErrors, rows: usize, sums
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::case::{CaseSize, draw_case};
+    use crate::case::draw_case;
+    use score::CaseSize;
 
     #[test]
     fn a_case_is_a_pure_function_of_its_seed_and_leaks_nothing() {

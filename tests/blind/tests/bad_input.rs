@@ -3,7 +3,8 @@
 
 use data::Dataset;
 use diagnose::{Diagnosis, Options, Rig, Verdict, diagnose};
-use lidarshift_blind::{CaseSize, Kind, draw_case, write_case};
+use lidarshift_blind::{Kind, draw_case, write_case};
+use score::CaseSize;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 

@@ -2,18 +2,15 @@
 //!
 //! A few cases of the large set, `cargo xtask bench blind`, as a regression test of the diagnosis.
 
-use data::Dataset;
-use diagnose::{Options, Rig, diagnose};
-use lidarshift_blind::{CAUSES, CaseSize, Kind, draw_case, write_case};
+use lidarshift_blind::{CAUSES, Kind, draw_case, write_case};
 use rayon::prelude::*;
-use score::{Outcome, score};
+use score::{CaseSize, Outcome, score};
+use trials::diagnosed;
 
 fn outcome(seed: u64, kind: Kind) -> Outcome {
     let folder = tempfile::tempdir().unwrap();
     let truth = write_case(&draw_case(seed, kind, CaseSize::USUAL), folder.path()).unwrap();
-    let open = |side: &str| Dataset::open(&folder.path().join(side)).unwrap();
-    let rig = Rig::read(&folder.path().join("sensor.toml")).unwrap();
-    let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ()).unwrap();
+    let found = diagnosed(folder.path(), "simulated").unwrap();
     score(&truth, &serde_json::to_value(&found.diagnosis).unwrap(), 0.0)
 }
 

@@ -20,4 +20,4 @@ pub use oracle::{Counts, FrameEvidence, FrameStds, Oracle, Verdicts};
 pub use outcome::{Outcome, ParameterScore, score};
 pub use summary::{Summary, summarise};
 pub use swarm::{GROUPS, SwarmRow, SwarmTable};
-pub use truth::{Hidden, Level, Truth};
+pub use truth::{CaseSize, Hidden, Level, Truth};

@@ -3,6 +3,20 @@
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
+/// Amount of data in a case.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CaseSize {
+    /// Frames per side.
+    pub frames: usize,
+    /// Shots per scan.
+    pub shots: usize,
+}
+
+impl CaseSize {
+    /// Usual size.
+    pub const USUAL: CaseSize = CaseSize { frames: 40, shots: 25_000 };
+}
+
 /// Strength of a hidden effect in three classes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

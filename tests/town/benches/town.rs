@@ -1,13 +1,10 @@
 //! The set of the second generator: many pairs with or without hidden differences, diagnosed and scored. Each result is
 //! written as soon as it is available, so an interrupted run can be resumed.
 
-use data::Dataset;
-use diagnose::{Options, Rig, diagnose};
-use lidarshift_town::{CaseSize, Kind, draw_case, write_case};
+use lidarshift_town::{Kind, draw_case, write_case};
 use rand::RngExt;
-use score::{Outcome, Truth, markdown, score, summarise};
-use std::path::{Path, PathBuf};
-use std::time::Instant;
+use score::{Outcome, markdown};
+use trials::Trials;
 
 const HELP: &str = "\
 Draws pairs of a town with hidden differences, diagnoses them and scores the answers. A line per case as it finishes,
@@ -26,49 +23,8 @@ cargo xtask bench town -- [OPTIONS]
   --draw-only     draw pairs without diagnosing them
   --help          this text";
 
-struct Arguments {
-    kinds: Vec<String>,
-    first: u64,
-    cases: u64,
-    size: CaseSize,
-    out: PathBuf,
-    keep: Option<PathBuf>,
-    draw_only: bool,
-}
-
-/// The options; `None` if help is wanted.
-fn arguments() -> Option<Arguments> {
-    let mut out = Arguments {
-        kinds: vec![],
-        first: 1,
-        cases: 100,
-        size: CaseSize::USUAL,
-        out: PathBuf::from("bench/town"),
-        keep: None,
-        draw_only: false,
-    };
-    let mut args = std::env::args().skip(1);
-    while let Some(arg) = args.next() {
-        let mut value = || args.next().unwrap_or_else(|| panic!("{arg} needs a value"));
-        match arg.as_str() {
-            "--kind" => out.kinds.push(value()),
-            "--first" => out.first = value().parse().expect("a seed"),
-            "--cases" => out.cases = value().parse().expect("a number of cases"),
-            "--frames" => out.size.frames = value().parse().expect("a number of frames"),
-            "--shots" => out.size.shots = value().parse().expect("a number of shots"),
-            "--out" => out.out = value().into(),
-            "--keep" => out.keep = Some(value().into()),
-            "--draw-only" => out.draw_only = true,
-            "--bench" => {}
-            "--help" | "-h" => return None,
-            other => panic!("unknown argument {other}"),
-        }
-    }
-    Some(out)
-}
-
-/// The kind of a seed: drawn, or `kinds` in turn.
-fn kind_of(seed: u64, kinds: &[String]) -> Kind {
+/// The kind of a seed: the wanted one, or drawn.
+fn kind_of(seed: u64, wanted: Option<&str>) -> Kind {
     let rng = &mut data::stream(seed, "town kind", 0, 0);
     let drawn = match rng.random_range(0..100u32) {
         0..20 => "null",
@@ -83,32 +39,8 @@ fn kind_of(seed: u64, kinds: &[String]) -> Kind {
         96..98 => "crawl",
         _ => "parallel",
     };
-    let name = if kinds.is_empty() { drawn } else { kinds[(seed % kinds.len() as u64) as usize].as_str() };
+    let name = wanted.unwrap_or(drawn);
     Kind::parse(name, rng).unwrap_or_else(|| panic!("no such kind or cause: {name}; see --help"))
-}
-
-/// Draws the pair of a seed in `folder`, unless it is there. The truth file is next to the folder, not in it.
-fn draw(seed: u64, arguments: &Arguments, folder: &Path) -> Truth {
-    let truth_file = folder.with_extension("truth.json");
-    let drawn = std::fs::read(&truth_file).ok().and_then(|bytes| serde_json::from_slice::<Truth>(&bytes).ok());
-    drawn.unwrap_or_else(|| {
-        let case = draw_case(seed, kind_of(seed, &arguments.kinds), arguments.size);
-        let truth = write_case(&case, folder).expect("a case can be written");
-        data::write_json(&truth_file, &truth).expect("the truth can be written");
-        truth
-    })
-}
-
-fn run(truth: &Truth, folder: &Path) -> (Outcome, serde_json::Value) {
-    let begin = Instant::now();
-    let open = |side: &str| Dataset::open(&folder.join(side)).expect("a data set");
-    let rig = Rig::read(&folder.join("sensor.toml")).expect("a rig");
-    let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ());
-    let value = match found {
-        Ok(outcome) => serde_json::to_value(&outcome.diagnosis).expect("JSON"),
-        Err(e) => serde_json::json!({ "verdict": format!("error: {e}") }),
-    };
-    (score(truth, &value, begin.elapsed().as_secs_f64()), value)
 }
 
 /// A line about a case.
@@ -143,37 +75,15 @@ fn line(outcome: &Outcome) -> String {
 
 #[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn main() {
-    let Some(arguments) = arguments() else {
+    let Some(trials) = Trials::new(100, "bench/town").with_arguments() else {
         println!("{HELP}");
         return;
     };
-    let mut outcomes = Vec::new();
-    for seed in arguments.first..arguments.first + arguments.cases {
-        let path = arguments.out.join(format!("case-{seed}.json"));
-        let temporary = tempfile::tempdir().expect("a temporary folder");
-        let folder = arguments.keep.as_deref().unwrap_or(temporary.path()).join(seed.to_string());
-        if arguments.draw_only {
-            let begin = Instant::now();
-            let truth = draw(seed, &arguments, &folder);
-            println!("{seed}: {} ({}) {:.1} s", truth.kind, truth.setting, begin.elapsed().as_secs_f64());
-            continue;
-        }
-        let done = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice::<Outcome>(&bytes).ok());
-        let outcome = done.unwrap_or_else(|| {
-            let truth = draw(seed, &arguments, &folder);
-            let (outcome, value) = run(&truth, &folder);
-            let diagnosis_file = arguments.out.join(format!("diagnosis-{seed}.json"));
-            data::write_json(&diagnosis_file, &value).expect("a diagnosis can be written");
-            data::write_json(&path, &outcome).expect("a result can be written");
-            outcome
-        });
-        println!("{}", line(&outcome));
-        outcomes.push(outcome);
+    let draw = |seed: u64, folder: &std::path::Path| {
+        let case = draw_case(seed, kind_of(seed, trials.kind_of(seed)), trials.size);
+        write_case(&case, folder).expect("a case can be written")
+    };
+    if let Some(summary) = trials.run(draw, line) {
+        println!("\n{}", markdown(&summary));
     }
-    if arguments.draw_only {
-        return;
-    }
-    let summary = summarise(&outcomes);
-    data::write_json(&arguments.out.join("summary.json"), &summary).expect("a summary can be written");
-    println!("\n{}", markdown(&summary));
 }

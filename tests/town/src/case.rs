@@ -9,21 +9,8 @@ use crate::side::{Nuisances, OwnErrors, Side, isometry, move_houses, real_world}
 use crate::world::World;
 use data::Stream;
 use rand::RngExt;
+use score::CaseSize;
 use std::sync::Arc;
-
-/// Amount of data in a case.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct CaseSize {
-    /// Frames per side.
-    pub frames: usize,
-    /// Shots per scan.
-    pub shots: usize,
-}
-
-impl CaseSize {
-    /// Usual size.
-    pub const USUAL: CaseSize = CaseSize { frames: 40, shots: 25_000 };
-}
 
 /// Kind of a case.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,6 +1,6 @@
 //! What each effect does to a frame.
 
-use crate::case::{Case, CaseSize, Kind, draw_case};
+use crate::case::{Case, Kind, draw_case};
 use crate::clutter::Law;
 use crate::draw::{CAUSES, OFF_CATALOGUE, draw_effect};
 use crate::effect::{Clock, Dark, Effect, Spot};
@@ -11,6 +11,7 @@ use crate::side::{POSE_STD, Side};
 use crate::solid::Material;
 use crate::world::Object;
 use nalgebra::{Point3, Vector3};
+use score::CaseSize;
 
 /// A case of a roof sensor without effects.
 fn case() -> Case {

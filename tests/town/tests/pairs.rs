@@ -1,11 +1,11 @@
 //! Pairs as a whole: the same bytes for any number of threads, nothing of the truth in them, and readable.
 
-use data::Dataset;
-use diagnose::{Options, Rig, Verdict, diagnose};
-use lidarshift_town::{CAUSES, CaseSize, Kind, OFF_CATALOGUE, draw_case, write_case};
-use score::CATALOGUE;
+use diagnose::Verdict;
+use lidarshift_town::{CAUSES, Kind, OFF_CATALOGUE, draw_case, write_case};
+use score::{CATALOGUE, CaseSize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+use trials::diagnosed;
 
 const SMALL: CaseSize = CaseSize { frames: 3, shots: 3_000 };
 
@@ -90,9 +90,7 @@ fn a_pair_can_be_diagnosed() {
     let size = CaseSize { frames: 16, shots: 10_000 };
     let case = draw_case(11, single("range_bias"), size);
     let truth = write_case(&case, folder.path()).unwrap();
-    let open = |side: &str| Dataset::open(&folder.path().join(side)).unwrap();
-    let rig = Rig::read(&folder.path().join("sensor.toml")).unwrap();
-    let found = diagnose(&open("measured"), &open("simulated"), &rig, &Options::default(), &|_, _, _| ()).unwrap();
+    let found = diagnosed(folder.path(), "simulated").unwrap();
     let outcome = score::score(&truth, &serde_json::to_value(&found.diagnosis).unwrap(), 0.0);
     assert!(outcome.verdict != "not_scenario_identical", "{:?}", found.diagnosis.notes);
     assert_ne!(found.diagnosis.verdict, Verdict::TooFewFrames);
