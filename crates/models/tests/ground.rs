@@ -30,8 +30,9 @@ fn detector(ground: Option<GroundConfig>) -> DetectorConfig {
 fn frame(road: impl Fn(f64, f64) -> f64) -> Frame {
     let mut random = stream(3, "road", 0, 0);
     let mut frame = Frame { id: "road".into(), cloud: Cloud::new(4), objects: Vec::new() };
-    for _ in 0..4000 {
-        let (x, y): (f64, f64) = (random.random_range(-25.0..25.0), random.random_range(-12.0..12.0));
+    // Wider than the range of the detectors: at the border of what is seen slopes are damped.
+    for _ in 0..16_000 {
+        let (x, y): (f64, f64) = (random.random_range(-50.0..50.0), random.random_range(-24.0..24.0));
         frame.cloud.values.extend([x as f32, y as f32, road(x, y) as f32, 0.0]);
     }
     for (x, y) in [(-15.0, 6.0), (3.0, -7.0), (18.0, 8.0)] {
@@ -73,8 +74,8 @@ fn targets_count_from_the_ground() {
     };
     let (level, banked) = (residuals(&|_, _| 0.0), residuals(&|x, y| 5.0 + 0.02 * x + 0.15 * y));
     assert!(level.len() > 6 && level.len() == banked.len());
-    // In heights of the anchor, 1.18 m. At the border of what is seen the slope of the ground is damped.
-    assert!(level.iter().zip(&banked).all(|(a, b)| (a - b).abs() < 0.3), "{level:?} {banked:?}");
+    // In heights of the anchor, 1.18 m.
+    assert!(level.iter().zip(&banked).all(|(a, b)| (a - b).abs() < 0.1), "{level:?} {banked:?}");
     let without = detector(None);
     let high = Preparer::new(&without).training(&frame(|_, _| 2.0), &mut stream(0, "", 0, 0)).unwrap();
     let NetworkSample::PointPillars(high) = high.network else { panic!("another network") };
@@ -96,7 +97,7 @@ fn a_suggestion_counts_heights_from_the_ground() {
         suggest(&config, &boxes).unwrap().detector.network.anchors()[0].bottom_m
     };
     let (by_z, above_ground) = (bottom(None), bottom(Some(GroundConfig::default())));
-    assert!(by_z > 0.7 && above_ground.abs() < 0.3, "{by_z} {above_ground}");
+    assert!(by_z > 0.7 && above_ground.abs() < 0.15, "{by_z} {above_ground}");
 }
 
 #[test]
