@@ -41,6 +41,8 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
         // On a smooth surface at grazing incidence neighbouring rows lie apart as well.
         _ if ray.in_gap && ray.company < FEW && !(ray.smooth && ray.across_m().abs() < FLAT_M) => Some(Odd::Between),
         Lies::On => None,
+        // Without rows nothing says that the simulation sent a shot there.
+        Lies::Open if ray.row == u16::MAX => None,
         _ if ray.company <= 1 => (ray.smooth || lies == Lies::Open).then_some(Odd::Alone),
         _ if ray.company < FEW || ray.surface == Surface::Object => None,
         Lies::Behind => Some(Odd::GroupBehind),

@@ -5,10 +5,11 @@ use super::gaps::{in_gap, mixed_per_rad};
 use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::{Matched, SideFrame};
+use super::roughness::{LONE, Roughness};
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
-use sensor::directions::{DirectionIndex, Entry, SensorScan, Sensors, fit_surface, in_or_beside};
+use sensor::directions::{DirectionIndex, SensorScan, Sensors, in_or_beside};
 use std::borrow::Cow;
 
 /// One frame of both sides.
@@ -44,13 +45,6 @@ pub struct ObjectPair {
 
 /// Of this many shots of a row one is tested, to count those without a return.
 const EVERY: usize = 3;
-
-/// Returns with at most this many neighbours at their range are not of a surface.
-const LONE: u8 = 1;
-
-/// Distance from the predicted surface, across it, from which on a return is not used for the roughness of its
-/// neighbours, m.
-const STRAY_M: f64 = 0.5;
 
 /// Shots of a sensor's scan, over the azimuths of its returns, around which a side has no return; `None` where rows are
 /// not known.
@@ -183,7 +177,8 @@ impl SensorPair<'_> {
         let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
         self.complete_measured(&mut measured, a, &own, &predictor);
         simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));
-        set_roughness(&mut measured, a, &own, predictor.around.window);
+        let edge_m = self.sensors.edge_m;
+        Roughness { own: &own, window: predictor.around.window, edge_m }.set([&mut measured, &mut simulated], [a, b]);
         frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.around.index);
         let missing = measured.len() as f64 - simulated.len() as f64;
         frame.open += open(self.sensors, self.sensor, [a, b], &predictor.around.index).unwrap_or(missing.max(0.0));
@@ -213,22 +208,6 @@ impl SensorPair<'_> {
             ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
             ray.company = company(own, scan, i);
             ray.in_gap = in_gap(&predictor.around.index, scan, i);
-        }
-    }
-}
-
-/// Sets the roughness of measured rays. Lone returns and returns off the predicted surface are left out: false alarms
-/// would make all returns around them rough.
-fn set_roughness(measured: &mut [Ray], scan: &SensorScan, own: &DirectionIndex, window: [f64; 2]) {
-    let stray: Vec<bool> =
-        measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
-    for (i, ray) in measured.iter_mut().enumerate() {
-        if ray.smooth && !stray[i] {
-            let others = |e: &Entry| e.index != i as u32 && !stray[e.index as usize];
-            if let Some(s) = fit_surface(own, window, scan.azimuth_rad[i], scan.elevation_rad[i], others) {
-                ray.roughness_m = (f64::from(scan.range_m[i]) - s.range_m) as f32;
-                ray.roughness_leverage = s.leverage as f32;
-            }
         }
     }
 }

@@ -8,6 +8,7 @@ mod matching;
 mod prediction;
 mod ray;
 mod recordings;
+mod roughness;
 
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
 pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, ShownShift, company_m, pair_frame};

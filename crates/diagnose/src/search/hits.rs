@@ -170,7 +170,7 @@ impl<'a> Search<'a> {
             };
             let gains = (0..self.select.len()).map(gain).collect();
             let whole = self.table.fit(&refit(&self.table, chosen), law);
-            let above_floor = self.above_floor(law, &whole);
+            let above_floor = self.above_floor(&self.table, &whole);
             let trial = Trial { candidate: k, cause: law.cause(), parameters: law.parameters(), gains, above_floor };
             let confined = (law == Law::Signal).then(|| self.table.confined_to(&whole[whole.len() - 1..]));
             (trial, confined.flatten())
@@ -189,11 +189,12 @@ impl<'a> Search<'a> {
 
     /// Whether the last of some laws loses enough to be reported. A second law must lose more than a correction of
     /// the form of the first.
-    fn above_floor(&self, law: Law, laws: &[FittedLaw]) -> bool {
-        let lost = self.table.lost(laws) - self.table.lost(&laws[..laws.len() - 1]);
-        let own = laws.last().map_or(0.0, |l| l.numbers[0].abs());
-        let joins = f64::from(u8::from(laws.len() > 1));
-        match law {
+    fn above_floor(&self, table: &LossTable, laws: &[FittedLaw]) -> bool {
+        let Some((last, before)) = laws.split_last() else { return false };
+        let lost = table.lost(laws) - table.lost(before);
+        let own = last.numbers[0].abs();
+        let joins = f64::from(u8::from(!before.is_empty()));
+        match last.law {
             Law::Zone(_) => own > ZONE_FLOOR + 0.07 * joins + 0.1 * self.displaced,
             Law::Random => own > FLOOR + 0.02 * joins + 0.01 * self.displaced,
             _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * self.displaced,
@@ -232,9 +233,24 @@ impl<'a> Search<'a> {
         Minimum::new(Quantity::Share, (Z_STAR * mismatches.max(1.0).sqrt() / simulated.max(1.0)).max(FLOOR))
     }
 
+    /// Those of the chosen laws that lose enough on the estimating frames as well.
+    fn large_enough(&self, mut selection: Selection, on_estimate: &LossTable) -> Selection {
+        let fitted = refit(on_estimate, &selection.laws);
+        let large: Vec<bool> = (1..=fitted.len()).map(|n| self.above_floor(on_estimate, &fitted[..n])).collect();
+        // Below a table by direction laws are forms, whatever they lose.
+        if selection.unexplained.is_none() {
+            let mut of_laws = large.iter();
+            selection.laws.retain(|_| of_laws.next() == Some(&true));
+            let mut of_selected = large.iter();
+            selection.selected.retain(|_| of_selected.next() == Some(&true));
+        }
+        selection
+    }
+
     /// Fits what was chosen on the estimating frames and measures it on the held-out ones.
     fn report(&self, selection: Selection, result: &mut ChannelResult) {
         let on_estimate = table(&self.hits, &self.estimate);
+        let selection = self.large_enough(selection, &on_estimate);
         let fitted = refit(&on_estimate, &selection.laws);
         let repeated = self.bootstrap(&selection.laws);
         let on_hold_out = table(&self.hits, &self.hold_out);

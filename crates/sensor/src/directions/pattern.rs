@@ -1,6 +1,7 @@
 //! Rows and angular steps of a sensor, estimated from the directions of its returns.
 
 use super::scan::{SensorScan, Steps};
+use statistics::weighted_median;
 
 /// Scan pattern of a sensor.
 #[derive(Clone, Debug, PartialEq)]
@@ -73,7 +74,8 @@ struct Cluster {
 }
 
 /// Elevations of the rows: clusters of the returns' elevations. Empty where clusters do not stand out: fewer than
-/// four, less than 80 % of the returns in them, or clusters wider than 60 % of their distance.
+/// four, less than 80 % of the returns in them, or the cluster of the median return wider than 60 % of their
+/// distance.
 fn rows(scans: &[&SensorScan]) -> Vec<f32> {
     let mut found = clusters(scans);
     let total: usize = scans.iter().map(|s| s.len()).sum();
@@ -83,12 +85,13 @@ fn rows(scans: &[&SensorScan]) -> Vec<f32> {
     let usual = sizes.get(sizes.len() / 2).copied().unwrap_or(0.0);
     found.retain(|c| c.count > 0.02 * usual);
     let inside: f32 = found.iter().map(|c| c.count).sum();
-    let mut widths: Vec<f32> = found.iter().map(|c| c.width).collect();
-    widths.sort_by(f32::total_cmp);
+    // The width of the cluster of the median return: beside one wide cluster of scattered shots there are narrow ones
+    // by chance, with few returns.
+    let widths = found.iter().map(|c| (f64::from(c.width), f64::from(c.count))).collect();
     let mut gaps: Vec<f32> = found.windows(2).map(|w| w[1].centre - w[0].centre).collect();
     gaps.sort_by(f32::total_cmp);
-    let (Some(width), Some(gap)) = (widths.get(widths.len() / 2), gaps.get(gaps.len() / 2)) else { return vec![] };
-    if found.len() < 4 || inside < 0.8 * total as f32 || *width > 0.6 * gap {
+    let (Some(width), Some(gap)) = (weighted_median(widths), gaps.get(gaps.len() / 2)) else { return vec![] };
+    if found.len() < 4 || inside < 0.8 * total as f32 || width > 0.6 * f64::from(*gap) {
         return vec![];
     }
     found.into_iter().map(|c| c.centre).collect()
@@ -223,6 +226,31 @@ mod tests {
         assert!(pattern.rows_rad.iter().zip(&truth).all(|(a, b)| (a - b).abs() < 1e-4));
         assert!((pattern.steps.azimuth_rad - 0.01).abs() < 1e-3, "{:?}", pattern.steps);
         assert_eq!(pattern.row(truth[7] + 1e-3), Some(7));
+    }
+
+    #[test]
+    fn a_rosette_has_no_rows() {
+        let mut rng = data::stream(3, "pattern", 0, 0);
+        let scans: Vec<SensorScan> = (0..6)
+            .map(|_| {
+                let mut scan = SensorScan::default();
+                let phases: [f64; 2] = [rng.random_range(0.0..6.3), rng.random_range(0.0..6.3)];
+                for i in 0..17_000 {
+                    let turn = i as f64 * 0.011;
+                    let [a, b] = [turn + phases[0], -0.787 * turn + phases[1]];
+                    let (az, el) = (0.3 * a.cos() + 0.31 * b.cos(), 0.3 * a.sin() + 0.31 * b.sin());
+                    // Sky above the horizon, but for some posts.
+                    if el < 0.1 || (az * 9.0).sin() > 0.9 {
+                        scan.azimuth_rad.push(az as f32);
+                        scan.elevation_rad.push(el as f32);
+                        scan.range_m.push(10.0);
+                    }
+                }
+                scan
+            })
+            .collect();
+        let pattern = ScanPattern::of_scans(&scans.iter().collect::<Vec<_>>());
+        assert!(pattern.rows_rad.is_empty(), "{:?}", pattern.rows_rad);
     }
 
     #[test]

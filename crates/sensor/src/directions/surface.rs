@@ -151,8 +151,14 @@ impl LocalSurface {
     /// Whether the neighbours lie on one surface: within `edge_m` of the plane across it, and along their rays no
     /// farther than on a plane at this incidence.
     pub fn smooth(&self, edge_m: f64) -> bool {
+        self.smooth_but_for(0.0, edge_m)
+    }
+
+    /// The same where ranges may be off by `noise_m`.
+    pub fn smooth_but_for(&self, noise_m: f64, edge_m: f64) -> bool {
         let [near, far] = self.near_far_m;
-        self.misfit_m < edge_m && self.misfit_along_m < (ALONG.0 * (far - near)).max(ALONG.1)
+        self.misfit_m < edge_m + self.cos_incidence * noise_m
+            && self.misfit_along_m < (ALONG.0 * (far - near)).max(ALONG.1) + noise_m
     }
 
     /// Unit normal towards the sensor, in the basis (along the ray, along growing azimuth, along growing elevation).

@@ -1,7 +1,7 @@
 //! Findings of geometry: parameters, sentences and plots.
 
 use super::curve::linear_curve;
-use super::floor::{FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SENSOR_M, FLOOR_TURN_RAD};
+use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD};
 use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit, split};
 use super::{Search, Selected};
@@ -309,6 +309,12 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(C
         let with: Vec<usize> = sums.base.iter().copied().chain([k]).collect();
         Some(fit(&frames, blocks, &with, &sums.precision).error(sums.base.len()))
     };
+    // The size of an effect of one column that displaces surfaces by as much as is reported.
+    let displacing = |c: Column| {
+        let sensor = if let Column::SensorPose(sensor, _) = c { Some(sensor) } else { None };
+        let k = sums.columns.iter().position(|x| *x == c);
+        k.map_or(0.0, |k| FLOOR_DISPLACED_M / sums.displaced_m(select, sensor, &[(k, 1.0)], &sums.base).max(1e-3))
+    };
     let mut all = Vec::new();
     let mut push = |cause: Cause, quantity: Quantity, value: Option<f64>, floor: f64, factor: f64| {
         if let Some(v) = value {
@@ -316,13 +322,13 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(C
         }
     };
     let deg = 1f64.to_degrees();
-    push(Cause::RangeBias, Quantity::OffsetM, error(Column::RangeOffset), FLOOR_OFFSET_M, 1.0);
-    push(Cause::PitchRoll, Quantity::PitchDeg, error(Column::Pose(1)), FLOOR_TURN_RAD, deg);
+    let [offset, pitch] = [Column::RangeOffset, Column::Pose(1)];
+    push(Cause::RangeBias, Quantity::OffsetM, error(offset), displacing(offset).max(FLOOR_OFFSET_M), 1.0);
+    push(Cause::PitchRoll, Quantity::PitchDeg, error(pitch), displacing(pitch).max(FLOOR_TURN_RAD), deg);
     let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
-    let of_one = sums.columns.iter().position(|x| *x == one).filter(|_| one != Column::Pose(2));
-    let displaced_m = of_one.map(|k| sums.displaced_m(select, 0, &[(k, 1.0)]));
-    let floor = displaced_m.map_or(FLOOR_TURN_RAD, |by_one_rad| FLOOR_SENSOR_M / by_one_rad.max(1e-3));
-    push(Cause::SensorExtrinsics, Quantity::YawDeg, error(one), floor, deg);
+    // The pose of one of several sensors has no other smallest size.
+    let least = if one == Column::Pose(2) { FLOOR_TURN_RAD } else { 0.0 };
+    push(Cause::SensorExtrinsics, Quantity::YawDeg, error(one), displacing(one).max(least), deg);
     push(Cause::BeamRangeOffset, Quantity::StdM, Some(0.0), FLOOR_GROUPS[0], 1.0);
     push(Cause::BeamElevationOffset, Quantity::StdDeg, Some(0.0), FLOOR_GROUPS[1], deg);
     all

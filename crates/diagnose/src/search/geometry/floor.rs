@@ -4,6 +4,8 @@ use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit};
 use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
+#[cfg(doc)]
+use crate::channels::mean::STRUCTURE_M;
 use crate::inference::grouped;
 use nalgebra::{DMatrix, DVector};
 
@@ -19,9 +21,10 @@ const FLOOR_SHIFT_M: f64 = 0.04;
 /// Smallest displacement over a scan that is reported: along x and y in m, about z in rad.
 const FLOOR_SWEEP: [f64; 3] = [0.3, 0.3, 0.01];
 
-/// Smallest displacement of surfaces by the pose of one sensor that is reported, root mean square, m. The six
-/// parameters of a pose absorb errors of the few surfaces that this sensor alone sees.
-pub(super) const FLOOR_SENSOR_M: f64 = 0.004;
+/// Smallest displacement of surfaces that is reported, root mean square over the returns, m, without the part that
+/// errors of the surfaces themselves and the other hypotheses can be. The surfaces of a model lie up to [`STRUCTURE_M`]
+/// beside the real ones in all frames alike: more frames do not tell a smaller displacement from that.
+pub(super) const FLOOR_DISPLACED_M: f64 = 0.004;
 
 /// Smallest spread of group offsets that is reported: rows in range, m; rows in elevation, rad; strips of azimuth in
 /// range, m.
@@ -44,8 +47,13 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
             let own = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
             let coefficients: Vec<(usize, f64)> = own.map(|(c, t)| (*c, *t)).collect();
             let sensor_of = |c: &usize| if let Column::SensorPose(s, _) = sums.columns[*c] { Some(s) } else { None };
-            if let Some(sensor) = columns.iter().find_map(sensor_of) {
-                return sums.displaced_m(select, sensor, &coefficients) > FLOOR_SENSOR_M;
+            let sensor = columns.iter().find_map(sensor_of);
+            let others: Vec<usize> = fitted.columns.iter().filter(|c| !columns.contains(c)).copied().collect();
+            if sums.displaced_m(select, sensor, &coefficients, &others) < FLOOR_DISPLACED_M {
+                return false;
+            }
+            if sensor.is_some() {
+                return true;
             }
             let of =
                 |column: Column| coefficients.iter().find(|(c, _)| sums.columns[*c] == column).map_or(0.0, |(_, t)| *t);
@@ -66,19 +74,31 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
 }
 
 impl Sums {
-    /// Displacement of the surfaces that a sensor sees by some columns, m, root mean square. The part that poses of
-    /// single frames and offsets of the surfaces absorb is subtracted.
-    pub(super) fn displaced_m(&self, frames: &[usize], sensor: usize, coefficients: &[(usize, f64)]) -> f64 {
-        let gram: DMatrix<f64> = frames.iter().map(|&f| &self.linear[f].gram).sum();
+    /// Displacement of the surfaces that a sensor sees, or all sensors, by some columns, m, root mean square. The part
+    /// that `others` of the columns absorb is subtracted; of what one sensor sees, also the part that the ego pose of a
+    /// single frame is.
+    pub(super) fn displaced_m(
+        &self,
+        frames: &[usize],
+        sensor: Option<usize>,
+        coefficients: &[(usize, f64)],
+        others: &[usize],
+    ) -> f64 {
+        let of_frame = |f: usize| if sensor.is_some() { &self.linear[f].gram } else { &self.whole[f] };
+        let gram: DMatrix<f64> = frames.iter().map(|&f| of_frame(f)).sum();
         let mut by = DVector::zeros(self.columns.len());
         coefficients.iter().for_each(|(c, x)| by[*c] = *x);
         let response = &gram * &by;
-        let prior = |i: usize, j: usize| if i == j { self.precision[self.base[i]] } else { 0.0 };
-        let n = self.base.len();
-        let structure = DMatrix::from_fn(n, n, |i, j| gram[(self.base[i], self.base[j])] + prior(i, j));
-        let on_base = DVector::from_fn(n, |i, _| response[self.base[i]]);
-        let absorbed = structure.cholesky().map_or(0.0, |c| on_base.dot(&c.solve(&on_base)));
-        let weights: f64 = frames.iter().map(|&f| self.of_sensors[f][sensor]).sum();
+        let prior = |i: usize, j: usize| if i == j { self.precision[others[i]] } else { 0.0 };
+        let n = others.len();
+        let absorbing = DMatrix::from_fn(n, n, |i, j| gram[(others[i], others[j])] + prior(i, j));
+        let on_others = DVector::from_fn(n, |i, _| response[others[i]]);
+        let absorbed = absorbing.cholesky().map_or(0.0, |c| on_others.dot(&c.solve(&on_others)));
+        let of_frame = |f: &usize| match sensor {
+            Some(sensor) => self.of_sensors[*f][sensor],
+            None => self.of_sensors[*f].iter().sum(),
+        };
+        let weights: f64 = frames.iter().map(of_frame).sum();
         ((by.dot(&response) - absorbed).max(0.0) / weights.max(1e-12)).sqrt()
     }
 }
@@ -105,6 +125,7 @@ mod tests {
             columns,
             precision: vec![2500.0, 2500.0, 25.0, 25.0],
             base: vec![0, 1],
+            whole: vec![gram.clone()],
             linear: vec![LinearFrame { gram, right: DVector::zeros(4) }],
             rows: none(),
             strips: none(),
@@ -117,9 +138,8 @@ mod tests {
     fn a_displaced_wall_absorbs_the_shift_of_the_only_sensor_that_sees_it() {
         let sums = sums();
         // 2500 of 1e6 are not absorbed: 5 % of the shift, in half of the returns.
-        let across = sums.displaced_m(&[0], 0, &[(2, 0.02)]);
+        let across = sums.displaced_m(&[0], Some(0), &[(2, 0.02)], &[0, 1]);
         assert!((across - 0.02 * 0.05 / 2f64.sqrt()).abs() < 1e-5, "{across}");
-        let free = Sums { base: vec![], ..sums };
-        assert!((free.displaced_m(&[0], 0, &[(2, 0.02)]) - 0.02 / 2f64.sqrt()).abs() < 1e-9);
+        assert!((sums.displaced_m(&[0], None, &[(2, 0.02)], &[]) - 0.02 / 2f64.sqrt()).abs() < 1e-9);
     }
 }

@@ -190,8 +190,7 @@ impl<'a> Search<'a> {
             .map(|k| {
                 let last: Vec<Hypothesis> =
                     (0..chosen.len()).filter(|i| *i != k).chain([k]).map(|i| chosen[i].clone()).collect();
-                matches!(chosen[k], Hypothesis::Groups { .. })
-                    || above_floor(&self.sums, &self.estimate, &self.estimate_blocks, &last)
+                above_floor(&self.sums, &self.estimate, &self.estimate_blocks, &last)
             })
             .collect();
         chosen.into_iter().zip(selected).zip(large).filter(|(_, large)| *large).map(|(both, _)| both).unzip()

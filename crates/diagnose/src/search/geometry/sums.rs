@@ -10,7 +10,7 @@ use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::median;
 use crate::search::Context;
-use nalgebra::SVector;
+use nalgebra::{DMatrix, SVector};
 use rayon::prelude::*;
 use sensor::Rig;
 
@@ -24,6 +24,8 @@ pub(super) struct Sums {
     pub(super) base: Vec<usize>,
     /// Linear sums of each frame, its own pose and displacement over a scan integrated out.
     pub(super) linear: Vec<LinearFrame>,
+    /// X' W X of each frame with its own pose.
+    pub(super) whole: Vec<DMatrix<f64>>,
     /// Sums by row.
     pub(super) rows: Groups,
     /// Sums by strip of azimuth.
@@ -72,6 +74,7 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
         precision,
         base,
         linear,
+        whole: means.into_iter().map(|m| m.gram).collect(),
         poses,
         of_sensors,
     }
@@ -80,7 +83,11 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
 /// Weights of all returns of each sensor, by frame. Surface normals have length 1, so that the squared levers of the
 /// shifts sum to the weights.
 fn sensor_weights(means: &[MeanFrame], columns: &[Column], sensors: usize) -> Vec<Vec<f64>> {
-    let shift_of = |c: &Column, s: usize| matches!(c, Column::SensorPose(of, 3..6) if *of == s);
+    let shift_of = |c: &Column, s: usize| match c {
+        Column::SensorPose(of, 3..6) => *of == s,
+        Column::Pose(3..6) => sensors == 1,
+        _ => false,
+    };
     let of_sensor = |m: &MeanFrame, s: usize| {
         let shifts = (0..columns.len()).filter(|&c| shift_of(&columns[c], s));
         shifts.map(|c| m.gram[(c, c)]).sum::<f64>()
@@ -182,7 +189,7 @@ impl Sums {
         fit(&frames, blocks, &with, &self.precision)
     }
 
-    /// Gain of one frame by one of the chosen hypotheses, fitted on the estimating frames, nats.
+    /// Gain of one frame by one of the chosen hypotheses, fitted on the estimating frames, over a fit without it, nats.
     pub(super) fn gain_of(
         &self,
         estimate: &[usize],
@@ -192,15 +199,10 @@ impl Sums {
         frame: usize,
     ) -> f64 {
         match hypothesis {
-            Hypothesis::Linear { columns, .. } => {
-                let fitted = self.fit_all(estimate, blocks, chosen);
-                let mut without = fitted.clone();
-                for (i, c) in fitted.columns.iter().enumerate() {
-                    if columns.contains(c) {
-                        without.theta[i] = 0.0;
-                    }
-                }
-                fitted.gain(&self.linear[frame]) - without.gain(&self.linear[frame])
+            Hypothesis::Linear { .. } => {
+                let others: Vec<Hypothesis> = chosen.iter().filter(|h| *h != hypothesis).cloned().collect();
+                let gain = |of: &[Hypothesis]| self.fit_all(estimate, blocks, of).gain(&self.linear[frame]);
+                gain(chosen) - gain(&others)
             }
             Hypothesis::Groups { grouping, column, .. } => {
                 let frames = self.groups_of(*grouping);
