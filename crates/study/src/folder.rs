@@ -193,11 +193,11 @@ impl Study {
         self.config.evaluation.tsne_dataset.as_ref().unwrap_or(&self.config.datasets[0].name)
     }
 
-    /// Describes the changes of the study's TOML since the study was last run, then replaces the copy in the folder.
+    /// Describes the changes of the study's TOML since the study was last run.
     ///
     /// # Errors
-    /// A copy that cannot be read or written.
-    pub fn update_copy(&self) -> Result<Vec<String>> {
+    /// A copy that cannot be read.
+    pub fn changes(&self) -> Result<Vec<String>> {
         let copy = self.folder.join(COPY);
         let mut texts = Vec::new();
         if copy.is_file() {
@@ -222,9 +222,22 @@ impl Study {
             };
             texts.extend(changes.removed.iter().map(removed));
         }
+        Ok(texts)
+    }
+
+    /// Whether the folder has a copy of the study's TOML as it is now.
+    pub fn is_copied(&self) -> bool {
+        fs_err::read_to_string(self.folder.join(COPY)).is_ok_and(|copy| copy == self.text)
+    }
+
+    /// Replaces the copy of the study's TOML in the folder.
+    ///
+    /// # Errors
+    /// A copy that cannot be written.
+    pub fn update_copy(&self) -> Result<()> {
+        let copy = self.folder.join(COPY);
         let origin = Origin { named: self.named.clone(), base: self.base.clone() };
         write_json(&self.folder.join(ORIGIN), &origin)?;
-        write_atomic(&copy, self.text.as_bytes())?;
-        Ok(texts)
+        Ok(write_atomic(&copy, self.text.as_bytes())?)
     }
 }
