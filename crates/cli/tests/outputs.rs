@@ -67,6 +67,9 @@ fn pipes_links_and_devices_stay_what_they_are() {
         assert!(output.status.success() && shown.ends_with(&plain), "{what}: {}", output_text(&output));
     }
     assert!(String::from_utf8_lossy(&fs::read(at("both")).unwrap()).len() > plain.len(), "the table is lost");
+    // Only root can make a device.
+    let device = format!("mknod null c 1 3 2>/dev/null || exit 0; $P {EVAL} null > /dev/null && test -c null");
+    assert!(bash(dir.path(), &device).status.success());
     // A link to nothing that can be written, and a folder.
     refused(dir.path(), &format!("{EVAL} found"), "found: cannot be written: it is a folder");
     std::os::unix::fs::symlink("loop", at("loop")).unwrap();
@@ -172,6 +175,17 @@ fn input_is_never_overwritten() {
 }
 
 #[test]
+fn a_result_that_cannot_be_written_ends_long_work_before_it_begins() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    fs::write(dir.path().join("plain"), "").unwrap();
+    for arguments in ["diagnose --measured . --simulated . --out out", "compare . . --split val --out out"] {
+        refused(dir.path(), &format!("{arguments} --json plain/a.json"), "plain");
+        assert!(!dir.path().join("out").exists(), "{arguments}");
+    }
+}
+
+#[test]
 fn a_diagnosis_removes_the_files_of_the_one_before() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
@@ -209,9 +223,15 @@ fn names_that_are_not_utf_8() {
     fs::remove_dir_all(&out).unwrap();
     with_out("simulate --config street --frames 3 --out");
     assert!(out.join("manifest.json").is_file());
-    let output = program(dir.path(), "train --detector tiny.toml --dataset").arg(name).output().unwrap();
-    assert_eq!(output.status.code(), Some(1));
-    assert!(output_text(&output).contains("is not UTF-8"), "{}", output_text(&output));
+    for (arguments, wanted) in [
+        ("train --detector tiny.toml --dataset", "is not UTF-8"),
+        ("compare . . --split val --out", "has to be UTF-8"),
+        ("study quick --only data --out", "has to be UTF-8"),
+    ] {
+        let output = program(dir.path(), arguments).arg(name).output().unwrap();
+        assert_eq!(output.status.code(), Some(1), "{arguments}");
+        assert!(output_text(&output).contains(wanted), "{arguments}: {}", output_text(&output));
+    }
 }
 
 #[test]

@@ -42,6 +42,14 @@ impl EvalTsneArgs {
         if let Some(path) = &self.json {
             write_json(path, &found)?;
         }
+        let mut page = None;
+        if let Some(out) = &self.figures {
+            let title = format!("Features of the study {}", study.config.name);
+            let shown = found.clone();
+            let (embeddings, cka, frechet, warnings) = (shown.embeddings, shown.cka, shown.frechet, shown.warnings);
+            let report = StudyReport { title, embeddings, cka, frechet, warnings, ..StudyReport::default() };
+            page = Some(report.write(out)?.page);
+        }
         for e in &found.embeddings {
             let (n, kl) = (e.points.len(), e.kl_divergence);
             outln!("{}: {n} points on {}, {}; Kullback-Leibler divergence {kl:.3}", e.network, e.test_set, e.layer);
@@ -66,11 +74,8 @@ impl EvalTsneArgs {
             );
         }
         found.warnings.iter().for_each(|warning| outln!("{warning}"));
-        if let Some(out) = &self.figures {
-            let title = format!("Features of the study {}", study.config.name);
-            let (embeddings, cka, frechet, warnings) = (found.embeddings, found.cka, found.frechet, found.warnings);
-            let report = StudyReport { title, embeddings, cka, frechet, warnings, ..StudyReport::default() };
-            outln!("figures: {}", report.write(out)?.page.display());
+        if let Some(page) = page {
+            outln!("figures: {}", page.display());
         }
         Ok(())
     }
