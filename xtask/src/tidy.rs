@@ -1,5 +1,6 @@
 //! `cargo xtask tidy`: checks the house rules in CONTRIBUTING.md that can be checked automatically.
 
+mod printing;
 mod source;
 mod wording;
 
@@ -113,6 +114,11 @@ pub fn complaints(root: &Path) -> Result<Vec<String>> {
         let text = fs::read_to_string(&file)?;
         let mut of_file = text_complaints(&path, &text);
         of_file.extend(wording::complaints(&path, &text));
+        if path.ends_with(".rs") && !is_test(&path) {
+            let code = source::lines(&path, &text);
+            let end = lines_before_tests(&text).min(code.len());
+            of_file.extend(printing::complaints(&path, &code[..end]));
+        }
         of_file.sort_by_key(|(line, _)| *line);
         found.extend(of_file.into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));
     }

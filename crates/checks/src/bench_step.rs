@@ -9,6 +9,7 @@ use clap::{Args, ValueEnum};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::{Frame, stream};
 use lidarshift::device::DeviceArgs;
+use lidarshift::outln;
 use models::bev::pillars::{PillarGrid, pillarise};
 use models::config::{DetectorConfig, NetworkConfig};
 use models::pointpillars::PointPillarsConfig;
@@ -78,7 +79,6 @@ struct Report {
 
 impl BenchStepArgs {
     /// Measures and prints a table.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let config = find_detector(&self.detector)?;
         let device = self.device.open()?.autodiff();
@@ -104,17 +104,20 @@ impl BenchStepArgs {
             config,
         };
         if self.work == Work::Step {
-            println!("pillars of 120,000 points, cells of 0.16 m: {:.1} ms", median(pillarise_ms()));
+            outln!("pillars of 120,000 points, cells of 0.16 m: {:.1} ms", median(pillarise_ms()));
         }
-        println!(
+        outln!(
             "{}, batch {}, {}: medians of {} times in ms",
-            report.detector, report.batch, report.device, report.steps
+            report.detector,
+            report.batch,
+            report.device,
+            report.steps
         );
         for (stage, ms) in &report.median_ms {
-            println!("  {stage:<11} {ms:>9.1} ms");
+            outln!("  {stage:<11} {ms:>9.1} ms");
         }
         if let Some(mib) = report.peak_mib {
-            println!("  peak memory {mib:>9} MiB");
+            outln!("  peak memory {mib:>9} MiB");
         }
         if let Some(path) = &self.json {
             data::write_json(path, &report)?;

@@ -7,6 +7,7 @@ use anyhow::{Result, bail};
 use clap::Args;
 use data::stream;
 use indicatif::{ProgressBar, ProgressStyle};
+use lidarshift::{errln, outln};
 use rand::RngExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -37,7 +38,6 @@ pub struct FuzzArgs {
 
 impl FuzzArgs {
     /// Runs the test; `true` if no reader failed.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
         // In memory if possible, since the readers of run folders write millions of files.
         let folder = tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir())?;
@@ -53,14 +53,14 @@ impl FuzzArgs {
         for target in &targets {
             let found = self.test(target)?;
             let memory = found.peak_mib.map_or("unknown".into(), |mib| format!("{mib} MiB"));
-            println!(
+            outln!(
                 "{:<18} {} inputs, {} accepted, {} broken, memory {memory}",
                 target.name,
                 self.inputs,
                 found.taken,
                 found.broken.len()
             );
-            found.broken.iter().take(5).for_each(|b| println!("    {b}"));
+            found.broken.iter().take(5).for_each(|b| outln!("    {b}"));
             stood &= found.broken.is_empty();
         }
         std::panic::set_hook(hook);
@@ -122,7 +122,7 @@ impl Watch {
                 match seen.load(Ordering::Relaxed) {
                     Watch::OVER => return,
                     now if now == last && now > 0 => {
-                        eprintln!("error: {name}: input {now} takes more than {} s", TIME_LIMIT.as_secs());
+                        errln!("error: {name}: input {now} takes more than {} s", TIME_LIMIT.as_secs());
                         std::process::exit(1);
                     }
                     now => last = now,

@@ -7,6 +7,7 @@ mod schema;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
+use lidarshift::errln;
 use std::process::ExitCode;
 
 /// Checks for developers.
@@ -44,12 +45,13 @@ impl Check {
 fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
     unsafe { lidarshift::allocator::keep_memory() };
-    match Program::parse().check.run() {
+    let code = match Program::parse().check.run() {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::FAILURE,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            errln!("error: {error:#}");
             ExitCode::FAILURE
         }
-    }
+    };
+    lidarshift::console::end(code)
 }

@@ -2,8 +2,10 @@
 
 use crate::device::DeviceArgs;
 use crate::study::listener;
+use crate::{errln, outln};
 use anyhow::{Result, bail};
 use clap::Args;
+use data::output::check_writable;
 use data::{Dataset, write_json};
 use diagnose::{OnClouds, Options, Rig, diagnose_with};
 use eval::BootstrapOptions;
@@ -108,6 +110,7 @@ impl CompareArgs {
             );
         }
         let study = study_of(&input, &self.out)?;
+        self.check_outputs(&input.datasets)?;
         let mut comparison = compare(&study, &self.device.arguments(), &listener())?;
         if self.diagnose {
             self.diagnose(&mut comparison)?;
@@ -120,6 +123,14 @@ impl CompareArgs {
         report.write(&self.out)?;
         print_ranks(&comparison, &self.out);
         Ok(())
+    }
+
+    /// Refuses outputs that would overwrite a data set, and those that cannot be written, before the work begins.
+    fn check_outputs(&self, datasets: &[PathBuf]) -> Result<()> {
+        for path in datasets {
+            Dataset::open(path)?.refuse_own_folder(&self.out)?;
+        }
+        Ok(self.json.as_deref().map_or(Ok(()), check_writable)?)
     }
 
     fn frozen(&self, names: &[String]) -> Result<Vec<FrozenDetector>> {
@@ -159,7 +170,7 @@ impl CompareArgs {
         let options = Options { split: Some(self.split.clone()), ..Options::default() };
         let mut sizes = Vec::new();
         for (path, name) in self.simulations.iter().zip(&comparison.simulations) {
-            eprintln!("diagnosing {name}");
+            errln!("diagnosing {name}");
             let simulated = Dataset::open(path)?;
             let rig = match (&self.sensor, &simulated.config.rig) {
                 (Some(path), _) | (None, Some(path)) => Rig::read(path)?,
@@ -217,18 +228,20 @@ impl CompareArgs {
 
 /// The command as it was called.
 fn command() -> String {
-    std::iter::once("lidarshift".to_string()).chain(std::env::args().skip(1)).collect::<Vec<_>>().join(" ")
+    std::iter::once("lidarshift".to_string())
+        .chain(std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()))
+        .collect::<Vec<_>>()
+        .join(" ")
 }
 
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn print_ranks(comparison: &Comparison, out: &Path) {
     for warning in &comparison.warnings {
-        eprintln!("note: {warning}");
+        errln!("note: {warning}");
     }
     let shown = |kind: CriterionKind| comparison.criteria.iter().find(move |c| c.kind == kind);
     for criterion in [CriterionKind::DetectorGap, CriterionKind::Distance, CriterionKind::Diagnosis].map(shown) {
         let Some(criterion) = criterion else { continue };
-        println!("{} ({} frames)", criterion.name, criterion.frames);
+        outln!("{} ({} frames)", criterion.name, criterion.frames);
         let mut rows: Vec<_> = criterion.rows.iter().collect();
         rows.sort_by_key(|row| row.rank.unwrap_or(usize::MAX));
         for row in rows {
@@ -240,8 +253,8 @@ fn print_ranks(comparison: &Comparison, out: &Path) {
                 (Some(v), None) => format!("; behind the first by {v:.4}"),
                 (None, _) => String::new(),
             };
-            println!("  {rank}. {}: {size} {}{interval}{behind}", row.simulation, criterion.unit);
+            outln!("  {rank}. {}: {size} {}{interval}{behind}", row.simulation, criterion.unit);
         }
     }
-    println!("page: {}", out.join("comparison.html").display());
+    outln!("page: {}", out.join("comparison.html").display());
 }

@@ -1,11 +1,12 @@
 //! `lidarshift detect`: detects objects in one point cloud or in all frames of a split.
 
 use crate::device::DeviceArgs;
+use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use data::{
-    Cloud, Dataset, Detection, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud, read_kitti_text,
-    write_atomic, write_json,
+    Cloud, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
+    read_kitti_text, refuse_input_file, write_atomic, write_json,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
@@ -81,8 +82,8 @@ impl DetectArgs {
         }
     }
 
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     fn cloud(&self, detector: &Detector) -> Result<()> {
+        refuse_input_file(self.json.as_deref(), [&*self.input].into_iter().chain(self.labels.as_deref()))?;
         let columns = match self.points {
             Some(Points::Xyz) => PointColumns::Xyz,
             Some(Points::Xyzi) => PointColumns::Xyzi,
@@ -94,10 +95,6 @@ impl DetectArgs {
         let frame = Frame { id: id.clone(), cloud, objects: Vec::new() };
         let sample = Preparer::new(detector.config()).inference(&frame)?;
         let detections = predict_samples(detector, &[sample])?.remove(0).detections;
-        for detection in &detections {
-            let found = LabelBox::from_box(&detection.class, &detection.bbox, Some(detection.score));
-            println!("{}", KittiLine(&found));
-        }
         if let Some(path) = &self.json {
             let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
             write_json(path, &found)?;
@@ -108,7 +105,11 @@ impl DetectArgs {
         };
         let picture = self.out.clone().unwrap_or_else(|| ".".into()).join(format!("{id}.png"));
         draw(&picture, &frame.cloud, &truth, &detections)?;
-        eprintln!("{} boxes, bird's eye view in {}", detections.len(), picture.display());
+        for detection in &detections {
+            let found = LabelBox::from_box(&detection.class, &detection.bbox, Some(detection.score));
+            outln!("{}", KittiLine(&found));
+        }
+        errln!("{} boxes, bird's eye view in {}", detections.len(), picture.display());
         Ok(())
     }
 
@@ -121,6 +122,8 @@ impl DetectArgs {
     fn split(&self, detector: &Detector) -> Result<()> {
         let Some(out) = &self.out else { bail!("--out DIR is required to detect on a data set") };
         let dataset = Dataset::open(&self.input)?;
+        dataset.refuse_frame_folder(out)?;
+        let _lock = FolderLock::acquire(out)?;
         let ids = match &self.split {
             Some(split) => dataset.ids(split)?,
             None => dataset.all_ids()?,
@@ -139,7 +142,7 @@ impl DetectArgs {
             Ok::<(), anyhow::Error>(())
         })?;
         progress.finish_and_clear();
-        eprintln!("{boxes} boxes in {} frames, written to {}", ids.len(), out.display());
+        errln!("{boxes} boxes in {} frames, written to {}", ids.len(), out.display());
         Ok(())
     }
 }

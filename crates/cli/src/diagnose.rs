@@ -1,13 +1,16 @@
 //! `lidarshift diagnose`: finds the differences between measured and simulated data, their causes and a correction.
 
 mod detectors;
+mod previous;
 mod simulator;
 
 use crate::commands::End;
+use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use data::output::check_writable;
 use data::write::{REPAIRED_ENDINGS, write_kitti_text};
-use data::{Dataset, LabelBox, write_atomic, write_json};
+use data::{Dataset, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
     DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage, Status, Verdict,
@@ -80,6 +83,8 @@ impl DiagnoseArgs {
         if self.out.is_file() {
             bail!("--out {}: is a file, but must be a folder", self.out.display());
         }
+        self.check_outputs()?;
+        let _lock = FolderLock::acquire(&self.out)?;
         let bar = ProgressBar::new(1).with_style(
             ProgressStyle::with_template("{msg:<20} {bar:30} {pos}/{len}, {eta} left").context("a template")?,
         );
@@ -114,12 +119,13 @@ impl DiagnoseArgs {
             _ => bail!("give --measured and --simulated, or --scans"),
         };
         bar.finish_and_clear();
+        previous::remove(&self.out)?;
         self.write_json(&outcome.diagnosis)?;
         write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         for (id, boxes) in &outcome.corrected {
             for (ending, boxes) in REPAIRED_ENDINGS.iter().zip(boxes) {
-                write_labels(&self.out.join(format!("label_2{ending}")), &measured, id, boxes)?;
+                write_labels(&self.out.join(format!("{}{ending}", previous::LABELS)), &measured, id, boxes)?;
             }
         }
         print_diagnosis(&outcome.diagnosis, &self.out, outcome.corrected.len());
@@ -135,6 +141,22 @@ impl DiagnoseArgs {
             self.write_json(&outcome.diagnosis)?;
         }
         Ok(end_of(&outcome.diagnosis))
+    }
+
+    /// Refuses outputs that would overwrite a data set, and those that cannot be written, before the work begins.
+    fn check_outputs(&self) -> Result<()> {
+        for path in [&self.measured, &self.simulated, &self.scans].into_iter().flatten() {
+            Dataset::open(path)?.refuse_own_folder(&self.out)?;
+        }
+        if Dataset::open(&self.out).is_ok() {
+            bail!(
+                "--out {}: is a data set, whose labels would be overwritten; choose another folder",
+                self.out.display()
+            );
+        }
+        let inputs = [&self.verify, &self.sensor].into_iter().flatten().map(PathBuf::as_path);
+        refuse_input_file(self.json.as_deref(), inputs)?;
+        Ok(self.json.as_deref().map_or(Ok(()), check_writable)?)
     }
 
     /// What the diagnosis leaves out: the frames on which detectors are tested.
@@ -167,7 +189,7 @@ impl DiagnoseArgs {
         match RaceSimulator::open(config, simulated) {
             Ok(simulator) => Box::new(simulator),
             Err(error) => {
-                eprintln!("note: the gain is measured on changed clouds, not by the simulator: {error:#}");
+                errln!("note: the gain is measured on changed clouds, not by the simulator: {error:#}");
                 Box::new(OnClouds { simulated, rig })
             }
         }
@@ -255,55 +277,53 @@ fn write_labels(folder: &Path, measured: &Dataset, id: &str, boxes: &[geometry::
     Ok(write_kitti_text(&folder.join(format!("{id}.txt")), &lines)?)
 }
 
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
     for note in &diagnosis.notes {
-        eprintln!("note: {note}");
+        errln!("note: {note}");
     }
     let statuses: Vec<Status> = diagnosis.findings.iter().map(|f| f.status).collect();
-    println!("verdict: {}", verdict_text(diagnosis.verdict, &statuses));
+    outln!("verdict: {}", verdict_text(diagnosis.verdict, &statuses));
     if diagnosis.verdict == Verdict::NothingFound && !diagnosis.minimum_detectable.is_empty() {
-        println!("detectable effect sizes:");
+        outln!("detectable effect sizes:");
         for (cause, m) in &diagnosis.minimum_detectable {
-            println!("  {cause}: {} {:.4} {}", m.parameter, m.value, m.unit);
+            outln!("  {cause}: {} {:.4} {}", m.parameter, m.value, m.unit);
         }
     }
     for f in &diagnosis.findings {
         let name = finding_name(f);
-        println!("{name}: {}", f.says);
+        outln!("{name}: {}", f.says);
         for (parameter, p) in f.parameters.iter().filter(|(id, _)| matches!(id, ParameterId::Of(_))) {
-            println!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
+            outln!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
         }
         if let Some(how) = &f.separate_by {
-            println!("  to distinguish these causes: {how}");
+            outln!("  to distinguish these causes: {how}");
         }
     }
     print_gain(&diagnosis.gain, "extended.toml");
     if corrected > 0 {
-        println!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());
+        outln!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());
     }
-    eprintln!("diagnosis.json and extended.toml written to {}", out.display());
+    errln!("diagnosis.json and extended.toml written to {}", out.display());
 }
 
 /// What is gone with a list of effects, by channel, and what could not be applied.
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn print_gain(gain: &Gain, list: &str) {
     let percent = |share: f64| format!("{:.0}", 100.0 * share);
     let between = |ci95: Option<[f64; 2]>| {
         ci95.map_or(String::new(), |[low, high]| format!(" ({} to {} %)", percent(low), percent(high)))
     };
     if let Some(closed) = gain.closed {
-        println!(
+        outln!(
             "measured on held-out frames that were made anew with {list}: {} % of the difference is gone{}",
             percent(closed),
             between(gain.ci95)
         );
         for (channel, c) in &gain.closed_by_channel {
-            println!("  {channel}: {} %{}", percent(c.closed), between(c.ci95));
+            outln!("  {channel}: {} %{}", percent(c.closed), between(c.ci95));
         }
     }
     for left in &gain.not_applied {
-        println!("not applied, and counted as not gone: {} {}", left.effect, left.why);
+        outln!("not applied, and counted as not gone: {} {}", left.effect, left.why);
     }
 }
 
@@ -324,15 +344,21 @@ fn verdict_text(verdict: Verdict, findings: &[Status]) -> String {
     }
 }
 
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
 fn print_gains(gains: &[DetectorGain], left_out: &[String]) {
-    left_out.iter().for_each(|note| println!("note: {note}"));
+    left_out.iter().for_each(|note| outln!("note: {note}"));
     for g in gains {
         let interval = g.ci95.map_or(String::new(), |[low, high]| format!(" ({low:.1} to {high:.1})"));
-        println!(
+        outln!(
             "{}, {} at IoU {}: AP on measured frames is {:.1} when trained on simulated, {:.1} on extended, {:.1} on measured data; \
              gain {:+.1}{interval} over {} runs each",
-            g.detector, g.class, g.overlap, g.before, g.after, g.ceiling, g.gain, g.runs
+            g.detector,
+            g.class,
+            g.overlap,
+            g.before,
+            g.after,
+            g.ceiling,
+            g.gain,
+            g.runs
         );
     }
 }

@@ -1,5 +1,6 @@
 //! `lidarshift doctor`: checks a data set for errors.
 
+use crate::outln;
 use anyhow::{Result, anyhow};
 use clap::Args;
 use data::Dataset;
@@ -38,7 +39,6 @@ pub struct DoctorArgs {
 
 impl DoctorArgs {
     /// Prints the report; `true` if no problem is found.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
         let detector = self.detector.as_deref().map(find_detector).transpose()?;
         let dataset = Dataset::open(&self.dataset)?;
@@ -46,9 +46,13 @@ impl DoctorArgs {
         if let Some(path) = &self.json {
             data::write_json(path, &report)?;
         }
-        println!("{report}");
-        if let (Some(path), Some(detector)) = (&self.suggest, &detector) {
-            println!("{}", self.write_suggestion(path, detector, &dataset)?);
+        let suggestion = match (&self.suggest, &detector) {
+            (Some(path), Some(detector)) => Some(self.write_suggestion(path, detector, &dataset)),
+            _ => None,
+        };
+        outln!("{report}");
+        if let Some(suggestion) = suggestion {
+            outln!("{}", suggestion?);
         }
         Ok(report.sound)
     }

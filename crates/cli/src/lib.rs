@@ -3,7 +3,9 @@
 #[macro_use]
 mod commands;
 pub mod allocator;
+pub mod console;
 pub mod device;
+pub mod signals;
 
 use clap::Parser;
 use std::process::ExitCode;
@@ -34,13 +36,17 @@ struct Program {
 }
 
 /// Runs the command line. Exit codes: 0 success, 1 failure, 2 wrong arguments, 3 a diagnosis of data sets that do not
-/// show the same scenes.
+/// show the same scenes. The program ends by SIGINT or SIGTERM if it was stopped, and by SIGPIPE if stdout was closed.
 pub fn run() -> ExitCode {
-    match Program::parse().command.run() {
-        Ok(end) => end.into(),
-        Err(error) => {
-            eprintln!("error: {error:#}");
+    signals::handle();
+    let code = match Program::try_parse().map(|program| program.command.run()) {
+        Ok(Ok(end)) => end.into(),
+        Ok(Err(error)) => {
+            errln!("error: {error:#}");
+            signals::end_if_stopped();
             ExitCode::FAILURE
         }
-    }
+        Err(usage) => console::print_usage(&usage),
+    };
+    console::end(code)
 }

@@ -1,5 +1,6 @@
 //! `lidarshift report`: writes the report of a study.
 
+use crate::outln;
 use crate::study::{StudySelection, listener};
 use anyhow::Result;
 use clap::Args;
@@ -31,7 +32,6 @@ impl ReportArgs {
     ///
     /// # Errors
     /// Missing data sets, damaged files.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let without_study = self.study.folder_of_runs().filter(|_| self.tensorboard.is_some());
         let runs = match without_study {
@@ -39,13 +39,13 @@ impl ReportArgs {
             None => {
                 let study = self.study.open()?;
                 let (_, files) = write_report(&study, &listener())?;
-                println!("report: {} ({:.1} MB)", files.page.display(), files.page_bytes as f64 / 1e6);
+                outln!("report: {} ({:.1} MB)", files.page.display(), files.page_bytes as f64 / 1e6);
                 study.folder
             }
         };
         if let Some(out) = &self.tensorboard {
             let n = write_event_files(&runs, out)?.len();
-            println!("training curves of {n} runs: tensorboard --logdir {}", out.display());
+            outln!("training curves of {n} runs: tensorboard --logdir {}", out.display());
         }
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! `lidarshift resim`: applies sensor effects to an existing data set.
 
+use crate::{errln, outln};
 use anyhow::{Context, Result};
 use clap::Args;
 use data::Dataset;
@@ -42,12 +43,12 @@ pub struct ResimArgs {
 
 impl ResimArgs {
     /// Writes the data set and prints its size.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let dataset = Dataset::open(&self.dataset)?;
+        dataset.refuse_own_folder(&self.out)?;
         let mut effects = EffectList::read(&self.effects)?;
         if effects.effects.is_empty() {
-            eprintln!("note: {} has no effect: the clouds are copied", self.effects.display());
+            errln!("note: {} has no effect: the clouds are copied", self.effects.display());
         }
         let rig = self.sensor.as_deref().map(Rig::read).transpose()?;
         let progress = ProgressBar::new(0)
@@ -56,7 +57,7 @@ impl ResimArgs {
             let refused =
                 Resim { dataset: &dataset, effects: &effects, rig: rig.clone(), seed: self.seed }.refused()?;
             for refusal in &refused {
-                println!("left out: effect[{}]: {} {}", refusal.index, refusal.kind, refusal.why);
+                outln!("left out: effect[{}]: {} {}", refusal.index, refusal.kind, refusal.why);
             }
             effects = effects.without(&refused);
         }
@@ -68,8 +69,8 @@ impl ResimArgs {
         let manifest = made.with_context(|| format!("{} on {}", self.effects.display(), self.dataset.display()))?;
         progress.finish_and_clear();
         let [before, after] = manifest.points.map(|n| n / manifest.frames.max(1));
-        println!("{} frames, {after} points per frame ({before} before)", manifest.frames);
-        eprintln!("data set written to {}", self.out.display());
+        outln!("{} frames, {after} points per frame ({before} before)", manifest.frames);
+        errln!("data set written to {}", self.out.display());
         Ok(())
     }
 }

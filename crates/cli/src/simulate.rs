@@ -1,5 +1,7 @@
 //! `lidarshift simulate`: simulates data sets and writes them to disk.
 
+use crate::console::escaped;
+use crate::{errln, out, outln};
 use anyhow::Result;
 use clap::Args;
 use data::{Dataset, write_atomic};
@@ -49,7 +51,6 @@ impl SimulateArgs {
         }
     }
 
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     fn street(&self, config: &RoadConfig) -> Result<()> {
         let out = self.out.clone().unwrap_or_else(|| "datasets/road".into());
         let progress = bar()?;
@@ -59,26 +60,25 @@ impl SimulateArgs {
         for (split, _) in config.frames.splits() {
             let counts = manifest.splits[split];
             let points = counts.points / counts.frames;
-            println!("{split}: {} frames, {} cars, {points} points per frame", counts.frames, counts.cars);
+            outln!("{split}: {} frames, {} cars, {points} points per frame", counts.frames, counts.cars);
         }
-        eprintln!("data set written to {}", out.display());
+        errln!("data set written to {}", out.display());
         Ok(())
     }
 
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     fn race(&self, config: &RaceConfig, files: &ConfigFiles) -> Result<()> {
         let out = self.out.clone().unwrap_or_else(|| Path::new("datasets").join(&config.name));
         let progress = bar()?;
         let show_progress = |name: &str, done: usize, total: usize| {
-            progress.set_message(name.to_string());
+            progress.set_message(escaped(name).into_owned());
             progress.set_length(total as u64);
             progress.set_position(done as u64);
         };
         let manifests = make_race_datasets(config, files, &out, &self.dataset, &show_progress)?;
         progress.finish_and_clear();
-        manifests.iter().for_each(|manifest| print!("{}", summary(manifest)));
         manifests.iter().try_for_each(|manifest| preview(&out.join(&manifest.name[1])))?;
-        eprintln!("data sets written to {}", out.display());
+        manifests.iter().for_each(|manifest| out!("{}", summary(manifest)));
+        errln!("data sets written to {}", out.display());
         Ok(())
     }
 }

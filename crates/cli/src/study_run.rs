@@ -1,9 +1,13 @@
 //! `lidarshift study-run`: executes one run of a study in a separate process.
 
 use crate::device::DeviceArgs;
+use crate::signals::{self, SaveFirst};
+use crate::{errln, outln};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
+use data::output::TemporaryFolder;
 use std::io::Read as _;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 use study::{RunPart, RunWork, Study, detect_frozen, execute_run, measure};
 use train::Event;
@@ -16,13 +20,18 @@ enum PartArg {
     Detect,
     /// Only the time and memory of a few training steps and detections, as JSON on stdout.
     Measure,
+    /// As measure, without a file in the folder of the study.
+    MeasureOnly,
 }
 
 /// Execute one run of a study. `lidarshift study` or Slurm starts one such process per run.
 #[derive(Args, Debug)]
 pub struct StudyRunArgs {
-    /// Folder of the study
+    /// Folder of the study, or its TOML with --out
     study: String,
+    /// Folder of the study, if STUDY is its TOML
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
     /// Name of the run: NETWORK/TRAIN_SET/seed-K
     #[arg(long, value_name = "NAME", required_unless_present = "frozen")]
     run: Option<String>,
@@ -47,24 +56,25 @@ impl StudyRunArgs {
     ///
     /// # Errors
     /// As [`execute_run`].
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         if self.attached {
             std::thread::spawn(exit_with_stdin);
         }
-        let study = Study::open(&self.study, None)?;
+        let study = Study::open(&self.study, self.out.as_deref())?;
         if let Some(name) = &self.frozen {
-            return Ok(detect_frozen(&study, name, &self.device.open()?, self.workers, &|note| eprintln!("{note}"))?);
+            return Ok(detect_frozen(&study, name, &self.device.open()?, self.workers, &|note| errln!("{note}"))?);
         }
         let run = study.run(self.run.as_deref().unwrap_or_default())?;
-        if self.parts.contains(&PartArg::Measure) {
-            println!("{}", serde_json::to_string(&measure(&study, &run, &self.device.open()?)?)?);
+        if let Some(part @ (PartArg::Measure | PartArg::MeasureOnly)) = self.parts.first() {
+            let temporary = (*part == PartArg::MeasureOnly).then(TemporaryFolder::new).transpose()?;
+            let cache = temporary.as_ref().map_or(run.folder(&study.folder).join("cache"), |t| t.path().into());
+            outln!("{}", serde_json::to_string(&measure(&study, &run, &cache, &self.device.open()?)?)?);
             return Ok(());
         }
         let part = |arg: &PartArg| match arg {
             PartArg::Train => Some(RunPart::Train),
             PartArg::Detect => Some(RunPart::Detect),
-            PartArg::Measure => None,
+            PartArg::Measure | PartArg::MeasureOnly => None,
         };
         let parts: Vec<RunPart> = self.parts.iter().filter_map(part).collect();
         let work = RunWork {
@@ -72,9 +82,15 @@ impl StudyRunArgs {
             device: &|| self.device.open().map_err(|e| format!("{e:#}")),
             device_name: self.device.describe(),
             workers: self.workers,
+            stop: signals::stop_flag(),
         };
         let mut last = Instant::now();
-        execute_run(&study, &run, &work, &mut |event| show(event, &mut last), &|note| eprintln!("{note}"))?;
+        let mut save_first = SaveFirst::default();
+        let mut on_training = |event: &Event<'_>| {
+            show(event, &mut last);
+            save_first.follow(event);
+        };
+        execute_run(&study, &run, &work, &mut on_training, &|note| errln!("{note}"))?;
         Ok(())
     }
 }
@@ -82,18 +98,18 @@ impl StudyRunArgs {
 fn show(event: &Event<'_>, last: &mut Instant) {
     match event {
         Event::Begin { state, epochs, frames, .. } => {
-            eprintln!("{frames} training frames, {epochs} epochs, step {} of {}", state.step, state.total_steps);
+            errln!("{frames} training frames, {epochs} epochs, step {} of {}", state.step, state.total_steps);
         }
-        Event::Warning(text) => eprintln!("warning: {text}"),
+        Event::Warning(text) => errln!("warning: {text}"),
         Event::Step { metrics, logged: true } if last.elapsed() > Duration::from_secs(10) => {
-            eprintln!("step {}: loss {:.4}, {:.1} samples/s", metrics.step, metrics.loss, metrics.samples_per_s);
+            errln!("step {}: loss {:.4}, {:.1} samples/s", metrics.step, metrics.loss, metrics.samples_per_s);
             *last = Instant::now();
         }
         Event::Step { .. } => {}
         Event::Epoch(metrics) => {
             let ap = metrics.validation.as_ref().and_then(|v| v.ap_loose);
             let ap = ap.map_or(String::new(), |ap| format!(", AP at loose overlaps {ap:.1}"));
-            eprintln!("epoch {}: loss {:.4}{ap}", metrics.epoch + 1, metrics.train_loss);
+            errln!("epoch {}: loss {:.4}{ap}", metrics.epoch + 1, metrics.train_loss);
         }
     }
 }
@@ -101,5 +117,5 @@ fn show(event: &Event<'_>, last: &mut Instant) {
 fn exit_with_stdin() {
     let mut ignored = [0; 64];
     while std::io::stdin().read(&mut ignored).is_ok_and(|n| n > 0) {}
-    std::process::exit(1);
+    signals::stop(0);
 }

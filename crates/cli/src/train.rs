@@ -4,10 +4,13 @@ mod progress;
 mod results;
 
 use crate::device::DeviceArgs;
+use crate::errln;
+use crate::signals::{self, SaveFirst};
 use crate::study::{SchedulingArgs, run_study};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
+use data::output::TemporaryFolder;
 use models::detector_text;
 use progress::Progress;
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
@@ -86,7 +89,7 @@ impl TrainArgs {
             return run_study(&study, &self.scheduling.options(vec![Step::Data, Step::Train], &self.device));
         }
         let device = self.device.open()?;
-        let temporary = (self.smoke && self.out.is_none()).then(tempfile::tempdir).transpose()?;
+        let temporary = (self.smoke && self.out.is_none()).then(TemporaryFolder::new).transpose()?;
         if let Some(folder) = &temporary {
             self.out = Some(folder.path().into());
         }
@@ -94,13 +97,20 @@ impl TrainArgs {
             Some((stored, out)) => (self.changed(stored.to_table())?, out),
             None => self.fresh()?,
         };
-        eprintln!("device: {}", self.device.describe());
+        Dataset::open(&config.dataset)?.refuse_own_folder(&out)?;
+        errln!("device: {}", self.device.describe());
         // The default run is always resumed.
         let resume = self.resume || self.dataset.is_none();
-        let session = Session { device, device_name: self.device.describe(), workers: self.workers, resume };
+        let (device_name, stop) = (self.device.describe(), signals::stop_flag());
+        let session = Session { device, device_name, workers: self.workers, resume, stop };
         let mut progress = Progress::default();
-        let trained = train(&config, &out, &session, &mut |event| progress.show(&event))?;
+        let mut save_first = SaveFirst::default();
+        let trained = train(&config, &out, &session, &mut |event| {
+            progress.show(&event);
+            save_first.follow(&event);
+        });
         progress.finish();
+        let trained = trained?;
 
         let set = Dataset::open(&config.dataset)?;
         let named = ["test", config.run.val_split.as_str()].into_iter().find(|s| set.config.splits.contains_key(*s));
@@ -108,10 +118,7 @@ impl TrainArgs {
             _ if config.overfit => (set.all_ids()?, "all frames, which are also the training frames".to_string()),
             Some(split) => (set.ids(split)?, format!("the split {split}")),
             None => {
-                eprintln!(
-                    "not evaluated: the data set has neither the split test nor the split {}",
-                    config.run.val_split
-                );
+                errln!("not evaluated: the data set has neither the split test nor the split {}", config.run.val_split);
                 return results::write_curve_and_list(&out, temporary.is_none());
             }
         };
@@ -119,8 +126,8 @@ impl TrainArgs {
         let mut count = |done| counter.set_position(done as u64);
         let found = evaluate_detector(&trained.detector, &set, &ids, self.workers, &mut count)?;
         counter.finish_and_clear();
-        results::show(&found, &what)?;
         results::write(&found, &set, &out)?;
+        results::show(&found, &what);
         results::write_curve_and_list(&out, temporary.is_none())
     }
 
@@ -220,6 +227,6 @@ fn make_data(folder: &Path, smoke: bool) -> Result<PathBuf> {
     let bar = progress::bar("{bar:30} {pos}/{len} frames generated, {eta} left", road.frames.total())?;
     make_road_dataset(&road, folder, &|done, _| bar.set_position(done as u64))?;
     bar.finish_and_clear();
-    eprintln!("data set: {}", folder.display());
+    errln!("data set: {}", folder.display());
     Ok(folder.into())
 }

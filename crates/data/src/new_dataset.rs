@@ -1,7 +1,8 @@
 //! Writes a new data set: folder, manifest, frames, splits and `dataset.toml`.
 
-use crate::write::{remove_unfinished, write_dataset_toml, write_split};
-use crate::{DataError, DatasetConfig, Layout, PointColumns, write_json};
+use crate::output::remove_unfinished;
+use crate::write::{write_dataset_toml, write_split};
+use crate::{DataError, DatasetConfig, FolderLock, Layout, PointColumns, is_unused, write_json};
 use rayon::prelude::*;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -20,26 +21,29 @@ pub trait Manifest: Serialize + DeserializeOwned {
     fn set_complete(&mut self, complete: bool);
 }
 
-/// A data set that is being written. Frames that an earlier run with the same manifest wrote are kept.
+/// A data set that is being written. Frames that an earlier run with the same manifest wrote are kept. Its folder is
+/// locked against other processes while this value lives.
 pub struct NewDataset<'a> {
     root: &'a Path,
     layout: Layout,
+    _lock: FolderLock,
 }
 
 impl<'a> NewDataset<'a> {
     /// Begins or resumes a data set in the folder `root`.
     ///
     /// `root` must be empty, not exist, or have a manifest with the same identity. `extra_folders` are further folders,
-    /// relative to `root`, into which the caller writes. Incomplete files in all these folders are removed.
+    /// relative to `root`, into which the caller writes. Incomplete files in all these folders are removed. A folder
+    /// that another process writes is refused.
     pub fn begin<M: Manifest>(
         root: &'a Path,
         layout: Layout,
         extra_folders: &[&str],
         manifest: &mut M,
     ) -> Result<Self, DataError> {
-        let set = NewDataset { root, layout };
+        let set = NewDataset { root, layout, _lock: FolderLock::acquire(root)? };
         set.check_folder(manifest)?;
-        for inside in ["", "ImageSets"].iter().chain(layout.folders()).chain(extra_folders) {
+        for inside in ["ImageSets"].iter().chain(layout.folders()).chain(extra_folders) {
             remove_unfinished(&root.join(inside))?;
         }
         manifest.set_complete(false);
@@ -122,7 +126,7 @@ impl<'a> NewDataset<'a> {
                 let message = format!("was made {}; choose another folder, or remove this one", M::DIFFERENCE);
                 return Err(DataError::file(self.root, message));
             }
-        } else if self.root.is_dir() && fs_err::read_dir(self.root)?.next().is_some() {
+        } else if !is_unused(self.root)? {
             return Err(DataError::file(self.root, "is not empty and has no manifest.json; choose another folder"));
         }
         Ok(())
@@ -184,5 +188,15 @@ mod tests {
         assert!(error.contains("was made with another recipe; choose another folder"), "{error}");
         std::fs::remove_file(root.join("manifest.json")).unwrap();
         assert!(make(&root, "1").unwrap_err().to_string().contains("is not empty"));
+        // A process that was killed before its first manifest.
+        let killed = folder.path().join("killed");
+        std::fs::create_dir(&killed).unwrap();
+        std::fs::write(killed.join(".writing-abc"), "half").unwrap();
+        std::fs::write(killed.join(".lock"), "process 1").unwrap();
+        assert_eq!(make(&killed, "1").unwrap(), 2);
+        assert!(!killed.join(".writing-abc").exists());
+        let lock = FolderLock::acquire(&root).unwrap();
+        assert!(make(&root, "1").unwrap_err().to_string().contains("in use by another process"));
+        drop(lock);
     }
 }

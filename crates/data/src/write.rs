@@ -1,47 +1,10 @@
-//! Writes files atomically: temporary file in the same folder, sync, rename.
+//! Writes the files of data sets, each as a whole (see [`crate::output`]).
 
 use crate::kitti_text::to_kitti_text;
+use crate::output::write_atomic;
 use crate::{Cloud, DataError, DatasetConfig, Frame, LabelBox, PcdEncoding, encode_pcd};
 use serde::Serialize;
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
-
-/// Prefix of the names of temporary files.
-const TEMPORARY_PREFIX: &str = ".writing-";
-
-/// Removes temporary files of killed processes from a folder, which need not exist. No other process may write there.
-pub fn remove_unfinished(folder: &Path) -> Result<(), DataError> {
-    if folder.is_dir() {
-        for entry in fs_err::read_dir(folder)? {
-            let entry = entry?;
-            if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) {
-                fs_err::remove_file(entry.path())?;
-            }
-        }
-    }
-    Ok(())
-}
-
-/// Writes `bytes` to `path` and creates its folder if needed. Readers see the old or the new file, never a part of it.
-pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
-    let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    fs_err::create_dir_all(folder)?;
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(TEMPORARY_PREFIX);
-    #[cfg(unix)]
-    let permissions = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
-    #[cfg(unix)]
-    builder.permissions(permissions); // before the umask; temporary files have 0600 by default
-    let mut file = builder.tempfile_in(folder).map_err(failed)?;
-    file.write_all(bytes).map_err(failed)?;
-    file.as_file().sync_all().map_err(failed)?;
-    file.persist(path).map_err(|e| failed(e.error))?;
-    Ok(())
-}
 
 /// Writes a value as indented JSON with a final line feed.
 pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), DataError> {
@@ -127,13 +90,5 @@ mod tests {
         let unsupported_keys = std::collections::BTreeMap::from([([1u8, 2], 3)]);
         let error = write_json(&path, &unsupported_keys).unwrap_err().to_string();
         assert!(error.contains("a.json") && error.contains("cannot be written as JSON"), "{error}");
-    }
-
-    #[test]
-    fn write_errors_name_the_file() {
-        let folder = tempfile::tempdir().unwrap();
-        std::fs::write(folder.path().join("plain"), b"").unwrap();
-        let error = write_atomic(&folder.path().join("plain/x.txt"), b"").unwrap_err();
-        assert!(error.to_string().contains("plain"), "{error}");
     }
 }

@@ -9,7 +9,7 @@ use crate::error::{Result, refused};
 use crate::folder::Study;
 use crate::frozen::{FrozenState, prepare};
 use crate::{Event, Listener};
-use data::Dataset;
+use data::{Dataset, FolderLock};
 use eval::comparison::{Comparison, Criterion};
 use eval::distance::{DISTANCES_SCHEMA, DistanceError, FrameDistances, Measure, Part, compare_by_frame};
 use eval::matrix::{PairedValues, Quantity, shared_ids};
@@ -92,6 +92,7 @@ pub fn study_of(input: &CompareInput, out: &Path) -> Result<Study> {
 /// # Errors
 /// Data sets without shared frames; detections that do not fit; frames that cannot be read.
 pub fn compare(study: &Study, device: &[String], listener: Listener<'_>) -> Result<Comparison> {
+    let _lock = FolderLock::acquire(&study.folder)?;
     study.update_copy()?;
     let split = &study.config.splits.test;
     let sets: Vec<Dataset> = study.config.datasets.iter().map(|d| open(study, &d.name)).collect::<Result<_>>()?;

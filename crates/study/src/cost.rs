@@ -13,6 +13,7 @@ use data::{Dataset, Frame, write_json};
 use models::{Detector, Preparer, predict_samples, reference_name};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 use train::memory::peak_mib;
@@ -41,14 +42,15 @@ pub struct NetworkCost {
 /// Costs of the networks of a study by name, stored in `costs.json`.
 pub type Costs = BTreeMap<String, NetworkCost>;
 
-/// Measures the network of a run in this process. The arguments of the device are left empty.
+/// Measures the network of a run in this process, with this folder for cached files. The arguments of the device are
+/// left empty.
 ///
 /// # Errors
 /// Frames that cannot be read, a failing step.
-pub fn measure(study: &Study, run: &StudyRun, device: &Device) -> Result<NetworkCost> {
+pub fn measure(study: &Study, run: &StudyRun, cache: &Path, device: &Device) -> Result<NetworkCost> {
     let config = study.run_config(run)?;
     let set = Dataset::open(&config.dataset)?;
-    let frames = TrainingFrames::new(&config, &set, &run.folder(&study.folder).join("cache"))?;
+    let frames = TrainingFrames::new(&config, &set, cache)?;
     let order = frames.order(0);
     let batch_size = config.detector.optimization.batch_size;
     let mut detector = Detector::new(&config.detector, config.seed, &device.clone().autodiff());
@@ -96,7 +98,7 @@ pub fn known_costs(study: &Study) -> Costs {
 }
 
 /// The costs of the networks of these runs. Unknown costs are measured in one process per network with `threads`
-/// threads. A network that cannot be measured is left out with a note.
+/// threads. A network that cannot be measured is left out with a note. With `dry_run` only `costs.json` is written.
 ///
 /// # Errors
 /// A process that cannot be started, a file that cannot be written.
@@ -104,7 +106,7 @@ pub fn costs(
     study: &Study,
     runs: &[StudyRun],
     threads: usize,
-    device: &[String],
+    (device, dry_run): (&[String], bool),
     listener: Listener<'_>,
 ) -> Result<Costs> {
     let mut costs = known_costs(study);
@@ -116,10 +118,14 @@ pub fn costs(
             continue;
         }
         listener(Event::Note(&format!("measuring the step time of {network}")));
-        let output = Command::new(current_program()?)
-            .arg("study-run")
-            .arg(&study.folder)
-            .args(["--run", &run.to_string(), "--parts", "measure"])
+        let mut command = Command::new(current_program()?);
+        // The folder may have no copy of the study's TOML, or that of an earlier version.
+        match dry_run && !study.is_copied() {
+            true => command.arg("study-run").arg(&study.named).arg("--out").arg(&study.folder),
+            false => command.arg("study-run").arg(&study.folder),
+        };
+        let output = command
+            .args(["--run", &run.to_string(), "--parts", if dry_run { "measure-only" } else { "measure" }])
             .args(device)
             .env("RAYON_NUM_THREADS", threads.to_string())
             .stdin(Stdio::null())

@@ -98,6 +98,18 @@ fn with_sources(race: &RaceConfig, name: &str) -> Vec<String> {
     names
 }
 
+/// Names of the data sets that do not exist or are not complete.
+pub fn absent_datasets(study: &Study) -> Vec<&str> {
+    let is_complete = |dataset: &StudyDataset| {
+        let path = study.dataset_path(dataset);
+        let manifest = fs_err::read(path.join("manifest.json")).ok();
+        let value = manifest.and_then(|bytes| serde_json::from_slice::<serde_json::Value>(&bytes).ok());
+        let unfinished = value.is_some_and(|manifest| manifest["complete"] == false);
+        Dataset::open(&path).is_ok() && !unfinished
+    };
+    study.config.datasets.iter().filter(|dataset| !is_complete(dataset)).map(|dataset| dataset.name.as_str()).collect()
+}
+
 /// Opens an existing data set of the study.
 ///
 /// # Errors

@@ -54,6 +54,17 @@ pub enum StudyError {
     },
 }
 
+impl StudyError {
+    /// Whether a training was stopped by [`train::Session::stop`], which is no failure.
+    pub fn is_stopped(&self) -> bool {
+        match self {
+            StudyError::Train(TrainError::Stopped { .. }) => true,
+            StudyError::Part { error, .. } => error.is_stopped(),
+            _ => false,
+        }
+    }
+}
+
 /// Result with an error of this crate.
 pub type Result<T, E = StudyError> = std::result::Result<T, E>;
 

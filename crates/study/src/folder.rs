@@ -67,7 +67,7 @@ impl Study {
         let config = StudyConfig::parse(&text, &path)?;
         let base = std::path::absolute(&path)?.parent().map(Path::to_path_buf).unwrap_or_default();
         let folder = out.map_or_else(|| Path::new("runs").join(&config.name), Path::to_path_buf);
-        Ok(Study { config, named: named.into(), text, base, folder: std::path::absolute(folder)? })
+        Ok(Study { config, named: named.into(), text, base, folder: absolute_utf8(&folder)? })
     }
 
     /// A study that a command makes instead of a TOML. Paths in `config` are relative to `base`; its folder is `out`.
@@ -77,7 +77,7 @@ impl Study {
     pub fn from_config(config: &StudyConfig, base: &Path, out: &Path) -> Result<Study> {
         let text = toml::to_string(config).map_err(|e| refused(format!("the study cannot be written: {e}")))?;
         let config = StudyConfig::parse(&text, &out.join(COPY))?;
-        let (base, folder) = (std::path::absolute(base)?, std::path::absolute(out)?);
+        let (base, folder) = (std::path::absolute(base)?, absolute_utf8(out)?);
         Ok(Study { config, named: out.display().to_string(), text, base, folder })
     }
 
@@ -193,11 +193,11 @@ impl Study {
         self.config.evaluation.tsne_dataset.as_ref().unwrap_or(&self.config.datasets[0].name)
     }
 
-    /// Describes the changes of the study's TOML since the study was last run, then replaces the copy in the folder.
+    /// Describes the changes of the study's TOML since the study was last run.
     ///
     /// # Errors
-    /// A copy that cannot be read or written.
-    pub fn update_copy(&self) -> Result<Vec<String>> {
+    /// A copy that cannot be read.
+    pub fn changes(&self) -> Result<Vec<String>> {
         let copy = self.folder.join(COPY);
         let mut texts = Vec::new();
         if copy.is_file() {
@@ -222,9 +222,33 @@ impl Study {
             };
             texts.extend(changes.removed.iter().map(removed));
         }
+        Ok(texts)
+    }
+
+    /// Whether the folder has a copy of the study's TOML as it is now.
+    pub fn is_copied(&self) -> bool {
+        fs_err::read_to_string(self.folder.join(COPY)).is_ok_and(|copy| copy == self.text)
+    }
+
+    /// Replaces the copy of the study's TOML in the folder.
+    ///
+    /// # Errors
+    /// A copy that cannot be written.
+    pub fn update_copy(&self) -> Result<()> {
+        let copy = self.folder.join(COPY);
         let origin = Origin { named: self.named.clone(), base: self.base.clone() };
         write_json(&self.folder.join(ORIGIN), &origin)?;
-        write_atomic(&copy, self.text.as_bytes())?;
-        Ok(texts)
+        Ok(write_atomic(&copy, self.text.as_bytes())?)
+    }
+}
+
+/// The absolute path of the folder of a study, which is written into the files and passed to the processes of its runs.
+fn absolute_utf8(folder: &Path) -> Result<PathBuf> {
+    let absolute = std::path::absolute(folder)?;
+    match absolute.to_str() {
+        Some(_) => Ok(absolute),
+        None => {
+            Err(refused(format!("{}: the path of a study has to be UTF-8; choose another --out", folder.display())))
+        }
     }
 }

@@ -3,11 +3,9 @@
 use crate::config::StudyRun;
 use crate::error::Result;
 use crate::folder::Study;
-use data::write_json;
+use data::{FolderLock, write_json};
 use serde::{Deserialize, Serialize};
-use std::fs::{File, TryLockError};
 use std::path::Path;
-use std::time::Duration;
 use train::{RunConfig, read_run_state};
 
 /// State of a run.
@@ -58,37 +56,22 @@ pub fn read_failure(folder: &Path) -> Option<String> {
     Some(serde_json::from_slice(&bytes).map_or_else(|e| format!("{FAILURE} is damaged: {e}"), |f: Failure| f.reason))
 }
 
-/// Lock on a run folder, held by the process that executes the run.
-pub struct RunLock(File);
+/// Lock on a run folder, held by the process that executes the run: its training, which also locks the folder as a
+/// writer, and its detections.
+pub struct RunLock(#[expect(dead_code, reason = "held until it is dropped")] FolderLock);
+
+/// Name of the file that is locked.
+const RUN_LOCK: &str = ".working";
 
 impl RunLock {
     /// Locks a run folder; `None` if another process holds the lock.
     pub fn acquire(folder: &Path) -> Result<Option<RunLock>> {
-        fs_err::create_dir_all(folder)?;
-        let path = folder.join(".working");
-        let file = fs_err::OpenOptions::new().write(true).create(true).truncate(false).open(path)?.into_file();
-        // `is_held` of another process holds the lock for a moment.
-        for _ in 0..20 {
-            match file.try_lock() {
-                Ok(()) => return Ok(Some(RunLock(file))),
-                Err(TryLockError::WouldBlock) => std::thread::sleep(Duration::from_millis(10)),
-                Err(TryLockError::Error(e)) => return Err(e.into()),
-            }
-        }
-        Ok(None)
+        Ok(FolderLock::acquire_as(folder, RUN_LOCK)?.map(RunLock))
     }
 
     /// Whether a process holds the lock on a run folder.
     pub fn is_held(folder: &Path) -> bool {
-        let Ok(file) = File::options().write(true).open(folder.join(".working")) else { return false };
-        matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
-    }
-}
-
-impl Drop for RunLock {
-    fn drop(&mut self) {
-        // An error can be ignored, since closing the file also releases the lock.
-        self.0.unlock().ok();
+        FolderLock::is_held(folder, RUN_LOCK)
     }
 }
 

@@ -2,7 +2,7 @@
 
 use crate::config::StudyRun;
 use crate::cost::{Costs, costs, duration, remaining};
-use crate::data_sets::make_datasets;
+use crate::data_sets::{absent_datasets, make_datasets};
 use crate::error::{Result, refused};
 use crate::folder::Study;
 use crate::local::{LocalJobs, run_all};
@@ -11,6 +11,7 @@ use crate::run_state::{RunLock, RunState, run_state};
 use crate::slurm::submit;
 use crate::work::RunPart;
 use crate::{Event, Listener};
+use data::FolderLock;
 use eval::matrix::Matrix;
 use report::ReportFiles;
 
@@ -90,33 +91,30 @@ pub struct Outcome {
 /// # Errors
 /// A step that fails. Failed runs are not an error; they are returned in [`Outcome::failed`].
 pub fn run_study(study: &Study, options: &RunOptions, listener: Listener<'_>) -> Result<Outcome> {
+    if options.dry_run {
+        return dry_run(study, options, listener).map(|()| Outcome::default());
+    }
     let RunOptions { steps, device, .. } = options;
-    for line in study.update_copy()? {
+    let _lock = FolderLock::acquire(&study.folder)?;
+    for line in study.changes()? {
         listener(Event::Note(&format!("the study has changed: {line}")));
     }
+    study.update_copy()?;
     if study.config.plan().networks.is_empty() {
         listener(Event::Note("the study has no detector; only its data sets are compared"));
     }
     if steps.contains(&Step::Data) {
         make_datasets(study, listener)?;
     }
-    if !options.dry_run && steps.contains(&Step::Detect) {
+    if steps.contains(&Step::Detect) {
         crate::frozen::prepare(study, device, listener)?;
     }
-    let wanted = |step, part| steps.contains(&step).then_some(part);
-    let parts: Vec<RunPart> =
-        [wanted(Step::Train, RunPart::Train), wanted(Step::Detect, RunPart::Detect)].into_iter().flatten().collect();
+    let parts = parts_of(steps);
     let mut outcome = Outcome::default();
     if !parts.is_empty() && study.config.trains() {
-        let invalid = invalid_runs(study, options.replace && !options.dry_run, listener)?;
+        let invalid = invalid_runs(study, options.replace, listener)?;
         let missing = missing_runs(study, &parts)?;
-        let jobs = LocalJobs::by_cores(missing.len(), options.jobs, device);
-        let known = costs(study, &missing, jobs.threads, device, listener)?;
-        let jobs = if options.jobs.is_some() { jobs } else { jobs.within_memory(&known) };
-        note_costs(study, &missing, &known, &jobs, listener)?;
-        if options.dry_run {
-            return Ok(outcome);
-        }
+        let (jobs, known) = note_expected(study, &missing, options, listener)?;
         if options.launcher == Launcher::Slurm {
             submit(study, &missing, options, listener)?;
             return Ok(outcome);
@@ -124,10 +122,59 @@ pub fn run_study(study: &Study, options: &RunOptions, listener: Listener<'_>) ->
         outcome.failed = invalid;
         outcome.failed.extend(run_all(study, &missing, &parts, &jobs, &known, listener)?);
     }
-    if steps.contains(&Step::Report) && !options.dry_run {
+    if steps.contains(&Step::Report) {
         outcome.report = Some(write_report(study, listener)?);
     }
     Ok(outcome)
+}
+
+/// The parts of a run that these steps execute.
+fn parts_of(steps: &[Step]) -> Vec<RunPart> {
+    let wanted = |step, part| steps.contains(&step).then_some(part);
+    [wanted(Step::Train, RunPart::Train), wanted(Step::Detect, RunPart::Detect)].into_iter().flatten().collect()
+}
+
+/// Reports what a study would do, without generating data sets or changing a run. Only the measured time of a step is
+/// written into the folder of a study whose data sets exist.
+fn dry_run(study: &Study, options: &RunOptions, listener: Listener<'_>) -> Result<()> {
+    let note = |text: &str| listener(Event::Note(text));
+    for line in study.changes()? {
+        note(&format!("the study has changed: {line}"));
+    }
+    let parts = parts_of(&options.steps);
+    let absent = absent_datasets(study);
+    if !absent.is_empty() {
+        note(&format!("data sets that would be generated: {}", absent.join(", ")));
+    }
+    if parts.is_empty() || !study.config.trains() {
+        return Ok(());
+    }
+    if !absent.is_empty() {
+        let missing = study.config.runs().len();
+        note(&format!(
+            "{missing} runs; their computing time is measured once the data sets exist: `lidarshift study {} --only data`",
+            study.named
+        ));
+        return Ok(());
+    }
+    invalid_runs(study, false, listener)?;
+    let missing = missing_runs(study, &parts)?;
+    note_expected(study, &missing, options, listener)?;
+    Ok(())
+}
+
+/// Measures and reports the expected computing time of the missing runs.
+fn note_expected(
+    study: &Study,
+    missing: &[StudyRun],
+    options: &RunOptions,
+    listener: Listener<'_>,
+) -> Result<(LocalJobs, Costs)> {
+    let jobs = LocalJobs::by_cores(missing.len(), options.jobs, &options.device);
+    let known = costs(study, missing, jobs.threads, (&options.device, options.dry_run), listener)?;
+    let jobs = if options.jobs.is_some() { jobs } else { jobs.within_memory(&known) };
+    note_costs(study, missing, &known, &jobs, listener)?;
+    Ok((jobs, known))
 }
 
 /// Runs with other settings than those of the study, with the reasons. If `replace` is set, their folders are removed

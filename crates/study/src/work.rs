@@ -6,9 +6,11 @@ use crate::error::{Result, refused};
 use crate::folder::Study;
 use crate::run_state::{RunLock, differences, remove_failure, write_failure};
 use burn::tensor::Device;
+use data::output::remove_unfinished_below;
 use models::Detector;
 use models::checkpoint::read_checkpoint;
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 use train::{RunConfig, Session, read_run_state, train};
 
 /// A part of a run.
@@ -40,6 +42,8 @@ pub struct RunWork<'a> {
     pub device_name: String,
     /// Threads that load frames.
     pub workers: usize,
+    /// As [`Session::stop`].
+    pub stop: Option<&'static AtomicBool>,
 }
 
 /// Executes a run. `on_training` is called with the events of the training, `note` with a message for each test set. An
@@ -58,9 +62,12 @@ pub fn execute_run(
     let Some(_lock) = RunLock::acquire(&folder)? else {
         return Err(refused(format!("{run} is in use by another process; wait until it ends")));
     };
+    remove_unfinished_below(&folder)?;
     remove_failure(&folder)?;
     let done = train_and_detect(study, run, work, on_training, note);
-    if let Err(error) = &done {
+    if let Err(error) = &done
+        && !error.is_stopped()
+    {
         write_failure(&folder, &error.to_string())?;
     }
     done
@@ -89,6 +96,7 @@ fn train_and_detect(
             device_name: work.device_name.clone(),
             workers: work.workers,
             resume: true,
+            stop: work.stop,
         };
         detector = Some(train(&config, &folder, &session, &mut |event| on_training(&event))?.detector);
     }

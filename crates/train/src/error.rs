@@ -36,6 +36,14 @@ pub enum TrainError {
         /// The message of the panic.
         message: String,
     },
+    /// The training was stopped by [`crate::Session::stop`]; its checkpoint is saved.
+    #[error("stopped after step {step} of {total_steps}; a checkpoint is saved, and --resume continues from it")]
+    Stopped {
+        /// Steps done.
+        step: u64,
+        /// Steps of the whole run.
+        total_steps: u64,
+    },
     /// The training has diverged, or its data are damaged.
     #[error(
         "step {step}: {what} is not finite; the batch holds the frames {}. The run stops; its last checkpoint is intact. \

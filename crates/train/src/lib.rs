@@ -1,6 +1,7 @@
 //! One run: optimiser, schedule, run folder, checkpoints, resume, metrics.
 
 mod adam;
+mod clock;
 mod error;
 mod frames;
 pub mod memory;

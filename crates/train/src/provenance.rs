@@ -76,7 +76,7 @@ impl SessionProvenance {
         SessionProvenance {
             from_step,
             began_unix_s: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |t| t.as_secs()),
-            command: std::env::args().collect(),
+            command: std::env::args_os().map(|argument| argument.to_string_lossy().into_owned()).collect(),
             version: env!("CARGO_PKG_VERSION").into(),
             program_sha256: program.map(|bytes| hex(&Sha256::digest(bytes))),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),

@@ -8,14 +8,12 @@
 
 use crate::TrainError;
 use crate::run_config::hex;
-use data::write::remove_unfinished;
-use data::{write_atomic, write_json};
+use data::output::{create_folder, remove_unfinished_below};
+use data::{FolderLock, write_atomic, write_json};
 use models::checkpoint::{NamedTensors, read_safetensors, write_safetensors};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::fs::{File, TryLockError};
-use std::io::{Read as _, Seek as _, Write as _};
 use std::path::{Path, PathBuf};
 
 /// Version of `state.json`.
@@ -66,7 +64,7 @@ struct StateFile {
 /// A run folder, locked against other processes while this value lives.
 pub struct RunFolder {
     path: PathBuf,
-    _lock: File,
+    _lock: FolderLock,
 }
 
 impl RunFolder {
@@ -75,11 +73,9 @@ impl RunFolder {
     /// # Errors
     /// A folder in use by another process, or one that cannot be written.
     pub fn open(path: &Path) -> Result<Self, TrainError> {
-        fs_err::create_dir_all(path.join("checkpoint"))?;
-        let folder = RunFolder { path: path.into(), _lock: lock(path)? };
-        for inside in [folder.path.clone(), folder.checkpoints()] {
-            remove_unfinished(&inside)?;
-        }
+        let folder = RunFolder { path: path.into(), _lock: FolderLock::acquire(path)? };
+        create_folder(&folder.checkpoints())?;
+        remove_unfinished_below(path)?;
         Ok(folder)
     }
 
@@ -269,30 +265,6 @@ fn link(file: &Path, name: &Path) -> Result<(), TrainError> {
         }
     }
     Ok(write_atomic(name, &fs_err::read(file)?)?)
-}
-
-fn lock(folder: &Path) -> Result<File, TrainError> {
-    let path = folder.join(".lock");
-    let mut file =
-        fs_err::OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path)?.into_file();
-    match file.try_lock() {
-        Ok(()) => {}
-        Err(TryLockError::WouldBlock) => {
-            let mut owner = String::new();
-            file.read_to_string(&mut owner).ok();
-            let message = format!(
-                "this run folder is in use by another process ({}); wait for it, or give another --out",
-                owner.trim()
-            );
-            return Err(TrainError::folder(folder, message));
-        }
-        Err(TryLockError::Error(e)) => return Err(TrainError::folder(&path, format!("cannot be locked: {e}"))),
-    }
-    let owner = format!("process {}", std::process::id());
-    file.set_len(0)?;
-    file.rewind()?;
-    file.write_all(owner.as_bytes())?;
-    Ok(file)
 }
 
 #[cfg(test)]

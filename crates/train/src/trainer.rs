@@ -1,11 +1,12 @@
 //! The training loop: [`train`].
 
+use crate::clock::{Clock, Step};
 use crate::error::without_panic;
 use crate::provenance::record_session;
 use crate::validation::loss_values;
 use crate::{
     Adam, Best, DatasetProvenance, EpochMetrics, GradientNorm, OneCycle, RunConfig, RunFolder, RunState,
-    SessionProvenance, StageSeconds, StepMetrics, TrainError, TrainingFrames, ValidationMetrics, evaluate_detector,
+    SessionProvenance, StepMetrics, TrainError, TrainingFrames, ValidationMetrics, evaluate_detector,
     metrics::MetricsFile, samples,
 };
 use burn::optim::GradientsParams;
@@ -18,7 +19,7 @@ use models::{Detector, ModelError, Sample, reference_name};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Settings of a process that trains a run. They do not change the weights, except for the rounding of another device.
 #[derive(Clone, Debug)]
@@ -31,6 +32,15 @@ pub struct Session {
     pub workers: usize,
     /// Resume an existing run. Without it a folder with a run is refused.
     pub resume: bool,
+    /// Once this is set, a checkpoint is saved after the current step or evaluation, and the training ends with
+    /// [`TrainError::Stopped`].
+    pub stop: Option<&'static AtomicBool>,
+}
+
+impl Session {
+    fn is_stopped(&self) -> bool {
+        self.stop.is_some_and(|stop| stop.load(Ordering::Relaxed))
+    }
 }
 
 /// Progress of a run.
@@ -75,7 +85,7 @@ pub struct Trained {
 ///
 /// # Errors
 /// A folder in use by another process, an existing run without `resume` or with another configuration, a data set that
-/// is wrong, files that cannot be written, and a loss or gradient that is not finite.
+/// is wrong, files that cannot be written, a loss or gradient that is not finite, and a training that was stopped.
 pub fn train(
     config: &RunConfig,
     out: &Path,
@@ -95,9 +105,16 @@ pub fn train(
     }
 
     let mut validation = None;
+    let mut saved_step = run.state.step;
     while run.state.epoch < epochs {
         let mut clock = Clock::default();
         while run.state.position < frames.ids().len() {
+            if session.is_stopped() {
+                if run.state.step > saved_step {
+                    run.checkpoint(&folder, &mut clock)?;
+                }
+                return Err(TrainError::Stopped { step: run.state.step, total_steps: run.state.total_steps });
+            }
             let wanted = batch_size.min(frames.ids().len() - run.state.position);
             let batch = clock.wait(|| samples.by_ref().take(wanted).collect::<Result<Vec<Sample>, _>>())?;
             let step = without_panic(run.state.step, || run.learn(&batch, &mut clock))?;
@@ -114,6 +131,7 @@ pub fn train(
             report(Event::Step { metrics: &metrics, logged });
             if !epoch_ends && run.state.step.is_multiple_of(config.run.checkpoint_every_steps) {
                 run.checkpoint(&folder, &mut clock)?;
+                saved_step = run.state.step;
             }
         }
         let turn = run.is_evaluation_due(epochs).then(|| run.validate(session.workers)).transpose()?;
@@ -122,6 +140,7 @@ pub fn train(
         let metrics = clock.epoch_metrics(&run.state, turn);
         log.epoch(&metrics)?;
         run.checkpoint(&folder, &mut clock)?;
+        saved_step = run.state.step;
         report(Event::Epoch(&metrics));
         validation = metrics.validation.or(validation);
     }
@@ -159,14 +178,6 @@ struct Run<'a> {
     adam: Adam,
     detector: Detector,
     state: RunState,
-}
-
-/// The metrics of one step.
-struct Step {
-    losses: Vec<(&'static str, f64)>,
-    gradient_norm: f64,
-    lr: f64,
-    beta1: f64,
 }
 
 impl<'a> Run<'a> {
@@ -315,86 +326,4 @@ fn refuse_other_run(config: &RunConfig, folder: &RunFolder, resume: bool) -> Res
         differences.join("; ")
     );
     Err(TrainError::folder(&path, message))
-}
-
-/// Time by stage of an epoch, and of the steps since the last line of metrics.
-struct Clock {
-    stages: StageSeconds,
-    losses: f64,
-    steps: u64,
-    line_began: Instant,
-    line_frames: usize,
-    line_wait: f64,
-}
-
-impl Default for Clock {
-    fn default() -> Self {
-        let stages = StageSeconds::default();
-        Clock { stages, losses: 0.0, steps: 0, line_began: Instant::now(), line_frames: 0, line_wait: 0.0 }
-    }
-}
-
-fn timed<T>(seconds: &mut f64, work: impl FnOnce() -> T) -> T {
-    let begin = Instant::now();
-    let result = work();
-    *seconds += begin.elapsed().as_secs_f64();
-    result
-}
-
-impl Clock {
-    fn wait<T>(&mut self, work: impl FnOnce() -> T) -> T {
-        let before = self.stages.data_wait;
-        let result = timed(&mut self.stages.data_wait, work);
-        self.line_wait += self.stages.data_wait - before;
-        result
-    }
-
-    fn forward<T>(&mut self, work: impl FnOnce() -> T) -> T {
-        timed(&mut self.stages.forward, work)
-    }
-
-    fn backward<T>(&mut self, work: impl FnOnce() -> T) -> T {
-        timed(&mut self.stages.backward, work)
-    }
-
-    fn optimizer<T>(&mut self, work: impl FnOnce() -> T) -> T {
-        timed(&mut self.stages.optimizer, work)
-    }
-
-    fn checkpoint<T>(&mut self, work: impl FnOnce() -> T) -> T {
-        timed(&mut self.stages.checkpoint, work)
-    }
-
-    fn metrics(&mut self, state: &RunState, step: Step, frames: usize) -> StepMetrics {
-        let (_, loss) = step.losses[0];
-        self.losses += loss;
-        self.steps += 1;
-        self.line_frames += frames;
-        let seconds = self.line_began.elapsed().as_secs_f64().max(1e-9);
-        StepMetrics {
-            step: state.step,
-            epoch: state.epoch,
-            loss,
-            losses: step.losses[1..].iter().map(|(name, value)| (name.to_string(), *value)).collect(),
-            lr: step.lr,
-            beta1: step.beta1,
-            gradient_norm: step.gradient_norm,
-            samples_per_s: self.line_frames as f64 / seconds,
-            data_wait_share: self.line_wait / seconds,
-        }
-    }
-
-    fn begin_line(&mut self) {
-        (self.line_began, self.line_frames, self.line_wait) = (Instant::now(), 0, 0.0);
-    }
-
-    fn epoch_metrics(&self, state: &RunState, validation: Option<ValidationMetrics>) -> EpochMetrics {
-        EpochMetrics {
-            step: state.step,
-            epoch: state.epoch - 1,
-            train_loss: self.losses / self.steps.max(1) as f64,
-            seconds: self.stages,
-            validation,
-        }
-    }
 }

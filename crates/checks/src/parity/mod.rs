@@ -25,6 +25,7 @@ detectors!(pointpillars, pointrcnn, centerpoint);
 use anyhow::{Context, Result};
 use clap::Args;
 use lidarshift::device::DeviceArgs;
+use lidarshift::outln;
 use reference::Row;
 use serde::Serialize;
 use std::path::PathBuf;
@@ -54,7 +55,6 @@ struct Parity<'a> {
 
 impl ParityArgs {
     /// Compares and prints; `true` if every tensor passes.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<bool> {
         let device = self.device.open()?;
         let folder = fs_err::canonicalize(&self.dir)?;
@@ -69,14 +69,14 @@ impl ParityArgs {
             let parity = Parity { schema: "lidarshift/parity/1", rows: &rows };
             data::write_json(path, &parity)?;
         }
-        println!("{:<24} {:<44} {:>10} {:>10}  ", "file", "tensor", "error", "tolerance");
+        outln!("{:<24} {:<44} {:>10} {:>10}  ", "file", "tensor", "error", "tolerance");
         for row in rows.iter().filter(|r| self.all || !r.pass || is_largest(r, &rows)) {
             let error = row.error.map_or("none".into(), |e| format!("{e:.1e}"));
             let verdict = if row.pass { "pass" } else { "FAIL" };
-            println!("{:<24} {:<44} {error:>10} {:>10.1e}  {verdict}", row.file, row.tensor, row.tolerance);
+            outln!("{:<24} {:<44} {error:>10} {:>10.1e}  {verdict}", row.file, row.tensor, row.tolerance);
         }
         let failed = rows.iter().filter(|r| !r.pass).count();
-        println!("{} tensors compared, {} pass, {failed} fail", rows.len(), rows.len() - failed);
+        outln!("{} tensors compared, {} pass, {failed} fail", rows.len(), rows.len() - failed);
         Ok(failed == 0 && !rows.is_empty())
     }
 }

@@ -36,7 +36,10 @@ pub(super) fn gain_of_detectors(
     let path = out.join("detectors.toml");
     let text = toml::to_string(&study_of(template, measured, simulated, (&effects, sensor))?)?;
     write_atomic(&path, text.as_bytes())?;
-    let study = Study::open(&path.to_string_lossy(), Some(&out.join("detectors")))?;
+    let Some(path) = path.to_str() else {
+        bail!("--out {}: with --detectors the path has to be UTF-8", out.display());
+    };
+    let study = Study::open(path, Some(&out.join("detectors")))?;
     run_study(&study, &RunOptions::here(DeviceArgs::default().arguments()))?;
     Ok((gains(&matrix(&study, &StudyState::read(&study)?)?)?, left_out))
 }

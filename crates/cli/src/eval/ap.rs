@@ -1,7 +1,9 @@
 //! `lidarshift eval ap`: average precision and recall of detections in KITTI text.
 
+use crate::{errln, out};
 use anyhow::{Result, bail};
 use clap::Args;
+use data::output::check_writable;
 use data::{Dataset, LabelFrame, write_json};
 use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_frames, read_ids};
 use std::collections::BTreeSet;
@@ -54,8 +56,8 @@ pub struct EvalApArgs {
 
 impl EvalApArgs {
     /// Reads the files, prints the table and writes the JSON.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
+        self.json.as_deref().map_or(Ok(()), check_writable)?;
         let (frames, mut options) = match (&self.dataset, &self.labels) {
             (Some(dataset), _) => self.of_dataset(dataset)?,
             (None, Some(labels)) => self.of_folder(labels)?,
@@ -74,7 +76,7 @@ impl EvalApArgs {
         if let Some(path) = &self.json {
             write_json(path, &report)?;
         }
-        print!("{report}");
+        out!("{report}");
         Ok(())
     }
 
@@ -108,7 +110,7 @@ impl EvalApArgs {
         let mut others = detected.iter().filter(|id| !known.contains(id));
         if let Some(first) = others.next() {
             let n = 1 + others.count();
-            eprintln!(
+            errln!(
                 "warning: {n} detection files have no label file and are ignored (first: {first}.txt); choose frames with --ids"
             );
         }

@@ -1,7 +1,9 @@
 //! `lidarshift eval distances`: distances between the point clouds of two data sets.
 
+use crate::out;
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
+use data::output::check_writable;
 use data::{Dataset, write_json};
 use eval::distance::{Compared, DistanceOptions, Distances};
 use models::find_detector;
@@ -56,8 +58,8 @@ impl EvalDistancesArgs {
     ///
     /// # Errors
     /// Frames that are not in both data sets or cannot be read.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
+        self.json.as_deref().map_or(Ok(()), check_writable)?;
         let [a, b] = [Dataset::open(&self.a)?, Dataset::open(&self.b)?];
         let compared = match self.compared {
             What::Raw => Compared::Raw,
@@ -75,7 +77,7 @@ impl EvalDistancesArgs {
         if let Some(path) = &self.json {
             write_json(path, &found)?;
         }
-        print!("{}", table(&found));
+        out!("{}", table(&found));
         Ok(())
     }
 }

@@ -1,5 +1,6 @@
 //! `lidarshift eval matrix`: AP and recall of a study by train set and test set.
 
+use crate::out;
 use crate::study::StudySelection;
 use anyhow::Result;
 use clap::Args;
@@ -35,7 +36,6 @@ impl EvalMatrixArgs {
     ///
     /// # Errors
     /// Missing data sets, labels that cannot be read.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let study = self.study.open()?;
         let matrix = matrix(&study, &StudyState::read(&study)?)?;
@@ -45,7 +45,7 @@ impl EvalMatrixArgs {
         write(&self.json, &|| matrix.to_json())?;
         write(&self.csv, &|| matrix.to_csv())?;
         write(&self.latex, &|| matrix.to_latex())?;
-        print!("{}", matrix.to_markdown());
+        out!("{}", matrix.to_markdown());
         Ok(())
     }
 }

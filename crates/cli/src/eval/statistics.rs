@@ -1,5 +1,6 @@
 //! `lidarshift eval statistics`: point and box statistics of two data sets with the same frames.
 
+use crate::out;
 use anyhow::Result;
 use clap::Args;
 use data::{Dataset, write_json};
@@ -33,14 +34,13 @@ pub struct EvalStatisticsArgs {
 
 impl EvalStatisticsArgs {
     /// Counts, prints the table and writes the JSON.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let [a, b] = [Dataset::open(&self.a)?, Dataset::open(&self.b)?];
         let report = compare_statistics(&a, &b, &self.split, self.max_range)?;
         if let Some(path) = &self.json {
             write_json(path, &report)?;
         }
-        print!("{report}");
+        out!("{report}");
         Ok(())
     }
 }

@@ -1,5 +1,6 @@
 //! `lidarshift eval targets`: statistics of the labelled targets of data sets.
 
+use crate::{out, outln};
 use anyhow::{Result, bail};
 use clap::Args;
 use data::{Dataset, write_json};
@@ -38,7 +39,6 @@ impl EvalTargetsArgs {
     ///
     /// # Errors
     /// Frames that cannot be read; no target in any data set.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let options = TargetOptions { class: self.class.clone(), ..TargetOptions::default() };
         let mut all = Vec::new();
@@ -53,12 +53,17 @@ impl EvalTargetsArgs {
         if let Some(path) = &self.json {
             write_json(path, &all)?;
         }
-        all.iter().for_each(|found| print!("{}", table(found)));
+        let tables: Vec<String> = all.iter().map(table).collect();
+        let mut figures = None;
         if let Some(out) = &self.out {
             let names: Vec<&str> = all.iter().map(|found| found.dataset.as_str()).collect();
             let title = format!("Targets of {}", names.join(", "));
             let files = StudyReport { title, targets: all, ..StudyReport::default() }.write(out)?;
-            println!("figures: {}", files.page.display());
+            figures = Some(files.page);
+        }
+        tables.iter().for_each(|table| out!("{table}"));
+        if let Some(page) = figures {
+            outln!("figures: {}", page.display());
         }
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! `lidarshift eval tsne`: features of the networks of a study.
 
+use crate::outln;
 use crate::study::StudySelection;
 use anyhow::{Result, bail};
 use clap::Args;
@@ -32,7 +33,6 @@ impl EvalTsneArgs {
     ///
     /// # Errors
     /// A study without a tested run.
-    #[expect(clippy::print_stdout, reason = "results go to stdout")]
     pub fn run(self) -> Result<()> {
         let study = self.study.open()?;
         let found = features(&study)?;
@@ -42,9 +42,17 @@ impl EvalTsneArgs {
         if let Some(path) = &self.json {
             write_json(path, &found)?;
         }
+        let mut page = None;
+        if let Some(out) = &self.figures {
+            let title = format!("Features of the study {}", study.config.name);
+            let shown = found.clone();
+            let (embeddings, cka, frechet, warnings) = (shown.embeddings, shown.cka, shown.frechet, shown.warnings);
+            let report = StudyReport { title, embeddings, cka, frechet, warnings, ..StudyReport::default() };
+            page = Some(report.write(out)?.page);
+        }
         for e in &found.embeddings {
             let (n, kl) = (e.points.len(), e.kl_divergence);
-            println!("{}: {n} points on {}, {}; Kullback-Leibler divergence {kl:.3}", e.network, e.test_set, e.layer);
+            outln!("{}: {n} points on {}, {}; Kullback-Leibler divergence {kl:.3}", e.network, e.test_set, e.layer);
         }
         for (name, table) in &found.cka {
             let same: Vec<String> = (0..table.layers_a.len())
@@ -53,21 +61,21 @@ impl EvalTsneArgs {
                     format!("{} {}", table.layers_a[i], value.map_or("-".into(), |v| format!("{v:.3}")))
                 })
                 .collect();
-            println!("{name}: CKA of corresponding layers: {}", same.join(", "));
+            outln!("{name}: CKA of corresponding layers: {}", same.join(", "));
         }
         for row in &found.frechet {
             let floor = row.floor.map_or("-".into(), |f| format!("{f:.3}"));
-            println!(
+            outln!(
                 "{}, {} and {}: Fréchet distance {:.3} (between halves of one run: {floor})",
-                row.network, row.a, row.b, row.distance
+                row.network,
+                row.a,
+                row.b,
+                row.distance
             );
         }
-        found.warnings.iter().for_each(|warning| println!("{warning}"));
-        if let Some(out) = &self.figures {
-            let title = format!("Features of the study {}", study.config.name);
-            let (embeddings, cka, frechet, warnings) = (found.embeddings, found.cka, found.frechet, found.warnings);
-            let report = StudyReport { title, embeddings, cka, frechet, warnings, ..StudyReport::default() };
-            println!("figures: {}", report.write(out)?.page.display());
+        found.warnings.iter().for_each(|warning| outln!("{warning}"));
+        if let Some(page) = page {
+            outln!("figures: {}", page.display());
         }
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! Progress of a training on stderr: a progress bar on a terminal, plain lines elsewhere.
 
+use crate::errln;
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::io::IsTerminal;
@@ -28,12 +29,12 @@ impl Progress {
         match event {
             Event::Begin { state, epochs, frames, validation_frames } => {
                 (self.epochs, self.total_steps) = (*epochs, state.total_steps);
-                eprintln!(
+                errln!(
                     "{frames} training frames, {validation_frames} validation frames, {epochs} epochs, {} steps",
                     state.total_steps
                 );
                 if state.step > 0 {
-                    eprintln!("resuming at step {} in epoch {}", state.step, state.epoch + 1);
+                    errln!("resuming at step {} in epoch {}", state.step, state.epoch + 1);
                 }
                 if std::io::stderr().is_terminal() && state.step < state.total_steps {
                     let style = ProgressStyle::with_template("{bar:30} step {pos}/{len}, {msg}, {eta} left");
@@ -42,7 +43,7 @@ impl Progress {
                     self.bar = Some(bar.with_style(style.expect("the template is valid")));
                 }
             }
-            Event::Warning(text) => eprintln!("warning: {text}"),
+            Event::Warning(text) => errln!("warning: {text}"),
             Event::Step { metrics, logged } => {
                 let message = format!("loss {:.4}, {:.1} samples/s", metrics.loss, metrics.samples_per_s);
                 if let Some(bar) = &self.bar {
@@ -52,9 +53,10 @@ impl Progress {
                     }
                 } else if *logged && self.last_line.is_none_or(|at| at.elapsed() >= PLAIN_EVERY) {
                     let wait = 100.0 * metrics.data_wait_share;
-                    eprintln!(
+                    errln!(
                         "step {}/{}: {message}, {wait:.1} % of the time waiting for data",
-                        metrics.step, self.total_steps
+                        metrics.step,
+                        self.total_steps
                     );
                     self.last_line = Some(Instant::now());
                 }
@@ -63,7 +65,7 @@ impl Progress {
                 let line = epoch_line(metrics, self.epochs);
                 match &self.bar {
                     Some(bar) => bar.println(line),
-                    None => eprintln!("{line}"),
+                    None => errln!("{line}"),
                 }
             }
         }

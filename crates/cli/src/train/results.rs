@@ -1,5 +1,6 @@
 //! Results of a finished run: the AP table, detections, pictures and the training curve.
 
+use crate::outln;
 use anyhow::Result;
 use data::write::write_kitti_text;
 use data::{Dataset, write_atomic, write_json};
@@ -12,13 +13,12 @@ use train::Evaluation;
 const PICTURES: usize = 3;
 
 /// Prints the 3D AP for difficulty "all"; the whole table is in `eval.json`.
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
-pub(super) fn show(found: &Evaluation, what: &str) -> Result<()> {
-    println!("3D AP in percent, all difficulties, on {what} ({} frames)", found.frames.len());
-    println!("class        overlap  exact area    AP40   n_gt    TP    FP");
+pub(super) fn show(found: &Evaluation, what: &str) {
+    outln!("3D AP in percent, all difficulties, on {what} ({} frames)", found.frames.len());
+    outln!("class        overlap  exact area    AP40   n_gt    TP    FP");
     for row in found.report.rows.iter().filter(|r| r.metric == Metric::ThreeD && r.difficulty == Difficulty::All) {
         let percent = |ap: Option<f64>| ap.map_or("undef.".into(), |ap| format!("{ap:.2}"));
-        println!(
+        outln!(
             "{:<12} {:>7} {:>11} {:>7} {:>6} {:>5} {:>5}",
             row.class,
             row.overlap,
@@ -29,7 +29,6 @@ pub(super) fn show(found: &Evaluation, what: &str) -> Result<()> {
             row.n_fp
         );
     }
-    Ok(())
 }
 
 /// Writes `eval.json`, `detections/` and `pictures/` into the run folder.
@@ -50,13 +49,12 @@ pub(super) fn write(found: &Evaluation, set: &Dataset, out: &Path) -> Result<()>
 }
 
 /// Writes the training curve and lists the result files of the run. A temporary run folder is not listed.
-#[expect(clippy::print_stdout, reason = "results go to stdout")]
 pub(super) fn write_curve_and_list(out: &Path, keep: bool) -> Result<()> {
     write_atomic(&out.join("curve.svg"), curve(&fs_err::read_to_string(out.join("metrics.jsonl"))?).as_bytes())?;
     if !keep {
         return Ok(());
     }
-    println!("run folder: {}", out.display());
+    outln!("run folder: {}", out.display());
     for (file, what) in [
         ("checkpoint/last.safetensors", "weights, with OpenPCDet's parameter names"),
         ("checkpoint/best.safetensors", "weights with the best AP on the validation split"),
@@ -66,7 +64,7 @@ pub(super) fn write_curve_and_list(out: &Path, keep: bool) -> Result<()> {
         ("curve.svg", "loss and AP over the steps"),
     ] {
         if out.join(file).exists() {
-            println!("  {file:<28} {what}");
+            outln!("  {file:<28} {what}");
         }
     }
     Ok(())

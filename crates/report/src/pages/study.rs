@@ -13,7 +13,8 @@ pub use training::{TrainingRun, read_training_run};
 use crate::ReportError;
 use crate::html::{Item, PageText, Section, page};
 use crate::scene::{Scene, scenes_json};
-use data::write_atomic;
+use data::output::remove_unfinished;
+use data::{FolderLock, write_atomic};
 use eval::analysis::RunAnalysis;
 use eval::distance::Distances;
 use eval::features::{CkaTable, Embedding};
@@ -98,13 +99,17 @@ impl StudyReport {
     }
 
     /// Writes `report.html`, `figures/NAME.svg`, `figures/NAME.png` and `tables/NAME.csv` into a folder, and
-    /// `matrix.md` and `matrix.tex` if there is a matrix.
+    /// `matrix.md` and `matrix.tex` if there is a matrix. Waits while another process writes a report there.
     ///
     /// # Errors
     /// A file that cannot be written, or a figure that cannot be drawn.
     pub fn write(&self, folder: &Path) -> Result<ReportFiles, ReportError> {
         let mut sections = self.sections();
         let html = self.render(&mut sections)?;
+        let _lock = FolderLock::wait_for(folder, ".reporting")?;
+        for inside in ["", "figures", "tables"] {
+            remove_unfinished(&folder.join(inside))?;
+        }
         let page = folder.join("report.html");
         write_atomic(&page, html.as_bytes())?;
         let mut others = Vec::new();

@@ -1,0 +1,126 @@
+//! Text on stdout and stderr. Writing never panics and never stops work.
+//!
+//! A command goes on if stdout is closed or full: its files are what matters. What the program could not print becomes
+//! its exit status when the command has ended, see [`end`]. Errors of stderr are ignored. Control characters, which
+//! names of files, classes and data sets may have, are escaped.
+
+use std::borrow::Cow;
+use std::fmt::Arguments;
+use std::io::{Error, ErrorKind, Write as _};
+use std::process::ExitCode;
+use std::sync::Mutex;
+
+/// The first error of stdout.
+static LOST: Mutex<Option<Error>> = Mutex::new(None);
+
+/// Prints a line on stdout, as `println!` does.
+#[macro_export]
+macro_rules! outln {
+    () => {
+        $crate::console::print(format_args!("\n"))
+    };
+    ($($text:tt)*) => {
+        $crate::console::print(format_args!("{}\n", format_args!($($text)*)))
+    };
+}
+
+/// Prints text on stdout, as `print!` does.
+#[macro_export]
+macro_rules! out {
+    ($($text:tt)*) => {
+        $crate::console::print(format_args!($($text)*))
+    };
+}
+
+/// Prints a line on stderr, as `eprintln!` does.
+#[macro_export]
+macro_rules! errln {
+    ($($text:tt)*) => {
+        $crate::console::print_error(format_args!("{}\n", format_args!($($text)*)))
+    };
+}
+
+/// Prints text on stdout. Nothing is printed after the first error.
+pub fn print(text: Arguments<'_>) {
+    let text = text.to_string();
+    let mut lost = lost();
+    if lost.is_none() {
+        let mut stdout = std::io::stdout().lock();
+        *lost = stdout.write_all(escaped(&text).as_bytes()).and_then(|()| stdout.flush()).err();
+    }
+}
+
+/// Prints text on stderr. An error is ignored, since there is no place to report it.
+pub fn print_error(text: Arguments<'_>) {
+    let text = text.to_string();
+    std::io::stderr().lock().write_all(escaped(&text).as_bytes()).ok();
+}
+
+/// Prints an error or a help text of the command line parser; returns its exit code.
+pub fn print_usage(error: &clap::Error) -> ExitCode {
+    // The parser's own colours are control characters, so only text with other ones loses its colours.
+    let strange = |argument: std::ffi::OsString| matches!(escaped(&argument.to_string_lossy()), Cow::Owned(_));
+    if !std::env::args_os().any(strange) {
+        let failed = error.print().err();
+        if !error.use_stderr() {
+            *lost() = failed;
+        }
+    } else if error.use_stderr() {
+        print_error(format_args!("{error}"));
+    } else {
+        print(format_args!("{error}"));
+    }
+    ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2))
+}
+
+/// The exit code of the program after its last output. If stdout is a pipe that was closed, the program ends as by
+/// SIGPIPE. If stdout could not be written for another reason, the exit code is 1.
+pub fn end(code: ExitCode) -> ExitCode {
+    let lost = lost().take();
+    match lost {
+        None => code,
+        Some(error) if error.kind() == ErrorKind::BrokenPipe => crate::signals::end_by_pipe(),
+        Some(error) => {
+            print_error(format_args!("error: stdout cannot be written: {error}\n"));
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The text with all control characters but line feed and tab written as `\u{1b}`, and with those that change the
+/// direction of text.
+pub fn escaped(text: &str) -> Cow<'_, str> {
+    let is_strange = |c: char| {
+        c.is_control() && !matches!(c, '\n' | '\t') || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+    };
+    if !text.contains(is_strange) {
+        return Cow::Borrowed(text);
+    }
+    let mut shown = String::with_capacity(text.len() + 8);
+    for c in text.chars() {
+        if is_strange(c) { shown.extend(c.escape_unicode()) } else { shown.push(c) }
+    }
+    Cow::Owned(shown)
+}
+
+fn lost() -> std::sync::MutexGuard<'static, Option<Error>> {
+    LOST.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn control_characters_are_escaped() {
+        for (text, want) in [
+            ("plain\ttext\n", "plain\ttext\n"),
+            ("a\u{1b}[31mb", "a\\u{1b}[31mb"),
+            ("\r\u{7}\u{9b}", "\\u{d}\\u{7}\\u{9b}"),
+            ("a\u{202e}b", "a\\u{202e}b"),
+            ("Größe 点", "Größe 点"),
+        ] {
+            assert_eq!(escaped(text), want);
+        }
+    }
+}
