@@ -4,7 +4,8 @@
 use super::planes::Patch;
 use super::rings::Beam;
 use crate::inference::simplex::minimise;
-use std::collections::BTreeMap;
+use rayon::prelude::*;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Bins of range and incidence with the sums of one scan.
 pub type ScatterSums = BTreeMap<(i32, i32), Bin>;
@@ -87,8 +88,17 @@ impl NoiseFit {
     }
 }
 
-/// A bin over several scans: mean range, mean lever, samples, robust standard deviation, m.
-pub fn pooled(scans: &[&ScatterSums]) -> BTreeMap<(i32, i32), [f64; 4]> {
+/// Bins of range and incidence over several scans: mean range, mean lever, samples, robust standard deviation, m.
+pub type Pooled = BTreeMap<(i32, i32), [f64; 4]>;
+
+/// Median of the absolute values of normal noise, in standard deviations.
+const MEDIAN_OF_NORMAL: f64 = 0.6745;
+
+/// Smallest standard deviation of a bin, m.
+const LEAST_STD_M: f64 = 1e-4;
+
+/// The bins of several scans together.
+pub fn pooled(scans: &[&ScatterSums]) -> Pooled {
     let mut all = BTreeMap::<(i32, i32), Bin>::new();
     for (key, bin) in scans.iter().flat_map(|s| s.iter()) {
         let sum = all.entry(*key).or_default();
@@ -98,16 +108,49 @@ pub fn pooled(scans: &[&ScatterSums]) -> BTreeMap<(i32, i32), [f64; 4]> {
     }
     let usual = |values: &[f32]| {
         let median = statistics::median_upper(values.iter().map(|v| v.abs()).collect());
-        f64::from(median.unwrap_or(0.0)) / 0.6745
+        f64::from(median.unwrap_or(0.0)) / MEDIAN_OF_NORMAL
     };
     all.into_iter()
         .filter(|(_, b)| b.n >= FEWEST)
-        .map(|(key, b)| (key, [b.place[0] / b.n, b.place[1] / b.n, b.n, usual(&b.values).max(1e-4)]))
+        .map(|(key, b)| (key, [b.place[0] / b.n, b.place[1] / b.n, b.n, usual(&b.values).max(LEAST_STD_M)]))
         .collect()
 }
 
+/// [`pooled`] of all scans but one, for each. The values of a bin are sorted once for all.
+pub fn pooled_but_each(scans: &[ScatterSums]) -> Vec<Pooled> {
+    let keys: BTreeSet<(i32, i32)> = scans.iter().flat_map(|s| s.keys().copied()).collect();
+    let bins: Vec<((i32, i32), Vec<Option<[f64; 4]>>)> =
+        keys.into_par_iter().map(|key| (key, bin_but_each(scans, key))).collect();
+    let of_scan = |s: usize| bins.iter().filter_map(|(key, but)| Some((*key, but[s]?))).collect();
+    (0..scans.len()).map(of_scan).collect()
+}
+
+/// One bin of all scans but one, for each.
+fn bin_but_each(scans: &[ScatterSums], key: (i32, i32)) -> Vec<Option<[f64; 4]>> {
+    let bins: Vec<(usize, &Bin)> =
+        scans.iter().enumerate().filter_map(|(s, sums)| Some((s, sums.get(&key)?))).collect();
+    let mut values: Vec<(f32, usize)> =
+        bins.iter().flat_map(|(s, bin)| bin.values.iter().map(|v| (v.abs(), *s))).collect();
+    values.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    let mut ranks: Vec<Vec<usize>> = vec![Vec::new(); scans.len()];
+    values.iter().enumerate().for_each(|(rank, (_, s))| ranks[*s].push(rank));
+    let but = |s: usize| {
+        let rest = || bins.iter().filter(|(of, _)| *of != s).map(|(_, bin)| bin);
+        let n: f64 = rest().map(|bin| bin.n).sum();
+        let mean = |k: usize| rest().map(|bin| bin.place[k]).sum::<f64>() / n;
+        // The upper median of what is left when the values of the scan are skipped.
+        let mut at = (values.len() - ranks[s].len()) / 2;
+        for rank in &ranks[s] {
+            at += usize::from(*rank <= at);
+        }
+        let usual = values.get(at).map_or(0.0, |v| f64::from(v.0)) / MEDIAN_OF_NORMAL;
+        (n >= FEWEST).then(|| [mean(0), mean(1), n, usual.max(LEAST_STD_M)])
+    };
+    (0..scans.len()).map(but).collect()
+}
+
 /// Fits a law to bins.
-pub fn fit(bins: &BTreeMap<(i32, i32), [f64; 4]>, free: Free) -> NoiseFit {
+pub fn fit(bins: &Pooled, free: Free) -> NoiseFit {
     let law = |p: &[f64]| {
         let mut p = p.iter().map(|v| v.exp());
         let std_m = p.next().unwrap_or(0.01);
@@ -142,4 +185,31 @@ pub fn likelihood(scan: &ScatterSums, law: &NoiseFit) -> [f64; 2] {
         sum[1] += n;
     }
     sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::RngExt;
+
+    #[test]
+    fn bins_of_all_scans_but_one_are_those_of_the_others() {
+        let mut rng = data::stream(1, "scatter test", 0, 0);
+        let mut scan = |samples: usize| -> ScatterSums {
+            let mut sums = ScatterSums::new();
+            for _ in 0..samples {
+                let bin = sums.entry((rng.random_range(0..3), rng.random_range(0..2))).or_default();
+                bin.n += 1.0;
+                bin.place = bin.place.map(|p| p + rng.random_range(1.0..9.0));
+                // Few distinct values, so that many are equal.
+                bin.values.push(rng.random_range(-4i8..=4).into());
+            }
+            sums
+        };
+        let scans: Vec<ScatterSums> = [200, 0, 90, 301, 7].into_iter().map(&mut scan).collect();
+        for (s, got) in pooled_but_each(&scans).into_iter().enumerate() {
+            let others: Vec<&ScatterSums> = (0..scans.len()).filter(|i| *i != s).map(|i| &scans[i]).collect();
+            assert_eq!(got, pooled(&others), "{s}");
+        }
+    }
 }

@@ -1,19 +1,15 @@
 //! Noise of the range, over range and incidence.
 
-use super::{Named, others, parameter, patches};
+use super::{Named, parameter, patches};
 use crate::catalogue::{Cause, Channel, Covariate, Hypothesis, NoiseForm, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Finding};
-use crate::scans::scatter::{self, Free, NoiseFit, ScatterSums};
+use crate::scans::scatter::{self, Free, NoiseFit, Pooled, ScatterSums};
 use crate::scans::{Seen, draws, gain_of, interval};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 
 /// Fewest bins of range and incidence that a law is fitted to.
 const FEWEST_BINS: usize = 4;
-
-/// Bins of range and incidence: mean range, mean lever, samples, standard deviation.
-type Bins = BTreeMap<(i32, i32), [f64; 4]>;
 
 /// Forms of a noise law, of growing freedom.
 const FORMS: [(NoiseForm, Free); 4] = [
@@ -42,7 +38,7 @@ pub(super) fn noise_found(seen: &Seen, step_m: f64, notes: &mut Vec<String>) -> 
 }
 
 /// Bins over some scans.
-fn bins(scans: &[ScatterSums], which: &[usize]) -> Bins {
+fn bins(scans: &[ScatterSums], which: &[usize]) -> Pooled {
     scatter::pooled(&which.iter().map(|&s| &scans[s]).collect::<Vec<_>>())
 }
 
@@ -55,13 +51,10 @@ struct Forms {
 
 impl Forms {
     fn new(scans: Vec<ScatterSums>) -> Self {
-        let n = scans.len();
+        let rest = scatter::pooled_but_each(&scans);
         let of_form = |(_, free): &(NoiseForm, Free)| {
-            let of = |s: usize| {
-                let rest = bins(&scans, &others(n, s).collect::<Vec<_>>());
-                scatter::likelihood(&scans[s], &scatter::fit(&rest, *free))
-            };
-            (0..n).map(of).collect()
+            let of = |s: usize| scatter::likelihood(&scans[s], &scatter::fit(&rest[s], *free));
+            (0..scans.len()).map(of).collect()
         };
         let likelihoods = FORMS.par_iter().map(of_form).collect();
         Forms { scans, likelihoods }
@@ -170,7 +163,7 @@ impl Forms {
 
 /// Standard deviation along the ray, by the angle of incidence or by range: measured, of an ideal sensor, and fitted.
 /// Range is shown on surfaces near normal incidence, where there are enough.
-fn curve(table: &Bins, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
+fn curve(table: &Pooled, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
     let row = |[r, l, m, sd]: &[f64; 4]| {
         let x = if by_angle { (l / r).atan().to_degrees() } else { *r };
         [x, *m, *sd, fitted.variance(*r, *l).sqrt(), ideal.std_m]
