@@ -153,3 +153,39 @@ fn coherent(lasers: impl Iterator<Item = Phasor>) -> f64 {
     }
     (sum / f64::max(all, 1.0)).max(0.0).sqrt()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::rings::Shot;
+    use super::*;
+    use rand::RngExt;
+
+    /// Scans of nine lasers whose ranges are rounded to 4 mm, each laser with a phase of its own.
+    fn scans() -> Vec<RingScan> {
+        let mut rng = data::stream(1, "comb test", 0, 0);
+        let mut scan = |s: usize| {
+            let mut ring = |beam: usize| -> Vec<Shot> {
+                let mut shot = || {
+                    let rounded = (rng.random_range(3.0..60.0f64) / 0.004).round() * 0.004;
+                    let range_m = rounded + 0.0004 * beam as f64 + rng.random_range(-3e-4..3e-4);
+                    Shot { azimuth_rad: 0.0, range_m, intensity: 0.0 }
+                };
+                (0..250 + 20 * s).map(|_| shot()).collect()
+            };
+            RingScan { id: s.to_string(), rings: (0..9).map(&mut ring).collect() }
+        };
+        (0..5).map(&mut scan).collect()
+    }
+
+    #[test]
+    fn combs_of_all_scans_but_one_are_those_of_the_others() {
+        let scans = scans();
+        let all = Combs::new(&scans).of_all().unwrap();
+        assert!((all.step_m - 0.004).abs() < 1e-6 && all.coherence > 0.9, "{all:?}");
+        for (s, got) in Combs::new(&scans).of_all_but_each().into_iter().enumerate() {
+            let others: Vec<RingScan> = scans.iter().filter(|scan| scan.id != s.to_string()).cloned().collect();
+            let (got, want) = (got.unwrap(), Combs::new(&others).of_all().unwrap());
+            assert!(got.step_m == want.step_m && (got.coherence - want.coherence).abs() < 1e-12, "{got:?} {want:?}");
+        }
+    }
+}

@@ -97,56 +97,78 @@ const MEDIAN_OF_NORMAL: f64 = 0.6745;
 /// Smallest standard deviation of a bin, m.
 const LEAST_STD_M: f64 = 1e-4;
 
-/// The bins of several scans together.
-pub fn pooled(scans: &[&ScatterSums]) -> Pooled {
-    let mut all = BTreeMap::<(i32, i32), Bin>::new();
-    for (key, bin) in scans.iter().flat_map(|s| s.iter()) {
-        let sum = all.entry(*key).or_default();
-        sum.n += bin.n;
-        (0..2).for_each(|k| sum.place[k] += bin.place[k]);
-        sum.values.extend(&bin.values);
+/// The values of each bin of all scans, sorted once for every choice of scans.
+pub struct SortedBins<'a> {
+    scans: &'a [ScatterSums],
+    /// Absolute values, m, with the number of their scan.
+    values: BTreeMap<(i32, i32), Vec<(f32, u32)>>,
+}
+
+impl<'a> SortedBins<'a> {
+    /// Sorts the values of all scans.
+    pub fn new(scans: &'a [ScatterSums]) -> Self {
+        let keys: BTreeSet<(i32, i32)> = scans.iter().flat_map(|s| s.keys().copied()).collect();
+        let sorted = |key: (i32, i32)| {
+            let of_scan =
+                |(s, sums): (u32, &'a ScatterSums)| Some(sums.get(&key)?.values.iter().map(move |v| (v.abs(), s)));
+            let mut values: Vec<(f32, u32)> = (0..).zip(scans).filter_map(of_scan).flatten().collect();
+            values.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+            (key, values)
+        };
+        SortedBins { scans, values: keys.into_par_iter().map(sorted).collect() }
     }
-    let usual = |values: &[f32]| {
-        let median = statistics::median_upper(values.iter().map(|v| v.abs()).collect());
-        f64::from(median.unwrap_or(0.0)) / MEDIAN_OF_NORMAL
-    };
-    all.into_iter()
-        .filter(|(_, b)| b.n >= FEWEST)
-        .map(|(key, b)| (key, [b.place[0] / b.n, b.place[1] / b.n, b.n, usual(&b.values).max(LEAST_STD_M)]))
-        .collect()
+
+    /// The bins of the scans of these numbers, which may repeat.
+    pub fn pooled(&self, which: &[usize]) -> Pooled {
+        let mut times = vec![0usize; self.scans.len()];
+        which.iter().for_each(|&s| times[s] += 1);
+        let of_bin = |(key, values): (&(i32, i32), &Vec<(f32, u32)>)| {
+            let chosen = || which.iter().filter_map(|&s| self.scans[s].get(key));
+            // The upper median of the chosen values, each as often as its scan is chosen.
+            let mut before = chosen().map(|bin| bin.values.len()).sum::<usize>() / 2;
+            let usual = values.iter().find(|(_, s)| {
+                let n = times[*s as usize];
+                let here = before < n;
+                before = before.saturating_sub(n);
+                here
+            });
+            Some((*key, pooled_bin(chosen, usual.map(|v| v.0))?))
+        };
+        self.values.iter().filter_map(of_bin).collect()
+    }
+
+    /// The bins of all scans but one, for each.
+    pub fn pooled_but_each(&self) -> Vec<Pooled> {
+        let of_bin = |(key, values): (&(i32, i32), &Vec<(f32, u32)>)| (*key, self.bin_but_each(key, values));
+        let bins: Vec<((i32, i32), Vec<Option<[f64; 4]>>)> = self.values.par_iter().map(of_bin).collect();
+        let of_scan = |s: usize| bins.iter().filter_map(|(key, but)| Some((*key, but[s]?))).collect();
+        (0..self.scans.len()).map(of_scan).collect()
+    }
+
+    /// One bin of all scans but one, for each.
+    fn bin_but_each(&self, key: &(i32, i32), values: &[(f32, u32)]) -> Vec<Option<[f64; 4]>> {
+        let mut ranks: Vec<Vec<usize>> = vec![Vec::new(); self.scans.len()];
+        values.iter().enumerate().for_each(|(rank, (_, s))| ranks[*s as usize].push(rank));
+        let but = |s: usize| {
+            let rest = || (0..self.scans.len()).filter(move |i| *i != s).filter_map(|i| self.scans[i].get(key));
+            // The upper median of what is left when the values of the scan are skipped.
+            let mut at = (values.len() - ranks[s].len()) / 2;
+            for rank in &ranks[s] {
+                at += usize::from(*rank <= at);
+            }
+            pooled_bin(rest, values.get(at).map(|v| v.0))
+        };
+        (0..self.scans.len()).map(but).collect()
+    }
 }
 
-/// [`pooled`] of all scans but one, for each. The values of a bin are sorted once for all.
-pub fn pooled_but_each(scans: &[ScatterSums]) -> Vec<Pooled> {
-    let keys: BTreeSet<(i32, i32)> = scans.iter().flat_map(|s| s.keys().copied()).collect();
-    let bins: Vec<((i32, i32), Vec<Option<[f64; 4]>>)> =
-        keys.into_par_iter().map(|key| (key, bin_but_each(scans, key))).collect();
-    let of_scan = |s: usize| bins.iter().filter_map(|(key, but)| Some((*key, but[s]?))).collect();
-    (0..scans.len()).map(of_scan).collect()
-}
-
-/// One bin of all scans but one, for each.
-fn bin_but_each(scans: &[ScatterSums], key: (i32, i32)) -> Vec<Option<[f64; 4]>> {
-    let bins: Vec<(usize, &Bin)> =
-        scans.iter().enumerate().filter_map(|(s, sums)| Some((s, sums.get(&key)?))).collect();
-    let mut values: Vec<(f32, usize)> =
-        bins.iter().flat_map(|(s, bin)| bin.values.iter().map(|v| (v.abs(), *s))).collect();
-    values.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-    let mut ranks: Vec<Vec<usize>> = vec![Vec::new(); scans.len()];
-    values.iter().enumerate().for_each(|(rank, (_, s))| ranks[*s].push(rank));
-    let but = |s: usize| {
-        let rest = || bins.iter().filter(|(of, _)| *of != s).map(|(_, bin)| bin);
-        let n: f64 = rest().map(|bin| bin.n).sum();
-        let mean = |k: usize| rest().map(|bin| bin.place[k]).sum::<f64>() / n;
-        // The upper median of what is left when the values of the scan are skipped.
-        let mut at = (values.len() - ranks[s].len()) / 2;
-        for rank in &ranks[s] {
-            at += usize::from(*rank <= at);
-        }
-        let usual = values.get(at).map_or(0.0, |v| f64::from(v.0)) / MEDIAN_OF_NORMAL;
-        (n >= FEWEST).then(|| [mean(0), mean(1), n, usual.max(LEAST_STD_M)])
-    };
-    (0..scans.len()).map(but).collect()
+/// Mean range, mean lever, samples and robust standard deviation of the bins of several scans; `None` with too few
+/// samples. `usual` is the median of the absolute values.
+fn pooled_bin<'b, I: Iterator<Item = &'b Bin>>(bins: impl Fn() -> I, usual: Option<f32>) -> Option<[f64; 4]> {
+    let n: f64 = bins().map(|bin| bin.n).sum();
+    let mean = |k: usize| bins().map(|bin| bin.place[k]).sum::<f64>() / n;
+    let std_m = usual.map_or(0.0, f64::from) / MEDIAN_OF_NORMAL;
+    (n >= FEWEST).then(|| [mean(0), mean(1), n, std_m.max(LEAST_STD_M)])
 }
 
 /// Fits a law to bins.
@@ -192,8 +214,22 @@ mod tests {
     use super::*;
     use rand::RngExt;
 
+    /// The bins of several scans, each median of its own.
+    fn pooled(scans: &[&ScatterSums]) -> Pooled {
+        let mut all = BTreeMap::<(i32, i32), Bin>::new();
+        for (key, bin) in scans.iter().flat_map(|s| s.iter()) {
+            let sum = all.entry(*key).or_default();
+            sum.n += bin.n;
+            (0..2).for_each(|k| sum.place[k] += bin.place[k]);
+            sum.values.extend(&bin.values);
+        }
+        let usual = |b: &Bin| statistics::median_upper(b.values.iter().map(|v| v.abs()).collect());
+        let enough = all.into_iter().filter(|(_, b)| b.n >= FEWEST);
+        enough.map(|(key, b)| (key, pooled_bin(|| [&b].into_iter(), usual(&b)).unwrap())).collect()
+    }
+
     #[test]
-    fn bins_of_all_scans_but_one_are_those_of_the_others() {
+    fn bins_of_chosen_scans_have_their_medians() {
         let mut rng = data::stream(1, "scatter test", 0, 0);
         let mut scan = |samples: usize| -> ScatterSums {
             let mut sums = ScatterSums::new();
@@ -207,7 +243,15 @@ mod tests {
             sums
         };
         let scans: Vec<ScatterSums> = [200, 0, 90, 301, 7].into_iter().map(&mut scan).collect();
-        for (s, got) in pooled_but_each(&scans).into_iter().enumerate() {
+        let sorted = SortedBins::new(&scans);
+        for which in [&[0, 1, 2, 3, 4][..], &[3, 3, 0, 2, 3], &[1], &[]] {
+            assert_eq!(
+                sorted.pooled(which),
+                pooled(&which.iter().map(|&s| &scans[s]).collect::<Vec<_>>()),
+                "{which:?}"
+            );
+        }
+        for (s, got) in sorted.pooled_but_each().into_iter().enumerate() {
             let others: Vec<&ScatterSums> = (0..scans.len()).filter(|i| *i != s).map(|i| &scans[i]).collect();
             assert_eq!(got, pooled(&others), "{s}");
         }
