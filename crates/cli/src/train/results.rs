@@ -43,8 +43,10 @@ pub(super) fn write(found: &Evaluation, set: &Dataset, out: &Path) -> Result<()>
         let seen = set.load(&frame.id)?;
         let mut boxes: Vec<_> = seen.objects.iter().map(|o| (o.bbox, Style::GroundTruth)).collect();
         boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));
-        let picture = birds_eye_png(&seen.cloud, &boxes, &BirdsEyeOptions::default())?;
-        write_atomic(&out.join(format!("pictures/{}.png", frame.id)), &picture)?;
+        match birds_eye_png(&seen.cloud, &boxes, &BirdsEyeOptions::default()) {
+            Ok(picture) => write_atomic(&out.join(format!("pictures/{}.png", frame.id)), &picture)?,
+            Err(error) => eprintln!("warning: no picture of frame {}: {error}", frame.id),
+        }
     }
     Ok(())
 }

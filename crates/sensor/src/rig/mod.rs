@@ -4,6 +4,7 @@ mod pattern;
 
 pub use pattern::{Pattern, RowBlock, Shot, Sweep, direction};
 
+use data::limits::check_name;
 use data::toml_text::{parse_toml, read_toml, within, wrong};
 use data::{DataError, KeyError};
 use geometry::Pose;
@@ -115,8 +116,9 @@ impl Rig {
         }
         for (i, sensor) in self.sensors.iter().enumerate() {
             let here = format!("sensor[{i}]");
-            if sensor.name.is_empty() || self.sensors[..i].iter().any(|s| s.name == sensor.name) {
-                return Err(wrong(format!("{here}.name"), format!("{:?} is empty or not unique", sensor.name)));
+            check_name(&sensor.name).map_err(|message| wrong(format!("{here}.name"), message))?;
+            if self.sensors[..i].iter().any(|s| s.name == sensor.name) {
+                return Err(wrong(format!("{here}.name"), format!("{:?} is not unique", sensor.name)));
             }
             sensor.check().map_err(|e| e.below(&here))?;
         }
@@ -306,7 +308,7 @@ mod tests {
             ("".to_owned(), "r.toml: sensor: there is none"),
             (
                 "[[sensor]]\nname = \"a\"\n[[sensor]]\nname = \"a\"\n".into(),
-                "r.toml:4: sensor[1].name: \"a\" is empty or not unique",
+                "r.toml:4: sensor[1].name: \"a\" is not unique",
             ),
             ("[[sensor]]\nname = \"a\"\ncolour = 1\n".into(), "r.toml:3: unknown field `colour`"),
             (

@@ -249,7 +249,8 @@ impl RaceConfig {
 /// Checks that a name can be used as a folder name.
 fn check_name(key: &str, name: &str) -> Result<(), KeyError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if name.is_empty() || !name.chars().all(plain) {
+    data::limits::check_name(name).map_err(|message| wrong(key, message))?;
+    if !name.chars().all(plain) {
         return Err(wrong(key, format!("{name:?} is no name of a folder: letters, digits, _ and - only")));
     }
     Ok(())
