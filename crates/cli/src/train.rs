@@ -61,6 +61,9 @@ pub struct TrainArgs {
     /// Resume the run in --out, or start it if there is none; options that are not repeated keep their values
     #[arg(long)]
     resume: bool,
+    /// Resume although the labels or clouds of the data set have changed since the last checkpoint
+    #[arg(long, requires = "resume")]
+    allow_changed_data: bool,
     /// Train and evaluate on all frames without augmentation, to check that the network can fit the data; without
     /// --epochs, the number of epochs is increased to what the network needs for this
     #[arg(long)]
@@ -97,7 +100,13 @@ impl TrainArgs {
         eprintln!("device: {}", self.device.describe());
         // The default run is always resumed.
         let resume = self.resume || self.dataset.is_none();
-        let session = Session { device, device_name: self.device.describe(), workers: self.workers, resume };
+        let session = Session {
+            device,
+            device_name: self.device.describe(),
+            workers: self.workers,
+            resume,
+            allow_changed_data: self.allow_changed_data,
+        };
         let mut progress = Progress::default();
         let trained = train(&config, &out, &session, &mut |event| progress.show(&event))?;
         progress.finish();

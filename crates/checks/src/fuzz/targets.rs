@@ -118,6 +118,7 @@ fn run_folder(path: &Path) -> Result<Vec<Target>> {
         position: 4,
         seed: 7,
         config_sha256: "c".into(),
+        data_sha256: None,
         frames_sha256: "f".into(),
         best: None,
     };
