@@ -390,12 +390,12 @@ mod tests {
         let cases = [
             ("name = \"a\"\nroat = \".\"\n", "dataset.toml:2: unknown field `roat`"),
             ("name = \"a\"\nclasses = \"Car\"\n", "dataset.toml:2: classes: invalid type"),
-            ("label_frame = \"world\"\n", "dataset.toml:1: unknown variant `world`"),
+            ("label_frame = \"world\"\n", "dataset.toml:1: label_frame: unknown variant `world`"),
             ("a = = 1", "dataset.toml:1: "),
             ("root = \"elsewhere\"", "elsewhere/velodyne: does not exist"),
             ("classes = [\"Car\", \"Car\"]", "occurs twice"),
             ("layout = \"s2r_dad\"\nlabel_frame = \"camera\"", "needs a calibration"),
-            ("image_size = [0, 375]", "must be positive"),
+            ("image_size = [0, 375]", "must be from 1 to 65536 px"),
         ];
         for (text, want) in cases {
             let error = with_toml(folder.path(), text).unwrap_err();

@@ -319,7 +319,7 @@ mod tests {
             ("[[sensor]]\nposition = [0, 0, 0]\n".into(), "r.toml:1: missing field `name`"),
             ("[[sensor]]\nname = \"a\"\nposition = [nan, 0, 0]\n".into(), "r.toml:3: sensor[0].position[0]: NaN"),
             ("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 0\n".into(), "sensor[0].horizontal_fov_deg: 0"),
-            ("[[sensor]]\nname = \"a\"\npattern = \"spiral\"\n".into(), "r.toml:3: invalid type"),
+            ("[[sensor]]\nname = \"a\"\npattern = \"spiral\"\n".into(), "r.toml:3: sensor[0].pattern: invalid type"),
             (pattern("blocks = []\ncolumns = 10"), "r.toml:4: sensor[0].pattern.blocks: is empty"),
             (
                 pattern("blocks = [{ rows = 0, top_deg = 1, bottom_deg = 0 }]\ncolumns = 10"),

@@ -291,7 +291,7 @@ mod tests {
                 "[dataset.auto_label]\nrate_hz = 0",
                 "c.toml:9: dataset[1].auto_label.rate_hz: 0 is not between",
             ),
-            ("frames = 100", "frames = 100\nsplit = \"lot\"", "c.toml:4: unknown variant `lot`"),
+            ("frames = 100", "frames = 100\nsplit = \"lot\"", "c.toml:4: split: unknown variant `lot`"),
             (
                 "frames = 100",
                 "frames = 100\nsplit_shares = [4, 0, 1]",
