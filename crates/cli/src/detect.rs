@@ -15,6 +15,7 @@ use models::{Detector, Preparer, find_detector, inference_samples, predict_frame
 use report::{BirdsEyeOptions, Style, birds_eye_png};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use train::verify_weights;
 
 /// Detect objects in a point cloud or in all frames of a split. For a point cloud, boxes are printed as KITTI text in
 /// the frame of the cloud, and a bird's eye view is written.
@@ -71,6 +72,7 @@ impl DetectArgs {
     pub fn run(self) -> Result<()> {
         let device = self.device.open()?;
         let config = detector_of(&self.checkpoint, self.detector.as_deref())?;
+        verify_weights(&self.checkpoint)?;
         let weights = read_checkpoint(&self.checkpoint)?;
         let detector = Detector::new(&config, 0, &device)
             .load_named(&weights)
@@ -104,12 +106,18 @@ impl DetectArgs {
             None => Vec::new(),
         };
         let picture = self.out.clone().unwrap_or_else(|| ".".into()).join(format!("{id}.png"));
-        draw(&picture, &frame.cloud, &truth, &detections)?;
+        let drawn = match draw(&frame.cloud, &truth, &detections) {
+            Ok(bytes) => {
+                write_atomic(&picture, &bytes)?;
+                format!("bird's eye view in {}", picture.display())
+            }
+            Err(error) => format!("warning: no picture: {error}"),
+        };
         for detection in &detections {
             let found = LabelBox::from_box(&detection.class, &detection.bbox, Some(detection.score));
             outln!("{}", KittiLine(&found));
         }
-        errln!("{} boxes, bird's eye view in {}", detections.len(), picture.display());
+        errln!("{} boxes, {drawn}", detections.len());
         Ok(())
     }
 
@@ -167,9 +175,8 @@ fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<DetectorConfig>
 }
 
 /// Draws points, ground truth and detections in a bird's eye view.
-fn draw(path: &Path, cloud: &Cloud, truth: &[LabelBox], detections: &[Detection]) -> Result<()> {
+fn draw(cloud: &Cloud, truth: &[LabelBox], detections: &[Detection]) -> Result<Vec<u8>> {
     let mut boxes: Vec<_> = truth.iter().map(|label| (label.lidar_box(), Style::GroundTruth)).collect();
     boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));
-    let picture = birds_eye_png(cloud, &boxes, &BirdsEyeOptions::default())?;
-    Ok(write_atomic(path, &picture)?)
+    Ok(birds_eye_png(cloud, &boxes, &BirdsEyeOptions::default())?)
 }

@@ -3,7 +3,7 @@
 use crate::{errln, outln};
 use anyhow::{Context, Result};
 use clap::Args;
-use data::Dataset;
+use data::{Dataset, verify_frames};
 use indicatif::{ProgressBar, ProgressStyle};
 use sensor::{EffectList, Rig};
 use simulate::resim::Resim;
@@ -12,7 +12,7 @@ use std::path::PathBuf;
 /// Apply sensor effects to an existing data set and write the result as a new one: noise, dropout, offsets, ... An
 /// effect that needs new ray casting, or something that the data set does not tell, is an error.
 ///
-/// Run the same command again to resume an interrupted run.
+/// Run the same command again to resume an interrupted run. Frames whose files or sources were changed are made anew.
 ///
 /// Examples:
 ///   lidarshift resim --effects configs/simulate/sim_noise.toml datasets/race/sim --out datasets/noisy
@@ -39,11 +39,18 @@ pub struct ResimArgs {
     /// Leave out effects that cannot be applied to this data set, and list them
     #[arg(long)]
     skip_inapplicable: bool,
+    /// Write nothing; compare every file of the frames in --out with its SHA-256 from when it was written
+    #[arg(long)]
+    verify: bool,
 }
 
 impl ResimArgs {
     /// Writes the data set and prints its size.
     pub fn run(self) -> Result<()> {
+        if self.verify {
+            outln!("{}: {} frames are as they were written", self.out.display(), verify_frames(&self.out)?);
+            return Ok(());
+        }
         let dataset = Dataset::open(&self.dataset)?;
         dataset.refuse_own_folder(&self.out)?;
         let mut effects = EffectList::read(&self.effects)?;
@@ -93,6 +100,7 @@ mod tests {
             sensor: None,
             seed: 1,
             skip_inapplicable: false,
+            verify: false,
         };
         std::fs::write(&effects, "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.02\n").unwrap();
         args("noisy").run().unwrap();

@@ -4,7 +4,7 @@ use crate::console::escaped;
 use crate::{errln, out, outln};
 use anyhow::Result;
 use clap::Args;
-use data::{Dataset, write_atomic};
+use data::{Dataset, verify_frames, write_atomic};
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
 use simulate::race::{ConfigFiles, RaceConfig, RaceManifest, make_race_datasets};
@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// Simulate data sets: a race on an oval, once as a stand-in for measured data and once as an ideal simulator would
 /// show it, or streets with cars. The same seed gives the same files, byte for byte.
 ///
-/// Run the same command again to resume an interrupted run.
+/// Run the same command again to resume an interrupted run. Frames whose files were changed are made anew.
 ///
 /// Examples:
 ///   lidarshift simulate
@@ -40,19 +40,47 @@ pub struct SimulateArgs {
     /// Only these data sets of a race, separated by commas [default: all]
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     dataset: Vec<String>,
+    /// Simulate nothing; compare every file of the frames with its SHA-256 from when it was written
+    #[arg(long)]
+    verify: bool,
 }
 
 impl SimulateArgs {
     /// Simulates the data sets and prints their sizes.
     pub fn run(self) -> Result<()> {
         match Scenery::find(&self.config, self.frames, self.seed)? {
+            scenery if self.verify => self.verify(&scenery),
             Scenery::Street(config) => self.street(&config),
             Scenery::Race(race) => self.race(&race.0, &race.1),
         }
     }
 
+    /// Compares the data sets on disk with their records.
+    fn verify(&self, scenery: &Scenery) -> Result<()> {
+        let folders: Vec<PathBuf> = match scenery {
+            Scenery::Street(_) => vec![self.street_folder()],
+            Scenery::Race(race) => {
+                let out = self.race_folder(&race.0);
+                let wanted = |name: &&String| self.dataset.is_empty() || self.dataset.contains(name);
+                race.0.datasets.iter().map(|set| &set.name).filter(wanted).map(|name| out.join(name)).collect()
+            }
+        };
+        for folder in folders {
+            outln!("{}: {} frames are as they were written", folder.display(), verify_frames(&folder)?);
+        }
+        Ok(())
+    }
+
+    fn street_folder(&self) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| "datasets/road".into())
+    }
+
+    fn race_folder(&self, config: &RaceConfig) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| Path::new("datasets").join(&config.name))
+    }
+
     fn street(&self, config: &RoadConfig) -> Result<()> {
-        let out = self.out.clone().unwrap_or_else(|| "datasets/road".into());
+        let out = self.street_folder();
         let progress = bar()?;
         progress.set_length(config.frames.total() as u64);
         let manifest = make_road_dataset(config, &out, &|done, _| progress.set_position(done as u64))?;
@@ -67,7 +95,7 @@ impl SimulateArgs {
     }
 
     fn race(&self, config: &RaceConfig, files: &ConfigFiles) -> Result<()> {
-        let out = self.out.clone().unwrap_or_else(|| Path::new("datasets").join(&config.name));
+        let out = self.race_folder(config);
         let progress = bar()?;
         let show_progress = |name: &str, done: usize, total: usize| {
             progress.set_message(escaped(name).into_owned());
@@ -98,8 +126,13 @@ fn preview(folder: &Path) -> Result<()> {
     let Some(id) = dataset.ids("test")?.into_iter().next() else { return Ok(()) };
     let frame = dataset.load(&id)?;
     let boxes: Vec<_> = frame.objects.iter().map(|o| (o.bbox, Style::GroundTruth)).collect();
-    let bytes = birds_eye_png(&frame.cloud, &boxes, &BirdsEyeOptions::default())?;
-    Ok(write_atomic(&picture, &bytes)?)
+    match birds_eye_png(&frame.cloud, &boxes, &BirdsEyeOptions::default()) {
+        Ok(bytes) => Ok(write_atomic(&picture, &bytes)?),
+        Err(error) => {
+            errln!("warning: no picture of frame {id}: {error}");
+            Ok(())
+        }
+    }
 }
 
 /// One line per split; for data sets with auto-labels, also the rms errors of the labels.

@@ -64,6 +64,9 @@ pub struct TrainArgs {
     /// Resume the run in --out, or start it if there is none; options that are not repeated keep their values
     #[arg(long)]
     resume: bool,
+    /// Resume although the labels or clouds of the data set have changed since the last checkpoint
+    #[arg(long, requires = "resume")]
+    allow_changed_data: bool,
     /// Train and evaluate on all frames without augmentation, to check that the network can fit the data; without
     /// --epochs, the number of epochs is increased to what the network needs for this
     #[arg(long)]
@@ -101,8 +104,14 @@ impl TrainArgs {
         errln!("device: {}", self.device.describe());
         // The default run is always resumed.
         let resume = self.resume || self.dataset.is_none();
-        let (device_name, stop) = (self.device.describe(), signals::stop_flag());
-        let session = Session { device, device_name, workers: self.workers, resume, stop };
+        let session = Session {
+            device,
+            device_name: self.device.describe(),
+            workers: self.workers,
+            resume,
+            allow_changed_data: self.allow_changed_data,
+            stop: signals::stop_flag(),
+        };
         let mut progress = Progress::default();
         let mut save_first = SaveFirst::default();
         let trained = train(&config, &out, &session, &mut |event| {

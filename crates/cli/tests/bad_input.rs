@@ -64,7 +64,7 @@ fn pcd_clouds() {
         (header("x y", "4 4", "F F", "1 1", "1", "ascii") + "1 2\n", "z"),
         (xyz("1", "binary_zipped", ""), "binary_zipped"),
         (xyz("2", "binary", "1234"), "bytes"),
-        (xyz("99999999999", "binary", "1234"), "bytes"),
+        (xyz("99999999999", "binary", "1234"), "points in its header; at most"),
         ("no header".into(), "cloud.pcd"),
     ] {
         let train = "train --dataset . --detector tiny.toml --epochs 1 --out run --set channels=3";

@@ -23,9 +23,7 @@ pub struct Calibration {
 impl Calibration {
     /// Reads a file of KITTI's `calib` folder.
     pub fn read(path: &Path) -> Result<Self, DataError> {
-        let bytes = fs_err::read(path)?;
-        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(path, "is not UTF-8 text"))?;
-        Self::parse(text, path)
+        Self::parse(&crate::limits::read_text(path)?, path)
     }
 
     /// Parses lines of the form `KEY: numbers`. `P2`, `R0_rect` and `Tr_velo_to_cam` are required, other keys are

@@ -1,5 +1,6 @@
 //! Reads point clouds and checks them: not empty, values finite, points within 10 km.
 
+use crate::limits::{MOST_CLOUD_BYTES, MOST_POINTS, at_most, read_file};
 use crate::{Cloud, DataError, parse_pcd};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -36,9 +37,12 @@ pub const FARTHEST_M: f32 = 10_000.0;
 pub fn read_cloud(path: &Path, columns: PointColumns) -> Result<Cloud, DataError> {
     let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     match ending.as_deref() {
-        Some("bin") => parse_bin(&fs_err::read(path)?, path, columns),
+        Some("bin") => {
+            let most = (MOST_POINTS * columns.channels() * size_of::<f32>()) as u64;
+            parse_bin(&read_file(path, most)?, path, columns)
+        }
         Some("pcd") => {
-            let cloud = parse_pcd(&fs_err::read(path)?, path)?;
+            let cloud = parse_pcd(&read_file(path, MOST_CLOUD_BYTES)?, path)?;
             Ok(if cloud.channels > columns.channels() { cloud.with_channels(columns.channels()) } else { cloud })
         }
         _ => Err(DataError::file(path, "not a point cloud: its name must end in .bin or .pcd")),
@@ -58,6 +62,7 @@ pub fn parse_bin(bytes: &[u8], path: &Path, columns: PointColumns) -> Result<Clo
             ),
         ));
     }
+    at_most(path, "points", (bytes.len() / channels / 4) as u64, MOST_POINTS)?;
     let values = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
     let cloud = Cloud { values, channels };
     check_cloud(&cloud, path)?;

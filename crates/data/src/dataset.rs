@@ -3,6 +3,7 @@
 use crate::dataset_config::DatasetConfig;
 use crate::kitti_text::{KittiText, read_kitti_text};
 use crate::layout::PointDetails;
+use crate::limits::{MOST_IDS, at_most, check_name, read_text};
 use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
 use geometry::Pose;
 use std::collections::BTreeSet;
@@ -42,10 +43,9 @@ impl Dataset {
     /// The frame ids of a split, in its order. An error if the split is empty or a frame has no cloud.
     pub fn ids(&self, split: &str) -> Result<Vec<String>, DataError> {
         let path = self.split_path(split)?;
-        let bytes = fs_err::read(&path)?;
-        let text = std::str::from_utf8(&bytes).map_err(|_| DataError::file(&path, "is not UTF-8 text"))?;
+        let text = read_text(&path)?;
         let mut ids = Vec::new();
-        for (line, id) in parse_split(text, &path)? {
+        for (line, id) in parse_split(&text, &path)? {
             if !self.config.layout.has_cloud(&self.config.root, id) {
                 let message = format!("frame {id} has no cloud: {} does not exist", self.cloud_path(id).display());
                 return Err(DataError::line(&path, line, message));
@@ -272,18 +272,16 @@ pub fn parse_split<'a>(text: &'a str, path: &Path) -> Result<Vec<(usize, &'a str
         let id = line.trim();
         if !id.is_empty() {
             check_frame_id(id).map_err(|message| DataError::line(path, i + 1, message))?;
+            at_most(path, "frames", ids.len() as u64 + 1, MOST_IDS)?;
             ids.push((i + 1, id));
         }
     }
     if ids.is_empty() { Err(DataError::file(path, "the split is empty")) } else { Ok(ids) }
 }
 
-/// An error unless the frame id is a file name: it must not contain a path.
+/// An error unless the frame id is a file name.
 fn check_frame_id(id: &str) -> Result<(), String> {
-    if id.is_empty() || id == "." || id == ".." || id.contains(['/', '\\', '\0']) {
-        return Err(format!("frame id {id:?} is not a file name: it must not be empty or contain a path separator"));
-    }
-    Ok(())
+    check_name(id).map_err(|message| format!("frame id {message}"))
 }
 
 #[cfg(test)]
@@ -391,13 +389,13 @@ mod tests {
         let folder = synthetic(Layout::Kitti, 4);
         let cases = [
             ("name = \"a\"\nroat = \".\"\n", "dataset.toml:2: unknown field `roat`"),
-            ("name = \"a\"\nclasses = \"Car\"\n", "dataset.toml:2: invalid type"),
-            ("label_frame = \"world\"\n", "dataset.toml:1: unknown variant `world`"),
+            ("name = \"a\"\nclasses = \"Car\"\n", "dataset.toml:2: classes: invalid type"),
+            ("label_frame = \"world\"\n", "dataset.toml:1: label_frame: unknown variant `world`"),
             ("a = = 1", "dataset.toml:1: "),
             ("root = \"elsewhere\"", "elsewhere/velodyne: does not exist"),
             ("classes = [\"Car\", \"Car\"]", "occurs twice"),
             ("layout = \"s2r_dad\"\nlabel_frame = \"camera\"", "needs a calibration"),
-            ("image_size = [0, 375]", "must be positive"),
+            ("image_size = [0, 375]", "must be from 1 to 65536 px"),
         ];
         for (text, want) in cases {
             let error = with_toml(folder.path(), text).unwrap_err();

@@ -1,6 +1,7 @@
 //! The TOML of a data set and its defaults.
 
-use crate::toml_text::{parse_toml, read_text};
+use crate::limits::{MOST_IMAGE_SIDE_PX, MOST_NAME_BYTES, check_name, read_text};
+use crate::toml_text::{KeyError, parse_toml, wrong};
 use crate::write::REPAIRED_ENDINGS;
 use crate::{DataError, LabelFrame, Layout, PointColumns};
 use schemars::JsonSchema;
@@ -101,7 +102,7 @@ impl DatasetConfig {
 
     /// Parses a data set's TOML. `root` and `rig` are resolved against the folder of `path`.
     pub fn parse(text: &str, path: &Path) -> Result<Self, DataError> {
-        let mut config: DatasetConfig = parse_toml(text, path, |_| Ok(()))?;
+        let mut config: DatasetConfig = parse_toml(text, path, DatasetConfig::check_values)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         config.root = folder.join(&config.root);
         config.rig = config.rig.map(|rig| folder.join(rig));
@@ -161,6 +162,21 @@ impl DatasetConfig {
         }))
     }
 
+    /// What needs no look at the files. The name may be missing.
+    fn check_values(&self) -> Result<(), KeyError> {
+        if !self.name.is_empty() {
+            check_name(&self.name).map_err(|message| wrong("name", message))?;
+        }
+        for split in self.splits.keys() {
+            check_name(split).map_err(|message| wrong("splits", message))?;
+        }
+        if self.image_size.iter().any(|side| !(1..=MOST_IMAGE_SIDE_PX).contains(side)) {
+            let message = format!("{:?}: both sides must be from 1 to {MOST_IMAGE_SIDE_PX} px", self.image_size);
+            return Err(wrong("image_size", message));
+        }
+        Ok(())
+    }
+
     fn check(&self, path: &Path) -> Result<(), DataError> {
         let wrong = |message: String| Err(DataError::file(path, message));
         let repaired = self.repaired_folders();
@@ -169,9 +185,6 @@ impl DatasetConfig {
         let others = others.into_iter().filter_map(|(key, folder)| Some((key, self.root.join(folder.as_ref()?))));
         if let Some((key, missing)) = others.chain(repaired).find(|(_, folder)| !folder.is_dir()) {
             return wrong(format!("{key}: {} is not a folder", missing.display()));
-        }
-        if self.image_size.contains(&0) {
-            return wrong(format!("image_size {:?}: both sides must be positive, px", self.image_size));
         }
         if !self.layout.supports_calibration() {
             let reason = format!("needs a calibration, which the layout {} does not have", self.layout.name());
@@ -184,7 +197,7 @@ impl DatasetConfig {
         }
         for (i, class) in self.classes.iter().enumerate() {
             if class.is_empty()
-                || class.contains(char::is_whitespace)
+                || class.contains(|c: char| c.is_whitespace() || c.is_control())
                 || class == "DontCare"
                 || self.classes[..i].contains(class)
             {
@@ -196,6 +209,18 @@ impl DatasetConfig {
 }
 
 pub(crate) fn folder_name(folder: &Path) -> String {
-    let name = |p: &Path| p.file_name().map(|n| n.to_string_lossy().into_owned());
+    let name = |p: &Path| p.file_name().map(|n| usable(&n.to_string_lossy()));
     name(folder).or_else(|| name(&folder.canonicalize().ok()?)).unwrap_or_else(|| "data set".into())
+}
+
+/// A name that [`check_name`] accepts.
+fn usable(name: &str) -> String {
+    let mut usable = String::new();
+    for c in name.trim_start_matches('.').chars().map(|c| if c.is_control() || c == '\\' { '_' } else { c }) {
+        if usable.len() + c.len_utf8() > MOST_NAME_BYTES {
+            break;
+        }
+        usable.push(c);
+    }
+    if usable.is_empty() { "data set".into() } else { usable }
 }

@@ -4,6 +4,7 @@
 //! The same columns are used for both label frames ([`crate::LabelFrame`]). This module does not convert between them.
 //! The rest of the program uses [`LabelBox`].
 
+use crate::limits::{MOST_BOXES, at_most, read_text};
 use crate::{DONT_CARE, DataError, LabelBox};
 use std::{fmt, path::Path};
 
@@ -119,13 +120,14 @@ impl fmt::Display for KittiLine<'_> {
 
 /// Parses a text, one box a line. Blank lines are skipped. `path` is used in error messages.
 pub fn parse_kitti_text(text: &str, path: &Path, kind: KittiText) -> Result<Vec<LabelBox>, DataError> {
-    let lines = text.lines().enumerate().filter(|(_, line)| !line.trim_ascii().is_empty());
-    lines.map(|(i, line)| parse_line(line, kind).map_err(|message| DataError::line(path, i + 1, message))).collect()
+    let lines = || text.lines().enumerate().filter(|(_, line)| !line.trim_ascii().is_empty());
+    at_most(path, "boxes", lines().count() as u64, MOST_BOXES)?;
+    lines().map(|(i, line)| parse_line(line, kind).map_err(|message| DataError::line(path, i + 1, message))).collect()
 }
 
 /// Reads a file of labels or detections.
 pub fn read_kitti_text(path: &Path, kind: KittiText) -> Result<Vec<LabelBox>, DataError> {
-    parse_kitti_text(&fs_err::read_to_string(path)?, path, kind)
+    parse_kitti_text(&read_text(path)?, path, kind)
 }
 
 /// Formats boxes as KITTI text, one a line.

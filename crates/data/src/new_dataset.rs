@@ -1,5 +1,7 @@
 //! Writes a new data set: folder, manifest, frames, splits and `dataset.toml`.
 
+use crate::frame_records::FrameRecords;
+use crate::limits::read_text;
 use crate::output::remove_unfinished;
 use crate::write::{write_dataset_toml, write_split};
 use crate::{DataError, DatasetConfig, FolderLock, Layout, PointColumns, is_unused, write_json};
@@ -19,6 +21,9 @@ pub trait Manifest: Serialize + DeserializeOwned {
 
     /// Sets whether all frames are written.
     fn set_complete(&mut self, complete: bool);
+
+    /// Sets the SHA-256 of `frames.jsonl`, which has those of all frames.
+    fn set_frames_sha256(&mut self, sha256: String);
 }
 
 /// A data set that is being written. Frames that an earlier run with the same manifest wrote are kept. Its folder is
@@ -26,6 +31,7 @@ pub trait Manifest: Serialize + DeserializeOwned {
 pub struct NewDataset<'a> {
     root: &'a Path,
     layout: Layout,
+    records: FrameRecords,
     _lock: FolderLock,
 }
 
@@ -41,20 +47,21 @@ impl<'a> NewDataset<'a> {
         extra_folders: &[&str],
         manifest: &mut M,
     ) -> Result<Self, DataError> {
-        let set = NewDataset { root, layout, _lock: FolderLock::acquire(root)? };
-        set.check_folder(manifest)?;
+        let lock = FolderLock::acquire(root)?;
+        check_folder(root, manifest)?;
         for inside in ["ImageSets"].iter().chain(layout.folders()).chain(extra_folders) {
             remove_unfinished(&root.join(inside))?;
         }
         manifest.set_complete(false);
-        write_json(&set.manifest_path(), manifest)?;
-        Ok(set)
+        write_json(&manifest_path(root), manifest)?;
+        Ok(NewDataset { root, layout, records: FrameRecords::open(root)?, _lock: lock })
     }
 
-    /// Marks the data set as complete and writes the manifest.
-    pub fn finish<M: Manifest>(&self, manifest: &mut M) -> Result<(), DataError> {
+    /// Writes the records of the frames `ids`, marks the data set as complete and writes the manifest.
+    pub fn finish<M: Manifest>(&self, manifest: &mut M, ids: &[String]) -> Result<(), DataError> {
+        manifest.set_frames_sha256(self.records.finish(ids)?);
         manifest.set_complete(true);
-        write_json(&self.manifest_path(), manifest)
+        write_json(&manifest_path(self.root), manifest)
     }
 
     /// The root folder.
@@ -102,9 +109,20 @@ impl<'a> NewDataset<'a> {
         made.collect()
     }
 
-    /// Whether a frame is written, with its labels if `labelled`.
-    pub fn has_frame(&self, id: &str, labelled: bool) -> bool {
-        self.layout.has_cloud(self.root, id) && (!labelled || self.layout.labels_path(self.root, id).is_file())
+    /// Makes a frame by `make`, unless its files are there as they were written and it was made from the same
+    /// `source` (a SHA-256). `files` gives its files after it was made.
+    pub fn frame<E: From<DataError>>(
+        &self,
+        id: &str,
+        source: Option<&str>,
+        files: impl Fn() -> Vec<PathBuf>,
+        make: impl FnOnce() -> Result<(), E>,
+    ) -> Result<(), E> {
+        if !self.records.is_whole(id, source, &files()) {
+            make()?;
+            self.records.add(id, source, &files())?;
+        }
+        Ok(())
     }
 
     /// Number of points and of labels of a written frame.
@@ -112,37 +130,38 @@ impl<'a> NewDataset<'a> {
         let points = self.layout.count_points(self.root, id, columns)?;
         Ok([points, self.layout.read_labels(self.root, id)?.len()])
     }
+}
 
-    fn manifest_path(&self) -> PathBuf {
-        self.root.join("manifest.json")
-    }
+fn manifest_path(root: &Path) -> PathBuf {
+    root.join("manifest.json")
+}
 
-    fn check_folder<M: Manifest>(&self, wanted: &M) -> Result<(), DataError> {
-        let path = self.manifest_path();
-        if path.is_file() {
-            let text = fs_err::read_to_string(&path)?;
-            let found: M = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
-            if found.identity() != wanted.identity() {
-                let message = format!("was made {}; choose another folder, or remove this one", M::DIFFERENCE);
-                return Err(DataError::file(self.root, message));
-            }
-        } else if !is_unused(self.root)? {
-            return Err(DataError::file(self.root, "is not empty and has no manifest.json; choose another folder"));
+fn check_folder<M: Manifest>(root: &Path, wanted: &M) -> Result<(), DataError> {
+    let path = manifest_path(root);
+    if path.is_file() {
+        let text = read_text(&path)?;
+        let found: M = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
+        if found.identity() != wanted.identity() {
+            let message = format!("was made {}; choose another folder, or remove this one", M::DIFFERENCE);
+            return Err(DataError::file(root, message));
         }
-        Ok(())
+    } else if !is_unused(root)? {
+        return Err(DataError::file(root, "is not empty and has no manifest.json; choose another folder"));
     }
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Cloud, Dataset, Frame};
+    use crate::{Cloud, Dataset, FRAMES_FILE, Frame, verify_frames};
     use serde::Deserialize;
 
     #[derive(Serialize, Deserialize)]
     struct Made {
         complete: bool,
         sha: String,
+        frames_sha256: String,
     }
 
     impl Manifest for Made {
@@ -155,23 +174,35 @@ mod tests {
         fn set_complete(&mut self, complete: bool) {
             self.complete = complete;
         }
+
+        fn set_frames_sha256(&mut self, sha256: String) {
+            self.frames_sha256 = sha256;
+        }
     }
 
     fn make(root: &Path, sha: &str) -> Result<usize, DataError> {
-        let mut manifest = Made { complete: true, sha: sha.into() };
+        make_from(root, sha, "source")
+    }
+
+    /// Returns the number of frames that were made.
+    fn make_from(root: &Path, sha: &str, source: &str) -> Result<usize, DataError> {
+        let mut manifest = Made { complete: true, sha: sha.into(), frames_sha256: String::new() };
         let set = NewDataset::begin(root, Layout::Kitti, &[], &mut manifest)?;
         let ids = ["a", "b"].map(String::from);
         set.describe(DatasetConfig { name: "made".into(), ..DatasetConfig::default() }, [("train", ids.to_vec())])?;
         let written = set.make_frames(&ids, &|_, _| (), |_, id| {
-            let there = set.has_frame(id, true);
-            if !there {
+            let layout = set.layout();
+            let files = || vec![layout.cloud_path(root, id), layout.labels_path(root, id)];
+            let mut made = 0;
+            set.frame(id, Some(source), files, || {
+                made += 1;
                 let cloud = Cloud { values: vec![1.0; 8], channels: 4 };
-                set.layout().write_frame(root, &Frame { id: id.clone(), cloud, objects: vec![] })?;
-            }
+                layout.write_frame(root, &Frame { id: id.clone(), cloud, objects: vec![] })
+            })?;
             assert_eq!(set.count(id, PointColumns::Xyzi)?, [2, 0]);
-            Ok::<usize, DataError>(usize::from(!there))
+            Ok::<usize, DataError>(made)
         })?;
-        set.finish(&mut manifest)?;
+        set.finish(&mut manifest, &ids)?;
         assert!(manifest.complete);
         Ok(written.iter().sum())
     }
@@ -186,6 +217,7 @@ mod tests {
         assert_eq!(make(&root, "1").unwrap(), 1);
         let error = make(&root, "2").unwrap_err().to_string();
         assert!(error.contains("was made with another recipe; choose another folder"), "{error}");
+        assert_eq!(make(&root, "1").unwrap(), 0);
         std::fs::remove_file(root.join("manifest.json")).unwrap();
         assert!(make(&root, "1").unwrap_err().to_string().contains("is not empty"));
         // A process that was killed before its first manifest.
@@ -198,5 +230,33 @@ mod tests {
         let lock = FolderLock::acquire(&root).unwrap();
         assert!(make(&root, "1").unwrap_err().to_string().contains("in use by another process"));
         drop(lock);
+    }
+
+    #[test]
+    fn changed_frames_are_made_again() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("set");
+        make(&root, "1").unwrap();
+        let records = std::fs::read_to_string(root.join(FRAMES_FILE)).unwrap();
+        assert_eq!(verify_frames(&root).unwrap(), 2);
+        let cloud = root.join("velodyne/b.bin");
+        let bytes = std::fs::read(&cloud).unwrap();
+        for damaged in [vec![], [&bytes[..31], &[1]].concat(), vec![0; bytes.len()]] {
+            std::fs::write(&cloud, damaged).unwrap();
+            let error = verify_frames(&root).unwrap_err().to_string();
+            assert!(
+                error.contains("1 files are missing or were changed") && error.contains("velodyne/b.bin"),
+                "{error}"
+            );
+            assert_eq!(make(&root, "1").unwrap(), 1);
+            assert_eq!(std::fs::read(&cloud).unwrap(), bytes);
+        }
+        assert_eq!(make_from(&root, "1", "another source").unwrap(), 2);
+        assert_eq!(make(&root, "1").unwrap(), 2);
+        // A record that is lost or torn by a kill: its frame is made again.
+        std::fs::write(root.join(FRAMES_FILE), &records[..records.len() - 20]).unwrap();
+        assert!(verify_frames(&root).unwrap_err().to_string().contains(FRAMES_FILE));
+        assert_eq!(make(&root, "1").unwrap(), 1);
+        assert_eq!(std::fs::read_to_string(root.join(FRAMES_FILE)).unwrap(), records);
     }
 }

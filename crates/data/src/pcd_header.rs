@@ -1,6 +1,7 @@
 //! The header of a PCD file.
 
 use crate::DataError;
+use crate::limits::{MOST_PCD_FIELDS, MOST_POINTS, at_most};
 use std::path::Path;
 
 /// Encoding of the points of a PCD.
@@ -212,6 +213,7 @@ pub fn parse_pcd_header(bytes: &[u8], path: &Path) -> Result<PcdHeader, DataErro
         let message = format!("POINTS {} is not WIDTH {width} x HEIGHT {height}", entry.1.join(" "));
         return Err(DataError::line(path, entry.2, message));
     }
+    at_most(path, "points in its header", points, MOST_POINTS)?;
     let body_start = at.min(bytes.len());
     Ok(PcdHeader {
         fields,
@@ -239,6 +241,10 @@ fn fields(
             let message = format!("{key} has {} values, but FIELDS has {}", values.len(), names.1.len());
             return Err(DataError::line(path, *line, message));
         }
+    }
+    if names.1.len() > MOST_PCD_FIELDS {
+        let message = format!("FIELDS has {} names; at most {MOST_PCD_FIELDS} are supported", names.1.len());
+        return Err(DataError::line(path, names.2, message));
     }
     let (mut fields, mut offset, mut first_number) = (Vec::<PcdField>::new(), 0usize, 0usize);
     for (i, name) in names.1.iter().enumerate() {

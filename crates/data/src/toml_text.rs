@@ -54,10 +54,7 @@ pub fn read_toml<T: DeserializeOwned>(
     parse_toml(&read_text(path)?, path, check)
 }
 
-/// Reads a text file. An error if it is not UTF-8.
-pub fn read_text(path: &Path) -> Result<String, DataError> {
-    String::from_utf8(fs_err::read(path)?).map_err(|_| DataError::file(path, "is not UTF-8 text"))
-}
+pub use crate::limits::read_text;
 
 /// Parses a TOML. `path` is used in error messages. An error of `check` is reported at the line of its key.
 pub fn parse_toml<T: DeserializeOwned>(
@@ -65,7 +62,8 @@ pub fn parse_toml<T: DeserializeOwned>(
     path: &Path,
     check: impl FnOnce(&T) -> Result<(), KeyError>,
 ) -> Result<T, DataError> {
-    let value: T = toml::from_str(text).map_err(|e| DataError::line(path, line_of_error(text, &e), message(&e)))?;
+    let value: T =
+        toml::from_str(text).map_err(|e| DataError::line(path, line_of_error(text, &e), message_at_key(text, &e)))?;
     check(&value).map_err(|error| error.in_file(text, path))?;
     Ok(value)
 }
@@ -73,6 +71,35 @@ pub fn parse_toml<T: DeserializeOwned>(
 /// The message of a TOML error. For an unknown key or variant it suggests a known one with a similar name.
 pub fn message(error: &toml::de::Error) -> String {
     with_suggestion(error.message())
+}
+
+/// [`message`] with the path of the key before it, if its value is what is wrong.
+fn message_at_key(text: &str, error: &toml::de::Error) -> String {
+    let names_a_key = ["unknown field", "missing field", "duplicate"].iter().any(|m| error.message().starts_with(m));
+    let key = || key_of_byte(DeTable::parse(text).ok()?.get_ref(), error.span()?.start);
+    match if names_a_key { None } else { key() } {
+        Some(key) => format!("{key}: {}", message(error)),
+        None => message(error),
+    }
+}
+
+/// Path of the innermost key in whose value a byte is.
+fn key_of_byte(table: &DeTable<'_>, byte: usize) -> Option<String> {
+    fn within(value: &toml::Spanned<DeValue<'_>>, byte: usize) -> Option<String> {
+        match value.get_ref() {
+            DeValue::Table(table) => key_of_byte(table, byte).map(|key| format!(".{key}")),
+            DeValue::Array(items) => items.iter().enumerate().find_map(|(i, item)| {
+                let inner = within(item, byte);
+                (inner.is_some() || item.span().contains(&byte)).then(|| format!("[{i}]{}", inner.unwrap_or_default()))
+            }),
+            _ => None,
+        }
+    }
+    table.iter().find_map(|(key, value)| {
+        let inner = within(value, byte);
+        (inner.is_some() || value.span().contains(&byte))
+            .then(|| format!("{}{}", key.get_ref(), inner.unwrap_or_default()))
+    })
 }
 
 /// [`message`] and the key concerned, in one line. For tables that were built in memory and have no line numbers.
@@ -208,6 +235,29 @@ mod tests {
         let check = |_: &toml::Table| Err(wrong("b.c", "is too large"));
         let error = parse_toml("a = 1\n[b]\nc = 9\n", Path::new("x.toml"), check).unwrap_err();
         assert_eq!(error.to_string(), "x.toml:3: b.c: is too large");
+    }
+
+    #[test]
+    fn a_wrong_type_is_reported_with_its_key() {
+        #[derive(Debug, Deserialize)]
+        struct Item {
+            #[serde(rename = "sizes")]
+            _sizes: Vec<f64>,
+        }
+        #[derive(Debug, Deserialize)]
+        struct List {
+            #[serde(rename = "item")]
+            _items: Vec<Item>,
+        }
+        let parse = |text: &str| parse_toml::<List>(text, Path::new("x.toml"), |_| Ok(())).unwrap_err().to_string();
+        for (text, want) in [
+            ("item = 3\n", "x.toml:1: item: invalid type: integer `3`"),
+            ("[[item]]\nsizes = [1.0]\n[[item]]\nsizes = \"one\"\n", "x.toml:4: item[1].sizes: invalid type: string"),
+            ("[[item]]\nsizes = [1.0,\n true]\n", "x.toml:3: item[0].sizes[1]: invalid type: boolean"),
+            ("[[item]]\n", "x.toml:1: missing field `sizes`"),
+        ] {
+            assert!(parse(text).starts_with(want), "{}", parse(text));
+        }
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! KITTI AP of a validation set: 3,769 frames with ten detections each, on one core.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use data::{LabelBox, stream};
+use data::{LabelBox, LabelFrame, stream};
+use geometry::Box3;
 use lidarshift_eval::{EvalFrame, EvalOptions, evaluate};
 use rand::RngExt;
 
@@ -52,5 +53,27 @@ fn kitti_ap(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, kitti_ap);
+/// One frame with two thousand labels and detections. Without a camera all image boxes are the same, so that every
+/// label overlaps every detection.
+fn crowd(c: &mut Criterion) {
+    let mut rng = stream(1, "crowd", 0, 0);
+    let (mut labels, mut detections) = (Vec::new(), Vec::new());
+    for _ in 0..2000 {
+        let at = [rng.random_range(-60.0..60.0), rng.random_range(-60.0..60.0)];
+        let off = [rng.random_range(-0.4..0.4), rng.random_range(-0.4..0.4)];
+        let car = |dx: f64, dy: f64| Box3::from_array([at[0] + dx, at[1] + dy, 0.0, 3.9, 1.6, 1.5, 0.3]);
+        labels.push(LabelBox::from_box("Car", &car(0.0, 0.0), None));
+        detections.push(LabelBox::from_box("Car", &car(off[0], off[1]), Some(rng.random())));
+    }
+    let frames = [EvalFrame { id: "crowd".into(), labels, detections }];
+    let options = EvalOptions { label_frame: LabelFrame::Lidar, ..EvalOptions::default() };
+    let mut group = c.benchmark_group("kitti AP");
+    group.sample_size(10);
+    group.bench_function("one frame x 2000 detections, all cores", |bench| {
+        bench.iter(|| evaluate(&frames, &options));
+    });
+    group.finish();
+}
+
+criterion_group!(benches, kitti_ap, crowd);
 criterion_main!(benches);

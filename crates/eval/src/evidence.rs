@@ -22,17 +22,9 @@ impl FrameEvidence {
         inside: impl Fn(BoxIndex) -> bool,
     ) -> Self {
         let mut matching = FrameMatching::new(frame, key, inside);
-        let mut out = FrameEvidence { n_gt: matching.n_gt(), hit_scores: Vec::new(), changes: Vec::new() };
-        matching.collect_hit_scores(&mut out.hit_scores);
-        let mut before = matching.count(f64::INFINITY);
-        for score in matching.distinct_scores() {
-            let now = matching.count(score);
-            if now != before {
-                out.changes.push((score, now - before));
-                before = now;
-            }
-        }
-        out
+        let mut hit_scores = Vec::new();
+        matching.collect_hit_scores(&mut hit_scores);
+        FrameEvidence { n_gt: matching.n_gt(), hit_scores, changes: matching.changes() }
     }
 }
 

@@ -1,9 +1,12 @@
 //! KITTI's assignment of detections to ground truths in one frame, equivalent to OpenPCDet's
 //! `kitti_object_eval_python/eval.py`.
 
+mod falling;
+
 use crate::overlaps::{FrameOverlaps, Pair};
 use crate::{Difficulty, EvalFrame, Metric};
 use data::LabelBox;
+use falling::Falling;
 use serde::{Deserialize, Serialize};
 use std::ops::{AddAssign, Sub};
 
@@ -122,13 +125,28 @@ impl<'a> FrameMatching<'a> {
         self.frame.detections[detection].score.unwrap_or(0.0)
     }
 
-    /// Distinct scores of the detections that take part, descending.
-    pub(crate) fn distinct_scores(&self) -> Vec<f64> {
-        let taking_part = (0..self.detections.len()).filter(|&j| self.detections[j] != Role::Absent);
-        let mut scores: Vec<f64> = taking_part.map(|j| self.score(j)).collect();
-        scores.sort_by(|a, b| b.total_cmp(a));
-        scores.dedup();
-        scores
+    /// Half of one plus the cosine of the difference in observation angle.
+    fn similarity(&self, label: usize, detection: usize) -> f64 {
+        let error = self.frame.labels[label].alpha - self.frame.detections[detection].alpha;
+        (1.0 + error.cos()) / 2.0
+    }
+
+    /// Scores at which the counts of the second pass change, descending, with the change.
+    pub(crate) fn changes(&self) -> Vec<(f64, Counts)> {
+        let mut by_score: Vec<usize> =
+            (0..self.detections.len()).filter(|&j| self.detections[j] != Role::Absent).collect();
+        by_score.sort_by(|&i, &j| self.score(j).total_cmp(&self.score(i)));
+        let mut falling = Falling::new(self);
+        let (mut changes, mut before) = (Vec::new(), falling.counts());
+        for equal in by_score.chunk_by(|&i, &j| self.score(i) == self.score(j)) {
+            equal.iter().for_each(|&j| falling.add(j));
+            let (score, now) = (self.score(equal[0]), falling.counts());
+            if now != before {
+                changes.push((score, now - before));
+                before = now;
+            }
+        }
+        changes
     }
 
     /// First pass, without a score threshold: each ground truth takes the free detection of highest score among those
@@ -195,8 +213,7 @@ impl<'a> FrameMatching<'a> {
                     if counted && self.detections[j] == Role::Counted {
                         counts.tp += 1;
                         self.hits[j] = true;
-                        let error = self.frame.labels[label].alpha - self.frame.detections[j].alpha;
-                        counts.similarity += (1.0 + error.cos()) / 2.0;
+                        counts.similarity += self.similarity(label, j);
                     }
                 }
             }
@@ -209,6 +226,18 @@ impl<'a> FrameMatching<'a> {
         });
         counts.fp = left_over.count() as i64;
         counts
+    }
+}
+
+#[cfg(test)]
+impl FrameMatching<'_> {
+    /// Distinct scores of the detections that take part, descending.
+    fn distinct_scores(&self) -> Vec<f64> {
+        let taking_part = (0..self.detections.len()).filter(|&j| self.detections[j] != Role::Absent);
+        let mut scores: Vec<f64> = taking_part.map(|j| self.score(j)).collect();
+        scores.sort_by(|a, b| b.total_cmp(a));
+        scores.dedup();
+        scores
     }
 }
 

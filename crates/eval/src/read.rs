@@ -1,6 +1,7 @@
 //! Reads labels and detections from folders of KITTI text files.
 
 use crate::EvalFrame;
+use data::limits::{MOST_IDS, at_most, check_name, read_text};
 use data::{DataError, KittiText, read_kitti_text};
 use rayon::prelude::*;
 use std::path::Path;
@@ -50,20 +51,16 @@ pub fn ids_of_folder(labels: &Path) -> Result<Vec<String>, DataError> {
 
 /// Reads a list of frame ids: file names without extension, one per line. Blank lines are skipped.
 pub fn read_ids(path: &Path) -> Result<Vec<String>, DataError> {
-    let text = fs_err::read_to_string(path)?;
+    let text = read_text(path)?;
     let mut ids: Vec<String> = Vec::new();
     let mut known = std::collections::HashSet::new();
     for (i, id) in text.lines().map(str::trim).enumerate().filter(|(_, id)| !id.is_empty()) {
-        let problem = if id.contains(['/', '\\', '\0']) || id == "." || id == ".." {
-            Some("is not a file name: it must not contain a path separator")
-        } else if !known.insert(id) {
-            Some("is there twice")
-        } else {
-            None
-        };
-        if let Some(problem) = problem {
-            return Err(DataError::line(path, i + 1, format!("frame id {id:?} {problem}")));
+        let wrong = |problem: String| DataError::line(path, i + 1, format!("frame id {problem}"));
+        check_name(id).map_err(wrong)?;
+        if !known.insert(id) {
+            return Err(wrong(format!("{id:?} is there twice")));
         }
+        at_most(path, "frame ids", known.len() as u64, MOST_IDS)?;
         ids.push(id.into());
     }
     if ids.is_empty() {

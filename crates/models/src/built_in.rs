@@ -16,12 +16,12 @@ pub fn detector_text(name_or_path: &str) -> Result<String, ModelError> {
         return Ok((*text).to_string());
     }
     let path = Path::new(name_or_path);
-    if !path.is_file() {
+    if !path.exists() {
         let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
         let message = format!("there is no such detector: neither a file nor one of {}", names.join(", "));
         return Err(ModelError::File { path: path.into(), message });
     }
-    Ok(fs_err::read_to_string(path).map_err(data::DataError::from)?)
+    Ok(data::limits::read_text(path)?)
 }
 
 /// A detector by its name or its path.

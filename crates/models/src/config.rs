@@ -3,8 +3,10 @@
 pub use crate::NetworkConfig;
 
 use crate::ModelError;
+use crate::limits::{MOST_BATCH, MOST_CLASSES, MOST_EPOCHS, at_most};
 use data::GroundConfig;
 use data::augment::AugmentConfig;
+use data::limits::check_name;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -102,7 +104,7 @@ impl DetectorConfig {
     /// # Errors
     /// A file that cannot be read, an unknown key, a wrong type, or sizes that do not fit together.
     pub fn read(path: &Path) -> Result<Self, ModelError> {
-        let text = fs_err::read_to_string(path).map_err(data::DataError::from)?;
+        let text = data::limits::read_text(path)?;
         Self::parse(&text).map_err(|message| ModelError::File { path: path.into(), message })
     }
 
@@ -116,6 +118,7 @@ impl DetectorConfig {
     /// Whether the sizes fit together; the message names the key.
     pub fn check(&self) -> Result<(), String> {
         let fail = |message: String| Err(message);
+        check_name(&self.name).map_err(|message| format!("name: {message}"))?;
         if self.classes.is_empty() {
             return fail("classes: a detector needs at least one class".into());
         }
@@ -137,6 +140,9 @@ impl DetectorConfig {
         {
             return fail("optimization: pct_start in [0, 1], momentum in [0, 1), weight_decay not negative".into());
         }
+        at_most(MOST_CLASSES, &[("the number of classes", &[self.classes.len()])])?;
+        at_most(MOST_EPOCHS, &[("optimization.epochs", &[o.epochs])])?;
+        at_most(MOST_BATCH, &[("optimization.batch_size", &[o.batch_size])])?;
         if let Some(ground) = &self.ground {
             ground.check()?;
         }

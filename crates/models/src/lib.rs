@@ -9,6 +9,7 @@ pub mod checkpoint;
 pub mod config;
 pub mod kernel_ops;
 pub mod layers;
+pub mod limits;
 pub mod loss;
 pub mod named;
 pub mod point_ops;

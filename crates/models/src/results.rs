@@ -37,7 +37,7 @@ pub struct FrameResult {
 /// A file that cannot be read, is not such a pickle, is damaged, or asks to run code; a frame that occurs twice, has
 /// arrays of different lengths, or a box or score that is not finite.
 pub fn read_results(path: &Path) -> Result<Vec<FrameResult>, ModelError> {
-    parse_results(path, &fs_err::read(path).map_err(data::DataError::from)?)
+    parse_results(path, &data::limits::read_file(path, crate::limits::MOST_CHECKPOINT_BYTES)?)
 }
 
 /// The same for the content of a file; `path` is only for messages.

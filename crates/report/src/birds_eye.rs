@@ -22,6 +22,11 @@ const TALL_M: f32 = 3.0;
 /// Detections below this score are drawn in the low-score colour.
 const SCORE_LIMIT: f32 = 0.5;
 
+/// Largest ratio of the sides of an area that is chosen from the points and boxes.
+const SLIMMEST: f64 = 8.0;
+/// Sides of a picture, px.
+const SIDES_PX: std::ops::RangeInclusive<f64> = 16.0..=20_000.0;
+
 /// How a box is drawn.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Style {
@@ -84,7 +89,7 @@ impl View {
         }
         let px_per_m = f64::from(options.width_px) / (y1 - y0);
         let [width, height] = [f64::from(options.width_px), ((x1 - x0) * px_per_m).round()];
-        if ![width, height].iter().all(|side| (16.0..=20_000.0).contains(side)) {
+        if ![width, height].iter().all(|side| SIDES_PX.contains(side)) {
             return Err(ReportError::Size { width, height });
         }
         Ok(View { area_m, px_per_m, size: [width, height] })
@@ -247,6 +252,13 @@ fn area_of(cloud: &Cloud, boxes: &[(Box3, Style)]) -> [f64; 4] {
         [low - MARGIN_M, high + MARGIN_M]
     };
     let ([x0, x1], [y0, y1]) = (axis(0), axis(1));
+    // A narrow strip is widened to both sides.
+    let longest = (x1 - x0).max(y1 - y0);
+    let widened = |low: f64, high: f64| {
+        let by = ((longest / SLIMMEST - (high - low)) / 2.0).max(0.0);
+        [low - by, high + by]
+    };
+    let ([x0, x1], [y0, y1]) = (widened(x0, x1), widened(y0, y1));
     [x0, x1, y0, y1]
 }
 
@@ -308,6 +320,8 @@ mod tests {
         birds_eye_png(&empty, &[], &BirdsEyeOptions::default()).unwrap();
         let broken = Cloud { values: vec![f32::NAN, 1.0, 2.0, f32::INFINITY, 0.0, 0.0], channels: 3 };
         birds_eye_png(&broken, &[], &BirdsEyeOptions::default()).unwrap();
+        let behind = Cloud { values: (0..900).flat_map(|i| [-300.0, (i % 3) as f32, 0.0]).collect(), channels: 3 };
+        birds_eye_png(&behind, &[], &BirdsEyeOptions::default()).unwrap();
         let area = |a| BirdsEyeOptions { area_m: Some(a), ..BirdsEyeOptions::default() };
         assert!(matches!(birds_eye_png(&empty, &[], &area([1.0, 1.0, 0.0, 2.0])), Err(ReportError::Area { .. })));
         assert!(matches!(birds_eye_png(&empty, &[], &area([0.0, 1e9, 0.0, 1.0])), Err(ReportError::Size { .. })));

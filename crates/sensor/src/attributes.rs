@@ -10,6 +10,7 @@ use crate::material::{MaterialId, MaterialTable};
 use crate::object::{FIRST_CAR, Group};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
+use data::limits::{MOST_CLOUD_BYTES, read_file};
 use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_json};
 use serde_json::json;
 use std::path::{Path, PathBuf};
@@ -94,7 +95,7 @@ pub fn read_materials(root: &Path) -> Result<MaterialTable, DataError> {
 
 /// Reads the returns of a frame from its attributes. Sensor positions are taken from `rig`.
 pub fn read(path: &Path, rig: &Rig) -> Result<Scan, DataError> {
-    let columns = parse_pcd_columns(&fs_err::read(path)?, path, &NAMES)?;
+    let columns = parse_pcd_columns(&read_file(path, MOST_CLOUD_BYTES)?, path, &NAMES)?;
     let origins: Vec<[f32; 3]> = rig.sensors.iter().map(|s| s.position.map(|v| v as f32)).collect();
     let echo = |i: usize| {
         let v: [f32; NAMES.len()] = std::array::from_fn(|k| columns[k][i]);

@@ -1,6 +1,8 @@
 //! Applies sensor effects to existing data sets, of this simulator or any other.
 
 use crate::SimulateError;
+use data::checksum::files_sha256;
+use data::limits::{MOST_TEXT_BYTES, read_file};
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, true_labels_path};
 use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, write_atomic};
@@ -33,6 +35,9 @@ pub struct ResimManifest {
     pub frames: usize,
     /// Points of all frames, before and after.
     pub points: [usize; 2],
+    /// SHA-256 of `frames.jsonl`, which has those of the files of each frame and of what the frame was made from.
+    #[serde(default)]
+    pub frames_sha256: String,
 }
 
 impl Manifest for ResimManifest {
@@ -44,6 +49,10 @@ impl Manifest for ResimManifest {
 
     fn set_complete(&mut self, complete: bool) {
         self.complete = complete;
+    }
+
+    fn set_frames_sha256(&mut self, sha256: String) {
+        self.frames_sha256 = sha256;
     }
 }
 
@@ -63,8 +72,8 @@ impl Resim<'_> {
     /// Writes the data set to the folder `out`, in the layout and label frame of the source.
     ///
     /// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an
-    /// earlier run with the same arguments are kept; a folder with other content is an error. The files do not depend
-    /// on the number of threads.
+    /// earlier run with the same arguments are kept if neither their files nor those that they were made from have
+    /// changed; a folder with other content is an error. The files do not depend on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
         let finished = self.finished()?;
@@ -82,6 +91,7 @@ impl Resim<'_> {
             config_sha256: self.fingerprint(finished.rig()),
             frames: finished.ids().len(),
             points: [0; 2],
+            frames_sha256: String::new(),
         };
         let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER, TRUE_LABELS], &mut manifest)?;
         self.write_descriptions(&new, finished.rig())?;
@@ -93,7 +103,7 @@ impl Resim<'_> {
             manifest.points[0] += before;
             manifest.points[1] += after;
         }
-        new.finish(&mut manifest)?;
+        new.finish(&mut manifest, finished.ids())?;
         Ok(manifest)
     }
 
@@ -135,7 +145,7 @@ impl Resim<'_> {
         Ok(())
     }
 
-    /// Writes one frame unless it exists; returns its number of points before and after.
+    /// Writes one frame unless it is there; returns its number of points before and after.
     fn make_frame_file(
         &self,
         new: &NewDataset,
@@ -143,9 +153,18 @@ impl Resim<'_> {
         id: &str,
     ) -> Result<[usize; 2], SimulateError> {
         let (layout, out) = (new.layout(), new.root());
-        let beside = attributes::path(out, id);
-        let (labelled, described) = (self.dataset.has_labels(), finished.is_described());
-        if !(new.has_frame(id, labelled) && (!described || beside.is_file())) {
+        let (beside, described) = (attributes::path(out, id), finished.is_described());
+        let labelled = self.dataset.has_labels();
+        let calibrations = self.dataset.calibration_path(id).zip(layout.calibration_path(out, id));
+        let calibrations = calibrations.filter(|(from, _)| from.is_file());
+        let files = || {
+            let labels = labelled.then(|| layout.labels_path(out, id));
+            let truth = self.dataset.true_labels_path(id).map(|_| true_labels_path(out, id));
+            let calibration = calibrations.as_ref().map(|(_, to)| to.clone());
+            let beside = described.then(|| beside.clone());
+            [Some(layout.cloud_path(out, id)), labels, truth, calibration, beside].into_iter().flatten().collect()
+        };
+        new.frame(id, Some(&self.source_sha256(id)?), files, || {
             let (frame, scan) = finished.frame(self.effects, self.seed, id)?;
             if frame.cloud.is_empty() {
                 let message = "would be empty: the effects leave no point";
@@ -155,19 +174,26 @@ impl Resim<'_> {
                 self.write_labels(new, &frame)?;
             }
             if let Some(truth) = self.dataset.true_labels_path(id) {
-                write_atomic(&true_labels_path(out, id), &fs_err::read(truth)?)?;
+                write_atomic(&true_labels_path(out, id), &read_file(&truth, MOST_TEXT_BYTES)?)?;
             }
-            if let (Some(from), Some(to)) = (self.dataset.calibration_path(id), layout.calibration_path(out, id))
-                && from.is_file()
-            {
-                write_atomic(&to, &fs_err::read(from)?)?;
+            if let Some((from, to)) = &calibrations {
+                write_atomic(to, &read_file(from, MOST_TEXT_BYTES)?)?;
             }
             if described {
                 write_atomic(&beside, &attributes::encode(&scan))?;
             }
-            layout.write_cloud(out, id, &frame.cloud)?;
-        }
+            Ok::<(), SimulateError>(layout.write_cloud(out, id, &frame.cloud)?)
+        })?;
         Ok([self.dataset.count_points(id)?, layout.count_points(out, id, self.dataset.config.points)?])
+    }
+
+    /// SHA-256 of all files of a frame of the source.
+    fn source_sha256(&self, id: &str) -> Result<String, DataError> {
+        let source = self.dataset;
+        let labels = source.has_labels().then(|| source.labels_path(id));
+        let beside = attributes::path(&source.config.root, id);
+        let files = [Some(source.cloud_path(id)), labels, source.true_labels_path(id), source.calibration_path(id)];
+        files_sha256(files.into_iter().flatten().chain([beside]))
     }
 
     /// Copies labels byte by byte if no effect changed them; otherwise writes them in the label frame of the source.
@@ -176,7 +202,7 @@ impl Resim<'_> {
         let boxes = self.dataset.objects(&frame.id, &source)?;
         if boxes.iter().zip(&frame.objects).all(|(a, b)| a.bbox == b.bbox) {
             let path = new.layout().labels_path(new.root(), &frame.id);
-            return Ok(write_atomic(&path, &fs_err::read(self.dataset.labels_path(&frame.id))?)?);
+            return Ok(write_atomic(&path, &read_file(&self.dataset.labels_path(&frame.id), MOST_TEXT_BYTES)?)?);
         }
         let mut labels = self.dataset.label_boxes(frame)?;
         labels.extend(source.into_iter().filter(|label| label.is_dont_care() || !label.has_box()));

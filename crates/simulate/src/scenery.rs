@@ -22,7 +22,7 @@ impl Scenery {
     pub fn find(name_or_path: &str, frames: Option<usize>, seed: Option<u64>) -> Result<Self, SimulateError> {
         let path = Path::new(name_or_path);
         let is_street = if path.is_file() {
-            let text = fs_err::read_to_string(path)?;
+            let text = data::limits::read_text(path)?;
             // A race names its sensors. Invalid TOML is treated as a race; its reader reports the line of the error.
             text.parse::<toml::Table>().is_ok_and(|table| !table.contains_key("rig"))
         } else {

@@ -249,7 +249,7 @@ impl StudyConfig {
     /// # Errors
     /// Invalid TOML, an unknown key, or invalid values.
     pub fn read(path: &Path) -> Result<Self, DataError> {
-        Self::parse(&fs_err::read_to_string(path)?, path)
+        Self::parse(&data::limits::read_text(path)?, path)
     }
 
     /// Parses a study. `path` is used in error messages.

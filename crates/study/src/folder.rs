@@ -65,9 +65,9 @@ impl Study {
             }
         };
         let config = StudyConfig::parse(&text, &path)?;
-        let base = std::path::absolute(&path)?.parent().map(Path::to_path_buf).unwrap_or_default();
+        let base = located(std::path::absolute(&path)?.parent().unwrap_or(Path::new("/")))?;
         let folder = out.map_or_else(|| Path::new("runs").join(&config.name), Path::to_path_buf);
-        Ok(Study { config, named: named.into(), text, base, folder: absolute_utf8(&folder)? })
+        Ok(Study { config, named: named.into(), text, base, folder: utf8(located(&folder)?)? })
     }
 
     /// A study that a command makes instead of a TOML. Paths in `config` are relative to `base`; its folder is `out`.
@@ -77,7 +77,7 @@ impl Study {
     pub fn from_config(config: &StudyConfig, base: &Path, out: &Path) -> Result<Study> {
         let text = toml::to_string(config).map_err(|e| refused(format!("the study cannot be written: {e}")))?;
         let config = StudyConfig::parse(&text, &out.join(COPY))?;
-        let (base, folder) = (std::path::absolute(base)?, absolute_utf8(out)?);
+        let (base, folder) = (located(base)?, utf8(located(out)?)?);
         Ok(Study { config, named: out.display().to_string(), text, base, folder })
     }
 
@@ -93,21 +93,38 @@ impl Study {
         let config = StudyConfig::parse(&text, &path)?;
         let origin: Origin = serde_json::from_slice(&fs_err::read(folder.join(ORIGIN))?)
             .in_part(|| format!("{} is damaged", folder.join(ORIGIN).display()))?;
-        Ok(Study { config, named: origin.named, text, base: origin.base, folder: std::path::absolute(folder)? })
+        Ok(Study { config, named: origin.named, text, base: origin.base, folder: located(folder)? })
     }
 
     /// Resolves a path of the study's TOML.
     pub fn path(&self, relative: &Path) -> PathBuf {
-        // `..` is resolved, so that the same file always has the same path.
-        let mut path = self.base.clone();
-        for part in relative.components() {
-            match part {
-                std::path::Component::ParentDir => drop(path.pop()),
-                std::path::Component::CurDir => {}
-                part => path.push(part),
-            }
+        resolved(&self.base, relative)
+    }
+
+    /// Whether `found`, the path of a data set in a run folder, is that of a data set of the study, which may have been
+    /// moved since, or be reached by another path.
+    pub fn is_path_of(&self, dataset: &StudyDataset, found: &Path) -> bool {
+        let now = self.dataset_path(dataset);
+        let same =
+            |a: &Path, b: &Path| a == b || matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
+        if same(found, &now) {
+            return true;
         }
-        path
+        match (&dataset.source, now.strip_prefix(&self.folder)) {
+            // Made in the folder of the study, at its place in it.
+            (Source::Simulate { .. } | Source::Resim { .. } | Source::TrueLabels { .. }, Ok(inside)) => {
+                found.ends_with(inside)
+            }
+            // At its place relative to where the TOML was when the study was last run.
+            (Source::Path(path), _) => self
+                .origin()
+                .is_some_and(|origin| origin.base != self.base && same(found, &resolved(&origin.base, path))),
+            _ => false,
+        }
+    }
+
+    fn origin(&self) -> Option<Origin> {
+        serde_json::from_slice(&fs_err::read(self.folder.join(ORIGIN)).ok()?).ok()
     }
 
     /// A data set by its name.
@@ -242,13 +259,35 @@ impl Study {
     }
 }
 
-/// The absolute path of the folder of a study, which is written into the files and passed to the processes of its runs.
-fn absolute_utf8(folder: &Path) -> Result<PathBuf> {
+/// The folder of a study, whose path is written into the files and passed to the processes of its runs.
+fn utf8(folder: PathBuf) -> Result<PathBuf> {
+    if folder.to_str().is_none() {
+        let message = format!("{}: the path of a study has to be UTF-8; choose another --out", folder.display());
+        return Err(refused(message));
+    }
+    Ok(folder)
+}
+
+/// The absolute path of a folder without links and `..`, as far as it exists.
+fn located(folder: &Path) -> Result<PathBuf> {
     let absolute = std::path::absolute(folder)?;
-    match absolute.to_str() {
-        Some(_) => Ok(absolute),
-        None => {
-            Err(refused(format!("{}: the path of a study has to be UTF-8; choose another --out", folder.display())))
+    for existing in absolute.ancestors() {
+        if let (Ok(found), Ok(rest)) = (existing.canonicalize(), absolute.strip_prefix(existing)) {
+            return Ok(resolved(&found, rest));
         }
     }
+    Ok(absolute)
+}
+
+/// A path relative to a folder. `..` is resolved, so that the same file always has the same path.
+fn resolved(base: &Path, relative: &Path) -> PathBuf {
+    let mut path = base.to_path_buf();
+    for part in relative.components() {
+        match part {
+            std::path::Component::ParentDir => drop(path.pop()),
+            std::path::Component::CurDir => {}
+            part => path.push(part),
+        }
+    }
+    path
 }

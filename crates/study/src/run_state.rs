@@ -82,9 +82,21 @@ pub fn differences(study: &Study, run: &StudyRun) -> Result<Vec<String>> {
         return Ok(Vec::new());
     }
     Ok(match RunConfig::read(&path) {
-        Ok(found) => found.differences(&study.run_config(run)?),
+        Ok(mut found) => {
+            let wanted = study.run_config(run)?;
+            if study.is_path_of(study.dataset(&run.id.train_set)?, &found.dataset) {
+                found.dataset.clone_from(&wanted.dataset);
+            }
+            found.differences(&wanted)
+        }
         Err(e) => vec![e.to_string()],
     })
+}
+
+/// Whether a state belongs to `config.toml` of the run folder.
+pub fn is_of_folder(state: &train::RunState, folder: &Path) -> Result<bool> {
+    let path = folder.join("config.toml");
+    Ok(path.is_file() && RunConfig::read(&path)?.has_sha256(&state.config_sha256))
 }
 
 /// The state of a run.
@@ -109,7 +121,7 @@ pub fn run_state(study: &Study, run: &StudyRun) -> Result<RunState> {
         return Ok(RunState::Failed(reason));
     }
     let Some(state) = state else { return Ok(RunState::Missing) };
-    if state.config_sha256 != study.run_config(run)?.sha256() {
+    if !is_of_folder(&state, &folder)? {
         let reason = "its checkpoint belongs to another configuration than config.toml in the run folder";
         return Ok(RunState::Failed(reason.into()));
     }

@@ -4,14 +4,14 @@ use crate::config::StudyRun;
 use crate::detections::detect_all;
 use crate::error::{Result, refused};
 use crate::folder::Study;
-use crate::run_state::{RunLock, differences, remove_failure, write_failure};
+use crate::run_state::{RunLock, differences, is_of_folder, remove_failure, write_failure};
 use burn::tensor::Device;
 use data::output::remove_unfinished_below;
 use models::Detector;
 use models::checkpoint::read_checkpoint;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
-use train::{RunConfig, Session, read_run_state, train};
+use train::{RunConfig, Session, read_run_state, train, verify_weights};
 
 /// A part of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -90,24 +90,28 @@ fn train_and_detect(
     }
     let (config, device) = (study.run_config(run)?, (work.device)().map_err(refused)?);
     let mut detector = None;
-    if work.parts.contains(&RunPart::Train) && !is_trained(&folder, &config)? {
+    if work.parts.contains(&RunPart::Train) && !is_trained(&folder)? {
+        follow_data_set(&folder, &config)?;
         let session = Session {
             device: device.clone(),
             device_name: work.device_name.clone(),
             workers: work.workers,
             resume: true,
+            allow_changed_data: false,
             stop: work.stop,
         };
         detector = Some(train(&config, &folder, &session, &mut |event| on_training(&event))?.detector);
     }
     if work.parts.contains(&RunPart::Detect) {
-        if !is_trained(&folder, &config)? {
+        if !is_trained(&folder)? {
             return Err(refused("the training of this run is not finished"));
         }
         let detector = match detector {
             Some(detector) => detector,
             None => {
-                let weights = read_checkpoint(&folder.join("checkpoint/last.safetensors"))?;
+                let path = folder.join("checkpoint/last.safetensors");
+                verify_weights(&path)?;
+                let weights = read_checkpoint(&path)?;
                 Detector::new(&config.detector, config.seed, &device).load_named(&weights)?
             }
         };
@@ -116,8 +120,19 @@ fn train_and_detect(
     Ok(())
 }
 
-/// Whether the training in a run folder is finished and has this configuration.
-fn is_trained(folder: &Path, config: &RunConfig) -> Result<bool> {
-    let state = read_run_state(folder)?;
-    Ok(state.is_some_and(|s| s.step == s.total_steps && s.total_steps > 0 && s.config_sha256 == config.sha256()))
+/// Whether the training in a run folder is finished. Its configuration is known to be that of the study.
+fn is_trained(folder: &Path) -> Result<bool> {
+    match read_run_state(folder)? {
+        Some(state) if state.step == state.total_steps && state.total_steps > 0 => is_of_folder(&state, folder),
+        _ => Ok(false),
+    }
+}
+
+/// Writes the present path of the data set to `config.toml` of a run that is to be continued.
+fn follow_data_set(folder: &Path, config: &RunConfig) -> Result<()> {
+    let path = folder.join("config.toml");
+    if path.is_file() && RunConfig::read(&path)?.dataset != config.dataset {
+        data::write_atomic(&path, config.to_toml().as_bytes())?;
+    }
+    Ok(())
 }

@@ -10,6 +10,7 @@ mod one_cycle;
 mod provenance;
 mod run_config;
 mod run_folder;
+mod state_file;
 mod trainer;
 mod validation;
 
@@ -20,6 +21,7 @@ pub use metrics::{EpochMetrics, StageSeconds, StepMetrics, ValidationMetrics};
 pub use one_cycle::OneCycle;
 pub use provenance::{DatasetProvenance, PROVENANCE_SCHEMA, Provenance, SessionProvenance};
 pub use run_config::{RunConfig, RunOptions, set_key};
-pub use run_folder::{Best, RunFolder, RunState, STATE_SCHEMA, read_run_state};
+pub use run_folder::{Checkpoint, RunFolder};
+pub use state_file::{Best, RunState, STATE_SCHEMA, read_run_state, verify_weights};
 pub use trainer::{Event, Session, Trained, train};
 pub use validation::{Evaluation, evaluate_detector};

@@ -102,9 +102,16 @@ impl RunConfig {
         self.to_toml().parse().expect("own TOML is valid")
     }
 
-    /// SHA-256 of the TOML, in hexadecimal.
+    /// SHA-256 of the TOML, in hexadecimal. Of the data set's path the last part counts: what is above it may be moved.
     pub fn sha256(&self) -> String {
-        hex(&Sha256::digest(self.to_toml()))
+        let dataset = self.dataset.file_name().map(PathBuf::from).unwrap_or_default();
+        hex(&Sha256::digest(RunConfig { dataset, ..self.clone() }.to_toml()))
+    }
+
+    /// Whether a hash is that of this configuration, by this version or an earlier one, which included the whole path
+    /// of the data set.
+    pub fn has_sha256(&self, sha256: &str) -> bool {
+        self.sha256() == sha256 || hex(&Sha256::digest(self.to_toml())) == sha256
     }
 
     /// The keys in which two runs differ, as `optimization.epochs is 10, not 20`, with the value of `self` first.

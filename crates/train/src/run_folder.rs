@@ -4,61 +4,36 @@
 //! A checkpoint is two files, weights and moments of the optimiser. They are written atomically and never changed. Then
 //! `state.json`, which names them, is replaced atomically; files that it does not name are ignored. `last.safetensors`
 //! and `best.safetensors` are links to such weights. They are updated before the state, so that the weights of the
-//! state's step are always available under these names.
+//! state's step are always available under these names. The state before it and its checkpoint are kept.
 
 use crate::TrainError;
-use crate::run_config::hex;
+use crate::state_file::{
+    BEST, LAST, NEXT, PREVIOUS, RunState, STATE, STATE_SCHEMA, StateFile, names, read_state_file, state_sha256,
+};
+use data::checksum::file_sha256;
 use data::output::{create_folder, remove_unfinished_below};
 use data::{FolderLock, write_atomic, write_json};
 use models::checkpoint::{NamedTensors, read_safetensors, write_safetensors};
-use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Version of `state.json`.
-pub const STATE_SCHEMA: &str = "lidarshift/run-state/1";
+/// Fewest checkpoints that are kept: the newest, and the one that is taken if it is damaged.
+const FEWEST_KEPT: usize = 2;
 
-/// The state of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RunState {
-    /// Steps done.
-    pub step: u64,
-    /// Steps of the whole run.
-    pub total_steps: u64,
-    /// The epoch that the next step belongs to, from 0.
-    pub epoch: u64,
-    /// Frames of that epoch that have been processed.
-    pub position: usize,
-    /// The run's seed.
-    pub seed: u64,
-    /// [`crate::RunConfig::sha256`].
-    pub config_sha256: String,
-    /// SHA-256 of the ids of the training frames.
-    pub frames_sha256: String,
-    /// The best checkpoint so far.
-    pub best: Option<Best>,
-}
+/// Advice for a checkpoint that cannot be used.
+const ADVICE: &str = "begin the run anew in another folder";
 
-/// An evaluated checkpoint.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Best {
-    /// The step after which it was written.
-    pub step: u64,
-    /// Average precision on the validation split, percent.
-    pub ap: f64,
-}
-
-/// The content of `state.json`.
-#[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct StateFile {
-    schema: String,
-    state: RunState,
-    /// SHA-256 of the files of the checkpoint by name, and of the state itself under `state`.
-    sha256: BTreeMap<String, String>,
+/// A checkpoint of a run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    /// The state of the run.
+    pub state: RunState,
+    /// The weights, under OpenPCDet's names.
+    pub weights: NamedTensors,
+    /// The moments of the optimiser.
+    pub moments: NamedTensors,
+    /// Why the newest checkpoint was not taken, if it was not.
+    pub warning: Option<String>,
 }
 
 /// A run folder, locked against other processes while this value lives.
@@ -101,12 +76,12 @@ impl RunFolder {
 
     /// The weights after the last checkpoint, under OpenPCDet's names.
     pub fn last_weights(&self) -> PathBuf {
-        self.checkpoints().join("last.safetensors")
+        self.checkpoints().join(LAST)
     }
 
     /// The weights with the best average precision on the validation split.
     pub fn best_weights(&self) -> PathBuf {
-        self.checkpoints().join("best.safetensors")
+        self.checkpoints().join(BEST)
     }
 
     fn checkpoints(&self) -> PathBuf {
@@ -114,23 +89,11 @@ impl RunFolder {
     }
 
     fn state_path(&self) -> PathBuf {
-        self.checkpoints().join("state.json")
+        self.checkpoints().join(STATE)
     }
 
-    /// The state of the run; `None` before its first checkpoint.
-    ///
-    /// # Errors
-    /// A state that is damaged.
-    pub fn state(&self) -> Result<Option<RunState>, TrainError> {
-        Ok(self.state_file()?.map(|file| file.state))
-    }
-
-    fn state_file(&self) -> Result<Option<StateFile>, TrainError> {
-        read_state_file(&self.state_path())
-    }
-
-    /// Writes a checkpoint; a resume continues from it once this returns. Keeps the last `keep` checkpoints and the
-    /// best one.
+    /// Writes a checkpoint; a resume continues from it once this returns. Keeps the last `keep` checkpoints, two at
+    /// least, and the best one.
     ///
     /// # Errors
     /// Files that cannot be written; the previous checkpoint then remains valid.
@@ -146,34 +109,69 @@ impl RunFolder {
         write_safetensors(&self.checkpoints().join(&weights_name), weights, metadata)?;
         write_safetensors(&self.checkpoints().join(&moments_name), moments, &BTreeMap::new())?;
         let mut sha256 = BTreeMap::from([("state".to_string(), state_sha256(state))]);
-        for name in [weights_name, moments_name] {
-            let bytes = fs_err::read(self.checkpoints().join(&name))?;
-            sha256.insert(name, hex(&Sha256::digest(bytes)));
+        for name in [&weights_name, &moments_name] {
+            sha256.insert(name.clone(), file_sha256(&self.checkpoints().join(name))?);
         }
+        let best_step = state.best.as_ref().map(|best| best.step);
+        let of_best = if best_step == Some(state.step) {
+            sha256.get(&weights_name).cloned()
+        } else {
+            let before = read_state_file(&self.state_path()).ok().flatten();
+            before.filter(|b| b.state.best == state.best).and_then(|b| b.sha256.get(BEST).cloned())
+        };
+        sha256.extend(of_best.map(|sum| (BEST.to_string(), sum)));
         let file = StateFile { schema: STATE_SCHEMA.into(), state: state.clone(), sha256 };
+        let next = self.checkpoints().join(NEXT);
+        write_json(&next, &file)?;
         self.link_last_and_best(state)?;
-        write_json(&self.state_path(), &file)?;
-        self.remove_all_but(state, keep)
+        if self.state_path().is_file() {
+            link(&self.state_path(), &self.checkpoints().join(PREVIOUS))?;
+        }
+        fs_err::rename(next, self.state_path())?;
+        self.remove_all_but(state, keep.max(FEWEST_KEPT))
     }
 
-    /// Weights and moments of the last checkpoint.
+    /// The last checkpoint. If its state or one of its files is damaged, the checkpoint before it, which then is the
+    /// last one.
     ///
     /// # Errors
-    /// Files that are missing or have a wrong checksum.
-    pub fn load(&self) -> Result<Option<(RunState, NamedTensors, NamedTensors)>, TrainError> {
-        let Some(file) = self.state_file()? else { return Ok(None) };
+    /// Files that are missing or have a wrong checksum, in both checkpoints.
+    pub fn load(&self) -> Result<Option<Checkpoint>, TrainError> {
+        let newest = self.checkpoint(STATE);
+        let previous = self.checkpoints().join(PREVIOUS);
+        let checkpoint = match newest {
+            Ok(None) if !previous.is_file() => return Ok(None),
+            Ok(Some(checkpoint)) => checkpoint,
+            newest => {
+                let reason = newest.map_or_else(
+                    |error| error.to_string(),
+                    |_| format!("{}: does not exist, but a state before it does", self.state_path().display()),
+                );
+                let Ok(Some(mut checkpoint)) = self.checkpoint(PREVIOUS) else {
+                    return Err(TrainError::folder(&self.path, format!("{reason}; {ADVICE}")));
+                };
+                write_atomic(&self.state_path(), &fs_err::read(previous)?)?;
+                let step = checkpoint.state.step;
+                checkpoint.warning =
+                    Some(format!("{reason}; the run goes on from the checkpoint before it, after {step} steps"));
+                checkpoint
+            }
+        };
+        self.link_last_and_best(&checkpoint.state)?;
+        Ok(Some(checkpoint))
+    }
+
+    /// The checkpoint of a state, if it is as it was written.
+    fn checkpoint(&self, state: &str) -> Result<Option<Checkpoint>, TrainError> {
+        let Some(file) = read_state_file(&self.checkpoints().join(state))? else { return Ok(None) };
         let [weights, moments] = names(file.state.step).map(|name| {
             let path = self.checkpoints().join(&name);
-            let bytes = fs_err::read(&path)?;
-            if file.sha256.get(&name) != Some(&hex(&Sha256::digest(bytes))) {
-                let message =
-                    "is not the file that the run wrote (its checksum differs); begin the run anew in another folder";
-                return Err(TrainError::folder(&path, message));
+            if file.sha256.get(&name) != Some(&file_sha256(&path)?) {
+                return Err(TrainError::folder(&path, "is not the file that the run wrote (its checksum differs)"));
             }
             Ok(read_safetensors(&path)?)
         });
-        self.link_last_and_best(&file.state)?;
-        Ok(Some((file.state, weights?, moments?)))
+        Ok(Some(Checkpoint { state: file.state, weights: weights?, moments: moments?, warning: None }))
     }
 
     /// Links `last` and `best` to the weights of the state. Repeated on loading, because they may belong to a step
@@ -207,52 +205,6 @@ impl RunFolder {
     }
 }
 
-/// The state of a run without locking its folder, which another process may be using. `None` before its first
-/// checkpoint.
-///
-/// # Errors
-/// A state that is damaged.
-pub fn read_run_state(folder: &Path) -> Result<Option<RunState>, TrainError> {
-    Ok(read_state_file(&folder.join("checkpoint/state.json"))?.map(|file| file.state))
-}
-
-fn read_state_file(path: &Path) -> Result<Option<StateFile>, TrainError> {
-    let bytes = match fs_err::read(path) {
-        Ok(bytes) => bytes,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(None),
-        Err(e) => return Err(e.into()),
-    };
-    let damaged =
-        |e: String| TrainError::folder(path, format!("is damaged ({e}); begin the run anew in another folder"));
-    let file: StateFile = serde_json::from_slice(&bytes).map_err(|e| damaged(e.to_string()))?;
-    if file.schema != STATE_SCHEMA {
-        return Err(damaged(format!("schema is {:?}, this program writes {STATE_SCHEMA:?}", file.schema)));
-    }
-    let written = file.sha256.get("state");
-    if ![state_sha256(&file.state), exact_sha256(&file.state)].iter().any(|sum| written == Some(sum)) {
-        return Err(damaged("the checksum is wrong".into()));
-    }
-    Ok(Some(file))
-}
-
-fn names(step: u64) -> [String; 2] {
-    [format!("step-{step}.safetensors"), format!("step-{step}.optimizer.safetensors")]
-}
-
-/// Checksum of a state with its AP rounded to six decimals, because reading JSON may change the last bit of a number.
-fn state_sha256(state: &RunState) -> String {
-    let mut state = state.clone();
-    if let Some(best) = &mut state.best {
-        best.ap = (best.ap * 1e6).round() / 1e6;
-    }
-    exact_sha256(&state)
-}
-
-/// The checksum of earlier versions.
-fn exact_sha256(state: &RunState) -> String {
-    hex(&Sha256::digest(serde_json::to_vec(state).expect("a state is plain JSON")))
-}
-
 /// Replaces `name` by a hard link to `file`, or by a copy if the file system has no links.
 fn link(file: &Path, name: &Path) -> Result<(), TrainError> {
     let temporary = name.with_file_name(format!(".writing-link-{}", std::process::id()));
@@ -270,6 +222,7 @@ fn link(file: &Path, name: &Path) -> Result<(), TrainError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::state_file::{Best, verify_weights};
     use models::checkpoint::{HostTensor, HostValues};
 
     fn state(step: u64, best: Option<Best>) -> RunState {
@@ -281,12 +234,19 @@ mod tests {
             seed: 1,
             config_sha256: "c".into(),
             frames_sha256: "f".into(),
+            data_sha256: None,
             best,
         }
     }
 
     fn tensors(value: f32) -> NamedTensors {
         [("w".into(), HostTensor { shape: vec![1], values: HostValues::F32(vec![value]) })].into()
+    }
+
+    fn change_a_byte(path: &Path) {
+        let mut bytes = std::fs::read(path).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::write(path, bytes).unwrap();
     }
 
     fn files(folder: &RunFolder) -> Vec<String> {
@@ -337,6 +297,7 @@ mod tests {
             "best.safetensors",
             "last.safetensors",
             "state.json",
+            "state.previous.json",
             "step-30.optimizer.safetensors",
             "step-30.safetensors",
             "step-40.optimizer.safetensors",
@@ -345,9 +306,15 @@ mod tests {
         assert_eq!(files(&folder), want);
         assert_eq!(read_safetensors(&folder.best_weights()).unwrap(), tensors(10.0));
         assert_eq!(read_safetensors(&folder.last_weights()).unwrap(), tensors(40.0));
-        let (loaded, weights, moments) = folder.load().unwrap().unwrap();
-        assert_eq!((loaded, weights, moments), (state(40, best), tensors(40.0), tensors(-1.0)));
-        assert_eq!(files(&folder), want);
+        let loaded = folder.load().unwrap().unwrap();
+        let want = Checkpoint { state: state(40, best), weights: tensors(40.0), moments: tensors(-1.0), warning: None };
+        assert_eq!(loaded, want);
+        for weights in [folder.best_weights(), folder.last_weights()] {
+            verify_weights(&weights).unwrap();
+            change_a_byte(&weights);
+            assert!(verify_weights(&weights).unwrap_err().to_string().contains("was changed after the run wrote it"));
+        }
+        assert!(folder.load().unwrap().unwrap().warning.unwrap().contains("after 30 steps"));
     }
 
     #[test]
@@ -363,8 +330,8 @@ mod tests {
         std::fs::remove_file(folder.best_weights()).unwrap();
         drop(folder);
         let folder = RunFolder::open(dir.path()).unwrap();
-        let (loaded, weights, _) = folder.load().unwrap().unwrap();
-        assert_eq!((loaded.step, weights), (10, tensors(10.0)));
+        let loaded = folder.load().unwrap().unwrap();
+        assert_eq!((loaded.state.step, loaded.weights), (10, tensors(10.0)));
         assert!(folder.last_weights().is_file() && folder.best_weights().is_file());
         folder.save(&state(15, best), &tensors(15.0), &BTreeMap::new(), &tensors(1.0), 2).unwrap();
         assert!(
@@ -395,12 +362,34 @@ mod tests {
         std::fs::write(folder.state_path(), &text[..text.len() / 2]).unwrap();
         assert!(message(&folder).contains("state.json: is damaged"), "{}", message(&folder));
         std::fs::write(folder.state_path(), &text).unwrap();
-        let weights = folder.checkpoints().join("step-10.safetensors");
-        let mut bytes = std::fs::read(&weights).unwrap();
-        *bytes.last_mut().unwrap() ^= 1;
-        std::fs::remove_file(&weights).unwrap();
-        std::fs::write(&weights, bytes).unwrap();
+        change_a_byte(&folder.checkpoints().join("step-10.safetensors"));
         assert!(message(&folder).contains("step-10.safetensors: is not the file"), "{}", message(&folder));
+    }
+
+    #[test]
+    fn the_checkpoint_before_a_damaged_one_is_taken() {
+        let damages: [&dyn Fn(&RunFolder); 4] = [
+            &|folder| std::fs::write(folder.state_path(), "").unwrap(),
+            &|folder| std::fs::remove_file(folder.state_path()).unwrap(),
+            &|folder| change_a_byte(&folder.checkpoints().join("step-20.safetensors")),
+            &|folder| std::fs::remove_file(folder.checkpoints().join("step-20.optimizer.safetensors")).unwrap(),
+        ];
+        for damage in damages {
+            let dir = tempfile::tempdir().unwrap();
+            let folder = RunFolder::open(dir.path()).unwrap();
+            for step in [10, 20] {
+                let best = Some(Best { step: 10, ap: 50.0 });
+                folder.save(&state(step, best), &tensors(step as f32), &BTreeMap::new(), &tensors(1.0), 1).unwrap();
+            }
+            damage(&folder);
+            let loaded = folder.load().unwrap().unwrap();
+            assert_eq!((loaded.state.step, loaded.weights), (10, tensors(10.0)));
+            assert!(loaded.warning.unwrap().contains("goes on from the checkpoint before it, after 10 steps"));
+            assert_eq!(read_safetensors(&folder.last_weights()).unwrap(), tensors(10.0));
+            assert_eq!(folder.load().unwrap().unwrap().warning, None);
+            folder.save(&state(20, None), &tensors(20.0), &BTreeMap::new(), &tensors(1.0), 1).unwrap();
+            assert_eq!(folder.load().unwrap().unwrap().weights, tensors(20.0));
+        }
     }
 
     #[test]

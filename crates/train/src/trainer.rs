@@ -5,9 +5,9 @@ use crate::error::without_panic;
 use crate::provenance::record_session;
 use crate::validation::loss_values;
 use crate::{
-    Adam, Best, DatasetProvenance, EpochMetrics, GradientNorm, OneCycle, RunConfig, RunFolder, RunState,
+    Adam, Best, Checkpoint, DatasetProvenance, EpochMetrics, GradientNorm, OneCycle, RunConfig, RunFolder, RunState,
     SessionProvenance, StepMetrics, TrainError, TrainingFrames, ValidationMetrics, evaluate_detector,
-    metrics::MetricsFile, samples,
+    metrics::MetricsFile, samples, verify_weights,
 };
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
@@ -32,6 +32,8 @@ pub struct Session {
     pub workers: usize,
     /// Resume an existing run. Without it a folder with a run is refused.
     pub resume: bool,
+    /// Resume a run although the labels or clouds of its data set have changed since its last checkpoint.
+    pub allow_changed_data: bool,
     /// Once this is set, a checkpoint is saved after the current step or evaluation, and the training ends with
     /// [`TrainError::Stopped`].
     pub stop: Option<&'static AtomicBool>,
@@ -93,13 +95,14 @@ pub fn train(
     report: &mut dyn FnMut(Event),
 ) -> Result<Trained, TrainError> {
     let folder = RunFolder::open(out)?;
-    let (mut run, frames) = Run::begin(config, &folder, session)?;
+    let (mut run, frames, warnings) = Run::begin(config, &folder, session)?;
     let (batch_size, epochs) = (config.detector.optimization.batch_size, config.detector.optimization.epochs as u64);
     let depth = 2 * batch_size + session.workers;
     let mut samples = samples(&frames, (run.state.epoch, run.state.position), epochs, session.workers, depth);
     let mut log = MetricsFile::open(&folder.metrics_path(), run.state.step)?;
     let (state, validation_frames) = (&run.state, run.validation_ids.len());
     report(Event::Begin { state, epochs, frames: frames.ids().len(), validation_frames });
+    warnings.iter().for_each(|warning| report(Event::Warning(warning)));
     if let Some(warning) = anchor_warning(config, &run.dataset, frames.ids())? {
         report(Event::Warning(&warning));
     }
@@ -181,16 +184,22 @@ struct Run<'a> {
 }
 
 impl<'a> Run<'a> {
-    /// Opens data set and network, and restores the last checkpoint if there is one.
+    /// Opens data set and network, and restores the last checkpoint if there is one. Also returns warnings.
     fn begin(
         config: &'a RunConfig,
         folder: &RunFolder,
         session: &Session,
-    ) -> Result<(Self, Arc<TrainingFrames>), TrainError> {
+    ) -> Result<(Self, Arc<TrainingFrames>, Vec<String>), TrainError> {
         refuse_other_run(config, folder, session.resume)?;
         let dataset = Dataset::open(&config.dataset)?;
         let frames = Arc::new(TrainingFrames::new(config, &dataset, &folder.path().join("cache"))?);
         let optimization = &config.detector.optimization;
+        let validation_ids = match () {
+            () if config.run.evaluate_every_epochs == 0 => Vec::new(),
+            () if config.overfit => frames.ids().to_vec(),
+            () if dataset.config.splits.contains_key(&config.run.val_split) => dataset.ids(&config.run.val_split)?,
+            () => Vec::new(),
+        };
         let steps_per_epoch = frames.ids().len().div_ceil(optimization.batch_size) as u64;
         let mut state = RunState {
             step: 0,
@@ -200,32 +209,43 @@ impl<'a> Run<'a> {
             seed: config.seed,
             config_sha256: config.sha256(),
             frames_sha256: frames.sha256(),
+            data_sha256: Some(dataset.content_sha256(&[frames.ids(), &validation_ids].concat())?),
             best: None,
         };
+        let mut warnings = Vec::new();
         let device = session.device.clone().autodiff();
         let mut detector = Detector::new(&config.detector, config.seed, &device);
         let mut adam = Adam::new(optimization.weight_decay, reference_name);
-        if let Some((saved, weights, moments)) = folder.load()? {
-            if (&saved.config_sha256, &saved.frames_sha256) != (&state.config_sha256, &state.frames_sha256) {
+        if let Some(Checkpoint { state: mut saved, weights, moments, warning }) = folder.load()? {
+            warnings.extend(warning);
+            if !config.has_sha256(&saved.config_sha256) || saved.frames_sha256 != state.frames_sha256 {
                 let message = "its checkpoint belongs to another configuration or to other training frames (has the data set changed?); \
                                begin a new run with another --out";
                 return Err(TrainError::folder(folder.path(), message));
             }
+            if saved.data_sha256.is_some() && saved.data_sha256 != state.data_sha256 {
+                let message = format!(
+                    "the labels or clouds of {} have changed since the last checkpoint",
+                    dataset.config.root.display()
+                );
+                if !session.allow_changed_data {
+                    let advice =
+                        "begin a new run with another --out, or continue on the changed data with --allow-changed-data";
+                    return Err(TrainError::folder(folder.path(), format!("{message}; {advice}")));
+                }
+                warnings.push(message);
+            }
+            saved.data_sha256 = state.data_sha256;
             detector = detector.load_named(&weights)?;
             adam.load_named(&moments, saved.step, &device).map_err(|m| TrainError::folder(folder.path(), m))?;
             state = saved;
         } else if let Some(init) = &config.init {
+            verify_weights(init)?;
             detector = detector.load_named(&read_checkpoint(init)?).map_err(|e| match e {
                 ModelError::Weights(message) => TrainError::folder(init, message),
                 other => other.into(),
             })?;
         }
-        let validation_ids = match () {
-            () if config.run.evaluate_every_epochs == 0 => Vec::new(),
-            () if config.overfit => frames.ids().to_vec(),
-            () if dataset.config.splits.contains_key(&config.run.val_split) => dataset.ids(&config.run.val_split)?,
-            () => Vec::new(),
-        };
         write_atomic(&folder.config_path(), config.to_toml().as_bytes())?;
         let learned_from = DatasetProvenance {
             name: dataset.config.name.clone(),
@@ -236,7 +256,7 @@ impl<'a> Run<'a> {
         let this = SessionProvenance::now(state.step, &session.device_name, session.workers);
         record_session(&folder.provenance_path(), config, learned_from, this)?;
         let schedule = OneCycle::new(optimization, state.total_steps);
-        Ok((Run { config, dataset, validation_ids, schedule, adam, detector, state }, frames))
+        Ok((Run { config, dataset, validation_ids, schedule, adam, detector, state }, frames, warnings))
     }
 
     /// One step: forward, backward, clipping, update.

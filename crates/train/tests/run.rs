@@ -116,7 +116,14 @@ fn pointrcnn(dataset: &Path, assignments: &[&str]) -> RunConfig {
 }
 
 fn session(workers: usize, resume: bool) -> Session {
-    Session { device: Device::flex(), device_name: "flex".into(), workers, resume, stop: None }
+    Session {
+        device: Device::flex(),
+        device_name: "flex".into(),
+        workers,
+        resume,
+        allow_changed_data: false,
+        stop: None,
+    }
 }
 
 fn run(config: &RunConfig, out: &Path, workers: usize, resume: bool) -> Result<Trained, TrainError> {

@@ -118,6 +118,7 @@ fn run_folder(path: &Path) -> Result<Vec<Target>> {
         position: 4,
         seed: 7,
         config_sha256: "c".into(),
+        data_sha256: None,
         frames_sha256: "f".into(),
         best: None,
     };
@@ -143,7 +144,7 @@ fn run_folder(path: &Path) -> Result<Vec<Target>> {
                 fs_err::write(&damaged, &valid).map_err(|e| e.to_string())?;
                 match loaded {
                     Err(_) => Ok(false),
-                    Ok(Some((read, weights, moments))) if read == state && weights == moments => Ok(true),
+                    Ok(Some(read)) if read.state == state && read.weights == read.moments => Ok(true),
                     Ok(_) => Err("read a state that was not written".to_string()),
                 }
             }

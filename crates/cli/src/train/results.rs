@@ -1,6 +1,6 @@
 //! Results of a finished run: the AP table, detections, pictures and the training curve.
 
-use crate::outln;
+use crate::{errln, outln};
 use anyhow::Result;
 use data::write::write_kitti_text;
 use data::{Dataset, write_atomic, write_json};
@@ -42,8 +42,10 @@ pub(super) fn write(found: &Evaluation, set: &Dataset, out: &Path) -> Result<()>
         let seen = set.load(&frame.id)?;
         let mut boxes: Vec<_> = seen.objects.iter().map(|o| (o.bbox, Style::GroundTruth)).collect();
         boxes.extend(detections.iter().map(|d| (d.bbox, Style::Detection { score: d.score })));
-        let picture = birds_eye_png(&seen.cloud, &boxes, &BirdsEyeOptions::default())?;
-        write_atomic(&out.join(format!("pictures/{}.png", frame.id)), &picture)?;
+        match birds_eye_png(&seen.cloud, &boxes, &BirdsEyeOptions::default()) {
+            Ok(picture) => write_atomic(&out.join(format!("pictures/{}.png", frame.id)), &picture)?,
+            Err(error) => errln!("warning: no picture of frame {}: {error}", frame.id),
+        }
     }
     Ok(())
 }

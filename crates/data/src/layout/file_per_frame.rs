@@ -2,6 +2,7 @@
 
 use super::DataLayout;
 use crate::kitti_text::{KittiText, read_kitti_text};
+use crate::limits::{MOST_CLOUD_BYTES, read_file};
 use crate::write::{write_bin, write_kitti_text, write_pcd};
 use crate::{Calibration, Cloud, DataError, DatasetConfig, LabelBox, LabelFrame, PcdEncoding, PointColumns};
 use crate::{Layout, parse_pcd_header, read_cloud};
@@ -117,7 +118,7 @@ impl<L: FilePerFrame> DataLayout for L {
         if is_bin(&path) {
             return Ok(true);
         }
-        Ok(parse_pcd_header(&fs_err::read(&path)?, &path)?.has_intensity())
+        Ok(parse_pcd_header(&read_file(&path, MOST_CLOUD_BYTES)?, &path)?.has_intensity())
     }
 
     fn read_cloud(&self, root: &Path, id: &str, columns: PointColumns) -> Result<Cloud, DataError> {

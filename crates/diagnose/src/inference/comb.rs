@@ -39,16 +39,32 @@ impl Default for Spectra {
 }
 
 impl Spectra {
-    /// Sum of exp(-2 pi i R / step) over ranges, by frequency. Ranges beyond the last bin count in it.
+    /// Sum of exp(-2 pi i R / step) over ranges, by frequency.
     pub fn of(&self, ranges: impl IntoIterator<Item = f64>) -> Vec<Complex<f32>> {
-        let mut values = vec![Complex::new(0.0f32, 0.0); BINS];
-        for r in ranges {
-            values[((r / BIN_M) as usize).min(BINS - 1)].re += 1.0;
-        }
+        self.of_counts(counts(ranges))
+    }
+
+    /// [`Spectra::of`] from the numbers of ranges in each bin, see [`counts`].
+    pub fn of_counts(&self, counts: Vec<f32>) -> Vec<Complex<f32>> {
+        let mut values: Vec<Complex<f32>> = counts.into_iter().map(|n| Complex::new(n, 0.0)).collect();
         self.0.process(&mut values);
         values.truncate(FREQUENCIES);
         values
     }
+}
+
+/// Number of ranges in each bin. Ranges beyond the last bin count in it.
+pub fn counts(ranges: impl IntoIterator<Item = f64>) -> Vec<f32> {
+    let mut counts = vec![0.0f32; BINS];
+    for r in ranges {
+        counts[bin_of(r)] += 1.0;
+    }
+    counts
+}
+
+/// The bin of a range.
+pub fn bin_of(range_m: f64) -> usize {
+    ((range_m / BIN_M) as usize).min(BINS - 1)
 }
 
 /// Sum of exp(2 pi i R / step) over ranges, and their number.

@@ -21,11 +21,12 @@ const FILE_STEP_M: f64 = 0.002;
 
 /// All findings.
 pub(super) fn all(seen: &Seen, notes: &mut Vec<String>) -> Findings {
-    let step = comb::find(&seen.scans.iter().collect::<Vec<_>>());
+    let combs = comb::Combs::new(&seen.scans);
+    let step = combs.of_all();
     let mut found: Vec<Option<Finding>> = vec![rows::offsets_found(seen, notes), rows::intensity_found(seen)];
     let (noise, considered) = noise::noise_found(seen, step.map_or(FILE_STEP_M, |c| c.step_m), notes);
     found.extend(noise.into_iter().map(Some));
-    found.push(step.map(|s| comb_found(seen, s)));
+    found.push(step.map(|s| comb_found(seen, &combs, s)));
     found.push(elevation::elevation_found(seen, notes));
     let minimum = BTreeMap::from([
         (Cause::BeamRangeOffset, Minimum::new(Quantity::StdM, rows::LEAST_OFFSET_M)),
@@ -95,12 +96,12 @@ fn patches(seen: &Seen, scan: usize) -> impl Iterator<Item = &Patch> {
 }
 
 /// The finding of a quantisation step.
-fn comb_found(seen: &Seen, found: comb::Comb) -> Finding {
+fn comb_found(seen: &Seen, combs: &comb::Combs, found: comb::Comb) -> Finding {
     let n = seen.scans.len();
+    let steps = combs.of_all_but_each();
     let one = |s: usize| {
-        let train: Vec<_> = others(n, s).map(|i| &seen.scans[i]).collect();
-        let step = comb::find(&train).map_or(found.step_m, |c| c.step_m);
-        let c = comb::coherence(&[&seen.scans[s]], step).min(0.999);
+        let step = steps[s].map_or(found.step_m, |c| c.step_m);
+        let c = comb::coherence(&seen.scans[s], step).min(0.999);
         let m: f64 = seen.scans[s].rings.iter().map(|r| r.len() as f64).sum();
         (step, [-(1.0 - c * c).ln() * m, m])
     };

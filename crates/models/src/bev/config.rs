@@ -2,6 +2,7 @@
 
 use crate::config::DetectorConfig;
 use crate::layers::Resampling;
+use crate::limits::{MOST_CELLS, MOST_FILTERS, MOST_LAYERS, MOST_PILLARS, MOST_SAMPLES, MOST_STRIDE, at_most};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -87,9 +88,18 @@ impl BackboneConfig {
         if self.strides.iter().chain(&self.filters).chain(&self.upsample_filters).any(|&n| n == 0) {
             return fail("network.backbone: strides and filters must be above 0".into());
         }
+        at_most(MOST_LAYERS, &[("the number of blocks of network.backbone", &[blocks])])?;
+        at_most(MOST_LAYERS, &[("network.backbone.layers", &self.layers)])?;
+        at_most(MOST_STRIDE, &[("network.backbone.strides", &self.strides)])?;
+        let filters = [
+            ("network.backbone.filters", &self.filters[..]),
+            ("network.backbone.upsample_filters", &self.upsample_filters),
+        ];
+        at_most(MOST_FILTERS, &filters)?;
         let (mut scale, mut multiple) = (1, 1);
         for (stride, &up) in self.strides.iter().zip(&self.upsample_strides) {
             scale *= stride;
+            at_most(MOST_CELLS, &[("the product of network.backbone.strides", &[scale])])?;
             let fits = match Resampling::of(up) {
                 None => {
                     return fail(format!(
@@ -134,7 +144,18 @@ impl PillarsConfig {
         {
             return Err("network.pillars: sizes and limits must be above 0".into());
         }
-        let [.., nz] = self.grid_size(detector);
+        let [nx, ny, nz] = self.grid_size(detector);
+        if nx.saturating_mul(ny) > MOST_CELLS {
+            return Err(format!(
+                "network.pillars.size_m = {:?} makes {nx} x {ny} pillars of range_m; at most {MOST_CELLS} cells are \
+                 supported",
+                self.size_m
+            ));
+        }
+        at_most(MOST_SAMPLES, &[("network.pillars.max_points", &[self.max_points])])?;
+        let pillars =
+            [("network.pillars.max_train", &[self.max_train][..]), ("network.pillars.max_test", &[self.max_test])];
+        at_most(MOST_PILLARS, &pillars)?;
         if nz != 1 {
             return Err(format!(
                 "network.pillars.size_m: {nz} pillars along z; the pillar must span the whole z range"

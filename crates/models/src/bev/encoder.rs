@@ -7,6 +7,7 @@ use super::scatter::scatter;
 use super::vfe::{PillarRows, PillarVfe};
 use crate::config::DetectorConfig;
 use crate::layers::{Init, Mode, host};
+use crate::limits::{MOST_FILTERS, MOST_LAYERS, at_most};
 use crate::{LayerFeatures, ModelError};
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -54,6 +55,8 @@ impl EncoderConfig<'_> {
         if *last == 0 || hidden.contains(&0) {
             return Err("network.vfe_filters must be above 0".into());
         }
+        at_most(MOST_LAYERS, &[("the number of network.vfe_filters", &[self.vfe_filters.len()])])?;
+        at_most(MOST_FILTERS, &[("network.vfe_filters", self.vfe_filters)])?;
         match hidden.iter().find(|filters| *filters % 2 != 0) {
             Some(odd) => Err(format!(
                 "network.vfe_filters: {odd} is odd; all layers but the last give half of their channels to the \

@@ -2,6 +2,7 @@
 
 use crate::bev::{BackboneConfig, EncoderConfig, PillarsConfig};
 use crate::config::DetectorConfig;
+use crate::limits::{MOST_FILTERS, MOST_LAYERS, MOST_NETWORK_BOXES, MOST_SAMPLES, at_most};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -180,6 +181,18 @@ impl CenterPointConfig {
                 self.targets.gaussian_overlap
             ));
         }
+        let layers = [hm, center, center_z, dim, rot];
+        at_most(MOST_FILTERS, &[("network.head.filters", &[self.head.filters])])?;
+        at_most(MOST_LAYERS, &[("network.head.layers", &layers)])?;
+        let (targets, found) = (&self.targets, &self.detection);
+        let boxes = [
+            ("network.targets.max_boxes", &[targets.max_boxes][..]),
+            ("network.detection.max_boxes", &[found.max_boxes]),
+            ("network.detection.nms_pre", &[found.nms_pre]),
+            ("network.detection.nms_post", &[found.nms_post]),
+        ];
+        at_most(MOST_NETWORK_BOXES, &boxes)?;
+        at_most(MOST_SAMPLES, &[("network.targets.min_radius", &[targets.min_radius])])?;
         if self.targets.max_boxes == 0 {
             return fail("network.targets.max_boxes must be above 0".into());
         }

@@ -63,7 +63,7 @@ impl NumberType {
 /// # Errors
 /// A file that cannot be read, has another format, is damaged or truncated, has trailing bytes, or asks to run code.
 pub fn read_checkpoint(path: &Path) -> Result<NamedTensors, ModelError> {
-    let bytes = fs_err::read(path).map_err(data::DataError::from)?;
+    let bytes = data::limits::read_file(path, crate::limits::MOST_CHECKPOINT_BYTES)?;
     parse_checkpoint(path, &bytes)
 }
 

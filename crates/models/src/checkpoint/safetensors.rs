@@ -2,6 +2,7 @@
 
 use super::{HostTensor, HostValues, NamedTensors, NumberType, file_error};
 use crate::ModelError;
+use crate::limits::{MOST_CHECKPOINT_BYTES, MOST_HEADER_BYTES};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
@@ -12,7 +13,7 @@ use std::path::Path;
 /// # Errors
 /// A file that cannot be read, is damaged or truncated, or holds tensors of other types than F32, F64 and I64.
 pub fn read_safetensors(path: &Path) -> Result<NamedTensors, ModelError> {
-    let bytes = fs_err::read(path).map_err(data::DataError::from)?;
+    let bytes = data::limits::read_file(path, MOST_CHECKPOINT_BYTES)?;
     parse(&bytes).map_err(|message| file_error(path, message))
 }
 
@@ -21,7 +22,8 @@ pub fn read_safetensors(path: &Path) -> Result<NamedTensors, ModelError> {
 /// # Errors
 /// A file that cannot be read, or whose header is damaged.
 pub fn read_metadata(path: &Path) -> Result<BTreeMap<String, String>, ModelError> {
-    let bytes = fs_err::read(path).map_err(data::DataError::from)?;
+    let bytes = data::limits::read_file(path, MOST_CHECKPOINT_BYTES)?;
+    check_header(&bytes).map_err(|message| file_error(path, message))?;
     let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| file_error(path, not_safetensors(&e)))?;
     Ok(header.metadata().iter().flatten().map(|(key, text)| (key.clone(), text.clone())).collect())
 }
@@ -40,6 +42,7 @@ pub fn write_safetensors(
 }
 
 pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
+    check_header(bytes)?;
     let file = SafeTensors::deserialize(bytes).map_err(|e| not_safetensors(&e))?;
     let mut tensors = NamedTensors::new();
     for (name, view) in file.iter() {
@@ -53,6 +56,19 @@ pub(super) fn parse(bytes: &[u8]) -> Result<NamedTensors, String> {
         tensors.insert(name.into(), HostTensor { shape: view.shape().to_vec(), values });
     }
     Ok(tensors)
+}
+
+/// Refuses a header with more text than networks have names, before it is parsed.
+fn check_header(bytes: &[u8]) -> Result<(), String> {
+    match bytes.first_chunk::<8>().map(|length| u64::from_le_bytes(*length)) {
+        Some(length) if length > bytes.len() as u64 => {
+            Err(format!("says that its header has {length} bytes, but the file has {}", bytes.len()))
+        }
+        Some(length) if length > MOST_HEADER_BYTES => {
+            Err(format!("has a header of {length} bytes with names of tensors; at most {MOST_HEADER_BYTES} are read"))
+        }
+        _ => Ok(()),
+    }
 }
 
 fn not_safetensors(error: &safetensors::SafeTensorError) -> String {
@@ -125,6 +141,19 @@ mod tests {
         assert_eq!(std::fs::read(&path).unwrap(), first, "the same content gives the same bytes");
         write_safetensors(&path, &some_tensors(), &BTreeMap::new()).unwrap();
         assert!(read_metadata(&path).unwrap().is_empty());
+    }
+
+    #[test]
+    fn a_million_names_are_refused_before_they_are_parsed() {
+        let names: Vec<String> = (0..1_000_000)
+            .map(|i| format!(r#""t{i:06}":{{"dtype":"F32","shape":[0],"data_offsets":[0,0]}}"#))
+            .collect();
+        let header = format!("{{{}}}", names.join(","));
+        let bytes = [&(header.len() as u64).to_le_bytes(), header.as_bytes()].concat();
+        let error = parse(&bytes).unwrap_err();
+        assert!(error.contains("names of tensors; at most 8388608 are read"), "{error}");
+        let error = parse(&[&u64::MAX.to_le_bytes()[..], b"{}"].concat()).unwrap_err();
+        assert!(error.contains("header has 18446744073709551615 bytes, but the file has 10"), "{error}");
     }
 
     #[test]

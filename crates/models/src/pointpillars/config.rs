@@ -2,6 +2,7 @@
 
 use crate::bev::{BackboneConfig, EncoderConfig, PillarsConfig};
 use crate::config::{AnchorConfig, DetectorConfig};
+use crate::limits::{MOST_CLASSES, MOST_NETWORK_BOXES, at_most};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::slice;
@@ -124,6 +125,16 @@ impl PointPillarsConfig {
         if net.head.dir_bins < 2 {
             return fail("network.head.dir_bins must be at least 2".into());
         }
+        let rotations: Vec<usize> = net.anchors.iter().map(|a| a.rotations_rad.len()).collect();
+        let headings = [
+            ("network.head.dir_bins", &[net.head.dir_bins][..]),
+            ("the number of network.anchors.rotations_rad", &rotations),
+        ];
+        at_most(MOST_CLASSES, &headings)?;
+        let found = &net.detection;
+        let boxes =
+            [("network.detection.nms_pre", &[found.nms_pre][..]), ("network.detection.nms_post", &[found.nms_post])];
+        at_most(MOST_NETWORK_BOXES, &boxes)?;
         Ok(())
     }
 

@@ -312,6 +312,7 @@ impl PointRcnnConfig {
                 detector.classes
             ));
         }
+        self.check_limits()?;
         let positive = |values: &[f32]| values.iter().all(|&v| v > 0.0 && v.is_finite());
         let not_negative = |values: &[f32]| values.iter().all(|&v| v >= 0.0 && v.is_finite());
         let some = |values: &[usize]| !values.is_empty() && values.iter().all(|&v| v > 0);

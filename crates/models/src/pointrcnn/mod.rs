@@ -9,6 +9,7 @@ mod point_head;
 mod roi_head;
 mod sample;
 mod set_abstraction;
+mod size_limits;
 mod training;
 
 pub mod box_coder;

@@ -4,6 +4,7 @@ mod pattern;
 
 pub use pattern::{Pattern, RowBlock, Shot, Sweep, direction};
 
+use data::limits::check_name;
 use data::toml_text::{parse_toml, read_toml, within, wrong};
 use data::{DataError, KeyError};
 use geometry::Pose;
@@ -115,8 +116,9 @@ impl Rig {
         }
         for (i, sensor) in self.sensors.iter().enumerate() {
             let here = format!("sensor[{i}]");
-            if sensor.name.is_empty() || self.sensors[..i].iter().any(|s| s.name == sensor.name) {
-                return Err(wrong(format!("{here}.name"), format!("{:?} is empty or not unique", sensor.name)));
+            check_name(&sensor.name).map_err(|message| wrong(format!("{here}.name"), message))?;
+            if self.sensors[..i].iter().any(|s| s.name == sensor.name) {
+                return Err(wrong(format!("{here}.name"), format!("{:?} is not unique", sensor.name)));
             }
             sensor.check().map_err(|e| e.below(&here))?;
         }
@@ -306,7 +308,7 @@ mod tests {
             ("".to_owned(), "r.toml: sensor: there is none"),
             (
                 "[[sensor]]\nname = \"a\"\n[[sensor]]\nname = \"a\"\n".into(),
-                "r.toml:4: sensor[1].name: \"a\" is empty or not unique",
+                "r.toml:4: sensor[1].name: \"a\" is not unique",
             ),
             ("[[sensor]]\nname = \"a\"\ncolour = 1\n".into(), "r.toml:3: unknown field `colour`"),
             (
@@ -317,7 +319,7 @@ mod tests {
             ("[[sensor]]\nposition = [0, 0, 0]\n".into(), "r.toml:1: missing field `name`"),
             ("[[sensor]]\nname = \"a\"\nposition = [nan, 0, 0]\n".into(), "r.toml:3: sensor[0].position[0]: NaN"),
             ("[[sensor]]\nname = \"a\"\nhorizontal_fov_deg = 0\n".into(), "sensor[0].horizontal_fov_deg: 0"),
-            ("[[sensor]]\nname = \"a\"\npattern = \"spiral\"\n".into(), "r.toml:3: invalid type"),
+            ("[[sensor]]\nname = \"a\"\npattern = \"spiral\"\n".into(), "r.toml:3: sensor[0].pattern: invalid type"),
             (pattern("blocks = []\ncolumns = 10"), "r.toml:4: sensor[0].pattern.blocks: is empty"),
             (
                 pattern("blocks = [{ rows = 0, top_deg = 1, bottom_deg = 0 }]\ncolumns = 10"),

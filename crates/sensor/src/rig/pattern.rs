@@ -1,5 +1,6 @@
 //! Directions and times of a sensor's shots.
 
+use data::limits::{MOST_TEXT_BYTES, read_file};
 use data::toml_text::{within, wrong};
 use data::{DataError, KeyError};
 use schemars::JsonSchema;
@@ -200,7 +201,7 @@ struct ShotLine {
 }
 
 fn read_shots(path: &Path) -> Result<Vec<Shot>, DataError> {
-    let bytes = fs_err::read(path)?;
+    let bytes = read_file(path, MOST_TEXT_BYTES)?;
     let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(bytes.as_slice());
     let mut shots = Vec::new();
     for line in reader.deserialize() {

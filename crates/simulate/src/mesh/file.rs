@@ -1,8 +1,9 @@
 //! Meshes from OBJ, STL and glTF files.
 
+use super::gltf_file::read_gltf;
 use super::{Face, Mesh};
-use base64::Engine as _;
 use data::DataError;
+use data::limits::read_file;
 use schemars::JsonSchema;
 use sensor::material::{MaterialId, MaterialTable};
 use serde::{Deserialize, Serialize};
@@ -53,10 +54,10 @@ pub enum UpAxis {
 }
 
 /// A mesh of the file with its material names.
-struct Part {
-    positions: Vec<[f64; 3]>,
-    corners: Vec<u32>,
-    material: Option<String>,
+pub(super) struct Part {
+    pub(super) positions: Vec<[f64; 3]>,
+    pub(super) corners: Vec<u32>,
+    pub(super) material: Option<String>,
 }
 
 impl MeshFile {
@@ -116,12 +117,18 @@ impl MeshFile {
     }
 }
 
+/// Bytes of a mesh file or of one of its buffers.
+pub const MOST_MESH_BYTES: u64 = 1 << 30;
+
+/// Vertices or corners of a mesh, counted as often as they are placed.
+pub const MOST_MESH_VERTICES: usize = 20_000_000;
+
 fn read_obj(path: &Path) -> Result<Vec<Part>, DataError> {
-    let bytes = fs_err::read(path)?;
+    let bytes = read_file(path, MOST_MESH_BYTES)?;
     let failed = |e: tobj::LoadError| DataError::file(path, format!("is not a valid OBJ file: {e}"));
     let options = tobj::LoadOptions { triangulate: true, single_index: true, ..tobj::LoadOptions::default() };
     let folder = path.parent().unwrap_or(Path::new(""));
-    let library = |name: &Path| match std::fs::read(folder.join(name)) {
+    let library = |name: &Path| match read_file(&folder.join(name), MOST_MESH_BYTES) {
         Ok(bytes) => tobj::load_mtl_buf(&mut bytes.as_slice()),
         Err(_) => Err(tobj::LoadError::OpenFileFailed),
     };
@@ -136,65 +143,28 @@ fn read_obj(path: &Path) -> Result<Vec<Part>, DataError> {
 }
 
 fn read_stl(path: &Path) -> Result<Vec<Part>, DataError> {
-    let bytes = fs_err::read(path)?;
+    let bytes = read_file(path, MOST_MESH_BYTES)?;
     let failed = |e: &dyn std::fmt::Display| DataError::file(path, format!("is not a valid STL file: {e}"));
+    if !bytes.starts_with(b"solid")
+        && let Some(count) = bytes.get(80..).and_then(|rest| rest.first_chunk::<4>()).map(|n| u32::from_le_bytes(*n))
+        && bytes.len() as u64 != 84 + 50 * u64::from(count)
+    {
+        return Err(failed(&format!(
+            "it has {} bytes, but its header says {count} triangles of 50 bytes",
+            bytes.len()
+        )));
+    }
     let mesh = stl_io::read_stl(&mut Cursor::new(bytes)).map_err(|e| failed(&e))?;
     let positions = mesh.vertices.iter().map(|v| [v[0], v[1], v[2]].map(f64::from)).collect();
     let corners = mesh.faces.iter().flat_map(|face| face.vertices.map(|v| v as u32)).collect();
     Ok(vec![Part { positions, corners, material: None }])
 }
 
-fn read_gltf(path: &Path) -> Result<Vec<Part>, DataError> {
-    let wrong = |message: String| DataError::file(path, message);
-    let gltf::Gltf { document, mut blob } =
-        gltf::Gltf::from_slice(&fs_err::read(path)?).map_err(|e| wrong(format!("is not a valid glTF file: {e}")))?;
-    let mut buffers = Vec::new();
-    for buffer in document.buffers() {
-        let bytes = match buffer.source() {
-            gltf::buffer::Source::Bin => blob.take().ok_or_else(|| wrong("has no binary part".into()))?,
-            gltf::buffer::Source::Uri(uri) => match uri.split_once(";base64,") {
-                Some((_, text)) => base64::engine::general_purpose::STANDARD
-                    .decode(text)
-                    .map_err(|e| wrong(format!("has a damaged buffer: {e}")))?,
-                None => fs_err::read(path.parent().unwrap_or(Path::new("")).join(uri))?,
-            },
-        };
-        if bytes.len() < buffer.length() {
-            return Err(wrong(format!("has {} bytes in a buffer of {}", bytes.len(), buffer.length())));
-        }
-        buffers.push(bytes);
-    }
-    let mut parts = Vec::new();
-    for scene in document.scenes() {
-        let mut open: Vec<_> = scene.nodes().map(|node| (node, nalgebra::Matrix4::identity())).collect();
-        while let Some((node, above)) = open.pop() {
-            let local = nalgebra::Matrix4::from(node.transform().matrix()).map(f64::from);
-            let root_from_node: nalgebra::Matrix4<f64> = above * local;
-            for primitive in node.mesh().into_iter().flat_map(|mesh| mesh.primitives().collect::<Vec<_>>()) {
-                if primitive.mode() != gltf::mesh::Mode::Triangles {
-                    return Err(wrong("has lines or strips; write it as plain triangles".into()));
-                }
-                let reader = primitive.reader(|buffer| buffers.get(buffer.index()).map(Vec::as_slice));
-                let positions = reader.read_positions().ok_or_else(|| wrong("has a mesh without positions".into()))?;
-                let positions: Vec<[f64; 3]> = positions
-                    .map(|p| root_from_node.transform_point(&nalgebra::Point3::from(p.map(f64::from))).coords.into())
-                    .collect();
-                let corners = match reader.read_indices() {
-                    Some(indices) => indices.into_u32().collect(),
-                    None => (0..positions.len() as u32).collect(),
-                };
-                parts.push(Part { positions, corners, material: primitive.material().name().map(String::from) });
-            }
-            open.extend(node.children().map(|child| (child, root_from_node)));
-        }
-    }
-    Ok(parts)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::mesh::cuboid;
+    use base64::Engine as _;
 
     fn mesh_file(name: &str) -> MeshFile {
         toml::from_str(&format!("file = {name:?}")).unwrap()

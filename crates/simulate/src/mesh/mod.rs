@@ -1,9 +1,11 @@
 //! Triangle meshes of the world and the cars.
 
 mod file;
+mod gltf_file;
 mod shapes;
 
-pub use file::{MeshFile, UpAxis};
+pub use file::{MOST_MESH_BYTES, MOST_MESH_VERTICES, MeshFile, UpAxis};
+pub use gltf_file::MOST_NODES;
 pub use shapes::{cuboid, cylinder, grid, loft};
 
 use crate::raycast::Tree;

@@ -249,7 +249,8 @@ impl RaceConfig {
 /// Checks that a name can be used as a folder name.
 fn check_name(key: &str, name: &str) -> Result<(), KeyError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-    if name.is_empty() || !name.chars().all(plain) {
+    data::limits::check_name(name).map_err(|message| wrong(key, message))?;
+    if !name.chars().all(plain) {
         return Err(wrong(key, format!("{name:?} is no name of a folder: letters, digits, _ and - only")));
     }
     Ok(())
@@ -290,7 +291,7 @@ mod tests {
                 "[dataset.auto_label]\nrate_hz = 0",
                 "c.toml:9: dataset[1].auto_label.rate_hz: 0 is not between",
             ),
-            ("frames = 100", "frames = 100\nsplit = \"lot\"", "c.toml:4: unknown variant `lot`"),
+            ("frames = 100", "frames = 100\nsplit = \"lot\"", "c.toml:4: split: unknown variant `lot`"),
             (
                 "frames = 100",
                 "frames = 100\nsplit_shares = [4, 0, 1]",

@@ -48,6 +48,9 @@ pub struct RaceManifest {
     pub splits: BTreeMap<String, SplitCounts>,
     /// Label errors, for automatic labels.
     pub label_errors: Vec<LabelError>,
+    /// SHA-256 of `frames.jsonl`, which has those of the files of each frame.
+    #[serde(default)]
+    pub frames_sha256: String,
 }
 
 impl Manifest for RaceManifest {
@@ -59,6 +62,10 @@ impl Manifest for RaceManifest {
 
     fn set_complete(&mut self, complete: bool) {
         self.complete = complete;
+    }
+
+    fn set_frames_sha256(&mut self, sha256: String) {
+        self.frames_sha256 = sha256;
     }
 }
 
@@ -109,6 +116,7 @@ fn make_set(
         config_sha256: fingerprint(simulator, &prepared),
         splits: BTreeMap::new(),
         label_errors: Vec::new(),
+        frames_sha256: String::new(),
     };
     let extra = [attributes::FOLDER, TRUE_LABELS];
     let new = NewDataset::begin(&root, simulator.config.layout, &extra, &mut manifest)?;
@@ -124,11 +132,12 @@ fn make_set(
     if set.auto_label.is_some() {
         manifest.label_errors = errors_of_labels(simulator, &new)?;
     }
-    new.finish(&mut manifest)?;
+    let ids: Vec<String> = simulator.keys().iter().map(FrameKey::id).collect();
+    new.finish(&mut manifest, &ids)?;
     Ok(manifest)
 }
 
-/// Writes one frame unless it exists; returns its counts.
+/// Writes one frame unless it is there; returns its counts.
 fn make_frame_file(
     simulator: &Simulator,
     set: &PreparedSet,
@@ -138,8 +147,13 @@ fn make_frame_file(
     let (config, id) = (&simulator.config, key.id());
     let beside = attributes::path(new.root(), &id);
     let truth = set.auto_label.map(|_| true_labels_path(new.root(), &id));
-    let has_truth = truth.as_ref().is_none_or(|path| path.is_file());
-    if !(new.has_frame(&id, true) && has_truth && (!config.attributes || beside.is_file())) {
+    let (layout, root) = (new.layout(), new.root());
+    let files = || {
+        let beside = config.attributes.then(|| beside.clone());
+        let frame = [layout.cloud_path(root, &id), layout.labels_path(root, &id)];
+        frame.into_iter().chain(truth.clone()).chain(beside).collect()
+    };
+    new.frame(&id, None, files, || {
         let made = simulator.make(set, key)?;
         if made.frame.cloud.is_empty() {
             let message = "would be empty: no shot has a return within the crop; check rig, effects and crop_m";
@@ -148,11 +162,11 @@ fn make_frame_file(
         if config.attributes {
             write_atomic(&beside, &attributes::encode(&made.scan))?;
         }
-        if let Some(path) = truth {
-            write_kitti_text(&path, &label_boxes(&made.with_true_boxes()))?;
+        if let Some(path) = &truth {
+            write_kitti_text(path, &label_boxes(&made.with_true_boxes()))?;
         }
-        new.layout().write_frame(new.root(), &made.frame)?;
-    }
+        Ok::<(), SimulateError>(layout.write_frame(root, &made.frame)?)
+    })?;
     let [points, cars] = new.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
 }

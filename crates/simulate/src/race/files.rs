@@ -75,8 +75,7 @@ impl ConfigFiles {
 }
 
 fn read(path: &Path) -> Result<String, SimulateError> {
-    let bytes = fs_err::read(path)?;
-    Ok(String::from_utf8(bytes).map_err(|_| DataError::file(path, "is not text"))?)
+    Ok(data::limits::read_text(path)?)
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! Vehicle trajectories: states from a file or a model, with smooth interpolation.
 
 use data::DataError;
+use data::limits::{MOST_TEXT_BYTES, read_file};
 use geometry::Pose;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -152,7 +153,7 @@ impl Trajectory {
 
     /// Reads a CSV with the columns of [`CarState`].
     pub fn read(path: &Path) -> Result<Trajectory, DataError> {
-        let bytes = fs_err::read(path)?;
+        let bytes = read_file(path, MOST_TEXT_BYTES)?;
         let mut reader =
             csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(bytes.as_slice());
         let headers = reader.headers().map_err(|e| DataError::line(path, 1, e.to_string()))?.clone();

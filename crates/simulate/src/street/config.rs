@@ -103,7 +103,7 @@ mod tests {
         let path = folder.path().join("road.toml");
         for (text, want) in [
             ("seed = 1\ncolour = 2\n", "road.toml:2: unknown field `colour`"),
-            ("[frames]\ntrain = \"many\"\n", "road.toml:2: invalid type"),
+            ("[frames]\ntrain = \"many\"\n", "road.toml:2: frames.train: invalid type"),
             ("[frames]\nval = 0\n", "frames.val: 0 is not between"),
             ("[sensor]\nrange_noise_m = -1.0\n", "sensor.range_noise_m: -1 is not between"),
             ("[sensor]\nazimuth_step_deg = nan\n", "sensor.azimuth_step_deg"),

@@ -32,6 +32,9 @@ pub struct Manifest {
     pub config: RoadConfig,
     /// Counts by split.
     pub splits: BTreeMap<String, SplitCounts>,
+    /// SHA-256 of `frames.jsonl`, which has those of the files of each frame.
+    #[serde(default)]
+    pub frames_sha256: String,
 }
 
 impl data::Manifest for Manifest {
@@ -43,6 +46,10 @@ impl data::Manifest for Manifest {
 
     fn set_complete(&mut self, complete: bool) {
         self.complete = complete;
+    }
+
+    fn set_frames_sha256(&mut self, sha256: String) {
+        self.frames_sha256 = sha256;
     }
 }
 
@@ -110,6 +117,7 @@ pub fn make_road_dataset(
         config_sha256: config_sha256(config),
         config: config.clone(),
         splits: BTreeMap::new(),
+        frames_sha256: String::new(),
     };
     let set = NewDataset::begin(out, Layout::Kitti, &[], &mut manifest)?;
     let splits = config.frames.splits();
@@ -121,11 +129,12 @@ pub fn make_road_dataset(
         Ok::<_, SimulateError>((*split, make_frame_file(config, &set, split, *index)?))
     })?;
     manifest.splits = SplitCounts::of_splits(counts);
-    set.finish(&mut manifest)?;
+    let ids: Vec<String> = frames.iter().map(|(split, index)| frame_id(split, *index)).collect();
+    set.finish(&mut manifest, &ids)?;
     Ok(manifest)
 }
 
-/// Writes one frame unless it exists; returns its counts.
+/// Writes one frame unless it is there; returns its counts.
 fn make_frame_file(
     config: &RoadConfig,
     set: &NewDataset,
@@ -133,9 +142,9 @@ fn make_frame_file(
     index: usize,
 ) -> Result<SplitCounts, SimulateError> {
     let id = frame_id(split, index);
-    if !set.has_frame(&id, true) {
-        set.layout().write_frame(set.root(), &make_road_frame(config, split, index))?;
-    }
+    let (layout, root) = (set.layout(), set.root());
+    let files = || vec![layout.cloud_path(root, &id), layout.labels_path(root, &id)];
+    set.frame(&id, None, files, || layout.write_frame(root, &make_road_frame(config, split, index)))?;
     let [points, cars] = set.count(&id, PointColumns::Xyzi)?;
     Ok(SplitCounts { frames: 1, cars, points })
 }

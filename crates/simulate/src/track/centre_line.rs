@@ -1,10 +1,14 @@
 //! The centre line of a closed track: a table of points, and a smooth curve through them.
 
 use data::DataError;
+use data::limits::{MOST_TEXT_BYTES, read_file};
 use serde::Deserialize;
 use std::f64::consts::TAU;
 use std::fmt::Write as _;
 use std::path::Path;
+
+/// Length of a lap, m. The Nordschleife has 21 km.
+pub const MOST_LAP_M: f64 = 100_000.0;
 
 /// A point of the table, in the world frame: x east, y north, z up, m.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
@@ -88,6 +92,9 @@ impl CentreLine {
             way_m.push(way_m[i] + step);
         }
         let lap = way_m[points.len()];
+        if lap > MOST_LAP_M {
+            return Err(wrong(None, format!("is {lap:.0} m long; at most {MOST_LAP_M} m are supported")));
+        }
         let closing = lap - way_m[points.len() - 1];
         if closing > 20.0 * lap / points.len() as f64 {
             return Err(wrong(None, format!("is not closed: {closing:.1} m lie between its last and its first point")));
@@ -98,7 +105,7 @@ impl CentreLine {
     /// Reads a CSV with the columns `x_m, y_m, z_m, bank_deg, width_left_m, width_right_m`; `z_m` and `bank_deg` are
     /// optional.
     pub fn read(path: &Path) -> Result<CentreLine, DataError> {
-        let bytes = fs_err::read(path)?;
+        let bytes = read_file(path, MOST_TEXT_BYTES)?;
         let mut reader =
             csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(bytes.as_slice());
         let headers = reader.headers().map_err(|e| DataError::line(path, 1, e.to_string()))?.clone();

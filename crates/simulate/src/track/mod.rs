@@ -6,7 +6,7 @@ mod roadside;
 mod stands;
 mod surface;
 
-pub use centre_line::{CentreLine, CentrePoint, Station};
+pub use centre_line::{CentreLine, CentrePoint, MOST_LAP_M, Station};
 pub use oval::las_vegas;
 
 use crate::mesh::Mesh;

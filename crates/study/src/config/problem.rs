@@ -1,6 +1,7 @@
 //! Validation of a study.
 
 use super::{Source, StudyConfig};
+use data::limits::check_name;
 use eval::distance::Compared;
 use std::collections::BTreeSet;
 
@@ -14,7 +15,7 @@ impl StudyConfig {
             ("variant", self.variants.iter().map(|v| v.name.as_str()).collect()),
         ];
         if !is_name(&self.name) {
-            return Some(format!("name {:?} has to be a file name", self.name));
+            return Some(format!("name {:?} has to be a file name of letters, digits, '-', '_' and '.'", self.name));
         }
         for (what, names) in &names {
             if names.is_empty() && *what == "dataset" {
@@ -102,5 +103,5 @@ impl StudyConfig {
 
 fn is_name(name: &str) -> bool {
     let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-    !name.is_empty() && !name.starts_with('.') && name.chars().all(plain)
+    check_name(name).is_ok() && name.chars().all(plain)
 }

@@ -47,6 +47,7 @@ pub fn detect_frozen(study: &Study, name: &str, device: &Device, workers: usize,
         return Err(refused(format!("frozen {name} has no checkpoint; its detections are given")));
     };
     let (path, config) = (study.path(checkpoint), config(study, frozen)?);
+    train::verify_weights(&path)?;
     let weights = read_checkpoint(&path)?;
     let detector = Detector::new(&config, 0, device)
         .load_named(&weights)

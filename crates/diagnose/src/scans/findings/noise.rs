@@ -1,19 +1,15 @@
 //! Noise of the range, over range and incidence.
 
-use super::{Named, others, parameter, patches};
+use super::{Named, parameter, patches};
 use crate::catalogue::{Cause, Channel, Covariate, Hypothesis, NoiseForm, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Finding};
-use crate::scans::scatter::{self, Free, NoiseFit, ScatterSums};
+use crate::scans::scatter::{self, Free, NoiseFit, Pooled, ScatterSums, SortedBins};
 use crate::scans::{Seen, draws, gain_of, interval};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
 
 /// Fewest bins of range and incidence that a law is fitted to.
 const FEWEST_BINS: usize = 4;
-
-/// Bins of range and incidence: mean range, mean lever, samples, standard deviation.
-type Bins = BTreeMap<(i32, i32), [f64; 4]>;
 
 /// Forms of a noise law, of growing freedom.
 const FORMS: [(NoiseForm, Free); 4] = [
@@ -33,38 +29,32 @@ pub(super) fn noise_found(seen: &Seen, step_m: f64, notes: &mut Vec<String>) -> 
     };
     let scans: Vec<ScatterSums> = (0..n).into_par_iter().map(of_scan).collect();
     let every: Vec<usize> = (0..n).collect();
-    if bins(&scans, &every).len() < FEWEST_BINS {
+    let sorted = SortedBins::new(&scans);
+    if sorted.pooled(&every).len() < FEWEST_BINS {
         return (vec![], vec![]);
     }
-    let forms = Forms::new(scans);
+    let forms = Forms::new(&scans, sorted);
     let chosen = forms.choose(notes);
     (forms.findings(chosen, step_m), forms.considered(chosen))
 }
 
-/// Bins over some scans.
-fn bins(scans: &[ScatterSums], which: &[usize]) -> Bins {
-    scatter::pooled(&which.iter().map(|&s| &scans[s]).collect::<Vec<_>>())
-}
-
 /// Scans with the likelihoods of the forms.
-struct Forms {
-    scans: Vec<ScatterSums>,
+struct Forms<'a> {
+    scans: &'a [ScatterSums],
+    sorted: SortedBins<'a>,
     /// By form and scan: log likelihood of the scan under a fit on the other scans, nats, and samples.
     likelihoods: Vec<Vec<[f64; 2]>>,
 }
 
-impl Forms {
-    fn new(scans: Vec<ScatterSums>) -> Self {
-        let n = scans.len();
+impl<'a> Forms<'a> {
+    fn new(scans: &'a [ScatterSums], sorted: SortedBins<'a>) -> Self {
+        let rest = sorted.pooled_but_each();
         let of_form = |(_, free): &(NoiseForm, Free)| {
-            let of = |s: usize| {
-                let rest = bins(&scans, &others(n, s).collect::<Vec<_>>());
-                scatter::likelihood(&scans[s], &scatter::fit(&rest, *free))
-            };
-            (0..n).map(of).collect()
+            let of = |s: usize| scatter::likelihood(&scans[s], &scatter::fit(&rest[s], *free));
+            (0..scans.len()).map(of).collect()
         };
         let likelihoods = FORMS.par_iter().map(of_form).collect();
-        Forms { scans, likelihoods }
+        Forms { scans, sorted, likelihoods }
     }
 
     fn every(&self) -> Vec<usize> {
@@ -121,10 +111,10 @@ impl Forms {
     /// Findings of the chosen form: noise of the range, and noise at grazing incidence where the form has it.
     fn findings(&self, chosen: usize, step_m: f64) -> Vec<Finding> {
         let free = FORMS[chosen].1;
-        let table = bins(&self.scans, &self.every());
+        let table = self.sorted.pooled(&self.every());
         let fitted = scatter::fit(&table, free);
         let drawn: Vec<NoiseFit> =
-            draws(self.scans.len()).par_iter().map(|d| scatter::fit(&bins(&self.scans, d), free)).collect();
+            draws(self.scans.len()).par_iter().map(|d| scatter::fit(&self.sorted.pooled(d), free)).collect();
         let ci = |f: fn(&NoiseFit) -> f64| interval(drawn.iter().map(f).collect());
         let ideal = NoiseFit { std_m: step_m / 12f64.sqrt(), per_m: 0.0, angle_rad: 0.0 };
         let against_ideal: Vec<[f64; 2]> = (0..self.scans.len())
@@ -170,7 +160,7 @@ impl Forms {
 
 /// Standard deviation along the ray, by the angle of incidence or by range: measured, of an ideal sensor, and fitted.
 /// Range is shown on surfaces near normal incidence, where there are enough.
-fn curve(table: &Bins, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
+fn curve(table: &Pooled, fitted: &NoiseFit, ideal: &NoiseFit, by_angle: bool) -> Curve {
     let row = |[r, l, m, sd]: &[f64; 4]| {
         let x = if by_angle { (l / r).atan().to_degrees() } else { *r };
         [x, *m, *sd, fitted.variance(*r, *l).sqrt(), ideal.std_m]

@@ -1,0 +1,72 @@
+//! SHA-256 of files.
+
+use crate::DataError;
+use crate::limits::length_of_file;
+use fs_err::File;
+use sha2::{Digest, Sha256};
+use std::io::Read as _;
+use std::path::Path;
+
+/// A hash in hexadecimal.
+pub fn hex(digest: &[u8]) -> String {
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// SHA-256 of a file in hexadecimal. The file is read in pieces.
+///
+/// # Errors
+/// A file that cannot be read, or is no regular file.
+pub fn file_sha256(path: &Path) -> Result<String, DataError> {
+    let mut hash = Sha256::new();
+    add_file(&mut hash, path)?;
+    Ok(hex(&hash.finalize()))
+}
+
+/// SHA-256 over several files, in hexadecimal. A file that does not exist counts as such.
+///
+/// # Errors
+/// As [`file_sha256`].
+pub fn files_sha256<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Result<String, DataError> {
+    let mut hash = Sha256::new();
+    for path in paths {
+        let path = path.as_ref();
+        if path.exists() {
+            hash.update(length_of_file(path, u64::MAX)?.to_le_bytes());
+            add_file(&mut hash, path)?;
+        } else {
+            hash.update(u64::MAX.to_le_bytes());
+        }
+    }
+    Ok(hex(&hash.finalize()))
+}
+
+fn add_file(hash: &mut Sha256, path: &Path) -> Result<(), DataError> {
+    length_of_file(path, u64::MAX)?;
+    let mut file = File::open(path)?;
+    let mut piece = vec![0; 1 << 18];
+    loop {
+        match file.read(&mut piece)? {
+            0 => return Ok(()),
+            n => hash.update(&piece[..n]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hashes_of_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        std::fs::write(path("a"), "abc").unwrap();
+        let want = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad";
+        assert_eq!(file_sha256(&path("a")).unwrap(), want);
+        std::fs::write(path("b"), vec![7; 600_000]).unwrap();
+        let of = |names: &[&str]| files_sha256(names.iter().map(|n| path(n))).unwrap();
+        assert_ne!(of(&["a", "b"]), of(&["b", "a"]));
+        assert_ne!(of(&["a", "missing"]), of(&["a"]));
+        assert!(file_sha256(&path("missing")).is_err() && file_sha256(folder.path()).is_err());
+    }
+}
