@@ -79,7 +79,16 @@ impl NoiseLaw {
 pub struct NoiseTable {
     cells: Vec<RoughCell>,
     used: Vec<bool>,
+    /// Smallest variance of a cell, m2.
+    least_m2: f64,
 }
+
+/// Smallest variance of a cell for fits, m2.
+const LEAST_M2: f64 = 1e-8;
+
+/// Smallest variance of a cell in distances between the sides, m2: (2 mm)^2. No LiDAR measures finer. Where the
+/// simulated returns of a surface repeat exactly, the likelihood would have no bound.
+const LEAST_IN_DISTANCES_M2: f64 = 4e-6;
 
 /// Fewest returns of either side in a cell.
 const FEWEST: f64 = 40.0;
@@ -93,12 +102,17 @@ impl NoiseTable {
         let enough =
             |c: &RoughCell| c.measured.n >= FEWEST && c.simulated.n >= FEWEST && c.simulated.mean().1 > least_cos;
         let used = cells.iter().map(enough).collect();
-        NoiseTable { cells, used }
+        NoiseTable { cells, used, least_m2: LEAST_M2 }
+    }
+
+    /// From the sums over some frames, for distances between the sides.
+    pub fn for_distances(cells: Vec<RoughCell>) -> Self {
+        NoiseTable { least_m2: LEAST_IN_DISTANCES_M2, ..NoiseTable::new(cells, 0.0) }
     }
 
     /// Variances of a cell, measured and simulated, m2; `None` where there are too few returns.
     pub fn variances(&self, cell: usize) -> Option<[f64; 2]> {
-        self.used[cell].then(|| self.cells[cell].variances().map(|v| v.max(1e-8)))
+        self.used[cell].then(|| self.cells[cell].variances().map(|v| v.max(self.least_m2)))
     }
 
     /// Linear sums of one frame: differences of the two sides' mean squares over the laws.
@@ -158,5 +172,28 @@ impl NoiseTable {
                 Some((range, cos, self.cells[i].measured.n, v))
             })
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::channels::cells::Place;
+
+    #[test]
+    fn returns_that_repeat_exactly_are_no_boundless_distance() {
+        let place = Place { n: 100.0, ..Place::default() };
+        let cell = RoughCell {
+            measured: place,
+            measured_squares: 100.0 * 0.02f64.powi(2),
+            simulated: place,
+            simulated_squares: 0.0,
+        };
+        let mut cells = vec![RoughCell::default(); CELLS];
+        cells[0] = cell;
+        let table = NoiseTable::for_distances(cells);
+        // A hundred times the smallest variance, with half of the returns counted.
+        let nats = table.likelihood(&vec![(0, cell)], &[]);
+        assert!((nats + 0.5 * 50.0 * (LEAST_IN_DISTANCES_M2.ln() + 100.0)).abs() < 1e-6, "{nats}");
     }
 }

@@ -48,7 +48,7 @@ pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let scales = scales(context.frames);
     let rough = rough_frames(context.frames, &scales);
-    let table = |frames: &[usize]| NoiseTable::new(total(frames.iter().map(|&i| &rough[i])), 0.0);
+    let table = |frames: &[usize]| NoiseTable::for_distances(total(frames.iter().map(|&i| &rough[i])));
     let (on_train, on_test) = (table(train), table(test));
     let gain = |i: &usize| on_test.likelihood_by_table(&rough[*i], &on_train) - on_test.likelihood(&rough[*i], &[]);
     test.iter().map(gain).collect()
