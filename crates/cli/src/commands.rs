@@ -61,3 +61,11 @@ macro_rules! commands {
         }
     };
 }
+
+/// The command as it was called.
+pub fn called() -> String {
+    std::iter::once("lidarshift".to_string())
+        .chain(std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()))
+        .collect::<Vec<_>>()
+        .join(" ")
+}

@@ -119,7 +119,8 @@ impl CompareArgs {
         if let Some(path) = &self.json {
             write_json(path, &comparison)?;
         }
-        let report = ComparisonReport { comparison: &comparison, command: command(), facts: self.facts(&names) };
+        let report =
+            ComparisonReport { comparison: &comparison, command: crate::commands::called(), facts: self.facts(&names) };
         report.write(&self.out)?;
         print_ranks(&comparison, &self.out);
         Ok(())
@@ -224,14 +225,6 @@ impl CompareArgs {
         facts.push(("intervals".into(), text));
         facts
     }
-}
-
-/// The command as it was called.
-fn command() -> String {
-    std::iter::once("lidarshift".to_string())
-        .chain(std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()))
-        .collect::<Vec<_>>()
-        .join(" ")
 }
 
 fn print_ranks(comparison: &Comparison, out: &Path) {

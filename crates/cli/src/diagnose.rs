@@ -4,7 +4,7 @@ mod detectors;
 mod previous;
 mod simulator;
 
-use crate::commands::End;
+use crate::commands::{End, called};
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -17,7 +17,7 @@ use diagnose::{
     diagnose_scans, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
-use report::{finding_name, write_finding_pictures};
+use report::{DiagnosisReport, finding_name, write_finding_pictures};
 use sensor::EffectList;
 use simulate::race::RaceConfig;
 use simulator::RaceSimulator;
@@ -63,8 +63,8 @@ pub struct DiagnoseArgs {
     /// Use only the frames of this split [default: all frames that both data sets have]
     #[arg(long, value_name = "NAME")]
     split: Option<String>,
-    /// Folder for diagnosis.json, extended.toml, a figure per finding and, if labels are wrong, corrected labels in
-    /// label_2/
+    /// Folder for report.html, diagnosis.json, extended.toml, a figure per finding and, if labels are wrong, corrected
+    /// labels in label_2/
     #[arg(long, value_name = "DIR", default_value = "runs/diagnosis")]
     out: PathBuf,
     /// Also train the detectors of this study, with its seeds and epochs, on measured, simulated and extended data, and
@@ -123,6 +123,7 @@ impl DiagnoseArgs {
         self.write_json(&outcome.diagnosis)?;
         write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
+        self.write_page(&outcome.diagnosis)?;
         for (id, boxes) in &outcome.corrected {
             for (ending, boxes) in REPAIRED_ENDINGS.iter().zip(boxes) {
                 write_labels(&self.out.join(format!("{}{ending}", previous::LABELS)), &measured, id, boxes)?;
@@ -139,6 +140,7 @@ impl DiagnoseArgs {
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
             self.write_json(&outcome.diagnosis)?;
+            self.write_page(&outcome.diagnosis)?;
         }
         Ok(end_of(&outcome.diagnosis))
     }
@@ -246,6 +248,13 @@ impl DiagnoseArgs {
         Ok(())
     }
 
+    fn write_page(&self, diagnosis: &Diagnosis) -> Result<()> {
+        let sets = [&self.measured, &self.simulated, &self.scans].into_iter().flatten();
+        let names: Vec<String> = sets.map(|path| path.display().to_string()).collect();
+        let report = DiagnosisReport { diagnosis, title: names.join(" against "), command: called() };
+        Ok(report.write(&self.out)?)
+    }
+
     fn rig(&self) -> Result<Rig> {
         match (&self.sensor, &self.simulator) {
             (Some(path), _) => Ok(Rig::read(path)?),
@@ -303,7 +312,7 @@ fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
     if corrected > 0 {
         outln!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());
     }
-    errln!("diagnosis.json and extended.toml written to {}", out.display());
+    errln!("report.html, diagnosis.json and extended.toml written to {}", out.display());
 }
 
 /// What is gone with a list of effects, by channel, and what could not be applied.

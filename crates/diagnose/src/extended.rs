@@ -70,6 +70,16 @@ fn comments(f: &Finding) -> Vec<String> {
     lines
 }
 
+/// What has to be changed in the simulation for a finding, in a sentence.
+pub fn what_to_change(finding: &Finding) -> String {
+    let mut kinds: Vec<&str> = finding.effects.iter().map(sensor::Effect::kind).collect();
+    kinds.dedup();
+    match kinds.is_empty() {
+        true => why_none(finding),
+        false => format!("Apply {} of extended.toml.", kinds.join(", ")),
+    }
+}
+
 /// Why no effect stands for a finding.
 pub(crate) fn why_none(f: &Finding) -> String {
     let negative = [Quantity::StdM, Quantity::StdDeg, Quantity::Share].into_iter().find_map(|quantity| {

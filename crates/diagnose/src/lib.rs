@@ -22,11 +22,13 @@ pub mod search;
 
 pub use catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
 pub use curve::{Curve, CurvePoint};
-pub use diagnosis::{DetectorGain, Diagnosis, Finding, FindingGain, Gain, SCHEMA, Status, Verdict};
+pub use diagnosis::{
+    Considered, DetectorGain, Diagnosis, Finding, FindingGain, Gain, Minimum, Parameter, SCHEMA, Status, Verdict,
+};
 pub use engine::{
     OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
 };
 pub use error::DiagnoseError;
-pub use extended::extended_toml;
+pub use extended::{extended_toml, what_to_change};
 pub use scans::diagnose_scans;
 pub use sensor::Rig;

@@ -19,7 +19,7 @@ pub use birds_eye::{BirdsEyeOptions, Style, birds_eye_png, birds_eye_svg};
 pub use curve::{CurveOptions, Series, curve_svg};
 pub use figure::*;
 pub use pages::comparison::ComparisonReport;
-pub use pages::diagnosis::{finding_name, write_finding_pictures};
+pub use pages::diagnosis::{DiagnosisReport, finding_name, write_finding_pictures};
 pub use pages::study::{FrechetRow, ReportFiles, StudyReport, TrainingRun, read_training_run};
 pub use scene::{Layer, LayerContent, Scene};
 

@@ -32,7 +32,8 @@ pub(super) fn remove(out: &Path) -> Result<(), DataError> {
         std::fs::remove_dir(folder).ok();
     }
     let is_figure = |name: &str| name.starts_with("finding-") && (name.ends_with(".svg") || name.ends_with(".png"));
-    let is_list = |name: &str| matches!(name, "extended.toml" | "extended_detectors.toml" | "verification.json");
+    let is_list =
+        |name: &str| matches!(name, "extended.toml" | "extended_detectors.toml" | "verification.json" | "report.html");
     remove_files(out, |name| is_figure(name) || is_list(name))?;
     Ok(fs_err::remove_file(out.join(MARK))?)
 }
@@ -54,13 +55,14 @@ mod tests {
     #[test]
     fn known_files_are_removed_and_others_stay() {
         let folder = tempfile::tempdir().unwrap();
-        let own = ["finding-1-rain.svg", "extended.toml", "label_2/a.txt", "label_2_low/a.txt", "diagnosis.json"];
+        let labels = ["label_2/a.txt", "label_2_low/a.txt"];
+        let own = ["finding-1-rain.svg", "extended.toml", "report.html", labels[0], labels[1], "diagnosis.json"];
         let others = ["thesis.txt", "finding-2.txt", "label_2/notes.md", "detectors/study.toml"];
         let write = |name: &&str| data::write_atomic(&folder.path().join(name), b"").unwrap();
-        own[..4].iter().chain(&others).for_each(write);
+        own[..5].iter().chain(&others).for_each(write);
         remove(folder.path()).unwrap();
-        assert!(own[..4].iter().all(|name| folder.path().join(name).exists()), "without a diagnosis");
-        write(&own[4]);
+        assert!(own[..5].iter().all(|name| folder.path().join(name).exists()), "without a diagnosis");
+        write(&own[5]);
         remove(folder.path()).unwrap();
         assert!(own.iter().all(|name| !folder.path().join(name).exists()));
         assert!(others.iter().all(|name| folder.path().join(name).exists()));

@@ -3,6 +3,7 @@
 use super::{Family, identifiers};
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
+use std::fmt;
 
 identifiers! {
     /// A cause of a difference between measured and simulated data.
@@ -146,9 +147,15 @@ impl From<Cause> for Hypothesis {
 
 impl Serialize for Hypothesis {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+impl fmt::Display for Hypothesis {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
         match self.form {
-            None => serializer.serialize_str(self.cause.name()),
-            Some(form) => serializer.collect_str(&format_args!("{}, {form}", self.cause)),
+            None => f.write_str(self.cause.name()),
+            Some(form) => write!(f, "{}, {form}", self.cause),
         }
     }
 }

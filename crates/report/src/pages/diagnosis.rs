@@ -1,4 +1,9 @@
-//! One figure per finding: measured and simulated values over the covariate, with and without the finding.
+//! One figure per finding: measured and simulated values over the covariate, with and without the finding; and the page
+//! of a diagnosis.
+
+mod page;
+
+pub use page::DiagnosisReport;
 
 use crate::{CurveOptions, Figure, ReportError, Series};
 use data::write_atomic;
@@ -63,11 +68,11 @@ mod tests {
     use super::*;
     use diagnose::{Channel, Covariate, Curve, CurvePoint, Family, FindingGain};
 
-    #[test]
-    fn a_picture_shows_before_and_after_by_sensor() {
+    /// An unexplained loss by row, of two sensors.
+    pub(super) fn loss_by_row() -> Finding {
         let point =
             |sensor: usize, x: f64| CurvePoint { sensor, x, measured: 0.8, before: 1.0, after: 0.79, error: 0.01 };
-        let finding = Finding {
+        Finding {
             status: Status::Unexplained,
             cause: None,
             candidates: None,
@@ -88,8 +93,12 @@ mod tests {
                 points: vec![point(0, 0.0), point(0, 5.0), point(1, 0.0), point(1, 5.0)],
             },
             effects: vec![],
-        };
-        let svg = figure(&finding).svg();
+        }
+    }
+
+    #[test]
+    fn a_picture_shows_before_and_after_by_sensor() {
+        let svg = figure(&loss_by_row()).svg();
         for words in [
             "measured, sensor 0",
             "measured, sensor 1",
