@@ -112,7 +112,7 @@ mod tests {
         let folder = folder();
         let list = folder.path().join("val.txt");
         for (text, message) in [
-            ("a\n../b\n", "val.txt:2: frame id \"../b\" is not a file name"),
+            ("a\n../b\n", "val.txt:2: frame id \"../b\" is not a name for a file"),
             ("a\n\nb\na\n", "val.txt:4: frame id \"a\" is there twice"),
             (" \n", "val.txt: names no frame"),
         ] {

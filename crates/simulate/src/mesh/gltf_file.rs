@@ -140,7 +140,10 @@ mod tests {
     fn counts_are_compared_before_values_are_read() {
         let text = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0]}],"nodes":[{"mesh":0}],
             "meshes":[{"primitives":[{"attributes":{"POSITION":0}}]}],
-            "accessors":[{"componentType":5126,"count":4000000000,"type":"VEC3","min":[0,0,0],"max":[1,1,1]}]}"#;
+            "buffers":[{"byteLength":12,"uri":"data:application/octet-stream;base64,AAAAAAAAAAAAAAAA"}],
+            "bufferViews":[{"buffer":0,"byteLength":12}],
+            "accessors":[{"bufferView":0,"componentType":5126,"count":4000000000,"type":"VEC3","min":[0,0,0],
+            "max":[1,1,1]}]}"#;
         let error = error_of(text);
         assert!(error.contains("accessors[0].count = 4000000000: at most 20000000"), "{error}");
     }

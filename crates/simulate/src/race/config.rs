@@ -251,7 +251,7 @@ fn check_name(key: &str, name: &str) -> Result<(), KeyError> {
     let plain = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
     data::limits::check_name(name).map_err(|message| wrong(key, message))?;
     if !name.chars().all(plain) {
-        return Err(wrong(key, format!("{name:?} is no name of a folder: letters, digits, _ and - only")));
+        return Err(wrong(key, format!("{name:?} is not a name for a file or folder: letters, digits, _ and - only")));
     }
     Ok(())
 }
@@ -281,7 +281,7 @@ mod tests {
         for (from, to, want) in [
             ("frames = 100", "frames = 3", "c.toml:3: frames: 3 are not between 18"),
             ("frames = 100", "frames = 99999", "c.toml:3: frames: 99999"),
-            ("name = \"r\"", "name = \"../r\"", "c.toml:1: name: \"../r\" is no name of a folder"),
+            ("name = \"r\"", "name = \"../r\"", "c.toml:1: name: \"../r\" is not a name for a file or folder"),
             ("name = \"b\"", "name = \"a\"", "c.toml:7: dataset[1].name: \"a\" is there twice"),
             ("from = \"a\"", "from = \"c\"", "c.toml:8: dataset[1].from: \"c\" is no data set"),
             ("from = \"a\"", "sensor_of = \"c\"", "c.toml:8: dataset[1].sensor_of: \"c\" is no data set"),

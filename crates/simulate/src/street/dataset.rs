@@ -210,7 +210,8 @@ mod tests {
         assert_eq!(make(&small(3), &resumed, 2).unwrap(), manifest);
         assert_eq!(files(&one), files(&four));
         assert_eq!(files(&one), files(&resumed));
-        assert_eq!(files(&one).len(), 2 * 8 + 3 + 2);
+        // Clouds and labels, splits, dataset.toml, manifest.json and frames.jsonl.
+        assert_eq!(files(&one).len(), 2 * 8 + 3 + 3);
         assert!(manifest.complete && manifest.splits["train"].frames == 4 && manifest.splits["test"].cars > 0);
 
         let mut clouds: Vec<_> =
