@@ -9,7 +9,7 @@ pub use self::by_table::by_table;
 use self::describe::found;
 use super::unexplained::{Unexplained, mean_by_group};
 use super::{
-    ChannelResult, Context, Found, Selected, Z_STAR, causes_of, confidence, first_demands, record,
+    ChannelResult, Context, Found, Selected, UNEXPLAINED_SHARE, Z_STAR, causes_of, confidence, first_demands, record,
     rivals_and_confidence, trimmed,
 };
 use crate::catalogue::{Cause, Channel, Quantity};
@@ -41,9 +41,6 @@ const MATERIAL_SHARE: f64 = 0.75;
 
 /// Smallest gain of a second law, as a share of the gain of the first.
 const SECOND_LAW_SHARE: f64 = 0.04;
-
-/// Smallest gain of a table by direction on top of a law, as a share of the gain of the law.
-const UNEXPLAINED_SHARE: f64 = 0.02;
 
 /// Share of its gain by which a richer law must exceed the simpler one to be reported beside it: the form of a law is
 /// never exactly that of the sensor.

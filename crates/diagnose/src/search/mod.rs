@@ -152,6 +152,10 @@ pub fn first_demands() -> Demands {
     Demands { z: Z_STAR, nats: 8.0, slack: 0.02, richer: 0.02 }
 }
 
+/// Smallest gain of a table by direction on top of laws, as a share of their gain: the form of a law is never exactly
+/// that of the sensor, and what it leaves depends on direction as ranges and angles of incidence do.
+pub const UNEXPLAINED_SHARE: f64 = 0.02;
+
 /// Share of groups, those with the largest offsets, that are left out of the spread. Rows: a single row may follow
 /// the upper edge of a wall, which every shift of the wall displaces.
 pub fn trimmed(grouping: Grouping) -> f64 {

@@ -7,7 +7,7 @@ use crate::inference::choice::{Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::GroupFit;
 use crate::inference::linear::{LinearFrame, cross_gains};
 use crate::inference::noise::{NOISE_LAWS, NoiseLaw};
-use crate::search::{ChannelResult, Selected, causes_of, confidence, record, rivals_and_confidence};
+use crate::search::{ChannelResult, Selected, UNEXPLAINED_SHARE, causes_of, confidence, record, rivals_and_confidence};
 
 /// Share of the first law's gain by which a pair of range noise and angular jitter must exceed a law of the signal.
 const PAIR_SHARE: f64 = 0.003;
@@ -137,8 +137,10 @@ impl Search<'_> {
         let terms: Vec<Term> =
             selection.laws.iter().zip(so_far.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)).collect();
         let tables = self.direction_trials(&terms, GroupFit { centred: true, ..super::directions::GROUPED });
-        let remains = choose(&tables, &self.demands);
-        self.record(result, &tables, remains.as_ref(), &self.demands);
+        let (by_laws, _) = total_and_z(&self.trial(&selection.laws, None).gains);
+        let demands = Demands { nats: (UNEXPLAINED_SHARE * by_laws).max(self.demands.nats), ..self.demands };
+        let remains = choose(&tables, &demands);
+        self.record(result, &tables, remains.as_ref(), &demands);
         if let Some(remains) = remains {
             selection.unexplained = Some(self.table_by_direction(&tables, remains.chosen));
             selection.selected.clear();
