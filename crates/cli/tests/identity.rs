@@ -3,7 +3,7 @@
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, output_text, run};
+use program::{data_set, must, output_text, run, small_study};
 use std::fs;
 use std::path::Path;
 
@@ -122,24 +122,7 @@ fn a_study_that_was_moved_is_still_done() {
     let home = dir.path().join("home");
     fs::create_dir(&home).unwrap();
     data_set(&home);
-    let study = r#"
-name = "small"
-about = ["A test."]
-seeds = [1]
-epochs = 1
-splits = { test = "val" }
-[[dataset]]
-name = "plain"
-source = { path = "." }
-[[dataset]]
-name = "noisy"
-source = { resim = { of = "plain", effects = "noise.toml" } }
-[[detector]]
-name = "tiny"
-config = "tiny.toml"
-"#;
-    fs::write(home.join("noise.toml"), "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n").unwrap();
-    fs::write(home.join("study.toml"), study).unwrap();
+    small_study(&home, "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n");
     must(&home, "study study.toml --out runs/small --only data,train,detect");
     let is_done = |folder: &Path, named: &str| {
         let text = output_text(&must(folder, &format!("study status {named}")));
@@ -155,7 +138,7 @@ config = "tiny.toml"
     fs::rename(home.join("runs/small"), dir.path().join("moved")).unwrap();
     is_done(dir.path(), "moved");
     // Nothing is trained again, and nothing is lost.
-    let weights = dir.path().join("moved/tiny/noisy/seed-1/checkpoint/last.safetensors");
+    let weights = dir.path().join("moved/tiny/changed/seed-1/checkpoint/last.safetensors");
     let written = fs::metadata(&weights).unwrap().modified().unwrap();
     must(dir.path(), "study moved --only data,train,detect");
     assert_eq!(fs::metadata(&weights).unwrap().modified().unwrap(), written);

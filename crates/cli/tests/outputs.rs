@@ -5,7 +5,7 @@
 mod program;
 
 use data::FolderLock;
-use program::{data_set, must, output_text, program, run};
+use program::{data_set, must, output_text, program, run, small_study};
 use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt as _;
@@ -238,27 +238,10 @@ fn names_that_are_not_utf_8() {
 fn a_dry_run_writes_no_data() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
-    let text = r#"
-        name = "tiny"
-        about = []
-        seeds = [1]
-        epochs = 1
-        splits = { test = "val" }
-        [[dataset]]
-        name = "plain"
-        source = { path = "." }
-        [[dataset]]
-        name = "copy"
-        source = { resim = { of = "plain", effects = "none.toml" } }
-        [[detector]]
-        name = "tiny"
-        config = "tiny.toml"
-    "#;
-    fs::write(dir.path().join("tiny-study.toml"), text).unwrap();
-    fs::write(dir.path().join("none.toml"), "").unwrap();
-    let study = |more: &str| output_text(&must(dir.path(), &format!("study tiny-study.toml {more}")));
+    small_study(dir.path(), "");
+    let study = |more: &str| output_text(&must(dir.path(), &format!("study study.toml {more}")));
     let before = study("--dry-run");
-    assert!(before.contains("would be generated: copy") && before.contains("2 runs"), "{before}");
+    assert!(before.contains("would be generated: changed") && before.contains("2 runs"), "{before}");
     assert!(!dir.path().join("runs").exists());
     study("--only data");
     let files = || {
@@ -268,5 +251,5 @@ fn a_dry_run_writes_no_data() {
     let made = files();
     let after = study("--dry-run");
     assert!(after.contains("2 runs, ") && after.contains("about"), "{after}");
-    assert_eq!(files().replace("runs/tiny/costs.json\n", ""), made);
+    assert_eq!(files().replace("runs/small/costs.json\n", ""), made);
 }

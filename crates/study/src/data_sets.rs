@@ -4,6 +4,7 @@ use crate::config::{Source, StudyDataset};
 use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
+use data::checksum::hex;
 use data::write::write_dataset_toml;
 use data::{Dataset, DatasetConfig};
 use sensor::{EffectList, Rig};
@@ -11,7 +12,6 @@ use sha2::{Digest, Sha256};
 use simulate::race::{RaceConfig, make_race_datasets};
 use simulate::resim::Resim;
 use simulate::{Scenery, make_road_dataset};
-use std::path::Path;
 
 /// Generates the missing data sets in the order of the study, and completes unfinished ones.
 ///
@@ -133,7 +133,7 @@ pub fn frames_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
         hash.update(id.as_bytes());
         hash.update(fs_err::metadata(dataset.cloud_path(id))?.len().to_le_bytes());
     }
-    Ok(hex(hash))
+    Ok(hex(&hash.finalize()))
 }
 
 /// Hash of frame ids, the file sizes of their clouds and the content of their labels and true boxes, in hexadecimal.
@@ -150,17 +150,5 @@ pub fn labelled_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
             hash.update(fs_err::read(beside)?);
         }
     }
-    Ok(hex(hash))
-}
-
-/// Hash of a file, in hexadecimal.
-///
-/// # Errors
-/// A file that cannot be read.
-pub fn file_sha256(path: &Path) -> Result<String> {
-    Ok(hex(Sha256::new().chain_update(fs_err::read(path)?)))
-}
-
-fn hex(hash: Sha256) -> String {
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    Ok(hex(&hash.finalize()))
 }

@@ -1,7 +1,7 @@
 //! Detections of a trained run on the test sets, and features of its layers, stored in the run folder.
 
 use crate::config::StudyRun;
-use crate::data_sets::{file_sha256, frames_sha256, open};
+use crate::data_sets::{frames_sha256, open};
 use crate::error::{InPart, Result};
 use crate::folder::Study;
 use data::write::write_kitti_text;
@@ -42,7 +42,7 @@ pub struct RunFeatures {
 /// # Errors
 /// A run without weights.
 pub fn weights_sha256(run_folder: &Path) -> Result<String> {
-    file_sha256(&run_folder.join("checkpoint/last.safetensors"))
+    Ok(data::checksum::file_sha256(&run_folder.join("checkpoint/last.safetensors"))?)
 }
 
 fn cell_path(study: &Study, run: &StudyRun, test_set: &str) -> PathBuf {

@@ -3,6 +3,7 @@
 
 use crate::{RunConfig, TrainError};
 use data::augment::{AugmentConfig, augment, crop_to_range};
+use data::checksum::hex;
 use data::{Dataset, Frame, GtDatabase, Prefetch, Stream, prefetch, stream};
 use models::config::DetectorConfig;
 use models::{Preparer, Sample};
@@ -61,7 +62,7 @@ impl TrainingFrames {
 
     /// SHA-256 of the ids, in hexadecimal.
     pub fn sha256(&self) -> String {
-        crate::run_config::hex(&Sha256::digest(self.ids.join("\n")))
+        hex(&Sha256::digest(self.ids.join("\n")))
     }
 
     /// Indices of all frames in the order of `epoch`.

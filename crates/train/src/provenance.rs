@@ -1,7 +1,7 @@
 //! `provenance.json`: program, data and machine of a run.
 
-use crate::run_config::hex;
 use crate::{RunConfig, TrainError};
+use data::checksum::{file_sha256, hex};
 use data::write_json;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -103,10 +103,7 @@ pub(crate) fn record_session(
             schema: PROVENANCE_SCHEMA.into(),
             config_sha256: config.sha256(),
             dataset,
-            init_sha256: match &config.init {
-                Some(init) => Some(hex(&Sha256::digest(fs_err::read(init)?))),
-                None => None,
-            },
+            init_sha256: config.init.as_deref().map(file_sha256).transpose()?,
             sessions: Vec::new(),
         },
         Err(e) => return Err(e.into()),

@@ -1,6 +1,7 @@
 //! The configuration of a run, `config.toml` in its folder: all that the weights depend on.
 
 use crate::TrainError;
+use data::checksum::hex;
 use data::toml_text::{message_with_key, read_toml};
 use models::config::DetectorConfig;
 use schemars::JsonSchema;
@@ -166,10 +167,6 @@ fn compare(path: &str, ours: &Value, theirs: &Value, found: &mut Vec<String>) {
     } else if ours != theirs {
         found.push(format!("{path} is {ours}, not {theirs}"));
     }
-}
-
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 #[cfg(test)]

@@ -4,8 +4,7 @@
 //! damaged. `state.next.json` is a state whose checkpoint is written, before it becomes `state.json`.
 
 use crate::TrainError;
-use crate::run_config::hex;
-use data::checksum::file_sha256;
+use data::checksum::{file_sha256, hex};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;

@@ -127,6 +127,29 @@ pub fn data_set(folder: &Path) {
     std::fs::write(folder.join("tiny_centerpoint.toml"), TINY_CENTERPOINT).unwrap();
 }
 
+/// Writes `study.toml` beside the data set of [`data_set`]: one run of a network on it as `plain`, and one on a copy
+/// with these effects as `changed`.
+pub fn small_study(folder: &Path, effects: &str) {
+    let study = r#"
+name = "small"
+about = ["A test."]
+seeds = [1]
+epochs = 1
+splits = { test = "val" }
+[[dataset]]
+name = "plain"
+source = { path = "." }
+[[dataset]]
+name = "changed"
+source = { resim = { of = "plain", effects = "effects.toml" } }
+[[detector]]
+name = "tiny"
+config = "tiny.toml"
+"#;
+    std::fs::write(folder.join("effects.toml"), effects).unwrap();
+    std::fs::write(folder.join("study.toml"), study).unwrap();
+}
+
 /// OpenPCDet's `result.pkl` with these detections by frame, as Python writes arrays of numpy 2 with protocol 3.
 pub fn result_pkl(frames: &[(String, Vec<Detection>)]) -> Vec<u8> {
     let text = |s: &str| [&b"X"[..], &(s.len() as u32).to_le_bytes(), s.as_bytes()].concat();

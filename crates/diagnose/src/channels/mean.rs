@@ -74,7 +74,7 @@ pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
         .filter(|r| r.smooth && r.cos_incidence > 0.2 && r.roughness_m.is_finite())
         .map(|r| r.roughness_m.abs() / (1.0 + r.roughness_leverage).sqrt())
         .collect();
-    statistics::median_upper(values).map_or(0.01, |v| f64::from(v) / 0.6745).max(0.002)
+    statistics::median_upper(values).map_or(0.01, |v| f64::from(v) / statistics::MEDIAN_OF_NORMAL).max(0.002)
 }
 
 /// Whether a measured ray is used for the place of a surface.

@@ -87,7 +87,7 @@ pub fn scales(frames: &[FramePair]) -> Vec<f64> {
                 });
                 bin.map_or(0.0, |b| ((b as f64 + 0.5) / 2.0 - 20.0).exp2())
             };
-            median(&both[0]).max(median(&both[1])) / 0.6745
+            median(&both[0]).max(median(&both[1])) / statistics::MEDIAN_OF_NORMAL
         })
         .collect()
 }

@@ -115,7 +115,7 @@ pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
     if differences.len() < 4 {
         return 0.0;
     }
-    median(differences) / 0.6745 / 1.5f64.sqrt()
+    median(differences) / statistics::MEDIAN_OF_NORMAL / 1.5f64.sqrt()
 }
 
 /// Groups with an offset of more than this many times the median variance are left out of spreads.

@@ -91,7 +91,7 @@ fn more_noise_m(measured: &[Ray], simulated: &[Ray]) -> Vec<f64> {
         rough.into_iter().map(|r| if r.len() < FEWEST { None } else { statistics::median_upper(r) }).collect()
     };
     let more = |pair: (Option<f32>, Option<f32>)| match pair {
-        (Some(a), Some(b)) => f64::from(a * a - b * b).max(0.0).sqrt() / 0.6745,
+        (Some(a), Some(b)) => f64::from(a * a - b * b).max(0.0).sqrt() / statistics::MEDIAN_OF_NORMAL,
         _ => 0.0,
     };
     usual(measured).into_iter().zip(usual(simulated)).map(more).collect()

@@ -91,9 +91,6 @@ impl NoiseFit {
 /// Bins of range and incidence over several scans: mean range, mean lever, samples, robust standard deviation, m.
 pub type Pooled = BTreeMap<(i32, i32), [f64; 4]>;
 
-/// Median of the absolute values of normal noise, in standard deviations.
-const MEDIAN_OF_NORMAL: f64 = 0.6745;
-
 /// Smallest standard deviation of a bin, m.
 const LEAST_STD_M: f64 = 1e-4;
 
@@ -167,7 +164,7 @@ impl<'a> SortedBins<'a> {
 fn pooled_bin<'b, I: Iterator<Item = &'b Bin>>(bins: impl Fn() -> I, usual: Option<f32>) -> Option<[f64; 4]> {
     let n: f64 = bins().map(|bin| bin.n).sum();
     let mean = |k: usize| bins().map(|bin| bin.place[k]).sum::<f64>() / n;
-    let std_m = usual.map_or(0.0, f64::from) / MEDIAN_OF_NORMAL;
+    let std_m = usual.map_or(0.0, f64::from) / statistics::MEDIAN_OF_NORMAL;
     (n >= FEWEST).then(|| [mean(0), mean(1), n, std_m.max(LEAST_STD_M)])
 }
 

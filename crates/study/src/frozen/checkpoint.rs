@@ -2,7 +2,7 @@
 
 use super::{FrozenCell, expected_cell, is_done};
 use crate::config::FrozenDetector;
-use crate::data_sets::{file_sha256, open};
+use crate::data_sets::open;
 use crate::detections::detect;
 use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
@@ -31,7 +31,7 @@ fn config(study: &Study, frozen: &FrozenDetector) -> Result<DetectorConfig> {
 /// A checkpoint that cannot be read, an unknown detector.
 pub(super) fn checkpoint_sha256(study: &Study, frozen: &FrozenDetector, checkpoint: &Path) -> Result<String> {
     let mut hash = Sha256::new();
-    hash.update(file_sha256(&study.path(checkpoint))?);
+    hash.update(data::checksum::file_sha256(&study.path(checkpoint))?);
     hash.update(serde_json::to_vec(&config(study, frozen)?)?);
     Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }

@@ -121,7 +121,7 @@ fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 
             let middle = median(values.clone());
             deviations.extend(values.iter().map(|v| (v - middle).abs()));
         }
-        (median(deviations) / 0.6745).max(least[k])
+        (median(deviations) / statistics::MEDIAN_OF_NORMAL).max(least[k])
     };
     let by_rows = rig.sensors.iter().find(|s| !s.sequential_rows().is_empty());
     let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);

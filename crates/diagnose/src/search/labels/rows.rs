@@ -184,7 +184,7 @@ pub(super) fn set_noise(rows: &mut [Row], select: &[usize], side: Side) {
             .filter(|r| side == Side::Labels || r.variance[axis] < 0.1)
             .map(|r| (r.shift[axis] - (0..8).map(|k| r.x[axis][k] * theta[k]).sum::<f64>()).abs())
             .collect();
-        let scale = (statistics::median_upper(left).unwrap_or(0.1) / 0.6745).max(0.008);
+        let scale = (statistics::median_upper(left).unwrap_or(0.1) / statistics::MEDIAN_OF_NORMAL).max(0.008);
         for r in rows.iter_mut() {
             r.variance[axis] = if side == Side::Labels { scale * scale } else { r.variance[axis] + scale * scale };
         }

@@ -132,6 +132,11 @@ fn parameters(finding: &Finding) -> String {
     shown.into_iter().chain(table).collect::<Vec<_>>().join("; ")
 }
 
+/// A table of these rows; none without rows.
+fn if_any(id: &str, caption: &str, columns: (&[&str], usize), rows: Vec<TableRow>) -> Vec<Item> {
+    if rows.is_empty() { vec![] } else { vec![Item::table(id, caption, columns, rows, None)] }
+}
+
 fn findings(d: &Diagnosis) -> Section {
     let total: f64 = d.findings.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
     let row = |f: &Finding| {
@@ -161,8 +166,7 @@ fn findings(d: &Diagnosis) -> Section {
     let caption = "What differs, the largest first. \"Share\" is the part of the gain of all findings. \"Gone in its channel\" is the share of \
                    the channel's difference that is gone with the extended simulation. \"Same choice\" is how often resampled frames choose \
                    the same cause.";
-    let items =
-        if rows.is_empty() { vec![] } else { vec![Item::table("findings", caption, (&columns, 3), rows, None)] };
+    let items = if_any("findings", caption, (&columns, 3), rows);
     Section { id: "found", title: "What differs", text: vec![], items }
 }
 
@@ -195,7 +199,7 @@ fn gain(d: &Diagnosis) -> Section {
     let columns = ["channel", "before", "after", "two draws of the extended simulation", "gone"];
     let caption = "What tables of the measured data predict better than the simulation, by channel, in nats for each simulated return: 0 where \
                    nothing differs. A dash: too small to be compared.";
-    let items = if rows.is_empty() { vec![] } else { vec![Item::table("gain", caption, (&columns, 1), rows, None)] };
+    let items = if_any("gain", caption, (&columns, 1), rows);
     Section { id: "gone", title: "What the extended simulation takes away", text: vec![], items }
 }
 
@@ -210,8 +214,7 @@ fn detectors(d: &Diagnosis) -> Section {
     let rows: Vec<TableRow> = d.detectors.iter().map(row).collect();
     let columns = ["detector", "trained on simulated", "on extended", "on measured", "gain"];
     let caption = "Average precision on measured frames that neither the diagnosis nor the training used.";
-    let items =
-        if rows.is_empty() { vec![] } else { vec![Item::table("detectors", caption, (&columns, 1), rows, None)] };
+    let items = if_any("detectors", caption, (&columns, 1), rows);
     Section { id: "detectors-gain", title: "What detectors gain", text: vec![], items }
 }
 
@@ -233,7 +236,7 @@ fn not_found(d: &Diagnosis) -> Section {
     let columns = ["cause", "parameter", "smallest size"];
     let caption =
         "Causes that were looked for and not found, with the smallest size that would have been found in these data.";
-    let items = if rows.is_empty() { vec![] } else { vec![Item::table("minimum", caption, (&columns, 2), rows, None)] };
+    let items = if_any("minimum", caption, (&columns, 2), rows);
     Section { id: "not-found", title: "What was not found", text: vec![], items }
 }
 
@@ -253,8 +256,7 @@ fn considered(d: &Diagnosis) -> Section {
     let rows: Vec<TableRow> = d.considered.iter().map(row).collect();
     let columns = ["hypothesis", "channel", "what became of it", "gain, nats a return", "gain over its standard error"];
     let caption = "Every hypothesis, in the order in which it was tried.";
-    let items =
-        if rows.is_empty() { vec![] } else { vec![Item::table("considered", caption, (&columns, 3), rows, None)] };
+    let items = if_any("considered", caption, (&columns, 3), rows);
     Section { id: "hypotheses", title: "All hypotheses", text: vec![], items }
 }
 
