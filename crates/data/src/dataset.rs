@@ -2,10 +2,9 @@
 
 use crate::dataset_config::DatasetConfig;
 use crate::kitti_text::{KittiText, read_kitti_text};
-use crate::layout::PointDetails;
+use crate::layout::{Moment, PointDetails};
 use crate::limits::{MOST_IDS, at_most, check_name, read_text};
 use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
-use geometry::Pose;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -110,14 +109,9 @@ impl Dataset {
         self.config.labels.is_some() || self.config.layout.has_labels(&self.config.root)
     }
 
-    /// Time stamp of a frame, s since a start that all frames share; `None` if not known.
-    pub fn stamp_s(&self, id: &str) -> Result<Option<f64>, DataError> {
-        self.config.layout.stamp_s(&self.config.root, id)
-    }
-
-    /// Pose of the LiDAR in a world frame that all frames share; `None` if not known.
-    pub fn world_from_lidar(&self, id: &str) -> Result<Option<Pose>, DataError> {
-        self.config.layout.world_from_lidar(&self.config.root, id)
+    /// Stamps, poses and tracked boxes of the frames `ids`, in their order.
+    pub fn moments(&self, ids: &[String]) -> Result<Vec<Moment>, DataError> {
+        self.config.layout.moments(&self.config.root, ids)
     }
 
     /// Per-point data besides position and intensity, for all points of a frame (not cropped to the image).

@@ -5,7 +5,7 @@ mod file_per_frame;
 
 use crate::write::label_boxes;
 use crate::{Calibration, Cloud, DataError, DatasetConfig, Frame, LabelBox, LabelFrame, PointColumns};
-use geometry::Pose;
+use geometry::{Box3, Pose};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Deref;
@@ -122,14 +122,10 @@ pub trait DataLayout: Send + Sync {
         Err(DataError::file(root, format!("the layout {} has no calibration", self.name())))
     }
 
-    /// Time stamp of a frame, s since a start that all frames of the data set share; `None` if not known.
-    fn stamp_s(&self, _root: &Path, _id: &str) -> Result<Option<f64>, DataError> {
-        Ok(None)
-    }
-
-    /// Pose of the LiDAR in a world frame that all frames of the data set share; `None` if not known.
-    fn world_from_lidar(&self, _root: &Path, _id: &str) -> Result<Option<Pose>, DataError> {
-        Ok(None)
+    /// Stamps, poses and tracked boxes of the frames `ids`, in their order. A layout that knows nothing of them returns
+    /// moments that hold the ids alone.
+    fn moments(&self, _root: &Path, ids: &[String]) -> Result<Vec<Moment>, DataError> {
+        Ok(ids.iter().map(|id| Moment::of(id)).collect())
     }
 
     /// Reads per-point data besides position and intensity.
@@ -153,6 +149,38 @@ pub trait DataLayout: Send + Sync {
     }
 }
 
+/// What a recording knows of the moment of a frame besides its points.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Moment {
+    /// Id of the frame.
+    pub id: String,
+    /// Time stamp, s since a start that all frames share; `None` if it is not known.
+    pub stamp_s: Option<f64>,
+    /// Pose of the LiDAR frame at the time stamp, in a world frame (z up) that all frames share; `None` if it is not
+    /// known.
+    pub world_from_lidar: Option<Pose>,
+    /// Labelled boxes that carry a track, in the LiDAR frame at the time stamp.
+    pub objects: Vec<TrackedObject>,
+}
+
+impl Moment {
+    /// A moment of which nothing but the id of its frame is known.
+    pub fn of(id: &str) -> Moment {
+        Moment { id: id.into(), stamp_s: None, world_from_lidar: None, objects: Vec::new() }
+    }
+}
+
+/// A labelled object that is known again in other frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrackedObject {
+    /// Name of the track, the same in all frames that show the object.
+    pub track: String,
+    /// Class as in the label file.
+    pub class: String,
+    /// Box in the LiDAR frame at the time stamp, m and rad.
+    pub bbox: Box3,
+}
+
 /// Optional data of each point of a cloud, in the order of its points; `None` if not known.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointDetails {
@@ -166,7 +194,6 @@ pub struct PointDetails {
 mod tests {
     use super::*;
     use crate::Object;
-    use geometry::Box3;
 
     #[test]
     fn layout_names_are_those_of_the_toml() {
@@ -208,8 +235,7 @@ mod tests {
             for path in [layout.cloud_path(root, "000007"), layout.labels_path(root, "000007")] {
                 assert!(layout.folders().iter().any(|inside| path.parent() == Some(&root.join(inside))));
             }
-            assert_eq!(layout.stamp_s(root, "000007").unwrap(), None);
-            assert_eq!(layout.world_from_lidar(root, "000007").unwrap(), None);
+            assert_eq!(layout.moments(root, &["000007".into()]).unwrap(), [Moment::of("000007")]);
             assert_eq!(layout.read_point_details(root, "000007").unwrap(), PointDetails::default());
         }
     }
