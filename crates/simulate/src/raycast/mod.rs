@@ -1,4 +1,4 @@
-//! Ray casting against triangle meshes: a two-level tree, traversed by packets of rays.
+//! Ray casting against triangle meshes and sets of discs: a two-level tree, traversed by packets of rays.
 //!
 //! The lower level has one tree for the static world and one per moving shape; the upper level is the list of
 //! [`Instance`]s, few in a race, each a shape with a pose. Every ray has a time, and an instance moves with its
@@ -14,13 +14,14 @@
 
 mod lanes;
 mod scene;
+mod through;
 mod traverse;
 mod tree;
 #[cfg(target_arch = "x86_64")]
 mod x86;
 
 pub use scene::{Instance, InstructionSet, Scene};
-pub use tree::Tree;
+pub use tree::{Disc, Tree};
 
 /// A ray in scene coordinates.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -67,6 +67,12 @@ pub(super) struct Best<L: Lanes> {
 /// See [`Lanes`].
 #[inline(always)]
 pub(super) unsafe fn traverse<L: Lanes>(tree: &Tree, packet: &Packet<L>, best: &mut Best<L>) -> u32 {
+    unsafe { if tree.discs { walk::<L, true>(tree, packet, best) } else { walk::<L, false>(tree, packet, best) } }
+}
+
+/// [`traverse`] of a tree of discs or of triangles.
+#[inline(always)]
+unsafe fn walk<L: Lanes, const DISCS: bool>(tree: &Tree, packet: &Packet<L>, best: &mut Best<L>) -> u32 {
     unsafe {
         let mut stack = [const { MaybeUninit::<(L, u32)>::uninit() }; DEEPEST];
         let (mut depth, mut at, mut improved) = (0, tree.root, 0);
@@ -103,7 +109,7 @@ pub(super) unsafe fn traverse<L: Lanes>(tree: &Tree, packet: &Packet<L>, best: &
                 let count = at & ((1 << COUNT_BITS) - 1);
                 let first = (at & !LEAF) >> COUNT_BITS;
                 for place in first..first + count {
-                    improved |= test(tree, packet, place, best, improved);
+                    improved |= test::<L, DISCS>(tree, packet, place, best, improved);
                 }
             }
             loop {
@@ -121,9 +127,16 @@ pub(super) unsafe fn traverse<L: Lanes>(tree: &Tree, packet: &Packet<L>, best: &
     }
 }
 
-/// Intersects one triangle with all rays (Möller-Trumbore, no division for misses); both sides can be hit.
+/// Intersects one triangle, or the largest ellipse in it, with all rays (Möller-Trumbore, no division for misses); both
+/// sides can be hit.
 #[inline(always)]
-unsafe fn test<L: Lanes>(tree: &Tree, packet: &Packet<L>, place: u32, best: &mut Best<L>, improved: u32) -> u32 {
+unsafe fn test<L: Lanes, const DISCS: bool>(
+    tree: &Tree,
+    packet: &Packet<L>,
+    place: u32,
+    best: &mut Best<L>,
+    improved: u32,
+) -> u32 {
     unsafe {
         let triangle = tree.triangles.get_unchecked(place as usize);
         let (o, d) = (&packet.origin, &packet.direction);
@@ -137,10 +150,17 @@ unsafe fn test<L: Lanes>(tree: &Tree, packet: &Packet<L>, place: u32, best: &mut
         let (u, v, det, along) = (dot(&r, edge2), dot(&r, edge1), dot(d, normal), dot(&c, normal));
         let zero = L::splat(0.0);
         let squared = det.mul(det);
-        let inside = L::and(
-            L::and(zero.le(u.mul(det)), zero.le(v.mul(det))),
-            L::and(u.add(v).mul(det).le(squared), zero.lt(squared)),
-        );
+        let inside = if DISCS {
+            // The barycentric coordinates times the determinant; their squares add up to half at the border.
+            let w = det.sub(u).sub(v);
+            let squares = w.mul_add(w, v.mul_add(v, u.mul(u)));
+            L::and(squares.le(squared.mul(L::splat(0.5))), zero.lt(squared))
+        } else {
+            L::and(
+                L::and(zero.le(u.mul(det)), zero.le(v.mul(det))),
+                L::and(u.add(v).mul(det).le(squared), zero.lt(squared)),
+            )
+        };
         if L::bits(inside) == 0 {
             return 0;
         }

@@ -1,8 +1,9 @@
-//! The tree of one mesh: built by `obvhs`, laid out for packet traversal.
+//! The tree of one mesh or of one set of discs: built by `obvhs`, laid out for packet traversal.
 
 use obvhs::BvhBuildParams;
+use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
-use obvhs::bvh2::builder::build_bvh2_from_tris;
+use obvhs::bvh2::builder::{build_bvh2, build_bvh2_from_tris};
 use obvhs::triangle::Triangle;
 use std::time::Duration;
 
@@ -33,7 +34,33 @@ pub(super) struct PackedTriangle {
     pub(super) normal: [f32; 3],
 }
 
-/// A triangle mesh prepared for ray casting.
+/// A flat ellipse.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Disc {
+    /// m.
+    pub centre: [f32; 3],
+    /// Two conjugate half axes, m: the border is `centre + cos(t) axes[0] + sin(t) axes[1]`.
+    pub axes: [[f32; 3]; 2],
+}
+
+impl Disc {
+    /// The triangle whose largest inscribed ellipse (Steiner's) is the disc. Its barycentric coordinates u, v, w fulfil
+    /// u^2 + v^2 + w^2 <= 1/2 inside of the disc.
+    fn triangle(&self) -> [[f32; 3]; 3] {
+        // Corners at twice the half axes, a third of a turn apart.
+        const CORNERS: [[f32; 2]; 3] = [[0.0, 2.0], [-1.732_050_8, -1.0], [1.732_050_8, -1.0]];
+        let [a, b] = self.axes;
+        CORNERS.map(|[s, t]| std::array::from_fn(|k| self.centre[k] + s * a[k] + t * b[k]))
+    }
+
+    fn bounds(&self) -> [[f32; 3]; 2] {
+        let [a, b] = self.axes;
+        let half: [f32; 3] = std::array::from_fn(|k| a[k].hypot(b[k]));
+        [std::array::from_fn(|k| self.centre[k] - half[k]), std::array::from_fn(|k| self.centre[k] + half[k])]
+    }
+}
+
+/// A triangle mesh or a set of discs prepared for ray casting.
 #[derive(Clone, Debug)]
 pub struct Tree {
     pub(super) nodes: Vec<Node>,
@@ -41,6 +68,8 @@ pub struct Tree {
     /// Mesh index of each of `triangles`.
     pub(super) ids: Vec<u32>,
     pub(super) root: u32,
+    /// Of each triangle only the largest inscribed ellipse can be hit.
+    pub(super) discs: bool,
     /// Minimum and maximum coordinates, m.
     pub(super) low: [f32; 3],
     pub(super) high: [f32; 3],
@@ -52,35 +81,62 @@ impl Tree {
         let sound: Vec<u32> = (0..corners.len() as u32)
             .filter(|i| corners[*i as usize].iter().flatten().all(|v| v.is_finite()))
             .collect();
-        let mut tree = Tree {
-            nodes: Vec::new(),
-            triangles: Vec::new(),
-            ids: Vec::new(),
-            root: LEAF,
-            low: [f32::INFINITY; 3],
-            high: [f32::NEG_INFINITY; 3],
-        };
+        let mut tree = Tree::nothing();
         if sound.is_empty() {
             return tree;
         }
-        for corner in sound.iter().flat_map(|i| corners[*i as usize]) {
-            for (k, v) in corner.into_iter().enumerate() {
-                tree.low[k] = tree.low[k].min(v);
-                tree.high[k] = tree.high[k].max(v);
-            }
-        }
+        tree.widen(sound.iter().flat_map(|i| corners[*i as usize]));
         let triangle = |i: &u32| {
             let [v0, v1, v2] = corners[*i as usize].map(Into::into);
             Triangle { v0, v1, v2 }
         };
-        let mut params = BvhBuildParams::medium_build();
-        params.max_prims_per_leaf = TRIANGLES_PER_LEAF;
         let triangles: Vec<Triangle> = sound.iter().map(triangle).collect();
-        let bvh = build_bvh2_from_tris(&triangles, params, &mut Duration::default());
+        let bvh = build_bvh2_from_tris(&triangles, build_params(), &mut Duration::default());
         tree.ids = bvh.primitive_indices.iter().map(|i| sound[*i as usize]).collect();
         tree.triangles = tree.ids.iter().map(|i| pack(&corners[*i as usize])).collect();
         tree.lay_out(&bvh);
         tree
+    }
+
+    /// Builds the tree of these discs. A disc with a non-finite value is never hit. The number of the triangle in a hit
+    /// is that of the disc.
+    pub fn of_discs(discs: &[Disc]) -> Tree {
+        let finite = |d: &Disc| d.bounds().iter().flatten().all(|v| v.is_finite());
+        let sound: Vec<u32> = (0..discs.len() as u32).filter(|i| finite(&discs[*i as usize])).collect();
+        let mut tree = Tree { discs: true, ..Tree::nothing() };
+        if sound.is_empty() {
+            return tree;
+        }
+        let bounds: Vec<[[f32; 3]; 2]> = sound.iter().map(|i| discs[*i as usize].bounds()).collect();
+        tree.widen(bounds.iter().flatten().copied());
+        let boxes: Vec<Aabb> = bounds.iter().map(|[low, high]| Aabb::new((*low).into(), (*high).into())).collect();
+        let bvh = build_bvh2(&boxes, build_params(), &mut Duration::default());
+        tree.ids = bvh.primitive_indices.iter().map(|i| sound[*i as usize]).collect();
+        tree.triangles = tree.ids.iter().map(|i| pack(&discs[*i as usize].triangle())).collect();
+        tree.lay_out(&bvh);
+        tree
+    }
+
+    fn nothing() -> Tree {
+        Tree {
+            nodes: Vec::new(),
+            triangles: Vec::new(),
+            ids: Vec::new(),
+            root: LEAF,
+            discs: false,
+            low: [f32::INFINITY; 3],
+            high: [f32::NEG_INFINITY; 3],
+        }
+    }
+
+    /// Widens the bounds by these points.
+    fn widen(&mut self, points: impl Iterator<Item = [f32; 3]>) {
+        for point in points {
+            for (k, v) in point.into_iter().enumerate() {
+                self.low[k] = self.low[k].min(v);
+                self.high[k] = self.high[k].max(v);
+            }
+        }
     }
 
     /// Number of triangles that can be hit.
@@ -123,6 +179,12 @@ impl Tree {
         self.nodes = order.iter().map(node).collect();
         self.root = reference(0);
     }
+}
+
+fn build_params() -> BvhBuildParams {
+    let mut params = BvhBuildParams::medium_build();
+    params.max_prims_per_leaf = TRIANGLES_PER_LEAF;
+    params
 }
 
 pub(super) fn pack(&[a, b, c]: &[[f32; 3]; 3]) -> PackedTriangle {

@@ -1,4 +1,5 @@
 use super::*;
+use crate::raycast::Disc;
 use crate::raycast::tree::pack;
 use data::stream;
 use proptest::prelude::*;
@@ -218,4 +219,58 @@ proptest! {
             prop_assert_eq!(got.triangle, want.triangle);
         }
     }
+}
+
+/// Random discs, and where a ray meets each: range, and squared distance from the centre in half axes (f64).
+fn discs(seed: u64, count: usize) -> Vec<Disc> {
+    let mut random = stream(seed, "discs", 0, 0);
+    let mut vector = |size: f32| -> [f32; 3] { std::array::from_fn(|_| random.random_range(-size..size)) };
+    (0..count).map(|_| Disc { centre: vector(60.0), axes: [vector(2.0), vector(2.0)] }).collect()
+}
+
+fn meet_disc(ray: &Ray, disc: &Disc) -> Option<(f64, f64)> {
+    let v = |a: [f32; 3]| nalgebra::Vector3::from(a.map(f64::from));
+    let [a, b] = disc.axes.map(v);
+    let (normal, from) = (a.cross(&b), v(disc.centre) - v(ray.origin));
+    let range = normal.dot(&from) / normal.dot(&v(ray.direction));
+    let off = v(ray.direction) * range - from;
+    // Coordinates of the place in half axes.
+    let [s, t] =
+        [b.cross(&normal).dot(&off) / b.cross(&normal).dot(&a), a.cross(&normal).dot(&off) / a.cross(&normal).dot(&b)];
+    (range >= 0.0).then_some((range, s * s + t * t))
+}
+
+#[test]
+fn discs_are_hit_where_their_ellipses_are() {
+    let discs = discs(5, 3000);
+    let rays = scan_rays(6, 16, 100);
+    let tree = Arc::new(Tree::of_discs(&discs));
+    let (mut inside, mut met) = (0, 0);
+    for set in sets() {
+        let hits = cast(&Scene::new(tree.clone(), vec![]).with_instructions(set), &rays, 100);
+        for (ray, hit) in rays.iter().zip(&hits) {
+            let all: Vec<(f64, f64)> = discs.iter().filter_map(|d| meet_disc(ray, d)).collect();
+            // Borders are rounded; a ray within 1e-3 of one may pass on either side.
+            let sure = all.iter().filter(|(_, q)| *q < 0.999).map(|m| m.0).fold(f64::INFINITY, f64::min);
+            let maybe = all.iter().filter(|(_, q)| *q < 1.001).map(|m| m.0).fold(f64::INFINITY, f64::min);
+            let range = f64::from(hit.range_m);
+            assert!(range <= sure + 1e-2 && range >= maybe - 1e-2, "{range} {sure} {maybe}");
+            inside += usize::from(hit.is_hit());
+        }
+    }
+    for ray in &rays {
+        let mut found = Vec::new();
+        tree.through(ray.origin, ray.direction, 1000.0, |id, range, off| {
+            found.push((id, range, off));
+            f32::INFINITY
+        });
+        for (id, range, off) in &found {
+            let (want, q) = meet_disc(ray, &discs[*id as usize]).expect("the disc is met");
+            assert!((f64::from(*range) - want).abs() < 1e-2 && (f64::from(*off) - q).abs() < 2e-2, "{off} {q}");
+        }
+        met += found.len();
+        let sure = discs.iter().filter_map(|d| meet_disc(ray, d)).filter(|m| m.1 < 0.999).count();
+        assert!(found.len() >= sure, "{} of {sure}", found.len());
+    }
+    assert!(inside > 300 && met > 300, "{inside} {met}");
 }
