@@ -1,7 +1,7 @@
 //! The static map: patches of all scans fused into surfels.
 //!
-//! Why surfels and no mesh: they need no topology, are built scan by scan, keep what each laser saw at the resolution it
-//! saw it, and end where the returns end. A mesh closes gaps that nobody looked into.
+//! Why surfels and no mesh: they need no topology, are built scan by scan, keep what each laser saw at its resolution,
+//! and end where the returns end. A mesh closes gaps that nobody looked into.
 //!
 //! A surfel is a flat ellipse with an *opacity*: the share of the shots of the recording that ended at it among those
 //! that reached it. Things that moved, the borders of surfels that stick out over an edge, and foliage are seen through
@@ -94,8 +94,8 @@ impl SurfelMap {
 
     /// Where a shot ends; `None` where the map has nothing. `met` is scratch space.
     ///
-    /// On a surface the range is the mean of the surfels' planes, weighted by their opacity, their returns, and how near
-    /// to their centre they are met: the nearest one alone would be too near by the noise.
+    /// On a surface the range is the mean of the surfels' planes, weighted by their opacity, their returns, and how
+    /// near to their centre they are met: the nearest one alone would be too near by the noise.
     pub fn end(&self, origin: [f32; 3], direction: [f32; 3], met: &mut Vec<Met>) -> Option<End> {
         met.clear();
         let along = Vector3::from(direction);
