@@ -26,8 +26,8 @@ const ARROWS: &[(&str, &[&str])] = &[
     // The simulator is only for its tests.
     ("diagnose", &["sensor", "simulate", "eval"]),
     ("report", &["eval", "diagnose"]),
-    ("study", &["simulate", "twin", "train", "report"]),
-    ("cli", &["study"]),
+    ("study", &["simulate", "train", "report"]),
+    ("cli", &["study", "twin"]),
     ("checks", &["cli"]),
     ("tests", &["checks"]),
     ("xtask", &["statistics"]),

@@ -22,6 +22,7 @@ commands! {
     StudyRun(study_run::StudyRunArgs) "Execute one run of a study";
     Compare(compare::CompareArgs) "Rank several simulations of the same recordings by their distance from measured data";
     Report(report::ReportArgs) "Write the report of a study";
+    Twin(twin::TwinArgs) "Make a simulated partner of a recording that has no simulation";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
     Doctor(doctor::DoctorArgs) "Check a data set for errors";

@@ -83,6 +83,18 @@ pub fn direction(azimuth_rad: f64, elevation_rad: f64) -> [f64; 3] {
 }
 
 impl Pattern {
+    /// The shots of a CSV file beside the rig, which are not read here.
+    pub fn of_file(file: PathBuf) -> Pattern {
+        Pattern {
+            blocks: Vec::new(),
+            columns: 0,
+            sweep: Sweep::Rows,
+            file: Some(file),
+            shots: Vec::new(),
+            grid_columns: 0,
+        }
+    }
+
     /// A grid of one block of rows, with its shots.
     pub fn grid(block: RowBlock, columns: u32, horizontal_fov_deg: f64, rate_hz: f64) -> Pattern {
         let mut pattern = Pattern {

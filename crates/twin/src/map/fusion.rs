@@ -45,7 +45,7 @@ pub struct FusionConfig {
 
 impl Default for FusionConfig {
     fn default() -> Self {
-        FusionConfig { cube_m: 0.07, rough_cube_m: 0.05, thickness_m: 0.06, cover: 1.4 }
+        FusionConfig { cube_m: 0.07, rough_cube_m: 0.05, thickness_m: 0.06, cover: 1.8 }
     }
 }
 

@@ -1,0 +1,17 @@
+//! Errors of twins.
+
+use data::{DataError, KeyError};
+
+/// Why no twin can be made.
+#[derive(Debug, thiserror::Error)]
+pub enum TwinError {
+    /// A file of the recording, or one that is written.
+    #[error(transparent)]
+    Data(#[from] DataError),
+    /// What is written as TOML or JSON.
+    #[error(transparent)]
+    Key(#[from] KeyError),
+    /// The recording lacks something.
+    #[error("{0}")]
+    Recording(String),
+}
