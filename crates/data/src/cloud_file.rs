@@ -33,7 +33,8 @@ pub const FARTHEST_M: f32 = 10_000.0;
 /// Reads a `.bin` (KITTI: little-endian f32) or a `.pcd`. The file name extension decides.
 ///
 /// `columns` gives the columns of a `.bin`. The columns of a `.pcd` are in its header; with [`PointColumns::Xyz`] its
-/// intensity is dropped. Errors: an empty cloud, values that are not finite, coordinates beyond [`FARTHEST_M`].
+/// intensity is dropped. Errors: an empty cloud, values that are not finite, coordinates beyond [`FARTHEST_M`], and a
+/// scan of nuScenes, which has five values a point.
 pub fn read_cloud(path: &Path, columns: PointColumns) -> Result<Cloud, DataError> {
     let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     match ending.as_deref() {
@@ -62,11 +63,40 @@ pub fn parse_bin(bytes: &[u8], path: &Path, columns: PointColumns) -> Result<Clo
             ),
         ));
     }
+    if path.to_string_lossy().ends_with(".pcd.bin") || has_five_columns(bytes) {
+        let message = format!(
+            "has five values a point (x y z intensity ring, as in nuScenes), not {channels}: use the layout nuscenes_scans"
+        );
+        return Err(DataError::file(path, message));
+    }
     at_most(path, "points", (bytes.len() / channels / 4) as u64, MOST_POINTS)?;
     let values = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
     let cloud = Cloud { values, channels };
     check_cloud(&cloud, path)?;
     Ok(cloud)
+}
+
+/// Whether bytes are points of nuScenes: every fifth value is a ring, every fourth of five a whole intensity to 255.
+///
+/// A file of 34,688 such points is also one of 43,360 points of four values.
+fn has_five_columns(bytes: &[u8]) -> bool {
+    const POINT_BYTES: usize = 5 * size_of::<f32>();
+    // Fewer points may look so by chance.
+    const FEWEST_POINTS: usize = 100;
+    let value = |point: &[u8], column: usize| f32::from_le_bytes(std::array::from_fn(|byte| point[4 * column + byte]));
+    let whole = |v: f32, most: f32| v.fract() == 0.0 && (0.0..=most).contains(&v);
+    let mut fewest_ring = f32::INFINITY;
+    let mut most_ring = f32::NEG_INFINITY;
+    let points = bytes.chunks_exact(POINT_BYTES);
+    let count = points.len();
+    for point in points {
+        let (intensity, ring) = (value(point, 3), value(point, 4));
+        if !(whole(ring, 255.0) && whole(intensity, 255.0)) {
+            return false;
+        }
+        (fewest_ring, most_ring) = (fewest_ring.min(ring), most_ring.max(ring));
+    }
+    bytes.len().is_multiple_of(POINT_BYTES) && count >= FEWEST_POINTS && most_ring > fewest_ring
 }
 
 /// An error if the cloud is empty, or for the first invalid point.

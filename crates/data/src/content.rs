@@ -22,7 +22,17 @@ impl Dataset {
     /// # Errors
     /// A cloud that cannot be read.
     pub fn content_sha256(&self, ids: &[String]) -> Result<String, DataError> {
+        // Layouts with one table of labels for all frames: it is read once.
+        let shared = match ids {
+            [first, .., last] if self.has_labels() && self.labels_path(first) == self.labels_path(last) => {
+                Some(files_sha256([self.labels_path(first)])?)
+            }
+            _ => None,
+        };
         let of_frame = |id: &String| {
+            if let Some(labels) = &shared {
+                return Ok([cloud_sha256(&self.cloud_path(id))?, labels.clone()]);
+            }
             let labels = self.has_labels().then(|| self.labels_path(id));
             let beside = labels.into_iter().chain(self.calibration_path(id));
             Ok([cloud_sha256(&self.cloud_path(id))?, files_sha256(beside)?])
@@ -85,5 +95,20 @@ mod tests {
         assert_eq!(now(), first);
         std::fs::write(labels, "Car 0 0 0 0 0 0 0 1.5 1.6 3.9 5 0 -1 0\n").unwrap();
         assert!([shorter, changed, now()].iter().all(|other| *other != first));
+    }
+
+    #[test]
+    fn one_table_of_labels_for_all_frames_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        for id in ["0", "1"] {
+            let cloud = Cloud { values: vec![1.0; 8], channels: 4 };
+            crate::write::write_bin(&folder.path().join(format!("velodyne/{id}.bin")), &cloud).unwrap();
+        }
+        let table = |yaw: f64| format!("frame,track,class,cx,cy,cz,l,w,h,yaw\n0,1,Car,9,1,0,4,2,2,{yaw}\n");
+        let now = |yaw: f64| {
+            std::fs::write(folder.path().join("labels.csv"), table(yaw)).unwrap();
+            Dataset::open(folder.path()).unwrap().content_sha256(&["0", "1"].map(String::from)).unwrap()
+        };
+        assert!(now(0.1) == now(0.1) && now(0.1) != now(0.2));
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::dataset_config::DatasetConfig;
 use crate::kitti_text::{KittiText, read_kitti_text};
-use crate::layout::{Moment, PointDetails};
+use crate::layout::{Moment, PointDetails, Sequence};
 use crate::limits::{MOST_IDS, at_most, check_name, read_text};
 use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
 use std::collections::BTreeSet;
@@ -109,7 +109,12 @@ impl Dataset {
         self.config.labels.is_some() || self.config.layout.has_labels(&self.config.root)
     }
 
-    /// Stamps, poses and tracked boxes of the frames `ids`, in their order.
+    /// The sequences of the data set: frames in a row that share a world.
+    pub fn sequences(&self) -> Result<Vec<Sequence>, DataError> {
+        self.config.layout.sequences(&self.config.root)
+    }
+
+    /// Stamps, poses and tracked boxes of the frames `ids`, in their order. All frames belong to one sequence.
     pub fn moments(&self, ids: &[String]) -> Result<Vec<Moment>, DataError> {
         self.config.layout.moments(&self.config.root, ids)
     }

@@ -48,7 +48,8 @@ impl KittiText {
     }
 }
 
-fn parse_line(text: &str, kind: KittiText) -> Result<LabelBox, String> {
+/// Parses a box of one line.
+pub(crate) fn parse_kitti_line(text: &str, kind: KittiText) -> Result<LabelBox, String> {
     let fields: Vec<&str> = text.split_ascii_whitespace().collect();
     if fields.len() != kind.fields() {
         let (what, found, wanted) = match kind {
@@ -122,7 +123,9 @@ impl fmt::Display for KittiLine<'_> {
 pub fn parse_kitti_text(text: &str, path: &Path, kind: KittiText) -> Result<Vec<LabelBox>, DataError> {
     let lines = || text.lines().enumerate().filter(|(_, line)| !line.trim_ascii().is_empty());
     at_most(path, "boxes", lines().count() as u64, MOST_BOXES)?;
-    lines().map(|(i, line)| parse_line(line, kind).map_err(|message| DataError::line(path, i + 1, message))).collect()
+    lines()
+        .map(|(i, line)| parse_kitti_line(line, kind).map_err(|message| DataError::line(path, i + 1, message)))
+        .collect()
 }
 
 /// Reads a file of labels or detections.

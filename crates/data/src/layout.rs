@@ -1,9 +1,14 @@
 //! Layouts: how the frames of a data set are stored on disk. A new layout is a file in this folder and a line in
 //! `layouts!`.
 
+mod feather;
+mod file_names;
 mod file_per_frame;
+mod nuscenes_tables;
+mod oxts;
 mod pose_text;
 mod stamps;
+mod tracklets;
 
 pub use stamps::StampUnit;
 
@@ -49,6 +54,12 @@ macro_rules! layouts {
 
 layouts! {
     Recording = recording: "A recorded drive: `velodyne/*.bin` with `poses.txt`, `labels.csv` and time stamps where known.";
+    KittiRaw = kitti_raw: "A drive of KITTI raw: `velodyne_points/data`, `oxts/data`, `tracklet_labels.xml`.";
+    KittiTracking = kitti_tracking: "KITTI's tracking benchmark: `velodyne/SSSS/`, `label_02`, `calib`, `oxts`.";
+    KittiOdometry = kitti_odometry: "A sequence of KITTI odometry or SemanticKITTI: `velodyne`, `calib.txt`, poses.";
+    Argoverse2 = argoverse2: "A log of Argoverse 2: `sensors/lidar/*.feather` with annotations and poses.";
+    Nuscenes = nuscenes: "nuScenes: tables in `v1.0-*/`, clouds in `samples/LIDAR_TOP` and `sweeps/LIDAR_TOP`.";
+    NuscenesScans = nuscenes_scans: "Scans of nuScenes alone: a folder of `*.pcd.bin`.";
     Kitti = kitti: "`velodyne/*.bin`, `label_2/*.txt` and, if there is a camera, `calib/*.txt`.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
 }
@@ -132,8 +143,13 @@ pub trait DataLayout: Send + Sync {
         Err(DataError::file(root, format!("the layout {} has no calibration", self.name())))
     }
 
-    /// Stamps, poses and tracked boxes of the frames `ids`, in their order. A layout that knows nothing of them returns
-    /// moments that hold the ids alone.
+    /// The sequences of the data set: frames in a row that share a world. By default all frames are one.
+    fn sequences(&self, root: &Path) -> Result<Vec<Sequence>, DataError> {
+        Ok(vec![Sequence { name: String::new(), ids: self.frame_ids(root)? }])
+    }
+
+    /// Stamps, poses and tracked boxes of the frames `ids`, in their order. All frames belong to one sequence. A layout
+    /// that knows nothing of them returns moments that hold the ids alone.
     fn moments(&self, _root: &Path, ids: &[String]) -> Result<Vec<Moment>, DataError> {
         Ok(ids.iter().map(|id| Moment::of(id)).collect())
     }
@@ -177,6 +193,15 @@ fn read_only(root: &Path, layout: &str) -> DataError {
     DataError::file(root, message)
 }
 
+/// Frames in a row that share a world and a clock.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Sequence {
+    /// Name of the sequence; empty if the data set has only one.
+    pub name: String,
+    /// Ids of its frames in the order of time.
+    pub ids: Vec<String>,
+}
+
 /// What a recording knows of the moment of a frame besides its points.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Moment {
@@ -209,6 +234,15 @@ pub struct TrackedObject {
     pub bbox: Box3,
 }
 
+impl TrackedObject {
+    /// The label in [`LabelFrame::Lidar`]. A track that is a number stays one.
+    pub(crate) fn label_box(&self) -> LabelBox {
+        let mut label = LabelBox::from_box(&self.class, &self.bbox, None);
+        label.track = self.track.parse().ok();
+        label
+    }
+}
+
 /// Optional data of each point of a cloud, in the order of its points; `None` if not known.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PointDetails {
@@ -216,6 +250,10 @@ pub struct PointDetails {
     pub ring: Option<Vec<u16>>,
     /// Time of the point relative to the time stamp of the frame, s.
     pub time_s: Option<Vec<f32>>,
+    /// Whether the point is labelled as part of something that moves.
+    pub moving: Option<Vec<bool>>,
+    /// Whether the motion of the sensor within the scan has been taken out of the points.
+    pub compensated: Option<bool>,
 }
 
 #[cfg(test)]

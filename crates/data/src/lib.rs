@@ -45,7 +45,7 @@ pub use ground_height::{GroundConfig, GroundHeight};
 pub use gt_database::{GtDatabase, GtSample};
 pub use kitti_text::{KittiLine, KittiText, parse_kitti_text, read_kitti_text, to_kitti_text};
 pub use label_box::{DONT_CARE, LabelBox, LabelFrame};
-pub use layout::{DataLayout, Layout, Moment, PointDetails, TrackedObject};
+pub use layout::{DataLayout, Layout, Moment, PointDetails, Sequence, TrackedObject};
 pub use new_dataset::{Manifest, NewDataset};
 pub use output::write_atomic;
 pub use output_guard::refuse_input_file;

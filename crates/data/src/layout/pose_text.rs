@@ -68,6 +68,23 @@ pub(super) fn pose_from_rows(rows: &[f64]) -> Result<Pose, String> {
     Ok(Pose::from_parts(Translation3::new(rows[3], rows[7], rows[11]), quaternion))
 }
 
+/// The pose of a quaternion w x y z and a position, m.
+///
+/// # Errors
+/// Values that are not finite, and a quaternion whose length is not 1.
+pub(super) fn pose_from_quaternion(wxyz: [f64; 4], position: [f64; 3]) -> Result<Pose, String> {
+    let [w, x, y, z] = wxyz;
+    let length = (w * w + x * x + y * y + z * z).sqrt();
+    if !((length - 1.0).abs() < MOST_SKEW) {
+        return Err(format!("the quaternion {wxyz:?} (w x y z) has the length {length}, not 1"));
+    }
+    if !position.iter().all(|v| v.is_finite()) {
+        return Err(format!("the position {position:?} is not finite"));
+    }
+    let quaternion = UnitQuaternion::new_normalize(nalgebra::Quaternion::new(w, x, y, z));
+    Ok(Pose::from_parts(Translation3::from(position), quaternion))
+}
+
 /// Where the line of each id is in a table with a line a frame.
 ///
 /// A table with as many lines as there are frames has them in the order of the sorted ids. Any other table has a line
@@ -148,6 +165,9 @@ mod tests {
                 prop_assert!(found.rotation.angle_to(&pose.rotation) < 1e-7);
             }
             prop_assert_eq!(again.len(), 2);
+            let q = pose.rotation.quaternion();
+            let found = pose_from_quaternion([q.w, q.i, q.j, q.k], t).unwrap();
+            prop_assert!(found.rotation.angle_to(&pose.rotation) < 1e-7);
         }
 
         #[test]

@@ -1,13 +1,14 @@
 //! A recorded drive in plain files: `velodyne/*.bin`, `poses.txt`, `labels.csv` and time stamps where they are known.
 
+use super::file_names::{check_folder, ids_of_files};
 use super::pose_text::{LineOfFrame, check_box, parse_poses};
 use super::stamps::parse_stamps;
 use super::{DataLayout, Moment, TrackedObject};
-use crate::limits::{MOST_BOXES, MOST_IDS, at_most, read_text};
+use crate::limits::{MOST_BOXES, at_most, read_text};
 use crate::{Cloud, DataError, DatasetConfig, LabelBox, Layout, PointColumns, read_cloud};
 use geometry::Box3;
 use serde::Deserialize;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The plain layout of a recorded drive. Read-only.
@@ -63,7 +64,7 @@ impl DataLayout for Recording {
 
     fn read_labels(&self, root: &Path, id: &str) -> Result<Vec<LabelBox>, DataError> {
         let labels = read_labels_csv(&root.join(LABELS))?;
-        Ok(labels.get(frame_key(id)).into_iter().flatten().map(label_box).collect())
+        Ok(labels.get(frame_key(id)).into_iter().flatten().map(TrackedObject::label_box).collect())
     }
 
     fn moments(&self, root: &Path, ids: &[String]) -> Result<Vec<Moment>, DataError> {
@@ -91,42 +92,6 @@ impl DataLayout for Recording {
         };
         ids.iter().map(moment).collect()
     }
-}
-
-/// An error that names the folder if it does not exist.
-pub(super) fn check_folder(folder: &Path) -> Result<(), DataError> {
-    if folder.is_dir() {
-        return Ok(());
-    }
-    Err(DataError::file(folder, "does not exist: check `root` and `layout` of the data set"))
-}
-
-/// The names of the files in `folder` that end with `ending`, without it, sorted.
-///
-/// # Errors
-/// There is no such file.
-pub(super) fn ids_of_files(folder: &Path, ending: &str) -> Result<Vec<String>, DataError> {
-    let mut ids = BTreeSet::new();
-    for entry in fs_err::read_dir(folder)? {
-        let path = entry?.path();
-        let Some(name) = path.file_name() else { continue };
-        let name = name.to_str().ok_or_else(|| DataError::file(&path, "its name is not UTF-8"))?;
-        if let Some(id) = name.strip_suffix(ending).filter(|id| !id.is_empty()) {
-            at_most(folder, "frames", ids.len() as u64 + 1, MOST_IDS)?;
-            ids.insert(id.to_string());
-        }
-    }
-    if ids.is_empty() {
-        return Err(DataError::file(folder, format!("has no file whose name ends in {ending}")));
-    }
-    Ok(ids.into_iter().collect())
-}
-
-/// A label in [`crate::LabelFrame::Lidar`] of a tracked box. A track that is a number stays one.
-pub(super) fn label_box(object: &TrackedObject) -> LabelBox {
-    let mut label = LabelBox::from_box(&object.class, &object.bbox, None);
-    label.track = object.track.parse().ok();
-    label
 }
 
 /// One line of `labels.csv`: the box in the LiDAR frame, m and rad.
