@@ -23,6 +23,7 @@ commands! {
     Compare(compare::CompareArgs) "Rank several simulations of the same recordings by their distance from measured data";
     Report(report::ReportArgs) "Write the report of a study";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
+    Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
     Doctor(doctor::DoctorArgs) "Check a data set for errors";
 }
