@@ -2,6 +2,10 @@
 //! `layouts!`.
 
 mod file_per_frame;
+mod pose_text;
+mod stamps;
+
+pub use stamps::StampUnit;
 
 use crate::write::label_boxes;
 use crate::{Calibration, Cloud, DataError, DatasetConfig, Frame, LabelBox, LabelFrame, PointColumns};
@@ -44,19 +48,23 @@ macro_rules! layouts {
 }
 
 layouts! {
+    Recording = recording: "A recorded drive: `velodyne/*.bin` with `poses.txt`, `labels.csv` and time stamps where known.";
     Kitti = kitti: "`velodyne/*.bin`, `label_2/*.txt` and, if there is a camera, `calib/*.txt`.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
 }
 
+// The table has no mark for the default.
+#[allow(clippy::derivable_impls)]
 impl Default for Layout {
     fn default() -> Self {
-        Layout::ALL[0]
+        Layout::Kitti
     }
 }
 
 /// Finds, reads and writes the frames of one layout. `root` is the root folder of a data set, `id` the id of a frame.
 ///
-/// Methods with a default are for optional data. The default is "not known" or "does not exist".
+/// Methods with a default are for optional data. The default is "not known" or "does not exist". A layout that names no
+/// folders for writing is read-only: its methods that write return an error.
 pub trait DataLayout: Send + Sync {
     /// The name of the layout in a data set's TOML.
     fn name(&self) -> &'static str;
@@ -89,7 +97,9 @@ pub trait DataLayout: Send + Sync {
     fn has_labels(&self, root: &Path) -> bool;
 
     /// Whether the clouds have an intensity; true if the files do not show it.
-    fn has_intensity(&self, root: &Path) -> Result<bool, DataError>;
+    fn has_intensity(&self, _root: &Path) -> Result<bool, DataError> {
+        Ok(true)
+    }
 
     /// Reads the cloud of a frame, with the checks of [`crate::read_cloud`].
     fn read_cloud(&self, root: &Path, id: &str, columns: PointColumns) -> Result<Cloud, DataError>;
@@ -133,20 +143,38 @@ pub trait DataLayout: Send + Sync {
         Ok(PointDetails::default())
     }
 
-    /// The folders into which frames are written, relative to the root.
-    fn folders(&self) -> &'static [&'static str];
+    /// The folders into which frames are written, relative to the root; empty if the layout is read-only.
+    fn folders(&self) -> &'static [&'static str] {
+        &[]
+    }
 
     /// Writes the cloud of a frame.
-    fn write_cloud(&self, root: &Path, id: &str, cloud: &Cloud) -> Result<(), DataError>;
+    ///
+    /// # Errors
+    /// The layout is read-only, or the file cannot be written.
+    fn write_cloud(&self, root: &Path, _id: &str, _cloud: &Cloud) -> Result<(), DataError> {
+        Err(read_only(root, self.name()))
+    }
 
     /// Writes the labels of a frame, in the label frame of the data set.
-    fn write_labels(&self, root: &Path, id: &str, labels: &[LabelBox]) -> Result<(), DataError>;
+    ///
+    /// # Errors
+    /// The layout is read-only, or the file cannot be written.
+    fn write_labels(&self, root: &Path, _id: &str, _labels: &[LabelBox]) -> Result<(), DataError> {
+        Err(read_only(root, self.name()))
+    }
 
     /// Writes cloud and labels of a frame. Labels are written in [`LabelFrame::Lidar`].
     fn write_frame(&self, root: &Path, frame: &Frame) -> Result<(), DataError> {
         self.write_cloud(root, &frame.id, &frame.cloud)?;
         self.write_labels(root, &frame.id, &label_boxes(frame))
     }
+}
+
+fn read_only(root: &Path, layout: &str) -> DataError {
+    let writable: Vec<&str> = Layout::ALL.iter().filter(|l| !l.folders().is_empty()).map(|l| l.name()).collect();
+    let message = format!("the layout {layout} is read-only; data sets are written in {}", writable.join(" or "));
+    DataError::file(root, message)
 }
 
 /// What a recording knows of the moment of a frame besides its points.
@@ -203,9 +231,34 @@ mod tests {
         assert_eq!(Layout::default(), Layout::Kitti);
     }
 
-    /// The contract of all layouts.
+    /// Layouts recognise their own folders and no empty one; those without folders for writing say that they have none.
     #[test]
-    fn every_layout_reads_what_it_writes() {
+    fn read_only_layouts_say_so() {
+        let folder = tempfile::tempdir().unwrap();
+        let (root, frame) = (folder.path(), frame());
+        let writable = |layout: &&Layout| !layout.folders().is_empty();
+        assert_eq!(Layout::ALL.iter().filter(writable).collect::<Vec<_>>(), [&Layout::Kitti, &Layout::S2rDad]);
+        for layout in Layout::ALL {
+            assert!(layout.check_root(root).is_err() && layout.recognise(root).is_none() && !layout.has_labels(root));
+            assert!(layout.frame_ids(root).is_err() && !layout.has_cloud(root, "000007"));
+            if writable(&layout) {
+                continue;
+            }
+            let errors = [
+                layout.write_cloud(root, "000007", &frame.cloud),
+                layout.write_labels(root, "000007", &[]),
+                layout.write_frame(root, &frame),
+            ];
+            for error in errors {
+                let (error, name) = (error.unwrap_err().to_string(), layout.name());
+                let want = format!("the layout {name} is read-only; data sets are written in kitti or s2r_dad");
+                assert!(error.contains(&want), "{error}");
+            }
+        }
+        assert_eq!(std::fs::read_dir(root).unwrap().count(), 0);
+    }
+
+    fn frame() -> Frame {
         let object = Object {
             class: "Car".into(),
             bbox: Box3::from_array([10.5, -2.25, -0.9, 4.1, 1.7, 1.5, 0.3]),
@@ -213,15 +266,20 @@ mod tests {
             occlusion: None,
             image_box: None,
         };
-        let frame = Frame {
+        Frame {
             id: "000007".into(),
             cloud: Cloud { values: vec![1.0, 2.0, 3.0, 0.5, -4.0, 5.0, 6.0, 0.25], channels: 4 },
             objects: vec![object],
-        };
-        for layout in Layout::ALL {
+        }
+    }
+
+    /// The contract of all layouts that are written.
+    #[test]
+    fn every_layout_reads_what_it_writes() {
+        let frame = frame();
+        for layout in Layout::ALL.iter().filter(|layout| !layout.folders().is_empty()) {
             let folder = tempfile::tempdir().unwrap();
             let root = folder.path();
-            assert!(layout.check_root(root).is_err() && layout.recognise(root).is_none() && !layout.has_labels(root));
             layout.write_frame(root, &frame).unwrap();
             layout.check_root(root).unwrap();
             let found = layout.recognise(root).unwrap();
