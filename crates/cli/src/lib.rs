@@ -24,6 +24,7 @@ commands! {
     Report(report::ReportArgs) "Write the report of a study";
     Twin(twin::TwinArgs) "Make a simulated partner of a recording that has no simulation";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
+    Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
     Doctor(doctor::DoctorArgs) "Check a data set for errors";
 }

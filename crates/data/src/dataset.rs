@@ -20,7 +20,7 @@ impl Dataset {
     /// recognised from its folders.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let inside = path.join("dataset.toml");
-        let config = if path.is_file() {
+        let config = if path.is_file() && !is_recording(path) {
             DatasetConfig::read(path)?
         } else if inside.is_file() {
             DatasetConfig::read(&inside)?
@@ -257,6 +257,11 @@ impl Dataset {
         }
         Ok(if found.is_empty() { kitti } else { found.into_iter().collect() })
     }
+}
+
+/// Whether a file is itself a data set.
+fn is_recording(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "mcap")
 }
 
 fn text_path(folder: &Path, id: &str) -> PathBuf {

@@ -61,6 +61,9 @@ layouts! {
     Nuscenes = nuscenes: "nuScenes: tables in `v1.0-*/`, clouds in `samples/LIDAR_TOP` and `sweeps/LIDAR_TOP`.";
     NuscenesScans = nuscenes_scans: "Scans of nuScenes alone: a folder of `*.pcd.bin`.";
     Kitti = kitti: "`velodyne/*.bin`, `label_2/*.txt` and, if there is a camera, `calib/*.txt`.";
+    OpenPcdet = open_pcdet: "OpenPCDet's custom data: `points/*.npy` and `labels/*.txt` (`x y z dx dy dz heading name`).";
+    Carla = carla: "`*.ply` that CARLA's LiDARs wrote, y negated, and `label/*.txt` in the LiDAR frame.";
+    Mcap = mcap_file: "Clouds of a topic of an MCAP file (ROS 2): `root = \"drive.mcap#/topic\"`; read only.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
 }
 
@@ -275,7 +278,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (root, frame) = (folder.path(), frame());
         let writable = |layout: &&Layout| !layout.folders().is_empty();
-        assert_eq!(Layout::ALL.iter().filter(writable).collect::<Vec<_>>(), [&Layout::Kitti, &Layout::S2rDad]);
+        let written: Vec<&str> = Layout::ALL.iter().filter(writable).map(|layout| layout.name()).collect();
+        assert_eq!(written, ["kitti", "open_pcdet", "carla", "s2r_dad"]);
         for layout in Layout::ALL {
             assert!(layout.check_root(root).is_err() && layout.recognise(root).is_none() && !layout.has_labels(root));
             assert!(layout.frame_ids(root).is_err() && !layout.has_cloud(root, "000007"));
@@ -289,7 +293,8 @@ mod tests {
             ];
             for error in errors {
                 let (error, name) = (error.unwrap_err().to_string(), layout.name());
-                let want = format!("the layout {name} is read-only; data sets are written in kitti or s2r_dad");
+                let written = written.join(" or ");
+                let want = format!("the layout {name} is read-only; data sets are written in {written}");
                 assert!(error.contains(&want), "{error}");
             }
         }

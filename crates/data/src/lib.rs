@@ -21,6 +21,7 @@ mod kitti_text;
 mod label_box;
 pub mod layout;
 pub mod limits;
+mod lzf;
 mod new_dataset;
 pub mod output;
 mod output_guard;

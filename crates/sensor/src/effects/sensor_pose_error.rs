@@ -29,7 +29,7 @@ pub struct SensorPoseError {
 
 impl SensorPoseError {
     /// `nominal_from_true` of the sensor's frame.
-    fn error(&self) -> Pose {
+    pub fn error(&self) -> Pose {
         let [roll, pitch, yaw] = self.rotation_deg.map(f64::to_radians);
         Isometry3::from_parts(
             Translation3::from(self.translation_m),
