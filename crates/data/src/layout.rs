@@ -3,6 +3,7 @@
 
 mod file_per_frame;
 
+use crate::Presence as _;
 use crate::write::label_boxes;
 use crate::{Calibration, Cloud, DataError, DatasetConfig, Frame, LabelBox, LabelFrame, PointColumns};
 use geometry::{Box3, Pose};
@@ -82,7 +83,7 @@ pub trait DataLayout: Send + Sync {
 
     /// Whether the frame has a cloud.
     fn has_cloud(&self, root: &Path, id: &str) -> bool {
-        self.cloud_path(root, id).is_file()
+        self.cloud_path(root, id).may_be_file()
     }
 
     /// Whether the data set has labels. Without labels its frames have no objects.
