@@ -4,6 +4,7 @@ use crate::device::DeviceArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
+use data::Presence as _;
 use data::{
     Cloud, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
     read_kitti_text, refuse_input_file, write_atomic, write_json,
@@ -163,7 +164,7 @@ fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<DetectorConfig>
     }
     for folder in checkpoint.ancestors().skip(1).take(3) {
         let path = folder.join("config.toml");
-        if path.is_file() {
+        if path.may_be_file() {
             let text = fs_err::read_to_string(&path)?;
             let run: toml::Table = text.parse().with_context(|| path.display().to_string())?;
             let Some(detector) = run.get("detector") else { continue };

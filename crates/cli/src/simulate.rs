@@ -4,6 +4,7 @@ use crate::console::escaped;
 use crate::{errln, out, outln};
 use anyhow::Result;
 use clap::Args;
+use data::Presence as _;
 use data::{Dataset, verify_frames, write_atomic};
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
@@ -119,7 +120,7 @@ fn bar() -> Result<ProgressBar> {
 /// Writes `preview.png`, a bird's eye view of the first test frame. All data sets of a race show the same frame.
 fn preview(folder: &Path) -> Result<()> {
     let picture = folder.join("preview.png");
-    if picture.is_file() {
+    if picture.may_be_file() {
         return Ok(());
     }
     let dataset = Dataset::open(folder)?;

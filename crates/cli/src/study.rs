@@ -8,6 +8,7 @@ pub use output::listener;
 use crate::device::DeviceArgs;
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
+use data::Presence as _;
 use std::path::{Path, PathBuf};
 use study::{FrozenState, Launcher, RunOptions, Step, Study, plan, status};
 
@@ -82,7 +83,7 @@ impl StudySelection {
     /// The given path if it is a folder that is not the folder of a study.
     pub fn folder_of_runs(&self) -> Option<&Path> {
         let folder = Path::new(&self.study);
-        (folder.is_dir() && !Study::is_folder(folder)).then_some(folder)
+        (folder.may_be_folder() && !Study::is_folder(folder)).then_some(folder)
     }
 }
 

@@ -10,6 +10,7 @@ use crate::study::{SchedulingArgs, run_study};
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::Dataset;
+use data::Presence as _;
 use data::output::TemporaryFolder;
 use models::detector_text;
 use progress::Progress;
@@ -144,7 +145,7 @@ impl TrainArgs {
     fn stored(&self) -> Result<Option<(RunConfig, PathBuf)>> {
         let Some(out) = self.out.as_ref().filter(|_| self.resume) else { return Ok(None) };
         let path = out.join("config.toml");
-        Ok(if path.is_file() { Some((RunConfig::read(&path)?, out.clone())) } else { None })
+        Ok(if path.may_be_file() { Some((RunConfig::read(&path)?, out.clone())) } else { None })
     }
 
     /// Configuration and folder of a new run.

@@ -1,6 +1,7 @@
 //! SHA-256 of files.
 
 use crate::DataError;
+use crate::Presence as _;
 use crate::limits::length_of_file;
 use fs_err::File;
 use sha2::{Digest, Sha256};
@@ -30,7 +31,7 @@ pub fn files_sha256<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Resul
     let mut hash = Sha256::new();
     for path in paths {
         let path = path.as_ref();
-        if path.exists() {
+        if path.may_exist() {
             hash.update(length_of_file(path, u64::MAX)?.to_le_bytes());
             add_file(&mut hash, path)?;
         } else {
@@ -45,9 +46,11 @@ fn add_file(hash: &mut Sha256, path: &Path) -> Result<(), DataError> {
     let mut file = File::open(path)?;
     let mut piece = vec![0; 1 << 18];
     loop {
-        match file.read(&mut piece)? {
-            0 => return Ok(()),
-            n => hash.update(&piece[..n]),
+        match file.read(&mut piece) {
+            Ok(0) => return Ok(()),
+            Ok(n) => hash.update(&piece[..n]),
+            Err(e) if e.kind() == std::io::ErrorKind::Interrupted => {}
+            Err(e) => return Err(e.into()),
         }
     }
 }

@@ -1,5 +1,6 @@
 //! A data set on disk. Frames are read by id; their boxes are converted to the LiDAR frame.
 
+use crate::Presence as _;
 use crate::dataset_config::DatasetConfig;
 use crate::kitti_text::{KittiText, read_kitti_text};
 use crate::layout::{Moment, PointDetails, Sequence};
@@ -20,9 +21,9 @@ impl Dataset {
     /// recognised from its folders.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let inside = path.join("dataset.toml");
-        let config = if path.is_file() && !is_recording(path) {
+        let config = if path.may_be_file() && !is_recording(path) {
             DatasetConfig::read(path)?
-        } else if inside.is_file() {
+        } else if inside.may_be_file() {
             DatasetConfig::read(&inside)?
         } else {
             DatasetConfig::of_folder(path)?
@@ -178,7 +179,7 @@ impl Dataset {
     /// without any.
     pub fn repaired_labels(&self, id: &str) -> Result<Option<[Vec<LabelBox>; 3]>, DataError> {
         let Some(paths) = self.repaired_labels_paths(id) else { return Ok(None) };
-        if let Some(missing) = paths.iter().find(|path| !path.is_file()) {
+        if let Some(missing) = paths.iter().find(|path| !path.may_be_file()) {
             let message = "does not exist: the diagnosis that repaired the labels did not see this frame; diagnose all \
                            frames, or test on those that it saw";
             return Err(DataError::file(missing, message));

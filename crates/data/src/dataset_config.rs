@@ -1,5 +1,6 @@
 //! The TOML of a data set and its defaults.
 
+use crate::Presence as _;
 use crate::limits::{MOST_IMAGE_SIDE_PX, MOST_NAME_BYTES, check_name, read_text};
 use crate::toml_text::{KeyError, parse_toml, wrong};
 use crate::write::REPAIRED_ENDINGS;
@@ -115,7 +116,7 @@ impl DatasetConfig {
     /// The configuration of a folder without a TOML, from the first layout that recognises it.
     pub fn of_folder(folder: &Path) -> Result<Self, DataError> {
         let Some(mut config) = Layout::ALL.iter().find_map(|layout| layout.recognise(folder)) else {
-            if !folder.is_dir() {
+            if !folder.may_be_folder() {
                 return Err(DataError::file(folder, "does not exist; give the folder or the TOML of a data set"));
             }
             let markers: Vec<&str> = Layout::ALL.iter().flat_map(|layout| layout.markers()).copied().collect();
@@ -145,7 +146,7 @@ impl DatasetConfig {
         if self.splits.is_empty() {
             for name in ["train", "val", "test"] {
                 let list = PathBuf::from(format!("ImageSets/{name}.txt"));
-                if self.root.join(&list).is_file() {
+                if self.root.join(&list).may_be_file() {
                     self.splits.insert(name.into(), list);
                 }
             }
@@ -183,7 +184,7 @@ impl DatasetConfig {
         let repaired = repaired.iter().flatten().map(|folder| ("repaired_labels", folder.clone()));
         let others = [("labels", &self.labels), ("true_labels", &self.true_labels)];
         let others = others.into_iter().filter_map(|(key, folder)| Some((key, self.root.join(folder.as_ref()?))));
-        if let Some((key, missing)) = others.chain(repaired).find(|(_, folder)| !folder.is_dir()) {
+        if let Some((key, missing)) = others.chain(repaired).find(|(_, folder)| !folder.may_be_folder()) {
             return wrong(format!("{key}: {} is not a folder", missing.display()));
         }
         if !self.layout.supports_calibration() {

@@ -3,7 +3,7 @@
 use crate::DataError;
 use crate::output::{TEMPORARY_PREFIX, create_folder, remove_unfinished};
 use std::fs::{File, TryLockError};
-use std::io::{Read as _, Seek as _, Write as _};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -65,7 +65,10 @@ impl FolderLock {
             }
             // Otherwise its owner has removed it between opening and locking.
             if is_same(&file, &path) {
-                return Ok(Some(FolderLock { path, file }.with_owner()?));
+                let lock = FolderLock { path, file };
+                let failed = |e| DataError::file(&lock.path, format!("cannot be written: {e}"));
+                lock.write_owner().map_err(failed)?;
+                return Ok(Some(lock));
             }
         }
         Ok(None)
@@ -89,13 +92,10 @@ impl FolderLock {
         matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
     }
 
-    fn with_owner(mut self) -> Result<Self, DataError> {
-        let mut before = String::new();
-        self.file.read_to_string(&mut before).ok();
-        self.file.set_len(0)?;
-        self.file.rewind()?;
-        self.file.write_all(format!("process {}", std::process::id()).as_bytes())?;
-        Ok(self)
+    fn write_owner(&self) -> std::io::Result<()> {
+        let mut file = &self.file;
+        file.set_len(0)?;
+        file.write_all(format!("process {}", std::process::id()).as_bytes())
     }
 }
 

@@ -3,6 +3,7 @@
 //! A line is appended when a frame is written, so that an interrupted run knows which frames are whole. A line that
 //! cannot be read is ignored: its frame is made again. At the end the file is sorted.
 
+use crate::Presence as _;
 use crate::checksum::file_sha256;
 use crate::{DataError, write_atomic};
 use fs_err::{File, OpenOptions};
@@ -39,7 +40,7 @@ impl FrameRecords {
     /// Reads what an earlier run recorded.
     pub(crate) fn open(root: &Path) -> Result<Self, DataError> {
         let path = root.join(FRAMES_FILE);
-        let text = if path.is_file() { fs_err::read(&path)? } else { Vec::new() };
+        let text = if path.may_be_file() { fs_err::read(&path)? } else { Vec::new() };
         let mut journal = OpenOptions::new().create(true).append(true).open(&path)?;
         if text.last().is_some_and(|last| *last != b'\n') {
             journal.write_all(b"\n")?;
@@ -106,7 +107,7 @@ pub fn verify_frames(root: &Path) -> Result<usize, DataError> {
         return Err(wrong("is not complete; run the same command again without --verify".into()));
     }
     let path = root.join(FRAMES_FILE);
-    if !path.is_file() || manifest["frames_sha256"] != file_sha256(&path)? {
+    if !path.may_be_file() || manifest["frames_sha256"] != file_sha256(&path)? {
         let message = "is missing or is not the file that belongs to manifest.json; run the same command again \
                        without --verify, which makes the frames anew";
         return Err(DataError::file(&path, message));

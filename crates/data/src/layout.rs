@@ -12,6 +12,7 @@ mod tracklets;
 
 pub use stamps::StampUnit;
 
+use crate::Presence as _;
 use crate::write::label_boxes;
 use crate::{Calibration, Cloud, DataError, DatasetConfig, Frame, LabelBox, LabelFrame, PointColumns};
 use geometry::{Box3, Pose};
@@ -104,7 +105,7 @@ pub trait DataLayout: Send + Sync {
 
     /// Whether the frame has a cloud.
     fn has_cloud(&self, root: &Path, id: &str) -> bool {
-        self.cloud_path(root, id).is_file()
+        self.cloud_path(root, id).may_be_file()
     }
 
     /// Whether the data set has labels. Without labels its frames have no objects.

@@ -1,5 +1,6 @@
 //! Writes a new data set: folder, manifest, frames, splits and `dataset.toml`.
 
+use crate::Presence as _;
 use crate::frame_records::FrameRecords;
 use crate::limits::read_text;
 use crate::output::remove_unfinished;
@@ -138,7 +139,7 @@ fn manifest_path(root: &Path) -> PathBuf {
 
 fn check_folder<M: Manifest>(root: &Path, wanted: &M) -> Result<(), DataError> {
     let path = manifest_path(root);
-    if path.is_file() {
+    if path.may_be_file() {
         let text = read_text(&path)?;
         let found: M = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
         if found.identity() != wanted.identity() {

@@ -5,10 +5,12 @@
 //! process (`/dev/fd/N`) is opened and written to.
 
 use crate::DataError;
+use crate::Presence as _;
 use std::collections::BTreeSet;
 use std::io::{ErrorKind, Result as IoResult, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
+use std::time::Duration;
 
 /// Prefix of the names of temporary files.
 pub(crate) const TEMPORARY_PREFIX: &str = ".writing-";
@@ -88,7 +90,7 @@ pub fn remove_temporary() {
 
 /// Removes temporary files of killed processes from a folder, which need not exist. No other process may write there.
 pub fn remove_unfinished(folder: &Path) -> Result<(), DataError> {
-    if folder.is_dir() {
+    if folder.may_be_folder() {
         for entry in fs_err::read_dir(folder)? {
             let entry = entry?;
             if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) {
@@ -99,10 +101,25 @@ pub fn remove_unfinished(folder: &Path) -> Result<(), DataError> {
     Ok(())
 }
 
+/// Age from which a temporary file is taken for one of a killed process, where other processes may write. Writing takes
+/// seconds.
+const OLD: Duration = Duration::from_secs(3600);
+
+/// Removes old temporary files of killed processes from a folder that other processes may write to. What cannot be
+/// removed stays.
+fn remove_old_unfinished(folder: &Path) {
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+        let is_old = || entry.metadata().ok()?.modified().ok()?.elapsed().ok().map(|age| age > OLD);
+        if entry.file_name().to_string_lossy().starts_with(TEMPORARY_PREFIX) && is_old() == Some(true) {
+            std::fs::remove_file(entry.path()).ok();
+        }
+    }
+}
+
 /// As [`remove_unfinished`], and from all folders below it.
 pub fn remove_unfinished_below(folder: &Path) -> Result<(), DataError> {
     remove_unfinished(folder)?;
-    if folder.is_dir() {
+    if folder.may_be_folder() {
         for entry in fs_err::read_dir(folder)? {
             let entry = entry?;
             if entry.file_type()?.is_dir() {
@@ -144,6 +161,7 @@ pub fn check_writable(path: &Path) -> Result<(), DataError> {
     if let Destination::File(file) = destination(path).map_err(failed)? {
         let folder = folder_of(&file);
         create_folder(folder)?;
+        remove_old_unfinished(folder);
         let probe = tempfile::Builder::new().prefix(TEMPORARY_PREFIX).tempfile_in(folder).map_err(failed)?;
         let _registered = TemporaryFile::new(probe.path());
         probe.close().map_err(failed)?;
@@ -224,8 +242,21 @@ fn replace(path: &Path, bytes: &[u8]) -> IoResult<()> {
     let _registered = TemporaryFile::new(file.path());
     file.write_all(bytes)?;
     file.as_file().sync_all()?;
-    file.persist(path).map_err(|e| e.error)?;
+    // Not `persist`, which calls the system without the C library: tests put a layer between that makes calls fail.
+    let temporary = file.into_temp_path();
+    std::fs::rename(&temporary, path)?;
+    temporary.keep().map_err(|e| e.error)?; // it has no file any more
     sync_folder(folder)
+}
+
+/// Renames a file within its folder, and syncs the folder.
+///
+/// # Errors
+/// A file that cannot be renamed; the message names it.
+pub fn rename(from: &Path, to: &Path) -> Result<(), DataError> {
+    fs_err::rename(from, to)?;
+    let folder = folder_of(to);
+    sync_folder(folder).map_err(|e| DataError::file(folder, format!("the folder cannot be synced: {e}")))
 }
 
 /// The folder of a file; `.` for a bare name.
@@ -247,7 +278,8 @@ pub fn create_folder(folder: &Path) -> Result<(), DataError> {
         fs_err::create_dir_all(folder)?;
     }
     for made in missing {
-        sync_folder(folder_of(made))?;
+        let above = folder_of(made);
+        sync_folder(above).map_err(|e| DataError::file(above, format!("the folder cannot be synced: {e}")))?;
     }
     Ok(())
 }
@@ -289,6 +321,21 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         check_writable(&folder.path().join("a.json")).unwrap();
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn old_temporary_files_beside_an_output_are_removed() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for name in [".writing-old", ".writing-new", "old"] {
+            std::fs::write(at(name), "").unwrap();
+        }
+        let before = std::time::SystemTime::now() - 2 * OLD;
+        for name in [".writing-old", "old"] {
+            std::fs::File::options().write(true).open(at(name)).unwrap().set_modified(before).unwrap();
+        }
+        check_writable(&at("a.json")).unwrap();
+        assert!(!at(".writing-old").exists() && at(".writing-new").exists() && at("old").exists());
     }
 
     #[cfg(unix)]

@@ -1,5 +1,6 @@
 //! Refuses output folders in which files of the input would be overwritten.
 
+use crate::Presence as _;
 use crate::{DataError, Dataset};
 use std::path::{Component, Path, PathBuf};
 
@@ -47,7 +48,7 @@ impl Dataset {
 /// # Errors
 /// Such a file; the message names it.
 pub fn refuse_input_file<'a>(out: Option<&Path>, inputs: impl IntoIterator<Item = &'a Path>) -> Result<(), DataError> {
-    let Some(out) = out.filter(|out| out.is_file()) else { return Ok(()) };
+    let Some(out) = out.filter(|out| out.may_be_file()) else { return Ok(()) };
     match inputs.into_iter().find(|input| resolved(input) == resolved(out)) {
         Some(_) => Err(DataError::file(out, "is a file that is read, and would be overwritten; choose another file")),
         None => Ok(()),

@@ -1,6 +1,7 @@
 //! Reads labels and detections from folders of KITTI text files.
 
 use crate::EvalFrame;
+use data::Presence as _;
 use data::limits::{MOST_IDS, at_most, check_name, read_text};
 use data::{DataError, KittiText, read_kitti_text};
 use rayon::prelude::*;
@@ -10,13 +11,13 @@ use std::path::Path;
 /// without detections has an empty file.
 pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<Vec<EvalFrame>, DataError> {
     for folder in [labels, detections] {
-        if !folder.is_dir() {
+        if !folder.may_be_folder() {
             return Err(DataError::file(folder, "is not a folder"));
         }
     }
     let read = |id: &String| {
         let detected = detections.join(format!("{id}.txt"));
-        if !detected.exists() {
+        if !detected.may_exist() {
             return Err(DataError::file(&detected, "does not exist; a frame without detections has an empty file"));
         }
         Ok(EvalFrame {

@@ -2,6 +2,7 @@
 
 use crate::ModelError;
 use crate::config::DetectorConfig;
+use data::Presence as _;
 use std::path::Path;
 
 /// Name and text of each file, by name.
@@ -16,7 +17,7 @@ pub fn detector_text(name_or_path: &str) -> Result<String, ModelError> {
         return Ok((*text).to_string());
     }
     let path = Path::new(name_or_path);
-    if !path.exists() {
+    if !path.may_exist() {
         let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
         let message = format!("there is no such detector: neither a file nor one of {}", names.join(", "));
         return Err(ModelError::File { path: path.into(), message });

@@ -8,6 +8,7 @@ use crate::material::MaterialTable;
 use crate::motion::{OwnMotion, own_motion, seen_velocity, static_edges, times_s};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
+use data::Presence as _;
 use data::{Cloud, DataError, Dataset, Frame, PointColumns};
 use geometry::Box3;
 use nalgebra::Vector3;
@@ -73,7 +74,7 @@ impl<'a> FinishedDataset<'a> {
         let some: Vec<&String> = ids.iter().step_by(step).collect();
         let clouds: Vec<Cloud> = some.par_iter().map(|id| dataset.load_cloud(id)).collect::<Result<_, _>>()?;
         let reader = CloudReader::new(&rig, &clouds);
-        let described = ids.first().is_some_and(|id| attributes::path(&dataset.config.root, id).is_file());
+        let described = ids.first().is_some_and(|id| attributes::path(&dataset.config.root, id).may_be_file());
         let materials =
             if described { attributes::read_materials(&dataset.config.root)? } else { MaterialTable::default() };
         let rate_hz = rig.sensors.first().map_or(20.0, |s| s.rate_hz);
@@ -227,7 +228,7 @@ impl<'a> FinishedDataset<'a> {
     /// A frame as a scan.
     fn scan(&self, frame: &Frame) -> Result<Scan, DataError> {
         let beside = attributes::path(&self.dataset.config.root, &frame.id);
-        if !beside.is_file() {
+        if !beside.may_be_file() {
             return Ok(self.reader.scan(&frame.cloud, &self.surfaces));
         }
         let mut scan = attributes::read(&beside, &self.rig)?;

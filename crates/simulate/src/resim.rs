@@ -1,6 +1,7 @@
 //! Applies sensor effects to existing data sets, of this simulator or any other.
 
 use crate::SimulateError;
+use data::Presence as _;
 use data::checksum::files_sha256;
 use data::limits::{MOST_TEXT_BYTES, read_file};
 use data::toml_text::wrong;
@@ -130,7 +131,7 @@ impl Resim<'_> {
             return Err(DataError::file(root, format!("{why}: {}", made.simulated.display())).into());
         }
         let already = root.join("effects.toml");
-        if already.is_file() && EffectList::read(&already)? == *self.effects {
+        if already.may_be_file() && EffectList::read(&already)? == *self.effects {
             return Err(DataError::file(&already, "the data set was made with this list: it would act twice").into());
         }
         let own: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
@@ -156,7 +157,7 @@ impl Resim<'_> {
         let (beside, described) = (attributes::path(out, id), finished.is_described());
         let labelled = self.dataset.has_labels();
         let calibrations = self.dataset.calibration_path(id).zip(layout.calibration_path(out, id));
-        let calibrations = calibrations.filter(|(from, _)| from.is_file());
+        let calibrations = calibrations.filter(|(from, _)| from.may_be_file());
         let files = || {
             let labels = labelled.then(|| layout.labels_path(out, id));
             let truth = self.dataset.true_labels_path(id).map(|_| true_labels_path(out, id));

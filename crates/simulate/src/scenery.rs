@@ -2,6 +2,7 @@
 
 use crate::race::{ConfigFiles, RaceConfig};
 use crate::{FrameCounts, RoadConfig, SimulateError};
+use data::Presence as _;
 use data::toml_text::wrong;
 use std::path::Path;
 
@@ -21,7 +22,7 @@ impl Scenery {
     /// There is no configuration of this name, the file is invalid, or the number of frames is not possible.
     pub fn find(name_or_path: &str, frames: Option<usize>, seed: Option<u64>) -> Result<Self, SimulateError> {
         let path = Path::new(name_or_path);
-        let is_street = if path.is_file() {
+        let is_street = if path.may_be_file() {
             let text = data::limits::read_text(path)?;
             // A race names its sensors. Invalid TOML is treated as a race; its reader reports the line of the error.
             text.parse::<toml::Table>().is_ok_and(|table| !table.contains_key("rig"))
@@ -29,7 +30,7 @@ impl Scenery {
             name_or_path == "street"
         };
         if is_street {
-            return Ok(Scenery::Street(street(path.is_file().then_some(path), frames, seed)?));
+            return Ok(Scenery::Street(street(path.may_be_file().then_some(path), frames, seed)?));
         }
         let (mut config, files) = RaceConfig::find(name_or_path)?;
         config.seed = seed.unwrap_or(config.seed);

@@ -1,6 +1,7 @@
 //! Results that are cached in files together with a hash of their inputs, and recomputed only if the inputs change.
 
 use crate::error::Result;
+use data::Presence as _;
 use data::write_atomic;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
@@ -29,7 +30,7 @@ pub fn cached<T: Serialize + DeserializeOwned>(
         return Ok(value);
     }
     // The key is removed before and written after the value, so that an interrupted update is never taken for a result.
-    if key_path.is_file() {
+    if key_path.may_be_file() {
         fs_err::remove_file(&key_path)?;
     }
     let value = make()?;

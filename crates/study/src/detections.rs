@@ -4,6 +4,7 @@ use crate::config::StudyRun;
 use crate::data_sets::{frames_sha256, open};
 use crate::error::{InPart, Result};
 use crate::folder::Study;
+use data::Presence as _;
 use data::write::write_kitti_text;
 use data::{Dataset, write_atomic, write_json};
 use models::{Detector, LayerFeatures, inference_samples, predict_frames};
@@ -84,10 +85,10 @@ pub fn is_done(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> 
     if found.weights_sha256 != weights {
         return Ok(false);
     }
-    let feature_is_there = test_set != study.feature_set() || features_path(study, run).is_file();
+    let feature_is_there = test_set != study.feature_set() || features_path(study, run).may_be_file();
     let (_, ids, cell) = expected_cell(study, run, test_set, weights)?;
     let folder = run.detections(&study.folder, test_set);
-    Ok(feature_is_there && found == cell && ids.iter().all(|id| folder.join(format!("{id}.txt")).is_file()))
+    Ok(feature_is_there && found == cell && ids.iter().all(|id| folder.join(format!("{id}.txt")).may_be_file()))
 }
 
 /// Detects on every test set without complete detections, and stores the features on one of them. `note` is called with
@@ -194,7 +195,7 @@ pub fn evenly_spaced(ids: &[String], most: usize) -> Vec<String> {
 /// A damaged file.
 pub fn read_features(study: &Study, run: &StudyRun) -> Result<Option<RunFeatures>> {
     let path = features_path(study, run);
-    if !path.is_file() {
+    if !path.may_be_file() {
         return Ok(None);
     }
     let features: RunFeatures = serde_json::from_slice(&fs_err::read(&path)?)

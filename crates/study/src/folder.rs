@@ -2,6 +2,7 @@
 
 use crate::config::{Source, StudyConfig, StudyDataset, StudyRun};
 use crate::error::{InPart, Result, refused};
+use data::Presence as _;
 use data::{write_atomic, write_json};
 use models::detector_text;
 use serde::{Deserialize, Serialize};
@@ -54,7 +55,7 @@ impl Study {
             return Self::of_folder(Path::new(named));
         }
         let below = PathBuf::from(format!("configs/studies/{named}.toml"));
-        let path = [PathBuf::from(named), below.clone()].into_iter().find(|path| path.is_file());
+        let path = [PathBuf::from(named), below.clone()].into_iter().find(|path| path.may_be_file());
         let built_in = BUILT_IN.iter().find(|(name, _)| *name == named);
         let (text, path) = match (path, built_in) {
             (Some(path), _) => (fs_err::read_to_string(&path)?, path),
@@ -83,7 +84,7 @@ impl Study {
 
     /// Whether a folder is the folder of a study.
     pub fn is_folder(folder: &Path) -> bool {
-        folder.join(COPY).is_file()
+        folder.join(COPY).may_be_file()
     }
 
     /// Opens the study of a folder from the copy of its TOML.
@@ -165,7 +166,7 @@ impl Study {
     /// Value of `simulate --config`: a file relative to the study's TOML, or a name.
     pub fn scenes_config(&self, config: &Path) -> String {
         let path = self.path(config);
-        if path.is_file() { path.display().to_string() } else { config.display().to_string() }
+        if path.may_be_file() { path.display().to_string() } else { config.display().to_string() }
     }
 
     /// The configuration of a run.
@@ -217,7 +218,7 @@ impl Study {
     pub fn changes(&self) -> Result<Vec<String>> {
         let copy = self.folder.join(COPY);
         let mut texts = Vec::new();
-        if copy.is_file() {
+        if copy.may_be_file() {
             let changes = self.config.changes_since(&StudyConfig::read(&copy)?);
             texts.extend(changes.invalid.iter().map(|(id, reasons)| {
                 format!("{}/{}/seed-{} is no longer valid: {}", id.network, id.train_set, id.seed, reasons.join("; "))

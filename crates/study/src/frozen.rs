@@ -14,6 +14,7 @@ use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
 use axes::check_axes;
+use data::Presence as _;
 use data::write_json;
 use eval::EvalFrame;
 use eval::matrix::{PairedValues, RunId, RunResult, RunScores, ScoredFrames, TestSet, paired_values};
@@ -109,7 +110,7 @@ fn is_done(study: &Study, frozen: &FrozenDetector, test_set: &str) -> Result<boo
     }
     let folder = frozen.detections_folder(study, test_set);
     let ids = open(study, test_set)?.ids(&study.config.splits.test)?;
-    Ok(ids.iter().all(|id| folder.join(format!("{id}.txt")).is_file()))
+    Ok(ids.iter().all(|id| folder.join(format!("{id}.txt")).may_be_file()))
 }
 
 /// The test frames of a data set with labels and the detections of a frozen detector, in the label frame.
@@ -251,8 +252,11 @@ impl FrozenState {
         }
         let frames = read_frames(study, frozen, test_set, labels)?;
         let folder = frozen.regions_folder(study, test_set);
-        let regions =
-            if frozen.checkpoint.is_some() && folder.is_dir() { Some(labels.with_detections(&folder)?) } else { None };
+        let regions = if frozen.checkpoint.is_some() && folder.may_be_folder() {
+            Some(labels.with_detections(&folder)?)
+        } else {
+            None
+        };
         let options = &study.config.evaluation.matrix;
         let scores = Arc::new(labels.scores(&frames, regions.as_deref(), options));
         self.scores.lock().unwrap_or_else(PoisonError::into_inner).insert(key, scores.clone());

@@ -8,6 +8,7 @@ use crate::error::Result;
 use crate::folder::Study;
 use crate::frozen::FrozenState;
 use crate::run_state::{RunState, run_state};
+use data::Presence as _;
 use data::{DataError, Dataset, LabelBox};
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
 use eval::matrix::{Matrix, MatrixOptions, RunId, RunResult, RunScores, TestSet, build};
@@ -104,7 +105,7 @@ pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
 fn scores(labels: &TestSet, folders: &[PathBuf; 2], options: &MatrixOptions) -> Result<RunScores, DataError> {
     let [detections, regions] = folders;
     let frames = labels.with_detections(detections)?;
-    let regions = if regions.is_dir() { Some(labels.with_detections(regions)?) } else { None };
+    let regions = if regions.may_be_folder() { Some(labels.with_detections(regions)?) } else { None };
     Ok(labels.scores(&frames, regions.as_deref(), options))
 }
 

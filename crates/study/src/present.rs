@@ -8,6 +8,7 @@ use crate::features::features;
 use crate::folder::Study;
 use crate::numbers::{StudyState, analyses, matrix, network_title, some_test_frames};
 use crate::{Event, Listener};
+use data::Presence as _;
 use data::{KittiText, read_kitti_text};
 use eval::matrix::{Matrix, PairedDifference, Quantity, TestSet, shared_ids};
 use geometry::Box3;
@@ -194,7 +195,7 @@ fn training(study: &Study) -> Result<Vec<TrainingRun>> {
     let mut out = Vec::new();
     for run in study.config.runs() {
         let path = run.folder(&study.folder).join("metrics.jsonl");
-        if path.is_file() {
+        if path.may_be_file() {
             let network = network_title(study, &run.id.network);
             let name = format!("{network}, {}, seed {}", study.title(&run.id.train_set), run.id.seed);
             out.push(read_training_run(&name, &path)?);

@@ -3,6 +3,7 @@
 use crate::config::StudyRun;
 use crate::error::Result;
 use crate::folder::Study;
+use data::Presence as _;
 use data::{FolderLock, write_json};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -78,7 +79,7 @@ impl RunLock {
 /// Differences between the settings in the run folder and those of the study; empty if the run has not started.
 pub fn differences(study: &Study, run: &StudyRun) -> Result<Vec<String>> {
     let path = run.folder(&study.folder).join("config.toml");
-    if !path.is_file() {
+    if !path.may_be_file() {
         return Ok(Vec::new());
     }
     Ok(match RunConfig::read(&path) {
@@ -96,13 +97,13 @@ pub fn differences(study: &Study, run: &StudyRun) -> Result<Vec<String>> {
 /// Whether a state belongs to `config.toml` of the run folder.
 pub fn is_of_folder(state: &train::RunState, folder: &Path) -> Result<bool> {
     let path = folder.join("config.toml");
-    Ok(path.is_file() && RunConfig::read(&path)?.has_sha256(&state.config_sha256))
+    Ok(path.may_be_file() && RunConfig::read(&path)?.has_sha256(&state.config_sha256))
 }
 
 /// The state of a run.
 pub fn run_state(study: &Study, run: &StudyRun) -> Result<RunState> {
     let folder = run.folder(&study.folder);
-    if !folder.is_dir() {
+    if !folder.may_be_folder() {
         return Ok(RunState::Missing);
     }
     let other = differences(study, run)?;

@@ -6,6 +6,7 @@ use crate::error::{Result, refused};
 use crate::folder::Study;
 use crate::run_state::{RunLock, differences, is_of_folder, remove_failure, write_failure};
 use burn::tensor::Device;
+use data::Presence as _;
 use data::output::remove_unfinished_below;
 use models::Detector;
 use models::checkpoint::read_checkpoint;
@@ -131,7 +132,7 @@ fn is_trained(folder: &Path) -> Result<bool> {
 /// Writes the present path of the data set to `config.toml` of a run that is to be continued.
 fn follow_data_set(folder: &Path, config: &RunConfig) -> Result<()> {
     let path = folder.join("config.toml");
-    if path.is_file() && RunConfig::read(&path)?.dataset != config.dataset {
+    if path.may_be_file() && RunConfig::read(&path)?.dataset != config.dataset {
         data::write_atomic(&path, config.to_toml().as_bytes())?;
     }
     Ok(())

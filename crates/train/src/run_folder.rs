@@ -10,9 +10,10 @@ use crate::TrainError;
 use crate::state_file::{
     BEST, LAST, NEXT, PREVIOUS, RunState, STATE, STATE_SCHEMA, StateFile, names, read_state_file, state_sha256,
 };
+use data::Presence as _;
 use data::checksum::file_sha256;
-use data::output::{create_folder, remove_unfinished_below};
-use data::{FolderLock, write_atomic, write_json};
+use data::output::{create_folder, remove_unfinished_below, rename};
+use data::{DataError, FolderLock, write_atomic, write_json};
 use models::checkpoint::{NamedTensors, read_safetensors, write_safetensors};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -116,7 +117,11 @@ impl RunFolder {
         let of_best = if best_step == Some(state.step) {
             sha256.get(&weights_name).cloned()
         } else {
-            let before = read_state_file(&self.state_path()).ok().flatten();
+            let before = match read_state_file(&self.state_path()) {
+                // Without the file the checksum of the best weights would be lost.
+                Err(error @ TrainError::Data(DataError::Io(_))) => return Err(error),
+                before => before.ok().flatten(),
+            };
             before.filter(|b| b.state.best == state.best).and_then(|b| b.sha256.get(BEST).cloned())
         };
         sha256.extend(of_best.map(|sum| (BEST.to_string(), sum)));
@@ -124,10 +129,11 @@ impl RunFolder {
         let next = self.checkpoints().join(NEXT);
         write_json(&next, &file)?;
         self.link_last_and_best(state)?;
-        if self.state_path().is_file() {
+        if self.state_path().may_be_file() {
             link(&self.state_path(), &self.checkpoints().join(PREVIOUS))?;
         }
-        fs_err::rename(next, self.state_path())?;
+        // On the disk before files of older checkpoints are removed.
+        rename(&next, &self.state_path())?;
         self.remove_all_but(state, keep.max(FEWEST_KEPT))
     }
 
@@ -140,7 +146,7 @@ impl RunFolder {
         let newest = self.checkpoint(STATE);
         let previous = self.checkpoints().join(PREVIOUS);
         let checkpoint = match newest {
-            Ok(None) if !previous.is_file() => return Ok(None),
+            Ok(None) if !previous.may_be_file() => return Ok(None),
             Ok(Some(checkpoint)) => checkpoint,
             newest => {
                 let reason = newest.map_or_else(

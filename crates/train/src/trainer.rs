@@ -11,6 +11,7 @@ use crate::{
 };
 use burn::optim::GradientsParams;
 use burn::tensor::Device;
+use data::Presence as _;
 use data::{Dataset, write_atomic};
 use models::checkpoint::read_checkpoint;
 use models::layers::Precision;
@@ -329,7 +330,7 @@ impl<'a> Run<'a> {
 /// Refuses a folder with a run, unless it is to be resumed with the same configuration.
 fn refuse_other_run(config: &RunConfig, folder: &RunFolder, resume: bool) -> Result<(), TrainError> {
     let path = folder.config_path();
-    if !path.is_file() {
+    if !path.may_be_file() {
         return Ok(());
     }
     if !resume {

@@ -49,6 +49,8 @@ pub struct RecordedScan {
     pub intensity: Vec<f32>,
     /// Time of each return relative to the frame's stamp, s; `None` if it is not known.
     pub time_s: Option<Vec<f32>>,
+    /// Whether a return is labelled as part of something that moves; `None` if it is not known.
+    pub moving: Option<Vec<bool>>,
     /// The returns by row; `None` if rows are not known.
     pub rows: Option<Rows>,
 }
@@ -125,8 +127,16 @@ impl Recording {
     pub fn scan(&self, frame: usize) -> Result<RecordedScan, TwinError> {
         let id = &self.moments[frame].id;
         let cloud = self.dataset.load_cloud(id)?;
-        let details = self.dataset.point_details(id)?;
-        let mut scan = RecordedScan { time_s: details.time_s.as_ref().map(|_| Vec::new()), ..RecordedScan::default() };
+        let mut details = self.dataset.point_details(id)?;
+        if details.compensated == Some(true) {
+            // The points are where they would have been at the stamp.
+            details.time_s = None;
+        }
+        let mut scan = RecordedScan {
+            time_s: details.time_s.as_ref().map(|_| Vec::new()),
+            moving: details.moving.as_ref().map(|_| Vec::new()),
+            ..RecordedScan::default()
+        };
         let mut ring = details.ring.as_ref().map(|_| Vec::new());
         for (i, p) in cloud.points().enumerate() {
             let [x, y, z] = [p[0], p[1], p[2]].map(f64::from);
@@ -140,6 +150,9 @@ impl Recording {
             scan.points.push([p[0], p[1], p[2]]);
             scan.intensity.push(p.get(3).copied().unwrap_or(0.0));
             if let (Some(to), Some(from)) = (&mut scan.time_s, &details.time_s) {
+                to.push(from[i]);
+            }
+            if let (Some(to), Some(from)) = (&mut scan.moving, &details.moving) {
                 to.push(from[i]);
             }
             if let (Some(to), Some(from)) = (&mut ring, &details.ring) {

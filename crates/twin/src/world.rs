@@ -64,6 +64,7 @@ impl World {
                 let patch = patch.moved(&stamp_from_time);
                 match objects.iter().find(|o| is_in(&o.bbox, &patch.place)) {
                     Some(o) => moving.entry(o.track.clone()).or_default().push(patch.moved(&pose_of(&o.bbox).inverse())),
+                    None if scan.moving.as_ref().is_some_and(|moving| moving[i]) => {}
                     None => still.push(patch.moved(&map_from_lidar)),
                 }
             }

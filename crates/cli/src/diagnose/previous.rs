@@ -2,6 +2,7 @@
 
 use anyhow::Result;
 use data::DataError;
+use data::Presence as _;
 use data::output::remove_unfinished;
 use data::write::REPAIRED_ENDINGS;
 use std::path::Path;
@@ -23,10 +24,10 @@ pub(super) fn remove(out: &Path) -> Result<(), DataError> {
     for folder in &folders {
         remove_unfinished(folder)?;
     }
-    if !out.join(MARK).is_file() {
+    if !out.join(MARK).may_be_file() {
         return Ok(());
     }
-    for folder in folders.iter().filter(|folder| folder.is_dir()) {
+    for folder in folders.iter().filter(|folder| folder.may_be_folder()) {
         remove_files(folder, |name| name.ends_with(".txt"))?;
         // A folder with other files stays.
         std::fs::remove_dir(folder).ok();

@@ -2,6 +2,7 @@
 
 use crate::{errln, outln};
 use anyhow::Result;
+use data::Presence as _;
 use data::write::write_kitti_text;
 use data::{Dataset, write_atomic, write_json};
 use eval::{Difficulty, Metric};
@@ -65,7 +66,7 @@ pub(super) fn write_curve_and_list(out: &Path, keep: bool) -> Result<()> {
         ("pictures", "bird's eye views of some frames"),
         ("curve.svg", "loss and AP over the steps"),
     ] {
-        if out.join(file).exists() {
+        if out.join(file).may_exist() {
             outln!("  {file:<28} {what}");
         }
     }

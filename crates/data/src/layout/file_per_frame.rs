@@ -1,6 +1,7 @@
 //! Layouts with one cloud file (`.bin` or `.pcd`) and one label file (KITTI text) per frame, in two folders.
 
 use super::DataLayout;
+use crate::Presence as _;
 use crate::kitti_text::{KittiText, read_kitti_text};
 use crate::limits::{MOST_CLOUD_BYTES, read_file};
 use crate::write::{write_bin, write_kitti_text, write_pcd};
@@ -58,7 +59,7 @@ pub(super) trait FilePerFrame: Send + Sync {
 /// The configuration of a data set with this root; `None` if the folder of clouds does not exist.
 pub(super) fn at_root<L: FilePerFrame>(root: &Path) -> Option<DatasetConfig> {
     let config = DatasetConfig { layout: L::LAYOUT, root: root.into(), ..DatasetConfig::default() };
-    root.join(L::FOLDERS[0]).is_dir().then_some(config)
+    root.join(L::FOLDERS[0]).may_be_folder().then_some(config)
 }
 
 impl<L: FilePerFrame> DataLayout for L {
@@ -76,7 +77,7 @@ impl<L: FilePerFrame> DataLayout for L {
 
     fn check_root(&self, root: &Path) -> Result<(), DataError> {
         let clouds = root.join(L::FOLDERS[0]);
-        if !clouds.is_dir() {
+        if !clouds.may_be_folder() {
             return Err(DataError::file(&clouds, "does not exist: check `root` and `layout` of the data set"));
         }
         Ok(())
@@ -101,7 +102,7 @@ impl<L: FilePerFrame> DataLayout for L {
     fn cloud_path(&self, root: &Path, id: &str) -> PathBuf {
         let path = |format: CloudFormat| root.join(L::FOLDERS[0]).join(format!("{id}.{}", format.extension()));
         let (usual, other) = (path(L::CLOUDS), path(L::CLOUDS.other()));
-        if !usual.is_file() && other.is_file() { other } else { usual }
+        if !usual.may_be_file() && other.may_be_file() { other } else { usual }
     }
 
     fn labels_path(&self, root: &Path, id: &str) -> PathBuf {
@@ -109,7 +110,7 @@ impl<L: FilePerFrame> DataLayout for L {
     }
 
     fn has_labels(&self, root: &Path) -> bool {
-        root.join(L::FOLDERS[1]).is_dir()
+        root.join(L::FOLDERS[1]).may_be_folder()
     }
 
     /// From the header of the first cloud if it is a `.pcd`. A `.bin` has no header: true.
@@ -144,7 +145,7 @@ impl<L: FilePerFrame> DataLayout for L {
 
     fn default_label_frame(&self, root: &Path) -> LabelFrame {
         match L::CALIBRATION {
-            Some(folder) if root.join(folder).is_dir() => LabelFrame::Camera,
+            Some(folder) if root.join(folder).may_be_folder() => LabelFrame::Camera,
             _ => LabelFrame::Lidar,
         }
     }

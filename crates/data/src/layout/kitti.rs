@@ -1,6 +1,7 @@
 //! KITTI's object benchmark: `velodyne/*.bin`, `label_2/*.txt` and, if there is a camera, `calib/*.txt`.
 
 use super::file_per_frame::{CloudFormat, FilePerFrame, at_root};
+use crate::Presence as _;
 use crate::dataset_config::folder_name;
 use crate::{DatasetConfig, Layout};
 use std::path::{Path, PathBuf};
@@ -24,7 +25,7 @@ impl FilePerFrame for Kitti {
         // ImageSets is beside `training/`. Its `test.txt` lists frames of `testing/` and is not used.
         for name in ["train", "val"] {
             let list = PathBuf::from(format!("../ImageSets/{name}.txt"));
-            if training.join(&list).is_file() {
+            if training.join(&list).may_be_file() {
                 config.splits.insert(name.into(), list);
             }
         }

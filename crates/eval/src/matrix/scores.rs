@@ -5,6 +5,7 @@ use crate::evidence::{Evidence, FrameEvidence};
 use crate::matching::{BoxIndex, CurveKey};
 use crate::overlaps::{FrameOverlaps, range_m};
 use crate::{EvalFrame, Metric, RangeSection};
+use data::Presence as _;
 use data::{DataError, Dataset, KittiText, LabelBox, LabelFrame, read_kitti_text};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -111,7 +112,7 @@ impl TestSet {
     pub fn with_detections(&self, folder: &Path) -> Result<Vec<EvalFrame>, DataError> {
         let read = |frame: &EvalFrame| {
             let path = folder.join(format!("{}.txt", frame.id));
-            if !path.exists() {
+            if !path.may_exist() {
                 let message =
                     "does not exist; a frame without detections has an empty file. Detect this test set again";
                 return Err(DataError::file(&path, message));

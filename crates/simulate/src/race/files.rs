@@ -2,6 +2,7 @@
 
 use crate::SimulateError;
 use data::DataError;
+use data::Presence as _;
 use std::path::{Path, PathBuf};
 
 /// The files next to a configuration.
@@ -36,12 +37,12 @@ impl ConfigFiles {
     /// Text and path of a configuration given by path or built-in name, and the files next to it.
     pub fn open(name_or_path: &str) -> Result<(String, PathBuf, ConfigFiles), SimulateError> {
         let path = PathBuf::from(name_or_path);
-        if !path.is_file() && ConfigFiles::NAMES.contains(&name_or_path) {
+        if !path.may_be_file() && ConfigFiles::NAMES.contains(&name_or_path) {
             let files = ConfigFiles { folder: None };
             let (text, path) = files.text(Path::new(&format!("{name_or_path}.toml")))?;
             return Ok((text, path, files));
         }
-        if !path.is_file() {
+        if !path.may_be_file() {
             let message =
                 format!("does not exist, and is none that comes with the program ({})", ConfigFiles::NAMES.join(", "));
             return Err(DataError::file(&path, message).into());

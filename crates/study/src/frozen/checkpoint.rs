@@ -9,6 +9,7 @@ use crate::folder::Study;
 use crate::local::current_program;
 use crate::{Event, Listener};
 use burn::tensor::Device;
+use data::Presence as _;
 use data::write_json;
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
@@ -21,7 +22,7 @@ use std::process::{Command, Stdio};
 fn config(study: &Study, frozen: &FrozenDetector) -> Result<DetectorConfig> {
     let named = frozen.detector.clone().unwrap_or_default();
     let path = study.path(&named);
-    let named = if path.is_file() { path.display().to_string() } else { named.display().to_string() };
+    let named = if path.may_be_file() { path.display().to_string() } else { named.display().to_string() };
     find_detector(&named).in_part(|| format!("frozen {}: detector", frozen.name))
 }
 

@@ -3,6 +3,7 @@
 
 use crate::config::FrozenDetector;
 use crate::error::{Result, refused};
+use data::Presence as _;
 use data::{DONT_CARE, DataError, Dataset, Detection, KittiText, LabelBox, parse_kitti_text};
 use eval::EvalFrame;
 use eval::matrix::TestSet;
@@ -31,10 +32,10 @@ impl Source<'_> {
     /// the data set does not have.
     pub(super) fn read(&self, known_classes: &[String]) -> Result<Vec<EvalFrame>> {
         let classes = Classes::new(self, known_classes);
-        if self.path.is_dir() {
+        if self.path.may_be_folder() {
             return self.read_folder(&classes);
         }
-        if !self.path.is_file() {
+        if !self.path.may_be_file() {
             return Err(refused(format!(
                 "{}: does not exist; detections of frozen {} on {} are a folder of KITTI text or a result.pkl of \
                  OpenPCDet",
@@ -144,7 +145,7 @@ impl Source<'_> {
 /// A file that cannot be read.
 pub(super) fn source_sha256(path: &Path) -> Result<String> {
     let mut hash = Sha256::new();
-    if path.is_dir() {
+    if path.may_be_folder() {
         let mut files: Vec<PathBuf> =
             fs_err::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<_>>()?;
         files.retain(|file| file.extension().is_some_and(|ending| ending == "txt"));
