@@ -113,7 +113,9 @@ impl DiagnoseArgs {
             (None, Some(measured), Some(simulated)) => {
                 let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
                 let remake = self.remake(&simulated, &rig);
-                let outcome = diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
+                let mut outcome =
+                    diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
+                outcome.diagnosis.notes.extend(twin::pair::note_for_diagnosis(&simulated)?);
                 (measured, outcome)
             }
             _ => bail!("give --measured and --simulated, or --scans"),

@@ -17,7 +17,7 @@ use twin::{AgreementNumbers, Leave, PoseOptions, PoseSource, Recording, TwinConf
 ///
 /// Examples:
 ///   lidarshift twin /data/drive_0001 --out twins/drive_0001
-///   lidarshift diagnose twins/drive_0001/measured twins/drive_0001/sim --out results
+///   lidarshift diagnose --measured twins/drive_0001/measured --simulated twins/drive_0001/sim --out results
 ///   lidarshift twin /data/drive_0001 --odometry --leave 1.0 --out twins/by_odometry
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
@@ -72,7 +72,7 @@ impl TwinArgs {
         print(&report);
         let [measured, sim] = ["measured", "sim"].map(|side| self.out.join(side));
         errln!("twin written to {}", self.out.display());
-        errln!("next: lidarshift diagnose {} {} --out RESULTS", measured.display(), sim.display());
+        errln!("next: lidarshift diagnose --measured {} --simulated {} --out RESULTS", measured.display(), sim.display());
         Ok(())
     }
 }

@@ -87,6 +87,8 @@ mod tests {
     #[test]
     fn the_ground_below_a_box_is_not_the_objects() {
         let bbox = Box3 { center: [10.0, 0.0, 0.0], size: [4.0, 2.0, 1.6], yaw_rad: 0.0 };
-        assert!(is_in(&bbox, &[10.0, 1.1, 0.0]) && !is_in(&bbox, &[10.0, 0.0, -0.78]) && !is_in(&bbox, &[10.0, 1.2, 0.0]));
+        assert!(
+            is_in(&bbox, &[10.0, 1.1, 0.0]) && !is_in(&bbox, &[10.0, 0.0, -0.78]) && !is_in(&bbox, &[10.0, 1.2, 0.0])
+        );
     }
 }

@@ -8,11 +8,15 @@ use crate::plan::{Leave, jobs};
 use crate::recording::{PoseSource, Recording};
 use crate::world::{FrameShots, World};
 use data::checksum::hex;
-use data::{Cloud, DatasetConfig, Frame, LabelFrame, Layout, Manifest, NewDataset, Object, write_atomic, write_json};
+use data::limits::read_text;
+use data::{
+    Cloud, DataError, Dataset, DatasetConfig, Frame, LabelFrame, Layout, Manifest, NewDataset, Object, Presence,
+    write_atomic, write_json,
+};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Schema version of `twin.json`.
 pub const TWIN_SCHEMA: &str = "lidarshift/twin/1";
@@ -141,10 +145,8 @@ pub fn make(
     let [measured, sim] = &roots;
     let mut manifests = [manifest.clone(), manifest.clone()];
     let [first, second] = &mut manifests;
-    let sides = [
-        NewDataset::begin(measured, Layout::Kitti, &[], first)?,
-        NewDataset::begin(sim, Layout::Kitti, &[], second)?,
-    ];
+    let sides =
+        [NewDataset::begin(measured, Layout::Kitti, &[], first)?, NewDataset::begin(sim, Layout::Kitti, &[], second)?];
     let classes: BTreeSet<String> = moments.iter().flat_map(|m| &m.objects).map(|o| o.class.clone()).collect();
     for (side, suffix) in sides.iter().zip(["measured", "twin"]) {
         let described = DatasetConfig {
@@ -251,7 +253,8 @@ fn write_frame(
 fn notes(recording: &Recording, lost_shots: bool) -> Vec<String> {
     let mut notes = Vec::new();
     if !lost_shots {
-        let why = "rows of the sensor are not known: shots without a return are not shot again, and losses cannot be told";
+        let why =
+            "rows of the sensor are not known: shots without a return are not shot again, and losses cannot be told";
         notes.push(why.into());
     }
     let poses = recording.world_from_lidar();
@@ -285,7 +288,20 @@ fn fingerprint(recording: &Recording, config: &TwinConfig, ids: &[String]) -> St
     hex(&Sha256::digest(text))
 }
 
-/// The files of a twin that a user looks for, relative to its folder.
-pub fn files() -> [PathBuf; 4] {
-    ["measured", "sim", "sensor.toml", "twin.json"].map(PathBuf::from)
+/// What to know of a diagnosis whose simulated side is a twin; `None` if it is none.
+pub fn note_for_diagnosis(simulated: &Dataset) -> Result<Option<String>, DataError> {
+    let root = &simulated.config.root;
+    let path = root.join("../twin.json");
+    if !path.may_be_file() {
+        return Ok(None);
+    }
+    let text = read_text(&path)?;
+    let twin: TwinReport = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
+    let names: Vec<&str> = twin.baked_in.iter().map(|[kind, _]| kind.as_str()).collect();
+    Ok(Some(format!(
+        "the simulated side is a twin of {}: these causes are in its map and are not identifiable: {}; a finding of one \
+         of them is an error of the twin",
+        twin.recording,
+        names.join(", ")
+    )))
 }

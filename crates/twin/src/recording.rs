@@ -171,7 +171,9 @@ impl Recording {
     /// The twist between this frame and the next (the one before, for the last) is taken to be constant.
     pub fn motion(&self, frame: usize, time_s: f32) -> Pose {
         let (a, b) = if frame + 1 < self.len() { (frame, frame + 1) } else { (frame - 1, frame) };
-        let (Some(from), Some(to)) = (self.moments[a].stamp_s, self.moments[b].stamp_s) else { return Pose::identity() };
+        let (Some(from), Some(to)) = (self.moments[a].stamp_s, self.moments[b].stamp_s) else {
+            return Pose::identity();
+        };
         let seconds = to - from;
         if !(seconds > 1e-3) || time_s == 0.0 {
             return Pose::identity();
@@ -204,7 +206,9 @@ impl Recording {
         let given: Option<Vec<Pose>> = self.moments.iter().map(|m| m.world_from_lidar).collect();
         if let Some(bad) = given.iter().flatten().position(|p| p.to_matrix().iter().any(|v| !v.is_finite())) {
             let id = &self.moments[bad].id;
-            return Err(TwinError::Recording(format!("frame {id}: its pose is not finite; leave it out, or --odometry")));
+            return Err(TwinError::Recording(format!(
+                "frame {id}: its pose is not finite; leave it out, or --odometry"
+            )));
         }
         match given.filter(|_| !options.odometry) {
             Some(given) => self.world_from_lidar = given,

@@ -1,10 +1,10 @@
 //! The world of a job: its map and its objects, and the shots of a frame into it.
 
+use crate::TwinError;
 use crate::map::{FARTHEST_M, FusionConfig, Met, Patch, SeenShot, SurfelMap, patches};
 use crate::objects::{is_in, model, pose_of};
 use crate::plan::Job;
 use crate::recording::{NEAREST_M, RecordedScan, Recording, Shot, shots};
-use crate::TwinError;
 use geometry::{Box3, Pose};
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
@@ -50,7 +50,8 @@ impl World {
         let middle = job.map[job.map.len() / 2];
         let map_from_world = recording.world_from_lidar()[middle].inverse();
         let steps = recording.steps();
-        let window = Steps { azimuth_rad: WINDOW[0] * steps.azimuth_rad, elevation_rad: WINDOW[1] * steps.elevation_rad };
+        let window =
+            Steps { azimuth_rad: WINDOW[0] * steps.azimuth_rad, elevation_rad: WINDOW[1] * steps.elevation_rad };
         let mut still = Vec::new();
         let mut moving: BTreeMap<String, Vec<Patch>> = BTreeMap::new();
         let mut seen = Vec::new();
@@ -63,7 +64,9 @@ impl World {
                 let stamp_from_time = motion_of(recording, *frame, &scan, i);
                 let patch = patch.moved(&stamp_from_time);
                 match objects.iter().find(|o| is_in(&o.bbox, &patch.place)) {
-                    Some(o) => moving.entry(o.track.clone()).or_default().push(patch.moved(&pose_of(&o.bbox).inverse())),
+                    Some(o) => {
+                        moving.entry(o.track.clone()).or_default().push(patch.moved(&pose_of(&o.bbox).inverse()))
+                    }
                     None if scan.moving.as_ref().is_some_and(|moving| moving[i]) => {}
                     None => still.push(patch.moved(&map_from_lidar)),
                 }
@@ -122,7 +125,8 @@ impl World {
         let shown = shown.collect();
         let of_object = |shot: &Shot| {
             let Some(i) = shot.measured else { return false };
-            let at = motion_of(recording, frame, &scan, i as usize) * Point3::from(scan.points[i as usize].map(f64::from));
+            let at =
+                motion_of(recording, frame, &scan, i as usize) * Point3::from(scan.points[i as usize].map(f64::from));
             let at = at.coords.map(|v| v as f32).into();
             boxes.iter().any(|o| is_in(&o.bbox, &at))
         };

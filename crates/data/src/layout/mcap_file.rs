@@ -112,7 +112,7 @@ impl DataLayout for Mcap {
 
     fn read_point_details(&self, root: &Path, id: &str) -> Result<PointDetails, DataError> {
         let message = clouds(root)?.read(root, id)?;
-        Ok(PointDetails { ring: message.ring, time_s: message.time_s })
+        Ok(PointDetails { ring: message.ring, time_s: message.time_s, ..PointDetails::default() })
     }
 }
 

@@ -40,12 +40,7 @@ impl Patch {
     /// The mirror image in the plane y = 0.
     pub fn mirrored(&self) -> Patch {
         let mirror = |[x, y, z]: [f32; 3]| [x, -y, z];
-        Patch {
-            place: mirror(self.place),
-            normal: mirror(self.normal),
-            axes: self.axes.map(mirror),
-            ..*self
-        }
+        Patch { place: mirror(self.place), normal: mirror(self.normal), axes: self.axes.map(mirror), ..*self }
     }
 
     /// Sum of the squared half axes, m^2.

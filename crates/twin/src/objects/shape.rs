@@ -34,7 +34,10 @@ pub(super) fn patches(class: &str, size: [f64; 3]) -> Vec<Patch> {
     } else {
         CAR
     };
-    parts.iter().flat_map(|part| faces(part.map(|corner| std::array::from_fn(|k| corner[k] * size[k] as f32)))).collect()
+    parts
+        .iter()
+        .flat_map(|part| faces(part.map(|corner| std::array::from_fn(|k| corner[k] * size[k] as f32))))
+        .collect()
 }
 
 /// Patches on the six faces of a cuboid.

@@ -87,8 +87,7 @@ impl Rows {
         let azimuth: Vec<f64> = self.0.iter().filter_map(|row| step(returns, row)).map(f64::from).collect();
         let mut elevations = self.elevations_rad(returns);
         elevations.sort_by(f32::total_cmp);
-        let gaps: Vec<f64> =
-            elevations.windows(2).map(|w| f64::from(w[1] - w[0])).filter(|gap| *gap > 1e-4).collect();
+        let gaps: Vec<f64> = elevations.windows(2).map(|w| f64::from(w[1] - w[0])).filter(|gap| *gap > 1e-4).collect();
         Some(Steps {
             azimuth_rad: statistics::median_upper(azimuth)? as f32,
             elevation_rad: statistics::median_upper(gaps)? as f32,
@@ -137,9 +136,8 @@ pub fn shots(scan: &super::RecordedScan) -> Vec<Shot> {
     let unit = |p: &[f32; 3]| Vector3::from(*p).normalize().into();
     let time = |i: usize| scan.time_s.as_ref().map_or(0.0, |t| t[i]);
     let measured = scan.points.iter().enumerate();
-    let mut all: Vec<Shot> = measured
-        .map(|(i, p)| Shot { direction: unit(p), measured: Some(i as u32), time_s: time(i) })
-        .collect();
+    let mut all: Vec<Shot> =
+        measured.map(|(i, p)| Shot { direction: unit(p), measured: Some(i as u32), time_s: time(i) }).collect();
     if let Some(rows) = &scan.rows {
         all.extend(rows.lost_shots(&scan.returns, scan.time_s.as_deref()));
     }
