@@ -2,3 +2,4 @@
 //! pattern, and the same moments shot again.
 
 pub mod odometry;
+pub mod poses;
