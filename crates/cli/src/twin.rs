@@ -12,8 +12,8 @@ use twin::{AgreementNumbers, Leave, PoseOptions, PoseSource, Recording, TwinConf
 /// Make a simulated partner of a recording that has no simulation: a map of all scans, the labelled objects, and the
 /// same shots again from the recorded poses. No frame is shot with a map that it is part of.
 ///
-/// DIR/measured and DIR/sim have the same ids and labels: diagnose, study and compare take them as a pair. DIR/twin.json
-/// says how well both agree, and which effects of the sensor are in the map and cannot be found.
+/// DIR/measured and DIR/sim have the same ids and labels: diagnose, study and compare take them as a pair.
+/// DIR/twin.json says how well both agree, and which effects of the sensor are in the map and cannot be found.
 ///
 /// Examples:
 ///   lidarshift twin /data/drive_0001 --out twins/drive_0001
@@ -72,7 +72,11 @@ impl TwinArgs {
         print(&report);
         let [measured, sim] = ["measured", "sim"].map(|side| self.out.join(side));
         errln!("twin written to {}", self.out.display());
-        errln!("next: lidarshift diagnose --measured {} --simulated {} --out RESULTS", measured.display(), sim.display());
+        errln!(
+            "next: lidarshift diagnose --measured {} --simulated {} --out RESULTS",
+            measured.display(),
+            sim.display()
+        );
         Ok(())
     }
 }
@@ -88,7 +92,9 @@ fn print(report: &TwinReport) {
         outln!("refined poses: walls {before:.2} cm thick before, {after:.2} cm after; moved by up to {moved:.1} cm");
     }
     let [recorded, measured, sim] = report.returns_per_frame;
-    outln!("returns a frame: {recorded:.0} recorded, {measured:.0} where the twin knows the world, {sim:.0} in the twin");
+    outln!(
+        "returns a frame: {recorded:.0} recorded, {measured:.0} where the twin knows the world, {sim:.0} in the twin"
+    );
     line("static world", &report.static_world);
     if report.objects.measured_returns > 0 {
         line("objects", &report.objects);
@@ -103,7 +109,9 @@ fn print(report: &TwinReport) {
 fn line(name: &str, a: &AgreementNumbers) {
     let [met, twin_met] = [a.met_share, a.twin_met_share].map(|v| 100.0 * v);
     let ranges = match (a.median_abs_m, a.within_10_cm) {
-        (Some(median), Some(within)) => format!("{:.1} cm apart in the median, {:.0} % within 10 cm", 100.0 * median, 100.0 * within),
+        (Some(median), Some(within)) => {
+            format!("{:.1} cm apart in the median, {:.0} % within 10 cm", 100.0 * median, 100.0 * within)
+        }
         _ => "no shot returns on both sides".into(),
     };
     outln!("{name}: {ranges}; {met:.1} % of the recorded returns are met, {twin_met:.1} % of the twin's");

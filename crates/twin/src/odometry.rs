@@ -11,7 +11,7 @@ mod motion;
 mod refine;
 mod registration;
 mod surface_map;
-mod voxels;
+pub(crate) mod voxels;
 
 pub use motion::{exp, log};
 pub use refine::{RefineConfig, Refined, refine};

@@ -1,11 +1,11 @@
 //! Twins of a made-up recording with exact ranges, and of real scans.
 
 use data::Dataset;
+use lidarshift_twin::map::FusionConfig;
+use lidarshift_twin::{Leave, PoseOptions, PoseSource, Recording, TwinConfig, TwinReport, pair};
 use nalgebra::Vector3;
 use std::fmt::Write;
 use std::path::Path;
-use twin::map::FusionConfig;
-use twin::{Leave, PoseOptions, PoseSource, Recording, TwinConfig, TwinReport, pair};
 
 /// Range from a place in a room of 30 x 20 x 5 m, with its floor at z = 0, along a direction.
 fn room(from: Vector3<f64>, direction: Vector3<f64>) -> f64 {

@@ -5,14 +5,14 @@ use std::collections::{HashMap, HashSet};
 use std::hash::{BuildHasherDefault, Hasher};
 
 /// A voxel: its three indices of 21 bits each. Worlds of 2 million voxels along an axis wrap around.
-pub(super) type Key = u64;
+pub(crate) type Key = u64;
 
 /// A map by voxels.
 pub(super) type ByVoxel<T> = HashMap<Key, T, BuildHasherDefault<KeyHasher>>;
 
 /// Hashes a [`Key`] with a multiplication: keys are neither secret nor chosen by anyone.
 #[derive(Clone, Copy, Default)]
-pub(super) struct KeyHasher(u64);
+pub(crate) struct KeyHasher(u64);
 
 impl Hasher for KeyHasher {
     fn finish(&self) -> u64 {
@@ -30,18 +30,18 @@ impl Hasher for KeyHasher {
 }
 
 /// The indices of the voxel of a point. `per_m` is the inverse of the side of a voxel.
-pub(super) fn indices(point: &Point3<f64>, per_m: f64) -> [i64; 3] {
+pub(crate) fn indices(point: &Point3<f64>, per_m: f64) -> [i64; 3] {
     [0, 1, 2].map(|axis| (point[axis] * per_m).floor() as i64)
 }
 
 /// The key of indices.
-pub(super) fn key(indices: [i64; 3]) -> Key {
+pub(crate) fn key(indices: [i64; 3]) -> Key {
     let [x, y, z] = indices.map(|index| (index & 0x1f_ffff) as u64);
     x | y << 21 | z << 42
 }
 
 /// The first point in each voxel of side `voxel_m`, in the order of the points.
-pub(super) fn thin(points: &[Point3<f64>], voxel_m: f64) -> Vec<Point3<f64>> {
+pub(crate) fn thin(points: &[Point3<f64>], voxel_m: f64) -> Vec<Point3<f64>> {
     let mut seen: HashSet<Key, BuildHasherDefault<KeyHasher>> = HashSet::default();
     let per_m = 1.0 / voxel_m;
     points.iter().filter(|p| seen.insert(key(indices(p, per_m)))).copied().collect()

@@ -36,8 +36,8 @@ impl Rows {
         Rows::of(returns, rows)
     }
 
-    /// By the order of the file: lasers one after the other, each counter-clockwise. A row ends where the azimuth passes
-    /// from below to above 0. `None` if the file has another order.
+    /// By the order of the file: lasers one after the other, each counter-clockwise. A row ends where the azimuth
+    /// passes from below to above 0. `None` if the file has another order.
     pub fn of_order(returns: &SensorScan) -> Option<Rows> {
         let (mut rows, mut before, mut forward) = (vec![Vec::new()], 0.0f32, 0usize);
         for (i, azimuth) in returns.azimuth_rad.iter().enumerate() {
