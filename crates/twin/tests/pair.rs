@@ -25,7 +25,7 @@ fn write_recording(root: &Path, frames: usize) {
         for row in 0..24 {
             for column in 0..400 {
                 let (azimuth, elevation) =
-                    ((f64::from(column) + 0.5) * 0.9_f64.to_radians(), (8.0 - f64::from(row)).to_radians());
+                    ((f64::from(column) + 0.5) * 0.9_f64.to_radians(), (8.3 - f64::from(row)).to_radians());
                 let direction = Vector3::from(sensor::rig::direction(azimuth, elevation));
                 let mut range = room(at, direction);
                 let hit = at + direction * range;
