@@ -174,11 +174,22 @@ impl Case {
     }
 
     /// The files that are compared. Names in a cache depend on the times of files. A temporary file that could not be
-    /// removed stays beside an output file whose folder is not the program's own.
+    /// removed stays beside an output file whose folder is not the program's own. The checkpoint before the last one is
+    /// that of a signal, if there was one.
     fn files(&self, root: &Path) -> BTreeMap<String, Vec<u8>> {
-        let mut found = files(root);
-        found.retain(|name, _| !name.contains("cache/") && !name.starts_with(".writing-"));
-        found
+        let (mut before_last, mut kept) = (0, BTreeMap::new());
+        for (name, bytes) in files(root) {
+            if name.contains("/step-") && !name.contains("/step-6.") || name.ends_with("state.previous.json") {
+                before_last += 1;
+            } else if !name.contains("cache/") && !name.starts_with(".writing-") {
+                kept.insert(name, bytes);
+            }
+        }
+        // Two checkpoints are kept of a run with more.
+        if kept.keys().any(|name| name.contains("/step-6.")) {
+            kept.insert("files before the last checkpoint".into(), format!("{before_last}").into_bytes());
+        }
+        kept
     }
 
     /// How the files of a finished command differ from those that it should have.
@@ -208,7 +219,8 @@ impl Case {
         let grows = |name: &str, bytes: &[u8]| {
             let whole_json = name.ends_with(".json") && serde_json::from_slice::<serde_json::Value>(bytes).is_ok();
             let ends = [".jsonl", "log.txt", ".safetensors", ".html", ".tex", ".csv", ".svg", ".png", ".key"];
-            whole_json || ends.iter().any(|end| name.ends_with(end))
+            let is_count = name.starts_with("files before");
+            whole_json || is_count || ends.iter().any(|end| name.ends_with(end))
         };
         let is_torn = |(name, bytes): &(&String, &Vec<u8>)| {
             let states = [before.get(*name), wanted.get(*name)];
