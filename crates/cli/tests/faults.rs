@@ -174,11 +174,22 @@ impl Case {
     }
 
     /// The files that are compared. Names in a cache depend on the times of files. A temporary file that could not be
-    /// removed stays beside an output file whose folder is not the program's own.
+    /// removed stays beside an output file whose folder is not the program's own. The checkpoint before the last one is
+    /// that of a signal, if there was one. A network whose costs cannot be measured is left out of `costs.json`.
     fn files(&self, root: &Path) -> BTreeMap<String, Vec<u8>> {
-        let mut found = files(root);
-        found.retain(|name, _| !name.contains("cache/") && !name.starts_with(".writing-"));
-        found
+        let (mut before_last, mut kept) = (0, BTreeMap::new());
+        for (name, bytes) in files(root) {
+            if name.contains("/step-") && !name.contains("/step-6.") || name.ends_with("state.previous.json") {
+                before_last += 1;
+            } else if !name.contains("cache/") && !name.starts_with(".writing-") && !name.ends_with("/costs.json") {
+                kept.insert(name, bytes);
+            }
+        }
+        // Two checkpoints are kept of a run with more.
+        if kept.keys().any(|name| name.contains("/step-6.")) {
+            kept.insert("files before the last checkpoint".into(), format!("{before_last}").into_bytes());
+        }
+        kept
     }
 
     /// How the files of a finished command differ from those that it should have.
@@ -207,8 +218,9 @@ impl Case {
         // These are appended to, or have states between. A study with a failed run has tables and a page with a gap.
         let grows = |name: &str, bytes: &[u8]| {
             let whole_json = name.ends_with(".json") && serde_json::from_slice::<serde_json::Value>(bytes).is_ok();
-            let ends = [".jsonl", "log.txt", ".safetensors", ".html", ".tex", ".csv", ".svg", ".png", ".key"];
-            whole_json || ends.iter().any(|end| name.ends_with(end))
+            let ends = [".jsonl", "log.txt", ".safetensors", ".html", ".md", ".tex", ".csv", ".svg", ".png", ".key"];
+            let is_count = name.starts_with("files before");
+            whole_json || is_count || ends.iter().any(|end| name.ends_with(end))
         };
         let is_torn = |(name, bytes): &(&String, &Vec<u8>)| {
             let states = [before.get(*name), wanted.get(*name)];
@@ -260,6 +272,7 @@ impl Case {
                 let mut known: Vec<&str> = path.iter().rev().take(2).filter_map(|part| part.to_str()).collect();
                 if self.failed_beside(path) {
                     known.extend(wanted.keys().map(String::as_str));
+                    known.extend(root.to_str());
                 }
                 if !text.contains("error: ") || !known.iter().any(|part| text.contains(part)) {
                     return say("no error that names the file".into());
@@ -426,6 +439,6 @@ fn study() {
         data_set(root);
         small_study(root, NOISE);
     };
-    let varying = &["provenance.json", "metrics.jsonl", "costs.json"];
+    let varying = &["provenance.json", "metrics.jsonl"];
     Case { name: "study", prepare, command, again: command, varying }.test(1, 1);
 }

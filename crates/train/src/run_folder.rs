@@ -134,7 +134,7 @@ impl RunFolder {
         }
         // On the disk before files of older checkpoints are removed.
         rename(&next, &self.state_path())?;
-        self.remove_all_but(state, keep.max(FEWEST_KEPT))
+        self.remove_old(state, keep)
     }
 
     /// The last checkpoint. If its state or one of its files is damaged, the checkpoint before it, which then is the
@@ -191,7 +191,12 @@ impl RunFolder {
         Ok(())
     }
 
-    fn remove_all_but(&self, state: &RunState, keep: usize) -> Result<(), TrainError> {
+    /// Removes all checkpoints but the last `keep` ones, two at least, up to that of the state.
+    ///
+    /// # Errors
+    /// A file that cannot be removed.
+    pub fn remove_old(&self, state: &RunState, keep: usize) -> Result<(), TrainError> {
+        let keep = keep.max(FEWEST_KEPT);
         let mut steps = BTreeMap::<u64, Vec<PathBuf>>::new();
         for entry in fs_err::read_dir(self.checkpoints())? {
             let entry = entry?;

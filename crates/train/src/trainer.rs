@@ -236,6 +236,8 @@ impl<'a> Run<'a> {
                 }
                 warnings.push(message);
             }
+            // A killed run may not have removed them.
+            folder.remove_old(&saved, config.run.keep_checkpoints)?;
             saved.data_sha256 = state.data_sha256;
             detector = detector.load_named(&weights)?;
             adam.load_named(&moments, saved.step, &device).map_err(|m| TrainError::folder(folder.path(), m))?;

@@ -105,6 +105,7 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
         };
         targets.push(Target { name, valid, read: Box::new(read) });
     }
+    targets.extend(super::scenes::targets(folder)?);
     targets.extend(run_folder(&folder.join("run"))?);
     Ok(targets)
 }
@@ -183,7 +184,7 @@ fn cloud_is_valid(cloud: Option<Cloud>) -> Result<bool, String> {
 }
 
 /// A reader of text. `read` returns `None` for an error, else whether the data are valid.
-fn text(read: impl Fn(&str) -> Option<bool> + 'static) -> Reader {
+pub(super) fn text(read: impl Fn(&str) -> Option<bool> + 'static) -> Reader {
     Box::new(move |bytes| match read(&String::from_utf8_lossy(bytes)) {
         None => Ok(false),
         Some(true) => Ok(true),

@@ -2,6 +2,7 @@
 
 mod pattern;
 
+use pattern::MOST_SHOTS;
 pub use pattern::{Pattern, RowBlock, Shot, Sweep, direction};
 
 use data::limits::check_name;
@@ -121,6 +122,11 @@ impl Rig {
                 return Err(wrong(format!("{here}.name"), format!("{:?} is not unique", sensor.name)));
             }
             sensor.check().map_err(|e| e.below(&here))?;
+        }
+        let shots: f64 = self.sensors.iter().filter_map(|s| s.pattern.as_ref()).map(Pattern::shots_of_grid).sum();
+        if shots > MOST_SHOTS {
+            let message = format!("all sensors have {shots} shots per scan, more than 16 million");
+            return Err(wrong("sensor", message));
         }
         Ok(())
     }
@@ -332,6 +338,15 @@ mod tests {
             (
                 pattern("blocks = [{ rows = 2, top_deg = 1, bottom_deg = 0 }]\ncolumns = 0"),
                 "r.toml:5: sensor[0].pattern.columns: 0",
+            ),
+            (
+                ["a", "b"]
+                    .map(|name| {
+                        let blocks = "[{ rows = 4000, top_deg = 1, bottom_deg = 0 }]";
+                        format!("[[sensor]]\nname = \"{name}\"\npattern = {{ blocks = {blocks}, columns = 3000 }}\n")
+                    })
+                    .concat(),
+                "all sensors have 24000000 shots",
             ),
             (pattern("file = \"none.csv\""), "none.csv"),
         ] {

@@ -7,6 +7,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
+/// Shots per scan of the grids of all sensors of a rig.
+pub(super) const MOST_SHOTS: f64 = 16e6;
+
 /// Scan pattern: a grid of rows and columns, or a CSV file of single shots.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -148,9 +151,14 @@ impl Pattern {
             within(&here("bottom_deg"), block.bottom_deg, -89.0, block.top_deg)?;
         }
         within("columns", self.columns.into(), 1.0, 65_535.0)?;
-        let shots = f64::from(self.columns) * self.blocks.iter().map(|b| f64::from(b.rows)).sum::<f64>();
-        within("columns", shots, 1.0, 16e6)
+        let shots = self.shots_of_grid();
+        within("columns", shots, 1.0, MOST_SHOTS)
             .map_err(|_| wrong("columns", format!("{shots} shots per scan, more than 16 million")))
+    }
+
+    /// Number of shots of the grid; 0 for a CSV pattern.
+    pub(super) fn shots_of_grid(&self) -> f64 {
+        f64::from(self.columns) * self.blocks.iter().map(|b| f64::from(b.rows)).sum::<f64>()
     }
 
     pub(super) fn load_shots(&mut self, folder: &Path, fov_deg: f64, rate_hz: f64) -> Result<(), DataError> {

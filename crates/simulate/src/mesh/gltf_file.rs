@@ -4,6 +4,7 @@ use super::file::{MOST_MESH_BYTES, MOST_MESH_VERTICES, Part};
 use base64::Engine as _;
 use data::DataError;
 use data::limits::read_file;
+use gltf::accessor::{DataType, Dimensions};
 use nalgebra::{Matrix4, Point3};
 use std::path::Path;
 
@@ -13,8 +14,17 @@ pub const MOST_NODES: usize = 100_000;
 /// The triangles of all nodes of all scenes, in the frame of the file.
 pub(super) fn read_gltf(path: &Path) -> Result<Vec<Part>, DataError> {
     let wrong = |message: String| DataError::file(path, message);
-    let gltf::Gltf { document, blob } = gltf::Gltf::from_slice(&read_file(path, MOST_MESH_BYTES)?)
-        .map_err(|e| wrong(format!("is not a valid glTF file: {e}")))?;
+    let invalid = |e: &dyn std::fmt::Display| wrong(format!("is not a valid glTF file: {e}"));
+    let bytes = read_file(path, MOST_MESH_BYTES)?;
+    // The library computes with these numbers before it checks them.
+    let length = bytes.get(8..12).and_then(|n| n.first_chunk::<4>()).map(|n| u32::from_le_bytes(*n));
+    if bytes.starts_with(b"glTF") && length.is_none_or(|length| length < 12) {
+        return Err(invalid(&"its header is cut off or gives a length below 12 bytes"));
+    }
+    let gltf = gltf::Gltf::from_slice_without_validation(&bytes).map_err(|e| invalid(&e))?;
+    check_indices(gltf.document.as_json()).map_err(|e| invalid(&e))?;
+    let blob = gltf.blob;
+    let document = gltf::Document::from_json(gltf.document.into_json()).map_err(|e| invalid(&e))?;
     let buffers = buffers(path, &document, blob)?;
     let mut parts = Parts { path, buffers, parts: Vec::new(), vertices: 0 };
     let mut nodes = 0;
@@ -41,6 +51,50 @@ pub(super) fn read_gltf(path: &Path) -> Result<Vec<Part>, DataError> {
         }
     }
     Ok(parts.parts)
+}
+
+/// Checks that the accessors of all primitives exist.
+fn check_indices(json: &gltf::json::Root) -> Result<(), String> {
+    for (i, mesh) in json.meshes.iter().enumerate() {
+        for primitive in &mesh.primitives {
+            if let Some(index) = primitive.attributes.values().find(|index| index.value() >= json.accessors.len()) {
+                return Err(format!("meshes[{i}] names accessors[{}], which does not exist", index.value()));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Checks that an accessor has values of one of these types, and that they lie in its buffer.
+fn check_accessor(accessor: &gltf::Accessor, types: &[DataType], dimensions: Dimensions) -> Result<(), String> {
+    let what = format!("accessors[{}]", accessor.index());
+    if !types.contains(&accessor.data_type()) || accessor.dimensions() != dimensions {
+        let (found, shape) = (accessor.data_type(), accessor.dimensions());
+        return Err(format!("{what} has values {found:?} {shape:?}, but must have {types:?} {dimensions:?}"));
+    }
+    let sparse = accessor.sparse();
+    if accessor.count() == 0 || sparse.as_ref().is_some_and(|s| !(1..=accessor.count()).contains(&s.count())) {
+        return Err(format!("{what}.count is 0, or smaller than the number of its sparse values"));
+    }
+    let most = MOST_MESH_BYTES as usize;
+    let check_view = |view: gltf::buffer::View, offset: usize, size: usize| {
+        if view.stride().is_some_and(|stride| stride < size || stride > most) {
+            return Err(format!("bufferViews[{}].byteStride: its values have {size} bytes", view.index()));
+        }
+        if [view.offset(), view.length(), offset].iter().any(|&bytes| bytes > most) {
+            return Err(format!("bufferViews[{}] of {what} ends after its buffer", view.index()));
+        }
+        Ok(())
+    };
+    if let Some(view) = accessor.view() {
+        check_view(view, accessor.offset(), accessor.size())?;
+    }
+    if let Some(sparse) = sparse {
+        let (indices, values) = (sparse.indices(), sparse.values());
+        check_view(indices.view(), indices.offset(), indices.index_type().size())?;
+        check_view(values.view(), values.offset(), accessor.size())?;
+    }
+    Ok(())
 }
 
 fn buffers(path: &Path, document: &gltf::Document, mut blob: Option<Vec<u8>>) -> Result<Vec<Vec<u8>>, DataError> {
@@ -91,6 +145,13 @@ impl Parts<'_> {
                 )));
             }
         }
+        if let Some(accessor) = &of_positions {
+            check_accessor(accessor, &[DataType::F32], Dimensions::Vec3).map_err(wrong)?;
+        }
+        if let Some(accessor) = &of_corners {
+            let types = [DataType::U8, DataType::U16, DataType::U32];
+            check_accessor(accessor, &types, Dimensions::Scalar).map_err(wrong)?;
+        }
         let reader = primitive.reader(|buffer| self.buffers.get(buffer.index()).map(Vec::as_slice));
         let positions = reader.read_positions().ok_or_else(|| wrong("has a mesh without positions".into()))?;
         let positions: Vec<[f64; 3]> =
@@ -120,6 +181,42 @@ mod tests {
 
     fn with_nodes(nodes: &str) -> String {
         format!(r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],"nodes":[{nodes}]}}"#)
+    }
+
+    #[test]
+    fn numbers_that_the_library_does_not_check_are_errors() {
+        let with = |accessors: &str, views: &str| {
+            format!(
+                r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],"nodes":[{{"mesh":0}}],
+                "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0}},"indices":1}}]}}],
+                "buffers":[{{"byteLength":3,"uri":"data:application/octet-stream;base64,AAAA"}}],
+                "bufferViews":[{views}],"accessors":[{accessors}]}}"#
+            )
+        };
+        let positions = r#"{"bufferView":0,"componentType":5126,"count":1,"type":"VEC3","min":[0,0,0],"max":[1,1,0]}"#;
+        let corners = |numbers: &str| format!(r#"{positions},{{"bufferView":0,{numbers}}}"#);
+        let view = r#"{"buffer":0,"byteLength":3}"#;
+        for (text, wanted) in [
+            (with("", view), "meshes[0] names accessors[0], which does not exist"),
+            (with(&corners(r#""componentType":5126,"count":3,"type":"SCALAR""#), view), "accessors[1] has values F32"),
+            (
+                with(&corners(r#""componentType":5121,"count":3,"type":"VEC3""#), view),
+                "must have [U8, U16, U32] Scalar",
+            ),
+            (with(&corners(r#""componentType":5121,"count":0,"type":"SCALAR""#), view), "accessors[1].count is 0"),
+            (
+                with(
+                    &corners(r#""componentType":5121,"count":3,"type":"SCALAR""#),
+                    r#"{"buffer":0,"byteLength":18446744073709551615,"byteOffset":9}"#,
+                ),
+                "bufferViews[0] of accessors[0] ends after its buffer",
+            ),
+            ("glTF\u{2}\0\0\0\u{3}\0\0\0".into(), "a length below 12 bytes"),
+            ("glTF\u{2}\0".into(), "cut off"),
+        ] {
+            let error = error_of(&text);
+            assert!(error.contains("car.gltf") && error.contains(wanted), "no {wanted:?} in {error}");
+        }
     }
 
     #[test]
