@@ -31,7 +31,7 @@ const GLTF: &str = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0
 {"bufferView":1,"componentType":5123,"count":3,"type":"SCALAR"}]}"#;
 
 const EFFECTS: &str = "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n\n[[effect]]\nkind = \"fog\"\nvisibility_m = 80\n\n\
-                       [[effect]]\nkind = \"range_dropout\"\nstart_m = 20.0\nend_m = 60.0\n";
+                       [[effect]]\nkind = \"range_dropout\"\nrange_m = [20.0, 60.0]\nshare = [0.1, 0.6]\n";
 
 /// A binary STL of two triangles.
 fn binary_stl() -> Vec<u8> {
