@@ -356,9 +356,12 @@ mod tests {
     fn last_weights_are_never_older_than_the_state() {
         let dir = tempfile::tempdir().unwrap();
         let folder = RunFolder::open(dir.path()).unwrap();
-        std::fs::create_dir(folder.state_path()).unwrap(); // simulates a kill when the state is written
-        assert!(folder.save(&state(10, None), &tensors(10.0), &BTreeMap::new(), &tensors(1.0), 2).is_err());
-        assert_eq!(read_safetensors(&folder.last_weights()).unwrap(), tensors(10.0));
+        folder.save(&state(10, None), &tensors(10.0), &BTreeMap::new(), &tensors(1.0), 2).unwrap();
+        // Simulates a kill before the state of step 10 is kept and that of step 20 takes its place.
+        std::fs::create_dir(folder.checkpoints().join(PREVIOUS)).unwrap();
+        assert!(folder.save(&state(20, None), &tensors(20.0), &BTreeMap::new(), &tensors(1.0), 2).is_err());
+        assert_eq!(read_safetensors(&folder.last_weights()).unwrap(), tensors(20.0));
+        assert_eq!(read_state_file(&folder.state_path()).unwrap().unwrap().state.step, 10);
     }
 
     #[test]
