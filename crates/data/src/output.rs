@@ -74,16 +74,19 @@ fn temporary() -> std::sync::MutexGuard<'static, BTreeSet<PathBuf>> {
 /// a file waits for the end.
 pub fn remove_temporary() {
     let all = temporary();
-    for path in all.iter() {
-        // Each thread may write one more file into the folder. Nothing can be done about other errors here; the next
-        // writer of a folder removes its temporary files.
-        for _ in 0..20 {
-            let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
-            if removed.is_ok() && !path.exists() {
-                break;
-            }
-            std::thread::sleep(std::time::Duration::from_millis(10));
+    // Each thread may still write one more file into a folder, and make it anew for that: a folder is gone when it is
+    // absent twice. Nothing can be done about other errors here; the next writer of a folder removes its temporary
+    // files.
+    let mut absent = if all.is_empty() { 2 } else { 0 };
+    for _ in 0..40 {
+        if absent == 2 {
+            break;
         }
+        for path in all.iter() {
+            let _ = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
+        }
+        std::thread::sleep(Duration::from_millis(10));
+        absent = if all.iter().any(|path| path.exists()) { 0 } else { absent + 1 };
     }
     std::mem::forget(all);
 }
