@@ -10,7 +10,7 @@ use crate::inference::noise::USUAL_SIGNAL;
 use crate::pairing::GAP_M;
 use sensor::beams::Pick;
 use sensor::effects::{
-    AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamRangeOffset, Clock,
+    AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamIntensity, BeamRangeOffset, Clock,
     Covariate as TableCovariate, DirtyWindow, Effect, EgoAttitude, Empirical, LabelOffset, LabelTimeOffset, RangeBias,
     RangeLimits, RangeNoise, RangeNoiseByIncidence, RangeNoiseByRange, RangeNoiseBySignal, RangeQuantisation,
     RollingShutter, SensorPoseError,
@@ -94,6 +94,12 @@ fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
             return row_tables(f, rig, rows_deg, 4).into_iter().map(of_sensor).collect();
         }
         Cause::BeamElevationOffset => return row_elevations(f, rig, rows_deg),
+        Cause::BeamIntensity => {
+            let of_sensor = |(sensor, rows_deg, gains_ln)| {
+                Effect::BeamIntensity(BeamIntensity { std: 0.0, gains_ln, sensor, rows_deg })
+            };
+            return row_tables(f, rig, rows_deg, 4).into_iter().map(of_sensor).collect();
+        }
         Cause::Quantisation => Effect::RangeQuantisation(RangeQuantisation { step_m: value(Quantity::StepM) }),
         Cause::AngularJitter => {
             let std_deg = value(Quantity::StdDeg);

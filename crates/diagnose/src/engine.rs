@@ -295,7 +295,7 @@ impl Engine<'_> {
         results.push(geometry);
         known.displaced = displaced;
         self.finished(3);
-        results.extend(self.single_returns(&context, &known)?);
+        results.extend(self.single_returns(&context, &known, &mut notes)?);
         self.finished(7);
         results.extend([Side::Labels, Side::Objects].map(|s| search::labels::search(&context, s, &known.displaced)));
         self.finished(SEARCHES);
@@ -348,10 +348,15 @@ impl Engine<'_> {
         self.pair(Corrections { shift_m, step_m: known.coarse_m(), ..Corrections::default() }).map(Some)
     }
 
-    /// Searches of silhouettes and single returns, on frames with the displacement of the scene undone; then of
+    /// Searches of silhouettes, single returns and intensities, on frames with the displacement of the scene undone; then of
     /// noise, with offsets of rows and quantisation corrected as well: they look like noise between neighbouring
     /// rows.
-    fn single_returns(&self, context: &Context, known: &Known) -> Result<Vec<ChannelResult>, DiagnoseError> {
+    fn single_returns(
+        &self,
+        context: &Context,
+        known: &Known,
+        notes: &mut Vec<String>,
+    ) -> Result<Vec<ChannelResult>, DiagnoseError> {
         let displaced = &known.displaced;
         let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
             known.slide_m(frame, p, sensor) + displaced.of_point(p, sensor, &self.origins[sensor])
@@ -366,6 +371,7 @@ impl Engine<'_> {
         let mut results = vec![hidden, search::hits::search(&context, &mask, elsewhere)];
         self.finished(5);
         results.push(search::returns::search(&context));
+        results.push(search::intensity::search(&context, notes));
         self.finished(6);
         let turns: Vec<_> = context.rig.sensors.iter().map(|s| s.pose().rotation).collect();
         let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);

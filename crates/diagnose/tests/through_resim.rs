@@ -74,6 +74,52 @@ fn the_two_causes_of_the_paper_are_found_and_corrected() {
     assert!(outcome.diagnosis.findings.is_empty(), "{:?}", outcome.diagnosis.findings);
 }
 
+/// Intensities by another law, and with a gain of each row: found with their parameters and corrected. Columns without
+/// a relation are said to have none.
+#[test]
+fn intensities_are_found_and_corrected() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = race_with(folder.path(), true);
+    let law = "[[effect]]\nkind = \"intensity_response\"\ngain = 180\ngamma = 0.8\nrange_exponent = 0.4\nstep = 1\nmost = 255\n";
+    let rows = "[[effect]]\nkind = \"beam_intensity\"\nstd = 0.15\n";
+    for (number, (effects, causes)) in [
+        (law.to_owned(), vec!["intensity_law"]),
+        (rows.to_owned(), vec!["beam_intensity"]),
+        (format!("{rows}{law}"), vec!["beam_intensity", "intensity_law"]),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let measured = with_effects(&sim, &effects, &folder.path().join(format!("measured {number}")), 11);
+        let outcome = diagnosed(&measured, &sim, folder.path());
+        let d = &outcome.diagnosis;
+        assert_eq!(named(d), causes, "{:?} {:?} {:?}", d.findings, d.considered, d.notes);
+        let value = |cause: Cause, quantity: Quantity| {
+            d.findings.iter().find(|f| f.cause == Some(cause)).map(|f| f.parameter(quantity).unwrap().estimate)
+        };
+        if let Some(exponent) = value(Cause::IntensityLaw, Quantity::RangeExponent) {
+            let gamma = value(Cause::IntensityLaw, Quantity::Gamma).unwrap();
+            let gain = value(Cause::IntensityLaw, Quantity::Gain).unwrap();
+            assert!((exponent - 0.4).abs() < 0.04 && (gamma - 0.8).abs() < 0.04, "{exponent} {gamma}");
+            assert!((gain / 180.0 - 1.0).abs() < 0.1, "{gain}");
+        }
+        if let Some(std) = value(Cause::BeamIntensity, Quantity::Std) {
+            assert!((0.1..0.2).contains(&std), "{std}");
+        }
+        let closed = d.gain.closed_by_channel[&Channel::Intensity].closed;
+        assert!(closed > 0.9 && d.gain.not_applied.is_empty(), "{:?}", d.gain);
+        let again = with_effects(&sim, &outcome.extended, &folder.path().join(format!("again {number}")), 12);
+        let second = diagnosed(&measured, &again, folder.path()).diagnosis;
+        assert!(second.findings.is_empty(), "{:?}", second.findings);
+    }
+    let constant = "[[effect]]\nkind = \"intensity_response\"\ngain = 0.5\ngamma = 0\n";
+    let measured = with_effects(&sim, constant, &folder.path().join("constant"), 11);
+    let d = diagnosed(&measured, &sim, folder.path()).diagnosis;
+    let [finding] = &d.findings[..] else { panic!("{:?}", d.findings) };
+    assert_eq!((finding.status, finding.channel), (Status::Unexplained, Channel::Intensity));
+    assert!(finding.says.contains("are all the same"), "{}", finding.says);
+}
+
 /// An unexplained finding is extended as a lookup table, which corrects the simulation.
 #[test]
 fn an_unexplained_finding_is_corrected_by_a_table() {

@@ -99,8 +99,8 @@ pub(crate) struct Placed {
     pub remaining: EffectList,
 }
 
-/// Effects on finished clouds that only remove returns: they may follow a rounding of ranges.
-const ONLY_LOSSES: &[&str] = &[
+/// Effects on finished clouds that change no range: they may follow a rounding of ranges.
+const RANGES_AS_THEY_ARE: &[&str] = &[
     "random_dropout",
     "signal_dropout",
     "range_dropout",
@@ -110,6 +110,8 @@ const ONLY_LOSSES: &[&str] = &[
     "packet_loss",
     "bright_target_dropout",
     "intensity_law",
+    "intensity_response",
+    "beam_intensity",
     "point_order",
 ];
 
@@ -117,7 +119,7 @@ const ONLY_LOSSES: &[&str] = &[
 pub(crate) fn place(program: Program, list: &EffectList, rig: &Rig) -> Placed {
     let placed = place_with(program, list, rig, true);
     // A sensor rounds what it measured. Where something still changes ranges, rounding has to come after it.
-    let changes_ranges = |e: &Effect| !ONLY_LOSSES.contains(&e.kind()) && e.kind() != "range_quantisation";
+    let changes_ranges = |e: &Effect| !RANGES_AS_THEY_ARE.contains(&e.kind()) && e.kind() != "range_quantisation";
     if placed.plan.step_m > 0.0 && placed.remaining.effects.iter().any(changes_ranges) {
         return place_with(program, list, rig, false);
     }

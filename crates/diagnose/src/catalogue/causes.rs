@@ -24,6 +24,8 @@ identifiers! {
         IncidenceDropout = "incidence_dropout",
         /// Range noise grows with the angle of incidence.
         IncidenceNoise = "incidence_noise",
+        /// Intensities depend otherwise on brightness, range or incidence.
+        IntensityLaw = "intensity_law",
         /// Labels are displaced by a constant.
         LabelOffset = "label_offset",
         /// One kind of surface loses returns.
@@ -89,12 +91,13 @@ impl Cause {
             Cause::BeamRangeOffset => (Family::RangeError, 170),
             Cause::RangeNoise => (Family::RangeError, 180),
             Cause::SignalNoise => (Family::RangeError, 190),
+            Cause::BeamIntensity => (Family::Returns, 192),
+            Cause::IntensityLaw => (Family::Returns, 194),
             Cause::RangeCut => (Family::Detection, 200),
             Cause::Unexplained => (Family::Unknown, 205),
             Cause::Quantisation => (Family::RangeError, 210),
             Cause::LabelOffset => (Family::Labels, 220),
             Cause::TimeOffset => (Family::Timing, 230),
-            Cause::BeamIntensity => (Family::Returns, LAST),
             Cause::GroundError => (Family::Geometry, LAST),
             Cause::IncidenceNoise => (Family::RangeError, LAST),
         }

@@ -37,10 +37,16 @@ identifiers! {
         Exponent = "exponent",
         /// Shift along the x axis of the object, or of the sensor.
         ForwardM = "forward_m",
+        /// Factor on the intensity.
+        Gain = "gain",
+        /// Exponent of the intensity.
+        Gamma = "gamma",
         /// Range at which half of the returns are lost.
         HalfAtM = "half_at_m",
         /// Measured objects are higher by this.
         HigherM = "higher_m",
+        /// Exponent of the cosine of incidence in the intensity.
+        IncidenceExponent = "incidence_exponent",
         /// Shift along the y axis of the object, or of the sensor.
         LeftM = "left_m",
         /// Measured objects are longer by this.
@@ -63,6 +69,8 @@ identifiers! {
         PitchDeg = "pitch_deg",
         /// Radius of a patch of directions.
         RadiusDeg = "radius_deg",
+        /// Exponent of the decrease of the intensity with range.
+        RangeExponent = "range_exponent",
         /// False alarms for each shot.
         Rate = "rate",
         /// Largest range of false alarms.

@@ -3,6 +3,7 @@
 pub mod cells;
 pub mod groups;
 pub mod hits;
+pub mod intensity;
 pub mod labels;
 pub mod mask;
 pub mod mean;

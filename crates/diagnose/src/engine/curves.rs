@@ -66,6 +66,7 @@ fn place_and_value(finding: &Finding, ray: &Ray) -> Option<(f64, f64)> {
     let value = match finding.channel {
         Channel::Hits => f64::from(u8::from(!ray.matched)),
         Channel::Roughness => own_roughness_m(ray)?,
+        Channel::Intensity => crate::channels::intensity::ln_ratio(ray)?,
         Channel::Residuals if ray.smooth => f64::from(ray.residual_m),
         Channel::Returns => f64::from(u8::from(odd(ray).is_some())),
         _ => return None,

@@ -16,7 +16,7 @@ use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
 use crate::search::{
-    Context, REPETITIONS, Z_STAR, geometry, hits, labels, noise, quantisation, returns, rolling_shutter,
+    Context, REPETITIONS, Z_STAR, geometry, hits, intensity, labels, noise, quantisation, returns, rolling_shutter,
 };
 use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
@@ -94,6 +94,7 @@ fn distances(context: &Context, train: &[usize], test: &[usize], slide: bool) ->
         (Channel::Roughness, noise::by_table(context, train, test)),
         (Channel::Returns, returns::by_table(context, train, test)),
         (Channel::Ranges, quantisation::by_table(context, train, test)),
+        (Channel::Intensity, intensity::by_table(context, train, test)),
         (Channel::Labels, labels::by_table(context, Side::Labels, train, test)),
         (Channel::Objects, labels::by_table(context, Side::Objects, train, test)),
     ]);

@@ -2,7 +2,7 @@
 
 use super::boxes::{BoxShift, SurfacePoint, fit_shift};
 use super::gaps::{in_gap, mixed_per_rad};
-use super::prediction::Predictor;
+use super::prediction::{Predictor, mean_intensity};
 use super::ray::{Ray, Surface};
 use super::recordings::{Matched, SideFrame};
 use super::roughness::{LONE, Roughness};
@@ -193,6 +193,7 @@ impl SensorPair<'_> {
         for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.1).enumerate() {
             ray.matched = *matched;
             ray.company = company(&predictor.around.index, scan, i);
+            ray.intensity_beside = ray.intensity_simulated;
             (ray.roughness_m, ray.roughness_leverage) =
                 if ray.smooth && ray.company > LONE { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
         }
@@ -208,6 +209,10 @@ impl SensorPair<'_> {
             ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
             ray.company = company(own, scan, i);
             ray.in_gap = in_gap(&predictor.around.index, scan, i);
+            if ray.smooth {
+                let at = [scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]];
+                ray.intensity_beside = mean_intensity(own, &scan.intensity, at, Some(i as u32));
+            }
         }
     }
 }
@@ -317,6 +322,7 @@ mod tests {
                 azimuth_rad: shots.iter().map(|s| s.0).collect(),
                 elevation_rad: shots.iter().map(|s| s.1).collect(),
                 range_m: vec![10.0; shots.len()],
+                intensity: vec![],
             }
         };
         let (measured, simulated) = (scan_up_to(300), scan_up_to(100));

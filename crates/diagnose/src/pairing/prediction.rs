@@ -1,9 +1,10 @@
 //! Predictions of the simulation for a direction: the surface around it, its range, incidence and kind.
 
+use super::frame::company_m;
 use super::ray::{Ray, Surface};
 use geometry::Box3;
 use nalgebra::Vector3;
-use sensor::directions::{Kind, SensorScan, Sensors, Surroundings, in_or_beside, kind_of};
+use sensor::directions::{DirectionIndex, Kind, SensorScan, Sensors, Surroundings, in_or_beside, kind_of};
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
 const BESIDE_M: f64 = 0.5;
@@ -16,11 +17,13 @@ pub(super) struct Predictor<'a> {
     pub(super) around: Surroundings,
     boxes: &'a [Box3],
     others: Vec<Box3>,
+    /// Intensities of the simulated returns; empty without the column.
+    intensity: &'a [f32],
 }
 
 impl<'a> Predictor<'a> {
     /// For the number of a sensor, its simulated returns, and the simulated labels.
-    pub(super) fn new(sensors: &'a Sensors, sensor: usize, simulated: &SensorScan, boxes: &'a [Box3]) -> Self {
+    pub(super) fn new(sensors: &'a Sensors, sensor: usize, simulated: &'a SensorScan, boxes: &'a [Box3]) -> Self {
         let origin = sensors.rig.sensors[sensor].pose().translation.vector;
         Predictor {
             sensor,
@@ -28,6 +31,7 @@ impl<'a> Predictor<'a> {
             others: others(boxes, origin.into()),
             around: Surroundings::new(sensors, sensor, simulated),
             boxes,
+            intensity: &simulated.intensity,
         }
     }
 
@@ -58,6 +62,9 @@ impl<'a> Predictor<'a> {
             roughness_m: f32::NAN,
             roughness_leverage: 0.0,
             near_far_m: [0.0; 2],
+            intensity: scan.intensity.get(i).copied().unwrap_or(f32::NAN),
+            intensity_simulated: f32::NAN,
+            intensity_beside: f32::NAN,
         };
         let around = self.around.look(az, el, without_itself.then_some(i as u32));
         ray.near_far_m = around.near_far_m;
@@ -70,6 +77,9 @@ impl<'a> Predictor<'a> {
                 ray.leverage = surface.leverage as f32;
                 ray.bulge_m = surface.bulge_m as f32;
                 ray.normal = normal.cast::<f32>().into();
+                let without = without_itself.then_some(i as u32);
+                ray.intensity_simulated =
+                    mean_intensity(&self.around.index, self.intensity, [az, el, ray.range_m], without);
                 self.set_kind(&mut ray, &direction, surface.range_m, Some(normal.z));
             }
             None if ray.near_far_m[1] > 0.0 => self.set_kind(&mut ray, &direction, f64::from(range), None),
@@ -89,6 +99,30 @@ impl<'a> Predictor<'a> {
             }
         };
     }
+}
+
+/// Standard deviation of ln(intensity) up to which a surface is evenly bright.
+const EVEN: f64 = 0.2;
+
+/// Mean intensity of the returns around a direction at about a range (azimuth and elevation, rad; range, m); NaN where
+/// there is none, or where they are not evenly bright: the mean does not tell what another return there would have. A
+/// return itself is left out by its number.
+pub(super) fn mean_intensity(index: &DirectionIndex, intensity: &[f32], at: [f32; 3], without: Option<u32>) -> f32 {
+    if intensity.is_empty() {
+        return f32::NAN;
+    }
+    let [azimuth_rad, elevation_rad, range_m] = at;
+    let reach_m = company_m(f64::from(range_m)) as f32;
+    let [mut n, mut sum, mut ln, mut square] = [0.0f64; 4];
+    index.around(azimuth_rad, elevation_rad, |e, _, _| {
+        if without != Some(e.index) && (e.range_m - range_m).abs() < reach_m {
+            let own = f64::from(intensity[e.index as usize]);
+            (n, sum, ln, square) = (n + 1.0, sum + own, ln + own.ln(), square + own.ln().powi(2));
+        }
+    });
+    // A dark return makes the logarithms infinite, and the deviation no number.
+    let even = square / n - (ln / n).powi(2) < EVEN * EVEN;
+    if even { (sum / n) as f32 } else { f32::NAN }
 }
 
 /// The labelled objects except the ego vehicle, whose box contains the sensor.

@@ -78,6 +78,13 @@ pub struct Ray {
     pub roughness_leverage: f32,
     /// Nearest and farthest simulated return around the direction, m; 0 without any.
     pub near_far_m: [f32; 2],
+    /// Its intensity; NaN in clouds without the column.
+    pub intensity: f32,
+    /// Mean intensity of the simulated returns on the surface around its direction, itself left out; NaN without such
+    /// returns.
+    pub intensity_simulated: f32,
+    /// The same of its own side.
+    pub intensity_beside: f32,
 }
 
 impl Ray {

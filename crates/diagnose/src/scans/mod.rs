@@ -88,6 +88,9 @@ pub fn diagnose_scans(
     let mut diagnosis = report(&seen, found, minimum_detectable, considered, notes);
     let rows_deg = seen.beams.iter().rev().map(|b| b.elevation_rad.to_degrees()).collect();
     fill_effects(&mut diagnosis.findings, rig, &[rows_deg]);
+    // Contrasts of single lasers are differences of intensities, not gains.
+    let contrasts = diagnosis.findings.iter_mut().filter(|f| f.cause == Some(Cause::BeamIntensity));
+    contrasts.for_each(|f| f.effects.clear());
     let extended = extended_toml(&diagnosis, None);
     Ok(Outcome { diagnosis, corrected: vec![], extended })
 }

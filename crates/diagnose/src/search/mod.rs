@@ -4,6 +4,7 @@
 pub mod confounders;
 pub mod geometry;
 pub mod hits;
+pub mod intensity;
 pub mod labels;
 pub mod mask;
 pub mod noise;

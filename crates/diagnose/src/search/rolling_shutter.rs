@@ -419,6 +419,9 @@ mod tests {
             roughness_m: 0.0,
             roughness_leverage: 0.2,
             near_far_m: [at.norm() as f32; 2],
+            intensity: f32::NAN,
+            intensity_simulated: f32::NAN,
+            intensity_beside: f32::NAN,
         }
     }
 

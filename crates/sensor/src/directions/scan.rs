@@ -15,6 +15,8 @@ pub struct SensorScan {
     pub elevation_rad: Vec<f32>,
     /// Distance, m.
     pub range_m: Vec<f32>,
+    /// Intensity in the unit of the cloud; empty for clouds without the column.
+    pub intensity: Vec<f32>,
 }
 
 impl SensorScan {
@@ -66,6 +68,7 @@ fn split(cloud: &Cloud, rig: &Rig, mut given: impl FnMut(usize, usize)) -> Vec<S
             scans[sensor].azimuth_rad.push(az as f32);
             scans[sensor].elevation_rad.push(el as f32);
             scans[sensor].range_m.push(range as f32);
+            scans[sensor].intensity.extend(point.get(3));
             given(sensor, number);
         }
     }
@@ -203,6 +206,7 @@ mod tests {
                 azimuth_rad: points.iter().map(|p| p.0).collect(),
                 elevation_rad: points.iter().map(|p| p.1).collect(),
                 range_m: vec![1.0; points.len()],
+                intensity: vec![],
             };
             let window = Steps { azimuth_rad: 0.15, elevation_rad: 0.05 };
             let index = DirectionIndex::new(&scan, window, true);

@@ -181,6 +181,8 @@ effects! {
     false_alarms::FalseAlarms "D5",
     dual_returns::DualReturns "D6",
     intensity_law::IntensityLaw "D7",
+    intensity_response::IntensityResponse "D8",
+    beam_intensity::BeamIntensity "D9",
     encoder_ripple::EncoderRipple "E1",
     mount_vibration::MountVibration "E2",
     point_order::PointOrder "E3",
