@@ -13,8 +13,8 @@ use data::write::{REPAIRED_ENDINGS, write_kitti_text};
 use data::{Dataset, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
-    DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage, Status, Verdict,
-    diagnose_scans, diagnose_with, verify,
+    BakedIn, Cause, DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage,
+    Status, Verdict, diagnose_scans, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{DiagnosisReport, finding_name, write_finding_pictures};
@@ -24,6 +24,7 @@ use simulator::RaceSimulator;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use study::Study;
+use twin::TwinReport;
 
 /// Compare measured data with a scenario-identical simulation. Each finding has its cause, its parameters with 95 %
 /// confidence intervals, and the gain of correcting it. With --scans, compare the scans of one spinning sensor with an
@@ -113,9 +114,12 @@ impl DiagnoseArgs {
             (None, Some(measured), Some(simulated)) => {
                 let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
                 let remake = self.remake(&simulated, &rig);
+                let twin = twin::pair::twin_of(&simulated)?;
+                let baked_in = twin.iter().flat_map(|twin| &twin.baked_in).filter_map(known_cause).collect();
+                let options = Options { baked_in, ..options.clone() };
                 let mut outcome =
                     diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
-                outcome.diagnosis.notes.extend(twin::pair::note_for_diagnosis(&simulated)?);
+                outcome.diagnosis.notes.extend(twin.as_ref().map(TwinReport::note_for_diagnosis));
                 (measured, outcome)
             }
             _ => bail!("give --measured and --simulated, or --scans"),
@@ -273,6 +277,12 @@ impl DiagnoseArgs {
     }
 }
 
+/// What a twin cannot tell, where the catalogue has it.
+fn known_cause(of_twin: &twin::BakedIn) -> Option<BakedIn> {
+    let cause = Cause::ALL.iter().copied().find(|cause| cause.name() == of_twin.cause)?;
+    Some(BakedIn { cause, why: of_twin.why.clone(), tell_by: of_twin.tell_by.clone() })
+}
+
 fn end_of(diagnosis: &Diagnosis) -> End {
     match diagnosis.verdict {
         Verdict::NotScenarioIdentical => End::NotTheSameScenes,
@@ -307,7 +317,10 @@ fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
             outln!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
         }
         if let Some(how) = &f.separate_by {
-            outln!("  to distinguish these causes: {how}");
+            match f.status {
+                Status::NotIdentifiable => outln!("  to tell it, record {how}"),
+                _ => outln!("  to distinguish these causes: {how}"),
+            }
         }
     }
     print_gain(&diagnosis.gain, "extended.toml");
@@ -343,13 +356,19 @@ fn verdict_text(verdict: Verdict, findings: &[Status]) -> String {
     let count = |status: Status| findings.iter().filter(|s| **s == status).count();
     let named = format!("{} of {} findings have a named cause", count(Status::Named), findings.len());
     let (ambiguous, unexplained) = (count(Status::Ambiguous), count(Status::Unexplained));
+    let hidden = match count(Status::NotIdentifiable) {
+        0 => String::new(),
+        n => format!(", {n} not identifiable"),
+    };
     match verdict {
         Verdict::NothingFound => "nothing found: there is no significant difference".into(),
-        Verdict::Explained => format!("explained: {named}"),
+        Verdict::Explained => format!("explained: {named}{hidden}"),
         Verdict::PartlyExplained => {
-            format!("partly explained: {named}; {ambiguous} ambiguous, {unexplained} unexplained")
+            format!("partly explained: {named}; {ambiguous} ambiguous, {unexplained} unexplained{hidden}")
         }
-        Verdict::Unexplained => format!("unexplained: {named}; {ambiguous} ambiguous, {unexplained} unexplained"),
+        Verdict::Unexplained => {
+            format!("unexplained: {named}; {ambiguous} ambiguous, {unexplained} unexplained{hidden}")
+        }
         Verdict::NotScenarioIdentical => "not scenario-identical: the two data sets do not show the same scenes".into(),
         Verdict::TooFewFrames => "too few frames: nothing can be found, fitted and tested on different frames".into(),
     }
@@ -377,6 +396,12 @@ fn print_gains(gains: &[DetectorGain], left_out: &[String]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn all_that_a_twin_cannot_tell_is_in_the_catalogue() {
+        let of_twin = twin::baked_in();
+        assert!(of_twin.len() > 10 && of_twin.iter().all(|b| known_cause(b).is_some()), "{of_twin:?}");
+    }
 
     #[test]
     fn the_verdict_counts_the_findings_by_status() {

@@ -28,6 +28,9 @@ pub struct TwinArgs {
     /// Folder for the twin: new, empty, or of an interrupted run
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// The sequence (scene, drive) of a data set that has several
+    #[arg(long, value_name = "NAME")]
+    sequence: Option<String>,
     /// Use only the first N frames
     #[arg(long, value_name = "N")]
     frames: Option<usize>,
@@ -41,10 +44,16 @@ pub struct TwinArgs {
     /// made of every second frame]
     #[arg(long, value_name = "S")]
     leave: Option<f64>,
+    /// Memory that a map may take, MiB [default: half of what is available]
+    #[arg(long, value_name = "MIB")]
+    memory: Option<u64>,
     /// Write the static maps as PLY files
     #[arg(long)]
     maps: bool,
 }
+
+/// Memory that a map may take where the system does not say what is available, MiB.
+const WITHOUT_LIMIT_MIB: u64 = 8192;
 
 impl TwinArgs {
     /// Makes the twin and prints how well it agrees with the recording.
@@ -58,11 +67,17 @@ impl TwinArgs {
         dataset.refuse_own_folder(&self.out)?;
         errln!("reading the scans and their poses");
         let options = PoseOptions { odometry: self.odometry, refine: !self.keep_poses };
-        let recording = Recording::open(dataset, self.frames, options)
+        let recording = Recording::open(dataset, self.sequence.as_deref(), self.frames, options)
             .with_context(|| format!("a twin of {}", self.recording.display()))?;
         let progress = ProgressBar::new(0)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
-        let config = TwinConfig { leave, fusion: FusionConfig::default(), write_maps: self.maps };
+        let most_mib = self.memory.or_else(|| Some(study::free_mib()? / 2)).unwrap_or(WITHOUT_LIMIT_MIB);
+        let config = TwinConfig {
+            leave,
+            fusion: FusionConfig::default(),
+            most_bytes: most_mib.saturating_mul(1 << 20),
+            write_maps: self.maps,
+        };
         let report = pair::make(&recording, &config, &self.out, &|done, total| {
             progress.set_length(total as u64);
             progress.set_position(done as u64);
@@ -99,8 +114,8 @@ fn print(report: &TwinReport) {
     if report.objects.measured_returns > 0 {
         line("objects", &report.objects);
     }
-    let names: Vec<&str> = report.baked_in.iter().map(|[kind, _]| kind.as_str()).collect();
-    outln!("in the map, so that a diagnosis cannot find them: {}", names.join(", "));
+    let names: Vec<&str> = report.baked_in.iter().map(|b| b.cause.as_str()).collect();
+    outln!("in both sides, so that a diagnosis cannot tell them: {}", names.join(", "));
     for note in &report.notes {
         outln!("note: {note}");
     }

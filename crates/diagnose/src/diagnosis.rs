@@ -52,10 +52,13 @@ pub enum Verdict {
 }
 
 impl Verdict {
-    /// The verdict of findings on data that could be compared.
+    /// The verdict of findings on data that could be compared. Findings that are not identifiable do not count, unless
+    /// there is no other.
     pub fn of(findings: &[Finding]) -> Self {
         let named = findings.iter().filter(|f| f.status == Status::Named).count();
-        match (findings.len(), named) {
+        let identifiable = findings.iter().filter(|f| f.status != Status::NotIdentifiable).count();
+        match (identifiable, named) {
+            (0, _) if !findings.is_empty() => Verdict::Unexplained,
             (0, _) => Verdict::NothingFound,
             (all, named) if all == named => Verdict::Explained,
             (_, 0) => Verdict::Unexplained,
@@ -133,6 +136,9 @@ pub enum Status {
     Ambiguous,
     /// None does.
     Unexplained,
+    /// The simulated side was made of the measured one, and its cause is in both: the numbers are no error of the
+    /// sensor.
+    NotIdentifiable,
 }
 
 /// A fitted number.

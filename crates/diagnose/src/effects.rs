@@ -40,6 +40,7 @@ pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) ->
             dirty_window(finding, rig).into_iter().collect()
         }
         Status::Unexplained => tables(finding, rig, rows_deg),
+        Status::NotIdentifiable => Vec::new(),
         _ => named(finding, rig, rows_deg),
     }
 }

@@ -1,10 +1,12 @@
 //! The whole way from two data sets to a diagnosis.
 
+mod baked_in;
 mod curves;
 mod notes;
 mod report;
 mod verification;
 
+pub use baked_in::BakedIn;
 pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
@@ -41,6 +43,8 @@ pub struct Options {
     pub split: Option<String>,
     /// Frames that are not used, such as those on which something else is tested.
     pub leave_out: BTreeSet<String>,
+    /// Causes that are in both sides, as the simulated one was made of the measured one.
+    pub baked_in: Vec<BakedIn>,
 }
 
 /// Stages, for the display of progress.
@@ -194,7 +198,8 @@ fn with_pairs<T>(
     let used: BTreeSet<&str> = frames.iter().map(|f| f.id.as_str()).collect();
     recordings.retain(|id| used.contains(id));
     let context = context(rig, &frames, &mut notes);
-    let engine = Engine { recordings: &recordings, sensors: &sensors, origins: origins(rig), progress };
+    let baked_in = &options.baked_in;
+    let engine = Engine { recordings: &recordings, sensors: &sensors, origins: origins(rig), baked_in, progress };
     work(&engine, context, notes).map(Ok)
 }
 
@@ -228,6 +233,7 @@ struct Engine<'a> {
     recordings: &'a Recordings<'a>,
     sensors: &'a Sensors,
     origins: Vec<Point3<f64>>,
+    baked_in: &'a [BakedIn],
     progress: Progress<'a>,
 }
 
@@ -305,6 +311,7 @@ impl Engine<'_> {
         let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
         let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
         let mut diagnosis = report(&context, results, notes);
+        baked_in::take_names(&mut diagnosis, self.baked_in);
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
         let made_from = if let Extension::Found(made_from) = extension { Some(made_from) } else { None };
         let extended = extended_toml(&diagnosis, made_from);

@@ -51,6 +51,10 @@ fn comments(f: &Finding) -> Vec<String> {
         let names = names.join(" and ");
         lines.push(format!("These data do not tell {names} apart for sure; the first of them stands here."));
     }
+    if f.status == Status::NotIdentifiable {
+        lines.extend(f.separate_by.iter().map(|by| format!("What can tell: {by}")));
+        return lines;
+    }
     if f.effects.is_empty() {
         lines.push(why_none(f));
         return lines;
@@ -82,6 +86,9 @@ pub fn what_to_change(finding: &Finding) -> String {
 
 /// Why no effect stands for a finding.
 pub(crate) fn why_none(f: &Finding) -> String {
+    if f.status == Status::NotIdentifiable {
+        return "Nothing: this pair cannot tell how large it is.".into();
+    }
     let negative = [Quantity::StdM, Quantity::StdDeg, Quantity::Share].into_iter().find_map(|quantity| {
         let p = f.parameter(quantity)?;
         (p.estimate < 0.0).then_some((quantity, p.estimate))

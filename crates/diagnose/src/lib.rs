@@ -26,7 +26,7 @@ pub use diagnosis::{
     Considered, DetectorGain, Diagnosis, Finding, FindingGain, Gain, Minimum, Parameter, SCHEMA, Status, Verdict,
 };
 pub use engine::{
-    OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
+    BakedIn, OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
 };
 pub use error::DiagnoseError;
 pub use extended::{extended_toml, what_to_change};

@@ -540,6 +540,9 @@ set = { "network.pillars.size_m" = [0.4, 0.4, 8.0] }
         assert!(known, "every cell has the paper's numbers");
         let quick = StudyConfig::read(&folder.join("quick.toml")).unwrap();
         assert_eq!(quick.runs().len(), 2 * 4);
+        let twin = StudyConfig::read(&folder.join("twin.toml")).unwrap();
+        let names: Vec<&str> = twin.datasets.iter().map(|d| d.name.as_str()).collect();
+        assert_eq!((twin.runs().len(), &names[..]), (3 * 3, &["measured", "twin", "twin-sensor"][..]));
         assert!(!StudyConfig::read(&folder.join("cpu.toml")).unwrap().about.is_empty());
     }
 }

@@ -11,11 +11,12 @@ use toml::{Table, Value};
 use train::{RunConfig, set_key};
 
 /// Built-in studies.
-const BUILT_IN: [(&str, &str); 4] = [
+const BUILT_IN: [(&str, &str); 5] = [
     ("quick", include_str!("../../../configs/studies/quick.toml")),
     ("cpu", include_str!("../../../configs/studies/cpu.toml")),
     ("gain", include_str!("../../../configs/studies/gain.toml")),
     ("paper", include_str!("../../../configs/studies/paper.toml")),
+    ("twin", include_str!("../../../configs/studies/twin.toml")),
 ];
 
 /// Copy of the study's TOML in its folder, from the last time the study was run.

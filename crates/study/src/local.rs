@@ -48,7 +48,7 @@ impl LocalJobs {
 }
 
 /// Available memory in MiB (Linux only).
-fn free_mib() -> Option<u64> {
+pub fn free_mib() -> Option<u64> {
     let text = fs_err::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
     line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok().map(|kib| kib / 1024)

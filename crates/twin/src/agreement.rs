@@ -30,6 +30,8 @@ pub struct AgreementNumbers {
     pub twin_met_share: f64,
     /// Median of the absolute range differences of shots that return on both sides, m.
     pub median_abs_m: Option<f64>,
+    /// Nine in ten of these are below, m; 1 m stands for all that is farther.
+    pub p90_abs_m: Option<f64>,
     /// Share of these within 10 cm.
     pub within_10_cm: Option<f64>,
 }
@@ -59,14 +61,18 @@ impl Agreement {
     pub fn numbers(&self) -> AgreementNumbers {
         let share = |a: u64, b: u64| if b == 0 { 0.0 } else { a as f64 / b as f64 };
         let below = |bin: usize| self.bins.iter().take(bin).sum::<u64>();
-        let half = (0..self.bins.len()).find(|bin| 2 * below(bin + 1) >= self.met);
         let any = self.met > 0;
+        let quantile = |tenths: u64| {
+            let bin = (0..self.bins.len()).find(|bin| 10 * below(bin + 1) >= tenths * self.met).filter(|_| any)?;
+            Some((bin as f64 + 0.5) / f64::from(BINS_PER_M))
+        };
         AgreementNumbers {
             measured_returns: self.measured,
             met_share: share(self.met, self.measured),
             twin_returns: self.shown,
             twin_met_share: share(self.shown_met, self.shown),
-            median_abs_m: half.filter(|_| any).map(|bin| (bin as f64 + 0.5) / f64::from(BINS_PER_M)),
+            median_abs_m: quantile(5),
+            p90_abs_m: quantile(9),
             within_10_cm: any.then(|| share(below((0.1 * BINS_PER_M) as usize), self.met)),
         }
     }

@@ -5,6 +5,7 @@
 //! is held against itself; [`World`] is the map and the objects of a part of the drive; [`pair`] writes the result.
 
 mod agreement;
+mod baked_in;
 mod error;
 pub mod map;
 pub mod objects;
@@ -17,6 +18,7 @@ pub mod recording;
 mod world;
 
 pub use agreement::AgreementNumbers;
+pub use baked_in::{BakedIn, baked_in};
 pub use error::TwinError;
 pub use pair::{TwinConfig, TwinReport};
 pub use plan::Leave;

@@ -12,7 +12,7 @@ mod opacity;
 mod patch;
 mod ply;
 
-pub use fusion::{FusionConfig, Surfel, fuse};
+pub use fusion::{Fusion, FusionConfig, Surfel, fuse};
 pub use patch::{Patch, patches};
 pub use ply::encode_ply;
 
@@ -68,7 +68,15 @@ pub const FARTHEST_M: f32 = 150.0;
 impl SurfelMap {
     /// Fuses patches. `shots` gives the shots of the recording frame by frame; without any, every surfel is opaque.
     pub fn build(patches: &[Patch], shots: impl IntoIterator<Item = Vec<SeenShot>>, config: &FusionConfig) -> Self {
-        let surfels = fuse(patches, config);
+        SurfelMap::of_surfels(fuse(patches, config), shots, config)
+    }
+
+    /// The same of surfels that were fused before.
+    pub fn of_surfels(
+        surfels: Vec<Surfel>,
+        shots: impl IntoIterator<Item = Vec<SeenShot>>,
+        config: &FusionConfig,
+    ) -> Self {
         let tree = tree_of(&surfels);
         let mut map =
             SurfelMap { densities: vec![UNTRIED; surfels.len()], surfels, tree, thickness_m: config.thickness_m };

@@ -20,8 +20,11 @@ const UNSEEN_M: f32 = 0.15;
 
 /// Whether a point belongs to the object in a box. Both in the same frame.
 pub fn is_in(bbox: &Box3, point: &[f32; 3]) -> bool {
-    let [x, y, z] = bbox.to_local(point.map(f64::from));
-    let [l, w, h] = bbox.size;
+    is_in_size(bbox.size, bbox.to_local(point.map(f64::from)))
+}
+
+/// The same for a point in the frame of the box, whose size is [l, w, h], m.
+pub fn is_in_size([l, w, h]: [f64; 3], [x, y, z]: [f64; 3]) -> bool {
     x.abs() <= l / 2.0 + MARGIN_M
         && y.abs() <= w / 2.0 + MARGIN_M
         && (GROUND_M - h / 2.0..=h / 2.0 + MARGIN_M).contains(&z)

@@ -2,6 +2,7 @@
 
 use crate::TwinError;
 use crate::agreement::{Agreement, AgreementNumbers};
+use crate::baked_in::{BakedIn, baked_in};
 use crate::map::{FusionConfig, encode_ply};
 use crate::odometry::Sharpness;
 use crate::plan::{Leave, jobs};
@@ -19,24 +20,11 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Schema version of `twin.json`.
-pub const TWIN_SCHEMA: &str = "lidarshift/twin/1";
+pub const TWIN_SCHEMA: &str = "lidarshift/twin/2";
 /// Schema version of the manifests of both sides.
 pub const TWIN_MANIFEST_SCHEMA: &str = "lidarshift/twin-dataset/1";
 /// Folder with the directions of which the twin knows nothing.
 pub const UNKNOWN_FOLDER: &str = "unknown";
-
-/// Effects of the sensor that are in the map of a twin, which was made of its returns: a diagnosis of the pair cannot
-/// find them. Names as in the catalogue of effects, each with the reason.
-pub const BAKED_IN: &[(&str, &str)] = &[
-    ("range_bias", "a bias of all ranges moves the map as it moves the returns"),
-    ("world_scale", "a scale of all ranges is in the map"),
-    ("range_noise", "the map averages noise; the twin is free of it, and what is left of it in the map is not"),
-    ("sensor_extrinsics", "poses of the recording are those of the sensor: a wrong mount moves both sides alike"),
-    ("missing_object", "the twin has what the recording shows"),
-    ("shape", "the shapes of objects are the recorded ones"),
-    ("range_cut", "what no scan of the recording reached is not in the map"),
-    ("ego_occlusion", "what the own vehicle hides in all frames is not in the map"),
-];
 
 /// How a twin is made.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -45,6 +33,8 @@ pub struct TwinConfig {
     pub leave: Leave,
     /// How scans are fused.
     pub fusion: FusionConfig,
+    /// Memory that a map may take, bytes.
+    pub most_bytes: u64,
     /// Whether to write the static maps as PLY files.
     pub write_maps: bool,
 }
@@ -77,8 +67,8 @@ pub struct TwinReport {
     pub static_world: AgreementNumbers,
     /// Agreement of both sides on labelled objects.
     pub objects: AgreementNumbers,
-    /// Effects that a diagnosis of this pair cannot find, with the reason.
-    pub baked_in: Vec<[String; 2]>,
+    /// Causes that a diagnosis of this pair cannot tell.
+    pub baked_in: Vec<BakedIn>,
     /// What else to know of this twin.
     pub notes: Vec<String>,
 }
@@ -161,7 +151,7 @@ pub fn make(
     let (mut returns, mut done, mut surfels, mut lost_shots) = ([0usize; 3], 0, 0, false);
     progress(0, ids.len());
     for (number, job) in jobs.iter().enumerate() {
-        let world = World::build(recording, job, &config.fusion)?;
+        let world = World::build(recording, job, &config.fusion, config.most_bytes)?;
         surfels += world.map().surfels().len();
         if config.write_maps {
             write_atomic(&out.join(format!("maps/map_{number:03}.ply")), &encode_ply(world.map()))?;
@@ -198,7 +188,7 @@ pub fn make(
         returns_per_frame: returns.map(|n| n as f64 / ids.len() as f64),
         static_world: still.numbers(),
         objects: objects.numbers(),
-        baked_in: BAKED_IN.iter().map(|(kind, why)| [(*kind).into(), (*why).into()]).collect(),
+        baked_in: baked_in(),
         notes: notes(recording, lost_shots),
     };
     write_json(&out.join("twin.json"), &report)?;
@@ -250,12 +240,18 @@ fn write_frame(
     Ok(counts)
 }
 
+/// With fewer frames a map is thin.
+const FEW: usize = 6;
+
 fn notes(recording: &Recording, lost_shots: bool) -> Vec<String> {
-    let mut notes = Vec::new();
+    let mut notes = recording.findings.clone();
     if !lost_shots {
         let why =
             "rows of the sensor are not known: shots without a return are not shot again, and losses cannot be told";
         notes.push(why.into());
+    }
+    if recording.len() < FEW {
+        notes.push(format!("{} frames: each is held against a map of hardly more than one scan", recording.len()));
     }
     let poses = recording.world_from_lidar();
     let path: f64 = poses.windows(2).map(|w| (w[1].translation.vector - w[0].translation.vector).norm()).sum();
@@ -288,20 +284,32 @@ fn fingerprint(recording: &Recording, config: &TwinConfig, ids: &[String]) -> St
     hex(&Sha256::digest(text))
 }
 
-/// What to know of a diagnosis whose simulated side is a twin; `None` if it is none.
-pub fn note_for_diagnosis(simulated: &Dataset) -> Result<Option<String>, DataError> {
-    let root = &simulated.config.root;
-    let path = root.join("../twin.json");
+/// What is known of a simulated data set that is one side of a twin; `None` if it is none.
+///
+/// # Errors
+/// A `twin.json` that cannot be read.
+pub fn twin_of(simulated: &Dataset) -> Result<Option<TwinReport>, DataError> {
+    let path = simulated.config.root.join("../twin.json");
     if !path.may_be_file() {
         return Ok(None);
     }
     let text = read_text(&path)?;
     let twin: TwinReport = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
-    let names: Vec<&str> = twin.baked_in.iter().map(|[kind, _]| kind.as_str()).collect();
-    Ok(Some(format!(
-        "the simulated side is a twin of {}: these causes are in its map and are not identifiable: {}; a finding of one \
-         of them is an error of the twin",
-        twin.recording,
-        names.join(", ")
-    )))
+    if twin.schema != TWIN_SCHEMA {
+        let message = format!("has the schema {}, not {TWIN_SCHEMA}; make the twin anew", twin.schema);
+        return Err(DataError::file(&path, message));
+    }
+    Ok(Some(twin))
+}
+
+impl TwinReport {
+    /// What to know of a diagnosis whose simulated side is this twin.
+    pub fn note_for_diagnosis(&self) -> String {
+        let names: Vec<&str> = self.baked_in.iter().map(|b| b.cause.as_str()).collect();
+        format!(
+            "the simulated side is a twin of {}: these causes are in both sides and are not identifiable: {}",
+            self.recording,
+            names.join(", ")
+        )
+    }
 }

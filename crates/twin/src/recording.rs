@@ -5,10 +5,12 @@ mod rows;
 pub use rows::{Rows, Shot, shots};
 
 use crate::TwinError;
+use crate::objects::pose_of;
 use crate::odometry::{Odometry, OdometryConfig, RefineConfig, Refined, exp, log, refine};
+use crate::poses::{Found, PoseFinding, Verdict, check_moments, compared, find_convention, mend, most_said};
 use data::{Dataset, Moment};
 use geometry::Pose;
-use nalgebra::Point3;
+use nalgebra::{Point3, Vector6};
 use sensor::directions::{SensorScan, Steps};
 use sensor::rig::Sensor;
 use statistics::median_upper;
@@ -36,6 +38,8 @@ pub struct Recording {
     pub pose_source: PoseSource,
     /// What the refinement of the poses changed; `None` if they are as they were given.
     pub refined: Option<Refined>,
+    /// What was wrong with the frames, their stamps or their poses, and what was done about it.
+    pub findings: Vec<String>,
 }
 
 /// One scan of a recording, without the returns of the own vehicle.
@@ -68,20 +72,31 @@ pub struct PoseOptions {
 const SCANS_FOR_STEPS: usize = 5;
 
 impl Recording {
-    /// Opens the first `frames` frames of a recording (all, if `None`), and finds their poses.
-    pub fn open(dataset: Dataset, frames: Option<usize>, options: PoseOptions) -> Result<Recording, TwinError> {
-        let mut ids = dataset.all_ids()?;
+    /// Opens the first `frames` frames of a recording (all, if `None`), and finds their poses. `sequence` names the
+    /// sequence of a data set that has several.
+    ///
+    /// Frames are put in the order of their stamps, each stamp once. Frames without a pose are left out where others
+    /// have one. Poses that follow another convention are converted, unless they are to be kept. [`Self::findings`] has
+    /// what was done.
+    ///
+    /// # Errors
+    /// Several sequences and no name of one, fewer than two frames, poses that are not finite or fit no convention, and
+    /// files that cannot be read.
+    pub fn open(
+        dataset: Dataset,
+        sequence: Option<&str>,
+        frames: Option<usize>,
+        options: PoseOptions,
+    ) -> Result<Recording, TwinError> {
+        let mut ids = of_sequence(&dataset, sequence)?;
         ids.truncate(frames.unwrap_or(usize::MAX));
-        if ids.len() < 4 {
-            return Err(TwinError::Recording(format!(
-                "{}: {} frames; a twin is made of at least 4, as no frame is held against itself",
-                dataset.config.root.display(),
-                ids.len()
-            )));
-        }
-        let moments = dataset.moments(&ids)?;
+        let root = dataset.config.root.display().to_string();
+        few(&root, ids.len(), "")?;
+        let Found { moments, said } = mend(dataset.moments(&ids)?, options.odometry);
+        few(&root, moments.len(), &said.join("; "))?;
         let mut recording = Recording {
-            world_from_lidar: vec![Pose::identity(); ids.len()],
+            world_from_lidar: vec![Pose::identity(); moments.len()],
+            findings: said,
             moments,
             steps: Steps { azimuth_rad: 0.0, elevation_rad: 0.0 },
             dataset,
@@ -182,6 +197,26 @@ impl Recording {
         exp(&(twist * (f64::from(time_s) / seconds)))
     }
 
+    /// Motion of a tracked object from the stamp of a frame on, in the frame of its box: the twist (m and rad) per
+    /// second between the frames before and after this one, or this one where it is the first or last of the track.
+    /// Zero where stamps or other boxes are not known, and where boxes turn by more than a radian: labels that were
+    /// turned round.
+    pub fn object_twist(&self, frame: usize, track: &str) -> Vector6<f64> {
+        let at = |frame: usize| {
+            let object = self.moments.get(frame)?.objects.iter().find(|o| o.track == track)?;
+            Some((self.moments[frame].stamp_s?, self.world_from_lidar[frame] * pose_of(&object.bbox)))
+        };
+        let before = frame.checked_sub(1).and_then(at).or_else(|| at(frame));
+        let Some(((from_s, from), (to_s, to))) = before.zip(at(frame + 1).or_else(|| at(frame))) else {
+            return Vector6::zeros();
+        };
+        let moved = from.inverse() * to;
+        if to_s - from_s < 1e-3 || moved.rotation.angle() > 1.0 {
+            return Vector6::zeros();
+        }
+        log(&moved) / (to_s - from_s)
+    }
+
     fn find_steps(&self) -> Result<Steps, TwinError> {
         let every = (self.len() / SCANS_FOR_STEPS).max(1);
         let scans: Vec<RecordedScan> =
@@ -204,14 +239,18 @@ impl Recording {
 
     fn find_poses(&mut self, options: PoseOptions) -> Result<(), TwinError> {
         let given: Option<Vec<Pose>> = self.moments.iter().map(|m| m.world_from_lidar).collect();
-        if let Some(bad) = given.iter().flatten().position(|p| p.to_matrix().iter().any(|v| !v.is_finite())) {
-            let id = &self.moments[bad].id;
-            return Err(TwinError::Recording(format!(
-                "frame {id}: its pose is not finite; leave it out, or --odometry"
-            )));
+        let finite = |f: &&PoseFinding| matches!(f, PoseFinding::NotFinite { .. });
+        if let Some(bad) = check_moments(&self.moments).iter().find(finite).filter(|_| !options.odometry) {
+            let root = self.dataset.config.root.display();
+            return Err(TwinError::Recording(format!("{root}: {bad}: --odometry")));
         }
         match given.filter(|_| !options.odometry) {
-            Some(given) => self.world_from_lidar = given,
+            Some(given) => {
+                self.world_from_lidar = self.in_convention(given, options)?;
+                for (moment, pose) in self.moments.iter_mut().zip(&self.world_from_lidar) {
+                    moment.world_from_lidar = Some(*pose);
+                }
+            }
             None => {
                 self.pose_source = PoseSource::Odometry;
                 let mut odometry = Odometry::new(OdometryConfig::default());
@@ -221,6 +260,11 @@ impl Recording {
                 }
             }
         }
+        let known = self.moments.iter().map(|m| match self.pose_source {
+            PoseSource::Recording => m.clone(),
+            PoseSource::Odometry => Moment { world_from_lidar: None, ..m.clone() },
+        });
+        self.findings.extend(most_said(&check_moments(&known.collect::<Vec<_>>())));
         if options.refine {
             let scans: Vec<Vec<[f32; 3]>> = (0..self.len()).map(|f| self.compensated(f)).collect::<Result<_, _>>()?;
             let refined = refine(&scans, &self.world_from_lidar, &RefineConfig::default());
@@ -228,6 +272,34 @@ impl Recording {
             self.refined = Some(refined);
         }
         Ok(())
+    }
+
+    /// The poses of the recording as `world_from_lidar`: as they are, or converted from the convention under which the
+    /// scans coincide.
+    fn in_convention(&mut self, given: Vec<Pose>, options: PoseOptions) -> Result<Vec<Pose>, TwinError> {
+        let frames = compared(&given);
+        let scans: Vec<_> = frames.iter().map(|f| Ok(self.scan(*f)?.points)).collect::<Result<_, TwinError>>()?;
+        let poses: Vec<Pose> = frames.iter().map(|f| given[*f]).collect();
+        let report = find_convention(&scans, &poses);
+        match report.verdict {
+            Verdict::AsGiven | Verdict::Unknown => Ok(given),
+            Verdict::Other(_) if !options.refine => {
+                self.findings.push(format!("{report}; they are kept as they are"));
+                Ok(given)
+            }
+            Verdict::Other(convention) => {
+                self.findings.push(format!("{report}; the twin is made with converted poses"));
+                Ok(convention.world_from_lidar(&given))
+            }
+            Verdict::None if !options.refine => {
+                self.findings.push(format!("{report}; they are kept as they are"));
+                Ok(given)
+            }
+            Verdict::None => {
+                let root = self.dataset.config.root.display();
+                Err(TwinError::Recording(format!("{root}: {report}: --odometry; or keep them: --keep-poses")))
+            }
+        }
     }
 
     /// Points of a scan, freed of the motion of the sensor, without those in boxes.
@@ -242,4 +314,37 @@ impl Recording {
         };
         Ok(scan.points.iter().enumerate().filter(|(_, p)| still(p)).map(moved).collect())
     }
+}
+
+/// The frames of the sequence of this name, or of the only one.
+fn of_sequence(dataset: &Dataset, name: Option<&str>) -> Result<Vec<String>, TwinError> {
+    let mut sequences = dataset.sequences()?;
+    let names: Vec<String> = sequences.iter().map(|s| s.name.clone()).collect();
+    let refused = |message: String| TwinError::Recording(format!("{}: {message}", dataset.config.root.display()));
+    let at = match name {
+        None if sequences.len() > 1 => {
+            let (some, count) = (names.iter().take(10).cloned().collect::<Vec<_>>().join(", "), names.len());
+            return Err(refused(format!("has {count} sequences; give --sequence NAME: {some}")));
+        }
+        None => 0,
+        Some(name) => names
+            .iter()
+            .position(|known| known == name)
+            .ok_or_else(|| refused(format!("has no sequence {name:?}, only {}", names.join(", "))))?,
+    };
+    Ok(if at < sequences.len() { sequences.swap_remove(at).ids } else { Vec::new() })
+}
+
+/// Fewest frames: one that is shot, and one that its map is made of.
+const FEWEST: usize = 2;
+
+/// Refuses too few frames. `why` says what became of the others.
+fn few(root: &str, frames: usize, why: &str) -> Result<(), TwinError> {
+    if frames >= FEWEST {
+        return Ok(());
+    }
+    let why = if why.is_empty() { String::new() } else { format!(" ({why})") };
+    Err(TwinError::Recording(format!(
+        "{root}: {frames} frames{why}; a twin is made of at least {FEWEST}, as no frame is held against itself"
+    )))
 }

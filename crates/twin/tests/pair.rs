@@ -1,65 +1,19 @@
 //! Twins of a made-up recording with exact ranges, and of real scans.
 
+mod room;
+
 use data::Dataset;
 use lidarshift_twin::map::FusionConfig;
 use lidarshift_twin::{Leave, PoseOptions, PoseSource, Recording, TwinConfig, TwinReport, pair};
-use nalgebra::Vector3;
-use std::fmt::Write;
+use room::write_recording;
 use std::path::Path;
-
-/// Range from a place in a room of 30 x 20 x 5 m, with its floor at z = 0, along a direction.
-fn room(from: Vector3<f64>, direction: Vector3<f64>) -> f64 {
-    let (low, high) = (Vector3::new(-10.0, -8.0, 0.0), Vector3::new(20.0, 12.0, 5.0));
-    let wall = |k: usize| ((if direction[k] > 0.0 { high[k] } else { low[k] }) - from[k]) / direction[k];
-    (0..3).map(wall).fold(f64::INFINITY, f64::min)
-}
-
-/// Writes a recording of the room by 24 rows of 400 shots, from a sensor that drives 1 m a frame. Shots through the
-/// window (a part of one wall) have no return. A box of 4 x 2 x 1.5 m stands in the room.
-fn write_recording(root: &Path, frames: usize) {
-    std::fs::create_dir_all(root.join("velodyne")).unwrap();
-    let (mut poses, mut labels) = (String::new(), String::from("frame,track,class,cx,cy,cz,l,w,h,yaw\n"));
-    for frame in 0..frames {
-        let at = Vector3::new(frame as f64, 0.0, 1.7);
-        let mut bytes = Vec::new();
-        for row in 0..24 {
-            for column in 0..400 {
-                let (azimuth, elevation) =
-                    ((f64::from(column) + 0.5) * 0.9_f64.to_radians(), (8.3 - f64::from(row)).to_radians());
-                let direction = Vector3::from(sensor::rig::direction(azimuth, elevation));
-                let mut range = room(at, direction);
-                let hit = at + direction * range;
-                if hit.x > 19.99 && (2.0..6.0).contains(&hit.y) {
-                    continue;
-                }
-                let low = Vector3::new(8.0, 3.0, 0.0);
-                let (mut near, mut far) = (0.0f64, f64::INFINITY);
-                for (k, size) in [4.0, 2.0, 1.5].into_iter().enumerate() {
-                    let [a, b] = [low[k], low[k] + size].map(|face| (face - at[k]) / direction[k]);
-                    (near, far) = (near.max(a.min(b)), far.min(a.max(b)));
-                }
-                if near < far {
-                    range = range.min(near);
-                }
-                let p = direction * range;
-                for v in [p.x, p.y, p.z, 0.5] {
-                    bytes.extend((v as f32).to_le_bytes());
-                }
-            }
-        }
-        std::fs::write(root.join(format!("velodyne/{frame:06}.bin")), bytes).unwrap();
-        writeln!(poses, "1 0 0 {} 0 1 0 {} 0 0 1 {}", at.x, at.y, at.z).unwrap();
-        writeln!(labels, "{frame},7,Car,{},4.0,{},4.0,2.0,1.5,0.0", 10.0 - at.x, 0.75 - at.z).unwrap();
-    }
-    std::fs::write(root.join("poses.txt"), poses).unwrap();
-    std::fs::write(root.join("labels.csv"), labels).unwrap();
-}
 
 const KEEP: PoseOptions = PoseOptions { odometry: false, refine: false };
 
 fn twin_of(root: &Path, out: &Path, frames: Option<usize>, options: PoseOptions) -> TwinReport {
-    let recording = Recording::open(Dataset::open(root).unwrap(), frames, options).unwrap();
-    let config = TwinConfig { leave: Leave::Alternate, fusion: FusionConfig::default(), write_maps: true };
+    let recording = Recording::open(Dataset::open(root).unwrap(), None, frames, options).unwrap();
+    let config =
+        TwinConfig { leave: Leave::Alternate, fusion: FusionConfig::default(), most_bytes: 1 << 30, write_maps: true };
     pair::make(&recording, &config, out, &|_, _| ()).unwrap()
 }
 
@@ -67,7 +21,7 @@ fn twin_of(root: &Path, out: &Path, frames: Option<usize>, options: PoseOptions)
 fn a_room_is_shown_as_it_is_and_a_lost_shot_has_no_surface_where_nobody_saw_one() {
     let folder = tempfile::tempdir().unwrap();
     let (root, out) = (folder.path().join("room"), folder.path().join("twin"));
-    write_recording(&root, 10);
+    write_recording(&root, 10, 1.0, 0.0);
     let report = twin_of(&root, &out, None, KEEP);
     assert_eq!((report.frames, report.poses), (10, PoseSource::Recording));
     let world = report.static_world;
@@ -95,8 +49,13 @@ fn a_room_is_shown_as_it_is_and_a_lost_shot_has_no_surface_where_nobody_saw_one(
     std::fs::remove_file(out.join("sim/velodyne/000004.bin")).unwrap();
     twin_of(&root, &out, None, KEEP);
     assert!(cloud() == before);
-    let recording = Recording::open(Dataset::open(&root).unwrap(), None, KEEP).unwrap();
-    let other = TwinConfig { leave: Leave::Seconds(0.3), fusion: FusionConfig::default(), write_maps: false };
+    let recording = Recording::open(Dataset::open(&root).unwrap(), None, None, KEEP).unwrap();
+    let other = TwinConfig {
+        leave: Leave::Seconds(0.3),
+        fusion: FusionConfig::default(),
+        most_bytes: 1 << 30,
+        write_maps: false,
+    };
     let error = pair::make(&recording, &other, &out, &|_, _| ()).unwrap_err().to_string();
     assert!(error.contains("with other options, poses or another version"), "{error}");
 }
@@ -105,10 +64,10 @@ fn a_room_is_shown_as_it_is_and_a_lost_shot_has_no_surface_where_nobody_saw_one(
 fn too_few_frames_are_refused_and_no_labels_are_said() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path().join("room");
-    write_recording(&root, 4);
-    let open = |frames| Recording::open(Dataset::open(&root).unwrap(), Some(frames), KEEP);
-    let error = open(3).err().expect("three frames are too few").to_string();
-    assert!(error.contains("3 frames; a twin is made of at least 4"), "{error}");
+    write_recording(&root, 4, 1.0, 0.0);
+    let open = |frames| Recording::open(Dataset::open(&root).unwrap(), None, Some(frames), KEEP);
+    let error = open(1).err().expect("one frame is too few").to_string();
+    assert!(error.contains("1 frames; a twin is made of at least 2"), "{error}");
     std::fs::remove_file(root.join("labels.csv")).unwrap();
     let report = twin_of(&root, &folder.path().join("out"), None, KEEP);
     assert!(report.notes.iter().any(|n| n.contains("no tracked boxes")), "{:?}", report.notes);
@@ -127,4 +86,56 @@ fn real_scans_are_met() {
     assert!(world.median_abs_m.unwrap() < 0.07 && world.within_10_cm.unwrap() > 0.6, "{world:?}");
     assert!(world.met_share > 0.9 && world.twin_met_share > 0.85, "{world:?}");
     assert!(report.lost_shots_known);
+}
+
+/// Recordings of which only a scan or two are at hand.
+#[test]
+fn single_scans_are_refused_and_two_sweeps_make_a_twin() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data");
+    if !data.is_dir() {
+        eprintln!("skipped: {} is absent", data.display());
+        return;
+    }
+    let refine = PoseOptions { odometry: false, refine: true };
+    let folder = tempfile::tempdir().unwrap();
+    // A scan of SemanticKITTI at its place in a sequence.
+    let sequence = folder.path().join("08");
+    for (name, ending, inside) in [("velodyne", "bin", "000000.bin"), ("labels", "label", "000000.label")] {
+        std::fs::create_dir_all(sequence.join(name)).unwrap();
+        let scan = data.join(format!("semantickitti/semantickitti_08_000000.{ending}"));
+        std::fs::copy(scan, sequence.join(name).join(inside)).unwrap();
+    }
+    std::fs::write(sequence.join("calib.txt"), "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n").unwrap();
+    let others = ["nuscenes_keyframe", "argoverse2/adcf7d18-0510-35b0-a2fa-b4cea13a6d76"].map(|name| data.join(name));
+    for single in others.into_iter().chain([sequence]) {
+        let dataset = Dataset::open(&single).unwrap();
+        let error = Recording::open(dataset, None, None, refine).err().expect("one scan").to_string();
+        assert!(error.contains("1 frames; a twin is made of at least 2"), "{}: {error}", single.display());
+    }
+    let log = data.join("argoverse2/7fab2350-7eaf-3b7e-a39d-6937a4c1bede");
+    let report = twin_of(&log, &folder.path().join("out"), None, refine);
+    println!("{report:#?}");
+    assert_eq!((report.frames, report.poses), (2, PoseSource::Recording));
+    assert!(report.lost_shots_known && report.static_world.met_share > 0.6, "{report:?}");
+    assert!(report.notes.iter().any(|n| n.contains("hardly more than one scan")), "{:?}", report.notes);
+}
+
+#[test]
+fn the_motion_of_a_track_is_that_between_the_frames_around() {
+    let folder = tempfile::tempdir().unwrap();
+    write_recording(folder.path(), 4, 1.0, 0.0);
+    std::fs::write(folder.path().join("times.txt"), "0.0\n0.1\n0.2\n0.3\n").unwrap();
+    // The sensor drives at 10 m/s along x; the object keeps its distance and is turned by 90 degrees.
+    let line = |frame: usize| format!("{frame},7,Car,10,2,-1,4,2,1.5,{}\n", std::f64::consts::FRAC_PI_2);
+    let header = "frame,track,class,cx,cy,cz,l,w,h,yaw\n";
+    std::fs::write(folder.path().join("labels.csv"), header.to_string() + &(0..4).map(line).collect::<String>())
+        .unwrap();
+    let recording = Recording::open(Dataset::open(folder.path()).unwrap(), None, None, KEEP).unwrap();
+    for frame in 0..4 {
+        let twist = recording.object_twist(frame, "7");
+        // In the frame of the box: to its right.
+        let off = (twist - nalgebra::Vector6::new(0.0, -10.0, 0.0, 0.0, 0.0, 0.0)).norm();
+        assert!(off < 1e-6, "{frame}: {twist}");
+    }
+    assert_eq!(recording.object_twist(1, "8"), nalgebra::Vector6::zeros());
 }

@@ -1,10 +1,11 @@
-//! A recorded drive in plain files: `velodyne/*.bin`, `poses.txt`, `labels.csv` and time stamps where they are known.
+//! A recorded drive in plain files: `velodyne/*.bin`, `poses.txt`, `labels.csv` and time stamps where they are known;
+//! `ring/*.bin` and `time_s/*.bin` where rows and times of points are.
 
 use super::file_names::{check_folder, ids_of_files};
 use super::pose_text::{LineOfFrame, check_box, parse_poses};
 use super::stamps::parse_stamps;
-use super::{DataLayout, Moment, TrackedObject};
-use crate::limits::{MOST_BOXES, at_most, read_text};
+use super::{DataLayout, Moment, PointDetails, TrackedObject};
+use crate::limits::{MOST_BOXES, MOST_CLOUD_BYTES, at_most, read_file, read_text};
 use crate::{Cloud, DataError, DatasetConfig, LabelBox, Layout, PointColumns, read_cloud};
 use geometry::Box3;
 use serde::Deserialize;
@@ -17,6 +18,9 @@ pub(super) struct Recording;
 const CLOUDS: &str = "velodyne";
 const POSES: &str = "poses.txt";
 const LABELS: &str = "labels.csv";
+/// A number a point, in the order of the points: its ring (u16), and its time relative to the stamp, s (f32).
+const RINGS: &str = "ring";
+const TIMES: &str = "time_s";
 /// Files with time stamps: the first of them that exists is read. The last is the log of a GPS whose first column is
 /// the time.
 const STAMPS: [&str; 3] = ["times.txt", "timestamps.txt", "oxts_ts_lat_lon_alt_roll_pitch_yaw.txt"];
@@ -92,6 +96,34 @@ impl DataLayout for Recording {
         };
         ids.iter().map(moment).collect()
     }
+
+    fn read_point_details(&self, root: &Path, id: &str) -> Result<PointDetails, DataError> {
+        let points = self.count_points(root, id, PointColumns::Xyzi)?;
+        let ring = numbers(&root.join(RINGS).join(format!("{id}.bin")), points, u16::from_le_bytes)?;
+        let time_s = numbers(&root.join(TIMES).join(format!("{id}.bin")), points, f32::from_le_bytes)?;
+        if let Some(i) = time_s.iter().flatten().position(|t| !t.is_finite()) {
+            let path = root.join(TIMES).join(format!("{id}.bin"));
+            return Err(DataError::file(&path, format!("the time of point {i} is not finite")));
+        }
+        Ok(PointDetails { ring, time_s, ..PointDetails::default() })
+    }
+}
+
+/// The numbers of a file, one a point; `None` if it does not exist.
+fn numbers<const N: usize, T>(
+    path: &Path,
+    points: usize,
+    number: fn([u8; N]) -> T,
+) -> Result<Option<Vec<T>>, DataError> {
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let bytes = read_file(path, MOST_CLOUD_BYTES)?;
+    if bytes.len() != N * points {
+        let message = format!("has {} bytes, not {N} for each of the {points} points of the cloud", bytes.len());
+        return Err(DataError::file(path, message));
+    }
+    Ok(Some(bytes.as_chunks().0.iter().map(|bytes| number(*bytes)).collect()))
 }
 
 /// One line of `labels.csv`: the box in the LiDAR frame, m and rad.
@@ -190,6 +222,27 @@ mod tests {
         assert_eq!((frame.objects.len(), frame.objects[0].bbox), (2, moments[1].objects[0].bbox));
         assert_eq!(dataset.labels("000002").unwrap().iter().map(|l| l.track).collect::<Vec<_>>(), [Some(7), None]);
         assert!(dataset.load("000001").unwrap().objects.is_empty());
+    }
+
+    #[test]
+    fn rings_and_times_of_points_are_read_where_they_are() {
+        let folder = recording(&["000001"]);
+        write(&folder, "labels.csv", HEADER);
+        let details = || Dataset::open(folder.path()).unwrap().point_details("000001");
+        assert_eq!(details().unwrap(), PointDetails::default());
+        for name in ["ring", "time_s"] {
+            std::fs::create_dir(folder.path().join(name)).unwrap();
+        }
+        std::fs::write(folder.path().join("ring/000001.bin"), 7u16.to_le_bytes()).unwrap();
+        std::fs::write(folder.path().join("time_s/000001.bin"), 0.02f32.to_le_bytes()).unwrap();
+        let found = details().unwrap();
+        assert_eq!((found.ring, found.time_s, found.compensated), (Some(vec![7]), Some(vec![0.02]), None));
+        std::fs::write(folder.path().join("time_s/000001.bin"), f32::NAN.to_le_bytes()).unwrap();
+        let error = details().unwrap_err().to_string();
+        assert!(error.contains("time_s/000001.bin: the time of point 0 is not finite"), "{error}");
+        std::fs::write(folder.path().join("ring/000001.bin"), [0; 3]).unwrap();
+        let error = details().unwrap_err().to_string();
+        assert!(error.contains("ring/000001.bin: has 3 bytes, not 2 for each of the 1 points"), "{error}");
     }
 
     #[test]

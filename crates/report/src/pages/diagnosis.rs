@@ -31,7 +31,7 @@ pub fn write_finding_pictures(diagnosis: &Diagnosis, out: &Path) -> Result<(), R
 pub fn finding_name(finding: &Finding) -> String {
     match finding.status {
         Status::Named => finding.cause.map_or_else(String::new, |c| c.to_string()),
-        Status::Ambiguous => {
+        Status::Ambiguous | Status::NotIdentifiable => {
             let names = finding.candidates.iter().flatten().map(|c| c.name());
             names.collect::<Vec<_>>().join(" or ")
         }

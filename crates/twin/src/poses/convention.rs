@@ -131,7 +131,8 @@ pub enum Verdict {
     Other(Convention),
     /// The scans are sharper without any motion than under each convention: the poses are of no use.
     None,
-    /// The vehicle hardly moved, or there are fewer than two scans: nothing can be said.
+    /// The vehicle hardly moved, hardly anything stands around it, or there are fewer than two scans: nothing can be
+    /// said.
     Unknown,
 }
 
@@ -163,14 +164,16 @@ impl fmt::Display for ConventionReport {
             Verdict::Other(convention) => write!(
                 f,
                 "the poses fit another convention, {convention}: {scans} scans fill {best:.3} of their voxels so, \
-                 {given:.3} as given, {still:.3} without motion; convert the poses"
+                 {given:.3} as given, {still:.3} without motion"
             ),
             Verdict::None => write!(
                 f,
                 "the poses fit no known convention: {scans} scans fill {still:.3} of their voxels without motion and \
-                 {best:.3} at best with it; use the odometry"
+                 {best:.3} at best with it; find others by the odometry"
             ),
-            Verdict::Unknown => f.write_str("the scans say nothing of the poses: the vehicle hardly moved"),
+            Verdict::Unknown => f.write_str(
+                "the scans say nothing of the poses: the vehicle hardly moved, or hardly anything stands around it",
+            ),
         }
     }
 }
@@ -183,7 +186,13 @@ const STEP_M: f64 = 2.0;
 const STEP_RAD: f64 = 0.05;
 
 /// Another convention must be sharper than the given one by this share.
-const LEAST_GAIN: f64 = 0.01;
+const LEAST_GAIN: f64 = 0.02;
+
+/// No motion must be sharper than the best convention by this share: along even walls both are alike.
+const STILL_GAIN: f64 = 0.05;
+
+/// Points on upright things, thinned, that each scan needs.
+const FEWEST_POINTS: usize = 100;
 
 /// Finds the convention under which scans fit together.
 ///
@@ -195,7 +204,7 @@ const LEAST_GAIN: f64 = 0.01;
 /// There are not as many poses as scans.
 pub fn find_convention<S: AsRef<[[f32; 3]]> + Sync>(scans: &[S], given: &[Pose]) -> ConventionReport {
     assert_eq!(scans.len(), given.len(), "as many poses as scans");
-    let compared = choose(given);
+    let compared = compared(given);
     let clouds: Vec<_> = compared.iter().map(|i| prepared(scans[*i].as_ref())).collect();
     let given: Vec<Pose> = compared.iter().map(|i| given[*i]).collect();
     let of = |convention: Convention| {
@@ -210,9 +219,9 @@ pub fn find_convention<S: AsRef<[[f32; 3]]> + Sync>(scans: &[S], given: &[Pose])
     candidates.sort_by(|a, b| a.spread.total_cmp(&b.spread));
     let without_motion = spread(&clouds, &vec![Pose::identity(); clouds.len()]);
     let best = candidates[0];
-    let verdict = if compared.len() < 2 {
+    let verdict = if compared.len() < 2 || clouds.iter().any(|cloud| cloud.len() < FEWEST_POINTS) {
         Verdict::Unknown
-    } else if without_motion < best.spread {
+    } else if without_motion * (1.0 + STILL_GAIN) < best.spread {
         Verdict::None
     } else if given_spread <= best.spread * (1.0 + LEAST_GAIN) {
         Verdict::AsGiven
@@ -223,8 +232,8 @@ pub fn find_convention<S: AsRef<[[f32; 3]]> + Sync>(scans: &[S], given: &[Pose])
 }
 
 /// The places of scans that are apart in position or direction, from the middle of the recording on, and if these are
-/// too few from its start.
-fn choose(poses: &[Pose]) -> Vec<usize> {
+/// too few from its start: those that [`find_convention`] compares.
+pub fn compared(poses: &[Pose]) -> Vec<usize> {
     let from = |start: usize| {
         let mut chosen: Vec<usize> = Vec::new();
         for (i, pose) in poses.iter().enumerate().skip(start) {

@@ -106,7 +106,7 @@ impl fmt::Display for PoseFinding {
                 write!(f, "between the frames {before} and {after} there are {gap_s:.2} s without a frame")
             }
             PoseFinding::NoPose { first, last, frames } => {
-                write!(f, "{frames} frames from {first} to {last} have no pose; leave them out or use the odometry")
+                write!(f, "{frames} frames from {first} to {last} have no pose")
             }
             PoseFinding::NotFinite { frame } => {
                 write!(f, "the pose of frame {frame} is not finite; leave the frame out or use the odometry")

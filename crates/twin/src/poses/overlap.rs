@@ -4,7 +4,7 @@ use crate::odometry::voxels::{Key, KeyHasher, indices, key, thin};
 use geometry::Pose;
 use nalgebra::Point3;
 use rayon::prelude::*;
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::hash::BuildHasherDefault;
 
 /// Side of a voxel, m: wider than the errors of a GPS between neighbouring scans.
@@ -19,11 +19,26 @@ const NEAREST_M: f64 = 3.0;
 /// Points farther than this are not used, m: there a small turn moves them by a voxel.
 const FARTHEST_M: f64 = 40.0;
 
-/// The points of a scan that are compared.
+/// Points stand on something upright if those of their column of voxels differ by this in height, m.
+const UPRIGHT_M: f64 = 0.5;
+
+/// The points of a scan that are compared: those on upright things. The rings of a sensor on level ground lie at the
+/// same places of each scan, wherever it is, and would coincide without any motion.
 pub(super) fn prepared(scan: &[[f32; 3]]) -> Vec<Point3<f64>> {
     let points = scan.iter().map(|p| Point3::from(p.map(f64::from)));
     let near: Vec<_> = points.filter(|p| (NEAREST_M..=FARTHEST_M).contains(&p.coords.norm())).collect();
-    thin(&near, THIN_M)
+    let column = |p: &Point3<f64>| {
+        let [x, y, _] = indices(p, 1.0 / VOXEL_M);
+        key([x, y, 0])
+    };
+    let mut heights: HashMap<Key, [f64; 2], BuildHasherDefault<KeyHasher>> = HashMap::default();
+    for p in &near {
+        let [low, high] = heights.entry(column(p)).or_insert([p.z; 2]);
+        (*low, *high) = (low.min(p.z), high.max(p.z));
+    }
+    let upright = |p: &&Point3<f64>| heights.get(&column(p)).is_some_and(|[low, high]| high - low > UPRIGHT_M);
+    let kept: Vec<_> = near.iter().filter(upright).copied().collect();
+    thin(&kept, THIN_M)
 }
 
 /// The number of voxels that scans fill together, as a share of the sum of what each fills: 1 if they have nothing in

@@ -73,10 +73,11 @@ fn about(d: &Diagnosis) -> Vec<String> {
             };
             let of = |n: usize, text: &str| if n > 0 { format!(", {n} {text}") } else { String::new() };
             format!(
-                "{} differences were found: {named}{}{}.",
+                "{} differences were found: {named}{}{}{}.",
                 d.findings.len(),
                 of(count(Status::Ambiguous), "that several causes explain equally well"),
-                of(count(Status::Unexplained), "that no cause of the catalogue explains")
+                of(count(Status::Unexplained), "that no cause of the catalogue explains"),
+                of(count(Status::NotIdentifiable), "whose cause this pair cannot tell")
             )
         }
     };
@@ -144,11 +145,14 @@ fn findings(d: &Diagnosis) -> Section {
             Status::Named => "named",
             Status::Ambiguous => "ambiguous",
             Status::Unexplained => "without a name",
+            Status::NotIdentifiable => "not identifiable",
         };
         let share = if total > 0.0 { percent(f.gain.nats_per_ray.max(0.0) / total) } else { "–".into() };
         let reached = f.reached.map_or_else(|| "–".into(), percent);
-        let tell =
-            f.separate_by.clone().map_or(String::new(), |how| format!("To distinguish the causes, record {how}."));
+        let tell = f.separate_by.as_ref().map_or(String::new(), |how| match f.status {
+            Status::NotIdentifiable => format!("To tell it, record {how}."),
+            _ => format!("To distinguish the causes, record {how}."),
+        });
         TableRow::new(
             false,
             [

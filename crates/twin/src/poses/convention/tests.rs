@@ -97,7 +97,7 @@ fn useless_poses_and_standing_vehicles_are_named() {
     let same = vec![scene(&truth[3]); truth.len()];
     let report = find_convention(&same, &truth);
     assert_eq!(report.verdict, Verdict::None, "{report}");
-    assert!(report.to_string().contains("use the odometry"));
+    assert!(report.to_string().contains("by the odometry"));
 }
 
 #[test]
