@@ -7,7 +7,7 @@ pub mod console;
 pub mod device;
 pub mod signals;
 
-use clap::Parser;
+use clap::{CommandFactory as _, Parser};
 use std::process::ExitCode;
 
 commands! {
@@ -24,9 +24,12 @@ commands! {
     Report(report::ReportArgs) "Write the report of a study";
     Twin(twin::TwinArgs) "Make a simulated partner of a recording that has no simulation";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
+    Convert(convert::ConvertArgs) "Write a data set in the format of KITTI, OpenPCDet, CARLA, PCD or MCAP (ROS 2)";
     Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
     Doctor(doctor::DoctorArgs) "Check a data set for errors";
+    Completions(completions::CompletionsArgs) "Print the completions of a shell";
+    Man(man::ManArgs) "Write the pages of the manual";
 }
 
 /// How much does a LiDAR detector trained in simulation lose on real data, why, and what must change in the simulator?
@@ -35,6 +38,11 @@ commands! {
 struct Program {
     #[command(subcommand)]
     command: Command,
+}
+
+/// The command line with all commands and options.
+pub fn command() -> clap::Command {
+    Program::command()
 }
 
 /// Runs the command line. Exit codes: 0 success, 1 failure, 2 wrong arguments, 3 a diagnosis of data sets that do not
