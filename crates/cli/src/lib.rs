@@ -8,6 +8,7 @@ pub mod device;
 pub mod signals;
 
 use clap::{CommandFactory as _, Parser};
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 commands! {
@@ -40,6 +41,9 @@ struct Program {
     command: Command,
 }
 
+/// Exit code of a command that failed.
+const FAILURE: u8 = 1;
+
 /// The command line with all commands and options.
 pub fn command() -> clap::Command {
     Program::command()
@@ -48,15 +52,22 @@ pub fn command() -> clap::Command {
 /// Runs the command line. Exit codes: 0 success, 1 failure, 2 wrong arguments, 3 a diagnosis of data sets that do not
 /// show the same scenes. The program ends by SIGINT or SIGTERM if it was stopped, and by SIGPIPE if stdout was closed.
 pub fn run() -> ExitCode {
+    ExitCode::from(run_with(std::env::args_os().collect()))
+}
+
+/// As [`run`] with these arguments, of which the first is the name of the program; returns the exit code. For programs
+/// in which this one is contained: it handles signals from then on, and it is called once.
+pub fn run_with(arguments: Vec<OsString>) -> u8 {
+    commands::set_called(&arguments);
     signals::handle();
-    let code = match Program::try_parse().map(|program| program.command.run()) {
+    let code = match Program::try_parse_from(&arguments).map(|program| program.command.run()) {
         Ok(Ok(end)) => end.into(),
         Ok(Err(error)) => {
             errln!("error: {error:#}");
             signals::end_if_stopped();
-            ExitCode::FAILURE
+            FAILURE
         }
-        Err(usage) => console::print_usage(&usage),
+        Err(usage) => console::print_usage(&usage, &arguments),
     };
     console::end(code)
 }
