@@ -12,7 +12,7 @@ use std::process::{Command, Stdio};
 const NEEDED: [&str; 2] = ["numpy", "pytest"];
 
 /// What some tests import, which are left out without it.
-const OPTIONAL: [&str; 1] = ["mcap-ros2-support"];
+const OPTIONAL: [&str; 2] = ["onnxruntime", "mcap-ros2-support"];
 
 /// Builds the extension module and runs the tests; prints a note if there is no Python or no package index.
 pub fn test(root: &Path, features: &[&str]) -> Result<()> {

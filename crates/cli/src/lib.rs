@@ -26,7 +26,7 @@ commands! {
     Twin(twin::TwinArgs) "Make a simulated partner of a recording that has no simulation";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
     Convert(convert::ConvertArgs) "Write a data set in the format of KITTI, OpenPCDet, CARLA, PCD or MCAP (ROS 2)";
-    Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++";
+    Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++, or a detector as ONNX";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
     Doctor(doctor::DoctorArgs) "Check a data set for errors";
     Completions(completions::CompletionsArgs) "Print the completions of a shell";

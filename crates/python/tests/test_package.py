@@ -198,3 +198,64 @@ def test_the_program_is_in_the_package():
     done = lidarshift.run("--version")
     assert done.stdout.split() == ["lidarshift", lidarshift.__version__]
     assert lidarshift.run("no-such-command", check=False).returncode == 2
+
+
+NETWORKS = {
+    "pointpillars": """
+vfe_filters = 8
+[[network.anchors]]
+class = "Car"
+size_m = [3.9, 1.6, 1.56]
+bottom_m = -1.78
+matched = 0.6
+unmatched = 0.45
+""",
+    "centerpoint": """
+vfe_filters = [8, 8]
+[network.head]
+filters = 8
+""",
+}
+
+
+@pytest.mark.parametrize("kind", NETWORKS)
+@pytest.mark.parametrize("strides", ["[1, 2]", "[0.5, 1]"])
+def test_onnx_graphs_give_the_same_numbers(folder, kind, strides):
+    pytest.importorskip("onnxruntime")
+    (folder / "tiny.toml").write_text(
+        f"""
+name = "tiny"
+classes = ["Car"]
+channels = 4
+range_m = [-20.48, -20.48, -3.0, 20.48, 20.48, 3.0]
+[network]
+kind = "{kind}"
+{NETWORKS[kind]}
+[network.pillars]
+size_m = [0.64, 0.64, 6.0]
+max_points = 8
+max_train = 1000
+max_test = 1000
+[network.backbone]
+layers = [0, 1]
+strides = [2, 2]
+filters = [8, 16]
+upsample_strides = {strides}
+upsample_filters = [8, 8]
+[optimization]
+epochs = 2
+batch_size = 2
+"""
+    )
+    for split in ("train", "val"):
+        (folder / f"ImageSets/{split}.txt").write_text("000000\n000001\n")
+    (folder / "dataset.toml").write_text('classes = ["Car"]\n')
+    lidarshift.run("train", "--dataset", folder, "--detector", folder / "tiny.toml", "--out", folder / "run")
+    cloud = folder / "velodyne/000002.bin"
+    lidarshift.run("export", "--to", "onnx", folder / "run", "--check", cloud, "--out", folder / "onnx")
+    script = [sys.executable, folder / "onnx/run_onnx.py"]
+    done = subprocess.run([*script, "--check"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert float(done.stdout.split()[-1]) <= 1e-4
+    done = subprocess.run([*script, cloud], capture_output=True, text=True)
+    assert "best score" in done.stdout, done.stderr
