@@ -6,7 +6,8 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-/// Format, house rules, the book, clippy, and tests, which include doc tests and a smoke run of the program.
+/// Format, house rules, the book, clippy, tests, which include doc tests and a smoke run of the program, and the tests
+/// of the Python package.
 ///
 /// Everything is built once with the wgpu backend, which compiles without a GPU.
 pub fn ci(root: &Path) -> Result<()> {
@@ -20,6 +21,7 @@ pub fn ci(root: &Path) -> Result<()> {
         component(root, "clippy", &args)
     })?;
     step("test", || must(cargo(root).args(["test", "--workspace"]).args(FEATURES)))?;
+    step("python", || crate::python::test(root, &FEATURES))?;
     eprintln!("ci: all passed in {:.0} s", start.elapsed().as_secs_f64());
     Ok(())
 }

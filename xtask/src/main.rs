@@ -8,6 +8,7 @@ mod ci;
 mod format;
 mod pages;
 mod program;
+mod python;
 mod tidy;
 
 use anyhow::{Result, bail};

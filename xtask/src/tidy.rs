@@ -29,6 +29,7 @@ const ARROWS: &[(&str, &[&str])] = &[
     ("report", &["eval", "diagnose"]),
     ("study", &["simulate", "train", "report"]),
     ("cli", &["study", "twin", "exchange"]),
+    ("python", &["cli"]),
     ("checks", &["cli"]),
     ("tests", &["checks"]),
     ("xtask", &["statistics"]),

@@ -46,12 +46,12 @@ fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
     unsafe { lidarshift::allocator::keep_memory() };
     let code = match Program::parse().check.run() {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
+        Ok(true) => 0,
+        Ok(false) => 1,
         Err(error) => {
             errln!("error: {error:#}");
-            ExitCode::FAILURE
+            1
         }
     };
-    lidarshift::console::end(code)
+    ExitCode::from(lidarshift::console::end(code))
 }

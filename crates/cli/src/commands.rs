@@ -1,6 +1,10 @@
 //! How a command is added to the program, and how its result becomes an exit code.
 
-use std::process::ExitCode;
+use std::ffi::OsString;
+use std::sync::OnceLock;
+
+/// The arguments of the program, its name included.
+static CALLED: OnceLock<Vec<String>> = OnceLock::new();
 
 /// Result of a command that ran without an error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,12 +29,12 @@ impl From<bool> for End {
     }
 }
 
-impl From<End> for ExitCode {
+impl From<End> for u8 {
     fn from(end: End) -> Self {
         match end {
-            End::Done => ExitCode::SUCCESS,
-            End::Failed => ExitCode::FAILURE,
-            End::NotTheSameScenes => ExitCode::from(3),
+            End::Done => 0,
+            End::Failed => crate::FAILURE,
+            End::NotTheSameScenes => 3,
         }
     }
 }
@@ -62,10 +66,14 @@ macro_rules! commands {
     };
 }
 
+/// Remembers the command as it is called.
+pub(crate) fn set_called(arguments: &[OsString]) {
+    CALLED.get_or_init(|| arguments.iter().map(|a| a.to_string_lossy().into_owned()).collect());
+}
+
 /// The command as it was called.
 pub fn called() -> String {
-    std::iter::once("lidarshift".to_string())
-        .chain(std::env::args_os().skip(1).map(|a| a.to_string_lossy().into_owned()))
-        .collect::<Vec<_>>()
-        .join(" ")
+    let arguments = CALLED.get().map_or(&[][..], Vec::as_slice);
+    let words = arguments.iter().skip(1).map(String::as_str);
+    std::iter::once("lidarshift").chain(words).collect::<Vec<_>>().join(" ")
 }

@@ -5,9 +5,9 @@
 //! names of files, classes and data sets may have, are escaped.
 
 use std::borrow::Cow;
+use std::ffi::OsString;
 use std::fmt::Arguments;
 use std::io::{Error, ErrorKind, Write as _};
-use std::process::ExitCode;
 use std::sync::Mutex;
 
 /// The first error of stdout.
@@ -57,10 +57,10 @@ pub fn print_error(text: Arguments<'_>) {
 }
 
 /// Prints an error or a help text of the command line parser; returns its exit code.
-pub fn print_usage(error: &clap::Error) -> ExitCode {
+pub fn print_usage(error: &clap::Error, arguments: &[OsString]) -> u8 {
     // The parser's own colours are control characters, so only text with other ones loses its colours.
-    let strange = |argument: std::ffi::OsString| matches!(escaped(&argument.to_string_lossy()), Cow::Owned(_));
-    if !std::env::args_os().any(strange) {
+    let strange = |argument: &OsString| matches!(escaped(&argument.to_string_lossy()), Cow::Owned(_));
+    if !arguments.iter().any(strange) {
         let failed = error.print().err();
         if !error.use_stderr() {
             *lost() = failed;
@@ -70,19 +70,19 @@ pub fn print_usage(error: &clap::Error) -> ExitCode {
     } else {
         print(format_args!("{error}"));
     }
-    ExitCode::from(u8::try_from(error.exit_code()).unwrap_or(2))
+    u8::try_from(error.exit_code()).unwrap_or(2)
 }
 
 /// The exit code of the program after its last output. If stdout is a pipe that was closed, the program ends as by
 /// SIGPIPE. If stdout could not be written for another reason, the exit code is 1.
-pub fn end(code: ExitCode) -> ExitCode {
+pub fn end(code: u8) -> u8 {
     let lost = lost().take();
     match lost {
         None => code,
         Some(error) if error.kind() == ErrorKind::BrokenPipe => crate::signals::end_by_pipe(),
         Some(error) => {
             print_error(format_args!("error: stdout cannot be written: {error}\n"));
-            ExitCode::FAILURE
+            crate::FAILURE
         }
     }
 }

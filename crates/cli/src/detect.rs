@@ -158,7 +158,7 @@ impl DetectArgs {
 
 /// The detector of the weights: the one `named` on the command line, else the one in config.toml of the run folder that
 /// contains them.
-fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<DetectorConfig> {
+pub(crate) fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<DetectorConfig> {
     if let Some(name) = named {
         return Ok(find_detector(name)?);
     }

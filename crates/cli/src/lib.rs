@@ -7,7 +7,8 @@ pub mod console;
 pub mod device;
 pub mod signals;
 
-use clap::Parser;
+use clap::{CommandFactory as _, Parser};
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 commands! {
@@ -24,9 +25,12 @@ commands! {
     Report(report::ReportArgs) "Write the report of a study";
     Twin(twin::TwinArgs) "Make a simulated partner of a recording that has no simulation";
     Resim(resim::ResimArgs) "Apply sensor effects to an existing data set and write the result";
-    Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++";
+    Convert(convert::ConvertArgs) "Write a data set in the format of KITTI, OpenPCDet, CARLA, PCD or MCAP (ROS 2)";
+    Export(export::ExportArgs) "Write a sensor model as files of CARLA, Isaac Sim, Gazebo, RGL or HELIOS++, or a detector as ONNX";
     Diagnose(diagnose::DiagnoseArgs) "Find the differences between measured and simulated data and their causes";
     Doctor(doctor::DoctorArgs) "Check a data set for errors";
+    Completions(completions::CompletionsArgs) "Print the completions of a shell";
+    Man(man::ManArgs) "Write the pages of the manual";
 }
 
 /// How much does a LiDAR detector trained in simulation lose on real data, why, and what must change in the simulator?
@@ -37,18 +41,33 @@ struct Program {
     command: Command,
 }
 
+/// Exit code of a command that failed.
+const FAILURE: u8 = 1;
+
+/// The command line with all commands and options.
+pub fn command() -> clap::Command {
+    Program::command()
+}
+
 /// Runs the command line. Exit codes: 0 success, 1 failure, 2 wrong arguments, 3 a diagnosis of data sets that do not
 /// show the same scenes. The program ends by SIGINT or SIGTERM if it was stopped, and by SIGPIPE if stdout was closed.
 pub fn run() -> ExitCode {
+    ExitCode::from(run_with(std::env::args_os().collect()))
+}
+
+/// As [`run`] with these arguments, of which the first is the name of the program; returns the exit code. For programs
+/// in which this one is contained: it handles signals from then on, and it is called once.
+pub fn run_with(arguments: Vec<OsString>) -> u8 {
+    commands::set_called(&arguments);
     signals::handle();
-    let code = match Program::try_parse().map(|program| program.command.run()) {
+    let code = match Program::try_parse_from(&arguments).map(|program| program.command.run()) {
         Ok(Ok(end)) => end.into(),
         Ok(Err(error)) => {
             errln!("error: {error:#}");
             signals::end_if_stopped();
-            ExitCode::FAILURE
+            FAILURE
         }
-        Err(usage) => console::print_usage(&usage),
+        Err(usage) => console::print_usage(&usage, &arguments),
     };
     console::end(code)
 }

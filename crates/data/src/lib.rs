@@ -8,6 +8,7 @@ mod calibration;
 pub mod checksum;
 mod cloud_file;
 mod content;
+pub mod convert;
 mod dataset;
 mod dataset_config;
 pub mod doctor;

@@ -140,7 +140,7 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
     match destination(path).map_err(failed)? {
         Destination::File(file) => {
             create_folder(folder_of(&file))?;
-            replace(&file, bytes).map_err(failed)
+            replace(&file, |to| to.write_all(bytes).map_err(failed))?.map_err(failed)
         }
         Destination::Stdout => write_all(&mut std::io::stdout().lock(), bytes).map_err(failed),
         Destination::Stderr => write_all(&mut std::io::stderr().lock(), bytes).map_err(failed),
@@ -153,6 +153,22 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
             options.write(true).open(&file).and_then(|mut f| write_all(&mut f, bytes)).map_err(failed)
         }
     }
+}
+
+/// As [`write_atomic`], for a file that is too large to be in memory: `fill` writes it piece by piece.
+///
+/// # Errors
+/// Those of `fill`, a file that cannot be written, and a path that is no regular file.
+pub fn write_atomic_with(
+    path: &Path,
+    fill: impl FnOnce(&mut std::fs::File) -> Result<(), DataError>,
+) -> Result<(), DataError> {
+    let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
+    let Destination::File(file) = destination(path).map_err(failed)? else {
+        return Err(DataError::file(path, "is no regular file; it is written in pieces, which needs one"));
+    };
+    create_folder(folder_of(&file))?;
+    replace(&file, fill)?.map_err(failed)
 }
 
 /// Checks that `path` can be written, without changing it: before long work whose result is written there.
@@ -233,7 +249,11 @@ fn write_all(to: &mut dyn Write, bytes: &[u8]) -> IoResult<()> {
     to.flush()
 }
 
-fn replace(path: &Path, bytes: &[u8]) -> IoResult<()> {
+/// Replaces a file by what `fill` writes. The outer error is that of `fill`.
+fn replace(
+    path: &Path,
+    fill: impl FnOnce(&mut std::fs::File) -> Result<(), DataError>,
+) -> Result<IoResult<()>, DataError> {
     let folder = folder_of(path);
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY_PREFIX);
@@ -241,9 +261,16 @@ fn replace(path: &Path, bytes: &[u8]) -> IoResult<()> {
     let permissions = <std::fs::Permissions as std::os::unix::fs::PermissionsExt>::from_mode(0o666);
     #[cfg(unix)]
     builder.permissions(permissions); // before the umask; temporary files have 0600 by default
-    let mut file = builder.tempfile_in(folder)?;
+    let mut file = match builder.tempfile_in(folder) {
+        Ok(file) => file,
+        Err(e) => return Ok(Err(e)),
+    };
     let _registered = TemporaryFile::new(file.path());
-    file.write_all(bytes)?;
+    fill(file.as_file_mut())?;
+    Ok(keep(file, path, folder))
+}
+
+fn keep(file: tempfile::NamedTempFile, path: &Path, folder: &Path) -> IoResult<()> {
     file.as_file().sync_all()?;
     // Not `persist`, which calls the system without the C library: tests put a layer between that makes calls fail.
     let temporary = file.into_temp_path();

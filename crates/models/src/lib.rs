@@ -12,6 +12,7 @@ pub mod layers;
 pub mod limits;
 pub mod loss;
 pub mod named;
+pub mod onnx;
 pub mod point_ops;
 pub mod results;
 pub mod suggest;

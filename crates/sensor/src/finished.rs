@@ -22,7 +22,7 @@ const PATTERN_FRAMES: usize = 10;
 const FRAME_S: f64 = 0.05;
 
 /// Name of the random number streams.
-const STREAM: &str = "resim";
+pub(crate) const STREAM: &str = "resim";
 
 /// A finished data set and what is known of its points.
 pub struct FinishedDataset<'a> {
@@ -70,8 +70,7 @@ impl<'a> FinishedDataset<'a> {
             (None, None) => Rig::single(),
         };
         let ids = dataset.all_ids()?;
-        let step = ids.len().div_ceil(PATTERN_FRAMES).max(1);
-        let some: Vec<&String> = ids.iter().step_by(step).collect();
+        let some: Vec<&String> = pattern_frames(ids.len()).map(|at| &ids[at]).collect();
         let clouds: Vec<Cloud> = some.par_iter().map(|id| dataset.load_cloud(id)).collect::<Result<_, _>>()?;
         let reader = CloudReader::new(&rig, &clouds);
         let described = ids.first().is_some_and(|id| attributes::path(&dataset.config.root, id).may_be_file());
@@ -120,28 +119,7 @@ impl<'a> FinishedDataset<'a> {
 
     /// Effects of the list that cannot be applied to this data set.
     pub fn refusals(&self, effects: &EffectList) -> Vec<Refusal> {
-        let known = self.known();
-        let mut refused = Vec::new();
-        for (index, effect) in effects.effects.iter().enumerate() {
-            let why = match effect.model().needs() {
-                None => Some(
-                    "changes what rays meet, which a finished cloud does not tell: use it with `simulate`".to_owned(),
-                ),
-                Some(needs) => self.why_not(needs.iter().filter(|n| !known.contains(n)).copied().collect()),
-            };
-            let why = why.or_else(|| effect.strange_to(&self.rig));
-            refused.extend(why.map(|why| Refusal { index, kind: effect.kind(), why }));
-        }
-        refused
-    }
-
-    /// Why effects with these needs cannot be applied; `None` without needs.
-    fn why_not(&self, missing: Vec<Need>) -> Option<String> {
-        let lacks: Vec<&str> = missing.iter().map(|n| n.description()).collect();
-        let mut how: Vec<&str> = missing.iter().map(|n| n.how_to_give()).collect();
-        how.dedup();
-        (!missing.is_empty())
-            .then(|| format!("needs {}, which this data set does not tell; {}", lacks.join(" and "), how.join("; ")))
+        refusals_of(effects, &self.rig, &self.known())
     }
 
     fn known(&self) -> BTreeSet<Need> {
@@ -302,8 +280,38 @@ impl<'a> FinishedDataset<'a> {
     }
 }
 
+/// Effects of a list that cannot be applied to finished clouds of a rig of which this is known.
+pub(crate) fn refusals_of(effects: &EffectList, rig: &Rig, known: &BTreeSet<Need>) -> Vec<Refusal> {
+    let mut refused = Vec::new();
+    for (index, effect) in effects.effects.iter().enumerate() {
+        let why = match effect.model().needs() {
+            None => {
+                Some("changes what rays meet, which a finished cloud does not tell: use it with `simulate`".to_owned())
+            }
+            Some(needs) => why_not(needs.iter().filter(|n| !known.contains(n)).copied().collect()),
+        };
+        let why = why.or_else(|| effect.strange_to(rig));
+        refused.extend(why.map(|why| Refusal { index, kind: effect.kind(), why }));
+    }
+    refused
+}
+
+/// Why effects with these needs cannot be applied; `None` without needs.
+fn why_not(missing: Vec<Need>) -> Option<String> {
+    let lacks: Vec<&str> = missing.iter().map(|n| n.description()).collect();
+    let mut how: Vec<&str> = missing.iter().map(|n| n.how_to_give()).collect();
+    how.dedup();
+    (!missing.is_empty())
+        .then(|| format!("needs {}, which this data set does not tell; {}", lacks.join(" and "), how.join("; ")))
+}
+
+/// The clouds of a data set, by number, in which its scan patterns are found.
+pub fn pattern_frames(frames: usize) -> impl Iterator<Item = usize> {
+    (0..frames).step_by(frames.div_ceil(PATTERN_FRAMES).max(1))
+}
+
 /// The cloud of a scan after effects. Points whose echo is as it was `before` are those of `source` to the bit.
-fn cloud_of(scan: &Scan, before: &Scan, source: &Cloud) -> Cloud {
+pub(crate) fn cloud_of(scan: &Scan, before: &Scan, source: &Cloud) -> Cloud {
     let mut cloud = Cloud::new(source.channels);
     cloud.values.reserve(source.values.len());
     let same = |a: &Echo, b: &Echo| a.point() == b.point() && a.intensity == b.intensity;

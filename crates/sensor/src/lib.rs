@@ -8,6 +8,7 @@ pub mod attributes;
 pub mod beams;
 pub mod car;
 pub mod cloud_scan;
+pub mod clouds;
 pub mod directions;
 pub mod effects;
 pub mod finished;

@@ -32,7 +32,7 @@ pub use error::StudyError;
 pub use event::{Event, Listener};
 pub use folder::Study;
 pub use frozen::{FrozenState, detect_frozen};
-pub use local::free_mib;
+pub use local::{free_mib, set_program};
 pub use plan::{Planned, ScatterFrom, plan};
 pub use present::write_report;
 pub use run_state::RunState;

@@ -9,6 +9,7 @@ use crate::work::RunPart;
 use crate::{Event, Listener};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 use train::read_run_state;
 
@@ -120,11 +121,27 @@ fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> 
     command.spawn().in_part(|| format!("{run} could not be started"))
 }
 
+/// The program that is started for runs, if it is not the running one.
+static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+
+/// Sets the program that is started for runs. For processes that contain the program instead of being it.
+pub fn set_program(path: PathBuf) {
+    PROGRAM.get_or_init(|| path);
+}
+
 /// Path of the running program. It stays valid if the file is replaced by a new build while a study runs (Linux).
 pub fn current_program() -> std::io::Result<PathBuf> {
+    if let Some(path) = PROGRAM.get() {
+        return Ok(path.clone());
+    }
     let path = std::env::current_exe()?;
     let running = Path::new("/proc/self/exe");
     Ok(if !path.is_file() && running.exists() { running.to_path_buf() } else { path })
+}
+
+/// Path of the program on the disk, for processes that start later.
+pub(crate) fn program_path() -> std::io::Result<PathBuf> {
+    PROGRAM.get().map_or_else(std::env::current_exe, |path| Ok(path.clone()))
 }
 
 /// The value of the command line option `--parts`.

@@ -85,7 +85,7 @@ impl<'a> Submission<'a> {
         let number = (1..).find(|n| !all.join(n.to_string()).exists()).unwrap_or(1);
         let folder = all.join(number.to_string());
         fs_err::create_dir_all(&folder)?;
-        let program = quoted(&std::env::current_exe()?.display().to_string());
+        let program = quoted(&crate::local::program_path()?.display().to_string());
         let device: Vec<String> = device.iter().map(|argument| quoted(argument)).collect();
         Ok(Submission { folder, program, device: device.join(" "), name: &study.config.name, sbatch })
     }

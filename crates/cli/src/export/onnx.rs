@@ -1,0 +1,92 @@
+//! `lidarshift export --to onnx`: a trained detector as ONNX graphs.
+
+use crate::detect::detector_of;
+use crate::{errln, outln};
+use anyhow::{Context, Result};
+use burn::tensor::Device;
+use data::{Frame, PointColumns, read_cloud, write_atomic, write_json};
+use models::checkpoint::{read_checkpoint, write_safetensors};
+use models::config::{DetectorConfig, NetworkConfig};
+use models::onnx::{onnx_check, to_onnx};
+use models::{Detector, Preparer};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use train::verify_weights;
+
+/// The example beside the graphs.
+const SCRIPT: &str = include_str!("run_onnx.py");
+
+/// What is exported.
+pub(super) struct OnnxExport {
+    /// Weights, or the folder of a run.
+    pub weights: PathBuf,
+    /// A name or a TOML.
+    pub detector: Option<String>,
+    /// A cloud whose inputs and outputs are written as well.
+    pub check: Option<PathBuf>,
+    /// Folder for the files.
+    pub out: PathBuf,
+}
+
+impl OnnxExport {
+    /// Writes the graphs and what is needed to run them.
+    pub fn run(&self) -> Result<()> {
+        let weights = match self.weights.join("checkpoint/last.safetensors") {
+            last if self.weights.is_dir() => last,
+            _ => self.weights.clone(),
+        };
+        let config = detector_of(&weights, self.detector.as_deref())?;
+        verify_weights(&weights)?;
+        let named = read_checkpoint(&weights)?;
+        let detector = Detector::new(&config, 0, &Device::flex())
+            .load_named(&named)
+            .with_context(|| format!("{} does not fit the detector {}", weights.display(), config.name))?;
+        let graphs = to_onnx(&detector).with_context(|| weights.display().to_string())?;
+        write_atomic(&self.out.join("pillar_net.onnx"), &graphs.pillar_net)?;
+        write_atomic(&self.out.join("backbone_head.onnx"), &graphs.backbone_head)?;
+        write_json(&self.out.join("detector.json"), &description(&config))?;
+        write_atomic(&self.out.join("run_onnx.py"), SCRIPT.as_bytes())?;
+        if let Some(cloud) = &self.check {
+            self.write_check(&detector, cloud)?;
+        }
+        outln!("{}: {}", config.name, config.classes.join(", "));
+        errln!("written to {}: pillar_net.onnx, backbone_head.onnx, detector.json, run_onnx.py", self.out.display());
+        Ok(())
+    }
+
+    fn write_check(&self, detector: &Detector, path: &Path) -> Result<()> {
+        let columns = if detector.config().channels == 3 { PointColumns::Xyz } else { PointColumns::Xyzi };
+        let cloud = read_cloud(path, columns)?;
+        let frame = Frame { id: "check".into(), cloud, objects: Vec::new() };
+        let sample = Preparer::new(detector.config()).inference(&frame)?;
+        if sample.is_empty() {
+            anyhow::bail!("{}: no point is within the range of the detector; give another cloud", path.display());
+        }
+        let tensors = onnx_check(detector, &sample)?;
+        Ok(write_safetensors(&self.out.join("check.safetensors"), &tensors, &BTreeMap::new())?)
+    }
+}
+
+/// What has to be known to make inputs and to read outputs.
+fn description(config: &DetectorConfig) -> Value {
+    let (pillars, network) = match &config.network {
+        NetworkConfig::PointPillars(net) => (Some(&net.pillars), "pointpillars"),
+        NetworkConfig::CenterPoint(net) => (Some(&net.pillars), "centerpoint"),
+        NetworkConfig::PointRcnn(_) => (None, "pointrcnn"),
+    };
+    json!({
+        "schema": "lidarshift/onnx-detector/1",
+        "name": config.name,
+        "network": network,
+        "classes": config.classes,
+        "channels": config.channels,
+        "range_m": config.range_m,
+        "ground": config.ground.is_some(),
+        "pillar_size_m": pillars.map(|p| p.size_m),
+        "grid_size": pillars.map(|p| p.grid_size(config)),
+        "max_points": pillars.map(|p| p.max_points),
+        "max_pillars": pillars.map(|p| p.max_test),
+        "config": config,
+    })
+}
