@@ -120,6 +120,10 @@ impl DiagnoseArgs {
                 let mut outcome =
                     diagnose_with(&measured, &simulated, &rig, &options, remake.as_ref(), &show_progress)?;
                 outcome.diagnosis.notes.extend(twin.as_ref().map(TwinReport::note_for_diagnosis));
+                // Labels that both sides share cannot be corrected by the pair.
+                if options.baked_in.iter().any(|b| b.cause == Cause::LabelOffset) {
+                    outcome.corrected.clear();
+                }
                 (measured, outcome)
             }
             _ => bail!("give --measured and --simulated, or --scans"),
