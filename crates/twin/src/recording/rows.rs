@@ -179,6 +179,7 @@ mod tests {
             azimuth_rad: order.iter().map(|i| returns.azimuth_rad[*i]).collect(),
             elevation_rad: order.iter().map(|i| returns.elevation_rad[*i]).collect(),
             range_m: order.iter().map(|i| returns.range_m[*i]).collect(),
+            intensity: vec![],
         };
         assert!(Rows::of_order(&mixed).is_none());
         let ring: Vec<u16> = order.iter().map(|i| (i / 360) as u16).collect();
