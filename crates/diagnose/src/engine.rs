@@ -355,9 +355,9 @@ impl Engine<'_> {
         self.pair(Corrections { shift_m, step_m: known.coarse_m(), ..Corrections::default() }).map(Some)
     }
 
-    /// Searches of silhouettes, single returns and intensities, on frames with the displacement of the scene undone; then of
-    /// noise, with offsets of rows and quantisation corrected as well: they look like noise between neighbouring
-    /// rows.
+    /// Searches of silhouettes, single returns and intensities, on frames with the displacement of the scene undone;
+    /// then of noise, with offsets of rows and quantisation corrected as well: they look like noise between
+    /// neighbouring rows.
     fn single_returns(
         &self,
         context: &Context,

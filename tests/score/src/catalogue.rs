@@ -1,7 +1,7 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 26] = [
+pub const CATALOGUE: [&str; 27] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
@@ -10,6 +10,7 @@ pub const CATALOGUE: [&str; 26] = [
     "ground_error",
     "incidence_dropout",
     "incidence_noise",
+    "intensity_law",
     "label_offset",
     "material_dropout",
     "missing_object",

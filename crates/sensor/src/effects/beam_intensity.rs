@@ -33,7 +33,10 @@ impl SensorEffect for BeamIntensity {
     fn check(&self) -> Result<(), KeyError> {
         within("std", self.std, 0.0, 3.0)?;
         if self.rows_deg.is_empty() && !self.gains_ln.is_empty() {
-            return Err(data::toml_text::wrong("rows_deg", "is missing: it gives the elevations of the rows of gains_ln"));
+            return Err(data::toml_text::wrong(
+                "rows_deg",
+                "is missing: it gives the elevations of the rows of gains_ln",
+            ));
         }
         check_rows(&self.sensor, &self.rows_deg, ("gains_ln", &self.gains_ln), 10.0)
     }

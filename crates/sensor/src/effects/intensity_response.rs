@@ -8,14 +8,14 @@ use data::toml_text::within;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// The intensity I becomes `gain * I^gamma * (reference_m / R)^range_exponent * cos^incidence_exponent`, R the range, m,
-/// cos the cosine of the angle of incidence; at most `most`, rounded to a multiple of `step`.
+/// The intensity I becomes `gain * I^gamma * (reference_m / R)^range_exponent * cos^incidence_exponent`, R the range,
+/// m, cos the cosine of the angle of incidence; at most `most`, rounded to a multiple of `step`.
 ///
 /// Unlike `intensity_law`, this effect changes the intensities that are there, in their own unit. It needs no
 /// reflectivity. A diagnosis writes it.
 ///
-/// Typical: `gain = 255` from intensities of 0 to 1 to counts of a byte; `range_exponent` 0.2 for a sensor that does not
-/// quite correct for range, 2 for raw power; `gamma` 0.5 for a receiver with a square-root response.
+/// Typical: `gain = 255` from intensities of 0 to 1 to counts of a byte; `range_exponent` 0.2 for a sensor that does
+/// not quite correct for range, 2 for raw power; `gamma` 0.5 for a receiver with a square-root response.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct IntensityResponse {
@@ -102,9 +102,13 @@ mod tests {
         let limited = IntensityResponse { most: 0.9, ..law.clone() };
         let rounded = IntensityResponse { step: 0.25, ..law.clone() };
         let inclined = IntensityResponse { incidence_exponent: 2.0, ..law.clone() };
-        for (effect, range_m, want) in
-            [(&law, 20.0, 1.0), (&law, 40.0, 0.5), (&limited, 20.0, 0.9), (&rounded, 50.0, 0.5), (&inclined, 20.0, 0.25)]
-        {
+        for (effect, range_m, want) in [
+            (&law, 20.0, 1.0),
+            (&law, 40.0, 0.5),
+            (&limited, 20.0, 0.9),
+            (&rounded, 50.0, 0.5),
+            (&inclined, 20.0, 0.25),
+        ] {
             let mut before = plate(1, range_m, 0.25);
             (before.echoes[0].intensity, before.echoes[0].cos_incidence) = (0.25, 0.5);
             let after = applied(effect, &before).echoes[0].intensity;
