@@ -241,15 +241,21 @@ impl Scale {
             averaging: SVector::zeros(),
             averaging_of_rows: BTreeMap::new(),
         };
+        scale.set_averaging(frames);
+        Some(scale)
+    }
+
+    /// Sets what averaging over neighbours does, from the ratios of simulated returns to their neighbours.
+    fn set_averaging(&mut self, frames: &[&FramePair]) {
         // Ratios of the simulated side are about 1.
-        let median = scale.median.iter().map(|m| 0.0 * m).collect();
-        let of_one = Scale { median, columns: [columns[1]; 2], ..scale.clone() };
+        let median = self.median.iter().map(|m| 0.0 * m).collect();
+        let of_one = Scale { median, columns: [self.columns[1]; 2], ..self.clone() };
         let simulated: Vec<LinearFrame> = frames.par_iter().map(|f| of_one.sums(&f.simulated)).collect();
         let blocks: Vec<usize> = (0..frames.len()).collect();
         let all: Vec<usize> = (0..COLUMNS).collect();
         let fitted = fit(&simulated.iter().collect::<Vec<_>>(), &blocks, &all, &[1.0; COLUMNS]);
-        scale.averaging = SVector::from_fn(|i, _| fitted.theta[i]);
-        let of_one = Scale { averaging: scale.averaging, ..of_one };
+        self.averaging = SVector::from_fn(|i, _| fitted.theta[i]);
+        let of_one = Scale { averaging: self.averaging, ..of_one };
         let mut rows = BTreeMap::<Group, [f64; 2]>::new();
         for ray in frames.iter().flat_map(|f| &f.simulated) {
             if let (Some(group), Some(s)) = (group_of(ray, Grouping::Row), of_one.sample(ray)) {
@@ -257,8 +263,7 @@ impl Scale {
                 (sum[0], sum[1]) = (sum[0] + s.y, sum[1] + 1.0);
             }
         }
-        scale.averaging_of_rows = rows.into_iter().map(|(group, [y, n])| (group, y / (n + SHRINKS))).collect();
-        Some(scale)
+        self.averaging_of_rows = rows.into_iter().map(|(group, [y, n])| (group, y / (n + SHRINKS))).collect();
     }
 
     /// A ray as a sample; `None` where it is not used.

@@ -107,6 +107,7 @@ struct Search<'a> {
     estimate: Vec<usize>,
     hold_out: Vec<usize>,
 }
+
 impl<'a> Search<'a> {
     fn new(context: &'a Context<'a>, scale: &'a Scale) -> Self {
         let sums = context.frames.par_iter().map(|f| scale.sums(&f.measured)).collect();

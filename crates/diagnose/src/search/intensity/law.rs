@@ -173,10 +173,16 @@ impl Search<'_> {
 
     /// The finding of a law.
     pub(super) fn law_found(&self, law: &Law, held_out_gains: Vec<f64>) -> Found {
-        let [range, cos, brightness] = [RANGE, COS, BRIGHTNESS].map(|c| law.coefficient(c));
+        // The true law may have another form: half of the smallest effect that is reported.
+        let with_form = |c: usize| {
+            let [value, error] = law.coefficient(c);
+            let of_form = if value == 0.0 { 0.0 } else { 0.5 * FLOOR_RMS / self.spread(&self.estimate, c).max(0.1) };
+            [value, error.hypot(of_form)]
+        };
+        let [range, cos, brightness] = [RANGE, COS, BRIGHTNESS].map(with_form);
         // ln I' = gain + gamma ln I + ..., with the logarithm counted from its mean in the fit.
         let ln_gain = law.gain[0] - brightness[0] * self.scale.centre;
-        let ln_error = law.gain[1].hypot(self.scale.centre * brightness[1]);
+        let ln_error = law.gain[1].hypot(0.5 * FLOOR).hypot(self.scale.centre * brightness[1]);
         let gain = ln_gain.exp();
         let with_bounds =
             |estimate: f64, low: f64, high: f64| Parameter { estimate, unit: Quantity::Gain.unit(), ci95: [low, high] };
