@@ -72,7 +72,8 @@ fn degrees(given: &Pose) -> Pose {
 
 #[test]
 fn poses_of_another_convention_are_found_and_said() {
-    let cases: [(fn(&Pose) -> Pose, &str); 5] = [
+    type Change = fn(&Pose) -> Pose;
+    let cases: [(Change, &str); 5] = [
         (inverse, "inverse (world to LiDAR)"),
         (camera, "camera axes (x right, y down, z forward)"),
         (|p| inverse(&camera(p)), "inverse, camera axes"),
@@ -113,7 +114,8 @@ fn what_is_wrong_with_frames_and_stamps_is_put_right_and_said() {
         must(folder.path(), &format!("twin drive --out {unit}"));
         assert!(shots(unit) == shots("seconds"), "{unit}");
     }
-    let cases: [(&str, fn(usize) -> f64, &str); 3] = [
+    type Stamps = fn(usize) -> f64;
+    let cases: [(&str, Stamps, &str); 3] = [
         ("order", |i| [0.0, 0.1, 0.2, 0.4, 0.3, 0.5, 0.6, 0.7][i], "frames are not in the order of their time stamps"),
         ("twice", |i| [0.0, 0.1, 0.2, 0.3, 0.3, 0.5, 0.6, 0.7][i], "and 1 that have the time stamp of another"),
         ("missing", |i| 0.1 * (i + if i > 4 { 7 } else { 0 }) as f64, "s without a frame"),
@@ -235,7 +237,7 @@ fn findings(sensor: Sensor, frames: usize) -> Vec<(String, Vec<String>)> {
     let of = |f: &serde_json::Value| {
         let causes =
             f["candidates"].as_array().map(|c| c.iter().map(word).collect()).unwrap_or(vec![word(&f["cause"])]);
-        println!("  {} {causes:?}: {}", f["status"], f["says"]);
+        eprintln!("  {} {causes:?}: {}", f["status"], f["says"]);
         (word(&f["status"]), causes)
     };
     diagnosis["findings"].as_array().unwrap().iter().map(of).collect()
@@ -246,7 +248,7 @@ fn findings(sensor: Sensor, frames: usize) -> Vec<(String, Vec<String>)> {
 #[ignore = "takes minutes: all faults"]
 fn no_fault_has_a_false_name_on_a_twin() {
     for (name, sensor, known) in FAULTS {
-        println!("{name}");
+        eprintln!("{name}");
         check(name, &findings(sensor, 36), known);
     }
 }

@@ -120,8 +120,8 @@ fn the_exact_scene_is_met_and_driving_cars_leave_no_ghosts() {
         let jobs = plan::jobs(&times, leave);
         let world = World::build(&recording, &jobs[0], &fusion, 1 << 30).unwrap();
         let ghosts = ghosts(&recording, &jobs[0], &world, &from);
-        println!("labelled {labelled}, refined {refine}: ghosts {ghosts:.5?}");
-        println!("static {:?}\nobjects {:?}\n{:?}", report.static_world, report.objects, report.wall_thickness_m);
+        eprintln!("labelled {labelled}, refined {refine}: ghosts {ghosts:.5?}");
+        eprintln!("static {:?}\nobjects {:?}\n{:?}", report.static_world, report.objects, report.wall_thickness_m);
         let still = report.static_world;
         assert!(still.median_abs_m.unwrap() < 0.03 && still.p90_abs_m.unwrap() < 0.25, "{still:?}");
         assert!(still.met_share > 0.95, "{still:?}");

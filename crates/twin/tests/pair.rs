@@ -114,7 +114,7 @@ fn single_scans_are_refused_and_two_sweeps_make_a_twin() {
     }
     let log = data.join("argoverse2/7fab2350-7eaf-3b7e-a39d-6937a4c1bede");
     let report = twin_of(&log, &folder.path().join("out"), None, refine);
-    println!("{report:#?}");
+    eprintln!("{report:#?}");
     assert_eq!((report.frames, report.poses), (2, PoseSource::Recording));
     assert!(report.lost_shots_known && report.static_world.met_share > 0.6, "{report:?}");
     assert!(report.notes.iter().any(|n| n.contains("hardly more than one scan")), "{:?}", report.notes);
