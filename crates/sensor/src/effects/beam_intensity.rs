@@ -1,6 +1,6 @@
 //! D9: a gain of the intensity of each beam (row).
 
-use super::row_table::{Rows, check_rows};
+use super::row_table::{by_row, by_table, check_rows, stream_of_row};
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
@@ -51,26 +51,18 @@ impl SensorEffect for BeamIntensity {
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if !self.rows_deg.is_empty() {
-            let Some(rows) = Rows::of(&self.sensor, &self.rows_deg, frame) else { return };
-            for echo in scan.returns_mut() {
-                if let Some(row) = rows.row(echo) {
-                    echo.intensity *= self.gains_ln[row].exp() as f32;
-                }
-            }
+            let table = (self.sensor.as_str(), &self.rows_deg[..], &self.gains_ln[..]);
+            by_table(table, scan, frame, |echo, gain_ln| echo.intensity *= gain_ln.exp() as f32);
             return;
         }
         if self.std == 0.0 {
             return;
         }
-        let mut known = (u8::MAX, u16::MAX, 1.0);
-        for echo in scan.returns_mut() {
-            if (known.0, known.1) != (echo.sensor, echo.row) {
-                let key = u64::from(echo.sensor) << 16 | u64::from(echo.row);
-                let noise: f64 = StandardNormal.sample(&mut draws.of_set(key));
-                known = (echo.sensor, echo.row, (self.std * noise).exp() as f32);
-            }
-            echo.intensity *= known.2;
-        }
+        let gain = |sensor: u8, row: u16| {
+            let noise: f64 = StandardNormal.sample(&mut stream_of_row(draws, sensor, row));
+            (self.std * noise).exp() as f32
+        };
+        by_row(scan, gain, |echo, gain| echo.intensity *= gain);
     }
 }
 

@@ -1,6 +1,6 @@
 //! A7: a constant range offset of each beam (row).
 
-use super::row_table::{Rows, check_rows};
+use super::row_table::{by_row, by_table, check_rows, stream_of_row};
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
@@ -35,7 +35,7 @@ impl BeamRangeOffset {
         if !self.offsets_m.is_empty() {
             return self.offsets_m.get(usize::from(row)).map_or(0.0, |v| *v as f32);
         }
-        let noise: f32 = StandardNormal.sample(&mut draws.of_set(u64::from(sensor) << 16 | u64::from(row)));
+        let noise: f32 = StandardNormal.sample(&mut stream_of_row(draws, sensor, row));
         self.std_m as f32 * noise
     }
 }
@@ -57,21 +57,11 @@ impl SensorEffect for BeamRangeOffset {
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if !self.rows_deg.is_empty() {
-            let Some(rows) = Rows::of(&self.sensor, &self.rows_deg, frame) else { return };
-            for echo in scan.returns_mut() {
-                if let Some(row) = rows.row(echo) {
-                    echo.add_range(self.offsets_m[row] as f32);
-                }
-            }
+            let table = (self.sensor.as_str(), &self.rows_deg[..], &self.offsets_m[..]);
+            by_table(table, scan, frame, |echo, offset_m| echo.add_range(offset_m as f32));
             return;
         }
-        let mut known = (u8::MAX, u16::MAX, 0.0);
-        for echo in scan.returns_mut() {
-            if (known.0, known.1) != (echo.sensor, echo.row) {
-                known = (echo.sensor, echo.row, self.offset_m(echo.sensor, echo.row, draws));
-            }
-            echo.add_range(known.2);
-        }
+        by_row(scan, |sensor, row| self.offset_m(sensor, row, draws), |echo, offset_m| echo.add_range(offset_m));
     }
 }
 

@@ -1,8 +1,8 @@
 //! Tables by row of one sensor, whose rows are distinguished by their elevations.
 
-use super::FrameContext;
+use super::{Draws, FrameContext};
 use crate::directions::{ScanPattern, Steps};
-use crate::scan::Echo;
+use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
 use geometry::Pose;
@@ -42,6 +42,41 @@ impl Rows {
     pub(super) fn of_direction(&self, own: Vector3<f64>) -> Option<usize> {
         self.pattern.row(own.z.atan2(own.x.hypot(own.y)) as f32)
     }
+}
+
+/// Changes the returns of a sensor by the values of its rows. Nothing changes where the rig does not have the sensor.
+pub(super) fn by_table(
+    (sensor, rows_deg, values): (&str, &[f64], &[f64]),
+    scan: &mut Scan,
+    frame: &FrameContext,
+    change: impl Fn(&mut Echo, f64),
+) {
+    let Some(rows) = Rows::of(sensor, rows_deg, frame) else { return };
+    for echo in scan.returns_mut() {
+        if let Some(row) = rows.row(echo) {
+            change(echo, values[row]);
+        }
+    }
+}
+
+/// Changes all returns by a value of their sensor and row.
+pub(super) fn by_row(scan: &mut Scan, of_row: impl Fn(u8, u16) -> f32, change: impl Fn(&mut Echo, f32)) {
+    // Rows follow each other.
+    let mut last: Option<((u8, u16), f32)> = None;
+    for echo in scan.returns_mut() {
+        let row = (echo.sensor, echo.row);
+        let value = match last {
+            Some((known, value)) if known == row => value,
+            _ => of_row(row.0, row.1),
+        };
+        last = Some((row, value));
+        change(echo, value);
+    }
+}
+
+/// The random numbers of a row, the same in every frame.
+pub(super) fn stream_of_row(draws: &Draws, sensor: u8, row: u16) -> data::Stream {
+    draws.of_set(u64::from(sensor) << 16 | u64::from(row))
 }
 
 /// Checks a table: the sensor is named, rows ascend, there are at least two and as many values.
