@@ -39,7 +39,7 @@ const DESIGN: f64 = 4.0;
 /// Smallest standard deviation of the logarithm of a ratio: what averaging over neighbours does.
 const LEAST_STD: f64 = 0.01;
 
-/// Bins of ln(intensity) of the simulated side.
+/// Number of bins of ln(intensity) of the simulated side.
 const BINS: usize = 24;
 
 /// Largest deviation of the logarithm of a ratio from the median of its bin that counts.
@@ -101,6 +101,11 @@ impl Column {
         }
     }
 
+    /// Logarithm of a value; of one below half a step, that of half a step.
+    fn ln(&self, value: f64) -> f64 {
+        value.max(0.5 * self.step).max(1e-9).ln()
+    }
+
     /// Whether a value is too small or too large to be used.
     fn censors(&self, value: f64) -> bool {
         value <= 0.0 || value < STEPS * self.step || self.most > 0.0 && value >= self.most
@@ -136,6 +141,25 @@ pub fn columns(frames: &[FramePair]) -> Option<[Column; 2]> {
     enough.then(|| [Column::of(side(true)), Column::of(side(false))])
 }
 
+/// Bins of ln(intensity) of the simulated side.
+#[derive(Clone, Copy, Debug)]
+struct Bins {
+    low: f64,
+    width: f64,
+}
+
+impl Bins {
+    /// The bin of a logarithm; `None` beyond both ends.
+    fn of(&self, ln: f64) -> Option<usize> {
+        let bin = ((ln - self.low) / self.width).floor();
+        (bin >= 0.0 && bin < BINS as f64).then_some(bin as usize)
+    }
+
+    fn middle(&self, bin: usize) -> f64 {
+        self.low + (bin as f64 + 0.5) * self.width
+    }
+}
+
 /// Both sides on one scale: which simulated intensities are used, and how they are centred.
 #[derive(Clone, Debug)]
 pub struct Scale {
@@ -146,8 +170,7 @@ pub struct Scale {
     /// Root mean square of what rounding of both columns does to the logarithm of a ratio. All rays of a row that meet
     /// one evenly bright surface are rounded alike.
     pub rounding: f64,
-    low: f64,
-    width: f64,
+    bins: Bins,
     /// Median of ln(ratio) in each bin of the simulated intensity; NaN in bins that are not used.
     median: Vec<f64>,
     /// Weight of a ray.
@@ -206,36 +229,35 @@ impl Scale {
         ln.sort_by(f64::total_cmp);
         let (low, high) = (ln[ln.len() / 200], ln[ln.len() - 1 - ln.len() / 200]);
         let width = ((high - low) / BINS as f64).max(1e-6);
-        let bin = |v: f64| Some(((v.ln() - low) / width).floor()).filter(|b| (-0.5..BINS as f64).contains(b));
-        let mut bins: Vec<Vec<f64>> = vec![Vec::new(); BINS];
+        let bins = Bins { low, width };
+        let mut ratios: Vec<Vec<f64>> = vec![Vec::new(); BINS];
         let mut censored = [0usize; BINS];
         let mut rounding = [0.0; BINS];
         for [own, simulated] in pairs {
-            let Some(b) = bin(simulated).map(|b| b as usize) else { continue };
+            let Some(b) = bins.of(simulated.ln()) else { continue };
             censored[b] += usize::from(columns[0].censors(own) || columns[1].censors(simulated));
             let share = |value: f64, column: &Column| (column.step / value.max(1e-9)).min(1.0).powi(2) / 12.0;
             rounding[b] += share(own, &columns[0]) + share(simulated, &columns[1]);
-            bins[b].push(own.max(0.5 * columns[0].step).max(1e-9).ln() - simulated.ln());
+            ratios[b].push(columns[0].ln(own) - simulated.ln());
         }
-        let used = |b: usize| bins[b].len() >= 20 && censored[b] as f64 <= CENSORED * bins[b].len() as f64;
+        let used = |b: usize| ratios[b].len() >= 20 && censored[b] as f64 <= CENSORED * ratios[b].len() as f64;
         let median: Vec<f64> =
-            (0..BINS).map(|b| if used(b) { crate::inference::median(bins[b].clone()) } else { f64::NAN }).collect();
+            (0..BINS).map(|b| if used(b) { crate::inference::median(ratios[b].clone()) } else { f64::NAN }).collect();
         let kept = || (0..BINS).filter(|b| median[*b].is_finite());
-        let n: usize = kept().map(|b| bins[b].len()).sum();
+        let n: usize = kept().map(|b| ratios[b].len()).sum();
         if n < FEWEST {
             return None;
         }
-        let square = |b: usize| bins[b].iter().map(|y| (y - median[b]).clamp(-CAP, CAP).powi(2)).sum::<f64>();
+        let square = |b: usize| ratios[b].iter().map(|y| (y - median[b]).clamp(-CAP, CAP).powi(2)).sum::<f64>();
         let variance = (kept().map(square).sum::<f64>() / n as f64).max(LEAST_STD.powi(2));
-        let centre = kept().map(|b| bins[b].len() as f64 * (low + (b as f64 + 0.5) * width)).sum::<f64>() / n as f64;
+        let centre = kept().map(|b| ratios[b].len() as f64 * bins.middle(b)).sum::<f64>() / n as f64;
         let rounding = (kept().map(|b| rounding[b]).sum::<f64>() / n as f64).sqrt();
         let weight = 1.0 / (DESIGN * variance);
         let mut scale = Scale {
             columns,
             centre,
             rounding,
-            low,
-            width,
+            bins,
             median,
             weight,
             averaging: SVector::zeros(),
@@ -273,9 +295,9 @@ impl Scale {
             return None;
         }
         let ln = simulated.ln();
-        let bin = ((ln - self.low) / self.width).floor();
-        let median = *self.median.get(bin as usize).filter(|m| bin >= 0.0 && m.is_finite())?;
-        let y = own.max(0.5 * self.columns[0].step).max(1e-9).ln() - ln;
+        let bin = self.bins.of(ln)?;
+        let median = Some(self.median[bin]).filter(|m| m.is_finite())?;
+        let y = self.columns[0].ln(own) - ln;
         let x = SVector::from([
             1.0,
             (f64::from(ray.range_m) / REFERENCE_M).ln(),
@@ -287,7 +309,7 @@ impl Scale {
         let y = y.clamp(median - CAP, median + CAP) - x.dot(&self.averaging);
         let of_row = group_of(ray, Grouping::Row).and_then(|group| self.averaging_of_rows.get(&group));
         let y = y - of_row.copied().unwrap_or(0.0);
-        Some(Sample { x, y, weight: self.weight, bin: bin as usize })
+        Some(Sample { x, y, weight: self.weight, bin })
     }
 
     /// Sums of the rays of one frame.

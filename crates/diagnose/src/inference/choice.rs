@@ -41,6 +41,13 @@ pub struct Choice {
     pub equals: Vec<usize>,
 }
 
+impl Choice {
+    /// The choice of the only trial.
+    pub fn of_one() -> Choice {
+        Choice { chosen: 0, equals: vec![] }
+    }
+}
+
 /// Sum of the gains, and their mean over its standard error. The relative standard deviation is taken to be at least
 /// 1/30, which bounds z by 30 times the square root of the number of frames.
 pub fn total_and_z(gains: &[f64]) -> (f64, f64) {

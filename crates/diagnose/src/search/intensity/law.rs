@@ -5,7 +5,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::intensity::{BRIGHTNESS, COS, GAIN, OF_THE_WORLD, RANGE, REFERENCE_M, Sample, ln_ratio};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Parameter};
-use crate::inference::choice::{Trial, significant, total_and_z};
+use crate::inference::choice::{Choice, Trial, significant, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::search::{ChannelResult, Found, Selected, Z_STAR, first_demands, parameter, record};
 use sensor::Effect;
@@ -105,11 +105,8 @@ impl Search<'_> {
         let chosen = above_floor && gain > demands.nats && (z > demands.z || significant(&gains, demands.z));
         let rays = self.context.returns(&self.select);
         let trial = Trial { above_floor, gains, ..trial.clone() };
-        let mut lines = record(&[trial], None, Channel::Intensity, rays, &demands);
-        if chosen {
-            lines[0].outcome = "chosen".into();
-        }
-        result.considered.append(&mut lines);
+        let choice = chosen.then(Choice::of_one);
+        result.considered.extend(record(&[trial], choice.as_ref(), Channel::Intensity, rays, &demands));
         result.minimum.push((Cause::IntensityLaw, Minimum::new(Quantity::Gain, (Z_STAR * law.gain[1]).max(FLOOR))));
         chosen.then(|| form.clone())
     }

@@ -7,7 +7,7 @@ use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::intensity::Sample;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
-use crate::inference::choice::{Trial, total_and_z};
+use crate::inference::choice::{Choice, Trial, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::search::{ChannelResult, Found, first_demands, parameter, record, with_error};
 
@@ -45,10 +45,8 @@ impl Search<'_> {
         let (total, z) = total_and_z(&trial.gains);
         let chosen = above_floor && total > demands.nats && z > demands.z;
         let rays = self.context.returns(&self.select);
-        let mut considered = record(&[trial], None, Channel::Intensity, rays, &demands);
-        if chosen {
-            considered[0].outcome = "chosen".into();
-        }
+        let choice = chosen.then(Choice::of_one);
+        let considered = record(&[trial], choice.as_ref(), Channel::Intensity, rays, &demands);
         TestOfRows { chosen, std, least, considered }
     }
 
