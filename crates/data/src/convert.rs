@@ -6,7 +6,7 @@ mod mcap_file;
 use crate::checksum::hex;
 use crate::limits::{MOST_TEXT_BYTES, read_file};
 use crate::write::write_kitti_text;
-use crate::{Cloud, DataError, Dataset, DatasetConfig, LabelBox, LabelFrame, Layout, Manifest, NewDataset};
+use crate::{Cloud, DataError, Dataset, DatasetConfig, LabelBox, LabelFrame, Layout, NewDataset};
 use crate::{Presence as _, to_kitti_text, write_atomic};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -72,21 +72,7 @@ pub struct ConvertManifest {
     pub frames_sha256: String,
 }
 
-impl Manifest for ConvertManifest {
-    const DIFFERENCE: &'static str = "from another data set, in another format or by another version";
-
-    fn identity(&self) -> [&str; 2] {
-        [&self.schema, &self.config_sha256]
-    }
-
-    fn set_complete(&mut self, complete: bool) {
-        self.complete = complete;
-    }
-
-    fn set_frames_sha256(&mut self, sha256: String) {
-        self.frames_sha256 = sha256;
-    }
-}
+crate::manifest!(ConvertManifest, "from another data set, in another format or by another version");
 
 /// A frame as it is written.
 struct Content {

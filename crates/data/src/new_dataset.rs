@@ -27,6 +27,29 @@ pub trait Manifest: Serialize + DeserializeOwned {
     fn set_frames_sha256(&mut self, sha256: String);
 }
 
+/// Makes a struct with the fields `schema`, `config_sha256`, `complete` and `frames_sha256` a [`Manifest`]; the second
+/// argument is [`Manifest::DIFFERENCE`].
+#[macro_export]
+macro_rules! manifest {
+    ($name:ident, $difference:literal) => {
+        impl $crate::Manifest for $name {
+            const DIFFERENCE: &'static str = $difference;
+
+            fn identity(&self) -> [&str; 2] {
+                [&self.schema, &self.config_sha256]
+            }
+
+            fn set_complete(&mut self, complete: bool) {
+                self.complete = complete;
+            }
+
+            fn set_frames_sha256(&mut self, sha256: String) {
+                self.frames_sha256 = sha256;
+            }
+        }
+    };
+}
+
 /// A data set that is being written. Frames that an earlier run with the same manifest wrote are kept. Its folder is
 /// locked against other processes while this value lives.
 pub struct NewDataset<'a> {

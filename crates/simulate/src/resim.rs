@@ -6,7 +6,7 @@ use data::checksum::files_sha256;
 use data::limits::{MOST_TEXT_BYTES, read_file};
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, true_labels_path};
-use data::{DataError, Dataset, DatasetConfig, Frame, Manifest, NewDataset, write_atomic};
+use data::{DataError, Dataset, DatasetConfig, Frame, NewDataset, write_atomic};
 use sensor::attributes;
 use sensor::effects::EffectList;
 use sensor::finished::{FinishedDataset, Refusal};
@@ -41,21 +41,7 @@ pub struct ResimManifest {
     pub frames_sha256: String,
 }
 
-impl Manifest for ResimManifest {
-    const DIFFERENCE: &'static str = "with other effects, another seed or version";
-
-    fn identity(&self) -> [&str; 2] {
-        [&self.schema, &self.config_sha256]
-    }
-
-    fn set_complete(&mut self, complete: bool) {
-        self.complete = complete;
-    }
-
-    fn set_frames_sha256(&mut self, sha256: String) {
-        self.frames_sha256 = sha256;
-    }
-}
+data::manifest!(ResimManifest, "with other effects, another seed or version");
 
 /// A data set, and what acts on it.
 pub struct Resim<'a> {

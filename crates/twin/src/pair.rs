@@ -11,8 +11,8 @@ use crate::world::{FrameShots, World};
 use data::checksum::hex;
 use data::limits::read_text;
 use data::{
-    Cloud, DataError, Dataset, DatasetConfig, Frame, LabelFrame, Layout, Manifest, NewDataset, Object, Presence,
-    write_atomic, write_json,
+    Cloud, DataError, Dataset, DatasetConfig, Frame, LabelFrame, Layout, NewDataset, Object, Presence, write_atomic,
+    write_json,
 };
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -87,21 +87,7 @@ struct TwinManifest {
     frames_sha256: String,
 }
 
-impl Manifest for TwinManifest {
-    const DIFFERENCE: &'static str = "with other options, poses or another version";
-
-    fn identity(&self) -> [&str; 2] {
-        [&self.schema, &self.config_sha256]
-    }
-
-    fn set_complete(&mut self, complete: bool) {
-        self.complete = complete;
-    }
-
-    fn set_frames_sha256(&mut self, sha256: String) {
-        self.frames_sha256 = sha256;
-    }
-}
+data::manifest!(TwinManifest, "with other options, poses or another version");
 
 /// Makes the twin of a recording in the folder `out`: `measured`, `sim`, `unknown`, `sensor.toml` and `twin.json`.
 ///

@@ -10,8 +10,7 @@ use crate::street::SplitCounts;
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, label_boxes, true_labels_path, write_kitti_text};
 use data::{
-    DataError, Dataset, DatasetConfig, KittiText, LabelFrame, Manifest, NewDataset, PointColumns, read_kitti_text,
-    write_atomic,
+    DataError, Dataset, DatasetConfig, KittiText, LabelFrame, NewDataset, PointColumns, read_kitti_text, write_atomic,
 };
 use rayon::prelude::*;
 use sensor::attributes;
@@ -53,21 +52,7 @@ pub struct RaceManifest {
     pub frames_sha256: String,
 }
 
-impl Manifest for RaceManifest {
-    const DIFFERENCE: &'static str = "from another configuration or version";
-
-    fn identity(&self) -> [&str; 2] {
-        [&self.schema, &self.config_sha256]
-    }
-
-    fn set_complete(&mut self, complete: bool) {
-        self.complete = complete;
-    }
-
-    fn set_frames_sha256(&mut self, sha256: String) {
-        self.frames_sha256 = sha256;
-    }
-}
+data::manifest!(RaceManifest, "from another configuration or version");
 
 /// Writes the data sets of a race below `out`, one folder each: clouds, labels, `ImageSets/`, `dataset.toml`,
 /// `rig.toml`, `manifest.json`, and `effects.toml` unless hidden. `only` selects data sets by name; empty for all.

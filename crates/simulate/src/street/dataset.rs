@@ -37,21 +37,7 @@ pub struct Manifest {
     pub frames_sha256: String,
 }
 
-impl data::Manifest for Manifest {
-    const DIFFERENCE: &'static str = "from another configuration or version";
-
-    fn identity(&self) -> [&str; 2] {
-        [&self.schema, &self.config_sha256]
-    }
-
-    fn set_complete(&mut self, complete: bool) {
-        self.complete = complete;
-    }
-
-    fn set_frames_sha256(&mut self, sha256: String) {
-        self.frames_sha256 = sha256;
-    }
-}
+data::manifest!(Manifest, "from another configuration or version");
 
 /// What a split holds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
