@@ -2,10 +2,11 @@
 
 mod detectors;
 mod previous;
+mod print;
 mod simulator;
 
 use crate::commands::{End, called};
-use crate::{errln, outln};
+use crate::errln;
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::output::check_writable;
@@ -13,11 +14,12 @@ use data::write::{REPAIRED_ENDINGS, write_kitti_text};
 use data::{Dataset, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
-    BakedIn, Cause, DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage,
-    Status, Verdict, diagnose_scans, diagnose_with, verify,
+    Cause, Diagnosis, OnClouds, Options, Outcome, Progress, Remake, Rig, Stage, Unidentifiable, Verdict,
+    diagnose_scans, diagnose_unpaired, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
-use report::{DiagnosisReport, finding_name, write_finding_pictures};
+use print::{print_diagnosis, print_gain, print_gains};
+use report::{DiagnosisReport, write_finding_pictures};
 use sensor::EffectList;
 use simulate::race::RaceConfig;
 use simulator::RaceSimulator;
@@ -36,6 +38,7 @@ use twin::TwinReport;
 /// Examples:
 ///   lidarshift diagnose --measured datasets/measured --simulated datasets/sim --sensor configs/sensors/av21.toml
 ///   lidarshift diagnose --measured real --simulated sim --sensor rig.toml --split test --out runs/diagnosis
+///   lidarshift diagnose --unpaired --measured real --simulated town --sensor rig.toml --out runs/unpaired
 ///   lidarshift diagnose --scans datasets/kitti.toml --sensor configs/sensors/hdl64e.toml --out runs/scans
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
@@ -43,9 +46,13 @@ pub struct DiagnoseArgs {
     /// Measured data set: folder or TOML
     #[arg(long, value_name = "DATASET", required_unless_present = "scans", requires = "simulated")]
     measured: Option<PathBuf>,
-    /// Simulated data set with the same frame ids: folder or TOML
+    /// Simulated data set with the same frame ids (with --unpaired: with any): folder or TOML
     #[arg(long, value_name = "DATASET", requires = "measured")]
     simulated: Option<PathBuf>,
+    /// The two data sets show different streets, seen by the same sensor or by its model: compare only what each side
+    /// shows by itself, and list what cannot be identified
+    #[arg(long, requires = "measured", conflicts_with_all = ["scans", "verify"])]
+    unpaired: bool,
     /// Data set with raw scans of one spinning sensor, compared with an ideal sensor; needs no simulated data set
     #[arg(long, value_name = "DATASET", conflicts_with_all = ["measured", "simulated", "simulator"])]
     scans: Option<PathBuf>,
@@ -105,7 +112,7 @@ impl DiagnoseArgs {
             bar.finish_and_clear();
             return Ok(end);
         }
-        let (measured, mut outcome) = match (&self.scans, &self.measured, &self.simulated) {
+        let (measured, outcome) = match (&self.scans, &self.measured, &self.simulated) {
             (Some(scans), ..) => {
                 let scans = Dataset::open(scans)?;
                 let outcome = diagnose_scans(&scans, &rig, &options, &show_progress)?;
@@ -114,6 +121,11 @@ impl DiagnoseArgs {
             (None, Some(measured), Some(simulated)) => {
                 let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
                 let remake = self.remake(&simulated, &rig);
+                if self.unpaired {
+                    let remake = remake.as_ref();
+                    let outcome = diagnose_unpaired(&measured, &simulated, &rig, &options, remake, &show_progress)?;
+                    return self.finish(outcome, &measured, &bar);
+                }
                 let twin = twin::pair::twin_of(&simulated)?;
                 let baked_in = twin.iter().flat_map(|twin| &twin.baked_in).filter_map(known_cause).collect();
                 let options = Options { baked_in, ..options.clone() };
@@ -128,6 +140,11 @@ impl DiagnoseArgs {
             }
             _ => bail!("give --measured and --simulated, or --scans"),
         };
+        self.finish(outcome, &measured, &bar)
+    }
+
+    /// Writes and prints a diagnosis, and trains detectors where they were asked for.
+    fn finish(&self, mut outcome: Outcome, measured: &Dataset, bar: &ProgressBar) -> Result<End> {
         bar.finish_and_clear();
         previous::remove(&self.out)?;
         self.write_json(&outcome.diagnosis)?;
@@ -136,7 +153,7 @@ impl DiagnoseArgs {
         self.write_page(&outcome.diagnosis)?;
         for (id, boxes) in &outcome.corrected {
             for (ending, boxes) in REPAIRED_ENDINGS.iter().zip(boxes) {
-                write_labels(&self.out.join(format!("{}{ending}", previous::LABELS)), &measured, id, boxes)?;
+                write_labels(&self.out.join(format!("{}{ending}", previous::LABELS)), measured, id, boxes)?;
             }
         }
         print_diagnosis(&outcome.diagnosis, &self.out, outcome.corrected.len());
@@ -282,9 +299,9 @@ impl DiagnoseArgs {
 }
 
 /// What a twin cannot tell, where the catalogue has it.
-fn known_cause(of_twin: &twin::BakedIn) -> Option<BakedIn> {
+fn known_cause(of_twin: &twin::BakedIn) -> Option<Unidentifiable> {
     let cause = Cause::ALL.iter().copied().find(|cause| cause.name() == of_twin.cause)?;
-    Some(BakedIn { cause, why: of_twin.why.clone(), tell_by: of_twin.tell_by.clone() })
+    Some(Unidentifiable { cause, why: of_twin.why.clone(), tell_by: of_twin.tell_by.clone() })
 }
 
 fn end_of(diagnosis: &Diagnosis) -> End {
@@ -302,101 +319,6 @@ fn write_labels(folder: &Path, measured: &Dataset, id: &str, boxes: &[geometry::
     Ok(write_kitti_text(&folder.join(format!("{id}.txt")), &lines)?)
 }
 
-fn print_diagnosis(diagnosis: &Diagnosis, out: &Path, corrected: usize) {
-    for note in &diagnosis.notes {
-        errln!("note: {note}");
-    }
-    let statuses: Vec<Status> = diagnosis.findings.iter().map(|f| f.status).collect();
-    outln!("verdict: {}", verdict_text(diagnosis.verdict, &statuses));
-    if diagnosis.verdict == Verdict::NothingFound && !diagnosis.minimum_detectable.is_empty() {
-        outln!("detectable effect sizes:");
-        for (cause, m) in &diagnosis.minimum_detectable {
-            outln!("  {cause}: {} {:.4} {}", m.parameter, m.value, m.unit);
-        }
-    }
-    for f in &diagnosis.findings {
-        let name = finding_name(f);
-        outln!("{name}: {}", f.says);
-        for (parameter, p) in f.parameters.iter().filter(|(id, _)| matches!(id, ParameterId::Of(_))) {
-            outln!("  {parameter} = {:.4} {} ({:.4} to {:.4})", p.estimate, p.unit, p.ci95[0], p.ci95[1]);
-        }
-        if let Some(how) = &f.separate_by {
-            match f.status {
-                Status::NotIdentifiable => outln!("  to tell it, record {how}"),
-                _ => outln!("  to distinguish these causes: {how}"),
-            }
-        }
-    }
-    print_gain(&diagnosis.gain, "extended.toml");
-    if corrected > 0 {
-        outln!("corrected labels of {corrected} frames written to {}", out.join("label_2").display());
-    }
-    errln!("report.html, diagnosis.json and extended.toml written to {}", out.display());
-}
-
-/// What is gone with a list of effects, by channel, and what could not be applied.
-fn print_gain(gain: &Gain, list: &str) {
-    let percent = |share: f64| format!("{:.0}", 100.0 * share);
-    let between = |ci95: Option<[f64; 2]>| {
-        ci95.map_or(String::new(), |[low, high]| format!(" ({} to {} %)", percent(low), percent(high)))
-    };
-    if let Some(closed) = gain.closed {
-        outln!(
-            "measured on held-out frames that were made anew with {list}: {} % of the difference is gone{}",
-            percent(closed),
-            between(gain.ci95)
-        );
-        for (channel, c) in &gain.closed_by_channel {
-            outln!("  {channel}: {} %{}", percent(c.closed), between(c.ci95));
-        }
-    }
-    for left in &gain.not_applied {
-        outln!("not applied, and counted as not gone: {} {}", left.effect, left.why);
-    }
-}
-
-/// The verdict in words, with the numbers of findings by status.
-fn verdict_text(verdict: Verdict, findings: &[Status]) -> String {
-    let count = |status: Status| findings.iter().filter(|s| **s == status).count();
-    let named = format!("{} of {} findings have a named cause", count(Status::Named), findings.len());
-    let (ambiguous, unexplained) = (count(Status::Ambiguous), count(Status::Unexplained));
-    let hidden = match count(Status::NotIdentifiable) {
-        0 => String::new(),
-        n => format!(", {n} not identifiable"),
-    };
-    match verdict {
-        Verdict::NothingFound => "nothing found: there is no significant difference".into(),
-        Verdict::Explained => format!("explained: {named}{hidden}"),
-        Verdict::PartlyExplained => {
-            format!("partly explained: {named}; {ambiguous} ambiguous, {unexplained} unexplained{hidden}")
-        }
-        Verdict::Unexplained => {
-            format!("unexplained: {named}; {ambiguous} ambiguous, {unexplained} unexplained{hidden}")
-        }
-        Verdict::NotScenarioIdentical => "not scenario-identical: the two data sets do not show the same scenes".into(),
-        Verdict::TooFewFrames => "too few frames: nothing can be found, fitted and tested on different frames".into(),
-    }
-}
-
-fn print_gains(gains: &[DetectorGain], left_out: &[String]) {
-    left_out.iter().for_each(|note| outln!("note: {note}"));
-    for g in gains {
-        let interval = g.ci95.map_or(String::new(), |[low, high]| format!(" ({low:.1} to {high:.1})"));
-        outln!(
-            "{}, {} at IoU {}: AP on measured frames is {:.1} when trained on simulated, {:.1} on extended, {:.1} on measured data; \
-             gain {:+.1}{interval} over {} runs each",
-            g.detector,
-            g.class,
-            g.overlap,
-            g.before,
-            g.after,
-            g.ceiling,
-            g.gain,
-            g.runs
-        );
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -405,15 +327,5 @@ mod tests {
     fn all_that_a_twin_cannot_tell_is_in_the_catalogue() {
         let of_twin = twin::baked_in();
         assert!(of_twin.len() > 10 && of_twin.iter().all(|b| known_cause(b).is_some()), "{of_twin:?}");
-    }
-
-    #[test]
-    fn the_verdict_counts_the_findings_by_status() {
-        use Status::{Ambiguous, Named, Unexplained};
-        assert_eq!(
-            verdict_text(Verdict::PartlyExplained, &[Named, Ambiguous, Named, Unexplained]),
-            "partly explained: 2 of 4 findings have a named cause; 1 ambiguous, 1 unexplained"
-        );
-        assert_eq!(verdict_text(Verdict::Explained, &[Named]), "explained: 1 of 1 findings have a named cause");
     }
 }

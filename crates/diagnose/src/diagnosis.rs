@@ -27,6 +27,9 @@ pub struct Diagnosis {
     /// What detectors gain on measured data, where it was asked for (`--detectors`).
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub detectors: Vec<DetectorGain>,
+    /// Causes that these data cannot tell, whatever is found: of a twin, and of different streets.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub not_identifiable: Vec<Unidentifiable>,
     /// Hypotheses that were considered and what became of them.
     pub considered: Vec<Considered>,
     /// Limits of the data, and what else is needed to read the result.
@@ -136,8 +139,8 @@ pub enum Status {
     Ambiguous,
     /// None does.
     Unexplained,
-    /// The simulated side was made of the measured one, and its cause is in both: the numbers are no error of the
-    /// sensor.
+    /// It may be no error of the sensor: the simulated side was made of the measured one, and its cause is in both; or
+    /// the two sides show different streets, and the streets differ.
     NotIdentifiable,
 }
 
@@ -269,6 +272,17 @@ pub struct DetectorGain {
     pub gain: f64,
     /// Its interval: the same measured frames drawn for both, seeds for each.
     pub ci95: Option<[f64; 2]>,
+}
+
+/// A cause that these data cannot tell.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Unidentifiable {
+    /// The cause.
+    pub cause: Cause,
+    /// Why these data cannot tell it.
+    pub why: String,
+    /// What recording can tell it.
+    pub tell_by: String,
 }
 
 /// A hypothesis that was considered.

@@ -6,16 +6,17 @@ mod notes;
 mod report;
 mod verification;
 
-pub use baked_in::BakedIn;
+pub(crate) use report::{refused, report};
+pub(crate) use verification::{Distances, GainFrames, set_reached};
 pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
-use self::report::{corrected, refused, report};
+use self::report::corrected;
 use self::verification::{Verification, measure_gain};
 use crate::channels::mask::Shown;
 use crate::channels::mean::origins;
 use crate::channels::motion;
-use crate::diagnosis::{Diagnosis, Gain, Verdict};
+use crate::diagnosis::{Diagnosis, Gain, Unidentifiable, Verdict};
 use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::extended::extended_toml;
@@ -44,7 +45,7 @@ pub struct Options {
     /// Frames that are not used, such as those on which something else is tested.
     pub leave_out: BTreeSet<String>,
     /// Causes that are in both sides, as the simulated one was made of the measured one.
-    pub baked_in: Vec<BakedIn>,
+    pub baked_in: Vec<Unidentifiable>,
 }
 
 /// Stages, for the display of progress.
@@ -77,7 +78,7 @@ pub struct Outcome {
 
 impl Outcome {
     /// A diagnosis without findings.
-    fn without_findings(diagnosis: Diagnosis) -> Self {
+    pub(crate) fn without_findings(diagnosis: Diagnosis) -> Self {
         let extended = extended_toml(&diagnosis, None);
         Outcome { diagnosis, corrected: vec![], extended }
     }
@@ -233,7 +234,7 @@ struct Engine<'a> {
     recordings: &'a Recordings<'a>,
     sensors: &'a Sensors,
     origins: Vec<Point3<f64>>,
-    baked_in: &'a [BakedIn],
+    baked_in: &'a [Unidentifiable],
     progress: Progress<'a>,
 }
 
@@ -312,6 +313,7 @@ impl Engine<'_> {
         let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();
         let mut diagnosis = report(&context, results, notes);
         baked_in::take_names(&mut diagnosis, self.baked_in);
+        diagnosis.not_identifiable = self.baked_in.to_vec();
         fill_effects(&mut diagnosis.findings, context.rig, &rows_deg);
         let made_from = if let Extension::Found(made_from) = extension { Some(made_from) } else { None };
         let extended = extended_toml(&diagnosis, made_from);

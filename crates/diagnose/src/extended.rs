@@ -163,6 +163,7 @@ mod tests {
             minimum_detectable: Default::default(),
             gain: Gain::default(),
             detectors: vec![],
+            not_identifiable: vec![],
             considered: vec![],
             notes: vec![],
         }

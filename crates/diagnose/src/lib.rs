@@ -19,16 +19,19 @@ pub mod inference;
 pub mod pairing;
 mod scans;
 pub mod search;
+mod unpaired;
 
 pub use catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
 pub use curve::{Curve, CurvePoint};
 pub use diagnosis::{
-    Considered, DetectorGain, Diagnosis, Finding, FindingGain, Gain, Minimum, Parameter, SCHEMA, Status, Verdict,
+    Considered, DetectorGain, Diagnosis, Finding, FindingGain, Gain, Minimum, Parameter, SCHEMA, Status,
+    Unidentifiable, Verdict,
 };
 pub use engine::{
-    BakedIn, OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
+    OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,
 };
 pub use error::DiagnoseError;
 pub use extended::{extended_toml, what_to_change};
 pub use scans::diagnose_scans;
 pub use sensor::Rig;
+pub use unpaired::diagnose_unpaired;

@@ -1,7 +1,7 @@
 //! The set of the second generator: many pairs with or without hidden differences, diagnosed and scored. Each result is
 //! written as soon as it is available, so an interrupted run can be resumed.
 
-use lidarshift_town::{Kind, draw_case, write_case};
+use lidarshift_town::{Kind, draw_case, draw_case_of_two_towns, write_case};
 use rand::RngExt;
 use score::{Outcome, markdown};
 use trials::Trials;
@@ -20,6 +20,7 @@ cargo xtask bench town -- [OPTIONS]
   --shots N       shots per scan; twice as many with 128 rows [default: 25000]
   --out DIR       folder of the results [default: bench/town]
   --keep DIR      keep the pairs in a folder, and reuse those already there
+  --unpaired      the simulated side shows another town, and nothing is paired
   --draw-only     draw pairs without diagnosing them
   --help          this text";
 
@@ -80,7 +81,11 @@ fn main() {
         return;
     };
     let draw = |seed: u64, folder: &std::path::Path| {
-        let case = draw_case(seed, kind_of(seed, trials.kind_of(seed)), trials.size);
+        let kind = kind_of(seed, trials.kind_of(seed));
+        let case = match trials.unpaired {
+            true => draw_case_of_two_towns(seed, kind, trials.size),
+            false => draw_case(seed, kind, trials.size),
+        };
         write_case(&case, folder).expect("a case can be written")
     };
     if let Some(summary) = trials.run(draw, line) {

@@ -185,6 +185,15 @@ fn effects_of(kind: Kind, setting: &Setting, mounts: &[Mount], rng: &mut Stream)
 
 /// Draws the case of a seed.
 pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
+    draw(seed, kind, size, false)
+}
+
+/// Draws the case of a seed with the simulated side in another town: the same sensors on another drive.
+pub fn draw_case_of_two_towns(seed: u64, kind: Kind, size: CaseSize) -> Case {
+    draw(seed, kind, size, true)
+}
+
+fn draw(seed: u64, kind: Kind, size: CaseSize, two_towns: bool) -> Case {
     let rng = &mut data::stream(seed, "town case", 0, 0);
     let setting = setting_of(kind, rng);
     let (mounts, above_m) = draw_mounts(rng, setting.layout, size.shots, setting.pattern_known);
@@ -206,6 +215,9 @@ pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
             *displacement = isometry(shift, turn);
         }
     }
+    let elsewhere = two_towns
+        .then(|| Scenario::draw(&mut data::stream(seed, "town other world", 0, 0), &setting, duration_s, above_m));
+    let elsewhere = elsewhere.map(|other| (Arc::new(other.world.clone()), Arc::new(other)));
     let simulated = Side {
         name: "simulated",
         seed,
@@ -220,5 +232,9 @@ pub fn draw_case(seed: u64, kind: Kind, size: CaseSize) -> Case {
         duration_s,
     };
     let measured = Side { name: "measured", own: Arc::new(own), ..simulated.clone() }.with_effects(&real, effects);
+    let simulated = match elsewhere {
+        Some((world, scenario)) => Side { world, scenario, ..simulated },
+        None => simulated,
+    };
     Case { seed, kind, size, measured, real_world: real, simulated }
 }

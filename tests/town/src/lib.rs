@@ -34,7 +34,7 @@ mod write;
 #[cfg(test)]
 mod tests;
 
-pub use case::{Case, Kind, draw_case};
+pub use case::{Case, Kind, draw_case, draw_case_of_two_towns};
 pub use draw::{CAUSES, OFF_CATALOGUE};
 pub use effect::{Clock, Dark, Effect, Spot};
 pub use frame::Frame;

@@ -2,7 +2,7 @@
 //! (`tests/blind`, `tests/town`) call it; the generators themselves do not know it.
 
 use data::Dataset;
-use diagnose::{DiagnoseError, Options, Outcome as Found, Rig, diagnose};
+use diagnose::{DiagnoseError, OnClouds, Options, Outcome as Found, Rig, diagnose, diagnose_unpaired};
 use score::{CaseSize, Outcome, Summary, Truth, score, summarise};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -22,6 +22,8 @@ pub struct Trials {
     pub out: PathBuf,
     /// Folder in which the pairs are kept.
     pub keep: Option<PathBuf>,
+    /// Whether the sides show different scenes.
+    pub unpaired: bool,
     /// Whether pairs are drawn without a diagnosis.
     pub draw_only: bool,
 }
@@ -30,7 +32,7 @@ impl Trials {
     /// So many cases of the usual size from seed 1 on.
     pub fn new(cases: u64, out: &str) -> Trials {
         let (kinds, size) = (vec![], CaseSize::USUAL);
-        Trials { kinds, first: 1, cases, size, out: out.into(), keep: None, draw_only: false }
+        Trials { kinds, first: 1, cases, size, out: out.into(), keep: None, unpaired: false, draw_only: false }
     }
 
     /// With the options of the command line; `None` if help is wanted.
@@ -49,6 +51,7 @@ impl Trials {
                 "--shots" => self.size.shots = value().parse().expect("a number of shots"),
                 "--out" => self.out = value().into(),
                 "--keep" => self.keep = Some(value().into()),
+                "--unpaired" => self.unpaired = true,
                 "--draw-only" => self.draw_only = true,
                 "--bench" => {}
                 "--help" | "-h" => return None,
@@ -84,7 +87,7 @@ impl Trials {
             let path = self.out.join(format!("case-{seed}.json"));
             let done = std::fs::read(&path).ok().and_then(|bytes| serde_json::from_slice::<Outcome>(&bytes).ok());
             let outcome = done.unwrap_or_else(|| {
-                let (outcome, diagnosis) = scored(&drawn(seed, &folder, &draw), &folder);
+                let (outcome, diagnosis) = scored(&drawn(seed, &folder, &draw), &folder, self.unpaired);
                 data::write_json(&self.out.join(format!("diagnosis-{seed}.json")), &diagnosis).expect("a diagnosis");
                 data::write_json(&path, &outcome).expect("a result");
                 outcome
@@ -120,18 +123,31 @@ fn drawn(seed: u64, folder: &Path, draw: impl Fn(u64, &Path) -> Truth) -> Truth 
 /// # Panics
 /// Where a side or the rig cannot be read.
 pub fn diagnosed(folder: &Path, simulated: &str) -> Result<Found, DiagnoseError> {
+    let (measured, simulated, rig) = sides(folder, simulated);
+    diagnose(&measured, &simulated, &rig, &Options::default(), &|_, _, _| ())
+}
+
+/// The same of two sides that show different scenes.
+fn diagnosed_unpaired(folder: &Path) -> Result<Found, DiagnoseError> {
+    let (measured, simulated, rig) = sides(folder, "simulated");
+    let remake = OnClouds { simulated: &simulated, rig: &rig };
+    diagnose_unpaired(&measured, &simulated, &rig, &Options::default(), &remake, &|_, _, _| ())
+}
+
+/// Both sides of a pair, and its sensors.
+fn sides(folder: &Path, simulated: &str) -> (Dataset, Dataset, Rig) {
     let open = |side: &str| Dataset::open(&folder.join(side)).expect("a data set");
-    let rig = Rig::read(&folder.join("sensor.toml")).expect("a rig");
-    diagnose(&open("measured"), &open(simulated), &rig, &Options::default(), &|_, _, _| ())
+    (open("measured"), open(simulated), Rig::read(&folder.join("sensor.toml")).expect("a rig"))
 }
 
 /// The score of the diagnosis of a pair, and the diagnosis as JSON.
 ///
 /// # Panics
 /// Where a side or the rig cannot be read.
-pub fn scored(truth: &Truth, folder: &Path) -> (Outcome, serde_json::Value) {
+pub fn scored(truth: &Truth, folder: &Path, unpaired: bool) -> (Outcome, serde_json::Value) {
     let begin = Instant::now();
-    let value = match diagnosed(folder, "simulated") {
+    let found = if unpaired { diagnosed_unpaired(folder) } else { diagnosed(folder, "simulated") };
+    let value = match found {
         Ok(found) => serde_json::to_value(&found.diagnosis).expect("JSON"),
         Err(e) => serde_json::json!({ "verdict": format!("error: {e}") }),
     };

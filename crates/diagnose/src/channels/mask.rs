@@ -127,6 +127,8 @@ pub enum Shown {
     MovedBack,
     /// It has motion distortion, or rows aim elsewhere.
     Elsewhere,
+    /// It is another scene.
+    Another,
 }
 
 /// Hidden cells: almost no simulated return is measured although `expected`, the share that other losses keep in a
@@ -140,8 +142,10 @@ pub fn blocked_cells(
     shown: Shown,
     expected: impl Fn(&DirectionCell) -> f64,
 ) -> BTreeSet<DirectionCell> {
+    // Another scene may have less to see in a direction, and seldom nothing at all.
+    let dark_below = if shown == Shown::Another { EMPTY } else { DARK };
     let is_dark =
-        |cell: &DirectionCell| share_seen(counts, cell).is_some_and(|seen| seen < DARK && expected(cell) > 0.5);
+        |cell: &DirectionCell| share_seen(counts, cell).is_some_and(|seen| seen < dark_below && expected(cell) > 0.5);
     let mut dark: BTreeSet<DirectionCell> =
         counts.keys().filter(|cell| covered(counts, cell) || is_dark(cell)).copied().collect();
     let mut blocked = BTreeSet::new();
@@ -150,7 +154,7 @@ pub fn blocked_cells(
         let stands_out = region.stands_out(shown);
         let believed = match shown {
             Shown::InPlace => true,
-            Shown::MovedBack => region.surrounded(),
+            Shown::MovedBack | Shown::Another => region.surrounded(),
             Shown::Elsewhere => false,
         };
         if region.on_ego_vehicle() {
@@ -247,7 +251,7 @@ pub(super) fn take_together(cells: &mut BTreeSet<DirectionCell>, first: Directio
 }
 
 /// A cell and those around it.
-pub(super) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = DirectionCell> {
+pub(crate) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = DirectionCell> {
     (-1..=1).flat_map(move |a| (-1..=1).map(move |e| (s, az + a, el + e)))
 }
 

@@ -53,7 +53,8 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
 /// Counts of one frame: measured and simulated returns of each kind, and all of them.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct OddFrame {
-    /// By kind: measured, simulated.
+    /// By kind: measured, simulated. Returns between the surfaces of an edge are for as many edges as the simulation
+    /// has.
     pub counts: [[f64; 2]; 4],
     /// All returns: measured, simulated.
     pub all: [f64; 2],
@@ -84,6 +85,8 @@ pub fn odd_frames(frames: &[FramePair], end_m: f64) -> Vec<OddFrame> {
                     }
                 }
             }
+            // Where the scenes differ, there are as many ranges between edges as there are edges.
+            out.counts[Odd::Between as usize][0] /= frame.jumps;
             out.mixed_per_rad = frame.mixed_per_rad * out.all[1];
             out
         })

@@ -1,25 +1,12 @@
 //! Causes that a comparison cannot tell, as the simulated side was made of the measured one.
 
-use crate::catalogue::Cause;
-use crate::diagnosis::{Diagnosis, Finding, Status, Verdict};
-use serde::{Deserialize, Serialize};
-
-/// A cause that is in both sides of a pair.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct BakedIn {
-    /// The cause.
-    pub cause: Cause,
-    /// Why this pair cannot tell it.
-    pub why: String,
-    /// What recording can tell it.
-    pub tell_by: String,
-}
+use crate::diagnosis::{Diagnosis, Finding, Status, Unidentifiable, Verdict};
 
 /// Gives findings that have one of these causes, or may have it, the status `not_identifiable`, with the reason and
 /// what can tell. Nothing is detectable of these causes.
-pub(super) fn take_names(diagnosis: &mut Diagnosis, baked_in: &[BakedIn]) {
+pub(super) fn take_names(diagnosis: &mut Diagnosis, baked_in: &[Unidentifiable]) {
     for finding in &mut diagnosis.findings {
-        let of_finding = |b: &&BakedIn| {
+        let of_finding = |b: &&Unidentifiable| {
             finding.cause == Some(b.cause) || finding.candidates.iter().flatten().any(|cause| *cause == b.cause)
         };
         if let Some(known) = baked_in.iter().find(of_finding) {
@@ -30,7 +17,7 @@ pub(super) fn take_names(diagnosis: &mut Diagnosis, baked_in: &[BakedIn]) {
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
 }
 
-fn take_name(finding: &mut Finding, known: &BakedIn) {
+fn take_name(finding: &mut Finding, known: &Unidentifiable) {
     // An ambiguous finding keeps its candidates: one of them may be true.
     let candidates = finding.candidates.take().or_else(|| finding.cause.map(|cause| vec![cause]));
     (finding.cause, finding.candidates, finding.status) = (None, candidates, Status::NotIdentifiable);
@@ -42,7 +29,7 @@ fn take_name(finding: &mut Finding, known: &BakedIn) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::catalogue::{Channel, Covariate, Family, Quantity};
+    use crate::catalogue::{Cause, Channel, Covariate, Family, Quantity};
     use crate::curve::Curve;
     use crate::diagnosis::{FindingGain, Minimum};
     use crate::engine::report::refused;
@@ -79,8 +66,11 @@ mod tests {
         for cause in [Cause::RangeBias, Cause::RandomDropout] {
             diagnosis.minimum_detectable.insert(cause, Minimum::new(Quantity::Share, 0.1));
         }
-        let baked_in =
-            BakedIn { cause: Cause::RangeBias, why: "the map moves with it".into(), tell_by: "a known wall".into() };
+        let baked_in = Unidentifiable {
+            cause: Cause::RangeBias,
+            why: "the map moves with it".into(),
+            tell_by: "a known wall".into(),
+        };
         take_names(&mut diagnosis, &[baked_in]);
         let [bias, rows, either] = &diagnosis.findings[..] else { panic!("three findings") };
         assert_eq!((bias.status, bias.cause), (Status::NotIdentifiable, None));

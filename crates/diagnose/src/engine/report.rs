@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 pub const METRIC: &str = "nats_per_ray";
 
 /// A diagnosis of notes alone.
-pub(super) fn refused(notes: Vec<String>) -> Diagnosis {
+pub(crate) fn refused(notes: Vec<String>) -> Diagnosis {
     Diagnosis {
         schema: SCHEMA.into(),
         verdict: Verdict::NotScenarioIdentical,
@@ -22,13 +22,14 @@ pub(super) fn refused(notes: Vec<String>) -> Diagnosis {
         minimum_detectable: Default::default(),
         gain: Gain { metric: METRIC.into(), ..Gain::default() },
         detectors: Vec::new(),
+        not_identifiable: Vec::new(),
         considered: vec![],
         notes,
     }
 }
 
 /// The diagnosis of all results.
-pub(super) fn report(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) -> Diagnosis {
+pub(crate) fn report(context: &Context, results: Vec<ChannelResult>, notes: Vec<String>) -> Diagnosis {
     let hold_out = context.of(Role::HoldOut);
     let mut report = Report {
         blocks: context.blocks(&hold_out),
@@ -60,6 +61,7 @@ pub(super) fn report(context: &Context, results: Vec<ChannelResult>, notes: Vec<
         findings,
         minimum_detectable,
         detectors: Vec::new(),
+        not_identifiable: Vec::new(),
         considered,
         notes,
     }

@@ -84,7 +84,7 @@ impl RemadeFrames for CloudsWith<'_> {
 }
 
 /// Distances of the held-out frames by channel, nats, frame by frame.
-type Distances = BTreeMap<Channel, Vec<f64>>;
+pub(crate) type Distances = BTreeMap<Channel, Vec<f64>>;
 
 /// The distances of some frames of a pair.
 fn distances(context: &Context, train: &[usize], test: &[usize], slide: bool) -> Distances {
@@ -211,31 +211,47 @@ impl<'a> Verification<'a> {
         Ok((distances, frames))
     }
 
-    /// Sums of the distances over the held-out frames. The totals are those of the channels in which something was
-    /// found, and of those that the extension made worse.
+    /// See [`GainFrames::gain`].
     fn gain(&self, after: &Distances, floor: &Distances, extended: bool) -> Gain {
-        let returns = self.context.returns(&self.test).max(1.0);
-        let members = blocks_of(&self.context.blocks(&self.test));
+        let (returns, blocks) = (self.context.returns(&self.test), self.context.blocks(&self.test));
+        GainFrames { returns, blocks }.gain([&self.before, after, floor], &self.found, extended)
+    }
+}
+
+/// The held-out frames of a gain.
+pub(crate) struct GainFrames {
+    /// Their simulated returns.
+    pub(crate) returns: f64,
+    /// Block of each.
+    pub(crate) blocks: Vec<usize>,
+}
+
+impl GainFrames {
+    /// Sums of the distances before, after and at the floor. The totals are those of the channels in which something
+    /// was `found`, of all where that is empty, and of those that the extension made worse.
+    pub(crate) fn gain(&self, three: [&Distances; 3], found: &BTreeSet<Channel>, extended: bool) -> Gain {
+        let returns = self.returns.max(1.0);
+        let members = blocks_of(&self.blocks);
         // The distances of a channel over some frames. What tables predict worse than the simulation is no distance.
         let sums = |channel: &Channel, which: &[usize]| {
-            [&self.before, after, floor].map(|d| which.iter().map(|&i| d[channel][i]).sum::<f64>().max(0.0))
+            three.map(|d| which.iter().map(|&i| d[channel][i]).sum::<f64>().max(0.0))
         };
         let closed = |[before, after, floor]: [f64; 3]| (before > floor).then(|| (before - after) / (before - floor));
         let over = |channels: &[Channel], which: &[usize]| {
             channels.iter().map(|c| sums(c, which)).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
         };
-        let all_frames: Vec<usize> = (0..self.test.len()).collect();
+        let all_frames: Vec<usize> = (0..self.blocks.len()).collect();
         let interval = |channels: &[Channel]| {
             let mut rng = data::stream(0, "diagnose closed", 1, 0);
             let drawn = (0..REPETITIONS).filter_map(|_| closed(over(channels, &draw_blocks(&members, &mut rng))));
             interval_nearest(drawn.collect())
         };
-        let channels: Vec<Channel> = self.before.keys().copied().collect();
+        let channels: Vec<Channel> = three[0].keys().copied().collect();
         let worse = |c: &Channel| {
             let [before, after, _] = sums(c, &all_frames);
             after - before > ENOUGH_NATS
         };
-        let found = |c: &Channel| self.found.is_empty() || self.found.contains(c);
+        let found = |c: &Channel| found.is_empty() || found.contains(c);
         let counted: Vec<Channel> = channels.iter().copied().filter(|c| found(c) || worse(c)).collect();
         let [before, after_all, floor_all] = over(&counted, &all_frames);
         let of_channel = |c: &Channel| (*c, sums(c, &all_frames).map(|v| v / returns));
@@ -276,24 +292,23 @@ pub(super) fn measure_gain(
         }
     };
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
-    diagnosis
-        .gain
-        .not_applied
-        .extend(without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) }));
-    set_reached(diagnosis);
+    set_reached(diagnosis, |_| true);
     Ok(())
 }
 
 /// Difference of what was promised and what was reached from which on the form of a cause does not fit.
 const FORM: f64 = 0.05;
 
-/// Writes to each finding what the fits promised of its channel and what was reached there. A named cause whose effect
-/// was applied and surely reaches less than it promised, by more than 5 points, does not have the form of the
-/// difference: it is ambiguous where another cause was significant as well, else without a name.
-fn set_reached(diagnosis: &mut Diagnosis) {
+/// Lists findings without an effect as not applied, and writes to each finding what the fits promised of its channel
+/// and what was reached there. A named cause whose effect was applied and surely reaches less than it promised, by more
+/// than 5 points, does not have the form of the difference: it is ambiguous where another cause was significant as
+/// well, else without a name. `seen` says whether the distances see what a finding changes.
+pub(crate) fn set_reached(diagnosis: &mut Diagnosis, seen: impl Fn(&Finding) -> bool) {
+    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
+    let not_applied = without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) });
+    diagnosis.gain.not_applied.extend(not_applied);
     let Diagnosis { findings, gain, considered, .. } = diagnosis;
-    for finding in findings.iter_mut() {
+    for finding in findings.iter_mut().filter(|f| seen(f)) {
         let measured = gain.closed_by_channel.get(&finding.channel);
         finding.reached = measured.map(|c| c.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));

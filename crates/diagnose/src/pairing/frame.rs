@@ -23,6 +23,8 @@ pub struct FramePair {
     pub simulated: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
+    /// Jumps of the measured scan for each one of the simulated scan, over returns: 1 where both show one scene.
+    pub jumps: f64,
     /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns
     /// it has fewer.
     pub open: f64,
@@ -104,6 +106,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         measured: Vec::new(),
         simulated: Vec::new(),
         mixed_per_rad: 0.0,
+        jumps: 1.0,
         open: 0.0,
         objects: Vec::new(),
     };
@@ -143,9 +146,13 @@ fn moved_back(recorded: &RecordedFrame, sensors: &Sensors, shift_m: Option<Shown
 fn rounded(scans: &[SensorScan], step_m: Option<f64>) -> Cow<'_, [SensorScan]> {
     let Some(step) = step_m else { return Cow::Borrowed(scans) };
     let mut scans = scans.to_vec();
-    let round = |r: &mut f32| *r = ((f64::from(*r) / step).round() * step).max(0.05) as f32;
-    scans.iter_mut().flat_map(|s| &mut s.range_m).for_each(round);
+    scans.iter_mut().for_each(|scan| round_ranges(scan, step));
     Cow::Owned(scans)
+}
+
+/// Rounds the ranges of a scan to a step, m.
+pub(crate) fn round_ranges(scan: &mut SensorScan, step_m: f64) {
+    scan.range_m.iter_mut().for_each(|r| *r = ((f64::from(*r) / step_m).round() * step_m).max(0.05) as f32);
 }
 
 /// One sensor of a frame.
@@ -223,7 +230,7 @@ pub fn company_m(range_m: f64) -> f64 {
 }
 
 /// Number of returns of a scan around one of its own that lie at about its range.
-fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
+pub(super) fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
     let range = scan.range_m[i];
     let mut n = 0u8;
     index.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {

@@ -1,5 +1,6 @@
 //! Pairing of two data sets of the same scenes, return by return.
 
+mod alone;
 mod boxes;
 mod frame;
 mod gaps;
@@ -10,7 +11,9 @@ mod ray;
 mod recordings;
 mod roughness;
 
+pub use alone::{FrameAlone, frame_alone};
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
+pub(crate) use frame::round_ranges;
 pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, ShownShift, company_m, pair_frame};
 pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity, met_squarely};
@@ -36,7 +39,7 @@ const KEPT: usize = 3_000_000;
 const PATTERN_FRAMES: usize = 10;
 
 /// Whether a cloud's file holds no point: it is empty, or a PCD whose header says so.
-fn has_no_point(path: &Path) -> Result<bool, DiagnoseError> {
+pub(crate) fn has_no_point(path: &Path) -> Result<bool, DiagnoseError> {
     let mut head = Vec::new();
     fs_err::File::open(path)?.take(2000).read_to_end(&mut head)?;
     let pcd = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pcd"));
@@ -153,12 +156,14 @@ pub fn pair_all(
 }
 
 /// Results in order. The first error in that order is returned, whatever the number of threads.
-fn in_order<T: Send>(results: impl ParallelIterator<Item = Result<T, DiagnoseError>>) -> Result<Vec<T>, DiagnoseError> {
+pub(crate) fn in_order<T: Send>(
+    results: impl ParallelIterator<Item = Result<T, DiagnoseError>>,
+) -> Result<Vec<T>, DiagnoseError> {
     results.collect::<Vec<_>>().into_iter().collect()
 }
 
 /// Keeps about `kept` of the rays, chosen at random.
-fn thin(rays: &mut Vec<Ray>, kept: usize, frame: u64, side: u64) {
+pub(crate) fn thin(rays: &mut Vec<Ray>, kept: usize, frame: u64, side: u64) {
     if rays.len() > kept {
         let share = kept as f64 / rays.len() as f64;
         let mut rng = data::stream(0, "diagnose thin", side, frame);

@@ -35,6 +35,11 @@ impl<'a> Predictor<'a> {
         }
     }
 
+    /// Distance across a plane from which on a neighbour belongs to another surface, m.
+    pub(super) fn edge_m(&self) -> f64 {
+        self.sensors.edge_m
+    }
+
     /// A return of a scan of that sensor with the prediction for its direction.
     pub(super) fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
         let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);

@@ -172,6 +172,7 @@ fn report(
             ..Gain::default()
         },
         detectors: Vec::new(),
+        not_identifiable: Vec::new(),
         considered,
         notes,
     }

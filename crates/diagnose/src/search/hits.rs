@@ -4,7 +4,7 @@ mod by_table;
 mod describe;
 mod form;
 
-pub use self::by_table::by_table;
+pub use self::by_table::{by_cell, by_table};
 
 use self::describe::found;
 use super::unexplained::{Unexplained, mean_by_group};

@@ -62,6 +62,15 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     (result, mask)
 }
 
+/// Gains of the `test` frames by a largest range of the `train` frames, nats: all measured returns lie before it, not
+/// all simulated ones.
+pub fn cut_by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let Some(cut) = range_cut(context.frames, train) else { return vec![0.0; test.len()] };
+    let rays = || train.iter().flat_map(|&i| &context.frames[i].simulated);
+    let beyond = rays().filter(|r| r.own_range_m() > cut).count() as f64 / rays().count().max(1) as f64;
+    test.iter().map(|&i| -(1.0 - beyond).ln() * context.frames[i].measured.len() as f64).collect()
+}
+
 /// The mask on the selecting frames, and findings of patches of directions.
 fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let select = context.of(Role::Select);
@@ -84,7 +93,8 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
     mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
     mask.partly = edge;
-    let spots = if shown == Shown::Elsewhere { vec![] } else { patch::search(context, &mut mask) };
+    let same_place = !matches!(shown, Shown::Elsewhere | Shown::Another);
+    let spots = if same_place { patch::search(context, &mut mask) } else { vec![] };
     (mask, spots)
 }
 

@@ -4,6 +4,9 @@ mod curve;
 mod describe;
 mod directions;
 mod select;
+mod surfaces;
+
+pub use self::surfaces::{SurfaceShare, by_surface};
 
 use self::describe::found;
 use self::select::Selection;
@@ -32,16 +35,21 @@ const CONSTANT: usize = 0;
 const ANGULAR: usize = 1;
 
 /// A law with its coefficient, m2 or rad2.
-type Term = (NoiseLaw, f64);
+pub type Term = (NoiseLaw, f64);
 
 /// The search; surfaces with a cosine of incidence below `least_cos` are left out.
 pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
+    search_laws(context, least_cos).0
+}
+
+/// The search, and the laws that it found.
+pub fn search_laws(context: &Context, least_cos: f64) -> (ChannelResult, Vec<Term>) {
     let search = Search::new(context, least_cos);
     let mut result = ChannelResult::new(Channel::Roughness, search.hold_out.len());
     let selection = search.select(&mut result);
     result.minimum = search.minimum();
-    search.report(selection, &mut result);
-    result
+    let terms = search.report(selection, &mut result);
+    (result, terms)
 }
 
 /// Gains of the `test` frames by variances of each cell and of each row fitted on the `train` frames, nats.
@@ -94,17 +102,23 @@ impl<'a> Search<'a> {
         fit(&self.linear.iter().collect::<Vec<_>>(), &self.blocks, columns, &NO_PRIOR)
     }
 
-    /// Detectable effect sizes.
+    /// Detectable effect sizes: significant, and large enough to be reported.
     fn minimum(&self) -> Vec<(Cause, Minimum)> {
-        let least = |law: usize, floor: f64| (Z_STAR * self.whole(&[law]).error(0)).sqrt().max(floor);
+        let least = |law: usize| {
+            let significant = Z_STAR * self.whole(&[law]).error(0);
+            // In steps of 2 %.
+            let mut sizes = (0..1500).map(|k| 1e-12 * 1.02f64.powi(k));
+            let reported = sizes.find(|theta| above_floor(&self.table, NOISE_LAWS[law], *theta));
+            significant.max(reported.unwrap_or(0.0)).sqrt()
+        };
         vec![
-            (Cause::RangeNoise, Minimum::new(Quantity::StdM, least(CONSTANT, FLOOR_M))),
-            (Cause::AngularJitter, Minimum::new(Quantity::StdDeg, least(ANGULAR, FLOOR_RAD).to_degrees())),
+            (Cause::RangeNoise, Minimum::new(Quantity::StdM, least(CONSTANT))),
+            (Cause::AngularJitter, Minimum::new(Quantity::StdDeg, least(ANGULAR).to_degrees())),
         ]
     }
 
-    /// Fits what was chosen on the estimating frames and measures it on the held-out ones.
-    fn report(&self, selection: Selection, result: &mut ChannelResult) {
+    /// Fits what was chosen on the estimating frames and measures it on the held-out ones. Returns the fitted laws.
+    fn report(&self, selection: Selection, result: &mut ChannelResult) -> Vec<Term> {
         let on_estimate = self.table(&self.estimate);
         let linear: Vec<LinearFrame> =
             self.estimate.iter().map(|&i| on_estimate.linear(&self.rough[i], &NOISE_LAWS)).collect();
@@ -135,6 +149,7 @@ impl<'a> Search<'a> {
             }
             result.found.push(found);
         }
+        terms
     }
 }
 

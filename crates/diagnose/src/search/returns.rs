@@ -27,31 +27,39 @@ const Z_BY_SIGNS: [f64; 2] = [3.0, 2.0];
 /// Smallest gain of the selecting frames, nats.
 const LEAST_NATS: f64 = 8.0;
 
-/// The search.
+/// The search of all kinds.
 pub fn search(context: &Context) -> ChannelResult {
+    search_kinds(context, &ODD)
+}
+
+/// The search of some kinds of returns.
+pub fn search_kinds(context: &Context, kinds: &[Odd]) -> ChannelResult {
     let end_m = 0.98 * end_m(context.frames);
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Returns, hold_out.len());
     let blocks = context.blocks(&select);
     let odd = odd_frames(context.frames, end_m);
     let search = Search { context, odd, select, blocks, estimate, hold_out, end_m };
-    for kind in ODD {
-        search.kind(kind, &mut result);
+    for kind in kinds {
+        search.kind(*kind, &mut result);
     }
     result
 }
 
 /// Gains of the `test` frames by the shares of odd returns of the `train` frames, nats.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    kinds_by_table(context, &ODD, train, test)
+}
+
+/// The same of some kinds of returns.
+pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &[usize]) -> Vec<f64> {
     let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
     let rates = ODD.map(|kind| excess(train.iter().map(|&i| &odd[i]), kind as usize));
-    let of_frame = |i: &usize| {
-        ODD.map(|kind| {
-            let [base, more] = rates[kind as usize];
-            gain(&odd[*i], kind as usize, base, more)
-        })
+    let of_kind = |i: usize, kind: Odd| {
+        let [base, more] = rates[kind as usize];
+        gain(&odd[i], kind as usize, base, more)
     };
-    test.iter().map(|i| of_frame(i).iter().sum()).collect()
+    test.iter().map(|&i| kinds.iter().map(|kind| of_kind(i, *kind)).sum()).collect()
 }
 
 /// Counts of all frames, and the frames by role.

@@ -437,6 +437,7 @@ mod tests {
                 let shown = |p: &Vector3<f64>| p + velocity * (p.y.atan2(p.x) / std::f64::consts::TAU * scan_s);
                 FramePair {
                     mixed_per_rad: 0.0,
+                    jumps: 1.0,
                     open: 0.0,
                     id: f.to_string(),
                     measured: posts.iter().map(|p| standing(&shown(p))).collect(),

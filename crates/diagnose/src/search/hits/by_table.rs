@@ -58,6 +58,15 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     test.iter().map(of_frame).zip(of_near_returns(context, train, test)).map(|(a, b)| a + b).collect()
 }
 
+/// Gains of the `test` frames by the shares of matched returns of the `train` frames, by cell of range, incidence and
+/// surface alone, nats.
+pub fn by_cell(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let hits = hit_frames(context.frames, &Mask::default());
+    let table = table(&hits, train);
+    let shares = table.matched_shares(&[]);
+    test.iter().map(|&i| table.gain_by_table(&hits[i], &shares)).collect()
+}
+
 /// Gains of the `test` frames by the numbers of near returns of the `train` frames in each cell of directions, nats:
 /// returns of the ego vehicle in place of those behind it.
 fn of_near_returns(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {

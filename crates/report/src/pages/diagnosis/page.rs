@@ -27,7 +27,8 @@ impl DiagnosisReport<'_> {
     /// A page that cannot be rendered.
     pub fn html(&self) -> Result<String, ReportError> {
         let d = self.diagnosis;
-        let mut sections = vec![findings(d), pictures(d), gain(d), detectors(d), not_found(d), considered(d)];
+        let mut sections =
+            vec![findings(d), pictures(d), gain(d), detectors(d), not_found(d), not_identifiable(d), considered(d)];
         sections.retain(|section| !section.items.is_empty());
         let left =
             d.gain.not_applied.iter().map(|n| format!("Not applied, and counted as not gone: {} {}", n.effect, n.why));
@@ -244,6 +245,18 @@ fn not_found(d: &Diagnosis) -> Section {
     Section { id: "not-found", title: "What was not found", text: vec![], items }
 }
 
+fn not_identifiable(d: &Diagnosis) -> Section {
+    let row = |n: &diagnose::Unidentifiable| {
+        let cells = [n.cause.name().to_owned(), n.why.clone(), n.tell_by.clone()];
+        TableRow::new(false, cells.map(TableCell::new))
+    };
+    let rows: Vec<TableRow> = d.not_identifiable.iter().map(row).collect();
+    let columns = ["cause", "why not", "what to record"];
+    let caption = "Causes that these data cannot tell, whatever their size.";
+    let items = if_any("not-identifiable-causes", caption, (&columns, 3), rows);
+    Section { id: "not-identifiable", title: "What these data cannot tell", text: vec![], items }
+}
+
 fn considered(d: &Diagnosis) -> Section {
     let row = |c: &diagnose::Considered| {
         TableRow::new(
@@ -268,7 +281,7 @@ fn considered(d: &Diagnosis) -> Section {
 mod tests {
     use super::super::tests::loss_by_row;
     use super::*;
-    use diagnose::{Cause, Gain, Minimum, Parameter, Quantity};
+    use diagnose::{Cause, Gain, Minimum, Parameter, Quantity, Unidentifiable};
 
     fn diagnosis(findings: Vec<Finding>) -> Diagnosis {
         Diagnosis {
@@ -279,6 +292,11 @@ mod tests {
             minimum_detectable: [(Cause::RangeNoise, Minimum::new(Quantity::StdM, 0.0031))].into(),
             gain: Gain { closed: Some(0.83), ci95: Some([0.7, 0.9]), ..Gain::default() },
             detectors: vec![],
+            not_identifiable: vec![Unidentifiable {
+                cause: Cause::RangeBias,
+                why: "streets differ".into(),
+                tell_by: "a wall".into(),
+            }],
             considered: vec![],
             notes: vec!["a note <b>".into()],
         }
@@ -304,6 +322,8 @@ mod tests {
             "<svg",
             "<td class=\"n\">0.00310 m</td>",
             "a note &#60;b&#62;",
+            "What these data cannot tell",
+            "streets differ",
         ] {
             assert!(page.contains(words), "{words}\n{page}");
         }
