@@ -83,7 +83,11 @@ fn verdict_text(verdict: Verdict, findings: &[Status]) -> String {
         Verdict::Unexplained => {
             format!("unexplained: {named}; {ambiguous} ambiguous, {unexplained} unexplained{hidden}")
         }
-        Verdict::NotScenarioIdentical => "not scenario-identical: the two data sets do not show the same scenes".into(),
+        Verdict::NotScenarioIdentical => {
+            "not scenario-identical: the two data sets do not show the same scenes; if they show different streets on \
+             purpose, give --unpaired"
+                .into()
+        }
         Verdict::TooFewFrames => "too few frames: nothing can be found, fitted and tested on different frames".into(),
     }
 }

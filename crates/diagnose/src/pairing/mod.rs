@@ -92,7 +92,7 @@ pub fn common_ids(
     if common.is_empty() {
         let show = |ids: &[String]| ids.first().cloned().unwrap_or_default();
         return Err(DiagnoseError::Pair(format!(
-            "no frame id is in both data sets: {} has {} frames ({}, ...), {} has {} ({}, ...)",
+            "no frame id is in both data sets: {} has {} frames ({}, ...), {} has {} ({}, ...). If they show different streets, give --unpaired",
             measured.config.root.display(),
             a.len(),
             show(&a),
