@@ -70,6 +70,9 @@ pub struct ConvertManifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame and of what the frame was made from.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 crate::manifest!(ConvertManifest, "from another data set, in another format or by another version");
@@ -125,6 +128,7 @@ impl Conversion<'_> {
             points: 0,
             labels: 0,
             frames_sha256: String::new(),
+            builds: Vec::new(),
         };
         let new = NewDataset::begin(out, self.to.layout(), &["calib", MCAP_LABELS, ""], &mut manifest)?;
         let written = if self.to == Format::Mcap {

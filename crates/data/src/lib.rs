@@ -4,6 +4,7 @@
 //! +x, rad. The centre of a box is its geometric centre.
 
 pub mod augment;
+mod build;
 mod calibration;
 pub mod checksum;
 mod cloud_file;
@@ -36,6 +37,7 @@ pub mod toml_text;
 pub mod write;
 
 pub use augment::{AugmentConfig, augment};
+pub use build::{build_id, program_sha256, set_commit, set_program_file};
 pub use calibration::Calibration;
 pub use cloud_file::{FARTHEST_M, PointColumns, parse_bin, read_cloud};
 pub use dataset::{Dataset, parse_split};

@@ -23,12 +23,13 @@ pub trait Manifest: Serialize + DeserializeOwned {
     /// Sets whether all frames are written.
     fn set_complete(&mut self, complete: bool);
 
-    /// Sets the SHA-256 of `frames.jsonl`, which has those of all frames.
-    fn set_frames_sha256(&mut self, sha256: String);
+    /// Sets the SHA-256 of `frames.jsonl`, which has those of all frames, and the builds of the program that wrote the
+    /// frames.
+    fn set_frames(&mut self, sha256: String, builds: Vec<String>);
 }
 
-/// Makes a struct with the fields `schema`, `config_sha256`, `complete` and `frames_sha256` a [`Manifest`]; the second
-/// argument is [`Manifest::DIFFERENCE`].
+/// Makes a struct with the fields `schema`, `config_sha256`, `complete`, `frames_sha256` and `builds` a [`Manifest`];
+/// the second argument is [`Manifest::DIFFERENCE`].
 #[macro_export]
 macro_rules! manifest {
     ($name:ident, $difference:literal) => {
@@ -43,8 +44,8 @@ macro_rules! manifest {
                 self.complete = complete;
             }
 
-            fn set_frames_sha256(&mut self, sha256: String) {
-                self.frames_sha256 = sha256;
+            fn set_frames(&mut self, sha256: String, builds: Vec<String>) {
+                (self.frames_sha256, self.builds) = (sha256, builds);
             }
         }
     };
@@ -83,7 +84,8 @@ impl<'a> NewDataset<'a> {
 
     /// Writes the records of the frames `ids`, marks the data set as complete and writes the manifest.
     pub fn finish<M: Manifest>(&self, manifest: &mut M, ids: &[String]) -> Result<(), DataError> {
-        manifest.set_frames_sha256(self.records.finish(ids)?);
+        let finished = self.records.finish(ids)?;
+        manifest.set_frames(finished.sha256, finished.builds);
         manifest.set_complete(true);
         write_json(&manifest_path(self.root), manifest)
     }
@@ -186,6 +188,7 @@ mod tests {
         complete: bool,
         sha: String,
         frames_sha256: String,
+        builds: Vec<String>,
     }
 
     impl Manifest for Made {
@@ -199,8 +202,8 @@ mod tests {
             self.complete = complete;
         }
 
-        fn set_frames_sha256(&mut self, sha256: String) {
-            self.frames_sha256 = sha256;
+        fn set_frames(&mut self, sha256: String, builds: Vec<String>) {
+            (self.frames_sha256, self.builds) = (sha256, builds);
         }
     }
 
@@ -210,7 +213,7 @@ mod tests {
 
     /// Returns the number of frames that were made.
     fn make_from(root: &Path, sha: &str, source: &str) -> Result<usize, DataError> {
-        let mut manifest = Made { complete: true, sha: sha.into(), frames_sha256: String::new() };
+        let mut manifest = Made { complete: true, sha: sha.into(), frames_sha256: String::new(), builds: vec![] };
         let set = NewDataset::begin(root, Layout::Kitti, &[], &mut manifest)?;
         let ids = ["a", "b"].map(String::from);
         set.describe(DatasetConfig { name: "made".into(), ..DatasetConfig::default() }, [("train", ids.to_vec())])?;
@@ -254,6 +257,24 @@ mod tests {
         let lock = FolderLock::acquire(&root).unwrap();
         assert!(make(&root, "1").unwrap_err().to_string().contains("in use by another process"));
         drop(lock);
+    }
+
+    #[test]
+    fn manifests_name_the_builds_of_their_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("set");
+        let builds = || {
+            make(&root, "1").unwrap();
+            let text = std::fs::read(root.join("manifest.json")).unwrap();
+            serde_json::from_slice::<Made>(&text).unwrap().builds
+        };
+        assert_eq!(builds(), [crate::build_id()]);
+        // Both frames from another build, one of which is lost.
+        let path = root.join(FRAMES_FILE);
+        let records = std::fs::read_to_string(&path).unwrap();
+        std::fs::write(&path, records.replace(crate::build_id(), "0.0.1+other")).unwrap();
+        std::fs::remove_file(root.join("velodyne/b.bin")).unwrap();
+        assert_eq!(builds(), ["0.0.1+other", crate::build_id()]);
     }
 
     #[test]

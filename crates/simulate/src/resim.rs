@@ -39,6 +39,9 @@ pub struct ResimManifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame and of what the frame was made from.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 data::manifest!(ResimManifest, "with other effects, another seed or version");
@@ -79,6 +82,7 @@ impl Resim<'_> {
             frames: finished.ids().len(),
             points: [0; 2],
             frames_sha256: String::new(),
+            builds: Vec::new(),
         };
         let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER, TRUE_LABELS], &mut manifest)?;
         self.write_descriptions(&new, finished.rig())?;

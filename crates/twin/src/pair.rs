@@ -85,6 +85,8 @@ struct TwinManifest {
     config_sha256: String,
     frames: usize,
     frames_sha256: String,
+    #[serde(default)]
+    builds: Vec<String>,
 }
 
 data::manifest!(TwinManifest, "with other options, poses or another version");
@@ -116,6 +118,7 @@ pub fn make(
         config_sha256: fingerprint(recording, config, &ids),
         frames: ids.len(),
         frames_sha256: String::new(),
+        builds: Vec::new(),
     };
     let roots = ["measured", "sim"].map(|side| out.join(side));
     let [measured, sim] = &roots;

@@ -50,6 +50,9 @@ pub struct RaceManifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 data::manifest!(RaceManifest, "from another configuration or version");
@@ -102,6 +105,7 @@ fn make_set(
         splits: BTreeMap::new(),
         label_errors: Vec::new(),
         frames_sha256: String::new(),
+        builds: Vec::new(),
     };
     let extra = [attributes::FOLDER, TRUE_LABELS];
     let new = NewDataset::begin(&root, simulator.config.layout, &extra, &mut manifest)?;
