@@ -57,7 +57,7 @@ pub use output_guard::refuse_input_file;
 pub use pcd::{encode_pcd, parse_pcd};
 pub use pcd_columns::{PcdColumn, encode_pcd_columns, parse_pcd_columns, write_pcd_columns};
 pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
-pub use prefetch::{Prefetch, prefetch};
+pub use prefetch::{Prefetch, prefetch, prefetch_numbered};
 pub use presence::Presence;
 pub use stream::{Stream, stream};
 pub use toml_text::KeyError;
