@@ -61,6 +61,16 @@ impl FrameRecords {
         Ok(FrameRecords { root: root.into(), known: Mutex::new(records.collect()), journal: Mutex::new(journal) })
     }
 
+    /// Whether a folder has the file, without any record. Earlier versions wrote frames without it.
+    pub(crate) fn is_empty(root: &Path) -> bool {
+        fs_err::read(root.join(FRAMES_FILE)).is_ok_and(|text| records_of(&text).next().is_none())
+    }
+
+    /// Whether an earlier run recorded a frame.
+    pub(crate) fn has(&self, id: &str) -> bool {
+        self.known.lock().expect("no thread panics with the records").contains_key(id)
+    }
+
     /// Whether a frame was made from `source` and consists of these files, unchanged.
     pub(crate) fn is_whole(&self, id: &str, source: Option<&str>, files: &[PathBuf]) -> bool {
         let known = self.known.lock().expect("no thread panics with the records").get(id).cloned();

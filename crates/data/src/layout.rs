@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 /// case. The documentation is shown in the reference of the configuration.
 macro_rules! layouts {
     ($($name:ident = $module:ident: $doc:tt;)+) => {
-        $(mod $module;)+
+        $(pub(crate) mod $module;)+
 
         /// Folders and files below the root of a data set.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -67,6 +67,7 @@ layouts! {
     Carla = carla: "`*.ply` that CARLA's LiDARs wrote, y negated, and `label/*.txt` in the LiDAR frame.";
     Mcap = mcap_file: "Clouds of a topic of an MCAP file (ROS 2): `root = \"drive.mcap#/topic\"`; read only.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
+    Shards = shards: "Frames in `shards/*.tar`, as `convert --to shards` writes them: members `ID.bin` or `ID.pcd`, `ID.txt`.";
 }
 
 // The table has no mark for the default.
