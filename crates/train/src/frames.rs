@@ -28,7 +28,7 @@ pub struct TrainingFrames {
 impl TrainingFrames {
     /// From a run's data set: the training split with augmentation, or all frames without augmentation to overfit.
     ///
-    /// The database of ground-truth sampling is built once and cached in `cache_folder`.
+    /// The database of ground-truth sampling is built once, in a file of `cache_folder` that other runs may share.
     ///
     /// # Errors
     /// A split that is missing or has no frame, classes or channels of the detector that the data set does not have, a
@@ -107,7 +107,7 @@ impl TrainingFrames {
     fn frame(&self, index: usize, random: &mut Stream) -> Result<Frame, TrainError> {
         let mut frame = self.dataset.load(&self.ids[index])?;
         if let Some((config, database)) = &self.augmentation {
-            frame = augment(frame, config, database.as_ref(), random);
+            frame = augment(frame, config, database.as_ref(), random)?;
         }
         let mut frame = crop_to_range(frame, &self.range_m);
         frame.objects.retain(|o| self.classes.contains(&o.class));

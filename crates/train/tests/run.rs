@@ -124,6 +124,7 @@ fn session(workers: usize, resume: bool) -> Session {
         workers,
         resume,
         allow_changed_data: false,
+        cache: None,
         stop: None,
     }
 }
