@@ -3,6 +3,7 @@
 mod printing;
 mod source;
 mod wording;
+mod writing;
 
 use crate::pages;
 use anyhow::{Context, Result};
@@ -118,14 +119,23 @@ pub fn complaints(root: &Path) -> Result<Vec<String>> {
         let mut of_file = text_complaints(&path, &text);
         of_file.extend(wording::complaints(&path, &text));
         if path.ends_with(".rs") && !is_test(&path) {
-            let code = source::lines(&path, &text);
-            let end = lines_before_tests(&text).min(code.len());
-            of_file.extend(printing::complaints(&path, &code[..end]));
+            let code = code_before_tests(&path, &text);
+            of_file.extend(printing::complaints(&path, &code));
+            of_file.extend(writing::complaints(&path, &code));
         }
         of_file.sort_by_key(|(line, _)| *line);
         found.extend(of_file.into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));
     }
+    let lines_of = |path: &str| Some(code_before_tests(path, &fs::read_to_string(root.join(path)).ok()?));
+    found.extend(writing::stale_exceptions(lines_of));
     Ok(found)
+}
+
+/// The lines of a source file up to its tests.
+fn code_before_tests(path: &str, text: &str) -> Vec<source::Line> {
+    let mut lines = source::lines(path, text);
+    lines.truncate(lines_before_tests(text));
+    lines
 }
 
 fn shown(root: &Path, path: &Path) -> String {
@@ -217,10 +227,11 @@ fn is_test(path: &str) -> bool {
     path.starts_with("tests/") || path.contains("/tests/") || path.ends_with("/tests.rs")
 }
 
-/// Number of lines up to `#[cfg(test)] mod ...`.
+/// Number of lines up to `#[cfg(test)] mod ...`, which may be public within the crate.
 fn lines_before_tests(text: &str) -> usize {
     let lines: Vec<&str> = text.lines().collect();
-    let tests = lines.windows(2).position(|w| w[0] == "#[cfg(test)]" && w[1].starts_with("mod "));
+    let is_module = |line: &str| line.starts_with("mod ") || line.starts_with("pub(") && line.contains(") mod ");
+    let tests = lines.windows(2).position(|w| w[0] == "#[cfg(test)]" && is_module(w[1]));
     tests.unwrap_or(lines.len())
 }
 
@@ -312,6 +323,7 @@ mod tests {
             ("crates/a/src/lib.rs", long.clone(), 1),
             ("crates/a/tests/all.rs", long.clone(), 0),
             ("crates/a/src/lib.rs", format!("#[cfg(test)]\nmod tests {{\n{long}}}\n"), 0),
+            ("crates/a/src/lib.rs", format!("#[cfg(test)]\npub(super) mod tests {{\n{long}}}\n"), 0),
         ] {
             let found = text_complaints(path, &text);
             assert_eq!(found.len(), complaints, "{path}: {found:?}");

@@ -211,7 +211,7 @@ fn samples(config: &DetectorConfig, frames: &[Frame], step: usize) -> Result<Vec
     let preparer = Preparer::new(config);
     let sample = |(i, frame): (usize, &Frame)| {
         let mut random = stream(0, "bench", step as u64, i as u64);
-        let augmented = augment(frame.clone(), &AugmentConfig::default(), None, &mut random);
+        let augmented = augment(frame.clone(), &AugmentConfig::default(), None, &mut random)?;
         let cropped = crop_to_range(augmented, &config.range_m.map(f64::from));
         Ok(preparer.training(&cropped, &mut random)?)
     };

@@ -2,6 +2,7 @@
 //! not panic, hang, or allocate far more memory than the file size justifies.
 
 mod scenes;
+mod shards;
 mod targets;
 
 use anyhow::{Result, bail};

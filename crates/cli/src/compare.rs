@@ -207,7 +207,7 @@ impl CompareArgs {
     }
 
     fn facts(&self, names: &[String]) -> Vec<(String, String)> {
-        let mut facts = vec![("program".to_string(), format!("lidarshift {}", env!("CARGO_PKG_VERSION")))];
+        let mut facts = vec![("program".to_string(), format!("lidarshift {}", data::build_id()))];
         let datasets = std::iter::once(&self.measured).chain(&self.simulations);
         for (i, (name, path)) in names.iter().zip(datasets).enumerate() {
             let what = if i == 0 { "measured data" } else { "simulation" };

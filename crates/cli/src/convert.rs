@@ -3,7 +3,7 @@
 use crate::{errln, outln};
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
-use data::convert::{Conversion, Format};
+use data::convert::{Conversion, Format, SHARD_FRAMES};
 use data::{Dataset, verify_frames};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
@@ -15,6 +15,7 @@ use std::path::PathBuf;
 /// Examples:
 ///   lidarshift convert drive.mcap --to kitti --out datasets/drive
 ///   lidarshift convert datasets/race/measured --to mcap --out datasets/measured-mcap
+///   lidarshift convert /data/million --to shards --out /data/million-shards
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct ConvertArgs {
@@ -27,6 +28,9 @@ pub struct ConvertArgs {
     /// Folder for the new data set: new, empty, or of an interrupted run
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// Frames of a shard, for --to shards
+    #[arg(long, value_name = "N", default_value_t = SHARD_FRAMES, value_parser = at_least_one)]
+    shard_frames: usize,
     /// Write nothing; compare every file of the frames in --out with its SHA-256 from when it was written
     #[arg(long)]
     verify: bool,
@@ -47,6 +51,12 @@ enum Target {
     Carla,
     /// One MCAP file of ROS 2: PointCloud2, poses on /tf, boxes as markers
     Mcap,
+    /// Tar files of many frames each, for data sets of many frames: shards/*.tar
+    Shards,
+}
+
+fn at_least_one(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|n| *n > 0).ok_or_else(|| "give a whole number above 0".into())
 }
 
 impl ConvertArgs {
@@ -64,13 +74,15 @@ impl ConvertArgs {
             Target::OpenPcdet => Format::OpenPcdet,
             Target::Carla => Format::Carla,
             Target::Mcap => Format::Mcap,
+            Target::Shards => Format::Shards,
         };
         let progress = ProgressBar::new(0)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
-        let made = Conversion { dataset: &dataset, to }.make(&self.out, &|done, total| {
-            progress.set_length(total as u64);
-            progress.set_position(done as u64);
-        });
+        let made =
+            Conversion { dataset: &dataset, to, shard_frames: self.shard_frames }.make(&self.out, &|done, total| {
+                progress.set_length(total as u64);
+                progress.set_position(done as u64);
+            });
         let manifest = made.with_context(|| format!("converting {}", self.dataset.display()))?;
         progress.finish_and_clear();
         outln!("{} frames, {} points, {} labels", manifest.frames, manifest.points, manifest.labels);

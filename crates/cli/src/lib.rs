@@ -7,7 +7,7 @@ pub mod console;
 pub mod device;
 pub mod signals;
 
-use clap::{CommandFactory as _, Parser};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser};
 use std::ffi::OsString;
 use std::process::ExitCode;
 
@@ -55,12 +55,30 @@ pub fn run() -> ExitCode {
     ExitCode::from(run_with(std::env::args_os().collect()))
 }
 
+/// Names the commit of the checkout that this program was built from, if there was one. [`run_with`] does so as well.
+pub fn set_commit() {
+    if let Some(commit) = option_env!("LIDARSHIFT_COMMIT").filter(|commit| !commit.is_empty()) {
+        data::set_commit(commit);
+    }
+}
+
+fn parse(arguments: &[OsString]) -> Result<Program, clap::Error> {
+    let mut command = command();
+    // The build may be named by a hash of the program, which takes time.
+    if arguments.get(1).is_some_and(|first| first == "--version" || first == "-V") {
+        command = command.version(data::build_id());
+    }
+    let matches = command.try_get_matches_from_mut(arguments)?;
+    Program::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
+}
+
 /// As [`run`] with these arguments, of which the first is the name of the program; returns the exit code. For programs
 /// in which this one is contained: it handles signals from then on, and it is called once.
 pub fn run_with(arguments: Vec<OsString>) -> u8 {
     commands::set_called(&arguments);
+    set_commit();
     signals::handle();
-    let code = match Program::try_parse_from(&arguments).map(|program| program.command.run()) {
+    let code = match parse(&arguments).map(|program| program.command.run()) {
         Ok(Ok(end)) => end.into(),
         Ok(Err(error)) => {
             errln!("error: {error:#}");

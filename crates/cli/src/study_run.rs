@@ -67,7 +67,7 @@ impl StudyRunArgs {
         let run = study.run(self.run.as_deref().unwrap_or_default())?;
         if let Some(part @ (PartArg::Measure | PartArg::MeasureOnly)) = self.parts.first() {
             let temporary = (*part == PartArg::MeasureOnly).then(TemporaryFolder::new).transpose()?;
-            let cache = temporary.as_ref().map_or(run.folder(&study.folder).join("cache"), |t| t.path().into());
+            let cache = temporary.as_ref().map_or_else(|| study.cache_folder(), |t| t.path().into());
             outln!("{}", serde_json::to_string(&measure(&study, &run, &cache, &self.device.open()?)?)?);
             return Ok(());
         }

@@ -68,6 +68,10 @@ pub struct TrainArgs {
     /// Resume although the labels or clouds of the data set have changed since the last checkpoint
     #[arg(long, requires = "resume")]
     allow_changed_data: bool,
+    /// Folder for the database of ground-truth sampling, which runs on the same frames may share [default: `cache` in
+    /// the run folder]
+    #[arg(long, value_name = "DIR")]
+    cache: Option<PathBuf>,
     /// Train and evaluate on all frames without augmentation, to check that the network can fit the data; without
     /// --epochs, the number of epochs is increased to what the network needs for this
     #[arg(long)]
@@ -111,6 +115,7 @@ impl TrainArgs {
             workers: self.workers,
             resume,
             allow_changed_data: self.allow_changed_data,
+            cache: self.cache.clone(),
             stop: signals::stop_flag(),
         };
         let mut progress = Progress::default();

@@ -13,7 +13,7 @@ fn a_data_set_goes_through_all_formats_and_comes_back() {
     data_set(dir.path());
     let source = Dataset::open(dir.path()).unwrap();
     let mut from = ".".to_owned();
-    for to in ["pcd", "open_pcdet", "carla", "kitti", "mcap"] {
+    for to in ["pcd", "open_pcdet", "shards", "carla", "kitti", "mcap"] {
         let output = must(dir.path(), &format!("convert {from} --to {to} --out as-{to}"));
         assert!(String::from_utf8(output.stdout).unwrap().starts_with("7 frames, "), "{to}");
         must(dir.path(), &format!("convert {from} --to {to} --out as-{to} --verify"));
@@ -40,6 +40,61 @@ fn a_data_set_goes_through_all_formats_and_comes_back() {
         assert!(text.contains(wanted) && !text.contains("panicked"), "{arguments}: no {wanted:?} in: {text}");
     }
     assert_eq!(run(dir.path(), "convert . --to rrd --out made").status.code(), Some(2));
+}
+
+/// The commands that read a data set read shards, and find in them what they find in single files.
+#[test]
+fn commands_read_shards_as_they_read_files() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    fs::write(dir.path().join("noise.toml"), "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n").unwrap();
+    must(dir.path(), "convert . --to shards --shard-frames 3 --out shards");
+    let names = ["shard-000000.tar", "shard-000001.tar", "shard-000002.tar", "index.jsonl"];
+    for name in names {
+        assert!(dir.path().join("shards/shards").join(name).is_file(), "{name}");
+    }
+    let same = |command: &str, files: &[&str]| {
+        for (from, to) in [(".", "of-files"), ("shards", "of-shards")] {
+            must(dir.path(), &command.replace("FROM", from).replace("TO", to));
+        }
+        for file in files {
+            let [a, b] = ["of-files", "of-shards"].map(|to| dir.path().join(file.replace("TO", to)));
+            assert!(fs::read(&a).unwrap() == fs::read(&b).unwrap(), "{command}: {file}");
+        }
+    };
+    let train = "train --dataset FROM --detector tiny.toml --epochs 2 --out TO/run";
+    same(train, &["TO/run/checkpoint/last.safetensors"]);
+    let detect = "detect FROM --split val --checkpoint of-files/run/checkpoint/last.safetensors --out TO/found";
+    same(detect, &["TO/found/000005.txt"]);
+    same("eval ap --dataset FROM --split val --detections of-files/found --json TO/ap.json", &["TO/ap.json"]);
+    same("eval targets FROM --split val --out TO/targets", &["TO/targets/tables/targets-aggregated.csv"]);
+    same(
+        "resim FROM --effects noise.toml --out TO/noisy",
+        &["TO/noisy/velodyne/000005.bin", "TO/noisy/label_2/000005.txt"],
+    );
+    let text = output_text(&must(dir.path(), "eval statistics . shards --split val"));
+    assert!(!text.contains("differ"), "{text}");
+    must(dir.path(), "doctor shards");
+    must(dir.path(), "diagnose --measured . --simulated shards --out diagnosis");
+    must(dir.path(), "convert shards --to kitti --out back");
+    assert!(
+        fs::read(dir.path().join("back/velodyne/000003.bin")).unwrap()
+            == fs::read(dir.path().join("velodyne/000003.bin")).unwrap()
+    );
+    // A byte of a shard, and a shard of an earlier conversion.
+    let shard = dir.path().join("shards/shards/shard-000001.tar");
+    let whole = fs::read(&shard).unwrap();
+    let mut bytes = whole.clone();
+    bytes[600] ^= 1;
+    fs::write(&shard, bytes).unwrap();
+    fs::copy(&shard, shard.with_file_name("shard-000007.tar")).unwrap();
+    let output = run(dir.path(), "convert . --to shards --shard-frames 3 --out shards --verify");
+    assert_eq!(output.status.code(), Some(1));
+    assert!(output_text(&output).contains("shards/shard-000001.tar"), "{}", output_text(&output));
+    must(dir.path(), "convert . --to shards --shard-frames 3 --out shards");
+    assert!(fs::read(&shard).unwrap() == whole && !shard.with_file_name("shard-000007.tar").exists());
+    let output = run(dir.path(), "convert . --to shards --shard-frames 4 --out shards");
+    assert!(output_text(&output).contains("in another format"), "{}", output_text(&output));
 }
 
 #[test]

@@ -11,6 +11,9 @@
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
+#[path = "../../twin/tests/room/mod.rs"]
+#[allow(dead_code, reason = "each test file uses a part of it")]
+mod room;
 
 use data::stream;
 use program::{data_set, output_text, program, small_study};
@@ -272,6 +275,7 @@ impl Case {
                 let mut known: Vec<&str> = path.iter().rev().take(2).filter_map(|part| part.to_str()).collect();
                 if self.failed_beside(path) {
                     known.extend(wanted.keys().map(String::as_str));
+                    known.extend(wanted.keys().filter_map(|name| name.split('/').next()));
                     known.extend(root.to_str());
                 }
                 if !text.contains("error: ") || !known.iter().any(|part| text.contains(part)) {
@@ -422,6 +426,21 @@ fn diagnose() {
         must(root, "diagnose --measured street --simulated street --out diagnosis");
     };
     Case { name: "diagnose", prepare, command, again: command, varying: &[] }.test(4, 2);
+}
+
+#[test]
+fn twin() {
+    let command = "twin drive --out twin --keep-poses";
+    let prepare = |root: &Path| room::write_recording(&root.join("drive"), 6, 1.0, 0.05);
+    Case { name: "twin", prepare, command, again: command, varying: &[] }.test(4, 2);
+}
+
+#[test]
+fn convert() {
+    let command = "convert . --to shards --shard-frames 3 --out made";
+    Case { name: "convert to shards", prepare: data_set, command, again: command, varying: &[] }.test(12, 3);
+    let command = "convert . --to mcap --out made";
+    Case { name: "convert to mcap", prepare: data_set, command, again: command, varying: &[] }.test(12, 3);
 }
 
 #[test]

@@ -94,6 +94,32 @@ fn training_data_that_changed_are_noticed() {
 }
 
 #[test]
+fn results_name_the_build() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    let printed = String::from_utf8(must(dir.path(), "--version").stdout).unwrap();
+    assert_eq!(printed, String::from_utf8(must(dir.path(), "-V").stdout).unwrap());
+    let build = printed.trim().strip_prefix("lidarshift ").unwrap();
+    let (version, built_from) = build.split_once('+').unwrap();
+    assert_eq!(version, env!("CARGO_PKG_VERSION"));
+    // A commit, or the hash of the program.
+    let digits = built_from.trim_start_matches("program-").trim_end_matches("-dirty");
+    assert!(digits.len() == 12 && digits.chars().all(|c| c.is_ascii_hexdigit()), "{built_from}");
+
+    let json = |name: &str| -> serde_json::Value {
+        serde_json::from_slice(&fs::read(dir.path().join(name)).unwrap()).unwrap()
+    };
+    must(dir.path(), "simulate --config street --frames 3 --out street");
+    assert_eq!(json("street/manifest.json")["builds"], serde_json::json!([build]));
+    must(dir.path(), "diagnose --measured street --simulated street --out diagnosis");
+    assert_eq!(json("diagnosis/diagnosis.json")["build"], build);
+    let page = fs::read_to_string(dir.path().join("diagnosis/report.html")).unwrap();
+    assert!(page.contains(&format!("(lidarshift {build})").replace('+', "&#43;")) || page.contains(build));
+    must(dir.path(), TRAIN);
+    assert_eq!(json("run/provenance.json")["sessions"][0]["version"], build);
+}
+
+#[test]
 fn a_damaged_checkpoint_is_replaced_by_the_one_before_it() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());

@@ -45,7 +45,8 @@ fn augmenting(c: &mut Criterion) {
         let mut sample = 0;
         b.iter(|| {
             sample += 1;
-            let out = augment(frame.clone(), &AugmentConfig::default(), None, &mut stream(1, "augment", 0, sample));
+            let out =
+                augment(frame.clone(), &AugmentConfig::default(), None, &mut stream(1, "augment", 0, sample)).unwrap();
             crop_to_range(out, &[0.0, -39.68, -3.0, 69.12, 39.68, 1.0])
         });
     });

@@ -15,7 +15,7 @@ pub use object_noise::{ObjectNoiseConfig, noise_objects};
 pub use points::{crop_to_range, shuffle_points};
 pub use world::{flip, rotate, scale, translate};
 
-use crate::{Frame, GtDatabase, Stream};
+use crate::{DataError, Frame, GtDatabase, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::FRAC_PI_4;
@@ -95,9 +95,17 @@ impl AugmentConfig {
 
 /// Applies all steps of `config`. Ground-truth sampling is skipped if there is no database. The resulting yaws are in
 /// [-pi, pi).
-pub fn augment(mut frame: Frame, config: &AugmentConfig, database: Option<&GtDatabase>, stream: &mut Stream) -> Frame {
+///
+/// # Errors
+/// A database whose file cannot be read; none without a database.
+pub fn augment(
+    mut frame: Frame,
+    config: &AugmentConfig,
+    database: Option<&GtDatabase>,
+    stream: &mut Stream,
+) -> Result<Frame, DataError> {
     if let Some(database) = database.filter(|_| config.gt_sampling.enabled) {
-        frame = sample_gt(frame, &config.gt_sampling, database, stream);
+        frame = sample_gt(frame, &config.gt_sampling, database, stream)?;
     }
     frame = noise_objects(frame, &config.object_noise, stream);
     frame = flip(frame, config.flip_along_x_probability, config.flip_along_y_probability, stream);
@@ -110,7 +118,7 @@ pub fn augment(mut frame: Frame, config: &AugmentConfig, database: Option<&GtDat
     for object in &mut frame.objects {
         object.bbox = object.bbox.with_wrapped_yaw();
     }
-    frame
+    Ok(frame)
 }
 
 #[cfg(test)]
@@ -173,7 +181,7 @@ mod tests {
                 rotate(frame.clone(), [turn, turn], &mut rng),
                 scale(frame.clone(), [size, size], &mut rng),
                 translate(frame.clone(), [shift; 3], &mut rng),
-                augment(frame.clone(), &AugmentConfig { shuffle_points: false, ..AugmentConfig::default() }, None, &mut rng),
+                augment(frame.clone(), &AugmentConfig { shuffle_points: false, ..AugmentConfig::default() }, None, &mut rng).unwrap(),
             ] {
                 prop_assert_eq!(&members(&changed), &before);
                 prop_assert!(changed.objects.iter().all(|o| o.bbox.size.iter().all(|s| *s > 0.0)));
@@ -184,13 +192,13 @@ mod tests {
     #[test]
     fn none_changes_nothing_and_equal_streams_give_equal_results() {
         let frame = scene(3, 4);
-        assert_eq!(augment(frame.clone(), &AugmentConfig::none(), None, &mut stream(1, "a", 0, 0)), frame);
+        assert_eq!(augment(frame.clone(), &AugmentConfig::none(), None, &mut stream(1, "a", 0, 0)).unwrap(), frame);
         let noisy = AugmentConfig {
             object_noise: ObjectNoiseConfig { translation_std_m: [0.5; 3], rotation_rad: [-0.5, 0.5], tries: 20 },
             translation_std_m: [0.2; 3],
             ..AugmentConfig::default()
         };
-        let run = |seed| augment(frame.clone(), &noisy, None, &mut stream(seed, "a", 0, 0));
+        let run = |seed| augment(frame.clone(), &noisy, None, &mut stream(seed, "a", 0, 0)).unwrap();
         assert_eq!(run(1), run(1));
         assert_ne!(run(1), run(2));
         assert!(noisy.check().is_ok() && AugmentConfig { scaling: [0.0, 1.0], ..noisy }.check().is_err());

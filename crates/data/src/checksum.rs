@@ -1,9 +1,7 @@
 //! SHA-256 of files.
 
-use crate::DataError;
 use crate::Presence as _;
-use crate::limits::length_of_file;
-use fs_err::File;
+use crate::{DataError, FilePart};
 use sha2::{Digest, Sha256};
 use std::io::Read as _;
 use std::path::Path;
@@ -19,21 +17,21 @@ pub fn hex(digest: &[u8]) -> String {
 /// A file that cannot be read, or is no regular file.
 pub fn file_sha256(path: &Path) -> Result<String, DataError> {
     let mut hash = Sha256::new();
-    add_file(&mut hash, path)?;
+    add(&mut hash, &path.into())?;
     Ok(hex(&hash.finalize()))
 }
 
-/// SHA-256 over several files, in hexadecimal. A file that does not exist counts as such.
+/// SHA-256 over several files or parts of files, in hexadecimal. A file that does not exist counts as such.
 ///
 /// # Errors
 /// As [`file_sha256`].
-pub fn files_sha256<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Result<String, DataError> {
+pub fn files_sha256<P: Into<FilePart>>(parts: impl IntoIterator<Item = P>) -> Result<String, DataError> {
     let mut hash = Sha256::new();
-    for path in paths {
-        let path = path.as_ref();
-        if path.may_exist() {
-            hash.update(length_of_file(path, u64::MAX)?.to_le_bytes());
-            add_file(&mut hash, path)?;
+    for part in parts {
+        let part = part.into();
+        if part.path.may_exist() {
+            hash.update(part.length()?.to_le_bytes());
+            add(&mut hash, &part)?;
         } else {
             hash.update(u64::MAX.to_le_bytes());
         }
@@ -41,9 +39,8 @@ pub fn files_sha256<P: AsRef<Path>>(paths: impl IntoIterator<Item = P>) -> Resul
     Ok(hex(&hash.finalize()))
 }
 
-fn add_file(hash: &mut Sha256, path: &Path) -> Result<(), DataError> {
-    length_of_file(path, u64::MAX)?;
-    let mut file = File::open(path)?;
+fn add(hash: &mut Sha256, part: &FilePart) -> Result<(), DataError> {
+    let mut file = part.open()?;
     let mut piece = vec![0; 1 << 18];
     loop {
         match file.read(&mut piece) {

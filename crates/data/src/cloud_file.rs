@@ -37,17 +37,21 @@ pub const FARTHEST_M: f32 = 10_000.0;
 /// scan of nuScenes, which has five values a point.
 pub fn read_cloud(path: &Path, columns: PointColumns) -> Result<Cloud, DataError> {
     let ending = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-    match ending.as_deref() {
-        Some("bin") => {
-            let most = (MOST_POINTS * columns.channels() * size_of::<f32>()) as u64;
-            parse_bin(&read_file(path, most)?, path, columns)
-        }
-        Some("pcd") => {
-            let cloud = parse_pcd(&read_file(path, MOST_CLOUD_BYTES)?, path)?;
-            Ok(if cloud.channels > columns.channels() { cloud.with_channels(columns.channels()) } else { cloud })
-        }
-        _ => Err(DataError::file(path, "not a point cloud: its name must end in .bin or .pcd")),
+    let most = match ending.as_deref() {
+        Some("bin") => (MOST_POINTS * columns.channels() * size_of::<f32>()) as u64,
+        Some("pcd") => MOST_CLOUD_BYTES,
+        _ => return Err(DataError::file(path, "not a point cloud: its name must end in .bin or .pcd")),
+    };
+    parse_cloud(&read_file(path, most)?, path, columns)
+}
+
+/// Parses the bytes of a `.pcd`, if the name of `path` ends so, or of a `.bin`.
+pub(crate) fn parse_cloud(bytes: &[u8], path: &Path, columns: PointColumns) -> Result<Cloud, DataError> {
+    if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("pcd")) {
+        let cloud = parse_pcd(bytes, path)?;
+        return Ok(if cloud.channels > columns.channels() { cloud.with_channels(columns.channels()) } else { cloud });
     }
+    parse_bin(bytes, path, columns)
 }
 
 /// Parses a `.bin`. `path` is used in error messages.

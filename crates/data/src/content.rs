@@ -1,12 +1,10 @@
 //! A fingerprint of the content of frames, affordable for large data sets.
 
 use crate::checksum::{files_sha256, hex};
-use crate::{DataError, Dataset};
-use fs_err::File;
+use crate::{DataError, Dataset, FilePart};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
-use std::io::{Read as _, Seek as _, SeekFrom};
-use std::path::Path;
+use std::io::Read as _;
 
 /// Pieces of a cloud that are read.
 const PIECES: u64 = 16;
@@ -24,18 +22,18 @@ impl Dataset {
     pub fn content_sha256(&self, ids: &[String]) -> Result<String, DataError> {
         // Layouts with one table of labels for all frames: it is read once.
         let shared = match ids {
-            [first, .., last] if self.has_labels() && self.labels_path(first) == self.labels_path(last) => {
-                Some(files_sha256([self.labels_path(first)])?)
+            [first, .., last] if self.has_labels() && self.labels_part(first)? == self.labels_part(last)? => {
+                Some(files_sha256([self.labels_part(first)?])?)
             }
             _ => None,
         };
         let of_frame = |id: &String| {
             if let Some(labels) = &shared {
-                return Ok([cloud_sha256(&self.cloud_path(id))?, labels.clone()]);
+                return Ok([cloud_sha256(&self.cloud_part(id)?)?, labels.clone()]);
             }
-            let labels = self.has_labels().then(|| self.labels_path(id));
-            let beside = labels.into_iter().chain(self.calibration_path(id));
-            Ok([cloud_sha256(&self.cloud_path(id))?, files_sha256(beside)?])
+            let labels = self.has_labels().then(|| self.labels_part(id)).transpose()?;
+            let beside = labels.into_iter().chain(self.calibration_path(id).map(FilePart::from));
+            Ok([cloud_sha256(&self.cloud_part(id)?)?, files_sha256(beside)?])
         };
         let frames: Vec<Result<[String; 2], DataError>> = ids.par_iter().map(of_frame).collect();
         let mut hash = Sha256::new();
@@ -47,10 +45,10 @@ impl Dataset {
     }
 }
 
-/// Hash of the size and of pieces of a file.
-fn cloud_sha256(path: &Path) -> Result<String, DataError> {
-    let length = crate::limits::length_of_file(path, u64::MAX)?;
-    let mut file = File::open(path)?;
+/// Hash of the size and of pieces of a cloud.
+fn cloud_sha256(part: &FilePart) -> Result<String, DataError> {
+    let mut file = part.open()?;
+    let length = file.length();
     let mut hash = Sha256::new();
     hash.update(length.to_le_bytes());
     let mut piece = Vec::new();
@@ -61,7 +59,7 @@ fn cloud_sha256(path: &Path) -> Result<String, DataError> {
     }
     for i in 0..PIECES {
         let at = (length - PIECE_BYTES) as u128 * u128::from(i) / u128::from(PIECES - 1);
-        file.seek(SeekFrom::Start(at as u64))?;
+        file.seek(at as u64)?;
         piece.clear();
         file.by_ref().take(PIECE_BYTES).read_to_end(&mut piece)?;
         hash.update(&piece);

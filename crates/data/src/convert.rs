@@ -2,8 +2,10 @@
 
 mod cdr;
 mod mcap_file;
+mod shards;
 
 use crate::checksum::hex;
+use crate::layout::shards::FOLDER;
 use crate::limits::{MOST_TEXT_BYTES, read_file};
 use crate::write::write_kitti_text;
 use crate::{Cloud, DataError, Dataset, DatasetConfig, LabelBox, LabelFrame, Layout, NewDataset};
@@ -32,6 +34,8 @@ pub enum Format {
     Carla,
     /// One MCAP file of ROS 2: clouds, poses and boxes.
     Mcap,
+    /// Tar files of many frames each: `shards/*.tar`.
+    Shards,
 }
 
 impl Format {
@@ -43,6 +47,7 @@ impl Format {
             Format::OpenPcdet => Layout::OpenPcdet,
             Format::Carla => Layout::Carla,
             Format::Mcap => Layout::Mcap,
+            Format::Shards => Layout::Shards,
         }
     }
 }
@@ -70,6 +75,9 @@ pub struct ConvertManifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame and of what the frame was made from.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 crate::manifest!(ConvertManifest, "from another data set, in another format or by another version");
@@ -99,7 +107,12 @@ pub struct Conversion<'a> {
     pub dataset: &'a Dataset,
     /// The format.
     pub to: Format,
+    /// Frames of a shard, for that format. At least one.
+    pub shard_frames: usize,
 }
+
+/// Usual number of frames of a shard.
+pub const SHARD_FRAMES: usize = 500;
 
 impl Conversion<'_> {
     /// Writes all frames of the data set to the folder `out`.
@@ -125,10 +138,17 @@ impl Conversion<'_> {
             points: 0,
             labels: 0,
             frames_sha256: String::new(),
+            builds: Vec::new(),
         };
-        let new = NewDataset::begin(out, self.to.layout(), &["calib", MCAP_LABELS, ""], &mut manifest)?;
+        // What cannot be read is found before anything is written.
+        for name in source.splits.keys() {
+            self.dataset.ids(name)?;
+        }
+        let new = NewDataset::begin(out, self.to.layout(), &["calib", MCAP_LABELS, FOLDER, ""], &mut manifest)?;
         let written = if self.to == Format::Mcap {
             mcap_file::write(self, &new, progress, &mut manifest)?
+        } else if self.to == Format::Shards {
+            shards::write(self, &new, &ids, progress, &mut manifest)?
         } else {
             let counts = new.make_frames(&ids, progress, |_, id| self.write_frame(&new, id))?;
             for [points, labels] in counts {
@@ -224,7 +244,11 @@ impl Conversion<'_> {
     fn fingerprint(&self) -> String {
         let source = DatasetConfig { root: PathBuf::new(), rig: None, ..self.dataset.config.clone() };
         let text = serde_json::to_string(&(env!("CARGO_PKG_VERSION"), self.to, source));
-        hex(&Sha256::digest(text.expect("a configuration is plain data")))
+        let mut text = text.expect("a configuration is plain data");
+        if self.to == Format::Shards {
+            text += &format!(" {} frames a shard", self.shard_frames);
+        }
+        hex(&Sha256::digest(text))
     }
 }
 

@@ -5,7 +5,8 @@ use crate::dataset_config::DatasetConfig;
 use crate::kitti_text::{KittiText, read_kitti_text};
 use crate::layout::{Moment, PointDetails, Sequence};
 use crate::limits::{MOST_IDS, at_most, check_name, read_text};
-use crate::{Calibration, Cloud, DataError, Detection, Frame, LabelBox, LabelFrame, Object, PointColumns};
+use crate::{Calibration, Cloud, DataError, Detection, FilePart, Frame, LabelBox, LabelFrame, Object, PointColumns};
+use rayon::prelude::*;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -44,15 +45,13 @@ impl Dataset {
     pub fn ids(&self, split: &str) -> Result<Vec<String>, DataError> {
         let path = self.split_path(split)?;
         let text = read_text(&path)?;
-        let mut ids = Vec::new();
-        for (line, id) in parse_split(&text, &path)? {
-            if !self.config.layout.has_cloud(&self.config.root, id) {
-                let message = format!("frame {id} has no cloud: {} does not exist", self.cloud_path(id).display());
-                return Err(DataError::line(&path, line, message));
-            }
-            ids.push(id.to_string());
+        let (lines, ids): (Vec<usize>, Vec<&str>) = parse_split(&text, &path)?.into_iter().unzip();
+        if let Some(missing) = self.config.layout.first_without_cloud(&self.config.root, &ids) {
+            let id = ids[missing];
+            let message = format!("frame {id} has no cloud: {} does not exist", self.cloud_path(id).display());
+            return Err(DataError::line(&path, lines[missing], message));
         }
-        Ok(ids)
+        Ok(ids.into_iter().map(String::from).collect())
     }
 
     /// Path of the list of frames of a split. An error if the split is not known.
@@ -87,6 +86,25 @@ impl Dataset {
         match &self.config.labels {
             Some(folder) => text_path(&self.config.root.join(folder), id),
             None => self.config.layout.labels_path(&self.config.root, id),
+        }
+    }
+
+    /// Where the bytes of a frame's cloud are.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    pub fn cloud_part(&self, id: &str) -> Result<FilePart, DataError> {
+        self.config.layout.cloud_part(&self.config.root, id)
+    }
+
+    /// Where the bytes of a frame's labels are, which need not exist.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    pub fn labels_part(&self, id: &str) -> Result<FilePart, DataError> {
+        match &self.config.labels {
+            Some(_) => Ok(self.labels_path(id).into()),
+            None => self.config.layout.labels_part(&self.config.root, id),
         }
     }
 
@@ -250,12 +268,15 @@ impl Dataset {
         if self.config.label_frame == LabelFrame::Camera || !self.has_labels() {
             return Ok(kitti);
         }
-        let mut found = BTreeSet::new();
-        for id in self.all_ids()? {
+        let of_frame = |mut found: BTreeSet<String>, id: &String| {
             // Missing and invalid label files are reported when their frame is loaded.
-            let lines = self.labels(&id).unwrap_or_default();
-            found.extend(lines.into_iter().filter(|line| !line.is_dont_care()).map(|line| line.class));
-        }
+            let lines = self.labels(id).unwrap_or_default();
+            let classes = lines.into_iter().filter(|line| !line.is_dont_care()).map(|line| line.class);
+            found.extend(classes);
+            found
+        };
+        let all = |a: BTreeSet<String>, b: BTreeSet<String>| a.into_iter().chain(b).collect();
+        let found = self.all_ids()?.par_iter().fold(BTreeSet::new, of_frame).reduce(BTreeSet::new, all);
         Ok(if found.is_empty() { kitti } else { found.into_iter().collect() })
     }
 }
@@ -423,6 +444,25 @@ mod tests {
             std::fs::write(folder.path().join("ImageSets/train.txt"), text).unwrap();
             let error = dataset.ids("train").unwrap_err().to_string();
             assert!(error.contains(want), "{error}, not {want}");
+        }
+        // Many frames, whose folder is read once: a link to a cloud is one, a folder and what is absent are none.
+        let ids: Vec<String> = (0..100).map(|i| format!("{i:06}")).collect();
+        for id in &ids[2..] {
+            std::fs::copy(folder.path().join("velodyne/000000.bin"), dataset.cloud_path(id)).unwrap();
+        }
+        write_split(&folder.path().join("ImageSets/train.txt"), &ids).unwrap();
+        assert_eq!(dataset.ids("train").unwrap(), ids);
+        #[cfg(unix)]
+        {
+            std::fs::remove_file(dataset.cloud_path("000050")).unwrap();
+            std::os::unix::fs::symlink("000000.bin", dataset.cloud_path("000050")).unwrap();
+            assert_eq!(dataset.ids("train").unwrap(), ids);
+        }
+        for (absent, line) in [("000090", 91), ("000070", 71)] {
+            std::fs::remove_file(dataset.cloud_path(absent)).unwrap();
+            std::fs::create_dir(folder.path().join(format!("velodyne/{absent}.bin"))).unwrap();
+            let error = dataset.ids("train").unwrap_err().to_string();
+            assert!(error.contains(&format!("train.txt:{line}: frame {absent} has no cloud")), "{error}");
         }
         let error = dataset.ids("val").unwrap_err().to_string();
         assert!(error.contains("no split \"val\" (it has: train)"), "{error}");

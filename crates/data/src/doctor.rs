@@ -14,7 +14,7 @@ use crate::{DataError, Dataset};
 use rayon::prelude::*;
 use report::{Findings, at_most};
 use serde::Serialize;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, HashSet};
 use survey::{FrameFacts, survey};
 
 /// What a detector expects of its data.
@@ -83,7 +83,7 @@ fn splits(dataset: &Dataset, all: &[String], findings: &mut Findings) -> BTreeMa
     for name in dataset.config.splits.keys() {
         match dataset.ids(name) {
             Ok(ids) => {
-                let mut seen = BTreeSet::new();
+                let mut seen = HashSet::new();
                 let twice: Vec<_> = ids.iter().filter(|id| !seen.insert(*id)).cloned().collect();
                 if !twice.is_empty() {
                     let message = format!(
@@ -105,7 +105,7 @@ fn splits(dataset: &Dataset, all: &[String], findings: &mut Findings) -> BTreeMa
             [],
         );
     } else {
-        let listed: BTreeSet<_> = splits.values().flatten().collect();
+        let listed: HashSet<_> = splits.values().flatten().collect();
         let unlisted: Vec<_> = all.iter().filter(|id| !listed.contains(id)).cloned().collect();
         if !unlisted.is_empty() {
             let message = format!("{} of {} frames are in no split", unlisted.len(), all.len());

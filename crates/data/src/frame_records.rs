@@ -1,15 +1,16 @@
-//! `frames.jsonl` of a generated data set: of each frame the SHA-256 of its files and of what it was made from.
+//! `frames.jsonl` of a generated data set: of each frame the SHA-256 of its files and of what it was made from, and the
+//! build of the program that wrote it.
 //!
 //! A line is appended when a frame is written, so that an interrupted run knows which frames are whole. A line that
 //! cannot be read is ignored: its frame is made again. At the end the file is sorted.
 
 use crate::Presence as _;
 use crate::checksum::file_sha256;
-use crate::{DataError, write_atomic};
+use crate::{DataError, build_id, write_atomic};
 use fs_err::{File, OpenOptions};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -25,8 +26,19 @@ struct FrameRecord {
     /// SHA-256 of what the frame was made from, if it was made from files.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     source: Option<String>,
+    /// [`build_id`] of the program that wrote it. Earlier versions have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    build: Option<String>,
     /// SHA-256 of each file by its path below the root.
     files: BTreeMap<String, String>,
+}
+
+/// What [`FrameRecords::finish`] tells of the frames.
+pub(crate) struct Finished {
+    /// SHA-256 of the file.
+    pub(crate) sha256: String,
+    /// The builds that wrote the frames, sorted.
+    pub(crate) builds: Vec<String>,
 }
 
 /// The records of a data set that is being written.
@@ -49,6 +61,16 @@ impl FrameRecords {
         Ok(FrameRecords { root: root.into(), known: Mutex::new(records.collect()), journal: Mutex::new(journal) })
     }
 
+    /// Whether a folder has the file, without any record. Earlier versions wrote frames without it.
+    pub(crate) fn is_empty(root: &Path) -> bool {
+        fs_err::read(root.join(FRAMES_FILE)).is_ok_and(|text| records_of(&text).next().is_none())
+    }
+
+    /// Whether an earlier run recorded a frame.
+    pub(crate) fn has(&self, id: &str) -> bool {
+        self.known.lock().expect("no thread panics with the records").contains_key(id)
+    }
+
     /// Whether a frame was made from `source` and consists of these files, unchanged.
     pub(crate) fn is_whole(&self, id: &str, source: Option<&str>, files: &[PathBuf]) -> bool {
         let known = self.known.lock().expect("no thread panics with the records").get(id).cloned();
@@ -60,21 +82,23 @@ impl FrameRecords {
     /// Records a frame that was written.
     pub(crate) fn add(&self, id: &str, source: Option<&str>, files: &[PathBuf]) -> Result<(), DataError> {
         let files = sha256_of(&self.root, files)?;
-        let record = FrameRecord { id: id.into(), source: source.map(String::from), files };
+        let record =
+            FrameRecord { id: id.into(), source: source.map(String::from), build: Some(build_id().into()), files };
         self.journal.lock().expect("no thread panics with the journal").write_all(line_of(&record).as_bytes())?;
         self.known.lock().expect("no thread panics with the records").insert(id.into(), record);
         Ok(())
     }
 
-    /// Writes the records of the frames `ids`, sorted; returns the SHA-256 of the file.
-    pub(crate) fn finish(&self, ids: &[String]) -> Result<String, DataError> {
+    /// Writes the records of the frames `ids`, sorted.
+    pub(crate) fn finish(&self, ids: &[String]) -> Result<Finished, DataError> {
         let mut known = self.known.lock().expect("no thread panics with the records");
-        let wanted: std::collections::BTreeSet<&String> = ids.iter().collect();
+        let wanted: BTreeSet<&String> = ids.iter().collect();
         known.retain(|id, _| wanted.contains(id));
         let text: String = known.values().map(line_of).collect();
         let path = self.root.join(FRAMES_FILE);
         write_atomic(&path, text.as_bytes())?;
-        file_sha256(&path)
+        let builds: BTreeSet<&String> = known.values().filter_map(|record| record.build.as_ref()).collect();
+        Ok(Finished { sha256: file_sha256(&path)?, builds: builds.into_iter().cloned().collect() })
     }
 }
 

@@ -14,8 +14,9 @@ pub use stamps::StampUnit;
 
 use crate::Presence as _;
 use crate::write::label_boxes;
-use crate::{Calibration, Cloud, DataError, DatasetConfig, Frame, LabelBox, LabelFrame, PointColumns};
+use crate::{Calibration, Cloud, DataError, DatasetConfig, FilePart, Frame, LabelBox, LabelFrame, PointColumns};
 use geometry::{Box3, Pose};
+use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Deref;
@@ -27,7 +28,7 @@ use std::path::{Path, PathBuf};
 /// case. The documentation is shown in the reference of the configuration.
 macro_rules! layouts {
     ($($name:ident = $module:ident: $doc:tt;)+) => {
-        $(mod $module;)+
+        $(pub(crate) mod $module;)+
 
         /// Folders and files below the root of a data set.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -66,6 +67,7 @@ layouts! {
     Carla = carla: "`*.ply` that CARLA's LiDARs wrote, y negated, and `label/*.txt` in the LiDAR frame.";
     Mcap = mcap_file: "Clouds of a topic of an MCAP file (ROS 2): `root = \"drive.mcap#/topic\"`; read only.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
+    Shards = shards: "Frames in `shards/*.tar`, as `convert --to shards` writes them: members `ID.bin` or `ID.pcd`, `ID.txt`.";
 }
 
 // The table has no mark for the default.
@@ -103,9 +105,30 @@ pub trait DataLayout: Send + Sync {
     /// Path of the labels of a frame, which need not exist.
     fn labels_path(&self, root: &Path, id: &str) -> PathBuf;
 
+    /// Where the bytes of the cloud of a frame are. Layouts with several frames in a file override this.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    fn cloud_part(&self, root: &Path, id: &str) -> Result<FilePart, DataError> {
+        Ok(self.cloud_path(root, id).into())
+    }
+
+    /// As [`Self::cloud_part`], of the labels, which need not exist.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    fn labels_part(&self, root: &Path, id: &str) -> Result<FilePart, DataError> {
+        Ok(self.labels_path(root, id).into())
+    }
+
     /// Whether the frame has a cloud.
     fn has_cloud(&self, root: &Path, id: &str) -> bool {
         self.cloud_path(root, id).may_be_file()
+    }
+
+    /// Index of the first of `ids` that has no cloud. The file system is asked in parallel.
+    fn first_without_cloud(&self, root: &Path, ids: &[&str]) -> Option<usize> {
+        ids.par_iter().position_first(|id| !self.has_cloud(root, id))
     }
 
     /// Whether the data set has labels. Without labels its frames have no objects.

@@ -4,6 +4,7 @@
 //! +x, rad. The centre of a box is its geometric centre.
 
 pub mod augment;
+mod build;
 mod calibration;
 pub mod checksum;
 mod cloud_file;
@@ -13,6 +14,7 @@ mod dataset;
 mod dataset_config;
 pub mod doctor;
 mod error;
+mod file_part;
 mod folder_lock;
 mod frame;
 mod frame_records;
@@ -36,11 +38,13 @@ pub mod toml_text;
 pub mod write;
 
 pub use augment::{AugmentConfig, augment};
+pub use build::{build_id, program_sha256, set_commit, set_program_file};
 pub use calibration::Calibration;
 pub use cloud_file::{FARTHEST_M, PointColumns, parse_bin, read_cloud};
 pub use dataset::{Dataset, parse_split};
 pub use dataset_config::DatasetConfig;
 pub use error::DataError;
+pub use file_part::FilePart;
 pub use folder_lock::{FolderLock, is_unused};
 pub use frame::{Cloud, Detection, Frame, Object};
 pub use frame_records::{FRAMES_FILE, verify_frames};
@@ -55,7 +59,7 @@ pub use output_guard::refuse_input_file;
 pub use pcd::{encode_pcd, parse_pcd};
 pub use pcd_columns::{PcdColumn, encode_pcd_columns, parse_pcd_columns, write_pcd_columns};
 pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
-pub use prefetch::{Prefetch, prefetch};
+pub use prefetch::{Prefetch, prefetch, prefetch_numbered};
 pub use presence::Presence;
 pub use stream::{Stream, stream};
 pub use toml_text::KeyError;

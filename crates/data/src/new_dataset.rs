@@ -23,12 +23,13 @@ pub trait Manifest: Serialize + DeserializeOwned {
     /// Sets whether all frames are written.
     fn set_complete(&mut self, complete: bool);
 
-    /// Sets the SHA-256 of `frames.jsonl`, which has those of all frames.
-    fn set_frames_sha256(&mut self, sha256: String);
+    /// Sets the SHA-256 of `frames.jsonl`, which has those of all frames, and the builds of the program that wrote the
+    /// frames.
+    fn set_frames(&mut self, sha256: String, builds: Vec<String>);
 }
 
-/// Makes a struct with the fields `schema`, `config_sha256`, `complete` and `frames_sha256` a [`Manifest`]; the second
-/// argument is [`Manifest::DIFFERENCE`].
+/// Makes a struct with the fields `schema`, `config_sha256`, `complete`, `frames_sha256` and `builds` a [`Manifest`];
+/// the second argument is [`Manifest::DIFFERENCE`].
 #[macro_export]
 macro_rules! manifest {
     ($name:ident, $difference:literal) => {
@@ -43,8 +44,8 @@ macro_rules! manifest {
                 self.complete = complete;
             }
 
-            fn set_frames_sha256(&mut self, sha256: String) {
-                self.frames_sha256 = sha256;
+            fn set_frames(&mut self, sha256: String, builds: Vec<String>) {
+                (self.frames_sha256, self.builds) = (sha256, builds);
             }
         }
     };
@@ -72,7 +73,8 @@ impl<'a> NewDataset<'a> {
         manifest: &mut M,
     ) -> Result<Self, DataError> {
         let lock = FolderLock::acquire(root)?;
-        check_folder(root, manifest)?;
+        let of_frames = layout.folders().iter().chain(extra_folders).filter(|inside| !inside.is_empty());
+        check_folder(root, manifest, &of_frames.map(|inside| root.join(inside)).collect::<Vec<_>>())?;
         for inside in ["ImageSets"].iter().chain(layout.folders()).chain(extra_folders) {
             remove_unfinished(&root.join(inside))?;
         }
@@ -83,7 +85,8 @@ impl<'a> NewDataset<'a> {
 
     /// Writes the records of the frames `ids`, marks the data set as complete and writes the manifest.
     pub fn finish<M: Manifest>(&self, manifest: &mut M, ids: &[String]) -> Result<(), DataError> {
-        manifest.set_frames_sha256(self.records.finish(ids)?);
+        let finished = self.records.finish(ids)?;
+        manifest.set_frames(finished.sha256, finished.builds);
         manifest.set_complete(true);
         write_json(&manifest_path(self.root), manifest)
     }
@@ -149,6 +152,28 @@ impl<'a> NewDataset<'a> {
         Ok(())
     }
 
+    /// As [`Self::frame`], for a file with several frames whose record has the name `name`. `read` reads what the
+    /// frames are made from, and `write` does so and writes the file. Both return the SHA-256 of what they read, and
+    /// counts of it.
+    pub fn file_of_frames<T, E: From<DataError>>(
+        &self,
+        name: &str,
+        file: &Path,
+        read: impl FnOnce() -> Result<(String, T), E>,
+        write: impl FnOnce() -> Result<(String, T), E>,
+    ) -> Result<T, E> {
+        let files = [file.to_path_buf()];
+        if self.records.has(name) && file.may_be_file() {
+            let (source, counts) = read()?;
+            if self.records.is_whole(name, Some(&source), &files) {
+                return Ok(counts);
+            }
+        }
+        let (source, counts) = write()?;
+        self.records.add(name, Some(&source), &files)?;
+        Ok(counts)
+    }
+
     /// Number of points and of labels of a written frame.
     pub fn count(&self, id: &str, columns: PointColumns) -> Result<[usize; 2], DataError> {
         let points = self.layout.count_points(self.root, id, columns)?;
@@ -160,12 +185,15 @@ fn manifest_path(root: &Path) -> PathBuf {
     root.join("manifest.json")
 }
 
-fn check_folder<M: Manifest>(root: &Path, wanted: &M) -> Result<(), DataError> {
+/// An error if the folder has another data set. A manifest without any frame is that of a process that failed before
+/// it wrote one, perhaps because it could not read all of its source. `of_frames` are the folders of frames.
+fn check_folder<M: Manifest>(root: &Path, wanted: &M, of_frames: &[PathBuf]) -> Result<(), DataError> {
     let path = manifest_path(root);
     if path.may_be_file() {
         let text = read_text(&path)?;
         let found: M = serde_json::from_str(&text).map_err(|e| DataError::line(&path, e.line(), e.to_string()))?;
-        if found.identity() != wanted.identity() {
+        let is_begun = || !FrameRecords::is_empty(root) || of_frames.iter().any(|folder| has_files(folder));
+        if found.identity() != wanted.identity() && is_begun() {
             let message = format!("was made {}; choose another folder, or remove this one", M::DIFFERENCE);
             return Err(DataError::file(root, message));
         }
@@ -173,6 +201,11 @@ fn check_folder<M: Manifest>(root: &Path, wanted: &M) -> Result<(), DataError> {
         return Err(DataError::file(root, "is not empty and has no manifest.json; choose another folder"));
     }
     Ok(())
+}
+
+/// Whether a folder holds anything; false if it does not exist.
+fn has_files(folder: &Path) -> bool {
+    folder.may_be_folder() && fs_err::read_dir(folder).map_or(true, |mut entries| entries.next().is_some())
 }
 
 #[cfg(test)]
@@ -186,6 +219,7 @@ mod tests {
         complete: bool,
         sha: String,
         frames_sha256: String,
+        builds: Vec<String>,
     }
 
     impl Manifest for Made {
@@ -199,8 +233,8 @@ mod tests {
             self.complete = complete;
         }
 
-        fn set_frames_sha256(&mut self, sha256: String) {
-            self.frames_sha256 = sha256;
+        fn set_frames(&mut self, sha256: String, builds: Vec<String>) {
+            (self.frames_sha256, self.builds) = (sha256, builds);
         }
     }
 
@@ -210,7 +244,7 @@ mod tests {
 
     /// Returns the number of frames that were made.
     fn make_from(root: &Path, sha: &str, source: &str) -> Result<usize, DataError> {
-        let mut manifest = Made { complete: true, sha: sha.into(), frames_sha256: String::new() };
+        let mut manifest = Made { complete: true, sha: sha.into(), frames_sha256: String::new(), builds: vec![] };
         let set = NewDataset::begin(root, Layout::Kitti, &[], &mut manifest)?;
         let ids = ["a", "b"].map(String::from);
         set.describe(DatasetConfig { name: "made".into(), ..DatasetConfig::default() }, [("train", ids.to_vec())])?;
@@ -244,6 +278,17 @@ mod tests {
         assert_eq!(make(&root, "1").unwrap(), 0);
         std::fs::remove_file(root.join("manifest.json")).unwrap();
         assert!(make(&root, "1").unwrap_err().to_string().contains("is not empty"));
+        // A process that failed before its first frame.
+        let failed = folder.path().join("failed");
+        let mut manifest = Made { complete: true, sha: "2".into(), frames_sha256: String::new(), builds: vec![] };
+        drop(NewDataset::begin(&failed, Layout::Kitti, &[], &mut manifest).unwrap());
+        assert_eq!(make(&failed, "1").unwrap(), 2);
+        assert!(NewDataset::begin(&failed, Layout::Kitti, &[], &mut manifest).is_err());
+        let failed = folder.path().join("begun");
+        drop(NewDataset::begin(&failed, Layout::Kitti, &[], &mut manifest).unwrap());
+        std::fs::create_dir(failed.join("velodyne")).unwrap();
+        std::fs::write(failed.join("velodyne/z.bin"), "a frame without its record").unwrap();
+        assert!(make(&failed, "1").unwrap_err().to_string().contains("was made with another recipe"));
         // A process that was killed before its first manifest.
         let killed = folder.path().join("killed");
         std::fs::create_dir(&killed).unwrap();
@@ -254,6 +299,24 @@ mod tests {
         let lock = FolderLock::acquire(&root).unwrap();
         assert!(make(&root, "1").unwrap_err().to_string().contains("in use by another process"));
         drop(lock);
+    }
+
+    #[test]
+    fn manifests_name_the_builds_of_their_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path().join("set");
+        let builds = || {
+            make(&root, "1").unwrap();
+            let text = std::fs::read(root.join("manifest.json")).unwrap();
+            serde_json::from_slice::<Made>(&text).unwrap().builds
+        };
+        assert_eq!(builds(), [crate::build_id()]);
+        // Both frames from another build, one of which is lost.
+        let path = root.join(FRAMES_FILE);
+        let records = std::fs::read_to_string(&path).unwrap();
+        std::fs::write(&path, records.replace(crate::build_id(), "0.0.1+other")).unwrap();
+        std::fs::remove_file(root.join("velodyne/b.bin")).unwrap();
+        assert_eq!(builds(), ["0.0.1+other", crate::build_id()]);
     }
 
     #[test]

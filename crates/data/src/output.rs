@@ -279,6 +279,24 @@ fn keep(file: tempfile::NamedTempFile, path: &Path, folder: &Path) -> IoResult<(
     sync_folder(folder)
 }
 
+/// Replaces `name` by a hard link to `file` of the same file system, or by a copy if it has no links, and syncs the
+/// folder.
+///
+/// # Errors
+/// Files that cannot be read or written; the message names them.
+pub fn link(file: &Path, name: &Path) -> Result<(), DataError> {
+    let temporary = name.with_file_name(format!("{TEMPORARY_PREFIX}link-{}", std::process::id()));
+    if fs_err::hard_link(file, &temporary).is_err() {
+        return write_atomic(name, &fs_err::read(file)?);
+    }
+    rename(&temporary, name)?;
+    // Both names were the same file: POSIX defines that the rename then does nothing.
+    match fs_err::remove_file(&temporary) {
+        Err(e) if e.kind() != ErrorKind::NotFound => Err(e.into()),
+        _ => Ok(()),
+    }
+}
+
 /// Renames a file within its folder, and syncs the folder.
 ///
 /// # Errors
@@ -309,7 +327,8 @@ pub fn create_folder(folder: &Path) -> Result<(), DataError> {
     }
     for made in missing {
         let above = folder_of(made);
-        sync_folder(above).map_err(|e| DataError::file(above, format!("the folder cannot be synced: {e}")))?;
+        let failed = |e| DataError::file(made, format!("the folder that has this one cannot be synced: {e}"));
+        sync_folder(above).map_err(failed)?;
     }
     Ok(())
 }

@@ -18,8 +18,16 @@ where
     T: Send + 'static,
     F: Fn(&J) -> T + Send + Sync + 'static,
 {
-    let total = jobs.len();
-    let make = Arc::new(move |i: usize| make(&jobs[i]));
+    prefetch_numbered(jobs.len(), workers, depth, move |i| make(&jobs[i]))
+}
+
+/// As [`prefetch`], for the jobs from 0 to `total`, which are not listed.
+pub fn prefetch_numbered<T, F>(total: usize, workers: usize, depth: usize, make: F) -> Prefetch<T>
+where
+    T: Send + 'static,
+    F: Fn(usize) -> T + Send + Sync + 'static,
+{
+    let make = Arc::new(make);
     let shared = Arc::new(Shared { state: Mutex::default(), changed: Condvar::new() });
     let worker = || {
         let (shared, make) = (shared.clone(), make.clone());

@@ -14,6 +14,10 @@ pub const SCHEMA: &str = "lidarshift/diagnosis/1";
 pub struct Diagnosis {
     /// [`SCHEMA`].
     pub schema: String,
+    /// Build of the program that made it: its version and the commit, or a hash of the program. Earlier versions have
+    /// none.
+    #[serde(default)]
+    pub build: String,
     /// The overall result.
     pub verdict: Verdict,
     /// Ids of the frames by role; no frame has two roles, except that of scans alone each is held out in turn.

@@ -157,6 +157,7 @@ mod tests {
         fill_effects(&mut findings, &Rig::single(), &[vec![-5.0, -4.0]]);
         Diagnosis {
             schema: SCHEMA.into(),
+            build: data::build_id().into(),
             verdict: Verdict::Explained,
             frames: Default::default(),
             findings,

@@ -3,18 +3,28 @@
 use crate::EvalFrame;
 use data::Presence as _;
 use data::limits::{MOST_IDS, at_most, check_name, read_text};
-use data::{DataError, KittiText, read_kitti_text};
+use data::{DataError, KittiText, LabelBox, read_kitti_text};
 use rayon::prelude::*;
 use std::path::Path;
 
 /// Reads the labels and detections of the given frames, in their order. A missing detection file is an error: a frame
 /// without detections has an empty file.
 pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<Vec<EvalFrame>, DataError> {
-    for folder in [labels, detections] {
-        if !folder.may_be_folder() {
-            return Err(DataError::file(folder, "is not a folder"));
-        }
-    }
+    check_folder(labels)?;
+    read_detections(|id| read_kitti_text(&labels.join(format!("{id}.txt")), KittiText::Labels), detections, ids)
+}
+
+fn check_folder(folder: &Path) -> Result<(), DataError> {
+    if folder.may_be_folder() { Ok(()) } else { Err(DataError::file(folder, "is not a folder")) }
+}
+
+/// As [`read_frames`], with the labels that `labels` returns for a frame: those of a data set, whatever its layout is.
+pub fn read_detections(
+    labels: impl Fn(&str) -> Result<Vec<LabelBox>, DataError> + Sync,
+    detections: &Path,
+    ids: &[String],
+) -> Result<Vec<EvalFrame>, DataError> {
+    check_folder(detections)?;
     let read = |id: &String| {
         let detected = detections.join(format!("{id}.txt"));
         if !detected.may_exist() {
@@ -22,7 +32,7 @@ pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<V
         }
         Ok(EvalFrame {
             id: id.clone(),
-            labels: read_kitti_text(&labels.join(format!("{id}.txt")), KittiText::Labels)?,
+            labels: labels(id)?,
             detections: read_kitti_text(&detected, KittiText::Detections)?,
         })
     };

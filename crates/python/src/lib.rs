@@ -14,11 +14,13 @@ use std::path::PathBuf;
 /// Runs the program with these arguments, its name included; returns the exit code. `program` is what a study starts
 /// for its runs.
 #[pyfunction]
-fn run(py: Python<'_>, arguments: Vec<OsString>, program: Option<PathBuf>) -> u8 {
+fn run(py: Python<'_>, arguments: Vec<OsString>, program: Option<PathBuf>) -> PyResult<u8> {
+    // The executable of the process is the interpreter.
+    data::set_program_file(py.import("lidarshift._native")?.filename()?.extract()?);
     if let Some(program) = program {
         study::set_program(program);
     }
-    py.detach(|| lidarshift::run_with(arguments))
+    Ok(py.detach(|| lidarshift::run_with(arguments)))
 }
 
 #[pymodule]

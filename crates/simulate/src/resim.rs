@@ -6,7 +6,7 @@ use data::checksum::files_sha256;
 use data::limits::{MOST_TEXT_BYTES, read_file};
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, true_labels_path};
-use data::{DataError, Dataset, DatasetConfig, Frame, NewDataset, write_atomic};
+use data::{DataError, Dataset, DatasetConfig, FilePart, Frame, Layout, NewDataset, write_atomic};
 use sensor::attributes;
 use sensor::effects::EffectList;
 use sensor::finished::{FinishedDataset, Refusal};
@@ -39,9 +39,17 @@ pub struct ResimManifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame and of what the frame was made from.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 data::manifest!(ResimManifest, "with other effects, another seed or version");
+
+/// The layout in which a data set of a layout is written.
+fn written_layout(of: Layout) -> Layout {
+    if of.folders().is_empty() { Layout::Kitti } else { of }
+}
 
 /// A data set, and what acts on it.
 pub struct Resim<'a> {
@@ -56,7 +64,8 @@ pub struct Resim<'a> {
 }
 
 impl Resim<'_> {
-    /// Writes the data set to the folder `out`, in the layout and label frame of the source.
+    /// Writes the data set to the folder `out`, in the layout and label frame of the source. Of a layout that is only
+    /// read, in that of KITTI.
     ///
     /// `progress(done, total)` is called with the number of frames, from several threads. Frames finished by an
     /// earlier run with the same arguments are kept if neither their files nor those that they were made from have
@@ -79,8 +88,10 @@ impl Resim<'_> {
             frames: finished.ids().len(),
             points: [0; 2],
             frames_sha256: String::new(),
+            builds: Vec::new(),
         };
-        let new = NewDataset::begin(out, source.layout, &[attributes::FOLDER, TRUE_LABELS], &mut manifest)?;
+        let new =
+            NewDataset::begin(out, written_layout(source.layout), &[attributes::FOLDER, TRUE_LABELS], &mut manifest)?;
         self.write_descriptions(&new, finished.rig())?;
         if finished.is_described() {
             attributes::write_names(out, finished.rig(), finished.materials())?;
@@ -177,10 +188,10 @@ impl Resim<'_> {
     /// SHA-256 of all files of a frame of the source.
     fn source_sha256(&self, id: &str) -> Result<String, DataError> {
         let source = self.dataset;
-        let labels = source.has_labels().then(|| source.labels_path(id));
+        let labels = source.has_labels().then(|| source.labels_part(id)).transpose()?;
         let beside = attributes::path(&source.config.root, id);
-        let files = [Some(source.cloud_path(id)), labels, source.true_labels_path(id), source.calibration_path(id)];
-        files_sha256(files.into_iter().flatten().chain([beside]))
+        let files = source.true_labels_path(id).into_iter().chain(source.calibration_path(id)).chain([beside]);
+        files_sha256([source.cloud_part(id)?].into_iter().chain(labels).chain(files.map(FilePart::from)))
     }
 
     /// Copies labels byte by byte if no effect changed them; otherwise writes them in the label frame of the source.
@@ -188,8 +199,12 @@ impl Resim<'_> {
         let source = self.dataset.labels(&frame.id)?;
         let boxes = self.dataset.objects(&frame.id, &source)?;
         if boxes.iter().zip(&frame.objects).all(|(a, b)| a.bbox == b.bbox) {
+            let layouts = [self.dataset.config.layout, new.layout()];
+            if layouts[0] != layouts[1] && layouts[0] != Layout::Shards {
+                return Ok(new.layout().write_labels(new.root(), &frame.id, &source)?);
+            }
             let path = new.layout().labels_path(new.root(), &frame.id);
-            return Ok(write_atomic(&path, &read_file(&self.dataset.labels_path(&frame.id), MOST_TEXT_BYTES)?)?);
+            return Ok(write_atomic(&path, &self.dataset.labels_part(&frame.id)?.read(MOST_TEXT_BYTES)?)?);
         }
         let mut labels = self.dataset.label_boxes(frame)?;
         labels.extend(source.into_iter().filter(|label| label.is_dont_care() || !label.has_box()));

@@ -9,7 +9,7 @@ use sha2::{Digest, Sha256};
 use std::path::Path;
 
 /// The result of `make`, cached as JSON in `path`. It is read from there if it was made from the same `parts` by the
-/// same version of the program.
+/// same build of the program.
 ///
 /// # Errors
 /// What `make` returns, and files that cannot be written.
@@ -19,7 +19,7 @@ pub fn cached<T: Serialize + DeserializeOwned>(
     make: impl FnOnce() -> Result<T>,
 ) -> Result<T> {
     let mut hash = Sha256::new();
-    hash.update(env!("CARGO_PKG_VERSION"));
+    hash.update(data::build_id());
     hash.update(serde_json::to_vec(parts)?);
     let key: String = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
     let key_path = path.with_extension("key");

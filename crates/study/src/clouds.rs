@@ -8,7 +8,7 @@ use crate::error::{Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
 use data::augment::{AugmentConfig, augment, crop_to_range};
-use data::{Dataset, Frame, stream};
+use data::{DataError, Dataset, Frame, stream};
 use eval::distance::{
     Compared, DISTANCES_SCHEMA, DistanceError, DistanceOptions, Distances, Regions, compare, paired_ids,
 };
@@ -28,13 +28,13 @@ impl Loader {
     }
 
     /// The frame as it is compared. Ground-truth sampling, which inserts targets of other frames, is left out.
-    fn apply(&self, frame: Frame, compared: Compared) -> Frame {
+    fn apply(&self, frame: Frame, compared: Compared) -> Result<Frame, DataError> {
         let mut random = stream(0, &format!("compared {}", frame.id), 0, 0);
-        match compared {
+        Ok(match compared {
             Compared::Raw => frame,
             Compared::Loader => crop_to_range(frame, &self.range_m),
-            Compared::Augmented => crop_to_range(augment(frame, &self.augmentation, None, &mut random), &self.range_m),
-        }
+            Compared::Augmented => crop_to_range(augment(frame, &self.augmentation, None, &mut random)?, &self.range_m),
+        })
     }
 }
 
@@ -53,10 +53,10 @@ pub fn distances_of(
     let ids = paired_ids(&a.ids(split)?, &b.ids(split)?)?;
     let ids = evenly_spaced(&ids, most.unwrap_or(ids.len()));
     let load = |id: &str| -> Result<[Frame; 2], DistanceError> {
-        let frames = [a.load(id)?, b.load(id)?];
+        let [a, b] = [a.load(id)?, b.load(id)?];
         Ok(match loader {
-            Some(loader) => frames.map(|frame| loader.apply(frame, options.compared)),
-            None => frames,
+            Some(loader) => [loader.apply(a, options.compared)?, loader.apply(b, options.compared)?],
+            None => [a, b],
         })
     };
     Ok(compare(names, &ids, load, Some(&Regions::of_scenery()), options)?)

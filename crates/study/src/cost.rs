@@ -51,14 +51,13 @@ pub fn measure(study: &Study, run: &StudyRun, cache: &Path, device: &Device) -> 
     let config = study.run_config(run)?;
     let set = Dataset::open(&config.dataset)?;
     let frames = TrainingFrames::new(&config, &set, cache)?;
-    let order = frames.order(0);
     let batch_size = config.detector.optimization.batch_size;
     let mut detector = Detector::new(&config.detector, config.seed, &device.clone().autodiff());
     let mut adam = Adam::new(config.detector.optimization.weight_decay, reference_name);
     let mut seconds = Vec::new();
     for step in 0..=MEASURED_STEPS {
         let begin = Instant::now();
-        let at = |i: usize| order[(step as usize * batch_size + i) % order.len()];
+        let at = |i: usize| frames.index(0, (step as usize * batch_size + i) % frames.ids().len());
         let batch = (0..batch_size).map(|i| frames.sample(0, at(i))).collect::<Result<Vec<_>, _>>()?;
         let losses = detector.loss(&batch)?;
         let gradients = GradientsParams::from_grads(losses.total.backward(), &detector.network);

@@ -5,8 +5,10 @@ use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use crate::{Event, Listener};
 use data::checksum::hex;
+use data::limits::MOST_TEXT_BYTES;
 use data::write::write_dataset_toml;
 use data::{Dataset, DatasetConfig};
+use rayon::prelude::*;
 use sensor::{EffectList, Rig};
 use sha2::{Digest, Sha256};
 use simulate::race::{RaceConfig, make_race_datasets};
@@ -129,9 +131,10 @@ pub fn open(study: &Study, name: &str) -> Result<Dataset> {
 /// A missing cloud.
 pub fn frames_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     let mut hash = Sha256::new();
-    for id in ids {
+    let lengths = ids.par_iter().map(|id| Ok(dataset.cloud_part(id)?.length()?));
+    for (id, length) in ids.iter().zip(lengths.collect::<Result<Vec<u64>>>()?) {
         hash.update(id.as_bytes());
-        hash.update(fs_err::metadata(dataset.cloud_path(id))?.len().to_le_bytes());
+        hash.update(length.to_le_bytes());
     }
     Ok(hex(&hash.finalize()))
 }
@@ -143,12 +146,18 @@ pub fn frames_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
 pub fn labelled_sha256(dataset: &Dataset, ids: &[String]) -> Result<String> {
     let mut hash = Sha256::new();
     hash.update(frames_sha256(dataset, ids)?);
-    for id in ids {
-        hash.update(fs_err::read(dataset.labels_path(id))?);
+    let labels = |id: &String| {
+        let mut text = dataset.labels_part(id)?.read(MOST_TEXT_BYTES)?;
         let repaired = dataset.repaired_labels_paths(id).into_iter().flatten();
         for beside in repaired.chain(dataset.true_labels_path(id)) {
-            hash.update(fs_err::read(beside)?);
+            text.extend(fs_err::read(beside)?);
         }
+        Ok(text)
+    };
+    // Some at a time, so that not all labels are in memory.
+    for some in ids.chunks(1 << 12) {
+        let texts = some.par_iter().map(labels).collect::<Result<Vec<_>>>()?;
+        texts.into_iter().for_each(|text| hash.update(text));
     }
     Ok(hex(&hash.finalize()))
 }

@@ -46,6 +46,11 @@ pub struct Study {
 }
 
 impl Study {
+    /// Folder of the databases of ground-truth sampling, which its runs share.
+    pub fn cache_folder(&self) -> PathBuf {
+        self.folder.join("cache")
+    }
+
     /// Opens a study by the path of its TOML, by its name in configs/studies, by the name of a built-in study, or by
     /// its folder. Its folder is `out`, or `runs/NAME`.
     ///

@@ -7,6 +7,7 @@ use crate::folder::Study;
 use crate::run_state::{RunLock, read_failure, write_failure};
 use crate::work::RunPart;
 use crate::{Event, Listener};
+use data::output::create_folder;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::OnceLock;
@@ -111,7 +112,7 @@ pub fn run_all(
 
 fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> Result<Child> {
     let folder = run.folder(&study.folder);
-    fs_err::create_dir_all(&folder)?;
+    create_folder(&folder)?;
     let log = || fs_err::OpenOptions::new().create(true).append(true).open(folder.join("log.txt"));
     let mut command = Command::new(current_program()?);
     command.arg("study-run").arg(&study.folder).args(["--attached", "--run", &run.to_string()]);

@@ -117,7 +117,7 @@ fn note_differences(study: &Study, paired: &[PairedDifference], listener: Listen
 fn facts(study: &Study) -> Result<Vec<(String, String)>> {
     let mut facts = Vec::new();
     let mut fact = |name: &str, value: String| facts.push((name.to_string(), value));
-    fact("program", format!("lidarshift {}", env!("CARGO_PKG_VERSION")));
+    fact("program", format!("lidarshift {}", data::build_id()));
     for dataset in &study.config.datasets {
         let set = open(study, &dataset.name)?;
         let splits = &study.config.splits;

@@ -5,6 +5,7 @@ use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use crate::steps::{RunOptions, Step};
 use crate::{Event, Listener};
+use data::output::create_folder;
 use data::write_atomic;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -84,7 +85,7 @@ impl<'a> Submission<'a> {
         let all = study.folder.join("slurm");
         let number = (1..).find(|n| !all.join(n.to_string()).exists()).unwrap_or(1);
         let folder = all.join(number.to_string());
-        fs_err::create_dir_all(&folder)?;
+        create_folder(&folder)?;
         let program = quoted(&crate::local::program_path()?.display().to_string());
         let device: Vec<String> = device.iter().map(|argument| quoted(argument)).collect();
         Ok(Submission { folder, program, device: device.join(" "), name: &study.config.name, sbatch })

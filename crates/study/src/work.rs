@@ -99,6 +99,7 @@ fn train_and_detect(
             workers: work.workers,
             resume: true,
             allow_changed_data: false,
+            cache: Some(study.cache_folder()),
             stop: work.stop,
         };
         detector = Some(train(&config, &folder, &session, &mut |event| on_training(&event))?.detector);

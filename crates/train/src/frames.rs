@@ -1,10 +1,11 @@
 //! The frames of a training run: their order, augmentation and preparation, each a function of (seed, epoch, frame)
 //! alone.
 
+use crate::order::EpochOrders;
 use crate::{RunConfig, TrainError};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::checksum::hex;
-use data::{Dataset, Frame, GtDatabase, Prefetch, Stream, prefetch, stream};
+use data::{Dataset, Frame, GtDatabase, Prefetch, Stream, prefetch_numbered, stream};
 use models::config::DetectorConfig;
 use models::{Preparer, Sample};
 use rand::seq::SliceRandom;
@@ -17,6 +18,7 @@ pub struct TrainingFrames {
     dataset: Dataset,
     ids: Vec<String>,
     seed: u64,
+    orders: EpochOrders,
     augmentation: Option<(AugmentConfig, Option<GtDatabase>)>,
     classes: Vec<String>,
     range_m: [f64; 6],
@@ -26,7 +28,7 @@ pub struct TrainingFrames {
 impl TrainingFrames {
     /// From a run's data set: the training split with augmentation, or all frames without augmentation to overfit.
     ///
-    /// The database of ground-truth sampling is built once and cached in `cache_folder`.
+    /// The database of ground-truth sampling is built once, in a file of `cache_folder` that other runs may share.
     ///
     /// # Errors
     /// A split that is missing or has no frame, classes or channels of the detector that the data set does not have, a
@@ -46,6 +48,7 @@ impl TrainingFrames {
         };
         Ok(TrainingFrames {
             dataset: dataset.clone(),
+            orders: EpochOrders::new(config.seed, ids.len()),
             ids,
             seed: config.seed,
             augmentation,
@@ -65,11 +68,9 @@ impl TrainingFrames {
         hex(&Sha256::digest(self.ids.join("\n")))
     }
 
-    /// Indices of all frames in the order of `epoch`.
-    pub fn order(&self, epoch: u64) -> Vec<usize> {
-        let mut order: Vec<usize> = (0..self.ids.len()).collect();
-        order.shuffle(&mut stream(self.seed, "order", epoch, 0));
-        order
+    /// Index of the frame at a position in the order of `epoch`.
+    pub fn index(&self, epoch: u64, position: usize) -> usize {
+        self.orders.of(epoch)[position] as usize
     }
 
     /// The sample of frame `index` in `epoch`.
@@ -106,7 +107,7 @@ impl TrainingFrames {
     fn frame(&self, index: usize, random: &mut Stream) -> Result<Frame, TrainError> {
         let mut frame = self.dataset.load(&self.ids[index])?;
         if let Some((config, database)) = &self.augmentation {
-            frame = augment(frame, config, database.as_ref(), random);
+            frame = augment(frame, config, database.as_ref(), random)?;
         }
         let mut frame = crop_to_range(frame, &self.range_m);
         frame.objects.retain(|o| self.classes.contains(&o.class));
@@ -122,11 +123,14 @@ pub fn samples(
     workers: usize,
     depth: usize,
 ) -> Prefetch<Result<Sample, TrainError>> {
-    let in_epoch =
-        |e: u64| frames.order(e).into_iter().skip(if e == epoch { position } else { 0 }).map(move |i| (e, i));
-    let jobs: Vec<(u64, usize)> = (epoch..epochs).flat_map(in_epoch).collect();
+    let per_epoch = frames.ids().len();
+    let left = (epochs.saturating_sub(epoch) as usize * per_epoch).saturating_sub(position);
     let frames = frames.clone();
-    prefetch(jobs, workers, depth, move |&(epoch, index)| frames.sample(epoch, index))
+    prefetch_numbered(left, workers, depth, move |job| {
+        let (later, position) = ((position + job) / per_epoch, (position + job) % per_epoch);
+        let epoch = epoch + later as u64;
+        frames.sample(epoch, frames.index(epoch, position))
+    })
 }
 
 /// The range in which training boxes are kept, `[x_min, y_min, z_min, x_max, y_max, z_max]`, m, LiDAR frame. If heights

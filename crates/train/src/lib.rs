@@ -7,6 +7,7 @@ mod frames;
 pub mod memory;
 mod metrics;
 mod one_cycle;
+mod order;
 mod provenance;
 mod run_config;
 mod run_folder;

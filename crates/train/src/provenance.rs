@@ -1,10 +1,9 @@
 //! `provenance.json`: program, data and machine of a run.
 
 use crate::{RunConfig, TrainError};
-use data::checksum::{file_sha256, hex};
-use data::write_json;
+use data::checksum::file_sha256;
+use data::{build_id, program_sha256, write_json};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -51,7 +50,7 @@ pub struct SessionProvenance {
     pub began_unix_s: u64,
     /// Its command line.
     pub command: Vec<String>,
-    /// Version of the program.
+    /// Build of the program: [`data::build_id`].
     pub version: String,
     /// SHA-256 of the program's file.
     pub program_sha256: Option<String>,
@@ -70,15 +69,14 @@ pub struct SessionProvenance {
 impl SessionProvenance {
     /// The entry of this process.
     pub fn now(from_step: u64, device: &str, workers: usize) -> Self {
-        let program = std::env::current_exe().ok().and_then(|path| std::fs::read(path).ok());
         let cpu = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
         let model = cpu.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
         SessionProvenance {
             from_step,
             began_unix_s: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |t| t.as_secs()),
             command: std::env::args_os().map(|argument| argument.to_string_lossy().into_owned()).collect(),
-            version: env!("CARGO_PKG_VERSION").into(),
-            program_sha256: program.map(|bytes| hex(&Sha256::digest(bytes))),
+            version: build_id().into(),
+            program_sha256: program_sha256().map(String::from),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
             processor: model.map(|(_, name)| name.trim().into()),
             threads: std::thread::available_parallelism().map_or(1, usize::from),

@@ -12,7 +12,7 @@ use crate::state_file::{
 };
 use data::Presence as _;
 use data::checksum::file_sha256;
-use data::output::{create_folder, remove_unfinished_below, rename};
+use data::output::{create_folder, link, remove_unfinished_below, rename};
 use data::{DataError, FolderLock, write_atomic, write_json};
 use models::checkpoint::{NamedTensors, read_safetensors, write_safetensors};
 use std::collections::BTreeMap;
@@ -214,20 +214,6 @@ impl RunFolder {
         }
         Ok(())
     }
-}
-
-/// Replaces `name` by a hard link to `file`, or by a copy if the file system has no links.
-fn link(file: &Path, name: &Path) -> Result<(), TrainError> {
-    let temporary = name.with_file_name(format!(".writing-link-{}", std::process::id()));
-    if fs_err::hard_link(file, &temporary).is_ok() {
-        fs_err::rename(&temporary, name)?;
-        // Both names were the same file: POSIX defines that the rename then does nothing.
-        match fs_err::remove_file(&temporary) {
-            Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(e.into()),
-            _ => return Ok(()),
-        }
-    }
-    Ok(write_atomic(name, &fs_err::read(file)?)?)
 }
 
 #[cfg(test)]

@@ -18,7 +18,7 @@ use models::layers::Precision;
 use models::suggest::{Assignment, FORCED_SHARE, LabelledBoxes};
 use models::{Detector, ModelError, Sample, reference_name};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -35,6 +35,9 @@ pub struct Session {
     pub resume: bool,
     /// Resume a run although the labels or clouds of its data set have changed since its last checkpoint.
     pub allow_changed_data: bool,
+    /// Folder for the database of ground-truth sampling, which runs on the same frames may share; `None`: `cache` in
+    /// the run folder.
+    pub cache: Option<PathBuf>,
     /// Once this is set, a checkpoint is saved after the current step or evaluation, and the training ends with
     /// [`TrainError::Stopped`].
     pub stop: Option<&'static AtomicBool>,
@@ -193,7 +196,8 @@ impl<'a> Run<'a> {
     ) -> Result<(Self, Arc<TrainingFrames>, Vec<String>), TrainError> {
         refuse_other_run(config, folder, session.resume)?;
         let dataset = Dataset::open(&config.dataset)?;
-        let frames = Arc::new(TrainingFrames::new(config, &dataset, &folder.path().join("cache"))?);
+        let cache = session.cache.clone().unwrap_or_else(|| folder.path().join("cache"));
+        let frames = Arc::new(TrainingFrames::new(config, &dataset, &cache)?);
         let optimization = &config.detector.optimization;
         let validation_ids = match () {
             () if config.run.evaluate_every_epochs == 0 => Vec::new(),

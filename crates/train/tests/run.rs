@@ -4,7 +4,9 @@ use burn::tensor::Device;
 use data::write::write_split;
 use data::{Cloud, Frame, Layout, Object, stream};
 use geometry::Box3;
-use lidarshift_train::{Event, Provenance, RunConfig, Session, TrainError, Trained, set_key, train};
+use lidarshift_train::{
+    Event, Provenance, RunConfig, Session, TrainError, Trained, TrainingFrames, samples, set_key, train,
+};
 use models::checkpoint::{NamedTensors, read_checkpoint, read_metadata};
 use rand::RngExt;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -122,12 +124,35 @@ fn session(workers: usize, resume: bool) -> Session {
         workers,
         resume,
         allow_changed_data: false,
+        cache: None,
         stop: None,
     }
 }
 
 fn run(config: &RunConfig, out: &Path, workers: usize, resume: bool) -> Result<Trained, TrainError> {
     train(config, out, &session(workers, resume), &mut |_| {})
+}
+
+#[test]
+fn a_resumed_run_sees_the_same_frames() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    let config = config(dir.path(), &["augmentation.gt_sampling.enabled=false"]);
+    let dataset = data::Dataset::open(dir.path()).unwrap();
+    let frames = TrainingFrames::new(&config, &dataset, &dir.path().join("cache")).unwrap();
+    let frames = std::sync::Arc::new(frames);
+    let ids = |from: (u64, usize), workers: usize| -> Vec<String> {
+        let all = samples(&frames, from, 4, workers, 3);
+        all.map(|sample| sample.unwrap().id().to_string()).collect()
+    };
+    let whole = ids((0, 0), 2);
+    assert_eq!(whole.len(), 4 * 5);
+    for epoch in 0..4 {
+        for position in 0..=5 {
+            assert_eq!(ids((epoch, position), position % 3), whole[5 * epoch as usize + position..]);
+        }
+    }
+    assert!(ids((4, 0), 1).is_empty());
 }
 
 fn weights(out: &Path) -> NamedTensors {

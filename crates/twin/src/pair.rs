@@ -10,6 +10,7 @@ use crate::recording::{PoseSource, Recording};
 use crate::world::{FrameShots, World};
 use data::checksum::hex;
 use data::limits::read_text;
+use data::output::remove_unfinished;
 use data::{
     Cloud, DataError, Dataset, DatasetConfig, Frame, LabelFrame, Layout, NewDataset, Object, Presence, write_atomic,
     write_json,
@@ -25,6 +26,9 @@ pub const TWIN_SCHEMA: &str = "lidarshift/twin/2";
 pub const TWIN_MANIFEST_SCHEMA: &str = "lidarshift/twin-dataset/1";
 /// Folder with the directions of which the twin knows nothing.
 pub const UNKNOWN_FOLDER: &str = "unknown";
+
+/// Folder of the static maps.
+const MAPS_FOLDER: &str = "maps";
 
 /// How a twin is made.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,6 +89,8 @@ struct TwinManifest {
     config_sha256: String,
     frames: usize,
     frames_sha256: String,
+    #[serde(default)]
+    builds: Vec<String>,
 }
 
 data::manifest!(TwinManifest, "with other options, poses or another version");
@@ -116,6 +122,7 @@ pub fn make(
         config_sha256: fingerprint(recording, config, &ids),
         frames: ids.len(),
         frames_sha256: String::new(),
+        builds: Vec::new(),
     };
     let roots = ["measured", "sim"].map(|side| out.join(side));
     let [measured, sim] = &roots;
@@ -123,6 +130,10 @@ pub fn make(
     let [first, second] = &mut manifests;
     let sides =
         [NewDataset::begin(measured, Layout::Kitti, &[], first)?, NewDataset::begin(sim, Layout::Kitti, &[], second)?];
+    // Of a killed process. Both sides are locked.
+    for inside in ["", UNKNOWN_FOLDER, MAPS_FOLDER] {
+        remove_unfinished(&out.join(inside))?;
+    }
     let classes: BTreeSet<String> = moments.iter().flat_map(|m| &m.objects).map(|o| o.class.clone()).collect();
     for (side, suffix) in sides.iter().zip(["measured", "twin"]) {
         let described = DatasetConfig {
@@ -140,7 +151,7 @@ pub fn make(
         let world = World::build(recording, job, &config.fusion, config.most_bytes)?;
         surfels += world.map().surfels().len();
         if config.write_maps {
-            write_atomic(&out.join(format!("maps/map_{number:03}.ply")), &encode_ply(world.map()))?;
+            write_atomic(&out.join(MAPS_FOLDER).join(format!("map_{number:03}.ply")), &encode_ply(world.map()))?;
         }
         for frame in &job.shoot {
             let shot = world.shoot(recording, *frame)?;

@@ -106,6 +106,7 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
         targets.push(Target { name, valid, read: Box::new(read) });
     }
     targets.extend(super::scenes::targets(folder)?);
+    targets.extend(super::shards::targets(folder)?);
     targets.extend(run_folder(&folder.join("run"))?);
     Ok(targets)
 }

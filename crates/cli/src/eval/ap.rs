@@ -5,7 +5,7 @@ use anyhow::{Result, bail};
 use clap::Args;
 use data::output::check_writable;
 use data::{Dataset, LabelFrame, write_json};
-use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_frames, read_ids};
+use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_detections, read_frames, read_ids};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -96,9 +96,7 @@ impl EvalApArgs {
     fn of_dataset(&self, dataset: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
         let dataset = Dataset::open(dataset)?;
         let ids = dataset.ids(&self.split)?;
-        let labels = dataset.labels_path("");
-        let labels = labels.parent().unwrap_or(Path::new("."));
-        let frames = read_frames(labels, &self.detections, &ids)?;
+        let frames = read_detections(|id| dataset.labels(id), &self.detections, &ids)?;
         let config = dataset.config;
         Ok((frames, EvalOptions { label_frame: config.label_frame, classes: config.classes, ..EvalOptions::default() }))
     }

@@ -1,6 +1,6 @@
 //! Ground-truth sampling: pastes objects of other frames, with their points, where they do not collide.
 
-use crate::{Frame, GroundConfig, GroundHeight, GtDatabase, Object, Stream};
+use crate::{DataError, Frame, GroundConfig, GroundHeight, GtDatabase, Object, Stream};
 use geometry::{Box3, bev_intersection, points_in_boxes};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -52,7 +52,15 @@ const REMOVE_MARGIN_M: f64 = 1e-2;
 ///
 /// Difference to OpenPCDet, which consumes one shuffled list over all frames: here each frame draws without replacement
 /// from the whole database, so the result depends on the frame's random stream only.
-pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatabase, stream: &mut Stream) -> Frame {
+///
+/// # Errors
+/// A database whose file cannot be read.
+pub fn sample_gt(
+    mut frame: Frame,
+    config: &GtSamplingConfig,
+    database: &GtDatabase,
+    stream: &mut Stream,
+) -> Result<Frame, DataError> {
     let mut boxes: Vec<Box3> = frame.objects.iter().map(|o| o.bbox).collect();
     let first_pasted = boxes.len();
     let mut pasted_values = Vec::new();
@@ -75,7 +83,7 @@ pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatab
             let [x, y, z] = &mut bbox.center;
             *z += ground.as_ref().map_or(0.0, |ground| ground.at(*x, *y));
             boxes.push(bbox);
-            for p in sample.points.chunks_exact(database.channels()) {
+            for p in database.points(sample)?.chunks_exact(database.channels()) {
                 pasted_values.extend((0..3).map(|i| (f64::from(p[i]) + bbox.center[i]) as f32));
                 pasted_values.extend(&p[3..]);
             }
@@ -97,5 +105,5 @@ pub fn sample_gt(mut frame: Frame, config: &GtSamplingConfig, database: &GtDatab
     }
     frame.cloud.retain(|k, _| !covered[k]);
     frame.cloud.values.splice(..0, pasted_values);
-    frame
+    Ok(frame)
 }

@@ -3,7 +3,8 @@ use crate::write::{write_dataset_toml, write_split};
 use crate::{Frame, Object, PointColumns, verify_frames};
 use geometry::Box3;
 
-const FORMATS: [Format; 5] = [Format::Kitti, Format::Pcd, Format::OpenPcdet, Format::Carla, Format::Mcap];
+const FORMATS: [Format; 6] =
+    [Format::Kitti, Format::Pcd, Format::OpenPcdet, Format::Carla, Format::Mcap, Format::Shards];
 
 fn frame(id: &str, shift: f32) -> Frame {
     let object = |class: &str, yaw_rad: f64| Object {
@@ -33,7 +34,7 @@ fn source(folder: &Path) -> Dataset {
 }
 
 fn convert(dataset: &Dataset, to: Format, out: &Path) -> Result<ConvertManifest, String> {
-    Conversion { dataset, to }.make(out, &|_, _| ()).map_err(|e| e.to_string())
+    Conversion { dataset, to, shard_frames: 2 }.make(out, &|_, _| ()).map_err(|e| e.to_string())
 }
 
 #[test]

@@ -4,6 +4,7 @@ use super::ground::Ground;
 use super::report::{Findings, at_most};
 use super::survey::FrameFacts;
 use crate::Cloud;
+use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -22,8 +23,9 @@ const NEAR_DUPLICATE: f64 = 0.7;
 /// Fingerprint of a frame: a hash of its exact values and a MinHash sketch of the voxels occupied above the ground.
 pub(super) struct Signature {
     exact: [u8; 16],
-    /// The smallest hashes of occupied voxels, ascending; empty if there are too few voxels.
-    sketch: Vec<u64>,
+    /// The smallest hashes of occupied voxels, ascending; empty if there are too few voxels. Of each the upper half, so
+    /// that the sketches of a million frames fit into memory.
+    sketch: Vec<u32>,
 }
 
 impl Signature {
@@ -35,13 +37,15 @@ impl Signature {
         let mut exact = [0; 16];
         exact.copy_from_slice(&hash.finalize()[..16]);
         let near = ground.standing().filter(|p| p[0].hypot(p[1]) < MAX_DISTANCE_M);
-        let mut sketch: Vec<u64> = near.map(|p| voxel_hash(p.map(|v| (v / VOXEL_M).floor() as i64))).collect();
+        let mut sketch: Vec<u32> =
+            near.map(|p| (voxel_hash(p.map(|v| (v / VOXEL_M).floor() as i64)) >> 32) as u32).collect();
         sketch.sort_unstable();
         sketch.dedup();
         if sketch.len() < MIN_VOXELS {
             sketch.clear();
         }
         sketch.truncate(SKETCH);
+        sketch.shrink_to_fit();
         Signature { exact, sketch }
     }
 }
@@ -58,7 +62,7 @@ fn voxel_hash(voxel: [i64; 3]) -> u64 {
 
 /// Estimated Jaccard index of two sets from their MinHash sketches: the fraction of the smallest hashes of the union
 /// that both sets have.
-fn jaccard(a: &[u64], b: &[u64]) -> f64 {
+fn jaccard(a: &[u32], b: &[u32]) -> f64 {
     let (mut i, mut j, mut seen, mut shared) = (0, 0, 0, 0);
     let size = a.len().min(b.len());
     while seen < size && i < a.len() && j < b.len() {
@@ -82,59 +86,110 @@ fn objects_agree(a: &FrameFacts, b: &FrameFacts) -> bool {
         && a.objects.iter().all(|o| b.objects.iter().any(|p| near(&o.bbox.center, &p.bbox.center)))
 }
 
+/// Which splits have which frames.
+struct Membership<'a> {
+    /// The sets of splits that frames are in; the first one is empty.
+    sets: Vec<BTreeSet<&'a str>>,
+    /// The set of each frame, an index.
+    set_of: Vec<usize>,
+}
+
+impl<'a> Membership<'a> {
+    fn of(frames: &[FrameFacts], split_of: &HashMap<&'a str, BTreeSet<&'a str>>) -> Self {
+        let mut sets = vec![BTreeSet::new()];
+        let set_of = frames.iter().map(|frame| {
+            let Some(own) = split_of.get(frame.id.as_str()) else { return 0 };
+            sets.iter().position(|set| set == own).unwrap_or_else(|| {
+                sets.push(own.clone());
+                sets.len() - 1
+            })
+        });
+        let set_of = set_of.collect();
+        Membership { sets, set_of }
+    }
+
+    fn splits_of(&self, i: usize) -> &BTreeSet<&'a str> {
+        &self.sets[self.set_of[i]]
+    }
+
+    /// Whether two frames are in different splits: no split has both.
+    fn differs(&self, i: usize, j: usize) -> bool {
+        let (a, b) = (self.splits_of(i), self.splits_of(j));
+        !a.is_empty() && !b.is_empty() && a.is_disjoint(b)
+    }
+}
+
+/// Number of frames with one hash, one number of objects and one set of splits that others are compared with. In data
+/// of a sensor that does not move all frames share hashes, and the time would grow with the square of their number.
+const MOST_CANDIDATES: usize = 32;
+
+/// Pairs of frames in different splits that show nearly the same scene: of each frame the first such frame before it.
+///
+/// Frames that share most voxels share most of their smallest hashes: candidates share one of the first eight.
+fn near_duplicates(frames: &[FrameFacts], membership: &Membership) -> Vec<(usize, usize)> {
+    let first = |j: usize| &frames[j].signature.sketch[..frames[j].signature.sketch.len().min(8)];
+    let mut by_hash: HashMap<(u32, usize, usize), Vec<usize>> = HashMap::new();
+    for (j, frame) in frames.iter().enumerate().filter(|(j, _)| membership.set_of[*j] != 0) {
+        for hash in first(j) {
+            let alike = by_hash.entry((*hash, frame.objects.len(), membership.set_of[j])).or_default();
+            if alike.len() < MOST_CANDIDATES {
+                alike.push(j);
+            }
+        }
+    }
+    let of_frame = |j: usize| {
+        let frame = &frames[j];
+        let others = (1..membership.sets.len()).filter(|set| {
+            let (own, other) = (membership.splits_of(j), &membership.sets[*set]);
+            !own.is_empty() && own.is_disjoint(other)
+        });
+        let keys = others.flat_map(|set| first(j).iter().map(move |hash| (*hash, frame.objects.len(), set)));
+        let candidates: BTreeSet<usize> = keys.filter_map(|key| by_hash.get(&key)).flatten().copied().collect();
+        let alike = |i: &usize| {
+            let (a, b) = (&frames[*i].signature, &frame.signature);
+            a.exact != b.exact && objects_agree(&frames[*i], frame) && jaccard(&a.sketch, &b.sketch) >= NEAR_DUPLICATE
+        };
+        candidates.range(..j).copied().find(alike).map(|i| (i, j))
+    };
+    (0..frames.len()).into_par_iter().filter_map(of_frame).collect()
+}
+
 pub(super) fn compare(frames: &[FrameFacts], splits: &BTreeMap<String, Vec<String>>, findings: &mut Findings) {
-    let mut split_of: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
+    let mut split_of: HashMap<&str, BTreeSet<&str>> = HashMap::new();
     for (split, ids) in splits {
         ids.iter().for_each(|id| _ = split_of.entry(id).or_default().insert(split));
     }
-    let in_two: Vec<_> = split_of.iter().filter(|(_, splits)| splits.len() > 1).map(|(id, _)| id.to_string()).collect();
+    let mut in_two: Vec<_> =
+        split_of.iter().filter(|(_, splits)| splits.len() > 1).map(|(id, _)| id.to_string()).collect();
+    in_two.sort_unstable();
     if !in_two.is_empty() {
         let message = format!("{} frames are in more than one split: {}", in_two.len(), at_most(5, &in_two, ", "));
         findings.problem("duplicates", message, in_two);
     }
 
-    // Two frames are in different splits if no split has both.
-    let none = BTreeSet::new();
-    let splits_of = |i: usize| split_of.get(frames[i].id.as_str()).unwrap_or(&none);
-    let in_different_splits = |i: usize, j: usize| {
-        let (a, b) = (splits_of(i), splits_of(j));
-        !a.is_empty() && !b.is_empty() && a.is_disjoint(b)
-    };
+    let membership = Membership::of(frames, &split_of);
     let name = |i: usize, j: usize| {
-        let named = |i: usize| match splits_of(i).first() {
+        let named = |i: usize| match membership.splits_of(i).first() {
             Some(split) => format!("{} ({split})", frames[i].id),
             None => frames[i].id.clone(),
         };
         format!("{} and {}", named(i), named(j))
     };
-    let (mut across, mut within, mut near) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut across, mut within) = (Vec::new(), Vec::new());
+    // The first frame with a cloud, and the first one of each set of splits.
     let mut by_exact: HashMap<[u8; 16], Vec<usize>> = HashMap::new();
     for (j, frame) in frames.iter().enumerate() {
         let same = by_exact.entry(frame.signature.exact).or_default();
-        if let Some(i) = same.iter().copied().find(|i| in_different_splits(*i, j)) {
+        if let Some(i) = same.iter().copied().find(|i| membership.differs(*i, j)) {
             across.push((i, j));
         } else if let Some(i) = same.first() {
             within.push((*i, j));
         }
-        same.push(j);
-    }
-    // Frames that share most voxels share most of their smallest hashes: candidates share one of the first eight.
-    let mut by_hash: HashMap<u64, Vec<usize>> = HashMap::new();
-    for (j, frame) in frames.iter().enumerate() {
-        let first = &frame.signature.sketch[..frame.signature.sketch.len().min(8)];
-        let candidates: BTreeSet<usize> = first.iter().filter_map(|h| by_hash.get(h)).flatten().copied().collect();
-        let alike = |i: &usize| {
-            let (a, b) = (&frames[*i].signature, &frame.signature);
-            in_different_splits(*i, j)
-                && a.exact != b.exact
-                && objects_agree(&frames[*i], frame)
-                && jaccard(&a.sketch, &b.sketch) >= NEAR_DUPLICATE
-        };
-        if let Some(i) = candidates.into_iter().find(alike) {
-            near.push((i, j));
+        if same.iter().all(|i| membership.set_of[*i] != membership.set_of[j]) {
+            same.push(j);
         }
-        first.iter().for_each(|h| by_hash.entry(*h).or_default().push(j));
     }
+    let near = near_duplicates(frames, &membership);
     let mut report = |pairs: Vec<(usize, usize)>, problem: bool, what: &str| {
         if !pairs.is_empty() {
             let names: Vec<_> = pairs.iter().map(|(i, j)| name(*i, *j)).collect();

@@ -2,7 +2,7 @@
 
 use crate::DataError;
 use crate::limits::{MOST_IDS, at_most};
-use std::collections::BTreeSet;
+use rayon::prelude::*;
 use std::path::Path;
 
 /// An error that names the folder if it does not exist.
@@ -18,18 +18,19 @@ pub(super) fn check_folder(folder: &Path) -> Result<(), DataError> {
 /// # Errors
 /// There is no such file.
 pub(super) fn ids_of_files(folder: &Path, ending: &str) -> Result<Vec<String>, DataError> {
-    let mut ids = BTreeSet::new();
+    let mut ids = Vec::new();
     for entry in fs_err::read_dir(folder)? {
         let path = entry?.path();
         let Some(name) = path.file_name() else { continue };
         let name = name.to_str().ok_or_else(|| DataError::file(&path, "its name is not UTF-8"))?;
         if let Some(id) = name.strip_suffix(ending).filter(|id| !id.is_empty()) {
             at_most(folder, "frames", ids.len() as u64 + 1, MOST_IDS)?;
-            ids.insert(id.to_string());
+            ids.push(id.to_string());
         }
     }
     if ids.is_empty() {
         return Err(DataError::file(folder, format!("has no file whose name ends in {ending}")));
     }
-    Ok(ids.into_iter().collect())
+    ids.par_sort_unstable();
+    Ok(ids)
 }

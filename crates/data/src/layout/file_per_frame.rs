@@ -7,7 +7,8 @@ use crate::limits::{MOST_CLOUD_BYTES, read_file};
 use crate::write::{write_bin, write_kitti_text, write_pcd};
 use crate::{Calibration, Cloud, DataError, DatasetConfig, LabelBox, LabelFrame, PcdEncoding, PointColumns};
 use crate::{Layout, parse_pcd_header, read_cloud};
-use std::collections::BTreeSet;
+use fs_err::DirEntry;
+use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
 /// File format of a cloud.
@@ -85,18 +86,21 @@ impl<L: FilePerFrame> DataLayout for L {
 
     fn frame_ids(&self, root: &Path) -> Result<Vec<String>, DataError> {
         let folder = root.join(L::FOLDERS[0]);
-        let mut ids = BTreeSet::new();
-        for entry in fs_err::read_dir(&folder)? {
-            let path = entry?.path();
-            let extension = path.extension().and_then(|e| e.to_str());
-            let (Some("bin" | "pcd"), Some(id)) = (extension, path.file_stem()) else { continue };
-            let id = id.to_str().ok_or_else(|| DataError::file(&path, "its name is not UTF-8"))?;
-            ids.insert(id.to_string());
-        }
+        let ids = ids_of_clouds(&folder, |_| true)?;
         if ids.is_empty() {
             return Err(DataError::file(&folder, "has no .bin or .pcd file"));
         }
-        Ok(ids.into_iter().collect())
+        Ok(ids)
+    }
+
+    /// Of many frames the folder is read once. What it does not list as a regular file, such as a symbolic link, is
+    /// asked for.
+    fn first_without_cloud(&self, root: &Path, ids: &[&str]) -> Option<usize> {
+        let is_file = |entry: &DirEntry| entry.file_type().is_ok_and(|kind| kind.is_file());
+        let listed = (ids.len() > FEW_FRAMES).then(|| ids_of_clouds(&root.join(L::FOLDERS[0]), is_file));
+        let listed = listed.and_then(Result::ok).unwrap_or_default();
+        let is_listed = |id: &str| listed.binary_search_by(|known| known.as_str().cmp(id)).is_ok();
+        ids.par_iter().position_first(|id| !is_listed(id) && !self.has_cloud(root, id))
     }
 
     fn cloud_path(&self, root: &Path, id: &str) -> PathBuf {
@@ -176,6 +180,29 @@ impl<L: FilePerFrame> DataLayout for L {
     fn write_labels(&self, root: &Path, id: &str, labels: &[LabelBox]) -> Result<(), DataError> {
         write_kitti_text(&self.labels_path(root, id), labels)
     }
+}
+
+/// Number of frames up to which each is asked for.
+const FEW_FRAMES: usize = 16;
+
+/// The names in a folder that end in `.bin` or `.pcd`, without the ending, sorted; of the entries that are `wanted`.
+fn ids_of_clouds(folder: &Path, wanted: impl Fn(&DirEntry) -> bool) -> Result<Vec<String>, DataError> {
+    let mut ids = Vec::new();
+    for entry in fs_err::read_dir(folder)? {
+        let entry = entry?;
+        let name = entry.file_name();
+        let name = Path::new(&name);
+        let (Some("bin" | "pcd"), Some(id)) = (name.extension().and_then(|e| e.to_str()), name.file_stem()) else {
+            continue;
+        };
+        if wanted(&entry) {
+            let id = id.to_str().ok_or_else(|| DataError::file(&entry.path(), "its name is not UTF-8"))?;
+            ids.push(id.to_string());
+        }
+    }
+    ids.par_sort_unstable();
+    ids.dedup();
+    Ok(ids)
 }
 
 fn is_bin(path: &Path) -> bool {

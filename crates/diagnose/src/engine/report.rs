@@ -16,6 +16,7 @@ pub const METRIC: &str = "nats_per_ray";
 pub(crate) fn refused(notes: Vec<String>) -> Diagnosis {
     Diagnosis {
         schema: SCHEMA.into(),
+        build: data::build_id().into(),
         verdict: Verdict::NotScenarioIdentical,
         frames: FrameRoles::default(),
         findings: vec![],
@@ -51,6 +52,7 @@ pub(crate) fn report(context: &Context, results: Vec<ChannelResult>, notes: Vec<
     let ids = |role| context.of(role).into_iter().map(|i| context.frames[i].id.clone()).collect();
     Diagnosis {
         schema: SCHEMA.into(),
+        build: data::build_id().into(),
         verdict: Verdict::of(&findings),
         frames: FrameRoles { select: ids(Role::Select), estimate: ids(Role::Estimate), hold_out: ids(Role::HoldOut) },
         gain: Gain {

@@ -29,8 +29,7 @@ use rayon::prelude::*;
 use sensor::Rig;
 use sensor::directions::{SensorScan, Sensors};
 use std::collections::BTreeSet;
-use std::io::Read;
-use std::path::Path;
+use std::io::{Read, Seek, SeekFrom};
 
 /// Returns that are kept of each side over all frames. More do not improve findings, and memory stays bounded.
 const KEPT: usize = 3_000_000;
@@ -38,11 +37,15 @@ const KEPT: usize = 3_000_000;
 /// Frames that the scan patterns are estimated from.
 const PATTERN_FRAMES: usize = 10;
 
-/// Whether a cloud's file holds no point: it is empty, or a PCD whose header says so.
-pub(crate) fn has_no_point(path: &Path) -> Result<bool, DiagnoseError> {
+/// Whether a cloud holds no point: it is empty, or a PCD whose header says so.
+pub(crate) fn has_no_point(set: &Dataset, id: &str) -> Result<bool, DiagnoseError> {
+    let part = set.cloud_part(id)?;
+    let (start, length) = part.range.unwrap_or((0, u64::MAX));
+    let mut file = fs_err::File::open(&part.path)?;
+    file.seek(SeekFrom::Start(start))?;
     let mut head = Vec::new();
-    fs_err::File::open(path)?.take(2000).read_to_end(&mut head)?;
-    let pcd = path.extension().is_some_and(|e| e.eq_ignore_ascii_case("pcd"));
+    file.take(length.min(2000)).read_to_end(&mut head)?;
+    let pcd = set.cloud_path(id).extension().is_some_and(|e| e.eq_ignore_ascii_case("pcd"));
     let says_so = |line: &str| line.split_whitespace().eq(["POINTS", "0"]);
     Ok(head.is_empty() || pcd && String::from_utf8_lossy(&head).lines().any(says_so))
 }
@@ -57,7 +60,7 @@ pub fn with_points(
     for id in ids {
         let empty = [("measured", measured), ("simulated", simulated)]
             .into_iter()
-            .map(|(name, side)| Ok((name, has_no_point(&side.cloud_path(&id))?)))
+            .map(|(name, side)| Ok((name, has_no_point(side, &id)?)))
             .collect::<Result<Vec<_>, DiagnoseError>>()?;
         match empty.iter().find(|e| e.1) {
             Some((name, _)) => notes.push(format!("frame {id}: the {name} cloud has no point; left out")),

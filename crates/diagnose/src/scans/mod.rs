@@ -159,6 +159,7 @@ fn report(
     let together: f64 = findings.iter().map(|f| f.gain.nats_per_ray.max(0.0)).sum();
     Diagnosis {
         schema: SCHEMA.into(),
+        build: data::build_id().into(),
         verdict: Verdict::of(&findings),
         frames: FrameRoles { select: vec![], estimate: used.clone(), hold_out: used },
         findings,

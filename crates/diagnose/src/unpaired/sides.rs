@@ -36,7 +36,7 @@ impl<'a> Side<'a> {
     pub(super) fn open(dataset: &'a Dataset, rig: &'a Rig, mut ids: Vec<String>) -> Result<Self, DiagnoseError> {
         let mut kept = Vec::new();
         for id in ids.drain(..) {
-            if !has_no_point(&dataset.cloud_path(&id))? {
+            if !has_no_point(dataset, &id)? {
                 kept.push(id);
             }
         }

@@ -7,7 +7,7 @@ use super::{
     Cell, CellNumber, CellRun, Gap, MATRIX_SCHEMA, Matrix, MatrixOptions, MatrixPlan, Place, PlannedNetwork, Quantity,
     Reference, RunId, RunNumber, RunState, published,
 };
-use crate::{RangeSection, ceiling_ap40};
+use crate::{BootstrapOptions, RangeSection, ceiling_ap40};
 use rayon::prelude::*;
 use statistics::{deviation, mean};
 use std::collections::BTreeMap;
@@ -97,8 +97,14 @@ fn draw(
     let places = [&network.network, train_set, test_set];
     let resamples =
         Resamples::new(&network.network.name, &frames_key, first.map_or(0, |s| s.frames), done.len(), options);
+    let of_runs =
+        Reference::ALL.map(|reference| done.iter().map(|(_, scores)| scores.curves_of(reference)).collect::<Vec<_>>());
+    let replicates = resamples.values(&of_runs, &options.bootstrap);
     let [(numbers, of_labels), (of_repaired_labels, of_repaired), (of_true_boxes, of_truth)] =
-        Reference::ALL.map(|reference| numbers_of(reference, &done, places, &resamples, options));
+        Reference::ALL.map(|reference| {
+            let drawn: Vec<&[Values]> = replicates.iter().map(|drawn| &drawn[reference as usize][..]).collect();
+            numbers_of(&of_runs[reference as usize], &drawn, &done, places, options)
+        });
     let cell = Cell {
         network: network.network.name.clone(),
         train_set: train_set.name.clone(),
@@ -112,9 +118,15 @@ fn draw(
     Drawn { cell, draws: [of_labels, of_repaired, of_truth], frames_key }
 }
 
-/// How often each frame, which seeds and which version of the boxes are drawn, by replicate.
+/// The quantities of a curve.
+type Values = [f64; Quantity::ALL.len()];
+
+/// Which frames, seeds and version of the boxes are drawn, by replicate.
 struct Resamples {
-    frames: Vec<Vec<u32>>,
+    /// Purpose of the random stream of the frames. How often each of them is drawn is computed when its replicate is:
+    /// for a million frames that of all replicates would be gigabytes.
+    of_frames: String,
+    frames: usize,
     seeds: Vec<Vec<usize>>,
     versions: Vec<usize>,
 }
@@ -124,48 +136,59 @@ impl Resamples {
     /// cells are paired.
     fn new(network: &str, frames_key: &str, frames: usize, seeds: usize, options: &MatrixOptions) -> Self {
         let replicates = 0..options.bootstrap.replicates;
-        let of_frames = format!("matrix frames {frames_key}");
         let of_seeds = format!("matrix seeds {network}");
         Resamples {
-            frames: replicates.clone().map(|r| options.bootstrap.frame_weights(&of_frames, r, frames)).collect(),
+            of_frames: format!("matrix frames {frames_key}"),
+            frames,
             seeds: replicates.clone().map(|r| options.bootstrap.seed_draws(&of_seeds, r, seeds)).collect(),
             versions: replicates.map(|r| options.bootstrap.version_draw(r)).collect(),
         }
     }
+
+    /// By replicate and reference the values of each curve: their means over the drawn seeds. `of_runs` are the curves
+    /// of all runs by reference.
+    fn values(&self, of_runs: &[Vec<Curves>; 3], bootstrap: &BootstrapOptions) -> Vec<[Vec<Values>; 3]> {
+        let of_replicate = |replicate: usize| {
+            let weights = bootstrap.frame_weights(&self.of_frames, replicate, self.frames);
+            let (seeds, version) = (&self.seeds[replicate], self.versions[replicate]);
+            let of_reference = |of_runs: &Vec<Curves>| {
+                let of_curve = |k: usize| {
+                    let mut known: Vec<Option<Values>> = vec![None; of_runs.len()];
+                    let mut sum = [0.0; Quantity::ALL.len()];
+                    for &i in seeds {
+                        let numbers =
+                            known[i].get_or_insert_with(|| of_runs[i].version(version)[k].numbers(Some(&weights)).0);
+                        sum.iter_mut().zip(numbers).for_each(|(sum, v)| *sum += *v);
+                    }
+                    sum.map(|sum| sum / seeds.len() as f64)
+                };
+                (0..curves_of_all(of_runs)).map(of_curve).collect()
+            };
+            [0, 1, 2].map(|reference: usize| of_reference(&of_runs[reference]))
+        };
+        (0..self.seeds.len()).into_par_iter().map(of_replicate).collect()
+    }
+}
+
+/// Number of curves that all runs have.
+fn curves_of_all(of_runs: &[Curves]) -> usize {
+    of_runs.iter().map(|curves| curves.estimate.len()).min().unwrap_or(0)
 }
 
 /// The values of a cell against a reference, with their bootstrap replicates.
 fn numbers_of(
-    reference: Reference,
+    of_runs: &[Curves],
+    drawn: &[&[Values]],
     done: &[(u64, &RunScores)],
     places: [&Place; 3],
-    resamples: &Resamples,
     options: &MatrixOptions,
 ) -> (Vec<CellNumber>, Vec<Vec<f64>>) {
-    let of_runs: Vec<Curves> = done.iter().map(|(_, scores)| scores.curves_of(reference)).collect();
-    let n_curves = of_runs.iter().map(|curves| curves.estimate.len()).min().unwrap_or(0);
     let (mut numbers, mut all_draws) = (Vec::new(), Vec::new());
-    for k in 0..n_curves {
+    for k in 0..curves_of_all(of_runs) {
         let whole: Vec<_> = of_runs.iter().map(|curves| curves.estimate[k].numbers(None)).collect();
-        let draws: Vec<[f64; Quantity::ALL.len()]> = resamples
-            .frames
-            .par_iter()
-            .zip(&resamples.seeds)
-            .zip(&resamples.versions)
-            .map(|((weights, seeds), &version)| {
-                let mut known: Vec<Option<[f64; Quantity::ALL.len()]>> = vec![None; of_runs.len()];
-                let mut sum = [0.0; Quantity::ALL.len()];
-                for &i in seeds {
-                    let numbers =
-                        known[i].get_or_insert_with(|| of_runs[i].version(version)[k].numbers(Some(weights)).0);
-                    sum.iter_mut().zip(numbers).for_each(|(sum, v)| *sum += *v);
-                }
-                sum.map(|sum| sum / seeds.len() as f64)
-            })
-            .collect();
         for (q, quantity) in Quantity::ALL.into_iter().enumerate() {
             let values = done.iter().zip(&whole).map(|((seed, _), (numbers, _))| (*seed, numbers[q])).collect();
-            let draws: Vec<f64> = draws.iter().map(|d| d[q]).collect();
+            let draws: Vec<f64> = drawn.iter().map(|of_curves| of_curves[k][q]).collect();
             let curve = &of_runs[0].estimate[k];
             let key =
                 NumberKey { class: curve.class.clone(), section: curve.section, quantity, overlap: curve.overlap };

@@ -7,6 +7,7 @@ use super::simulator::{PreparedSet, Simulator};
 use crate::SimulateError;
 use crate::auto_label::{LabelError, label_errors};
 use crate::street::SplitCounts;
+use data::output::create_folder;
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, label_boxes, true_labels_path, write_kitti_text};
 use data::{
@@ -50,6 +51,9 @@ pub struct RaceManifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 data::manifest!(RaceManifest, "from another configuration or version");
@@ -102,11 +106,12 @@ fn make_set(
         splits: BTreeMap::new(),
         label_errors: Vec::new(),
         frames_sha256: String::new(),
+        builds: Vec::new(),
     };
     let extra = [attributes::FOLDER, TRUE_LABELS];
     let new = NewDataset::begin(&root, simulator.config.layout, &extra, &mut manifest)?;
     if set.auto_label.is_some() {
-        fs_err::create_dir_all(root.join(TRUE_LABELS))?;
+        create_folder(&root.join(TRUE_LABELS))?;
     }
     write_descriptions(simulator, &new, set, &prepared)?;
     let progress = |done: usize, all: usize| progress(&set.name, done, all);

@@ -35,6 +35,9 @@ pub struct Manifest {
     /// SHA-256 of `frames.jsonl`, which has those of the files of each frame.
     #[serde(default)]
     pub frames_sha256: String,
+    /// Builds of the program that wrote the frames; several if one of them was interrupted.
+    #[serde(default)]
+    pub builds: Vec<String>,
 }
 
 data::manifest!(Manifest, "from another configuration or version");
@@ -104,6 +107,7 @@ pub fn make_road_dataset(
         config: config.clone(),
         splits: BTreeMap::new(),
         frames_sha256: String::new(),
+        builds: Vec::new(),
     };
     let set = NewDataset::begin(out, Layout::Kitti, &[], &mut manifest)?;
     let splits = config.frames.splits();

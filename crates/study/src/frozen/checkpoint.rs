@@ -10,6 +10,7 @@ use crate::local::current_program;
 use crate::{Event, Listener};
 use burn::tensor::Device;
 use data::Presence as _;
+use data::output::create_folder;
 use data::write_json;
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
@@ -80,7 +81,7 @@ pub(super) fn run_process(
 ) -> Result<()> {
     listener(Event::Note(&format!("frozen {}: detecting with its checkpoint", frozen.name)));
     let folder = frozen.folder(study);
-    fs_err::create_dir_all(&folder)?;
+    create_folder(&folder)?;
     let log_path: PathBuf = folder.join("log.txt");
     let log = fs_err::File::create(&log_path)?;
     let mut command = Command::new(current_program()?);

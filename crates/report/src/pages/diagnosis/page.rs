@@ -33,7 +33,9 @@ impl DiagnosisReport<'_> {
         let left =
             d.gain.not_applied.iter().map(|n| format!("Not applied, and counted as not gone: {} {}", n.effect, n.why));
         let warnings: Vec<String> = d.notes.iter().cloned().chain(left).collect();
-        let footer = format!("Made by: {}. One file: figures and numbers are inside; nothing is loaded.", self.command);
+        let build = if d.build.is_empty() { String::new() } else { format!(" (lidarshift {})", d.build) };
+        let footer =
+            format!("Made by: {}{build}. One file: figures and numbers are inside; nothing is loaded.", self.command);
         let title = format!("lidarshift diagnose: {}", self.title);
         page(&PageText { title: &title, about: &about(d), warnings: &warnings, footer: &footer }, &mut sections)
     }
@@ -286,6 +288,7 @@ mod tests {
     fn diagnosis(findings: Vec<Finding>) -> Diagnosis {
         Diagnosis {
             schema: diagnose::SCHEMA.into(),
+            build: "0.1.0+abc".into(),
             verdict: Verdict::of(&findings),
             frames: Default::default(),
             findings,
