@@ -63,7 +63,7 @@ impl Resim<'_> {
     /// changed; a folder with other content is an error. The files do not depend on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
-        let finished = self.finished()?;
+        let finished = self.finished()?.for_effects(self.effects);
         if let Some(refusal) = finished.refusals(self.effects).into_iter().next() {
             let why = format!("{} {}", refusal.kind, refusal.why);
             return Err(wrong(format!("effect[{}]", refusal.index), why).into());
