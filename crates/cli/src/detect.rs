@@ -1,12 +1,14 @@
 //! `lidarshift detect`: detects objects in one point cloud or in all frames of a split.
 
 use crate::device::DeviceArgs;
+use crate::errors::InFile;
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use data::Presence as _;
+use data::toml_text::parse_toml;
 use data::{
-    Cloud, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
+    Cloud, DataError, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
     read_kitti_text, refuse_input_file, write_atomic, write_json,
 };
 use indicatif::{ProgressBar, ProgressStyle};
@@ -77,7 +79,7 @@ impl DetectArgs {
         let weights = read_checkpoint(&self.checkpoint)?;
         let detector = Detector::new(&config, 0, &device)
             .load_named(&weights)
-            .with_context(|| format!("{} does not fit the detector {}", self.checkpoint.display(), config.name))?;
+            .with_context(|| InFile::new(&self.checkpoint, &format!(" does not fit the detector {}", config.name)))?;
         let ending = self.input.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
         match ending.as_str() {
             "bin" | "pcd" => self.cloud(&detector),
@@ -166,13 +168,13 @@ pub(crate) fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<Dete
         let path = folder.join("config.toml");
         if path.may_be_file() {
             let text = fs_err::read_to_string(&path)?;
-            let run: toml::Table = text.parse().with_context(|| path.display().to_string())?;
+            let run: toml::Table = parse_toml(&text, &path, |_| Ok(()))?;
             let Some(detector) = run.get("detector") else { continue };
-            let config: DetectorConfig = detector.clone().try_into().with_context(|| path.display().to_string())?;
+            let config: DetectorConfig = detector.clone().try_into().with_context(|| InFile::new(&path, ""))?;
             return Ok(config);
         }
     }
-    bail!("{}: the detector of these weights is unknown; give it with --detector", checkpoint.display())
+    Err(DataError::file(checkpoint, "the detector of these weights is unknown; give it with --detector").into())
 }
 
 /// Draws points, ground truth and detections in a bird's eye view.

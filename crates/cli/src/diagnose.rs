@@ -10,7 +10,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use data::output::check_writable;
 use data::write::{REPAIRED_ENDINGS, write_kitti_text};
-use data::{Dataset, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
+use data::{DataError, Dataset, ErrorKind, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
     BakedIn, Cause, DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage,
@@ -82,7 +82,8 @@ impl DiagnoseArgs {
     pub fn run(self) -> Result<End> {
         let rig = self.rig()?;
         if self.out.is_file() {
-            bail!("--out {}: is a file, but must be a folder", self.out.display());
+            let message = "is a file, but must be a folder; choose another --out";
+            return Err(DataError::of_kind(ErrorKind::Refused, &self.out, message).into());
         }
         self.check_outputs()?;
         let _lock = FolderLock::acquire(&self.out)?;
@@ -161,10 +162,8 @@ impl DiagnoseArgs {
             Dataset::open(path)?.refuse_own_folder(&self.out)?;
         }
         if Dataset::open(&self.out).is_ok() {
-            bail!(
-                "--out {}: is a data set, whose labels would be overwritten; choose another folder",
-                self.out.display()
-            );
+            let message = "is a data set, whose labels would be overwritten; choose another --out";
+            return Err(DataError::of_kind(ErrorKind::Refused, &self.out, message).into());
         }
         let inputs = [&self.verify, &self.sensor].into_iter().flatten().map(PathBuf::as_path);
         refuse_input_file(self.json.as_deref(), inputs)?;
@@ -219,18 +218,16 @@ impl DiagnoseArgs {
     ) -> Result<End> {
         let effects = EffectList::read(list)?;
         if effects.effects.is_empty() {
-            bail!("{}: has no effect, and so no gain", list.display());
+            return Err(DataError::file(list, "has no effect, and so no gain").into());
         }
         let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
         if let Some(made) = &effects.made_from {
             let own: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
             if own != made.sensors {
-                bail!(
-                    "{}: was made for the sensors {}, but the rig has {}: give that rig (--sensor)",
-                    list.display(),
-                    made.sensors.join(", "),
-                    own.join(", ")
-                );
+                let [made, own] = [made.sensors.join(", "), own.join(", ")];
+                let message =
+                    format!("was made for the sensors {made}, but the rig has {own}: give that rig (--sensor)");
+                return Err(DataError::file(list, message).into());
             }
         }
         let remake = self.remake(&simulated, rig);

@@ -5,6 +5,7 @@ mod onnx;
 use crate::{errln, outln};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
+use data::DataError;
 use exchange::{NOT_EXPRESSED, Program, Remedy};
 use sensor::{EffectList, Rig};
 use std::path::PathBuf;
@@ -82,7 +83,7 @@ impl ExportArgs {
         let list = EffectList::read(&self.model)?;
         let rig = self.rig.as_deref().map_or(Ok(Rig::single()), Rig::read)?;
         if let Some(why) = list.effects.iter().find_map(|e| Some(format!("{} {}", e.kind(), e.strange_to(&rig)?))) {
-            anyhow::bail!("{}: {why}", self.model.display());
+            return Err(DataError::file(&self.model, why).into());
         }
         let rig_name = self.rig.as_ref().map(|path| path.display().to_string());
         let export = exchange::export(program, &list, &rig, &self.model.display().to_string(), rig_name.as_deref());

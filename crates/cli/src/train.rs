@@ -12,6 +12,7 @@ use clap::Args;
 use data::Dataset;
 use data::Presence as _;
 use data::output::TemporaryFolder;
+use data::toml_text::parse_toml;
 use models::detector_text;
 use progress::Progress;
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
@@ -216,7 +217,7 @@ impl TrainArgs {
 }
 
 fn detector_table(name_or_path: &str) -> Result<Table> {
-    detector_text(name_or_path)?.parse().with_context(|| name_or_path.to_string())
+    Ok(parse_toml(&detector_text(name_or_path)?, Path::new(name_or_path), |_| Ok(()))?)
 }
 
 /// The absolute path, so that a run can be resumed from any working directory.

@@ -12,13 +12,14 @@ use std::path::Path;
 pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<Vec<EvalFrame>, DataError> {
     for folder in [labels, detections] {
         if !folder.may_be_folder() {
-            return Err(DataError::file(folder, "is not a folder"));
+            let error = if folder.may_exist() { DataError::file } else { DataError::missing };
+            return Err(error(folder, "is not a folder".to_owned()));
         }
     }
     let read = |id: &String| {
         let detected = detections.join(format!("{id}.txt"));
         if !detected.may_exist() {
-            return Err(DataError::file(&detected, "does not exist; a frame without detections has an empty file"));
+            return Err(DataError::missing(&detected, "does not exist; a frame without detections has an empty file"));
         }
         Ok(EvalFrame {
             id: id.clone(),

@@ -186,6 +186,37 @@ def test_errors_have_file_and_hint(folder):
         lidarshift.kitti_ap([{"boxes": np.ones((1, 7)), "classes": []}], [{"boxes": [], "classes": [], "scores": []}])
 
 
+def test_errors_of_commands_have_the_same_attributes(folder):
+    def raised(function, *arguments, **options):
+        with pytest.raises(lidarshift.LidarshiftError) as caught:
+            function(*arguments, **options)
+        return caught.value
+
+    (folder / "bad.toml").write_text('[[effect]]\nkind = "range_noise"\nstd = 0.1\n')
+    error = raised(lidarshift.run, "resim", folder, "--effects", folder / "bad.toml", "--out", folder / "made")
+    assert (error.code, error.kind, error.line, error.hint) == (1, "invalid", 3, "did you mean `std_m`?")
+    assert error.file.endswith("bad.toml") and "bad.toml:3: unknown field `std`" in str(error)
+    # The same error without the program.
+    native = raised(lidarshift.Effects, folder / "bad.toml")
+    for name in ("file", "line", "hint", "code", "kind"):
+        assert getattr(native, name) == getattr(error, name), name
+    error = raised(lidarshift.diagnose, folder / "nowhere", folder, folder / "out")
+    assert (error.code, error.kind, error.line) == (1, "missing", None) and error.file.endswith("nowhere")
+    assert error.hint == "give the folder or the TOML of a data set"
+    error = raised(lidarshift.diagnose, folder, folder, folder / "out", no_such_option=3)
+    assert (error.code, error.kind, error.file) == (2, "usage", None) and "--no-such-option" in str(error)
+    error = raised(lidarshift.twin, folder, folder / "twin", leave=0)
+    assert error.code == 1 and error.hint == "give seconds above 0"
+    error = raised(lidarshift.twin, folder / "nowhere", folder / "twin")
+    assert (error.kind, error.file) == ("missing", str(folder / "nowhere"))
+    (folder / "label_2/000001.txt").write_text("Car 1 2\n")
+    error = raised(lidarshift.run, "resim", folder, "--effects", folder / "noise.toml", "--out", folder / "made")
+    assert error.file.endswith("000001.txt") and error.line == 1, (error.file, str(error))
+    # Without the check, stderr is what people read.
+    done = lidarshift.run("doctor", folder / "nowhere", check=False)
+    assert done.returncode == 1 and done.stderr.startswith("error: "), done.stderr
+
+
 def test_a_diagnosis_of_few_frames(folder):
     lidarshift.run("resim", folder, "--effects", folder / "noise.toml", "--out", folder / "noisy")
     diagnosis = lidarshift.diagnose(folder / "noisy", folder, folder / "diagnosis")

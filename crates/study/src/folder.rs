@@ -3,6 +3,7 @@
 use crate::config::{Source, StudyConfig, StudyDataset, StudyRun};
 use crate::error::{InPart, Result, refused};
 use data::Presence as _;
+use data::toml_text::parse_toml;
 use data::{write_atomic, write_json};
 use models::detector_text;
 use serde::{Deserialize, Serialize};
@@ -177,7 +178,7 @@ impl Study {
     pub fn run_config(&self, run: &StudyRun) -> Result<RunConfig> {
         let named = run.config.as_ref().map_or(run.detector.clone(), |file| self.path(file).display().to_string());
         let mut table = Table::new();
-        let detector: Table = detector_text(&named)?.parse().in_part(|| named.clone())?;
+        let detector: Table = parse_toml(&detector_text(&named)?, Path::new(&named), |_| Ok(()))?;
         table.insert("detector".into(), Value::Table(detector));
         table.insert(
             "seed".into(),

@@ -1,10 +1,11 @@
 //! `lidarshift export --to onnx`: a trained detector as ONNX graphs.
 
 use crate::detect::detector_of;
+use crate::errors::InFile;
 use crate::{errln, outln};
 use anyhow::{Context, Result};
 use burn::tensor::Device;
-use data::{Frame, PointColumns, read_cloud, write_atomic, write_json};
+use data::{DataError, Frame, PointColumns, read_cloud, write_atomic, write_json};
 use models::checkpoint::{read_checkpoint, write_safetensors};
 use models::config::{DetectorConfig, NetworkConfig};
 use models::onnx::{onnx_check, to_onnx};
@@ -41,8 +42,8 @@ impl OnnxExport {
         let named = read_checkpoint(&weights)?;
         let detector = Detector::new(&config, 0, &Device::flex())
             .load_named(&named)
-            .with_context(|| format!("{} does not fit the detector {}", weights.display(), config.name))?;
-        let graphs = to_onnx(&detector).with_context(|| weights.display().to_string())?;
+            .with_context(|| InFile::new(&weights, &format!(" does not fit the detector {}", config.name)))?;
+        let graphs = to_onnx(&detector).with_context(|| InFile::new(&weights, ""))?;
         write_atomic(&self.out.join("pillar_net.onnx"), &graphs.pillar_net)?;
         write_atomic(&self.out.join("backbone_head.onnx"), &graphs.backbone_head)?;
         write_json(&self.out.join("detector.json"), &description(&config))?;
@@ -61,7 +62,8 @@ impl OnnxExport {
         let frame = Frame { id: "check".into(), cloud, objects: Vec::new() };
         let sample = Preparer::new(detector.config()).inference(&frame)?;
         if sample.is_empty() {
-            anyhow::bail!("{}: no point is within the range of the detector; give another cloud", path.display());
+            let message = "no point is within the range of the detector; give another cloud";
+            return Err(DataError::file(path, message).into());
         }
         let tensors = onnx_check(detector, &sample)?;
         Ok(write_safetensors(&self.out.join("check.safetensors"), &tensors, &BTreeMap::new())?)
