@@ -9,9 +9,18 @@ use std::ffi::OsString;
 use std::fmt::Arguments;
 use std::io::{Error, ErrorKind, Write as _};
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The first error of stdout.
 static LOST: Mutex<Option<Error>> = Mutex::new(None);
+
+/// Whether text goes to stderr, so that stdout has the JSON of `--json -` alone.
+static TEXT_TO_STDERR: AtomicBool = AtomicBool::new(false);
+
+/// Sends the text of [`print`] to stderr from now on.
+pub(crate) fn text_to_stderr() {
+    TEXT_TO_STDERR.store(true, Ordering::SeqCst);
+}
 
 /// Prints a line on stdout, as `println!` does.
 #[macro_export]
@@ -40,13 +49,25 @@ macro_rules! errln {
     };
 }
 
-/// Prints text on stdout. Nothing is printed after the first error.
+/// Prints text on stdout, or on stderr if stdout is for JSON. Nothing is printed after the first error of stdout.
 pub fn print(text: Arguments<'_>) {
-    let text = text.to_string();
+    if TEXT_TO_STDERR.load(Ordering::SeqCst) {
+        print_error(text);
+    } else {
+        write_stdout(&escaped(&text.to_string()));
+    }
+}
+
+/// Prints JSON on stdout, with a line feed behind it.
+pub fn print_json(json: &str) {
+    write_stdout(&format!("{}\n", escaped_json(json)));
+}
+
+fn write_stdout(text: &str) {
     let mut lost = lost();
     if lost.is_none() {
         let mut stdout = std::io::stdout().lock();
-        *lost = stdout.write_all(escaped(&text).as_bytes()).and_then(|()| stdout.flush()).err();
+        *lost = stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).err();
     }
 }
 

@@ -2,6 +2,7 @@
 
 use crate::device::DeviceArgs;
 use crate::errors::InFile;
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
@@ -9,13 +10,14 @@ use data::Presence as _;
 use data::toml_text::parse_toml;
 use data::{
     Cloud, DataError, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
-    read_kitti_text, refuse_input_file, write_atomic, write_json,
+    read_kitti_text, write_atomic,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
 use models::{Detector, Preparer, find_detector, inference_samples, predict_frames, predict_samples};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use train::verify_weights;
@@ -49,9 +51,8 @@ pub struct DetectArgs {
     /// Ground truth to draw into the picture of a point cloud: KITTI text in the label frame "lidar"
     #[arg(long, value_name = "FILE")]
     labels: Option<PathBuf>,
-    /// Also write the boxes of a point cloud as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
     #[command(flatten)]
     device: DeviceArgs,
 }
@@ -62,12 +63,45 @@ enum Points {
     Xyzi,
 }
 
-/// The boxes of one point cloud, in its frame.
-#[derive(Serialize)]
-struct Found<'a> {
+/// Version of the JSON of a point cloud.
+pub(crate) const DETECTIONS_SCHEMA: &str = "lidarshift/detections/1";
+
+/// Version of the JSON of a data set.
+pub(crate) const SET_DETECTIONS_SCHEMA: &str = "lidarshift/set-detections/1";
+
+/// Boxes found in one point cloud.
+#[derive(Serialize, JsonSchema)]
+#[schemars(title = "Detections")]
+pub(crate) struct Found<'a> {
+    /// `lidarshift/detections/1`.
     schema: &'static str,
+    /// Name of the cloud, or id of the frame.
     frame: &'a str,
+    /// The boxes, in the frame of the cloud.
     detections: &'a [Detection],
+}
+
+/// Boxes found in the frames of a data set.
+#[derive(Serialize, JsonSchema)]
+#[schemars(title = "SetDetections")]
+pub(crate) struct FoundInSet {
+    /// `lidarshift/set-detections/1`.
+    schema: &'static str,
+    /// Name of the data set.
+    dataset: String,
+    /// The split; null for all frames.
+    split: Option<String>,
+    /// The frames in their order.
+    frames: Vec<FoundInFrame>,
+}
+
+/// Boxes found in one frame.
+#[derive(Serialize, JsonSchema)]
+pub(crate) struct FoundInFrame {
+    /// Its id.
+    frame: String,
+    /// The boxes, in the frame of its cloud.
+    detections: Vec<Detection>,
 }
 
 impl DetectArgs {
@@ -88,7 +122,7 @@ impl DetectArgs {
     }
 
     fn cloud(&self, detector: &Detector) -> Result<()> {
-        refuse_input_file(self.json.as_deref(), [&*self.input].into_iter().chain(self.labels.as_deref()))?;
+        self.json.check([&*self.input].into_iter().chain(self.labels.as_deref()))?;
         let columns = match self.points {
             Some(Points::Xyz) => PointColumns::Xyz,
             Some(Points::Xyzi) => PointColumns::Xyzi,
@@ -100,10 +134,7 @@ impl DetectArgs {
         let frame = Frame { id: id.clone(), cloud, objects: Vec::new() };
         let sample = Preparer::new(detector.config()).inference(&frame)?;
         let detections = predict_samples(detector, &[sample])?.remove(0).detections;
-        if let Some(path) = &self.json {
-            let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
-            write_json(path, &found)?;
-        }
+        self.json.write(&Found { schema: DETECTIONS_SCHEMA, frame: &id, detections: &detections })?;
         let truth = match &self.labels {
             Some(path) => read_kitti_text(path, KittiText::Labels)?,
             None => Vec::new(),
@@ -134,6 +165,7 @@ impl DetectArgs {
         let Some(out) = &self.out else { bail!("--out DIR is required to detect on a data set") };
         let dataset = Dataset::open(&self.input)?;
         dataset.refuse_frame_folder(out)?;
+        self.json.check([])?;
         let _lock = FolderLock::acquire(out)?;
         let ids = match &self.split {
             Some(split) => dataset.ids(split)?,
@@ -141,18 +173,23 @@ impl DetectArgs {
         };
         let progress = ProgressBar::new(ids.len() as u64)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
-        let mut boxes = 0;
+        let (mut boxes, mut frames) = (0, Vec::new());
         let samples = inference_samples(detector, &dataset, &ids, 1).zip(&ids).map(|(sample, id)| Ok((sample?, id)));
         predict_frames(detector, 1, samples, |batch| {
             for (id, found) in batch {
                 boxes += found.detections.len();
                 let labels = dataset.detection_boxes(id, &found.detections)?;
                 data::write::write_kitti_text(&out.join(format!("{id}.txt")), &labels)?;
+                if self.json.is_given() {
+                    frames.push(FoundInFrame { frame: id.clone(), detections: found.detections });
+                }
                 progress.inc(1);
             }
             Ok::<(), anyhow::Error>(())
         })?;
         progress.finish_and_clear();
+        let (dataset, split) = (dataset.config.name.clone(), self.split.clone());
+        self.json.write(&FoundInSet { schema: SET_DETECTIONS_SCHEMA, dataset, split, frames })?;
         errln!("{boxes} boxes in {} frames, written to {}", ids.len(), out.display());
         Ok(())
     }

@@ -5,16 +5,16 @@ mod previous;
 mod simulator;
 
 use crate::commands::{End, called};
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use data::output::check_writable;
 use data::write::{REPAIRED_ENDINGS, write_kitti_text};
-use data::{DataError, Dataset, ErrorKind, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
+use data::{DataError, Dataset, ErrorKind, FolderLock, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
     BakedIn, Cause, DetectorGain, Diagnosis, Gain, OnClouds, Options, ParameterId, Progress, Remake, Rig, Stage,
-    Status, Verdict, diagnose_scans, diagnose_with, verify,
+    Status, Verdict, Verification, diagnose_scans, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{DiagnosisReport, finding_name, write_finding_pictures};
@@ -72,9 +72,8 @@ pub struct DiagnoseArgs {
     /// test them on measured frames; the study `gain` is made for this
     #[arg(long, value_name = "STUDY", requires = "measured")]
     detectors: Option<String>,
-    /// Also write diagnosis.json to this file
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl DiagnoseArgs {
@@ -131,7 +130,9 @@ impl DiagnoseArgs {
         };
         bar.finish_and_clear();
         previous::remove(&self.out)?;
-        self.write_json(&outcome.diagnosis)?;
+        let with_detectors = self.detectors.is_some() && !outcome.diagnosis.findings.is_empty();
+        // Stdout gets the diagnosis once, with the detectors.
+        self.write_json(&outcome.diagnosis, !(with_detectors && self.json.is_stdout()))?;
         write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         self.write_page(&outcome.diagnosis)?;
@@ -142,7 +143,7 @@ impl DiagnoseArgs {
         }
         print_diagnosis(&outcome.diagnosis, &self.out, outcome.corrected.len());
         if let (Some(study), Some(measured), Some(simulated)) = (&self.detectors, &self.measured, &self.simulated)
-            && !outcome.diagnosis.findings.is_empty()
+            && with_detectors
         {
             let extended = self.out.join("extended.toml");
             let (gains, left_out) =
@@ -150,7 +151,7 @@ impl DiagnoseArgs {
             print_gains(&gains, &left_out);
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
-            self.write_json(&outcome.diagnosis)?;
+            self.write_json(&outcome.diagnosis, true)?;
             self.write_page(&outcome.diagnosis)?;
         }
         Ok(end_of(&outcome.diagnosis))
@@ -166,8 +167,7 @@ impl DiagnoseArgs {
             return Err(DataError::of_kind(ErrorKind::Refused, &self.out, message).into());
         }
         let inputs = [&self.verify, &self.sensor].into_iter().flatten().map(PathBuf::as_path);
-        refuse_input_file(self.json.as_deref(), inputs)?;
-        Ok(self.json.as_deref().map_or(Ok(()), check_writable)?)
+        Ok(self.json.check(inputs)?)
     }
 
     /// What the diagnosis leaves out: the frames on which detectors are tested.
@@ -233,24 +233,25 @@ impl DiagnoseArgs {
         let remake = self.remake(&simulated, rig);
         match verify(&measured, &simulated, rig, options, &effects, remake.as_ref(), progress)? {
             Ok(gain) => {
-                write_json(&self.out.join("verification.json"), &gain)?;
-                if let Some(path) = &self.json {
-                    write_json(path, &gain)?;
-                }
-                print_gain(&gain, &list.display().to_string());
+                let verification = Verification::new(gain);
+                write_json(&self.out.join("verification.json"), &verification)?;
+                self.json.write(&verification)?;
+                print_gain(&verification.gain, &list.display().to_string());
                 Ok(End::Done)
             }
             Err(diagnosis) => {
+                self.json.write(&diagnosis)?;
                 print_diagnosis(&diagnosis, &self.out, 0);
                 Ok(end_of(&diagnosis))
             }
         }
     }
 
-    fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {
+    /// Writes diagnosis.json, and what `--json` asks for if it is `also` wanted.
+    fn write_json(&self, diagnosis: &Diagnosis, also: bool) -> Result<()> {
         write_json(&self.out.join("diagnosis.json"), diagnosis)?;
-        if let Some(path) = &self.json {
-            write_json(path, diagnosis)?;
+        if also {
+            self.json.write(diagnosis)?;
         }
         Ok(())
     }

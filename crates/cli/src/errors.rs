@@ -5,6 +5,7 @@ use crate::console;
 use clap::ValueEnum;
 use clap::error::{ContextKind, ContextValue, ErrorKind as Kind};
 use data::{ErrorKind, Located, Place};
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::ffi::OsString;
 use std::fmt;
@@ -35,7 +36,7 @@ impl ErrorFormat {
 }
 
 /// What is reported of an error to a program.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 pub struct ErrorReport {
     /// `lidarshift/error/1`.
     pub schema: &'static str,

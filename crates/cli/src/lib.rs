@@ -6,13 +6,17 @@ pub mod allocator;
 pub mod console;
 pub mod device;
 pub mod errors;
+pub mod json;
+mod json_forms;
 pub mod signals;
 
-use clap::{CommandFactory as _, Parser};
+use clap::{CommandFactory as _, FromArgMatches as _, Parser};
 use data::Place;
 use errors::{ErrorFormat, ErrorReport};
 use std::ffi::OsString;
 use std::process::ExitCode;
+
+pub use json_forms::json_forms;
 
 commands! {
     /// The commands, in the order of the help.
@@ -67,7 +71,7 @@ pub fn run_with(arguments: Vec<OsString>) -> u8 {
     commands::set_called(&arguments);
     signals::handle();
     let is_json = ErrorFormat::of(&arguments) == ErrorFormat::Json;
-    let (code, report) = match Program::try_parse_from(&arguments).map(|program| program.command.run()) {
+    let (code, report) = match parsed(&arguments).map(|program| program.command.run()) {
         Ok(Ok(end)) => (end.into(), ErrorReport::of_end(end)),
         Ok(Err(error)) => {
             if !is_json {
@@ -95,4 +99,13 @@ pub fn run_with(arguments: Vec<OsString>) -> u8 {
         ErrorReport::new(FAILURE, place, format!("stdout cannot be written: {error}")).print();
     }
     FAILURE
+}
+
+/// The parsed arguments. From then on text goes to stderr if they want JSON on stdout.
+fn parsed(arguments: &[OsString]) -> Result<Program, clap::Error> {
+    let mut matches = Program::command().try_get_matches_from(arguments)?;
+    if json::is_on_stdout(&matches) {
+        console::text_to_stderr();
+    }
+    Program::from_arg_matches_mut(&mut matches).map_err(|error| error.format(&mut Program::command()))
 }
