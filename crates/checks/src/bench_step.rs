@@ -15,6 +15,7 @@ use models::config::{DetectorConfig, NetworkConfig};
 use models::pointpillars::PointPillarsConfig;
 use models::{Detector, Preparer, Sample, find_detector, reference_name};
 use rand::RngExt;
+use schemars::JsonSchema;
 use serde::Serialize;
 use simulate::{RoadConfig, make_road_frame};
 use std::path::PathBuf;
@@ -44,7 +45,7 @@ pub struct BenchStepArgs {
 }
 
 /// What to measure.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum, JsonSchema)]
 #[serde(rename_all = "kebab-case")]
 enum Work {
     /// A whole training step
@@ -58,7 +59,7 @@ enum Work {
     PillarNet,
 }
 
-#[derive(Serialize)]
+#[derive(Serialize, JsonSchema)]
 struct Report {
     schema: &'static str,
     work: Work,

@@ -2,7 +2,7 @@
 
 use anyhow::Result;
 use clap::Args;
-use data::{DatasetConfig, write_atomic};
+use data::{DatasetConfig, JsonForm, write_atomic};
 use models::config::DetectorConfig;
 use schemars::{JsonSchema, Schema, schema_for};
 use sensor::{EffectList, Rig};
@@ -13,7 +13,11 @@ use std::fmt::Write;
 use std::path::PathBuf;
 use study::StudyConfig;
 
-/// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
+/// Folder of the forms of JSON files.
+const SCHEMAS: &str = "docs/src/reference/schemas";
+
+/// Write configs/schema.json, docs/src/reference/configuration.md, docs/src/reference/schemas.md and the files that it
+/// lists from the Rust types.
 #[derive(Args, Debug)]
 pub struct SchemaArgs {
     /// Folder of the repository
@@ -25,11 +29,21 @@ pub struct SchemaArgs {
 }
 
 impl SchemaArgs {
-    /// Writes both files, or compares them.
+    /// Writes the files, or compares them.
     pub fn run(self) -> Result<()> {
-        for (path, text) in
-            [("configs/schema.json", schema_json()?), ("docs/src/reference/configuration.md", reference())]
-        {
+        let mut files = vec![
+            ("configs/schema.json".to_owned(), schema_json()?),
+            ("docs/src/reference/configuration.md".to_owned(), reference()),
+        ];
+        let forms = lidarshift::json_forms();
+        files.push(("docs/src/reference/schemas.md".to_owned(), list_of_forms(&forms)));
+        files.extend(forms.iter().map(|form| (format!("{SCHEMAS}/{}.schema.json", form.name), form.text())));
+        for entry in fs_err::read_dir(self.root.join(SCHEMAS))? {
+            let path = entry?.path();
+            let known = files.iter().any(|(file, _)| path.ends_with(file));
+            anyhow::ensure!(known, "{}: no JSON of the program has this form; remove the file", path.display());
+        }
+        for (path, text) in files {
             let path = self.root.join(path);
             if !self.check {
                 write_atomic(&path, text.as_bytes())?;
@@ -63,6 +77,19 @@ pub fn schema_json() -> Result<String> {
         files().into_iter().map(|(name, _, schema)| (name.to_string(), schema.to_value())).collect();
     let schema = json!({ "$schema": "https://json-schema.org/draft/2020-12/schema", "definitions": definitions });
     Ok(serde_json::to_string_pretty(&schema)? + "\n")
+}
+
+/// The page that lists the forms of JSON files.
+fn list_of_forms(forms: &[JsonForm]) -> String {
+    let mut text = String::from(
+        "# JSON schemas\n\nGenerated from the Rust types by `cargo xtask schema`; do not edit. What the files mean is in [JSON files](json.md).\n\n\
+         | schema | version in the field `schema` | files |\n|---|---|---|\n",
+    );
+    for JsonForm { name, version, written, .. } in forms {
+        let version = version.map_or(String::new(), |version| format!("`{version}`"));
+        let _ = writeln!(text, "| [{name}](schemas/{name}.schema.json) | {version} | {written} |");
+    }
+    text
 }
 
 /// The Markdown reference, with one table per type.

@@ -66,9 +66,18 @@ macro_rules! commands {
     };
 }
 
-/// Remembers the command as it is called.
+/// Remembers the command as it is called, without `--errors`, which changes no result.
 pub(crate) fn set_called(arguments: &[OsString]) {
-    CALLED.get_or_init(|| arguments.iter().map(|a| a.to_string_lossy().into_owned()).collect());
+    CALLED.get_or_init(|| {
+        let mut words: Vec<String> = arguments.iter().map(|a| a.to_string_lossy().into_owned()).collect();
+        let end = words.iter().position(|word| word == "--").unwrap_or(words.len());
+        let own = words.split_off(end);
+        if let Some(at) = words.iter().position(|word| word == "--errors") {
+            words.drain(at..(at + 2).min(words.len()));
+        }
+        words.retain(|word| !word.starts_with("--errors="));
+        words.into_iter().chain(own).collect()
+    });
 }
 
 /// The command as it was called.

@@ -1,11 +1,11 @@
 //! `lidarshift compare`: several simulations of the same recordings, ranked by how far they are from measured data.
 
 use crate::device::DeviceArgs;
+use crate::json::JsonArgs;
 use crate::study::listener;
 use crate::{errln, outln};
 use anyhow::{Result, bail};
 use clap::Args;
-use data::output::check_writable;
 use data::{Dataset, write_json};
 use diagnose::{OnClouds, Options, Rig, diagnose_with};
 use eval::BootstrapOptions;
@@ -69,9 +69,8 @@ pub struct CompareArgs {
     /// Folder for the results
     #[arg(long, value_name = "DIR", default_value = "runs/compare")]
     out: PathBuf,
-    /// Also write the result to this file
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
     #[command(flatten)]
     device: DeviceArgs,
 }
@@ -116,9 +115,7 @@ impl CompareArgs {
             self.diagnose(&mut comparison)?;
         }
         write_json(&self.out.join("comparison.json"), &comparison)?;
-        if let Some(path) = &self.json {
-            write_json(path, &comparison)?;
-        }
+        self.json.write(&comparison)?;
         let report =
             ComparisonReport { comparison: &comparison, command: crate::commands::called(), facts: self.facts(&names) };
         report.write(&self.out)?;
@@ -131,7 +128,7 @@ impl CompareArgs {
         for path in datasets {
             Dataset::open(path)?.refuse_own_folder(&self.out)?;
         }
-        Ok(self.json.as_deref().map_or(Ok(()), check_writable)?)
+        Ok(self.json.check([])?)
     }
 
     fn frozen(&self, names: &[String]) -> Result<Vec<FrozenDetector>> {

@@ -9,9 +9,18 @@ use std::ffi::OsString;
 use std::fmt::Arguments;
 use std::io::{Error, ErrorKind, Write as _};
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The first error of stdout.
 static LOST: Mutex<Option<Error>> = Mutex::new(None);
+
+/// Whether text goes to stderr, so that stdout has the JSON of `--json -` alone.
+static TEXT_TO_STDERR: AtomicBool = AtomicBool::new(false);
+
+/// Sends the text of [`print`] to stderr from now on.
+pub(crate) fn text_to_stderr() {
+    TEXT_TO_STDERR.store(true, Ordering::SeqCst);
+}
 
 /// Prints a line on stdout, as `println!` does.
 #[macro_export]
@@ -40,13 +49,25 @@ macro_rules! errln {
     };
 }
 
-/// Prints text on stdout. Nothing is printed after the first error.
+/// Prints text on stdout, or on stderr if stdout is for JSON. Nothing is printed after the first error of stdout.
 pub fn print(text: Arguments<'_>) {
-    let text = text.to_string();
+    if TEXT_TO_STDERR.load(Ordering::SeqCst) {
+        print_error(text);
+    } else {
+        write_stdout(&escaped(&text.to_string()));
+    }
+}
+
+/// Prints JSON on stdout, with a line feed behind it.
+pub fn print_json(json: &str) {
+    write_stdout(&format!("{}\n", escaped_json(json)));
+}
+
+fn write_stdout(text: &str) {
     let mut lost = lost();
     if lost.is_none() {
         let mut stdout = std::io::stdout().lock();
-        *lost = stdout.write_all(escaped(&text).as_bytes()).and_then(|()| stdout.flush()).err();
+        *lost = stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()).err();
     }
 }
 
@@ -73,26 +94,27 @@ pub fn print_usage(error: &clap::Error, arguments: &[OsString]) -> u8 {
     u8::try_from(error.exit_code()).unwrap_or(2)
 }
 
-/// The exit code of the program after its last output. If stdout is a pipe that was closed, the program ends as by
-/// SIGPIPE. If stdout could not be written for another reason, the exit code is 1.
+/// The exit code of a program after its last output: 1 with a message if stdout could not be written, else this code.
 pub fn end(code: u8) -> u8 {
+    lost_stdout().map_or(code, |error| {
+        print_error(format_args!("error: stdout cannot be written: {error}\n"));
+        crate::FAILURE
+    })
+}
+
+/// Why stdout could not be written, if it could not. If it is a pipe that was closed, the program ends as by SIGPIPE.
+pub(crate) fn lost_stdout() -> Option<Error> {
     let lost = lost().take();
-    match lost {
-        None => code,
-        Some(error) if error.kind() == ErrorKind::BrokenPipe => crate::signals::end_by_pipe(),
-        Some(error) => {
-            print_error(format_args!("error: stdout cannot be written: {error}\n"));
-            crate::FAILURE
+    lost.inspect(|error| {
+        if error.kind() == ErrorKind::BrokenPipe {
+            crate::signals::end_by_pipe();
         }
-    }
+    })
 }
 
 /// The text with all control characters but line feed and tab written as `\u{1b}`, and with those that change the
 /// direction of text.
 pub fn escaped(text: &str) -> Cow<'_, str> {
-    let is_strange = |c: char| {
-        c.is_control() && !matches!(c, '\n' | '\t') || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
-    };
     if !text.contains(is_strange) {
         return Cow::Borrowed(text);
     }
@@ -101,6 +123,23 @@ pub fn escaped(text: &str) -> Cow<'_, str> {
         if is_strange(c) { shown.extend(c.escape_unicode()) } else { shown.push(c) }
     }
     Cow::Owned(shown)
+}
+
+/// JSON with the same characters escaped as JSON does. They stand in strings alone.
+pub fn escaped_json(text: &str) -> Cow<'_, str> {
+    if !text.contains(is_strange) {
+        return Cow::Borrowed(text);
+    }
+    let mut shown = String::with_capacity(text.len() + 8);
+    for c in text.chars() {
+        if is_strange(c) { shown += &format!("\\u{:04x}", u32::from(c)) } else { shown.push(c) }
+    }
+    Cow::Owned(shown)
+}
+
+/// Control characters other than line feed and tab, and those that change the direction of text.
+fn is_strange(c: char) -> bool {
+    c.is_control() && !matches!(c, '\n' | '\t') || matches!(c, '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
 fn lost() -> std::sync::MutexGuard<'static, Option<Error>> {

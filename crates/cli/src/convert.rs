@@ -1,5 +1,6 @@
 //! `lidarshift convert`: a data set in another format.
 
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result};
 use clap::{Args, ValueEnum};
@@ -32,8 +33,10 @@ pub struct ConvertArgs {
     #[arg(long, value_name = "N", default_value_t = SHARD_FRAMES, value_parser = at_least_one)]
     shard_frames: usize,
     /// Write nothing; compare every file of the frames in --out with its SHA-256 from when it was written
-    #[arg(long)]
+    #[arg(long, conflicts_with = "json")]
     verify: bool,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 /// The formats, as words of the command line.
@@ -68,6 +71,7 @@ impl ConvertArgs {
         }
         let dataset = Dataset::open(&self.dataset)?;
         dataset.refuse_own_folder(&self.out)?;
+        self.json.check([])?;
         let to = match self.to {
             Target::Kitti => Format::Kitti,
             Target::Pcd => Format::Pcd,
@@ -85,6 +89,7 @@ impl ConvertArgs {
             });
         let manifest = made.with_context(|| format!("converting {}", self.dataset.display()))?;
         progress.finish_and_clear();
+        self.json.write(&manifest)?;
         outln!("{} frames, {} points, {} labels", manifest.frames, manifest.points, manifest.labels);
         errln!("data set written to {}", self.out.display());
         Ok(())

@@ -1,19 +1,23 @@
 //! `lidarshift detect`: detects objects in one point cloud or in all frames of a split.
 
 use crate::device::DeviceArgs;
+use crate::errors::InFile;
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::{Args, ValueEnum};
 use data::Presence as _;
+use data::toml_text::parse_toml;
 use data::{
-    Cloud, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
-    read_kitti_text, refuse_input_file, write_atomic, write_json,
+    Cloud, DataError, Dataset, Detection, FolderLock, Frame, KittiLine, KittiText, LabelBox, PointColumns, read_cloud,
+    read_kitti_text, write_atomic,
 };
 use indicatif::{ProgressBar, ProgressStyle};
 use models::checkpoint::read_checkpoint;
 use models::config::DetectorConfig;
 use models::{Detector, Preparer, find_detector, inference_samples, predict_frames, predict_samples};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use train::verify_weights;
@@ -47,9 +51,8 @@ pub struct DetectArgs {
     /// Ground truth to draw into the picture of a point cloud: KITTI text in the label frame "lidar"
     #[arg(long, value_name = "FILE")]
     labels: Option<PathBuf>,
-    /// Also write the boxes of a point cloud as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
     #[command(flatten)]
     device: DeviceArgs,
 }
@@ -60,12 +63,45 @@ enum Points {
     Xyzi,
 }
 
-/// The boxes of one point cloud, in its frame.
-#[derive(Serialize)]
-struct Found<'a> {
+/// Version of the JSON of a point cloud.
+pub(crate) const DETECTIONS_SCHEMA: &str = "lidarshift/detections/1";
+
+/// Version of the JSON of a data set.
+pub(crate) const SET_DETECTIONS_SCHEMA: &str = "lidarshift/set-detections/1";
+
+/// Boxes found in one point cloud.
+#[derive(Serialize, JsonSchema)]
+#[schemars(title = "Detections")]
+pub(crate) struct Found<'a> {
+    /// `lidarshift/detections/1`.
     schema: &'static str,
+    /// Name of the cloud, or id of the frame.
     frame: &'a str,
+    /// The boxes, in the frame of the cloud.
     detections: &'a [Detection],
+}
+
+/// Boxes found in the frames of a data set.
+#[derive(Serialize, JsonSchema)]
+#[schemars(title = "SetDetections")]
+pub(crate) struct FoundInSet {
+    /// `lidarshift/set-detections/1`.
+    schema: &'static str,
+    /// Name of the data set.
+    dataset: String,
+    /// The split; null for all frames.
+    split: Option<String>,
+    /// The frames in their order.
+    frames: Vec<FoundInFrame>,
+}
+
+/// Boxes found in one frame.
+#[derive(Serialize, JsonSchema)]
+pub(crate) struct FoundInFrame {
+    /// Its id.
+    frame: String,
+    /// The boxes, in the frame of its cloud.
+    detections: Vec<Detection>,
 }
 
 impl DetectArgs {
@@ -77,7 +113,7 @@ impl DetectArgs {
         let weights = read_checkpoint(&self.checkpoint)?;
         let detector = Detector::new(&config, 0, &device)
             .load_named(&weights)
-            .with_context(|| format!("{} does not fit the detector {}", self.checkpoint.display(), config.name))?;
+            .with_context(|| InFile::new(&self.checkpoint, &format!(" does not fit the detector {}", config.name)))?;
         let ending = self.input.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
         match ending.as_str() {
             "bin" | "pcd" => self.cloud(&detector),
@@ -86,7 +122,7 @@ impl DetectArgs {
     }
 
     fn cloud(&self, detector: &Detector) -> Result<()> {
-        refuse_input_file(self.json.as_deref(), [&*self.input].into_iter().chain(self.labels.as_deref()))?;
+        self.json.check([&*self.input].into_iter().chain(self.labels.as_deref()))?;
         let columns = match self.points {
             Some(Points::Xyz) => PointColumns::Xyz,
             Some(Points::Xyzi) => PointColumns::Xyzi,
@@ -98,10 +134,7 @@ impl DetectArgs {
         let frame = Frame { id: id.clone(), cloud, objects: Vec::new() };
         let sample = Preparer::new(detector.config()).inference(&frame)?;
         let detections = predict_samples(detector, &[sample])?.remove(0).detections;
-        if let Some(path) = &self.json {
-            let found = Found { schema: "lidarshift/detections/1", frame: &id, detections: &detections };
-            write_json(path, &found)?;
-        }
+        self.json.write(&Found { schema: DETECTIONS_SCHEMA, frame: &id, detections: &detections })?;
         let truth = match &self.labels {
             Some(path) => read_kitti_text(path, KittiText::Labels)?,
             None => Vec::new(),
@@ -132,6 +165,7 @@ impl DetectArgs {
         let Some(out) = &self.out else { bail!("--out DIR is required to detect on a data set") };
         let dataset = Dataset::open(&self.input)?;
         dataset.refuse_frame_folder(out)?;
+        self.json.check([])?;
         let _lock = FolderLock::acquire(out)?;
         let ids = match &self.split {
             Some(split) => dataset.ids(split)?,
@@ -139,18 +173,23 @@ impl DetectArgs {
         };
         let progress = ProgressBar::new(ids.len() as u64)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames, {per_sec}, {eta} left")?);
-        let mut boxes = 0;
+        let (mut boxes, mut frames) = (0, Vec::new());
         let samples = inference_samples(detector, &dataset, &ids, 1).zip(&ids).map(|(sample, id)| Ok((sample?, id)));
         predict_frames(detector, 1, samples, |batch| {
             for (id, found) in batch {
                 boxes += found.detections.len();
                 let labels = dataset.detection_boxes(id, &found.detections)?;
                 data::write::write_kitti_text(&out.join(format!("{id}.txt")), &labels)?;
+                if self.json.is_given() {
+                    frames.push(FoundInFrame { frame: id.clone(), detections: found.detections });
+                }
                 progress.inc(1);
             }
             Ok::<(), anyhow::Error>(())
         })?;
         progress.finish_and_clear();
+        let (dataset, split) = (dataset.config.name.clone(), self.split.clone());
+        self.json.write(&FoundInSet { schema: SET_DETECTIONS_SCHEMA, dataset, split, frames })?;
         errln!("{boxes} boxes in {} frames, written to {}", ids.len(), out.display());
         Ok(())
     }
@@ -166,13 +205,13 @@ pub(crate) fn detector_of(checkpoint: &Path, named: Option<&str>) -> Result<Dete
         let path = folder.join("config.toml");
         if path.may_be_file() {
             let text = fs_err::read_to_string(&path)?;
-            let run: toml::Table = text.parse().with_context(|| path.display().to_string())?;
+            let run: toml::Table = parse_toml(&text, &path, |_| Ok(()))?;
             let Some(detector) = run.get("detector") else { continue };
-            let config: DetectorConfig = detector.clone().try_into().with_context(|| path.display().to_string())?;
+            let config: DetectorConfig = detector.clone().try_into().with_context(|| InFile::new(&path, ""))?;
             return Ok(config);
         }
     }
-    bail!("{}: the detector of these weights is unknown; give it with --detector", checkpoint.display())
+    Err(DataError::file(checkpoint, "the detector of these weights is unknown; give it with --detector").into())
 }
 
 /// Draws points, ground truth and detections in a bird's eye view.

@@ -7,14 +7,14 @@ mod simulator;
 
 use crate::commands::{End, called};
 use crate::errln;
+use crate::json::JsonArgs;
 use anyhow::{Context, Result, bail};
 use clap::Args;
-use data::output::check_writable;
 use data::write::{REPAIRED_ENDINGS, write_kitti_text};
-use data::{Dataset, FolderLock, LabelBox, refuse_input_file, write_atomic, write_json};
+use data::{DataError, Dataset, ErrorKind, FolderLock, LabelBox, write_atomic, write_json};
 use detectors::gain_of_detectors;
 use diagnose::{
-    Cause, Diagnosis, OnClouds, Options, Outcome, Progress, Remake, Rig, Stage, Unidentifiable, Verdict,
+    Cause, Diagnosis, OnClouds, Options, Outcome, Progress, Remake, Rig, Stage, Unidentifiable, Verdict, Verification,
     diagnose_scans, diagnose_unpaired, diagnose_with, verify,
 };
 use indicatif::{ProgressBar, ProgressStyle};
@@ -79,9 +79,8 @@ pub struct DiagnoseArgs {
     /// test them on measured frames; the study `gain` is made for this
     #[arg(long, value_name = "STUDY", requires = "measured")]
     detectors: Option<String>,
-    /// Also write diagnosis.json to this file
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl DiagnoseArgs {
@@ -89,7 +88,8 @@ impl DiagnoseArgs {
     pub fn run(self) -> Result<End> {
         let rig = self.rig()?;
         if self.out.is_file() {
-            bail!("--out {}: is a file, but must be a folder", self.out.display());
+            let message = "is a file, but must be a folder; choose another --out";
+            return Err(DataError::of_kind(ErrorKind::Refused, &self.out, message).into());
         }
         self.check_outputs()?;
         let _lock = FolderLock::acquire(&self.out)?;
@@ -147,7 +147,9 @@ impl DiagnoseArgs {
     fn finish(&self, mut outcome: Outcome, measured: &Dataset, bar: &ProgressBar) -> Result<End> {
         bar.finish_and_clear();
         previous::remove(&self.out)?;
-        self.write_json(&outcome.diagnosis)?;
+        let with_detectors = self.detectors.is_some() && !outcome.diagnosis.findings.is_empty();
+        // Stdout gets the diagnosis once, with the detectors.
+        self.write_json(&outcome.diagnosis, !(with_detectors && self.json.is_stdout()))?;
         write_atomic(&self.out.join("extended.toml"), outcome.extended.as_bytes())?;
         write_finding_pictures(&outcome.diagnosis, &self.out)?;
         self.write_page(&outcome.diagnosis)?;
@@ -158,7 +160,7 @@ impl DiagnoseArgs {
         }
         print_diagnosis(&outcome.diagnosis, &self.out, outcome.corrected.len());
         if let (Some(study), Some(measured), Some(simulated)) = (&self.detectors, &self.measured, &self.simulated)
-            && !outcome.diagnosis.findings.is_empty()
+            && with_detectors
         {
             let extended = self.out.join("extended.toml");
             let (gains, left_out) =
@@ -166,7 +168,7 @@ impl DiagnoseArgs {
             print_gains(&gains, &left_out);
             outcome.diagnosis.detectors = gains;
             outcome.diagnosis.notes.extend(left_out);
-            self.write_json(&outcome.diagnosis)?;
+            self.write_json(&outcome.diagnosis, true)?;
             self.write_page(&outcome.diagnosis)?;
         }
         Ok(end_of(&outcome.diagnosis))
@@ -178,14 +180,11 @@ impl DiagnoseArgs {
             Dataset::open(path)?.refuse_own_folder(&self.out)?;
         }
         if Dataset::open(&self.out).is_ok() {
-            bail!(
-                "--out {}: is a data set, whose labels would be overwritten; choose another folder",
-                self.out.display()
-            );
+            let message = "is a data set, whose labels would be overwritten; choose another --out";
+            return Err(DataError::of_kind(ErrorKind::Refused, &self.out, message).into());
         }
         let inputs = [&self.verify, &self.sensor].into_iter().flatten().map(PathBuf::as_path);
-        refuse_input_file(self.json.as_deref(), inputs)?;
-        Ok(self.json.as_deref().map_or(Ok(()), check_writable)?)
+        Ok(self.json.check(inputs)?)
     }
 
     /// What the diagnosis leaves out: the frames on which detectors are tested.
@@ -236,41 +235,40 @@ impl DiagnoseArgs {
     ) -> Result<End> {
         let effects = EffectList::read(list)?;
         if effects.effects.is_empty() {
-            bail!("{}: has no effect, and so no gain", list.display());
+            return Err(DataError::file(list, "has no effect, and so no gain").into());
         }
         let (measured, simulated) = (Dataset::open(measured)?, Dataset::open(simulated)?);
         if let Some(made) = &effects.made_from {
             let own: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
             if own != made.sensors {
-                bail!(
-                    "{}: was made for the sensors {}, but the rig has {}: give that rig (--sensor)",
-                    list.display(),
-                    made.sensors.join(", "),
-                    own.join(", ")
-                );
+                let [made, own] = [made.sensors.join(", "), own.join(", ")];
+                let message =
+                    format!("was made for the sensors {made}, but the rig has {own}: give that rig (--sensor)");
+                return Err(DataError::file(list, message).into());
             }
         }
         let remake = self.remake(&simulated, rig);
         match verify(&measured, &simulated, rig, options, &effects, remake.as_ref(), progress)? {
             Ok(gain) => {
-                write_json(&self.out.join("verification.json"), &gain)?;
-                if let Some(path) = &self.json {
-                    write_json(path, &gain)?;
-                }
-                print_gain(&gain, &list.display().to_string());
+                let verification = Verification::new(gain);
+                write_json(&self.out.join("verification.json"), &verification)?;
+                self.json.write(&verification)?;
+                print_gain(&verification.gain, &list.display().to_string());
                 Ok(End::Done)
             }
             Err(diagnosis) => {
+                self.json.write(&diagnosis)?;
                 print_diagnosis(&diagnosis, &self.out, 0);
                 Ok(end_of(&diagnosis))
             }
         }
     }
 
-    fn write_json(&self, diagnosis: &Diagnosis) -> Result<()> {
+    /// Writes diagnosis.json, and what `--json` asks for if it is `also` wanted.
+    fn write_json(&self, diagnosis: &Diagnosis, also: bool) -> Result<()> {
         write_json(&self.out.join("diagnosis.json"), diagnosis)?;
-        if let Some(path) = &self.json {
-            write_json(path, diagnosis)?;
+        if also {
+            self.json.write(diagnosis)?;
         }
         Ok(())
     }

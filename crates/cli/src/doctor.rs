@@ -1,5 +1,6 @@
 //! `lidarshift doctor`: checks a data set for errors.
 
+use crate::json::JsonArgs;
 use crate::outln;
 use anyhow::{Result, anyhow};
 use clap::Args;
@@ -17,7 +18,7 @@ use std::path::{Path, PathBuf};
 ///
 /// Examples:
 ///   lidarshift doctor datasets/road
-///   lidarshift doctor /data/kitti --detector pointpillars --json doctor.json
+///   lidarshift doctor /data/kitti --detector pointpillars --json -
 ///   lidarshift doctor datasets/road --detector pointpillars_small --suggest mine.toml
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
@@ -32,20 +33,18 @@ pub struct DoctorArgs {
     /// for each change
     #[arg(long, value_name = "TOML", requires = "detector")]
     suggest: Option<PathBuf>,
-    /// Also write the report as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl DoctorArgs {
     /// Prints the report; `true` if no problem is found.
     pub fn run(self) -> Result<bool> {
+        self.json.check([])?;
         let detector = self.detector.as_deref().map(find_detector).transpose()?;
         let dataset = Dataset::open(&self.dataset)?;
         let report = doctor(&dataset, detector.as_ref().map(facts).as_ref())?;
-        if let Some(path) = &self.json {
-            data::write_json(path, &report)?;
-        }
+        self.json.write(&report)?;
         let suggestion = match (&self.suggest, &detector) {
             (Some(path), Some(detector)) => Some(self.write_suggestion(path, detector, &dataset)),
             _ => None,
@@ -102,7 +101,7 @@ mod tests {
     use data::write::write_bin;
     use data::{Cloud, write_atomic};
 
-    fn args(dataset: PathBuf, json: Option<PathBuf>) -> DoctorArgs {
+    fn args(dataset: PathBuf, json: JsonArgs) -> DoctorArgs {
         DoctorArgs { dataset, detector: Some("pointpillars".into()), suggest: None, json }
     }
 
@@ -112,7 +111,7 @@ mod tests {
         write_bin(&folder.path().join("velodyne/000000.bin"), &Cloud { values: vec![1.0; 40], channels: 4 }).unwrap();
         write_atomic(&folder.path().join("label_2/000000.txt"), b"").unwrap();
         let json = folder.path().join("doctor.json");
-        assert!(!args(folder.path().into(), Some(json.clone())).run().unwrap());
+        assert!(!args(folder.path().into(), JsonArgs::file(&json)).run().unwrap());
         let report: serde_json::Value = serde_json::from_slice(&std::fs::read(json).unwrap()).unwrap();
         assert_eq!(report["schema"], "lidarshift/doctor/1");
         assert_eq!(report["sound"], false);
@@ -122,7 +121,7 @@ mod tests {
     #[test]
     fn a_folder_without_a_data_set_is_an_error() {
         let folder = tempfile::tempdir().unwrap();
-        let error = args(folder.path().into(), None).run().unwrap_err().to_string();
+        let error = args(folder.path().into(), JsonArgs::default()).run().unwrap_err().to_string();
         assert!(error.contains("neither dataset.toml nor velodyne/"), "{error}");
     }
 
@@ -132,6 +131,6 @@ mod tests {
         if !root.exists() {
             return eprintln!("skipped: {} is not there", root.display());
         }
-        assert!(args(root, None).run().unwrap());
+        assert!(args(root, JsonArgs::default()).run().unwrap());
     }
 }

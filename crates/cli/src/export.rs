@@ -2,9 +2,13 @@
 
 mod onnx;
 
+pub(crate) use onnx::{ONNX_SCHEMA, OnnxDescription};
+
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::Result;
 use clap::{Args, ValueEnum};
+use data::DataError;
 use exchange::{NOT_EXPRESSED, Program, Remedy};
 use sensor::{EffectList, Rig};
 use std::path::PathBuf;
@@ -39,6 +43,8 @@ pub struct ExportArgs {
     /// Folder for the files
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 /// The simulators, as words of the command line.
@@ -72,21 +78,23 @@ impl ExportArgs {
                 if self.rig.is_some() {
                     anyhow::bail!("--rig is for sensor models, not for --to onnx; leave it out");
                 }
-                let Self { model, detector, check, out, .. } = self;
-                return onnx::OnnxExport { weights: model, detector, check, out }.run();
+                let Self { model, detector, check, out, json, .. } = self;
+                return onnx::OnnxExport { weights: model, detector, check, out, json }.run();
             }
         };
         if let Some((option, _)) = network_only.iter().find(|(_, given)| *given) {
             anyhow::bail!("{option} is for --to onnx; leave it out");
         }
+        self.json.check([&*self.model].into_iter().chain(self.rig.as_deref()))?;
         let list = EffectList::read(&self.model)?;
         let rig = self.rig.as_deref().map_or(Ok(Rig::single()), Rig::read)?;
         if let Some(why) = list.effects.iter().find_map(|e| Some(format!("{} {}", e.kind(), e.strange_to(&rig)?))) {
-            anyhow::bail!("{}: {why}", self.model.display());
+            return Err(DataError::file(&self.model, why).into());
         }
         let rig_name = self.rig.as_ref().map(|path| path.display().to_string());
         let export = exchange::export(program, &list, &rig, &self.model.display().to_string(), rig_name.as_deref());
         export.write(&self.out)?;
+        self.json.write(&export.summary)?;
         for e in &export.summary.expressed {
             outln!("effect[{}]: {}: {}", e.index, e.kind, e.by);
         }
@@ -117,8 +125,15 @@ mod tests {
     fn a_list_for_another_rig_is_refused() {
         let folder = tempfile::tempdir().unwrap();
         let (model, out) = (folder.path().join("m.toml"), folder.path().join("out"));
-        let args =
-            |to| ExportArgs { model: model.clone(), to, rig: None, detector: None, check: None, out: out.clone() };
+        let args = |to| ExportArgs {
+            model: model.clone(),
+            to,
+            rig: None,
+            detector: None,
+            check: None,
+            out: out.clone(),
+            json: JsonArgs::default(),
+        };
         std::fs::write(&model, "[[effect]]\nkind = \"sensor_pose_error\"\nsensor = \"front\"\n").unwrap();
         let error = args(Target::Carla).run().unwrap_err().to_string();
         assert!(error.contains("m.toml") && error.contains("\"front\""), "{error}");

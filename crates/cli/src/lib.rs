@@ -5,11 +5,18 @@ mod commands;
 pub mod allocator;
 pub mod console;
 pub mod device;
+pub mod errors;
+pub mod json;
+mod json_forms;
 pub mod signals;
 
 use clap::{CommandFactory as _, FromArgMatches as _, Parser};
+use data::Place;
+use errors::{ErrorFormat, ErrorReport};
 use std::ffi::OsString;
 use std::process::ExitCode;
+
+pub use json_forms::json_forms;
 
 commands! {
     /// The commands, in the order of the help.
@@ -37,6 +44,9 @@ commands! {
 #[derive(Parser, Debug)]
 #[command(name = "lidarshift", version, about, arg_required_else_help = true)]
 struct Program {
+    /// Form of an error on stderr; json: one object, the last line, with code, kind, file, line, hint and message
+    #[arg(long, global = true, value_enum, value_name = "FORMAT", default_value = "text")]
+    errors: ErrorFormat,
     #[command(subcommand)]
     command: Command,
 }
@@ -69,6 +79,9 @@ fn parse(arguments: &[OsString]) -> Result<Program, clap::Error> {
         command = command.version(data::build_id());
     }
     let matches = command.try_get_matches_from_mut(arguments)?;
+    if json::is_on_stdout(&matches) {
+        console::text_to_stderr();
+    }
     Program::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
 }
 
@@ -78,14 +91,33 @@ pub fn run_with(arguments: Vec<OsString>) -> u8 {
     commands::set_called(&arguments);
     set_commit();
     signals::handle();
-    let code = match parse(&arguments).map(|program| program.command.run()) {
-        Ok(Ok(end)) => end.into(),
+    let is_json = ErrorFormat::of(&arguments) == ErrorFormat::Json;
+    let (code, report) = match parse(&arguments).map(|program| program.command.run()) {
+        Ok(Ok(end)) => (end.into(), ErrorReport::of_end(end)),
         Ok(Err(error)) => {
-            errln!("error: {error:#}");
-            signals::end_if_stopped();
-            FAILURE
+            if !is_json {
+                errln!("error: {error:#}");
+            }
+            (FAILURE, Some(ErrorReport::of_error(&error)))
         }
-        Err(usage) => console::print_usage(&usage, &arguments),
+        Err(usage) => match ErrorReport::of_usage(&usage).filter(|_| is_json) {
+            Some(report) => (report.code, Some(report)),
+            None => (console::print_usage(&usage, &arguments), None),
+        },
     };
-    console::end(code)
+    if let Some(report) = report.as_ref().filter(|_| is_json) {
+        report.print();
+    }
+    if code == FAILURE {
+        signals::end_if_stopped();
+    }
+    if !is_json {
+        return console::end(code);
+    }
+    let Some(error) = console::lost_stdout() else { return code };
+    if report.is_none() {
+        let place = Place::of_kind(error.kind().into());
+        ErrorReport::new(FAILURE, place, format!("stdout cannot be written: {error}")).print();
+    }
+    FAILURE
 }

@@ -1,5 +1,6 @@
 //! `lidarshift resim`: applies sensor effects to an existing data set.
 
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result};
 use clap::Args;
@@ -40,8 +41,10 @@ pub struct ResimArgs {
     #[arg(long)]
     skip_inapplicable: bool,
     /// Write nothing; compare every file of the frames in --out with its SHA-256 from when it was written
-    #[arg(long)]
+    #[arg(long, conflicts_with = "json")]
     verify: bool,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl ResimArgs {
@@ -53,6 +56,7 @@ impl ResimArgs {
         }
         let dataset = Dataset::open(&self.dataset)?;
         dataset.refuse_own_folder(&self.out)?;
+        self.json.check([&*self.effects].into_iter().chain(self.sensor.as_deref()))?;
         let mut effects = EffectList::read(&self.effects)?;
         if effects.effects.is_empty() {
             errln!("note: {} has no effect: the clouds are copied", self.effects.display());
@@ -75,6 +79,7 @@ impl ResimArgs {
         });
         let manifest = made.with_context(|| format!("{} on {}", self.effects.display(), self.dataset.display()))?;
         progress.finish_and_clear();
+        self.json.write(&manifest)?;
         let [before, after] = manifest.points.map(|n| n / manifest.frames.max(1));
         outln!("{} frames, {after} points per frame ({before} before)", manifest.frames);
         errln!("data set written to {}", self.out.display());
@@ -101,6 +106,7 @@ mod tests {
             seed: 1,
             skip_inapplicable: false,
             verify: false,
+            json: JsonArgs::default(),
         };
         std::fs::write(&effects, "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.02\n").unwrap();
         args("noisy").run().unwrap();

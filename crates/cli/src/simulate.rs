@@ -1,6 +1,7 @@
 //! `lidarshift simulate`: simulates data sets and writes them to disk.
 
 use crate::console::escaped;
+use crate::json::JsonArgs;
 use crate::{errln, out, outln};
 use anyhow::Result;
 use clap::Args;
@@ -8,6 +9,8 @@ use data::Presence as _;
 use data::{Dataset, verify_frames, write_atomic};
 use indicatif::{ProgressBar, ProgressStyle};
 use report::{BirdsEyeOptions, Style, birds_eye_png};
+use schemars::JsonSchema;
+use serde::Serialize;
 use simulate::race::{ConfigFiles, RaceConfig, RaceManifest, make_race_datasets};
 use simulate::{RoadConfig, Scenery, make_road_dataset};
 use std::path::{Path, PathBuf};
@@ -42,13 +45,29 @@ pub struct SimulateArgs {
     #[arg(long, value_name = "NAMES", value_delimiter = ',')]
     dataset: Vec<String>,
     /// Simulate nothing; compare every file of the frames with its SHA-256 from when it was written
-    #[arg(long)]
+    #[arg(long, conflicts_with = "json")]
     verify: bool,
+    #[command(flatten)]
+    json: JsonArgs,
+}
+
+/// Version of the JSON of a race.
+pub(crate) const RACE_MANIFESTS_SCHEMA: &str = "lidarshift/race-manifests/1";
+
+/// The data sets of a race.
+#[derive(Serialize, JsonSchema)]
+#[schemars(title = "RaceManifests")]
+pub(crate) struct RaceManifests<'a> {
+    /// `lidarshift/race-manifests/1`.
+    schema: &'static str,
+    /// `manifest.json` of each data set.
+    manifests: &'a [RaceManifest],
 }
 
 impl SimulateArgs {
     /// Simulates the data sets and prints their sizes.
     pub fn run(self) -> Result<()> {
+        self.json.check([])?;
         match Scenery::find(&self.config, self.frames, self.seed)? {
             scenery if self.verify => self.verify(&scenery),
             Scenery::Street(config) => self.street(&config),
@@ -86,6 +105,7 @@ impl SimulateArgs {
         progress.set_length(config.frames.total() as u64);
         let manifest = make_road_dataset(config, &out, &|done, _| progress.set_position(done as u64))?;
         progress.finish_and_clear();
+        self.json.write(&manifest)?;
         for (split, _) in config.frames.splits() {
             let counts = manifest.splits[split];
             let points = counts.points / counts.frames;
@@ -106,6 +126,7 @@ impl SimulateArgs {
         let manifests = make_race_datasets(config, files, &out, &self.dataset, &show_progress)?;
         progress.finish_and_clear();
         manifests.iter().try_for_each(|manifest| preview(&out.join(&manifest.name[1])))?;
+        self.json.write(&RaceManifests { schema: RACE_MANIFESTS_SCHEMA, manifests: &manifests })?;
         manifests.iter().for_each(|manifest| out!("{}", summary(manifest)));
         errln!("data sets written to {}", out.display());
         Ok(())

@@ -6,11 +6,12 @@ mod output;
 pub use output::listener;
 
 use crate::device::DeviceArgs;
+use crate::json::JsonArgs;
 use anyhow::{Result, bail};
 use clap::{Args, Subcommand, ValueEnum};
 use data::Presence as _;
 use std::path::{Path, PathBuf};
-use study::{FrozenState, Launcher, RunOptions, Step, Study, plan, status};
+use study::{FrozenState, Launcher, PlanReport, RunOptions, StatusReport, Step, Study, plan, status};
 
 /// Run a study: generate the missing data sets, train the missing runs, detect on every test set, evaluate, and write a
 /// report. The expected computing time is printed before training starts.
@@ -43,12 +44,19 @@ pub struct StudyArgs {
     scheduling: SchedulingArgs,
     #[command(flatten)]
     device: DeviceArgs,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 #[derive(Subcommand, Debug)]
 enum StudyCommand {
     /// State of each run and the remaining computing time
-    Status(StudySelection),
+    Status {
+        #[command(flatten)]
+        selection: StudySelection,
+        #[command(flatten)]
+        json: JsonArgs,
+    },
     /// The differences that a study will be able to see with 80 % power, and what it costs; nothing is run
     Plan {
         #[command(flatten)]
@@ -57,6 +65,8 @@ enum StudyCommand {
         /// stored values]
         #[arg(long, value_name = "DIR")]
         pilot: Option<PathBuf>,
+        #[command(flatten)]
+        json: JsonArgs,
     },
 }
 
@@ -155,17 +165,23 @@ impl StudyArgs {
     /// A step that fails. Failed runs are reported after all other runs have ended.
     pub fn run(self) -> Result<()> {
         match self.command {
-            Some(StudyCommand::Status(selection)) => {
+            Some(StudyCommand::Status { selection, json }) => {
+                json.check([])?;
                 let study = selection.open()?;
-                output::print_status(&study, &status(&study)?);
+                let (runs, frozen) = (status(&study)?, FrozenState::read(&study)?);
+                json.write(&StatusReport::new(&study, &runs, &frozen))?;
+                output::print_status(&study, &runs);
                 if !study.config.frozen.is_empty() {
-                    output::print_frozen(&FrozenState::read(&study)?);
+                    output::print_frozen(&frozen);
                 }
                 return Ok(());
             }
-            Some(StudyCommand::Plan { selection, pilot }) => {
+            Some(StudyCommand::Plan { selection, pilot, json }) => {
+                json.check([])?;
                 let study = selection.open()?;
-                output::print_plan(&study, &plan(&study, pilot.as_deref())?, &status(&study)?);
+                let planned = plan(&study, pilot.as_deref())?;
+                json.write(&PlanReport::new(&study, &planned))?;
+                output::print_plan(&study, &planned, &status(&study)?);
                 return Ok(());
             }
             None => {}
@@ -175,17 +191,22 @@ impl StudyArgs {
             true => Step::ALL.to_vec(),
             false => self.only.iter().map(|step| step.step()).collect(),
         };
-        run_study(&Study::open(&named, self.out.as_deref())?, &self.scheduling.options(steps, &self.device))
+        if self.json.is_given() && (self.scheduling.dry_run || !steps.contains(&Step::Report)) {
+            bail!("--json is for the matrix, which the step `report` makes; leave out --json, or --dry-run and --only");
+        }
+        self.json.check([])?;
+        run_study(&Study::open(&named, self.out.as_deref())?, &self.scheduling.options(steps, &self.device), &self.json)
     }
 }
 
-/// Runs the steps of a study and prints its matrix and the path of its report.
+/// Runs the steps of a study and prints its matrix and the path of its report; the matrix also goes to `json`.
 ///
 /// # Errors
 /// A step that fails. Failed runs are reported after all other runs have ended.
-pub fn run_study(study: &Study, options: &RunOptions) -> Result<()> {
+pub fn run_study(study: &Study, options: &RunOptions, json: &JsonArgs) -> Result<()> {
     let outcome = study::run_study(study, options, &listener())?;
     if let Some((matrix, files)) = &outcome.report {
+        json.write(matrix)?;
         output::print_results(matrix, files);
     }
     if !outcome.failed.is_empty() {

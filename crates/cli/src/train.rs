@@ -5,6 +5,7 @@ mod results;
 
 use crate::device::DeviceArgs;
 use crate::errln;
+use crate::json::JsonArgs;
 use crate::signals::{self, SaveFirst};
 use crate::study::{SchedulingArgs, run_study};
 use anyhow::{Context, Result, bail};
@@ -12,6 +13,7 @@ use clap::Args;
 use data::Dataset;
 use data::Presence as _;
 use data::output::TemporaryFolder;
+use data::toml_text::parse_toml;
 use models::detector_text;
 use progress::Progress;
 use simulate::{FrameCounts, RoadConfig, make_road_dataset};
@@ -83,10 +85,12 @@ pub struct TrainArgs {
     #[arg(long, conflicts_with_all = ["dataset", "resume"])]
     smoke: bool,
     /// Train all missing runs of a study instead of one run: a name (quick, cpu, gain, paper) or a TOML
-    #[arg(long, value_name = "STUDY", conflicts_with_all = ["dataset", "detector", "seed", "epochs", "set", "init", "resume", "overfit", "smoke"])]
+    #[arg(long, value_name = "STUDY", conflicts_with_all = ["dataset", "detector", "seed", "epochs", "set", "init", "resume", "overfit", "smoke", "json"])]
     study: Option<String>,
     #[command(flatten)]
     scheduling: SchedulingArgs,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl TrainArgs {
@@ -94,8 +98,10 @@ impl TrainArgs {
     pub fn run(mut self) -> Result<()> {
         if let Some(study) = &self.study {
             let study = Study::open(study, self.out.as_deref())?;
-            return run_study(&study, &self.scheduling.options(vec![Step::Data, Step::Train], &self.device));
+            let options = self.scheduling.options(vec![Step::Data, Step::Train], &self.device);
+            return run_study(&study, &options, &JsonArgs::default());
         }
+        self.json.check([])?;
         let device = self.device.open()?;
         let temporary = (self.smoke && self.out.is_none()).then(TemporaryFolder::new).transpose()?;
         if let Some(folder) = &temporary {
@@ -142,6 +148,7 @@ impl TrainArgs {
         let found = evaluate_detector(&trained.detector, &set, &ids, self.workers, &mut count)?;
         counter.finish_and_clear();
         results::write(&found, &set, &out)?;
+        self.json.write(&found.report)?;
         results::show(&found, &what);
         results::write_curve_and_list(&out, temporary.is_none())
     }
@@ -221,7 +228,7 @@ impl TrainArgs {
 }
 
 fn detector_table(name_or_path: &str) -> Result<Table> {
-    detector_text(name_or_path)?.parse().with_context(|| name_or_path.to_string())
+    Ok(parse_toml(&detector_text(name_or_path)?, Path::new(name_or_path), |_| Ok(()))?)
 }
 
 /// The absolute path, so that a run can be resumed from any working directory.

@@ -1,5 +1,6 @@
 //! `lidarshift twin`: makes a simulated partner of a recording.
 
+use crate::json::JsonArgs;
 use crate::{errln, outln};
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -50,6 +51,8 @@ pub struct TwinArgs {
     /// Write the static maps as PLY files
     #[arg(long)]
     maps: bool,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 /// Memory that a map may take where the system does not say what is available, MiB.
@@ -65,6 +68,7 @@ impl TwinArgs {
         };
         let dataset = Dataset::open(&self.recording)?;
         dataset.refuse_own_folder(&self.out)?;
+        self.json.check([])?;
         errln!("reading the scans and their poses");
         let options = PoseOptions { odometry: self.odometry, refine: !self.keep_poses };
         let recording = Recording::open(dataset, self.sequence.as_deref(), self.frames, options)
@@ -84,6 +88,7 @@ impl TwinArgs {
         })
         .with_context(|| format!("a twin of {}", self.recording.display()))?;
         progress.finish_and_clear();
+        self.json.write(&report)?;
         print(&report);
         let [measured, sim] = ["measured", "sim"].map(|side| self.out.join(side));
         errln!("twin written to {}", self.out.display());

@@ -1,5 +1,6 @@
 //! Detectors that were trained elsewhere, through the program: studies of detections and checkpoints, and bad input.
 
+mod forms;
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
@@ -102,6 +103,8 @@ fn detections_made_elsewhere_are_a_study_without_training() {
     for part in ["Measured minus simulated", "Ours 7, trained elsewhere, to Sim", "Chamfer"] {
         assert!(html.contains(part), "{part} is not in the report");
     }
+    let forms = forms::check_files(&dir.path().join("runs/frozen"), &[]);
+    assert!(["paired", "frozen-cell"].iter().all(|form| forms.contains(*form)), "{forms:?}");
     let paired: serde_json::Value =
         serde_json::from_slice(&fs::read(dir.path().join("runs/frozen/paired.json")).unwrap()).unwrap();
     let of = |overlap: f64| {

@@ -1,6 +1,7 @@
 //! Simulation of a race through the program: the same bytes with any number of threads and after a kill; errors of
 //! invalid input.
 
+mod forms;
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
@@ -106,7 +107,9 @@ fn threads_and_kills_change_no_byte() {
 fn pairs_are_compared_and_effects_applied_to_an_existing_data_set() {
     let dir = tempfile::tempdir().unwrap();
     race(dir.path());
-    must(dir.path(), "simulate --config race.toml --out race --dataset measured,sim");
+    must(dir.path(), "simulate --config race.toml --out race --dataset measured,sim --json race/made.json");
+    let found = forms::check_files(&dir.path().join("race"), &[]);
+    assert!(["race-dataset", "race-manifests"].iter().all(|form| found.contains(*form)), "{found:?}");
     let table = output_text(&must(dir.path(), "eval statistics race/measured race/sim --json table.json"));
     assert!(table.contains("points a cloud, mean") && dir.path().join("table.json").is_file(), "{table}");
 

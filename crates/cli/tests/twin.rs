@@ -1,5 +1,6 @@
 //! `lidarshift twin` on recordings in which something is wrong: what is put right and said, and what is refused.
 
+mod forms;
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 #[path = "../../twin/tests/room/mod.rs"]
@@ -141,6 +142,8 @@ fn gaps_missing_labels_and_a_standing_car_are_said() {
     assert!(text.contains("6 frames; poses of the recording"), "{text}");
     let text = output_text(&must(folder.path(), "twin drive --out odometry --odometry"));
     assert!(text.contains("8 frames; poses by aligning the scans"), "{text}");
+    let found = forms::check_files(&folder.path().join("odometry"), &[]);
+    assert!(["twin", "twin-dataset"].iter().all(|form| found.contains(*form)), "{found:?}");
     fs::remove_file(folder.path().join("drive/poses.txt")).unwrap();
     let text = output_text(&must(folder.path(), "twin drive --out without"));
     assert!(text.contains("8 frames; poses by aligning the scans"), "{text}");

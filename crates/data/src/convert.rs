@@ -10,6 +10,7 @@ use crate::limits::{MOST_TEXT_BYTES, read_file};
 use crate::write::write_kitti_text;
 use crate::{Cloud, DataError, Dataset, DatasetConfig, LabelBox, LabelFrame, Layout, NewDataset};
 use crate::{Presence as _, to_kitti_text, write_atomic};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::path::{Path, PathBuf};
@@ -21,7 +22,7 @@ pub const CONVERT_MANIFEST_SCHEMA: &str = "lidarshift/converted-dataset/1";
 const MCAP_LABELS: &str = "labels";
 
 /// The formats that are written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Format {
     /// KITTI's folders: `velodyne/*.bin`, `label_2/*.txt`.
@@ -53,7 +54,7 @@ impl Format {
 }
 
 /// Content of the `manifest.json` of a converted data set.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ConvertManifest {
     /// [`CONVERT_MANIFEST_SCHEMA`].

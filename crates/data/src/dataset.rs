@@ -200,7 +200,7 @@ impl Dataset {
         if let Some(missing) = paths.iter().find(|path| !path.may_be_file()) {
             let message = "does not exist: the diagnosis that repaired the labels did not see this frame; diagnose all \
                            frames, or test on those that it saw";
-            return Err(DataError::file(missing, message));
+            return Err(DataError::missing(missing, message));
         }
         let [estimate, low, high] = paths.map(|path| read_kitti_text(&path, KittiText::Labels));
         Ok(Some([estimate?, low?, high?]))

@@ -117,7 +117,7 @@ impl DatasetConfig {
     pub fn of_folder(folder: &Path) -> Result<Self, DataError> {
         let Some(mut config) = Layout::ALL.iter().find_map(|layout| layout.recognise(folder)) else {
             if !folder.may_be_folder() {
-                return Err(DataError::file(folder, "does not exist; give the folder or the TOML of a data set"));
+                return Err(DataError::missing(folder, "does not exist; give the folder or the TOML of a data set"));
             }
             let markers: Vec<&str> = Layout::ALL.iter().flat_map(|layout| layout.markers()).copied().collect();
             let markers = match &markers[..] {

@@ -8,17 +8,18 @@ mod report;
 mod statistics;
 mod survey;
 
-pub use report::{ClassFacts, DoctorReport, Finding, PointFacts, Severity, Spread};
+pub use report::{ClassFacts, DOCTOR_SCHEMA, DoctorReport, Finding, PointFacts, Severity, Spread};
 
 use crate::{DataError, Dataset};
 use rayon::prelude::*;
 use report::{Findings, at_most};
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
 use survey::{FrameFacts, survey};
 
 /// What a detector expects of its data.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct DetectorFacts {
     /// Classes that it detects.
     pub classes: Vec<String>,
@@ -29,7 +30,7 @@ pub struct DetectorFacts {
 }
 
 /// The anchors of one class.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct AnchorFacts {
     /// The class.
     pub class: String,

@@ -1,7 +1,7 @@
 //! The lock of an output folder. Every writer of a folder takes it before it looks at what the folder holds.
 
-use crate::DataError;
 use crate::output::{TEMPORARY_PREFIX, create_folder, remove_unfinished};
+use crate::{DataError, ErrorKind};
 use std::fs::{File, TryLockError};
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
@@ -37,7 +37,7 @@ impl FolderLock {
                 let owner = if owner.is_empty() { String::new() } else { format!(" ({})", owner.trim()) };
                 let message =
                     format!("is in use by another process{owner}; wait until it ends, or choose another --out");
-                Err(DataError::file(folder, message))
+                Err(DataError::of_kind(ErrorKind::InUse, folder, message))
             }
         }
     }
@@ -60,13 +60,13 @@ impl FolderLock {
                     continue;
                 }
                 Err(TryLockError::Error(e)) => {
-                    return Err(DataError::file(&path, format!("cannot be locked: {e}")));
+                    return Err(DataError::io(&path, "cannot be locked", &e));
                 }
             }
             // Otherwise its owner has removed it between opening and locking.
             if is_same(&file, &path) {
                 let lock = FolderLock { path, file };
-                let failed = |e| DataError::file(&lock.path, format!("cannot be written: {e}"));
+                let failed = |e| DataError::io(&lock.path, "cannot be written", &e);
                 lock.write_owner().map_err(failed)?;
                 return Ok(Some(lock));
             }

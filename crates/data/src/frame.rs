@@ -1,6 +1,7 @@
 //! A frame of a data set: a point cloud and its labelled objects.
 
 use geometry::Box3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A point cloud: x, y, z (m, LiDAR frame) and optionally intensity (in [0, 1] for KITTI), one point after the other.
@@ -65,7 +66,7 @@ impl Cloud {
 }
 
 /// A labelled object.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Object {
     /// Class as in the label file.
     pub class: String,
@@ -91,7 +92,7 @@ pub struct Frame {
 }
 
 /// A detected object.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Detection {
     /// Class name.
     pub class: String,

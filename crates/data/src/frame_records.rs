@@ -9,6 +9,7 @@ use crate::checksum::file_sha256;
 use crate::{DataError, build_id, write_atomic};
 use fs_err::{File, OpenOptions};
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::Write as _;
@@ -19,9 +20,10 @@ use std::sync::Mutex;
 pub const FRAMES_FILE: &str = "frames.jsonl";
 
 /// The files of one frame.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-struct FrameRecord {
+pub(crate) struct FrameRecord {
+    /// Id of the frame.
     id: String,
     /// SHA-256 of what the frame was made from, if it was made from files.
     #[serde(default, skip_serializing_if = "Option::is_none")]

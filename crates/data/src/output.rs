@@ -136,7 +136,7 @@ pub fn remove_unfinished_below(folder: &Path) -> Result<(), DataError> {
 /// Writes `bytes` to `path` and creates its folder if needed. Readers see the old or the new file, never a part of it.
 /// What exists and is no regular file is written to and stays.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
-    let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
+    let failed = |e: std::io::Error| DataError::io(path, "cannot be written", &e);
     match destination(path).map_err(failed)? {
         Destination::File(file) => {
             create_folder(folder_of(&file))?;
@@ -163,7 +163,7 @@ pub fn write_atomic_with(
     path: &Path,
     fill: impl FnOnce(&mut std::fs::File) -> Result<(), DataError>,
 ) -> Result<(), DataError> {
-    let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
+    let failed = |e: std::io::Error| DataError::io(path, "cannot be written", &e);
     let Destination::File(file) = destination(path).map_err(failed)? else {
         return Err(DataError::file(path, "is no regular file; it is written in pieces, which needs one"));
     };
@@ -176,7 +176,7 @@ pub fn write_atomic_with(
 /// # Errors
 /// A folder in which no file can be created, or a path that is a folder.
 pub fn check_writable(path: &Path) -> Result<(), DataError> {
-    let failed = |e: std::io::Error| DataError::file(path, format!("cannot be written: {e}"));
+    let failed = |e: std::io::Error| DataError::io(path, "cannot be written", &e);
     if let Destination::File(file) = destination(path).map_err(failed)? {
         let folder = folder_of(&file);
         create_folder(folder)?;
@@ -304,7 +304,7 @@ pub fn link(file: &Path, name: &Path) -> Result<(), DataError> {
 pub fn rename(from: &Path, to: &Path) -> Result<(), DataError> {
     fs_err::rename(from, to)?;
     let folder = folder_of(to);
-    sync_folder(folder).map_err(|e| DataError::file(folder, format!("the folder cannot be synced: {e}")))
+    sync_folder(folder).map_err(|e| DataError::io(folder, "the folder cannot be synced", &e))
 }
 
 /// The folder of a file; `.` for a bare name.
@@ -327,7 +327,7 @@ pub fn create_folder(folder: &Path) -> Result<(), DataError> {
     }
     for made in missing {
         let above = folder_of(made);
-        let failed = |e| DataError::file(made, format!("the folder that has this one cannot be synced: {e}"));
+        let failed = |e| DataError::io(made, "the folder that has this one cannot be synced", &e);
         sync_folder(above).map_err(failed)?;
     }
     Ok(())

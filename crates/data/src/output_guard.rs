@@ -1,7 +1,7 @@
 //! Refuses output folders in which files of the input would be overwritten.
 
 use crate::Presence as _;
-use crate::{DataError, Dataset};
+use crate::{DataError, Dataset, ErrorKind};
 use std::path::{Component, Path, PathBuf};
 
 impl Dataset {
@@ -24,7 +24,7 @@ impl Dataset {
                     "is a folder of the data set {}, whose files would be overwritten; choose another --out",
                     self.config.root.display()
                 );
-                return Err(DataError::file(out, message));
+                return Err(DataError::of_kind(ErrorKind::Refused, out, message));
             }
         }
         Ok(())
@@ -37,7 +37,7 @@ impl Dataset {
     pub fn refuse_own_folder(&self, out: &Path) -> Result<(), DataError> {
         if resolved(out) == resolved(&self.config.root) {
             let message = "is the folder of the data set that is read; choose another --out";
-            return Err(DataError::file(out, message));
+            return Err(DataError::of_kind(ErrorKind::Refused, out, message));
         }
         self.refuse_frame_folder(out)
     }
@@ -50,7 +50,11 @@ impl Dataset {
 pub fn refuse_input_file<'a>(out: Option<&Path>, inputs: impl IntoIterator<Item = &'a Path>) -> Result<(), DataError> {
     let Some(out) = out.filter(|out| out.may_be_file()) else { return Ok(()) };
     match inputs.into_iter().find(|input| resolved(input) == resolved(out)) {
-        Some(_) => Err(DataError::file(out, "is a file that is read, and would be overwritten; choose another file")),
+        Some(_) => Err(DataError::of_kind(
+            ErrorKind::Refused,
+            out,
+            "is a file that is read, and would be overwritten; choose another file",
+        )),
         None => Ok(()),
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::catalogue::{Cause, Channel, Covariate, Family, Hypothesis, ParameterId, Quantity, Unit};
 use crate::curve::Curve;
+use data::JsonForm;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -304,23 +305,41 @@ pub struct Considered {
     pub outcome: String,
 }
 
-/// The JSON schema of the file, as docs/src/reference/diagnosis.schema.json has it.
-pub fn schema_json() -> String {
-    format!("{:#}\n", schemars::schema_for!(Diagnosis).to_value())
+/// Version of a [`Verification`].
+pub const VERIFICATION_SCHEMA: &str = "lidarshift/verification/1";
+
+/// The content of `verification.json`: the gain of a given list of effects.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+pub struct Verification {
+    /// [`VERIFICATION_SCHEMA`].
+    pub schema: String,
+    /// The gain.
+    #[serde(flatten)]
+    pub gain: Gain,
+}
+
+impl Verification {
+    /// Of a gain.
+    pub fn new(gain: Gain) -> Self {
+        Verification { schema: VERIFICATION_SCHEMA.into(), gain }
+    }
+}
+
+/// The forms of the JSON files of this crate.
+pub fn json_forms() -> Vec<JsonForm> {
+    vec![
+        JsonForm::of::<Diagnosis>("diagnosis", "`diagnosis.json` of `diagnose`, `diagnose --json`", Some(SCHEMA)),
+        JsonForm::of::<Verification>(
+            "verification",
+            "`verification.json` of `diagnose --verify`, `--json` with it",
+            Some(VERIFICATION_SCHEMA),
+        ),
+    ]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_schema_in_the_docs_is_up_to_date() {
-        let path =
-            std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs/src/reference/diagnosis.schema.json");
-        let text = fs_err::read_to_string(path).unwrap();
-        let how = "run `cargo run -p lidarshift-diagnose --example schema > docs/src/reference/diagnosis.schema.json`";
-        assert!(text == schema_json(), "docs/src/reference/diagnosis.schema.json is stale: {how}");
-    }
 
     #[test]
     fn names_in_the_file_are_those_of_the_schema() {

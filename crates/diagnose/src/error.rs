@@ -1,6 +1,6 @@
 //! Errors of a diagnosis.
 
-use data::DataError;
+use data::{DataError, ErrorKind, Located, Place};
 
 /// A pair that cannot be diagnosed.
 #[derive(Debug, thiserror::Error)]
@@ -14,4 +14,14 @@ pub enum DiagnoseError {
     /// The two sides do not match, or scans cannot be used.
     #[error("{0}")]
     Pair(String),
+}
+
+impl Located for DiagnoseError {
+    fn place(&self) -> Place {
+        match self {
+            DiagnoseError::Data(error) => error.place(),
+            DiagnoseError::Io(error) => error.place(),
+            DiagnoseError::Pair(_) => Place::of_kind(ErrorKind::Invalid),
+        }
+    }
 }

@@ -25,7 +25,7 @@ pub use catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Un
 pub use curve::{Curve, CurvePoint};
 pub use diagnosis::{
     Considered, DetectorGain, Diagnosis, Finding, FindingGain, Gain, Minimum, Parameter, SCHEMA, Status,
-    Unidentifiable, Verdict,
+    Unidentifiable, Verdict, Verification, json_forms,
 };
 pub use engine::{
     OnClouds, Options, Outcome, Progress, RemadeFrames, Remake, SEEDS, Stage, diagnose, diagnose_with, verify,

@@ -26,7 +26,7 @@ pub use regions::{RegionRow, Regions};
 pub use sinkhorn::sinkhorn;
 pub use sliced::sliced_wasserstein;
 
-use data::DataError;
+use data::{DataError, ErrorKind, Located, Place};
 
 /// Position of a point, m.
 pub type Point = [f32; 3];
@@ -69,6 +69,15 @@ pub enum DistanceError {
     /// A frame could not be read.
     #[error(transparent)]
     Data(#[from] DataError),
+}
+
+impl Located for DistanceError {
+    fn place(&self) -> Place {
+        match self {
+            DistanceError::Data(error) => error.place(),
+            _ => Place::of_kind(ErrorKind::Invalid),
+        }
+    }
 }
 
 /// Checks that a cloud is not empty and all positions are finite.

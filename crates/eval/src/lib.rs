@@ -15,6 +15,7 @@ pub mod distance;
 mod evaluate;
 mod evidence;
 pub mod features;
+mod json_forms;
 mod matching;
 pub mod matrix;
 mod options;
@@ -32,6 +33,7 @@ pub use dataset_statistics::{
     Extent, FrameCounts, STATISTICS_SCHEMA, SetStatistics, StatisticsReport, compare_statistics, sum_up,
 };
 pub use evaluate::evaluate;
+pub use json_forms::json_forms;
 pub use matching::Counts;
 pub use options::{Difficulty, EvalFrame, EvalOptions, Metric, RangeSection, default_classes, reference_overlaps};
 pub use read::{ids_of_folder, read_detections, read_frames, read_ids};

@@ -15,7 +15,11 @@ pub fn read_frames(labels: &Path, detections: &Path, ids: &[String]) -> Result<V
 }
 
 fn check_folder(folder: &Path) -> Result<(), DataError> {
-    if folder.may_be_folder() { Ok(()) } else { Err(DataError::file(folder, "is not a folder")) }
+    if folder.may_be_folder() {
+        return Ok(());
+    }
+    let error = if folder.may_exist() { DataError::file } else { DataError::missing };
+    Err(error(folder, "is not a folder".to_owned()))
 }
 
 /// As [`read_frames`], with the labels that `labels` returns for a frame: those of a data set, whatever its layout is.
@@ -28,7 +32,7 @@ pub fn read_detections(
     let read = |id: &String| {
         let detected = detections.join(format!("{id}.txt"));
         if !detected.may_exist() {
-            return Err(DataError::file(&detected, "does not exist; a frame without detections has an empty file"));
+            return Err(DataError::missing(&detected, "does not exist; a frame without detections has an empty file"));
         }
         Ok(EvalFrame {
             id: id.clone(),

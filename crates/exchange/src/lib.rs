@@ -25,8 +25,9 @@ pub use placement::{Expressed, FitError, NotExpressed, Remedy};
 pub use program::Program;
 
 use data::output::write_atomic;
-use data::{DataError, write_json};
+use data::{DataError, JsonForm, write_json};
 use placement::Placed;
+use schemars::JsonSchema;
 use sensor::{EffectList, Rig};
 use serde::Serialize;
 use std::path::Path;
@@ -43,8 +44,11 @@ pub struct Export {
     pub summary: Summary,
 }
 
+/// Version of [`Summary`].
+const SUMMARY_SCHEMA: &str = "lidarshift/not-expressed/1";
+
 /// What an export expresses, for `not_expressed.json`.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Summary {
     /// Name and version of the form of this file.
     pub schema: &'static str,
@@ -76,7 +80,7 @@ pub fn export(program: Program, list: &EffectList, rig: &Rig, model: &str, rig_n
     let mut files = made.files;
     files.extend(post_process::files(&head, &remaining));
     let summary = Summary {
-        schema: "lidarshift/not-expressed/1",
+        schema: SUMMARY_SCHEMA,
         program: program.name(),
         expressed,
         not_expressed,
@@ -97,4 +101,13 @@ impl Export {
         }
         write_json(&folder.join(NOT_EXPRESSED), &self.summary)
     }
+}
+
+/// The forms of the JSON files of this crate. Those for other programs have the forms of those programs.
+pub fn json_forms() -> Vec<JsonForm> {
+    vec![JsonForm::of::<Summary>(
+        "not-expressed",
+        "`not_expressed.json` of `export`, `export --json`",
+        Some(SUMMARY_SCHEMA),
+    )]
 }

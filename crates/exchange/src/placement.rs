@@ -4,12 +4,13 @@
 use crate::plan::Plan;
 use crate::program::Program;
 use crate::{carla, gazebo, helios, isaac, rgl, scenario};
+use schemars::JsonSchema;
 use sensor::effects::WorldPlan;
 use sensor::{Effect, EffectList, Rig};
 use serde::Serialize;
 
 /// An effect that a program's parameters express.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Expressed {
     /// Index of the effect in the list.
     pub index: usize,
@@ -20,7 +21,7 @@ pub struct Expressed {
 }
 
 /// Something that a program's parameters do not express.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct NotExpressed {
     /// Index of the effect in the list; `None` for what belongs to the rig.
     pub index: Option<usize>,
@@ -33,7 +34,7 @@ pub struct NotExpressed {
 }
 
 /// What to do about something that is not expressed.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(tag = "by", rename_all = "snake_case")]
 pub enum Remedy {
     /// `post_process.py` applies it to finished clouds.
@@ -54,7 +55,7 @@ pub enum Remedy {
 }
 
 /// A fitted law with its remaining error.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct FitError {
     /// What was fitted to what.
     pub what: String,

@@ -1,12 +1,13 @@
 //! The oriented 3D box.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::f64::consts::PI;
 
 /// An upright box: geometric centre (m), full extents along its own axes (m), yaw counter-clockwise from +x (rad).
 ///
 /// The same seven numbers, in the same order, as OpenPCDet's `[x, y, z, dx, dy, dz, heading]`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Box3 {
     /// Geometric centre, m.
     pub center: [f64; 3],

@@ -1,5 +1,6 @@
 //! Errors of networks, their files and their inputs.
 
+use data::{ErrorKind, Located, Place};
 use std::path::PathBuf;
 
 /// An error of a detector.
@@ -33,4 +34,17 @@ pub enum ModelError {
     /// A tensor of an unexpected type or kind.
     #[error("tensor: {0}")]
     Tensor(String),
+}
+
+impl Located for ModelError {
+    fn place(&self) -> Place {
+        match self {
+            ModelError::Data(error) => error.place(),
+            ModelError::File { path, .. } => Place::in_file(ErrorKind::Invalid, path),
+            ModelError::NonFinite(_) => Place::of_kind(ErrorKind::NotFinite),
+            ModelError::Weights(_) | ModelError::Frame { .. } | ModelError::Tensor(_) => {
+                Place::of_kind(ErrorKind::Invalid)
+            }
+        }
+    }
 }

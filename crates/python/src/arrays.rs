@@ -29,7 +29,7 @@ pub fn array_of<'py>(py: Python<'py>, cloud: &Cloud) -> (Bound<'py, PyByteArray>
 /// # Errors
 /// Another number of columns, no points, values that are not finite, and coordinates beyond 10 km.
 pub fn cloud_of(py: Python<'_>, bytes: &[u8], channels: usize) -> PyResult<Cloud> {
-    let wrong = |text: String| Err(with_place(py, &text, None, None));
+    let wrong = |text: String| Err(with_place(py, &text, None));
     if !(3..=4).contains(&channels) {
         return wrong(format!("points have {channels} columns; give N x 3 (x y z) or N x 4 (x y z intensity)"));
     }
@@ -61,7 +61,7 @@ pub fn boxes_of(py: Python<'_>, bytes: &[u8]) -> PyResult<Vec<Box3>> {
         let bbox = Box3::from_array(*row);
         if row.iter().any(|v| !v.is_finite()) || bbox.size.iter().any(|v| *v <= 0.0) {
             let text = format!("boxes[{i}] has a value that is not finite or a size that is not positive");
-            return Err(with_place(py, &text, None, None));
+            return Err(with_place(py, &text, None));
         }
         boxes.push(bbox);
     }

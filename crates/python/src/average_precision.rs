@@ -22,7 +22,7 @@ pub fn kitti_ap(
     overlaps: Vec<f64>,
     max_range_m: Option<f64>,
 ) -> PyResult<String> {
-    let wrong = |text: String| with_place(py, &text, None, None);
+    let wrong = |text: String| with_place(py, &text, None);
     if labels.len() != detections.len() {
         let text =
             format!("labels have {} frames, detections {}; give the same frames", labels.len(), detections.len());

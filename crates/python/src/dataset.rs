@@ -15,7 +15,7 @@ fn columns_of(py: Python<'_>, name: &str) -> PyResult<PointColumns> {
     match name {
         "xyz" => Ok(PointColumns::Xyz),
         "xyzi" => Ok(PointColumns::Xyzi),
-        _ => Err(with_place(py, &format!("columns are {name:?}; give \"xyz\" or \"xyzi\""), None, None)),
+        _ => Err(with_place(py, &format!("columns are {name:?}; give \"xyz\" or \"xyzi\""), None)),
     }
 }
 

@@ -71,7 +71,7 @@ impl Effects {
             Ok(cloud) => Ok(array_of(py, &cloud)),
             Err(why) => {
                 let text = format!("{}: {why}", self.model.display());
-                Err(with_place(py, &text, Some(self.model.clone()), None))
+                Err(with_place(py, &text, Some(self.model.clone())))
             }
         }
     }

@@ -52,3 +52,12 @@ pub enum ReportError {
     #[error("the PNG could not be encoded: {0}")]
     Png(String),
 }
+
+impl data::Located for ReportError {
+    fn place(&self) -> data::Place {
+        match self {
+            ReportError::Data(error) => error.place(),
+            _ => data::Place::default(),
+        }
+    }
+}

@@ -11,8 +11,10 @@ use crate::object::{FIRST_CAR, Group};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
 use data::limits::{MOST_CLOUD_BYTES, read_file};
-use data::{DataError, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_json};
-use serde_json::json;
+use data::{DataError, JsonForm, PcdColumn, encode_pcd_columns, parse_pcd_columns, write_json};
+use schemars::JsonSchema;
+use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Attribute folder below the root of a data set.
@@ -73,12 +75,38 @@ pub fn encode(scan: &Scan) -> Vec<u8> {
 
 /// Writes `names.json` with the names of sensors, materials and objects to the attribute folder.
 pub fn write_names(root: &Path, rig: &Rig, materials: &MaterialTable) -> Result<(), DataError> {
-    let objects: serde_json::Map<String, serde_json::Value> =
-        Group::ALL.into_iter().map(|g| ((g as u16).to_string(), json!(g))).collect();
-    let sensors: Vec<&str> = rig.sensors.iter().map(|s| s.name.as_str()).collect();
-    let names =
-        json!({ "sensors": sensors, "materials": materials.names(), "objects": objects, "first_car": FIRST_CAR });
+    let names = AttributeNames {
+        schema: NAMES_SCHEMA,
+        sensors: rig.sensors.iter().map(|s| s.name.clone()).collect(),
+        materials: materials.names().to_vec(),
+        objects: Group::ALL.into_iter().map(|g| ((g as u16).to_string(), g)).collect(),
+        first_car: FIRST_CAR,
+    };
     write_json(&root.join(FOLDER).join("names.json"), &names)
+}
+
+/// Version of `names.json`.
+const NAMES_SCHEMA: &str = "lidarshift/attribute-names/1";
+
+/// The content of `names.json`: what the numbers in the attributes mean.
+#[derive(Serialize, JsonSchema)]
+struct AttributeNames {
+    /// `lidarshift/attribute-names/1`.
+    schema: &'static str,
+    /// Sensors by their number.
+    sensors: Vec<String>,
+    /// Materials by their number.
+    materials: Vec<String>,
+    /// Groups of static objects by the number `object`.
+    objects: BTreeMap<String, Group>,
+    /// Number `object` of the first car; the others follow.
+    first_car: u16,
+}
+
+/// The forms of the JSON files of this crate.
+pub fn json_forms() -> Vec<JsonForm> {
+    let written = "`names.json` of the attributes of simulated data sets";
+    vec![JsonForm::of::<AttributeNames>("attribute-names", written, Some(NAMES_SCHEMA))]
 }
 
 /// The materials of a data set, by their index in the attributes.

@@ -2,7 +2,7 @@
 //! the diagnosis recovers them.
 
 use crate::directions::{DirectionIndex, SensorScan, Sensors, Surroundings, split_by_sensor, split_with_places};
-use crate::effects::Need;
+use crate::effects::{Need, Reads};
 use crate::rig::{Rig, Sensor};
 use crate::scan::{Echo, Scan, dot};
 use data::Cloud;
@@ -51,14 +51,27 @@ impl Surfaces {
 #[derive(Clone, Debug)]
 pub struct CloudReader {
     sensors: Sensors,
+    reads: Reads,
 }
 
 impl CloudReader {
     /// For clouds of a rig. The scan patterns are found in some of its clouds, or of all, where they are few.
     pub fn new(rig: &Rig, some: &[Cloud]) -> CloudReader {
+        CloudReader::of(rig, some, Reads::ALL)
+    }
+
+    /// The same for effects that read no more than this. Without anything to read no pattern is looked for, and none is
+    /// [known](Self::known).
+    pub fn of(rig: &Rig, some: &[Cloud], reads: Reads) -> CloudReader {
+        let some = if reads == Reads::NOTHING { &[] } else { some };
         let scans: Vec<Vec<SensorScan>> = some.iter().map(|cloud| split_by_sensor(cloud, rig)).collect();
         let frames: Vec<&[SensorScan]> = scans.iter().map(Vec::as_slice).collect();
-        CloudReader { sensors: Sensors::find(rig, &frames) }
+        CloudReader { sensors: Sensors::find(rig, &frames), reads }
+    }
+
+    /// The reader with the same patterns for effects that read no more than this.
+    pub fn reading(self, reads: Reads) -> CloudReader {
+        CloudReader { reads, ..self }
     }
 
     /// The sensors.
@@ -83,7 +96,8 @@ impl CloudReader {
         known
     }
 
-    /// The cloud as a scan: one echo for each point in its order, then the shots without a return.
+    /// The cloud as a scan: one echo for each point in its order, then the shots without a return. What is not read is
+    /// not known: rows and columns are [`Echo::UNKNOWN`], normals are 0.
     pub fn scan(&self, cloud: &Cloud, surfaces: &Surfaces) -> Scan {
         let (scans, places) = split_with_places(cloud, &self.sensors.rig);
         let nowhere = Echo::nothing([0.0; 3], [1.0, 0.0, 0.0]);
@@ -99,7 +113,9 @@ impl CloudReader {
         for echo in &mut echoes {
             set_light(echo, cloud.channels, surfaces);
         }
-        echoes.extend(self.empty_shots(&scans));
+        if self.reads.empty_shots {
+            echoes.extend(self.empty_shots(&scans));
+        }
         Scan { echoes }
     }
 
@@ -107,20 +123,34 @@ impl CloudReader {
     fn read_sensor(&self, number: usize, scan: &SensorScan, places: &[u32], cloud: &Cloud, echoes: &mut [Echo]) {
         let (sensor, pattern) = (&self.sensors.rig.sensors[number], &self.sensors.patterns[number]);
         let pose = sensor.pose();
-        let rows = pattern.rows_rad.len();
-        let around = Surroundings::new(&self.sensors, number, scan);
-        for (i, &place) in places.iter().enumerate() {
-            let (azimuth, elevation) = (scan.azimuth_rad[i], scan.elevation_rad[i]);
+        for &place in places {
             let echo = &mut echoes[place as usize];
             (echo.sensor, echo.origin, echo.range_m) = (number as u8, sensor.position.map(|v| v as f32), 1.0);
             let at = place as usize * cloud.channels;
             echo.move_point([cloud.values[at], cloud.values[at + 1], cloud.values[at + 2]]);
-            if let Some(row) = pattern.row(elevation) {
-                echo.row = (rows - 1 - row) as u16;
-                let column = (azimuth + std::f32::consts::PI) / pattern.steps.azimuth_rad;
-                echo.column = column.round().clamp(0.0, 65_534.0) as u16;
+        }
+        if self.reads.pattern {
+            for (&place, (azimuth, elevation)) in places.iter().zip(scan.azimuth_rad.iter().zip(&scan.elevation_rad)) {
+                let echo = &mut echoes[place as usize];
+                if let Some(row) = pattern.row(*elevation) {
+                    echo.row = (pattern.rows_rad.len() - 1 - row) as u16;
+                    let column = (azimuth + std::f32::consts::PI) / pattern.steps.azimuth_rad;
+                    echo.column = column.round().clamp(0.0, 65_534.0) as u16;
+                }
+                place_in_pattern(echo, sensor, &pose);
             }
-            place_in_pattern(echo, sensor, &pose);
+        }
+        if self.reads.surfaces {
+            self.read_surfaces(number, scan, places, echoes);
+        }
+    }
+
+    /// Sets normals and angles of incidence of the points of one sensor.
+    fn read_surfaces(&self, number: usize, scan: &SensorScan, places: &[u32], echoes: &mut [Echo]) {
+        let around = Surroundings::new(&self.sensors, number, scan);
+        for (i, &place) in places.iter().enumerate() {
+            let (azimuth, elevation) = (scan.azimuth_rad[i], scan.elevation_rad[i]);
+            let echo = &mut echoes[place as usize];
             echo.cos_incidence = f32::NAN;
             if let Some((surface, normal)) = around.look(azimuth, elevation, Some(i as u32)).surface {
                 echo.normal = normal.map(|v| v as f32).into();

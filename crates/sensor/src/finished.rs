@@ -97,6 +97,13 @@ impl<'a> FinishedDataset<'a> {
         Ok(set)
     }
 
+    /// The same set for frames with these effects. What they do not read is not looked for in clouds without
+    /// attributes, and is not known in the scans that [`Self::frames`] returns. The clouds keep their bits.
+    #[must_use]
+    pub fn for_effects(self, effects: &EffectList) -> Self {
+        FinishedDataset { reader: self.reader.reading(effects.reads()), ..self }
+    }
+
     /// The sensors.
     pub fn rig(&self) -> &Rig {
         &self.rig

@@ -207,7 +207,7 @@ pub fn refine_to_faces(cloud: &Cloud, bbox: &Box3) -> Box3 {
 pub const SECTIONS_M: [[f64; 2]; 3] = [[0.0, 33.3], [33.3, 66.6], [66.6, 100.0]];
 
 /// Label errors in one range section.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, Default)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, Default, JsonSchema)]
 pub struct LabelError {
     /// Lower and upper bound, m.
     pub range_m: [f64; 2],

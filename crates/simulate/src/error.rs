@@ -1,6 +1,6 @@
 //! Errors of the simulator.
 
-use data::{DataError, KeyError};
+use data::{DataError, KeyError, Located, Place};
 
 /// Error that prevents a data set from being generated.
 #[derive(Debug, thiserror::Error)]
@@ -14,4 +14,14 @@ pub enum SimulateError {
     /// A value is invalid; the message names the key.
     #[error(transparent)]
     Config(#[from] KeyError),
+}
+
+impl Located for SimulateError {
+    fn place(&self) -> Place {
+        match self {
+            SimulateError::Data(error) => error.place(),
+            SimulateError::Io(error) => error.place(),
+            SimulateError::Config(error) => error.place(),
+        }
+    }
 }

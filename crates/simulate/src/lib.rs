@@ -3,6 +3,7 @@
 pub mod auto_label;
 mod error;
 pub mod frame_scene;
+mod json_forms;
 pub mod mesh;
 pub mod race;
 pub mod race_car;
@@ -16,5 +17,6 @@ pub mod track;
 pub mod world;
 
 pub use error::SimulateError;
+pub use json_forms::json_forms;
 pub use scenery::Scenery;
 pub use street::{FrameCounts, MANIFEST_SCHEMA, Manifest, RoadConfig, SplitCounts, make_road_dataset, make_road_frame};

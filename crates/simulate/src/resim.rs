@@ -7,6 +7,7 @@ use data::limits::{MOST_TEXT_BYTES, read_file};
 use data::toml_text::wrong;
 use data::write::{TRUE_LABELS, true_labels_path};
 use data::{DataError, Dataset, DatasetConfig, FilePart, Frame, Layout, NewDataset, write_atomic};
+use schemars::JsonSchema;
 use sensor::attributes;
 use sensor::effects::EffectList;
 use sensor::finished::{FinishedDataset, Refusal};
@@ -19,7 +20,7 @@ use std::path::{Path, PathBuf};
 pub const RESIM_MANIFEST_SCHEMA: &str = "lidarshift/resim-dataset/1";
 
 /// Content of the `manifest.json` of a data set with effects applied.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ResimManifest {
     /// [`RESIM_MANIFEST_SCHEMA`].
@@ -72,7 +73,7 @@ impl Resim<'_> {
     /// changed; a folder with other content is an error. The files do not depend on the number of threads.
     pub fn make(&self, out: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<ResimManifest, SimulateError> {
         self.effects.check()?;
-        let finished = self.finished()?;
+        let finished = self.finished()?.for_effects(self.effects);
         if let Some(refusal) = finished.refusals(self.effects).into_iter().next() {
             let why = format!("{} {}", refusal.kind, refusal.why);
             return Err(wrong(format!("effect[{}]", refusal.index), why).into());

@@ -11,6 +11,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::Device;
 use data::{Dataset, Frame, write_json};
 use models::{Detector, Preparer, predict_samples, reference_name};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -25,7 +26,7 @@ const MEASURED_STEPS: u64 = 5;
 const MEASURED_FRAMES: usize = 3;
 
 /// Time and memory of a network on a machine.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct NetworkCost {
     /// Time of a training step, s.
     pub step_s: f64,
@@ -37,6 +38,18 @@ pub struct NetworkCost {
     pub threads: usize,
     /// Command line arguments of the device.
     pub device: String,
+}
+
+/// Version of [`CostsFile`].
+pub(crate) const COSTS_SCHEMA: &str = "lidarshift/study-costs/1";
+
+/// The content of `costs.json`.
+#[derive(Serialize, Deserialize, JsonSchema)]
+pub(crate) struct CostsFile {
+    /// [`COSTS_SCHEMA`].
+    schema: String,
+    /// By name of the network.
+    networks: Costs,
 }
 
 /// Costs of the networks of a study by name, stored in `costs.json`.
@@ -93,7 +106,7 @@ fn median(values: Vec<f64>) -> f64 {
 /// The costs that have been measured for a study.
 pub fn known_costs(study: &Study) -> Costs {
     let bytes = fs_err::read(study.folder.join("costs.json")).unwrap_or_default();
-    serde_json::from_slice(&bytes).unwrap_or_default()
+    serde_json::from_slice::<CostsFile>(&bytes).map(|file| file.networks).unwrap_or_default()
 }
 
 /// The costs of the networks of these runs. Unknown costs are measured in one process per network with `threads`
@@ -139,7 +152,8 @@ pub fn costs(
             .in_part(|| format!("{network}: unexpected output of the measurement"))?;
         cost.device = device.join(" ");
         costs.insert(network.clone(), cost);
-        write_json(&study.folder.join("costs.json"), &costs)?;
+        let file = CostsFile { schema: COSTS_SCHEMA.into(), networks: costs.clone() };
+        write_json(&study.folder.join("costs.json"), &file)?;
     }
     Ok(costs)
 }

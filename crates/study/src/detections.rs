@@ -8,13 +8,14 @@ use data::Presence as _;
 use data::write::write_kitti_text;
 use data::{Dataset, write_atomic, write_json};
 use models::{Detector, LayerFeatures, inference_samples, predict_frames};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 /// Inputs of the detections of a run on a test set. Written to `cell.json` after the detections, so that it marks them
 /// as complete.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-struct DetectionCell {
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub(crate) struct DetectionCell {
     schema: String,
     run: String,
     test_set: String,
@@ -25,7 +26,7 @@ struct DetectionCell {
 }
 
 /// Features of all layers of a run on test clouds.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct RunFeatures {
     schema: String,
     frames_sha256: String,
@@ -37,6 +38,11 @@ pub struct RunFeatures {
     /// For each layer, the concatenated feature vectors of all frames.
     pub values: Vec<Vec<f32>>,
 }
+
+/// Version of [`DetectionCell`].
+pub(crate) const CELL_SCHEMA: &str = "lidarshift/detection-cell/2";
+/// Version of [`RunFeatures`].
+pub(crate) const RUN_FEATURES_SCHEMA: &str = "lidarshift/run-features/1";
 
 /// Hash of the weights of a run.
 ///
@@ -64,7 +70,7 @@ fn expected_cell(
     let dataset = open(study, test_set)?;
     let ids = dataset.ids(&study.config.splits.test)?;
     let cell = DetectionCell {
-        schema: "lidarshift/detection-cell/2".into(),
+        schema: CELL_SCHEMA.into(),
         run: run.to_string(),
         test_set: test_set.into(),
         split: study.config.splits.test.clone(),
@@ -158,7 +164,7 @@ fn write_features(
     let most = study.config.evaluation.tsne_frames.unwrap_or(ids.len());
     let ids = evenly_spaced(ids, most);
     let mut features = RunFeatures {
-        schema: "lidarshift/run-features/1".into(),
+        schema: RUN_FEATURES_SCHEMA.into(),
         frames_sha256: frames_sha256(set, &ids)?,
         weights_sha256: weights.into(),
         frames: Vec::new(),

@@ -1,6 +1,6 @@
 //! Errors of a study.
 
-use data::DataError;
+use data::{DataError, ErrorKind, Located, Place};
 use eval::distance::DistanceError;
 use eval::features::FeatureError;
 use models::ModelError;
@@ -38,9 +38,9 @@ pub enum StudyError {
     /// A result file with invalid JSON.
     #[error(transparent)]
     Json(#[from] serde_json::Error),
-    /// A detector file with invalid TOML.
-    #[error(transparent)]
-    Toml(#[from] toml::de::Error),
+    /// A run or its folder that another process uses.
+    #[error("{0} is in use by another process; wait until it ends")]
+    InUse(String),
     /// A request that cannot be fulfilled; the text gives the reason.
     #[error("{0}")]
     Refused(String),
@@ -52,6 +52,24 @@ pub enum StudyError {
         /// The error.
         error: Box<StudyError>,
     },
+}
+
+impl Located for StudyError {
+    fn place(&self) -> Place {
+        match self {
+            StudyError::Data(error) => error.place(),
+            StudyError::Simulate(error) => error.place(),
+            StudyError::Model(error) => error.place(),
+            StudyError::Train(error) => error.place(),
+            StudyError::Distance(error) => error.place(),
+            StudyError::Report(error) => error.place(),
+            StudyError::Io(error) => error.place(),
+            StudyError::Part { error, .. } => error.place(),
+            StudyError::Feature(_) | StudyError::Json(_) => Place::of_kind(ErrorKind::Invalid),
+            StudyError::InUse(_) => Place::of_kind(ErrorKind::InUse),
+            StudyError::Refused(_) => Place::of_kind(ErrorKind::Refused),
+        }
+    }
 }
 
 impl StudyError {

@@ -8,11 +8,17 @@ use crate::folder::Study;
 use crate::numbers::network_title;
 use eval::features::{CkaTable, Embedded, Embedding, Features, TSNE_SCHEMA, cka_table, frechet_distance, tsne};
 use report::FrechetRow;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+/// Version of [`FeatureResults`].
+pub const FEATURES_SCHEMA: &str = "lidarshift/features/1";
+
 /// Results of the feature comparisons of a study.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FeatureResults {
+    /// [`FEATURES_SCHEMA`].
+    pub schema: String,
     /// t-SNE of each network.
     pub embeddings: Vec<Embedding>,
     /// CKA between the layers of two runs on the same clouds, by name.
@@ -40,7 +46,7 @@ pub fn features(study: &Study) -> Result<FeatureResults> {
     let options = &study.config.evaluation.tsne;
     let key: Vec<_> = seen.iter().map(|(run, features)| (run.to_string(), features)).collect();
     cached(&study.folder.join("features.json"), &(key, options, study.title(study.feature_set())), || {
-        let mut out = FeatureResults::default();
+        let mut out = FeatureResults { schema: FEATURES_SCHEMA.into(), ..FeatureResults::default() };
         for planned in study.config.plan().networks {
             let network = &planned.network.name;
             let of_network: Vec<&Seen> = seen.iter().filter(|(run, _)| run.id.network == *network).collect();

@@ -3,8 +3,10 @@
 use crate::config::{Source, StudyConfig, StudyDataset, StudyRun};
 use crate::error::{InPart, Result, refused};
 use data::Presence as _;
+use data::toml_text::parse_toml;
 use data::{write_atomic, write_json};
 use models::detector_text;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use toml::{Table, Value};
@@ -24,11 +26,19 @@ const COPY: &str = "study.toml";
 /// Path of the study's TOML and base of its relative paths.
 const ORIGIN: &str = "origin.json";
 
-#[derive(Serialize, Deserialize)]
-struct Origin {
+#[derive(Serialize, Deserialize, JsonSchema)]
+pub(crate) struct Origin {
+    /// [`ORIGIN_SCHEMA`].
+    #[serde(default)]
+    schema: String,
+    /// Name or path of the study on the command line.
     named: String,
+    /// Folder of its TOML.
     base: PathBuf,
 }
+
+/// Version of [`Origin`].
+pub(crate) const ORIGIN_SCHEMA: &str = "lidarshift/study-origin/1";
 
 /// A study with its folder.
 #[derive(Clone, Debug)]
@@ -182,7 +192,7 @@ impl Study {
     pub fn run_config(&self, run: &StudyRun) -> Result<RunConfig> {
         let named = run.config.as_ref().map_or(run.detector.clone(), |file| self.path(file).display().to_string());
         let mut table = Table::new();
-        let detector: Table = detector_text(&named)?.parse().in_part(|| named.clone())?;
+        let detector: Table = parse_toml(&detector_text(&named)?, Path::new(&named), |_| Ok(()))?;
         table.insert("detector".into(), Value::Table(detector));
         table.insert(
             "seed".into(),
@@ -260,7 +270,7 @@ impl Study {
     /// A copy that cannot be written.
     pub fn update_copy(&self) -> Result<()> {
         let copy = self.folder.join(COPY);
-        let origin = Origin { named: self.named.clone(), base: self.base.clone() };
+        let origin = Origin { schema: ORIGIN_SCHEMA.into(), named: self.named.clone(), base: self.base.clone() };
         write_json(&self.folder.join(ORIGIN), &origin)?;
         Ok(write_atomic(&copy, self.text.as_bytes())?)
     }

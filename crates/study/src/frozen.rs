@@ -19,6 +19,7 @@ use data::write_json;
 use eval::EvalFrame;
 use eval::matrix::{PairedValues, RunId, RunResult, RunScores, ScoredFrames, TestSet, paired_values};
 use paired::check_shared_frames;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use source::Source;
 use std::collections::BTreeMap;
@@ -26,7 +27,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Inputs of the checked detections of a frozen detector on a data set. Written to `cell.json` after the check.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub(crate) struct FrozenCell {
     schema: String,
     detector: FrozenDetectorKey,
@@ -38,12 +39,15 @@ pub(crate) struct FrozenCell {
 }
 
 /// What of a frozen detector changes its detections, besides their files.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 struct FrozenDetectorKey {
     name: String,
     classes: BTreeMap<String, String>,
     ignored_classes: Vec<String>,
 }
+
+/// Version of [`FrozenCell`].
+pub(crate) const CELL_SCHEMA: &str = "lidarshift/frozen-cell/1";
 
 impl FrozenCell {
     fn path(study: &Study, frozen: &FrozenDetector, test_set: &str) -> PathBuf {
@@ -84,7 +88,7 @@ fn expected_cell(study: &Study, frozen: &FrozenDetector, test_set: &str) -> Resu
         (None, None) => return Err(refused(format!("frozen {} has no detections on {test_set}", frozen.name))),
     };
     Ok(FrozenCell {
-        schema: "lidarshift/frozen-cell/1".into(),
+        schema: CELL_SCHEMA.into(),
         detector: FrozenDetectorKey {
             name: frozen.name.clone(),
             classes: frozen.classes.clone(),

@@ -6,6 +6,8 @@ use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
 use data::Dataset;
 use eval::matrix::{Matrix, Power, Scatter};
+use schemars::JsonSchema;
+use serde::Serialize;
 use simulate::Scenery;
 use std::path::Path;
 
@@ -16,7 +18,8 @@ const STORED: [(f64, Scatter); 2] =
     [(0.5, Scatter { of_seeds: 1.9, of_frames: 20.8 }), (0.7, Scatter { of_seeds: 3.2, of_frames: 31.8 })];
 
 /// Origin of the scatter behind a plan.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
 pub enum ScatterFrom {
     /// Results of this study, or of a pilot.
     Results,
@@ -25,7 +28,7 @@ pub enum ScatterFrom {
 }
 
 /// The difference between two cells that a study will be able to see.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Planned {
     /// Title of the network.
     pub network: String,
@@ -43,6 +46,27 @@ pub struct Planned {
     pub from: ScatterFrom,
     /// Smallest difference of 3D AP that is seen in 80 of 100 repetitions, percentage points.
     pub detectable: f64,
+}
+
+/// Version of [`PlanReport`].
+pub const PLAN_SCHEMA: &str = "lidarshift/study-plan/1";
+
+/// The plan of a study, as `study plan --json` writes it.
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
+pub struct PlanReport {
+    /// [`PLAN_SCHEMA`].
+    pub schema: String,
+    /// Name of the study.
+    pub study: String,
+    /// What it will be able to see.
+    pub planned: Vec<Planned>,
+}
+
+impl PlanReport {
+    /// Of a study.
+    pub fn new(study: &Study, planned: &[Planned]) -> Self {
+        PlanReport { schema: PLAN_SCHEMA.into(), study: study.config.name.clone(), planned: planned.to_vec() }
+    }
 }
 
 /// What a study will be able to see, by network, test set and overlap. The scatter is that of the results of `pilot`, a

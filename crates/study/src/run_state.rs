@@ -5,6 +5,7 @@ use crate::error::Result;
 use crate::folder::Study;
 use data::Presence as _;
 use data::{FolderLock, write_json};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use train::{RunConfig, read_run_state};
@@ -29,17 +30,22 @@ pub enum RunState {
 }
 
 /// Content of `failed.json` in the folder of a failed run.
-#[derive(Serialize, Deserialize)]
-struct Failure {
+#[derive(Serialize, Deserialize, JsonSchema)]
+pub(crate) struct Failure {
+    /// [`FAILURE_SCHEMA`].
     schema: String,
+    /// Why the run failed.
     reason: String,
 }
 
 const FAILURE: &str = "failed.json";
 
+/// Version of [`Failure`].
+pub(crate) const FAILURE_SCHEMA: &str = "lidarshift/failed-run/1";
+
 /// Writes `failed.json`.
 pub fn write_failure(folder: &Path, reason: &str) -> Result<()> {
-    let failure = Failure { schema: "lidarshift/failed-run/1".into(), reason: reason.into() };
+    let failure = Failure { schema: FAILURE_SCHEMA.into(), reason: reason.into() };
     Ok(write_json(&folder.join(FAILURE), &failure)?)
 }
 

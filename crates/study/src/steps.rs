@@ -3,7 +3,7 @@
 use crate::config::StudyRun;
 use crate::cost::{Costs, costs, duration, remaining};
 use crate::data_sets::{absent_datasets, make_datasets};
-use crate::error::{Result, refused};
+use crate::error::{Result, StudyError};
 use crate::folder::Study;
 use crate::local::{LocalJobs, run_all};
 use crate::present::write_report;
@@ -192,7 +192,7 @@ fn invalid_runs(study: &Study, replace: bool, listener: Listener<'_>) -> Result<
             continue;
         }
         let Some(_lock) = RunLock::acquire(&folder)? else {
-            return Err(refused(format!("{run} is in use by another process; wait until it ends")));
+            return Err(StudyError::InUse(run.to_string()));
         };
         note(format!("{run} had other settings ({differences}) and was removed"));
         fs_err::remove_dir_all(&folder)?;

@@ -2,7 +2,7 @@
 
 use crate::config::StudyRun;
 use crate::detections::detect_all;
-use crate::error::{Result, refused};
+use crate::error::{Result, StudyError, refused};
 use crate::folder::Study;
 use crate::run_state::{RunLock, differences, is_of_folder, remove_failure, write_failure};
 use burn::tensor::Device;
@@ -61,7 +61,7 @@ pub fn execute_run(
 ) -> Result<()> {
     let folder = run.folder(&study.folder);
     let Some(_lock) = RunLock::acquire(&folder)? else {
-        return Err(refused(format!("{run} is in use by another process; wait until it ends")));
+        return Err(StudyError::InUse(run.to_string()));
     };
     remove_unfinished_below(&folder)?;
     remove_failure(&folder)?;

@@ -1,6 +1,6 @@
 //! Errors of a training run.
 
-use data::DataError;
+use data::{DataError, ErrorKind, Located, Place};
 use models::ModelError;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -71,6 +71,20 @@ pub(crate) fn without_panic<T>(step: u64, work: impl FnOnce() -> Result<T, Train
 impl From<std::io::Error> for TrainError {
     fn from(error: std::io::Error) -> Self {
         TrainError::Data(error.into())
+    }
+}
+
+impl Located for TrainError {
+    fn place(&self) -> Place {
+        match self {
+            TrainError::Data(error) => error.place(),
+            TrainError::Model(error) => error.place(),
+            TrainError::Folder { path, .. } => Place::in_file(ErrorKind::Invalid, path),
+            TrainError::Config(_) => Place::of_kind(ErrorKind::Invalid),
+            TrainError::Panicked { .. } => Place::of_kind(ErrorKind::Computation),
+            TrainError::Stopped { .. } => Place::of_kind(ErrorKind::Stopped),
+            TrainError::NotFinite { .. } => Place::of_kind(ErrorKind::NotFinite),
+        }
     }
 }
 

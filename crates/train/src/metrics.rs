@@ -2,13 +2,14 @@
 
 use crate::TrainError;
 use data::write_atomic;
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::io::Write as _;
 use std::path::Path;
 
 /// Metrics of the steps since the previous line.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct StepMetrics {
     /// Steps done.
     pub step: u64,
@@ -31,7 +32,7 @@ pub struct StepMetrics {
 }
 
 /// Metrics of an epoch.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct EpochMetrics {
     /// Steps done.
     pub step: u64,
@@ -46,7 +47,7 @@ pub struct EpochMetrics {
 }
 
 /// Time by stage, s.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, JsonSchema)]
 pub struct StageSeconds {
     /// Waiting for frames to be loaded and augmented.
     pub data_wait: f64,
@@ -61,7 +62,7 @@ pub struct StageSeconds {
 }
 
 /// An evaluation during training.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ValidationMetrics {
     /// Mean loss over the batches, with the running statistics.
     pub loss: f64,
@@ -76,9 +77,9 @@ pub struct ValidationMetrics {
     pub seconds: f64,
 }
 
-#[derive(Serialize)]
+#[derive(Serialize, JsonSchema)]
 #[serde(tag = "kind", rename_all = "lowercase")]
-enum Line<'a> {
+pub(crate) enum Line<'a> {
     Step(&'a StepMetrics),
     Epoch(&'a EpochMetrics),
 }

@@ -3,6 +3,7 @@
 use crate::{RunConfig, TrainError};
 use data::checksum::file_sha256;
 use data::{build_id, program_sha256, write_json};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::time::{SystemTime, UNIX_EPOCH};
@@ -11,7 +12,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 pub const PROVENANCE_SCHEMA: &str = "lidarshift/provenance/1";
 
 /// Program, data and machine of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// [`PROVENANCE_SCHEMA`].
@@ -27,7 +28,7 @@ pub struct Provenance {
 }
 
 /// The training data of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DatasetProvenance {
     /// Its name.
@@ -41,7 +42,7 @@ pub struct DatasetProvenance {
 }
 
 /// One process that trained a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct SessionProvenance {
     /// Number of steps before it.

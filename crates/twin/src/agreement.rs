@@ -1,6 +1,7 @@
 //! How well a twin agrees with the recording it was made of, shot by shot.
 
 use crate::world::FrameShots;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Sums over shots.
@@ -18,7 +19,7 @@ pub struct Agreement {
 const BINS_PER_M: f32 = 1000.0;
 
 /// An [`Agreement`] in numbers. Shares are 0 to 1.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct AgreementNumbers {
     /// Recorded returns.
     pub measured_returns: u64,

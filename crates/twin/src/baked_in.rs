@@ -1,9 +1,10 @@
 //! What a pair of a recording and its twin cannot tell.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// A cause that is in both sides of a twin, which was made of the returns of the recording.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct BakedIn {
     /// Its name in the catalogue of the diagnosis.
     pub cause: String,

@@ -1,6 +1,6 @@
 //! Errors of twins.
 
-use data::{DataError, KeyError};
+use data::{DataError, ErrorKind, KeyError, Located, Place};
 
 /// Why no twin can be made.
 #[derive(Debug, thiserror::Error)]
@@ -14,4 +14,14 @@ pub enum TwinError {
     /// The recording lacks something.
     #[error("{0}")]
     Recording(String),
+}
+
+impl Located for TwinError {
+    fn place(&self) -> Place {
+        match self {
+            TwinError::Data(error) => error.place(),
+            TwinError::Key(error) => error.place(),
+            TwinError::Recording(_) => Place::of_kind(ErrorKind::Invalid),
+        }
+    }
 }

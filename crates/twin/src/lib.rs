@@ -20,7 +20,7 @@ mod world;
 pub use agreement::AgreementNumbers;
 pub use baked_in::{BakedIn, baked_in};
 pub use error::TwinError;
-pub use pair::{TwinConfig, TwinReport};
+pub use pair::{TwinConfig, TwinReport, json_forms};
 pub use plan::Leave;
 pub use recording::{PoseOptions, PoseSource, RecordedScan, Recording};
 pub use world::{FrameShots, Shown, World};

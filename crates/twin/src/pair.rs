@@ -12,9 +12,10 @@ use data::checksum::hex;
 use data::limits::read_text;
 use data::output::remove_unfinished;
 use data::{
-    Cloud, DataError, Dataset, DatasetConfig, Frame, LabelFrame, Layout, NewDataset, Object, Presence, write_atomic,
-    write_json,
+    Cloud, DataError, Dataset, DatasetConfig, Frame, JsonForm, LabelFrame, Layout, NewDataset, Object, Presence,
+    write_atomic, write_json,
 };
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
@@ -44,7 +45,7 @@ pub struct TwinConfig {
 }
 
 /// Content of `twin.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct TwinReport {
     /// [`TWIN_SCHEMA`].
     pub schema: String,
@@ -78,7 +79,7 @@ pub struct TwinReport {
 }
 
 /// Content of the `manifest.json` of one side.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 struct TwinManifest {
     schema: String,
@@ -309,4 +310,12 @@ impl TwinReport {
             names.join(", ")
         )
     }
+}
+
+/// The forms of the JSON files of this crate.
+pub fn json_forms() -> Vec<JsonForm> {
+    vec![
+        JsonForm::of::<TwinReport>("twin", "`twin.json` of `twin`, `twin --json`", Some(TWIN_SCHEMA)),
+        JsonForm::of::<TwinManifest>("twin-dataset", "`manifest.json` of `twin`", Some(TWIN_MANIFEST_SCHEMA)),
+    ]
 }

@@ -1,10 +1,11 @@
 //! Which frames a map is made of, and which are shot with it: no frame is held against itself.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
 
 /// Which frames are left out of the map that a frame is shot with.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Leave {
     /// Every second frame: even frames are shot with the map of the odd ones, and the other way round.

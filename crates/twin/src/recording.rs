@@ -11,6 +11,7 @@ use crate::poses::{Found, PoseFinding, Verdict, check_moments, compared, find_co
 use data::{Dataset, Moment};
 use geometry::Pose;
 use nalgebra::{Point3, Vector6};
+use schemars::JsonSchema;
 use sensor::directions::{SensorScan, Steps};
 use sensor::rig::Sensor;
 use statistics::median_upper;
@@ -19,7 +20,7 @@ use statistics::median_upper;
 pub const NEAREST_M: f64 = 1.5;
 
 /// Where the poses of a recording come from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum PoseSource {
     /// The recording has them.

@@ -27,6 +27,7 @@ use clap::Args;
 use lidarshift::device::DeviceArgs;
 use lidarshift::outln;
 use reference::Row;
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -47,7 +48,7 @@ pub struct ParityArgs {
     all: bool,
 }
 
-#[derive(Serialize)]
+#[derive(Serialize, JsonSchema)]
 struct Parity<'a> {
     schema: &'static str,
     rows: &'a [Row],

@@ -2,12 +2,13 @@
 
 use anyhow::{Context, Result};
 use models::checkpoint::{HostTensor, HostValues, NamedTensors, read_safetensors};
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::collections::BTreeSet;
 use std::path::Path;
 
 /// Comparison of a tensor.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct Row {
     /// File name without extension.
     pub file: String,

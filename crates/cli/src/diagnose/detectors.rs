@@ -2,6 +2,7 @@
 //! measured data.
 
 use crate::device::DeviceArgs;
+use crate::json::JsonArgs;
 use crate::study::run_study;
 use anyhow::{Context, Result, bail};
 use data::{Dataset, write_atomic};
@@ -40,7 +41,7 @@ pub(super) fn gain_of_detectors(
         bail!("--out {}: with --detectors the path has to be UTF-8", out.display());
     };
     let study = Study::open(path, Some(&out.join("detectors")))?;
-    run_study(&study, &RunOptions::here(DeviceArgs::default().arguments()))?;
+    run_study(&study, &RunOptions::here(DeviceArgs::default().arguments()), &JsonArgs::default())?;
     Ok((gains(&matrix(&study, &StudyState::read(&study)?)?)?, left_out))
 }
 

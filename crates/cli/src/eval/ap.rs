@@ -1,10 +1,10 @@
 //! `lidarshift eval ap`: average precision and recall of detections in KITTI text.
 
+use crate::json::JsonArgs;
 use crate::{errln, out};
 use anyhow::{Result, bail};
 use clap::Args;
-use data::output::check_writable;
-use data::{Dataset, LabelFrame, write_json};
+use data::{Dataset, LabelFrame};
 use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_detections, read_frames, read_ids};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -49,15 +49,14 @@ pub struct EvalApArgs {
     /// Ignore ground truth and detections at a larger horizontal distance, m
     #[arg(long, value_name = "M", value_parser = range)]
     max_range: Option<f64>,
-    /// Also write the result as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl EvalApArgs {
     /// Reads the files, prints the table and writes the JSON.
     pub fn run(self) -> Result<()> {
-        self.json.as_deref().map_or(Ok(()), check_writable)?;
+        self.json.check([])?;
         let (frames, mut options) = match (&self.dataset, &self.labels) {
             (Some(dataset), _) => self.of_dataset(dataset)?,
             (None, Some(labels)) => self.of_folder(labels)?,
@@ -73,9 +72,7 @@ impl EvalApArgs {
             );
         }
         let report = evaluate(&frames, &options);
-        if let Some(path) = &self.json {
-            write_json(path, &report)?;
-        }
+        self.json.write(&report)?;
         out!("{report}");
         Ok(())
     }

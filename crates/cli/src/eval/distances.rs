@@ -1,10 +1,10 @@
 //! `lidarshift eval distances`: distances between the point clouds of two data sets.
 
+use crate::json::JsonArgs;
 use crate::out;
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
-use data::output::check_writable;
-use data::{Dataset, write_json};
+use data::Dataset;
 use eval::distance::{Compared, DistanceOptions, Distances};
 use models::find_detector;
 use std::path::PathBuf;
@@ -38,9 +38,8 @@ pub struct EvalDistancesArgs {
     /// Detector whose training loader is used, for --compared loader and augmented
     #[arg(long, value_name = "NAME|TOML")]
     detector: Option<String>,
-    /// Also write the result as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -59,7 +58,7 @@ impl EvalDistancesArgs {
     /// # Errors
     /// Frames that are not in both data sets or cannot be read.
     pub fn run(self) -> Result<()> {
-        self.json.as_deref().map_or(Ok(()), check_writable)?;
+        self.json.check([])?;
         let [a, b] = [Dataset::open(&self.a)?, Dataset::open(&self.b)?];
         let compared = match self.compared {
             What::Raw => Compared::Raw,
@@ -74,9 +73,7 @@ impl EvalDistancesArgs {
         let options = DistanceOptions { compared, ..DistanceOptions::default() };
         let names = [a.config.name.as_str(), &b.config.name];
         let found = distances_of(names, [&a, &b], &self.split, self.frames, loader.as_ref(), &options)?;
-        if let Some(path) = &self.json {
-            write_json(path, &found)?;
-        }
+        self.json.write(&found)?;
         out!("{}", table(&found));
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! `lidarshift eval matrix`: AP and recall of a study by train set and test set.
 
+use crate::json::JsonArgs;
 use crate::out;
 use crate::study::StudySelection;
 use anyhow::Result;
@@ -20,9 +21,8 @@ use study::numbers::{StudyState, matrix};
 pub struct EvalMatrixArgs {
     #[command(flatten)]
     study: StudySelection,
-    /// Also write the matrix as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
     /// Also write all metrics of all runs as CSV
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -38,11 +38,12 @@ impl EvalMatrixArgs {
     /// Missing data sets, labels that cannot be read.
     pub fn run(self) -> Result<()> {
         let study = self.study.open()?;
+        self.json.check([])?;
         let matrix = matrix(&study, &StudyState::read(&study)?)?;
         let write = |path: &Option<PathBuf>, text: &dyn Fn() -> String| -> Result<()> {
             path.as_deref().map_or(Ok(()), |path: &Path| Ok(write_atomic(path, text().as_bytes())?))
         };
-        write(&self.json, &|| matrix.to_json())?;
+        self.json.write(&matrix)?;
         write(&self.csv, &|| matrix.to_csv())?;
         write(&self.latex, &|| matrix.to_latex())?;
         out!("{}", matrix.to_markdown());

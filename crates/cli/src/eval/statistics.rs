@@ -1,9 +1,10 @@
 //! `lidarshift eval statistics`: point and box statistics of two data sets with the same frames.
 
+use crate::json::JsonArgs;
 use crate::out;
 use anyhow::Result;
 use clap::Args;
-use data::{Dataset, write_json};
+use data::Dataset;
 use eval::compare_statistics;
 use std::path::PathBuf;
 
@@ -27,19 +28,17 @@ pub struct EvalStatisticsArgs {
     /// Ignore points with a larger |x| or |y|, and boxes at a larger distance, m
     #[arg(long, value_name = "M", default_value_t = 100.0)]
     max_range: f64,
-    /// Also write the result as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl EvalStatisticsArgs {
     /// Counts, prints the table and writes the JSON.
     pub fn run(self) -> Result<()> {
+        self.json.check([])?;
         let [a, b] = [Dataset::open(&self.a)?, Dataset::open(&self.b)?];
         let report = compare_statistics(&a, &b, &self.split, self.max_range)?;
-        if let Some(path) = &self.json {
-            write_json(path, &report)?;
-        }
+        self.json.write(&report)?;
         out!("{report}");
         Ok(())
     }

@@ -1,9 +1,10 @@
 //! `lidarshift eval targets`: statistics of the labelled targets of data sets.
 
+use crate::json::JsonArgs;
 use crate::{out, outln};
 use anyhow::{Result, bail};
 use clap::Args;
-use data::{Dataset, write_json};
+use data::Dataset;
 use eval::targets::{Spread, TargetOptions, Targets, targets};
 use report::StudyReport;
 use std::path::PathBuf;
@@ -29,9 +30,8 @@ pub struct EvalTargetsArgs {
     /// Folder for report.html, figures and tables
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Also write the result as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl EvalTargetsArgs {
@@ -40,6 +40,7 @@ impl EvalTargetsArgs {
     /// # Errors
     /// Frames that cannot be read; no target in any data set.
     pub fn run(self) -> Result<()> {
+        self.json.check([])?;
         let options = TargetOptions { class: self.class.clone(), ..TargetOptions::default() };
         let mut all = Vec::new();
         for path in &self.datasets {
@@ -50,9 +51,7 @@ impl EvalTargetsArgs {
         if all.iter().all(|found| found.targets.is_empty()) {
             bail!("no frame of the split {} has a {} within {} m", self.split, self.class, options.max_range_m);
         }
-        if let Some(path) = &self.json {
-            write_json(path, &all)?;
-        }
+        self.json.write(&all)?;
         let tables: Vec<String> = all.iter().map(table).collect();
         let mut figures = None;
         if let Some(out) = &self.out {

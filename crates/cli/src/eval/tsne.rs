@@ -1,10 +1,10 @@
 //! `lidarshift eval tsne`: features of the networks of a study.
 
+use crate::json::JsonArgs;
 use crate::outln;
 use crate::study::StudySelection;
 use anyhow::{Result, bail};
 use clap::Args;
-use data::write_json;
 use report::StudyReport;
 use std::path::PathBuf;
 use study::features::features;
@@ -23,9 +23,8 @@ pub struct EvalTsneArgs {
     /// Folder for report.html, figures and tables
     #[arg(long, value_name = "DIR")]
     figures: Option<PathBuf>,
-    /// Also write t-SNE coordinates, CKA and distances as JSON
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    json: JsonArgs,
 }
 
 impl EvalTsneArgs {
@@ -35,13 +34,12 @@ impl EvalTsneArgs {
     /// A study without a tested run.
     pub fn run(self) -> Result<()> {
         let study = self.study.open()?;
+        self.json.check([])?;
         let found = features(&study)?;
         if found.embeddings.is_empty() && found.frechet.is_empty() && found.warnings.is_empty() {
             bail!("no run of the study has been tested yet; run `lidarshift study {}`", study.named);
         }
-        if let Some(path) = &self.json {
-            write_json(path, &found)?;
-        }
+        self.json.write(&found)?;
         let mut page = None;
         if let Some(out) = &self.figures {
             let title = format!("Features of the study {}", study.config.name);

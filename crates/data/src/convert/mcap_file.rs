@@ -260,7 +260,10 @@ const TOPICS: [(&str, &str, &str); 3] = [
 ];
 
 fn failed(path: &Path, e: McapError) -> DataError {
-    DataError::file(path, format!("cannot be written: {e}"))
+    match e {
+        McapError::Io(e) => DataError::io(path, "cannot be written", &e),
+        e => DataError::file(path, format!("cannot be written: {e}")),
+    }
 }
 
 impl<'a> Recorder<'a> {

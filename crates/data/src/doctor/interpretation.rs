@@ -9,6 +9,7 @@ use super::report::Findings;
 use super::survey::FrameFacts;
 use crate::{Calibration, Dataset, LabelBox, LabelFrame};
 use geometry::Box3;
+use schemars::JsonSchema;
 use serde::Serialize;
 use std::f64::consts::FRAC_PI_2;
 
@@ -55,7 +56,7 @@ const MAX_DISTANCE_M: f64 = 70.0;
 const CLEAR_RATIO: f64 = 0.85;
 
 /// An interpretation of the labels and how well it agrees with the points.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Interpretation {
     /// Meaning of location, rotation and sizes, as text.
     pub reading: String,

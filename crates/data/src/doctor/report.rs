@@ -3,6 +3,7 @@
 use super::interpretation::Interpretation;
 use super::survey::FrameFacts;
 use crate::{Dataset, LabelFrame, PointColumns};
+use schemars::JsonSchema;
 use serde::Serialize;
 use statistics::median_upper_of_sorted;
 use std::collections::BTreeMap;
@@ -10,7 +11,7 @@ use std::fmt;
 use std::path::PathBuf;
 
 /// Severity of a finding.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Severity {
     /// Training or evaluation with this data would fail or give wrong results.
@@ -20,7 +21,7 @@ pub enum Severity {
 }
 
 /// A result of a check.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct Finding {
     /// Severity.
     pub severity: Severity,
@@ -66,7 +67,7 @@ impl Findings {
 }
 
 /// Smallest, median and largest of a set of values; all 0 if it is empty.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, JsonSchema)]
 pub struct Spread {
     /// Smallest.
     pub min: f64,
@@ -91,7 +92,7 @@ impl Spread {
 }
 
 /// Statistics of the clouds.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, JsonSchema)]
 pub struct PointFacts {
     /// Points per frame.
     pub per_frame: Spread,
@@ -102,7 +103,7 @@ pub struct PointFacts {
 }
 
 /// Statistics of the labels of one class.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct ClassFacts {
     /// The class.
     pub class: String,
@@ -126,8 +127,11 @@ pub struct ClassFacts {
     pub without_points: usize,
 }
 
+/// Version of the JSON of a [`DoctorReport`].
+pub const DOCTOR_SCHEMA: &str = "lidarshift/doctor/1";
+
 /// Report of the checks of a data set.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct DoctorReport {
     /// Name and version of this JSON format.
     pub schema: &'static str,
@@ -182,7 +186,7 @@ impl DoctorReport {
             _ => format!("{problems} things are wrong with {name}, the first: {}.", findings[0].message),
         };
         DoctorReport {
-            schema: "lidarshift/doctor/1",
+            schema: DOCTOR_SCHEMA,
             dataset: name.clone(),
             root: dataset.config.root.clone(),
             label_frame: dataset.config.label_frame,

@@ -10,7 +10,7 @@ pub(super) fn check_folder(folder: &Path) -> Result<(), DataError> {
     if folder.is_dir() {
         return Ok(());
     }
-    Err(DataError::file(folder, "does not exist: check `root` and `layout` of the data set"))
+    Err(DataError::missing(folder, "does not exist: check `root` and `layout` of the data set"))
 }
 
 /// The names of the files in `folder` that end with `ending`, without it, sorted.

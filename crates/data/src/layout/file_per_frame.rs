@@ -79,7 +79,7 @@ impl<L: FilePerFrame> DataLayout for L {
     fn check_root(&self, root: &Path) -> Result<(), DataError> {
         let clouds = root.join(L::FOLDERS[0]);
         if !clouds.may_be_folder() {
-            return Err(DataError::file(&clouds, "does not exist: check `root` and `layout` of the data set"));
+            return Err(DataError::missing(&clouds, "does not exist: check `root` and `layout` of the data set"));
         }
         Ok(())
     }

@@ -44,7 +44,7 @@ impl DataLayout for OpenPcdet {
     fn frame_ids(&self, root: &Path) -> Result<Vec<String>, DataError> {
         let folder = root.join(POINTS);
         if !folder.is_dir() {
-            return Err(DataError::file(&folder, "does not exist: check `root` and `layout` of the data set"));
+            return Err(DataError::missing(&folder, "does not exist: check `root` and `layout` of the data set"));
         }
         let mut ids = BTreeSet::new();
         for entry in fs_err::read_dir(&folder)? {

@@ -72,7 +72,7 @@ impl Remake for OnClouds<'_> {
         let finished = FinishedDataset::open(self.simulated, Some(self.rig), effects)?;
         let refused = finished.refusals(effects);
         let effects = effects.without(&refused);
-        Ok((Box::new(CloudsWith { finished, effects }), refused))
+        Ok((Box::new(CloudsWith { finished: finished.for_effects(&effects), effects }), refused))
     }
 }
 

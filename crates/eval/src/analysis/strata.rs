@@ -19,6 +19,7 @@ pub struct Stratum {
     pub from: f64,
     /// Upper bound, exclusive; infinite (`null` in JSON) for an open last bin.
     #[serde(deserialize_with = "or_infinite")]
+    #[schemars(with = "Option<f64>")]
     pub to: f64,
     /// Ground truths in the subset.
     pub n_gt: i64,

@@ -1,10 +1,11 @@
 //! Distances of single frames, kept separately so that frames can be resampled together with those of another pair.
 
 use super::{Measure, MeasureRow, Part};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// One measure on one part, for every frame pair.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FrameDistances {
     /// Subset of points.
     pub part: Part,

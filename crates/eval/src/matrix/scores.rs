@@ -115,7 +115,7 @@ impl TestSet {
             if !path.may_exist() {
                 let message =
                     "does not exist; a frame without detections has an empty file. Detect this test set again";
-                return Err(DataError::file(&path, message));
+                return Err(DataError::missing(&path, message));
             }
             let detections = read_kitti_text(&path, KittiText::Detections)?;
             Ok(EvalFrame { id: frame.id.clone(), labels: frame.labels.clone(), detections })

@@ -269,16 +269,34 @@ def run(*arguments, check=True):
     :param arguments: words of the command line, such as ``"doctor", "my-data"``.
     :param check: raise an error if it fails.
     :returns: the finished process with ``returncode``, ``stdout`` and ``stderr`` as text.
-    :raises LidarshiftError: the command failed; ``file`` and ``hint`` are not set.
+    :raises LidarshiftError: the command failed. ``code`` is its exit code.
     """
+    if not check:
+        return _process(arguments)
+    return _checked(arguments)
+
+
+def _process(arguments):
     command = [sys.executable, "-m", "lidarshift", *(os.fspath(a) for a in arguments)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if check and done.returncode != 0:
-        text = done.stderr.strip().rpartition("error: ")[2] or f"ended with {done.returncode}"
-        error = LidarshiftError(text)
-        error.file, error.line, error.hint = None, None, None
-        raise error
-    return done
+    return subprocess.run(command, capture_output=True, text=True, encoding="utf-8")
+
+
+def _checked(arguments, sound=(0,)):
+    """The finished process; an exit code that is not sound is raised."""
+    done = _process(["--errors", "json", *arguments])
+    if done.returncode in sound:
+        return done
+    last = done.stderr.rstrip("\n").rpartition("\n")[2]
+    try:
+        report = dict(json.loads(last))
+        error = LidarshiftError(report["message"])
+    except (ValueError, TypeError, KeyError):
+        # It ended by a signal.
+        report = {"code": done.returncode}
+        error = LidarshiftError(last or f"ended with {done.returncode}")
+    for name in ("file", "line", "hint", "code", "kind"):
+        setattr(error, name, report.get(name))
+    raise error
 
 
 def _options(options):
@@ -307,12 +325,7 @@ def diagnose(measured, simulated, out, **options):
     :raises LidarshiftError: a diagnosis that could not be made.
     """
     words = ["diagnose", "--measured", measured, "--simulated", simulated, "--out", out, *_options(options)]
-    done = run(*words, check=False)
-    if done.returncode not in (0, 3):
-        run_error = done.stderr.strip().rpartition("error: ")[2] or f"ended with {done.returncode}"
-        error = LidarshiftError(run_error)
-        error.file, error.line, error.hint = None, None, None
-        raise error
+    _checked(words, sound=(0, 3))
     return json.loads((Path(out) / "diagnosis.json").read_text(encoding="utf-8"))
 
 

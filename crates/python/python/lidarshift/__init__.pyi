@@ -16,6 +16,8 @@ class LidarshiftError(ValueError):
     file: str | None
     line: int | None
     hint: str | None
+    code: int
+    kind: str | None
 
 def read_cloud(path: _Path, columns: str = "xyzi") -> NDArray[np.float32]: ...
 @dataclass

@@ -21,6 +21,7 @@ use eval::features::{CkaTable, Embedding};
 use eval::matrix::{Matrix, PairedDifference};
 use eval::targets::Targets;
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -60,7 +61,7 @@ pub struct StudyReport {
 }
 
 /// Fréchet distance between the features of two train sets.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FrechetRow {
     /// The network.
     pub network: String,

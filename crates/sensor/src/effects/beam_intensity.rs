@@ -1,7 +1,7 @@
 //! D9: a gain of the intensity of each beam (row).
 
 use super::row_table::{by_row, by_table, check_rows, stream_of_row};
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -43,6 +43,10 @@ impl SensorEffect for BeamIntensity {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(if self.rows_deg.is_empty() { &[Need::Row] } else { &[] })
+    }
+
+    fn reads(&self) -> Reads {
+        if self.rows_deg.is_empty() { Reads::PATTERN } else { Reads::NOTHING }
     }
 
     fn sensor(&self) -> &str {

@@ -1,6 +1,6 @@
 //! B8: a dirty spot on a sensor's window.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -61,6 +61,10 @@ impl SensorEffect for DirtyWindow {
         within("transmission", self.transmission, 0.01, 1.0)?;
         within("loss", self.loss, 0.0, 1.0)?;
         within("noise_m", self.noise_m, 0.0, 10.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

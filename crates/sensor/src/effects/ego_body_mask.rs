@@ -1,6 +1,6 @@
 //! B7: directions hidden by parts of the ego vehicle.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
@@ -49,6 +49,10 @@ impl SensorEffect for EgoBodyMask {
             }
         }
         self.returns_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("returns_m[{i}]"), *v, 0.0, 100.0))
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::EMPTY_SHOTS
     }
 
     fn sensor(&self) -> &str {

@@ -1,7 +1,7 @@
 //! E4: lookup tables of loss, range offset and range noise over one covariate, without a physical model.
 
 use super::table::{check_table, interpolated};
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::{Echo, Scan, dot};
 use data::KeyError;
 use nalgebra::Vector3;
@@ -82,6 +82,14 @@ impl SensorEffect for Empirical {
             check_table(("at", &self.at, [-1e4, 1e4]), (name, values, [low, high]))?;
         }
         Ok(())
+    }
+
+    fn reads(&self) -> Reads {
+        match self.covariate {
+            Covariate::RangeM | Covariate::AzimuthDeg | Covariate::ElevationDeg => Reads::NOTHING,
+            Covariate::CosIncidence | Covariate::Signal => Reads::SURFACES,
+            Covariate::Row => Reads::PATTERN,
+        }
     }
 
     fn sensor(&self) -> &str {

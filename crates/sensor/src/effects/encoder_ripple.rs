@@ -1,6 +1,6 @@
 //! E1: a range error that is periodic in azimuth.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -33,6 +33,10 @@ impl SensorEffect for EncoderRipple {
         within("amplitude_m", self.amplitude_m, -5.0, 5.0)?;
         within("periods", self.periods, 0.0, 1e4)?;
         within("phase_rad", self.phase_rad, -100.0, 100.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

@@ -1,6 +1,6 @@
 //! D5: false returns from receiver noise and sunlight.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -50,6 +50,10 @@ impl SensorEffect for FalseAlarms {
         within("sun_azimuth_deg", self.sun_azimuth_deg, -360.0, 360.0)?;
         within("sun_width_deg", self.sun_width_deg, 0.1, 360.0)?;
         within("reach_m", self.reach_m, 0.1, 5000.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::EMPTY_SHOTS
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

@@ -1,6 +1,6 @@
 //! A5: outliers in range.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -25,6 +25,10 @@ impl SensorEffect for HeavyTails {
     fn check(&self) -> Result<(), KeyError> {
         within("probability", self.probability, 0.0, 1.0)?;
         within("std_m", self.std_m, 0.0, 10.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

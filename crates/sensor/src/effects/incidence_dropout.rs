@@ -2,7 +2,7 @@
 
 use super::form::{Form, factor};
 use super::random_dropout::drop_some;
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -63,6 +63,10 @@ impl SensorEffect for IncidenceDropout {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[Need::Incidence])
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

@@ -1,6 +1,6 @@
 //! D7: intensity as a function of returned light and range.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -54,6 +54,10 @@ impl SensorEffect for IntensityLaw {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[Need::Incidence, Need::Reflectivity])
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

@@ -1,6 +1,6 @@
 //! D8: another dependence of the intensity on range, incidence and brightness than the simulation's.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::cloud_scan::ROUND_COS;
 use crate::scan::Scan;
 use data::KeyError;
@@ -69,6 +69,10 @@ impl SensorEffect for IntensityResponse {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(if self.incidence_exponent == 0.0 { &[] } else { &[Need::Incidence] })
+    }
+
+    fn reads(&self) -> Reads {
+        if self.incidence_exponent == 0.0 { Reads::NOTHING } else { Reads::SURFACES }
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

@@ -1,6 +1,6 @@
 //! C7: random label errors, new in every frame.
 
-use super::{Draws, FrameContext, LabelledCar, SensorEffect};
+use super::{Draws, FrameContext, LabelledCar, Reads, SensorEffect};
 use data::KeyError;
 use data::toml_text::within;
 use rand::RngExt;
@@ -42,6 +42,10 @@ impl SensorEffect for LabelNoise {
         }
         within("yaw_std_deg", self.yaw_std_deg, 0.0, 180.0)?;
         within("slip_probability", self.slip_probability, 0.0, 1.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_labels(&self, cars: &mut [LabelledCar], _frame: &FrameContext, draws: &Draws) {

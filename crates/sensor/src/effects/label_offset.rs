@@ -1,6 +1,6 @@
 //! C6: a constant label error in the object's frame.
 
-use super::{Draws, FrameContext, LabelledCar, SensorEffect};
+use super::{Draws, FrameContext, LabelledCar, Reads, SensorEffect};
 use data::KeyError;
 use data::toml_text::within;
 use schemars::JsonSchema;
@@ -29,6 +29,10 @@ impl SensorEffect for LabelOffset {
             within(key, value, -20.0, 20.0)?;
         }
         within("yaw_deg", self.yaw_deg, -180.0, 180.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_labels(&self, cars: &mut [LabelledCar], _frame: &FrameContext, _draws: &Draws) {

@@ -1,6 +1,6 @@
 //! C5: a time offset between labels and cloud.
 
-use super::{Draws, FrameContext, LabelledCar, Need, SensorEffect};
+use super::{Draws, FrameContext, LabelledCar, Need, Reads, SensorEffect};
 use data::KeyError;
 use data::toml_text::within;
 use schemars::JsonSchema;
@@ -39,6 +39,10 @@ impl SensorEffect for LabelTimeOffset {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(if self.clock == Clock::Cloud { &[Need::SeenMotion] } else { &[Need::Motion] })
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_labels(&self, cars: &mut [LabelledCar], frame: &FrameContext, _draws: &Draws) {

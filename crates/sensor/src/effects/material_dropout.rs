@@ -2,7 +2,7 @@
 
 use super::assumed::{boxes, kind};
 use super::random_dropout::drop_some;
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::directions::Kind;
 use crate::material::MaterialId;
 use crate::scan::{Echo, Scan};
@@ -58,6 +58,10 @@ impl SensorEffect for MaterialDropout {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(if self.materials.is_empty() { &[Need::Incidence, Need::Cars] } else { &[Need::Material] })
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

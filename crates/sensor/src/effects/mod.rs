@@ -21,6 +21,7 @@ mod assumed;
 mod context;
 mod form;
 mod local_plane;
+mod reads;
 mod reshoot;
 mod row_table;
 mod shot_grid;
@@ -35,6 +36,7 @@ pub use form::Form;
 pub use incidence_dropout::CosineScale;
 pub use label_time_offset::Clock;
 pub use material_dropout::SurfaceKind;
+pub use reads::Reads;
 pub use table::interpolated;
 
 use crate::beams::Beams;
@@ -58,6 +60,11 @@ pub trait SensorEffect {
     /// Quantities that must be known for the effect to be applied to a finished cloud; `None` if it cannot be applied.
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[])
+    }
+
+    /// What it reads of a finished cloud. What no effect of a list reads is not looked for.
+    fn reads(&self) -> Reads {
+        Reads::ALL
     }
 
     /// Name of the sensor that it acts on; empty where it acts on all.
@@ -255,6 +262,11 @@ impl EffectList {
     /// What the list says of the surfaces of finished clouds.
     pub fn surfaces(&self) -> Surfaces {
         Surfaces { intensity: self.intensity, reflectivity: self.reflectivity }
+    }
+
+    /// What the effects of the list read of a finished cloud.
+    pub fn reads(&self) -> Reads {
+        self.effects.iter().fold(Reads::NOTHING, |all, effect| all | effect.model().reads())
     }
 
     /// Reads a list from a TOML file.

@@ -1,6 +1,6 @@
 //! B9: lost packets and sensor outages.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -43,6 +43,10 @@ impl SensorEffect for PacketLoss {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[Need::Time])
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::PATTERN | Reads::EMPTY_SHOTS
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

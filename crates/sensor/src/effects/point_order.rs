@@ -1,6 +1,6 @@
 //! E3: random order of the points.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use rand::seq::SliceRandom;
@@ -19,6 +19,10 @@ pub struct PointOrder {
 impl SensorEffect for PointOrder {
     fn check(&self) -> Result<(), KeyError> {
         Ok(())
+    }
+
+    fn reads(&self) -> Reads {
+        if self.shuffled { Reads::EMPTY_SHOTS } else { Reads::NOTHING }
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

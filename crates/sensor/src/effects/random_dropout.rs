@@ -1,6 +1,6 @@
 //! B1: returns lost at random.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
@@ -22,6 +22,10 @@ pub struct RandomDropout {
 impl SensorEffect for RandomDropout {
     fn check(&self) -> Result<(), KeyError> {
         within("share", self.share, 0.0, 1.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

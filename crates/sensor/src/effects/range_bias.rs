@@ -1,6 +1,6 @@
 //! A6: an offset and a scale error of all ranges.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -23,6 +23,10 @@ impl SensorEffect for RangeBias {
     fn check(&self) -> Result<(), KeyError> {
         within("offset_m", self.offset_m, -10.0, 10.0)?;
         within("scale", self.scale, -0.5, 0.5)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

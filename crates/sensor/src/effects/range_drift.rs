@@ -1,6 +1,6 @@
 //! A10: a range offset that changes with time, as by warm-up.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -30,6 +30,10 @@ impl SensorEffect for RangeDrift {
     fn check(&self) -> Result<(), KeyError> {
         within("drift_m", self.drift_m, -10.0, 10.0)?;
         within("time_constant_s", self.time_constant_s, 0.01, 1e6)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {

@@ -2,7 +2,7 @@
 
 use super::random_dropout::drop_some;
 use super::table::{check_table, interpolated};
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use schemars::JsonSchema;
@@ -35,6 +35,10 @@ impl SensorEffect for RangeDropout {
             return Ok(());
         }
         check_table(("range_m", &self.range_m, [0.0, 1e4]), ("share", &self.share, [0.0, 1.0]))
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

@@ -1,6 +1,6 @@
 //! B6: minimum and maximum range.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -29,6 +29,10 @@ impl SensorEffect for RangeLimits {
     fn check(&self) -> Result<(), KeyError> {
         within("max_m", self.max_m, 0.0, 1e4)?;
         within("min_m", self.min_m, 0.0, self.max_m)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

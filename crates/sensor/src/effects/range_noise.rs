@@ -1,6 +1,6 @@
 //! A1: range noise with a constant standard deviation.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -21,6 +21,10 @@ pub struct RangeNoise {
 impl SensorEffect for RangeNoise {
     fn check(&self) -> Result<(), KeyError> {
         within("std_m", self.std_m, 0.0, 10.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

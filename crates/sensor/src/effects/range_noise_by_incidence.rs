@@ -1,7 +1,7 @@
 //! A4: range noise from the footprint on inclined surfaces.
 
 use super::range_noise::add_noise;
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -39,6 +39,10 @@ impl SensorEffect for RangeNoiseByIncidence {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[Need::Incidence])
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

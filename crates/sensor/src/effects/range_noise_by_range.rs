@@ -1,7 +1,7 @@
 //! A2: range noise that grows with range.
 
 use super::range_noise::add_noise;
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -28,6 +28,10 @@ impl SensorEffect for RangeNoiseByRange {
     fn check(&self) -> Result<(), KeyError> {
         within("base_m", self.base_m, 0.0, 10.0)?;
         within("per_m", self.per_m, 0.0, 0.1)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {

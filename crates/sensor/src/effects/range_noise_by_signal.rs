@@ -2,7 +2,7 @@
 
 use super::assumed::{AssumedReflectivity, boxes, signal as own_signal};
 use super::range_noise::add_noise;
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
@@ -49,6 +49,10 @@ impl SensorEffect for RangeNoiseBySignal {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(if self.assumed.is_some() { &[Need::Incidence] } else { &[Need::Incidence, Need::Reflectivity] })
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

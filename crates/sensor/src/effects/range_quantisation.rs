@@ -1,6 +1,6 @@
 //! A9: ranges rounded to a step.
 
-use super::{Draws, FrameContext, SensorEffect};
+use super::{Draws, FrameContext, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -20,6 +20,10 @@ pub struct RangeQuantisation {
 impl SensorEffect for RangeQuantisation {
     fn check(&self) -> Result<(), KeyError> {
         within("step_m", self.step_m, 0.0, 10.0)
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::NOTHING
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

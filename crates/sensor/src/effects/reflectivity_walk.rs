@@ -1,6 +1,6 @@
 //! A8: range walk, a range error that depends on reflectivity.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -34,6 +34,10 @@ impl SensorEffect for ReflectivityWalk {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(&[Need::Reflectivity])
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, _draws: &Draws) {

@@ -3,7 +3,7 @@
 use super::assumed::{AssumedReflectivity, boxes, signal};
 use super::form::{Form, factor};
 use super::random_dropout::drop_some;
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
 use data::KeyError;
 use data::toml_text::within;
@@ -56,6 +56,10 @@ impl SensorEffect for SignalDropout {
 
     fn needs(&self) -> Option<&'static [Need]> {
         Some(if self.assumed.is_some() { &[Need::Incidence] } else { &[Need::Incidence, Need::Reflectivity] })
+    }
+
+    fn reads(&self) -> Reads {
+        Reads::SURFACES
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {

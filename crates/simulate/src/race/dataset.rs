@@ -14,6 +14,7 @@ use data::{
     DataError, Dataset, DatasetConfig, KittiText, LabelFrame, NewDataset, PointColumns, read_kitti_text, write_atomic,
 };
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use sensor::attributes;
 use sensor::effects::{Effect, EffectList};
 use sensor::matched::{RangeHistogram, fit_range_dropout};
@@ -30,7 +31,7 @@ const POINT_BYTES: (u64, u64) = (16, 53);
 const SPARE_BYTES: u64 = 200 << 20;
 
 /// Content of a data set's `manifest.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RaceManifest {
     /// [`RACE_MANIFEST_SCHEMA`].

@@ -45,7 +45,7 @@ impl ConfigFiles {
         if !path.may_be_file() {
             let message =
                 format!("does not exist, and is none that comes with the program ({})", ConfigFiles::NAMES.join(", "));
-            return Err(DataError::file(&path, message).into());
+            return Err(DataError::missing(&path, message).into());
         }
         let files = ConfigFiles::in_folder(path.parent().unwrap_or(Path::new("")));
         Ok((read(&path)?, path, files))

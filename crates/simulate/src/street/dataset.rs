@@ -5,6 +5,7 @@ use crate::street::config::RoadConfig;
 use crate::street::scene::Scene;
 use crate::street::sensor::scan;
 use data::{DatasetConfig, Frame, LabelFrame, Layout, NewDataset, Object, PointColumns, stream};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -17,7 +18,7 @@ pub const MANIFEST_SCHEMA: &str = "lidarshift/simulated-dataset/1";
 const LEAST_POINTS: usize = 5;
 
 /// Content of the `manifest.json` written by [`make_road_dataset`].
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
     /// [`MANIFEST_SCHEMA`].
@@ -43,7 +44,7 @@ pub struct Manifest {
 data::manifest!(Manifest, "from another configuration or version");
 
 /// What a split holds.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct SplitCounts {
     /// Frames.
     pub frames: usize,
