@@ -27,8 +27,11 @@ use sides::{How, Side, as_pairs, edge_m};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Kinds of odd returns that a side tells by itself.
-const KINDS: [Odd; 2] = [Odd::Alone, Odd::Between];
+/// Kinds of odd returns that both sides show by themselves: edges are counted along rows.
+fn kinds(returns: &Context) -> &'static [Odd] {
+    let edges = returns.frames.iter().any(|f| f.mixed_per_rad > 0.0);
+    if edges { &[Odd::Alone, Odd::Between] } else { &[Odd::Alone] }
+}
 
 /// Ratio of the excess noise on the ground to that on standing surfaces from which on it is not one of the sensor.
 const SAME_NOISE: f64 = 1.6;
@@ -201,9 +204,11 @@ fn search_all(
     finished(1);
     let (hidden, hides) = mask::search(&contexts.returns, Shown::Another);
     finished(2);
-    let lost = hits::search(&contexts.shots, &hides, false);
+    // Without rows there are no shots, and without a loss that could be seen none is said to have been looked for.
+    let has_shots = contexts.shots.frames.iter().any(|f| !f.measured.is_empty() && !f.simulated.is_empty());
+    let lost = has_shots.then(|| hits::search(&contexts.shots, &hides, false));
     finished(3);
-    let odd = returns::search_kinds(&contexts.returns, &KINDS);
+    let odd = returns::search_kinds(&contexts.returns, kinds(&contexts.returns));
     finished(4);
     // Rounding is no noise: the simulated side is rounded as well.
     let rounded = match step_m {
@@ -216,7 +221,8 @@ fn search_all(
     let (rough, laws) = noise::search_laws(returns, 0.0);
     let by_surface = noise::by_surface(returns, &laws);
     finished(SEARCHES);
-    let mut diagnosis = report(&contexts.returns, vec![rounding, hidden, lost, odd, rough], notes);
+    let results = [Some(rounding), Some(hidden), lost, Some(odd), Some(rough)];
+    let mut diagnosis = report(&contexts.returns, results.into_iter().flatten().collect(), notes);
     for finding in diagnosis.findings.iter_mut().filter(|f| f.channel == Channel::Roughness) {
         judge_by_surface(finding, by_surface);
     }

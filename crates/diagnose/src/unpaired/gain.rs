@@ -1,7 +1,7 @@
 //! The gain of an unpaired comparison: frames of the simulation are made anew with the list of effects, and the same
 //! distances are measured again.
 
-use super::{Contexts, KINDS, Pairs, Unpaired};
+use super::{Contexts, Pairs, Unpaired, kinds};
 use crate::catalogue::Channel;
 use crate::diagnosis::{Gain, NotApplied};
 use crate::engine::{Distances, GainFrames, Remake};
@@ -21,7 +21,7 @@ fn distances(contexts: &Contexts, train: &[usize], test: &[usize]) -> Distances 
     Distances::from([
         (Channel::Hits, lost.into_iter().zip(cut).map(|(lost, cut)| lost + cut).collect()),
         (Channel::Roughness, noise::by_table(&contexts.returns, train, test)),
-        (Channel::Returns, returns::kinds_by_table(&contexts.returns, &KINDS, train, test)),
+        (Channel::Returns, returns::kinds_by_table(&contexts.returns, kinds(&contexts.returns), train, test)),
         (Channel::Ranges, quantisation::by_table(&contexts.returns, train, test)),
     ])
 }

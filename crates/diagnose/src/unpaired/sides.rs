@@ -129,8 +129,8 @@ pub(super) fn as_pairs(ids: &[String], sides: [Vec<FrameAlone>; 2]) -> (Vec<Fram
         id: id.clone(),
         measured,
         simulated,
-        mixed_per_rad: mixed[1],
-        jumps: if mixed[1] > 0.0 && mixed[0] > 0.0 { mixed[0] / mixed[1] } else { 1.0 },
+        mixed_per_rad: if mixed[0] > 0.0 { mixed[1] } else { 0.0 },
+        jumps: if mixed.iter().all(|m| *m > 0.0) { mixed[0] / mixed[1] } else { 1.0 },
         open: 0.0,
         objects: Vec::new(),
     };
