@@ -83,6 +83,27 @@ fn a_diagnosis_is_written_once() {
     assert_eq!(found, of_file);
 }
 
+/// Two streets are refused as a pair, with what to give; given, what cannot be identified is in the result.
+#[test]
+fn streets_that_are_not_the_same() {
+    let dir = tempfile::tempdir().unwrap();
+    for (name, seed) in [("real", 1), ("sim", 2)] {
+        let made = format!("simulate --config street --frames 8 --seed {seed} --out {name}");
+        assert!(run(dir.path(), &made).status.success());
+    }
+    let output = run(dir.path(), "diagnose --measured real --simulated sim --out pair");
+    assert_eq!(output.status.code(), Some(3));
+    assert!(output_text(&output).contains("give --unpaired"), "{}", output_text(&output));
+    let unpaired = "diagnose --unpaired --measured real --simulated sim --out out";
+    let found = of_stdout(dir.path(), unpaired, "these data cannot identify:");
+    assert_eq!(found["verdict"], "nothing_found");
+    let bias = |n: &Value| n["cause"] == "range_bias" && n["tell_by"].as_str().is_some_and(|by| !by.is_empty());
+    assert!(found["not_identifiable"].as_array().unwrap().iter().any(bias), "{found}");
+    let page = fs::read_to_string(dir.path().join("out/report.html")).unwrap();
+    assert!(page.contains("What these data cannot tell"));
+    assert_eq!(run(dir.path(), "diagnose --unpaired --scans real").status.code(), Some(2));
+}
+
 #[test]
 fn training_detection_and_studies() {
     let dir = tempfile::tempdir().unwrap();
