@@ -71,6 +71,14 @@ impl Dataset {
         }
     }
 
+    /// Frame ids of a split; of all frames without one.
+    ///
+    /// # Errors
+    /// As [`Dataset::ids`] and [`Dataset::all_ids`].
+    pub fn ids_of(&self, split: Option<&str>) -> Result<Vec<String>, DataError> {
+        split.map_or_else(|| self.all_ids(), |split| self.ids(split))
+    }
+
     /// The ids of all frames that have a cloud, sorted.
     pub fn all_ids(&self) -> Result<Vec<String>, DataError> {
         self.config.layout.frame_ids(&self.config.root)

@@ -132,6 +132,17 @@ impl Finding {
     pub fn parameter(&self, quantity: Quantity) -> Option<&Parameter> {
         self.parameters.get(&ParameterId::Of(quantity))
     }
+
+    /// Takes its name: these data cannot identify its cause. `why` follows "not identifiable", `tell_by` says what
+    /// recording can. An ambiguous finding keeps its candidates: one of them may be true.
+    pub(crate) fn becomes_not_identifiable(&mut self, why: &str, tell_by: &str) {
+        let named = self.cause.take().map(|cause| vec![cause]);
+        self.candidates = self.candidates.take().or(named);
+        self.status = Status::NotIdentifiable;
+        self.effects.clear();
+        self.says.push_str(&format!("; not identifiable{why}"));
+        self.separate_by = Some(tell_by.into());
+    }
 }
 
 /// Whether the cause of a finding is named.

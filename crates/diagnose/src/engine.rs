@@ -19,7 +19,7 @@ use crate::channels::motion;
 use crate::diagnosis::{Diagnosis, Gain, Unidentifiable, Verdict};
 use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
-use crate::extended::extended_toml;
+use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
 use crate::pairing::{
     Corrections, FramePair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors, kept_of_frame,
@@ -111,11 +111,7 @@ pub fn diagnose_with(
     remake: &dyn Remake,
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
-    let made_from = MadeFrom {
-        measured: measured.config.root.clone(),
-        simulated: simulated.config.root.clone(),
-        sensors: rig.sensors.iter().map(|s| s.name.clone()).collect(),
-    };
+    let made_from = made_from(measured, simulated, rig);
     let paired = with_pairs(measured, simulated, rig, options, progress, |engine, context, notes| {
         engine.diagnose(context, notes, remake, Extension::Found(&made_from))
     })?;

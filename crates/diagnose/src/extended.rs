@@ -4,9 +4,19 @@
 use crate::catalogue::{Cause, Covariate, ParameterId, Quantity};
 use crate::diagnosis::{Diagnosis, Finding, Status};
 use crate::effects::cause_of;
+use data::Dataset;
 use sensor::effects::MadeFrom;
-use sensor::{Effect, EffectList};
+use sensor::{Effect, EffectList, Rig};
 use std::fmt::Write;
+
+/// What a list of effects is made from.
+pub(crate) fn made_from(measured: &Dataset, simulated: &Dataset, rig: &Rig) -> MadeFrom {
+    MadeFrom {
+        measured: measured.config.root.clone(),
+        simulated: simulated.config.root.clone(),
+        sensors: rig.sensors.iter().map(|s| s.name.clone()).collect(),
+    }
+}
 
 /// The text of `extended.toml`, for a diagnosis whose findings carry their effects.
 pub fn extended_toml(diagnosis: &Diagnosis, made_from: Option<&MadeFrom>) -> String {

@@ -16,11 +16,12 @@ use crate::diagnosis::{Diagnosis, Finding, Gain, Status, Verdict};
 use crate::effects::fill_effects;
 use crate::engine::{Options, Outcome, Progress, Remake, Stage, refused, report, set_reached};
 use crate::error::DiagnoseError;
-use crate::extended::extended_toml;
+use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, roles};
 use crate::pairing::{FrameAlone, FramePair, kept_of_frame};
 use crate::search::{Context, hits, mask, noise, quantisation, returns};
 use data::Dataset;
+use gain::Verification;
 use sensor::effects::MadeFrom;
 use sensor::{EffectList, Rig};
 use sides::{How, Side, as_pairs, edge_m};
@@ -52,14 +53,16 @@ struct Unpaired<'a> {
     ids: Vec<String>,
     /// The simulated side.
     side: Side<'a>,
+    /// The measured side.
     measured: Vec<FrameAlone>,
-    simulated: Vec<FrameAlone>,
+    /// How both sides are looked at.
     recorded: How,
 }
 
 impl Unpaired<'_> {
-    fn pairs(&self, measured: Vec<FrameAlone>, simulated: Vec<FrameAlone>) -> Pairs {
-        as_pairs(&self.ids, [measured, simulated])
+    /// The measured side with a simulated one.
+    fn pairs(&self, simulated: Vec<FrameAlone>) -> Pairs {
+        as_pairs(&self.ids, [self.measured.clone(), simulated])
     }
 
     fn contexts<'c>(&'c self, (returns, shots): &'c Pairs) -> Contexts<'c> {
@@ -88,10 +91,7 @@ pub fn diagnose_unpaired(
 ) -> Result<Outcome, DiagnoseError> {
     progress(Stage::Comparing, 0, 1);
     let ids = |dataset: &Dataset| -> Result<Vec<String>, DiagnoseError> {
-        let mut ids = match &options.split {
-            Some(split) => dataset.ids(split)?,
-            None => dataset.all_ids()?,
-        };
+        let mut ids = dataset.ids_of(options.split.as_deref())?;
         ids.sort();
         ids.dedup();
         Ok(ids)
@@ -119,18 +119,16 @@ pub fn diagnose_unpaired(
     }
     notes.extend(patterns(&a, &b));
     progress(Stage::Comparing, 1, 1);
-    let unpaired = look(rig, a, b, progress)?;
-    let (mut diagnosis, rows_deg) = search_all(&unpaired, notes, progress)?;
+    let (unpaired, recorded) = look(rig, a, b, progress)?;
+    let contexts = unpaired.contexts(&recorded);
+    let (mut diagnosis, rows_deg) = search_all(&unpaired, &contexts, notes, progress)?;
     fill_effects(&mut diagnosis.findings, rig, &rows_deg);
-    let made_from = MadeFrom {
-        measured: measured.config.root.clone(),
-        simulated: simulated.config.root.clone(),
-        sensors: rig.sensors.iter().map(|s| s.name.clone()).collect(),
-    };
+    let made_from = made_from(measured, simulated, rig);
     progress(Stage::Verifying, 0, 1);
-    let mut extended = verify(&mut diagnosis, &unpaired, &made_from, remake)?;
+    let verification = Verification::new(&unpaired, &contexts);
+    let mut extended = verify(&mut diagnosis, &verification, &made_from, remake)?;
     if judge_by_gain(&mut diagnosis.findings) {
-        extended = verify(&mut diagnosis, &unpaired, &made_from, remake)?;
+        extended = verify(&mut diagnosis, &verification, &made_from, remake)?;
     }
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
     progress(Stage::Verifying, 1, 1);
@@ -140,14 +138,14 @@ pub fn diagnose_unpaired(
 /// The text of `extended.toml`; its gain goes into the diagnosis.
 fn verify(
     diagnosis: &mut Diagnosis,
-    unpaired: &Unpaired,
+    verification: &Verification,
     made_from: &MadeFrom,
     remake: &dyn Remake,
 ) -> Result<String, DiagnoseError> {
     let extended = extended_toml(diagnosis, Some(made_from));
     let list = EffectList::parse(&extended, Path::new("extended.toml"))?;
     let found = diagnosis.findings.iter().map(|f| f.channel).collect();
-    let gain = gain::gain(unpaired, found, Some(&list).filter(|list| !list.effects.is_empty()), remake)?;
+    let gain = verification.of(&found, Some(&list).filter(|list| !list.effects.is_empty()), remake)?;
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
     // What the ego vehicle hides is in no distance.
     set_reached(diagnosis, |f| f.cause != Some(Cause::EgoOcclusion));
@@ -176,8 +174,13 @@ fn patterns(a: &Side, b: &Side) -> Vec<String> {
     notes
 }
 
-/// Reads both sides, each frame by itself.
-fn look<'a>(rig: &'a Rig, a: Side<'a>, b: Side<'a>, progress: Progress) -> Result<Unpaired<'a>, DiagnoseError> {
+/// Reads both sides, each frame by itself, and pairs them as they were recorded.
+fn look<'a>(
+    rig: &'a Rig,
+    a: Side<'a>,
+    b: Side<'a>,
+    progress: Progress,
+) -> Result<(Unpaired<'a>, Pairs), DiagnoseError> {
     let n = a.ids.len();
     let finished = AtomicUsize::new(0);
     let done = || progress(Stage::Pairing, finished.fetch_add(1, Ordering::Relaxed) + 1, 3 * n);
@@ -186,20 +189,21 @@ fn look<'a>(rig: &'a Rig, a: Side<'a>, b: Side<'a>, progress: Progress) -> Resul
     let recorded = How { edge_m: edge_m([&a.some_frames(&first)?, &b.some_frames(&first)?]), ..first };
     let measured = a.frames(&recorded, &done)?;
     let simulated = b.frames(&recorded, &done)?;
-    Ok(Unpaired { rig, ids: a.ids, side: b, measured, simulated, recorded })
+    let unpaired = Unpaired { rig, ids: a.ids, side: b, measured, recorded };
+    let pairs = unpaired.pairs(simulated);
+    Ok((unpaired, pairs))
 }
 
 /// All searches, and the elevations of the rows, degrees.
 fn search_all(
     unpaired: &Unpaired,
+    contexts: &Contexts,
     notes: Vec<String>,
     progress: Progress,
 ) -> Result<(Diagnosis, Vec<Vec<f64>>), DiagnoseError> {
     const SEARCHES: usize = 5;
     let finished = |searches: usize| progress(Stage::Weighing, searches, SEARCHES);
     finished(0);
-    let pairs = unpaired.pairs(unpaired.measured.clone(), unpaired.simulated.clone());
-    let contexts = unpaired.contexts(&pairs);
     let (rounding, step_m) = quantisation::search(&contexts.returns);
     finished(1);
     let (hidden, hides) = mask::search(&contexts.returns, Shown::Another);
@@ -215,11 +219,10 @@ fn search_all(
         Some(_) => Some(unpaired.side.frames(&How { step_m, ..unpaired.recorded }, &|| ())?),
         None => None,
     };
-    let pairs = rounded.map(|simulated| unpaired.pairs(unpaired.measured.clone(), simulated));
+    let pairs = rounded.map(|simulated| unpaired.pairs(simulated));
     let even = pairs.as_ref().map(|pairs| unpaired.contexts(pairs));
-    let returns = &even.as_ref().unwrap_or(&contexts).returns;
-    let (rough, laws) = noise::search_laws(returns, 0.0);
-    let by_surface = noise::by_surface(returns, &laws);
+    let returns = &even.as_ref().unwrap_or(contexts).returns;
+    let (rough, by_surface) = noise::search_by_surface(returns);
     finished(SEARCHES);
     let results = [Some(rounding), Some(hidden), lost, Some(odd), Some(rough)];
     let mut diagnosis = report(&contexts.returns, results.into_iter().flatten().collect(), notes);
@@ -233,6 +236,9 @@ fn search_all(
     Ok((diagnosis, unpaired.side.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect()))
 }
 
+/// What recording tells noise of the sensor from rough surfaces.
+const TELL_NOISE_BY: &str = "a flat wall from a standing sensor, or the same scenes on both sides";
+
 /// Takes the name of noise that is not the same on the ground and on standing surfaces: the sensor does not know on
 /// what it measures, and streets differ in how rough they are.
 fn judge_by_surface(finding: &mut Finding, [ground, standing]: [Option<noise::SurfaceShare>; 2]) {
@@ -242,11 +248,12 @@ fn judge_by_surface(finding: &mut Finding, [ground, standing]: [Option<noise::Su
         return;
     }
     let why = format!(
-        "on the ground it is {:.1} times, on standing surfaces {:.1} times that; the surfaces of one street are rougher",
+        ": on the ground it is {:.1} times, on standing surfaces {:.1} times that; the surfaces of one street are \
+         rougher",
         ground.ratio.max(0.0),
         standing.ratio.max(0.0)
     );
-    take_name(finding, &why);
+    finding.becomes_not_identifiable(&why, TELL_NOISE_BY);
 }
 
 /// Share of the difference of roughness that has to be gone with noise. Below it the streets differ more than by it.
@@ -258,18 +265,9 @@ fn judge_by_gain(findings: &mut [Finding]) -> bool {
     let rough = findings.iter_mut().filter(|f| f.channel == Channel::Roughness && f.status != Status::NotIdentifiable);
     let mut taken = false;
     for finding in rough.filter(|f| f.reached.is_none_or(|reached| reached < MOST_OF_IT)) {
-        take_name(finding, "most of the difference of roughness stays with it; the streets differ by more");
+        let why = ": most of the difference of roughness stays with it; the streets differ by more";
+        finding.becomes_not_identifiable(why, TELL_NOISE_BY);
         taken = true;
     }
     taken
-}
-
-/// The finding may be a difference of the streets.
-fn take_name(finding: &mut Finding, why: &str) {
-    let named = finding.cause.take().map(|cause| vec![cause]);
-    finding.candidates = named.or(finding.candidates.take());
-    finding.status = Status::NotIdentifiable;
-    finding.effects.clear();
-    finding.says.push_str(&format!("; not identifiable: {why}"));
-    finding.separate_by = Some("a flat wall from a standing sensor, or the same scenes on both sides".into());
 }

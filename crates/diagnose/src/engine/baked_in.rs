@@ -1,6 +1,6 @@
 //! Causes that a comparison cannot tell, as the simulated side was made of the measured one.
 
-use crate::diagnosis::{Diagnosis, Finding, Status, Unidentifiable, Verdict};
+use crate::diagnosis::{Diagnosis, Unidentifiable, Verdict};
 
 /// Gives findings that have one of these causes, or may have it, the status `not_identifiable`, with the reason and
 /// what can tell. Nothing is detectable of these causes.
@@ -10,20 +10,11 @@ pub(super) fn take_names(diagnosis: &mut Diagnosis, baked_in: &[Unidentifiable])
             finding.cause == Some(b.cause) || finding.candidates.iter().flatten().any(|cause| *cause == b.cause)
         };
         if let Some(known) = baked_in.iter().find(of_finding) {
-            take_name(finding, known);
+            finding.becomes_not_identifiable(&format!(" ({}): {}", known.cause, known.why), &known.tell_by);
         }
     }
     diagnosis.minimum_detectable.retain(|cause, _| baked_in.iter().all(|b| b.cause != *cause));
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
-}
-
-fn take_name(finding: &mut Finding, known: &Unidentifiable) {
-    // An ambiguous finding keeps its candidates: one of them may be true.
-    let candidates = finding.candidates.take().or_else(|| finding.cause.map(|cause| vec![cause]));
-    (finding.cause, finding.candidates, finding.status) = (None, candidates, Status::NotIdentifiable);
-    finding.effects.clear();
-    finding.says.push_str(&format!("; not identifiable ({}): {}", known.cause, known.why));
-    finding.separate_by = Some(known.tell_by.clone());
 }
 
 #[cfg(test)]
@@ -31,7 +22,7 @@ mod tests {
     use super::*;
     use crate::catalogue::{Cause, Channel, Covariate, Family, Quantity};
     use crate::curve::Curve;
-    use crate::diagnosis::{FindingGain, Minimum};
+    use crate::diagnosis::{Finding, FindingGain, Minimum, Status};
     use crate::engine::report::refused;
     use std::collections::BTreeMap;
 

@@ -1,12 +1,10 @@
 //! One side by itself: each return against the surface of its own neighbours, and the shots of smooth surfaces with and
 //! without a return. Two sides that show different streets are compared by these.
 
-use super::frame::company;
 use super::gaps::{in_gap, mixed_per_rad};
-use super::prediction::{Predictor, mean_intensity};
+use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
-use super::roughness::LONE;
 use geometry::Box3;
 use sensor::directions::{LocalSurface, SensorScan, Sensors};
 
@@ -34,44 +32,42 @@ pub fn frame_alone(side: &SideFrame, sensors: &Sensors) -> FrameAlone {
     let mut out = FrameAlone::default();
     for (sensor, scan) in side.scans.iter().enumerate() {
         let predictor = Predictor::new(sensors, sensor, scan, &boxes);
-        let returns: Vec<Ray> = (0..scan.len()).map(|i| alone(&predictor, scan, i)).collect();
+        let alone = |i| alone(&predictor, scan, i);
+        let (returns, surfaces): (Vec<Ray>, Vec<Option<LocalSurface>>) = (0..scan.len()).map(alone).unzip();
         out.mixed_per_rad += mixed_per_rad(&returns, &predictor.around.index);
-        out.shots.extend(shots(&predictor, scan, &returns, sensors.patterns[sensor].steps.azimuth_rad));
+        out.shots.extend(shots(&predictor, scan, (&returns, &surfaces), sensors.patterns[sensor].steps.azimuth_rad));
         out.returns.extend(returns);
     }
     out.mixed_per_rad /= out.returns.len().max(1) as f64;
     out
 }
 
-/// A return with what the others of its side say.
-fn alone(predictor: &Predictor, scan: &SensorScan, i: usize) -> Ray {
-    let index = &predictor.around.index;
-    let mut ray = predictor.ray(scan, i, true);
+/// A return with what the others of its side say, and their surface.
+fn alone(predictor: &Predictor, scan: &SensorScan, i: usize) -> (Ray, Option<LocalSurface>) {
+    let (mut ray, surface) = predictor.own_ray(scan, i);
     ray.matched = true;
-    ray.company = company(index, scan, i);
-    ray.in_gap = in_gap(index, scan, i);
-    if ray.smooth {
-        let at = [scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]];
-        ray.intensity_beside = mean_intensity(index, &scan.intensity, at, Some(i as u32));
-        if ray.company > LONE {
-            (ray.roughness_m, ray.roughness_leverage) = (ray.residual_m, ray.leverage);
-        }
-    }
+    ray.in_gap = in_gap(&predictor.around.index, scan, i);
     // In the open a far post is as lone as a false alarm.
     if ray.surface == Surface::Open {
         ray.row = u16::MAX;
     }
-    ray
+    (ray, surface)
 }
 
 /// Shots of the rows onto smooth surfaces: returns, and places between two returns of a row. The neighbours of a shot
 /// in its row lie on the surface as well, so that shots beside the end of a surface are none.
-fn shots(predictor: &Predictor, scan: &SensorScan, returns: &[Ray], step_rad: f32) -> Vec<Ray> {
+fn shots(
+    predictor: &Predictor,
+    scan: &SensorScan,
+    (returns, surfaces): (&[Ray], &[Option<LocalSurface>]),
+    step_rad: f32,
+) -> Vec<Ray> {
     let rows = returns.iter().map(|r| r.row).filter(|row| *row != u16::MAX).max().map_or(0, |row| usize::from(row) + 1);
     let mut by_row: Vec<Vec<usize>> = vec![Vec::new(); rows];
     for (i, ray) in returns.iter().enumerate().filter(|(_, r)| r.row != u16::MAX) {
         by_row[usize::from(ray.row)].push(i);
     }
+    let edge_m = predictor.edge_m();
     let mut out = Vec::new();
     for row in &mut by_row {
         row.sort_by(|a, b| scan.azimuth_rad[*a].total_cmp(&scan.azimuth_rad[*b]));
@@ -79,7 +75,7 @@ fn shots(predictor: &Predictor, scan: &SensorScan, returns: &[Ray], step_rad: f3
             let [before, at, after] = [three[0], three[1], three[2]];
             let near = [(before, at), (at, after)].iter().all(|(a, b)| gap(scan, *a, *b, step_rad).is_some());
             let place = [scan.azimuth_rad[at], scan.elevation_rad[at]];
-            if near && between(predictor, scan, place, Some(at as u32), [before, after]) {
+            if near && between(scan, surfaces[at].as_ref(), place, [before, after], edge_m) {
                 out.push(Ray { matched: true, ..returns[at] });
             }
         }
@@ -90,8 +86,10 @@ fn shots(predictor: &Predictor, scan: &SensorScan, returns: &[Ray], step_rad: f3
                 let of = |values: &[f32]| values[before] + (values[after] - values[before]) * k as f32 / steps as f32;
                 [of(&scan.azimuth_rad), of(&scan.elevation_rad)]
             });
-            let seen = missed.filter(|place| between(predictor, scan, *place, None, [before, after]));
-            out.extend(seen.filter_map(|place| missed_shot(predictor, place)));
+            out.extend(missed.filter_map(|place| {
+                let (ray, surface) = missed_shot(predictor, place);
+                between(scan, surface.as_ref(), place, [before, after], edge_m).then_some(ray)
+            }));
         }
     }
     out
@@ -104,18 +102,18 @@ fn gap(scan: &SensorScan, a: usize, b: usize, step_rad: f32) -> Option<i32> {
     ((steps - whole).abs() < OFF_STEP && (1.0..=LONGEST_GAP as f32).contains(&whole)).then_some(whole as i32)
 }
 
-/// Whether a direction looks onto a smooth surface on which two returns beside it lie as well.
+/// Whether the surface of a direction is a smooth one on which two returns beside it lie as well.
 fn between(
-    predictor: &Predictor,
     scan: &SensorScan,
+    surface: Option<&LocalSurface>,
     [azimuth_rad, elevation_rad]: [f32; 2],
-    without: Option<u32>,
     beside: [usize; 2],
+    edge_m: f64,
 ) -> bool {
-    let Some((surface, _)) = predictor.around.look(azimuth_rad, elevation_rad, without).surface else { return false };
+    let Some(surface) = surface else { return false };
     beside.iter().all(|&i| {
         let off = [scan.azimuth_rad[i] - azimuth_rad, scan.elevation_rad[i] - elevation_rad].map(f64::from);
-        off_surface_m(&surface, off, f64::from(elevation_rad), f64::from(scan.range_m[i])) < predictor.edge_m()
+        off_surface_m(surface, off, f64::from(elevation_rad), f64::from(scan.range_m[i])) < edge_m
     })
 }
 
@@ -128,17 +126,17 @@ fn off_surface_m(surface: &LocalSurface, [azimuth, elevation]: [f64; 2], at_elev
     if there > 0.0 { (range_m - 1.0 / there).abs() * surface.cos_incidence } else { f64::INFINITY }
 }
 
-/// A shot without a return.
-fn missed_shot(predictor: &Predictor, [azimuth_rad, elevation_rad]: [f32; 2]) -> Option<Ray> {
+/// A shot without a return, and the surface that it meets.
+fn missed_shot(predictor: &Predictor, [azimuth_rad, elevation_rad]: [f32; 2]) -> (Ray, Option<LocalSurface>) {
     let place = SensorScan {
         azimuth_rad: vec![azimuth_rad],
         elevation_rad: vec![elevation_rad],
         range_m: vec![1.0],
         intensity: vec![],
     };
-    let ray = predictor.ray(&place, 0, false);
+    let (ray, surface) = predictor.seen(&place, 0, false);
     // Nothing came back: it has no range of its own.
-    ray.smooth.then_some(Ray { matched: false, residual_m: 0.0, ..ray })
+    (Ray { matched: false, residual_m: 0.0, ..ray }, surface)
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use super::gaps::{in_gap, mixed_per_rad};
 use super::prediction::{Predictor, mean_intensity};
 use super::ray::{Ray, Surface};
 use super::recordings::{Matched, SideFrame};
-use super::roughness::{LONE, Roughness};
+use super::roughness::Roughness;
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
@@ -196,15 +196,8 @@ impl SensorPair<'_> {
     /// Simulated rays, each predicted from the others.
     fn simulated_rays(&self, predictor: &Predictor) -> Vec<Ray> {
         let scan = self.simulated;
-        let mut rays: Vec<Ray> = (0..scan.len()).map(|i| predictor.ray(scan, i, true)).collect();
-        for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.1).enumerate() {
-            ray.matched = *matched;
-            ray.company = company(&predictor.around.index, scan, i);
-            ray.intensity_beside = ray.intensity_simulated;
-            (ray.roughness_m, ray.roughness_leverage) =
-                if ray.smooth && ray.company > LONE { (ray.residual_m, ray.leverage) } else { (f32::NAN, 0.0) };
-        }
-        rays
+        let own = |(i, matched): (usize, &bool)| Ray { matched: *matched, ..predictor.own_ray(scan, i).0 };
+        self.matched.1.iter().enumerate().map(own).collect()
     }
 
     /// Sets what depends on the direction in which measured rays were sent, and on the returns around them. `own` is

@@ -83,11 +83,7 @@ pub fn common_ids(
     simulated: &Dataset,
     split: Option<&str>,
 ) -> Result<(Vec<String>, Vec<String>), DiagnoseError> {
-    let ids = |d: &Dataset| match split {
-        Some(split) => d.ids(split),
-        None => d.all_ids(),
-    };
-    let (a, b) = (ids(measured)?, ids(simulated)?);
+    let (a, b) = (measured.ids_of(split)?, simulated.ids_of(split)?);
     let in_b: BTreeSet<&String> = b.iter().collect();
     let mut common: Vec<String> = a.iter().filter(|id| in_b.contains(id)).cloned().collect();
     common.sort();

@@ -1,10 +1,13 @@
 //! Predictions of the simulation for a direction: the surface around it, its range, incidence and kind.
 
-use super::frame::company_m;
+use super::frame::{company, company_m};
 use super::ray::{Ray, Surface};
+use super::roughness::LONE;
 use geometry::Box3;
 use nalgebra::Vector3;
-use sensor::directions::{DirectionIndex, Kind, SensorScan, Sensors, Surroundings, in_or_beside, kind_of};
+use sensor::directions::{
+    DirectionIndex, Kind, LocalSurface, SensorScan, Sensors, Surroundings, in_or_beside, kind_of,
+};
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
 const BESIDE_M: f64 = 0.5;
@@ -40,8 +43,24 @@ impl<'a> Predictor<'a> {
         self.sensors.edge_m
     }
 
+    /// A return of the simulated scan itself with what the others say, and their surface where it is a smooth one.
+    pub(super) fn own_ray(&self, scan: &SensorScan, i: usize) -> (Ray, Option<LocalSurface>) {
+        let (mut ray, surface) = self.seen(scan, i, true);
+        ray.company = company(&self.around.index, scan, i);
+        ray.intensity_beside = ray.intensity_simulated;
+        if ray.smooth && ray.company > LONE {
+            (ray.roughness_m, ray.roughness_leverage) = (ray.residual_m, ray.leverage);
+        }
+        (ray, surface)
+    }
+
     /// A return of a scan of that sensor with the prediction for its direction.
     pub(super) fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
+        self.seen(scan, i, without_itself).0
+    }
+
+    /// The same, and the surface that predicts it where there is a smooth one.
+    pub(super) fn seen(&self, scan: &SensorScan, i: usize, without_itself: bool) -> (Ray, Option<LocalSurface>) {
         let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
         let direction = self.around.direction(az, el);
         let mut ray = Ray {
@@ -90,7 +109,7 @@ impl<'a> Predictor<'a> {
             None if ray.near_far_m[1] > 0.0 => self.set_kind(&mut ray, &direction, f64::from(range), None),
             None => {}
         }
-        ray
+        (ray, around.surface.map(|(surface, _)| surface))
     }
 
     /// Sets the kind of the surface in a direction at a range.

@@ -58,10 +58,7 @@ pub fn diagnose_scans(
     progress: Progress,
 ) -> Result<Outcome, DiagnoseError> {
     let mount = only_mount(rig)?;
-    let ids = match &options.split {
-        Some(split) => dataset.ids(split)?,
-        None => dataset.all_ids()?,
-    };
+    let ids = dataset.ids_of(options.split.as_deref())?;
     if ids.len() < FEWEST_SCANS {
         return Err(DiagnoseError::Pair(format!(
             "{}: {} scans; at least {FEWEST_SCANS} are wanted, so that gains are measured on scans that were not fitted on",

@@ -6,7 +6,7 @@ mod directions;
 mod select;
 mod surfaces;
 
-pub use self::surfaces::{SurfaceShare, by_surface};
+pub use self::surfaces::SurfaceShare;
 
 use self::describe::found;
 use self::select::Selection;
@@ -35,21 +35,18 @@ const CONSTANT: usize = 0;
 const ANGULAR: usize = 1;
 
 /// A law with its coefficient, m2 or rad2.
-pub type Term = (NoiseLaw, f64);
+type Term = (NoiseLaw, f64);
 
 /// The search; surfaces with a cosine of incidence below `least_cos` are left out.
 pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
-    search_laws(context, least_cos).0
+    Search::new(context, least_cos).run().0
 }
 
-/// The search, and the laws that it found.
-pub fn search_laws(context: &Context, least_cos: f64) -> (ChannelResult, Vec<Term>) {
-    let search = Search::new(context, least_cos);
-    let mut result = ChannelResult::new(Channel::Roughness, search.hold_out.len());
-    let selection = search.select(&mut result);
-    result.minimum = search.minimum();
-    let terms = search.report(selection, &mut result);
-    (result, terms)
+/// The search on all surfaces, and what of the found noise is measured on the ground and on standing surfaces.
+pub fn search_by_surface(context: &Context) -> (ChannelResult, [Option<SurfaceShare>; 2]) {
+    let search = Search::new(context, 0.0);
+    let (result, laws) = search.run();
+    (result, search.by_surface(&laws))
 }
 
 /// Gains of the `test` frames by variances of each cell and of each row fitted on the `train` frames, nats.
@@ -92,6 +89,15 @@ impl<'a> Search<'a> {
         Search { context, least_cos, scales, rough, select, estimate, hold_out, blocks, table, linear, demands }
     }
 
+    /// The search, and the fitted laws.
+    fn run(&self) -> (ChannelResult, Vec<Term>) {
+        let mut result = ChannelResult::new(Channel::Roughness, self.hold_out.len());
+        let selection = self.select(&mut result);
+        result.minimum = self.minimum();
+        let laws = self.report(selection, &mut result);
+        (result, laws)
+    }
+
     /// Variances over some frames.
     fn table(&self, frames: &[usize]) -> NoiseTable {
         NoiseTable::new(total(frames.iter().map(|&i| &self.rough[i])), self.least_cos)
@@ -107,9 +113,9 @@ impl<'a> Search<'a> {
         let least = |law: usize| {
             let significant = Z_STAR * self.whole(&[law]).error(0);
             // In steps of 2 %.
-            let mut sizes = (0..1500).map(|k| 1e-12 * 1.02f64.powi(k));
-            let reported = sizes.find(|theta| above_floor(&self.table, NOISE_LAWS[law], *theta));
-            significant.max(reported.unwrap_or(0.0)).sqrt()
+            let sizes: Vec<f64> = (0..1500).map(|k| 1e-12 * 1.02f64.powi(k)).collect();
+            let first = sizes.partition_point(|theta| !above_floor(&self.table, NOISE_LAWS[law], *theta));
+            significant.max(sizes.get(first).copied().unwrap_or(0.0)).sqrt()
         };
         vec![
             (Cause::RangeNoise, Minimum::new(Quantity::StdM, least(CONSTANT))),

@@ -1,7 +1,8 @@
 //! The gain of an unpaired comparison: frames of the simulation are made anew with the list of effects, and the same
 //! distances are measured again.
 
-use super::{Contexts, Pairs, Unpaired, kinds};
+use super::sides::as_pairs;
+use super::{Contexts, Unpaired, kinds};
 use crate::catalogue::Channel;
 use crate::diagnosis::{Gain, NotApplied};
 use crate::engine::{Distances, GainFrames, Remake};
@@ -26,45 +27,56 @@ fn distances(contexts: &Contexts, train: &[usize], test: &[usize]) -> Distances 
     ])
 }
 
-/// The gain of a list of effects in the channels in which something was found. Without a list, the distances alone.
-pub(super) fn gain(
-    unpaired: &Unpaired,
-    found: BTreeSet<Channel>,
-    effects: Option<&EffectList>,
-    remake: &dyn Remake,
-) -> Result<Gain, DiagnoseError> {
-    let pairs = unpaired.pairs(unpaired.measured.clone(), unpaired.simulated.clone());
-    let contexts = unpaired.contexts(&pairs);
-    let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| contexts.returns.of(role));
-    let of = |contexts: &Contexts| distances(contexts, &train, &test);
-    let before = of(&contexts);
-    let frames = GainFrames { returns: contexts.returns.returns(&test), blocks: contexts.returns.blocks(&test) };
-    let Some(effects) = effects else {
-        return Ok(Gain {
-            before: 0.0,
-            after: 0.0,
-            floor: 0.0,
-            ..frames.gain([&before, &before, &before], &found, false)
-        });
-    };
-    let (made, refused) = remake.with(effects)?;
-    let none_applied = refused.len() == effects.effects.len();
-    let not_applied = refused.into_iter().map(|r| NotApplied { effect: r.kind.into(), why: r.why }).collect();
-    let zero: Distances = before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
-    if none_applied {
-        return Ok(Gain { not_applied, ..frames.gain([&before, &before, &zero], &found, true) });
+/// Distances as they were recorded, and those of frames that are made anew.
+pub(super) struct Verification<'a> {
+    unpaired: &'a Unpaired<'a>,
+    train: Vec<usize>,
+    test: Vec<usize>,
+    frames: GainFrames,
+    before: Distances,
+}
+
+impl<'a> Verification<'a> {
+    /// Of both sides as they were recorded.
+    pub(super) fn new(unpaired: &'a Unpaired<'a>, recorded: &Contexts) -> Self {
+        let returns = &recorded.returns;
+        let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| returns.of(role));
+        let frames = GainFrames { returns: returns.returns(&test), blocks: returns.blocks(&test) };
+        let before = distances(recorded, &train, &test);
+        Verification { unpaired, train, test, frames, before }
     }
-    let two = |(number, id): (usize, &String)| -> Result<[FrameAlone; 2], DiagnoseError> {
-        let frames = made.frame(id)?;
-        Ok(frames.map(|(cloud, objects)| unpaired.side.remade(&cloud, objects, &unpaired.recorded, number)))
-    };
-    let (one, other): (Vec<FrameAlone>, Vec<FrameAlone>) =
-        in_order(unpaired.side.ids.par_iter().enumerate().map(two))?.into_iter().map(|[a, b]| (a, b)).unzip();
-    let after: Pairs = unpaired.pairs(unpaired.measured.clone(), one.clone());
-    // Two draws of the extended simulation, half of the drive apart: other places as well.
-    let mut elsewhere = other;
-    elsewhere.rotate_left(unpaired.ids.len() / 2);
-    let floor: Pairs = unpaired.pairs(elsewhere, one);
-    let [after, floor] = [after, floor].map(|pairs| of(&unpaired.contexts(&pairs)));
-    Ok(Gain { not_applied, ..frames.gain([&before, &after, &floor], &found, true) })
+
+    /// The gain of a list of effects in the channels in which something was found. Without a list, the distances alone.
+    pub(super) fn of(
+        &self,
+        found: &BTreeSet<Channel>,
+        effects: Option<&EffectList>,
+        remake: &dyn Remake,
+    ) -> Result<Gain, DiagnoseError> {
+        let (before, unpaired) = (&self.before, self.unpaired);
+        let Some(effects) = effects else {
+            let gain = self.frames.gain([before; 3], found, false);
+            return Ok(Gain { before: 0.0, after: 0.0, floor: 0.0, ..gain });
+        };
+        let (made, refused) = remake.with(effects)?;
+        let none_applied = refused.len() == effects.effects.len();
+        let not_applied = refused.into_iter().map(|r| NotApplied { effect: r.kind.into(), why: r.why }).collect();
+        if none_applied {
+            let zero: Distances = before.iter().map(|(c, d)| (*c, vec![0.0; d.len()])).collect();
+            return Ok(Gain { not_applied, ..self.frames.gain([before, before, &zero], found, true) });
+        }
+        let two = |(number, id): (usize, &String)| -> Result<[FrameAlone; 2], DiagnoseError> {
+            let frames = made.frame(id)?;
+            Ok(frames.map(|(cloud, objects)| unpaired.side.remade(&cloud, objects, &unpaired.recorded, number)))
+        };
+        let (one, other): (Vec<FrameAlone>, Vec<FrameAlone>) =
+            in_order(unpaired.side.ids.par_iter().enumerate().map(two))?.into_iter().map(|[a, b]| (a, b)).unzip();
+        let after = unpaired.pairs(one.clone());
+        // Two draws of the extended simulation, half of the drive apart: other places as well.
+        let mut elsewhere = other;
+        elsewhere.rotate_left(unpaired.ids.len() / 2);
+        let floor = as_pairs(&unpaired.ids, [elsewhere, one]);
+        let [after, floor] = [after, floor].map(|p| distances(&unpaired.contexts(&p), &self.train, &self.test));
+        Ok(Gain { not_applied, ..self.frames.gain([before, &after, &floor], found, true) })
+    }
 }

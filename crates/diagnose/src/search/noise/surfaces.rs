@@ -1,10 +1,11 @@
 //! Whether added noise is the same on the ground and on standing surfaces: that of a sensor is, rough surfaces are not.
 
-use super::Term;
+use super::{Search, Term};
 use crate::channels::cells::zone_of;
-use crate::channels::roughness::{RoughFrame, rough_frames, scales, total};
-use crate::inference::noise::NoiseTable;
-use crate::search::{Context, REPETITIONS};
+use crate::channels::roughness::RoughFrame;
+use crate::inference::noise::{NoiseLaw, NoiseTable};
+use crate::search::REPETITIONS;
+use nalgebra::DVector;
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 
 /// Excess of the measured variance on one kind of surface, in units of what laws say.
@@ -19,38 +20,31 @@ pub struct SurfaceShare {
 /// Weighted products of the laws' variance with the measured excess, and with themselves, by zone.
 type Sums = [[f64; 2]; 2];
 
-/// The excess on the ground and on standing surfaces; `None` of a kind without enough returns.
-pub fn by_surface(context: &Context, laws: &[Term]) -> [Option<SurfaceShare>; 2] {
-    let rough = rough_frames(context.frames, &scales(context.frames));
-    let table = NoiseTable::new(total(rough.iter()), 0.0);
-    let sums: Vec<Sums> = rough.iter().map(|frame| of_frame(&table, frame, laws)).collect();
-    let every: Vec<usize> = (0..sums.len()).collect();
-    let ratio = |zone: usize, frames: &[usize]| {
-        let [excess, expected] = frames.iter().fold([0.0; 2], |s, &i| [0, 1].map(|k: usize| s[k] + sums[i][zone][k]));
-        (expected > 0.0).then(|| excess / expected)
-    };
-    let members = blocks_of(&context.blocks(&every));
-    [0, 1].map(|zone| {
-        let mut rng = data::stream(0, "diagnose surfaces", zone as u64, 0);
-        let drawn = (0..REPETITIONS).filter_map(|_| ratio(zone, &draw_blocks(&members, &mut rng)));
-        Some(SurfaceShare { ratio: ratio(zone, &every)?, ci95: interval_nearest(drawn.collect())? })
-    })
+impl Search<'_> {
+    /// The excess on the ground and on standing surfaces; `None` of a kind without enough returns.
+    pub(super) fn by_surface(&self, laws: &[Term]) -> [Option<SurfaceShare>; 2] {
+        let every: Vec<usize> = (0..self.rough.len()).collect();
+        let table = self.table(&every);
+        let sums: Vec<Sums> =
+            self.rough.iter().map(|frame| [0, 1].map(|zone| of_zone(&table, frame, zone, laws))).collect();
+        let ratio = |zone: usize, frames: &[usize]| {
+            let [excess, expected] =
+                frames.iter().fold([0.0; 2], |s, &i| [0, 1].map(|k: usize| s[k] + sums[i][zone][k]));
+            (expected > 0.0).then(|| excess / expected)
+        };
+        let members = blocks_of(&self.context.blocks(&every));
+        [0, 1].map(|zone| {
+            let mut rng = data::stream(0, "diagnose surfaces", zone as u64, 0);
+            let drawn = (0..REPETITIONS).filter_map(|_| ratio(zone, &draw_blocks(&members, &mut rng)));
+            Some(SurfaceShare { ratio: ratio(zone, &every)?, ci95: interval_nearest(drawn.collect())? })
+        })
+    }
 }
 
-fn of_frame(table: &NoiseTable, frame: &RoughFrame, laws: &[Term]) -> Sums {
-    let mut sums = Sums::default();
-    for (cell, held) in frame {
-        let zone = zone_of(*cell as usize);
-        let (Some([va, vb]), Some(sum)) = (table.variances(*cell as usize), sums.get_mut(zone)) else { continue };
-        let (na, nb) = (held.measured.n, held.simulated.n);
-        if na < 3.0 || nb < 3.0 {
-            continue;
-        }
-        let [ya, yb] = held.variances();
-        let (range_m, cos) = held.measured.mean();
-        let expected: f64 = laws.iter().map(|(law, theta)| theta * law.variance(range_m, cos)).sum();
-        let weight = 1.0 / (2.0 * va * va / na + 2.0 * vb * vb / nb);
-        *sum = [sum[0] + weight * expected * (ya - yb), sum[1] + weight * expected * expected];
-    }
-    sums
+/// The sums of one zone of a frame.
+fn of_zone(table: &NoiseTable, frame: &RoughFrame, zone: usize, laws: &[Term]) -> [f64; 2] {
+    let cells: RoughFrame = frame.iter().filter(|(cell, _)| zone_of(*cell as usize) == zone).copied().collect();
+    let (forms, theta): (Vec<NoiseLaw>, Vec<f64>) = laws.iter().copied().unzip();
+    let (linear, theta) = (table.linear(&cells, &forms), DVector::from_vec(theta));
+    [theta.dot(&linear.right), theta.dot(&(&linear.gram * &theta))]
 }
