@@ -11,9 +11,9 @@ use crate::pairing::GAP_M;
 use sensor::beams::Pick;
 use sensor::effects::{
     AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamIntensity, BeamRangeOffset, Clock,
-    Covariate as TableCovariate, DirtyWindow, Effect, EgoAttitude, Empirical, LabelOffset, LabelTimeOffset, RangeBias,
-    RangeLimits, RangeNoise, RangeNoiseByIncidence, RangeNoiseByRange, RangeNoiseBySignal, RangeQuantisation,
-    RollingShutter, SensorPoseError,
+    CoordinateRounding, Covariate as TableCovariate, DirtyWindow, DualReturns, Effect, EgoAttitude, Empirical,
+    LabelOffset, LabelTimeOffset, PacketLoss, RangeBias, RangeLimits, RangeNoise, RangeNoiseByIncidence,
+    RangeNoiseByRange, RangeNoiseBySignal, RangeQuantisation, RollingShutter, SensorPoseError,
 };
 use sensor::signal::DIAGNOSIS_REFLECTIVITY;
 use sensor::{Rig, Sensor};
@@ -36,9 +36,6 @@ pub(crate) fn fill_effects(findings: &mut [Finding], rig: &Rig, rows_deg: &[Vec<
 /// candidate.
 pub(crate) fn effects_of(finding: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
     match finding.status {
-        Status::Unexplained if finding.covariate == Covariate::Direction => {
-            dirty_window(finding, rig).into_iter().collect()
-        }
         Status::Unexplained => tables(finding, rig, rows_deg),
         Status::NotIdentifiable => Vec::new(),
         _ => named(finding, rig, rows_deg),
@@ -108,6 +105,19 @@ fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
             return positive(std_deg, Effect::AngularJitter(jitter));
         }
         Cause::RangeCut => Effect::RangeLimits(RangeLimits { min_m: 0.0, max_m: value(Quantity::MaxM) }),
+        Cause::NearCut => Effect::RangeLimits(RangeLimits { min_m: value(Quantity::MinM), ..RangeLimits::default() }),
+        Cause::DirtyWindow => return dirty_window(f, rig).into_iter().collect(),
+        Cause::DualReturns if value(Quantity::DivergenceRad) > 0.0 => {
+            let beam = BeamDivergence { divergence_rad: value(Quantity::DivergenceRad), ..BeamDivergence::default() };
+            return vec![Effect::BeamDivergence(beam), Effect::DualReturns(DualReturns {})];
+        }
+        Cause::PacketLoss => Effect::PacketLoss(PacketLoss {
+            packet_ms: value(Quantity::PacketMs),
+            loss: value(Quantity::Loss),
+            burst: value(Quantity::Burst),
+            outage: 0.0,
+        }),
+        Cause::CoordinateRounding => Effect::CoordinateRounding(CoordinateRounding { step_m: value(Quantity::StepM) }),
         Cause::SensorExtrinsics => Effect::SensorPoseError(SensorPoseError {
             sensor: sensor_of(f, rig).name.clone(),
             translation_m: [Quantity::ForwardM, Quantity::LeftM, Quantity::UpM].map(value),

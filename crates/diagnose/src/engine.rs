@@ -27,6 +27,7 @@ use crate::pairing::{
 };
 use crate::search::geometry::Displacement;
 use crate::search::labels::Side;
+use crate::search::quantisation::Rounded;
 use crate::search::rolling_shutter::{self, Slide};
 use crate::search::{self, ChannelResult, Context};
 use data::Dataset;
@@ -288,8 +289,9 @@ impl Engine<'_> {
         let context = recorded.clone();
         self.finished(0);
         let (sliding, slide) = self.rolling_shutter(&context)?;
-        let (rounding, step_m) = search::quantisation::search(&context);
-        let mut results = vec![sliding, rounding];
+        let (rounding, step_m) = search::quantisation::search(&context, Rounded::Ranges);
+        let (of_coordinates, _) = search::quantisation::search(&context, Rounded::Coordinates);
+        let mut results = vec![sliding, rounding, of_coordinates, search::dual_returns::search(&context)];
         let mut known = Known { slide, step_m, displaced: Displacement::default() };
         let standing = self.standing(&known)?;
         let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
@@ -371,9 +373,12 @@ impl Engine<'_> {
             Corrections { shift_m: moves.then_some(&shift), step_m: known.coarse_m(), ..Corrections::default() };
         let upright = if displaced.moves() { Some(self.pair(moved)?) } else { None };
         let context = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
-        let (hidden, mask) = search::mask::search(&context, known.shown());
+        let (packets, arrived) = search::packets::search(&context, self.sensors);
+        let of_hits = Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let (hidden, mask) = search::mask::search(&of_hits, known.shown());
         let elsewhere = known.shown() != Shown::InPlace;
-        let mut results = vec![hidden, search::hits::search(&context, &mask, elsewhere)];
+        let mut results = vec![packets, hidden, search::hits::search(&of_hits, &mask, elsewhere)];
+        drop(arrived);
         self.finished(5);
         results.push(search::returns::search(&context));
         results.push(search::intensity::search(&context, notes));

@@ -204,7 +204,8 @@ fn search_all(
     const SEARCHES: usize = 5;
     let finished = |searches: usize| progress(Stage::Weighing, searches, SEARCHES);
     finished(0);
-    let (rounding, step_m) = quantisation::search(&contexts.returns);
+    let (rounding, step_m) = quantisation::search(&contexts.returns, quantisation::Rounded::Ranges);
+    let (of_coordinates, _) = quantisation::search(&contexts.returns, quantisation::Rounded::Coordinates);
     finished(1);
     let (hidden, hides) = mask::search(&contexts.returns, Shown::Another);
     finished(2);
@@ -224,7 +225,7 @@ fn search_all(
     let returns = &even.as_ref().unwrap_or(contexts).returns;
     let (rough, by_surface) = noise::search_by_surface(returns);
     finished(SEARCHES);
-    let results = [Some(rounding), Some(hidden), lost, Some(odd), Some(rough)];
+    let results = [Some(rounding), Some(of_coordinates), Some(hidden), lost, Some(odd), Some(rough)];
     let mut diagnosis = report(&contexts.returns, results.into_iter().flatten().collect(), notes);
     for finding in diagnosis.findings.iter_mut().filter(|f| f.channel == Channel::Roughness) {
         judge_by_surface(finding, by_surface);

@@ -12,15 +12,18 @@ use std::path::Path;
 
 /// A small race without any effect.
 fn race(folder: &Path) -> Dataset {
-    race_with(folder, false)
+    race_with(folder, false, "rows")
 }
 
-/// The same, with attributes of the points on request.
-fn race_with(folder: &Path, attributes: bool) -> Dataset {
+/// The same, with attributes of the points on request, and with another order of the shots.
+fn race_with(folder: &Path, attributes: bool, sweep: &str) -> Dataset {
     let text = "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 30\nresolution = 0.3\nlabel_points = 1\nrace = { runs = 1, frames = 1500 }\n\
                 [[dataset]]\nname = \"sim\"\neffects = \"none.toml\"\n";
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
-    fs_err::copy(configs.join("sensors/av21.toml"), folder.join("rig.toml")).unwrap();
+    let rig = fs_err::read_to_string(configs.join("sensors/av21.toml")).unwrap();
+    assert!(rig.contains("sweep = \"rows\""));
+    let rig = rig.replace("sweep = \"rows\"", &format!("sweep = \"{sweep}\""));
+    fs_err::write(folder.join("rig.toml"), rig).unwrap();
     fs_err::write(folder.join("none.toml"), "").unwrap();
     let text = format!("attributes = {attributes}\n{text}");
     fs_err::write(folder.join("r.toml"), text).unwrap();
@@ -79,7 +82,7 @@ fn the_two_causes_of_the_paper_are_found_and_corrected() {
 #[test]
 fn intensities_are_found_and_corrected() {
     let folder = tempfile::tempdir().unwrap();
-    let sim = race_with(folder.path(), true);
+    let sim = race_with(folder.path(), true, "rows");
     let law = "[[effect]]\nkind = \"intensity_response\"\ngain = 180\ngamma = 0.8\nrange_exponent = 0.4\nstep = 1\nmost = 255\n";
     let rows = "[[effect]]\nkind = \"beam_intensity\"\nstd = 0.15\n";
     for (number, (effects, causes)) in [
@@ -118,6 +121,36 @@ fn intensities_are_found_and_corrected() {
     let [finding] = &d.findings[..] else { panic!("{:?}", d.findings) };
     assert_eq!((finding.status, finding.channel), (Status::Unexplained, Channel::Intensity));
     assert!(finding.says.contains("are all the same"), "{}", finding.says);
+}
+
+/// What a file format, a minimum range, lost packets and dirt do is found with its size, and corrected.
+#[test]
+fn formats_limits_packets_and_dirt_are_found_and_corrected() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = race_with(folder.path(), false, "columns");
+    let dirt = "kind = \"dirty_window\"\nsensor = \"front\"\nazimuth_deg = 10\nelevation_deg = -9\nradius_deg = 5\n\
+                transmission = 0.4\nloss = 0.9\n";
+    for (effect, cause, quantity, truth, within) in [
+        ("kind = \"coordinate_rounding\"\nstep_m = 0.015\n", Cause::CoordinateRounding, Quantity::StepM, 0.015, 1e-3),
+        ("kind = \"range_limits\"\nmin_m = 9\n", Cause::NearCut, Quantity::MinM, 9.0, 0.02),
+        (
+            "kind = \"packet_loss\"\npacket_ms = 3\nloss = 0.02\nburst = 0.4\n",
+            Cause::PacketLoss,
+            Quantity::PacketMs,
+            3.0,
+            0.4,
+        ),
+        (dirt, Cause::DirtyWindow, Quantity::AzimuthDeg, 10.0, 0.15),
+    ] {
+        let measured = with_effects(&sim, &format!("[[effect]]\n{effect}"), &folder.path().join(cause.name()), 11);
+        let outcome = diagnosed(&measured, &sim, folder.path());
+        let d = &outcome.diagnosis;
+        assert_eq!(named(d), [cause.name()], "{:?}", d.findings);
+        let found = d.findings[0].parameter(quantity).unwrap();
+        assert!((found.estimate / truth - 1.0).abs() < within, "{cause}: {found:?}");
+        let closed = d.gain.closed.unwrap_or_else(|| panic!("{:?} {:?} {}", d.gain, d.findings, outcome.extended));
+        assert!(closed > 0.8 && d.gain.not_applied.is_empty(), "{cause}: {:?}", d.gain);
+    }
 }
 
 /// An unexplained finding is extended as a lookup table, which corrects the simulation.
@@ -160,7 +193,7 @@ fn foreign(sim: &Dataset, folder: &Path) -> Dataset {
 #[test]
 fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
     let folder = tempfile::tempdir().unwrap();
-    let sim = race_with(folder.path(), true);
+    let sim = race_with(folder.path(), true, "rows");
     let foreign = foreign(&sim, folder.path());
     let rig = Rig::read(&foreign.config.root.join("rig.toml")).unwrap();
     for (cause, hidden) in [

@@ -41,6 +41,7 @@ const TABLE: &[[&str; 3]] = &[
     ["missing_object", "the twin has what the recording shows", "the same street by another sensor"],
     ["wrong_shape", "the shapes of objects are the recorded ones", "an object of known size"],
     ["range_cut", "what no scan of the recording reached is not in the map", "the same street from nearer by"],
+    ["near_cut", "what is nearer than all returns of the recording is not in the map", "scans by another sensor"],
     ["ego_occlusion", "what the own vehicle hides in all frames is not in the map", "scans with another mount"],
     ["label_offset", LABELS, "boxes by another sensor or another labeller"],
     ["time_offset", LABELS, "boxes by another sensor with its own clock"],

@@ -66,7 +66,7 @@ pub enum Effect {
     StripedLoss { share: f64, stripes: f64 },
     /// Not in the catalogue: noise that grows towards one side of the field of view.
     SidedNoise { sigma_m: f64 },
-    /// Not in the catalogue: losses within an ellipse of directions of the first sensor, with a soft edge. `middle` is
+    /// Losses within an ellipse of directions of the first sensor, with a soft edge. `middle` is
     /// given as a fraction of the field of view: -1/2 to 1/2 horizontally, 0 (lowest row) to 1 vertically.
     Smear { share: f64, middle: [f64; 2], half_rad: [f64; 2] },
 }
@@ -97,10 +97,8 @@ impl Effect {
             Effect::MixedPixels { .. } => "mixed_pixels",
             Effect::MissingObject { .. } => "missing_object",
             Effect::WrongShape { .. } => "wrong_shape",
-            Effect::AzimuthRipple { .. }
-            | Effect::StripedLoss { .. }
-            | Effect::SidedNoise { .. }
-            | Effect::Smear { .. } => return None,
+            Effect::Smear { .. } => "dirty_window",
+            Effect::AzimuthRipple { .. } | Effect::StripedLoss { .. } | Effect::SidedNoise { .. } => return None,
         })
     }
 }

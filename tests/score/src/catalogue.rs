@@ -1,11 +1,14 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 27] = [
+pub const CATALOGUE: [&str; 32] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
     "beam_range_offset",
+    "coordinate_rounding",
+    "dirty_window",
+    "dual_returns",
     "ego_occlusion",
     "ground_error",
     "incidence_dropout",
@@ -15,7 +18,9 @@ pub const CATALOGUE: [&str; 27] = [
     "material_dropout",
     "missing_object",
     "mixed_pixels",
+    "near_cut",
     "outliers",
+    "packet_loss",
     "pitch_roll",
     "quantisation",
     "random_dropout",

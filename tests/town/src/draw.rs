@@ -47,7 +47,7 @@ pub const CAUSES: [&str; 40] = [
     "spray",
     "range_drift",
     "ego_attitude",
-    "range_limits",
+    "near_cut",
 ];
 
 /// Effects that are in no catalogue.
@@ -167,7 +167,7 @@ pub fn draw_effect(cause: &str, mounts: &[Mount], scan_s: f64, rng: &mut Stream)
         "spray" => Effect::Spray { per_m: log(rng, 0.02, 0.3) },
         "range_drift" => Effect::RangeDrift { drift_m: sign(rng) * log(rng, 0.005, 0.12) },
         "ego_attitude" => Effect::EgoAttitude { pitch_rad: sign(rng) * deg(log(rng, 0.03, 0.5)) },
-        "range_limits" => Effect::RangeLimits { min_m: rng.random_range(3.5..9.0) },
+        "near_cut" => Effect::RangeLimits { min_m: rng.random_range(3.5..9.0) },
         "thermal_rows" => Effect::ThermalRows { drift_m: sign(rng) * log(rng, 0.02, 0.1) },
         "bursts" => Effect::Bursts { frames: rng.random_range(0.2..0.6), std_m: log(rng, 0.04, 0.2) },
         "encoder_ripple" => Effect::EncoderRipple {

@@ -179,7 +179,7 @@ impl Effect {
             Effect::Spray { .. } => "spray",
             Effect::RangeDrift { .. } => "range_drift",
             Effect::EgoAttitude { .. } => "ego_attitude",
-            Effect::RangeLimits { .. } => "range_limits",
+            Effect::RangeLimits { .. } => "near_cut",
             Effect::ThermalRows { .. } => "thermal_rows",
             Effect::Bursts { .. } => "bursts",
             Effect::EncoderRipple { .. } => "encoder_ripple",

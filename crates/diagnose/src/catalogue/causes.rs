@@ -16,6 +16,12 @@ identifiers! {
         BeamIntensity = "beam_intensity",
         /// Each row has a range offset of its own.
         BeamRangeOffset = "beam_range_offset",
+        /// Coordinates are rounded.
+        CoordinateRounding = "coordinate_rounding",
+        /// A patch of directions loses returns: dirt on the sensor's window.
+        DirtyWindow = "dirty_window",
+        /// Some shots have a second return, farther away.
+        DualReturns = "dual_returns",
         /// A part of the ego vehicle hides some directions.
         EgoOcclusion = "ego_occlusion",
         /// The ground is not the plane that it is taken for.
@@ -34,8 +40,12 @@ identifiers! {
         MissingObject = "missing_object",
         /// A beam that meets two surfaces reports a range between them.
         MixedPixels = "mixed_pixels",
+        /// Nothing is measured nearer than a range.
+        NearCut = "near_cut",
         /// False alarms.
         Outliers = "outliers",
+        /// Neighbouring shots are lost together, in a few places of each scan: packets are lost.
+        PacketLoss = "packet_loss",
         /// The ego vehicle is pitched or rolled against the simulation.
         PitchRoll = "pitch_roll",
         /// Ranges are rounded.
@@ -60,7 +70,7 @@ identifiers! {
         SignalNoise = "signal_noise",
         /// Labels or objects are stamped late or early.
         TimeOffset = "time_offset",
-        /// No cause of the catalogue: the difference depends on row, azimuth or direction.
+        /// No cause of the catalogue: the difference depends on row or azimuth.
         Unexplained = "unexplained",
         /// Objects have another size or shape.
         WrongShape = "wrong_shape",
@@ -80,7 +90,9 @@ impl Cause {
             Cause::AngularJitter => (Family::RangeError, 60),
             Cause::RollingShutter => (Family::Timing, 70),
             Cause::MixedPixels => (Family::Returns, 80),
+            Cause::DualReturns => (Family::Returns, 85),
             Cause::EgoOcclusion => (Family::Detection, 90),
+            Cause::DirtyWindow => (Family::Detection, 95),
             Cause::MaterialDropout => (Family::Detection, 100),
             Cause::SignalDropout => (Family::Detection, 110),
             Cause::IncidenceDropout => (Family::Detection, 120),
@@ -94,8 +106,11 @@ impl Cause {
             Cause::BeamIntensity => (Family::Returns, 192),
             Cause::IntensityLaw => (Family::Returns, 194),
             Cause::RangeCut => (Family::Detection, 200),
+            Cause::NearCut => (Family::Detection, 201),
+            Cause::PacketLoss => (Family::Detection, 203),
             Cause::Unexplained => (Family::Unknown, 205),
             Cause::Quantisation => (Family::RangeError, 210),
+            Cause::CoordinateRounding => (Family::RangeError, 212),
             Cause::LabelOffset => (Family::Labels, 220),
             Cause::TimeOffset => (Family::Timing, 230),
             Cause::GroundError => (Family::Geometry, LAST),

@@ -23,6 +23,8 @@ identifiers! {
         BrighterObjects = "brighter_objects",
         /// Reflectivity of standing surfaces over that of the ground, ln.
         BrighterStanding = "brighter_standing",
+        /// Probability that a packet is lost after one that was lost.
+        Burst = "burst",
         /// Cosine of incidence at which half of the returns are lost.
         CosHalf = "cos_half",
         /// Full width of the beam.
@@ -51,18 +53,24 @@ identifiers! {
         LeftM = "left_m",
         /// Measured objects are longer by this.
         LongerM = "longer_m",
+        /// Probability that a packet is lost after one that arrived.
+        Loss = "loss",
         /// Largest range that is measured.
         MaxM = "max_m",
         /// Mean elevation error from the lean of walls.
         MeanByWallsDeg = "mean_by_walls_deg",
         /// Mean elevation error of all rows.
         MeanDeg = "mean_deg",
+        /// Smallest range that is measured.
+        MinM = "min_m",
         /// Detection probability where the law has no effect.
         Most = "most",
         /// Constant range offset.
         OffsetM = "offset_m",
         /// Time offset.
         OffsetS = "offset_s",
+        /// Duration of a packet.
+        PacketMs = "packet_ms",
         /// Growth of the noise with range.
         PerM = "per_m",
         /// Turn about the y axis.
@@ -125,6 +133,8 @@ identifiers! {
         Degree = "deg",
         /// Metres.
         Metre = "m",
+        /// Milliseconds.
+        Millisecond = "ms",
         /// Metres for each metre of range.
         MetrePerMetre = "m/m",
         /// A number of a sensor.
@@ -146,6 +156,7 @@ impl Quantity {
             | Quantity::LeftM
             | Quantity::LongerM
             | Quantity::MaxM
+            | Quantity::MinM
             | Quantity::OffsetM
             | Quantity::ReachM
             | Quantity::ShearXM
@@ -172,6 +183,7 @@ impl Quantity {
             | Quantity::YawDeg => Unit::Degree,
             Quantity::AngleRad | Quantity::DivergenceRad => Unit::Radian,
             Quantity::OffsetS | Quantity::ScanS => Unit::Second,
+            Quantity::PacketMs => Unit::Millisecond,
             Quantity::PerM => Unit::MetrePerMetre,
             Quantity::Sensor => Unit::Number,
             _ => Unit::One,

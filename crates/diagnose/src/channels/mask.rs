@@ -12,6 +12,8 @@ use std::f64::consts::FRAC_PI_2;
 pub struct Mask {
     /// Nothing is measured beyond this, m.
     pub cut_m: Option<f64>,
+    /// Nothing is measured nearer than this, m.
+    pub near_m: Option<f64>,
     /// Hidden cells of directions.
     pub blocked: BTreeSet<DirectionCell>,
     /// Cells at their edge, which are hidden in part.
@@ -39,13 +41,15 @@ impl Mask {
     /// Whether a ray is hidden, or may be.
     pub fn hides(&self, ray: &Ray) -> bool {
         // Range noise moves returns near the largest range across it.
-        self.cut_m.is_some_and(|cut| f64::from(ray.range_m) > 0.985 * cut)
+        let range_m = f64::from(ray.range_m);
+        self.cut_m.is_some_and(|cut| range_m > 0.985 * cut)
+            || self.near_m.is_some_and(|near| range_m < 1.015 * near)
             || !self.around.is_empty() && self.around.contains(&direction_cell(ray))
     }
 
     /// Whether it hides nothing.
     pub fn is_empty(&self) -> bool {
-        self.cut_m.is_none() && self.blocked.is_empty()
+        self.cut_m.is_none() && self.near_m.is_none() && self.blocked.is_empty()
     }
 }
 
@@ -298,13 +302,31 @@ const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
 
 /// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.
 pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
+    cut(frames, which, |range_m| range_m)
+}
+
+/// Share of the simulated returns nearer than the smallest measured range that have a counterpart in their direction,
+/// from which on the near surface was moved and not lost.
+const MOVED: f64 = 0.1;
+
+/// The smallest measured range, m: nearer only the simulation has returns, and nothing is measured in their directions.
+pub fn near_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
+    let near_m = 1.0 / cut(frames, which, |range_m| 1.0 / range_m.max(1e-3))?;
+    let nearer = || which.iter().flat_map(|&i| &frames[i].simulated).filter(|r| r.own_range_m() < 0.985 * near_m);
+    let moved = nearer().filter(|r| r.matched).count() as f64;
+    (moved < MOVED * nearer().count() as f64).then_some(near_m)
+}
+
+/// The largest value of the measured returns, by a value of their range: beyond it only the simulation has returns,
+/// before it both sides have.
+fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Option<f64> {
     // Returns with neighbours at their range only: false alarms occur at all ranges.
     let ranges = |measured: bool| {
         let mut all: Vec<f64> = which
             .iter()
             .flat_map(|&i| if measured { &frames[i].measured } else { &frames[i].simulated })
             .filter(|r| r.company >= 2)
-            .map(Ray::own_range_m)
+            .map(|r| value(r.own_range_m()))
             .collect();
         all.sort_by(f64::total_cmp);
         all

@@ -1,7 +1,7 @@
 //! Patches of directions of a sensor with more losses than the same surfaces elsewhere, as by dirt on a window.
 
 use super::cells::cell;
-use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, SIDES, direction_cell, neighbours, take_together};
+use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, SIDES, direction_cell, neighbours};
 use crate::pairing::FramePair;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -129,14 +129,14 @@ pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
     for share in SHARES {
         let mut high: BTreeSet<DirectionCell> = shares.iter().filter(|(_, s)| **s > share).map(|(c, _)| *c).collect();
         while let Some(first) = high.first().copied() {
-            let cells = take_together(&mut high, first);
+            let cells = take_connected(&mut high, first, losses);
             let Some(middle) = cells.iter().max_by(|a, b| shares[a].total_cmp(&shares[b])) else { continue };
             let new = found.iter().all(|f| f.cells.is_disjoint(&cells));
             if new && shares[middle] > 1.5 * share && stands_alone(losses, &cells) {
                 // Cells beside it with small losses do not belong to it.
                 let half = 0.5 * shares[middle];
                 let mut more: BTreeSet<DirectionCell> = cells.iter().filter(|c| shares[c] > half).copied().collect();
-                let cells = take_together(&mut more, *middle);
+                let cells = take_connected(&mut more, *middle, losses);
                 if cells.len() >= FEWEST_CELLS {
                     found.push(Patch { cells, share: half });
                 }
@@ -145,6 +145,32 @@ pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
     }
     found.sort_by(|a, b| b.sum(losses).lost().total_cmp(&a.sum(losses).lost()));
     found
+}
+
+/// Cells without any return that may lie between two rows of a sensor with few rows.
+const BETWEEN_ROWS: i32 = 4;
+
+/// The next cell on one side that has returns, across cells between two rows.
+fn next(losses: &DirectionLosses, (s, az, el): DirectionCell, (a, e): (i32, i32)) -> Option<DirectionCell> {
+    let reach = if e == 0 { 1 } else { BETWEEN_ROWS };
+    (1..=reach).map(|k| (s, az + k * a, el + k * e)).find(|c| losses.contains_key(c))
+}
+
+/// Removes the connected region of `first` from `cells`. Cells without returns between two rows do not part it.
+fn take_connected(
+    cells: &mut BTreeSet<DirectionCell>,
+    first: DirectionCell,
+    losses: &DirectionLosses,
+) -> BTreeSet<DirectionCell> {
+    cells.remove(&first);
+    let mut all = vec![first];
+    let mut at = 0;
+    while at < all.len() {
+        let here = all[at];
+        at += 1;
+        all.extend(SIDES.into_iter().filter_map(|side| next(losses, here, side)).filter(|c| cells.remove(c)));
+    }
+    all.into_iter().collect()
 }
 
 /// Whether losses are small on all sides of a patch. Below it the field of view may end, but not above, where scenes
@@ -200,7 +226,10 @@ pub fn spot(losses: &DirectionLosses, patch: &Patch) -> [f64; 4] {
     let middle = total(cells.iter().take(cells.len().div_ceil(3)).map(|(_, l)| l));
     let most = middle.share().clamp(1.2 * patch.share, 1.0);
     // The loss exceeds `share` within an angle of r ln(most / share)^(1/4).
-    let area = patch.cells.len() as f64 * AZIMUTH_RAD * elevation.cos() * ELEVATION_RAD;
+    // A cell stands for those between its row and the next one above.
+    let above = |c: &DirectionCell| (1..=BETWEEN_ROWS).find(|k| losses.contains_key(&(c.0, c.1, c.2 + k))).unwrap_or(1);
+    let number: i32 = patch.cells.iter().map(above).sum();
+    let area = f64::from(number) * AZIMUTH_RAD * elevation.cos() * ELEVATION_RAD;
     [azimuth, elevation, (area / std::f64::consts::PI).sqrt() / (most / patch.share).ln().powf(0.25), most]
 }
 
@@ -230,6 +259,13 @@ mod tests {
         let [azimuth, elevation, radius, most] = spot(&losses, &found[0]);
         assert!((azimuth + 0.3).abs() < 0.01 && (elevation + 0.05).abs() < 0.01, "{azimuth} {elevation}");
         assert!((radius / 0.09 - 1.0).abs() < 0.15 && (most / 0.4 - 1.0).abs() < 0.1, "{radius} {most}");
+        // A sensor with a row every two degrees.
+        let few_rows: DirectionLosses = losses.into_iter().filter(|(c, _)| c.2.rem_euclid(2) == 0).collect();
+        let found = patches(&few_rows);
+        assert_eq!(found.len(), 1);
+        let [azimuth, elevation, radius, most] = spot(&few_rows, &found[0]);
+        assert!((azimuth + 0.3).abs() < 0.02 && (elevation + 0.05).abs() < 0.02, "{azimuth} {elevation}");
+        assert!((radius / 0.09 - 1.0).abs() < 0.3 && (most / 0.4 - 1.0).abs() < 0.15, "{radius} {most}");
         assert!(patches(&field(|_, el| if el.abs() < 0.04 { 0.4 } else { 0.0 })).is_empty(), "a band");
         assert!(patches(&field(|az, _| if az < -0.6 { 0.4 } else { 0.0 })).is_empty(), "a side");
         assert!(patches(&field(|_, _| 0.02)).is_empty(), "nothing");

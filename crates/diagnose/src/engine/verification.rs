@@ -16,10 +16,12 @@ use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
 use crate::search::{
-    Context, REPETITIONS, Z_STAR, geometry, hits, intensity, labels, noise, quantisation, returns, rolling_shutter,
+    Context, REPETITIONS, Z_STAR, geometry, hits, intensity, labels, noise, packets, quantisation, returns,
+    rolling_shutter,
 };
 use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
+use sensor::directions::Sensors;
 use sensor::finished::{FinishedDataset, Refusal};
 use sensor::{EffectList, Rig};
 use statistics::{blocks_of, draw_blocks, interval_nearest};
@@ -87,10 +89,16 @@ impl RemadeFrames for CloudsWith<'_> {
 pub(crate) type Distances = BTreeMap<Channel, Vec<f64>>;
 
 /// The distances of some frames of a pair.
-fn distances(context: &Context, train: &[usize], test: &[usize], slide: bool) -> Distances {
+fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usize], slide: bool) -> Distances {
+    // Each side loses its own packets: only their number is compared.
+    let packets = packets::Packets::new(context, sensors, train);
+    let arrived = packets.arrived(context.frames);
+    let context = &Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
+    let mut lost = hits::by_table(context, train, test);
+    lost.iter_mut().zip(packets.by_table(train, test)).for_each(|(sum, nats)| *sum += nats);
     let mut all = Distances::from([
         (Channel::Residuals, geometry::by_table(context, train, test)),
-        (Channel::Hits, hits::by_table(context, train, test)),
+        (Channel::Hits, lost),
         (Channel::Roughness, noise::by_table(context, train, test)),
         (Channel::Returns, returns::by_table(context, train, test)),
         (Channel::Ranges, quantisation::by_table(context, train, test)),
@@ -133,7 +141,7 @@ impl<'a> Verification<'a> {
     pub(super) fn new(engine: &'a Engine<'a>, context: &'a Context<'a>, found: BTreeSet<Channel>) -> Self {
         let slide = found.contains(&Channel::Slide);
         let [train, test] = [Role::Estimate, Role::HoldOut].map(|role| some(context.of(role)));
-        let before = distances(context, &train, &test, slide);
+        let before = distances(context, engine.sensors, &train, &test, slide);
         Verification { engine, context, train, test, slide, found, before }
     }
 
@@ -207,7 +215,7 @@ impl<'a> Verification<'a> {
         let places = |frames: &[usize]| -> Vec<usize> {
             frames.iter().filter_map(|frame| which.iter().position(|own| own == frame)).collect()
         };
-        let distances = distances(&context, &places(&self.train), &places(&self.test), self.slide);
+        let distances = distances(&context, self.engine.sensors, &places(&self.train), &places(&self.test), self.slide);
         Ok((distances, frames))
     }
 

@@ -163,7 +163,7 @@ mod tests {
                 }
             }
         }
-        SideFrame { scans: vec![scan], objects: vec![] }
+        SideFrame { scans: vec![scan], objects: vec![], second: 0 }
     }
 
     fn seen(side: &SideFrame) -> FrameAlone {

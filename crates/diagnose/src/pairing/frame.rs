@@ -28,6 +28,8 @@ pub struct FramePair {
     /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns
     /// it has fewer.
     pub open: f64,
+    /// Second returns of the shots of the measured and of the simulated side; the rays do not hold them.
+    pub second: [f64; 2],
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
 }
@@ -108,6 +110,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         mixed_per_rad: 0.0,
         jumps: 1.0,
         open: 0.0,
+        second: [recorded.measured, recorded.simulated].map(|side| side.second as f64),
         objects: Vec::new(),
     };
     for (sensor, scan) in measured.into_iter().enumerate() {

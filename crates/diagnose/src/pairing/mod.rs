@@ -10,6 +10,7 @@ mod prediction;
 mod ray;
 mod recordings;
 mod roughness;
+mod second;
 
 pub use alone::{FrameAlone, frame_alone};
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};

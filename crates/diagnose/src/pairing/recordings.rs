@@ -1,6 +1,7 @@
 //! The frames of both data sets, read once and held in memory for every pairing.
 
 use super::matching::match_directions;
+use super::second::drop_second;
 use crate::error::DiagnoseError;
 use data::{Cloud, Dataset, Object};
 use sensor::Rig;
@@ -14,6 +15,8 @@ pub struct SideFrame {
     pub scans: Vec<SensorScan>,
     /// Labelled objects.
     pub objects: Vec<Object>,
+    /// Second returns of shots; the scans do not hold them.
+    pub second: usize,
 }
 
 /// Which side of a pair.
@@ -43,9 +46,11 @@ struct Held {
 }
 
 impl SideFrame {
-    /// From a cloud and its objects.
+    /// From a cloud and its objects. Shots keep the nearer one of two returns.
     pub fn new(cloud: &Cloud, objects: Vec<Object>, rig: &Rig) -> Self {
-        SideFrame { scans: split_by_sensor(cloud, rig), objects }
+        let mut scans = split_by_sensor(cloud, rig);
+        let second = scans.iter_mut().map(drop_second).sum();
+        SideFrame { scans, objects, second }
     }
 }
 

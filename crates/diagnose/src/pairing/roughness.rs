@@ -129,7 +129,7 @@ mod tests {
         let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
         let matched = vec![(vec![true; measured.len()], vec![true; simulated.len()])];
-        let side = |scan| SideFrame { scans: vec![scan], objects: vec![] };
+        let side = |scan| SideFrame { scans: vec![scan], objects: vec![], second: 0 };
         let recorded = RecordedFrame {
             number: 0,
             id: "0",

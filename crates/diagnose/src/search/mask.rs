@@ -8,7 +8,7 @@ use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
     AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, below, blocked_cells, direction_cell, direction_counts,
-    edge_cells, range_cut, with_neighbours,
+    edge_cells, near_cut, range_cut, with_neighbours,
 };
 use crate::channels::returns::OWN_CAR_M;
 use crate::curve::{Curve, CurvePoint};
@@ -34,9 +34,8 @@ const OCCLUSION_SURPRISE: f64 = 20.0;
 pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     let (mask, spots) = find(context, shown);
     let mut result = ChannelResult::new(Channel::Hits, context.of(Role::HoldOut).len());
-    if let Some(cut) = mask.cut_m {
-        result.found.push(cut_found(context, cut));
-    }
+    result.found.extend(mask.cut_m.map(|cut| cut_found(context, End::Far, cut)));
+    result.found.extend(mask.near_m.map(|near| cut_found(context, End::Near, near)));
     if !mask.blocked.is_empty() {
         result.found.push(blocked_found(context, &mask));
     }
@@ -44,8 +43,9 @@ pub fn search(context: &Context, shown: Shown) -> (ChannelResult, Mask) {
     result.found.extend(spots);
     let searched = [
         (Cause::RangeCut, mask.cut_m.is_some()),
+        (Cause::NearCut, mask.near_m.is_some()),
         (Cause::EgoOcclusion, !mask.blocked.is_empty()),
-        (Cause::Unexplained, patched),
+        (Cause::DirtyWindow, patched),
     ];
     result.considered.extend(searched.map(|(cause, found)| Considered {
         cause: cause.into(),
@@ -74,7 +74,9 @@ pub fn cut_by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f
 /// The mask on the selecting frames, and findings of patches of directions.
 fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let select = context.of(Role::Select);
-    let mut mask = Mask { cut_m: range_cut(context.frames, &select), ..Mask::default() };
+    // Another street may have nothing near.
+    let near_m = (shown != Shown::Another).then(|| near_cut(context.frames, &select)).flatten();
+    let mut mask = Mask { cut_m: range_cut(context.frames, &select), near_m, ..Mask::default() };
     let counts = direction_counts(context.frames, &select);
     // Losses that laws explain are no occlusion, whether the laws are fitted with the dark directions or without
     // them. Far ground may be dark in all directions.
@@ -124,11 +126,33 @@ fn expected_shares(
     sums.into_iter().filter(|(_, s)| s[1] >= 10.0).map(|(k, s)| (k, s[0] / s[1])).collect()
 }
 
-/// The finding of a largest range.
-fn cut_found(context: &Context, on_select: f64) -> Found {
+/// An end of the ranges that are measured.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum End {
+    Near,
+    Far,
+}
+
+impl End {
+    /// Whether a range lies outside of what is measured.
+    fn excludes(self, range_m: f64, cut_m: f64) -> bool {
+        match self {
+            End::Near => range_m < cut_m,
+            End::Far => range_m > cut_m,
+        }
+    }
+}
+
+/// The finding of a smallest or largest range.
+fn cut_found(context: &Context, end: End, on_select: f64) -> Found {
     let [estimate, hold_out] = [Role::Estimate, Role::HoldOut].map(|r| context.of(r));
-    let cut = range_cut(context.frames, &estimate).unwrap_or(on_select);
-    let beyond = |i: usize| context.frames[i].simulated.iter().filter(|r| f64::from(r.range_m) > cut).count() as f64;
+    let (found, cause, quantity) = match end {
+        End::Near => (near_cut(context.frames, &estimate), Cause::NearCut, Quantity::MinM),
+        End::Far => (range_cut(context.frames, &estimate), Cause::RangeCut, Quantity::MaxM),
+    };
+    let cut = found.unwrap_or(on_select);
+    let outside = |ray: &&Ray| end.excludes(f64::from(ray.range_m), cut);
+    let beyond = |i: usize| context.frames[i].simulated.iter().filter(outside).count() as f64;
     let held = hold_out.iter().map(|&i| beyond(i) * CUT_SURPRISE.ln()).collect();
     let longest = 1.4 * cut;
     let points = (0..20).map(|b| {
@@ -138,25 +162,21 @@ fn cut_found(context: &Context, on_select: f64) -> Found {
             rays.filter(|r| (low..high).contains(&r.own_range_m())).count() as f64
         };
         let (a, b) = (count(|f| &f.measured), count(|f| &f.simulated));
-        CurvePoint {
-            sensor: 0,
-            x: 0.5 * (low + high),
-            measured: a,
-            before: b,
-            after: if low >= cut { 0.0 } else { b },
-            error: a.sqrt(),
-        }
+        let middle = 0.5 * (low + high);
+        let after = if end.excludes(middle, cut) { 0.0 } else { b };
+        CurvePoint { sensor: 0, x: middle, measured: a, before: b, after, error: a.sqrt() }
     });
+    let than = if end == End::Near { "nearer than" } else { "beyond" };
     Found {
         effects: Vec::new(),
         status: Status::Named,
-        causes: vec![Cause::RangeCut],
-        parameters: vec![parameter(Quantity::MaxM, cut, 0.004 * cut)],
+        causes: vec![cause],
+        parameters: vec![parameter(quantity, cut, 0.004 * cut)],
         confidence: 1.0,
         channel: Channel::Hits,
         covariate: Covariate::Range,
         held_out_gains: held,
-        says: format!("nothing is measured beyond {cut:.1} m; your simulator has returns there"),
+        says: format!("nothing is measured {than} {cut:.1} m; your simulator has returns there"),
         separate_by: None,
         curve: Curve { x: "range, m".into(), y: "returns".into(), by_sensor: false, points: points.collect() },
     }

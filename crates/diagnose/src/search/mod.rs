@@ -2,12 +2,14 @@
 //! their gain is measured on the held-out frames.
 
 pub mod confounders;
+pub mod dual_returns;
 pub mod geometry;
 pub mod hits;
 pub mod intensity;
 pub mod labels;
 pub mod mask;
 pub mod noise;
+pub mod packets;
 mod patch;
 pub mod quantisation;
 pub mod returns;

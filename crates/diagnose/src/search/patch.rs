@@ -1,8 +1,7 @@
-//! Patches of directions that lose more than others, as by dirt on a window, a scratch or a reflection. No cause of
-//! the catalogue.
+//! Patches of directions that lose more than others: dirt or a scratch on a sensor's window.
 
 use super::{Context, Found, NamedParameter, Z_STAR, parameter, sensor_number};
-use crate::catalogue::{Channel, Covariate, Quantity};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{AZIMUTH_RAD, ELEVATION_RAD, Mask, with_neighbours};
 use crate::channels::patch::{DirectionLosses, Losses, Patch, direction_losses, patches, share_of_spot, spot};
@@ -88,15 +87,15 @@ fn describe(
     let [azimuth, elevation, radius] = [0, 1, 2].map(|k| spot[k].to_degrees());
     Found {
         effects: Vec::new(),
-        status: Status::Unexplained,
-        causes: vec![],
+        status: Status::Named,
+        causes: vec![Cause::DirtyWindow],
         parameters: parameters(patch, blocks, of_estimate, sensor, spot),
         confidence: 1.0,
         channel: Channel::Hits,
         covariate: Covariate::Direction,
         held_out_gains,
         says: format!(
-            "sensor {name} loses up to {:.0} % of the returns of a patch of directions, {radius:.0} degrees about azimuth {azimuth:.0} and elevation {elevation:.0}, that come back from surfaces like them elsewhere: as dirt on its window would do; no cause of the catalogue does that",
+            "sensor {name} loses up to {:.0} % of the returns of a patch of directions, {radius:.0} degrees about azimuth {azimuth:.0} and elevation {elevation:.0}, that come back from surfaces like them elsewhere: dirt on its window does that",
             100.0 * spot[3]
         ),
         separate_by: None,

@@ -1,11 +1,13 @@
-//! Quantisation: measured ranges fall on multiples of a step, simulated ranges do not.
+//! Quantisation: measured ranges, or coordinates, fall on multiples of a step, simulated ones do not.
 
 use super::{ChannelResult, Context, Found, parameter};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::channels::mean::origins;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::comb::{self, BIN_M, LENGTH_M, Refinement, Spectra};
 use crate::inference::roles::Role;
+use crate::pairing::Ray;
 
 /// Returns that are used of each side, at most.
 const RETURNS: usize = 60_000;
@@ -29,12 +31,53 @@ const REFINEMENT: Refinement = Refinement { rounds: 5, to_either_side: 20, narro
 /// Half width of the refinement on the estimating frames, as a share of the step.
 const WITHIN: f64 = 3e-4;
 
+/// What may be rounded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Rounded {
+    /// Ranges, by the sensor.
+    Ranges,
+    /// The horizontal coordinates in the cloud's frame, by the format of a file. Heights are those of the ground, which
+    /// is level in many scenes.
+    Coordinates,
+}
+
+impl Rounded {
+    fn cause(self) -> Cause {
+        match self {
+            Rounded::Ranges => Cause::Quantisation,
+            Rounded::Coordinates => Cause::CoordinateRounding,
+        }
+    }
+
+    fn name(self) -> &'static str {
+        match self {
+            Rounded::Ranges => "range",
+            Rounded::Coordinates => "coordinate",
+        }
+    }
+
+    /// The values of some returns, m.
+    fn of<'a>(self, context: &Context, rays: impl Iterator<Item = &'a Ray>) -> Vec<f64> {
+        let within = |value: &f64| *value < LENGTH_M;
+        match self {
+            Rounded::Ranges => rays.map(Ray::own_range_m).filter(within).collect(),
+            Rounded::Coordinates => {
+                let origins = origins(context.rig);
+                let point = |r: &Ray| origins[usize::from(r.sensor)] + r.direction_vector() * r.own_range_m();
+                rays.map(point).flat_map(|p| [p.x.abs(), p.y.abs()]).filter(within).collect()
+            }
+        }
+    }
+}
+
 /// The search, and the step, m.
-pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
+pub fn search(context: &Context, rounded: Rounded) -> (ChannelResult, Option<f64>) {
+    let ranges = |frames: &[usize], measured: bool| values(context, rounded, frames, measured);
+    let cause = rounded.cause();
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Ranges, hold_out.len());
-    result.minimum.push((Cause::Quantisation, Minimum::new(Quantity::StepM, 2.0 * BIN_M * 2.0)));
-    let (a, b) = (ranges(context, &select, true), ranges(context, &select, false));
+    result.minimum.push((cause, Minimum::new(Quantity::StepM, 2.0 * BIN_M * 2.0)));
+    let (a, b) = (ranges(&select, true), ranges(&select, false));
     if a.len() < FEWEST || b.len() < FEWEST {
         return (result, None);
     }
@@ -42,32 +85,38 @@ pub fn search(context: &Context) -> (ChannelResult, Option<f64>) {
     let (peak, strongest) = peak_of(&sides);
     let [a, b] = sides;
     result.considered.push(Considered {
-        cause: Cause::Quantisation.into(),
+        cause: cause.into(),
         channel: Channel::Ranges,
         nats_per_ray: 0.0,
         z: strongest * (a.len() as f64).sqrt(),
-        outcome: if peak.is_some() { "chosen".into() } else { "ranges fall on no comb".into() },
+        outcome: if peak.is_some() { "chosen".into() } else { format!("{}s fall on no comb", rounded.name()) },
     });
     let Some(k) = peak else { return (result, None) };
     // The peak within its bin on the selecting frames, then the step on the estimating ones.
     let near = refine(&a, comb::step_of(k), 1.5 / k as f64);
-    let on_estimate = ranges(context, &estimate, true);
+    let on_estimate = ranges(&estimate, true);
     let step = refine(&on_estimate, near, WITHIN);
-    let held = held_out_gains(context, &hold_out, step);
+    let held = held_out_gains(context, rounded, &hold_out, step);
     for (d, g) in result.distance.iter_mut().zip(&held) {
         *d = [*g; 3];
     }
-    result.found.push(found(step, &on_estimate, &b, held));
+    result.found.push(found(rounded, step, &on_estimate, &b, held));
     (result, Some(step))
 }
 
-/// Gains of the `test` frames by the comb of the `train` frames, nats; zeros without one.
+/// Gains of the `test` frames by the combs of the `train` frames, nats; zeros without one.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
-    let sides = [ranges(context, train, true), ranges(context, train, false)];
-    match sides.iter().all(|side| side.len() >= FEWEST).then(|| peak_of(&sides).0).flatten() {
-        Some(k) => held_out_gains(context, test, refine(&sides[0], comb::step_of(k), 1.5 / k as f64)),
-        None => vec![0.0; test.len()],
+    let gains = |rounded: Rounded| {
+        let sides = [true, false].map(|measured| values(context, rounded, train, measured));
+        let peak = sides.iter().all(|side| side.len() >= FEWEST).then(|| peak_of(&sides).0).flatten()?;
+        let step = refine(&sides[0], comb::step_of(peak), 1.5 / peak as f64);
+        Some(held_out_gains(context, rounded, test, step))
+    };
+    let mut sum = vec![0.0; test.len()];
+    for of_kind in [Rounded::Ranges, Rounded::Coordinates].into_iter().filter_map(gains) {
+        sum.iter_mut().zip(of_kind).for_each(|(s, g)| *s += g);
     }
+    sum
 }
 
 /// The frequency of the comb on which the first of two sides falls and the second does not; and the strongest one of
@@ -80,20 +129,19 @@ fn peak_of(sides: &[Vec<f64>; 2]) -> (Option<usize>, f64) {
     (first.map(|k| top(&spectrum[0], k)), spectrum[0][from..].iter().copied().fold(0.0, f64::max))
 }
 
-/// Ranges of one side, m, evenly thinned.
-fn ranges(context: &Context, frames: &[usize], measured: bool) -> Vec<f64> {
+/// Ranges or coordinates of one side, m, evenly thinned.
+fn values(context: &Context, rounded: Rounded, frames: &[usize], measured: bool) -> Vec<f64> {
     let side = |i: usize| if measured { &context.frames[i].measured } else { &context.frames[i].simulated };
     let all: usize = frames.iter().map(|&i| side(i).len()).sum();
     let step = (all / RETURNS).max(1);
-    let some = frames.iter().flat_map(|&i| side(i)).step_by(step);
-    some.map(|r| r.own_range_m()).filter(|r| *r < LENGTH_M).collect()
+    rounded.of(context, frames.iter().flat_map(|&i| side(i)).step_by(step))
 }
 
 /// Gains of held-out frames, nats: a range on the comb gives its place between the steps, for the share of ranges on
 /// the comb.
-fn held_out_gains(context: &Context, hold_out: &[usize], step: f64) -> Vec<f64> {
+fn held_out_gains(context: &Context, rounded: Rounded, hold_out: &[usize], step: f64) -> Vec<f64> {
     let gain = |&i: &usize| {
-        let own = ranges(context, &[i], true);
+        let own = values(context, rounded, &[i], true);
         let c = coherence(&own, step).clamp(0.0, 0.999);
         0.5 * -(1.0 - c * c).ln() * context.frames[i].simulated.len() as f64
     };
@@ -101,7 +149,8 @@ fn held_out_gains(context: &Context, hold_out: &[usize], step: f64) -> Vec<f64> 
 }
 
 /// The finding, with the distribution of the ranges over the step.
-fn found(step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64>) -> Found {
+fn found(rounded: Rounded, step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64>) -> Found {
+    let name = rounded.name();
     let longest = measured.iter().copied().fold(1.0, f64::max);
     let n = measured.len() as f64;
     let error = step * step / (std::f64::consts::TAU * longest * n.sqrt()) * 10.0;
@@ -123,7 +172,7 @@ fn found(step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64
     Found {
         effects: Vec::new(),
         status: Status::Named,
-        causes: vec![Cause::Quantisation],
+        causes: vec![rounded.cause()],
         parameters: vec![
             parameter(Quantity::StepM, step, error.max(1e-6)),
             parameter(Quantity::ShareOnComb, coherence(measured, step), 0.02),
@@ -132,10 +181,10 @@ fn found(step: f64, measured: &[f64], simulated: &[f64], held_out_gains: Vec<f64
         channel: Channel::Ranges,
         covariate: Covariate::FractionOfTheStep,
         held_out_gains,
-        says: format!("measured ranges are rounded to {:.1} mm; simulated ones are not", 1000.0 * step),
+        says: format!("measured {name}s are rounded to {:.1} mm; simulated ones are not", 1000.0 * step),
         separate_by: None,
         curve: Curve {
-            x: "range / step, fraction".into(),
+            x: format!("{name} / step, fraction"),
             y: "share of the returns".into(),
             by_sensor: false,
             points: points.collect(),

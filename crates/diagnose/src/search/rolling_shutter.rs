@@ -439,6 +439,7 @@ mod tests {
                     mixed_per_rad: 0.0,
                     jumps: 1.0,
                     open: 0.0,
+                    second: [0.0; 2],
                     id: f.to_string(),
                     measured: posts.iter().map(|p| standing(&shown(p))).collect(),
                     simulated: posts.iter().map(standing).collect(),

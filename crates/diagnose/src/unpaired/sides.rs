@@ -132,6 +132,7 @@ pub(super) fn as_pairs(ids: &[String], sides: [Vec<FrameAlone>; 2]) -> (Vec<Fram
         mixed_per_rad: if mixed[0] > 0.0 { mixed[1] } else { 0.0 },
         jumps: if mixed.iter().all(|m| *m > 0.0) { mixed[0] / mixed[1] } else { 1.0 },
         open: 0.0,
+        second: [0.0; 2],
         objects: Vec::new(),
     };
     let both = ids.iter().zip(measured.into_iter().zip(simulated));

@@ -1,0 +1,371 @@
+//! Lost packets: of shots that a sensor sends one after the other no return arrives in one scan, and in other scans the
+//! same shots have returns.
+
+use super::{ChannelResult, Context, Found, NamedParameter, Z_STAR, parameter, sensor_number};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::channels::mask::{Mask, near_cut, range_cut};
+use crate::curve::{Curve, CurvePoint};
+use crate::diagnosis::{Considered, Minimum, Parameter, Status};
+use crate::inference::choice::total_and_z;
+use crate::inference::roles::Role;
+use crate::pairing::{FramePair, Ray};
+use rayon::prelude::*;
+use sensor::directions::{ScanPattern, Sensors};
+use sensor::rig::Sweep;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Smallest width of a bin of azimuth, rad: half a degree. Packets of rotating sensors cover one to five degrees.
+const BIN_RAD: f64 = 0.0087;
+
+/// Width of a bin in steps between columns, at least, so that every bin has a column; and of a sensor that scans row
+/// by row, so that every bin has enough shots.
+const BIN_STEPS: [f64; 2] = [1.5, 12.0];
+
+/// Fewest simulated returns of a bin that is judged: by chance half of the returns would not all be lost.
+const FEWEST: f64 = 8.0;
+
+/// Share of the returns of a bin below which all are lost; the rest are false alarms.
+const DARK: f64 = 0.1;
+
+/// Share of the returns of the same bin in other scans from which on the bin is not always dark.
+const USUALLY_SEEN: f64 = 0.5;
+
+/// Smallest share of returns that is reported: as for any loss.
+const FLOOR: f64 = 1e-3;
+
+/// Fewest dark bins, and fewest frames with some.
+const FEWEST_DARK: [usize; 2] = [5, 3];
+
+/// Largest ratio of dark bins of the other side: these are things that one side lacks.
+const OTHER_SIDE: f64 = 0.2;
+
+/// Factor by which the loss of a return is less likely without packets.
+const SURPRISE: f64 = 20.0;
+
+/// Sensor and number of a bin of the time within a scan.
+type Bin = (u8, i32);
+
+/// How the shots of a sensor follow each other. Times are shares of a scan.
+#[derive(Clone, Copy, Debug)]
+struct Order {
+    /// Width of a bin.
+    width: f64,
+    fov_rad: f64,
+    /// Number of rows of a sensor that scans row by row; else 1.
+    rows: f64,
+}
+
+impl Order {
+    /// Of every sensor. Without a pattern in the rig columns are taken to follow each other, as with a spinning sensor.
+    /// `None` where rows are not known: what is beside each other was not sent one after the other.
+    fn of_sensors(context: &Context, sensors: &Sensors) -> Vec<Option<Order>> {
+        let of_sensor = |(sensor, found): (&sensor::Sensor, &ScanPattern)| {
+            let fov_rad = 2.0 * sensor.half_fov_rad();
+            let step = f64::from(found.steps.azimuth_rad) / fov_rad;
+            let by_row = sensor.pattern.as_ref().is_some_and(|p| p.sweep == Sweep::Rows);
+            let (width, rows) = match (by_row, found.rows_rad.len() as f64) {
+                (true, rows) => (BIN_STEPS[1] * step / rows, rows),
+                (false, _) => ((BIN_RAD / fov_rad).max(BIN_STEPS[0] * step), 1.0),
+            };
+            (!found.rows_rad.is_empty()).then_some(Order { width, fov_rad, rows })
+        };
+        context.rig.sensors.iter().zip(&sensors.patterns).map(of_sensor).collect()
+    }
+
+    /// The bin of a ray.
+    fn bin(&self, ray: &Ray) -> i32 {
+        let along = (0.5 - f64::from(ray.azimuth_rad) / self.fov_rad).clamp(0.0, 1.0);
+        let above = if self.rows > 1.0 { self.rows - 1.0 - f64::from(ray.row) } else { 0.0 };
+        ((above + along) / self.rows / self.width).floor() as i32
+    }
+}
+
+/// Returns of one side of a frame by bin: all, and those with a counterpart.
+type Counts = BTreeMap<Bin, [f64; 2]>;
+
+/// The dark bins of every frame, and the counts of all bins.
+struct Dark(Vec<BTreeSet<Bin>>, Vec<Counts>);
+
+/// What is lost in all frames.
+pub struct Packets {
+    orders: Vec<Option<Order>>,
+    /// Of the simulated returns, those that are not measured; and of the measured returns those that are not simulated.
+    sides: [Dark; 2],
+}
+
+impl Packets {
+    /// The limits of range are those of the `limiting` frames.
+    pub fn new(context: &Context, sensors: &Sensors, limiting: &[usize]) -> Self {
+        let orders = Order::of_sensors(context, sensors);
+        // Shots that only show what is nearer or farther than all that is measured are no packet.
+        let [cut_m, near_m] = [range_cut, near_cut].map(|end| end(context.frames, limiting));
+        let limits = Mask { cut_m, near_m, ..Mask::default() };
+        let bin = |ray: &Ray| bin_of(ray, &orders).filter(|_| !limits.hides(ray));
+        let sides: [fn(&FramePair) -> &[Ray]; 2] = [|f| &f.simulated, |f| &f.measured];
+        let sides = sides.map(|side| {
+            let all: Vec<Counts> = context.frames.par_iter().map(|f| counts(side(f), bin)).collect();
+            Dark(dark_bins(&all), all)
+        });
+        Packets { orders, sides }
+    }
+
+    /// The frames without the rays of packets that either side lost, and of the bins beside them, which are lost in
+    /// part; `None` where no packet was lost.
+    pub fn arrived(&self, frames: &[FramePair]) -> Option<Vec<FramePair>> {
+        let [Dark(a, _), Dark(b, _)] = &self.sides;
+        let of_frame = |(frame, lost): (&FramePair, [&BTreeSet<Bin>; 2])| {
+            let stays = |ray: &Ray| {
+                let Some((sensor, bin)) = bin_of(ray, &self.orders) else { return true };
+                (-1..=1).all(|k| lost.iter().all(|lost| !lost.contains(&(sensor, bin + k))))
+            };
+            let mut frame = frame.clone();
+            frame.measured.retain(&stays);
+            frame.simulated.retain(&stays);
+            frame
+        };
+        let any = a.iter().chain(b).any(|lost| !lost.is_empty());
+        any.then(|| frames.par_iter().zip(a.par_iter().zip(b)).map(|(f, (a, b))| of_frame((f, [a, b]))).collect())
+    }
+
+    /// Gains of the `test` frames by the share of dark bins of the `train` frames over that of the other side, nats.
+    pub fn by_table(&self, train: &[usize], test: &[usize]) -> Vec<f64> {
+        let number = |Dark(dark, counts): &Dark, i: usize| [dark[i].len() as f64, counts[i].len() as f64];
+        let [lost, lacking] = self.sides.each_ref().map(|side| {
+            let [dark, all] = train.iter().map(|&i| number(side, i)).fold([0.0; 2], |s, n| [s[0] + n[0], s[1] + n[1]]);
+            (dark + 0.5) / (all + 1.0)
+        });
+        let gain = |&i: &usize| {
+            let [dark, all] = number(&self.sides[0], i);
+            dark * (lost / lacking).ln() - all * (lost - lacking)
+        };
+        test.iter().map(gain).collect()
+    }
+}
+
+/// The search; and the frames without what is lost, where there is something.
+pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Vec<FramePair>>) {
+    let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
+    let mut result = ChannelResult::new(Channel::Hits, hold_out.len());
+    let packets = Packets::new(context, sensors, &select);
+    let [dark, other] = &packets.sides;
+    let returns = |i: usize, Dark(dark, counts): &Dark| dark[i].iter().map(|bin| counts[i][bin][0]).sum::<f64>();
+    let share = |i: usize| {
+        let all = (context.frames[i].simulated.len() as f64).max(1.0);
+        (returns(i, dark) - returns(i, other)) / all
+    };
+    let differences = |of: &[usize]| of.iter().map(|&i| share(i)).collect::<Vec<f64>>();
+    let (_, z) = total_and_z(&differences(&select));
+    // Bursts are rare: those of the estimating frames count as well.
+    let looked_at = || select.iter().chain(&estimate);
+    let number = |of: &[BTreeSet<Bin>]| looked_at().map(|&i| of[i].len()).sum::<usize>();
+    let frames_with = looked_at().filter(|&&i| !dark.0[i].is_empty()).count();
+    let mean = looked_at().map(|&i| share(i)).sum::<f64>() / looked_at().count().max(1) as f64;
+    let chosen = number(&dark.0) >= FEWEST_DARK[0]
+        && frames_with >= FEWEST_DARK[1]
+        && (number(&other.0) as f64) < OTHER_SIDE * number(&dark.0) as f64
+        && mean > FLOOR;
+    result.considered.push(Considered {
+        cause: Cause::PacketLoss.into(),
+        channel: Channel::Hits,
+        nats_per_ray: 0.0,
+        z,
+        outcome: if chosen { "chosen" } else { "no shots in a row are lost in single scans" }.into(),
+    });
+    result.minimum.push((Cause::PacketLoss, Minimum::new(Quantity::Share, FLOOR)));
+    if !chosen {
+        return (result, None);
+    }
+    let held: Vec<f64> = hold_out.iter().map(|&i| returns(i, dark) * SURPRISE.ln()).collect();
+    result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [*g; 3]);
+    let each = differences(&estimate);
+    let (total, z) = total_and_z(&each);
+    let share = total / each.len().max(1) as f64;
+    let widths: Vec<f64> = packets.orders.iter().map(|o| o.map_or(1.0, |o| o.width)).collect();
+    let runs = Runs::new(&dark.0, &dark.1, &estimate, &widths);
+    result.found.push(found(context, &runs, [share, share / z.max(Z_STAR)], held));
+    (result, packets.arrived(context.frames))
+}
+
+fn bin_of(ray: &Ray, orders: &[Option<Order>]) -> Option<Bin> {
+    let order = orders[usize::from(ray.sensor)].filter(|_| ray.row != u16::MAX)?;
+    Some((ray.sensor, order.bin(ray)))
+}
+
+fn counts(rays: &[Ray], bin: impl Fn(&Ray) -> Option<Bin>) -> Counts {
+    let mut counts = Counts::new();
+    for (ray, bin) in rays.iter().filter_map(|r| Some((r, bin(r)?))) {
+        let [all, matched] = counts.entry(bin).or_default();
+        *all += 1.0;
+        *matched += f64::from(u8::from(ray.matched));
+    }
+    counts.retain(|_, c| c[0] >= FEWEST);
+    counts
+}
+
+/// Bins that lose all returns in a frame, and not in most of the others.
+fn dark_bins(frames: &[Counts]) -> Vec<BTreeSet<Bin>> {
+    let mut all = Counts::new();
+    for (bin, [n, matched]) in frames.iter().flatten() {
+        let sum = all.entry(*bin).or_default();
+        *sum = [sum[0] + n, sum[1] + matched];
+    }
+    let is_dark = |bin: &Bin, [n, matched]: [f64; 2]| {
+        let [others, seen] = [all[bin][0] - n, all[bin][1] - matched];
+        matched < DARK * n && seen > USUALLY_SEEN * others
+    };
+    let of_frame = |f: &Counts| f.iter().filter(|(bin, c)| is_dark(bin, **c)).map(|(bin, _)| *bin).collect();
+    frames.iter().map(of_frame).collect()
+}
+
+/// Runs of dark bins of the sensor that has most of them.
+struct Runs {
+    sensor: usize,
+    /// Width of a bin, as a share of a scan.
+    bin: f64,
+    /// Length of each run as a share of a scan, with the parts of bins at its ends.
+    lengths: Vec<f64>,
+    /// Length of all bins that were judged, in scans.
+    all: f64,
+}
+
+impl Runs {
+    fn new(dark: &[BTreeSet<Bin>], counts: &[Counts], frames: &[usize], widths: &[f64]) -> Self {
+        let of_sensor = |s: usize| frames.iter().flat_map(|&i| &dark[i]).filter(|b| usize::from(b.0) == s).count();
+        let sensor = (0..widths.len()).max_by_key(|s| (of_sensor(*s), usize::MAX - s)).unwrap_or(0);
+        let own = |bin: &&Bin| usize::from(bin.0) == sensor;
+        let mut lengths = Vec::new();
+        for &i in frames {
+            let mut last = None;
+            for (_, bin) in dark[i].iter().filter(own) {
+                match lengths.last_mut() {
+                    Some(length) if last == Some(bin - 1) => *length += widths[sensor],
+                    // A packet covers half a bin more at each end.
+                    _ => lengths.push(2.0 * widths[sensor]),
+                }
+                last = Some(*bin);
+            }
+        }
+        let judged = frames.iter().flat_map(|&i| counts[i].keys()).filter(own).count();
+        Runs { sensor, bin: widths[sensor], lengths, all: judged as f64 * widths[sensor] }
+    }
+
+    /// Length of a packet as a share of a scan: most bursts are short, so that the shortest runs are single packets.
+    fn packet(&self) -> f64 {
+        let mut sorted = self.lengths.clone();
+        sorted.sort_by(f64::total_cmp);
+        sorted.get(sorted.len() / 10).copied().unwrap_or(self.bin)
+    }
+
+    /// Probabilities of a loss after a packet that arrived, and after one that was lost (a Gilbert channel).
+    fn probabilities(&self) -> [f64; 2] {
+        let lost: f64 = self.lengths.iter().sum();
+        let arrived = ((self.all - lost) / self.packet()).max(1.0);
+        let runs = self.lengths.len() as f64;
+        [(runs / arrived).min(1.0), (1.0 - runs * self.packet() / lost.max(1e-9)).max(0.0)]
+    }
+}
+
+/// The finding.
+fn found(context: &Context, runs: &Runs, [share, error]: [f64; 2], held_out_gains: Vec<f64>) -> Found {
+    let sensor = &context.rig.sensors[runs.sensor];
+    let scan_ms = 1e3 / sensor.rate_hz;
+    let packet_ms = runs.packet() * scan_ms;
+    let [loss, burst] = runs.probabilities();
+    let number = (runs.lengths.len() as f64).max(1.0);
+    // The width of a packet is known to a bin.
+    let of_width = runs.bin / runs.packet();
+    let points = curve_points(runs, scan_ms);
+    Found {
+        effects: Vec::new(),
+        status: Status::Named,
+        causes: vec![Cause::PacketLoss],
+        parameters: vec![
+            sensor_number(runs.sensor),
+            parameter(Quantity::PacketMs, packet_ms, of_width * packet_ms),
+            probability(Quantity::Loss, loss, loss * number.sqrt().recip().hypot(of_width)),
+            probability(Quantity::Burst, burst, (1.0 - burst) * number.sqrt().recip().hypot(of_width)),
+            parameter(Quantity::Share, share, error),
+        ],
+        confidence: 1.0,
+        channel: Channel::Hits,
+        covariate: Covariate::ScanPhase,
+        held_out_gains,
+        says: format!(
+            "in single scans all returns of some time are lost ({:.1} % of the returns): packets of {packet_ms:.1} ms do not arrive",
+            100.0 * share
+        ),
+        separate_by: None,
+        curve: Curve {
+            x: "time for which all is lost, ms".into(),
+            y: "number of losses".into(),
+            by_sensor: false,
+            points,
+        },
+    }
+}
+
+/// A parameter between 0 and 1.
+fn probability(quantity: Quantity, estimate: f64, error: f64) -> NamedParameter {
+    let (id, Parameter { estimate, unit, ci95 }) = parameter(quantity, estimate, error);
+    (id, Parameter { estimate, unit, ci95: ci95.map(|end| end.clamp(0.0, 1.0)) })
+}
+
+/// How many runs there are of each width, and how many the Gilbert channel has.
+fn curve_points(runs: &Runs, scan_ms: f64) -> Vec<CurvePoint> {
+    let (packet, [_, burst]) = (runs.packet(), runs.probabilities());
+    let number = runs.lengths.len() as f64;
+    let point = |k: i32| {
+        let inside = |w: &&f64| ((**w / packet).round() as i32) == k;
+        let measured = runs.lengths.iter().filter(inside).count() as f64;
+        let after = number * (1.0 - burst) * burst.powi(k - 1);
+        let x = f64::from(k) * packet * scan_ms;
+        CurvePoint { sensor: 0, x, measured, before: 0.0, after, error: measured.sqrt() }
+    };
+    (1..=12).map(point).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Thirty frames of 400 bins with twenty returns each.
+    fn frames(lost: impl Fn(usize, i32) -> bool) -> Vec<Counts> {
+        let cell = |f: usize, bin: i32| ((0u8, bin), [20.0, if lost(f, bin) { 0.0 } else { 19.0 }]);
+        (0..30).map(|f| (0..400).map(|bin| cell(f, bin)).collect()).collect()
+    }
+
+    #[test]
+    fn bins_that_are_dark_in_one_frame_count_and_those_that_always_are_do_not() {
+        let counts = frames(|f, bin| (100..105).contains(&bin) || f == 7 && (200..204).contains(&bin));
+        let dark = dark_bins(&counts);
+        assert_eq!(dark[7].iter().map(|b| b.1).collect::<Vec<_>>(), [200, 201, 202, 203]);
+        assert!(dark[6].is_empty());
+    }
+
+    #[test]
+    fn packets_and_bursts_are_found_with_their_probabilities() {
+        use rand::RngExt;
+        // Packets of four bins, with their ends inside of bins: three bins of each single one are dark.
+        let mut rng = data::stream(0, "packets", 0, 0);
+        let (loss, burst) = (0.03, 0.4);
+        let mut lost = vec![vec![false; 100]; 30];
+        for frame in &mut lost {
+            let mut before = false;
+            for packet in frame.iter_mut() {
+                *packet = rng.random_bool(if before { burst } else { loss });
+                before = *packet;
+            }
+        }
+        let dark = |f: usize, bin: i32| {
+            let of = |b: i32| lost[f][(b / 4).clamp(0, 99) as usize];
+            of(bin) && (bin == 0 || of(bin - 1))
+        };
+        let counts = frames(dark);
+        let all: Vec<usize> = (0..30).collect();
+        let runs = Runs::new(&dark_bins(&counts), &counts, &all, &[0.0025]);
+        assert!((runs.packet() / 0.0025 - 4.0).abs() < 0.1, "{}", runs.packet() / 0.0025);
+        let [found_loss, found_burst] = runs.probabilities();
+        assert!((found_loss / loss - 1.0).abs() < 0.35, "{found_loss}");
+        assert!((found_burst - burst).abs() < 0.15, "{found_burst}");
+    }
+}
