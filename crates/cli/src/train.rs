@@ -111,7 +111,7 @@ impl TrainArgs {
             Some((stored, out)) => (self.changed(stored.to_table())?, out),
             None => self.fresh()?,
         };
-        Dataset::open(&config.dataset)?.refuse_own_folder(&out)?;
+        Dataset::without_classes(&config.dataset)?.refuse_own_folder(&out)?;
         errln!("device: {}", self.device.describe());
         // The default run is always resumed.
         let resume = self.resume || self.dataset.is_none();
@@ -174,7 +174,7 @@ impl TrainArgs {
         }
         let mut config = self.changed(table)?;
         if config.overfit && self.epochs.is_none() && !self.set.iter().any(|s| s.contains("optimization.epochs")) {
-            let frames = Dataset::open(&config.dataset)?.all_ids()?.len();
+            let frames = Dataset::without_classes(&config.dataset)?.all_ids()?.len();
             let least = config.detector.network.overfit_steps();
             let optimization = &mut config.detector.optimization;
             // Evaluation uses running statistics, which differ from the batch statistics of a single frame.
@@ -188,7 +188,7 @@ impl TrainArgs {
             (Some(out), Some(_)) => out.clone(),
             (_, None) => home.join(seed),
             (None, Some(dataset)) => {
-                let mut name = Dataset::open(dataset)?.config.name;
+                let mut name = Dataset::without_classes(dataset)?.config.name;
                 if config.overfit {
                     name += "-overfit";
                 }
@@ -204,7 +204,7 @@ impl TrainArgs {
             table.insert("seed".into(), Value::Integer(i64::try_from(seed).context("--seed is too large")?));
         }
         if let Some(dataset) = &self.dataset {
-            Dataset::open(dataset)?;
+            Dataset::without_classes(dataset)?;
             table.insert("dataset".into(), path_value(dataset)?);
         }
         if let Some(init) = &self.init {

@@ -20,7 +20,21 @@ pub struct Dataset {
 impl Dataset {
     /// Opens a data set by its folder or its TOML. Of a folder, `dataset.toml` is read; without that file the layout is
     /// recognised from its folders.
+    ///
+    /// Classes that the TOML does not give come from all labels.
     pub fn open(path: &Path) -> Result<Self, DataError> {
+        let mut dataset = Self::without_classes(path)?;
+        if dataset.config.classes.is_empty() {
+            dataset.config.classes = dataset.default_classes()?;
+        }
+        Ok(dataset)
+    }
+
+    /// As [`Dataset::open`], without reading labels for the classes: there are none if the TOML does not give them.
+    ///
+    /// # Errors
+    /// As [`Dataset::open`].
+    pub fn without_classes(path: &Path) -> Result<Self, DataError> {
         let inside = path.join("dataset.toml");
         let config = if path.may_be_file() && !is_recording(path) {
             DatasetConfig::read(path)?
@@ -34,9 +48,6 @@ impl Dataset {
         layout.check_root(root)?;
         if *points == PointColumns::Xyzi && !layout.has_intensity(root)? {
             dataset.config.points = PointColumns::Xyz;
-        }
-        if dataset.config.classes.is_empty() {
-            dataset.config.classes = dataset.default_classes()?;
         }
         Ok(dataset)
     }

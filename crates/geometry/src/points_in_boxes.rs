@@ -84,24 +84,38 @@ struct BoxGrid {
 impl BoxGrid {
     fn new(tests: &[InsideTest]) -> Option<Self> {
         tests.first()?;
-        let mut grid = BoxGrid { low: [0.0; 2], cells_per_m: [0.0; 2], starts: vec![0], boxes: Vec::new() };
+        let mut grid = BoxGrid { low: [0.0; 2], cells_per_m: [0.0; 2], starts: Vec::new(), boxes: Vec::new() };
         for axis in [0, 1] {
             grid.low[axis] = tests.iter().map(|t| t.low[axis]).fold(f64::INFINITY, f64::min);
             let high = tests.iter().map(|t| t.high[axis]).fold(f64::NEG_INFINITY, f64::max);
             grid.cells_per_m[axis] = CELLS as f64 / (high - grid.low[axis]);
         }
-        let mut in_cell = vec![Vec::new(); CELLS * CELLS];
-        for (k, test) in tests.iter().enumerate() {
-            let [x0, y0] = [0, 1].map(|axis| grid.index(axis, test.low[axis]));
-            let [x1, y1] = [0, 1].map(|axis| grid.index(axis, test.high[axis]));
-            for x in x0..=x1 {
-                in_cell[x * CELLS + y0..=x * CELLS + y1].iter_mut().for_each(|cell| cell.push(k as u32));
+        // Counted, then filled: an allocation for each cell would cost more than a small cloud.
+        let cells: Vec<[usize; 4]> = tests
+            .iter()
+            .map(|test| {
+                let [x0, y0] = [0, 1].map(|axis| grid.index(axis, test.low[axis]));
+                let [x1, y1] = [0, 1].map(|axis| grid.index(axis, test.high[axis]));
+                [x0, x1, y0, y1]
+            })
+            .collect();
+        let rows = |&[x0, x1, y0, y1]: &[usize; 4]| (x0..=x1).map(move |x| x * CELLS + y0..x * CELLS + y1 + 1);
+        let mut starts = vec![0; CELLS * CELLS + 1];
+        for row in cells.iter().flat_map(rows) {
+            starts[row.start + 1..=row.end].iter_mut().for_each(|count| *count += 1);
+        }
+        for cell in 1..starts.len() {
+            starts[cell] += starts[cell - 1];
+        }
+        grid.boxes = vec![0; starts[CELLS * CELLS] as usize];
+        let mut next: Vec<u32> = starts[..CELLS * CELLS].to_vec();
+        for (k, cells) in cells.iter().enumerate() {
+            for cell in rows(cells).flatten() {
+                grid.boxes[next[cell] as usize] = k as u32;
+                next[cell] += 1;
             }
         }
-        for cell in in_cell {
-            grid.boxes.extend(cell);
-            grid.starts.push(grid.boxes.len() as u32);
-        }
+        grid.starts = starts;
         Some(grid)
     }
 
