@@ -26,6 +26,11 @@ pub fn file_sha256(path: &Path) -> Result<String, DataError> {
 /// # Errors
 /// As [`file_sha256`].
 pub fn files_sha256<P: Into<FilePart>>(parts: impl IntoIterator<Item = P>) -> Result<String, DataError> {
+    Ok(hex(&files_sha256_bytes(parts)?))
+}
+
+/// As [`files_sha256`], the bytes of the hash.
+pub(crate) fn files_sha256_bytes<P: Into<FilePart>>(parts: impl IntoIterator<Item = P>) -> Result<[u8; 32], DataError> {
     let mut hash = Sha256::new();
     for part in parts {
         let part = part.into();
@@ -36,12 +41,13 @@ pub fn files_sha256<P: Into<FilePart>>(parts: impl IntoIterator<Item = P>) -> Re
             hash.update(u64::MAX.to_le_bytes());
         }
     }
-    Ok(hex(&hash.finalize()))
+    Ok(hash.finalize().into())
 }
 
 fn add(hash: &mut Sha256, part: &FilePart) -> Result<(), DataError> {
     let mut file = part.open()?;
-    let mut piece = vec![0; 1 << 18];
+    // Most files are labels of some lines.
+    let mut piece = vec![0; file.length().clamp(1, 1 << 18) as usize];
     loop {
         match file.read(&mut piece) {
             Ok(0) => return Ok(()),

@@ -1,6 +1,7 @@
 //! A fingerprint of the content of frames, affordable for large data sets.
 
-use crate::checksum::{files_sha256, hex};
+use crate::checksum::{files_sha256_bytes, hex};
+use crate::frame_index::FrameIndex;
 use crate::{DataError, Dataset, FilePart};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
@@ -8,6 +9,9 @@ use std::io::Read as _;
 
 /// Pieces of a cloud that are read.
 const PIECES: u64 = 16;
+
+/// Frames that are read in parallel before their hashes are added.
+const AT_ONCE: usize = 1 << 14;
 
 /// Length of a piece, bytes.
 const PIECE_BYTES: u64 = 4096;
@@ -23,30 +27,29 @@ impl Dataset {
         // Layouts with one table of labels for all frames: it is read once.
         let shared = match ids {
             [first, .., last] if self.has_labels() && self.labels_part(first)? == self.labels_part(last)? => {
-                Some(files_sha256([self.labels_part(first)?])?)
+                Some(files_sha256_bytes([self.labels_part(first)?])?)
             }
             _ => None,
         };
+        let index = FrameIndex::of(self, ids.len());
         let of_frame = |id: &String| {
-            if let Some(labels) = &shared {
-                return Ok([cloud_sha256(&self.cloud_part(id)?)?, labels.clone()]);
-            }
-            let labels = self.has_labels().then(|| self.labels_part(id)).transpose()?;
-            let beside = labels.into_iter().chain(self.calibration_path(id).map(FilePart::from));
-            Ok([cloud_sha256(&self.cloud_part(id)?)?, files_sha256(beside)?])
+            let beside = shared.as_ref().map_or_else(|| index.labels(id), |labels| Ok(*labels))?;
+            Ok(format!("{id}\n{}\n{}\n", hex(&index.cloud(id)?), hex(&beside)))
         };
-        let frames: Vec<Result<[String; 2], DataError>> = ids.par_iter().map(of_frame).collect();
         let mut hash = Sha256::new();
-        for (id, frame) in ids.iter().zip(frames) {
-            let [cloud, beside] = frame?;
-            hash.update(format!("{id}\n{cloud}\n{beside}\n"));
+        for some in ids.chunks(AT_ONCE) {
+            let frames: Vec<Result<String, DataError>> = some.par_iter().map(of_frame).collect();
+            for frame in frames {
+                hash.update(frame?);
+            }
         }
+        index.finish(true);
         Ok(hex(&hash.finalize()))
     }
 }
 
 /// Hash of the size and of pieces of a cloud.
-fn cloud_sha256(part: &FilePart) -> Result<String, DataError> {
+pub(crate) fn cloud_sha256(part: &FilePart) -> Result<[u8; 32], DataError> {
     let mut file = part.open()?;
     let length = file.length();
     let mut hash = Sha256::new();
@@ -55,7 +58,7 @@ fn cloud_sha256(part: &FilePart) -> Result<String, DataError> {
     if length <= PIECES * PIECE_BYTES {
         file.read_to_end(&mut piece)?;
         hash.update(&piece);
-        return Ok(hex(&hash.finalize()));
+        return Ok(hash.finalize().into());
     }
     for i in 0..PIECES {
         let at = (length - PIECE_BYTES) as u128 * u128::from(i) / u128::from(PIECES - 1);
@@ -64,7 +67,7 @@ fn cloud_sha256(part: &FilePart) -> Result<String, DataError> {
         file.by_ref().take(PIECE_BYTES).read_to_end(&mut piece)?;
         hash.update(&piece);
     }
-    Ok(hex(&hash.finalize()))
+    Ok(hash.finalize().into())
 }
 
 #[cfg(test)]

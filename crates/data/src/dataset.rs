@@ -2,6 +2,7 @@
 
 use crate::Presence as _;
 use crate::dataset_config::DatasetConfig;
+use crate::frame_index::FrameIndex;
 use crate::kitti_text::{KittiText, read_kitti_text};
 use crate::layout::{Moment, PointDetails, Sequence};
 use crate::limits::{MOST_IDS, at_most, check_name, read_text};
@@ -21,7 +22,7 @@ impl Dataset {
     /// Opens a data set by its folder or its TOML. Of a folder, `dataset.toml` is read; without that file the layout is
     /// recognised from its folders.
     ///
-    /// Classes that the TOML does not give come from all labels.
+    /// Classes that the TOML does not give come from all labels, which are read again only if they were changed.
     pub fn open(path: &Path) -> Result<Self, DataError> {
         let mut dataset = Self::without_classes(path)?;
         if dataset.config.classes.is_empty() {
@@ -124,6 +125,25 @@ impl Dataset {
         match &self.config.labels {
             Some(_) => Ok(self.labels_path(id).into()),
             None => self.config.layout.labels_part(&self.config.root, id),
+        }
+    }
+
+    /// As [`Dataset::cloud_part`], from the index alone where there is one: the file is not looked at.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    pub(crate) fn cloud_place(&self, id: &str) -> Result<FilePart, DataError> {
+        self.config.layout.cloud_place(&self.config.root, id)
+    }
+
+    /// As [`Dataset::cloud_place`], of the labels.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    pub(crate) fn labels_place(&self, id: &str) -> Result<FilePart, DataError> {
+        match &self.config.labels {
+            Some(_) => Ok(self.labels_path(id).into()),
+            None => self.config.layout.labels_place(&self.config.root, id),
         }
     }
 
@@ -287,15 +307,15 @@ impl Dataset {
         if self.config.label_frame == LabelFrame::Camera || !self.has_labels() {
             return Ok(kitti);
         }
+        let ids = self.all_ids()?;
+        let index = FrameIndex::of(self, ids.len());
         let of_frame = |mut found: BTreeSet<String>, id: &String| {
-            // Missing and invalid label files are reported when their frame is loaded.
-            let lines = self.labels(id).unwrap_or_default();
-            let classes = lines.into_iter().filter(|line| !line.is_dont_care()).map(|line| line.class);
-            found.extend(classes);
+            index.add_classes(id, &mut found);
             found
         };
         let all = |a: BTreeSet<String>, b: BTreeSet<String>| a.into_iter().chain(b).collect();
-        let found = self.all_ids()?.par_iter().fold(BTreeSet::new, of_frame).reduce(BTreeSet::new, all);
+        let found = ids.par_iter().fold(BTreeSet::new, of_frame).reduce(BTreeSet::new, all);
+        index.finish(true);
         Ok(if found.is_empty() { kitti } else { found.into_iter().collect() })
     }
 }

@@ -3,6 +3,7 @@
 
 use crate::augment::GtSamplingConfig;
 use crate::checksum::hex;
+use crate::frame_index::FrameIndex;
 use crate::output::{check_writable, write_atomic_with};
 use crate::{DataError, Dataset, FilePart, FolderLock, Frame, GroundHeight, Object};
 use geometry::{Box3, points_in_boxes};
@@ -258,9 +259,15 @@ fn collect(
 ) -> Result<BTreeMap<String, Vec<GtSample>>, DataError> {
     let mut classes: BTreeMap<String, Vec<GtSample>> = BTreeMap::new();
     let mut first = 0;
+    let index = FrameIndex::of(dataset, ids.len());
     for some in ids.chunks(AT_ONCE) {
-        let frames: Vec<Result<Vec<Found>, DataError>> =
-            some.par_iter().map(|id| Ok(objects_of(&dataset.load(id)?, wanted, config))).collect();
+        let of_frame = |id: &String| {
+            let frame = dataset.load(id)?;
+            // For the hash of the content, while the file is at hand.
+            index.cloud(id)?;
+            Ok(objects_of(&frame, wanted, config))
+        };
+        let frames: Vec<Result<Vec<Found>, DataError>> = some.par_iter().map(of_frame).collect();
         for frame in frames {
             for Found { class, bbox, points } in frame? {
                 write(&points)?;
@@ -270,6 +277,7 @@ fn collect(
             }
         }
     }
+    index.finish(false);
     Ok(classes)
 }
 

@@ -121,6 +121,22 @@ pub trait DataLayout: Send + Sync {
         Ok(self.labels_path(root, id).into())
     }
 
+    /// As [`Self::cloud_part`], without a look at the file. Layouts with an index override this.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    fn cloud_place(&self, root: &Path, id: &str) -> Result<FilePart, DataError> {
+        self.cloud_part(root, id)
+    }
+
+    /// As [`Self::cloud_place`], of the labels.
+    ///
+    /// # Errors
+    /// There is no such frame.
+    fn labels_place(&self, root: &Path, id: &str) -> Result<FilePart, DataError> {
+        self.labels_part(root, id)
+    }
+
     /// Whether the frame has a cloud.
     fn has_cloud(&self, root: &Path, id: &str) -> bool {
         self.cloud_path(root, id).may_be_file()

@@ -17,6 +17,7 @@ mod error;
 mod file_part;
 mod folder_lock;
 mod frame;
+mod frame_index;
 mod frame_records;
 mod ground_height;
 mod gt_database;

@@ -78,6 +78,14 @@ impl DataLayout for Shards {
         index.labels(id)?.part()
     }
 
+    fn cloud_place(&self, root: &Path, id: &str) -> Result<FilePart, DataError> {
+        Ok(index(root)?.cloud(id)?.place())
+    }
+
+    fn labels_place(&self, root: &Path, id: &str) -> Result<FilePart, DataError> {
+        Ok(index(root)?.labels(id)?.place())
+    }
+
     fn has_cloud(&self, root: &Path, id: &str) -> bool {
         index(root).is_ok_and(|index| index.cloud(id).is_ok())
     }

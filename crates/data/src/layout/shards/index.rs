@@ -301,7 +301,12 @@ impl Member<'_> {
         let mut header = [0; HEADER as usize];
         self.open()?.read_exact(&mut header).map_err(|_| self.moved())?;
         self.check(&header)?;
-        Ok(FilePart { path: self.shard.into(), range: Some((self.at, self.length.into())) })
+        Ok(self.place())
+    }
+
+    /// Where its bytes are, as the index says.
+    pub(super) fn place(&self) -> FilePart {
+        FilePart { path: self.shard.into(), range: Some((self.at, self.length.into())) }
     }
 
     /// Reads its bytes, of which there are at most `most`.
