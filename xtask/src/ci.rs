@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use std::time::Instant;
 
 /// Format, house rules, the book, clippy, tests, which include doc tests and a smoke run of the program, and the tests
-/// of the Python package.
+/// of object stores and of the Python package.
 ///
 /// Everything is built once with the wgpu backend, which compiles without a GPU.
 pub fn ci(root: &Path) -> Result<()> {
@@ -21,6 +21,10 @@ pub fn ci(root: &Path) -> Result<()> {
         component(root, "clippy", &args)
     })?;
     step("test", || must(cargo(root).args(["test", "--workspace"]).args(FEATURES)))?;
+    // Apart, since the program is built without stores.
+    step("stores", || {
+        must(cargo(root).args(["test", "-p", "lidarshift-data", "--features", "store", "--test", "store"]))
+    })?;
     step("python", || crate::python::test(root, &FEATURES))?;
     eprintln!("ci: all passed in {:.0} s", start.elapsed().as_secs_f64());
     Ok(())

@@ -233,7 +233,7 @@ fn detector_table(name_or_path: &str) -> Result<Table> {
 
 /// The absolute path, so that a run can be resumed from any working directory.
 fn path_value(path: &Path) -> Result<Value> {
-    let absolute = fs_err::canonicalize(path)?;
+    let absolute = if data::is_url(path) { path.to_path_buf() } else { fs_err::canonicalize(path)? };
     match absolute.to_str() {
         Some(text) => Ok(Value::String(text.into())),
         None => bail!("{}: the path is not UTF-8 and cannot be written to a TOML", path.display()),

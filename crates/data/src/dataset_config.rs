@@ -1,7 +1,9 @@
 //! The TOML of a data set and its defaults.
 
 use crate::Presence as _;
+use crate::layout::shards::list_shards;
 use crate::limits::{MOST_IMAGE_SIDE_PX, MOST_NAME_BYTES, check_name, read_text};
+use crate::source::is_url;
 use crate::toml_text::{KeyError, parse_toml, wrong};
 use crate::write::REPAIRED_ENDINGS;
 use crate::{DataError, LabelFrame, Layout, PointColumns};
@@ -115,7 +117,12 @@ impl DatasetConfig {
 
     /// The configuration of a folder without a TOML, from the first layout that recognises it.
     pub fn of_folder(folder: &Path) -> Result<Self, DataError> {
-        let Some(mut config) = Layout::ALL.iter().find_map(|layout| layout.recognise(folder)) else {
+        // Only shards are read from stores. The error of a store says more than "maybe".
+        let layouts = if is_url(folder) { &[Layout::Shards][..] } else { Layout::ALL };
+        let Some(mut config) = layouts.iter().find_map(|layout| layout.recognise(folder)) else {
+            if is_url(folder) {
+                list_shards(folder)?;
+            }
             if !folder.may_be_folder() {
                 return Err(DataError::missing(folder, "does not exist; give the folder or the TOML of a data set"));
             }

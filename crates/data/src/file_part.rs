@@ -2,7 +2,7 @@
 
 use crate::DataError;
 use crate::limits::length_of_file;
-use fs_err::File;
+use crate::source::Source;
 use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
@@ -62,9 +62,11 @@ impl FilePart {
     /// # Errors
     /// A file that cannot be opened or is no regular file.
     pub(crate) fn open(&self) -> Result<PartReader, DataError> {
-        let length = length_of_file(&self.path, u64::MAX)?;
-        let (start, length) = self.range.unwrap_or((0, length));
-        let mut file = File::open(&self.path)?;
+        let (start, length) = match self.range {
+            Some(range) => range,
+            None => (0, length_of_file(&self.path, u64::MAX)?),
+        };
+        let mut file = Source::open(&self.path, Some(start + length))?;
         if start > 0 {
             file.seek(SeekFrom::Start(start))?;
         }
@@ -74,7 +76,7 @@ impl FilePart {
 
 /// Reads a part of a file.
 pub(crate) struct PartReader {
-    file: File,
+    file: Source,
     start: u64,
     length: u64,
     at: u64,

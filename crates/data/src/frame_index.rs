@@ -9,6 +9,7 @@ mod file;
 
 use crate::checksum::files_sha256_bytes;
 use crate::content::cloud_sha256;
+use crate::source::{facts, is_url};
 use crate::{DataError, Dataset, FilePart, Layout};
 use file::{read_entries, write_entries};
 use sha2::{Digest as _, Sha256};
@@ -266,7 +267,10 @@ fn key(what: What, id: &str) -> u64 {
 fn file_name(dataset: &Dataset) -> Option<String> {
     let config = &dataset.config;
     let indexed = [Layout::Kitti, Layout::S2rDad, Layout::OpenPcdet, Layout::Carla, Layout::Shards];
-    let root = config.root.canonicalize().ok().filter(|_| indexed.contains(&config.layout))?;
+    let root = if is_url(&config.root) { config.root.clone() } else { config.root.canonicalize().ok()? };
+    if !indexed.contains(&config.layout) {
+        return None;
+    }
     let described = format!("{root:?}\n{}\n{:?}\n", config.layout.name(), config.labels);
     let digest = crate::checksum::hex(&Sha256::digest(described));
     Some(format!("frames-{}.bin", &digest[..32]))
@@ -275,6 +279,11 @@ fn file_name(dataset: &Dataset) -> Option<String> {
 /// Size and times of a file, or that it does not exist; `None` if it was changed a moment before `now`, or cannot be
 /// asked for.
 fn state_of_file(path: &Path, now: SystemTime) -> Option<Vec<u8>> {
+    if is_url(path) {
+        // An entity tag tells at any time.
+        let facts = facts(path).ok().filter(|facts| facts.tag.is_some())?;
+        return Some(format!("{facts:?}").into_bytes());
+    }
     let metadata = match std::fs::metadata(path) {
         Ok(metadata) => metadata,
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Some(b"absent".to_vec()),

@@ -5,6 +5,7 @@ use crate::augment::GtSamplingConfig;
 use crate::checksum::hex;
 use crate::frame_index::FrameIndex;
 use crate::output::{check_writable, write_atomic_with};
+use crate::source::facts;
 use crate::{DataError, Dataset, FilePart, FolderLock, Frame, GroundHeight, Object};
 use geometry::{Box3, points_in_boxes};
 use rayon::prelude::*;
@@ -335,10 +336,13 @@ fn cache_key(
     }
     key.update(text);
     let of_frame = |id: &String| {
-        let parts = [dataset.cloud_part(id)?, dataset.labels_part(id)?].into_iter();
+        let parts = [dataset.cloud_place(id)?, dataset.labels_place(id)?].into_iter();
         let parts = parts.chain(dataset.calibration_path(id).map(FilePart::from));
-        let state =
-            |part: FilePart| (std::fs::metadata(&part.path).ok().map(|m| (m.len(), m.modified().ok())), part.range);
+        let state = |part: FilePart| {
+            let facts = facts(&part.path).ok();
+            let tag = facts.as_ref().and_then(|facts| facts.tag.clone());
+            (facts.map(|facts| (facts.bytes, facts.changed)), part.range, tag)
+        };
         let states: Vec<_> = parts.map(state).collect();
         Ok(format!("{id} {states:?}\n"))
     };

@@ -36,6 +36,9 @@ mod pcd_header;
 mod place;
 mod prefetch;
 mod presence;
+mod source;
+#[cfg(feature = "store")]
+mod store;
 mod stream;
 pub mod toml_text;
 pub mod write;
@@ -66,6 +69,7 @@ pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
 pub use place::{ErrorKind, Located, Place, hint};
 pub use prefetch::{Prefetch, prefetch, prefetch_numbered};
 pub use presence::Presence;
+pub use source::is_url;
 pub use stream::{Stream, stream};
 pub use toml_text::KeyError;
 pub use write::write_json;

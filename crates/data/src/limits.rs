@@ -3,7 +3,7 @@
 //! The page `reference/limits.md` of the book lists all limits of the program.
 
 use crate::DataError;
-use fs_err::File;
+use crate::source::{Source, facts, is_url};
 use std::io::Read as _;
 use std::path::Path;
 
@@ -39,7 +39,7 @@ pub fn read_file(path: &Path, most: u64) -> Result<Vec<u8>, DataError> {
     let length = length_of_file(path, most)?;
     let mut bytes = Vec::with_capacity(length as usize);
     // A file that grows meanwhile is read up to one byte beyond the limit.
-    File::open(path)?.take(most + 1).read_to_end(&mut bytes)?;
+    Source::open(path, None)?.take(most + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > most {
         return Err(too_large(path, bytes.len() as u64, most));
     }
@@ -59,6 +59,10 @@ pub fn read_text(path: &Path) -> Result<String, DataError> {
 /// # Errors
 /// As [`read_file`].
 pub fn length_of_file(path: &Path, most: u64) -> Result<u64, DataError> {
+    if is_url(path) {
+        let bytes = facts(path)?.bytes;
+        return if bytes > most { Err(too_large(path, bytes, most)) } else { Ok(bytes) };
+    }
     // Opening a FIFO would wait for a writer.
     let metadata = fs_err::metadata(path)?;
     if !metadata.is_file() {

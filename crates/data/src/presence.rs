@@ -1,5 +1,6 @@
 //! Whether files exist, on file systems that may fail to say so.
 
+use crate::source::is_url;
 use std::io::ErrorKind;
 use std::path::Path;
 
@@ -19,16 +20,46 @@ pub trait Presence {
 
 impl Presence for Path {
     fn may_be_file(&self) -> bool {
+        if is_url(self) {
+            return may_be_object(self);
+        }
         self.metadata().map_or_else(is_unknown, |found| found.is_file())
     }
 
     fn may_be_folder(&self) -> bool {
+        if is_url(self) {
+            return may_be_prefix(self);
+        }
         self.metadata().map_or_else(is_unknown, |found| found.is_dir())
     }
 
     fn may_exist(&self) -> bool {
+        if is_url(self) {
+            return may_be_object(self) || may_be_prefix(self);
+        }
         self.metadata().map_or_else(is_unknown, |_| true)
     }
+}
+
+#[cfg(feature = "store")]
+fn may_be_object(url: &Path) -> bool {
+    crate::store::is_object(url).unwrap_or(true)
+}
+
+#[cfg(feature = "store")]
+fn may_be_prefix(url: &Path) -> bool {
+    crate::store::is_prefix(url).unwrap_or(true)
+}
+
+/// Reading it is the error that says what is missing.
+#[cfg(not(feature = "store"))]
+fn may_be_object(_: &Path) -> bool {
+    true
+}
+
+#[cfg(not(feature = "store"))]
+fn may_be_prefix(_: &Path) -> bool {
+    true
 }
 
 #[expect(clippy::needless_pass_by_value, reason = "the form that `map_or_else` takes")]

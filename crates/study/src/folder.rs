@@ -115,7 +115,7 @@ impl Study {
 
     /// Resolves a path of the study's TOML.
     pub fn path(&self, relative: &Path) -> PathBuf {
-        resolved(&self.base, relative)
+        if data::is_url(relative) { relative.into() } else { resolved(&self.base, relative) }
     }
 
     /// Whether `found`, the path of a data set in a run folder, is that of a data set of the study, which may have been

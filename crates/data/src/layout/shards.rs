@@ -130,6 +130,14 @@ impl DataLayout for Shards {
     }
 }
 
+/// Lists the shards of a root.
+///
+/// # Errors
+/// A folder or store that cannot be listed.
+pub(crate) fn list_shards(root: &Path) -> Result<(), DataError> {
+    index::shards_in(&folder_of(root)).map(drop)
+}
+
 /// The folder of the shards of a root.
 fn folder_of(root: &Path) -> PathBuf {
     let inside = root.join(FOLDER);

@@ -4,14 +4,13 @@
 //! than a hint: each read of a member compares the header before it.
 
 use crate::limits::{MOST_CLOUD_BYTES, MOST_IDS, at_most, check_name, length_of_file};
+use crate::source::{Facts, Source, list};
 use crate::{DataError, FilePart, Presence as _};
-use fs_err::File;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::io::{BufRead as _, BufReader, Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
-use std::time::SystemTime;
 
 /// Name of the file with the index.
 pub(super) const INDEX: &str = "index.jsonl";
@@ -31,8 +30,7 @@ pub(super) struct ShardIndex {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct ShardFile {
     pub path: PathBuf,
-    pub bytes: u64,
-    changed: Option<SystemTime>,
+    pub facts: Facts,
 }
 
 /// A frame of a shard.
@@ -71,15 +69,8 @@ pub(super) struct Member<'a> {
 
 /// The shards in a folder, sorted by name.
 pub(super) fn shards_in(folder: &Path) -> Result<Vec<ShardFile>, DataError> {
-    let mut shards = Vec::new();
-    for entry in fs_err::read_dir(folder)? {
-        let path = entry?.path();
-        let is_hidden = path.file_name().is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-        if path.extension().is_some_and(|e| e == "tar") && !is_hidden {
-            let metadata = fs_err::metadata(&path)?;
-            shards.push(ShardFile { path, bytes: metadata.len(), changed: metadata.modified().ok() });
-        }
-    }
+    let found = list(folder, "tar", INDEX)?;
+    let mut shards: Vec<ShardFile> = found.into_iter().map(|(path, facts)| ShardFile { path, facts }).collect();
     shards.sort_by(|a, b| a.path.cmp(&b.path));
     Ok(shards)
 }
@@ -102,7 +93,7 @@ impl ShardIndex {
         let shards = shards_in(folder)?;
         let of_shard = |(number, shard): (usize, &ShardFile)| {
             let name = shard.path.file_name().and_then(|name| name.to_str());
-            match name.and_then(|name| lines.get(name)).filter(|line| line.bytes == shard.bytes) {
+            match name.and_then(|name| lines.get(name)).filter(|line| line.bytes == shard.facts.bytes) {
                 Some(line) => Ok(line.entries(number)),
                 None => headers_of(shard, number),
             }
@@ -175,7 +166,7 @@ impl ShardIndex {
         let mut lines: Vec<Line> = Vec::new();
         for shard in &self.shards {
             let name = shard.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            lines.push(Line { shard: name, bytes: shard.bytes, frames: Vec::new() });
+            lines.push(Line { shard: name, bytes: shard.facts.bytes, frames: Vec::new() });
         }
         let mut whole = vec![true; lines.len()];
         for frame in &self.frames {
@@ -214,7 +205,7 @@ fn known_lines(folder: &Path) -> HashMap<String, Line> {
     if length_of_file(&path, MOST_CLOUD_BYTES).is_err() {
         return HashMap::new();
     }
-    let Ok(file) = File::open(&path) else { return HashMap::new() };
+    let Ok(file) = Source::open(&path, None) else { return HashMap::new() };
     let texts: Vec<Vec<u8>> = BufReader::new(file).split(b'\n').map_while(Result::ok).collect();
     let line = |text: &Vec<u8>| serde_json::from_slice::<Line>(text).ok().filter(Line::is_sound);
     texts.par_iter().filter_map(line).map(|line| (line.shard.clone(), line)).collect()
@@ -224,8 +215,7 @@ fn known_lines(folder: &Path) -> HashMap<String, Line> {
 fn headers_of(shard: &ShardFile, number: usize) -> Result<Vec<Entry>, DataError> {
     let wrong = |message: String| DataError::file(&shard.path, message);
     let unread = |e: std::io::Error| wrong(format!("is no tar file that can be read: {e}"));
-    length_of_file(&shard.path, u64::MAX)?;
-    let mut archive = tar::Archive::new(Repeating(File::open(&shard.path)?));
+    let mut archive = tar::Archive::new(Repeating(Source::open(&shard.path, None)?));
     let mut found: Vec<(String, &'static str, Place)> = Vec::new();
     for entry in archive.entries_with_seek().map_err(unread)? {
         let entry = entry.map_err(unread)?;
@@ -240,7 +230,7 @@ fn headers_of(shard: &ShardFile, number: usize) -> Result<Vec<Entry>, DataError>
             let message = format!("its member {id}.{ending} has {length} bytes; at most {MOST_CLOUD_BYTES} are read");
             return Err(wrong(message));
         }
-        if at.saturating_add(length) > shard.bytes {
+        if at.saturating_add(length) > shard.facts.bytes {
             return Err(wrong(format!("ends within its member {id}.{ending}: it is truncated")));
         }
         at_most(&shard.path, "frames", found.len() as u64 / 2, MOST_IDS)?;
@@ -264,7 +254,7 @@ fn headers_of(shard: &ShardFile, number: usize) -> Result<Vec<Entry>, DataError>
 }
 
 /// Repeats reads that a signal interrupts, which the library for tar files gives up.
-struct Repeating(File);
+struct Repeating(Source);
 
 impl std::io::Read for Repeating {
     fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
@@ -299,7 +289,10 @@ impl Member<'_> {
     /// Where its bytes are, after a look at its header.
     pub(super) fn part(&self) -> Result<FilePart, DataError> {
         let mut header = [0; HEADER as usize];
-        self.open()?.read_exact(&mut header).map_err(|_| self.moved())?;
+        self.open(0)?.read_exact(&mut header).map_err(|e| match e.kind() {
+            std::io::ErrorKind::UnexpectedEof => self.moved(),
+            _ => e.into(),
+        })?;
         self.check(&header)?;
         Ok(self.place())
     }
@@ -317,7 +310,7 @@ impl Member<'_> {
         }
         let all = HEADER + u64::from(self.length);
         let mut bytes = Vec::with_capacity(all as usize);
-        self.open()?.take(all).read_to_end(&mut bytes)?;
+        self.open(self.length.into())?.take(all).read_to_end(&mut bytes)?;
         if bytes.len() as u64 != all {
             return Err(self.moved());
         }
@@ -325,10 +318,9 @@ impl Member<'_> {
         Ok(bytes.split_off(HEADER as usize))
     }
 
-    /// The shard, at the header of this member.
-    fn open(&self) -> Result<File, DataError> {
-        length_of_file(self.shard, u64::MAX)?;
-        let mut file = File::open(self.shard)?;
+    /// The shard, at the header of this member, of which `wanted` bytes will be read.
+    fn open(&self, wanted: u64) -> Result<Source, DataError> {
+        let mut file = Source::open(self.shard, Some(self.at + wanted))?;
         file.seek(SeekFrom::Start(self.at - HEADER))?;
         Ok(file)
     }
