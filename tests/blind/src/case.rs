@@ -67,7 +67,8 @@ pub const CAUSES: [&str; 22] = [
     "wrong_shape",
 ];
 
-/// Number of effects that are in no catalogue.
+/// Number of effects that were in no catalogue when the generator was written. The last one, a smear on a window, has
+/// a name since.
 pub const OFF_CATALOGUE: usize = 4;
 
 /// Sizes of the hidden effects.

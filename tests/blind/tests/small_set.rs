@@ -27,7 +27,9 @@ fn what_is_hidden_is_named() {
         (220, single("range_noise"), "right"),
         (221, single("range_bias"), "right"),
         (226, single("random_dropout"), "right"),
-        (60010, Kind::OffCatalogue(3), "unexplained"),
+        (60010, Kind::OffCatalogue(3), "right"),
+        (60011, Kind::OffCatalogue(0), "unexplained"),
+        (60012, Kind::OffCatalogue(2), "unexplained"),
     ];
     let wrong: Vec<String> = cases
         .par_iter()
