@@ -1,5 +1,6 @@
-//! Objects in stores: S3 and servers with its protocol, and files of HTTP servers. Requests that fail are repeated, and
-//! a body that breaks off is continued, as long as the object is the one of the beginning (its entity tag).
+//! Objects in stores: S3 and stores with the same interface, and files of HTTP servers. Requests that fail are
+//! repeated, and a body that breaks off is continued, as long as the object is the one of the beginning (its entity
+//! tag).
 
 use crate::limits::MOST_CLOUD_BYTES;
 use crate::place::{ErrorKind, Located as _};

@@ -1,5 +1,4 @@
-//! Data sets in an object store: a small server with as much of the protocol of S3 as reading needs, which fails on
-//! demand.
+//! Data sets in an object store: a small server with as much of S3 as reading needs, which fails on demand.
 #![cfg(feature = "store")]
 
 use geometry::Box3;
