@@ -91,7 +91,7 @@ pub(crate) type Distances = BTreeMap<Channel, Vec<f64>>;
 /// The distances of some frames of a pair.
 fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usize], slide: bool) -> Distances {
     // Each side loses its own packets: only their number is compared.
-    let packets = packets::Packets::new(context, sensors, train);
+    let packets = packets::Packets::new(context, sensors);
     let arrived = packets.arrived(context.frames);
     let context = &Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
     let mut lost = hits::by_table(context, train, test);

@@ -3,7 +3,6 @@
 
 use super::{ChannelResult, Context, Found, NamedParameter, Z_STAR, parameter, sensor_number};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::mask::{Mask, near_cut, range_cut};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
 use crate::inference::choice::total_and_z;
@@ -27,7 +26,8 @@ const FEWEST: f64 = 8.0;
 /// Share of the returns of a bin below which all are lost; the rest are false alarms.
 const DARK: f64 = 0.1;
 
-/// Share of the returns of the same bin in other scans from which on the bin is not always dark.
+/// Share of the returns of the same bin in other scans, and of returns at the same ranges, from which on the bin is not
+/// dark for another reason.
 const USUALLY_SEEN: f64 = 0.5;
 
 /// Smallest share of returns that is reported: as for any loss.
@@ -80,8 +80,9 @@ impl Order {
     }
 }
 
-/// Returns of one side of a frame by bin: all, and those with a counterpart.
-type Counts = BTreeMap<Bin, [f64; 2]>;
+/// Returns of one side of a frame by bin: all, those with a counterpart, and how many of them would have one by their
+/// ranges.
+type Counts = BTreeMap<Bin, [f64; 3]>;
 
 /// The dark bins of every frame, and the counts of all bins.
 struct Dark(Vec<BTreeSet<Bin>>, Vec<Counts>);
@@ -94,16 +95,14 @@ pub struct Packets {
 }
 
 impl Packets {
-    /// The limits of range are those of the `limiting` frames.
-    pub fn new(context: &Context, sensors: &Sensors, limiting: &[usize]) -> Self {
+    /// Of all frames.
+    pub fn new(context: &Context, sensors: &Sensors) -> Self {
         let orders = Order::of_sensors(context, sensors);
-        // Shots that only show what is nearer or farther than all that is measured are no packet.
-        let [cut_m, near_m] = [range_cut, near_cut].map(|end| end(context.frames, limiting));
-        let limits = Mask { cut_m, near_m, ..Mask::default() };
-        let bin = |ray: &Ray| bin_of(ray, &orders).filter(|_| !limits.hides(ray));
         let sides: [fn(&FramePair) -> &[Ray]; 2] = [|f| &f.simulated, |f| &f.measured];
         let sides = sides.map(|side| {
-            let all: Vec<Counts> = context.frames.par_iter().map(|f| counts(side(f), bin)).collect();
+            let usual = shares_by_range(context.frames, side);
+            let of_frame = |f: &FramePair| counts(side(f), &orders, &usual);
+            let all: Vec<Counts> = context.frames.par_iter().map(of_frame).collect();
             Dark(dark_bins(&all), all)
         });
         Packets { orders, sides }
@@ -146,7 +145,7 @@ impl Packets {
 pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Vec<FramePair>>) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Hits, hold_out.len());
-    let packets = Packets::new(context, sensors, &select);
+    let packets = Packets::new(context, sensors);
     let [dark, other] = &packets.sides;
     let returns = |i: usize, Dark(dark, counts): &Dark| dark[i].iter().map(|bin| counts[i][bin][0]).sum::<f64>();
     let share = |i: usize| {
@@ -191,12 +190,30 @@ fn bin_of(ray: &Ray, orders: &[Option<Order>]) -> Option<Bin> {
     Some((ray.sensor, order.bin(ray)))
 }
 
-fn counts(rays: &[Ray], bin: impl Fn(&Ray) -> Option<Bin>) -> Counts {
+/// Width of a bin of the logarithm of range.
+const LN_RANGE: f64 = 0.1;
+
+fn range_bin(ray: &Ray) -> i32 {
+    (f64::from(ray.range_m).max(0.1).ln() / LN_RANGE).floor() as i32
+}
+
+/// Share of the returns at each range that have a counterpart: near and far ones may all be lost, which is no packet.
+fn shares_by_range(frames: &[FramePair], side: impl Fn(&FramePair) -> &[Ray]) -> BTreeMap<i32, f64> {
+    let mut sums = BTreeMap::<i32, [f64; 2]>::new();
+    for ray in frames.iter().flat_map(side) {
+        let [all, matched] = sums.entry(range_bin(ray)).or_default();
+        (*all, *matched) = (*all + 1.0, *matched + f64::from(u8::from(ray.matched)));
+    }
+    sums.into_iter().map(|(bin, [all, matched])| (bin, matched / all)).collect()
+}
+
+fn counts(rays: &[Ray], orders: &[Option<Order>], usual: &BTreeMap<i32, f64>) -> Counts {
     let mut counts = Counts::new();
-    for (ray, bin) in rays.iter().filter_map(|r| Some((r, bin(r)?))) {
-        let [all, matched] = counts.entry(bin).or_default();
+    for (ray, bin) in rays.iter().filter_map(|r| Some((r, bin_of(r, orders)?))) {
+        let [all, matched, expected] = counts.entry(bin).or_default();
         *all += 1.0;
         *matched += f64::from(u8::from(ray.matched));
+        *expected += usual.get(&range_bin(ray)).copied().unwrap_or(0.0);
     }
     counts.retain(|_, c| c[0] >= FEWEST);
     counts
@@ -204,14 +221,14 @@ fn counts(rays: &[Ray], bin: impl Fn(&Ray) -> Option<Bin>) -> Counts {
 
 /// Bins that lose all returns in a frame, and not in most of the others.
 fn dark_bins(frames: &[Counts]) -> Vec<BTreeSet<Bin>> {
-    let mut all = Counts::new();
-    for (bin, [n, matched]) in frames.iter().flatten() {
+    let mut all = BTreeMap::<Bin, [f64; 2]>::new();
+    for (bin, [n, matched, _]) in frames.iter().flatten() {
         let sum = all.entry(*bin).or_default();
         *sum = [sum[0] + n, sum[1] + matched];
     }
-    let is_dark = |bin: &Bin, [n, matched]: [f64; 2]| {
+    let is_dark = |bin: &Bin, [n, matched, expected]: [f64; 3]| {
         let [others, seen] = [all[bin][0] - n, all[bin][1] - matched];
-        matched < DARK * n && seen > USUALLY_SEEN * others
+        matched < DARK * n && expected > USUALLY_SEEN * n && seen > USUALLY_SEEN * others
     };
     let of_frame = |f: &Counts| f.iter().filter(|(bin, c)| is_dark(bin, **c)).map(|(bin, _)| *bin).collect();
     frames.iter().map(of_frame).collect()
@@ -330,7 +347,7 @@ mod tests {
 
     /// Thirty frames of 400 bins with twenty returns each.
     fn frames(lost: impl Fn(usize, i32) -> bool) -> Vec<Counts> {
-        let cell = |f: usize, bin: i32| ((0u8, bin), [20.0, if lost(f, bin) { 0.0 } else { 19.0 }]);
+        let cell = |f: usize, bin: i32| ((0u8, bin), [20.0, if lost(f, bin) { 0.0 } else { 19.0 }, 18.0]);
         (0..30).map(|f| (0..400).map(|bin| cell(f, bin)).collect()).collect()
     }
 
