@@ -69,7 +69,7 @@ pub use pcd_header::{PcdEncoding, PcdHeader, parse_pcd_header};
 pub use place::{ErrorKind, Located, Place, hint};
 pub use prefetch::{Prefetch, prefetch, prefetch_numbered};
 pub use presence::Presence;
-pub use source::is_url;
+pub use source::{absolute, is_url};
 pub use stream::{Stream, stream};
 pub use toml_text::KeyError;
 pub use write::write_json;

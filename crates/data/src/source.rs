@@ -80,6 +80,14 @@ impl Seek for Source {
     }
 }
 
+/// The absolute path of a file or folder; the address of an object as it is.
+///
+/// # Errors
+/// An empty path, and a working directory that is not known.
+pub fn absolute(path: &Path) -> std::io::Result<PathBuf> {
+    if is_url(path) { Ok(path.into()) } else { std::path::absolute(path) }
+}
+
 /// Size and state of a file or an object.
 ///
 /// # Errors

@@ -7,7 +7,7 @@ use crate::{Event, Listener};
 use data::checksum::hex;
 use data::limits::MOST_TEXT_BYTES;
 use data::write::write_dataset_toml;
-use data::{Dataset, DatasetConfig, is_url};
+use data::{Dataset, DatasetConfig};
 use rayon::prelude::*;
 use sensor::{EffectList, Rig};
 use sha2::{Digest, Sha256};
@@ -71,7 +71,7 @@ fn make(study: &Study, dataset: &StudyDataset, listener: Listener<'_>) -> Result
                 )));
             };
             // Absolute, since the folder of a study may be given by another relative path later.
-            let root = if is_url(&source.root) { source.root } else { std::path::absolute(&source.root)? };
+            let root = data::absolute(&source.root)?;
             let rig = source.rig.map(std::path::absolute).transpose()?;
             let name = format!("{}-true-labels", source.name);
             let config = DatasetConfig {

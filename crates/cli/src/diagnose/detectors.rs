@@ -69,8 +69,7 @@ fn study_of(
     simulated: &Path,
     (extended, sensor): (&Path, Option<&Path>),
 ) -> Result<StudyConfig> {
-    let absolute =
-        |path: &Path| if data::is_url(path) { Ok(path.into()) } else { std::path::absolute(path) }.map(Source::Path);
+    let absolute = |path: &Path| data::absolute(path).map(Source::Path);
     let set = |name: &str, title: &str, source| StudyDataset {
         name: name.into(),
         title: title.into(),

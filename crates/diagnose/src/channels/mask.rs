@@ -154,7 +154,8 @@ pub fn blocked_cells(
         counts.keys().filter(|cell| covered(counts, cell) || is_dark(cell)).copied().collect();
     let mut blocked = BTreeSet::new();
     while let Some(first) = dark.first().copied() {
-        let region = Region { counts, cells: take_together(&mut dark, first) };
+        let region =
+            Region { counts, cells: take_together(&mut dark, first, |(s, az, el), (a, e)| Some((s, az + a, el + e))) };
         let stands_out = region.stands_out(shown);
         let believed = match shown {
             Shown::InPlace => true,
@@ -241,15 +242,19 @@ impl Region<'_> {
 /// Steps to the cells beside one: left, right, above, below.
 pub(super) const SIDES: [(i32, i32); 4] = [(1, 0), (-1, 0), (0, 1), (0, -1)];
 
-/// Removes the connected region of `first` from `cells`.
-pub(super) fn take_together(cells: &mut BTreeSet<DirectionCell>, first: DirectionCell) -> BTreeSet<DirectionCell> {
+/// Removes the connected region of `first` from `cells`; `next` is the cell on one side of another.
+pub(super) fn take_together(
+    cells: &mut BTreeSet<DirectionCell>,
+    first: DirectionCell,
+    next: impl Fn(DirectionCell, (i32, i32)) -> Option<DirectionCell>,
+) -> BTreeSet<DirectionCell> {
     cells.remove(&first);
     let mut all = vec![first];
     let mut at = 0;
     while at < all.len() {
-        let (s, az, el) = all[at];
+        let here = all[at];
         at += 1;
-        all.extend(SIDES.map(|(a, e)| (s, az + a, el + e)).into_iter().filter(|c| cells.remove(c)));
+        all.extend(SIDES.into_iter().filter_map(|side| next(here, side)).filter(|c| cells.remove(c)));
     }
     all.into_iter().collect()
 }

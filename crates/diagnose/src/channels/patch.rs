@@ -1,7 +1,7 @@
 //! Patches of directions of a sensor with more losses than the same surfaces elsewhere, as by dirt on a window.
 
 use super::cells::cell;
-use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, SIDES, direction_cell, neighbours};
+use super::mask::{AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, SIDES, direction_cell, neighbours, take_together};
 use crate::pairing::FramePair;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
@@ -126,17 +126,19 @@ pub fn patches(losses: &DirectionLosses) -> Vec<Patch> {
     let known = losses.keys().map(|c| (*c, sum(losses, neighbours(*c)))).filter(|(_, l)| l.simulated >= FEWEST);
     let shares: BTreeMap<DirectionCell, f64> = known.map(|(c, l)| (c, l.share())).collect();
     let mut found: Vec<Patch> = Vec::new();
+    // Cells without returns between two rows do not part a patch.
+    let beside = |cell, side| next(losses, cell, side);
     for share in SHARES {
         let mut high: BTreeSet<DirectionCell> = shares.iter().filter(|(_, s)| **s > share).map(|(c, _)| *c).collect();
         while let Some(first) = high.first().copied() {
-            let cells = take_connected(&mut high, first, losses);
+            let cells = take_together(&mut high, first, beside);
             let Some(middle) = cells.iter().max_by(|a, b| shares[a].total_cmp(&shares[b])) else { continue };
             let new = found.iter().all(|f| f.cells.is_disjoint(&cells));
             if new && shares[middle] > 1.5 * share && stands_alone(losses, &cells) {
                 // Cells beside it with small losses do not belong to it.
                 let half = 0.5 * shares[middle];
                 let mut more: BTreeSet<DirectionCell> = cells.iter().filter(|c| shares[c] > half).copied().collect();
-                let cells = take_connected(&mut more, *middle, losses);
+                let cells = take_together(&mut more, *middle, beside);
                 if cells.len() >= FEWEST_CELLS {
                     found.push(Patch { cells, share: half });
                 }
@@ -154,23 +156,6 @@ const BETWEEN_ROWS: i32 = 4;
 fn next(losses: &DirectionLosses, (s, az, el): DirectionCell, (a, e): (i32, i32)) -> Option<DirectionCell> {
     let reach = if e == 0 { 1 } else { BETWEEN_ROWS };
     (1..=reach).map(|k| (s, az + k * a, el + k * e)).find(|c| losses.contains_key(c))
-}
-
-/// Removes the connected region of `first` from `cells`. Cells without returns between two rows do not part it.
-fn take_connected(
-    cells: &mut BTreeSet<DirectionCell>,
-    first: DirectionCell,
-    losses: &DirectionLosses,
-) -> BTreeSet<DirectionCell> {
-    cells.remove(&first);
-    let mut all = vec![first];
-    let mut at = 0;
-    while at < all.len() {
-        let here = all[at];
-        at += 1;
-        all.extend(SIDES.into_iter().filter_map(|side| next(losses, here, side)).filter(|c| cells.remove(c)));
-    }
-    all.into_iter().collect()
 }
 
 /// Whether losses are small on all sides of a patch. Below it the field of view may end, but not above, where scenes

@@ -5,6 +5,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity, Unit};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
 use crate::inference::choice::total_and_z;
+use crate::inference::gain_of_count;
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
 
@@ -91,7 +92,7 @@ fn difference(frame: &FramePair) -> f64 {
 /// Gain of a frame by its own share of second returns over that of the other side, nats.
 fn gain(frame: &FramePair) -> f64 {
     let [measured, simulated] = shares(frame).map(|share| share.max(BY_CHANCE));
-    frame.second[0] * (measured / simulated).ln() - frame.measured.len() as f64 * (measured - simulated)
+    gain_of_count(frame.second[0], frame.measured.len() as f64, measured, simulated)
 }
 
 /// Share of the shots with a second return, frame by frame.

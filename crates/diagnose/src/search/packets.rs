@@ -6,6 +6,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
 use crate::inference::choice::total_and_z;
+use crate::inference::gain_of_count;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
 use rayon::prelude::*;
@@ -30,7 +31,7 @@ const DARK: f64 = 0.1;
 /// dark for another reason.
 const USUALLY_SEEN: f64 = 0.5;
 
-/// Smallest share of returns that is reported: as for any loss.
+/// Smallest share of returns that is reported: one in a thousand.
 const FLOOR: f64 = 1e-3;
 
 /// Fewest dark bins, and fewest frames with some.
@@ -135,7 +136,7 @@ impl Packets {
         });
         let gain = |&i: &usize| {
             let [dark, all] = number(&self.sides[0], i);
-            dark * (lost / lacking).ln() - all * (lost - lacking)
+            gain_of_count(dark, all, lost, lacking)
         };
         test.iter().map(gain).collect()
     }

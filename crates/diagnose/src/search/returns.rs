@@ -10,6 +10,7 @@ use crate::catalogue::{Cause, Channel, Quantity, Unit};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Minimum, Parameter};
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
+use crate::inference::gain_of_count;
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::roles::Role;
 
@@ -234,7 +235,7 @@ fn share_of(more: f64, each: &[f64]) -> Parameter {
 /// Gain of a frame's count, nats.
 fn gain(frame: &OddFrame, k: usize, base: f64, more: f64) -> f64 {
     let rate = (base + more).max(0.05 * base);
-    frame.counts[k][0] * (rate / base).ln() - frame.all[0] * (rate - base)
+    gain_of_count(frame.counts[k][0], frame.all[0], rate, base)
 }
 
 /// Kullback-Leibler distance of a frame's count from the simulated share, and from that with the excess, nats.
