@@ -1,6 +1,7 @@
 //! `cargo xtask fuzz`: tests all file readers with damaged files. A reader must return valid data or an error. It must
 //! not panic, hang, or allocate far more memory than the file size justifies.
 
+mod recordings;
 mod scenes;
 mod shards;
 mod targets;

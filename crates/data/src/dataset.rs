@@ -322,7 +322,8 @@ impl Dataset {
 
 /// Whether a file is itself a data set.
 fn is_recording(path: &Path) -> bool {
-    path.extension().is_some_and(|e| e == "mcap")
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    [".mcap", ".db3", ".mcap.zstd", ".db3.zstd"].iter().any(|ending| name.ends_with(ending))
 }
 
 fn text_path(folder: &Path, id: &str) -> PathBuf {

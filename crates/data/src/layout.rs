@@ -1,6 +1,7 @@
 //! Layouts: how the frames of a data set are stored on disk. A new layout is a file in this folder and a line in
 //! `layouts!`.
 
+mod bag;
 mod feather;
 mod file_names;
 mod file_per_frame;
@@ -66,6 +67,7 @@ layouts! {
     OpenPcdet = open_pcdet: "OpenPCDet's custom data: `points/*.npy` and `labels/*.txt` (`x y z dx dy dz heading name`).";
     Carla = carla: "`*.ply` that CARLA's LiDARs wrote, y negated, and `label/*.txt` in the LiDAR frame.";
     Mcap = mcap_file: "Clouds of a topic of an MCAP file (ROS 2): `root = \"drive.mcap#/topic\"`; read only.";
+    Db3 = db3: "Clouds of a topic of a recording of rosbag2 in SQLite: `root = \"drive_0.db3#/topic\"`; read only.";
     S2rDad = s2r_dad: "`data/pcl/*.pcd` and `data/label/*.txt`, without calibration.";
     Shards = shards: "Frames in `shards/*.tar`, as `convert --to shards` writes them: members `ID.bin` or `ID.pcd`, `ID.txt`.";
 }

@@ -107,6 +107,7 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
     }
     targets.extend(super::scenes::targets(folder)?);
     targets.extend(super::shards::targets(folder)?);
+    targets.extend(super::recordings::targets(folder)?);
     targets.extend(run_folder(&folder.join("run"))?);
     Ok(targets)
 }

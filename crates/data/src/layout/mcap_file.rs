@@ -1,231 +1,187 @@
-//! MCAP files of ROS 2 with `sensor_msgs/msg/PointCloud2` in CDR. Read only.
-//!
-//! The root of the data set is the file, or a folder with one file (rosbag2), and behind a `#` the topic:
-//! `drive.mcap#/front/points`. The topic may be left out if there is one with clouds. Frames are numbered in the order
-//! of their log times. Poses come from `/tf` and `/tf_static` or from odometry.
+//! MCAP files of ROS 2. They are read by ranges, so that their size does not matter.
 
-mod cdr;
-mod index;
-mod point_cloud2;
-mod transforms;
-
-use super::{DataLayout, Moment, PointDetails};
-use crate::cloud_file::check_cloud;
-use crate::{Cloud, DataError, DatasetConfig, LabelBox, Layout, PointColumns};
-use index::{Place, Recording};
-use std::collections::HashMap;
+use super::bag::{BagFile, Bags, Place, Topic, Visit};
+use crate::limits::MOST_CLOUD_BYTES;
+use crate::{DataError, Layout};
+use ::mcap::records::{ChunkIndex, Record, op};
+use ::mcap::sans_io::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
+use ::mcap::{McapError, Summary};
+use fs_err::File;
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::SystemTime;
-use transforms::Transforms;
 
 /// Clouds in MCAP files.
-pub(super) struct Mcap;
+#[allow(non_upper_case_globals, reason = "a line of `layouts!`")]
+pub(super) const Mcap: Bags = Bags {
+    layout: Layout::Mcap,
+    name: "mcap",
+    extension: "mcap",
+    markers: &["*.mcap (ROS 2)"],
+    open: |path| Ok(Box::new(Recording::open(path)?)),
+};
 
-/// Names of the types in ROS 2 and in bags that were converted from ROS 1.
-const CLOUD: &str = "sensor_msgs/msg/PointCloud2";
-const TF: &str = "tf2_msgs/msg/TFMessage";
-const ODOMETRY: &str = "nav_msgs/msg/Odometry";
-
-/// The clouds of one topic.
-struct Clouds {
-    recording: Recording,
-    channel: u16,
-    places: Vec<Place>,
+/// An open file with its summary.
+struct Recording {
+    path: PathBuf,
+    length: u64,
+    summary: Summary,
 }
 
-/// Files that are open, with what their index said, and when and how large they were.
-static OPEN: Mutex<Option<HashMap<PathBuf, Opened>>> = Mutex::new(None);
-
-/// Length, time of change and content.
-type Opened = (u64, Option<SystemTime>, Arc<Clouds>);
-
-impl DataLayout for Mcap {
-    fn name(&self) -> &'static str {
-        "mcap"
-    }
-
-    fn markers(&self) -> &'static [&'static str] {
-        &["*.mcap (ROS 2)"]
-    }
-
-    fn recognise(&self, folder: &Path) -> Option<DatasetConfig> {
-        file_and_topic(folder).ok()?;
-        Some(DatasetConfig { layout: Layout::Mcap, root: folder.into(), ..DatasetConfig::default() })
-    }
-
-    fn check_root(&self, root: &Path) -> Result<(), DataError> {
-        clouds(root).map(drop)
-    }
-
-    fn frame_ids(&self, root: &Path) -> Result<Vec<String>, DataError> {
-        Ok((0..clouds(root)?.places.len()).map(|i| format!("{i:06}")).collect())
-    }
-
-    fn cloud_path(&self, root: &Path, _id: &str) -> PathBuf {
-        file_and_topic(root).map_or_else(|_| root.into(), |(file, _)| file)
-    }
-
-    fn labels_path(&self, root: &Path, id: &str) -> PathBuf {
-        self.cloud_path(root, id).with_extension("labels").join(format!("{id}.txt"))
-    }
-
-    fn has_cloud(&self, root: &Path, id: &str) -> bool {
-        clouds(root).is_ok_and(|clouds| clouds.place(root, id).is_ok())
-    }
-
-    fn has_labels(&self, _root: &Path) -> bool {
-        false
-    }
-
-    /// From the first cloud.
-    fn has_intensity(&self, root: &Path) -> Result<bool, DataError> {
-        Ok(clouds(root)?.read(root, "000000")?.channels == 4)
-    }
-
-    fn read_cloud(&self, root: &Path, id: &str, columns: PointColumns) -> Result<Cloud, DataError> {
-        let message = clouds(root)?.read(root, id)?;
-        let cloud = Cloud { values: message.values, channels: message.channels };
-        check_cloud(&cloud, &frame_path(root, id))?;
-        Ok(if cloud.channels > columns.channels() { cloud.with_channels(columns.channels()) } else { cloud })
-    }
-
-    fn read_labels(&self, _root: &Path, _id: &str) -> Result<Vec<LabelBox>, DataError> {
-        Ok(Vec::new())
-    }
-
-    fn moments(&self, root: &Path, ids: &[String]) -> Result<Vec<Moment>, DataError> {
-        let clouds = clouds(root)?;
-        let transforms = clouds.transforms()?;
-        let mut moments = Vec::new();
-        let start_ns = clouds.header(root, "000000")?.stamp_ns;
-        for id in ids {
-            let header = clouds.header(root, id)?;
-            moments.push(Moment {
-                stamp_s: Some((header.stamp_ns - start_ns) as f64 * 1e-9),
-                world_from_lidar: transforms.world_from(&header.frame, header.stamp_ns),
-                ..Moment::of(id)
-            });
+impl Recording {
+    /// # Errors
+    /// A file that is no MCAP, has no summary (as after a crash of the recorder), or whose index points outside.
+    fn open(path: &Path) -> Result<Recording, DataError> {
+        let wrong = |e: &dyn std::fmt::Display| {
+            let advice = "if its recorder crashed, `mcap recover` writes a complete file";
+            DataError::file(path, format!("is no complete MCAP file: {e}; {advice}"))
+        };
+        let length = fs_err::metadata(path)?.len();
+        let mut file = File::open(path)?;
+        let options = SummaryReaderOptions::default().with_file_size(length);
+        let mut reader = SummaryReader::new_with_options(options);
+        while let Some(event) = reader.next_event() {
+            match event.map_err(|e| wrong(&e))? {
+                SummaryReadEvent::ReadRequest(n) => {
+                    let read = file.read(reader.insert(n.min(1 << 24)))?;
+                    reader.notify_read(read);
+                }
+                SummaryReadEvent::SeekRequest(to) => reader.notify_seeked(file.seek(to)?),
+            }
         }
-        Ok(moments)
+        let summary = reader.finish().ok_or_else(|| wrong(&"it has no summary"))?;
+        for chunk in &summary.chunk_indexes {
+            let end = chunk.chunk_start_offset.checked_add(chunk.chunk_length);
+            let inside = end.is_some_and(|end| end <= length) && chunk.chunk_length >= 9;
+            if !inside || chunk.chunk_length > MOST_CLOUD_BYTES || chunk.uncompressed_size > MOST_CLOUD_BYTES {
+                return Err(wrong(&"its index names a chunk that lies outside or is too large"));
+            }
+        }
+        Ok(Recording { path: path.into(), length, summary })
     }
 
-    fn read_point_details(&self, root: &Path, id: &str) -> Result<PointDetails, DataError> {
-        let message = clouds(root)?.read(root, id)?;
-        Ok(PointDetails { ring: message.ring, time_s: message.time_s, ..PointDetails::default() })
-    }
-}
-
-impl Clouds {
-    fn place(&self, root: &Path, id: &str) -> Result<Place, DataError> {
-        let number = id.parse::<usize>().ok().filter(|n| format!("{n:06}") == id);
-        let place = number.and_then(|n| self.places.get(n)).copied();
-        place.ok_or_else(|| {
-            DataError::file(root, format!("has no frame {id:?}; there are {} from 000000", self.places.len()))
-        })
+    fn wrong(&self, message: impl std::fmt::Display) -> DataError {
+        DataError::file(&self.path, message.to_string())
     }
 
-    fn bytes(&self, root: &Path, id: &str) -> Result<Vec<u8>, DataError> {
-        self.recording.message(self.channel, self.place(root, id)?)
+    fn range(&self, start: u64, length: u64) -> Result<Vec<u8>, DataError> {
+        if start.checked_add(length).is_none_or(|end| end > self.length) || length > MOST_CLOUD_BYTES {
+            return Err(self.wrong("its index points outside of the file"));
+        }
+        let mut file = File::open(&self.path)?;
+        file.seek(SeekFrom::Start(start))?;
+        let mut bytes = vec![0; length as usize];
+        file.read_exact(&mut bytes)?;
+        Ok(bytes)
     }
 
-    fn read(&self, root: &Path, id: &str) -> Result<point_cloud2::Message, DataError> {
-        let wrong = |e| DataError::file(root, format!("frame {id}: its PointCloud2 cannot be read: {e}"));
-        point_cloud2::parse(&self.bytes(root, id)?).map_err(wrong)
-    }
-
-    fn header(&self, root: &Path, id: &str) -> Result<cdr::Header, DataError> {
-        let wrong = |e| DataError::file(root, format!("frame {id}: its PointCloud2 cannot be read: {e}"));
-        point_cloud2::header(&self.bytes(root, id)?).map_err(wrong)
-    }
-
-    fn transforms(&self) -> Result<Transforms, DataError> {
-        let of = |kind: &str| self.recording.topics(kind);
-        let (tf, odometry) = (of(TF), of(ODOMETRY));
-        let fixed: Vec<u16> = tf.iter().filter(|t| t.name.ends_with("tf_static")).map(|t| t.channel).collect();
-        let moving: Vec<u16> = tf.iter().map(|t| t.channel).collect();
-        let odometry: Vec<u16> = odometry.iter().map(|t| t.channel).collect();
-        let mut transforms = Transforms::default();
-        self.recording.all(&moving, |channel, data| transforms.add_tf(data, fixed.contains(&channel)))?;
-        // What `/tf` says stands; odometry adds what it does not say.
-        self.recording.all(&odometry, |_, data| transforms.add_odometry(data))?;
-        Ok(transforms)
-    }
-}
-
-/// What error messages name for a frame.
-fn frame_path(root: &Path, id: &str) -> PathBuf {
-    PathBuf::from(format!("{} frame {id}", root.display()))
-}
-
-/// The file of a root, and the topic if it names one.
-fn file_and_topic(root: &Path) -> Result<(PathBuf, Option<String>), DataError> {
-    let text = root.to_string_lossy();
-    let (place, topic) = match text.split_once('#') {
-        Some((place, topic)) if !root.exists() => (Path::new(place), Some(topic.to_string())),
-        _ => (root, None),
-    };
-    let is_mcap = |path: &Path| path.extension().is_some_and(|e| e == "mcap") && path.is_file();
-    if is_mcap(place) {
-        return Ok((place.into(), topic));
-    }
-    let mut files = Vec::new();
-    if place.is_dir() {
-        for entry in fs_err::read_dir(place)? {
-            files.push(entry?.path());
+    /// Log times and offsets of a message index record.
+    fn message_index(&self, offset: u64, channel: u16) -> Result<Vec<(u64, u64)>, DataError> {
+        let head = self.range(offset, 9)?;
+        let length = head[1..9].iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
+        if head[0] != op::MESSAGE_INDEX {
+            return Err(self.wrong("its index points to no index of messages"));
+        }
+        let body = self.range(offset + 9, length)?;
+        match ::mcap::parse_record(op::MESSAGE_INDEX, &body).map_err(|e| self.wrong(e))? {
+            Record::MessageIndex(index) if index.channel_id == channel => {
+                Ok(index.records.iter().map(|r| (r.log_time, r.offset)).collect())
+            }
+            _ => Err(self.wrong("its index points to the messages of another topic")),
         }
     }
-    files.retain(|path| is_mcap(path));
-    files.sort();
-    match &files[..] {
-        [file] => Ok((file.clone(), topic)),
-        [] => Err(DataError::file(place, "is no .mcap file and has none: check `root` and `layout` of the data set")),
-        several => {
-            let names: Vec<String> = several.iter().map(|f| f.display().to_string()).collect();
-            Err(DataError::file(place, format!("has several .mcap files; name one as `root`: {}", names.join(", "))))
+
+    fn looked_through(&self, chunk: &ChunkIndex, channel: u16) -> Result<Vec<(u64, u64)>, DataError> {
+        let mut found = Vec::new();
+        self.each(chunk, |id, log_time, _| {
+            if id == channel {
+                found.push((log_time, found.len() as u64));
+            }
+        })?;
+        Ok(found)
+    }
+
+    /// Calls `visit` with channel, log time and data of the messages of a chunk. It is read to its end, where its
+    /// checksum is compared.
+    fn each(&self, chunk: &ChunkIndex, mut visit: impl FnMut(u16, u64, &[u8])) -> Result<(), DataError> {
+        let wrong = |e: McapError| self.wrong(format!("a chunk of it cannot be read: {e}"));
+        let bytes = self.range(chunk.chunk_start_offset + 9, chunk.chunk_length - 9)?;
+        let Record::Chunk { header, data } = ::mcap::parse_record(op::CHUNK, &bytes).map_err(wrong)? else {
+            return Err(self.wrong("its index points to no chunk"));
+        };
+        if header.uncompressed_size > MOST_CLOUD_BYTES {
+            return Err(self.wrong("a chunk of it is larger than 2 GiB"));
         }
+        for record in ::mcap::read::ChunkReader::new(header, &data).map_err(wrong)? {
+            if let Record::Message { header, data } = record.map_err(wrong)? {
+                visit(header.channel_id, header.log_time, &data);
+            }
+        }
+        Ok(())
     }
 }
 
-/// The clouds of a root, from the files that are open.
-fn clouds(root: &Path) -> Result<Arc<Clouds>, DataError> {
-    let (file, topic) = file_and_topic(root)?;
-    let metadata = fs_err::metadata(&file)?;
-    let (length, changed) = (metadata.len(), metadata.modified().ok());
-    let mut open = OPEN.lock().unwrap_or_else(PoisonError::into_inner);
-    let open = open.get_or_insert_with(HashMap::new);
-    if let Some((l, c, clouds)) = open.get(root)
-        && (*l, *c) == (length, changed)
-    {
-        return Ok(clouds.clone());
+impl BagFile for Recording {
+    fn topics(&self) -> Vec<Topic> {
+        let topic = |(number, channel): (&u16, &std::sync::Arc<::mcap::Channel<'static>>)| Topic {
+            channel: i64::from(*number),
+            name: channel.topic.clone(),
+            kind: channel.schema.as_ref().map(|s| s.name.clone()).unwrap_or_default(),
+            encoding: channel.message_encoding.clone(),
+        };
+        self.summary.channels.iter().map(topic).collect()
     }
-    let recording = Recording::open(&file)?;
-    let topics = recording.topics(CLOUD);
-    let listed = || topics.iter().map(|t| format!("{}#{}", file.display(), t.name)).collect::<Vec<_>>().join(", ");
-    let chosen = match (&topic, &topics[..]) {
-        (_, []) => return Err(DataError::file(&file, format!("has no topic with {CLOUD}"))),
-        (None, [one]) => one,
-        (None, _) => {
-            let message = format!("has several topics with clouds; choose one of {}", listed());
-            return Err(DataError::file(&file, message));
+
+    fn places(&self, channel: i64) -> Result<Vec<Place>, DataError> {
+        let channel = number(channel);
+        let mut places = Vec::new();
+        for (chunk, index) in self.summary.chunk_indexes.iter().enumerate() {
+            let mut entries = match index.message_index_offsets.get(&channel) {
+                Some(offset) => self.message_index(*offset, channel)?,
+                // A chunk without an index has to be looked through.
+                None if index.message_index_offsets.is_empty() => self.looked_through(index, channel)?,
+                None => continue,
+            };
+            entries.sort_by_key(|(_, offset)| *offset);
+            let time = |log_time: u64| i64::try_from(log_time).unwrap_or(i64::MAX);
+            places.extend((0..).zip(entries).map(|(number, (at, _))| Place { log_time: time(at), chunk, number }));
         }
-        (Some(name), _) => topics
-            .iter()
-            .find(|t| t.name == *name)
-            .ok_or_else(|| DataError::file(&file, format!("has no topic {name:?} with clouds; it has {}", listed())))?,
-    };
-    if chosen.encoding != "cdr" {
-        let message = format!("its topic {} has the encoding {:?}; cdr is read", chosen.name, chosen.encoding);
-        return Err(DataError::file(&file, message));
+        Ok(places)
     }
-    let places = recording.places(chosen.channel)?;
-    if places.is_empty() {
-        return Err(DataError::file(&file, format!("its topic {} has no message", chosen.name)));
+
+    fn message(&self, channel: i64, place: Place) -> Result<Vec<u8>, DataError> {
+        let channel = number(channel);
+        let (mut number, mut found) = (0, None);
+        self.each(&self.summary.chunk_indexes[place.chunk], |id, _, data| {
+            if id == channel {
+                if number == place.number {
+                    found = Some(data.to_vec());
+                }
+                number += 1;
+            }
+        })?;
+        found.ok_or_else(|| self.wrong("a message of its index does not exist"))
     }
-    let clouds = Arc::new(Clouds { channel: chosen.channel, places, recording });
-    open.insert(root.into(), (length, changed, clouds.clone()));
-    Ok(clouds)
+
+    fn all(&self, channels: &[i64], visit: &mut Visit) -> Result<(), DataError> {
+        let channels: Vec<u16> = channels.iter().map(|channel| number(*channel)).collect();
+        for chunk in &self.summary.chunk_indexes {
+            let offsets = &chunk.message_index_offsets;
+            if !offsets.is_empty() && channels.iter().all(|c| !offsets.contains_key(c)) {
+                continue;
+            }
+            let mut result = Ok(());
+            self.each(chunk, |id, _, data| {
+                if channels.contains(&id) && result.is_ok() {
+                    result = visit(i64::from(id), data);
+                }
+            })?;
+            result.map_err(|e| self.wrong(format!("a message of it cannot be read: {e}")))?;
+        }
+        Ok(())
+    }
 }
 
-#[cfg(test)]
-mod tests;
+/// The number of a channel that [`Recording::topics`] returned.
+fn number(channel: i64) -> u16 {
+    u16::try_from(channel).expect("a channel of this file")
+}

@@ -1,6 +1,7 @@
 //! MCAP files that the crate `mcap` writes, with messages encoded here.
 
 use super::*;
+use crate::layout::mcap_file::Mcap;
 use ::mcap::records::MessageHeader;
 use ::mcap::{Compression, WriteOptions, Writer};
 use std::collections::BTreeMap;
