@@ -1,4 +1,4 @@
-"""Times training steps of the networks, inference and the costliest layers in PyTorch on the CPU, on made-up inputs of given sizes.
+"""Times training steps of the networks, inference and the costliest layers in PyTorch, on made-up inputs of given sizes.
 
 Reads the report of `lidarshift-checks bench-step --json` and builds the same network from the configuration in it, so that both sides have the
 same layers, the same number of points and the same number of pillars. Prints one line of JSON.
@@ -20,6 +20,7 @@ def main():
     parser.add_argument("--form", choices=["openpcdet", "best"], default="openpcdet")
     parser.add_argument("--threads", type=int, required=True)
     parser.add_argument("--steps", type=int, required=True)
+    parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     arguments = parser.parse_args()
     with open(arguments.report) as file:
         report = json.load(file)
@@ -28,6 +29,8 @@ def main():
 
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
+    torch.set_default_device(arguments.device)
+    wait = torch.cuda.synchronize if arguments.device == "cuda" else lambda: None
     config = report["config"]
     if config["network"]["kind"] == "pointpillars":
         import pointpillars
@@ -54,10 +57,12 @@ def main():
     for i in range(arguments.steps + 2):  # two to warm up
         begin = time.perf_counter()
         step()
+        wait()
         if i >= 2:
             times_ms.append(1e3 * (time.perf_counter() - begin))
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    json.dump({"torch": torch.__version__, "whole_ms": times_ms, "peak_mib": peak_mib}, sys.stdout)
+    device_mib = torch.cuda.max_memory_reserved() >> 20 if arguments.device == "cuda" else None
+    json.dump({"torch": torch.__version__, "whole_ms": times_ms, "peak_mib": peak_mib, "device_mib": device_mib}, sys.stdout)
     print()
 
 

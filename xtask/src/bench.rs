@@ -1,5 +1,6 @@
 //! `cargo xtask bench [NAME]`: benchmarks of the crates, and training steps compared with PyTorch.
 
+use crate::bench_gpu::bench_gpu;
 use crate::bench_kills::bench_kills;
 use crate::bench_mutants::bench_mutants;
 use crate::bench_train::bench_train;
@@ -12,12 +13,15 @@ use std::path::Path;
 const GENERATORS: &[&str] = &["blind", "town"];
 
 /// Runs the benchmark `name`, the benchmarks of the crate folder `name`, the comparison of training steps with PyTorch
-/// (`train`; `args` are parts of the row ids), the blind cases with mutated diagnosis code (`mutants`), commands that
+/// (`train`; `args` are parts of the row ids), the networks on the GPU of this machine (`gpu`), the blind cases with mutated diagnosis code (`mutants`), commands that
 /// are ended by signals (`kills`), or all benchmarks of the crates. Pairs with hidden differences (`blind`, `loop`,
 /// `town`) run only by name.
 pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     if name == Some("train") {
         return bench_train(root, args);
+    }
+    if name == Some("gpu") {
+        return bench_gpu(root, args);
     }
     if name == Some("mutants") {
         return bench_mutants(root, args);
@@ -52,7 +56,7 @@ pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
             }
         }
     }
-    known.extend(["kills".into(), "mutants".into(), "train".into()]);
+    known.extend(["gpu", "kills", "mutants", "train"].map(String::from));
     if !ran {
         bail!("no such benchmark; available: {}", known.join(", "));
     }

@@ -2,6 +2,7 @@
 //! is passed to the program `lidarshift`. Both programs are built in release.
 
 mod bench;
+mod bench_gpu;
 mod bench_kills;
 mod bench_mutants;
 mod bench_train;
@@ -50,12 +51,13 @@ enum Task {
     /// Write configs/schema.json and docs/src/reference/configuration.md from the Rust types.
     Schema,
     /// Run the benchmarks. NAME is a benchmark or a crate; further arguments go to Criterion. `bench train` compares
-    /// training steps with PyTorch; `bench mutants` runs the blind cases against a diagnosis with deliberate defects;
+    /// training steps with PyTorch; `bench gpu` times the networks on the GPU of this machine (`bench gpu -- --help`);
+    /// `bench mutants` runs the blind cases against a diagnosis with deliberate defects;
     /// `bench kills` ends commands by signals and repeats them;
     /// `bench loop -- --help` applies diagnoses to the simulated data and diagnoses again; `bench town -- --help`
     /// diagnoses pairs of the second generator.
     Bench {
-        /// A benchmark (`crates/*/benches/NAME.rs`), a crate folder, `train`, `mutants` or `kills`; default: all
+        /// A benchmark (`crates/*/benches/NAME.rs`), a crate folder, `gpu`, `train`, `mutants` or `kills`; default: all
         /// benchmarks of crates.
         name: Option<String>,
         /// Arguments for Criterion, such as `--quick` or a filter; for `train` and `mutants`: parts of the wanted ids;

@@ -75,6 +75,8 @@ struct Report {
     median_ms: Vec<(&'static str, f64)>,
     /// Peak resident memory of the process, MiB.
     peak_mib: Option<u64>,
+    /// Memory that the device has reserved at the end, MiB; `None` on the CPU.
+    device_mib: Option<u64>,
     config: DetectorConfig,
 }
 
@@ -98,6 +100,7 @@ impl BenchStepArgs {
             whole_ms: timed.stages.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
             median_ms: timed.stages.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
             peak_mib: train::memory::peak_mib(),
+            device_mib: device.memory_pool_usage().map(|usage| usage.bytes_reserved >> 20),
             detector: config.name.clone(),
             device: self.device.describe(),
             batch: self.batch,
@@ -119,6 +122,9 @@ impl BenchStepArgs {
         }
         if let Some(mib) = report.peak_mib {
             outln!("  peak memory {mib:>9} MiB");
+        }
+        if let Some(mib) = report.device_mib {
+            outln!("  on device   {mib:>9} MiB");
         }
         if let Some(path) = &self.json {
             data::write_json(path, &report)?;

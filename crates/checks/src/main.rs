@@ -7,7 +7,7 @@ mod schema;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};
-use lidarshift::errln;
+use lidarshift::{errln, outln};
 use std::process::ExitCode;
 
 /// Checks for developers.
@@ -26,6 +26,9 @@ enum Check {
     Fuzz(fuzz::FuzzArgs),
     /// Measure the time of each stage of a training step
     BenchStep(bench_step::BenchStepArgs),
+    /// Print the adapters of the device wgpu, and the features of this program, as JSON
+    #[command(hide = true)]
+    Adapters,
     /// Write the JSON schema and the Markdown reference of the configuration files
     Schema(schema::SchemaArgs),
 }
@@ -37,6 +40,16 @@ impl Check {
             Check::Parity(args) => args.run(),
             Check::Fuzz(args) => args.run(),
             Check::BenchStep(args) => args.run().map(|()| true),
+            Check::Adapters => {
+                let adapters = lidarshift::device::adapters();
+                let found = serde_json::json!({
+                    "build": data::build_id(),
+                    "features": lidarshift::FEATURES,
+                    "adapters": adapters,
+                });
+                outln!("{found}");
+                Ok(true)
+            }
             Check::Schema(args) => args.run().map(|()| true),
         }
     }
@@ -45,6 +58,7 @@ impl Check {
 fn main() -> ExitCode {
     // SAFETY: no other thread runs yet.
     unsafe { lidarshift::allocator::keep_memory() };
+    lidarshift::name_build();
     let code = match Program::parse().check.run() {
         Ok(true) => 0,
         Ok(false) => 1,

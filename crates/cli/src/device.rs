@@ -6,6 +6,8 @@ use clap::{Args, ValueEnum};
 use kernels::InstructionSet;
 use models::kernel_ops::{Kernels, choose_kernels};
 use models::layers::{Precision, choose_precision};
+use serde::Serialize;
+use study::GPU_VARIABLE;
 
 /// The device on which the network runs, its kernels and the precision.
 #[derive(Args, Clone, Debug)]
@@ -85,6 +87,12 @@ impl DeviceArgs {
         arguments
     }
 
+    /// The cards of this machine, by the names that [`GPU_VARIABLE`] takes. None for other devices than `wgpu`, and if
+    /// the variable chooses one already.
+    pub fn gpus(&self) -> Vec<String> {
+        if self.device != "wgpu" || std::env::var_os(GPU_VARIABLE).is_some() { Vec::new() } else { cards() }
+    }
+
     /// Device, kernels and precision as text.
     pub fn describe(&self) -> String {
         match (self.device.as_str(), self.kernels) {
@@ -127,6 +135,47 @@ fn wgpu() -> Result<Device> {
         bail!("no adapter for wgpu: no Vulkan, Metal or DirectX 12 driver was found; use --device flex");
     }
     Ok(Device::wgpu(DeviceKind::DefaultDevice))
+}
+
+/// What computes behind the device `wgpu`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Adapter {
+    /// Its own name for itself.
+    pub name: String,
+    /// Whether it is a card. A rasteriser in software is none.
+    pub is_gpu: bool,
+}
+
+/// The adapters that the device `wgpu` finds on this machine; none without the feature `wgpu`.
+#[cfg(feature = "wgpu")]
+pub fn adapters() -> Vec<Adapter> {
+    let identities = Device::enumerate(burn::tensor::DeviceType::Wgpu).into_iter().filter_map(|d| d.identity());
+    identities.map(|found| Adapter { name: found.name, is_gpu: found.physical.is_some() }).collect()
+}
+
+/// The adapters that the device `wgpu` finds on this machine; none without the feature `wgpu`.
+#[cfg(not(feature = "wgpu"))]
+pub fn adapters() -> Vec<Adapter> {
+    Vec::new()
+}
+
+/// Names of the cards that `wgpu` finds, such as `DiscreteGpu(0)`, without opening them.
+#[cfg(feature = "wgpu")]
+fn cards() -> Vec<String> {
+    let devices = Device::enumerate(burn::tensor::DeviceType::Wgpu);
+    devices.into_iter().filter_map(|device| card_in(&format!("{device:?}"))).collect()
+}
+
+/// burn names the kind of a device in its debugging output only.
+#[cfg(feature = "wgpu")]
+fn card_in(text: &str) -> Option<String> {
+    let found = &text[text.find("DiscreteGpu(")?..];
+    Some(found[..=found.find(')')?].into())
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn cards() -> Vec<String> {
+    Vec::new()
 }
 
 #[cfg(not(feature = "wgpu"))]

@@ -65,8 +65,24 @@ pub fn run() -> ExitCode {
     ExitCode::from(run_with(std::env::args_os().collect()))
 }
 
-/// Names the commit of the checkout that this program was built from, if there was one. [`run_with`] does so as well.
-pub fn set_commit() {
+/// The features of cargo that this program was built with, those that change what a device computes.
+pub const FEATURES: &[&str] = &[
+    #[cfg(feature = "wgpu")]
+    "wgpu",
+    #[cfg(feature = "vulkan")]
+    "vulkan",
+    #[cfg(feature = "cuda")]
+    "cuda",
+    #[cfg(feature = "fusion")]
+    "fusion",
+    #[cfg(feature = "autotune")]
+    "autotune",
+];
+
+/// Names the build of this program, for its results: the commit of the checkout that it was built from, if there was
+/// one, and [`FEATURES`]. [`run_with`] does so as well.
+pub fn name_build() {
+    data::set_features(FEATURES);
     if let Some(commit) = option_env!("LIDARSHIFT_COMMIT").filter(|commit| !commit.is_empty()) {
         data::set_commit(commit);
     }
@@ -89,7 +105,7 @@ fn parse(arguments: &[OsString]) -> Result<Program, clap::Error> {
 /// in which this one is contained: it handles signals from then on, and it is called once.
 pub fn run_with(arguments: Vec<OsString>) -> u8 {
     commands::set_called(&arguments);
-    set_commit();
+    name_build();
     signals::handle();
     let is_json = ErrorFormat::of(&arguments) == ErrorFormat::Json;
     let (code, report) = match parse(&arguments).map(|program| program.command.run()) {

@@ -125,7 +125,7 @@ impl SchedulingArgs {
             LauncherArg::Slurm => Launcher::Slurm,
         };
         let SchedulingArgs { dry_run, jobs, replace, sbatch, .. } = self;
-        RunOptions { steps, launcher, dry_run, jobs, replace, sbatch, device: device.arguments() }
+        RunOptions { steps, launcher, dry_run, jobs, replace, sbatch, device: device.arguments(), gpus: device.gpus() }
     }
 }
 

@@ -91,3 +91,33 @@ fn half_precision() {
         }
     }
 }
+
+/// Kernels that a training of each network runs on the device wgpu, by name: rows are gathered in both directions, and
+/// nothing is added or scattered row by row.
+#[test]
+fn a_training_on_a_gpu_gathers_only() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    for detector in ["tiny", "tiny_pointrcnn", "tiny_centerpoint"] {
+        let log = format!("{detector}.log");
+        let config = format!("[profiling.logger]\nlevel = \"minimal\"\nfile = \"{log}\"\n");
+        std::fs::write(dir.path().join("cubecl.toml"), config).unwrap();
+        let output = run(
+            dir.path(),
+            &format!("train --dataset . --detector {detector}.toml --epochs 2 --device wgpu --out {detector}"),
+        );
+        let text = output_text(&output);
+        if ["was built without the feature", "no adapter"].iter().any(|reason| text.contains(reason)) {
+            eprintln!("not tested: {}", text.trim());
+            return;
+        }
+        assert!(output.status.success(), "{text}");
+        let kernels = std::fs::read_to_string(dir.path().join(&log)).unwrap();
+        let count = |name: &str| kernels.lines().filter(|line| line.contains(name)).count();
+        assert!(count("select_kernel") > 10, "{detector}: the log has no gathers");
+        for kernel in ["select_assign", "scatter"] {
+            assert_eq!(count(kernel), 0, "{detector}: {kernel}");
+        }
+        eprintln!("{detector}: {} kernels", kernels.lines().count());
+    }
+}

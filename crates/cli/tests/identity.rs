@@ -120,6 +120,29 @@ fn results_name_the_build() {
 }
 
 #[test]
+fn a_run_records_the_features_of_the_program() {
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    must(dir.path(), TRAIN);
+    let text = fs::read(dir.path().join("run/provenance.json")).unwrap();
+    let provenance: serde_json::Value = serde_json::from_slice(&text).unwrap();
+    let built = [
+        ("wgpu", cfg!(feature = "wgpu")),
+        ("vulkan", cfg!(feature = "vulkan")),
+        ("cuda", cfg!(feature = "cuda")),
+        ("fusion", cfg!(feature = "fusion")),
+        ("autotune", cfg!(feature = "autotune")),
+    ];
+    let built: Vec<&str> = built.into_iter().filter(|(_, is_built)| *is_built).map(|(name, _)| name).collect();
+    assert_eq!(provenance["sessions"][0]["features"], serde_json::json!(built));
+    for device in ["wgpu", "cuda"] {
+        let output = run(dir.path(), &format!("{TRAIN}-{device} --device {device}"));
+        let is_absent = output_text(&output).contains(&format!("was built without the feature `{device}`"));
+        assert_eq!(is_absent, !built.contains(&device), "{}", output_text(&output));
+    }
+}
+
+#[test]
 fn a_damaged_checkpoint_is_replaced_by_the_one_before_it() {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());

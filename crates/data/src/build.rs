@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::OnceLock;
 
 static COMMIT: OnceLock<&'static str> = OnceLock::new();
+static FEATURES: OnceLock<&'static [&'static str]> = OnceLock::new();
 static FILE: OnceLock<PathBuf> = OnceLock::new();
 
 /// Digits of a hash of the program in a build id.
@@ -13,6 +14,16 @@ const DIGITS: usize = 12;
 /// Names the commit that the program was built from. Programs call this once, before they write anything.
 pub fn set_commit(commit: &'static str) {
     COMMIT.get_or_init(|| commit);
+}
+
+/// Names the features of cargo that the program was built with. Programs call this once, before they write anything.
+pub fn set_features(features: &'static [&'static str]) {
+    FEATURES.get_or_init(|| features);
+}
+
+/// The features of cargo that this program was built with.
+pub fn features() -> &'static [&'static str] {
+    FEATURES.get().copied().unwrap_or_default()
 }
 
 /// Names the file that has the code of this program, where that is not the executable of the process: a library of an

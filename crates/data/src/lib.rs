@@ -44,7 +44,7 @@ pub mod toml_text;
 pub mod write;
 
 pub use augment::{AugmentConfig, augment};
-pub use build::{build_id, program_sha256, set_commit, set_program_file};
+pub use build::{build_id, features, program_sha256, set_commit, set_features, set_program_file};
 pub use calibration::Calibration;
 pub use cloud_file::{FARTHEST_M, PointColumns, parse_bin, read_cloud};
 pub use dataset::{Dataset, parse_split};

@@ -8,6 +8,7 @@
 
 pub mod adam;
 pub mod append_maximum;
+mod background;
 pub mod batch_norm;
 mod blocks;
 pub mod canvas;

@@ -1,5 +1,6 @@
 //! Convolutions as products of small matrices, in blocks that fit the cache.
 
+use crate::background::Background;
 use crate::blocks::{Segment, TileGrid};
 use crate::scratch;
 use crate::tile::{PIXELS, Row, Tile, TileWork, dispatch_tiles, product, tile_rows, zeros};
@@ -84,11 +85,12 @@ pub(crate) fn run<C: Scheme>(scheme: &C, weights: &PackedWeights) {
         "weights were packed for another convolution"
     );
     let tile_rows = weights.tile_rows;
-    (0..scheme.grid().blocks()).into_par_iter().for_each(|block| {
+    (0..scheme.grid().blocks()).into_par_iter().for_each_init(Background::default, |background, block| {
         let lengths = [scheme.panel_rows() * PIXELS, products.len() * tile_rows * PIXELS];
         scratch::with(lengths, |[panel, sums]| {
             let (panel, sums) = (panel.as_chunks_mut().0, sums.as_chunks_mut().0);
-            dispatch_tiles(Block { scheme, products: &products, weights: &weights.values, block, panel, sums });
+            let weights = &weights.values;
+            dispatch_tiles(Block { scheme, products: &products, weights, block, panel, sums, background });
         });
     });
 }
@@ -100,6 +102,7 @@ struct Block<'a, C> {
     block: usize,
     panel: &'a mut [Row],
     sums: &'a mut [Row],
+    background: &'a mut Background,
 }
 
 impl<C: Scheme> TileWork for Block<'_, C> {
@@ -107,7 +110,7 @@ impl<C: Scheme> TileWork for Block<'_, C> {
 
     #[inline(always)]
     fn run<S: Simd, const R: usize, const V: usize>(self, simd: S) {
-        let Block { scheme, products, weights, block, panel, sums } = self;
+        let Block { scheme, products, weights, block, panel, sums, background } = self;
         let segments = scheme.grid().segments(block);
         let next = scheme.grid().segments(block + 1);
         for channel in 0..scheme.inputs() {
@@ -124,6 +127,14 @@ impl<C: Scheme> TileWork for Block<'_, C> {
             }
             return;
         }
+        let panel = &panel[..scheme.panel_rows()];
+        if let Some(sums) = background.find(panel) {
+            for (channel, sums) in sums.chunks_exact(products.len()).enumerate() {
+                scheme.write(simd, segments.list(), channel, |p| &sums[p]);
+            }
+            return;
+        }
+        let mut kept = background.begin(panel, scheme.outputs() * products.len());
         let mut weights = weights.as_chunks::<R>().0;
         for first in (0..scheme.outputs()).step_by(R) {
             for (p, range) in products.iter().enumerate() {
@@ -140,6 +151,9 @@ impl<C: Scheme> TileWork for Block<'_, C> {
             }
             for r in 0..R.min(scheme.outputs() - first) {
                 scheme.write(simd, segments.list(), first + r, |p| &sums[p * R + r]);
+                if let Some(kept) = &mut kept {
+                    kept.extend((0..products.len()).map(|p| sums[p * R + r]));
+                }
             }
         }
     }

@@ -15,6 +15,7 @@ pub mod named;
 pub mod onnx;
 pub mod point_ops;
 pub mod results;
+pub mod row_ops;
 pub mod suggest;
 
 mod architecture;

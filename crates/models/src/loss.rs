@@ -2,7 +2,7 @@
 
 use crate::kernel_ops::{self, focal_loss_sum};
 use burn::tensor::activation::{log_softmax, sigmoid};
-use burn::tensor::{Int, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 
 /// Sigmoid focal loss with alpha 0.25 and gamma 2, one value per entry.
 ///
@@ -78,8 +78,11 @@ pub fn add_sin_difference(pred: Tensor<2>, target: Tensor<2>) -> (Tensor<2>, Ten
 /// Cross entropy of each row.
 ///
 /// # Shapes
-/// `logits`: `[N, K]`; `target`: `[N]`; result `[N]`.
-pub fn cross_entropy(logits: Tensor<2>, target: Tensor<1, Int>) -> Tensor<1> {
-    let [n, _] = logits.dims();
-    -log_softmax(logits, 1).gather(1, target.reshape([n, 1])).reshape([n])
+/// `logits`: `[N, K]`; `target`: N columns; result `[N]`.
+pub fn cross_entropy(logits: Tensor<2>, target: &[usize]) -> Tensor<1> {
+    let ([n, classes], device) = (logits.dims(), logits.device());
+    let mut one_hot = vec![0f32; n * classes];
+    target.iter().enumerate().for_each(|(row, column)| one_hot[row * classes + column] = 1.0);
+    let one_hot = Tensor::<2>::from_data(TensorData::new(one_hot, [n, classes]), &device);
+    -(log_softmax(logits, 1) * one_hot).sum_dim(1).reshape([n])
 }

@@ -169,8 +169,8 @@ pub fn onnx_check(detector: &Detector, sample: &Sample) -> Result<NamedTensors, 
         }
         _ => return Err(refused(&detector.config().name)),
     };
-    insert(&mut out, "pillar_features", bev.pillar_features)?;
-    insert(&mut out, "spatial_features", bev.spatial_features)?;
+    insert(&mut out, "spatial_features", bev.canvas.image())?;
+    insert(&mut out, "pillar_features", bev.canvas.features)?;
     let max_points = match &detector.config().network {
         NetworkConfig::PointPillars(net) => net.pillars.max_points,
         NetworkConfig::CenterPoint(net) => net.pillars.max_points,

@@ -5,6 +5,7 @@ use data::stream;
 use lidarshift_models as models;
 use models::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, host};
 use models::point_ops::{Groups, Interpolation, group_max, interpolate};
+use models::row_ops::gather;
 use rand::RngExt;
 
 fn random(count: usize, seed: u64) -> Vec<f32> {
@@ -53,7 +54,7 @@ fn groups() -> Groups {
 #[test]
 fn gathering_and_maximum() {
     let groups = groups().to_device(&Device::flex().autodiff());
-    check([20, 3], |x| group_max(x.select(0, groups.source.clone()), &groups));
+    check([20, 3], |x| group_max(gather(x, &groups.source), &groups));
 }
 
 #[test]

@@ -34,7 +34,7 @@ pub use event::{Event, Listener};
 pub use folder::Study;
 pub use frozen::{FrozenState, detect_frozen};
 pub use json_forms::json_forms;
-pub use local::{free_mib, set_program};
+pub use local::{GPU_VARIABLE, free_mib, set_program};
 pub use plan::{PlanReport, Planned, ScatterFrom, plan};
 pub use present::write_report;
 pub use run_state::RunState;

@@ -23,19 +23,31 @@ pub struct LocalJobs {
     pub threads: usize,
     /// Command line arguments of the device for each process.
     pub device: Vec<String>,
+    /// Names of the GPUs among which the processes are divided; empty: each process chooses.
+    pub gpus: Vec<String>,
 }
+
+/// Environment variable that chooses the GPU of a process.
+pub const GPU_VARIABLE: &str = "CUBECL_WGPU_DEFAULT_DEVICE";
 
 /// Memory that is left free, MiB.
 const SPARE_MIB: u64 = 512;
 
 impl LocalJobs {
-    /// Limits the number of parallel runs to the number of cores and divides the cores among them.
-    pub fn by_cores(runs: usize, at_once: Option<usize>, device: &[String]) -> LocalJobs {
+    /// Limits the number of parallel runs to the number of GPUs or, on the CPU, of cores, and divides the cores among
+    /// them.
+    pub fn by_cores(runs: usize, at_once: Option<usize>, device: &[String], gpus: &[String]) -> LocalJobs {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        // An accelerator is used by one run at a time.
-        let most = if device.iter().any(|word| word == "wgpu" || word == "cuda") { 1 } else { cores };
+        // A GPU is used by one run at a time.
+        let is_gpu = device.iter().any(|word| word == "wgpu" || word == "cuda");
+        let most = if is_gpu { gpus.len().max(1) } else { cores };
         let at_once = at_once.unwrap_or(most.min(runs)).max(1);
-        LocalJobs { at_once, threads: (cores / at_once).max(1), device: device.to_vec() }
+        LocalJobs { at_once, threads: (cores / at_once).max(1), device: device.to_vec(), gpus: gpus.to_vec() }
+    }
+
+    /// The GPU with the fewest of the running processes, the first of equal ones.
+    fn free_gpu(&self, running: impl Iterator<Item = Option<usize>> + Clone) -> Option<usize> {
+        (0..self.gpus.len()).min_by_key(|&gpu| running.clone().filter(|used| *used == Some(gpu)).count())
     }
 
     /// Limits the number of parallel runs to what fits into the available memory.
@@ -60,6 +72,8 @@ pub fn free_mib() -> Option<u64> {
 struct Job<'a> {
     run: &'a StudyRun,
     child: Child,
+    /// Index of its GPU in [`LocalJobs::gpus`].
+    gpu: Option<usize>,
 }
 
 /// Executes all runs; returns the failed ones with the reasons. The processes exit when this process ends.
@@ -84,8 +98,10 @@ pub fn run_all(
             let free = waiting.iter().rposition(|run| !RunLock::is_held(&run.folder(&study.folder)));
             let Some(free) = free else { break };
             let run = waiting.remove(free);
-            note(format!("{run} started"));
-            running.push(Job { run, child: start(study, run, parts, jobs)? });
+            let gpu = jobs.free_gpu(running.iter().map(|job| job.gpu));
+            let name = gpu.map(|gpu| jobs.gpus[gpu].as_str());
+            note(format!("{run} started{}", name.map_or(String::new(), |name| format!(" on {name}"))));
+            running.push(Job { run, child: start(study, run, parts, jobs, name)?, gpu });
         }
         std::thread::sleep(Duration::from_millis(100));
         let mut unfinished = Vec::new();
@@ -110,7 +126,7 @@ pub fn run_all(
     Ok(failed)
 }
 
-fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> Result<Child> {
+fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs, gpu: Option<&str>) -> Result<Child> {
     let folder = run.folder(&study.folder);
     create_folder(&folder)?;
     let log = || fs_err::OpenOptions::new().create(true).append(true).open(folder.join("log.txt"));
@@ -118,6 +134,7 @@ fn start(study: &Study, run: &StudyRun, parts: &[RunPart], jobs: &LocalJobs) -> 
     command.arg("study-run").arg(&study.folder).args(["--attached", "--run", &run.to_string()]);
     command.args(["--parts", &parts_argument(parts)]).args(&jobs.device);
     command.env("RAYON_NUM_THREADS", jobs.threads.to_string());
+    command.envs(gpu.map(|gpu| (GPU_VARIABLE, gpu)));
     command.stdin(Stdio::piped()).stdout(log()?.into_file()).stderr(log()?.into_file());
     command.spawn().in_part(|| format!("{run} could not be started"))
 }
@@ -230,15 +247,26 @@ mod tests {
 
     #[test]
     fn memory_limits_the_number_of_parallel_runs() {
-        let jobs = LocalJobs { at_once: 4, threads: 1, device: Vec::new() };
+        let jobs = LocalJobs { at_once: 4, threads: 1, device: Vec::new(), gpus: Vec::new() };
         let cost = |peak_mib| {
             let cost = NetworkCost { step_s: 1.0, detection_s: 1.0, peak_mib, threads: 1, device: "flex".into() };
             Costs::from([("a".to_string(), cost)])
         };
         assert_eq!(jobs.clone().within_memory(&cost(1 << 40)).at_once, 1);
         assert_eq!(jobs.clone().within_memory(&cost(0)).at_once, 4);
-        assert_eq!(LocalJobs::by_cores(8, Some(3), &[]).at_once, 3);
-        assert_eq!(LocalJobs::by_cores(8, None, &["--device".into(), "wgpu".into()]).at_once, 1);
+        assert_eq!(LocalJobs::by_cores(8, Some(3), &[], &[]).at_once, 3);
+    }
+
+    #[test]
+    fn a_gpu_has_one_run() {
+        let (device, gpus) = (["--device", "wgpu"].map(String::from), ["a", "b", "c"].map(String::from));
+        let at_once = |runs, jobs, gpus: &[String]| LocalJobs::by_cores(runs, jobs, &device, gpus).at_once;
+        assert_eq!([at_once(8, None, &gpus), at_once(2, None, &gpus), at_once(8, None, &[])], [3, 2, 1]);
+        assert_eq!(at_once(8, Some(5), &gpus), 5, "as the user says");
+        let jobs = LocalJobs::by_cores(8, None, &device, &gpus);
+        let free = |running: &[usize]| jobs.free_gpu(running.iter().map(|&gpu| Some(gpu)));
+        assert_eq!([free(&[]), free(&[0, 2]), free(&[0, 1, 2])], [Some(0), Some(1), Some(0)]);
+        assert_eq!(LocalJobs { gpus: Vec::new(), ..jobs }.free_gpu([None].into_iter()), None);
     }
 
     #[test]

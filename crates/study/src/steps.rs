@@ -60,6 +60,8 @@ pub struct RunOptions {
     pub sbatch: Vec<String>,
     /// Command line arguments of the device for the process of a run.
     pub device: Vec<String>,
+    /// Names of this machine's GPUs for [`GPU_VARIABLE`](crate::GPU_VARIABLE), one run each; empty: one run at a time.
+    pub gpus: Vec<String>,
 }
 
 impl RunOptions {
@@ -73,6 +75,7 @@ impl RunOptions {
             replace: true,
             sbatch: Vec::new(),
             device,
+            gpus: Vec::new(),
         }
     }
 }
@@ -170,7 +173,7 @@ fn note_expected(
     options: &RunOptions,
     listener: Listener<'_>,
 ) -> Result<(LocalJobs, Costs)> {
-    let jobs = LocalJobs::by_cores(missing.len(), options.jobs, &options.device);
+    let jobs = LocalJobs::by_cores(missing.len(), options.jobs, &options.device, &options.gpus);
     let known = costs(study, missing, jobs.threads, (&options.device, options.dry_run), listener)?;
     let jobs = if options.jobs.is_some() { jobs } else { jobs.within_memory(&known) };
     note_costs(study, missing, &known, &jobs, listener)?;

@@ -204,21 +204,38 @@ pub struct GradientNorm {
 impl GradientNorm {
     /// The norm of the gradients of `module`, in one transfer from the device.
     pub fn of<M: Module>(module: &M, gradients: &GradientsParams, name_of: NameOf) -> Self {
+        GradientNorm::beside(None, module, gradients, name_of).0
+    }
+
+    /// The same and other values, in one transfer for both.
+    ///
+    /// # Shapes
+    /// `values`: `[V]`, f32, without autodiff graph; V values on the host, none without `values`.
+    pub fn beside<M: Module>(
+        values: Option<Tensor<1>>,
+        module: &M,
+        gradients: &GradientsParams,
+        name_of: NameOf,
+    ) -> (Self, Vec<f32>) {
+        let host = |tensor: Tensor<1>| tensor.into_data().try_into_vec::<f32>().expect("losses and gradients are f32");
         let mut visitor = FlatGradients { gradients, path: Vec::new(), names: Vec::new(), flat: Vec::new() };
         module.visit(&mut visitor);
         let FlatGradients { names, flat, .. } = visitor;
         if flat.is_empty() {
-            return GradientNorm { total: 0.0, not_finite: None };
+            return (GradientNorm { total: 0.0, not_finite: None }, values.map_or_else(Vec::new, host));
         }
         let name = |i: usize| name_of(&names[i]);
-        if let Some(values) = flat.iter().map(FlexValues::of).collect::<Option<Vec<_>>>() {
-            let norm = kernels::GradientNorm::of(&values.iter().map(FlexValues::as_slice).collect::<Vec<_>>());
-            return GradientNorm { total: norm.total, not_finite: norm.not_finite.map(name) };
+        if let Some(gradients) = flat.iter().map(FlexValues::of).collect::<Option<Vec<_>>>() {
+            let norm = kernels::GradientNorm::of(&gradients.iter().map(FlexValues::as_slice).collect::<Vec<_>>());
+            let norm = GradientNorm { total: norm.total, not_finite: norm.not_finite.map(name) };
+            return (norm, values.map_or_else(Vec::new, host));
         }
-        let sums = flat.into_iter().map(|gradient| gradient.clone().mul(gradient).sum()).collect();
-        let sums = Tensor::cat(sums, 0).into_data().try_into_vec::<f32>().expect("gradients are f32");
+        let parameters = flat.len();
+        let sums = flat.into_iter().map(|gradient| gradient.clone().mul(gradient).sum());
+        let mut sums = host(Tensor::cat(sums.chain(values).collect(), 0));
+        let values = sums.split_off(parameters);
         let not_finite = sums.iter().position(|s| !s.is_finite()).map(name);
-        GradientNorm { total: sums.iter().map(|&s| s as f64).sum::<f64>().sqrt(), not_finite }
+        (GradientNorm { total: sums.iter().map(|&s| s as f64).sum::<f64>().sqrt(), not_finite }, values)
     }
 
     /// Factor of the gradients that limits their norm to `max_norm`, as in `torch.nn.utils.clip_grad_norm_`.
@@ -429,5 +446,20 @@ mod tests {
         let gradients = GradientsParams::from_grads(loss.backward(), &toy);
         let norm = GradientNorm::of(&toy, &gradients, sequential_name);
         assert_eq!(norm.not_finite.as_deref(), Some("6.bias"));
+    }
+
+    #[test]
+    fn losses_are_read_beside_the_norm() {
+        #[expect(deprecated, reason = "it has no kernels")]
+        let ndarray = Device::ndarray();
+        for device in [Device::flex().autodiff(), ndarray.autodiff()] {
+            let toy = Toy::new(&device);
+            let loss = toy.forward(Tensor::<2>::ones([4, 6], &device)).sum();
+            let value: f32 = loss.clone().into_scalar();
+            let values = Tensor::cat(vec![loss.clone().inner(), loss.clone().inner() * 2.0], 0);
+            let gradients = GradientsParams::from_grads(loss.backward(), &toy);
+            let (norm, values) = GradientNorm::beside(Some(values), &toy, &gradients, sequential_name);
+            assert_eq!((norm, values), (GradientNorm::of(&toy, &gradients, sequential_name), vec![value, 2.0 * value]));
+        }
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::{RunConfig, TrainError};
 use data::checksum::file_sha256;
-use data::{build_id, program_sha256, write_json};
+use data::{build_id, features, program_sha256, write_json};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -53,6 +53,9 @@ pub struct SessionProvenance {
     pub command: Vec<String>,
     /// Build of the program: [`data::build_id`].
     pub version: String,
+    /// Features of cargo that the program was built with: [`data::features`]. Earlier versions have none.
+    #[serde(default)]
+    pub features: Vec<String>,
     /// SHA-256 of the program's file.
     pub program_sha256: Option<String>,
     /// Operating system and architecture.
@@ -77,6 +80,7 @@ impl SessionProvenance {
             began_unix_s: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |t| t.as_secs()),
             command: std::env::args_os().map(|argument| argument.to_string_lossy().into_owned()).collect(),
             version: build_id().into(),
+            features: features().iter().map(|feature| feature.to_string()).collect(),
             program_sha256: program_sha256().map(String::from),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
             processor: model.map(|(_, name)| name.trim().into()),

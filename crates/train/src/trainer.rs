@@ -3,7 +3,7 @@
 use crate::clock::{Clock, Step};
 use crate::error::without_panic;
 use crate::provenance::record_session;
-use crate::validation::loss_values;
+use crate::validation::{loss_names, loss_tensor};
 use crate::{
     Adam, Best, Checkpoint, DatasetProvenance, EpochMetrics, GradientNorm, OneCycle, RunConfig, RunFolder, RunState,
     SessionProvenance, StepMetrics, TrainError, TrainingFrames, ValidationMetrics, evaluate_detector,
@@ -268,22 +268,23 @@ impl<'a> Run<'a> {
 
     /// One step: forward, backward, clipping, update.
     fn learn(&mut self, batch: &[Sample], clock: &mut Clock) -> Result<Step, TrainError> {
-        let (losses, values) = clock.forward(|| {
-            let losses = self.detector.loss(batch)?;
-            loss_values(&losses).map(|values| (losses, values))
-        })?;
+        let losses = clock.forward(|| self.detector.loss(batch))?;
+        let scale = Precision::chosen().loss_scale();
+        // Losses and norm are read together: the device is waited for once a step.
+        let (gradients, norm, values) = clock.backward(|| {
+            let (names, values) = (loss_names(&losses), loss_tensor(&losses));
+            let loss = if scale == 1.0 { losses.total } else { losses.total * scale };
+            let gradients = GradientsParams::from_grads(loss.backward(), &self.detector.network);
+            let network = &self.detector.network;
+            let (mut norm, values) = GradientNorm::beside(Some(values), network, &gradients, reference_name);
+            norm.total /= scale;
+            let values: Vec<_> = names.into_iter().zip(values.into_iter().map(f64::from)).collect();
+            (gradients, norm, values)
+        });
         // The parts are checked before their sum, so that the message names the part.
         if let Some((name, _)) = values[1..].iter().chain(&values[..1]).find(|(_, value)| !value.is_finite()) {
             return Err(self.not_finite(format!("the loss {name}"), batch));
         }
-        let scale = Precision::chosen().loss_scale();
-        let (gradients, norm) = clock.backward(|| {
-            let loss = if scale == 1.0 { losses.total } else { losses.total * scale };
-            let gradients = GradientsParams::from_grads(loss.backward(), &self.detector.network);
-            let mut norm = GradientNorm::of(&self.detector.network, &gradients, reference_name);
-            norm.total /= scale;
-            (gradients, norm)
-        });
         if let Some(parameter) = norm.not_finite {
             return Err(self.not_finite(format!("the gradient of {parameter}"), batch));
         }

@@ -4,7 +4,8 @@ use crate::{TrainError, ValidationMetrics};
 use burn::tensor::Tensor;
 use data::{Dataset, Detection, prefetch, stream};
 use eval::{Difficulty, EvalFrame, EvalOptions, EvalReport, Metric, evaluate, reference_overlaps};
-use models::{Detector, Losses, ModelError, Prediction, Preparer, Sample, predict_frames};
+use models::layers::host;
+use models::{Detector, Losses, Prediction, Preparer, Sample, predict_frames};
 use std::collections::BTreeMap;
 use std::time::Instant;
 
@@ -49,7 +50,7 @@ pub fn evaluate_detector(
     let mut losses = Vec::new();
     predict_frames(detector, batch_size, &mut samples, |batch: Vec<(Sample, Prediction)>| {
         let (training, found): (Vec<Sample>, Vec<Prediction>) = batch.into_iter().unzip();
-        losses.push(loss_values(&detector.validation_loss(&training)?)?[0].1);
+        losses.push(f64::from(host(detector.validation_loss(&training)?.total)?[0]));
         detections.extend(found.into_iter().map(|found| found.detections));
         progress(detections.len());
         Ok::<(), TrainError>(())
@@ -93,13 +94,13 @@ impl Evaluation {
     }
 }
 
-/// `total` and the parts of a loss by name, in one transfer from the device.
-pub(crate) fn loss_values(losses: &Losses) -> Result<Vec<(&'static str, f64)>, TrainError> {
-    let names: Vec<&'static str> = std::iter::once("total").chain(losses.parts.iter().map(|(name, _)| *name)).collect();
+/// The total and the parts of a loss on its device, without autodiff graph, in the order of [`loss_names`].
+pub(crate) fn loss_tensor(losses: &Losses) -> Tensor<1> {
     let tensors = std::iter::once(&losses.total).chain(losses.parts.iter().map(|(_, part)| part));
-    let values = Tensor::cat(tensors.map(|t| t.clone().inner()).collect(), 0)
-        .into_data()
-        .try_into_vec::<f32>()
-        .map_err(|e| ModelError::Tensor(format!("losses: {e:?}")))?;
-    Ok(names.into_iter().zip(values.into_iter().map(f64::from)).collect())
+    Tensor::cat(tensors.map(|t| t.clone().inner()).collect(), 0)
+}
+
+/// `total` and the names of the parts of a loss.
+pub(crate) fn loss_names(losses: &Losses) -> Vec<&'static str> {
+    std::iter::once("total").chain(losses.parts.iter().map(|(name, _)| *name)).collect()
 }

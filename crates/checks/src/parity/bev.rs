@@ -67,8 +67,9 @@ pub fn stage<const D: usize>(
 
 /// Compares the stages in front of the head.
 pub fn stages(case: &Case, file: &mut ReferenceFile, mode: &str, stages: &BevStages) -> Result<()> {
-    stage(case, file, mode, "pillar_features", &stages.pillar_features)?;
-    let mut maps = vec![("spatial_features".to_string(), &stages.spatial_features)];
+    stage(case, file, mode, "pillar_features", &stages.canvas.features)?;
+    let image = stages.canvas.image();
+    let mut maps = vec![("spatial_features".to_string(), &image)];
     maps.extend(stages.backbone.blocks.iter().enumerate().map(|(i, t)| (format!("block{i}"), t)));
     maps.extend(stages.backbone.deblocks.iter().enumerate().map(|(i, t)| (format!("deblock{i}"), t)));
     maps.push(("spatial_features_2d".to_string(), &stages.backbone.spatial_features_2d));

@@ -3,7 +3,7 @@
 use super::reference::{ReferenceFile, Row, numbers};
 use super::{point_operators, toy_training};
 use anyhow::Result;
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use geometry::{Box3, bev_intersection, bev_iou, iou_3d, rotated_nms};
 use models::bev::pillars::{PillarGrid, decorate, pillarise};
 use models::config::OptimizationConfig;
@@ -220,9 +220,8 @@ fn losses(file: &mut ReferenceFile, device: &Device) -> Result<()> {
     check(file, "smooth_l1", &pred, smooth_l1(a - b, 1.0 / 9.0) * weights.clone())?;
 
     let logits = tensor(file.floats("direction.logits")?, [400, 2]).require_grad();
-    let bins: Vec<i32> = file.ints("direction.target")?.into_iter().map(|b| b as i32).collect();
-    let bins = Tensor::<1, Int>::from_data(TensorData::new(bins, [400]), device);
-    check(file, "direction", &logits, cross_entropy(logits.clone(), bins).reshape([400, 1]) * weights)
+    let bins: Vec<usize> = file.ints("direction.target")?.into_iter().map(|b| b as usize).collect();
+    check(file, "direction", &logits, cross_entropy(logits.clone(), &bins).reshape([400, 1]) * weights)
 }
 
 fn batch_norm(file: &mut ReferenceFile, device: &Device) -> Result<()> {

@@ -2,6 +2,7 @@
 
 mod direct;
 mod gradient_panels;
+mod pixel_gradient;
 mod strided_gradient;
 mod winograd;
 mod winograd_product;
@@ -150,6 +151,28 @@ impl Conv3x3 {
                     run(&StridedGradient { batch: self.batch, dy, dx }, &weights);
                 });
             }
+        }
+    }
+
+    /// Gradient with respect to `x` at some pixels, for stride 2; `dx` is overwritten.
+    ///
+    /// # Shapes
+    /// `dy`: `[batch, outputs, out_height, out_width]`; `weight`: `[outputs, inputs, 3, 3]`; `cells`: P indices into
+    /// `[batch, height, width]`; `dx`: `[P, inputs]`.
+    pub fn data_gradient_at(&self, dy: &[f32], weight: &[f32], cells: &[u32], dx: &mut Vec<f32>) {
+        assert_eq!(dy.len(), self.y_len(), "elements of dy of {self:?}");
+        self.check_weight(weight);
+        assert_eq!(self.stride, 2, "the stride must be 2: {self:?}");
+        let pixels = self.batch * self.height * self.width;
+        assert!(cells.iter().all(|&cell| (cell as usize) < pixels), "cells of {self:?}");
+        // SAFETY: each cell is at one place of its tile, and is written with all its channels.
+        unsafe {
+            fill(dx, cells.len() * self.inputs, |dx| {
+                let dy = Images { values: dy, shape: self.y_shape() };
+                for (scheme, weights) in pixel_gradient::by_place(self, dy, cells, Shared::new(dx), weight) {
+                    run(&scheme, &weights);
+                }
+            });
         }
     }
 

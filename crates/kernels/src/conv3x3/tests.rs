@@ -142,6 +142,34 @@ fn nan_propagates() {
     }
 }
 
+/// The bits of the gradient at all pixels.
+#[test]
+fn gradient_at_some_pixels() {
+    for conv in shapes().into_iter().filter(|conv| conv.stride == 2) {
+        let (w, dy) = (random(conv.weight_len(), 2), random(conv.y_len(), 3));
+        let pixels = conv.height * conv.width;
+        let (mut all, mut at) = (Vec::new(), vec![7.0; 5]);
+        conv.data_gradient(&dy, &w, &mut all);
+        for step in [1, 3, conv.batch * pixels + 1] {
+            // Falling, so that they are not sorted.
+            let cells: Vec<u32> = (0..(conv.batch * pixels) as u32).rev().step_by(step).collect();
+            conv.data_gradient_at(&dy, &w, &cells, &mut at);
+            let of_cell = |&cell: &u32| {
+                let first = cell as usize / pixels * conv.inputs * pixels + cell as usize % pixels;
+                (0..conv.inputs).map(move |channel| first + channel * pixels)
+            };
+            let want: Vec<f32> = cells.iter().flat_map(of_cell).map(|place| all[place]).collect();
+            assert!(at == want, "{conv:?}, every {step} pixel");
+            crate::reference::assert_same_for_threads(|| {
+                conv.data_gradient_at(&dy, &w, &cells, &mut at);
+                [at.clone()]
+            });
+        }
+        conv.data_gradient_at(&dy, &w, &[], &mut at);
+        assert!(at.is_empty());
+    }
+}
+
 #[test]
 fn an_empty_batch_is_empty() {
     for stride in [1, 2] {

@@ -1,6 +1,7 @@
 //! The 2D backbone and neck (OpenPCDet: `BaseBEVBackbone`).
 
 use super::config::BackboneConfig;
+use super::scatter::PillarCanvas;
 use crate::layers::{BatchNorm, ConvBnRelu, Init, Mode, ResampleBnRelu, Resampling};
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -59,12 +60,22 @@ impl BaseBevBackbone {
     }
 
     /// # Shapes
-    /// `x`: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s =
+    /// The canvas: `[B, C, H, W]`; `spatial_features_2d`: `[B, sum of the neck's channels, H / s, W / s]`, s =
     /// [`BackboneConfig::output_stride`].
-    pub fn forward(&self, mut x: Tensor<4>, mode: Mode) -> BackboneStages {
+    pub fn forward(&self, canvas: &PillarCanvas, mode: Mode, on_stage: &mut dyn FnMut(&'static str)) -> BackboneStages {
+        let first = &self.blocks[0].convs[0];
+        let by_kernel = match mode {
+            Mode::Train => first.forward_pillars(&canvas.features, &canvas.cells, canvas.shape),
+            Mode::Eval => None,
+        };
+        let mut x = by_kernel.unwrap_or_else(|| {
+            let image = canvas.image();
+            on_stage("scatter");
+            first.forward(image, mode)
+        });
         let (mut blocks, mut deblocks) = (Vec::new(), Vec::new());
-        for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
-            for conv in &block.convs {
+        for (i, (block, deblock)) in self.blocks.iter().zip(&self.deblocks).enumerate() {
+            for conv in &block.convs[usize::from(i == 0)..] {
                 x = conv.forward(x, mode);
             }
             blocks.push(x.clone());

@@ -3,14 +3,13 @@
 use super::backbone::{BackboneStages, BaseBevBackbone};
 use super::config::{BackboneConfig, PillarsConfig};
 use super::input::PillarInput;
-use super::scatter::scatter;
+use super::scatter::PillarCanvas;
 use super::vfe::{PillarRows, PillarVfe};
 use crate::config::DetectorConfig;
 use crate::layers::{Init, Mode, host};
 use crate::limits::{MOST_FILTERS, MOST_LAYERS, at_most};
 use crate::{LayerFeatures, ModelError};
 use burn::module::Module;
-use burn::tensor::Tensor;
 
 /// From pillars to the feature map that the head reads. Field names are OpenPCDet's.
 #[derive(Module, Debug)]
@@ -37,10 +36,8 @@ pub struct EncoderConfig<'a> {
 /// The outputs of every stage of the encoder.
 #[derive(Clone, Debug)]
 pub struct BevStages {
-    /// `[P, C]`.
-    pub pillar_features: Tensor<2>,
-    /// `[B, C, H, W]`.
-    pub spatial_features: Tensor<4>,
+    /// Features of the pillars, `[P, C]`, and their places.
+    pub canvas: PillarCanvas,
     /// Blocks and neck.
     pub backbone: BackboneStages,
 }
@@ -88,14 +85,13 @@ impl BevEncoder {
 
     /// The forward pass of a batch. `on_stage` is called with the name of each stage after it was launched.
     pub fn forward(&self, batch: &[&PillarInput], mode: Mode, on_stage: &mut dyn FnMut(&'static str)) -> BevStages {
-        let pillar_features = self.vfe.forward(self.pillar_rows(batch), mode);
+        let features = self.vfe.forward(self.pillar_rows(batch), mode);
         on_stage("encoder");
         let (cells, shape) = self.cells(batch);
-        let spatial_features = scatter(pillar_features.clone(), &cells, shape);
-        on_stage("scatter");
-        let backbone = self.backbone_2d.forward(spatial_features.clone(), mode);
+        let canvas = PillarCanvas { features, cells, shape };
+        let backbone = self.backbone_2d.forward(&canvas, mode, on_stage);
         on_stage("backbone");
-        BevStages { pillar_features, spatial_features, backbone }
+        BevStages { canvas, backbone }
     }
 
     /// The points of all pillars of a batch, sorted by sample.
@@ -131,7 +127,7 @@ impl BevEncoder {
     /// Tensors that are not f32.
     pub fn layer_features(&self, sample: &PillarInput) -> Result<Vec<LayerFeatures>, ModelError> {
         let stages = self.forward(&[sample], Mode::Eval, &mut |_| ());
-        let mut layers = vec![LayerFeatures::mean("pillar features", stages.pillar_features)?];
+        let mut layers = vec![LayerFeatures::mean("pillar features", stages.canvas.features)?];
         for (i, block) in stages.backbone.blocks.into_iter().enumerate() {
             layers.push(LayerFeatures::map_mean(format!("block {}", i + 1), block)?);
         }

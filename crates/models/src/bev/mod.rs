@@ -16,4 +16,5 @@ pub use config::{BackboneConfig, PillarsConfig};
 pub use encoder::{BevEncoder, BevStages, EncoderConfig, tensor_name};
 pub use input::{PillarInput, PillarPreparation, PillarSample};
 pub use suppression::suppress;
+pub(crate) use suppression::far_below;
 pub use vfe::{PillarRows, PillarVfe};

@@ -1,7 +1,7 @@
 //! Scatter of pillar features to the BEV canvas (OpenPCDet: `PointPillarScatter`).
 
-use crate::kernel_ops;
-use burn::tensor::{IndexingUpdateOp, Int, Tensor, TensorData};
+use crate::{kernel_ops, row_ops};
+use burn::tensor::Tensor;
 
 /// Writes each pillar's features to its cell; the rest of the canvas is zero.
 ///
@@ -12,26 +12,41 @@ pub fn scatter(features: Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Tensor
     kernel_ops::scatter(&features, cells, canvas).unwrap_or_else(|| scatter_on_device(features, cells, canvas))
 }
 
-/// The same with burn's operations.
+/// A canvas that is zero but for its pillars.
+#[derive(Clone, Debug)]
+pub struct PillarCanvas {
+    /// Features of the pillars, `[P, C]`.
+    pub features: Tensor<2>,
+    /// Index of each pillar's cell in `shape`, as [`scatter`] wants them.
+    pub cells: Vec<u32>,
+    /// `[B, H, W]`.
+    pub shape: [usize; 3],
+}
+
+impl PillarCanvas {
+    /// The canvas as an image, `[B, C, H, W]`.
+    pub fn image(&self) -> Tensor<4> {
+        scatter(self.features.clone(), &self.cells, self.shape)
+    }
+}
+
+/// The same by gathers: each cell reads the row of its pillar or zeros, and in the backward pass each pillar its cell.
 fn scatter_on_device(features: Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Tensor<4> {
     let [b, h, w] = canvas;
-    let [p, c] = features.dims();
-    let device = features.device();
-    let index = Tensor::<1, Int>::from_data(
-        TensorData::new(cells.iter().map(|&cell| cell as i32).collect::<Vec<_>>(), [p]),
-        &device,
-    );
-    Tensor::zeros([b * h * w, c], &device)
-        .select_assign(0, index, features, IndexingUpdateOp::Add) // [B * H * W, C]
-        .reshape([b, h, w, c])
-        .permute([0, 3, 1, 2]) // [B, C, H, W]
+    let c = features.dims()[1];
+    let mut pillars = vec![row_ops::ZERO; b * h * w];
+    for (pillar, &cell) in cells.iter().enumerate() {
+        pillars[cell as usize] = pillar as u32;
+    }
+    let rows = row_ops::gather(features, &pillars.into()); // [B * H * W, C]
+    rows.reshape([b, h, w, c]).permute([0, 3, 1, 2]) // [B, C, H, W]
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::layers::host;
-    use burn::tensor::Device;
+    use burn::tensor::{Device, TensorData};
 
     #[test]
     fn both_forms_give_the_same_values_and_gradients() {

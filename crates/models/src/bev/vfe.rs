@@ -3,6 +3,7 @@
 use crate::kernel_ops::{MlpGroups, MlpRows, append_maximum, pillar_net, pillar_net_inference};
 use crate::layers::{BatchNorm, Init, Mode, RowsBnRelu, rows_kernel};
 use crate::point_ops::{Groups, group_max};
+use crate::row_ops;
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
 use std::slice;
@@ -117,12 +118,12 @@ impl PillarVfe {
         let (mut x, groups) = self.padded(rows);
         let groups = groups.to_device(&x.device());
         let [rows, inputs] = x.dims();
-        let filled = groups.source.dims()[0] - rows;
+        let filled = groups.source.len() - rows;
         x = Tensor::cat(vec![x.clone(), Tensor::zeros([filled, inputs], &x.device())], 0); // multiplicity 0
         let last = self.pfn_layers.len() - 1;
         for layer in &self.pfn_layers[..last] {
             let y = layer.forward(x, &groups.counts, mode); // [R, C / 2]
-            let maximum = group_max(y.clone(), &groups).select(0, groups.source.clone()); // [R, C / 2]
+            let maximum = row_ops::gather(group_max(y.clone(), &groups), &groups.source); // [R, C / 2]
             x = Tensor::cat(vec![y, maximum], 1); // [R, C]
         }
         group_max(self.pfn_layers[last].forward(x, &groups.counts, mode), &groups) // [P, C]
@@ -149,6 +150,7 @@ mod tests {
     const NUM_POINTS: [u32; 3] = [2, 4, 1];
 
     /// The reference's form: all rows, padding included.
+    #[expect(clippy::disallowed_methods, reason = "burn's own operations are the reference")]
     fn padded_form(vfe: &PillarVfe, values: &[f32], device: &Device) -> Tensor<2> {
         let mut padded = vec![0.0f32; 3 * MAX_POINTS * 3];
         let mut from = 0;

@@ -1,7 +1,11 @@
 //! Decoding of a head's outputs to boxes (OpenPCDet: `decode_bbox_from_heatmap`, `class_agnostic_nms`).
 
 use super::box_coder::{CenterGrid, Code};
-use crate::bev::suppress;
+use crate::bev::{far_below, suppress};
+use rayon::prelude::*;
+
+/// Cells a task.
+const CELLS_A_TASK: usize = 8192;
 
 /// Score threshold, limits and NMS.
 #[derive(Clone, Debug, PartialEq)]
@@ -71,15 +75,24 @@ pub fn best_boxes(
     options: &DecodeOptions,
 ) -> Result<Vec<CenterBox>, NonFinite> {
     let cells = grid.cells();
+    let far_below = far_below(options.score_threshold);
+    let of_task = |(task, logits): (usize, &[f32])| {
+        let mut best = Vec::new();
+        for (place, &logit) in (task * CELLS_A_TASK..).zip(logits) {
+            if !logit.is_finite() {
+                return Err(NonFinite { cell: place % cells, output: "heat map" });
+            }
+            let score = if logit < far_below { 0.0 } else { 1.0 / (1.0 + (-logit).exp()) };
+            if score > options.score_threshold {
+                best.push((place, score));
+            }
+        }
+        Ok(best)
+    };
+    let tasks: Vec<_> = values.hm.par_chunks(CELLS_A_TASK).enumerate().map(of_task).collect();
     let mut best: Vec<(usize, f32)> = Vec::new();
-    for (place, &logit) in values.hm.iter().enumerate() {
-        if !logit.is_finite() {
-            return Err(NonFinite { cell: place % cells, output: "heat map" });
-        }
-        let score = 1.0 / (1.0 + (-logit).exp());
-        if score > options.score_threshold {
-            best.push((place, score));
-        }
+    for task in tasks {
+        best.extend(task?);
     }
     best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay ordered by class and cell
     best.truncate(options.max_boxes);

@@ -6,7 +6,8 @@ use super::head::HeadOutputs;
 use super::target_assigner::HeadTargets;
 use crate::Losses;
 use crate::loss::gaussian_focal_sum;
-use burn::tensor::{Int, Tensor, TensorData};
+use crate::row_ops;
+use burn::tensor::{Tensor, TensorData};
 
 /// Weighted losses of a batch, summed over the heads: focal loss of the heat maps, divided by the number of peaks; L1
 /// loss of the box codes at the cells of the boxes, divided by the number of boxes. Both numbers are those of the
@@ -43,9 +44,8 @@ fn box_loss(outputs: &HeadOutputs, targets: &[&HeadTargets], weights: &CenterLos
     let pick = |map: &Tensor<4>| {
         let [b, c, h, w] = map.dims();
         let place = |&(frame, (cell, _)): &(usize, (usize, _))| (0..c).map(move |k| (frame * c + k) * h * w + cell);
-        let index: Vec<i32> = boxes.iter().flat_map(place).map(|place| place as i32).collect();
-        let index = Tensor::<1, Int>::from_data(TensorData::new(index, [n * c]), &device);
-        map.clone().reshape([b * c * h * w]).select(0, index).reshape([n, c]) // [n, c]
+        let index = boxes.iter().flat_map(place).map(|place| place as u32).collect();
+        row_ops::gather(map.clone().reshape([b * c * h * w, 1]), &index).reshape([n, c]) // [n, c]
     };
     let found = Tensor::cat(outputs.code().map(pick).to_vec(), 1); // [n, 8]
     let (mut code, mut share) = (Vec::with_capacity(n * 8), Vec::with_capacity(n * 8));

@@ -10,6 +10,7 @@ use crate::config::DetectorConfig;
 use crate::{ModelError, layers};
 use data::{Detection, Frame};
 use geometry::Box3;
+use rayon::prelude::*;
 
 /// One frame, ready for the network.
 pub type Sample = PillarSample<Targets>;
@@ -85,16 +86,20 @@ impl Preparation {
             let hm = layers::host(outputs.hm.clone())?;
             let code = outputs.code().map(|map| layers::host(map.clone()));
             let code = code.into_iter().collect::<Result<Vec<_>, _>>()?;
-            for (f, (frame, sample)) in frames.iter_mut().zip(batch).enumerate() {
+            let of_frame = |f: usize| {
                 let of = |values: &'_ [f32]| {
                     let length = values.len() / batch.len();
                     f * length..(f + 1) * length
                 };
                 let code = std::array::from_fn(|branch| &code[branch][of(&code[branch])]);
-                let best = best_boxes(HeadValues { hm: &hm[of(&hm)], code }, &self.grid, &self.decode);
-                let mut best = best.map_err(|e| non_finite(&sample.input.id, e))?;
+                let mut best = best_boxes(HeadValues { hm: &hm[of(&hm)], code }, &self.grid, &self.decode)?;
                 best.iter_mut().for_each(|found| found.class = classes[found.class]);
-                frame.push([best.clone(), suppressed(best, &self.decode)]);
+                let kept = suppressed(best.clone(), &self.decode);
+                Ok([best, kept])
+            };
+            let found: Vec<_> = (0..batch.len()).into_par_iter().map(of_frame).collect();
+            for ((frame, sample), found) in frames.iter_mut().zip(batch).zip(found) {
+                frame.push(found.map_err(|e| non_finite(&sample.input.id, e))?);
             }
         }
         Ok(frames)

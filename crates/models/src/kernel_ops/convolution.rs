@@ -8,7 +8,7 @@ fn algorithm() -> Algorithm {
     if chosen_kernels() == Kernels::AutoF4 { Algorithm::WinogradF4 } else { Algorithm::WinogradF2 }
 }
 
-fn conv(x: [usize; 4], outputs: usize, stride: usize) -> Option<Conv3x3> {
+pub(super) fn conv(x: [usize; 4], outputs: usize, stride: usize) -> Option<Conv3x3> {
     let [batch, inputs, height, width] = x;
     let algorithm = algorithm();
     matches!(stride, 1 | 2).then_some(Conv3x3 { batch, inputs, outputs, height, width, stride, algorithm })

@@ -14,7 +14,7 @@ mod shared_mlp;
 mod values;
 
 pub use append_maximum::append_maximum;
-pub use canvas::scatter;
+pub use canvas::{pillar_conv, scatter};
 pub use convolution::{conv3x3, folded_conv3x3, folded_transposed, transposed};
 pub use focal_loss::focal_loss_sum;
 pub use gaussian_focal_loss::gaussian_focal_loss;

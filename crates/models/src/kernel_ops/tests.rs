@@ -3,6 +3,7 @@
 use super::*;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, rows_kernel};
 use crate::point_ops::{Groups, group_max};
+use crate::row_ops;
 use burn::module::Module;
 use burn::tensor::Device;
 use burn::tensor::activation::relu;
@@ -80,6 +81,17 @@ fn convolutions() {
         transposed(&random([1, 1, 2, 2], 1), &random([1, 1, 3, 3], 1), 3).is_none(),
         "there is no kernel for stride 3"
     );
+}
+
+#[test]
+fn convolution_of_pillars() {
+    for (cells, canvas) in [(vec![7u32, 2, 13, 12, 40], [2, 4, 6]), (vec![0], [1, 3, 5]), (vec![14, 4], [1, 3, 5])] {
+        let (features, w) = (random([cells.len(), 3], 20), random([4, 3, 3, 3], 21));
+        let ours = pillar_conv(&features, &cells, canvas, &w).unwrap();
+        let theirs = conv3x3(&scatter(&features, &cells, canvas).unwrap(), &w, 2).unwrap();
+        check!(format!("pillars, {canvas:?}"), [features, w], ours, theirs);
+        assert!(pillar_conv(&features.inner(), &cells, canvas, &w.inner()).is_none(), "inference folds the norm");
+    }
 }
 
 #[test]
@@ -183,7 +195,7 @@ fn shared_mlp_over_groups_of_neighbours() {
         };
         let theirs = |layers: &[RowsBnRelu<4>], x: Tensor<2>| {
             let y = layers[0].project(on_device.offset.clone(), 0);
-            let y = y + layers[0].project(x, 3).select(0, on_device.source.clone());
+            let y = y + row_ops::gather(layers[0].project(x, 3), &on_device.source);
             let x = layers[0].norm_relu(y, &on_device.counts, Mode::Train);
             group_max(layers[1..].iter().fold(x, |x, l| l.forward(x, &on_device.counts, Mode::Train)), &on_device)
         };
@@ -224,7 +236,7 @@ fn shared_mlp_at_inference() {
     let ours = rows_kernel(&layers, &ours, Some(&groups), Mode::Eval).unwrap();
     let on_device = groups.to_device(&device);
     let y = layers[0].project(on_device.offset.clone(), 0)
-        + layers[0].project(features, 3).select(0, on_device.source.clone());
+        + row_ops::gather(layers[0].project(features, 3), &on_device.source);
     let x = layers[0].norm_relu(y, &on_device.counts, Mode::Eval);
     let theirs = group_max(layers[1].forward(x, &on_device.counts, Mode::Eval), &on_device);
     assert_close("inference", &host(ours), &host(theirs));
@@ -283,14 +295,13 @@ fn appended_maximum() {
     let groups = Arc::new(groups(9, 7, 11));
     let x = random([groups.source.len(), 5], 19);
     let on_device = groups.to_device(&device());
-    let of_row: Vec<i32> = {
+    let of_row: Vec<u32> = {
         let mut begin = 0;
-        let of_group = |(g, &end): (usize, &u32)| vec![g as i32; (end - std::mem::replace(&mut begin, end)) as usize];
+        let of_group = |(g, &end): (usize, &u32)| vec![g as u32; (end - std::mem::replace(&mut begin, end)) as usize];
         groups.ends.iter().enumerate().flat_map(of_group).collect()
     };
-    let rows = of_row.len();
-    let of_row = Tensor::<1, burn::tensor::Int>::from_data(TensorData::new(of_row, [rows]), &device());
-    let theirs = Tensor::cat(vec![x.clone(), group_max(x.clone(), &on_device).select(0, of_row)], 1);
+    let of_row = row_ops::gather(group_max(x.clone(), &on_device), &of_row.into());
+    let theirs = Tensor::cat(vec![x.clone(), of_row], 1);
     check!("appended maximum", [x], append_maximum(&x, &groups).unwrap(), theirs);
 }
 

@@ -2,7 +2,7 @@
 
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode, host};
-use crate::kernel_ops::{conv3x3, folded_conv3x3, pixel_heads};
+use crate::kernel_ops::{conv3x3, folded_conv3x3, pillar_conv, pixel_heads};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use burn::tensor::module::conv2d;
@@ -44,6 +44,18 @@ impl ConvBnRelu {
         }
         let y = conv(x, weight, stride);
         self.norm.forward_relu(y, bias, mode)
+    }
+
+    /// The layer on a canvas of pillars, which need not be made, if there is a kernel: in training, with stride 2.
+    ///
+    /// # Shapes
+    /// `features`: `[P, C_in]`; `cells`: P indices into `canvas`, `[B, H, W]`; result `[B, C_out, H / 2, W / 2]`.
+    pub fn forward_pillars(&self, features: &Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Option<Tensor<4>> {
+        if self.stride != 2 {
+            return None;
+        }
+        let y = pillar_conv(features, cells, canvas, &self.weight.val())?;
+        Some(self.norm.forward_relu(y, self.bias.as_ref().map(Param::val), Mode::Train))
     }
 }
 

@@ -216,6 +216,7 @@ fn project<const D: usize>(weight: &Param<Tensor<D>>, x: Tensor<2>, first: usize
 mod tests {
     use super::*;
     use crate::layers::host;
+    use crate::row_ops;
 
     fn tensor(values: &[f32], shape: [usize; 2], device: &Device) -> Tensor<2> {
         Tensor::from_data(TensorData::new(values.to_vec(), shape), device)
@@ -227,11 +228,10 @@ mod tests {
     }
 
     /// Values, gradient with respect to the weight, and running variance.
-    fn run(rows: &[f32], counts: RowCounts, pick: &[i32], device: &Device) -> [Vec<f32>; 3] {
+    fn run(rows: &[f32], counts: RowCounts, pick: &[u32], device: &Device) -> [Vec<f32>; 3] {
         let layer = layer(device);
         let x = tensor(rows, [rows.len() / 3, 3], device);
-        let pick = Tensor::<1, burn::tensor::Int>::from_data(TensorData::new(pick.to_vec(), [pick.len()]), device);
-        let y = layer.forward(x, &counts, Mode::Train).select(0, pick);
+        let y = row_ops::gather(layer.forward(x, &counts, Mode::Train), &pick.into());
         let gradients = (y.clone() * y.clone()).sum().backward();
         let gradient = layer.weight.val().grad(&gradients).unwrap();
         [host(y).unwrap(), host(gradient).unwrap(), host(layer.norm.running_var.value()).unwrap()]

@@ -1,7 +1,9 @@
 //! Groups of neighbours (OpenPCDet: `QueryAndGroup`, `GroupAll`), without repeated rows.
 
 use crate::layers::RowCounts;
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use crate::row_ops::{self, RowGroups};
+use burn::tensor::{Device, Tensor, TensorData};
+use std::sync::Arc;
 
 /// Neighbours of many centres, sorted by group. G groups have N rows.
 ///
@@ -53,51 +55,35 @@ impl Groups {
         Tensor::from_data(TensorData::new(values, [self.offset_m.len(), 3]), device)
     }
 
-    /// The groups on a device, padded with rows of multiplicity 0.
+    /// The groups for operations on a device, padded with rows of multiplicity 0.
     pub fn to_device(&self, device: &Device) -> GroupTensors {
         let filled = |values: &[f32], width: usize| {
             let mut values = values.to_vec();
             values.resize(RowCounts::filled_up(self.source.len()) * width, 0.0);
             values
         };
-        let mut source: Vec<i32> = self.source.iter().map(|&s| s as i32).collect();
-        source.resize(RowCounts::filled_up(source.len()), 0);
+        let mut source = self.source.clone();
+        source.resize(RowCounts::filled_up(source.len()), row_ops::ZERO);
         let rows = source.len();
-        let mut begin = 0;
-        let spans = self.ends.iter().map(|&end| (std::mem::replace(&mut begin, end), end));
-        let spans: Vec<(u32, u32)> = spans.collect();
-        let slots = spans.iter().map(|(begin, end)| end - begin).max().unwrap_or(0) as usize;
-        // Groups are padded with their first row, which does not change the maximum.
-        let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
-        let places = spans.iter().flat_map(|&(b, e)| (0..slots as u32).map(move |s| place(b, e, s) as i32));
-        let int = |values: Vec<i32>| {
-            let length = values.len();
-            Tensor::<1, Int>::from_data(TensorData::new(values, [length]), device)
-        };
         GroupTensors {
-            source: int(source),
+            source: source.into(),
             offset: Tensor::from_data(TensorData::new(filled(self.offset_m.as_flattened(), 3), [rows, 3]), device),
             counts: RowCounts::new(filled(&self.count, 1), device),
-            places: int(places.collect()),
-            groups: self.ends.len(),
-            slots,
+            groups: Arc::new(RowGroups::new(&self.ends)),
         }
     }
 }
 
-/// [`Groups`] on a device; N is the padded number of rows.
+/// [`Groups`] for operations on a device; N is the padded number of rows.
 #[derive(Clone, Debug)]
 pub struct GroupTensors {
-    /// `[N]`.
-    pub source: Tensor<1, Int>,
+    /// Input row of each row, for [`row_ops::gather`]. Length N.
+    pub source: Arc<[u32]>,
     /// `[N, 3]`, m.
     pub offset: Tensor<2>,
     /// Multiplicities of the N rows.
     pub counts: RowCounts,
-    /// Rows of each group, padded to S, `[G * S]`.
-    places: Tensor<1, Int>,
-    groups: usize,
-    slots: usize,
+    groups: Arc<RowGroups>,
 }
 
 /// The maximum over each group.
@@ -105,9 +91,7 @@ pub struct GroupTensors {
 /// # Shapes
 /// `x`: `[N, C]`; result `[G, C]`.
 pub fn group_max(x: Tensor<2>, groups: &GroupTensors) -> Tensor<2> {
-    let channels = x.dims()[1];
-    let filled = x.select(0, groups.places.clone()).reshape([groups.groups, groups.slots, channels]); // [G, S, C]
-    filled.max_dim(1).reshape([groups.groups, channels]) // [G, C]
+    row_ops::group_max(x, &groups.groups)
 }
 
 #[cfg(test)]
@@ -138,7 +122,7 @@ mod tests {
         let device = Device::flex().autodiff();
         let groups = two_groups().to_device(&device);
         assert_eq!(groups.counts.total(), 6);
-        assert_eq!((groups.source.dims(), groups.offset.dims()), ([256], [256, 3]));
+        assert_eq!((groups.source.len(), groups.offset.dims()), (256, [256, 3]));
         let x = Tensor::<2>::from_floats([[1.0, 5.0], [3.0, 2.0], [-1.0, -2.0]], &device).require_grad();
         let y = group_max(x.clone(), &groups);
         assert_eq!(host(y.clone()).unwrap(), [3.0, 5.0, -1.0, -2.0]);

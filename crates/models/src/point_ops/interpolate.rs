@@ -1,7 +1,9 @@
 //! Interpolation of features from the three nearest known points (OpenPCDet: `three_interpolate`).
 
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use crate::row_ops;
+use burn::tensor::{Device, Tensor, TensorData};
 use geometry::three_nearest;
+use std::sync::Arc;
 
 /// Added to distances so that the weight of a coincident point is finite, m.
 const LEAST_DISTANCE_M: f32 = 1e-8;
@@ -44,9 +46,8 @@ impl Interpolation {
     /// The interpolation on a device.
     pub fn to_device(&self, device: &Device) -> InterpolationTensors {
         let points = self.source.len();
-        let source = self.source.as_flattened().iter().map(|&row| row as i32).collect::<Vec<_>>();
         InterpolationTensors {
-            source: Tensor::from_data(TensorData::new(source, [points * 3]), device),
+            source: self.source.as_flattened().into(),
             weight: Tensor::from_data(TensorData::new(self.weight.as_flattened().to_vec(), [points, 3, 1]), device),
         }
     }
@@ -55,8 +56,8 @@ impl Interpolation {
 /// [`Interpolation`] on a device.
 #[derive(Clone, Debug)]
 pub struct InterpolationTensors {
-    /// `[U * 3]`.
-    source: Tensor<1, Int>,
+    /// Length U * 3.
+    source: Arc<[u32]>,
     /// `[U, 3, 1]`.
     weight: Tensor<3>,
 }
@@ -67,7 +68,7 @@ pub struct InterpolationTensors {
 /// `known`: `[K, C]`; result `[U, C]`.
 pub fn interpolate(known: Tensor<2>, from: &InterpolationTensors) -> Tensor<2> {
     let ([points, _, _], channels) = (from.weight.dims(), known.dims()[1]);
-    let three = known.select(0, from.source.clone()).reshape([points, 3, channels]); // [U, 3, C]
+    let three = row_ops::gather(known, &from.source).reshape([points, 3, channels]); // [U, 3, C]
     (three * from.weight.clone()).sum_dim(1).reshape([points, channels]) // [U, C]
 }
 

@@ -1,8 +1,8 @@
 //! Operations of PointNet++ on tensors: grouping, the maximum over a group, interpolation.
 //!
 //! Neighbours depend on coordinates alone, which no network changes. The crate `geometry` therefore finds the indices
-//! on the host, mostly on loader threads. The device only runs gathers, sums and maxima, with gradients, on every
-//! backend.
+//! on the host, mostly on loader threads. The device only runs gathers, sums and maxima ([`crate::row_ops`]), with
+//! gradients, on every backend.
 
 mod groups;
 mod interpolate;

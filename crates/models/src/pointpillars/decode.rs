@@ -2,7 +2,11 @@
 //! `class_agnostic_nms`).
 
 use super::box_coder;
-use crate::bev::suppress;
+use crate::bev::{far_below, suppress};
+use rayon::prelude::*;
+
+/// Anchors a task.
+const ANCHORS: usize = 8192;
 
 /// Score threshold, NMS and direction constants.
 #[derive(Clone, Debug, PartialEq)]
@@ -66,15 +70,11 @@ pub fn decode(
     }
     let (classes, bins) = (cls.len() / anchors.len(), dir.len() / anchors.len());
     assert_eq!((cls.len(), boxes.len()), (anchors.len() * classes, anchors.len() * 7), "one prediction per anchor");
+    let of_task = |(task, cls): (usize, &[f32])| best_anchors(cls, task * ANCHORS, classes, options.score_threshold);
+    let tasks: Vec<_> = cls.par_chunks(ANCHORS * classes).enumerate().map(of_task).collect();
     let mut best: Vec<(usize, f32)> = Vec::new();
-    for (anchor, logits) in cls.chunks_exact(classes).enumerate() {
-        if logits.iter().any(|logit| !logit.is_finite()) {
-            return Err(NonFinite { anchor, output: "class score" });
-        }
-        let score = sigmoid(logits.iter().copied().fold(f32::NEG_INFINITY, f32::max));
-        if score >= options.score_threshold {
-            best.push((anchor, score));
-        }
+    for task in tasks {
+        best.extend(task?);
     }
     best.sort_by(|a, b| b.1.total_cmp(&a.1)); // stable: equal scores stay ordered by anchor
     best.truncate(options.nms_pre);
@@ -98,6 +98,27 @@ pub fn decode(
     let scores: Vec<f32> = found.iter().map(|raw| raw.score).collect();
     let kept = suppress(found.iter().map(|raw| raw.bbox), &scores, options.nms_iou, options.nms_post);
     Ok(kept.into_iter().map(|i| found[i].clone()).collect())
+}
+
+/// The anchors from `first` on whose best score reaches the threshold, with this score.
+fn best_anchors(cls: &[f32], first: usize, classes: usize, threshold: f32) -> Result<Vec<(usize, f32)>, NonFinite> {
+    let far_below = far_below(threshold);
+    let mut best = Vec::new();
+    for (i, logits) in cls.chunks_exact(classes).enumerate() {
+        let anchor = first + i;
+        if logits.iter().any(|logit| !logit.is_finite()) {
+            return Err(NonFinite { anchor, output: "class score" });
+        }
+        let most = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        if most < far_below {
+            continue;
+        }
+        let score = sigmoid(most);
+        if score >= threshold {
+            best.push((anchor, score));
+        }
+    }
+    Ok(best)
 }
 
 /// The box of every anchor, before any threshold.

@@ -5,7 +5,9 @@ use super::config::LossConfig;
 use super::head::Predictions;
 use crate::Losses;
 use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal_sum, smooth_l1};
-use burn::tensor::{Int, Tensor, TensorData};
+use crate::row_ops;
+use burn::tensor::{Tensor, TensorData};
+use std::sync::Arc;
 
 /// Weighted losses of a batch: classes over all anchors that are not ignored, boxes and directions over the positive
 /// ones. Each is divided by the number of positives of its frame and by the number of frames.
@@ -25,10 +27,10 @@ pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig
         let weights = class_weight[frame * anchors..].iter_mut().zip(&targets.labels);
         weights.filter(|(_, label)| **label >= 0).for_each(|(weight, _)| *weight = norm);
         for (k, &(anchor, _)) in targets.positive.iter().enumerate() {
-            positive.push((frame * anchors + anchor) as i32);
+            positive.push((frame * anchors + anchor) as u32);
             share.push(norm);
             residuals.extend(targets.reg[k]);
-            bins.push(targets.dir[k] as i32);
+            bins.push(targets.dir[k]);
         }
     }
     let tensor = |values, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
@@ -39,17 +41,16 @@ pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig
     let (boxes, dir) = if n == 0 {
         (Tensor::zeros([1], &device), Tensor::zeros([1], &device))
     } else {
-        let int = |values| Tensor::<1, Int>::from_data(TensorData::new(values, [n]), &device);
-        let index = int(positive);
+        let index: Arc<[u32]> = positive.into();
         let share = tensor(share, [n, 1]);
-        let pred = predictions.boxes.clone().reshape([rows, 7]).select(0, index.clone()); // [n, 7]
+        let pred = row_ops::gather(predictions.boxes.clone().reshape([rows, 7]), &index); // [n, 7]
         let code = tensor(weights.code_weights.to_vec(), [1, 7]);
         let (pred, target) = add_sin_difference(pred, tensor(residuals, [n, 7]));
         let difference = (pred - target) * code; // [n, 7]
         let boxes = (smooth_l1(difference, 1.0 / 9.0) * share.clone()).sum() * weights.box_weight;
         let bins_a_box = predictions.dir.dims()[2];
-        let logits = predictions.dir.clone().reshape([rows, bins_a_box]).select(0, index); // [n, bins]
-        let dir = (cross_entropy(logits, int(bins)) * share.reshape([n])).sum() * weights.direction_weight;
+        let logits = row_ops::gather(predictions.dir.clone().reshape([rows, bins_a_box]), &index); // [n, bins]
+        let dir = (cross_entropy(logits, &bins) * share.reshape([n])).sum() * weights.direction_weight;
         (boxes, dir)
     };
     Losses { total: cls.clone() + boxes.clone() + dir.clone(), parts: vec![("cls", cls), ("box", boxes), ("dir", dir)] }

@@ -11,6 +11,7 @@ use crate::suggest::BoxMatch;
 use crate::{ModelError, layers};
 use data::{Detection, Frame, Object};
 use geometry::Box3;
+use rayon::prelude::*;
 
 /// One frame, ready for the network.
 pub type Sample = PillarSample<Targets>;
@@ -114,21 +115,22 @@ impl Preparation {
         let cls = layers::host(predictions.cls)?;
         let boxes = layers::host(predictions.boxes)?;
         let dir = layers::host(predictions.dir)?;
-        let of = |values: &[f32], frame: usize, width: usize| {
-            values[frame * anchors * width..(frame + 1) * anchors * width].to_vec()
+        let of_frame = |f: usize| {
+            let rows = f * anchors..(f + 1) * anchors;
+            let of = |width: usize| rows.start * width..rows.end * width;
+            decode(&cls[of(classes)], &boxes[of(7)], &dir[of(bins)], &self.anchors, &self.decode)
         };
-        (0..b)
-            .map(|f| {
-                let raw = decode(&of(&cls, f, classes), &of(&boxes, f, 7), &of(&dir, f, bins), &self.anchors, &self.decode)
-                    .map_err(|_| {
-                        ModelError::NonFinite(format!(
-                            "frame {}: the network gives scores that are not numbers; its weights are damaged or its training diverged",
-                            batch[f].input.id
-                        ))
-                    })?;
-                Ok(raw.iter().map(|r| self.named(r)).collect())
-            })
-            .collect()
+        let frames: Vec<_> = (0..b).into_par_iter().map(of_frame).collect();
+        let named = |(raw, sample): (Result<Vec<RawBox>, _>, &&Sample)| {
+            let raw = raw.map_err(|_| {
+                ModelError::NonFinite(format!(
+                    "frame {}: the network gives scores that are not numbers; its weights are damaged or its training diverged",
+                    sample.input.id
+                ))
+            })?;
+            Ok(raw.iter().map(|r| self.named(r)).collect())
+        };
+        frames.into_iter().zip(batch).map(named).collect()
     }
 
     fn named(&self, raw: &RawBox) -> Detection {

@@ -11,6 +11,7 @@ use crate::pointpillars::box_coder::decode;
 use crate::{ModelError, Prediction};
 use data::Detection;
 use geometry::{Box3, rotated_nms_first};
+use rayon::prelude::*;
 
 /// Boxes of each sample, by falling score, and all refined regions.
 ///
@@ -28,22 +29,32 @@ pub fn detections(
     let (net, classes) = (&preparation.net, preparation.mean_sizes.len());
     let stages = network.points(&seen, Mode::Eval);
     let (logits, codes) = (host(stages.predictions.cls.clone())?, host(stages.predictions.boxes.clone())?);
-    let (mut regions, mut input) = (Vec::new(), RoiInput::empty(&net.roi_head));
-    let mut first = 0;
-    for sample in &seen {
-        let points = sample.points.len();
-        let logits = &logits[first * classes..][..points * classes];
-        let codes = &codes[first * super::POINT_CODE..][..points * super::POINT_CODE];
+    let first_rows = seen.iter().scan(0, |rows, sample| {
+        let first = *rows;
+        *rows += sample.points.len();
+        Some(first)
+    });
+    let first_rows: Vec<usize> = first_rows.collect();
+    let of_frame = |f: usize| {
+        let (points, first) = (&seen[f].points, first_rows[f]);
+        let logits = &logits[first * classes..][..points.len() * classes];
+        let codes = &codes[first * super::POINT_CODE..][..points.len() * super::POINT_CODE];
         if !logits.iter().chain(codes).all(|v| v.is_finite()) {
-            return Err(not_finite(&sample.id));
+            return Err(not_finite(&seen[f].id));
         }
-        let boxes = point_boxes(&sample.points, logits, codes, &preparation.mean_sizes);
+        let boxes = point_boxes(points, logits, codes, &preparation.mean_sizes);
         let found = proposals(&boxes, logits, classes, &net.proposals.test);
         let scores = point_scores(logits, classes);
-        let scene = Scene { points: &sample.points, scores: &scores, first_row: first as u32 };
-        input.append(&RoiInput::new(scene, &found.boxes, &net.roi_head));
+        let scene = Scene { points, scores: &scores, first_row: first as u32 };
+        let input = RoiInput::new(scene, &found.boxes, &net.roi_head);
+        Ok((found, input))
+    };
+    let frames: Vec<_> = (0..seen.len()).into_par_iter().map(of_frame).collect();
+    let (mut regions, mut input) = (Vec::new(), RoiInput::empty(&net.roi_head));
+    for frame in frames {
+        let (found, own) = frame?;
+        input.append(&own);
         regions.push(found);
-        first += points;
     }
     let roi = network.roi_head.forward(stages.point_features(), &input, Mode::Eval);
     let (cls, reg) = (host(roi.cls)?, host(roi.reg)?);

@@ -6,7 +6,8 @@ use super::point_head::{POINT_CODE, PointPredictions};
 use super::point_targets::PointTargets;
 use super::roi_targets::RoiTargets;
 use crate::loss::{sigmoid_focal, smooth_l1};
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use crate::row_ops;
+use burn::tensor::{Device, Tensor, TensorData};
 
 /// Beta of the smooth L1 loss of codes and residuals.
 const BETA: f64 = 1.0 / 9.0;
@@ -16,11 +17,6 @@ const LEAST_LENGTH2_M2: f64 = 1e-20;
 
 fn rows(values: Vec<f32>, shape: [usize; 2], device: &Device) -> Tensor<2> {
     Tensor::from_data(TensorData::new(values, shape), device)
-}
-
-fn indices(values: Vec<i32>, device: &Device) -> Tensor<1, Int> {
-    let length = values.len();
-    Tensor::from_data(TensorData::new(values, [length]), device)
 }
 
 /// Weighted losses of the points: classes over all points that are not ignored, boxes over the positive ones. Both are
@@ -45,7 +41,7 @@ pub fn point_losses(
                 one_hot[(first + i) * classes + label as usize - 1] = 1.0;
             }
         }
-        positive.extend(target.positive.iter().map(|(i, _)| (first + i) as i32));
+        positive.extend(target.positive.iter().map(|(i, _)| (first + i) as u32));
         codes.extend_from_slice(target.codes.as_flattened());
         first += target.labels.len();
     }
@@ -56,7 +52,7 @@ pub fn point_losses(
     if n == 0 {
         return [cls, Tensor::zeros([1], &device)];
     }
-    let predicted = predictions.boxes.clone().select(0, indices(positive, &device)); // [n, 8]
+    let predicted = row_ops::gather(predictions.boxes.clone(), &positive.into()); // [n, 8]
     let code_weights = rows(weights.point_code_weights.to_vec(), [1, POINT_CODE], &device);
     let difference = (predicted - rows(codes, [n, POINT_CODE], &device)) * code_weights;
     let boxes = smooth_l1(difference, BETA).sum() * (share * f64::from(weights.point_box_weight));
@@ -81,7 +77,7 @@ pub fn roi_losses(
     if n == 0 {
         return [cls, Tensor::zeros([1], &device), Tensor::zeros([1], &device)];
     }
-    let reg = reg.select(0, indices(learned.iter().map(|&r| r as i32).collect(), &device)); // [n, 7]
+    let reg = row_ops::gather(reg, &learned.iter().map(|&r| r as u32).collect()); // [n, 7]
     let residuals = rows(learned.iter().flat_map(|&r| targets.residuals[r]).collect(), [n, 7], &device);
     let code_weights = rows(weights.roi_code_weights.to_vec(), [1, 7], &device);
     let difference = (reg.clone() - residuals) * code_weights;

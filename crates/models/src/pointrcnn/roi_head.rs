@@ -6,9 +6,10 @@ use super::point_head::HiddenLayers;
 use super::roi_input::{PREFIX, RoiInput};
 use super::set_abstraction::SharedMlp;
 use crate::layers::{BatchNorm, Init, Mode, RowCounts, RowsBnRelu, RowsLinear};
+use crate::row_ops;
 use burn::module::Module;
 use burn::tensor::activation::relu;
-use burn::tensor::{Int, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 
 /// Refines regions of interest. Its set abstraction has batch norm, as in OpenPCDet, where `USE_BN` has no effect on
 /// it.
@@ -85,17 +86,13 @@ impl RoiHead {
     /// `point_features`: `[B * N, C]`.
     pub fn forward(&self, point_features: Tensor<2>, input: &RoiInput, mode: Mode) -> RoiStages {
         let device = point_features.device();
-        let [rows, channels] = point_features.dims();
         let points = input.prefix.len();
         let prefix = TensorData::new(input.prefix.as_flattened().to_vec(), [points, PREFIX]);
         let prefix = Tensor::<2>::from_data(prefix, &device); // [P, 5]
         let xyz_up = self.xyz_up_layer.iter().fold(prefix, |x, layer| relu(layer.forward(x)));
 
-        // A region without points reads the row of zeros appended after the last.
-        let source: Vec<i32> = input.source.iter().map(|s| s.map_or(rows as i32, |row| row as i32)).collect();
-        let source = Tensor::<1, Int>::from_data(TensorData::new(source, [points]), &device);
-        let features = Tensor::cat(vec![point_features.detach(), Tensor::zeros([1, channels], &device)], 0);
-        let features = features.select(0, source); // [P, C]
+        let source = input.source.iter().map(|row| row.unwrap_or(row_ops::ZERO)).collect();
+        let features = row_ops::gather(point_features.detach(), &source); // [P, C]
         let merge = &self.merge_down_layer[0];
         let positions = xyz_up.dims()[1];
         let merged =

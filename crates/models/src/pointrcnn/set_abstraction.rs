@@ -3,6 +3,7 @@
 use crate::kernel_ops::MlpRows;
 use crate::layers::{Mode, RowsBnRelu, rows_kernel};
 use crate::point_ops::{GroupTensors, Groups, group_max};
+use crate::row_ops;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use std::sync::Arc;
@@ -50,7 +51,7 @@ impl SharedMlp {
         let (first, rest) = (&self.layers[0], &self.layers[1..]);
         let mut y = first.project(groups.offset.clone(), 0); // [N, C]
         if let Some(projected) = projected {
-            y = y + projected.select(0, groups.source.clone());
+            y = y + row_ops::gather(projected, &groups.source);
         }
         let x = first.norm_relu(y, &groups.counts, mode);
         let x = rest.iter().fold(x, |x, layer| layer.forward(x, &groups.counts, mode)); // [N, C']

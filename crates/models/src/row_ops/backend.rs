@@ -1,0 +1,166 @@
+//! The operations on the primitives of every backend, and their gradients.
+
+use super::segments::SegmentSums;
+use super::{RowGroups, ZERO};
+use burn::backend::autodiff::checkpoint::base::Checkpointer;
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, unary};
+use burn::backend::tensor::{FloatTensor, IntTensor};
+use burn::backend::{Autodiff, Backend, Flex, NdArray, TensorMetadata, backend_extension, get_device_settings};
+use burn::tensor::{IntDType, Shape, TensorData};
+use std::sync::Arc;
+
+/// Operations on rows. Without autodiff they are compositions of the backend's operations.
+#[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
+pub trait RowOps: Backend {
+    /// See [`super::gather`].
+    fn gather_rows(x: FloatTensor<Self>, index: Arc<[u32]>) -> FloatTensor<Self> {
+        select::<Self>(x, &index)
+    }
+
+    /// See [`super::group_max`].
+    fn max_of_groups(x: FloatTensor<Self>, groups: Arc<RowGroups>) -> FloatTensor<Self> {
+        max_with_slots::<Self>(x, &groups).0
+    }
+}
+
+impl RowOps for Flex {}
+
+impl RowOps for NdArray {}
+
+#[cfg(feature = "cube")]
+impl RowOps for burn::backend::Cube {}
+
+impl<B: RowOps, C: CheckpointStrategy> RowOps for Autodiff<B, C> {
+    fn gather_rows(x: FloatTensor<Self>, index: Arc<[u32]>) -> FloatTensor<Self> {
+        let (x, node) = x.into_parts();
+        let rows = x.shape()[0];
+        let y = B::gather_rows(x, index.clone());
+        match GatherRows.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prepared) => prepared.finish((index, rows), y),
+            OpsKind::UnTracked(prepared) => prepared.finish(y),
+        }
+    }
+
+    fn max_of_groups(x: FloatTensor<Self>, groups: Arc<RowGroups>) -> FloatTensor<Self> {
+        let (x, node) = x.into_parts();
+        let rows = x.shape()[0];
+        let (y, slots) = max_with_slots::<B>(x, &groups);
+        match MaxOfGroups.prepare::<C>([node]).compute_bound().stateful() {
+            OpsKind::Tracked(prepared) => prepared.finish((slots, groups, rows), y),
+            OpsKind::UnTracked(prepared) => prepared.finish(y),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct GatherRows;
+
+impl<B: Backend> Backward<B, 1> for GatherRows {
+    /// The index and the number of rows it points into.
+    type State = (Arc<[u32]>, usize);
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let (index, rows) = ops.state;
+        unary::<B, _>(ops.parents, ops.node, grads, |dy| segment_sums::<B>(dy, &SegmentSums::new(&index, rows)));
+    }
+}
+
+#[derive(Debug)]
+struct MaxOfGroups;
+
+impl<B: Backend> Backward<B, 1> for MaxOfGroups {
+    /// Slot of each maximum, `[G, C]`; the groups; number of rows.
+    type State = (Option<IntTensor<B>>, Arc<RowGroups>, usize);
+
+    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
+        let (slots, groups, rows) = ops.state;
+        unary::<B, _>(ops.parents, ops.node, grads, |dy| match slots {
+            Some(slots) => max_gradient::<B>(dy, slots, &groups, rows),
+            None => zeros::<B>([rows, dy.shape()[1]], &dy),
+        });
+    }
+}
+
+fn zeros<B: Backend>(shape: [usize; 2], like: &FloatTensor<B>) -> FloatTensor<B> {
+    B::float_zeros(Shape::from(shape), &like.device(), like.dtype().into())
+}
+
+fn ints<B: Backend>(values: Vec<i32>, device: &B::Device) -> IntTensor<B> {
+    let length = values.len();
+    B::int_from_data(TensorData::new(values, [length]), device)
+}
+
+/// The rows of `x` with these indices.
+fn select<B: Backend>(x: FloatTensor<B>, index: &[u32]) -> FloatTensor<B> {
+    let [rows, channels] = [x.shape()[0], x.shape()[1]];
+    if rows == 0 || index.is_empty() {
+        return zeros::<B>([index.len(), channels], &x);
+    }
+    let to_row = |&i: &u32| if i == ZERO { rows as i32 } else { i as i32 };
+    let rows_of_x = ints::<B>(index.iter().map(to_row).collect(), &x.device());
+    let x = if index.contains(&ZERO) {
+        let nothing = zeros::<B>([1, channels], &x);
+        B::float_cat(vec![x, nothing], 0) // [R + 1, C]
+    } else {
+        x
+    };
+    B::float_select(x, 0, rows_of_x)
+}
+
+fn segment_sums<B: Backend>(mut x: FloatTensor<B>, plan: &SegmentSums) -> FloatTensor<B> {
+    let channels = x.shape()[1];
+    for level in &plan.levels {
+        let blocks = level.index.len() / level.width;
+        let rows = B::float_reshape(select::<B>(x, &level.index), Shape::from([blocks, level.width, channels]));
+        x = B::float_reshape(B::float_sum_dim(rows, 1), Shape::from([blocks, channels]));
+    }
+    match &plan.last {
+        Some(last) => select::<B>(x, last),
+        None => x,
+    }
+}
+
+/// The maxima, `[G, C]`, and the slot of each in its group, `None` without groups.
+fn max_with_slots<B: Backend>(x: FloatTensor<B>, groups: &RowGroups) -> (FloatTensor<B>, Option<IntTensor<B>>) {
+    let channels = x.shape()[1];
+    if groups.is_empty() {
+        return (zeros::<B>([0, channels], &x), None);
+    }
+    let filled = select::<B>(x, &groups.places());
+    let filled = B::float_reshape(filled, Shape::from([groups.len(), groups.most, channels])); // [G, S, C]
+    let (most, slots) = B::float_max_dim_with_indices(filled, 1, IntDType::I32); // [G, 1, C]
+    let shape = Shape::from([groups.len(), channels]);
+    (B::float_reshape(most, shape.clone()), Some(B::int_reshape(slots, shape)))
+}
+
+/// Each row gets the gradient of its group in those channels whose maximum it has.
+fn max_gradient<B: Backend>(
+    dy: FloatTensor<B>,
+    slots: IntTensor<B>,
+    groups: &RowGroups,
+    rows: usize,
+) -> FloatTensor<B> {
+    let (device, channels) = (dy.device(), dy.shape()[1]);
+    let column = |values: Vec<i32>, to: usize| {
+        let values = B::int_reshape(ints::<B>(values, &device), Shape::from([to, 1]));
+        B::int_expand(values, Shape::from([to, channels]))
+    };
+    // The row of each maximum, [G, C]. A slot behind the end of its group is the group's first row.
+    let first_slots = (0..groups.len()).map(|group| (group * groups.most) as i32).collect();
+    let places = B::int_add(slots, column(first_slots, groups.len()));
+    let places = B::int_reshape(places, Shape::from([groups.len() * channels]));
+    let rows_of_places = ints::<B>(groups.places().iter().map(|&row| row as i32).collect(), &device);
+    let winners = B::int_select(rows_of_places, 0, places);
+    let winners = B::int_reshape(winners, Shape::from([groups.len(), channels]));
+
+    let group_of_row = groups.group_of_row(rows);
+    let index = ints::<B>(group_of_row.iter().map(|&group| group as i32).collect(), &device);
+    let winners = B::int_select(winners, 0, index); // [N, C]
+    let members = groups.ends.last().copied().unwrap_or(0) as usize;
+    let own = (0..rows).map(|row| if row < members { row as i32 } else { -1 }).collect();
+    let bool_dtype = get_device_settings::<B>(&device).bool_dtype;
+    let lost = B::int_not_equal(winners, column(own, rows), bool_dtype);
+    B::float_mask_fill(select::<B>(dy, &group_of_row), lost, 0.0.into())
+}

@@ -1,0 +1,355 @@
+//! `cargo xtask bench gpu`: the networks on the GPU of this machine. Parity with the reference, then the training step
+//! of each network by stage, at batch sizes that double until the memory or the patience ends, with PyTorch beside it
+//! where it is installed with CUDA. Writes `gpu.json` and a page, at the end and nothing before.
+
+use crate::program::{self, Program};
+use anyhow::{Context, Result, bail, ensure};
+use clap::Parser;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Environment variable with the path of a Python that has PyTorch.
+const PYTHON: &str = "LIDARSHIFT_PYTHON";
+
+/// Folders of reference numbers for the parity, in `tests/golden/synthetic`.
+const PARITY: [&str; 3] = ["pointpillars_tiny", "centerpoint_tiny", "pointrcnn_tiny"];
+
+/// Detectors that are timed.
+const DETECTORS: [&str; 3] = ["pointpillars", "centerpoint", "pointrcnn"];
+
+/// Batch sizes stop doubling once a step takes longer, ms.
+const PATIENCE_MS: f64 = 4000.0;
+
+/// Time the networks on the GPU of this machine.
+#[derive(Parser, Debug)]
+#[command(name = "cargo xtask bench gpu --")]
+struct GpuArgs {
+    /// Cargo features that the program is built with, besides `wgpu`
+    #[arg(long, value_delimiter = ',', default_value = "vulkan,fusion,autotune")]
+    features: Vec<String>,
+    /// A built `lidarshift-checks` that is used instead of building one
+    #[arg(long, value_name = "FILE")]
+    program: Option<PathBuf>,
+    /// Detectors: names or TOML files
+    #[arg(long, value_delimiter = ',')]
+    detectors: Vec<String>,
+    /// Largest batch size
+    #[arg(long, default_value_t = 64)]
+    most: usize,
+    /// Timed steps of each case
+    #[arg(long, default_value_t = 5)]
+    steps: usize,
+    /// Also on a rasteriser in software, to test this command; its times say nothing about GPUs
+    #[arg(long)]
+    software: bool,
+    /// Folder for `gpu.json` and `gpu.md`
+    #[arg(long, default_value = "bench")]
+    out: PathBuf,
+    /// Folder of the device files
+    #[arg(long, default_value = "/dev", hide = true)]
+    devices: PathBuf,
+}
+
+/// What `lidarshift-checks adapters` prints.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Build {
+    build: String,
+    features: Vec<String>,
+    adapters: Vec<Adapter>,
+}
+
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Adapter {
+    name: String,
+    is_gpu: bool,
+}
+
+/// What `lidarshift-checks bench-step` and the PyTorch side report.
+#[derive(Clone, Debug, Deserialize)]
+struct Turn {
+    whole_ms: Vec<f64>,
+    #[serde(default)]
+    median_ms: Vec<(String, f64)>,
+    peak_mib: Option<u64>,
+    device_mib: Option<u64>,
+}
+
+/// A network at one batch size.
+#[derive(Clone, Debug, Serialize)]
+struct Row {
+    detector: String,
+    batch: usize,
+    /// `lidarshift`, or PyTorch in the form of OpenPCDet or at its best.
+    by: String,
+    /// Median of the whole step, ms; `None` if it failed.
+    step_ms: Option<f64>,
+    /// Median of each stage, ms, the device waited for after each.
+    stages_ms: Vec<(String, f64)>,
+    /// Peak resident memory of the process, MiB.
+    host_mib: Option<u64>,
+    /// Memory reserved on the device, MiB.
+    device_mib: Option<u64>,
+    /// Why there are no times.
+    failure: Option<String>,
+}
+
+#[derive(Serialize)]
+struct Report {
+    schema: &'static str,
+    /// Seconds since 1970.
+    measured_unix_s: u64,
+    command: Vec<String>,
+    system: String,
+    build: Build,
+    /// Folders of reference numbers that the device agrees with.
+    parity: Vec<String>,
+    rows: Vec<Row>,
+    /// What was not measured and why.
+    not_measured: Vec<String>,
+}
+
+/// Runs the command with its arguments.
+///
+/// # Errors
+/// A machine without a GPU, a parity that fails, a network that fails at batch 1, files that cannot be written. Nothing
+/// is written then.
+pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
+    let args = match GpuArgs::try_parse_from([&["gpu".to_string()], args].concat()) {
+        Ok(args) => args,
+        Err(error) => error.exit(),
+    };
+    if !args.software && !has_gpu(&args.devices) {
+        bail!(
+            "this machine has no GPU: there is neither nvidia*, kfd nor dri/renderD* in {}; nothing was measured and \
+             nothing was written (--software tests this command on a rasteriser in software)",
+            args.devices.display()
+        );
+    }
+    let features = [vec!["wgpu".to_string()], args.features.clone()].concat().join(",");
+    let program = match &args.program {
+        Some(program) => program.clone(),
+        None => program::build(root, Program::Checks, Some(&features))?,
+    };
+    let build: Build = serde_json::from_slice(&output(Command::new(&program).arg("adapters"))?)?;
+    let usable = build.adapters.iter().any(|adapter| adapter.is_gpu || args.software);
+    ensure!(
+        usable,
+        "the device wgpu finds no GPU on this machine, but {:?}; nothing was measured and nothing was written",
+        build.adapters.iter().map(|adapter| &adapter.name).collect::<Vec<_>>()
+    );
+    for network in PARITY {
+        eprintln!("parity of {network}");
+        let folder = root.join("tests/golden/synthetic").join(network);
+        output(Command::new(&program).arg("parity").arg(folder).args(["--device", "wgpu"]))?;
+    }
+    let mut report = Report {
+        schema: "lidarshift/bench-gpu/1",
+        measured_unix_s: std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.as_secs(),
+        command: std::env::args().collect(),
+        system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+        build,
+        parity: PARITY.map(String::from).to_vec(),
+        rows: Vec::new(),
+        not_measured: Vec::new(),
+    };
+    let python = python().map_err(|reason| report.not_measured.push(format!("PyTorch: {reason}"))).ok();
+    let chosen = if args.detectors.is_empty() { DETECTORS.map(String::from).to_vec() } else { args.detectors.clone() };
+    for detector in &chosen {
+        report.rows.extend(measure(root, &program, python.as_deref(), detector, &args)?);
+    }
+    if python.is_some() {
+        report.not_measured.push("PointRCNN in PyTorch: its neighbours are searched on the CPU".into());
+    }
+    write(&root.join(&args.out), &report)
+}
+
+/// Whether there is a device file of a GPU. On other systems than Linux there always is one.
+fn has_gpu(devices: &Path) -> bool {
+    let starts_with = |folder: &Path, start: &str| {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+        entries.into_iter().any(|entry| entry.file_name().to_string_lossy().starts_with(start))
+    };
+    let found = ["nvidia", "kfd", "dxg"].into_iter().any(|start| starts_with(devices, start));
+    !cfg!(target_os = "linux") || found || starts_with(&devices.join("dri"), "renderD")
+}
+
+/// The rows of one detector.
+fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, args: &GpuArgs) -> Result<Vec<Row>> {
+    let file = std::env::temp_dir().join(format!("lidarshift-bench-gpu-{}.json", std::process::id()));
+    let steps = args.steps.to_string();
+    let mut rows = Vec::new();
+    for batch in std::iter::successors(Some(1), |batch| Some(2 * batch)).take_while(|&batch| batch <= args.most) {
+        eprintln!("{detector}, batch {batch}");
+        let mut step = Command::new(program);
+        step.args(["bench-step", "--device", "wgpu", "--detector", detector, "--batch", &batch.to_string()]);
+        step.args(["--steps", &steps, "--json"]).arg(&file).current_dir(root);
+        let turn = output(&mut step).and_then(|_| Ok(serde_json::from_slice::<Turn>(&fs_err::read(&file)?)?));
+        let turn = if batch == 1 { Ok(turn?) } else { turn };
+        let is_end = turn.as_ref().map_or(true, |turn| median(&turn.whole_ms) > PATIENCE_MS);
+        let is_failure = turn.is_err();
+        rows.push(Row::new(detector, batch, "lidarshift", turn));
+        for form in ["openpcdet", "best"] {
+            let Some(python) = python.filter(|_| !is_failure && detector != "pointrcnn") else { continue };
+            let mut step = Command::new(python);
+            step.arg(root.join("xtask/bench_train/step.py")).arg(&file).args(["--form", form, "--steps", &steps]);
+            let threads = std::thread::available_parallelism().map_or(1, usize::from);
+            step.args(["--device", "cuda", "--threads", &threads.to_string()]);
+            let turn = output(&mut step).and_then(|text| Ok(serde_json::from_slice::<Turn>(&text)?));
+            rows.push(Row::new(detector, batch, &format!("torch, {form}"), turn));
+        }
+        if is_end {
+            break;
+        }
+    }
+    std::fs::remove_file(&file).ok();
+    Ok(rows)
+}
+
+impl Row {
+    fn new(detector: &str, batch: usize, by: &str, turn: Result<Turn>) -> Self {
+        let (turn, failure) = match turn {
+            Ok(turn) => (Some(turn), None),
+            Err(error) => (None, Some(format!("{error:#}").lines().last().unwrap_or_default().to_string())),
+        };
+        Row {
+            detector: detector.into(),
+            batch,
+            by: by.into(),
+            step_ms: turn.as_ref().map(|turn| median(&turn.whole_ms)),
+            host_mib: turn.as_ref().and_then(|turn| turn.peak_mib),
+            device_mib: turn.as_ref().and_then(|turn| turn.device_mib),
+            stages_ms: turn.map_or_else(Vec::new, |turn| turn.median_ms),
+            failure,
+        }
+    }
+}
+
+fn median(values: &[f64]) -> f64 {
+    statistics::median_upper(values.to_vec()).unwrap_or(f64::NAN)
+}
+
+/// The Python that has PyTorch with CUDA; the error says why there is none.
+fn python() -> Result<PathBuf, String> {
+    let python = PathBuf::from(std::env::var_os(PYTHON).unwrap_or_else(|| "python3".into()));
+    let test = "import torch; assert torch.cuda.is_available()";
+    match Command::new(&python).args(["-c", test]).output() {
+        Ok(output) if output.status.success() => Ok(python),
+        _ => Err(format!("{} has none with CUDA ({PYTHON} names another Python)", python.display())),
+    }
+}
+
+/// Runs a command and returns its stdout.
+fn output(command: &mut Command) -> Result<Vec<u8>> {
+    let name = command.get_program().display().to_string();
+    let output = command.output().with_context(|| format!("could not start {name}"))?;
+    ensure!(output.status.success(), "{name} failed: {}", String::from_utf8_lossy(&output.stderr).trim());
+    Ok(output.stdout)
+}
+
+fn write(folder: &Path, report: &Report) -> Result<()> {
+    fs_err::create_dir_all(folder)?;
+    for (name, text) in [("gpu.json", serde_json::to_string_pretty(report)? + "\n"), ("gpu.md", page(report))] {
+        let partial = folder.join(format!("{name}.partial"));
+        fs_err::write(&partial, text)?;
+        fs_err::rename(&partial, folder.join(name))?;
+        eprintln!("{}", folder.join(name).display());
+    }
+    Ok(())
+}
+
+/// The page.
+fn page(report: &Report) -> String {
+    let names: Vec<&str> = report.build.adapters.iter().map(|adapter| adapter.name.as_str()).collect();
+    let mut page = format!(
+        "# The networks on a GPU\n\n`{}`, {} ({}), build {} with {}. Parity holds for {}.\n",
+        report.command.join(" "),
+        names.join(", "),
+        report.system,
+        report.build.build,
+        report.build.features.join(", "),
+        report.parity.join(", ")
+    );
+    if report.build.adapters.iter().all(|adapter| !adapter.is_gpu) {
+        page += "\nThere is no GPU: these are times of a rasteriser in software.\n";
+    }
+    page += "\nMedians of a training step, ms; the device is waited for after each stage. Memory in MiB.\n\n";
+    page += "| detector | batch | by | step | samples/s | on device | host | stages |\n|---|---|---|---|---|---|---|---|\n";
+    for row in &report.rows {
+        let number = |value: Option<f64>| value.map_or("not measured".into(), |value| format!("{value:.1}"));
+        let mib = |value: Option<u64>| value.map_or(String::new(), |mib| mib.to_string());
+        let stages = row.stages_ms.iter().filter(|(stage, _)| stage != "whole");
+        let stages: Vec<String> = stages.map(|(stage, ms)| format!("{stage} {ms:.1}")).collect();
+        page += &format!(
+            "| `{}` | {} | {} | {} | {} | {} | {} | {} |\n",
+            row.detector,
+            row.batch,
+            row.by,
+            number(row.step_ms),
+            number(row.step_ms.map(|ms| 1e3 * row.batch as f64 / ms)),
+            mib(row.device_mib),
+            mib(row.host_mib),
+            row.failure.clone().unwrap_or_else(|| stages.join(", "))
+        );
+    }
+    for note in &report.not_measured {
+        page += &format!("\nNot measured: {note}.\n");
+    }
+    page
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn device_files_of_gpus() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = |name: &str| {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, "").unwrap();
+            path
+        };
+        file("null");
+        file("dri/card0");
+        assert!(!has_gpu(folder.path()) && !has_gpu(&folder.path().join("absent")));
+        for name in ["nvidia0", "kfd", "dri/renderD128"] {
+            let path = file(name);
+            assert!(has_gpu(folder.path()), "{name}");
+            std::fs::remove_file(path).unwrap();
+        }
+    }
+
+    #[test]
+    fn failures_are_rows_without_times() {
+        let turn = Turn {
+            whole_ms: vec![3.0, 1.0, 2.0],
+            median_ms: vec![("backbone".into(), 1.25), ("whole".into(), 2.0)],
+            peak_mib: Some(5),
+            device_mib: Some(7),
+        };
+        let failed = Row::new("pointrcnn", 8, "lidarshift", Err(anyhow::anyhow!("a\nout of memory")));
+        let build = Build { build: "0.1.0+x".into(), features: vec!["wgpu".into()], adapters: Vec::new() };
+        let report = Report {
+            schema: "",
+            measured_unix_s: 0,
+            command: vec!["bench".into()],
+            system: "linux".into(),
+            build,
+            parity: vec!["pointpillars_tiny".into()],
+            rows: vec![Row::new("pointpillars", 4, "lidarshift", Ok(turn)), failed],
+            not_measured: vec!["PyTorch: none".into()],
+        };
+        let page = page(&report);
+        for line in [
+            "| `pointpillars` | 4 | lidarshift | 2.0 | 2000.0 | 7 | 5 | backbone 1.2 |",
+            "| `pointrcnn` | 8 | lidarshift | not measured | not measured |  |  | out of memory |",
+            "There is no GPU",
+            "Not measured: PyTorch: none.",
+        ] {
+            assert!(page.contains(line), "{line}: {page}");
+        }
+    }
+}
