@@ -13,9 +13,9 @@ use std::path::Path;
 const GENERATORS: &[&str] = &["blind", "town"];
 
 /// Runs the benchmark `name`, the benchmarks of the crate folder `name`, the comparison of training steps with PyTorch
-/// (`train`; `args` are parts of the row ids), the networks on the GPU of this machine (`gpu`), the blind cases with mutated diagnosis code (`mutants`), commands that
-/// are ended by signals (`kills`), or all benchmarks of the crates. Pairs with hidden differences (`blind`, `loop`,
-/// `town`) run only by name.
+/// (`train`; `args` are parts of the row ids), the networks on the GPU of this machine (`gpu`), the blind cases with
+/// mutated diagnosis code (`mutants`), commands that are ended by signals (`kills`), or all benchmarks of the crates.
+/// Pairs with hidden differences (`blind`, `loop`, `town`) run only by name.
 pub fn bench(root: &Path, name: Option<&str>, args: &[String]) -> Result<()> {
     if name == Some("train") {
         return bench_train(root, args);

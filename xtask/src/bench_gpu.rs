@@ -274,7 +274,8 @@ fn page(report: &Report) -> String {
         page += "\nThere is no GPU: these are times of a rasteriser in software.\n";
     }
     page += "\nMedians of a training step, ms; the device is waited for after each stage. Memory in MiB.\n\n";
-    page += "| detector | batch | by | step | samples/s | on device | host | stages |\n|---|---|---|---|---|---|---|---|\n";
+    page +=
+        "| detector | batch | by | step | samples/s | on device | host | stages |\n|---|---|---|---|---|---|---|---|\n";
     for row in &report.rows {
         let number = |value: Option<f64>| value.map_or("not measured".into(), |value| format!("{value:.1}"));
         let mib = |value: Option<u64>| value.map_or(String::new(), |mib| mib.to_string());

@@ -37,6 +37,7 @@ const EXCEPTIONS: &[(&str, &str)] = &[
     ("crates/study/src/local.rs", "appends the output of processes to `log.txt`"),
     ("crates/study/src/frozen/checkpoint.rs", "the log of a process"),
     ("crates/checks/src/fuzz.rs", "mutated inputs in memory, which no user sees"),
+    ("crates/checks/src/fuzz/recordings.rs", "mutated inputs in a temporary folder, which no user sees"),
     ("crates/checks/src/fuzz/scenes.rs", "mutated inputs in memory, which no user sees"),
     ("crates/checks/src/fuzz/shards.rs", "mutated inputs in memory, which no user sees"),
     ("crates/checks/src/fuzz/targets.rs", "mutated inputs in memory, which no user sees"),

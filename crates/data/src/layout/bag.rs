@@ -1,9 +1,9 @@
 //! Recordings of ROS 2: topics with `sensor_msgs/msg/PointCloud2` in CDR. Read only.
 //!
 //! What holds the messages is a layout of its own: MCAP ([`super::mcap_file`]) or SQLite ([`super::db3`]). The root of
-//! the data set is a file, or a folder of rosbag2, and behind a `#` the topic: `drive.mcap#/front/points`. The topic may
-//! be left out if there is one with clouds. Frames are numbered in the order of their log times. Poses come from `/tf`
-//! and `/tf_static` or from odometry.
+//! the data set is a file, or a folder of rosbag2, and behind a `#` the topic: `drive.mcap#/front/points`. The topic
+//! may be left out if there is one with clouds. Frames are numbered in the order of their log times. Poses come from
+//! `/tf` and `/tf_static` or from odometry.
 
 mod cdr;
 mod files;

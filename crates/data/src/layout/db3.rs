@@ -41,8 +41,7 @@ impl Recording {
             DataError::file(path, format!("is no rosbag2 recording in SQLite: {e}; {advice}"))
         };
         check_closed(path)?;
-        let flags =
-            OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX | OpenFlags::SQLITE_OPEN_URI;
+        let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX | OpenFlags::SQLITE_OPEN_URI;
         let connection = Connection::open_with_flags(address(path)?, flags).map_err(wrong)?;
         // Functions in the schema of a foreign file are not called.
         connection.pragma_update(None, "trusted_schema", false).map_err(wrong)?;
@@ -66,7 +65,8 @@ impl Recording {
     fn topics_of_table(&self) -> Result<Vec<Topic>, DataError> {
         let connection = self.connection();
         let mut topics = Vec::new();
-        let mut found = self.prepared(&connection, "topics", "SELECT id, name, type, serialization_format FROM topics")?;
+        let mut found =
+            self.prepared(&connection, "topics", "SELECT id, name, type, serialization_format FROM topics")?;
         let mut rows = found.query([]).map_err(|e| self.wrong("topics", e))?;
         while let Some(row) = rows.next().map_err(|e| self.wrong("topics", e))? {
             let text = |column: usize| self.value::<String>("topics", row, column);

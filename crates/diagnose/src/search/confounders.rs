@@ -1,6 +1,6 @@
 //! Confounders across channels: findings that are side effects of others are dropped, and the reason is recorded.
 
-use super::{ChannelResult, Found, NamedParameter};
+use super::{ChannelResult, Found, NamedParameter, first_demands};
 use crate::catalogue::{Cause, Channel, Hypothesis, ParameterId, Quantity, Unit};
 use crate::diagnosis::Status;
 
@@ -235,6 +235,9 @@ fn has_significant_size(f: &Found) -> bool {
 pub fn drop_confounded(results: &mut [ChannelResult], returns: f64) {
     let had_findings: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
     drop_all(results, "the frames that say how large it is do not tell it from nothing", |f| !has_significant_size(f));
+    // As much evidence against a finding as the selection demands for one.
+    let evidence = first_demands().nats;
+    drop_all(results, "the held-out frames are less likely with it", |f| gain(f) < -evidence);
     drop_noise_of_rows(results);
     for Confounder { effect, by, share, because } in CONFOUNDERS {
         if let Some(most) = most(results, |f| by(f).then(|| gain(f))) {
@@ -389,6 +392,17 @@ mod tests {
 
     fn named(cause: Cause, channel: Channel, parameters: Vec<NamedParameter>) -> Found {
         found(Some(cause), channel, 1.0, parameters)
+    }
+
+    #[test]
+    fn what_makes_held_out_frames_less_likely_is_no_finding() {
+        let first = || found(Some(Cause::RangeCut), Channel::Hits, 4.0, vec![]);
+        let beside = |gain: f64| {
+            let share = vec![parameter(Quantity::Share, 0.1, 0.01)];
+            left(vec![first(), found(Some(Cause::RandomDropout), Channel::Hits, gain, share)])
+        };
+        assert!(beside(-1.0).is_empty(), "10 nats less on 10 frames");
+        assert_eq!(beside(-0.5), [Cause::RandomDropout], "5 nats are chance");
     }
 
     #[test]

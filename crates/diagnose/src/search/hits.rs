@@ -189,8 +189,9 @@ impl<'a> Search<'a> {
     fn above_floor(&self, table: &LossTable, laws: &[FittedLaw]) -> bool {
         let Some((last, before)) = laws.split_last() else { return false };
         let lost = table.lost(laws) - table.lost(before);
-        let own = last.numbers[0].abs();
         let joins = f64::from(u8::from(!before.is_empty()));
+        // What loses less than the laws before it say only corrects their form.
+        let own = if before.is_empty() { last.numbers[0].abs() } else { last.numbers[0] };
         match last.law {
             Law::Zone(_) => own > ZONE_FLOOR + 0.07 * joins + 0.1 * self.displaced,
             Law::Random => own > FLOOR + 0.02 * joins + 0.01 * self.displaced,

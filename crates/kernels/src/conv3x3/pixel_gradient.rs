@@ -33,7 +33,8 @@ pub(super) struct PixelGradient<'a> {
     inputs: usize,
 }
 
-/// The pixels `cells`, indices into `[batch, height, width]`, by their place in the tile, with the weights of this place.
+/// The pixels `cells`, indices into `[batch, height, width]`, by their place in the tile, with the weights of this
+/// place.
 pub(super) fn by_place<'a>(
     conv: &Conv3x3,
     dy: Images<'a>,

@@ -15,7 +15,8 @@ use std::ops::Range;
 pub(super) const SHIFTS: [(usize, usize); 4] = [(1, 0), (0, 0), (0, 1), (1, 1)];
 
 /// For each pixel of a tile the range of [`SHIFTS`] and, for each of them, the tap `ky * 3 + kx`.
-pub(super) const PRODUCTS: [(Range<usize>, &[usize]); 4] = [(1..2, &[4]), (1..3, &[5, 3]), (0..2, &[1, 7]), (0..4, &[2, 8, 6, 0])];
+pub(super) const PRODUCTS: [(Range<usize>, &[usize]); 4] =
+    [(1..2, &[4]), (1..3, &[5, 3]), (0..2, &[1, 7]), (0..4, &[2, 8, 6, 0])];
 
 /// No other code may write to `dx`.
 pub(super) struct StridedGradient<'a> {

@@ -15,6 +15,6 @@ pub use backbone::{BackboneStages, BaseBevBackbone, Block};
 pub use config::{BackboneConfig, PillarsConfig};
 pub use encoder::{BevEncoder, BevStages, EncoderConfig, tensor_name};
 pub use input::{PillarInput, PillarPreparation, PillarSample};
-pub use suppression::suppress;
 pub(crate) use suppression::far_below;
+pub use suppression::suppress;
 pub use vfe::{PillarRows, PillarVfe};

@@ -1,8 +1,8 @@
 //! Copies of rows and maxima over groups of rows, whose gradients are gathers as well.
 //!
-//! The gradient of burn's `select` adds the rows one after the other, on a GPU with one thread for each channel; that of
-//! `max_dim` scatters. Here the indices are known on the host, so that both directions of an operation read rows in any
-//! order and write each value once. Sums have a fixed order: the same bits in every run on the same device.
+//! The gradient of burn's `select` adds the rows one after the other, on a GPU with one thread for each channel; that
+//! of `max_dim` scatters. Here the indices are known on the host, so that both directions of an operation read rows in
+//! any order and write each value once. Sums have a fixed order: the same bits in every run on the same device.
 
 #[expect(deprecated, reason = "NdArray is kept as long as burn has it")]
 mod backend;

@@ -129,7 +129,8 @@ impl Bags {
         }
     }
 
-    /// The files that `metadata.yaml` lists. All lie beside it; early versions of rosbag2 wrote folders before the names.
+    /// The files that `metadata.yaml` lists. All lie beside it; early versions of rosbag2 wrote folders before the
+    /// names.
     fn listed_files(&self, folder: &Path) -> Result<Vec<PathBuf>, DataError> {
         let path = folder.join(METADATA);
         let wrong = |message: String| DataError::file(&path, message);
@@ -137,7 +138,8 @@ impl Bags {
         let metadata = Metadata::parse(&text).map_err(wrong)?;
         let format = metadata.compression_format;
         if !["", "none", "zstd"].contains(&format.as_str()) {
-            let message = format!("compression_format is {format:?}; zstd is read: write it anew with `ros2 bag convert`");
+            let message =
+                format!("compression_format is {format:?}; zstd is read: write it anew with `ros2 bag convert`");
             return Err(wrong(message));
         }
         let mut files = Vec::new();

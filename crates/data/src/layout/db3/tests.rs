@@ -98,7 +98,11 @@ fn files_that_are_compressed_or_missing_are_named() {
     fs::write(place("metadata.yaml"), METADATA.replace("_1.db3", "_1.mcap")).unwrap();
     assert!(refusal(folder.path()).contains("its file drive_1.mcap is no .db3 file: check `root` and `layout`"));
     fs::write(place("metadata.yaml"), METADATA.replace("format: \"\"", "format: lz4")).unwrap();
-    assert!(refusal(folder.path()).contains("compression_format is \"lz4\"; zstd is read"), "{}", refusal(folder.path()));
+    assert!(
+        refusal(folder.path()).contains("compression_format is \"lz4\"; zstd is read"),
+        "{}",
+        refusal(folder.path())
+    );
     for (text, want) in [
         ("a: [", "is no YAML"),
         ("rosbag2_bagfile_information: 7", "lists no file"),
@@ -148,7 +152,10 @@ fn what_is_wrong_is_named_with_table_and_row() {
         ("ALTER TABLE topics RENAME TO t; CREATE VIEW topics AS SELECT * FROM t", "lacks the table topics"),
         ("ALTER TABLE topics DROP COLUMN type", "its table topics cannot be read: no such column: type"),
         ("UPDATE topics SET name = x'00' WHERE id = 2", "its table topics cannot be read: row with the id 2: "),
-        ("UPDATE messages SET timestamp = 'now' WHERE id = 3", "its table messages cannot be read: row with the id 3: "),
+        (
+            "UPDATE messages SET timestamp = 'now' WHERE id = 3",
+            "its table messages cannot be read: row with the id 3: ",
+        ),
         ("UPDATE messages SET data = 'text' WHERE topic_id = 1", "its table messages cannot be read: row with the id "),
         ("UPDATE messages SET data = x'0001000005' WHERE topic_id = 1", "frame 000000: its PointCloud2 cannot be read"),
         ("DELETE FROM messages WHERE topic_id = 1", "its topic /points has no message"),
