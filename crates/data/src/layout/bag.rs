@@ -37,6 +37,8 @@ pub(super) struct Bags {
     /// Of the files, without the full stop.
     pub extension: &'static str,
     pub markers: &'static [&'static str],
+    /// Refuses a file before each use, also one that is open.
+    pub check: fn(&Path) -> Result<(), DataError>,
     /// Opens a file.
     pub open: fn(&Path) -> Result<Box<dyn BagFile>, DataError>,
 }
@@ -249,6 +251,7 @@ impl Bags {
         let (files, topic) = self.files_and_topic(root)?;
         let mut state = State::new();
         for path in files {
+            (self.check)(&path)?;
             let metadata = fs_err::metadata(&path)?;
             state.push((path, metadata.len(), metadata.modified().ok()));
         }

@@ -17,6 +17,7 @@ pub(super) const Db3: Bags = Bags {
     name: "db3",
     extension: "db3",
     markers: &["*.db3 (ROS 2)"],
+    check: check_closed,
     open: |path| Ok(Box::new(Recording::open(path)?)),
 };
 
@@ -40,7 +41,6 @@ impl Recording {
             let advice = "if the file was damaged, `sqlite3 FILE .recover` saves what can be read";
             DataError::file(path, format!("is no rosbag2 recording in SQLite: {e}; {advice}"))
         };
-        check_closed(path)?;
         let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX | OpenFlags::SQLITE_OPEN_URI;
         let connection = Connection::open_with_flags(address(path)?, flags).map_err(wrong)?;
         // Functions in the schema of a foreign file are not called.

@@ -17,6 +17,7 @@ pub(super) const Mcap: Bags = Bags {
     name: "mcap",
     extension: "mcap",
     markers: &["*.mcap (ROS 2)"],
+    check: |_| Ok(()),
     open: |path| Ok(Box::new(Recording::open(path)?)),
 };
 
