@@ -2,15 +2,13 @@
 //! of each network by stage, at batch sizes that double until the memory or the patience ends, with PyTorch beside it
 //! where it is installed with CUDA. Writes `gpu.json` and a page, at the end and nothing before.
 
-use crate::program::{self, Program};
-use anyhow::{Context, Result, bail, ensure};
+use crate::bench_train::{VARIABLE, median};
+use crate::program::{self, Program, output};
+use anyhow::{Result, bail, ensure};
 use clap::Parser;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-
-/// Environment variable with the path of a Python that has PyTorch.
-const PYTHON: &str = "LIDARSHIFT_PYTHON";
 
 /// Folders of reference numbers for the parity, in `tests/golden/synthetic`.
 const PARITY: [&str; 3] = ["pointpillars_tiny", "centerpoint_tiny", "pointrcnn_tiny"];
@@ -186,7 +184,7 @@ fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, a
         step.args(["--steps", &steps, "--json"]).arg(&file).current_dir(root);
         let turn = output(&mut step).and_then(|_| Ok(serde_json::from_slice::<Turn>(&fs_err::read(&file)?)?));
         let turn = if batch == 1 { Ok(turn?) } else { turn };
-        let is_end = turn.as_ref().map_or(true, |turn| median(&turn.whole_ms) > PATIENCE_MS);
+        let is_end = turn.as_ref().map_or(true, |turn| median(turn.whole_ms.clone()) > PATIENCE_MS);
         let is_failure = turn.is_err();
         rows.push(Row::new(detector, batch, "lidarshift", turn));
         for form in ["openpcdet", "best"] {
@@ -216,7 +214,7 @@ impl Row {
             detector: detector.into(),
             batch,
             by: by.into(),
-            step_ms: turn.as_ref().map(|turn| median(&turn.whole_ms)),
+            step_ms: turn.as_ref().map(|turn| median(turn.whole_ms.clone())),
             host_mib: turn.as_ref().and_then(|turn| turn.peak_mib),
             device_mib: turn.as_ref().and_then(|turn| turn.device_mib),
             stages_ms: turn.map_or_else(Vec::new, |turn| turn.median_ms),
@@ -225,26 +223,14 @@ impl Row {
     }
 }
 
-fn median(values: &[f64]) -> f64 {
-    statistics::median_upper(values.to_vec()).unwrap_or(f64::NAN)
-}
-
 /// The Python that has PyTorch with CUDA; the error says why there is none.
 fn python() -> Result<PathBuf, String> {
-    let python = PathBuf::from(std::env::var_os(PYTHON).unwrap_or_else(|| "python3".into()));
+    let python = PathBuf::from(std::env::var_os(VARIABLE).unwrap_or_else(|| "python3".into()));
     let test = "import torch; assert torch.cuda.is_available()";
     match Command::new(&python).args(["-c", test]).output() {
         Ok(output) if output.status.success() => Ok(python),
-        _ => Err(format!("{} has none with CUDA ({PYTHON} names another Python)", python.display())),
+        _ => Err(format!("{} has none with CUDA ({VARIABLE} names another Python)", python.display())),
     }
-}
-
-/// Runs a command and returns its stdout.
-fn output(command: &mut Command) -> Result<Vec<u8>> {
-    let name = command.get_program().display().to_string();
-    let output = command.output().with_context(|| format!("could not start {name}"))?;
-    ensure!(output.status.success(), "{name} failed: {}", String::from_utf8_lossy(&output.stderr).trim());
-    Ok(output.stdout)
 }
 
 fn write(folder: &Path, report: &Report) -> Result<()> {

@@ -1,14 +1,14 @@
 //! `cargo xtask bench train [FILTER]`: training steps, inference and the most expensive layers, compared with the same
 //! networks in PyTorch. Both sides run alternately.
 
-use crate::program::{self, Program};
+use crate::program::{self, Program, output};
 use anyhow::{Context, Result, bail, ensure};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Environment variable with the path of a Python that has PyTorch.
-const VARIABLE: &str = "LIDARSHIFT_PYTHON";
+pub(crate) const VARIABLE: &str = "LIDARSHIFT_PYTHON";
 
 /// File in which the rows are kept.
 const FILE: &str = "bench/train.json";
@@ -186,7 +186,7 @@ impl Row {
     }
 }
 
-fn median(values: Vec<f64>) -> f64 {
+pub(crate) fn median(values: Vec<f64>) -> f64 {
     statistics::median_upper(values).unwrap_or(f64::NAN)
 }
 
@@ -231,14 +231,6 @@ fn python() -> Result<PathBuf> {
             python.display()
         ),
     }
-}
-
-/// Runs a command and returns its stdout.
-fn output(command: &mut Command) -> Result<Vec<u8>> {
-    let name = command.get_program().display().to_string();
-    let output = command.output().with_context(|| format!("could not start {name}"))?;
-    ensure!(output.status.success(), "{name} failed: {}", String::from_utf8_lossy(&output.stderr));
-    Ok(output.stdout)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! caller's arguments.
 
 use crate::cargo;
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, bail, ensure};
 use std::ffi::{OsStr, OsString};
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -58,6 +58,14 @@ pub fn run(root: &Path, program: Program, args: &[OsString]) -> Result<()> {
         bail!("{} {} ended with {status}", program.name(), args.join(OsStr::new(" ")).display());
     }
     Ok(())
+}
+
+/// Runs a command and returns its stdout.
+pub fn output(command: &mut Command) -> Result<Vec<u8>> {
+    let name = command.get_program().display().to_string();
+    let output = command.output().with_context(|| format!("could not start {name}"))?;
+    ensure!(output.status.success(), "{name} failed: {}", String::from_utf8_lossy(&output.stderr).trim());
+    Ok(output.stdout)
 }
 
 /// Path of a program, built in release, with an additional backend feature if requested.

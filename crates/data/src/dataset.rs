@@ -4,7 +4,7 @@ use crate::Presence as _;
 use crate::dataset_config::DatasetConfig;
 use crate::frame_index::FrameIndex;
 use crate::kitti_text::{KittiText, read_kitti_text};
-use crate::layout::{Moment, PointDetails, Sequence};
+use crate::layout::{Moment, PointDetails, Sequence, is_recording};
 use crate::limits::{MOST_IDS, at_most, check_name, read_text};
 use crate::{Calibration, Cloud, DataError, Detection, FilePart, Frame, LabelBox, LabelFrame, Object, PointColumns};
 use rayon::prelude::*;
@@ -318,12 +318,6 @@ impl Dataset {
         index.finish(true);
         Ok(if found.is_empty() { kitti } else { found.into_iter().collect() })
     }
-}
-
-/// Whether a file is itself a data set.
-fn is_recording(path: &Path) -> bool {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    [".mcap", ".db3", ".mcap.zstd", ".db3.zstd"].iter().any(|ending| name.ends_with(ending))
 }
 
 fn text_path(folder: &Path, id: &str) -> PathBuf {

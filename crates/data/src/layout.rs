@@ -72,6 +72,11 @@ layouts! {
     Shards = shards: "Frames in `shards/*.tar`, as `convert --to shards` writes them: members `ID.bin` or `ID.pcd`, `ID.txt`.";
 }
 
+/// Whether the name is that of a file that is itself a data set.
+pub(crate) fn is_recording(path: &Path) -> bool {
+    [&mcap_file::Mcap, &db3::Db3].iter().any(|bags| bags.names(path))
+}
+
 // The table has no mark for the default.
 #[allow(clippy::derivable_impls)]
 impl Default for Layout {

@@ -305,4 +305,4 @@ impl Bags {
 }
 
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;

@@ -3,7 +3,7 @@
 //! place of their tile of 2 x 2, so that the same taps contribute to them.
 
 use super::Conv3x3;
-use super::strided_gradient::{PRODUCTS, SHIFTS};
+use super::strided_gradient::{PRODUCTS, SHIFTS, pack_taps};
 use crate::blocks::{Segment, TileGrid};
 use crate::images::Images;
 use crate::output::Shared;
@@ -54,14 +54,8 @@ pub(super) fn by_place<'a>(
     }
     let places = pixels.into_iter().zip(PRODUCTS).filter(|(pixels, _)| !pixels.is_empty());
     let with_weights = |(pixels, (shifts, taps)): (Vec<Pixel>, (Range<usize>, &[usize]))| {
-        let weights = PackedWeights::new(conv.inputs, taps.len() * conv.outputs, |input, insert| {
-            for (k, tap) in taps.iter().enumerate() {
-                for output in 0..conv.outputs {
-                    insert(k * conv.outputs + output, weight[(output * conv.inputs + input) * 9 + tap]);
-                }
-            }
-        });
-        (PixelGradient { dy, pixels, shifts, dx, inputs: conv.inputs }, weights)
+        let gradient = PixelGradient { dy, pixels, shifts, dx, inputs: conv.inputs };
+        (gradient, pack_taps(conv, weight, taps))
     };
     places.map(with_weights).collect()
 }

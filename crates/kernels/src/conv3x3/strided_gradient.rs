@@ -27,9 +27,13 @@ pub(super) struct StridedGradient<'a> {
 
 /// The weights `[outputs, inputs, 3, 3]` of `conv` for [`StridedGradient`].
 pub(super) fn pack(conv: &Conv3x3, weight: &[f32]) -> PackedWeights {
-    PackedWeights::new(conv.inputs, 9 * conv.outputs, |input, insert| {
-        let taps = PRODUCTS.iter().flat_map(|(_, taps)| taps.iter());
-        for (k, tap) in taps.enumerate() {
+    pack_taps(conv, weight, &PRODUCTS.map(|(_, taps)| taps).concat())
+}
+
+/// The weights of some taps in their order.
+pub(super) fn pack_taps(conv: &Conv3x3, weight: &[f32], taps: &[usize]) -> PackedWeights {
+    PackedWeights::new(conv.inputs, taps.len() * conv.outputs, |input, insert| {
+        for (k, tap) in taps.iter().enumerate() {
             for output in 0..conv.outputs {
                 insert(k * conv.outputs + output, weight[(output * conv.inputs + input) * 9 + tap]);
             }

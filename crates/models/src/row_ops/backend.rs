@@ -128,7 +128,7 @@ fn max_with_slots<B: Backend>(x: FloatTensor<B>, groups: &RowGroups) -> (FloatTe
     if groups.is_empty() {
         return (zeros::<B>([0, channels], &x), None);
     }
-    let filled = select::<B>(x, &groups.places());
+    let filled = select::<B>(x, &groups.places);
     let filled = B::float_reshape(filled, Shape::from([groups.len(), groups.most, channels])); // [G, S, C]
     let (most, slots) = B::float_max_dim_with_indices(filled, 1, IntDType::I32); // [G, 1, C]
     let shape = Shape::from([groups.len(), channels]);
@@ -151,7 +151,7 @@ fn max_gradient<B: Backend>(
     let first_slots = (0..groups.len()).map(|group| (group * groups.most) as i32).collect();
     let places = B::int_add(slots, column(first_slots, groups.len()));
     let places = B::int_reshape(places, Shape::from([groups.len() * channels]));
-    let rows_of_places = ints::<B>(groups.places().iter().map(|&row| row as i32).collect(), &device);
+    let rows_of_places = ints::<B>(groups.places.iter().map(|&row| row as i32).collect(), &device);
     let winners = B::int_select(rows_of_places, 0, places);
     let winners = B::int_reshape(winners, Shape::from([groups.len(), channels]));
 

@@ -36,6 +36,8 @@ pub struct RowGroups {
     ends: Vec<u32>,
     /// Rows of the largest group.
     most: usize,
+    /// The rows of each group, filled up to the size of the largest with its first row, which changes no maximum.
+    places: Vec<u32>,
 }
 
 impl RowGroups {
@@ -44,10 +46,12 @@ impl RowGroups {
     /// # Panics
     /// A group without rows.
     pub fn new(ends: &[u32]) -> Self {
-        let groups = RowGroups { ends: ends.to_vec(), most: 0 };
-        let most = groups.spans().map(|(begin, end)| end.checked_sub(begin).expect("ends rise") as usize).max();
-        assert!(groups.spans().all(|(begin, end)| begin < end), "a group has no rows");
-        RowGroups { most: most.unwrap_or(0), ..groups }
+        let spans = || std::iter::once(0).chain(ends.iter().copied()).zip(ends.iter().copied());
+        let most = spans().map(|(begin, end)| end.checked_sub(begin).expect("ends rise")).max().unwrap_or(0);
+        assert!(spans().all(|(begin, end)| begin < end), "a group has no rows");
+        let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
+        let places = spans().flat_map(|(b, e)| (0..most).map(move |slot| place(b, e, slot))).collect();
+        RowGroups { ends: ends.to_vec(), most: most as usize, places }
     }
 
     /// Number of groups.
@@ -58,18 +62,6 @@ impl RowGroups {
     /// Whether there is no group.
     pub fn is_empty(&self) -> bool {
         self.ends.is_empty()
-    }
-
-    /// Begin and end of each group.
-    fn spans(&self) -> impl Iterator<Item = (u32, u32)> {
-        let begins = std::iter::once(0).chain(self.ends.iter().copied());
-        begins.zip(self.ends.iter().copied())
-    }
-
-    /// The rows of each group, filled up to the size of the largest with its first row, which changes no maximum.
-    fn places(&self) -> Vec<u32> {
-        let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
-        self.spans().flat_map(|(b, e)| (0..self.most as u32).map(move |slot| place(b, e, slot))).collect()
     }
 
     /// The group of each of `rows` rows; 0 for rows that belong to none.

@@ -94,7 +94,12 @@ impl Bags {
         if place.is_dir() {
             return Ok(self.files_in(place, "")?.len() + self.files_in(place, ".zstd")?.len() > 0);
         }
-        Ok(place.is_file() && (self.is_file(place, "") || self.is_file(place, ".zstd")))
+        Ok(place.is_file() && self.names(place))
+    }
+
+    /// Whether the name is that of a file of this layout, compressed or not.
+    pub(in crate::layout) fn names(&self, path: &Path) -> bool {
+        self.is_file(path, "") || self.is_file(path, ".zstd")
     }
 
     /// The files of a root, and the topic if it names one.
