@@ -19,7 +19,8 @@ use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, roles};
 use crate::pairing::{FrameAlone, FramePair, kept_of_frame};
-use crate::search::{Context, hits, mask, noise, quantisation, returns};
+use crate::search::returns::{self, Scenes};
+use crate::search::{Context, hits, mask, noise, quantisation};
 use data::Dataset;
 use gain::Verification;
 use sensor::effects::MadeFrom;
@@ -213,7 +214,7 @@ fn search_all(
     let has_shots = contexts.shots.frames.iter().any(|f| !f.measured.is_empty() && !f.simulated.is_empty());
     let lost = has_shots.then(|| hits::search(&contexts.shots, &hides, false));
     finished(3);
-    let odd = returns::search_kinds(&contexts.returns, kinds(&contexts.returns));
+    let odd = returns::search_kinds(&contexts.returns, kinds(&contexts.returns), Scenes::Different);
     finished(4);
     // Rounding is no noise: the simulated side is rounded as well.
     let rounded = match step_m {

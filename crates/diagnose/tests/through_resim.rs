@@ -17,7 +17,12 @@ fn race(folder: &Path) -> Dataset {
 
 /// The same, with attributes of the points on request, and with another order of the shots.
 fn race_with(folder: &Path, attributes: bool, sweep: &str) -> Dataset {
-    let text = "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 30\nresolution = 0.3\nlabel_points = 1\nrace = { runs = 1, frames = 1500 }\n\
+    race_of(folder, attributes, sweep, 0.3)
+}
+
+/// The same with so many of the sensors' rows and columns.
+fn race_of(folder: &Path, attributes: bool, sweep: &str, resolution: f64) -> Dataset {
+    let text = "name = \"r\"\nseed = 3\nrig = \"rig.toml\"\nframes = 30\nlabel_points = 1\nrace = { runs = 1, frames = 1500 }\n\
                 [[dataset]]\nname = \"sim\"\neffects = \"none.toml\"\n";
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../configs");
     let rig = fs_err::read_to_string(configs.join("sensors/av21.toml")).unwrap();
@@ -25,7 +30,7 @@ fn race_with(folder: &Path, attributes: bool, sweep: &str) -> Dataset {
     let rig = rig.replace("sweep = \"rows\"", &format!("sweep = \"{sweep}\""));
     fs_err::write(folder.join("rig.toml"), rig).unwrap();
     fs_err::write(folder.join("none.toml"), "").unwrap();
-    let text = format!("attributes = {attributes}\n{text}");
+    let text = format!("attributes = {attributes}\nresolution = {resolution}\n{text}");
     fs_err::write(folder.join("r.toml"), text).unwrap();
     let (config, files) = RaceConfig::find(&folder.join("r.toml").display().to_string()).unwrap();
     make_race_datasets(&config, &files, folder, &[], &|_, _, _| ()).unwrap();
@@ -146,6 +151,39 @@ fn formats_limits_packets_and_dirt_are_found_and_corrected() {
         let outcome = diagnosed(&measured, &sim, folder.path());
         let d = &outcome.diagnosis;
         assert_eq!(named(d), [cause.name()], "{:?}", d.findings);
+        let found = d.findings[0].parameter(quantity).unwrap();
+        assert!((found.estimate / truth - 1.0).abs() < within, "{cause}: {found:?}");
+        let closed = d.gain.closed.unwrap_or_else(|| panic!("{:?} {:?} {}", d.gain, d.findings, outcome.extended));
+        assert!(closed > 0.8 && d.gain.not_applied.is_empty(), "{cause}: {:?}", d.gain);
+    }
+}
+
+/// What is in the air, and ranges that are far off, are found with their size, and corrected.
+#[test]
+fn weather_and_tails_are_found_and_corrected() {
+    let folder = tempfile::tempdir().unwrap();
+    let noise = "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.01\n";
+    let made = race_of(folder.path(), true, "rows", 0.6);
+    let sim = with_effects(&made, noise, &folder.path().join("simulated"), 10);
+    for (effect, cause, quantity, truth, within) in [
+        // The mean distance of droplets is a sixth of the visibility.
+        (
+            "kind = \"fog\"\nvisibility_m = 120\nbackscatter = 0.02\nreach_m = 110\n",
+            Cause::Fog,
+            Quantity::DepthM,
+            20.0,
+            0.15,
+        ),
+        ("kind = \"rain\"\nrate_mm_per_h = 20\ndrops = 0.005\n", Cause::Rain, Quantity::DepthM, 2.3, 0.15),
+        ("kind = \"spray\"\ndensity_per_m = 0.1\n", Cause::Spray, Quantity::DensityPerM, 0.1, 0.2),
+        ("kind = \"heavy_tails\"\nprobability = 0.01\nstd_m = 0.15\n", Cause::HeavyTails, Quantity::StdM, 0.15, 0.15),
+    ] {
+        let measured = format!("{noise}[[effect]]\n{effect}");
+        let measured = with_effects(&made, &measured, &folder.path().join(cause.name()), 11);
+        let outcome = diagnosed(&measured, &sim, folder.path());
+        let d = &outcome.diagnosis;
+        let says: Vec<&str> = d.findings.iter().map(|f| f.says.as_str()).collect();
+        assert_eq!(named(d), [cause.name()], "{says:?} {:?}", d.considered);
         let found = d.findings[0].parameter(quantity).unwrap();
         assert!((found.estimate / truth - 1.0).abs() < within, "{cause}: {found:?}");
         let closed = d.gain.closed.unwrap_or_else(|| panic!("{:?} {:?} {}", d.gain, d.findings, outcome.extended));

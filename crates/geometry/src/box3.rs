@@ -60,6 +60,28 @@ impl Box3 {
         [self.center[0] + p[0] * c - p[1] * s, self.center[1] + p[0] * s + p[1] * c, self.center[2] + p[2]]
     }
 
+    /// Distances at which a ray enters and leaves the box, m, between 0 and `until_m`; `None` for a ray that misses it.
+    pub fn path_through(&self, origin: [f64; 3], direction: [f64; 3], until_m: f64) -> Option<[f64; 2]> {
+        let start = self.to_local(origin);
+        let (s, c) = self.yaw_rad.sin_cos();
+        let [x, y, z] = direction;
+        let local = [x * c + y * s, y * c - x * s, z];
+        let (mut near, mut far) = (0.0, until_m);
+        for k in 0..3 {
+            let half = self.size[k] / 2.0;
+            if local[k] == 0.0 {
+                if start[k].abs() > half {
+                    return None;
+                }
+                continue;
+            }
+            let (a, z) = ((-half - start[k]) / local[k], (half - start[k]) / local[k]);
+            near = f64::max(near, a.min(z));
+            far = f64::min(far, a.max(z));
+        }
+        (near < far).then_some([near, far])
+    }
+
     /// The same box with its yaw in [-pi, pi).
     pub fn with_wrapped_yaw(mut self) -> Self {
         self.yaw_rad = limit_period(self.yaw_rad, 0.5, 2.0 * PI);

@@ -1,7 +1,7 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 32] = [
+pub const CATALOGUE: [&str; 36] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
@@ -10,7 +10,9 @@ pub const CATALOGUE: [&str; 32] = [
     "dirty_window",
     "dual_returns",
     "ego_occlusion",
+    "fog",
     "ground_error",
+    "heavy_tails",
     "incidence_dropout",
     "incidence_noise",
     "intensity_law",
@@ -23,6 +25,7 @@ pub const CATALOGUE: [&str; 32] = [
     "packet_loss",
     "pitch_roll",
     "quantisation",
+    "rain",
     "random_dropout",
     "range_bias",
     "range_cut",
@@ -32,6 +35,7 @@ pub const CATALOGUE: [&str; 32] = [
     "sensor_extrinsics",
     "signal_dropout",
     "signal_noise",
+    "spray",
     "time_offset",
     "wrong_shape",
 ];
@@ -47,6 +51,6 @@ mod tests {
 
     #[test]
     fn the_list_is_sorted() {
-        assert!(CATALOGUE.is_sorted() && in_catalogue("wrong_shape") && !in_catalogue("fog"));
+        assert!(CATALOGUE.is_sorted() && in_catalogue("wrong_shape") && !in_catalogue("encoder_ripple"));
     }
 }

@@ -34,6 +34,8 @@ pub enum Law {
     Backscatter(f64),
     /// Between two ranges, m.
     Between(f64, f64),
+    /// In the air between two ranges, m.
+    Plume(f64, f64),
     /// At a range, m.
     At(f64),
 }
@@ -50,9 +52,14 @@ impl Law {
                 let v: f64 = rng.random();
                 -0.5 * mean * ((1.0 - u) * (1.0 - v)).max(1e-12).ln()
             }
-            Law::Between(low, high) => low + (high - low) * u,
+            Law::Between(low, high) | Law::Plume(low, high) => low + (high - low) * u,
             Law::At(range) => range + 0.05 * (u - 0.5),
         }
+    }
+
+    /// Whether the returns come from droplets in the air.
+    pub fn is_of_droplets(&self) -> bool {
+        matches!(self, Law::Drops(..) | Law::Backscatter(_) | Law::Plume(..))
     }
 
     /// Length of the ranges that hold most of the returns, m: how far they are from being spread over all ranges.
@@ -62,7 +69,7 @@ impl Law {
             Law::Power(reach, power) => reach / power.max(1.0),
             Law::Drops(_, high) => 0.3 * high,
             Law::Backscatter(mean) => 2.0 * mean,
-            Law::Between(low, high) => (high - low).max(0.2),
+            Law::Between(low, high) | Law::Plume(low, high) => (high - low).max(0.2),
             Law::At(_) => 0.2,
         }
     }
@@ -85,9 +92,9 @@ impl Frame<'_> {
                 Effect::Fog { visibility_m, backscatter } => {
                     Some(Clutter { rate: backscatter, law: Law::Backscatter(0.06 * visibility_m) })
                 }
-                Effect::Spray { per_m } => self.plume_m(shot, free_m).map(|[begin, length]| Clutter {
-                    rate: 1.0 - (-per_m * length).exp(),
-                    law: Law::Between(begin, begin + length.min(7.0)),
+                Effect::Spray { per_m } => self.plume_m(shot, free_m).map(|([begin, end], times)| Clutter {
+                    rate: 1.0 - (-per_m * times * (end - begin)).exp(),
+                    law: Law::Plume(begin, end),
                 }),
                 Effect::Interference { share, stripes } => {
                     let oblique = stripes * shot.azimuth_rad + 3.0 * stripes * shot.elevation_rad + self.stripes;

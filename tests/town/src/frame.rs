@@ -295,9 +295,9 @@ impl<'a> Frame<'a> {
         Some(hit.range_m)
     }
 
-    /// Length of the way through plumes behind moving cars before `until_m`, and where the plume begins, m. The density
-    /// is that of a car at 8 m/s.
-    pub fn plume_m(&self, shot: &Shot, until_m: f64) -> Option<[f64; 2]> {
+    /// Where the way through a plume behind a moving car begins and ends before `until_m`, m, and its density over that
+    /// behind a car at 8 m/s.
+    pub fn plume_m(&self, shot: &Shot, until_m: f64) -> Option<([f64; 2], f64)> {
         let (ray, _) = self.rays(shot, [0.0; 2]);
         let world = &self.side.world;
         for (vehicle, place) in self.slice(shot).moment.places() {
@@ -313,9 +313,9 @@ impl<'a> Frame<'a> {
             let center = [x - behind * cos, y - behind * sin, z - size[2] / 2.0 + 0.6];
             let plume = Block::new(center, [7.5, size[1] + 0.5, 1.2], place.heading_rad);
             if let Some([enter, leave]) = plume.chord(&ray) {
-                let length = leave.min(until_m) - enter;
-                if length > 0.0 {
-                    return Some([enter, length * (speed / 8.0).powi(2)]);
+                let leave = leave.min(until_m);
+                if leave > enter {
+                    return Some(([enter, leave], (speed / 8.0).powi(2)));
                 }
             }
         }

@@ -100,8 +100,13 @@ impl Frame<'_> {
         let packet_lost = self.lost[shot.sensor][shot.column / crate::frame::PACKET];
         for way in std::iter::once(self.usual_clutter()).chain(self.clutter(shot, met.first.as_ref())) {
             if rng.random::<f64>() < way.rate {
+                let range = way.law.draw(rng);
+                // No droplet is seen through a surface.
+                if way.law.is_of_droplets() && met.first.as_ref().is_some_and(|echo| echo.range_m < range) {
+                    continue;
+                }
                 if !packet_lost {
-                    report(way.law.draw(rng), None, rng);
+                    report(range, None, rng);
                 }
                 return;
             }

@@ -24,8 +24,12 @@ identifiers! {
         DualReturns = "dual_returns",
         /// A part of the ego vehicle hides some directions.
         EgoOcclusion = "ego_occlusion",
+        /// Fog: droplets return light, ever fewer with range, and the light of surfaces falls.
+        Fog = "fog",
         /// The ground is not the plane that it is taken for.
         GroundError = "ground_error",
+        /// Single ranges are much farther off than the others.
+        HeavyTails = "heavy_tails",
         /// Returns are lost at grazing incidence.
         IncidenceDropout = "incidence_dropout",
         /// Range noise grows with the angle of incidence.
@@ -50,6 +54,8 @@ identifiers! {
         PitchRoll = "pitch_roll",
         /// Ranges are rounded.
         Quantisation = "quantisation",
+        /// Rain: drops near the sensor return light.
+        Rain = "rain",
         /// The same share of returns is lost everywhere.
         RandomDropout = "random_dropout",
         /// A constant range offset or a scale error.
@@ -68,6 +74,8 @@ identifiers! {
         SignalDropout = "signal_dropout",
         /// Range noise grows as the received signal falls.
         SignalNoise = "signal_noise",
+        /// Spray or dust behind vehicles returns light.
+        Spray = "spray",
         /// Labels or objects are stamped late or early.
         TimeOffset = "time_offset",
         /// No cause of the catalogue: the difference depends on row or azimuth.
@@ -99,10 +107,14 @@ impl Cause {
             Cause::RangeDropout => (Family::Detection, 130),
             Cause::RandomDropout => (Family::Detection, 140),
             Cause::Outliers => (Family::Returns, 150),
+            Cause::Fog => (Family::Returns, 152),
+            Cause::Rain => (Family::Returns, 154),
+            Cause::Spray => (Family::Returns, 156),
             Cause::RangeBias => (Family::RangeError, 160),
             Cause::BeamRangeOffset => (Family::RangeError, 170),
             Cause::RangeNoise => (Family::RangeError, 180),
             Cause::SignalNoise => (Family::RangeError, 190),
+            Cause::HeavyTails => (Family::RangeError, 191),
             Cause::BeamIntensity => (Family::Returns, 192),
             Cause::IntensityLaw => (Family::Returns, 194),
             Cause::RangeCut => (Family::Detection, 200),

@@ -27,6 +27,10 @@ identifiers! {
         Burst = "burst",
         /// Cosine of incidence at which half of the returns are lost.
         CosHalf = "cos_half",
+        /// Droplets for each metre of a path behind vehicles, over all vehicles.
+        DensityPerM = "density_per_m",
+        /// Mean distance of droplets where nothing stands before them.
+        DepthM = "depth_m",
         /// Full width of the beam.
         DivergenceRad = "divergence_rad",
         /// Middle of a patch of directions.
@@ -45,12 +49,16 @@ identifiers! {
         Gamma = "gamma",
         /// Range at which half of the returns are lost.
         HalfAtM = "half_at_m",
+        /// Height of what is behind vehicles over the ground.
+        HeightM = "height_m",
         /// Measured objects are higher by this.
         HigherM = "higher_m",
         /// Exponent of the cosine of incidence in the intensity.
         IncidenceExponent = "incidence_exponent",
         /// Shift along the y axis of the object, or of the sensor.
         LeftM = "left_m",
+        /// Length of what is behind vehicles.
+        LengthM = "length_m",
         /// Measured objects are longer by this.
         LongerM = "longer_m",
         /// Probability that a packet is lost after one that arrived.
@@ -117,6 +125,8 @@ identifiers! {
         Threshold = "threshold",
         /// Shift along the z axis of the object, or of the sensor.
         UpM = "up_m",
+        /// Range at which an eye sees 5 % of the contrast.
+        VisibilityM = "visibility_m",
         /// Measured objects are wider by this.
         WiderM = "wider_m",
         /// Turn about the z axis.
@@ -135,6 +145,8 @@ identifiers! {
         Metre = "m",
         /// Milliseconds.
         Millisecond = "ms",
+        /// For each metre.
+        PerMetre = "1/m",
         /// Metres for each metre of range.
         MetrePerMetre = "m/m",
         /// A number of a sensor.
@@ -150,10 +162,13 @@ impl Quantity {
     /// Its unit.
     pub const fn unit(self) -> Unit {
         match self {
-            Quantity::ForwardM
+            Quantity::DepthM
+            | Quantity::ForwardM
             | Quantity::HalfAtM
+            | Quantity::HeightM
             | Quantity::HigherM
             | Quantity::LeftM
+            | Quantity::LengthM
             | Quantity::LongerM
             | Quantity::MaxM
             | Quantity::MinM
@@ -165,6 +180,7 @@ impl Quantity {
             | Quantity::StdM
             | Quantity::StepM
             | Quantity::UpM
+            | Quantity::VisibilityM
             | Quantity::WiderM => Unit::Metre,
             Quantity::AzimuthDeg
             | Quantity::AzimuthFromDeg
@@ -184,6 +200,7 @@ impl Quantity {
             Quantity::AngleRad | Quantity::DivergenceRad => Unit::Radian,
             Quantity::OffsetS | Quantity::ScanS => Unit::Second,
             Quantity::PacketMs => Unit::Millisecond,
+            Quantity::DensityPerM => Unit::PerMetre,
             Quantity::PerM => Unit::MetrePerMetre,
             Quantity::Sensor => Unit::Number,
             _ => Unit::One,

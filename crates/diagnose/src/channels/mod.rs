@@ -1,6 +1,7 @@
 //! Channels: sums over a pair of data sets from which causes are fitted.
 
 pub mod cells;
+pub mod free_path;
 pub mod groups;
 pub mod hits;
 pub mod intensity;
@@ -9,5 +10,7 @@ pub mod mask;
 pub mod mean;
 pub mod motion;
 pub mod patch;
+pub mod plumes;
 pub mod returns;
 pub mod roughness;
+pub mod tails;

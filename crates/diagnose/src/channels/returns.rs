@@ -2,7 +2,7 @@
 //! returns are counted in the same way, each against the others and in gaps of the measured side, so that effects of
 //! both sides cancel.
 
-use crate::pairing::{FramePair, Lies, Ray, Surface};
+use crate::pairing::{FramePair, Lies, Ray, Surface, company_m};
 use rayon::prelude::*;
 
 /// Kinds of returns off the surfaces.
@@ -21,7 +21,13 @@ pub enum Odd {
 /// All kinds.
 pub const ODD: [Odd; 4] = [Odd::Alone, Odd::Between, Odd::GroupInFront, Odd::GroupBehind];
 
-/// Range below which a return may be from the ego vehicle, m.
+/// Distance from a surface within which a return lies on it, m: along the ray, or across the surface.
+const ON_M: [f64; 2] = [0.6, 0.3];
+
+/// Nearest range of lone returns, m: nearer ones are from the sensor's housing.
+pub const NEAREST_M: f64 = 1.0;
+
+/// Range below which a return may be from the ego vehicle, m: only single ones in front of surfaces count.
 pub const OWN_CAR_M: f64 = 4.0;
 
 /// Neighbours at the same range from which on returns are grouped. Mixed ranges may have a few: a beam wider than the
@@ -34,8 +40,12 @@ const FLAT_M: f64 = 0.15;
 /// The kind of a return; `None` on a surface.
 pub fn odd(ray: &Ray) -> Option<Odd> {
     let lies = ray.lies();
-    if ray.own_range_m() < OWN_CAR_M {
+    if ray.shown {
         return None;
+    }
+    if ray.own_range_m() < OWN_CAR_M {
+        let single = ray.own_range_m() >= NEAREST_M && is_lone_before(ray);
+        return single.then_some(Odd::Alone);
     }
     match lies {
         // On a smooth surface at grazing incidence neighbouring rows lie apart as well.
@@ -48,6 +58,27 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
         Lies::Behind => Some(Odd::GroupBehind),
         _ => Some(Odd::GroupInFront),
     }
+}
+
+/// Range up to which a shot towards a smooth surface is free, m: nearer than all that the simulation has around its
+/// direction.
+pub fn free_until_m(ray: &Ray) -> f64 {
+    f64::from(ray.range_m.min(ray.near_far_m[0])) - margin_m(ray)
+}
+
+/// Distance in front of the predicted surface of a ray within which returns cannot be distinguished from it, m.
+pub fn margin_m(ray: &Ray) -> f64 {
+    (ON_M[1] / f64::from(ray.cos_incidence).max(1e-3)).max(ON_M[0]).max(company_m(ray.range_m.into()))
+}
+
+/// Whether a return is alone on the free path of its shot, or where the simulation has nothing.
+pub fn is_lone_before(ray: &Ray) -> bool {
+    let before = match ray.lies() {
+        Lies::InFront => ray.smooth && ray.own_range_m() < free_until_m(ray),
+        Lies::Open => ray.row != u16::MAX,
+        _ => false,
+    };
+    before && !ray.shown && ray.company <= 1
 }
 
 /// Counts of one frame: measured and simulated returns of each kind, and all of them.
@@ -71,16 +102,22 @@ pub fn end_m(frames: &[FramePair]) -> f64 {
     ranges.get(last).copied().unwrap_or(f64::INFINITY)
 }
 
-/// Counts of every frame, of returns nearer than `end_m`.
-pub fn odd_frames(frames: &[FramePair], end_m: f64) -> Vec<OddFrame> {
+/// Counts of every frame, of returns nearer than `end_m`. `explained` says which returns do not count, by the number of
+/// the frame, side (0 measured) and their place there.
+pub fn odd_frames(
+    frames: &[FramePair],
+    end_m: f64,
+    explained: &(dyn Fn(usize, usize, usize) -> bool + Sync),
+) -> Vec<OddFrame> {
     frames
         .par_iter()
-        .map(|frame| {
+        .enumerate()
+        .map(|(number, frame)| {
             let mut out =
                 OddFrame { all: [frame.measured.len() as f64, frame.simulated.len() as f64], ..OddFrame::default() };
             for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
-                for ray in rays.iter().filter(|r| r.own_range_m() < end_m) {
-                    if let Some(kind) = odd(ray) {
+                for (i, ray) in rays.iter().enumerate().filter(|(_, r)| r.own_range_m() < end_m) {
+                    if let Some(kind) = odd(ray).filter(|_| !explained(number, side, i)) {
                         out.counts[kind as usize][side] += 1.0;
                     }
                 }

@@ -39,7 +39,7 @@ impl RoughCell {
 pub type RoughFrame = Vec<(u32, RoughCell)>;
 
 /// Largest roughness that counts, in standard deviations.
-const CAP: f64 = 4.0;
+pub const CAP: f64 = 4.0;
 
 /// Number of bins of the logarithm of the roughness, for medians.
 const LOG_BINS: usize = 56;

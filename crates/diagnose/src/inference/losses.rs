@@ -176,6 +176,13 @@ impl LossTable {
         lost / n.max(1.0)
     }
 
+    /// Share of the measured returns, of one kind of surface or of all, that the simulated side lacks.
+    pub fn only_measured(&self, zone: Option<usize>) -> f64 {
+        let of_zone = |i: &&usize| zone.is_none_or(|zone| in_zone(zone, self.places[**i].zone));
+        let sum = |of: fn(&HitCell) -> f64| self.used.iter().filter(of_zone).map(|&i| of(&self.cells[i])).sum::<f64>();
+        (sum(|c| c.measured.n) - sum(|c| c.measured_matched)) / sum(|c| c.measured.n).max(1.0)
+    }
+
     /// The kind of standing surface or object with more than nine tenths of the losses; `None` without one.
     pub fn confined_to(&self, laws: &[FittedLaw]) -> Option<usize> {
         let mut lost = [0.0f64; ZONES];

@@ -186,7 +186,10 @@ impl SensorPair<'_> {
         let closes = self.sensors.rig.sensors[self.sensor].is_full_circle();
         let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
         self.complete_measured(&mut measured, a, &own, &predictor);
-        simulated.iter_mut().enumerate().for_each(|(i, ray)| ray.in_gap = in_gap(&own, b, i));
+        for (i, ray) in simulated.iter_mut().enumerate() {
+            ray.in_gap = in_gap(&own, b, i);
+            ray.shown = near(&own, b, i, None) > 0;
+        }
         let edge_m = self.sensors.edge_m;
         Roughness { own: &own, window: predictor.around.window, edge_m }.set([&mut measured, &mut simulated], [a, b]);
         frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.around.index);
@@ -227,10 +230,15 @@ pub fn company_m(range_m: f64) -> f64 {
 
 /// Number of returns of a scan around one of its own that lie at about its range.
 pub(super) fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
+    near(index, scan, i, Some(i as u32))
+}
+
+/// Number of the returns of an index around one of a scan that lie at about its range, but for one.
+fn near(index: &DirectionIndex, scan: &SensorScan, i: usize, without: Option<u32>) -> u8 {
     let range = scan.range_m[i];
     let mut n = 0u8;
     index.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
-        if e.index != i as u32 && f64::from((e.range_m - range).abs()) < company_m(f64::from(range)) {
+        if without != Some(e.index) && f64::from((e.range_m - range).abs()) < company_m(f64::from(range)) {
             n = n.saturating_add(1);
         }
     });

@@ -71,6 +71,7 @@ impl<'a> Predictor<'a> {
             at_object: at_object(&self.others, self.around.place(&direction, f64::from(range))),
             matched: false,
             company: 0,
+            shown: false,
             in_gap: false,
             row: self.sensors.row(self.sensor, el),
             object: u16::MAX,

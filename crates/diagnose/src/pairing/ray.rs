@@ -48,6 +48,9 @@ pub struct Ray {
     pub matched: bool,
     /// Number of neighbours of its own side at about its range.
     pub company: u8,
+    /// Of a simulated return: whether the measured side has one in this direction at about its range. (For a measured
+    /// one, [`Ray::lies`] tells it.)
+    pub shown: bool,
     /// Whether it lies between two surfaces of the *other* side, over a range discontinuity that beams mix.
     pub in_gap: bool,
     /// Row of the sensor; `u16::MAX` where rows are not known.

@@ -17,7 +17,7 @@ struct Confounder {
 }
 
 /// Confounders in the order in which they are applied: a finding that is dropped confounds nothing after it.
-const CONFOUNDERS: [Confounder; 18] = [
+const CONFOUNDERS: [Confounder; 20] = [
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
@@ -53,6 +53,18 @@ const CONFOUNDERS: [Confounder; 18] = [
         by: rows_aim_elsewhere,
         share: 2.5,
         because: "on the ground the range jumps from row to row where rows aim elsewhere",
+    },
+    Confounder {
+        effect: |f| f.is(Cause::HeavyTails),
+        by: lone,
+        share: 0.5,
+        because: "droplets and false alarms right in front of surfaces",
+    },
+    Confounder {
+        effect: lone,
+        by: |f| f.is(Cause::HeavyTails),
+        share: 0.5,
+        because: "the farthest of the ranges that are off",
     },
     Confounder {
         effect: |f| f.is(Cause::Outliers),
@@ -144,6 +156,11 @@ const NOISE_OF_SURFACES: [f64; 2] = [0.03, 0.1];
 
 /// Shifts of objects below this many times the largest unexplained offset of surfaces are a part of that offset.
 const SHIFTS_OF_SURFACES: f64 = 1.5;
+
+/// Whether returns are alone in the air.
+fn lone(f: &Found) -> bool {
+    f.causes.iter().any(|c| matches!(c, Cause::Outliers | Cause::Fog | Cause::Rain | Cause::Spray))
+}
 
 /// Whether rows have elevation offsets.
 fn rows_aim_elsewhere(f: &Found) -> bool {

@@ -192,9 +192,11 @@ impl<'a> Search<'a> {
         let joins = f64::from(u8::from(!before.is_empty()));
         // What loses less than the laws before it say only corrects their form.
         let own = if before.is_empty() { last.numbers[0].abs() } else { last.numbers[0] };
+        // What the simulation loses beyond the measured side is no more than what only the measured side has.
+        let most = |zone: Option<usize>| if last.numbers[0] < 0.0 { table.only_measured(zone) } else { f64::INFINITY };
         match last.law {
-            Law::Zone(_) => own > ZONE_FLOOR + 0.07 * joins + 0.1 * self.displaced,
-            Law::Random => own > FLOOR + 0.02 * joins + 0.01 * self.displaced,
+            Law::Zone(zone) => own.min(most(Some(zone))) > ZONE_FLOOR + 0.07 * joins + 0.1 * self.displaced,
+            Law::Random => own.min(most(None)) > FLOOR + 0.02 * joins + 0.01 * self.displaced,
             _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * self.displaced,
         }
     }

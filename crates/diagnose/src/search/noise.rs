@@ -5,6 +5,7 @@ mod describe;
 mod directions;
 mod select;
 mod surfaces;
+mod tails;
 
 pub use self::surfaces::SurfaceShare;
 
@@ -39,13 +40,21 @@ type Term = (NoiseLaw, f64);
 
 /// The search; surfaces with a cosine of incidence below `least_cos` are left out.
 pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
-    Search::new(context, least_cos).run().0
+    let scales = scales(context.frames);
+    let mut rough = rough_frames(context.frames, &scales);
+    let mut result = ChannelResult::new(Channel::Roughness, context.of(Role::HoldOut).len());
+    let drawn_m2 = tails::search(context, &mut rough, &scales, &mut result);
+    Search { drawn_m2, ..Search::new(context, least_cos, scales, rough) }.run(&mut result);
+    result
 }
 
 /// The search on all surfaces, and what of the found noise is measured on the ground and on standing surfaces.
 pub fn search_by_surface(context: &Context) -> (ChannelResult, [Option<SurfaceShare>; 2]) {
-    let search = Search::new(context, 0.0);
-    let (result, laws) = search.run();
+    let scales = scales(context.frames);
+    let rough = rough_frames(context.frames, &scales);
+    let mut result = ChannelResult::new(Channel::Roughness, context.of(Role::HoldOut).len());
+    let search = Search::new(context, 0.0, scales, rough);
+    let laws = search.run(&mut result);
     (result, search.by_surface(&laws))
 }
 
@@ -63,6 +72,8 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
 struct Search<'a> {
     context: &'a Context<'a>,
     least_cos: f64,
+    /// Variance by which heavy tails draw the surfaces through their neighbours, m2: less is no other noise.
+    drawn_m2: f64,
     scales: Vec<f64>,
     rough: Vec<RoughFrame>,
     select: Vec<usize>,
@@ -78,24 +89,33 @@ struct Search<'a> {
 }
 
 impl<'a> Search<'a> {
-    fn new(context: &'a Context<'a>, least_cos: f64) -> Self {
-        let scales = scales(context.frames);
-        let rough = rough_frames(context.frames, &scales);
+    fn new(context: &'a Context<'a>, least_cos: f64, scales: Vec<f64>, rough: Vec<RoughFrame>) -> Self {
         let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
         let table = NoiseTable::new(total(select.iter().map(|&i| &rough[i])), least_cos);
         let linear = select.iter().map(|&i| table.linear(&rough[i], &NOISE_LAWS)).collect();
         let blocks = context.blocks(&select);
         let demands = first_demands();
-        Search { context, least_cos, scales, rough, select, estimate, hold_out, blocks, table, linear, demands }
+        Search {
+            context,
+            least_cos,
+            drawn_m2: 0.0,
+            scales,
+            rough,
+            select,
+            estimate,
+            hold_out,
+            blocks,
+            table,
+            linear,
+            demands,
+        }
     }
 
-    /// The search, and the fitted laws.
-    fn run(&self) -> (ChannelResult, Vec<Term>) {
-        let mut result = ChannelResult::new(Channel::Roughness, self.hold_out.len());
-        let selection = self.select(&mut result);
-        result.minimum = self.minimum();
-        let laws = self.report(selection, &mut result);
-        (result, laws)
+    /// The search; returns the fitted laws.
+    fn run(&self, result: &mut ChannelResult) -> Vec<Term> {
+        let selection = self.select(result);
+        result.minimum.extend(self.minimum());
+        self.report(selection, result)
     }
 
     /// Variances over some frames.
@@ -114,13 +134,33 @@ impl<'a> Search<'a> {
             let significant = Z_STAR * self.whole(&[law]).error(0);
             // In steps of 2 %.
             let sizes: Vec<f64> = (0..1500).map(|k| 1e-12 * 1.02f64.powi(k)).collect();
-            let first = sizes.partition_point(|theta| !above_floor(&self.table, NOISE_LAWS[law], *theta));
+            let first = sizes.partition_point(|theta| !self.above_floor(NOISE_LAWS[law], *theta));
             significant.max(sizes.get(first).copied().unwrap_or(0.0)).sqrt()
         };
         vec![
             (Cause::RangeNoise, Minimum::new(Quantity::StdM, least(CONSTANT))),
             (Cause::AngularJitter, Minimum::new(Quantity::StdDeg, least(ANGULAR).to_degrees())),
         ]
+    }
+
+    /// Whether a law with a coefficient adds enough noise to be reported.
+    fn above_floor(&self, law: NoiseLaw, theta: f64) -> bool {
+        // Returns weighted by the inverse of the simulated variance: what counts is where the law is best seen.
+        let (mut share, mut along, mut n) = (0.0, 0.0, 0.0);
+        for (range, cos, returns, [_, vb]) in self.table.rows() {
+            let added = theta.abs() * law.variance(range, cos);
+            let w = returns / vb;
+            share += returns * (added / vb).min(1.0);
+            along += w * added;
+            n += returns;
+        }
+        let typical = self.table.rows().iter().map(|r| r.2 / r.3[1]).sum::<f64>();
+        let added_m2 = along / typical.max(1e-12);
+        let enough = match law {
+            NoiseLaw::Angular => theta.abs().sqrt() > FLOOR_RAD,
+            _ => added_m2.sqrt() > FLOOR_M,
+        };
+        enough && added_m2 > self.drawn_m2 && share / n.max(1.0) > FLOOR_SHARE
     }
 
     /// Fits what was chosen on the estimating frames and measures it on the held-out ones. Returns the fitted laws.
@@ -135,14 +175,20 @@ impl<'a> Search<'a> {
             selection.laws.iter().zip(fitted.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)).collect();
         for (k, selected) in selection.selected.into_iter().enumerate() {
             let without: Vec<_> = terms.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, t)| *t).collect();
+            // What a law brings beside the others, or alone: beside one that takes noise away it brings what that
+            // takes.
             let gain = |&i: &usize| {
-                on_hold_out.likelihood(&self.rough[i], &terms) - on_hold_out.likelihood(&self.rough[i], &without)
+                let likelihood = |terms: &[Term]| on_hold_out.likelihood(&self.rough[i], terms);
+                let alone = likelihood(&terms[k..=k]) - likelihood(&[]);
+                alone.min(likelihood(&terms) - likelihood(&without))
             };
             let gains = self.hold_out.iter().map(gain).collect();
             result.found.push(found(&fitted, k, selected, gains, &on_hold_out, &terms));
         }
         let of_frame = |&i: &usize| distance(&on_hold_out, &on_estimate, &self.rough[i], &terms);
-        result.distance = self.hold_out.iter().map(of_frame).collect();
+        for (d, more) in result.distance.iter_mut().zip(self.hold_out.iter().map(of_frame)) {
+            d.iter_mut().zip(more).for_each(|(sum, m)| *sum += m);
+        }
         if let Some((grouping, confidence)) = selection.unexplained {
             let mut found = self.unexplained(grouping, confidence, &on_estimate, &terms);
             for (d, g) in result.distance.iter_mut().zip(&found.held_out_gains) {
@@ -161,25 +207,6 @@ impl<'a> Search<'a> {
 
 /// Prior precisions of the laws' coefficients: none.
 const NO_PRIOR: [f64; NOISE_LAWS.len()] = [0.0; NOISE_LAWS.len()];
-
-/// Whether a law with a coefficient adds enough noise to be reported.
-fn above_floor(table: &NoiseTable, law: NoiseLaw, theta: f64) -> bool {
-    // Returns weighted by the inverse of the simulated variance: what counts is where the law is best seen.
-    let (mut share, mut along, mut n) = (0.0, 0.0, 0.0);
-    for (range, cos, returns, [_, vb]) in table.rows() {
-        let added = theta.abs() * law.variance(range, cos);
-        let w = returns / vb;
-        share += returns * (added / vb).min(1.0);
-        along += w * added;
-        n += returns;
-    }
-    let typical = table.rows().iter().map(|r| r.2 / r.3[1]).sum::<f64>();
-    let enough = match law {
-        NoiseLaw::Angular => theta.abs().sqrt() > FLOOR_RAD,
-        _ => (along / typical.max(1e-12)).sqrt() > FLOOR_M,
-    };
-    enough && share / n.max(1.0) > FLOOR_SHARE
-}
 
 /// Of one frame the Kullback-Leibler distance of its roughness from the simulation, the gain of the laws, and the
 /// gain of the variances of `other` frames cell by cell, nats.

@@ -3,16 +3,22 @@
 
 mod describe;
 mod false_alarms;
+mod spray;
+mod weather;
 
 use self::describe::found;
 use super::{ChannelResult, Context, NamedParameter, Z_STAR, with_error};
 use crate::catalogue::{Cause, Channel, Quantity, Unit};
+use crate::channels::mean::origins;
+use crate::channels::plumes::{Extent, MOST, PlumeFrame, plume_frame};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Minimum, Parameter};
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::gain_of_count;
 use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::roles::Role;
+use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Smallest share of returns that is reported, by kind.
 const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.003];
@@ -28,33 +34,89 @@ const Z_BY_SIGNS: [f64; 2] = [3.0, 2.0];
 /// Smallest gain of the selecting frames, nats.
 const LEAST_NATS: f64 = 8.0;
 
+/// Whether the sides show the same scenes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scenes {
+    /// The same: surfaces of the simulated side are those of the measured one.
+    Same,
+    /// Different streets.
+    Different,
+}
+
 /// The search of all kinds.
 pub fn search(context: &Context) -> ChannelResult {
-    search_kinds(context, &ODD)
+    search_kinds(context, &ODD, Scenes::Same)
 }
 
 /// The search of some kinds of returns.
-pub fn search_kinds(context: &Context, kinds: &[Odd]) -> ChannelResult {
+pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> ChannelResult {
     let end_m = 0.98 * end_m(context.frames);
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Returns, hold_out.len());
     let blocks = context.blocks(&select);
-    let odd = odd_frames(context.frames, end_m);
-    let search = Search { context, odd, select, blocks, estimate, hold_out, end_m };
+    let mut spray = Vec::new();
+    if scenes == Scenes::Same {
+        let plumes = plumes(context);
+        let returns = context.returns(&select);
+        let of_estimate = |extent: Extent| {
+            let origins = origins(context.rig);
+            estimate.par_iter().map(|&i| plume_frame(&context.frames[i], &origins, extent)).collect()
+        };
+        let frames = spray::Frames {
+            plumes: &plumes,
+            within: &of_estimate,
+            select: &select,
+            blocks: &blocks,
+            estimate: &estimate,
+            hold_out: &hold_out,
+            returns,
+        };
+        if spray::search(&frames, &mut result) {
+            spray = plumes.into_iter().map(|p| p.around).collect();
+        }
+    }
+    let odd = odd_frames(context.frames, end_m, &|frame, side, ray| is_spray(&spray, frame, side, ray));
+    let search = Search { context, scenes, spray, odd, select, blocks, estimate, hold_out, end_m };
     for kind in kinds {
         search.kind(*kind, &mut result);
     }
     result
 }
 
-/// Gains of the `test` frames by the shares of odd returns of the `train` frames, nats.
-pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
-    kinds_by_table(context, &ODD, train, test)
+/// Whether a return, by the number of its frame, its side and its place there, may be one of spray.
+fn is_spray(spray: &[[HashSet<usize>; 2]], frame: usize, side: usize, ray: usize) -> bool {
+    spray.get(frame).is_some_and(|of_frame| of_frame[side].contains(&ray))
 }
 
-/// The same of some kinds of returns.
+/// Gains of the `test` frames by the shares of odd returns of the `train` frames, and by the density of returns behind
+/// vehicles, nats.
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+    let plumes = plumes(context);
+    let around = |frame: usize, side: usize, ray: usize| plumes[frame].around[side].contains(&ray);
+    let gains = shares_by_table(context, &ODD, [train, test], &around);
+    let of_plumes = spray::by_table(&plumes, train, test);
+    gains.into_iter().zip(of_plumes).map(|(gain, more)| gain + more).collect()
+}
+
+/// Gains by the shares of some kinds of returns alone.
 pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &[usize]) -> Vec<f64> {
-    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
+    shares_by_table(context, kinds, [train, test], &|_, _, _| false)
+}
+
+/// The air behind the vehicles of each frame.
+fn plumes(context: &Context) -> Vec<PlumeFrame> {
+    let origins = origins(context.rig);
+    context.frames.par_iter().map(|f| plume_frame(f, &origins, MOST)).collect()
+}
+
+/// Gains by the shares of some kinds of returns, without those that are explained: see [`odd_frames`].
+fn shares_by_table(
+    context: &Context,
+    kinds: &[Odd],
+    [train, test]: [&[usize]; 2],
+    explained: &(dyn Fn(usize, usize, usize) -> bool + Sync),
+) -> Vec<f64> {
+    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames), explained);
     let rates = ODD.map(|kind| excess(train.iter().map(|&i| &odd[i]), kind as usize));
     let of_kind = |i: usize, kind: Odd| {
         let [base, more] = rates[kind as usize];
@@ -66,6 +128,9 @@ pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &
 /// Counts of all frames, and the frames by role.
 struct Search<'a> {
     context: &'a Context<'a>,
+    scenes: Scenes,
+    /// Returns that may be spray, frame by frame, of both sides; empty where there is none.
+    spray: Vec<[HashSet<usize>; 2]>,
     odd: Vec<OddFrame>,
     select: Vec<usize>,
     /// Blocks of the selecting frames.
@@ -191,7 +256,7 @@ pub fn is_explained_by_displacement(before: &Context, moved: &Context) -> bool {
 /// Gain by grouped returns off the surfaces, nats a return: objects that only one side has, or surfaces that stand
 /// elsewhere.
 fn grouped_gain(context: &Context) -> f64 {
-    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames));
+    let odd = odd_frames(context.frames, 0.98 * end_m(context.frames), &|_, _, _| false);
     let select = context.of(Role::Select);
     let blocks = context.blocks(&select);
     let gain = |kind: Odd| cross_gains(&odd, &select, &blocks, kind as usize).iter().sum::<f64>().max(0.0);
@@ -240,12 +305,14 @@ fn gain(frame: &OddFrame, k: usize, base: f64, more: f64) -> f64 {
 
 /// Kullback-Leibler distance of a frame's count from the simulated share, and from that with the excess, nats.
 fn distance(frame: &OddFrame, k: usize, base: f64, more: f64) -> (f64, f64) {
-    let n = frame.counts[k][0];
-    let from = |rate: f64| {
-        let expected = frame.all[0] * rate.max(1e-9);
-        (if n > 0.0 { n * (n / expected).ln() } else { 0.0 }) - (n - expected)
-    };
+    let from = |rate: f64| poisson_distance(frame.counts[k][0], frame.all[0] * rate);
     (from(base), from((base + more).max(0.05 * base)))
+}
+
+/// Kullback-Leibler distance of a count from what is expected, nats.
+fn poisson_distance(count: f64, expected: f64) -> f64 {
+    let expected = expected.max(1e-6);
+    (if count > 0.0 { count * (count / expected).ln() } else { 0.0 }) - (count - expected)
 }
 
 /// Cross-validated gains of the selecting frames, nats.

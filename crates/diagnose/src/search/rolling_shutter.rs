@@ -403,6 +403,7 @@ mod tests {
             corner: false,
             at_object: false,
             matched: true,
+            shown: false,
             company: 5,
             in_gap: false,
             row: 0,

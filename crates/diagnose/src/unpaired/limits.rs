@@ -25,6 +25,12 @@ const TABLE: &[(Cause, &str, &str)] = &[
     (Cause::NearCut, "another street may have nothing near", SAME_SCENES),
     (Cause::PacketLoss, "which shots should have a return is only known from the same scene", SAME_SCENES),
     (Cause::DualReturns, "other streets have other edges", SAME_SCENES),
+    (
+        Cause::HeavyTails,
+        "the surfaces of another street have other small things on them",
+        "a flat wall from a standing sensor, or the same scenes on both sides",
+    ),
+    (Cause::Spray, "behind other vehicles other things stand", SAME_SCENES),
     (Cause::LabelOffset, "a label is compared with that of the same object", SAME_SCENES),
     (Cause::TimeOffset, "a label is compared with that of the same object", SAME_SCENES),
     (Cause::IntensityLaw, "other streets have other reflectivities", SAME_SCENES),

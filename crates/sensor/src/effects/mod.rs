@@ -32,6 +32,7 @@ pub(crate) mod testing;
 pub use assumed::AssumedReflectivity;
 pub use context::{Draws, FrameContext, LabelledCar, Need, Undulation, WorldPlan};
 pub use empirical::Covariate;
+pub use false_alarms::{FIRST_DROP_M, RangeLaw};
 pub use form::Form;
 pub use incidence_dropout::CosineScale;
 pub use label_time_offset::Clock;

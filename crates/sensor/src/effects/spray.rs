@@ -1,7 +1,7 @@
 //! D4: spray or dust behind other cars.
 
 use super::{Draws, FrameContext, Need, SensorEffect};
-use crate::scan::Scan;
+use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
 use geometry::Box3;
@@ -48,7 +48,7 @@ impl SensorEffect for Spray {
         let mut random = draws.of_frame();
         for echo in &mut scan.echoes {
             for plume in &plumes {
-                let Some([near, far]) = path_through(plume, echo.origin, echo.direction, echo.range_m) else {
+                let Some([near, far]) = path_through(plume, echo) else {
                     continue;
                 };
                 let passed = (-density * (far - near)).exp();
@@ -71,26 +71,10 @@ impl Spray {
     }
 }
 
-/// Ranges at which a ray enters and leaves a box, limited to `until_m`, m.
-fn path_through(b: &Box3, origin: [f32; 3], direction: [f32; 3], until_m: f32) -> Option<[f32; 2]> {
-    let start = b.to_local(origin.map(f64::from));
-    let (s, c) = b.yaw_rad.sin_cos();
-    let d = direction.map(f64::from);
-    let local = [d[0] * c + d[1] * s, d[1] * c - d[0] * s, d[2]];
-    let (mut near, mut far) = (0.0, f64::from(until_m));
-    for k in 0..3 {
-        let half = b.size[k] / 2.0;
-        if local[k] == 0.0 {
-            if start[k].abs() > half {
-                return None;
-            }
-            continue;
-        }
-        let (a, z) = ((-half - start[k]) / local[k], (half - start[k]) / local[k]);
-        near = f64::max(near, a.min(z));
-        far = f64::min(far, a.max(z));
-    }
-    (near < far).then_some([near as f32, far as f32])
+/// Ranges at which the path of an echo enters and leaves a box, limited to its own, m.
+fn path_through(b: &Box3, echo: &Echo) -> Option<[f32; 2]> {
+    let path = b.path_through(echo.origin.map(f64::from), echo.direction.map(f64::from), echo.range_m.into());
+    path.map(|ends| ends.map(|m| m as f32))
 }
 
 #[cfg(test)]
@@ -111,7 +95,7 @@ mod tests {
             assert!((0..3).all(|k| local[k].abs() <= plume.size[k] / 2.0 + 1e-3), "{local:?}");
         }
         // A fraction 1 - exp(-0.2 w) of the shots with a path of w m within the plume report a droplet.
-        let through = |e: &crate::scan::Echo| path_through(&plume, e.origin, e.direction, e.range_m);
+        let through = |e: &Echo| path_through(&plume, e);
         let expected: f64 =
             before.echoes.iter().filter_map(through).map(|[n, f]| 1.0 - f64::from((-0.2 * (f - n)).exp())).sum();
         assert!((changed.len() as f64 / expected - 1.0).abs() < 0.15, "{} {expected}", changed.len());

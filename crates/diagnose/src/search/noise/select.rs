@@ -1,6 +1,6 @@
 //! Forward selection of noise laws.
 
-use super::{ANGULAR, CONSTANT, NO_PRIOR, Search, Term, above_floor};
+use super::{ANGULAR, CONSTANT, NO_PRIOR, Search, Term};
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
 use crate::inference::choice::{Demands, Trial, choose, total_and_z};
@@ -25,11 +25,12 @@ pub(super) struct Selection {
 
 impl Search<'_> {
     /// Forward selection: one law and at most a second one of another cause, or a pair that replaces a law of the
-    /// signal; a table by direction where no law is chosen, or where laws leave one.
+    /// signal; a table by direction where no law is chosen, or where laws leave one, unless heavy tails make the
+    /// surfaces rough.
     pub(super) fn select(&self, result: &mut ChannelResult) -> Selection {
         let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| self.trial(&[k], None)).collect();
         let mut choice = choose(&trials, &self.demands);
-        if choice.is_none() {
+        if choice.is_none() && self.drawn_m2 == 0.0 {
             trials.extend(self.direction_trials(&[], super::directions::GROUPED));
             choice = choose(&trials, &self.demands);
         }
@@ -50,7 +51,9 @@ impl Search<'_> {
         };
         let gains = self.add_second(trial, &mut selection, result);
         self.try_pair(trial, gains, &mut selection, result);
-        self.try_directions(&mut selection, result);
+        if self.drawn_m2 == 0.0 {
+            self.try_directions(&mut selection, result);
+        }
         selection
     }
 
@@ -81,7 +84,7 @@ impl Search<'_> {
             parameters: law.parameters(),
             gains,
             // A negative second law only corrects the form of the first.
-            above_floor: (last == 0 || fitted.theta[last] > 0.0) && above_floor(&self.table, law, fitted.theta[last]),
+            above_floor: (last == 0 || fitted.theta[last] > 0.0) && self.above_floor(law, fitted.theta[last]),
         }
     }
 
@@ -114,7 +117,7 @@ impl Search<'_> {
         let along = (0..NOISE_LAWS.len()).filter(|&k| NOISE_LAWS[k].cause() == range_noise);
         let pairs = along.map(|k| (k, self.trial(&[k, ANGULAR], None))).filter(|(k, t)| {
             let theta = || self.whole(&[*k, ANGULAR]).theta[0].max(0.0);
-            t.above_floor && above_floor(&self.table, NOISE_LAWS[*k], theta())
+            t.above_floor && self.above_floor(NOISE_LAWS[*k], theta())
         });
         let best = pairs.max_by(|a, b| total_and_z(&a.1.gains).0.total_cmp(&total_and_z(&b.1.gains).0));
         let by_signal = selection.laws.iter().any(|&c| matches!(NOISE_LAWS[c], NoiseLaw::Signal(_)));

@@ -1,8 +1,10 @@
 //! Findings of returns off the simulated surfaces: parameters, sentences and plots.
 
 use super::false_alarms::{FalseAlarms, false_alarms};
-use super::{NamedParameter, Search, cause};
-use crate::catalogue::{Channel, Covariate, Quantity};
+use super::weather::{Weather, lost_with_range, weather};
+use super::{NamedParameter, Scenes, Search, cause, is_spray};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::channels::free_path::{Shape, bins};
 use crate::channels::returns::{self, Odd, OddFrame};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Parameter, Status};
@@ -10,6 +12,7 @@ use crate::effects::rounded;
 use crate::pairing::Ray;
 use crate::search::{Context, Found, parameter};
 use sensor::Effect;
+use sensor::effects::RangeLaw;
 
 /// Factor by which the true width of a beam may differ from that of a uniform disc that mixes as many ranges.
 const WIDTH_FACTOR: f64 = 5.0;
@@ -19,6 +22,7 @@ const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
 
 /// What is said of one kind of returns.
 struct Description {
+    causes: Vec<Cause>,
     effects: Vec<Effect>,
     covariate: Covariate,
     says: String,
@@ -28,10 +32,14 @@ struct Description {
 /// The finding of an excess of one kind of returns; `share` is the excess, `z` its significance on the selecting
 /// frames.
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
-    let Description { effects, covariate, says, parameters } = match kind {
-        Odd::Alone => of_false_alarms(search, &share),
+    let Description { causes, effects, covariate, says, parameters } = match kind {
+        Odd::Alone => match weather_of(search) {
+            Some(weather) => of_weather(&weather, &share),
+            None => of_false_alarms(search, &share),
+        },
         Odd::Between => mixed(search, share),
         Odd::GroupInFront => Description {
+            causes: vec![cause(kind)],
             effects: vec![],
             covariate: Covariate::Place,
             says: format!(
@@ -44,16 +52,81 @@ pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains
     };
     Found {
         effects,
-        status: Status::Named,
-        causes: vec![cause(kind)],
+        status: if causes.len() > 1 { Status::Ambiguous } else { Status::Named },
+        separate_by: (causes.len() > 1).then(|| TELL_WEATHER_BY.into()),
+        causes,
         parameters,
         confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
         channel: Channel::Returns,
         covariate,
         held_out_gains,
         says,
-        separate_by: None,
         curve: curve(search.context, kind, &search.estimate),
+    }
+}
+
+/// What recording tells fog from rain.
+const TELL_WEATHER_BY: &str =
+    "a flat wall at two known distances in the same weather: fog weakens its light by far more";
+
+/// The weather that the lone returns of the estimating frames tell. No droplet is seen through a surface: where lone
+/// returns are behind surfaces as well, they come from the receiver.
+fn weather_of(search: &Search) -> Option<Weather> {
+    if false_alarms(search.context, &search.estimate, search.end_m).instead {
+        return None;
+    }
+    let frames: Vec<_> = search.estimate.iter().map(|&f| &search.context.frames[f]).collect();
+    let of_spray = |f: usize, side: usize, ray: usize| is_spray(&search.spray, search.estimate[f], side, ray);
+    let bins = bins(&frames, search.end_m, &of_spray);
+    weather(&bins, |depth_m| match search.scenes {
+        Scenes::Same => lost_with_range(&frames, depth_m),
+        Scenes::Different => None,
+    })
+}
+
+/// Describes droplets. `extended.toml` has the droplets alone: what the light of surfaces loses is a law of its own.
+fn of_weather(weather: &Weather, share: &Parameter) -> Description {
+    let [depth_m, low, high] = weather.depth_m;
+    let within = |quantity: Quantity, [estimate, low, high]: [f64; 3]| {
+        (quantity.into(), Parameter { estimate, ci95: [low, high], unit: quantity.unit() })
+    };
+    let more = share.estimate.abs().max(1e-9);
+    let form = ((share.ci95[1] - share.ci95[0]) / 2.0 / 1.96 / more).hypot(0.1);
+    let droplets = sensor::effects::FalseAlarms {
+        rate: rounded(weather.rate.min(1.0), 7),
+        depth_m: rounded(depth_m, 3),
+        law: match weather.shape {
+            Shape::Exponential(_) => RangeLaw::Exponential,
+            Shape::Gamma(_) => RangeLaw::Gamma,
+            Shape::Drops(_) => RangeLaw::Inverse,
+            Shape::Even(_) | Shape::OfPath => RangeLaw::Uniform,
+        },
+        reach_m: match weather.shape {
+            Shape::Drops(reach_m) | Shape::Even(reach_m) => rounded(reach_m, 3),
+            _ => rounded(8.0 * depth_m, 3).min(1000.0),
+        },
+        ..Default::default()
+    };
+    let mut parameters =
+        vec![parameter(Quantity::Rate, weather.rate, form * weather.rate), within(Quantity::DepthM, weather.depth_m)];
+    let name = match weather.causes[0] {
+        Cause::Fog => {
+            let visibility = weather.visibility_m();
+            parameters.push(within(Quantity::VisibilityM, visibility));
+            format!("fog with a visibility of {:.0} to {:.0} m", visibility[1], visibility[2])
+        }
+        _ => "rain".to_owned(),
+    };
+    Description {
+        causes: weather.causes.clone(),
+        effects: vec![Effect::FalseAlarms(droplets)],
+        covariate: Covariate::Range,
+        says: format!(
+            "{:.2} % of the shots return from droplets, {depth_m:.0} m ({low:.0} to {high:.0}) away in the mean, where \
+             the simulation has nothing: {name}",
+            100.0 * weather.rate
+        ),
+        parameters,
     }
 }
 
@@ -69,6 +142,7 @@ fn of_false_alarms(search: &Search, share: &Parameter) -> Description {
         ..Default::default()
     };
     Description {
+        causes: vec![Cause::Outliers],
         effects: vec![Effect::FalseAlarms(alarms)],
         covariate: Covariate::None,
         says: format!(
@@ -99,6 +173,7 @@ fn mixed(search: &Search, share: Parameter) -> Description {
         String::new()
     };
     Description {
+        causes: vec![Cause::MixedPixels],
         effects: vec![],
         covariate: Covariate::Edge,
         says: format!(
@@ -114,6 +189,7 @@ fn mixed(search: &Search, share: Parameter) -> Description {
 fn behind(share: Parameter) -> Description {
     let [low, high] = share.ci95;
     Description {
+        causes: vec![Cause::MissingObject],
         effects: vec![],
         covariate: Covariate::Place,
         says: format!(

@@ -1,11 +1,9 @@
 //! Rate of false alarms, ranges at which nothing is, and the largest range at which they occur.
 
-use crate::channels::returns::{OWN_CAR_M, Odd, odd};
-use crate::pairing::{FramePair, Lies, Ray, company_m};
+use crate::channels::free_path::scale;
+use crate::channels::returns::{OWN_CAR_M, Odd, margin_m, odd};
+use crate::pairing::{FramePair, Lies, Ray};
 use crate::search::Context;
-
-/// Distance from a surface within which a return lies on it, m: along the ray, or across the surface.
-const ON_M: [f64; 2] = [0.6, 0.3];
 
 /// False alarms, uniform over range.
 pub(super) struct FalseAlarms {
@@ -66,11 +64,6 @@ pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64) -> F
     FalseAlarms { rate, reach_m, instead: within.behind_as_well() }
 }
 
-/// Measured returns for each simulated one.
-fn scale(frame: &FramePair) -> f64 {
-    frame.measured.len() as f64 / frame.simulated.len().max(1) as f64
-}
-
 /// Largest range of false alarms, m: the 99 % quantile of the excess of lone returns, over 0.99.
 fn reach_m(frames: &[&FramePair]) -> f64 {
     let mut ranges: Vec<(f64, f64)> = Vec::new();
@@ -102,8 +95,7 @@ fn seen(frames: &[&FramePair], [from, to]: [f64; 2]) -> Seen {
         // Shots without a return show the whole interval. At edges no return is lone.
         seen.lengths_m[0] += frame.open * (to - from).max(0.0);
         for ray in frame.simulated.iter().filter(|r| r.smooth) {
-            let range = ray.own_range_m();
-            let margin = (ON_M[1] / f64::from(ray.cos_incidence).max(1e-3)).max(ON_M[0]).max(company_m(range));
+            let (range, margin) = (ray.own_range_m(), margin_m(ray));
             seen.lengths_m[0] += (to.min(range - margin) - from).max(0.0);
             seen.lengths_m[1] += (to - from.max(range + margin)).max(0.0);
         }

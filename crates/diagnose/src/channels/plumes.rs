@@ -1,0 +1,176 @@
+//! The air behind vehicles, where wheels throw up water and dust, and as a comparison the air before them.
+
+use crate::pairing::{FramePair, Lies, Ray};
+use geometry::Box3;
+use nalgebra::Point3;
+use sensor::directions::in_or_beside;
+use std::collections::HashSet;
+
+/// Where the air behind a vehicle begins, m from its box: nearer returns may be those of a longer vehicle.
+const FROM_M: f64 = 1.5;
+
+/// Where the air begins over the ground, m: what is lower may be the ground.
+const OVER_GROUND_M: f64 = 0.35;
+
+/// How far the air behind a vehicle reaches.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Extent {
+    /// Distance from the vehicle, m.
+    pub until_m: f64,
+    /// Height over the ground, m.
+    pub height_m: f64,
+    /// Beyond the vehicle's width on either side, m.
+    pub beside_m: f64,
+}
+
+/// The largest extent.
+pub const MOST: Extent = Extent { until_m: 13.5, height_m: 2.0, beside_m: 0.3 };
+
+/// Distance from other labelled objects within which returns may be theirs, m.
+const OTHERS_M: f64 = 0.8;
+
+/// Margin around the air within which droplets may lie that are not counted as such, m: along the vehicle, across it
+/// and upwards.
+const AROUND_M: [f64; 3] = [1.2, 1.0, 1.0];
+
+/// Smallest length of what is a vehicle, m.
+const LEAST_LENGTH_M: f64 = 2.5;
+
+/// A return in the air behind a vehicle, or before one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Droplet {
+    /// Place among the rays of its side.
+    pub ray: usize,
+    /// Distance from the box, m.
+    pub behind_m: f64,
+    /// Height over the ground of the box, m.
+    pub over_ground_m: f64,
+    /// Whether the simulation has a surface behind it, to which the path of the shot goes.
+    pub on_path: bool,
+}
+
+/// What one frame shows of the air behind vehicles, and of that before them.
+#[derive(Clone, Debug, Default)]
+pub struct PlumeFrame {
+    /// Returns that nothing simulated explains: behind, before; measured.
+    pub measured: [Vec<Droplet>; 2],
+    /// The same of the simulated side.
+    pub simulated: [Vec<Droplet>; 2],
+    /// Places of all returns of either side in the air behind vehicles or around it, measured first.
+    pub around: [HashSet<usize>; 2],
+    /// Paths of shots with a simulated surface, m: behind, before.
+    pub paths_m: [Vec<f32>; 2],
+}
+
+impl PlumeFrame {
+    /// Metres of all paths: behind, before.
+    pub fn path_m(&self, place: usize) -> f64 {
+        self.paths_m[place].iter().copied().map(f64::from).sum()
+    }
+}
+
+/// The air of a vehicle: behind it (0) or before it (1).
+struct Air<'a> {
+    vehicle: &'a Box3,
+    place: usize,
+    air: Box3,
+}
+
+impl Air<'_> {
+    fn of(vehicle: &Box3, Extent { until_m, height_m, beside_m }: Extent) -> [Air<'_>; 2] {
+        [0, 1].map(|place| {
+            let [from, to] = [FROM_M, until_m.max(FROM_M + 0.5)].map(|m| vehicle.size[0] / 2.0 + m);
+            let along = if place == 0 { -(from + to) / 2.0 } else { (from + to) / 2.0 };
+            let [low, high] = [OVER_GROUND_M, height_m.max(OVER_GROUND_M + 0.1)].map(|m| m - vehicle.size[2] / 2.0);
+            let center = vehicle.from_local([along, 0.0, (low + high) / 2.0]);
+            let size = [to - from, vehicle.size[1] + 2.0 * beside_m, high - low];
+            Air { vehicle, place, air: Box3 { center, size, yaw_rad: vehicle.yaw_rad } }
+        })
+    }
+
+    /// Whether a point lies in this air or around it.
+    fn is_around(&self, point: [f64; 3]) -> bool {
+        let local = self.air.to_local(point);
+        (0..3).all(|k| local[k].abs() <= self.air.size[k] / 2.0 + AROUND_M[k])
+    }
+
+    /// A return at a point, where it lies in this air.
+    fn droplet(&self, ray: usize, on_path: bool, point: [f64; 3]) -> Option<Droplet> {
+        let local = self.air.to_local(point);
+        if (0..3).any(|k| local[k].abs() > self.air.size[k] / 2.0) {
+            return None;
+        }
+        let of_vehicle = self.vehicle.to_local(point);
+        Some(Droplet {
+            ray,
+            on_path,
+            behind_m: of_vehicle[0].abs() - self.vehicle.size[0] / 2.0,
+            over_ground_m: of_vehicle[2] + self.vehicle.size[2] / 2.0,
+        })
+    }
+}
+
+/// Whether nothing simulated explains a return.
+fn in_the_air(ray: &Ray) -> bool {
+    match ray.lies() {
+        Lies::InFront => true,
+        Lies::Open => ray.row != u16::MAX,
+        _ => false,
+    }
+}
+
+/// The air around the vehicles of a frame; `origins` are those of the sensors, in the cloud's frame.
+pub fn plume_frame(frame: &FramePair, origins: &[Point3<f64>], extent: Extent) -> PlumeFrame {
+    let boxes: Vec<Box3> = frame.objects.iter().flat_map(|o| [o.simulated, o.measured]).flatten().collect();
+    let vehicles: Vec<Box3> = frame.objects.iter().filter_map(|o| o.simulated).collect();
+    let vehicles = vehicles.iter().filter(|b| b.size[0] > LEAST_LENGTH_M);
+    // The ego vehicle's own air is that of the sensors.
+    let vehicles = vehicles.filter(|b| origins.iter().all(|o| !in_or_beside(b, (*o).into(), OTHERS_M)));
+    let airs: Vec<Air> = vehicles.flat_map(|b| Air::of(b, extent)).collect();
+    let mut out = PlumeFrame::default();
+    if airs.is_empty() {
+        return out;
+    }
+    for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
+        for (i, ray) in rays.iter().enumerate().filter(|(_, ray)| in_the_air(ray)) {
+            let point: [f64; 3] = (origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m()).into();
+            if airs.iter().any(|air| air.place == 0 && air.is_around(point)) {
+                out.around[side].insert(i);
+            }
+            if boxes.iter().any(|b| in_or_beside(b, point, OTHERS_M)) {
+                continue;
+            }
+            if let Some((air, droplet)) = airs.iter().find_map(|air| Some((air, air.droplet(i, ray.smooth, point)?))) {
+                let found = if side == 0 { &mut out.measured } else { &mut out.simulated };
+                found[air.place].push(droplet);
+            }
+        }
+    }
+    for ray in frame.simulated.iter().filter(|r| r.smooth) {
+        let origin: [f64; 3] = origins[ray.sensor as usize].into();
+        let until_m = ray.own_range_m() - super::returns::margin_m(ray);
+        for air in &airs {
+            if let Some([from, to]) = air.air.path_through(origin, ray.direction_vector().into(), until_m) {
+                out.paths_m[air.place].push((to - from) as f32);
+            }
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_air_is_behind_and_before_a_vehicle_and_above_the_ground() {
+        let car = Box3::from_array([20.0, 5.0, 0.8, 4.0, 2.0, 1.6, std::f64::consts::PI]);
+        let [behind, before] = Air::of(&car, MOST);
+        let droplet = behind.droplet(7, true, [20.0 + 2.0 + 4.0, 5.0, 1.0]).unwrap();
+        assert!((droplet.behind_m - 4.0).abs() < 1e-9 && (droplet.over_ground_m - 1.0).abs() < 1e-9);
+        assert!(before.droplet(7, true, [20.0 - 2.0 - 4.0, 5.0, 1.0]).is_some());
+        for point in [[23.0, 5.0, 1.0], [26.0, 5.0, 0.2], [26.0, 7.0, 1.0], [40.0, 5.0, 1.0]] {
+            assert!(behind.droplet(7, true, point).is_none(), "{point:?}");
+        }
+    }
+}

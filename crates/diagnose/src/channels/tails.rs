@@ -1,0 +1,110 @@
+//! Tails of the roughness: single returns far off their surface, by the usual roughness of the shots around them.
+//!
+//! The usual roughness is the median over the shots before and after in the same row: it follows what a surface, its
+//! brightness and its incidence do to the noise. A return beyond [`BEYOND`] standard deviations of it is in the tail.
+
+use super::cells::place_of;
+use super::roughness::own_roughness_m;
+use crate::pairing::{FramePair, Ray};
+use rayon::prelude::*;
+
+/// Standard deviations from which on a return is in the tail.
+pub const BEYOND: f64 = 6.0;
+
+/// Shots before and after one that tell the usual roughness.
+const AROUND: usize = 8;
+
+/// Fewest of these with a roughness.
+const FEWEST: usize = 10;
+
+/// Smallest usual roughness, m: a surface that is even to the last digit has no noise.
+const LEAST_M: f64 = 0.002;
+
+/// Bins of the logarithm of the usual roughness: four for each factor of 2, from 1 mm.
+const BINS: usize = 40;
+
+fn bin_of(usual_m: f64) -> usize {
+    ((usual_m / 1e-3).log2() * 4.0).clamp(0.0, BINS as f64 - 1.0) as usize
+}
+
+/// Measured returns with the same usual roughness.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TailBin {
+    /// Returns.
+    pub all: f64,
+    /// Standard deviation of the usual roughness, m, summed over them.
+    pub usual_m: f64,
+    /// Cosine of incidence, summed over them.
+    pub cos: f64,
+}
+
+/// Tails of one side of a frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Tail {
+    /// Returns.
+    pub all: f64,
+    /// Of these in the tail.
+    pub beyond: f64,
+    /// Sum of their squared roughness, m2.
+    pub squares: f64,
+    /// Shots that follow one in the tail, and those of them that are in it as well.
+    pub next: [f64; 2],
+    /// All returns by their usual roughness.
+    pub bins: Vec<TailBin>,
+}
+
+impl Default for Tail {
+    fn default() -> Self {
+        Tail { all: 0.0, beyond: 0.0, squares: 0.0, next: [0.0; 2], bins: vec![TailBin::default(); BINS] }
+    }
+}
+
+/// Tails of both sides of each frame.
+pub fn tails(frames: &[FramePair]) -> Vec<[Tail; 2]> {
+    frames.par_iter().map(|f| [tail(&f.measured), tail(&f.simulated)]).collect()
+}
+
+/// Rays in the order in which a row sends them; of sensors without rows as they are recorded.
+fn in_order(rays: &[Ray]) -> Vec<&Ray> {
+    let mut order: Vec<&Ray> = rays.iter().collect();
+    order.sort_by(|a, b| {
+        let by_azimuth =
+            || if a.row == u16::MAX { std::cmp::Ordering::Equal } else { a.azimuth_rad.total_cmp(&b.azimuth_rad) };
+        (a.sensor, a.row).cmp(&(b.sensor, b.row)).then_with(by_azimuth)
+    });
+    order
+}
+
+fn tail(rays: &[Ray]) -> Tail {
+    let shots: Vec<(&Ray, Option<f64>)> = in_order(rays).into_iter().map(|ray| (ray, own_roughness_m(ray))).collect();
+    let mut out = Tail::default();
+    let (mut before, mut around) = (false, Vec::with_capacity(2 * AROUND));
+    for (i, (ray, own)) in shots.iter().enumerate() {
+        let row = |j: &usize| shots[*j].0.row == ray.row && shots[*j].0.sensor == ray.sensor;
+        let window = i.saturating_sub(AROUND)..(i + AROUND + 1).min(shots.len());
+        around.clear();
+        around.extend(window.filter(|j| *j != i).filter(row).filter_map(|j| shots[j].1).map(f64::abs));
+        let (Some(own), true) = (own, around.len() >= FEWEST) else {
+            before = false;
+            continue;
+        };
+        let half = around.len() / 2;
+        let median = *around.select_nth_unstable_by(half, f64::total_cmp).1;
+        let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(LEAST_M);
+        let beyond = own.abs() > BEYOND * usual_m;
+        let bin = &mut out.bins[bin_of(usual_m)];
+        let cos = place_of(ray).map_or(1.0, |(_, cos, _)| cos);
+        *bin = TailBin { all: bin.all + 1.0, usual_m: bin.usual_m + usual_m, cos: bin.cos + cos };
+        out.all += 1.0;
+        if before {
+            out.next[0] += 1.0;
+            out.next[1] += f64::from(u8::from(beyond));
+        }
+        if beyond {
+            out.beyond += 1.0;
+            out.squares += own * own;
+        }
+        before = beyond;
+    }
+    out
+}
