@@ -4,12 +4,17 @@ use super::table::Table;
 use crate::DataError;
 use crate::limits::{MOST_POINTS, at_most, length_of_file};
 use arrow_array::RecordBatch;
+use bytes::Bytes;
 use parquet::arrow::ProjectionMask;
 use parquet::arrow::arrow_reader::{
     ArrowReaderMetadata, ArrowReaderOptions, ParquetRecordBatchReader, ParquetRecordBatchReaderBuilder,
 };
+use parquet::errors::ParquetError;
 use parquet::file::metadata::ColumnChunkMetaData;
+use parquet::file::reader::{ChunkReader, Length};
 use std::fmt::Display;
+use std::fs::File;
+use std::io::{BufReader, Read as _};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
@@ -77,7 +82,7 @@ impl ParquetFile {
         };
         let indices: Vec<usize> = columns.iter().map(index).collect::<Result<_, _>>()?;
         // A file of its own for each reader, because readers move its position.
-        let file = fs_err::File::open(&self.path)?.into_file();
+        let file = Pages(fs_err::File::open(&self.path)?.into_file());
         let builder = ParquetRecordBatchReaderBuilder::new_with_metadata(file, self.metadata.clone())
             .with_projection(ProjectionMask::roots(schema, indices))
             .with_row_groups((group..self.starts.len() - 1).collect())
@@ -94,6 +99,63 @@ impl ParquetFile {
         let names = columns.join(", ");
         DataError::file(&self.path, format!("is damaged: the columns {names} cannot be read: {error}"))
     }
+}
+
+/// A file of which pages are read. The library reserves the size that the head of a page claims to have decompressed.
+struct Pages(File);
+
+/// Bytes of a page that may come of any compression. A larger page may be so many times as large as in the file.
+const PAGE_BYTES: i64 = 16 << 20;
+const MOST_COMPRESSION: i64 = 250;
+
+impl Length for Pages {
+    fn len(&self) -> u64 {
+        self.0.len()
+    }
+}
+
+impl ChunkReader for Pages {
+    type T = BufReader<File>;
+
+    /// Pages are read from their heads on.
+    fn get_read(&self, start: u64) -> Result<BufReader<File>, ParquetError> {
+        let mut head = Vec::new();
+        self.0.get_read(start)?.take(32).read_to_end(&mut head)?;
+        if let Some((whole, compressed)) = sizes_of_page(&head)
+            && whole > PAGE_BYTES.max(compressed.saturating_mul(MOST_COMPRESSION))
+        {
+            return Err(ParquetError::General(format!("a page of {compressed} bytes claims to have {whole}")));
+        }
+        self.0.get_read(start)
+    }
+
+    fn get_bytes(&self, start: u64, length: usize) -> Result<Bytes, ParquetError> {
+        self.0.get_bytes(start, length)
+    }
+}
+
+/// The sizes without and with compression in the head of a page: a struct of Thrift's compact protocol, whose first
+/// three fields are the kind and the sizes, i32.
+fn sizes_of_page(head: &[u8]) -> Option<(i64, i64)> {
+    const NEXT_FIELD_I32: u8 = 0x15;
+    let mut bytes = head.iter();
+    let mut field = || {
+        if *bytes.next()? != NEXT_FIELD_I32 {
+            return None;
+        }
+        let mut value = 0u64;
+        for shift in (0..64).step_by(7) {
+            let byte = *bytes.next()?;
+            value |= u64::from(byte & 0x7f) << shift;
+            if byte & 0x80 == 0 {
+                // Zigzag: 0, -1, 1, -2, ...
+                return Some((value >> 1) as i64 ^ -((value & 1) as i64));
+            }
+        }
+        None
+    };
+    field()?;
+    Some((field()?, field()?))
 }
 
 /// What the library gives, or says against it. Some damage of pages makes it panic.
@@ -163,5 +225,33 @@ impl Rows {
             places.remove(0);
         }
         places.push((next, reader));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pages_that_claim_more_than_they_hold_are_refused() {
+        // Kind 0, 150 bytes without and 20 with compression; then other fields.
+        assert_eq!(sizes_of_page(&[0x15, 0, 0x15, 0xac, 0x02, 0x15, 40, 0x2c]), Some((150, 20)));
+        assert_eq!(sizes_of_page(&[0x15, 0, 0x15, 1, 0x15, 3]), Some((-1, -2)));
+        assert_eq!(sizes_of_page(&[0x15, 0, 0x25, 2, 0x15, 2]), None);
+        assert_eq!(sizes_of_page(&[0x15, 0, 0x15, 0x80]), None);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        let field = |value: u32| {
+            let bytes = (0..5).map(|i| ((2 * u64::from(value)) >> (7 * i)) as u8 & 0x7f | if i < 4 { 0x80 } else { 0 });
+            std::iter::once(0x15).chain(bytes).collect::<Vec<u8>>()
+        };
+        let read = |whole: u32, compressed: u32| {
+            std::fs::write(&path, [field(0), field(whole), field(compressed)].concat()).unwrap();
+            Pages(File::open(&path).unwrap()).get_read(0).map(drop).map_err(|e| e.to_string())
+        };
+        assert_eq!([read(16 << 20, 1), read(1_000_000_000, 4_000_000)], [Ok(()), Ok(())]);
+        let error = read(1_000_000_000, 3_999_999).unwrap_err();
+        assert!(error.contains("a page of 3999999 bytes claims to have 1000000000"), "{error}");
+        assert!(read((16 << 20) + 1, 1).is_err());
     }
 }
