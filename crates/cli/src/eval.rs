@@ -7,7 +7,7 @@ use clap::Args;
 commands! {
     /// The evaluations, in the order of the help.
     EvalCommand:
-    Ap(ap::EvalApArgs) "Average precision and recall of detections in KITTI text";
+    Ap(ap::EvalApArgs) "Average precision and recall of detections in KITTI text or of OpenPCDet";
     Statistics(statistics::EvalStatisticsArgs) "Points and boxes of two data sets with the same frames";
     Matrix(matrix::EvalMatrixArgs) "Matrix of a study: AP and recall by train set and test set";
     Distances(distances::EvalDistancesArgs) "Distances between the point clouds of two data sets";

@@ -7,8 +7,10 @@ mod file_names;
 mod file_per_frame;
 mod nuscenes_tables;
 mod oxts;
+mod parquet_file;
 mod pose_text;
 mod stamps;
+mod table;
 mod tracklets;
 
 pub use stamps::StampUnit;
@@ -61,6 +63,7 @@ layouts! {
     KittiTracking = kitti_tracking: "KITTI's tracking benchmark: `velodyne/SSSS/`, `label_02`, `calib`, `oxts`.";
     KittiOdometry = kitti_odometry: "A sequence of KITTI odometry or SemanticKITTI: `velodyne`, `calib.txt`, poses.";
     Argoverse2 = argoverse2: "A log of Argoverse 2: `sensors/lidar/*.feather` with annotations and poses.";
+    Waymo = waymo: "The Waymo Open Dataset, version 2: `lidar/*.parquet` beside the other components; read only.";
     Nuscenes = nuscenes: "nuScenes: tables in `v1.0-*/`, clouds in `samples/LIDAR_TOP` and `sweeps/LIDAR_TOP`.";
     NuscenesScans = nuscenes_scans: "Scans of nuScenes alone: a folder of `*.pcd.bin`.";
     Kitti = kitti: "`velodyne/*.bin`, `label_2/*.txt` and, if there is a camera, `calib/*.txt`.";

@@ -4,9 +4,11 @@
 mod axes;
 mod checkpoint;
 mod paired;
+mod results;
 mod source;
 
 pub use checkpoint::detect_frozen;
+pub use results::read_result_frames;
 
 use crate::config::{ELSEWHERE, FrozenDetector};
 use crate::data_sets::{labelled_sha256, open};

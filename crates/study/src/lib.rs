@@ -32,7 +32,7 @@ pub use cost::{NetworkCost, duration, measure};
 pub use error::StudyError;
 pub use event::{Event, Listener};
 pub use folder::Study;
-pub use frozen::{FrozenState, detect_frozen};
+pub use frozen::{FrozenState, detect_frozen, read_result_frames};
 pub use json_forms::json_forms;
 pub use local::{GPU_VARIABLE, free_mib, set_program};
 pub use plan::{PlanReport, Planned, ScatterFrom, plan};

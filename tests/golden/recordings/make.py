@@ -1,5 +1,7 @@
 """Writes the recordings of this folder with sqlite3, struct and nothing of lidarshift. Run in this folder.
 
+plain.mcap, zstd.mcap: the whole recording in chunks of 600 bytes, with a metadata record and an attachment, written by
+the package mcap from PyPI (1.6.0 was used).
 drive_0.db3, drive_1.db3: one recording of rosbag2 in two files, the tables of version 3 of its schema.
 compressed.db3: the same messages, each compressed with the program zstd (compression_mode MESSAGE).
 """
@@ -8,6 +10,8 @@ import os
 import sqlite3
 import struct
 import subprocess
+
+from mcap.writer import CompressionType, Writer
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -102,3 +106,22 @@ def compressed(data):
 write("drive_0.db3", part(0, 2))
 write("drive_1.db3", part(2, 1))
 write("compressed.db3", [(topic, at, compressed(data)) for topic, at, data in part(0, 3)])
+
+
+def write_mcap(name, compression):
+    with open(name, "wb") as file:
+        writer = Writer(file, chunk_size=600, compression=compression)
+        writer.start(profile="ros2", library="make.py")
+        channels = {}
+        for number, topic, kind in TOPICS:
+            schema = writer.register_schema(name=kind, encoding="ros2msg", data=b"# left out")
+            channels[number] = writer.register_channel(topic, "cdr", schema, metadata={"offered_qos_profiles": ""})
+        writer.add_metadata("rosbag2", {"ROS_DISTRO": "humble"})
+        writer.add_attachment(START_NS, START_NS, "notes.txt", "text/plain", b"made up")
+        for topic, at, data in part(0, 3):
+            writer.add_message(channels[topic], at, data, at)
+        writer.finish()
+
+
+write_mcap("plain.mcap", CompressionType.NONE)
+write_mcap("zstd.mcap", CompressionType.ZSTD)

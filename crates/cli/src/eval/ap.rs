@@ -1,4 +1,4 @@
-//! `lidarshift eval ap`: average precision and recall of detections in KITTI text.
+//! `lidarshift eval ap`: average precision and recall of detections in KITTI text or of OpenPCDet.
 
 use crate::json::JsonArgs;
 use crate::{errln, out};
@@ -9,22 +9,24 @@ use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, rea
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Average precision and recall of detections in KITTI text.
+/// Average precision and recall of detections in KITTI text or of OpenPCDet.
 ///
 /// Label lines have 15 values. Detection lines have 16; the last one is the score. A frame without objects has an empty
-/// file. Boxes are compared in the frame in which the files give them.
+/// file. Boxes are compared in the frame in which the files give them. OpenPCDet's `result.pkl` needs --dataset: its
+/// boxes are in the LiDAR frame.
 ///
 /// Examples:
 ///   lidarshift eval ap --labels data/label_2 --detections runs/mine/detections
 ///   lidarshift eval ap --dataset datasets/road --split test --detections detections --json ap.json
+///   lidarshift eval ap --dataset datasets/road --split val --detections output/result.pkl
 #[derive(Args, Debug)]
 #[command(verbatim_doc_comment)]
 pub struct EvalApArgs {
     /// Folder of label files
     #[arg(long, value_name = "DIR", required_unless_present = "dataset", conflicts_with = "dataset")]
     labels: Option<PathBuf>,
-    /// Folder of detection files with the same names as the label files
-    #[arg(long, value_name = "DIR")]
+    /// Folder of detection files with the same names as the label files, or OpenPCDet's `result.pkl`
+    #[arg(long, value_name = "PATH")]
     detections: PathBuf,
     /// Frame of labels and detections: `camera` (as in KITTI) or `lidar` (location is the box centre, rotation the
     /// yaw). With --dataset, the data set defines it [default: camera]
@@ -78,6 +80,10 @@ impl EvalApArgs {
     }
 
     fn of_folder(&self, labels: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
+        if self.detections.is_file() {
+            let path = self.detections.display();
+            bail!("{path}: is a file; give --dataset for OpenPCDet's result.pkl, or a folder of KITTI text");
+        }
         let ids = match &self.ids {
             Some(list) => read_ids(list)?,
             None => ids_of_folder(labels)?,
@@ -93,7 +99,11 @@ impl EvalApArgs {
     fn of_dataset(&self, dataset: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
         let dataset = Dataset::open(dataset)?;
         let ids = dataset.ids(&self.split)?;
-        let frames = read_detections(|id| dataset.labels(id), &self.detections, &ids)?;
+        let frames = if self.detections.is_file() {
+            study::read_result_frames(&self.detections, &dataset, &ids)?
+        } else {
+            read_detections(|id| dataset.labels(id), &self.detections, &ids)?
+        };
         let config = dataset.config;
         Ok((frames, EvalOptions { label_frame: config.label_frame, classes: config.classes, ..EvalOptions::default() }))
     }
@@ -179,5 +189,41 @@ mod tests {
         assert!(run(&["--detections", &detections]).unwrap_err().to_string().contains("--labels"));
         let error = run(&["--labels", &labels, "--detections", "/nowhere"]).unwrap_err().to_string();
         assert!(error.contains("/nowhere: is not a folder"), "{error}");
+    }
+    /// The file has two cars and a pedestrian in 000000, nothing in 000001, a car in 000007.
+    #[test]
+    fn detections_of_openpcdet_are_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |name: &str, content: &[u8]| {
+            let path = folder.path().join(name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, content).unwrap();
+        };
+        let car = |x: f64, y: f64, yaw: f64| format!("Car 0 0 0 0 0 50 50 1.5 1.75 4 {x} {y} -0.75 {yaw}\n");
+        let point: Vec<u8> = [5.0f32, 0.0, 0.0, 0.5].iter().flat_map(|v| v.to_le_bytes()).collect();
+        let labels = [("000000", car(10.0, 0.0, 0.0) + &car(30.0, -3.0, 0.5)), ("000001", String::new())];
+        for (id, text) in labels.iter().chain(&[("000007", car(20.0, 0.0, 0.0))]) {
+            write(&format!("velodyne/{id}.bin"), &point);
+            write(&format!("label_2/{id}.txt"), text.as_bytes());
+        }
+        write("dataset.toml", b"root = \".\"\nlayout = \"kitti\"\nlabel_frame = \"lidar\"\n");
+        write("ImageSets/val.txt", b"000000\n000001\n000007\n");
+        let dataset = folder.path().to_str().unwrap();
+        let json = folder.path().join("ap.json");
+        let file = format!("{}/../../tests/golden/results/numpy2_protocol5.pkl", env!("CARGO_MANIFEST_DIR"));
+        let arguments = ["--dataset", dataset, "--split", "val", "--detections", &file, "--classes", "Car"];
+        run(&[&arguments[..], &["--json", json.to_str().unwrap()]].concat()).unwrap();
+        let report: serde_json::Value = serde_json::from_slice(&std::fs::read(json).unwrap()).unwrap();
+        let rows = report["rows"].as_array().unwrap();
+        let found = rows.iter().find(|row| row["metric"] == "3d" && row["overlap"] == 0.7).unwrap();
+        let counts = ["n_gt", "n_tp", "n_fp"].map(|name| found[name].as_i64().unwrap());
+        assert_eq!(counts, [3, 3, 0]);
+        write("velodyne/000009.bin", &point);
+        write("label_2/000009.txt", b"");
+        write("ImageSets/val.txt", b"000000\n000009\n");
+        let error = run(&arguments).unwrap_err().to_string();
+        assert!(error.contains("numpy2_protocol5.pkl: has no frame 000009; 1 of 2 frames have no entry"), "{error}");
+        let error = run(&["--labels", dataset, "--detections", &file]).unwrap_err().to_string();
+        assert!(error.contains("numpy2_protocol5.pkl: is a file; give --dataset"), "{error}");
     }
 }

@@ -4,9 +4,10 @@
 //! the upper LiDAR, so that ranges are what the sensor measured. Without the calibration of the log it is the frame of
 //! the car.
 
-use super::feather::Feather;
+use super::feather::read_feather;
 use super::file_names::{check_folder, ids_of_files};
 use super::pose_text::{check_box, pose_from_quaternion};
+use super::table::Table;
 use super::{DataLayout, Moment, PointDetails, TrackedObject};
 use crate::cloud_file::check_cloud;
 use crate::{Cloud, DataError, DatasetConfig, LabelBox, Layout, PointColumns};
@@ -60,7 +61,7 @@ impl DataLayout for Argoverse2 {
     /// The intensity of the files, 0 to 255, becomes 0 to 1.
     fn read_cloud(&self, root: &Path, id: &str, columns: PointColumns) -> Result<Cloud, DataError> {
         let path = self.cloud_path(root, id);
-        let table = Feather::read(&path)?;
+        let table = read_feather(&path)?;
         let origin = car_from_lidar(root)?;
         let [x, y, z] = [table.reals("x")?, table.reals("y")?, table.reals("z")?];
         let intensity = match columns {
@@ -102,7 +103,7 @@ impl DataLayout for Argoverse2 {
 
     /// The number of the laser (two heads of 32) and the time. The points are freed of the motion of the car.
     fn read_point_details(&self, root: &Path, id: &str) -> Result<PointDetails, DataError> {
-        let table = Feather::read(&self.cloud_path(root, id))?;
+        let table = read_feather(&self.cloud_path(root, id))?;
         let lasers = table.integers("laser_number")?;
         let ring = |(row, laser): (usize, &i64)| {
             u16::try_from(*laser).map_err(|_| table.wrong(row, &format!("laser_number {laser} is not from 0 to 65535")))
@@ -129,7 +130,7 @@ fn car_from_lidar(root: &Path) -> Result<[f64; 3], DataError> {
     if !path.is_file() {
         return Ok([0.0; 3]);
     }
-    let table = Feather::read(&path)?;
+    let table = read_feather(&path)?;
     let row = table.texts("sensor_name")?.iter().position(|name| name == UPPER);
     let row = row.ok_or_else(|| DataError::file(&path, format!("has no sensor {UPPER}")))?;
     let place = [table.reals("tx_m")?[row], table.reals("ty_m")?[row], table.reals("tz_m")?[row]];
@@ -140,7 +141,7 @@ fn car_from_lidar(root: &Path) -> Result<[f64; 3], DataError> {
 }
 
 /// The poses of all rows of a table, m.
-fn poses_of(table: &Feather) -> Result<Vec<Pose>, DataError> {
+fn poses_of(table: &Table) -> Result<Vec<Pose>, DataError> {
     let reals = |name: &str| table.reals(name);
     let q = [reals("qw")?, reals("qx")?, reals("qy")?, reals("qz")?];
     let t = [reals("tx_m")?, reals("ty_m")?, reals("tz_m")?];
@@ -158,7 +159,7 @@ fn read_poses(root: &Path) -> Result<BTreeMap<i64, Pose>, DataError> {
     if !path.is_file() {
         return Ok(BTreeMap::new());
     }
-    let table = Feather::read(&path)?;
+    let table = read_feather(&path)?;
     Ok(table.integers("timestamp_ns")?.into_iter().zip(poses_of(&table)?).collect())
 }
 
@@ -173,7 +174,7 @@ fn pose_at(poses: &BTreeMap<i64, Pose>, at_ns: i64) -> Option<Pose> {
 
 /// The annotated boxes of each stamp, in the LiDAR frame. Boxes stand upright: roll and pitch are left out.
 fn read_annotations(root: &Path) -> Result<BTreeMap<i64, Vec<TrackedObject>>, DataError> {
-    let table = Feather::read(&root.join(ANNOTATIONS))?;
+    let table = read_feather(&root.join(ANNOTATIONS))?;
     let origin = car_from_lidar(root)?;
     let stamps = table.integers("timestamp_ns")?;
     let (tracks, classes) = (table.texts("track_uuid")?, table.texts("category")?);

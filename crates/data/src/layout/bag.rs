@@ -88,6 +88,9 @@ struct Clouds {
     places: Vec<(usize, i64, Place)>,
 }
 
+/// Recordings that stay open.
+const MOST_OPEN: usize = 64;
+
 /// Recordings that are open, with the state of their files.
 static OPEN: Mutex<Option<HashMap<PathBuf, Opened>>> = Mutex::new(None);
 
@@ -263,6 +266,9 @@ impl Bags {
             return Ok(clouds.clone());
         }
         let clouds = Arc::new(self.opened(root, &state, topic)?);
+        if open.len() >= MOST_OPEN {
+            open.clear();
+        }
         open.insert(root.into(), (state, clouds.clone()));
         Ok(clouds)
     }

@@ -1,13 +1,17 @@
 //! MCAP files of ROS 2. They are read by ranges, so that their size does not matter.
 
+mod lengths;
+
 use super::bag::{BagFile, Bags, Place, Topic, Visit};
-use crate::limits::MOST_CLOUD_BYTES;
+use crate::limits::{MOST_CLOUD_BYTES, MOST_TEXT_BYTES};
 use crate::{DataError, Layout};
 use ::mcap::records::{ChunkIndex, Record, op};
-use ::mcap::sans_io::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
+use ::mcap::sans_io::{
+    LinearReadEvent, LinearReader, LinearReaderOptions, SummaryReadEvent, SummaryReader, SummaryReaderOptions,
+};
 use ::mcap::{McapError, Summary};
 use fs_err::File;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// Clouds in MCAP files.
@@ -20,6 +24,9 @@ pub(super) const Mcap: Bags = Bags {
     check: |_| Ok(()),
     open: |path| Ok(Box::new(Recording::open(path)?)),
 };
+
+/// Bytes before the records of a chunk without compression.
+const CHUNK_HEADER: u64 = 40;
 
 /// An open file with its summary.
 struct Recording {
@@ -38,6 +45,9 @@ impl Recording {
         };
         let length = fs_err::metadata(path)?.len();
         let mut file = File::open(path)?;
+        let section = summary_section(&mut file, length)?.ok_or_else(|| wrong(&"its summary is too large"))?;
+        lengths::check_summary(&section).map_err(|e| wrong(&e))?;
+        drop(section);
         let options = SummaryReaderOptions::default().with_file_size(length);
         let mut reader = SummaryReader::new_with_options(options);
         while let Some(event) = reader.next_event() {
@@ -105,20 +115,69 @@ impl Recording {
     /// checksum is compared.
     fn each(&self, chunk: &ChunkIndex, mut visit: impl FnMut(u16, u64, &[u8])) -> Result<(), DataError> {
         let wrong = |e: McapError| self.wrong(format!("a chunk of it cannot be read: {e}"));
-        let bytes = self.range(chunk.chunk_start_offset + 9, chunk.chunk_length - 9)?;
-        let Record::Chunk { header, data } = ::mcap::parse_record(op::CHUNK, &bytes).map_err(wrong)? else {
+        let bytes = self.range(chunk.chunk_start_offset, chunk.chunk_length)?;
+        let (head, body) = bytes.split_at(9);
+        if head[0] != op::CHUNK || head[1..] != (body.len() as u64).to_le_bytes() {
+            return Err(self.wrong("its index points to no chunk"));
+        }
+        if !lengths::fit(op::CHUNK, body) {
+            return Err(self.wrong("a chunk of it is damaged"));
+        }
+        let Record::Chunk { header, .. } = ::mcap::parse_record(op::CHUNK, body).map_err(wrong)? else {
             return Err(self.wrong("its index points to no chunk"));
         };
+        // Behind the records of a chunk without compression the library expects nothing.
+        if header.compression.is_empty() && header.compressed_size.checked_add(CHUNK_HEADER) != Some(body.len() as u64)
+        {
+            return Err(self.wrong("a chunk of it is damaged: its records do not fill it"));
+        }
         if header.uncompressed_size > MOST_CLOUD_BYTES {
             return Err(self.wrong("a chunk of it is larger than 2 GiB"));
         }
-        for record in ::mcap::read::ChunkReader::new(header, &data).map_err(wrong)? {
-            if let Record::Message { header, data } = record.map_err(wrong)? {
-                visit(header.channel_id, header.log_time, &data);
+        let options = LinearReaderOptions::default()
+            .with_skip_start_magic(true)
+            .with_skip_end_magic(true)
+            .with_validate_chunk_crcs(true)
+            .with_record_length_limit((header.uncompressed_size as usize).max(bytes.len()));
+        let (mut reader, mut rest) = (LinearReader::new_with_options(options), &bytes[..]);
+        while let Some(event) = reader.next_event() {
+            match event.map_err(wrong)? {
+                LinearReadEvent::ReadRequest(wanted) => {
+                    let (next, behind) = rest.split_at(wanted.min(rest.len()));
+                    reader.insert(next.len()).copy_from_slice(next);
+                    reader.notify_read(next.len());
+                    rest = behind;
+                }
+                LinearReadEvent::Record { opcode: op::MESSAGE, data } => {
+                    if let Record::Message { header, data } = ::mcap::parse_record(op::MESSAGE, data).map_err(wrong)? {
+                        visit(header.channel_id, header.log_time, &data);
+                    }
+                }
+                LinearReadEvent::Record { .. } => {}
             }
         }
         Ok(())
     }
+}
+
+/// The bytes from the start of the summary to the end of the file: none if there is no summary, `None` if there are
+/// more than [`MOST_TEXT_BYTES`]. The footer says 28 bytes before the end where it starts.
+fn summary_section(file: &mut File, length: u64) -> Result<Option<Vec<u8>>, DataError> {
+    let mut start = [0; 8];
+    if let Some(at) = length.checked_sub(28) {
+        file.seek(SeekFrom::Start(at))?;
+        file.read_exact(&mut start)?;
+    }
+    let start = u64::from_le_bytes(start);
+    let mut bytes = Vec::new();
+    if (1..length).contains(&start) {
+        if length - start > MOST_TEXT_BYTES {
+            return Ok(None);
+        }
+        file.seek(SeekFrom::Start(start))?;
+        file.take(length - start).read_to_end(&mut bytes)?;
+    }
+    Ok(Some(bytes))
 }
 
 impl BagFile for Recording {

@@ -1,16 +1,16 @@
 //! Detections made elsewhere: read from a folder of KITTI text or from a `result.pkl`, checked against the frames and
 //! classes of a data set, and converted to its label frame.
 
+use super::results::results_by_frame;
 use crate::config::FrozenDetector;
 use crate::error::{Result, refused};
 use data::Presence as _;
-use data::{DONT_CARE, DataError, Dataset, Detection, KittiText, LabelBox, parse_kitti_text};
+use data::{DONT_CARE, DataError, Dataset, KittiText, LabelBox, parse_kitti_text};
 use eval::EvalFrame;
 use eval::matrix::TestSet;
-use models::results::read_results;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Detections of a frozen detector on the test split of a data set.
@@ -80,14 +80,7 @@ impl Source<'_> {
     }
 
     fn read_pickle(&self, classes: &Classes) -> Result<Vec<EvalFrame>> {
-        let own = OwnIds::new(self.dataset.all_ids()?);
-        let mut found: BTreeMap<String, Vec<Detection>> = BTreeMap::new();
-        for frame in read_results(&self.path)? {
-            let id = own.own(&frame.frame_id);
-            if found.insert(id.clone(), frame.detections).is_some() {
-                return Err(DataError::file(&self.path, format!("frame {id} occurs twice")).into());
-            }
-        }
+        let found = results_by_frame(&self.path, self.dataset)?;
         let of_id = |id: &str| format!("{}: frame {id}", self.path.display());
         self.check_ids(&found.keys().cloned().collect(), &of_id)?;
         let read = |frame: &EvalFrame| {
@@ -163,37 +156,6 @@ pub(super) fn source_sha256(path: &Path) -> Result<String> {
     Ok(hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }
 
-/// The ids of a data set, found from ids that may lack leading zeros.
-struct OwnIds {
-    ids: BTreeSet<String>,
-    /// By the id without leading zeros; `None` if several ids are the same number.
-    by_number: BTreeMap<String, Option<String>>,
-}
-
-impl OwnIds {
-    fn new(ids: Vec<String>) -> Self {
-        let mut by_number: BTreeMap<String, Option<String>> = BTreeMap::new();
-        for id in &ids {
-            by_number.entry(number(id)).and_modify(|known| *known = None).or_insert_with(|| Some(id.clone()));
-        }
-        OwnIds { ids: ids.into_iter().collect(), by_number }
-    }
-
-    /// The id of the data set; unchanged if it has no such frame.
-    fn own(&self, id: &str) -> String {
-        let is_number = !id.is_empty() && id.bytes().all(|b| b.is_ascii_digit());
-        if self.ids.contains(id) || !is_number {
-            return id.into();
-        }
-        self.by_number.get(&number(id)).cloned().flatten().unwrap_or_else(|| id.into())
-    }
-}
-
-fn number(id: &str) -> String {
-    let short = id.trim_start_matches('0');
-    if short.is_empty() && !id.is_empty() { "0".into() } else { short.into() }
-}
-
 /// The classes of a data set, and how those of the detections are renamed.
 struct Classes<'a> {
     frozen: &'a FrozenDetector,
@@ -243,17 +205,6 @@ impl<'a> Classes<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn ids_without_leading_zeros_are_found() {
-        let own = OwnIds::new(["000000", "000007", "07x", "8", "08"].map(String::from).into());
-        for (id, wanted) in
-            [("7", "000007"), ("0", "000000"), ("000007", "000007"), ("07x", "07x"), ("7x", "7x"), ("9", "9")]
-        {
-            assert_eq!(own.own(id), wanted);
-        }
-        assert_eq!(own.own("008"), "008", "8 and 08 are the same number");
-    }
 
     #[test]
     fn the_hash_knows_names_and_contents() {

@@ -33,8 +33,8 @@ fn refusal(path: &Path) -> String {
 }
 
 /// Checks the three clouds of the recording, with rings, times, stamps and poses.
-fn check_drive(dataset: &Dataset) {
-    assert_eq!((dataset.config.layout, dataset.config.points), (Layout::Db3, PointColumns::Xyzi));
+fn check_drive(dataset: &Dataset, layout: Layout) {
+    assert_eq!((dataset.config.layout, dataset.config.points), (layout, PointColumns::Xyzi));
     let ids = dataset.all_ids().unwrap();
     assert_eq!(ids, ["000000", "000001", "000002"]);
     let moments = dataset.moments(&ids).unwrap();
@@ -52,7 +52,7 @@ fn check_drive(dataset: &Dataset) {
 #[test]
 fn a_folder_of_several_files_is_one_recording() {
     let folder = drive();
-    check_drive(&Dataset::open(folder.path()).unwrap());
+    check_drive(&Dataset::open(folder.path()).unwrap(), Layout::Db3);
     // The frame names the file that has it.
     let dataset = Dataset::open(&folder.path().join(".#/points")).unwrap();
     let name = |id: &str| dataset.cloud_path(id).file_name().unwrap().to_owned();
@@ -66,13 +66,22 @@ fn a_folder_of_several_files_is_one_recording() {
     assert_eq!(Dataset::open(folder.path()).unwrap().all_ids().unwrap().len(), 3);
 }
 
+/// The same recording in MCAP files of another program.
+#[test]
+fn recordings_in_mcap_are_those_in_sqlite() {
+    for name in ["plain", "zstd"] {
+        let path = format!("{}/../../tests/golden/recordings/{name}.mcap", env!("CARGO_MANIFEST_DIR"));
+        check_drive(&Dataset::open(Path::new(&path)).unwrap(), Layout::Mcap);
+    }
+}
+
 #[test]
 fn messages_that_are_compressed_one_by_one_are_read() {
     let folder = tempfile::tempdir().unwrap();
     // A name that is an address with other characters.
     let path = folder.path().join("50% #1?mode=rwc é.db3");
     fs::write(&path, COMPRESSED).unwrap();
-    check_drive(&Dataset::open(&path).unwrap());
+    check_drive(&Dataset::open(&path).unwrap(), Layout::Db3);
     let mut damaged = COMPRESSED.to_vec();
     for at in 0..damaged.len() - 10 {
         if damaged[at..].starts_with(&[0x28, 0xB5, 0x2F, 0xFD]) {
