@@ -99,6 +99,22 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_ray_passes_through_a_turned_box_up_to_where_it_ends() {
+        let b = Box3::from_array([10.0, 0.0, 1.0, 4.0, 2.0, 2.0, PI / 2.0]);
+        let ahead = [1.0, 0.0, 0.0];
+        let near = |got: Option<[f64; 2]>, want: [f64; 2]| {
+            let got = got.unwrap();
+            assert!((0..2).all(|k| (got[k] - want[k]).abs() < 1e-9), "{got:?}");
+        };
+        near(b.path_through([0.0, 0.0, 1.0], ahead, 50.0), [9.0, 11.0]);
+        near(b.path_through([0.0, 0.0, 1.0], ahead, 10.5), [9.0, 10.5]);
+        near(b.path_through([10.0, 0.0, 1.0], ahead, 50.0), [0.0, 1.0]);
+        assert_eq!(b.path_through([0.0, 0.0, 3.0], ahead, 50.0), None);
+        assert_eq!(b.path_through([0.0, 0.0, 1.0], ahead, 8.0), None);
+        assert_eq!(b.path_through([0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], 50.0), None);
+    }
+
+    #[test]
     fn local_and_back() {
         let b = Box3::from_array([3.0, -2.0, 1.0, 4.0, 2.0, 1.5, 0.7]);
         let p = [10.0, 4.0, -1.0];

@@ -40,9 +40,6 @@ const FLAT_M: f64 = 0.15;
 /// The kind of a return; `None` on a surface.
 pub fn odd(ray: &Ray) -> Option<Odd> {
     let lies = ray.lies();
-    if ray.shown {
-        return None;
-    }
     if ray.own_range_m() < OWN_CAR_M {
         let single = ray.own_range_m() >= NEAREST_M && is_lone_before(ray);
         return single.then_some(Odd::Alone);
@@ -53,7 +50,8 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
         Lies::On => None,
         // Without rows nothing says that the simulation sent a shot there.
         Lies::Open if ray.row == u16::MAX => None,
-        _ if ray.company <= 1 => (ray.smooth || lies == Lies::Open).then_some(Odd::Alone),
+        // What both sides show is lone on neither.
+        _ if ray.company <= 1 => (!ray.shown && (ray.smooth || lies == Lies::Open)).then_some(Odd::Alone),
         _ if ray.company < FEW || ray.surface == Surface::Object => None,
         Lies::Behind => Some(Odd::GroupBehind),
         _ => Some(Odd::GroupInFront),

@@ -295,6 +295,6 @@ mod tests {
             let tail = Tail { all: 1e5, beyond: 1e3, next, ..Tail::default() };
             super::clustering(&[&[tail, Tail::default()]])
         };
-        assert!(clustering([1e3, 12.0]) < INDEPENDENT && clustering([1e3, 300.0]) > INDEPENDENT);
+        assert!(clustering([1e3, 12.0]) < INDEPENDENT && clustering([1e3, 500.0]) > INDEPENDENT);
     }
 }

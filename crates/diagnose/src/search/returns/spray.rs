@@ -12,8 +12,8 @@ use crate::inference::linear::{FOLDS, fold_of};
 use crate::search::{ChannelResult, Found, Z_STAR, first_demands, parameter};
 use sensor::Effect;
 
-/// Smallest density that is reported, 1/m: one droplet in ten paths through a plume of ten metres.
-const FLOOR_PER_M: f64 = 0.01;
+/// Smallest share of all returns that is reported: some droplets behind the nearest vehicle.
+const FLOOR: f64 = 2e-4;
 
 /// Ratio of the density behind vehicles to that before them from which on it is theirs: what is missing in the
 /// simulation stands before vehicles as often as behind them.
@@ -87,9 +87,10 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
         select.iter().map(|f| f.measured[0].len() as f64 - f.measured[1].len() as f64).collect();
     let density = Density::of(select.iter().copied());
     let seen = significant(&gains, Z_STAR) || significant_by_signs(&differences, Z_BY_SIGNS[0]);
+    let floor_per_m = FLOOR * frames.returns / select.iter().map(|f| f.path_m(0)).sum::<f64>().max(1.0);
     let outcome = match density {
         _ if total <= first_demands().nats || !seen => "no more returns behind vehicles than before them",
-        Density { behind, base } if behind < FLOOR_PER_M || behind < TIMES * base => "too few to speak of",
+        Density { behind, base } if behind < floor_per_m.max(TIMES * base) => "too few to speak of",
         _ => "chosen",
     };
     result.considered.push(Considered {
@@ -100,7 +101,7 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
         outcome: outcome.into(),
     });
     if select.iter().any(|f| f.path_m(0) > 0.0) {
-        let detectable = FLOOR_PER_M.max(TIMES * density.base);
+        let detectable = floor_per_m.max(TIMES * density.base);
         result.minimum.push((Cause::Spray, Minimum::new(Quantity::DensityPerM, detectable)));
     }
     if outcome != "chosen" {
