@@ -39,8 +39,6 @@ const LEAST_LENGTH_M: f64 = 2.5;
 /// A return in the air behind a vehicle, or before one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Droplet {
-    /// Place among the rays of its side.
-    pub ray: usize,
     /// Distance from the box, m.
     pub behind_m: f64,
     /// Height over the ground of the box, m.
@@ -95,14 +93,13 @@ impl Air<'_> {
     }
 
     /// A return at a point, where it lies in this air.
-    fn droplet(&self, ray: usize, on_path: bool, point: [f64; 3]) -> Option<Droplet> {
+    fn droplet(&self, on_path: bool, point: [f64; 3]) -> Option<Droplet> {
         let local = self.air.to_local(point);
         if (0..3).any(|k| local[k].abs() > self.air.size[k] / 2.0) {
             return None;
         }
         let of_vehicle = self.vehicle.to_local(point);
         Some(Droplet {
-            ray,
             on_path,
             behind_m: of_vehicle[0].abs() - self.vehicle.size[0] / 2.0,
             over_ground_m: of_vehicle[2] + self.vehicle.size[2] / 2.0,
@@ -140,7 +137,7 @@ pub fn plume_frame(frame: &FramePair, origins: &[Point3<f64>], extent: Extent) -
             if boxes.iter().any(|b| in_or_beside(b, point, OTHERS_M)) {
                 continue;
             }
-            if let Some((air, droplet)) = airs.iter().find_map(|air| Some((air, air.droplet(i, ray.smooth, point)?))) {
+            if let Some((air, droplet)) = airs.iter().find_map(|air| Some((air, air.droplet(ray.smooth, point)?))) {
                 let found = if side == 0 { &mut out.measured } else { &mut out.simulated };
                 found[air.place].push(droplet);
             }
@@ -166,11 +163,11 @@ mod tests {
     fn the_air_is_behind_and_before_a_vehicle_and_above_the_ground() {
         let car = Box3::from_array([20.0, 5.0, 0.8, 4.0, 2.0, 1.6, std::f64::consts::PI]);
         let [behind, before] = Air::of(&car, MOST);
-        let droplet = behind.droplet(7, true, [20.0 + 2.0 + 4.0, 5.0, 1.0]).unwrap();
+        let droplet = behind.droplet(true, [20.0 + 2.0 + 4.0, 5.0, 1.0]).unwrap();
         assert!((droplet.behind_m - 4.0).abs() < 1e-9 && (droplet.over_ground_m - 1.0).abs() < 1e-9);
-        assert!(before.droplet(7, true, [20.0 - 2.0 - 4.0, 5.0, 1.0]).is_some());
+        assert!(before.droplet(true, [20.0 - 2.0 - 4.0, 5.0, 1.0]).is_some());
         for point in [[23.0, 5.0, 1.0], [26.0, 5.0, 0.2], [26.0, 7.0, 1.0], [40.0, 5.0, 1.0]] {
-            assert!(behind.droplet(7, true, point).is_none(), "{point:?}");
+            assert!(behind.droplet(true, point).is_none(), "{point:?}");
         }
     }
 }

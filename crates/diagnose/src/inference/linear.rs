@@ -88,18 +88,24 @@ impl LinearFit {
 
 /// Gains of each frame when the columns are fitted on the blocks of other folds.
 pub fn cross_gains(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize], precision: &[f64]) -> Vec<f64> {
+    let fit_on = |train: &[usize]| {
+        let (train, train_blocks): (Vec<_>, Vec<_>) = train.iter().map(|&i| (frames[i], blocks[i])).unzip();
+        (!train.is_empty()).then(|| fit(&train, &train_blocks, columns, precision))
+    };
+    cross_validated(blocks, fit_on, |fit, i| fit.as_ref().map_or(0.0, |fit| fit.gain(frames[i])))
+}
+
+/// Gains of each frame by what is fitted on the blocks of other folds; frames are known by their places in `blocks`.
+pub fn cross_validated<F>(blocks: &[usize], fit: impl Fn(&[usize]) -> F, gain: impl Fn(&F, usize) -> f64) -> Vec<f64> {
     let folds = fold_of(blocks);
-    let mut gains = vec![0.0; frames.len()];
+    let mut gains = vec![0.0; blocks.len()];
     for fold in 0..FOLDS {
-        let (train, train_blocks): (Vec<_>, Vec<_>) =
-            (0..frames.len()).filter(|&i| folds[i] != fold).map(|i| (frames[i], blocks[i])).unzip();
-        if train.is_empty() || train.len() == frames.len() {
+        let (test, train): (Vec<usize>, Vec<usize>) = (0..blocks.len()).partition(|&i| folds[i] == fold);
+        if test.is_empty() {
             continue;
         }
-        let fit = fit(&train, &train_blocks, columns, precision);
-        for i in (0..frames.len()).filter(|&i| folds[i] == fold) {
-            gains[i] = fit.gain(frames[i]);
-        }
+        let fitted = fit(&train);
+        test.into_iter().for_each(|i| gains[i] = gain(&fitted, i));
     }
     gains
 }

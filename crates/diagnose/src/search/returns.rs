@@ -15,7 +15,7 @@ use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Minimum, Parameter};
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::gain_of_count;
-use crate::inference::linear::{FOLDS, fold_of};
+use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use rayon::prelude::*;
 use std::collections::HashSet;
@@ -317,14 +317,6 @@ fn poisson_distance(count: f64, expected: f64) -> f64 {
 
 /// Cross-validated gains of the selecting frames, nats.
 fn cross_gains(odd: &[OddFrame], select: &[usize], blocks: &[usize], k: usize) -> Vec<f64> {
-    let folds = fold_of(blocks);
-    let mut gains = vec![0.0; select.len()];
-    for fold in 0..FOLDS {
-        let train = (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &odd[select[i]]);
-        let [base, more] = excess(train, k);
-        for i in (0..select.len()).filter(|&i| folds[i] == fold) {
-            gains[i] = gain(&odd[select[i]], k, base, more.max(0.0));
-        }
-    }
-    gains
+    let fit = |train: &[usize]| excess(train.iter().map(|&i| &odd[select[i]]), k);
+    cross_validated(blocks, fit, |[base, more], i| gain(&odd[select[i]], k, *base, more.max(0.0)))
 }

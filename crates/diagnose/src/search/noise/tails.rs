@@ -8,7 +8,7 @@ use crate::diagnosis::{Considered, Minimum, Status};
 use crate::effects::rounded;
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::gain_of_count;
-use crate::inference::linear::{FOLDS, fold_of};
+use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter};
 use sensor::Effect;
@@ -57,7 +57,8 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     let gains = cross_gains(&on_select, &context.blocks(&select));
     let (total, z) = total_and_z(&gains);
     let [base, share] = shares(&on_select);
-    let off_m = fit(&on_select, leverage(context)).map_or(0.0, |t| t.std_m);
+    let leverage = leverage(context);
+    let off_m = fit(&on_select, leverage).map_or(0.0, |t| t.std_m);
     let outcome = match clustering(&on_select) {
         _ if total <= first_demands().nats || !significant(&gains, Z_STAR) => {
             "no more of them than on the simulated side"
@@ -79,7 +80,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
         return 0.0;
     }
     let on_estimate = tail(&estimate);
-    let Some(found) = fit(&on_estimate, leverage(context)) else { return 0.0 };
+    let Some(found) = fit(&on_estimate, leverage) else { return 0.0 };
     let [base, share] = shares(&on_estimate);
     let held: Vec<f64> = tail(&hold_out).iter().map(|t| gain(t, base, share)).collect();
     for (d, gain) in result.distance.iter_mut().zip(&held) {
@@ -106,16 +107,8 @@ fn gain(frame: &[Tail; 2], base: f64, share: f64) -> f64 {
 
 /// Cross-validated gains of the selecting frames, nats.
 fn cross_gains(tails: &[&[Tail; 2]], blocks: &[usize]) -> Vec<f64> {
-    let folds = fold_of(blocks);
-    let mut gains = vec![0.0; tails.len()];
-    for fold in 0..FOLDS {
-        let train: Vec<&[Tail; 2]> = (0..tails.len()).filter(|&i| folds[i] != fold).map(|i| tails[i]).collect();
-        let [base, share] = shares(&train);
-        for i in (0..tails.len()).filter(|&i| folds[i] == fold) {
-            gains[i] = gain(tails[i], base, share);
-        }
-    }
-    gains
+    let fit = |train: &[usize]| shares(&train.iter().map(|&i| tails[i]).collect::<Vec<_>>());
+    cross_validated(blocks, fit, |[base, share], i| gain(tails[i], *base, *share))
 }
 
 /// Share of tails right after one, of those that the measured side has beyond the simulated one. Edges and small things

@@ -33,10 +33,14 @@ struct Description {
 /// frames.
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
     let Description { causes, effects, covariate, says, parameters } = match kind {
-        Odd::Alone => match weather_of(search) {
-            Some(weather) => of_weather(&weather, &share),
-            None => of_false_alarms(search, &share),
-        },
+        Odd::Alone => {
+            let alarms = false_alarms(search.context, &search.estimate, search.end_m);
+            // No droplet is seen through a surface: returns behind them as well come from the receiver.
+            match (!alarms.instead).then(|| weather_of(search)).flatten() {
+                Some(weather) => of_weather(&weather, &share),
+                None => of_false_alarms(&alarms, &share),
+            }
+        }
         Odd::Between => mixed(search, share),
         Odd::GroupInFront => Description {
             causes: vec![cause(kind)],
@@ -69,12 +73,8 @@ pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains
 const TELL_WEATHER_BY: &str =
     "a flat wall at two known distances in the same weather: fog weakens its light by far more";
 
-/// The weather that the lone returns of the estimating frames tell. No droplet is seen through a surface: where lone
-/// returns are behind surfaces as well, they come from the receiver.
+/// The weather that the lone returns of the estimating frames tell.
 fn weather_of(search: &Search) -> Option<Weather> {
-    if false_alarms(search.context, &search.estimate, search.end_m).instead {
-        return None;
-    }
     let frames: Vec<_> = search.estimate.iter().map(|&f| &search.context.frames[f]).collect();
     let of_spray = |f: usize, side: usize, ray: usize| is_spray(&search.spray, search.estimate[f], side, ray);
     let bins = bins(&frames, search.end_m, &of_spray);
@@ -131,9 +131,9 @@ fn of_weather(weather: &Weather, share: &Parameter) -> Description {
 }
 
 /// Describes lone returns.
-fn of_false_alarms(search: &Search, share: &Parameter) -> Description {
+fn of_false_alarms(alarms: &FalseAlarms, share: &Parameter) -> Description {
     let (more, error) = (share.estimate, (share.ci95[1] - share.ci95[0]) / 2.0 / 1.96);
-    let FalseAlarms { rate, reach_m, instead } = false_alarms(search.context, &search.estimate, search.end_m);
+    let FalseAlarms { rate, reach_m, instead } = *alarms;
     let form = (error / more.abs().max(1e-9)).hypot(0.06);
     let alarms = sensor::effects::FalseAlarms {
         rate: rounded(rate, 7),

@@ -8,7 +8,7 @@ use crate::diagnosis::{Considered, Minimum, Status};
 use crate::effects::rounded;
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::gain_of_count;
-use crate::inference::linear::{FOLDS, fold_of};
+use crate::inference::linear::cross_validated;
 use crate::search::{ChannelResult, Found, Z_STAR, first_demands, parameter};
 use sensor::Effect;
 
@@ -73,15 +73,9 @@ impl Density {
 /// Searches spray. What it explains, other searches leave out.
 pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
     let of = |which: &[usize]| which.iter().map(|&i| &frames.plumes[i]).collect::<Vec<_>>();
-    let (select, folds) = (of(frames.select), fold_of(frames.blocks));
-    let mut gains = vec![0.0; select.len()];
-    for fold in 0..FOLDS {
-        let train = select.iter().zip(&folds).filter(|(_, f)| **f != fold).map(|(frame, _)| *frame);
-        let density = Density::of(train);
-        for ((gain, frame), _) in gains.iter_mut().zip(&select).zip(&folds).filter(|(_, f)| **f == fold) {
-            *gain = density.gain(frame);
-        }
-    }
+    let select = of(frames.select);
+    let fit = |train: &[usize]| Density::of(train.iter().map(|&i| select[i]));
+    let gains = cross_validated(frames.blocks, fit, |density, i| density.gain(select[i]));
     let (total, z) = total_and_z(&gains);
     let differences: Vec<f64> =
         select.iter().map(|f| f.measured[0].len() as f64 - f.measured[1].len() as f64).collect();
@@ -206,8 +200,7 @@ mod tests {
 
     /// Twelve frames with so many droplets behind and before a vehicle.
     fn searched(behind: usize, before: usize) -> (bool, ChannelResult) {
-        let droplet =
-            |k: usize| Droplet { ray: k, on_path: true, behind_m: 1.5 + (k % 80) as f64 / 10.0, over_ground_m: 0.8 };
+        let droplet = |k: usize| Droplet { on_path: true, behind_m: 1.5 + (k % 80) as f64 / 10.0, over_ground_m: 0.8 };
         let frame = |i: usize| PlumeFrame {
             measured: [(0..behind + i % 2).map(droplet).collect(), (0..before + i % 3).map(droplet).collect()],
             simulated: [vec![], vec![]],

@@ -60,12 +60,16 @@ pub(super) fn weather(bins: &[Bin], lost: impl Fn(f64) -> Option<f64>) -> Option
     if droplets.nats - even.nats.max(of_path.nats) < first_demands().nats || of_view > OF_VIEW[1] {
         return None;
     }
-    let causes = match lost(depth) {
-        _ if of_view > OF_VIEW[0] => vec![Cause::Outliers, Cause::Fog],
-        _ if depth > SINGLE_DROPS_M[1] => vec![Cause::Fog],
-        Some(lost) if lost < LOSES[1] && depth < SINGLE_DROPS_M[0] => vec![Cause::Rain],
-        Some(lost) if lost > LOSES[0] => vec![Cause::Fog, Cause::Rain],
-        _ => vec![Cause::Rain, Cause::Fog],
+    let causes = if of_view > OF_VIEW[0] {
+        vec![Cause::Outliers, Cause::Fog]
+    } else if depth > SINGLE_DROPS_M[1] {
+        vec![Cause::Fog]
+    } else {
+        match lost(depth) {
+            Some(lost) if lost < LOSES[1] && depth < SINGLE_DROPS_M[0] => vec![Cause::Rain],
+            Some(lost) if lost > LOSES[0] => vec![Cause::Fog, Cause::Rain],
+            _ => vec![Cause::Rain, Cause::Fog],
+        }
     };
     let [low, high] = interval(bins, &droplets);
     Some(Weather { causes, shape: droplets.shape, rate: droplets.rate, depth_m: [depth, low, high] })
