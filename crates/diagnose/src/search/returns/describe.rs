@@ -115,7 +115,8 @@ fn of_weather(weather: &Weather, share: &Parameter) -> Description {
             parameters.push(within(Quantity::VisibilityM, visibility));
             format!("fog with a visibility of {:.0} to {:.0} m", visibility[1], visibility[2])
         }
-        _ => "rain".to_owned(),
+        Cause::Rain => "rain".to_owned(),
+        _ => "fog that reaches beyond the sensor's range, or false alarms".to_owned(),
     };
     Description {
         causes: weather.causes.clone(),
