@@ -20,7 +20,7 @@ use crate::diagnosis::{Diagnosis, Gain, Unidentifiable, Verdict};
 use crate::effects::fill_effects;
 use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
-use crate::inference::roles::{FEWEST_FRAMES, Role, roles};
+use crate::inference::roles::{FEWEST_FRAMES, roles};
 use crate::pairing::{
     Corrections, FramePair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors, kept_of_frame,
     pair_all, with_points,
@@ -304,7 +304,7 @@ impl Engine<'_> {
         self.finished(7);
         results.extend([Side::Labels, Side::Objects].map(|s| search::labels::search(&context, s, &known.displaced)));
         self.finished(SEARCHES);
-        search::confounders::drop_confounded(&mut results, context.returns(&context.of(Role::HoldOut)));
+        search::confounders::drop_confounded(&mut results);
         notes.extend(search::set_aside(&mut results));
         let corrected = corrected(&context, &results);
         let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();

@@ -1,9 +1,11 @@
 //! Tails of the roughness: single returns far off their surface, by the usual roughness of the shots around them.
 //!
 //! The usual roughness is the median over the shots before and after in the same row: it follows what a surface, its
-//! brightness and its incidence do to the noise. A return beyond [`BEYOND`] standard deviations of it is in the tail.
+//! brightness and its incidence do to the noise. It is at least that of the noisier side at such ranges and angles:
+//! what is uneven in the world is off by the same lengths on both sides, and is a tail on both or on neither. A return
+//! beyond [`BEYOND`] standard deviations of it is in the tail.
 
-use super::cells::place_of;
+use super::cells::{cell, place_of};
 use super::roughness::own_roughness_m;
 use crate::pairing::{FramePair, Ray};
 use rayon::prelude::*;
@@ -27,6 +29,18 @@ fn bin_of(usual_m: f64) -> usize {
     ((usual_m / 1e-3).log2() * 4.0).clamp(0.0, BINS as f64 - 1.0) as usize
 }
 
+/// Bins of the size of what is in the tail: four for each factor of 2, from 1 cm.
+pub const SIZES: usize = 28;
+
+/// Lower end of a bin of sizes, m.
+pub fn size_m(bin: usize) -> f64 {
+    0.01 * (bin as f64 / 4.0).exp2()
+}
+
+fn size_bin(size_m: f64) -> usize {
+    ((size_m / 0.01).log2() * 4.0).clamp(0.0, SIZES as f64 - 1.0) as usize
+}
+
 /// Measured returns with the same usual roughness.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TailBin {
@@ -45,8 +59,8 @@ pub struct Tail {
     pub all: f64,
     /// Of these in the tail.
     pub beyond: f64,
-    /// Sum of their squared roughness, m2.
-    pub squares: f64,
+    /// The same by the size of their roughness: see [`size_m`].
+    pub sizes: [f64; SIZES],
     /// Shots that follow one in the tail, and those of them that are in it as well.
     pub next: [f64; 2],
     /// All returns by their usual roughness.
@@ -55,13 +69,14 @@ pub struct Tail {
 
 impl Default for Tail {
     fn default() -> Self {
-        Tail { all: 0.0, beyond: 0.0, squares: 0.0, next: [0.0; 2], bins: vec![TailBin::default(); BINS] }
+        Tail { all: 0.0, beyond: 0.0, sizes: [0.0; SIZES], next: [0.0; 2], bins: vec![TailBin::default(); BINS] }
     }
 }
 
-/// Tails of both sides of each frame.
-pub fn tails(frames: &[FramePair]) -> Vec<[Tail; 2]> {
-    frames.par_iter().map(|f| [tail(&f.measured), tail(&f.simulated)]).collect()
+/// Tails of both sides of each frame. `scales` holds the usual roughness of the noisier side by cell, m: see
+/// [`super::roughness::scales`].
+pub fn tails(frames: &[FramePair], scales: &[f64]) -> Vec<[Tail; 2]> {
+    frames.par_iter().map(|f| [&f.measured, &f.simulated].map(|rays| tail(rays, scales))).collect()
 }
 
 /// Rays in the order in which a row sends them; of sensors without rows as they are recorded.
@@ -75,7 +90,7 @@ fn in_order(rays: &[Ray]) -> Vec<&Ray> {
     order
 }
 
-fn tail(rays: &[Ray]) -> Tail {
+fn tail(rays: &[Ray], scales: &[f64]) -> Tail {
     let shots: Vec<(&Ray, Option<f64>)> = in_order(rays).into_iter().map(|ray| (ray, own_roughness_m(ray))).collect();
     let mut out = Tail::default();
     let (mut before, mut around) = (false, Vec::with_capacity(2 * AROUND));
@@ -90,7 +105,8 @@ fn tail(rays: &[Ray]) -> Tail {
         };
         let half = around.len() / 2;
         let median = *around.select_nth_unstable_by(half, f64::total_cmp).1;
-        let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(LEAST_M);
+        let of_cell_m = cell(ray).map_or(0.0, |c| scales[c]);
+        let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(of_cell_m).max(LEAST_M);
         let beyond = own.abs() > BEYOND * usual_m;
         let bin = &mut out.bins[bin_of(usual_m)];
         let cos = place_of(ray).map_or(1.0, |(_, cos, _)| cos);
@@ -102,7 +118,7 @@ fn tail(rays: &[Ray]) -> Tail {
         }
         if beyond {
             out.beyond += 1.0;
-            out.squares += own * own;
+            out.sizes[size_bin(own.abs())] += 1.0;
         }
         before = beyond;
     }

@@ -69,21 +69,56 @@ pub fn fit(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize], precisi
 impl LinearFit {
     /// Gain of a frame over zero coefficients, nats.
     pub fn gain(&self, frame: &LinearFrame) -> f64 {
-        let k = self.columns.len();
-        let mut gain = 0.0;
-        for i in 0..k {
-            gain += self.theta[i] * frame.right[self.columns[i]];
-            for j in 0..k {
-                gain -= 0.5 * self.theta[i] * self.theta[j] * frame.gram[(self.columns[i], self.columns[j])];
-            }
-        }
-        gain
+        gain(frame, &self.columns, self.theta.as_slice())
     }
 
     /// Standard error of a coefficient.
     pub fn error(&self, i: usize) -> f64 {
         self.covariance[(i, i)].sqrt()
     }
+}
+
+/// Gain of a frame by coefficients of some columns over zero ones, nats.
+fn gain(frame: &LinearFrame, columns: &[usize], theta: &[f64]) -> f64 {
+    let mut gain = 0.0;
+    for (i, &a) in columns.iter().enumerate() {
+        gain += theta[i] * frame.right[a];
+        for (j, &b) in columns.iter().enumerate() {
+            gain -= 0.5 * theta[i] * theta[j] * frame.gram[(a, b)];
+        }
+    }
+    gain
+}
+
+/// Rounds of [`positive_fit`] over the columns.
+const ROUNDS: usize = 2000;
+
+/// Coefficients of some columns of which none is negative, fitted on frames: one column after the other, until none
+/// changes.
+pub fn positive_fit(frames: &[&LinearFrame], columns: &[usize]) -> Vec<f64> {
+    let sum = |i: usize, j: usize| frames.iter().map(|f| f.gram[(columns[i], columns[j])]).sum::<f64>();
+    let gram = DMatrix::from_fn(columns.len(), columns.len(), sum);
+    let right = DVector::from_fn(columns.len(), |i, _| frames.iter().map(|f| f.right[columns[i]]).sum::<f64>());
+    let mut theta = DVector::<f64>::zeros(columns.len());
+    for _ in 0..ROUNDS {
+        let mut change = 0.0f64;
+        for k in 0..columns.len() {
+            let scale = gram[(k, k)].max(1e-300);
+            let free = theta[k] + (right[k] - gram.row(k).transpose().dot(&theta)) / scale;
+            change = change.max((free.max(0.0) - theta[k]).powi(2) * scale);
+            theta[k] = free.max(0.0);
+        }
+        if change < 1e-9 {
+            break;
+        }
+    }
+    theta.as_slice().to_vec()
+}
+
+/// Gains of each frame when coefficients that are not negative are fitted on the blocks of other folds.
+pub fn positive_cross_gains(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize]) -> Vec<f64> {
+    let fit_on = |train: &[usize]| positive_fit(&train.iter().map(|&i| frames[i]).collect::<Vec<_>>(), columns);
+    cross_validated(blocks, fit_on, |theta, i| gain(frames[i], columns, theta))
 }
 
 /// Gains of each frame when the columns are fitted on the blocks of other folds.
@@ -154,5 +189,20 @@ mod tests {
         let none: f64 = cross_gains(&refs, &blocks, &[0], &[0.0, 0.0]).iter().sum();
         // A gain by chance is below what a choice demands.
         assert!(gain > 20.0 && none < 8.0, "{gain} {none}");
+    }
+
+    #[test]
+    fn no_coefficient_of_a_positive_fit_is_negative() {
+        let frames = made([-0.3, 0.5], 24, 2);
+        let refs: Vec<_> = frames.iter().collect();
+        let blocks: Vec<usize> = (0..24).map(|i| i / 2).collect();
+        let theta = positive_fit(&refs, &[0, 1]);
+        let alone = fit(&refs, &blocks, &[1], &[0.0, 0.0]);
+        assert!(theta[0] == 0.0 && (theta[1] - alone.theta[0]).abs() < 1e-6, "{theta:?}");
+        let both = positive_fit(&made([0.3, 0.5], 24, 3).iter().collect::<Vec<_>>(), &[0, 1]);
+        assert!((both[0] - 0.3).abs() < 0.1 && (both[1] - 0.5).abs() < 0.15, "{both:?}");
+        let gains: f64 = positive_cross_gains(&refs, &blocks, &[0, 1]).iter().sum();
+        let free: f64 = cross_gains(&refs, &blocks, &[1], &[0.0, 0.0]).iter().sum();
+        assert!((gains - free).abs() < 1e-3, "{gains} {free}");
     }
 }

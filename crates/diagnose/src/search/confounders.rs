@@ -43,13 +43,13 @@ const CONFOUNDERS: [Confounder; 20] = [
         because: "where far returns are lost, those that come back are the nearer ones",
     },
     Confounder {
-        effect: |f| f.channel == Channel::Roughness,
+        effect: noise,
         by: |f| f.causes.first().is_some_and(|c| BEAM_CAUSES.contains(c)),
         share: 0.15,
         because: "offsets of rows are mended but for their errors",
     },
     Confounder {
-        effect: |f| f.channel == Channel::Roughness,
+        effect: noise,
         by: rows_aim_elsewhere,
         share: 2.5,
         because: "on the ground the range jumps from row to row where rows aim elsewhere",
@@ -115,7 +115,7 @@ const CONFOUNDERS: [Confounder; 20] = [
         because: "the scene shears, and rays pass the edges of what they met",
     },
     Confounder {
-        effect: |f| matches!(f.channel, Channel::Hits | Channel::Roughness | Channel::Returns),
+        effect: |f| matches!(f.channel, Channel::Hits | Channel::Returns) || noise(f),
         by: pose,
         share: 0.005,
         because: "the scene was moved back, but for an error",
@@ -150,16 +150,18 @@ const BEAM_CAUSES: [Cause; 3] = [Cause::BeamElevationOffset, Cause::BeamIntensit
 /// Range noise at 20 m below this share of the spread of per-row range offsets is the error of their correction.
 const NOISE_OF_ROWS: f64 = 0.25;
 
-/// Gain below which a noise law is a side effect, nats a return: of displaced surfaces, motion distortion or mixed
-/// ranges, and of unexplained offsets of surfaces.
-const NOISE_OF_SURFACES: [f64; 2] = [0.03, 0.1];
-
 /// Shifts of objects below this many times the largest unexplained offset of surfaces are a part of that offset.
 const SHIFTS_OF_SURFACES: f64 = 1.5;
 
 /// Whether returns are alone in the air.
 fn lone(f: &Found) -> bool {
     f.causes.iter().any(|c| matches!(c, Cause::Outliers | Cause::Fog | Cause::Rain | Cause::Spray))
+}
+
+/// Whether a finding is noise of many shots: single ones that are far off the shots around them come from no surface
+/// that stands elsewhere.
+fn noise(f: &Found) -> bool {
+    f.channel == Channel::Roughness && !f.is(Cause::HeavyTails)
 }
 
 /// Whether rows have elevation offsets.
@@ -247,9 +249,8 @@ fn has_significant_size(f: &Found) -> bool {
 }
 
 /// Drops findings that are side effects of others: remainders of corrections (pose, rows, motion distortion) in
-/// channels of single returns, and findings without a significant size. `returns` is the number of simulated returns
-/// of the held-out frames.
-pub fn drop_confounded(results: &mut [ChannelResult], returns: f64) {
+/// channels of single returns, and findings without a significant size.
+pub fn drop_confounded(results: &mut [ChannelResult]) {
     let had_findings: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
     drop_all(results, "the frames that say how large it is do not tell it from nothing", |f| !has_significant_size(f));
     // As much evidence against a finding as the selection demands for one.
@@ -263,7 +264,6 @@ pub fn drop_confounded(results: &mut [ChannelResult], returns: f64) {
         }
     }
     drop_shifts_of_surfaces(results);
-    drop_noise_of_surfaces(results, returns);
     // Remainders explain nothing, no sensor model could remove them, and labels are not corrected for them.
     for (result, had_findings) in results.iter_mut().zip(had_findings) {
         if had_findings && result.found.is_empty() {
@@ -298,17 +298,6 @@ fn drop_shifts_of_surfaces(results: &mut [ChannelResult]) {
     });
 }
 
-/// Drops noise with a small gain where surfaces are displaced.
-fn drop_noise_of_surfaces(results: &mut [ChannelResult], returns: f64) {
-    let disturbs = |f: &Found| matches!(f.channel, Channel::Residuals | Channel::Slide) || f.is(Cause::MixedPixels);
-    for (nats, by) in NOISE_OF_SURFACES.into_iter().zip([&disturbs as &dyn Fn(&Found) -> bool, &unexplained_surfaces]) {
-        if results.iter().flat_map(|r| &r.found).any(by) {
-            let least = nats * returns;
-            drop_all(results, "surfaces stand elsewhere", |f| f.channel == Channel::Roughness && gain(f) < least);
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -333,10 +322,10 @@ mod tests {
         }
     }
 
-    /// Causes that are kept beside the first, on 1,000 held-out returns.
+    /// Causes that are kept beside the first.
     fn left(all: Vec<Found>) -> Vec<Cause> {
         let mut results: Vec<ChannelResult> = all.into_iter().map(|f| result(vec![f])).collect();
-        drop_confounded(&mut results, 1000.0);
+        drop_confounded(&mut results);
         results.into_iter().skip(1).flat_map(|r| r.found).flat_map(|f| f.causes).collect()
     }
 
@@ -367,7 +356,6 @@ mod tests {
             ),
             ((Some(Cause::RollingShutter), Channel::Slide, 4.0), (Cause::Outliers, Channel::Returns, 0.004, 1.9, 2.1)),
             ((None, Channel::Residuals, 1.0), (Cause::TimeOffset, Channel::Objects, 0.002, 0.04, 0.06)),
-            ((None, Channel::Residuals, 1.0), (Cause::RangeNoise, Channel::Roughness, 0.02, 9.0, 11.0)),
         ];
         for ((first, channel, gain), (second, of, size, side_effect, own)) in cases {
             let beside = |g| {
@@ -402,7 +390,7 @@ mod tests {
         };
         let rows = found(Some(Cause::BeamElevationOffset), Channel::Residuals, 3.0, vec![]);
         let mut results = [of_returns, result(vec![rows])];
-        drop_confounded(&mut results, 1000.0);
+        drop_confounded(&mut results);
         let outcomes: Vec<&str> = results[0].considered.iter().map(|c| c.outcome.as_str()).collect();
         assert_eq!(outcomes, ["left over: rows that aim elsewhere see past edges", "gains less", "chosen"]);
     }

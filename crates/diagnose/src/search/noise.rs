@@ -23,8 +23,8 @@ use crate::inference::roles::Role;
 /// Smallest standard deviation along the ray that is reported, m.
 const FLOOR_M: f64 = 0.003;
 
-/// Smallest jitter of directions that is reported, rad: 0.01 degrees.
-const FLOOR_RAD: f64 = 1.7e-4;
+/// Smallest jitter of directions that is reported, rad: 0.005 degrees, which are 4 mm at 50 m.
+const FLOOR_RAD: f64 = 8.7e-5;
 
 /// Smallest relative increase of the variance, averaged over returns, that is reported.
 const FLOOR_SHARE: f64 = 0.1;
@@ -160,7 +160,9 @@ impl<'a> Search<'a> {
             NoiseLaw::Angular => theta.abs().sqrt() > FLOOR_RAD,
             _ => added_m2.sqrt() > FLOOR_M,
         };
-        enough && added_m2 > self.drawn_m2 && share / n.max(1.0) > FLOOR_SHARE
+        // Surfaces that heavy tails draw are uneven alike at all angles of incidence.
+        let drawn = !matches!(law, NoiseLaw::Angular) && added_m2 < self.drawn_m2;
+        enough && !drawn && share / n.max(1.0) > FLOOR_SHARE
     }
 
     /// Fits what was chosen on the estimating frames and measures it on the held-out ones. Returns the fitted laws.

@@ -1,18 +1,23 @@
-//! Forward selection of noise laws.
+//! Which causes of noise are there: all sets of causes are compared, each with laws of any form of its causes.
 
-use super::{ANGULAR, CONSTANT, NO_PRIOR, Search, Term};
+use super::{CONSTANT, NO_PRIOR, Search, Term};
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::diagnosis::Considered;
+use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::GroupFit;
-use crate::inference::linear::{LinearFrame, cross_gains};
-use crate::inference::noise::{NOISE_LAWS, NoiseLaw};
+use crate::inference::linear::{LinearFrame, cross_gains, positive_cross_gains, positive_fit};
+use crate::inference::noise::NOISE_LAWS;
 use crate::search::{ChannelResult, Selected, UNEXPLAINED_SHARE, causes_of, confidence, record, rivals_and_confidence};
+use statistics::{blocks_of, draw_blocks};
 
-/// Share of the first law's gain by which a pair of range noise and angular jitter must exceed a law of the signal.
-const PAIR_SHARE: f64 = 0.003;
+/// Causes of noise.
+const CAUSES: [Cause; 3] = [Cause::RangeNoise, Cause::SignalNoise, Cause::AngularJitter];
 
-/// What the forward selection chose.
+/// Bootstrap repetitions of the choice among sets of causes.
+const REPETITIONS: usize = 200;
+
+/// What the selection chose.
 #[derive(Default)]
 pub(super) struct Selection {
     /// Laws by their place in the list.
@@ -23,12 +28,22 @@ pub(super) struct Selection {
     pub(super) unexplained: Option<(Grouping, f64)>,
 }
 
+/// Causes that add noise together.
+struct Set {
+    causes: Vec<Cause>,
+    /// The law of each cause that fits best beside those of the others.
+    laws: Vec<usize>,
+    /// Free parameters of these laws.
+    parameters: usize,
+    /// Gain of each selecting frame by any mixture of the laws of these causes, nats.
+    gains: Vec<f64>,
+}
+
 impl Search<'_> {
-    /// Forward selection: one law and at most a second one of another cause, or a pair that replaces a law of the
-    /// signal; a table by direction where no law is chosen, or where laws leave one, unless heavy tails make the
-    /// surfaces rough.
+    /// The causes of added noise; a table by direction where there is none, or where their laws leave one, unless heavy
+    /// tails make the surfaces rough. Where the measured side has less noise, the law by which it has less.
     pub(super) fn select(&self, result: &mut ChannelResult) -> Selection {
-        let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| self.trial(&[k], None)).collect();
+        let mut trials: Vec<Trial> = (0..NOISE_LAWS.len()).map(|k| self.trial(k)).collect();
         let mut choice = choose(&trials, &self.demands);
         if choice.is_none() && self.drawn_m2 == 0.0 {
             trials.extend(self.direction_trials(&[], super::directions::GROUPED));
@@ -44,93 +59,133 @@ impl Search<'_> {
             };
         }
         let equals = causes_of(&trials, &first.equals);
-        let mut selection = Selection {
+        let alone = || Selection {
             laws: vec![trial.candidate],
             selected: vec![rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands)],
             unexplained: None,
         };
-        let gains = self.add_second(trial, &mut selection, result);
-        self.try_pair(trial, gains, &mut selection, result);
+        let adds = self.whole(&[trial.candidate]).theta[0] > 0.0;
+        let mut selection = adds.then(|| self.select_set(result)).flatten().unwrap_or_else(alone);
         if self.drawn_m2 == 0.0 {
             self.try_directions(&mut selection, result);
         }
         selection
     }
 
-    fn record(
-        &self,
-        result: &mut ChannelResult,
-        trials: &[Trial],
-        choice: Option<&crate::inference::choice::Choice>,
-        demands: &Demands,
-    ) {
+    fn record(&self, result: &mut ChannelResult, trials: &[Trial], choice: Option<&Choice>, demands: &Demands) {
         let returns = self.context.returns(&self.select);
         result.considered.extend(record(trials, choice, Channel::Roughness, returns, demands));
     }
 
-    /// A trial of the last of some laws, with the others fitted beside it.
-    fn trial(&self, columns: &[usize], before: Option<&[f64]>) -> Trial {
-        let fitted = self.whole(columns);
-        let last = columns.len() - 1;
-        let law = NOISE_LAWS[columns[last]];
+    /// A trial of one law.
+    fn trial(&self, law: usize) -> Trial {
         let frames: Vec<&LinearFrame> = self.linear.iter().collect();
-        let mut gains = cross_gains(&frames, &self.blocks, columns, &NO_PRIOR);
-        if let Some(before) = before {
-            gains.iter_mut().zip(before).for_each(|(g, b)| *g -= b);
-        }
         Trial {
-            candidate: columns[last],
-            cause: law.cause(),
-            parameters: law.parameters(),
-            gains,
-            // A negative second law only corrects the form of the first.
-            above_floor: (last == 0 || fitted.theta[last] > 0.0) && self.above_floor(law, fitted.theta[last]),
+            candidate: law,
+            cause: NOISE_LAWS[law].cause(),
+            parameters: NOISE_LAWS[law].parameters(),
+            gains: cross_gains(&frames, &self.blocks, &[law], &NO_PRIOR),
+            above_floor: self.above_floor(NOISE_LAWS[law], self.whole(&[law]).theta[0]),
         }
     }
 
-    /// Adds a second law of another cause that brings at least 5 % of the first gain. Returns the gains of the
-    /// selecting frames.
-    fn add_second(&self, first: &Trial, selection: &mut Selection, result: &mut ChannelResult) -> Vec<f64> {
-        let mut gains = first.gains.clone();
-        let (first_gain, _) = total_and_z(&first.gains);
-        let demands = Demands { nats: (0.05 * first_gain).max(8.0), ..self.demands };
-        let rivals: Vec<Trial> = (0..NOISE_LAWS.len())
-            .filter(|&k| NOISE_LAWS[k].cause() != NOISE_LAWS[first.candidate].cause())
-            .map(|k| self.trial(&[first.candidate, k], Some(&first.gains)))
-            .collect();
-        let second = choose(&rivals, &demands);
-        self.record(result, &rivals, second.as_ref(), &demands);
-        if let Some(second) = second {
-            let trial = &rivals[second.chosen];
-            let equals = causes_of(&rivals, &second.equals);
-            selection.laws.push(trial.candidate);
-            selection.selected.push(rivals_and_confidence(equals, &rivals, &self.blocks, trial.cause, &demands));
-            gains.iter_mut().zip(&trial.gains).for_each(|(g, more)| *g += more);
-        }
-        gains
+    /// Places of the laws of a cause.
+    fn laws_of(cause: Cause) -> impl Iterator<Item = usize> {
+        (0..NOISE_LAWS.len()).filter(move |&k| NOISE_LAWS[k].cause() == cause)
     }
 
-    /// Replaces a law of the signal by range noise together with angular jitter, where the pair gains more: the two
-    /// together resemble noise that grows as the signal falls.
-    fn try_pair(&self, first: &Trial, gains: Vec<f64>, selection: &mut Selection, result: &mut ChannelResult) {
-        let range_noise = NOISE_LAWS[CONSTANT].cause();
-        let along = (0..NOISE_LAWS.len()).filter(|&k| NOISE_LAWS[k].cause() == range_noise);
-        let pairs = along.map(|k| (k, self.trial(&[k, ANGULAR], None))).filter(|(k, t)| {
-            let theta = || self.whole(&[*k, ANGULAR]).theta[0].max(0.0);
-            t.above_floor && self.above_floor(NOISE_LAWS[*k], theta())
+    /// A set of causes with its best laws; `None` where some cause adds too little to speak of.
+    fn set(&self, causes: Vec<Cause>) -> Option<Set> {
+        let frames: Vec<&LinearFrame> = self.linear.iter().collect();
+        let mut combinations: Vec<Vec<usize>> = vec![vec![]];
+        for cause in &causes {
+            let with = |laws: &Vec<usize>, law: usize| [laws.as_slice(), &[law]].concat();
+            combinations =
+                combinations.iter().flat_map(|laws| Self::laws_of(*cause).map(move |law| with(laws, law))).collect();
+        }
+        let gain = |laws: &Vec<usize>| positive_cross_gains(&frames, &self.blocks, laws).iter().sum::<f64>();
+        let (_, laws) = combinations.into_iter().map(|laws| (gain(&laws), laws)).max_by(|a, b| a.0.total_cmp(&b.0))?;
+        let theta = positive_fit(&frames, &laws);
+        let large = laws.iter().zip(theta).all(|(&law, theta)| self.above_floor(NOISE_LAWS[law], theta));
+        let all: Vec<usize> = causes.iter().flat_map(|c| Self::laws_of(*c)).collect();
+        large.then(|| Set {
+            parameters: laws.iter().map(|&law| NOISE_LAWS[law].parameters()).sum(),
+            gains: positive_cross_gains(&frames, &self.blocks, &all),
+            laws,
+            causes,
+        })
+    }
+
+    /// The set of causes with the fewest parameters of those that are as good as the best. Every cause of a set has to
+    /// bring what is demanded of a finding beside any form of the others.
+    fn select_set(&self, result: &mut ChannelResult) -> Option<Selection> {
+        let subsets = (1..1usize << CAUSES.len()).map(|bits| {
+            let causes = CAUSES.iter().enumerate().filter(|(k, _)| bits & (1 << k) != 0);
+            causes.map(|(_, cause)| *cause).collect::<Vec<_>>()
         });
-        let best = pairs.max_by(|a, b| total_and_z(&a.1.gains).0.total_cmp(&total_and_z(&b.1.gains).0));
-        let by_signal = selection.laws.iter().any(|&c| matches!(NOISE_LAWS[c], NoiseLaw::Signal(_)));
-        let Some((k, pair)) = best.filter(|_| by_signal) else { return };
-        let (first_gain, _) = total_and_z(&first.gains);
-        let (more, z) = total_and_z(&pair.gains.iter().zip(&gains).map(|(a, b)| a - b).collect::<Vec<_>>());
-        if more > (PAIR_SHARE * first_gain).max(self.demands.nats) && z > 2.0 {
-            let both = [pair, Trial { cause: Cause::SignalNoise, gains, ..first.clone() }];
-            let confidence = confidence(&both, &self.blocks, both[0].cause, &self.demands);
-            selection.laws = vec![k, ANGULAR];
-            selection.selected = vec![Selected { rivals: vec![], confidence }; 2];
-            self.record(result, &both, None, &self.demands);
+        let sets: Vec<Set> = subsets.filter_map(|causes| self.set(causes)).collect();
+        let frames: Vec<&LinearFrame> = self.linear.iter().collect();
+        // What a cause brings beside any form of the others of its set. Surfaces that heavy tails draw are uneven.
+        let brings = |set: &Set, cause: Cause| -> Vec<f64> {
+            let others = set.causes.iter().filter(|c| **c != cause).flat_map(|c| Self::laws_of(*c));
+            let drawn = (self.drawn_m2 > 0.0 && cause != Cause::RangeNoise).then_some(CONSTANT);
+            let others: Vec<usize> = others.chain(drawn.filter(|_| !set.causes.contains(&Cause::RangeNoise))).collect();
+            let with: Vec<usize> = others.iter().copied().chain(Self::laws_of(cause)).collect();
+            let [with, without] = [with, others].map(|laws| positive_cross_gains(&frames, &self.blocks, &laws));
+            with.iter().zip(without).map(|(with, without)| with - without).collect()
+        };
+        let is_needed = |gains: &[f64]| {
+            let (total, z) = total_and_z(gains);
+            total > self.demands.nats && z > self.demands.z
+        };
+        let needed: Vec<bool> = sets.iter().map(|s| s.causes.iter().all(|c| is_needed(&brings(s, *c)))).collect();
+        let chosen = choose_set(&sets, &needed, &self.demands)?;
+        let set = &sets[chosen.chosen];
+        let members = blocks_of(&self.blocks);
+        let mut rng = data::stream(0, "diagnose noise", sets.len() as u64, 0);
+        let same = (0..REPETITIONS)
+            .filter(|_| {
+                let drawn = draw_blocks(&members, &mut rng);
+                let again: Vec<Set> = sets
+                    .iter()
+                    .map(|s| Set {
+                        causes: s.causes.clone(),
+                        laws: s.laws.clone(),
+                        parameters: s.parameters,
+                        gains: drawn.iter().map(|&i| s.gains[i]).collect(),
+                    })
+                    .collect();
+                choose_set(&again, &needed, &self.demands).is_some_and(|c| c.chosen == chosen.chosen)
+            })
+            .count();
+        let confidence = same as f64 / REPETITIONS as f64;
+        for cause in CAUSES {
+            let chosen = set.causes.contains(&cause);
+            let causes = CAUSES.into_iter().filter(|c| *c == cause || set.causes.contains(c)).collect();
+            let (total, z, outcome) = match self.set(causes) {
+                Some(with) => {
+                    let (total, z) = total_and_z(&brings(&with, cause));
+                    (total, z, if chosen { "chosen" } else { "no more than another form of the others" })
+                }
+                None => (0.0, 0.0, "too small to speak of beside the others"),
+            };
+            result.considered.push(Considered {
+                cause: cause.into(),
+                channel: Channel::Roughness,
+                nats_per_ray: total / self.context.returns(&self.select),
+                z,
+                outcome: outcome.into(),
+            });
         }
+        // Each cause has those of the rival sets as rivals that are not chosen themselves.
+        let mut rivals: Vec<Cause> = chosen.equals.iter().flat_map(|&k| sets[k].causes.clone()).collect();
+        rivals.retain(|c| !set.causes.contains(c));
+        rivals.sort();
+        rivals.dedup();
+        // A cause that all rival sets have as well is certain.
+        let is_certain = |c: &Cause| chosen.equals.iter().all(|&k| sets[k].causes.contains(c));
+        let of = |c: &Cause| Selected { rivals: if is_certain(c) { vec![] } else { rivals.clone() }, confidence };
+        Some(Selection { selected: set.causes.iter().map(of).collect(), laws: set.laws.clone(), unexplained: None })
     }
 
     /// Looks for a dependence on the direction that the chosen laws leave. Where there is one, the laws are forms,
@@ -140,7 +195,8 @@ impl Search<'_> {
         let terms: Vec<Term> =
             selection.laws.iter().zip(so_far.theta.iter()).map(|(&k, &t)| (NOISE_LAWS[k], t)).collect();
         let tables = self.direction_trials(&terms, GroupFit { centred: true, ..super::directions::GROUPED });
-        let (by_laws, _) = total_and_z(&self.trial(&selection.laws, None).gains);
+        let frames: Vec<&LinearFrame> = self.linear.iter().collect();
+        let by_laws: f64 = cross_gains(&frames, &self.blocks, &selection.laws, &NO_PRIOR).iter().sum();
         let demands = Demands { nats: (UNEXPLAINED_SHARE * by_laws).max(self.demands.nats), ..self.demands };
         let remains = choose(&tables, &demands);
         self.record(result, &tables, remains.as_ref(), &demands);
@@ -155,5 +211,63 @@ impl Search<'_> {
         let by_row = trials[chosen].candidate == NOISE_LAWS.len();
         let grouping = if by_row { Grouping::Row } else { Grouping::Azimuth };
         (grouping, confidence(trials, &self.blocks, Cause::Unexplained, &self.demands))
+    }
+}
+
+/// The set with the fewest parameters of those whose gain is less than the slack behind the best one, or not
+/// significantly; then the one that gains most. Sets with as many parameters or fewer, from which it is not
+/// significantly different, are its equals. Only needed sets count.
+fn choose_set(sets: &[Set], needed: &[bool], demands: &Demands) -> Option<Choice> {
+    let total = |k: usize| sets[k].gains.iter().sum::<f64>();
+    let counted: Vec<usize> = (0..sets.len()).filter(|&k| needed[k]).collect();
+    let best = counted.iter().copied().max_by(|&a, &b| total(a).total_cmp(&total(b)))?;
+    let behind = |k: usize, of: usize| {
+        let differences: Vec<f64> = sets[of].gains.iter().zip(&sets[k].gains).map(|(a, b)| a - b).collect();
+        total_and_z(&differences)
+    };
+    let near = |k: &usize| {
+        let (deficit, z) = behind(*k, best);
+        deficit < demands.slack * total(best) || z < 2.0
+    };
+    let order =
+        |&a: &usize, &b: &usize| sets[a].parameters.cmp(&sets[b].parameters).then(total(b).total_cmp(&total(a)));
+    let chosen = counted.iter().copied().filter(near).min_by(order)?;
+    let equal = |k: &usize| {
+        *k != chosen && sets[*k].parameters <= sets[chosen].parameters && behind(*k, chosen).1 < 2.0 && near(k)
+    };
+    Some(Choice { chosen, equals: counted.iter().copied().filter(equal).collect() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::search::first_demands;
+
+    fn set(causes: &[Cause], parameters: usize, gains: [f64; 4]) -> Set {
+        Set { causes: causes.to_vec(), laws: vec![], parameters, gains: gains.to_vec() }
+    }
+
+    #[test]
+    fn a_cause_more_is_chosen_where_it_brings_more_than_a_form() {
+        let [range, signal, jitter] = CAUSES;
+        let demands = first_demands();
+        let sets = |pair: [f64; 4]| {
+            [
+                set(&[range], 1, [800.0, 810.0, 790.0, 800.0]),
+                set(&[signal], 2, [1000.0, 1010.0, 990.0, 1000.0]),
+                set(&[signal, jitter], 3, pair),
+            ]
+        };
+        let chosen = |pair, needed: [bool; 3]| choose_set(&sets(pair), &needed, &demands).unwrap().chosen;
+        assert_eq!(chosen([1040.0, 1052.0, 1029.0, 1041.0], [true; 3]), 2, "4 % more");
+        assert_eq!(chosen([1010.0, 1021.0, 999.0, 1010.0], [true; 3]), 1, "1 % more: another form");
+        assert_eq!(chosen([1040.0, 1052.0, 1029.0, 1041.0], [true, true, false]), 1, "a cause that is not needed");
+        let equal = [
+            set(&[signal], 2, [1000.0, 1030.0, 985.0, 1001.0]),
+            set(&[range, jitter], 2, [1001.0, 1000.0, 1010.0, 1000.0]),
+        ];
+        let choice = choose_set(&equal, &[true; 2], &demands).unwrap();
+        assert_eq!((choice.chosen, choice.equals), (0, vec![1]));
+        assert!(choose_set(&equal, &[false; 2], &demands).is_none());
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::roughness::{CAP, RoughFrame};
-use crate::channels::tails::{BEYOND, Tail, tails};
+use crate::channels::tails::{BEYOND, SIZES, Tail, TailBin, size_m, tails};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::effects::rounded;
@@ -10,9 +10,12 @@ use crate::inference::choice::{significant, total_and_z};
 use crate::inference::gain_of_count;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
+use crate::inference::simplex::minimise;
 use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter};
+use rayon::prelude::*;
 use sensor::Effect;
 use sensor::effects::HeavyTails;
+use statistics::{blocks_of, draw_blocks};
 
 /// Smallest share of the returns in the tail that is reported.
 const FLOOR: f64 = 3e-4;
@@ -51,7 +54,7 @@ fn leverage(context: &Context) -> f64 {
 /// which it draws the surfaces through the neighbours of what is far off, m2; 0 where nothing is found.
 pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64], result: &mut ChannelResult) -> f64 {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
-    let all = tails(context.frames);
+    let all = tails(context.frames, scales);
     let tail = |which: &[usize]| which.iter().map(|&i| &all[i]).collect::<Vec<_>>();
     let on_select = tail(&select);
     let gains = cross_gains(&on_select, &context.blocks(&select));
@@ -87,7 +90,8 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
         *d = [d[0] + gain.max(0.0), d[1] + gain, d[2] + gain];
     }
     take_out(rough, scales, found);
-    result.found.push(describe(found, &on_estimate, held, z));
+    let errors = errors(&on_estimate, &context.blocks(&estimate), leverage);
+    result.found.push(describe(found, errors, &on_estimate, held, z));
     found.leverage * found.share * found.std_m * found.std_m
 }
 
@@ -131,40 +135,71 @@ fn variance_beyond(deviations: f64) -> f64 {
     beyond(deviations) + 2.0 * deviations * density
 }
 
-/// Share and standard deviation that give the excess of the tails and of their squares; `None` without an excess.
+/// What the returns in the tail consist of.
+#[derive(Clone, Copy)]
+struct Mixture {
+    /// Share of the returns with a larger error, and its standard deviation, m.
+    share: f64,
+    off_m: f64,
+    /// Returns that are spread evenly about surfaces, such as parts of things beside them: share for each metre.
+    stray_per_m: f64,
+}
+
+/// Returns by their usual roughness: their number, the roughness, and the size up to which a return has one, m.
+fn usual(tails: &[&[Tail; 2]]) -> Vec<[f64; 3]> {
+    let mut sum = vec![TailBin::default(); tails.first().map_or(0, |t| t[0].bins.len())];
+    for (to, of) in tails.iter().flat_map(|t| t[0].bins.iter().enumerate()) {
+        let b = &mut sum[to];
+        *b = TailBin { all: b.all + of.all, usual_m: b.usual_m + of.usual_m, cos: b.cos + of.cos };
+    }
+    let filled = sum.into_iter().filter(|b| b.all > 0.0);
+    filled.map(|b| [b.all, b.usual_m / b.all, STRAY_M / (b.cos / b.all).max(0.05)]).collect()
+}
+
+/// Expected number of returns in the tail by their size.
+fn expected(usual: &[[f64; 3]], mixture: &Mixture) -> [f64; SIZES] {
+    let mut out = [0.0; SIZES];
+    for [all, usual_m, most_m] in usual {
+        let deviation = usual_m.hypot(mixture.off_m);
+        for (bin, sum) in out.iter_mut().enumerate() {
+            let from = size_m(bin).max(BEYOND * usual_m);
+            let to = size_m(bin + 1).min(*most_m);
+            if from < to {
+                let normal = beyond(from / deviation) - beyond(to / deviation);
+                *sum += all * (mixture.share * normal + mixture.stray_per_m * (to - from));
+            }
+        }
+    }
+    out
+}
+
+/// Share and standard deviation by which the sizes in the measured tail are likeliest beside those of the simulated
+/// side (Poisson); `None` without an excess.
 fn fit(tails: &[&[Tail; 2]], leverage: f64) -> Option<Tails> {
-    let sum = |side: usize, of: fn(&Tail) -> f64| tails.iter().map(|t| of(&t[side])).sum::<f64>();
-    let scale = sum(0, |t| t.all) / sum(1, |t| t.all).max(1.0);
-    let number = sum(0, |t| t.beyond) - scale * sum(1, |t| t.beyond);
-    let squares = sum(0, |t| t.squares) - scale * sum(1, |t| t.squares);
-    if number <= 0.0 || squares <= 0.0 {
+    let sum = |side: usize, of: &dyn Fn(&Tail) -> f64| tails.iter().map(|t| of(&t[side])).sum::<f64>();
+    let scale = sum(0, &|t| t.all) / sum(1, &|t| t.all).max(1.0);
+    let sizes = |side: usize| std::array::from_fn::<f64, SIZES, _>(|k| sum(side, &|t| t.sizes[k]));
+    let [measured, simulated] = [sizes(0), sizes(1).map(|n| scale * n)];
+    let excess: f64 = measured.iter().zip(simulated).map(|(a, b)| a - b).sum();
+    let all = sum(0, &|t| t.all);
+    if excess <= 0.0 {
         return None;
     }
-    // Number and squares for a share of 1.
-    let expected = |std_m: f64| {
-        let bins = tails.iter().flat_map(|t| &t[0].bins).filter(|b| b.all > 0.0);
-        bins.fold([0.0; 2], |[n, s], c| {
-            let usual_m = c.usual_m / c.all;
-            let deviation = usual_m.hypot(std_m);
-            let [from, to] = [BEYOND * usual_m, STRAY_M / (c.cos / c.all).max(0.05)].map(|m| m / deviation);
-            let to = to.max(from);
-            [
-                n + c.all * (beyond(from) - beyond(to)),
-                s + c.all * (variance_beyond(from) - variance_beyond(to)) * deviation * deviation,
-            ]
-        })
+    let usual = usual(tails);
+    let mixture = |p: &[f64]| Mixture { share: p[0].exp(), off_m: p[1].exp(), stray_per_m: p[2].exp() };
+    let surprise = |p: &[f64]| {
+        let expected = expected(&usual, &mixture(p));
+        let of_bin = |k: usize| {
+            let rate = (expected[k] + simulated[k]).max(1e-6);
+            rate - measured[k] * rate.ln()
+        };
+        (0..SIZES).map(of_bin).sum::<f64>()
     };
-    // The mean square grows with the standard deviation.
-    let (mut low, mut high) = (1e-3f64, 3.0f64);
-    for _ in 0..60 {
-        let middle = (low * high).sqrt();
-        let [n, s] = expected(middle);
-        if s / n.max(1e-12) < squares / number { low = middle } else { high = middle }
-    }
-    let std_m = (low * high).sqrt();
-    let share = number / expected(std_m)[0].max(1e-12);
+    let start = [(2.0 * excess / all).ln(), 0.1f64.ln(), (0.1 * excess / all).ln()];
+    let (p, _) = minimise(&start, &[0.5, 0.5, -1.0], surprise);
+    let Mixture { share, off_m, .. } = mixture(&p);
     // Roughness is in units of the noise of one range, of which a single error has no part in the surface.
-    (share < 0.5).then_some(Tails { share, std_m: std_m * (1.0 + leverage).sqrt(), leverage })
+    (share < 0.5).then_some(Tails { share, std_m: off_m * (1.0 + leverage).sqrt(), leverage })
 }
 
 /// Mean square of a normal number with this deviation, each square at most that of `most`.
@@ -185,7 +220,25 @@ fn take_out(rough: &mut [RoughFrame], scales: &[f64], Tails { share, std_m, leve
     }
 }
 
-fn describe(tails: Tails, on_estimate: &[&[Tail; 2]], held_out_gains: Vec<f64>, z: f64) -> Found {
+/// Bootstrap repetitions for intervals.
+const REPETITIONS: usize = 40;
+
+/// Standard errors of share and standard deviation, over blocks of frames.
+fn errors(tails: &[&[Tail; 2]], blocks: &[usize], leverage: f64) -> [f64; 2] {
+    let members = blocks_of(blocks);
+    let mut rng = data::stream(0, "diagnose tails", 0, 0);
+    let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
+    let again = |drawn: &Vec<usize>| fit(&drawn.iter().map(|&i| tails[i]).collect::<Vec<_>>(), leverage);
+    let fits: Vec<Tails> = draws.par_iter().filter_map(again).collect();
+    let error = |of: fn(&Tails) -> f64| {
+        let n = (fits.len() as f64).max(1.0);
+        let mean = fits.iter().map(of).sum::<f64>() / n;
+        (fits.iter().map(|t| (of(t) - mean).powi(2)).sum::<f64>() / n).sqrt()
+    };
+    [error(|t| t.share), error(|t| t.std_m)]
+}
+
+fn describe(tails: Tails, errors: [f64; 2], on_estimate: &[&[Tail; 2]], held_out_gains: Vec<f64>, z: f64) -> Found {
     let Tails { share, std_m, .. } = tails;
     let number: f64 = on_estimate.iter().map(|t| t[0].beyond).sum();
     let relative = 1.0 / number.max(1.0).sqrt();
@@ -195,10 +248,7 @@ fn describe(tails: Tails, on_estimate: &[&[Tail; 2]], held_out_gains: Vec<f64>, 
     Found {
         status: Status::Named,
         causes: vec![Cause::HeavyTails],
-        parameters: vec![
-            parameter(Quantity::Share, share, share * relative.hypot(0.05)),
-            parameter(Quantity::StdM, std_m, std_m * relative.hypot(0.05)),
-        ],
+        parameters: vec![parameter(Quantity::Share, share, errors[0]), parameter(Quantity::StdM, std_m, errors[1])],
         confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
         channel: Channel::Roughness,
         covariate: Covariate::None,
@@ -224,7 +274,6 @@ mod tests {
     use super::*;
     use crate::channels::cells::CELLS;
     use crate::channels::roughness::RoughCell;
-    use crate::channels::tails::TailBin;
     use rand::RngExt;
     use rand_distr::{Distribution, StandardNormal};
 
@@ -241,7 +290,8 @@ mod tests {
                 let off = tails.filter(|t| rng.random_bool(t.share)).map_or(0.0, |t| t.std_m * b);
                 if (a + off).abs() > BEYOND * middle_m {
                     tail.beyond += 1.0;
-                    tail.squares += (a + off).powi(2);
+                    let bin = (0..SIZES).rfind(|k| size_m(*k) <= (a + off).abs()).unwrap_or(0);
+                    tail.sizes[bin] += 1.0;
                 }
             }
             tail
