@@ -13,4 +13,5 @@ pub mod patch;
 pub mod plumes;
 pub mod returns;
 pub mod roughness;
+pub mod row_patches;
 pub mod tails;

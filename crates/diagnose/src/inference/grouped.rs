@@ -105,11 +105,11 @@ pub fn cross_part_gains(
     out
 }
 
-/// Standard deviation of the offsets from row to row, from the median second difference between neighbouring groups:
+/// Standard deviation of offsets from row to row, from the median second difference between neighbouring groups:
 /// zero for offsets that are smooth except for a few jumps.
-pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
-    let offsets = offsets(sums, how);
-    let known = |k: Group| sums.get(&k).filter(|s| s.gram[2 * how.column] > 3.0 * how.precision).map(|_| offsets[&k]);
+pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, offsets: &BTreeMap<Group, f64>, how: GroupFit) -> f64 {
+    let is_known = |k: &Group| sums.get(k).is_some_and(|s| s.gram[2 * how.column] > 3.0 * how.precision);
+    let known = |k: Group| offsets.get(&k).copied().filter(|_| is_known(&k));
     let second = |k: &Group| Some((known(*k)? - 0.5 * (known(k.previous()?)? + known(k.next())?)).abs());
     let differences: Vec<f64> = sums.keys().filter_map(second).collect();
     if differences.len() < 4 {
@@ -122,11 +122,14 @@ pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> f64 {
 const WORSE: f64 = 16.0;
 
 /// Offsets with their variances, of the groups that are known well.
-fn known(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> BTreeMap<Group, (f64, f64)> {
-    let offsets = offsets(sums, how);
+fn known(
+    sums: &BTreeMap<Group, GroupSums>,
+    offsets: &BTreeMap<Group, f64>,
+    how: GroupFit,
+) -> BTreeMap<Group, (f64, f64)> {
     let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
-    let mut known: BTreeMap<Group, (f64, f64)> =
-        known.map(|(k, s)| (*k, (offsets[k], 1.0 / s.gram[2 * how.column]))).collect();
+    let with_noise = |(k, s): (&Group, &GroupSums)| Some((*k, (*offsets.get(k)?, 1.0 / s.gram[2 * how.column])));
+    let mut known: BTreeMap<Group, (f64, f64)> = known.filter_map(with_noise).collect();
     let usual = median(known.values().map(|(_, noise)| *noise).collect());
     known.retain(|_, (_, noise)| *noise <= WORSE * usual);
     known
@@ -135,7 +138,11 @@ fn known(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> BTreeMap<Group, (f
 /// Root mean square of the offsets beyond their errors, and the number of groups that are known well. The `trimmed`
 /// share with the largest offsets is left out.
 pub fn spread(sums: &BTreeMap<Group, GroupSums>, how: GroupFit, trimmed: f64) -> (f64, f64) {
-    let mut squares: Vec<(f64, f64)> = known(sums, how).into_values().map(|(o, noise)| (o.powi(2), noise)).collect();
+    spread_of(known(sums, &offsets(sums, how), how), trimmed)
+}
+
+fn spread_of(known: BTreeMap<Group, (f64, f64)>, trimmed: f64) -> (f64, f64) {
+    let mut squares: Vec<(f64, f64)> = known.into_values().map(|(o, noise)| (o.powi(2), noise)).collect();
     squares.sort_by(|a, b| a.0.total_cmp(&b.0));
     squares.truncate(((1.0 - trimmed) * squares.len() as f64).ceil() as usize);
     let n = squares.len() as f64;
@@ -148,8 +155,8 @@ const TOGETHER: f64 = 1.12;
 
 /// The same for rows. A displaced wall shifts many rows together. Where the spread about the mean of the neighbours
 /// is significantly smaller than for independent rows, it is returned.
-pub fn spread_of_rows(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> (f64, f64) {
-    let known = known(sums, how);
+pub fn spread_of_rows(sums: &BTreeMap<Group, GroupSums>, offsets: &BTreeMap<Group, f64>, how: GroupFit) -> (f64, f64) {
+    let known = known(sums, offsets, how);
     let about = |(k, (offset, noise)): (&Group, &(f64, f64))| {
         let around = known.range(k.around(NEIGHBOURS)).filter(|(g, _)| *g != k);
         let (n, sum, of_mean) = around.fold((0.0, 0.0, 0.0), |(n, sum, v), (_, (o, e))| (n + 1.0, sum + o, v + e));
@@ -158,7 +165,7 @@ pub fn spread_of_rows(sums: &BTreeMap<Group, GroupSums>, how: GroupFit) -> (f64,
     let squares: Vec<f64> = known.iter().filter_map(about).collect();
     let n = squares.len() as f64;
     let about_neighbours = (squares.iter().sum::<f64>() / n.max(1.0)).max(0.0).sqrt();
-    let whole = spread(sums, how, 0.0);
+    let whole = spread_of(known, 0.0);
     if n >= 4.0 && whole.0 > TOGETHER * about_neighbours { (about_neighbours, n) } else { whole }
 }
 
@@ -188,17 +195,18 @@ mod tests {
         let how = GroupFit { column: 0, precision: 1.0, centred: true, trust: 1.0 };
         let select: Vec<usize> = (0..16).collect();
         let all = |frames: &[PartedFrame]| total(frames.iter().flatten());
-        for rough in [false, true] {
+        let rough = |sums: &BTreeMap<Group, GroupSums>| rough_spread(sums, &offsets(sums, how), how);
+        for of_rows in [false, true] {
             let frames = made(0.05, 0.0);
-            assert!(cross_part_gains(&frames, &select, &select, how, rough).iter().sum::<f64>() > 50.0);
+            assert!(cross_part_gains(&frames, &select, &select, how, of_rows).iter().sum::<f64>() > 50.0);
             assert!((spread(&all(&frames), how, 0.0).0 - 0.05).abs() < 0.01);
             // Neighbours differ by twice the offset each time.
-            assert!((rough_spread(&all(&frames), how) - 0.12).abs() < 0.03, "{}", rough_spread(&all(&frames), how));
+            assert!((rough(&all(&frames)) - 0.12).abs() < 0.03, "{}", rough(&all(&frames)));
             let nothing = made(0.0, 0.0);
-            assert!(cross_part_gains(&nothing, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
+            assert!(cross_part_gains(&nothing, &select, &select, how, of_rows).iter().sum::<f64>() < 5.0);
             let surface = made(0.0, 0.2);
-            assert!(cross_part_gains(&surface, &select, &select, how, rough).iter().sum::<f64>() < 5.0);
-            assert!(rough_spread(&all(&surface), how) < 0.02);
+            assert!(cross_part_gains(&surface, &select, &select, how, of_rows).iter().sum::<f64>() < 5.0);
+            assert!(rough(&all(&surface)) < 0.02);
         }
     }
 
@@ -215,12 +223,12 @@ mod tests {
                 .map(|k| (row(k as u16), GroupSums { gram: [w, 0.0, 0.0], right: [w * at(k), 0.0], n: 1.0 }))
                 .collect()
         };
-        assert_eq!(spread_of_rows(&with_step(0.0), how), spread(&with_step(0.0), how, 0.0));
+        let rows = |step: f64| {
+            let sums = with_step(step);
+            spread_of_rows(&sums, &super::offsets(&sums, how), how)
+        };
+        assert_eq!(rows(0.0), spread(&with_step(0.0), how, 0.0));
         assert!((spread(&with_step(0.2), how, 0.0).0 - 0.11).abs() < 0.01);
-        assert!(
-            (spread_of_rows(&with_step(0.2), how).0 - 0.05).abs() < 0.01,
-            "{:?}",
-            spread_of_rows(&with_step(0.2), how)
-        );
+        assert!((rows(0.2).0 - 0.05).abs() < 0.01, "{:?}", rows(0.2));
     }
 }

@@ -104,7 +104,10 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, bias
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
     let (std, n) = match grouping {
-        Grouping::Row => grouped::spread_of_rows(&all, group_fit(column)),
+        Grouping::Row => {
+            let offsets = search.sums.offsets(&search.estimate, grouping, group_fit(column));
+            grouped::spread_of_rows(&all, &offsets, group_fit(column))
+        }
         Grouping::Azimuth => grouped::spread(&all, group_fit(column), 0.0),
     };
     let error = std / (2.0 * n.max(1.0)).sqrt();
@@ -112,7 +115,7 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, bias
     let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
     let precision = std.max(least).powi(-2).max(group_fit(column).precision);
     let fit = GroupFit { precision, ..group_fit(column) };
-    let mut offsets = grouped::offsets(&all, fit);
+    let mut offsets = search.sums.offsets(&search.estimate, grouping, fit);
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
     if column == 0 && grouping == Grouping::Row && !biased {

@@ -2,9 +2,8 @@
 
 use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit, split};
-use crate::channels::groups::{Group, Grouping, STRIP_RAD, elevation_lever, group_of, total};
+use crate::channels::groups::{Group, Grouping, STRIP_RAD, elevation_lever, group_of};
 use crate::channels::mean::Column;
-use crate::inference::grouped;
 use crate::pairing::Ray;
 use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
 use sensor::Rig;
@@ -86,8 +85,7 @@ pub(super) fn displacement(
         }
     }
     if let Some((grouping, column)) = groups.first() {
-        let frames = sums.groups_of(*grouping);
-        let offsets = grouped::offsets(&total(select.iter().map(|&i| &frames[i])), group_fit(*column));
+        let offsets = sums.offsets(select, *grouping, group_fit(*column));
         out.groups = Some((*grouping, *column, offsets));
     }
     out

@@ -38,7 +38,10 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
             let frames = sums.groups_of(*grouping);
             let all = total(select.iter().map(|&i| &frames[i]));
             match grouping {
-                Grouping::Row => grouped::rough_spread(&all, group_fit(*column)) > FLOOR_GROUPS[*column],
+                Grouping::Row => {
+                    let offsets = sums.offsets(select, *grouping, group_fit(*column));
+                    grouped::rough_spread(&all, &offsets, group_fit(*column)) > FLOOR_GROUPS[*column]
+                }
                 Grouping::Azimuth => grouped::spread(&all, group_fit(*column), 0.0).0 > FLOOR_GROUPS[2],
             }
         }
@@ -127,7 +130,9 @@ mod tests {
             base: vec![0, 1],
             whole: vec![gram.clone()],
             linear: vec![LinearFrame { gram, right: DVector::zeros(4) }],
-            rows: none(),
+            rows: vec![],
+            of_patches: 1.0,
+            whole_rows: vec![],
             strips: none(),
             poses: vec![],
             of_sensors: vec![vec![2e6]],

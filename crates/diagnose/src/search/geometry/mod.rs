@@ -17,13 +17,12 @@ use self::displacement::displacement;
 use self::floor::above_floor;
 use self::hypotheses::{Hypothesis, hypotheses, is_pose, may_join};
 use self::rows::drop_less_certain_rows;
-use self::sums::{Sums, group_fit, sums};
+use self::sums::{Sums, sums};
 use super::{ChannelResult, Context, Selected, Z_STAR, causes_of, first_demands, record, rivals_and_confidence};
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
 use crate::diagnosis::Considered;
 use crate::inference::choice::{Demands, Trial, choose, significant, total_and_z};
-use crate::inference::grouped;
 use crate::inference::roles::Role;
 use rayon::prelude::*;
 
@@ -60,9 +59,8 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     all.sort_unstable();
     let blocks = context.blocks(&all);
     let groups = |grouping: Grouping, column: usize| -> Vec<f64> {
-        let (rows, cause) = (grouping == Grouping::Row, Cause::Unexplained);
-        let frames = if rows { &sums.rows.parted } else { &sums.strips.parted };
-        let gains = grouped::cross_part_gains(frames, &all, &blocks, group_fit(column), rows);
+        let cause = Cause::Unexplained;
+        let gains = sums.group_gains(&all, &blocks, grouping, column);
         let large = || above_floor(&sums, &all, &blocks, &[Hypothesis::Groups { cause, grouping, column }]);
         if !significant(&gains, Z_STAR) || !large() {
             return vec![0.0; test.len()];

@@ -1,18 +1,20 @@
 //! Sums of all frames that the hypotheses of geometry are fitted on, and the fits.
 
 use super::hypotheses::Hypothesis;
-use crate::channels::groups::{GroupFrame, Grouping, PartedFrame, group_frames, total, whole};
+use crate::channels::groups::{Group, GroupFrame, GroupSums, Grouping, PARTS, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
     usual_noise_m,
 };
+use crate::channels::row_patches::{self, Band, RowFrame, row_frames};
 use crate::inference::grouped::{self, GroupFit};
-use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
+use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
 use crate::inference::median;
 use crate::search::Context;
 use nalgebra::{DMatrix, SVector};
 use rayon::prelude::*;
 use sensor::Rig;
+use std::collections::BTreeMap;
 
 /// Sums of all frames.
 pub(super) struct Sums {
@@ -26,8 +28,12 @@ pub(super) struct Sums {
     pub(super) linear: Vec<LinearFrame>,
     /// X' W X of each frame with its own pose.
     pub(super) whole: Vec<DMatrix<f64>>,
-    /// Sums by row.
-    pub(super) rows: Groups,
+    /// Sums by row, offsets and slopes of the surfaces in patches integrated out.
+    pub(super) rows: Vec<RowFrame>,
+    /// Variance of means of rows in patches, in units of the assumed one.
+    pub(super) of_patches: f64,
+    /// Sums by row, of surfaces as they are.
+    pub(super) whole_rows: Vec<GroupFrame>,
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
     /// Pose error of each frame, as each sensor sees it.
@@ -67,8 +73,11 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
         let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
+    let rows = row_frames(frames, rig, &poses, noise_m);
     Sums {
-        rows: groups(Grouping::Row),
+        of_patches: of_patches(&rows, select, rig.sensors.len()),
+        rows,
+        whole_rows: groups(Grouping::Row).whole,
         strips: groups(Grouping::Azimuth),
         columns,
         precision,
@@ -78,6 +87,20 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
         poses,
         of_sensors,
     }
+}
+
+/// Variance of means of rows in patches, in units of the assumed one, at least 1: what the patches leave once each row
+/// has an offset of its own, in range or in elevation.
+fn of_patches(rows: &[RowFrame], select: &[usize], sensors: usize) -> f64 {
+    let [squares, freedom] = select.iter().fold([0.0; 2], |s, &i| [s[0] + rows[i].squares, s[1] + rows[i].freedom]);
+    let explained = |column: usize| -> f64 {
+        let of_sensor = |sensor: usize| {
+            let sum = row_patches::total(select.iter().map(|&i| &rows[i]), sensor, column, &|_| true);
+            2.0 * sum.gain(&sum.offsets(group_fit(column).precision))
+        };
+        (0..sensors).map(of_sensor).sum()
+    };
+    ((squares - explained(0).max(explained(1)).max(0.0)) / freedom.max(1.0)).max(1.0)
 }
 
 /// Weights of all returns of each sensor, by frame. Surface normals have length 1, so that the squared levers of the
@@ -131,6 +154,12 @@ fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 
 /// Standard deviations of ego motion: speed along and across the heading, m/s; yaw rate, rad/s.
 const OWN_MOTION: [f64; 3] = [40.0, 3.0, 0.3];
 
+/// Rows to either side of one whose mean is not the rows' but that of the surfaces they meet.
+const BESIDE: usize = 4;
+
+/// Variance of a median in units of that of a mean, of normal numbers.
+const OF_MEDIAN: f64 = std::f64::consts::FRAC_PI_2;
+
 /// Linear columns of some hypotheses, each once, and their groupings with the column of the group sums.
 pub(super) fn split(hypotheses: &[Hypothesis]) -> (Vec<usize>, Vec<(Grouping, usize)>) {
     let mut columns: Vec<usize> = Vec::new();
@@ -168,17 +197,95 @@ impl Sums {
             (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
         }
         for (grouping, column) in groups {
-            let parted = if grouping == Grouping::Row { &self.rows.parted } else { &self.strips.parted };
-            let of_rows = grouping == Grouping::Row;
-            let more = grouped::cross_part_gains(parted, select, blocks, group_fit(column), of_rows);
+            let more = self.group_gains(select, blocks, grouping, column);
             out.iter_mut().zip(more).for_each(|(o, g)| *o += g);
         }
         out
     }
 
-    /// The groups of every frame.
+    /// Gains of the selecting frames by offsets of groups, fitted on other frames and on other parts of each group.
+    pub(super) fn group_gains(
+        &self,
+        select: &[usize],
+        blocks: &[usize],
+        grouping: Grouping,
+        column: usize,
+    ) -> Vec<f64> {
+        if grouping == Grouping::Azimuth {
+            return grouped::cross_part_gains(&self.strips.parted, select, blocks, group_fit(column), false);
+        }
+        let folds = fold_of(blocks);
+        let mut out = vec![0.0; select.len()];
+        for (fold, part) in (0..FOLDS).flat_map(|fold| (0..PARTS).map(move |part| (fold, part))) {
+            let train = || (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &self.rows[select[i]]);
+            for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
+                let others = row_patches::total(train(), sensor, column, &|p| p != part);
+                let offsets = others.offsets(self.of_patches * group_fit(column).precision);
+                for i in (0..select.len()).filter(|&i| folds[i] == fold) {
+                    let band = &self.rows[select[i]].sensors[sensor][part][column];
+                    out[i] += band.gain(&offsets) / self.of_patches;
+                }
+            }
+        }
+        out
+    }
+
+    /// Offsets of groups over some frames: those of rows against the rows beside them from the patches. What
+    /// neighbouring rows have in common is that of surfaces in range, and of the rows in elevation.
+    pub(super) fn offsets(&self, frames: &[usize], grouping: Grouping, how: GroupFit) -> BTreeMap<Group, f64> {
+        let all = total(frames.iter().map(|&i| &self.groups_of(grouping)[i]));
+        let mut offsets = grouped::offsets(&all, how);
+        if grouping == Grouping::Azimuth {
+            return offsets;
+        }
+        for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
+            let own = self.own_offsets(frames, sensor, how);
+            if how.column == 0 {
+                offsets.retain(|g, _| usize::from(g.sensor) != sensor);
+                offsets.extend(own);
+                continue;
+            }
+            let others: BTreeMap<Group, f64> =
+                offsets.iter().filter(|(g, _)| own.contains_key(g)).map(|(g, o)| (*g, o - own[g])).collect();
+            let sums: BTreeMap<Group, GroupSums> =
+                all.iter().filter(|(g, _)| others.contains_key(g)).map(|(g, s)| (*g, *s)).collect();
+            for (group, common) in grouped::smooth(&sums, &others, how) {
+                offsets.insert(group, own[&group] + common);
+            }
+        }
+        offsets
+    }
+
+    /// Offsets of the rows of a sensor against those beside them: the median over the quarters of its field of view,
+    /// of which one may show the upper edge of a wall that stands elsewhere.
+    fn own_offsets(&self, frames: &[usize], sensor: usize, how: GroupFit) -> BTreeMap<Group, f64> {
+        let mut of_parts: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+        for part in 0..PARTS {
+            let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, how.column, &|p| p == part);
+            let offsets = sum.offsets(self.of_patches * how.precision);
+            let known = |row: &usize| sum.precision(*row) > 3.0 * self.of_patches * how.precision;
+            for row in (0..sum.rows()).filter(known) {
+                let beside = row.saturating_sub(BESIDE)..(row + BESIDE + 1).min(sum.rows());
+                let (n, all) = beside.filter(known).fold((0.0, 0.0), |(n, s), r| (n + 1.0, s + offsets[r]));
+                of_parts.entry(row).or_default().push(offsets[row] - all / n);
+            }
+        }
+        // Each with the variance of its median, from the scatter of the parts.
+        let of_row = |(row, parts): (usize, Vec<f64>)| {
+            let (n, middle) = (parts.len() as f64, median(parts.clone()));
+            let scatter = parts.iter().map(|o| (o - middle).powi(2)).sum::<f64>();
+            (n > 1.0).then(|| (row, middle, OF_MEDIAN * scatter / (n * (n - 1.0))))
+        };
+        let all: Vec<(usize, f64, f64)> = of_parts.into_iter().filter_map(of_row).collect();
+        // Rows whose parts disagree are taken to be as the others are.
+        let usual = median(all.iter().map(|(_, o, _)| o.abs()).collect()) / statistics::MEDIAN_OF_NORMAL;
+        let shrunk = |offset: f64, variance: f64| offset * usual.powi(2) / (usual.powi(2) + variance).max(1e-30);
+        all.into_iter().map(|(row, o, v)| (row_patches::group(sensor, row), shrunk(o, v))).collect()
+    }
+
+    /// The groups of every frame, of surfaces as they are.
     pub(super) fn groups_of(&self, grouping: Grouping) -> &[GroupFrame] {
-        if grouping == Grouping::Row { &self.rows.whole } else { &self.strips.whole }
+        if grouping == Grouping::Row { &self.whole_rows } else { &self.strips.whole }
     }
 
     /// Fit of the base model together with the linear hypotheses.
@@ -205,9 +312,17 @@ impl Sums {
                 gain(chosen) - gain(&others)
             }
             Hypothesis::Groups { grouping, column, .. } => {
-                let frames = self.groups_of(*grouping);
-                let offsets = grouped::offsets(&total(estimate.iter().map(|&i| &frames[i])), group_fit(*column));
-                grouped::gain(&frames[frame], *column, &offsets)
+                let offsets = self.offsets(estimate, *grouping, group_fit(*column));
+                if *grouping == Grouping::Azimuth {
+                    return grouped::gain(&self.groups_of(*grouping)[frame], *column, &offsets);
+                }
+                let of_sensor = |(sensor, parts): (usize, &[[Band; 2]; PARTS])| -> f64 {
+                    let last = offsets.keys().map(|g| usize::from(g.index)).max().unwrap_or(0);
+                    let of = |row| offsets.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
+                    let of_row: Vec<f64> = (0..=last).map(of).collect();
+                    parts.iter().map(|bands| bands[*column].gain(&of_row)).sum()
+                };
+                self.rows[frame].sensors.iter().enumerate().map(of_sensor).sum::<f64>() / self.of_patches
             }
         }
     }

@@ -38,7 +38,7 @@ impl Search<'_> {
         let blocks = self.context.blocks(&self.select);
         let gains = grouped::cross_part_gains(rows, &self.select, &blocks, ROWS, true);
         let all = group_total(self.select.iter().flat_map(|&i| &rows[i]));
-        let std = grouped::rough_spread(&all, ROWS);
+        let std = grouped::rough_spread(&all, &grouped::offsets(&all, ROWS), ROWS);
         let least = FLOOR_ROWS + self.scale.rounding;
         let above_floor = std > least;
         let trial = Trial { candidate: 0, cause: Cause::BeamIntensity, parameters: 2, gains, above_floor };
@@ -59,7 +59,7 @@ impl Search<'_> {
             return None;
         }
         let all = group_total(self.estimate.iter().flat_map(|&i| &rows[i]));
-        let std = grouped::rough_spread(&all, ROWS);
+        let std = grouped::rough_spread(&all, &grouped::offsets(&all, ROWS), ROWS);
         // Their mean is what the law leaves of the factor.
         let offsets = grouped::offsets(&all, GroupFit { centred: false, ..ROWS });
         let error = |group| 1.0 / (all[group].gram[0] + ROWS.precision).sqrt();

@@ -1,0 +1,274 @@
+//! Offsets of rows against the rows beside them. A surface of the simulation may stand a little elsewhere, or lean:
+//! over a few rows that meet it side by side this is an offset and a slope along it, which are integrated out. What is
+//! left belongs to the rows.
+
+use super::groups::{Group, PARTS, elevation_lever, part_of};
+use super::mean::{KINDS, OwnPoses, STRAY_M, kind_of, origins, pose_row, usable, weight};
+use crate::pairing::{FramePair, Surface};
+use nalgebra::{DMatrix, DVector, Matrix2, Point3, Vector2};
+use rayon::prelude::*;
+use sensor::Rig;
+use std::collections::BTreeMap;
+
+/// Rows of a patch.
+const WIDE: usize = 6;
+
+/// Rows from one patch to the next: every row is in two of them.
+const STEP: usize = 3;
+
+/// Width of a patch, rad.
+const AZIMUTH_RAD: f64 = 0.12;
+
+/// Largest extent of a patch along its surface, m: farther away a surface is not even.
+const LONG_M: f64 = 12.0;
+
+/// Fewest rows of a patch: two are needed for its offset and slope.
+const FEWEST_ROWS: usize = 4;
+
+/// Fewest returns of a row in a patch.
+const FEWEST: f64 = 3.0;
+
+/// Columns: offset of the range, m, and of the elevation, rad.
+const COLUMNS: usize = 2;
+
+/// Products of the offsets of rows with each other, up to the width of a patch, and with what is measured.
+#[derive(Clone, Debug, Default)]
+pub struct Band {
+    gram: Vec<[f64; WIDE]>,
+    right: Vec<f64>,
+}
+
+impl Band {
+    /// Room for a row.
+    fn grow(&mut self, rows: usize) {
+        if self.right.len() < rows {
+            self.gram.resize(rows, [0.0; WIDE]);
+            self.right.resize(rows, 0.0);
+        }
+    }
+
+    /// Adds another one.
+    pub fn merge(&mut self, other: &Band) {
+        self.grow(other.right.len());
+        for (row, (gram, right)) in other.gram.iter().zip(&other.right).enumerate() {
+            (0..WIDE).for_each(|k| self.gram[row][k] += gram[k]);
+            self.right[row] += right;
+        }
+    }
+
+    /// Offsets of the rows with a prior precision, about 0 for rows without returns.
+    pub fn offsets(&self, precision: f64) -> Vec<f64> {
+        let n = self.right.len();
+        let at = |i: usize, j: usize| if j - i < WIDE { self.gram[i][j - i] } else { 0.0 };
+        let gram = DMatrix::from_fn(n, n, |i, j| at(i.min(j), i.max(j)) + if i == j { precision } else { 0.0 });
+        let right = DVector::from_column_slice(&self.right);
+        gram.cholesky().map_or_else(|| vec![0.0; n], |c| c.solve(&right).as_slice().to_vec())
+    }
+
+    /// Gain by offsets, nats.
+    pub fn gain(&self, offsets: &[f64]) -> f64 {
+        let of = |row: usize| offsets.get(row).copied().unwrap_or(0.0);
+        let of_row = |(row, gram): (usize, &[f64; WIDE])| {
+            let beside: f64 = (1..WIDE).map(|k| gram[k] * of(row + k)).sum();
+            of(row) * (self.right[row] - beside - 0.5 * gram[0] * of(row))
+        };
+        self.gram.iter().enumerate().map(of_row).sum()
+    }
+
+    /// Number of rows, those without returns among them.
+    pub fn rows(&self) -> usize {
+        self.right.len()
+    }
+
+    /// Information about a row that its neighbours do not share.
+    pub fn precision(&self, row: usize) -> f64 {
+        self.gram.get(row).map_or(0.0, |g| g[0])
+    }
+}
+
+/// Sums of one frame: by sensor and part, both columns.
+#[derive(Clone, Debug, Default)]
+pub struct RowFrame {
+    /// By sensor.
+    pub sensors: Vec<[[Band; COLUMNS]; PARTS]>,
+    /// Squares that the patches leave, in units of the assumed variance.
+    pub squares: f64,
+    /// Degrees of freedom of these squares.
+    pub freedom: f64,
+}
+
+/// Sums of the returns of one row in one patch: weights, by both levers, their squares, and by what is measured.
+#[derive(Clone, Copy, Debug, Default)]
+struct Cell {
+    n: f64,
+    w: f64,
+    /// Place along the surface, m: distance on the ground, height on what stands.
+    place_m: f64,
+    wx: [f64; COLUMNS],
+    wxx: [f64; COLUMNS],
+    wy: f64,
+    wxy: [f64; COLUMNS],
+    wyy: f64,
+}
+
+/// The sums of all frames. `poses` are the frames' own.
+pub fn row_frames(frames: &[FramePair], rig: &Rig, poses: &[OwnPoses], noise_m: f64) -> Vec<RowFrame> {
+    let origins = origins(rig);
+    let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
+    let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
+    let one = |(frame, poses): (&FramePair, &OwnPoses)| {
+        // By sensor, part, azimuth and kind of surface: the rows.
+        let mut strips = BTreeMap::<(usize, usize, i32, usize), BTreeMap<usize, Cell>>::new();
+        for ray in frame.measured.iter().filter(|r| usable(r) && r.row != u16::MAX) {
+            let sensor = ray.sensor as usize;
+            let y = ray.across_nearest_m() - pose_row(ray, &origins[sensor], &Point3::origin()).dot(&poses[sensor]);
+            if y.abs() > STRAY_M {
+                continue;
+            }
+            let part = part_of(ray, super::groups::Grouping::Row, half_fov[sensor]);
+            let strip = (f64::from(ray.azimuth_rad) / AZIMUTH_RAD).floor() as i32;
+            let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
+            let rows = strips.entry((sensor, part, strip, kind_of(ray).min(KINDS - 1))).or_default();
+            let (sin, cos) = f64::from(ray.elevation_rad).sin_cos();
+            let along = if ray.surface == Surface::Ground { cos } else { sin };
+            let place_m = along * f64::from(ray.range_m);
+            rows.entry(usize::from(ray.row)).or_default().add(place_m, x, y, weight(ray, noise_m));
+        }
+        let mut out = RowFrame { sensors: vec![Default::default(); rig.sensors.len()], ..RowFrame::default() };
+        for ((sensor, part, ..), rows) in strips {
+            let last = rows.keys().next_back().copied().unwrap_or(0);
+            for from in (0..=last).step_by(STEP) {
+                // The first rows are in one patch alone otherwise.
+                let from = from as i64 - STEP as i64;
+                let within = from.max(0) as usize..(from + WIDE as i64).max(0) as usize;
+                let cells: Vec<(usize, Cell)> =
+                    rows.range(within).filter(|(_, c)| c.n >= FEWEST).map(|(r, c)| (*r, *c)).collect();
+                if cells.len() >= FEWEST_ROWS {
+                    add_patch(&mut out, &cells, sensor, part);
+                }
+            }
+        }
+        out
+    };
+    frames.par_iter().zip(poses).map(one).collect()
+}
+
+impl Cell {
+    fn add(&mut self, place_m: f64, x: [f64; COLUMNS], y: f64, w: f64) {
+        self.n += 1.0;
+        self.place_m += place_m;
+        self.w += w;
+        self.wy += w * y;
+        self.wyy += w * y * y;
+        for (c, x) in x.into_iter().enumerate() {
+            self.wx[c] += w * x;
+            self.wxx[c] += w * x * x;
+            self.wxy[c] += w * x * y;
+        }
+    }
+}
+
+/// Adds a patch with its offset and slope integrated out, with half of its weight: its rows are in another one as well.
+fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part: usize) {
+    let along = |cell: &Cell| cell.place_m / cell.n;
+    let middle = cells.iter().map(|(_, c)| along(c)).sum::<f64>() / cells.len() as f64;
+    let place = |cell: &Cell| Vector2::new(1.0, along(cell) - middle);
+    if cells.iter().any(|(_, c)| (along(c) - middle).abs() > 0.5 * LONG_M) {
+        return;
+    }
+    let mut own = Matrix2::zeros();
+    let mut of_own = Vector2::zeros();
+    for (_, c) in cells {
+        own += place(c) * place(c).transpose() * c.w;
+        of_own += place(c) * c.wy;
+    }
+    let Some(inverse) = own.try_inverse() else { return };
+    // Between the means of rows, as the patch is made of them: the scatter within a row is not that of the surface.
+    let of_means: f64 = cells.iter().map(|(_, c)| c.wy * c.wy / c.w).sum();
+    frame.squares += 0.5 * (of_means - of_own.dot(&(inverse * of_own)));
+    frame.freedom += 0.5 * (cells.len() as f64 - 2.0);
+    for column in 0..COLUMNS {
+        let band = &mut frame.sensors[sensor][part][column];
+        band.grow(cells.last().map_or(0, |(r, _)| r + 1));
+        for (i, (row, c)) in cells.iter().enumerate() {
+            let across = inverse * place(c) * c.wx[column];
+            band.right[*row] += 0.5 * (c.wxy[column] - across.dot(&of_own));
+            for (other, o) in &cells[i..] {
+                let same = if other == row { c.wxx[column] } else { 0.0 };
+                band.gram[*row][other - row] += 0.5 * (same - across.dot(&(place(o) * o.wx[column])));
+            }
+        }
+    }
+}
+
+/// Sums over frames and some parts of one sensor and column.
+pub fn total<'a>(
+    frames: impl Iterator<Item = &'a RowFrame>,
+    sensor: usize,
+    column: usize,
+    parts: &dyn Fn(usize) -> bool,
+) -> Band {
+    let mut sum = Band::default();
+    for frame in frames {
+        let Some(of_sensor) = frame.sensors.get(sensor) else { continue };
+        (0..PARTS).filter(|p| parts(*p)).for_each(|p| sum.merge(&of_sensor[p][column]));
+    }
+    sum
+}
+
+/// The group of a row.
+pub fn group(sensor: usize, row: usize) -> Group {
+    Group { sensor: sensor as u8, index: row as u16 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand_distr::{Distribution, StandardNormal};
+
+    /// A frame of patches with an offset and a slope each, and rows with an offset of 1 cm, in turn longer and shorter.
+    fn frame(rng: &mut data::Stream, row_m: f64) -> RowFrame {
+        let mut frame = RowFrame { sensors: vec![Default::default()], ..RowFrame::default() };
+        let mut normal = || -> f64 { StandardNormal.sample(rng) };
+        for part in 0..PARTS {
+            for from in (0..24).step_by(STEP) {
+                let (offset, slope) = (0.05 * normal(), 0.01 * normal());
+                let cells: Vec<(usize, Cell)> = (from..from + WIDE)
+                    .map(|row| {
+                        let mut cell = Cell::default();
+                        let own = if row.is_multiple_of(2) { row_m } else { -row_m };
+                        for _ in 0..10 {
+                            let y = offset + slope * row as f64 - own + 0.02 * normal();
+                            cell.add(0.5 * row as f64, [-1.0, -10.0], y, 1.0 / (0.02 * 0.02));
+                        }
+                        (row, cell)
+                    })
+                    .collect();
+                add_patch(&mut frame, &cells, 0, part);
+            }
+        }
+        frame
+    }
+
+    #[test]
+    fn rows_are_found_beneath_errors_of_the_surfaces() {
+        let mut rng = data::stream(4, "row patches", 0, 0);
+        let frames: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.01)).collect();
+        let train = total(frames[..10].iter(), 0, 0, &|_| true);
+        let offsets = train.offsets(100.0);
+        // An offset and a slope of all rows are not known.
+        for (row, next) in offsets.windows(3).enumerate().take(22) {
+            let bend = next[0] - 2.0 * next[1] + next[2];
+            let own = if row.is_multiple_of(2) { 0.04 } else { -0.04 };
+            assert!((bend - own).abs() < 0.006, "{row} {bend}");
+        }
+        let test = total(frames[10..].iter(), 0, 0, &|_| true);
+        assert!(test.gain(&offsets) > 100.0, "{}", test.gain(&offsets));
+        let nothing: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.0)).collect();
+        let of_nothing = total(nothing[..10].iter(), 0, 0, &|_| true).offsets(100.0);
+        assert!(total(nothing[10..].iter(), 0, 0, &|_| true).gain(&of_nothing) < 8.0);
+        // What the patches leave is the noise.
+        let [squares, freedom] = nothing.iter().fold([0.0; 2], |s, f| [s[0] + f.squares, s[1] + f.freedom]);
+        assert!((squares / freedom - 1.0).abs() < 0.1, "{}", squares / freedom);
+    }
+}
