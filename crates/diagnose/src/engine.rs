@@ -385,7 +385,7 @@ impl Engine<'_> {
         self.finished(6);
         let turns: Vec<_> = context.rig.sensors.iter().map(|s| s.pose().rotation).collect();
         let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
-        let uneven = displaced.groups.is_some();
+        let uneven = !displaced.groups.is_empty();
         let even = match (uneven, known.step_m) {
             (false, None) => None,
             _ => Some(self.pair(Corrections { range_m: uneven.then_some(&off), step_m: known.step_m, ..moved })?),

@@ -31,19 +31,23 @@ const FEWEST: f64 = 3.0;
 /// Columns: offset of the range, m, and of the elevation, rad.
 const COLUMNS: usize = 2;
 
-/// Products of the offsets of rows with each other, up to the width of a patch, and with what is measured.
+/// Offsets of rows by column.
+pub type Offsets = [Vec<f64>; COLUMNS];
+
+/// Products of the offsets of rows with those of the rows after them, up to the width of a patch, column by column, and
+/// with what is measured.
 #[derive(Clone, Debug, Default)]
 pub struct Band {
-    gram: Vec<[f64; WIDE]>,
-    right: Vec<f64>,
+    gram: Vec<[[[f64; COLUMNS]; COLUMNS]; WIDE]>,
+    right: Vec<[f64; COLUMNS]>,
 }
 
 impl Band {
     /// Room for a row.
     fn grow(&mut self, rows: usize) {
         if self.right.len() < rows {
-            self.gram.resize(rows, [0.0; WIDE]);
-            self.right.resize(rows, 0.0);
+            self.gram.resize(rows, Default::default());
+            self.right.resize(rows, [0.0; COLUMNS]);
         }
     }
 
@@ -51,28 +55,47 @@ impl Band {
     pub fn merge(&mut self, other: &Band) {
         self.grow(other.right.len());
         for (row, (gram, right)) in other.gram.iter().zip(&other.right).enumerate() {
-            (0..WIDE).for_each(|k| self.gram[row][k] += gram[k]);
-            self.right[row] += right;
+            for (a, b) in pairs() {
+                (0..WIDE).for_each(|k| self.gram[row][k][a][b] += gram[k][a][b]);
+            }
+            (0..COLUMNS).for_each(|c| self.right[row][c] += right[c]);
         }
     }
 
-    /// Offsets of the rows with a prior precision, about 0 for rows without returns.
-    pub fn offsets(&self, precision: f64) -> Vec<f64> {
-        let n = self.right.len();
-        let at = |i: usize, j: usize| if j - i < WIDE { self.gram[i][j - i] } else { 0.0 };
-        let gram = DMatrix::from_fn(n, n, |i, j| at(i.min(j), i.max(j)) + if i == j { precision } else { 0.0 });
-        let right = DVector::from_column_slice(&self.right);
-        gram.cholesky().map_or_else(|| vec![0.0; n], |c| c.solve(&right).as_slice().to_vec())
+    /// Offsets of the rows in some columns, fitted together, with the prior precision of each; 0 in those without one.
+    pub fn offsets(&self, precision: [Option<f64>; COLUMNS]) -> Offsets {
+        let rows = self.right.len();
+        let fitted: Vec<(usize, f64)> =
+            precision.iter().enumerate().filter_map(|(c, precision)| Some((c, (*precision)?))).collect();
+        let place = |i: usize| (i / fitted.len().max(1), fitted[i % fitted.len().max(1)]);
+        let n = rows * fitted.len();
+        let gram = DMatrix::from_fn(n, n, |i, j| {
+            let ((row, (a, precision)), (other, (b, _))) = (place(i), place(j));
+            let ((first, a), (last, b)) = if row <= other { ((row, a), (other, b)) } else { ((other, b), (row, a)) };
+            let shared = if last - first < WIDE { self.gram[first][last - first][a][b] } else { 0.0 };
+            shared + if i == j { precision } else { 0.0 }
+        });
+        let right = DVector::from_fn(n, |i, _| self.right[place(i).0][place(i).1.0]);
+        let mut out: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
+        if let Some(solved) = gram.cholesky().map(|c| c.solve(&right)) {
+            (0..n).for_each(|i| out[place(i).1.0][place(i).0] = solved[i]);
+        }
+        out
     }
 
     /// Gain by offsets, nats.
-    pub fn gain(&self, offsets: &[f64]) -> f64 {
-        let of = |row: usize| offsets.get(row).copied().unwrap_or(0.0);
-        let of_row = |(row, gram): (usize, &[f64; WIDE])| {
-            let beside: f64 = (1..WIDE).map(|k| gram[k] * of(row + k)).sum();
-            of(row) * (self.right[row] - beside - 0.5 * gram[0] * of(row))
+    pub fn gain(&self, offsets: &Offsets) -> f64 {
+        let of = |row: usize, column: usize| offsets[column].get(row).copied().unwrap_or(0.0);
+        let of_row = |row: usize| -> f64 {
+            let beside = |(a, b): (usize, usize)| -> f64 {
+                let same = 0.5 * self.gram[row][0][a][b] * of(row, b);
+                let others = (1..WIDE).map(|k| self.gram[row][k][a][b] * of(row + k, b)).sum::<f64>();
+                of(row, a) * (same + others)
+            };
+            let measured: f64 = (0..COLUMNS).map(|c| of(row, c) * self.right[row][c]).sum();
+            measured - pairs().map(beside).sum::<f64>()
         };
-        self.gram.iter().enumerate().map(of_row).sum()
+        (0..self.right.len()).map(of_row).sum()
     }
 
     /// Number of rows, those without returns among them.
@@ -80,17 +103,22 @@ impl Band {
         self.right.len()
     }
 
-    /// Information about a row that its neighbours do not share.
-    pub fn precision(&self, row: usize) -> f64 {
-        self.gram.get(row).map_or(0.0, |g| g[0])
+    /// Information about the offset of a row in one column.
+    pub fn precision(&self, row: usize, column: usize) -> f64 {
+        self.gram.get(row).map_or(0.0, |g| g[0][column][column])
     }
 }
 
-/// Sums of one frame: by sensor and part, both columns.
+/// All pairs of columns.
+fn pairs() -> impl Iterator<Item = (usize, usize)> {
+    (0..COLUMNS).flat_map(|a| (0..COLUMNS).map(move |b| (a, b)))
+}
+
+/// Sums of one frame by sensor and part.
 #[derive(Clone, Debug, Default)]
 pub struct RowFrame {
     /// By sensor.
-    pub sensors: Vec<[[Band; COLUMNS]; PARTS]>,
+    pub sensors: Vec<[Band; PARTS]>,
     /// Squares that the patches leave, in units of the assumed variance.
     pub squares: f64,
     /// Degrees of freedom of these squares.
@@ -105,7 +133,7 @@ struct Cell {
     /// Place along the surface, m: distance on the ground, height on what stands.
     place_m: f64,
     wx: [f64; COLUMNS],
-    wxx: [f64; COLUMNS],
+    wxx: [[f64; COLUMNS]; COLUMNS],
     wy: f64,
     wxy: [f64; COLUMNS],
     wyy: f64,
@@ -162,9 +190,9 @@ impl Cell {
         self.wyy += w * y * y;
         for (c, x) in x.into_iter().enumerate() {
             self.wx[c] += w * x;
-            self.wxx[c] += w * x * x;
             self.wxy[c] += w * x * y;
         }
+        pairs().for_each(|(a, b)| self.wxx[a][b] += w * x[a] * x[b]);
     }
 }
 
@@ -187,31 +215,26 @@ fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part:
     let of_means: f64 = cells.iter().map(|(_, c)| c.wy * c.wy / c.w).sum();
     frame.squares += 0.5 * (of_means - of_own.dot(&(inverse * of_own)));
     frame.freedom += 0.5 * (cells.len() as f64 - 2.0);
-    for column in 0..COLUMNS {
-        let band = &mut frame.sensors[sensor][part][column];
-        band.grow(cells.last().map_or(0, |(r, _)| r + 1));
-        for (i, (row, c)) in cells.iter().enumerate() {
-            let across = inverse * place(c) * c.wx[column];
-            band.right[*row] += 0.5 * (c.wxy[column] - across.dot(&of_own));
-            for (other, o) in &cells[i..] {
-                let same = if other == row { c.wxx[column] } else { 0.0 };
-                band.gram[*row][other - row] += 0.5 * (same - across.dot(&(place(o) * o.wx[column])));
+    let band = &mut frame.sensors[sensor][part];
+    band.grow(cells.last().map_or(0, |(r, _)| r + 1));
+    for (i, (row, c)) in cells.iter().enumerate() {
+        for a in 0..COLUMNS {
+            let across = inverse * place(c) * c.wx[a];
+            band.right[*row][a] += 0.5 * (c.wxy[a] - across.dot(&of_own));
+            for ((other, o), b) in cells[i..].iter().flat_map(|o| (0..COLUMNS).map(move |b| (o, b))) {
+                let same = if other == row { c.wxx[a][b] } else { 0.0 };
+                band.gram[*row][other - row][a][b] += 0.5 * (same - across.dot(&(place(o) * o.wx[b])));
             }
         }
     }
 }
 
-/// Sums over frames and some parts of one sensor and column.
-pub fn total<'a>(
-    frames: impl Iterator<Item = &'a RowFrame>,
-    sensor: usize,
-    column: usize,
-    parts: &dyn Fn(usize) -> bool,
-) -> Band {
+/// Sums over frames and some parts of one sensor.
+pub fn total<'a>(frames: impl Iterator<Item = &'a RowFrame>, sensor: usize, parts: &dyn Fn(usize) -> bool) -> Band {
     let mut sum = Band::default();
     for frame in frames {
         let Some(of_sensor) = frame.sensors.get(sensor) else { continue };
-        (0..PARTS).filter(|p| parts(*p)).for_each(|p| sum.merge(&of_sensor[p][column]));
+        (0..PARTS).filter(|p| parts(*p)).for_each(|p| sum.merge(&of_sensor[p]));
     }
     sum
 }
@@ -254,19 +277,23 @@ mod tests {
     fn rows_are_found_beneath_errors_of_the_surfaces() {
         let mut rng = data::stream(4, "row patches", 0, 0);
         let frames: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.01)).collect();
-        let train = total(frames[..10].iter(), 0, 0, &|_| true);
-        let offsets = train.offsets(100.0);
+        let only = [Some(100.0), None];
+        let train = total(frames[..10].iter(), 0, &|_| true);
+        let offsets = train.offsets(only);
         // An offset and a slope of all rows are not known.
-        for (row, next) in offsets.windows(3).enumerate().take(22) {
+        for (row, next) in offsets[0].windows(3).enumerate().take(22) {
             let bend = next[0] - 2.0 * next[1] + next[2];
             let own = if row.is_multiple_of(2) { 0.04 } else { -0.04 };
             assert!((bend - own).abs() < 0.006, "{row} {bend}");
         }
-        let test = total(frames[10..].iter(), 0, 0, &|_| true);
+        let test = total(frames[10..].iter(), 0, &|_| true);
         assert!(test.gain(&offsets) > 100.0, "{}", test.gain(&offsets));
+        // Both columns together explain no more than the one that is there.
+        let both = test.gain(&train.offsets([Some(100.0), Some(1e4)]));
+        assert!((both / test.gain(&offsets) - 1.0).abs() < 0.05, "{both}");
         let nothing: Vec<RowFrame> = (0..20).map(|_| frame(&mut rng, 0.0)).collect();
-        let of_nothing = total(nothing[..10].iter(), 0, 0, &|_| true).offsets(100.0);
-        assert!(total(nothing[10..].iter(), 0, 0, &|_| true).gain(&of_nothing) < 8.0);
+        let of_nothing = total(nothing[..10].iter(), 0, &|_| true).offsets(only);
+        assert!(total(nothing[10..].iter(), 0, &|_| true).gain(&of_nothing) < 8.0);
         // What the patches leave is the noise.
         let [squares, freedom] = nothing.iter().fold([0.0; 2], |s, f| [s[0] + f.squares, s[1] + f.freedom]);
         assert!((squares / freedom - 1.0).abs() < 0.1, "{}", squares / freedom);

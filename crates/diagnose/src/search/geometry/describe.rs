@@ -3,7 +3,7 @@
 use super::curve::linear_curve;
 use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD};
 use super::hypotheses::Hypothesis;
-use super::sums::{Sums, group_fit, split};
+use super::sums::{Sums, group_fit, row_columns, split};
 use super::{Search, Selected};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
 use crate::channels::groups::{Group, GroupSums, Grouping, total};
@@ -38,7 +38,7 @@ pub(super) fn found(
         Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
         Hypothesis::Groups { cause, grouping, column } => {
             let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
-            groups(search, *cause, *grouping, *column, biased)
+            groups(search, *cause, *grouping, *column, biased, &row_columns(chosen))
         }
     };
     let named = cause != Cause::Unexplained;
@@ -99,13 +99,21 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     }
 }
 
-/// Describes offsets of groups of rays; `biased` says that a bias of all ranges was found beside them.
-fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, biased: bool) -> Description {
+/// Describes offsets of groups of rays; `biased` says that a bias of all ranges was found beside them, `columns` are
+/// those of rows that are fitted together.
+fn groups(
+    search: &Search,
+    cause: Cause,
+    grouping: Grouping,
+    column: usize,
+    biased: bool,
+    columns: &[usize],
+) -> Description {
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
     let (std, n) = match grouping {
         Grouping::Row => {
-            let offsets = search.sums.offsets(&search.estimate, grouping, group_fit(column));
+            let offsets = search.sums.offsets(&search.estimate, grouping, group_fit(column), columns);
             grouped::spread_of_rows(&all, &offsets, group_fit(column))
         }
         Grouping::Azimuth => grouped::spread(&all, group_fit(column), 0.0),
@@ -115,7 +123,7 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, bias
     let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
     let precision = std.max(least).powi(-2).max(group_fit(column).precision);
     let fit = GroupFit { precision, ..group_fit(column) };
-    let mut offsets = search.sums.offsets(&search.estimate, grouping, fit);
+    let mut offsets = search.sums.offsets(&search.estimate, grouping, fit, columns);
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
     if column == 0 && grouping == Grouping::Row && !biased {

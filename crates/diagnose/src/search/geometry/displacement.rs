@@ -1,7 +1,7 @@
 //! The displacement that the search of geometry found, to be undone before other channels are searched.
 
 use super::hypotheses::Hypothesis;
-use super::sums::{Sums, group_fit, split};
+use super::sums::{Sums, group_fit, row_columns, split};
 use crate::channels::groups::{Group, Grouping, STRIP_RAD, elevation_lever, group_of};
 use crate::channels::mean::Column;
 use crate::pairing::Ray;
@@ -20,7 +20,7 @@ pub struct Displacement {
     pub bias: [f64; 2],
     /// Offsets of groups of rays: the grouping, the column (0: range, m; 1: elevation, rad), and the offset of each
     /// group.
-    pub groups: Option<(Grouping, usize, BTreeMap<Group, f64>)>,
+    pub groups: Vec<(Grouping, usize, BTreeMap<Group, f64>)>,
 }
 
 impl Displacement {
@@ -31,7 +31,7 @@ impl Displacement {
 
     /// Whether rows have elevation offsets.
     pub fn rows_aim_elsewhere(&self) -> bool {
-        matches!(self.groups, Some((Grouping::Row, 1, _)))
+        self.groups.iter().any(|(grouping, column, _)| (*grouping, *column) == (Grouping::Row, 1))
     }
 
     /// Displacement of a point seen by a sensor, m.
@@ -46,22 +46,26 @@ impl Displacement {
 
     /// Correction to subtract from the range of a measured ray, for the offset of its row or strip, m.
     pub fn of_range(&self, ray: &Ray, turn: &UnitQuaternion<f64>) -> f64 {
-        let Some((grouping, column, offsets)) = &self.groups else { return 0.0 };
-        let Some(group) = group_of(ray, *grouping) else { return 0.0 };
-        let of = |g: Group| offsets.get(&g).copied();
-        let Some(offset) = of(group) else { return 0.0 };
-        if *grouping == Grouping::Azimuth {
-            // Offsets vary continuously: interpolated between the middles of strips.
-            let beside = (f64::from(ray.azimuth_rad) - group.place(*grouping)) / STRIP_RAD;
-            let next = if beside < 0.0 { group.previous().and_then(of) } else { of(group.next()) };
-            return offset + beside.abs().min(0.5) * (next.unwrap_or(offset) - offset);
-        }
-        if *column == 0 {
-            offset
-        } else {
-            -offset * elevation_lever(ray, turn) / f64::from(ray.cos_incidence.max(0.01))
-        }
+        self.groups.iter().map(|groups| of_groups(groups, ray, turn)).sum()
     }
+}
+
+/// Offset of the range of a ray by those of groups, m.
+fn of_groups(
+    (grouping, column, offsets): &(Grouping, usize, BTreeMap<Group, f64>),
+    ray: &Ray,
+    turn: &UnitQuaternion<f64>,
+) -> f64 {
+    let Some(group) = group_of(ray, *grouping) else { return 0.0 };
+    let of = |g: Group| offsets.get(&g).copied();
+    let Some(offset) = of(group) else { return 0.0 };
+    if *grouping == Grouping::Azimuth {
+        // Offsets vary continuously: interpolated between the middles of strips.
+        let beside = (f64::from(ray.azimuth_rad) - group.place(*grouping)) / STRIP_RAD;
+        let next = if beside < 0.0 { group.previous().and_then(of) } else { of(group.next()) };
+        return offset + beside.abs().min(0.5) * (next.unwrap_or(offset) - offset);
+    }
+    if *column == 0 { offset } else { -offset * elevation_lever(ray, turn) / f64::from(ray.cos_incidence.max(0.01)) }
 }
 
 /// The displacement by the chosen hypotheses, fitted on the selecting frames.
@@ -84,9 +88,10 @@ pub(super) fn displacement(
             Column::Sweep(_) | Column::Structure(_) => {}
         }
     }
-    if let Some((grouping, column)) = groups.first() {
-        let offsets = sums.offsets(select, *grouping, group_fit(*column));
-        out.groups = Some((*grouping, *column, offsets));
+    let columns = row_columns(chosen);
+    for (grouping, column) in groups {
+        let offsets = sums.offsets(select, grouping, group_fit(column), &columns);
+        out.groups.push((grouping, column, offsets));
     }
     out
 }

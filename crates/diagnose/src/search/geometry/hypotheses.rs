@@ -75,12 +75,16 @@ pub(super) fn is_pose(hypothesis: &Hypothesis) -> bool {
     matches!(hypothesis.cause(), Cause::PitchRoll | Cause::SensorExtrinsics)
 }
 
-/// Whether a hypothesis may be added to those chosen: another cause, at most one grouping, and nothing after motion
-/// distortion. A strong shear leaves every sensor with an apparent turn and shift of its own.
+/// Whether a hypothesis may be added to those chosen: another cause, one grouping (by rows in range and in elevation),
+/// and nothing after motion distortion. A strong shear leaves every sensor with an apparent turn and shift of its own.
 pub(super) fn may_join(hypothesis: &Hypothesis, chosen: &[Hypothesis]) -> bool {
     chosen.iter().all(|c| {
-        let grouped = |h: &Hypothesis| matches!(h, Hypothesis::Groups { .. });
+        let grouping = |h: &Hypothesis| match h {
+            Hypothesis::Groups { grouping, .. } => Some(*grouping),
+            Hypothesis::Linear { .. } => None,
+        };
         let sheared = c.cause() == Cause::RollingShutter;
-        c.cause() != hypothesis.cause() && !sheared && !(grouped(c) && grouped(hypothesis))
+        let grouped_otherwise = grouping(c).zip(grouping(hypothesis)).is_some_and(|(a, b)| a != b);
+        c.cause() != hypothesis.cause() && !sheared && !grouped_otherwise
     })
 }

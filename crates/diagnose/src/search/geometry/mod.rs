@@ -60,7 +60,7 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     let blocks = context.blocks(&all);
     let groups = |grouping: Grouping, column: usize| -> Vec<f64> {
         let cause = Cause::Unexplained;
-        let gains = sums.group_gains(&all, &blocks, grouping, column);
+        let gains = sums.group_gains(&all, &blocks, grouping, &[column]);
         let large = || above_floor(&sums, &all, &blocks, &[Hypothesis::Groups { cause, grouping, column }]);
         if !significant(&gains, Z_STAR) || !large() {
             return vec![0.0; test.len()];
@@ -116,12 +116,12 @@ impl<'a> Search<'a> {
         self.sums.gain_of(&self.estimate, &self.estimate_blocks, hypothesis, chosen, frame)
     }
 
-    /// Forward selection of at most two hypotheses.
+    /// Forward selection, until no hypothesis brings what is demanded.
     fn select(&self, result: &mut ChannelResult) -> Chosen {
         let all = hypotheses(self.context, &self.sums.columns);
         let (mut chosen, mut selected): Chosen = (Vec::new(), Vec::new());
         let mut first_gains: Vec<f64> = Vec::new();
-        for step in 0..2 {
+        for step in 0..all.len() {
             let candidates: Vec<&Hypothesis> = all.iter().filter(|h| may_join(h, &chosen)).collect();
             let mut trials = self.trials(&candidates, &chosen, &first_gains);
             drop_less_certain_rows(&mut trials, &candidates);
@@ -138,6 +138,9 @@ impl<'a> Search<'a> {
             selected.push(rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands));
             chosen.push(candidates[trial.candidate].clone());
         }
+        // What is there as well is no rival.
+        let is_chosen = |cause: &Cause| chosen.iter().any(|h| h.cause() == *cause);
+        selected.iter_mut().for_each(|s| s.rivals.retain(|r| !is_chosen(r)));
         (chosen, selected)
     }
 

@@ -6,7 +6,7 @@ use crate::channels::mean::{
     Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
     usual_noise_m,
 };
-use crate::channels::row_patches::{self, Band, RowFrame, row_frames};
+use crate::channels::row_patches::{self, Band, Offsets, RowFrame, row_frames};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
 use crate::inference::median;
@@ -89,18 +89,21 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
     }
 }
 
+/// Prior precisions of the offsets of rows in some columns, times the variance of what they are fitted to.
+fn precisions(columns: &[usize], variance: f64) -> [Option<f64>; 2] {
+    [0, 1].map(|c| columns.contains(&c).then(|| variance * group_fit(c).precision))
+}
+
 /// Variance of means of rows in patches, in units of the assumed one, at least 1: what the patches leave once each row
 /// has an offset of its own, in range or in elevation.
 fn of_patches(rows: &[RowFrame], select: &[usize], sensors: usize) -> f64 {
     let [squares, freedom] = select.iter().fold([0.0; 2], |s, &i| [s[0] + rows[i].squares, s[1] + rows[i].freedom]);
-    let explained = |column: usize| -> f64 {
-        let of_sensor = |sensor: usize| {
-            let sum = row_patches::total(select.iter().map(|&i| &rows[i]), sensor, column, &|_| true);
-            2.0 * sum.gain(&sum.offsets(group_fit(column).precision))
-        };
-        (0..sensors).map(of_sensor).sum()
+    let explained = |sensor: usize| {
+        let sum = row_patches::total(select.iter().map(|&i| &rows[i]), sensor, &|_| true);
+        2.0 * sum.gain(&sum.offsets(precisions(&[0, 1], 1.0)))
     };
-    ((squares - explained(0).max(explained(1)).max(0.0)) / freedom.max(1.0)).max(1.0)
+    let explained: f64 = (0..sensors).map(explained).sum();
+    ((squares - explained.max(0.0)) / freedom.max(1.0)).max(1.0)
 }
 
 /// Weights of all returns of each sensor, by frame. Surface normals have length 1, so that the squared levers of the
@@ -179,6 +182,15 @@ pub(super) fn split(hypotheses: &[Hypothesis]) -> (Vec<usize>, Vec<(Grouping, us
     (columns, groups)
 }
 
+/// Columns of the offsets of rows among some hypotheses.
+pub(super) fn row_columns(hypotheses: &[Hypothesis]) -> Vec<usize> {
+    let column = |h: &Hypothesis| match h {
+        Hypothesis::Groups { grouping: Grouping::Row, column, .. } => Some(*column),
+        _ => None,
+    };
+    hypotheses.iter().filter_map(column).collect()
+}
+
 /// Prior of group offsets: standard deviations of 10 cm in range (column 0) and 0.3 degrees in elevation (column 1).
 pub(super) fn group_fit(column: usize) -> GroupFit {
     GroupFit { column, precision: [1.0 / (0.1 * 0.1), 1.0 / (0.0052 * 0.0052)][column], centred: true, trust: 1.0 }
@@ -196,33 +208,37 @@ impl Sums {
             let all = cross_gains(&frames, blocks, &with, &self.precision);
             (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
         }
-        for (grouping, column) in groups {
-            let more = self.group_gains(select, blocks, grouping, column);
-            out.iter_mut().zip(more).for_each(|(o, g)| *o += g);
+        for grouping in [Grouping::Row, Grouping::Azimuth] {
+            let columns: Vec<usize> = groups.iter().filter(|(g, _)| *g == grouping).map(|(_, c)| *c).collect();
+            if !columns.is_empty() {
+                let more = self.group_gains(select, blocks, grouping, &columns);
+                out.iter_mut().zip(more).for_each(|(o, g)| *o += g);
+            }
         }
         out
     }
 
-    /// Gains of the selecting frames by offsets of groups, fitted on other frames and on other parts of each group.
+    /// Gains of the selecting frames by offsets of groups in some columns, fitted on other frames and on other parts
+    /// of each group; those of rows together.
     pub(super) fn group_gains(
         &self,
         select: &[usize],
         blocks: &[usize],
         grouping: Grouping,
-        column: usize,
+        columns: &[usize],
     ) -> Vec<f64> {
         if grouping == Grouping::Azimuth {
-            return grouped::cross_part_gains(&self.strips.parted, select, blocks, group_fit(column), false);
+            return grouped::cross_part_gains(&self.strips.parted, select, blocks, group_fit(columns[0]), false);
         }
         let folds = fold_of(blocks);
         let mut out = vec![0.0; select.len()];
         for (fold, part) in (0..FOLDS).flat_map(|fold| (0..PARTS).map(move |part| (fold, part))) {
             let train = || (0..select.len()).filter(|&i| folds[i] != fold).map(|i| &self.rows[select[i]]);
             for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
-                let others = row_patches::total(train(), sensor, column, &|p| p != part);
-                let offsets = others.offsets(self.of_patches * group_fit(column).precision);
+                let others = row_patches::total(train(), sensor, &|p| p != part);
+                let offsets = others.offsets(precisions(columns, self.of_patches));
                 for i in (0..select.len()).filter(|&i| folds[i] == fold) {
-                    let band = &self.rows[select[i]].sensors[sensor][part][column];
+                    let band = &self.rows[select[i]].sensors[sensor][part];
                     out[i] += band.gain(&offsets) / self.of_patches;
                 }
             }
@@ -232,14 +248,21 @@ impl Sums {
 
     /// Offsets of groups over some frames: those of rows against the rows beside them from the patches. What
     /// neighbouring rows have in common is that of surfaces in range, and of the rows in elevation.
-    pub(super) fn offsets(&self, frames: &[usize], grouping: Grouping, how: GroupFit) -> BTreeMap<Group, f64> {
+    /// `columns` of rows are fitted together.
+    pub(super) fn offsets(
+        &self,
+        frames: &[usize],
+        grouping: Grouping,
+        how: GroupFit,
+        columns: &[usize],
+    ) -> BTreeMap<Group, f64> {
         let all = total(frames.iter().map(|&i| &self.groups_of(grouping)[i]));
         let mut offsets = grouped::offsets(&all, how);
         if grouping == Grouping::Azimuth {
             return offsets;
         }
         for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
-            let own = self.own_offsets(frames, sensor, how);
+            let own = self.own_offsets(frames, sensor, how.column, columns);
             if how.column == 0 {
                 offsets.retain(|g, _| usize::from(g.sensor) != sensor);
                 offsets.extend(own);
@@ -258,12 +281,13 @@ impl Sums {
 
     /// Offsets of the rows of a sensor against those beside them: the median over the quarters of its field of view,
     /// of which one may show the upper edge of a wall that stands elsewhere.
-    fn own_offsets(&self, frames: &[usize], sensor: usize, how: GroupFit) -> BTreeMap<Group, f64> {
+    fn own_offsets(&self, frames: &[usize], sensor: usize, column: usize, columns: &[usize]) -> BTreeMap<Group, f64> {
         let mut of_parts: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
         for part in 0..PARTS {
-            let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, how.column, &|p| p == part);
-            let offsets = sum.offsets(self.of_patches * how.precision);
-            let known = |row: &usize| sum.precision(*row) > 3.0 * self.of_patches * how.precision;
+            let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, &|p| p == part);
+            let offsets = &sum.offsets(precisions(columns, self.of_patches))[column];
+            let least = 3.0 * self.of_patches * group_fit(column).precision;
+            let known = |row: &usize| sum.precision(*row, column) > least;
             for row in (0..sum.rows()).filter(known) {
                 let beside = row.saturating_sub(BESIDE)..(row + BESIDE + 1).min(sum.rows());
                 let (n, all) = beside.filter(known).fold((0.0, 0.0), |(n, s), r| (n + 1.0, s + offsets[r]));
@@ -311,20 +335,32 @@ impl Sums {
                 let gain = |of: &[Hypothesis]| self.fit_all(estimate, blocks, of).gain(&self.linear[frame]);
                 gain(chosen) - gain(&others)
             }
-            Hypothesis::Groups { grouping, column, .. } => {
-                let offsets = self.offsets(estimate, *grouping, group_fit(*column));
-                if *grouping == Grouping::Azimuth {
-                    return grouped::gain(&self.groups_of(*grouping)[frame], *column, &offsets);
-                }
-                let of_sensor = |(sensor, parts): (usize, &[[Band; 2]; PARTS])| -> f64 {
-                    let last = offsets.keys().map(|g| usize::from(g.index)).max().unwrap_or(0);
-                    let of = |row| offsets.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
-                    let of_row: Vec<f64> = (0..=last).map(of).collect();
-                    parts.iter().map(|bands| bands[*column].gain(&of_row)).sum()
-                };
-                self.rows[frame].sensors.iter().enumerate().map(of_sensor).sum::<f64>() / self.of_patches
+            Hypothesis::Groups { grouping: Grouping::Azimuth, column, .. } => {
+                let offsets = self.offsets(estimate, Grouping::Azimuth, group_fit(*column), &[*column]);
+                grouped::gain(&self.groups_of(Grouping::Azimuth)[frame], *column, &offsets)
+            }
+            Hypothesis::Groups { column, .. } => {
+                let all = row_columns(chosen);
+                let others: Vec<usize> = all.iter().copied().filter(|c| c != column).collect();
+                self.gain_of_rows(estimate, frame, &all) - self.gain_of_rows(estimate, frame, &others)
             }
         }
+    }
+
+    /// Gain of one frame by the offsets of rows in some columns, fitted together, nats.
+    fn gain_of_rows(&self, estimate: &[usize], frame: usize, columns: &[usize]) -> f64 {
+        let fits: Vec<(usize, BTreeMap<Group, f64>)> =
+            columns.iter().map(|&c| (c, self.offsets(estimate, Grouping::Row, group_fit(c), columns))).collect();
+        let of_sensor = |(sensor, parts): (usize, &[Band; PARTS])| -> f64 {
+            let rows = parts.iter().map(Band::rows).max().unwrap_or(0);
+            let mut of_rows: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
+            for (column, offsets) in &fits {
+                let of = |row| offsets.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
+                of_rows[*column] = (0..rows).map(of).collect();
+            }
+            parts.iter().map(|band| band.gain(&of_rows)).sum()
+        };
+        self.rows[frame].sensors.iter().enumerate().map(of_sensor).sum::<f64>() / self.of_patches
     }
 
     /// Fits of all columns and of the base model alone.

@@ -29,6 +29,7 @@ pub(super) struct Selection {
 }
 
 /// Causes that add noise together.
+#[derive(Clone)]
 struct Set {
     causes: Vec<Cause>,
     /// The law of each cause that fits best beside those of the others.
@@ -141,24 +142,7 @@ impl Search<'_> {
         let needed: Vec<bool> = sets.iter().map(|s| s.causes.iter().all(|c| is_needed(&brings(s, *c)))).collect();
         let chosen = choose_set(&sets, &needed, &self.demands)?;
         let set = &sets[chosen.chosen];
-        let members = blocks_of(&self.blocks);
-        let mut rng = data::stream(0, "diagnose noise", sets.len() as u64, 0);
-        let same = (0..REPETITIONS)
-            .filter(|_| {
-                let drawn = draw_blocks(&members, &mut rng);
-                let again: Vec<Set> = sets
-                    .iter()
-                    .map(|s| Set {
-                        causes: s.causes.clone(),
-                        laws: s.laws.clone(),
-                        parameters: s.parameters,
-                        gains: drawn.iter().map(|&i| s.gains[i]).collect(),
-                    })
-                    .collect();
-                choose_set(&again, &needed, &self.demands).is_some_and(|c| c.chosen == chosen.chosen)
-            })
-            .count();
-        let confidence = same as f64 / REPETITIONS as f64;
+        let confidence = same_again(&sets, &needed, chosen.chosen, &self.blocks, &self.demands);
         for cause in CAUSES {
             let chosen = set.causes.contains(&cause);
             let causes = CAUSES.into_iter().filter(|c| *c == cause || set.causes.contains(c)).collect();
@@ -212,6 +196,21 @@ impl Search<'_> {
         let grouping = if by_row { Grouping::Row } else { Grouping::Azimuth };
         (grouping, confidence(trials, &self.blocks, Cause::Unexplained, &self.demands))
     }
+}
+
+/// Share of bootstrap repetitions over blocks of frames that choose the same set.
+fn same_again(sets: &[Set], needed: &[bool], chosen: usize, blocks: &[usize], demands: &Demands) -> f64 {
+    let members = blocks_of(blocks);
+    let mut rng = data::stream(0, "diagnose noise", sets.len() as u64, 0);
+    let mut again: Vec<Set> = sets.to_vec();
+    let mut same = |_: &usize| {
+        let drawn = draw_blocks(&members, &mut rng);
+        for (to, of) in again.iter_mut().zip(sets) {
+            to.gains = drawn.iter().map(|&i| of.gains[i]).collect();
+        }
+        choose_set(&again, needed, demands).is_some_and(|c| c.chosen == chosen)
+    };
+    (0..REPETITIONS).filter(|k| same(k)).count() as f64 / REPETITIONS as f64
 }
 
 /// The set with the fewest parameters of those whose gain is less than the slack behind the best one, or not
