@@ -83,7 +83,10 @@ mod tests {
             };
             let (drawn, mut sorted) = (all(1), all(1));
             sorted.sort_unstable();
-            assert!(sorted.iter().copied().eq((0..frames).filter(|i| *i != without)), "{without} of {frames}: {drawn:?}");
+            assert!(
+                sorted.iter().copied().eq((0..frames).filter(|i| *i != without)),
+                "{without} of {frames}: {drawn:?}"
+            );
             assert!(frames < 40 || drawn != all(2));
         }
         let mut counts = [0; 4];
