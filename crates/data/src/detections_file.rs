@@ -308,6 +308,7 @@ mod tests {
 
     #[test]
     #[ignore = "takes minutes: prints files, bytes and times of a cell of 20,000 frames"]
+    #[expect(clippy::print_stdout, reason = "a measurement")]
     fn a_cell_as_text_and_as_one_file() {
         use crate::write::write_kitti_text;
         use crate::{KittiText, read_kitti_text, stream};
