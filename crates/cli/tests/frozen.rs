@@ -200,7 +200,10 @@ fn a_checkpoint_made_elsewhere_is_evaluated_on_every_data_set() {
     assert!(text.contains("| older | elsewhere | Sim | 1 of 1 |"), "{text}");
     let detections = dir.path().join("runs/frozen/frozen/older/detections");
     // Both data sets hold the same clouds.
-    let of = |set: &str| fs::read_to_string(detections.join(set).join("000003.txt")).unwrap();
+    let of = |set: &str| {
+        let file = detections.join(set).join("detections.parquet");
+        data::read_detections_file(&file, &["000003"]).unwrap().frames[0].clone().unwrap()
+    };
     assert_eq!(of("measured"), of("sim"));
     let again = output_text(&must(dir.path(), "study frozen.toml"));
     assert!(!again.contains("detecting with its checkpoint"), "{again}");
@@ -212,6 +215,46 @@ fn a_checkpoint_made_elsewhere_is_evaluated_on_every_data_set() {
     let text = output_text(&output);
     assert_eq!(output.status.code(), Some(1), "{text}");
     assert!(text.contains("last.safetensors does not fit the detector tiny_pointrcnn"), "{text}");
+}
+
+#[test]
+fn a_file_of_detections_is_read_as_a_folder_of_text() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    let paired = || fs::read_to_string(dir.path().join("runs/frozen/paired.json")).unwrap();
+    must(dir.path(), "study frozen.toml");
+    let of_text = paired();
+    let texts = dir.path().join("dets/measured");
+    let mut frames: Vec<(String, Vec<LabelBox>)> = frames(&dir.path().join("measured"))
+        .iter()
+        .map(|frame| {
+            let text = texts.join(format!("{}.txt", frame.id));
+            (frame.id.clone(), data::read_kitti_text(&text, data::KittiText::Detections).unwrap())
+        })
+        .collect();
+    let file = dir.path().join("dets/ours.parquet");
+    let write = |frames: &[(String, Vec<LabelBox>)]| {
+        let fill = |to: &mut data::DetectionsWriter<'_>| frames.iter().try_for_each(|(id, boxes)| to.frame(id, boxes));
+        data::write_detections::<data::DataError>(&file, fill).unwrap();
+    };
+    write(&frames);
+    toml("dets/measured", "dets/ours.parquet")(dir.path());
+    let text = output_text(&must(dir.path(), "study frozen.toml"));
+    assert!(text.contains("reading its detections on measured"), "{text}");
+    assert_eq!(paired(), of_text);
+
+    let left = frames.pop().unwrap();
+    for (id, wanted) in [
+        ("999", "ours.parquet: frame 999: data set measured has no such frame; 1 of"),
+        ("", "does not exist; 1 of the"),
+    ] {
+        let more = (!id.is_empty()).then(|| [left.clone(), (id.to_string(), left.1.clone())]);
+        write(&[&frames[..], more.as_ref().map_or(&[], |more| &more[..])].concat());
+        let output = run(dir.path(), "study frozen.toml");
+        let text = output_text(&output);
+        assert_eq!(output.status.code(), Some(1), "{text}");
+        assert!(text.contains(wanted), "no {wanted:?} in: {text}");
+    }
 }
 
 /// Spoils the study, runs it, and checks that it fails with each text of `wanted`.

@@ -139,8 +139,11 @@ fn regions_of_two_stages_and_tensorboard_files_are_written() {
     fs::write(dir.path().join("tiny-study.toml"), two_stage).unwrap();
     must(dir.path(), "study tiny-study.toml");
     let run = dir.path().join("runs/tiny/tiny/plain/seed-1");
-    let lines = |folder: &str| fs::read_to_string(run.join(folder).join("noisy/000005.txt")).unwrap().lines().count();
-    assert!(lines("regions") >= lines("detections").max(1));
+    let boxes = |folder: &str| {
+        let file = run.join(folder).join("noisy/detections.parquet");
+        data::read_detections_file(&file, &["000005"]).unwrap().frames[0].clone().unwrap().len()
+    };
+    assert!(boxes("regions") >= boxes("detections").max(1));
     let matrix = fs::read_to_string(dir.path().join("runs/tiny/matrix.json")).unwrap();
     assert!(matrix.contains("recall_final_boxes"), "{matrix}");
 
@@ -185,14 +188,29 @@ fn a_failed_run_and_a_changed_study_are_reported() {
     let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
     assert!(status.contains("2 trained") && status.contains("not tested on plain, noisy"), "{status}");
 
-    // A deleted detection is written again.
+    // Deleted or shortened detections are written again.
     must(dir.path(), "study tiny-study.toml --only detect");
-    let lost = dir.path().join("runs/tiny/tiny/plain/seed-1/detections/noisy/000005.txt");
-    fs::remove_file(&lost).unwrap();
-    let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
-    assert!(status.contains("1 done, 1 trained") && status.contains("not tested on noisy"), "{status}");
+    let cell = dir.path().join("runs/tiny/tiny/plain/seed-1/detections/noisy");
+    let file = cell.join("detections.parquet");
+    let whole = fs::read(&file).unwrap();
+    for left in [None, Some(&whole[..whole.len() / 2])] {
+        left.map_or_else(|| fs::remove_file(&file), |left| fs::write(&file, left)).unwrap();
+        let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
+        assert!(status.contains("1 done, 1 trained") && status.contains("not tested on noisy"), "{status}");
+        must(dir.path(), "study tiny-study.toml --only detect");
+        assert!(fs::read(&file).unwrap() == whole);
+    }
+    // Changed ones are not evaluated.
+    let mut changed = whole.clone();
+    changed[whole.len() / 2] ^= 1;
+    fs::write(&file, changed).unwrap();
+    let output = run(dir.path(), "report tiny-study.toml");
+    let text = output_text(&output);
+    assert_eq!(output.status.code(), Some(1), "{text}");
+    assert!(text.contains("detections.parquet: was changed after it was written; remove"), "{text}");
+    fs::remove_file(cell.join("cell.json")).unwrap();
     must(dir.path(), "study tiny-study.toml --only detect");
-    assert!(lost.is_file());
+    assert!(fs::read(&file).unwrap() == whole);
 
     // Weights of another configuration in a run folder.
     let state = dir.path().join("runs/tiny/tiny/plain/seed-1/checkpoint/state.json");
@@ -201,6 +219,57 @@ fn a_failed_run_and_a_changed_study_are_reported() {
     let text = output_text(&must(dir.path(), "report tiny-study.toml"));
     assert!(text.contains("report.html"), "{text}");
     assert!(page(dir.path()).contains("belongs to another configuration"));
+}
+
+/// What an earlier version of the program wrote in the place of a file of detections.
+fn as_text(folder: &Path) {
+    let ids = ["000005", "000006"];
+    let found = data::read_detections_file(&folder.join("detections.parquet"), &ids).unwrap();
+    for (id, boxes) in ids.iter().zip(found.frames) {
+        fs::write(folder.join(format!("{id}.txt")), data::to_kitti_text(&boxes.unwrap())).unwrap();
+    }
+    fs::remove_file(folder.join("detections.parquet")).unwrap();
+    let mut cell: serde_json::Value = serde_json::from_slice(&fs::read(folder.join("cell.json")).unwrap()).unwrap();
+    cell.as_object_mut().unwrap().remove("files").unwrap();
+    cell["schema"] = "lidarshift/detection-cell/2".into();
+    fs::write(folder.join("cell.json"), cell.to_string()).unwrap();
+}
+
+#[test]
+fn a_cell_is_one_file_and_those_of_text_are_read() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    fs::write(dir.path().join("tiny-study.toml"), STUDY.replace("seeds = [1, 2]", "seeds = [1]")).unwrap();
+    must(dir.path(), "study tiny-study.toml");
+    let (html, cell) = (page(dir.path()), dir.path().join("runs/tiny/tiny/plain/seed-1/detections/noisy"));
+    let mut names: Vec<_> = fs::read_dir(&cell).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    names.sort_unstable();
+    assert_eq!(names, ["cell.json", "detections.parquet"]);
+    let eval = |path: &str| {
+        let arguments =
+            format!("eval ap --dataset runs/tiny/data/noisy --split val --detections {path} --json ap.json");
+        must(dir.path(), &arguments);
+        fs::read_to_string(dir.path().join("ap.json")).unwrap()
+    };
+    let folder = "runs/tiny/tiny/plain/seed-1/detections/noisy";
+    let of_file = eval(&format!("{folder}/detections.parquet"));
+    assert_eq!(eval(folder), of_file);
+
+    as_text(&cell);
+    assert_eq!(eval(folder), of_file);
+    for cache in ["matrix.json", "analyses.json"] {
+        fs::remove_file(dir.path().join("runs/tiny").join(cache)).unwrap();
+    }
+    let status = output_text(&must(dir.path(), "study status tiny-study.toml"));
+    assert!(status.contains("2 done"), "{status}");
+    must(dir.path(), "study tiny-study.toml");
+    assert_same_page(&page(dir.path()), &html);
+    assert!(cell.join("000005.txt").is_file() && !cell.join("detections.parquet").exists());
+    // What has to be detected again is one file.
+    fs::remove_file(cell.join("000006.txt")).unwrap();
+    must(dir.path(), "study tiny-study.toml");
+    assert!(cell.join("detections.parquet").is_file() && !cell.join("000005.txt").exists());
+    assert_same_page(&page(dir.path()), &html);
 }
 
 #[test]

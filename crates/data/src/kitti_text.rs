@@ -78,29 +78,33 @@ pub(crate) fn parse_kitti_line(text: &str, kind: KittiText) -> Result<LabelBox, 
         score: (kind == KittiText::Detections).then_some(v[15]),
         track: None,
     };
-    check_box(&label, kind)?;
+    check_box(&label, kind).map_err(|(i, problem)| format!("{} (value {}) {problem}", FIELDS[i], i + 1))?;
     Ok(label)
 }
 
-fn check_box(label: &LabelBox, kind: KittiText) -> Result<(), String> {
+/// Whether a box is possible; else the index of its value in [`FIELDS`], and what is wrong with it.
+fn check_box(label: &LabelBox, kind: KittiText) -> Result<(), (usize, String)> {
     let dont_care = label.class.eq_ignore_ascii_case(DONT_CARE);
     if !label.has_box() && (kind == KittiText::Detections || dont_care) {
         return Ok(());
     }
     for (i, size) in label.size_hwl.iter().enumerate() {
-        let name = FIELDS[8 + i];
         if *size < 0.0 {
-            return Err(format!("{name} (value {}) is {size}; a size cannot be negative", 9 + i));
+            return Err((8 + i, format!("is {size}; a size cannot be negative")));
         }
         if *size == 0.0 && kind == KittiText::Labels && !dont_care {
-            return Err(format!("{name} (value {}) is 0; the size of a labelled object must be positive", 9 + i));
+            return Err((8 + i, "is 0; the size of a labelled object must be positive".into()));
         }
     }
-    if let Some(i) = label.location.iter().position(|v| v.abs() > FARTHEST_M) {
-        let (name, number) = (FIELDS[11 + i], 12 + i);
-        return Err(format!("{name} (value {number}) is {} m, farther than 10 km", label.location[i]));
+    match label.location.iter().position(|v| v.abs() > FARTHEST_M) {
+        Some(i) => Err((11 + i, format!("is {} m, farther than 10 km", label.location[i]))),
+        None => Ok(()),
     }
-    Ok(())
+}
+
+/// Whether a detection of a table is possible; else what is wrong with it.
+pub(crate) fn check_detection(detection: &LabelBox) -> Result<(), String> {
+    check_box(detection, KittiText::Detections).map_err(|(i, problem)| format!("{} {problem}", FIELDS[i]))
 }
 
 /// Formats a box as a line of KITTI text, without a line feed. Reading it gives bit-identical numbers. The track is not

@@ -7,10 +7,10 @@ mod file_names;
 mod file_per_frame;
 mod nuscenes_tables;
 mod oxts;
-mod parquet_file;
+pub(crate) mod parquet_file;
 mod pose_text;
 mod stamps;
-mod table;
+pub(crate) mod table;
 mod tracklets;
 
 pub use stamps::StampUnit;

@@ -12,6 +12,7 @@ mod content;
 pub mod convert;
 mod dataset;
 mod dataset_config;
+mod detections_file;
 pub mod doctor;
 mod error;
 mod file_part;
@@ -49,6 +50,10 @@ pub use calibration::Calibration;
 pub use cloud_file::{FARTHEST_M, PointColumns, parse_bin, read_cloud};
 pub use dataset::{Dataset, parse_split};
 pub use dataset_config::DatasetConfig;
+pub use detections_file::{
+    DETECTIONS_FILE, DetectionsWriter, FoundDetections, detections_file, frames_of_detections, read_detections_file,
+    write_detections,
+};
 pub use error::DataError;
 pub use file_part::FilePart;
 pub use folder_lock::{FolderLock, is_unused};

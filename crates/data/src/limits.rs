@@ -22,6 +22,9 @@ pub const MOST_TEXT_BYTES: u64 = 256 << 20;
 /// Boxes of a frame, labelled or detected.
 pub const MOST_BOXES: usize = 100_000;
 
+/// Rows of a file of detections.
+pub const MOST_DETECTIONS: usize = 1_000_000_000;
+
 /// Frames of a split or of a list.
 pub const MOST_IDS: usize = 10_000_000;
 

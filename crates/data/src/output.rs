@@ -159,16 +159,16 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), DataError> {
 ///
 /// # Errors
 /// Those of `fill`, a file that cannot be written, and a path that is no regular file.
-pub fn write_atomic_with(
+pub fn write_atomic_with<E: From<DataError>>(
     path: &Path,
-    fill: impl FnOnce(&mut std::fs::File) -> Result<(), DataError>,
-) -> Result<(), DataError> {
+    fill: impl FnOnce(&mut std::fs::File) -> Result<(), E>,
+) -> Result<(), E> {
     let failed = |e: std::io::Error| DataError::io(path, "cannot be written", &e);
     let Destination::File(file) = destination(path).map_err(failed)? else {
-        return Err(DataError::file(path, "is no regular file; it is written in pieces, which needs one"));
+        return Err(DataError::file(path, "is no regular file; it is written in pieces, which needs one").into());
     };
     create_folder(folder_of(&file))?;
-    replace(&file, fill)?.map_err(failed)
+    Ok(replace(&file, fill)?.map_err(failed)?)
 }
 
 /// Checks that `path` can be written, without changing it: before long work whose result is written there.
@@ -250,10 +250,10 @@ fn write_all(to: &mut dyn Write, bytes: &[u8]) -> IoResult<()> {
 }
 
 /// Replaces a file by what `fill` writes. The outer error is that of `fill`.
-fn replace(
+fn replace<E: From<DataError>>(
     path: &Path,
-    fill: impl FnOnce(&mut std::fs::File) -> Result<(), DataError>,
-) -> Result<IoResult<()>, DataError> {
+    fill: impl FnOnce(&mut std::fs::File) -> Result<(), E>,
+) -> Result<IoResult<()>, E> {
     let folder = folder_of(path);
     let mut builder = tempfile::Builder::new();
     builder.prefix(TEMPORARY_PREFIX);

@@ -36,6 +36,6 @@ pub use evaluate::evaluate;
 pub use json_forms::json_forms;
 pub use matching::Counts;
 pub use options::{Difficulty, EvalFrame, EvalOptions, Metric, RangeSection, default_classes, reference_overlaps};
-pub use read::{ids_of_folder, read_detections, read_frames, read_ids};
+pub use read::{detections_of, ids_of_folder, read_detections, read_frames, read_ids};
 pub use recall::{RECALL_OVERLAPS, Recall, RecallDefinition};
 pub use report::{EvalReport, OverlapSet, Row, SCHEMA};

@@ -1,9 +1,9 @@
-//! Reads labels and detections from folders of KITTI text files.
+//! Reads labels from folders of KITTI text files, and detections from such folders or from files of detections.
 
 use crate::EvalFrame;
 use data::Presence as _;
 use data::limits::{MOST_IDS, at_most, check_name, read_text};
-use data::{DataError, KittiText, LabelBox, read_kitti_text};
+use data::{DataError, KittiText, LabelBox, detections_file, read_detections_file, read_kitti_text};
 use rayon::prelude::*;
 use std::path::Path;
 
@@ -28,20 +28,43 @@ pub fn read_detections(
     detections: &Path,
     ids: &[String],
 ) -> Result<Vec<EvalFrame>, DataError> {
-    check_folder(detections)?;
-    let read = |id: &String| {
-        let detected = detections.join(format!("{id}.txt"));
-        if !detected.may_exist() {
-            return Err(DataError::missing(&detected, "does not exist; a frame without detections has an empty file"));
-        }
-        Ok(EvalFrame {
-            id: id.clone(),
-            labels: labels(id)?,
-            detections: read_kitti_text(&detected, KittiText::Detections)?,
-        })
-    };
+    let found = detections_of(detections, ids)?;
+    let read =
+        |(id, detections): (&String, Vec<LabelBox>)| Ok(EvalFrame { id: id.clone(), labels: labels(id)?, detections });
     // Collects all results first, so that the first bad frame is reported for any number of threads.
-    ids.par_iter().map(read).collect::<Vec<_>>().into_iter().collect()
+    ids.par_iter().zip(found).map(read).collect::<Vec<_>>().into_iter().collect()
+}
+
+/// Reads the detections on the given frames, in their order: from a folder of KITTI text (`ID.txt`), from a file of
+/// detections, or from a folder with such a file ([`data::detections_file`]).
+///
+/// # Errors
+/// A file that cannot be read, and a frame without a file or a row.
+pub fn detections_of(path: &Path, ids: &[impl AsRef<str> + Sync]) -> Result<Vec<Vec<LabelBox>>, DataError> {
+    let Some(file) = detections_file(path) else {
+        check_folder(path)?;
+        return ids.par_iter().map(|id| text_of(path, id.as_ref())).collect::<Vec<_>>().into_iter().collect();
+    };
+    let ids: Vec<&str> = ids.iter().map(AsRef::as_ref).collect();
+    let found = read_detections_file(&file, &ids)?.frames;
+    let missing = ids.iter().zip(&found).filter(|(_, boxes)| boxes.is_none()).map(|(id, _)| *id);
+    if let Some(first) = missing.clone().next() {
+        let (without, all) = (missing.count(), ids.len());
+        let message = format!(
+            "has no row of frame {first}; {without} of {all} frames have none. A frame without detections has one row \
+             with nothing but its name"
+        );
+        return Err(DataError::file(&file, message));
+    }
+    Ok(found.into_iter().flatten().collect())
+}
+
+fn text_of(folder: &Path, id: &str) -> Result<Vec<LabelBox>, DataError> {
+    let path = folder.join(format!("{id}.txt"));
+    if !path.may_exist() {
+        return Err(DataError::missing(&path, "does not exist; a frame without detections has an empty file"));
+    }
+    read_kitti_text(&path, KittiText::Detections)
 }
 
 /// The frame ids of a label folder, sorted: every `.txt` file in it.
@@ -116,10 +139,28 @@ mod tests {
         let error = read_frames(&labels, &found, &ids).unwrap_err().to_string();
         assert!(error.contains("found/b.txt:2: a detection has 16 values"), "{error}");
 
+        std::fs::write(found.join("b.txt"), "").unwrap();
         std::fs::remove_file(labels.join("b.txt")).unwrap();
         let error = read_frames(&labels, &found, &ids).unwrap_err().to_string();
         assert!(error.contains("labels/b.txt"), "{error}");
         assert!(read_frames(&labels.join("none"), &found, &ids).unwrap_err().to_string().contains("is not a folder"));
+    }
+
+    #[test]
+    fn a_file_of_detections_stands_for_a_folder_of_text() {
+        let folder = folder();
+        let (labels, found) = (folder.path().join("labels"), folder.path().join("found"));
+        let ids = ["a".to_string()];
+        let text = read_frames(&labels, &found, &ids).unwrap();
+        let table = folder.path().join("other/detections.parquet");
+        data::write_detections::<DataError>(&table, |to| to.frame("a", &text[0].detections)).unwrap();
+        for path in [&table, table.parent().unwrap()] {
+            assert_eq!(read_frames(&labels, path, &ids).unwrap(), text);
+        }
+        let ids = [&ids[..], &["b".into(), "c".into()]].concat();
+        let error = detections_of(&table, &ids).unwrap_err().to_string();
+        let wanted = "other/detections.parquet: has no row of frame b; 2 of 3 frames have none. A frame without";
+        assert!(error.contains(wanted), "{error}");
     }
 
     #[test]

@@ -8,6 +8,7 @@ mod problem;
 pub use changes::StudyChanges;
 pub use frozen::{ELSEWHERE, FrozenDetector};
 
+use crate::folder::Study;
 use data::DataError;
 use eval::analysis::AnalysisOptions;
 use eval::distance::DistanceOptions;
@@ -232,14 +233,19 @@ impl StudyRun {
         study.join(self.to_string())
     }
 
-    /// Folder of the detections on a test set, one KITTI text file per frame.
+    /// Folder of the detections on a test set: `detections.parquet`, or one KITTI text file per frame.
     pub fn detections(&self, study: &Path, test_set: &str) -> PathBuf {
         self.folder(study).join("detections").join(test_set)
     }
 
-    /// Folder of all refined regions of a two-stage network on a test set, one KITTI text file per frame.
+    /// Folder of all refined regions of a two-stage network on a test set, with files as those of the detections.
     pub fn regions(&self, study: &Path, test_set: &str) -> PathBuf {
         self.folder(study).join("regions").join(test_set)
+    }
+
+    /// Folders of the detections and of the regions on a test set.
+    pub(crate) fn cell(&self, study: &Study, test_set: &str) -> [PathBuf; 2] {
+        [self.detections(&study.folder, test_set), self.regions(&study.folder, test_set)]
     }
 }
 

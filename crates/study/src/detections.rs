@@ -4,9 +4,9 @@ use crate::config::StudyRun;
 use crate::data_sets::{frames_sha256, open};
 use crate::error::{InPart, Result};
 use crate::folder::Study;
+use crate::written::{CellFiles, WrittenFile};
 use data::Presence as _;
-use data::write::write_kitti_text;
-use data::{Dataset, write_atomic, write_json};
+use data::{DETECTIONS_FILE, Dataset, DetectionsWriter, write_atomic, write_detections, write_json};
 use models::{Detector, LayerFeatures, inference_samples, predict_frames};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -23,6 +23,9 @@ pub(crate) struct DetectionCell {
     frames: usize,
     frames_sha256: String,
     weights_sha256: String,
+    /// The files; none in cells of text files, which version 2 had.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    files: Option<CellFiles>,
 }
 
 /// Features of all layers of a run on test clouds.
@@ -40,7 +43,7 @@ pub struct RunFeatures {
 }
 
 /// Version of [`DetectionCell`].
-pub(crate) const CELL_SCHEMA: &str = "lidarshift/detection-cell/2";
+pub(crate) const CELL_SCHEMA: &str = "lidarshift/detection-cell/3";
 /// Version of [`RunFeatures`].
 pub(crate) const RUN_FEATURES_SCHEMA: &str = "lidarshift/run-features/1";
 
@@ -77,6 +80,7 @@ fn expected_cell(
         frames: ids.len(),
         frames_sha256: frames_sha256(&dataset, &ids)?,
         weights_sha256: weights.into(),
+        files: None,
     };
     Ok((dataset, ids, cell))
 }
@@ -87,14 +91,15 @@ fn expected_cell(
 /// A missing test set.
 pub fn is_done(study: &Study, run: &StudyRun, test_set: &str, weights: &str) -> Result<bool> {
     let Ok(bytes) = fs_err::read(cell_path(study, run, test_set)) else { return Ok(false) };
-    let Ok(found) = serde_json::from_slice::<DetectionCell>(&bytes) else { return Ok(false) };
+    let Ok(mut found) = serde_json::from_slice::<DetectionCell>(&bytes) else { return Ok(false) };
     if found.weights_sha256 != weights {
         return Ok(false);
     }
+    let files = found.files.take();
+    found.schema = CELL_SCHEMA.into();
     let feature_is_there = test_set != study.feature_set() || features_path(study, run).may_be_file();
     let (_, ids, cell) = expected_cell(study, run, test_set, weights)?;
-    let folder = run.detections(&study.folder, test_set);
-    Ok(feature_is_there && found == cell && ids.iter().all(|id| folder.join(format!("{id}.txt")).may_be_file()))
+    Ok(feature_is_there && found == cell && CellFiles::are_there(files.as_ref(), &run.cell(study, test_set), &ids))
 }
 
 /// Detects on every test set without complete detections, and stores the features on one of them. `note` is called with
@@ -115,42 +120,66 @@ pub fn detect_all(
             continue;
         }
         note(&format!("detecting on {}", dataset.name));
-        let (set, ids, cell) = expected_cell(study, run, &dataset.name, &weights)?;
+        let (set, ids, mut cell) = expected_cell(study, run, &dataset.name, &weights)?;
         if dataset.name == study.feature_set() {
             write_features(study, run, detector, &set, &ids, &weights)?;
         }
-        let folders = [run.detections(&study.folder, &dataset.name), run.regions(&study.folder, &dataset.name)];
-        detect(detector, &set, &ids, &folders, workers).in_part(|| format!("test set {}", dataset.name))?;
+        let folders = run.cell(study, &dataset.name);
+        let files = detect(detector, &set, &ids, &folders, workers).in_part(|| format!("test set {}", dataset.name))?;
+        cell.files = Some(files);
         write_json(&cell_path(study, run, &dataset.name), &cell)?;
     }
     Ok(())
 }
 
-/// Writes the detections on all frames, one KITTI text file per frame, and the regions of a two-stage network in the
-/// same way.
+/// Writes the detections on all frames to one file ([`data::write_detections`]), and the regions of a two-stage network
+/// in the same way.
 ///
 /// # Errors
 /// As [`detect_all`].
-pub fn detect(
+pub(crate) fn detect(
     detector: &Detector,
     set: &Dataset,
     ids: &[String],
     folders: &[PathBuf; 2],
     workers: usize,
-) -> Result<()> {
-    let [of_detections, of_regions] = folders;
-    let two_stage = detector.config().network.is_two_stage();
-    let samples = inference_samples(detector, set, ids, workers).zip(ids).map(|(sample, id)| Ok((sample?, id)));
-    predict_frames(detector, detector.config().optimization.batch_size, samples, |batch| {
-        for (id, found) in batch {
-            let name = format!("{id}.txt");
-            write_kitti_text(&of_detections.join(&name), &set.detection_boxes(id, &found.detections)?)?;
-            if two_stage {
-                write_kitti_text(&of_regions.join(&name), &set.detection_boxes(id, &found.regions)?)?;
+) -> Result<CellFiles> {
+    let [detections, regions] = folders.each_ref().map(|folder| folder.join(DETECTIONS_FILE));
+    type Writer<'a, 'b> = &'a mut DetectionsWriter<'b>;
+    let work = |of_detections: Writer<'_, '_>, mut of_regions: Option<Writer<'_, '_>>| -> Result<()> {
+        let samples = inference_samples(detector, set, ids, workers).zip(ids).map(|(sample, id)| Ok((sample?, id)));
+        predict_frames(detector, detector.config().optimization.batch_size, samples, |batch| {
+            for (id, found) in batch {
+                of_detections.frame(id, &set.detection_boxes(id, &found.detections)?)?;
+                if let Some(of_regions) = &mut of_regions {
+                    of_regions.frame(id, &set.detection_boxes(id, &found.regions)?)?;
+                }
             }
-        }
-        Ok(())
+            Ok(())
+        })
+    };
+    let two_stage = detector.config().network.is_two_stage();
+    write_detections(&detections, |of_detections| match two_stage {
+        true => write_detections(&regions, |of_regions| work(of_detections, Some(of_regions))),
+        false => work(of_detections, None),
+    })?;
+    folders.iter().try_for_each(|folder| remove_text(folder, ids))?;
+    Ok(CellFiles {
+        detections: WrittenFile::of(&detections)?,
+        regions: two_stage.then(|| WrittenFile::of(&regions)).transpose()?,
     })
+}
+
+/// Removes the text files that an earlier version of the program wrote. The first one is removed last, so that all are
+/// gone if it is.
+fn remove_text(folder: &Path, ids: &[String]) -> Result<()> {
+    let text = |id: &String| folder.join(format!("{id}.txt"));
+    if ids.first().is_some_and(|id| text(id).may_be_file()) {
+        for path in ids.iter().rev().map(text).filter(|path| path.may_be_file()) {
+            fs_err::remove_file(path)?;
+        }
+    }
+    Ok(())
 }
 
 fn write_features(

@@ -14,6 +14,7 @@ use crate::config::{ELSEWHERE, FrozenDetector};
 use crate::data_sets::{labelled_sha256, open};
 use crate::error::{InPart, Result, refused};
 use crate::folder::Study;
+use crate::written::CellFiles;
 use crate::{Event, Listener};
 use axes::check_axes;
 use data::Presence as _;
@@ -38,6 +39,10 @@ pub(crate) struct FrozenCell {
     frames: usize,
     labels_sha256: String,
     source_sha256: String,
+    /// The files of a checkpoint's detections; none if they were made elsewhere, and in cells of text files, which
+    /// version 1 had.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    files: Option<CellFiles>,
 }
 
 /// What of a frozen detector changes its detections, besides their files.
@@ -49,7 +54,7 @@ struct FrozenDetectorKey {
 }
 
 /// Version of [`FrozenCell`].
-pub(crate) const CELL_SCHEMA: &str = "lidarshift/frozen-cell/1";
+pub(crate) const CELL_SCHEMA: &str = "lidarshift/frozen-cell/2";
 
 impl FrozenCell {
     fn path(study: &Study, frozen: &FrozenDetector, test_set: &str) -> PathBuf {
@@ -71,6 +76,11 @@ impl FrozenDetector {
     /// Folder of all refined regions of a two-stage network on a data set.
     fn regions_folder(&self, study: &Study, test_set: &str) -> PathBuf {
         self.folder(study).join("regions").join(test_set)
+    }
+
+    /// Folders of the detections and of the regions on a data set.
+    fn cell(&self, study: &Study, test_set: &str) -> [PathBuf; 2] {
+        [self.detections_folder(study, test_set), self.regions_folder(study, test_set)]
     }
 
     /// Its run in the matrix.
@@ -101,27 +111,30 @@ fn expected_cell(study: &Study, frozen: &FrozenDetector, test_set: &str) -> Resu
         frames: ids.len(),
         labels_sha256: labelled_sha256(&dataset, &ids)?,
         source_sha256,
+        files: None,
     })
 }
 
 /// Whether the detections on a data set have been checked, or made, with the present files.
 fn is_done(study: &Study, frozen: &FrozenDetector, test_set: &str) -> Result<bool> {
     let Ok(bytes) = fs_err::read(FrozenCell::path(study, frozen, test_set)) else { return Ok(false) };
-    let Ok(found) = serde_json::from_slice::<FrozenCell>(&bytes) else { return Ok(false) };
+    let Ok(mut found) = serde_json::from_slice::<FrozenCell>(&bytes) else { return Ok(false) };
+    let files = found.files.take();
+    found.schema = CELL_SCHEMA.into();
     if found != expected_cell(study, frozen, test_set)? {
         return Ok(false);
     }
     if frozen.checkpoint.is_none() {
         return Ok(true);
     }
-    let folder = frozen.detections_folder(study, test_set);
     let ids = open(study, test_set)?.ids(&study.config.splits.test)?;
-    Ok(ids.iter().all(|id| folder.join(format!("{id}.txt")).may_be_file()))
+    Ok(CellFiles::are_there(files.as_ref(), &frozen.cell(study, test_set), &ids))
 }
 
 /// The test frames of a data set with labels and the detections of a frozen detector, in the label frame.
 fn read_frames(study: &Study, frozen: &FrozenDetector, test_set: &str, labels: &TestSet) -> Result<Vec<EvalFrame>> {
     let Some(path) = frozen.detections.get(test_set) else {
+        CellFiles::verify(&frozen.cell(study, test_set))?;
         let mut frames = labels.with_detections(&frozen.detections_folder(study, test_set))?;
         for frame in &mut frames {
             frame.detections = frozen.in_classes_of_labels(std::mem::take(&mut frame.detections));
@@ -229,6 +242,20 @@ impl FrozenState {
     /// Whether there are detections.
     pub(crate) fn has(&self, name: &str, test_set: &str) -> bool {
         self.cells.iter().any(|c| c.name == name && c.test_set == test_set && c.state.is_ok())
+    }
+
+    /// Compares the detections of checkpoints with their checksums.
+    ///
+    /// # Errors
+    /// A file that was changed.
+    pub(crate) fn verify(&self, study: &Study) -> Result<()> {
+        for cell in self.cells.iter().filter(|cell| cell.state.is_ok()) {
+            let frozen = study.config.frozen_detector(&cell.name);
+            if let Some(frozen) = frozen.filter(|frozen| frozen.checkpoint.is_some()) {
+                CellFiles::verify(&frozen.cell(study, &cell.test_set))?;
+            }
+        }
+        Ok(())
     }
 
     /// The results for the matrix on a data set, by run and data set.

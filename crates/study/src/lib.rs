@@ -26,6 +26,7 @@ mod slurm;
 mod status;
 mod steps;
 mod work;
+mod written;
 
 pub use config::{FrozenDetector, Source, StudyConfig, StudyDataset, StudyEvaluation, StudyRun};
 pub use cost::{NetworkCost, duration, measure};

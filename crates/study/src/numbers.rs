@@ -8,6 +8,7 @@ use crate::error::Result;
 use crate::folder::Study;
 use crate::frozen::FrozenState;
 use crate::run_state::{RunState, run_state};
+use crate::written::CellFiles;
 use data::Presence as _;
 use data::{DataError, Dataset, LabelBox};
 use eval::analysis::{AnalysisOptions, BoxPoints, RunAnalysis, analyse};
@@ -77,18 +78,20 @@ impl StudyState {
 /// The matrix of a study, cached in `matrix.json`.
 ///
 /// # Errors
-/// Labels that cannot be read.
+/// Labels that cannot be read, and detections that were changed.
 pub fn matrix(study: &Study, state: &StudyState) -> Result<Matrix> {
     let options = &study.config.evaluation.matrix;
     let path = study.folder.join("matrix.json");
     cached(&path, &(state.key(study)?, study.config.plan(), options), || {
         let mut results: BTreeMap<(RunId, String), RunResult> = BTreeMap::new();
+        state.frozen.verify(study)?;
         for (test_set, _) in &state.tests {
+            let tested = state.run_states.par_iter().filter(|(_, run_state)| StudyState::has(run_state, test_set));
+            tested.try_for_each(|(run, _)| CellFiles::verify(&run.cell(study, test_set)))?;
             let labels = TestSet::read(&open(study, test_set)?, &study.config.splits.test)?;
             let of_run = |(run, run_state): &(StudyRun, RunState)| {
                 let result = if StudyState::has(run_state, test_set) {
-                    let folders = [run.detections(&study.folder, test_set), run.regions(&study.folder, test_set)];
-                    scores(&labels, &folders, options).map_err(|e| e.to_string())
+                    scores(&labels, &run.cell(study, test_set), options).map_err(|e| e.to_string())
                 } else {
                     Err(reason(run_state)?)
                 };
@@ -152,6 +155,7 @@ pub fn analyses(study: &Study, state: &StudyState) -> Result<Vec<(String, RunAna
                 );
                 let dataset = open(study, test_set)?;
                 let labels = TestSet::read(&dataset, &study.config.splits.test)?;
+                CellFiles::verify(&run.cell(study, test_set))?;
                 let frames = labels.with_detections(&run.detections(&study.folder, test_set))?;
                 for reference in labels.known_beside() {
                     let frames = labels.labelled_by(reference, &frames);

@@ -8,8 +8,9 @@ use crate::features::features;
 use crate::folder::Study;
 use crate::numbers::{StudyState, analyses, matrix, network_title, some_test_frames};
 use crate::{Event, Listener};
+use data::LabelBox;
 use data::Presence as _;
-use data::{KittiText, read_kitti_text};
+use eval::detections_of;
 use eval::matrix::{Matrix, PairedDifference, Quantity, TestSet, shared_ids};
 use geometry::Box3;
 use report::{Layer, LayerContent, ReportFiles, Scene, StudyReport, TrainingRun, read_training_run};
@@ -217,14 +218,24 @@ fn scenes(study: &Study, state: &StudyState) -> Result<Vec<Scene>> {
             frozen.extend(frames.map(|frames| (detector, frames)));
         }
     }
+    let ids = some_test_frames(study, &first, SCENES)?;
+    let mut runs: Vec<(&StudyRun, Vec<Vec<LabelBox>>)> = Vec::new();
+    for (run, _) in state.run_states.iter().filter(|(_, run_state)| StudyState::has(run_state, names[0])) {
+        let is_known = runs
+            .iter()
+            .any(|(known, _)| (&known.id.network, &known.id.train_set) == (&run.id.network, &run.id.train_set));
+        if !is_known && first.config.label_frame == data::LabelFrame::Lidar {
+            runs.push((run, detections_of(&run.detections(&study.folder, names[0]), &ids)?));
+        }
+    }
     let mut scenes = Vec::new();
-    for id in some_test_frames(study, &first, SCENES)? {
+    for (k, id) in ids.iter().enumerate() {
         let mut layers = Vec::new();
         let mut focus_m = None;
         for (name, color) in names.iter().zip(CLOUDS) {
             let set = open(study, name)?;
             // A data set with other scenes does not have this frame.
-            let Ok(frame) = set.load(&id) else { continue };
+            let Ok(frame) = set.load(id) else { continue };
             if *name == names[0] {
                 focus_m = frame.objects.first().map(|object| object.bbox.center);
                 let boxes: Vec<Box3> = frame.objects.iter().map(|object| object.bbox).collect();
@@ -232,22 +243,15 @@ fn scenes(study: &Study, state: &StudyState) -> Result<Vec<Scene>> {
             }
             layers.push(layer(study.title(name), color, LayerContent::Cloud(frame.cloud.with_channels(3))));
         }
-        let mut seen = Vec::new();
-        for (run, _) in state.run_states.iter().filter(|(_, run_state)| StudyState::has(run_state, names[0])) {
-            let of = (&run.id.network, &run.id.train_set);
-            if seen.contains(&of) || first.config.label_frame != data::LabelFrame::Lidar {
-                continue;
-            }
-            let color = DETECTIONS[seen.len() % DETECTIONS.len()];
-            seen.push(of);
-            let path = run.detections(&study.folder, names[0]).join(format!("{id}.txt"));
-            let boxes = read_kitti_text(&path, KittiText::Detections)?.iter().map(|line| line.lidar_box()).collect();
-            let name = format!("{} trained on {}", network_title(study, of.0), study.title(of.1));
+        for (color, (run, found)) in DETECTIONS.iter().cycle().zip(&runs) {
+            let boxes = found[k].iter().map(|line| line.lidar_box()).collect();
+            let name =
+                format!("{} trained on {}", network_title(study, &run.id.network), study.title(&run.id.train_set));
             layers.push(layer(&name, color, LayerContent::Boxes(boxes)));
         }
         for (frozen, frames) in &frozen {
-            let color = DETECTIONS[(seen.len() + layers.len()) % DETECTIONS.len()];
-            if let Some(frame) = frames.iter().find(|frame| frame.id == id) {
+            let color = DETECTIONS[(runs.len() + layers.len()) % DETECTIONS.len()];
+            if let Some(frame) = frames.iter().find(|frame| frame.id == *id) {
                 let boxes = frame.detections.iter().map(|line| line.lidar_box()).collect();
                 let name = format!("{}, trained elsewhere", frozen.title);
                 layers.push(layer(&name, color, LayerContent::Boxes(boxes)));

@@ -1,14 +1,13 @@
 //! The frames of a training run: their order, augmentation and preparation, each a function of (seed, epoch, frame)
 //! alone.
 
-use crate::order::EpochOrders;
+use crate::order::{EpochOrders, Others};
 use crate::{RunConfig, TrainError};
 use data::augment::{AugmentConfig, augment, crop_to_range};
 use data::checksum::hex;
 use data::{Dataset, Frame, GtDatabase, Prefetch, Stream, prefetch_numbered, stream};
 use models::config::DetectorConfig;
 use models::{Preparer, Sample};
-use rand::seq::SliceRandom;
 use sha2::{Digest, Sha256};
 use std::path::Path;
 use std::sync::Arc;
@@ -76,7 +75,7 @@ impl TrainingFrames {
     /// The sample of frame `index` in `epoch`.
     ///
     /// As in the reference, a frame without a box of the detector's classes in range after augmentation is replaced by
-    /// a random other one, except when overfitting.
+    /// a random other one, except when overfitting. Others are drawn one by one, each at most once.
     ///
     /// # Errors
     /// A frame that cannot be read, or no frame at all with a box.
@@ -86,9 +85,8 @@ impl TrainingFrames {
         if self.augmentation.is_none() || !frame.objects.is_empty() {
             return Ok(self.preparer.training(&frame, &mut random)?);
         }
-        let mut others: Vec<usize> = (0..self.ids.len()).filter(|other| *other != index).collect();
-        others.shuffle(&mut random);
-        for other in others {
+        let mut others = Others::of(index, self.ids.len());
+        while let Some(other) = others.draw(&mut random) {
             let frame = self.frame(other, &mut random)?;
             if !frame.objects.is_empty() {
                 return Ok(self.preparer.training(&frame, &mut random)?);

@@ -1,8 +1,10 @@
-//! The order of the frames in each epoch, computed when the epoch is reached.
+//! The order of the frames in each epoch, computed when the epoch is reached, and frames in place of those without
+//! boxes, drawn when they are needed.
 
-use data::stream;
+use data::{Stream, stream};
+use rand::RngExt as _;
 use rand::seq::SliceRandom;
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Orders that are kept. Frames of the next epoch are loaded while those of the last one are still used.
@@ -41,9 +43,67 @@ impl EpochOrders {
     }
 }
 
+/// All frames but one in random order, of which as much is computed as is drawn: the shuffle of Fisher and Yates, whose
+/// memory is the exchanges so far.
+pub(crate) struct Others {
+    without: usize,
+    left: usize,
+    /// Numbers of the places whose number is not their own.
+    moved: HashMap<usize, usize>,
+}
+
+impl Others {
+    /// The frames 0 to `frames - 1` without the frame `without`.
+    pub(crate) fn of(without: usize, frames: usize) -> Self {
+        Others { without, left: frames - 1, moved: HashMap::new() }
+    }
+
+    /// The next one; `None` after the last one.
+    pub(crate) fn draw(&mut self, random: &mut Stream) -> Option<usize> {
+        let last = self.left.checked_sub(1)?;
+        let place = random.random_range(0..self.left);
+        let at_last = self.moved.remove(&last).unwrap_or(last);
+        let drawn = if place == last { at_last } else { self.moved.insert(place, at_last).unwrap_or(place) };
+        self.left = last;
+        // Numbers from the frame on that is left out stand for the frames behind it.
+        Some(drawn + usize::from(drawn >= self.without))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn others_are_drawn_once_each_and_alike() {
+        for (without, frames) in [(0, 1), (0, 2), (1, 2), (0, 40), (17, 40), (39, 40)] {
+            let all = |seed| {
+                let (mut others, mut random) = (Others::of(without, frames), stream(seed, "augment", 3, 0));
+                std::iter::from_fn(|| others.draw(&mut random)).collect::<Vec<usize>>()
+            };
+            let (drawn, mut sorted) = (all(1), all(1));
+            sorted.sort_unstable();
+            assert!(
+                sorted.iter().copied().eq((0..frames).filter(|i| *i != without)),
+                "{without} of {frames}: {drawn:?}"
+            );
+            assert!(frames < 40 || drawn != all(2));
+        }
+        let mut counts = [0; 4];
+        for epoch in 0..3000 {
+            counts[Others::of(2, 4).draw(&mut stream(1, "augment", epoch, 2)).unwrap()] += 1;
+        }
+        assert!(counts[2] == 0 && [0, 1, 3].iter().all(|i| (900..1100).contains(&counts[*i])), "{counts:?}");
+    }
+
+    #[test]
+    fn memory_grows_with_what_is_drawn_not_with_the_frames() {
+        let (mut others, mut random) = (Others::of(5, 1_000_000), stream(1, "augment", 0, 5));
+        for drawn in 1..=10 {
+            others.draw(&mut random).unwrap();
+            assert!(others.moved.len() <= drawn);
+        }
+    }
 
     #[test]
     fn orders_are_those_of_the_seed() {

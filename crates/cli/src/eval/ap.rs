@@ -1,19 +1,19 @@
-//! `lidarshift eval ap`: average precision and recall of detections in KITTI text or of OpenPCDet.
+//! `lidarshift eval ap`: average precision and recall of detections in KITTI text, of a study, or of OpenPCDet.
 
 use crate::json::JsonArgs;
 use crate::{errln, out};
 use anyhow::{Result, bail};
 use clap::Args;
-use data::{Dataset, LabelFrame};
+use data::{Dataset, LabelFrame, detections_file, frames_of_detections};
 use eval::{EvalFrame, EvalOptions, default_classes, evaluate, ids_of_folder, read_detections, read_frames, read_ids};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Average precision and recall of detections in KITTI text or of OpenPCDet.
+/// Average precision and recall of detections in KITTI text, of a study, or of OpenPCDet.
 ///
 /// Label lines have 15 values. Detection lines have 16; the last one is the score. A frame without objects has an empty
-/// file. Boxes are compared in the frame in which the files give them. OpenPCDet's `result.pkl` needs --dataset: its
-/// boxes are in the LiDAR frame.
+/// file. Boxes are compared in the frame in which the files give them. A study writes the detections on a test set to
+/// one file, `detections.parquet`. OpenPCDet's `result.pkl` needs --dataset: its boxes are in the LiDAR frame.
 ///
 /// Examples:
 ///   lidarshift eval ap --labels data/label_2 --detections runs/mine/detections
@@ -25,7 +25,8 @@ pub struct EvalApArgs {
     /// Folder of label files
     #[arg(long, value_name = "DIR", required_unless_present = "dataset", conflicts_with = "dataset")]
     labels: Option<PathBuf>,
-    /// Folder of detection files with the same names as the label files, or OpenPCDet's `result.pkl`
+    /// Folder of detection files with the same names as the label files, `detections.parquet` or its folder, or
+    /// OpenPCDet's `result.pkl`
     #[arg(long, value_name = "PATH")]
     detections: PathBuf,
     /// Frame of labels and detections: `camera` (as in KITTI) or `lidar` (location is the box centre, rotation the
@@ -80,9 +81,12 @@ impl EvalApArgs {
     }
 
     fn of_folder(&self, labels: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
-        if self.detections.is_file() {
+        if self.is_pickle() {
             let path = self.detections.display();
-            bail!("{path}: is a file; give --dataset for OpenPCDet's result.pkl, or a folder of KITTI text");
+            bail!(
+                "{path}: is a file; give --dataset for OpenPCDet's result.pkl, or a folder of KITTI text, or a Parquet \
+                 file of detections (.parquet)"
+            );
         }
         let ids = match &self.ids {
             Some(list) => read_ids(list)?,
@@ -99,7 +103,7 @@ impl EvalApArgs {
     fn of_dataset(&self, dataset: &Path) -> Result<(Vec<EvalFrame>, EvalOptions)> {
         let dataset = Dataset::open(dataset)?;
         let ids = dataset.ids(&self.split)?;
-        let frames = if self.detections.is_file() {
+        let frames = if self.is_pickle() {
             study::read_result_frames(&self.detections, &dataset, &ids)?
         } else {
             read_detections(|id| dataset.labels(id), &self.detections, &ids)?
@@ -108,15 +112,26 @@ impl EvalApArgs {
         Ok((frames, EvalOptions { label_frame: config.label_frame, classes: config.classes, ..EvalOptions::default() }))
     }
 
+    fn is_pickle(&self) -> bool {
+        self.detections.is_file() && detections_file(&self.detections).is_none()
+    }
+
     /// Without --ids the label files define the frames. Warns about detections of other frames, which are ignored.
     fn warn_of_detections_without_labels(&self, ids: &[String]) {
         let known: BTreeSet<&String> = ids.iter().collect();
-        let detected = ids_of_folder(&self.detections).unwrap_or_default();
+        let (what, ending, detected) = match detections_file(&self.detections) {
+            Some(file) => ("frames with detections", "", frames_of_detections(&file).unwrap_or_default()),
+            None => {
+                let files = ids_of_folder(&self.detections).unwrap_or_default();
+                ("detection files", ".txt", files.into_iter().collect())
+            }
+        };
         let mut others = detected.iter().filter(|id| !known.contains(id));
         if let Some(first) = others.next() {
             let n = 1 + others.count();
             errln!(
-                "warning: {n} detection files have no label file and are ignored (first: {first}.txt); choose frames with --ids"
+                "warning: {n} {what} have no label file and are ignored (first: {first}{ending}); choose frames with \
+                 --ids"
             );
         }
     }

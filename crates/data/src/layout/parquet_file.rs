@@ -26,7 +26,7 @@ const BATCH_ROWS: usize = 4096;
 const MOST_PLACES: usize = 4;
 
 /// A Parquet file whose metadata is in memory.
-pub(super) struct ParquetFile {
+pub(crate) struct ParquetFile {
     path: PathBuf,
     metadata: ArrowReaderMetadata,
     /// The first row of each group of rows, and the number of all rows.
@@ -38,7 +38,15 @@ impl ParquetFile {
     ///
     /// # Errors
     /// What is no Parquet file, and more rows than a cloud may have points.
-    pub(super) fn open(path: &Path) -> Result<ParquetFile, DataError> {
+    pub(crate) fn open(path: &Path) -> Result<ParquetFile, DataError> {
+        Self::open_within(path, MOST_POINTS)
+    }
+
+    /// As [`ParquetFile::open`], with at most `most` rows.
+    ///
+    /// # Errors
+    /// What is no Parquet file, and more rows.
+    pub(crate) fn open_within(path: &Path, most: usize) -> Result<ParquetFile, DataError> {
         let length = length_of_file(path, u64::MAX)?;
         let file = fs_err::File::open(path)?.into_file();
         // The types are those of the columns themselves, not those of a schema that Arrow wrote beside them.
@@ -51,7 +59,7 @@ impl ParquetFile {
                 return Err(wrong("a column lies outside of the file".into()));
             }
             let rows = starts[starts.len() - 1] as u64 + u64::try_from(group.num_rows()).unwrap_or(u64::MAX / 2);
-            at_most(path, "rows", rows, MOST_POINTS)?;
+            at_most(path, "rows", rows, most)?;
             starts.push(rows as usize);
         }
         Ok(ParquetFile { path: path.into(), metadata, starts })
@@ -61,7 +69,7 @@ impl ParquetFile {
     ///
     /// # Errors
     /// A column that is not there, or that cannot be read.
-    pub(super) fn table(&self, columns: &[&str]) -> Result<Table, DataError> {
+    pub(crate) fn table(&self, columns: &[&str]) -> Result<Table, DataError> {
         let mut reader = self.reader(columns, BATCH_ROWS, 0)?;
         let batches = std::iter::from_fn(|| self.next(&mut reader, columns).transpose());
         let table = Table::of_batches(&self.path, batches)?;
@@ -70,6 +78,24 @@ impl ParquetFile {
             return Err(self.damaged(columns, &format!("has {} rows, not {rows}", table.rows())));
         }
         Ok(table)
+    }
+
+    /// Whether there is a column with this name.
+    pub(crate) fn has_column(&self, name: &str) -> bool {
+        self.metadata.parquet_schema().root_schema().get_fields().iter().any(|field| field.name() == name)
+    }
+
+    /// All rows of some columns, some rows at a time, in their order.
+    ///
+    /// # Errors
+    /// A column that is not there. The iterator gives an error for rows that cannot be read.
+    pub(crate) fn tables<'a>(
+        &'a self,
+        columns: &'a [&'a str],
+    ) -> Result<impl Iterator<Item = Result<Table, DataError>> + 'a, DataError> {
+        let mut reader = self.reader(columns, BATCH_ROWS, 0)?;
+        let batches = std::iter::from_fn(move || self.next(&mut reader, columns).transpose());
+        Ok(batches.map(|batch| Table::of_batches(&self.path, [Ok(batch?)])))
     }
 
     /// Reads rows of some columns from the beginning of a group of rows on, `batch_rows` at once.
@@ -172,7 +198,7 @@ fn lies_inside(column: &ColumnChunkMetaData, length: u64) -> bool {
 }
 
 /// Single rows of a file. Rows that are asked for in their order are decoded once: a reader goes on where it stands.
-pub(super) struct Rows {
+pub(crate) struct Rows {
     file: ParquetFile,
     columns: &'static [&'static str],
     /// Readers and the rows that they read next.
@@ -181,7 +207,7 @@ pub(super) struct Rows {
 
 impl Rows {
     /// Single rows of some columns.
-    pub(super) fn new(file: ParquetFile, columns: &'static [&'static str]) -> Rows {
+    pub(crate) fn new(file: ParquetFile, columns: &'static [&'static str]) -> Rows {
         Rows { file, columns, places: Mutex::default() }
     }
 
@@ -189,7 +215,7 @@ impl Rows {
     ///
     /// # Errors
     /// A row or column that is not there, or that cannot be read.
-    pub(super) fn row(&self, row: usize) -> Result<Table, DataError> {
+    pub(crate) fn row(&self, row: usize) -> Result<Table, DataError> {
         let starts = &self.file.starts;
         let group = starts.partition_point(|start| *start <= row) - 1;
         if group + 1 >= starts.len() {

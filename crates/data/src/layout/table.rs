@@ -10,7 +10,7 @@ use arrow_array::{Array, ArrayRef, ArrowPrimitiveType, RecordBatch};
 use std::path::{Path, PathBuf};
 
 /// A table in memory. Its errors name the file that it was read from, and the column or the row.
-pub(super) struct Table {
+pub(crate) struct Table {
     path: PathBuf,
     batches: Vec<RecordBatch>,
     rows: usize,
@@ -21,7 +21,7 @@ impl Table {
     ///
     /// # Errors
     /// A batch that cannot be read, and more rows than a cloud may have points.
-    pub(super) fn of_batches(
+    pub(crate) fn of_batches(
         path: &Path,
         batches: impl IntoIterator<Item = Result<RecordBatch, DataError>>,
     ) -> Result<Table, DataError> {
@@ -36,43 +36,60 @@ impl Table {
     }
 
     /// Number of rows.
-    pub(super) fn rows(&self) -> usize {
+    pub(crate) fn rows(&self) -> usize {
         self.rows
     }
 
     /// An error of a row, from 0.
-    pub(super) fn wrong(&self, row: usize, message: &str) -> DataError {
+    pub(crate) fn wrong(&self, row: usize, message: &str) -> DataError {
         DataError::file(&self.path, format!("row {row} (from 0): {message}"))
     }
 
     /// A column of real numbers, of any width.
-    pub(super) fn reals(&self, name: &str) -> Result<Vec<f64>, DataError> {
+    pub(crate) fn reals(&self, name: &str) -> Result<Vec<f64>, DataError> {
         self.column(name, "real numbers", reals)
     }
 
     /// A column of whole numbers, of any width.
-    pub(super) fn integers(&self, name: &str) -> Result<Vec<i64>, DataError> {
+    pub(crate) fn integers(&self, name: &str) -> Result<Vec<i64>, DataError> {
         self.column(name, "whole numbers", integers)
     }
 
     /// A column of lists of real numbers; `None` for a list that is missing or empty.
-    pub(super) fn real_lists(&self, name: &str) -> Result<Vec<Option<Vec<f64>>>, DataError> {
+    pub(crate) fn real_lists(&self, name: &str) -> Result<Vec<Option<Vec<f64>>>, DataError> {
         self.lists(name, "lists of real numbers", reals)
     }
 
     /// A column of lists of whole numbers; `None` for a list that is missing or empty.
-    pub(super) fn integer_lists(&self, name: &str) -> Result<Vec<Option<Vec<i64>>>, DataError> {
+    pub(crate) fn integer_lists(&self, name: &str) -> Result<Vec<Option<Vec<i64>>>, DataError> {
         self.lists(name, "lists of whole numbers", integers)
     }
 
     /// A column of texts.
-    pub(super) fn texts(&self, name: &str) -> Result<Vec<String>, DataError> {
+    pub(crate) fn texts(&self, name: &str) -> Result<Vec<String>, DataError> {
         self.column(name, "texts", |column| {
             let short = column.as_string_opt::<i32>().map(|a| a.iter().map(|v| v.unwrap_or("").to_string()).collect());
             short.or_else(|| {
                 let long = column.as_string_opt::<i64>()?;
                 Some(long.iter().map(|v| v.unwrap_or("").to_string()).collect())
             })
+        })
+    }
+
+    /// A column of texts; `None` where a value is missing.
+    pub(crate) fn optional_texts(&self, name: &str) -> Result<Vec<Option<String>>, DataError> {
+        self.each(name, "texts", |column| {
+            let short = column.as_string_opt::<i32>().map(|a| a.iter().map(|v| v.map(String::from)).collect());
+            short.or_else(|| Some(column.as_string_opt::<i64>()?.iter().map(|v| v.map(String::from)).collect()))
+        })
+    }
+
+    /// A column of real or whole numbers, of any width; `None` where a value is missing.
+    pub(crate) fn optional_numbers(&self, name: &str) -> Result<Vec<Option<f64>>, DataError> {
+        self.each(name, "numbers", |column| {
+            let whole = || Some(integers(column)?.into_iter().map(|v| v as f64).collect());
+            let values: Vec<f64> = reals(column).or_else(whole)?;
+            Some(values.into_iter().enumerate().map(|(i, value)| column.is_valid(i).then_some(value)).collect())
         })
     }
 

@@ -4,9 +4,8 @@ use super::{MatrixOptions, Quantity, Reference};
 use crate::evidence::{Evidence, FrameEvidence};
 use crate::matching::{BoxIndex, CurveKey};
 use crate::overlaps::{FrameOverlaps, range_m};
-use crate::{EvalFrame, Metric, RangeSection};
-use data::Presence as _;
-use data::{DataError, Dataset, KittiText, LabelBox, LabelFrame, read_kitti_text};
+use crate::{EvalFrame, Metric, RangeSection, detections_of};
+use data::{DataError, Dataset, LabelBox, LabelFrame};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::path::Path;
@@ -104,24 +103,18 @@ impl TestSet {
         self.frames.is_empty()
     }
 
-    /// The frames with the detections of a run, read from `folder/ID.txt`. A frame without detections has an empty
-    /// file.
+    /// The frames with the detections of a run, read as [`detections_of`] does.
     ///
     /// # Errors
-    /// A missing or invalid detection file.
-    pub fn with_detections(&self, folder: &Path) -> Result<Vec<EvalFrame>, DataError> {
-        let read = |frame: &EvalFrame| {
-            let path = folder.join(format!("{}.txt", frame.id));
-            if !path.may_exist() {
-                let message =
-                    "does not exist; a frame without detections has an empty file. Detect this test set again";
-                return Err(DataError::missing(&path, message));
-            }
-            let detections = read_kitti_text(&path, KittiText::Detections)?;
-            Ok(EvalFrame { id: frame.id.clone(), labels: frame.labels.clone(), detections })
+    /// Missing or invalid detections of a frame.
+    pub fn with_detections(&self, path: &Path) -> Result<Vec<EvalFrame>, DataError> {
+        let ids: Vec<&str> = self.frames.iter().map(|frame| frame.id.as_str()).collect();
+        let with = |(frame, detections): (&EvalFrame, _)| EvalFrame {
+            id: frame.id.clone(),
+            labels: frame.labels.clone(),
+            detections,
         };
-        let frames: Vec<Result<EvalFrame, DataError>> = self.frames.par_iter().map(read).collect();
-        frames.into_iter().collect()
+        Ok(self.frames.iter().zip(detections_of(path, &ids)?).map(with).collect())
     }
 }
 

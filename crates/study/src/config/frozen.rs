@@ -21,8 +21,9 @@ pub struct FrozenDetector {
     /// Title in tables and figures. Default: the name.
     pub title: String,
     /// Its detections, by the name of the data set: a folder of KITTI text files (`ID.txt`, 16 values a line, in the
-    /// label frame of the data set), or a `result.pkl` of OpenPCDet (boxes in the LiDAR frame). Paths are relative to
-    /// the study's TOML. Data sets without an entry are not evaluated.
+    /// label frame of the data set), a Parquet file of detections or the folder with its `detections.parquet` (in the
+    /// label frame as well), or a `result.pkl` of OpenPCDet (boxes in the LiDAR frame). Paths are relative to the
+    /// study's TOML. Data sets without an entry are not evaluated.
     pub detections: BTreeMap<String, PathBuf>,
     /// Its weights: a `.pth` of OpenPCDet, or safetensors. Needs `detector`; every data set is evaluated.
     pub checkpoint: Option<PathBuf>,

@@ -61,9 +61,10 @@ pub fn detect_frozen(study: &Study, name: &str, device: &Device, workers: usize,
         note(&format!("detecting on {}", dataset.name));
         let set = open(study, &dataset.name)?;
         let ids = set.ids(&study.config.splits.test)?;
-        let folders = [frozen.detections_folder(study, &dataset.name), frozen.regions_folder(study, &dataset.name)];
-        detect(&detector, &set, &ids, &folders, workers).in_part(|| format!("data set {}", dataset.name))?;
-        let cell: FrozenCell = expected_cell(study, frozen, &dataset.name)?;
+        let folders = frozen.cell(study, &dataset.name);
+        let files =
+            detect(&detector, &set, &ids, &folders, workers).in_part(|| format!("data set {}", dataset.name))?;
+        let cell = FrozenCell { files: Some(files), ..expected_cell(study, frozen, &dataset.name)? };
         write_json(&FrozenCell::path(study, frozen, &dataset.name), &cell)?;
     }
     Ok(())

@@ -1,13 +1,16 @@
-//! Detections made elsewhere: read from a folder of KITTI text or from a `result.pkl`, checked against the frames and
-//! classes of a data set, and converted to its label frame.
+//! Detections made elsewhere: read from a folder of KITTI text, a file of detections or a `result.pkl`, checked against
+//! the frames and classes of a data set, and converted to its label frame.
 
 use super::results::results_by_frame;
 use crate::config::FrozenDetector;
 use crate::error::{Result, refused};
 use data::Presence as _;
-use data::{DONT_CARE, DataError, Dataset, KittiText, LabelBox, parse_kitti_text};
-use eval::EvalFrame;
+use data::{
+    DETECTIONS_FILE, DONT_CARE, DataError, Dataset, KittiText, LabelBox, detections_file, frames_of_detections,
+    parse_kitti_text,
+};
 use eval::matrix::TestSet;
+use eval::{EvalFrame, detections_of};
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeSet;
@@ -32,13 +35,16 @@ impl Source<'_> {
     /// the data set does not have.
     pub(super) fn read(&self, known_classes: &[String]) -> Result<Vec<EvalFrame>> {
         let classes = Classes::new(self, known_classes);
+        if let Some(file) = detections_file(&self.path) {
+            return self.read_table(&file, &classes);
+        }
         if self.path.may_be_folder() {
             return self.read_folder(&classes);
         }
         if !self.path.may_be_file() {
             return Err(refused(format!(
-                "{}: does not exist; detections of frozen {} on {} are a folder of KITTI text or a result.pkl of \
-                 OpenPCDet",
+                "{}: does not exist; detections of frozen {} on {} are a folder of KITTI text, a {DETECTIONS_FILE} or a \
+                 result.pkl of OpenPCDet",
                 self.path.display(),
                 self.frozen.name,
                 self.test_set
@@ -77,6 +83,20 @@ impl Source<'_> {
         // Collects all results first, so that the first bad frame is reported for any number of threads.
         let frames: Vec<Result<EvalFrame, DataError>> = self.labels.frames().par_iter().map(read).collect();
         Ok(frames.into_iter().collect::<Result<_, _>>()?)
+    }
+
+    fn read_table(&self, file: &Path, classes: &Classes) -> Result<Vec<EvalFrame>> {
+        let of_id = |id: &str| format!("{}: frame {id}", file.display());
+        self.check_ids(&frames_of_detections(file)?, &of_id)?;
+        let ids: Vec<&str> = self.ids().collect();
+        let with = |(frame, detections): (&EvalFrame, Vec<LabelBox>)| {
+            classes.check(&detections).map_err(|(k, message)| {
+                DataError::file(file, format!("frame {}, detection {k}: {message}", frame.id))
+            })?;
+            let detections = self.frozen.in_classes_of_labels(detections);
+            Ok(EvalFrame { id: frame.id.clone(), labels: frame.labels.clone(), detections })
+        };
+        self.labels.frames().iter().zip(detections_of(file, &ids)?).map(with).collect()
     }
 
     fn read_pickle(&self, classes: &Classes) -> Result<Vec<EvalFrame>> {
@@ -122,7 +142,7 @@ impl Source<'_> {
             None => Ok(()),
             Some(first) => Err(refused(format!(
                 "{}: does not exist; {} of the {} test frames of data set {} have no detections. A frame without \
-                 detections has an empty file, or an entry with empty arrays",
+                 detections has an empty file, an entry with empty arrays, or a row with nothing but its name",
                 place(first),
                 missing.len(),
                 split.len(),
@@ -132,12 +152,16 @@ impl Source<'_> {
     }
 }
 
-/// Hash of the detections at a path, in hexadecimal: a file, or the text files of a folder with their names.
+/// Hash of the detections at a path, in hexadecimal: a file, also in a folder ([`detections_file`]), or the text files
+/// of a folder with their names.
 ///
 /// # Errors
 /// A file that cannot be read.
 pub(super) fn source_sha256(path: &Path) -> Result<String> {
     let mut hash = Sha256::new();
+    if let Some(file) = detections_file(path) {
+        return Ok(data::checksum::file_sha256(&file)?);
+    }
     if path.may_be_folder() {
         let mut files: Vec<PathBuf> =
             fs_err::read_dir(path)?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<_>>()?;
