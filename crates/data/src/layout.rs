@@ -12,6 +12,7 @@ mod pose_text;
 mod stamps;
 mod table;
 mod tracklets;
+mod without_panic;
 
 pub use stamps::StampUnit;
 
