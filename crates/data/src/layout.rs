@@ -9,6 +9,7 @@ mod nuscenes_tables;
 mod oxts;
 mod parquet_file;
 mod pose_text;
+mod recent;
 mod stamps;
 mod table;
 mod tracklets;
