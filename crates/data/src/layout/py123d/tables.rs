@@ -105,22 +105,22 @@ pub(super) fn read_boxes(path: &Path) -> Result<Vec<Vec<WorldBox>>, DataError> {
     let boxes = table.lists_of_rows::<10>(&column("bounding_box_se3"))?;
     let tracks = table.text_lists(&column("track_token"))?;
     let labels = table.integer_lists(&column("label"))?;
-    let row = |(row, ((boxes, tracks), labels)): (usize, ((Vec<[f64; 10]>, Vec<String>), Option<Vec<i64>>))| {
-        let labels = labels.unwrap_or_default();
+    let row = |row: usize| {
+        let (boxes, tracks, labels) = (&boxes[row], &tracks[row], labels[row].as_deref().unwrap_or_default());
         if (boxes.len(), boxes.len()) != (tracks.len(), labels.len()) {
             let [b, t, l] = [boxes.len(), tracks.len(), labels.len()];
             return Err(table.wrong(row, &format!("it has {b} boxes, {t} tracks and {l} labels")));
         }
         at_most(path, "boxes of a frame", boxes.len() as u64, MOST_BOXES)?;
-        let world_box = |((values, track), label): (([f64; 10], String), i64)| {
-            let [x, y, z, qw, qx, qy, qz, length, width, height] = values;
+        let world_box = |i: usize| {
+            let ([x, y, z, qw, qx, qy, qz, length, width, height], track) = (boxes[i], tracks[i].clone());
             let pose = pose_from_quaternion([qw, qx, qy, qz], [x, y, z]);
             let world_from_box = pose.map_err(|message| table.wrong(row, &format!("track {track:?}: {message}")))?;
-            let name = usize::try_from(label).ok().and_then(|label| names.get(label));
-            let class = name.map_or_else(|| label.to_string(), |name| (*name).to_string());
+            let name = usize::try_from(labels[i]).ok().and_then(|label| names.get(label));
+            let class = name.map_or_else(|| labels[i].to_string(), |name| (*name).to_string());
             Ok(WorldBox { track, class, world_from_box, size: [length, width, height] })
         };
-        boxes.into_iter().zip(tracks).zip(labels).map(world_box).collect()
+        (0..boxes.len()).map(world_box).collect()
     };
-    boxes.into_iter().zip(tracks).zip(labels).enumerate().map(row).collect()
+    (0..table.rows()).map(row).collect()
 }
