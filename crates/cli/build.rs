@@ -13,9 +13,12 @@ const VARIABLE: &str = "LIDARSHIFT_COMMIT";
 
 fn main() {
     println!("cargo::rerun-if-env-changed={VARIABLE}");
-    let crates = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("a crate is in a folder");
-    let root = crates.parent().expect("the folder of the crates is in one");
-    let sources = sources(root, crates);
+    let manifest = Path::new(env!("CARGO_MANIFEST_DIR"));
+    // A package of a registry lies among packages of others, and belongs to no checkout.
+    let Some(root) = manifest.ancestors().nth(2).filter(|root| root.join("crates").join("cli") == manifest) else {
+        return;
+    };
+    let sources = sources(root, &root.join("crates"));
     for path in &sources {
         println!("cargo::rerun-if-changed={}", path.display());
     }

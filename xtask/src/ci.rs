@@ -6,8 +6,8 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Instant;
 
-/// Format, house rules, the book, clippy, tests, which include doc tests and a smoke run of the program, and the tests
-/// of object stores and of the Python package.
+/// Format, house rules, packages, the book, clippy, tests, which include doc tests and a smoke run of the program, and
+/// the tests of object stores and of the Python package.
 ///
 /// Everything is built once with the wgpu backend, which compiles without a GPU.
 pub fn ci(root: &Path) -> Result<()> {
@@ -15,6 +15,7 @@ pub fn ci(root: &Path) -> Result<()> {
     let start = Instant::now();
     step("format", || crate::format::format(root, true))?;
     step("tidy", crate::tidy)?;
+    step("package", || crate::package::package(root))?;
     step("book", || book(root))?;
     step("clippy", || {
         let args = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];
@@ -57,7 +58,7 @@ fn step(name: &str, work: impl FnOnce() -> Result<()>) -> Result<()> {
 }
 
 /// Runs a command; a non-zero exit code is an error.
-fn must(command: &mut Command) -> Result<()> {
+pub fn must(command: &mut Command) -> Result<()> {
     let status = command.status().with_context(|| format!("could not start {command:?}"))?;
     if !status.success() {
         bail!("{command:?} ended with {status}");

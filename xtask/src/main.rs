@@ -8,6 +8,7 @@ mod bench_mutants;
 mod bench_train;
 mod ci;
 mod format;
+mod package;
 mod pages;
 mod program;
 mod python;

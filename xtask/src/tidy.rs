@@ -1,5 +1,6 @@
 //! `cargo xtask tidy`: checks the house rules in CONTRIBUTING.md that can be checked automatically.
 
+mod packages;
 mod printing;
 mod source;
 mod wording;
@@ -14,15 +15,16 @@ use std::path::{Path, PathBuf};
 /// Allowed dependencies: a crate's folder, and the folders on which it may depend directly. Indirect dependencies are
 /// allowed as well.
 const ARROWS: &[(&str, &[&str])] = &[
+    ("configs", &[]),
     ("geometry", &[]),
     ("kernels", &[]),
     ("statistics", &[]),
     ("data", &["geometry", "statistics"]),
     ("sensor", &["data"]),
-    ("simulate", &["sensor"]),
+    ("simulate", &["sensor", "configs"]),
     ("twin", &["simulate"]),
     ("exchange", &["sensor"]),
-    ("models", &["data", "kernels"]),
+    ("models", &["data", "kernels", "configs"]),
     ("eval", &["data"]),
     ("train", &["kernels", "models", "eval"]),
     // The simulator is only for its tests.
@@ -74,17 +76,26 @@ impl Manifest {
 
     /// Names of all dependencies, including those for tests and builds.
     fn dependencies(&self) -> BTreeSet<&str> {
+        self.dependency_tables().map(|(name, _)| name.as_str()).collect()
+    }
+
+    /// Name and value of each dependency, including those for tests and builds.
+    fn dependency_tables(&self) -> impl Iterator<Item = (&String, &toml::Value)> {
         ["dependencies", "dev-dependencies", "build-dependencies"]
             .into_iter()
             .filter_map(|kind| self.toml.get(kind)?.as_table())
-            .flat_map(|table| table.keys().map(String::as_str))
-            .collect()
+            .flatten()
     }
 
     /// Names of its `[[bench]]` entries.
     pub fn benches(&self) -> Vec<String> {
         let entries = self.toml.get("bench").and_then(|b| b.as_array()).into_iter().flatten();
         entries.filter_map(|b| Some(b.get("name")?.as_str()?.to_owned())).collect()
+    }
+
+    /// Whether it may be published: it takes no `publish = false`, from the workspace or of its own.
+    pub fn is_published(&self) -> bool {
+        self.toml.get("package").and_then(|p| p.get("publish")).is_none()
     }
 
     fn takes_workspace_lints(&self) -> bool {
@@ -94,7 +105,7 @@ impl Manifest {
 
 /// The manifests of all workspace members, sorted by path.
 pub fn manifests(root: &Path) -> Result<Vec<Manifest>> {
-    let mut paths = vec![root.join("tests/Cargo.toml"), root.join("xtask/Cargo.toml")];
+    let mut paths = ["configs", "tests", "xtask"].map(|folder| root.join(folder).join("Cargo.toml")).to_vec();
     for entry in fs::read_dir(root.join("crates"))? {
         paths.push(entry?.path().join("Cargo.toml"));
     }
@@ -105,10 +116,14 @@ pub fn manifests(root: &Path) -> Result<Vec<Manifest>> {
 
 /// All violations of the house rules, one message each, sorted by path.
 pub fn complaints(root: &Path) -> Result<Vec<String>> {
-    let mut found = Vec::new();
+    let (mut found, mut published) = (Vec::new(), Vec::new());
     for manifest in manifests(root)? {
         let path = shown(root, &manifest.path);
         found.extend(manifest_complaints(&manifest).into_iter().map(|c| format!("{path}: {c}")));
+        if manifest.is_published() {
+            published.push(path.trim_end_matches("Cargo.toml").to_owned());
+            found.extend(packages::complaints(&manifest).into_iter().map(|c| format!("{path}: {c}")));
+        }
     }
     let files = texts(root)?;
     let pages: Vec<PathBuf> = files.iter().filter(|f| f.extension().is_some_and(|e| e == "md")).cloned().collect();
@@ -122,6 +137,10 @@ pub fn complaints(root: &Path) -> Result<Vec<String>> {
             let code = code_before_tests(&path, &text);
             of_file.extend(printing::complaints(&path, &code));
             of_file.extend(writing::complaints(&path, &code));
+            let before_tests: Vec<&str> = text.lines().take(lines_before_tests(&text)).collect();
+            if let Some(package) = published.iter().find(|package| path.starts_with(*package)) {
+                of_file.extend(packages::outside(package, &path, &before_tests.join("\n")));
+            }
         }
         of_file.sort_by_key(|(line, _)| *line);
         found.extend(of_file.into_iter().map(|(line, c)| format!("{path}:{line}: {c}")));

@@ -48,6 +48,17 @@ fn what_commands_write_is_published() {
     }
     must(dir.path(), "compare . . --split val --out compared --detections ours=found,found");
     run(dir.path(), "doctor . --json doctor.json");
+    // The gain of a list of effects alone.
+    must(dir.path(), "simulate --config street --frames 8 --out made/street");
+    must(dir.path(), "resim made/street --effects noise.toml --out made/street_noisy");
+    let pair = "--measured made/street_noisy --simulated made/street";
+    must(dir.path(), &format!("diagnose {pair} --verify noise.toml --out verified --json verified.json"));
+    // A run that fails: the loss is not finite with this learning rate.
+    let study = fs::read_to_string(dir.path().join("study.toml")).unwrap();
+    let wild = study.replace("name = \"small\"", "name = \"wild\"").replace("epochs = 1", "epochs = 2");
+    let wild = wild.replace("\"tiny.toml\"", "\"tiny.toml\"\nset = { optimization.lr_max = 1e30 }");
+    fs::write(dir.path().join("wild.toml"), wild).unwrap();
+    assert!(!run(dir.path(), "study wild.toml").status.success());
     let mut found = check_files(dir.path(), &["carla/carla", "carla/sensor", "carla/attributes"]);
     for arguments in ["doctor nowhere", "docter", "resim . --effects tiny.toml --out x"] {
         let stderr = run(dir.path(), &format!("{arguments} --errors json")).stderr;
@@ -65,6 +76,7 @@ fn what_commands_write_is_published() {
         "doctor",
         "error",
         "eval-ap",
+        "failed-run",
         "features",
         "frame-record",
         "frozen-cell",
@@ -84,6 +96,7 @@ fn what_commands_write_is_published() {
         "study-plan",
         "study-status",
         "targets",
+        "verification",
     ] {
         assert!(found.contains(form), "no {form} among {found:?}");
     }

@@ -277,7 +277,7 @@ fn invalid_studies_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
     for (from, to, arguments, want) in [
-        ("", "", "study none", "no study \"none\": neither a file nor one of quick, cpu, gain, paper"),
+        ("", "", "study none", "no study \"none\": neither a file nor one of cpu, gain, paper, quick"),
         ("", "", "study", "the study is missing"),
         (
             "",

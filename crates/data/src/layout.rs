@@ -1,6 +1,8 @@
 //! Layouts: how the frames of a data set are stored on disk. A new layout is a file in this folder and a line in
 //! `layouts!`.
 
+mod arrow_file;
+mod arrow_metadata;
 mod bag;
 mod feather;
 mod file_names;
@@ -9,9 +11,11 @@ mod nuscenes_tables;
 mod oxts;
 pub(crate) mod parquet_file;
 mod pose_text;
+mod recent;
 mod stamps;
 pub(crate) mod table;
 mod tracklets;
+mod without_panic;
 
 pub use stamps::StampUnit;
 
@@ -63,6 +67,7 @@ layouts! {
     KittiTracking = kitti_tracking: "KITTI's tracking benchmark: `velodyne/SSSS/`, `label_02`, `calib`, `oxts`.";
     KittiOdometry = kitti_odometry: "A sequence of KITTI odometry or SemanticKITTI: `velodyne`, `calib.txt`, poses.";
     Argoverse2 = argoverse2: "A log of Argoverse 2: `sensors/lidar/*.feather` with annotations and poses.";
+    Py123d = py123d: "Logs of 123D (py123d): a folder of logs, or one log with `sync.arrow`; read only.";
     Waymo = waymo: "The Waymo Open Dataset, version 2: `lidar/*.parquet` beside the other components; read only.";
     Nuscenes = nuscenes: "nuScenes: tables in `v1.0-*/`, clouds in `samples/LIDAR_TOP` and `sweeps/LIDAR_TOP`.";
     NuscenesScans = nuscenes_scans: "Scans of nuScenes alone: a folder of `*.pcd.bin`.";

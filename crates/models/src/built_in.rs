@@ -5,20 +5,17 @@ use crate::config::DetectorConfig;
 use data::Presence as _;
 use std::path::Path;
 
-/// Name and text of each file, by name.
-const BUILT_IN: &[(&str, &str)] = &include!(concat!(env!("OUT_DIR"), "/detectors.rs"));
-
 /// The text of a detector's TOML, by its name or its path.
 ///
 /// # Errors
 /// Neither a name nor a file.
 pub fn detector_text(name_or_path: &str) -> Result<String, ModelError> {
-    if let Some((_, text)) = BUILT_IN.iter().find(|(name, _)| *name == name_or_path) {
-        return Ok((*text).to_string());
+    if let Some(text) = configs::text(&format!("detectors/{name_or_path}.toml")) {
+        return Ok(text.to_string());
     }
     let path = Path::new(name_or_path);
     if !path.may_exist() {
-        let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
+        let names: Vec<&str> = configs::names("detectors").collect();
         let message = format!("there is no such detector: neither a file nor one of {}", names.join(", "));
         return Err(ModelError::File { path: path.into(), message });
     }
@@ -40,10 +37,10 @@ mod tests {
 
     #[test]
     fn built_in_files_are_right() {
-        for (name, _) in BUILT_IN {
-            assert_eq!(find_detector(name).unwrap().name, *name);
+        for name in configs::names("detectors") {
+            assert_eq!(find_detector(name).unwrap().name, name);
         }
-        assert!(BUILT_IN.len() >= 8);
+        assert!(configs::names("detectors").count() >= 8);
         assert!(find_detector("pointpilars").unwrap_err().to_string().contains("pointpillars_small"));
     }
 }

@@ -12,15 +12,6 @@ use std::path::{Path, PathBuf};
 use toml::{Table, Value};
 use train::{RunConfig, set_key};
 
-/// Built-in studies.
-const BUILT_IN: [(&str, &str); 5] = [
-    ("quick", include_str!("../../../configs/studies/quick.toml")),
-    ("cpu", include_str!("../../../configs/studies/cpu.toml")),
-    ("gain", include_str!("../../../configs/studies/gain.toml")),
-    ("paper", include_str!("../../../configs/studies/paper.toml")),
-    ("twin", include_str!("../../../configs/studies/twin.toml")),
-];
-
 /// Copy of the study's TOML in its folder, from the last time the study was run.
 const COPY: &str = "study.toml";
 /// Path of the study's TOML and base of its relative paths.
@@ -72,12 +63,12 @@ impl Study {
         }
         let below = PathBuf::from(format!("configs/studies/{named}.toml"));
         let path = [PathBuf::from(named), below.clone()].into_iter().find(|path| path.may_be_file());
-        let built_in = BUILT_IN.iter().find(|(name, _)| *name == named);
+        let built_in = configs::text(&format!("studies/{named}.toml"));
         let (text, path) = match (path, built_in) {
             (Some(path), _) => (fs_err::read_to_string(&path)?, path),
-            (None, Some((_, text))) => ((*text).to_string(), below),
+            (None, Some(text)) => (text.to_string(), below),
             (None, None) => {
-                let names: Vec<&str> = BUILT_IN.iter().map(|(name, _)| *name).collect();
+                let names: Vec<&str> = configs::names("studies").collect();
                 return Err(refused(format!("no study {named:?}: neither a file nor one of {}", names.join(", "))));
             }
         };

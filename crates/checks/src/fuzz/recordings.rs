@@ -1,4 +1,4 @@
-//! The readers of recordings: SQLite and MCAP of ROS 2, what rosbag2 says of its files, and Parquet.
+//! The readers of recordings: SQLite and MCAP of ROS 2, what rosbag2 says of its files, Parquet, and Arrow IPC.
 
 use super::targets::Target;
 use anyhow::Result;
@@ -30,10 +30,29 @@ macro_rules! waymo {
 const WAYMO: [File; 5] =
     [waymo!("lidar"), waymo!("lidar_pose"), waymo!("lidar_calibration"), waymo!("vehicle_pose"), waymo!("lidar_box")];
 
+/// A table of a log of 123D.
+macro_rules! py123d {
+    ($log:literal, $name:literal) => {
+        (
+            concat!($name, ".arrow"),
+            include_bytes!(concat!("../../../../tests/golden/py123d/made_up_val/", $log, "/", $name, ".arrow")),
+        )
+    };
+}
+
+/// The tables of two logs of 123D: compressed within the points, and as a whole.
+const CURVE: [File; 4] = [
+    py123d!("curve", "lidar.lidar_merged"),
+    py123d!("curve", "sync"),
+    py123d!("curve", "ego_state_se3"),
+    py123d!("curve", "box_detections_se3"),
+];
+const STILL: [File; 2] = [py123d!("still", "lidar.lidar_merged"), py123d!("still", "sync")];
+
 /// A recording of each kind, and the list of its files, each damaged separately.
 pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
     let [lidar, poses, calibration, vehicle, boxes] = WAYMO;
-    let kinds: [(&'static str, &'static [File], &'static str, File); 10] = [
+    let kinds: [(&'static str, &'static [File], &'static str, File); 15] = [
         ("db3", &[], "drive.db3", ("drive.db3", DRIVE)),
         ("db3 compressed", &[], "drive.db3", ("drive.db3", COMPRESSED)),
         ("rosbag2 metadata", &[("drive.db3", DRIVE)], "", ("metadata.yaml", METADATA.as_bytes())),
@@ -44,6 +63,11 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
         ("waymo calibration", &WAYMO, "", calibration),
         ("waymo vehicle", &WAYMO, "", vehicle),
         ("waymo boxes", &WAYMO, "", boxes),
+        ("py123d points", &CURVE, "", CURVE[0]),
+        ("py123d points lz4", &STILL, "", STILL[0]),
+        ("py123d moments", &CURVE, "", CURVE[1]),
+        ("py123d poses", &CURVE, "", CURVE[2]),
+        ("py123d boxes", &CURVE, "", CURVE[3]),
     ];
     let target = |(name, files, root, damaged)| target(name, files, root, damaged, &folder.join(name));
     kinds.into_iter().map(target).collect()

@@ -33,6 +33,11 @@ const GLTF: &str = r#"{"asset":{"version":"2.0"},"scene":0,"scenes":[{"nodes":[0
 const EFFECTS: &str = "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n\n[[effect]]\nkind = \"fog\"\nvisibility_m = 80\n\n\
                        [[effect]]\nkind = \"range_dropout\"\nrange_m = [20.0, 60.0]\nshare = [0.1, 0.6]\n";
 
+/// The text of a file of `configs`.
+fn built_in(path: &str) -> &'static str {
+    configs::text(path).expect("the file comes with the program")
+}
+
 /// A binary STL of two triangles.
 fn binary_stl() -> Vec<u8> {
     let mut bytes = vec![b' '; 80];
@@ -99,10 +104,9 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
             Trajectory::read(path).map(|way| way.span_s().iter().all(|time| time.is_finite()))
         }),
     });
-    for (name, valid) in [
-        ("rig toml", include_str!("../../../../configs/sensors/av21.toml")),
-        ("rig toml spinning", include_str!("../../../../configs/sensors/hdl64e.toml")),
-    ] {
+    for (name, valid) in
+        [("rig toml", built_in("sensors/av21.toml")), ("rig toml spinning", built_in("sensors/hdl64e.toml"))]
+    {
         let read = text(|t| {
             let rig = Rig::parse(t, Path::new("fuzz.toml")).ok()?;
             Some(rig.sensors.iter().all(|sensor| sensor.rate_hz.is_finite()))
@@ -116,13 +120,12 @@ pub(super) fn targets(folder: &Path) -> Result<Vec<Target>> {
     });
     targets.push(Target {
         name: "race toml",
-        valid: include_bytes!("../../../../configs/simulate/race.toml").to_vec(),
+        valid: built_in("simulate/race.toml").into(),
         read: text(|t| RaceConfig::parse(t, Path::new("fuzz.toml")).ok().map(|config| config.check().is_ok())),
     });
-    for (name, valid) in [
-        ("study toml", include_str!("../../../../configs/studies/quick.toml")),
-        ("study toml paper", include_str!("../../../../configs/studies/paper.toml")),
-    ] {
+    for (name, valid) in
+        [("study toml", built_in("studies/quick.toml")), ("study toml paper", built_in("studies/paper.toml"))]
+    {
         let read = text(|t| StudyConfig::parse(t, Path::new("fuzz.toml")).ok().map(|study| !study.name.is_empty()));
         targets.push(Target { name, valid: valid.into(), read });
     }

@@ -1,10 +1,8 @@
 //! Tables in Feather files: Arrow's IPC format, plain or compressed.
 
+use super::arrow_file::ArrowFile;
 use super::table::Table;
 use crate::DataError;
-use crate::limits::{MOST_CLOUD_BYTES, read_file};
-use arrow_ipc::reader::FileReader;
-use std::io::Cursor;
 use std::path::Path;
 
 /// Reads a table.
@@ -12,10 +10,7 @@ use std::path::Path;
 /// # Errors
 /// What is no Feather file of version 2, and more rows than a cloud may have points.
 pub(super) fn read_feather(path: &Path) -> Result<Table, DataError> {
-    let wrong = |e: &dyn std::fmt::Display| DataError::file(path, format!("is not a Feather file (Arrow IPC): {e}"));
-    let bytes = read_file(path, MOST_CLOUD_BYTES)?;
-    let reader = FileReader::try_new(Cursor::new(bytes), None).map_err(|e| wrong(&e))?;
-    Table::of_batches(path, reader.map(|batch| batch.map_err(|e| wrong(&e))))
+    ArrowFile::open(path)?.table()
 }
 
 #[cfg(test)]
@@ -63,7 +58,7 @@ pub(super) mod tests {
         for bad in [&b"not a table"[..], &bytes[..bytes.len() - 9], b""] {
             std::fs::write(&path, bad).unwrap();
             let error = read_feather(&path).err().unwrap().to_string();
-            assert!(error.contains("a.feather: is not a Feather file"), "{error}");
+            assert!(error.contains("a.feather: is not a file of Arrow IPC"), "{error}");
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Tables in Parquet files. Columns are read by name, rows in ranges, so that the size of a file does not matter.
 
 use super::table::Table;
+use super::without_panic::without_panic;
 use crate::DataError;
 use crate::limits::{MOST_POINTS, at_most, length_of_file};
 use arrow_array::RecordBatch;
@@ -15,7 +16,6 @@ use parquet::file::reader::{ChunkReader, Length};
 use std::fmt::Display;
 use std::fs::File;
 use std::io::{BufReader, Read as _};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -52,7 +52,7 @@ impl ParquetFile {
         // The types are those of the columns themselves, not those of a schema that Arrow wrote beside them.
         let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
         let wrong = |e: String| DataError::file(path, format!("is not a Parquet file, or is damaged: {e}"));
-        let metadata = without_panic(|| ArrowReaderMetadata::load(&file, options)).map_err(wrong)?;
+        let metadata = without_panic("parquet", || ArrowReaderMetadata::load(&file, options)).map_err(wrong)?;
         let mut starts = vec![0];
         for group in metadata.metadata().row_groups() {
             if !group.columns().iter().all(|column| lies_inside(column, length)) {
@@ -113,12 +113,12 @@ impl ParquetFile {
             .with_projection(ProjectionMask::roots(schema, indices))
             .with_row_groups((group..self.starts.len() - 1).collect())
             .with_batch_size(batch_rows);
-        without_panic(|| builder.build()).map_err(|e| self.damaged(columns, &e))
+        without_panic("parquet", || builder.build()).map_err(|e| self.damaged(columns, &e))
     }
 
     /// The next rows; `None` behind the last one.
     fn next(&self, reader: &mut ParquetRecordBatchReader, columns: &[&str]) -> Result<Option<RecordBatch>, DataError> {
-        without_panic(|| reader.next().transpose()).map_err(|e| self.damaged(columns, &e))
+        without_panic("parquet", || reader.next().transpose()).map_err(|e| self.damaged(columns, &e))
     }
 
     fn damaged(&self, columns: &[&str], error: &dyn Display) -> DataError {
@@ -182,12 +182,6 @@ fn sizes_of_page(head: &[u8]) -> Option<(i64, i64)> {
     };
     field()?;
     Some((field()?, field()?))
-}
-
-/// What the library gives, or says against it. Some damage of pages makes it panic.
-fn without_panic<T, E: Display>(work: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
-    let unclear = |_| Err("its library (parquet) panicked".to_string());
-    catch_unwind(AssertUnwindSafe(|| work().map_err(|e| e.to_string()))).unwrap_or_else(unclear)
 }
 
 /// Whether the pages of a column lie in a file of this length.

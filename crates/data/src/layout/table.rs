@@ -65,15 +65,43 @@ impl Table {
         self.lists(name, "lists of whole numbers", integers)
     }
 
+    /// Whether there is such a column.
+    pub(super) fn has(&self, name: &str) -> bool {
+        self.batches.iter().all(|batch| batch.column_by_name(name).is_some())
+    }
+
+    /// A column of whole numbers, of any width; `None` for one that is missing.
+    pub(super) fn optional_integers(&self, name: &str) -> Result<Vec<Option<i64>>, DataError> {
+        self.each(name, "whole numbers", |column| {
+            let values = integers(column)?.into_iter().enumerate();
+            Some(values.map(|(row, value)| column.is_valid(row).then_some(value)).collect())
+        })
+    }
+
+    /// A column of lists of texts; an empty one for a list that is missing.
+    pub(super) fn text_lists(&self, name: &str) -> Result<Vec<Vec<String>>, DataError> {
+        let list = |values: Option<ArrayRef>| values.map_or(Some(Vec::new()), |values| texts(&values));
+        self.each(name, "lists of texts", |column| column.as_list_opt::<i32>()?.iter().map(list).collect())
+    }
+
+    /// A column of lists of rows of `N` real numbers; an empty one for a list that is missing.
+    pub(super) fn lists_of_rows<const N: usize>(&self, name: &str) -> Result<Vec<Vec<[f64; N]>>, DataError> {
+        let rows = |values: Option<ArrayRef>| {
+            let Some(values) = values else { return Some(Vec::new()) };
+            let rows = values.as_fixed_size_list_opt()?;
+            let numbers = rows.values();
+            if rows.value_length() != N as i32 || rows.null_count() + numbers.null_count() > 0 {
+                return None;
+            }
+            Some(reals(numbers)?.chunks_exact(N).map(|row| std::array::from_fn(|i| row[i])).collect())
+        };
+        let what = format!("lists of {N} real numbers each");
+        self.each(name, &what, |column| column.as_list_opt::<i32>()?.iter().map(rows).collect())
+    }
+
     /// A column of texts.
     pub(crate) fn texts(&self, name: &str) -> Result<Vec<String>, DataError> {
-        self.column(name, "texts", |column| {
-            let short = column.as_string_opt::<i32>().map(|a| a.iter().map(|v| v.unwrap_or("").to_string()).collect());
-            short.or_else(|| {
-                let long = column.as_string_opt::<i64>()?;
-                Some(long.iter().map(|v| v.unwrap_or("").to_string()).collect())
-            })
-        })
+        self.column(name, "texts", texts)
     }
 
     /// A column of texts; `None` where a value is missing.
@@ -104,7 +132,10 @@ impl Table {
             Some(_) => None,
             None => Some(None),
         };
-        self.each(name, what, |column| column.as_list_opt::<i32>()?.iter().map(list).collect())
+        self.each(name, what, |column| match column.as_fixed_size_list_opt() {
+            Some(rows) => rows.iter().map(list).collect(),
+            None => column.as_list_opt::<i32>()?.iter().map(list).collect(),
+        })
     }
 
     fn column<T>(
@@ -137,6 +168,14 @@ impl Table {
     fn refused(&self, name: &str, why: &str) -> DataError {
         DataError::file(&self.path, format!("column {name} {why}"))
     }
+}
+
+fn texts(column: &ArrayRef) -> Option<Vec<String>> {
+    let short = column.as_string_opt::<i32>().map(|a| a.iter().map(|v| v.unwrap_or("").to_string()).collect());
+    short.or_else(|| {
+        let long = column.as_string_opt::<i64>()?;
+        Some(long.iter().map(|v| v.unwrap_or("").to_string()).collect())
+    })
 }
 
 fn reals(column: &ArrayRef) -> Option<Vec<f64>> {

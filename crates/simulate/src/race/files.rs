@@ -12,19 +12,6 @@ pub struct ConfigFiles {
     folder: Option<PathBuf>,
 }
 
-/// Built-in files, by their path below `configs/`.
-const BUILT_IN: [(&str, &str); 9] = [
-    ("simulate/race.toml", include_str!("../../../../configs/simulate/race.toml")),
-    ("simulate/race_small.toml", include_str!("../../../../configs/simulate/race_small.toml")),
-    ("simulate/race_full.toml", include_str!("../../../../configs/simulate/race_full.toml")),
-    ("simulate/race_study.toml", include_str!("../../../../configs/simulate/race_study.toml")),
-    ("simulate/measured.toml", include_str!("../../../../configs/simulate/measured.toml")),
-    ("simulate/sim.toml", include_str!("../../../../configs/simulate/sim.toml")),
-    ("simulate/sim_noise.toml", include_str!("../../../../configs/simulate/sim_noise.toml")),
-    ("simulate/sim_downsampled.toml", include_str!("../../../../configs/simulate/sim_downsampled.toml")),
-    ("sensors/av21.toml", include_str!("../../../../configs/sensors/av21.toml")),
-];
-
 impl ConfigFiles {
     /// Names of the built-in configurations.
     pub const NAMES: [&str; 4] = ["race", "race_small", "race_full", "race_study"];
@@ -61,8 +48,8 @@ impl ConfigFiles {
             None => {
                 let below = Path::new("simulate").join(file);
                 let name = below.to_string_lossy().replace("simulate/../", "");
-                match BUILT_IN.iter().find(|(known, _)| *known == name) {
-                    Some((_, text)) => Ok(((*text).into(), Path::new("configs").join(name))),
+                match configs::text(&name) {
+                    Some(text) => Ok((text.into(), Path::new("configs").join(name))),
                     None => Err(DataError::file(file, "does not come with the program").into()),
                 }
             }

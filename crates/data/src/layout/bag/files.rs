@@ -1,10 +1,12 @@
 //! The files of a recording: one, or those that `metadata.yaml` of rosbag2 lists.
 
+use super::super::recent::{Recent, State, state};
 use super::Bags;
 use crate::DataError;
 use crate::limits::read_text;
 use saphyr_parser::{Event, Parser};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// What rosbag2 writes beside the files of a recording.
 const METADATA: &str = "metadata.yaml";
@@ -30,6 +32,15 @@ enum Level {
 }
 
 impl Metadata {
+    /// Reads a file. It stays in memory, and is read again if it has changed: every frame asks for it.
+    fn read(path: &Path) -> Result<Arc<Metadata>, DataError> {
+        static KNOWN: Recent<(PathBuf, State), Metadata> = Recent::new();
+        let state = state(&[path], "does not exist: check `root` of the data set")?;
+        KNOWN.get((path.into(), state), || {
+            Metadata::parse(&read_text(path)?).map_err(|message| DataError::file(path, message))
+        })
+    }
+
     /// Walks through the text once. Anchors are not followed.
     fn parse(text: &str) -> Result<Metadata, String> {
         let mut metadata = Metadata::default();
@@ -139,9 +150,8 @@ impl Bags {
     fn listed_files(&self, folder: &Path) -> Result<Vec<PathBuf>, DataError> {
         let path = folder.join(METADATA);
         let wrong = |message: String| DataError::file(&path, message);
-        let text = read_text(&path)?;
-        let metadata = Metadata::parse(&text).map_err(wrong)?;
-        let format = metadata.compression_format;
+        let metadata = Metadata::read(&path)?;
+        let format = &metadata.compression_format;
         if !["", "none", "zstd"].contains(&format.as_str()) {
             let message =
                 format!("compression_format is {format:?}; zstd is read: write it anew with `ros2 bag convert`");

@@ -3,15 +3,15 @@
 use super::super::TrackedObject;
 use super::super::parquet_file::{ParquetFile, Rows};
 use super::super::pose_text::check_box;
+use super::super::recent::{Recent, State, state};
 use super::range_image::{Columns, Inclinations, Laser, Scan, pose_from_matrix};
 use crate::DataError;
 use crate::limits::{MOST_BOXES, at_most};
 use geometry::{Box3, Pose};
 use nalgebra::Translation3;
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::SystemTime;
 
 /// The sensor on the roof, whose place is the origin of the LiDAR frame.
 pub(super) const TOP: i64 = 1;
@@ -49,14 +49,11 @@ const BOX: [&str; 7] = [
 /// Names of the types of objects, from 0.
 const TYPES: [&str; 5] = ["unknown", "Vehicle", "Pedestrian", "Sign", "Cyclist"];
 
-/// Segments and scans that stay in memory, or as many as there are threads: each may read frames one after the other.
-const MOST_RECENT: usize = 8;
+/// What to do about a file that is missing.
+const MISSING: &str = "does not exist: add this component of the segment";
 
 /// Segments whose frames stay in memory. The largest split has 798.
 const MOST_INDICES: usize = 4096;
-
-/// Length and time of change of files.
-type State = Vec<(u64, Option<SystemTime>)>;
 
 /// The rows of the sensors by the stamps of the frames, us. Sensors are in their order.
 pub(super) type Index = BTreeMap<i64, BTreeMap<i64, usize>>;
@@ -71,7 +68,7 @@ pub(super) fn index(folder: &Path, segment: &str) -> Result<Arc<Index>, DataErro
     type Known = HashMap<PathBuf, (State, Arc<Index>)>;
     static INDICES: Mutex<Option<Known>> = Mutex::new(None);
     let path = component(folder, LIDAR, segment);
-    let state = state(&[&path])?;
+    let state = state(&[&path], MISSING)?;
     let find = |known: &Known| known.get(&path).filter(|(of, _)| *of == state).map(|(_, index)| index.clone());
     let known = INDICES.lock().unwrap_or_else(PoisonError::into_inner).as_ref().and_then(find);
     if let Some(index) = known {
@@ -101,17 +98,6 @@ fn rows_of_sensors(file: &ParquetFile) -> Result<Index, DataError> {
     Ok(index)
 }
 
-fn state(paths: &[&Path]) -> Result<State, DataError> {
-    let of = |path: &&Path| match std::fs::metadata(path) {
-        Ok(found) => Ok((found.len(), found.modified().ok())),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
-            Err(DataError::missing(path, "does not exist: add this component of the segment"))
-        }
-        Err(e) => Err(DataError::io(path, "cannot be read", &e)),
-    };
-    paths.iter().map(of).collect()
-}
-
 /// A segment with what all of its frames need.
 pub(super) struct Segment {
     path: PathBuf,
@@ -126,35 +112,15 @@ pub(super) struct Segment {
     state: State,
 }
 
-/// Values that were used last, the newest one at the end.
-struct Recent<K, V>(Mutex<VecDeque<(K, Arc<V>)>>);
-
-impl<K: PartialEq, V> Recent<K, V> {
-    /// A value that is known, or made. Threads that ask for it at the same time may each make it.
-    fn get(&self, key: K, make: impl FnOnce() -> Result<V, DataError>) -> Result<Arc<V>, DataError> {
-        let lock = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, value)) = lock().iter().find(|(known, _)| *known == key) {
-            return Ok(value.clone());
-        }
-        let value = Arc::new(make()?);
-        let mut known = lock();
-        if known.len() >= MOST_RECENT.max(rayon::current_num_threads()) {
-            known.pop_front();
-        }
-        known.push_back((key, value.clone()));
-        Ok(value)
-    }
-}
-
 /// A segment. It is read again if one of its files has changed.
 pub(super) fn segment(folder: &Path, name: &str) -> Result<Arc<Segment>, DataError> {
-    static SEGMENTS: Recent<(PathBuf, State), Segment> = Recent(Mutex::new(VecDeque::new()));
+    static SEGMENTS: Recent<(PathBuf, State), Segment> = Recent::new();
     let names = [LIDAR, "lidar_calibration", "lidar_pose", "vehicle_pose"];
     let [lidar, calibration, poses, vehicle] = names.map(|part| component(folder, part, name));
     let mut paths = vec![&*lidar, &*calibration, &*poses, &*vehicle];
     let boxes = Some(component(folder, BOXES, name)).filter(|_| folder.join(BOXES).is_dir());
     paths.extend(boxes.as_deref());
-    let state = state(&paths)?;
+    let state = state(&paths, MISSING)?;
     SEGMENTS.get((lidar.clone(), state.clone()), || {
         let index = index(folder, name)?;
         let of_poses = ParquetFile::open(&poses)?;
@@ -216,7 +182,7 @@ impl Segment {
     /// The points of a frame, of all sensors or of the upper one alone.
     pub(super) fn scan(&self, stamp_us: i64, top_alone: bool) -> Result<Arc<Scan>, DataError> {
         type Key = (PathBuf, State, i64, bool);
-        static SCANS: Recent<Key, Scan> = Recent(Mutex::new(VecDeque::new()));
+        static SCANS: Recent<Key, Scan> = Recent::new();
         let key = (self.path.clone(), self.state.clone(), stamp_us, top_alone);
         SCANS.get(key, || self.read_scan(stamp_us, top_alone))
     }

@@ -1,0 +1,85 @@
+//! Names of the classes of boxes, which the files have as numbers.
+
+/// The sets of classes of the data sets that 123D converts (py123d 0.7.0): the beginning of the name of the set, and
+/// its classes from number 0 on.
+const SETS: &[(&str, &str)] = &[
+    (
+        "Default",
+        "EGO VEHICLE TRAIN TWO_WHEELER PERSON ANIMAL TRAFFIC_SIGN TRAFFIC_CONE TRAFFIC_LIGHT BARRIER GENERIC_OBJECT \
+         OTHER",
+    ),
+    (
+        "AV2Sensor",
+        "ANIMAL ARTICULATED_BUS BICYCLE BICYCLIST BOLLARD BOX_TRUCK BUS CONSTRUCTION_BARREL CONSTRUCTION_CONE DOG \
+         LARGE_VEHICLE MESSAGE_BOARD_TRAILER MOBILE_PEDESTRIAN_CROSSING_SIGN MOTORCYCLE MOTORCYCLIST \
+         OFFICIAL_SIGNALER PEDESTRIAN RAILED_VEHICLE REGULAR_VEHICLE SCHOOL_BUS SIGN STOP_SIGN STROLLER \
+         TRAFFIC_LIGHT_TRAILER TRUCK TRUCK_CAB VEHICULAR_TRAILER WHEELCHAIR WHEELED_DEVICE WHEELED_RIDER",
+    ),
+    (
+        "KITTI360",
+        "BICYCLE BOX BUS CAR CARAVAN LAMP MOTORCYCLE PERSON POLE RIDER SMALLPOLE STOP TRAFFIC_LIGHT TRAFFIC_SIGN \
+         TRAILER TRAIN TRASH_BIN TRUCK VENDING_MACHINE",
+    ),
+    ("NuPlan", "VEHICLE BICYCLE PEDESTRIAN TRAFFIC_CONE BARRIER CZONE_SIGN GENERIC_OBJECT"),
+    (
+        "Nureasoning",
+        "VEHICLE_CAR VEHICLE_PERSONAL_MOBILITY_BYCICLE HUMAN OTHER_TRAFFICCONE OTHER_TEMPORARY_TRAFFICSIGN \
+         OTHER_OTHER VEHICLE_DOOR VEHICLE_TRUCK VEHICLE_BUS VEHICLE_MOTORCYCLE VEHICLE_BICYCLE HUMAN_PEDESTRIAN \
+         CONSTRUCTION_TRAFFIC_CONE",
+    ),
+    (
+        "NuScenes",
+        "VEHICLE_CAR VEHICLE_TRUCK VEHICLE_BUS_BENDY VEHICLE_BUS_RIGID VEHICLE_CONSTRUCTION \
+         VEHICLE_EMERGENCY_AMBULANCE VEHICLE_EMERGENCY_POLICE VEHICLE_TRAILER VEHICLE_BICYCLE VEHICLE_MOTORCYCLE \
+         HUMAN_PEDESTRIAN_ADULT HUMAN_PEDESTRIAN_CHILD HUMAN_PEDESTRIAN_CONSTRUCTION_WORKER \
+         HUMAN_PEDESTRIAN_PERSONAL_MOBILITY HUMAN_PEDESTRIAN_POLICE_OFFICER HUMAN_PEDESTRIAN_STROLLER \
+         HUMAN_PEDESTRIAN_WHEELCHAIR MOVABLE_OBJECT_TRAFFICCONE MOVABLE_OBJECT_BARRIER \
+         MOVABLE_OBJECT_PUSHABLE_PULLABLE MOVABLE_OBJECT_DEBRIS STATIC_OBJECT_BICYCLE_RACK ANIMAL",
+    ),
+    (
+        "Pandaset",
+        "ANIMALS_BIRD ANIMALS_OTHER BICYCLE BUS CAR CONES CONSTRUCTION_SIGNS EMERGENCY_VEHICLE MEDIUM_SIZED_TRUCK \
+         MOTORCYCLE MOTORIZED_SCOOTER OTHER_VEHICLE_CONSTRUCTION_VEHICLE OTHER_VEHICLE_PEDICAB \
+         OTHER_VEHICLE_UNCOMMON PEDESTRIAN PEDESTRIAN_WITH_OBJECT PERSONAL_MOBILITY_DEVICE PICKUP_TRUCK PYLONS \
+         ROAD_BARRIERS ROLLING_CONTAINERS SEMI_TRUCK SIGNS TEMPORARY_CONSTRUCTION_BARRIERS TOWED_OBJECT TRAIN \
+         TRAM_SUBWAY",
+    ),
+    ("WODPerception", "TYPE_UNKNOWN TYPE_VEHICLE TYPE_PEDESTRIAN TYPE_SIGN TYPE_CYCLIST"),
+    ("WODMotion", "TYPE_UNSET TYPE_VEHICLE TYPE_PEDESTRIAN TYPE_CYCLIST TYPE_OTHER"),
+    (
+        "PhysicalAIAV",
+        "AUTOMOBILE PERSON BUS HEAVY_TRUCK OTHER_VEHICLE PROTRUDING_OBJECT RIDER STROLLER TRAILER ANIMAL \
+         TRAIN_OR_TRAM_CAR TROLLEY_BUS",
+    ),
+    ("Griffin", "PEDESTRIAN CAR TRUCK BUS MOTORCYCLE BICYCLE"),
+    (
+        "TruckDrive",
+        "BIKE PASSENGER_CAR PERSON ROAD_OBSTRUCTION SEMI_TRUCK_CAB SEMI_TRUCK_TRAILER VEHICLE TRAFFIC_SIGN \
+         EMERGENCY_VEHICLE",
+    ),
+];
+
+/// The end of the name of each set.
+const END: &str = "BoxDetectionLabel";
+
+/// The names of the classes of a set by their numbers, such as `py123d.parser.registry.NuScenesBoxDetectionLabel`;
+/// none for a set that is not known.
+pub(super) fn names(set: &str) -> Vec<&'static str> {
+    let name = set.rsplit('.').next().and_then(|name| name.strip_suffix(END));
+    let found = SETS.iter().find(|(known, _)| Some(*known) == name);
+    found.map(|(_, classes)| classes.split(' ').collect()).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sets_are_found_by_the_name_of_their_type() {
+        let names_of = |set: &str| names(&format!("py123d.parser.registry.{set}{END}"));
+        assert_eq!(names_of("NuPlan").len(), 7);
+        assert_eq!(names_of("NuScenes")[17], "MOVABLE_OBJECT_TRAFFICCONE");
+        assert_eq!(names("WODPerceptionBoxDetectionLabel")[4], "TYPE_CYCLIST");
+        assert!(names_of("Unheard").is_empty() && names("").is_empty());
+    }
+}
