@@ -301,91 +301,9 @@ pub fn with_neighbours(cells: &BTreeSet<DirectionCell>) -> BTreeSet<DirectionCel
     cells.iter().flat_map(|c| neighbours(*c)).collect()
 }
 
-/// One of so many measured returns may lie beyond the largest range: false alarms. The second value is for scenes
-/// with few returns near it.
-const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
-
-/// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.
-pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
-    cut(frames, which, |range_m| range_m)
-}
-
-/// Share of the simulated returns nearer than the smallest measured range that have a counterpart in their direction,
-/// from which on the near surface was moved and not lost.
-const MOVED: f64 = 0.1;
-
-/// The smallest measured range, m: nearer only the simulation has returns, and nothing is measured in their directions.
-pub fn near_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
-    let near_m = 1.0 / cut(frames, which, |range_m| 1.0 / range_m.max(1e-3))?;
-    let nearer = || which.iter().flat_map(|&i| &frames[i].simulated).filter(|r| r.own_range_m() < 0.985 * near_m);
-    let moved = nearer().filter(|r| r.matched).count() as f64;
-    (moved < MOVED * nearer().count() as f64).then_some(near_m)
-}
-
-/// The largest value of the measured returns, by a value of their range: beyond it only the simulation has returns,
-/// before it both sides have.
-fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Option<f64> {
-    // Returns with neighbours at their range only: false alarms occur at all ranges.
-    let ranges = |measured: bool| {
-        let mut all: Vec<f64> = which
-            .iter()
-            .flat_map(|&i| if measured { &frames[i].measured } else { &frames[i].simulated })
-            .filter(|r| r.company >= 2)
-            .map(|r| value(r.own_range_m()))
-            .collect();
-        all.sort_by(f64::total_cmp);
-        all
-    };
-    let (a, b) = (ranges(true), ranges(false));
-    if a.len() < 200 || b.len() < 200 {
-        return None;
-    }
-    let above = |v: &[f64], r: f64| (v.len() - v.partition_point(|x| *x <= r)) as f64;
-    let between = |v: &[f64], low: f64, high: f64| above(v, low) - above(v, high);
-    OUTLIER_ONE_IN.into_iter().find_map(|one_in| {
-        let farthest = a[a.len() - 1 - a.len() / one_in];
-        let lost = above(&b, 1.01 * farthest);
-        let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
-        let beyond = above(&a, 1.01 * farthest) / lost.max(1.0);
-        let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
-        (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
-    })
-}
-
-/// The most likely single step of the share of measured returns among all, beyond `from_m`, m.
-fn change(measured: &[f64], simulated: &[f64], from_m: f64) -> f64 {
-    let mut all: Vec<(f64, f64)> =
-        measured.iter().map(|r| (*r, 1.0)).chain(simulated.iter().map(|r| (*r, 0.0))).collect();
-    all.retain(|(r, _)| *r > from_m);
-    all.sort_by(|x, y| x.0.total_cmp(&y.0));
-    let total: f64 = all.iter().map(|(_, m)| m).sum();
-    let count = all.len() as f64;
-    let likelihood = |n: f64, m: f64| {
-        let p = ((m + 0.5) / (n + 1.0)).clamp(1e-6, 1.0 - 1e-6);
-        m * p.ln() + (n - m) * (1.0 - p).ln()
-    };
-    let (mut best, mut at, mut m) = (f64::NEG_INFINITY, from_m, 0.0);
-    for (i, (range, measured)) in all.iter().enumerate() {
-        m += measured;
-        let n = i as f64 + 1.0;
-        let value = likelihood(n, m) + likelihood(count - n, total - m);
-        if value > best {
-            (best, at) = (value, *range);
-        }
-    }
-    at
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_step_of_returns_is_found() {
-        let simulated: Vec<f64> = (0..2000).map(|i| 0.1 * f64::from(i) + 0.03).collect();
-        let measured: Vec<f64> = (0..800).map(|i| 0.1 * f64::from(i)).chain([130.0]).collect();
-        assert!((change(&measured, &simulated, 60.0) - 80.0).abs() < 0.2);
-    }
 
     #[test]
     fn a_hole_in_all_frames_is_found_and_a_single_dark_cell_is_not() {

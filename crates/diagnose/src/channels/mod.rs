@@ -11,6 +11,7 @@ pub mod mean;
 pub mod motion;
 pub mod patch;
 pub mod plumes;
+pub mod range_ends;
 pub mod returns;
 pub mod roughness;
 pub mod row_patches;

@@ -8,8 +8,9 @@ use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
     AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, below, blocked_cells, direction_cell, direction_counts,
-    edge_cells, near_cut, range_cut, with_neighbours,
+    edge_cells, with_neighbours,
 };
+use crate::channels::range_ends::{End, half_point, near_cut, range_cut};
 use crate::channels::returns::OWN_CAR_M;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
@@ -126,20 +127,11 @@ fn expected_shares(
     sums.into_iter().filter(|(_, s)| s[1] >= 10.0).map(|(k, s)| (k, s[0] / s[1])).collect()
 }
 
-/// An end of the ranges that are measured.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum End {
-    Near,
-    Far,
-}
-
-impl End {
-    /// Whether a range lies outside of what is measured.
-    fn excludes(self, range_m: f64, cut_m: f64) -> bool {
-        match self {
-            End::Near => range_m < cut_m,
-            End::Far => range_m > cut_m,
-        }
+/// Whether a range lies outside of what is measured.
+fn excludes(end: End, range_m: f64, cut_m: f64) -> bool {
+    match end {
+        End::Near => range_m < cut_m,
+        End::Far => range_m > cut_m,
     }
 }
 
@@ -150,8 +142,9 @@ fn cut_found(context: &Context, end: End, on_select: f64) -> Found {
         End::Near => (near_cut(context.frames, &estimate), Cause::NearCut, Quantity::MinM),
         End::Far => (range_cut(context.frames, &estimate), Cause::RangeCut, Quantity::MaxM),
     };
-    let cut = found.unwrap_or(on_select);
-    let outside = |ray: &&Ray| end.excludes(f64::from(ray.range_m), cut);
+    let about = found.unwrap_or(on_select);
+    let [cut, error] = half_point(context.frames, &estimate, &context.blocks(&estimate), about, end);
+    let outside = |ray: &&Ray| excludes(end, f64::from(ray.range_m), cut);
     let beyond = |i: usize| context.frames[i].simulated.iter().filter(outside).count() as f64;
     let held = hold_out.iter().map(|&i| beyond(i) * CUT_SURPRISE.ln()).collect();
     let longest = 1.4 * cut;
@@ -163,7 +156,7 @@ fn cut_found(context: &Context, end: End, on_select: f64) -> Found {
         };
         let (a, b) = (count(|f| &f.measured), count(|f| &f.simulated));
         let middle = 0.5 * (low + high);
-        let after = if end.excludes(middle, cut) { 0.0 } else { b };
+        let after = if excludes(end, middle, cut) { 0.0 } else { b };
         CurvePoint { sensor: 0, x: middle, measured: a, before: b, after, error: a.sqrt() }
     });
     let than = if end == End::Near { "nearer than" } else { "beyond" };
@@ -171,7 +164,7 @@ fn cut_found(context: &Context, end: End, on_select: f64) -> Found {
         effects: Vec::new(),
         status: Status::Named,
         causes: vec![cause],
-        parameters: vec![parameter(quantity, cut, 0.004 * cut)],
+        parameters: vec![parameter(quantity, cut, error)],
         confidence: 1.0,
         channel: Channel::Hits,
         covariate: Covariate::Range,
