@@ -17,7 +17,7 @@ struct Confounder {
 }
 
 /// Confounders in the order in which they are applied: a finding that is dropped confounds nothing after it.
-const CONFOUNDERS: [Confounder; 20] = [
+const CONFOUNDERS: [Confounder; 21] = [
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
@@ -131,6 +131,12 @@ const CONFOUNDERS: [Confounder; 20] = [
         by: unexplained_surfaces,
         share: 0.25,
         because: "a part of what is off in a way without a name",
+    },
+    Confounder {
+        effect: noise,
+        by: unexplained_surfaces,
+        share: 1.0,
+        because: "offsets that change from ray to ray are rough, and were not corrected",
     },
     Confounder {
         // Motion distortion makes unexplained offsets of surfaces itself.
@@ -356,6 +362,7 @@ mod tests {
             ),
             ((Some(Cause::RollingShutter), Channel::Slide, 4.0), (Cause::Outliers, Channel::Returns, 0.004, 1.9, 2.1)),
             ((None, Channel::Residuals, 1.0), (Cause::TimeOffset, Channel::Objects, 0.002, 0.04, 0.06)),
+            ((None, Channel::Residuals, 1.0), (Cause::RangeNoise, Channel::Roughness, 0.02, 0.9, 1.1)),
         ];
         for ((first, channel, gain), (second, of, size, side_effect, own)) in cases {
             let beside = |g| {

@@ -133,7 +133,7 @@ mod tests {
             linear: vec![LinearFrame { gram, right: DVector::zeros(4) }],
             rows: vec![],
             of_patches: 1.0,
-            whole_rows: vec![],
+            whole_rows: none(),
             strips: none(),
             poses: vec![],
             of_sensors: vec![vec![2e6]],

@@ -1,7 +1,7 @@
 //! Sums of all frames that the hypotheses of geometry are fitted on, and the fits.
 
 use super::hypotheses::Hypothesis;
-use crate::channels::groups::{Group, GroupFrame, GroupSums, Grouping, PARTS, PartedFrame, group_frames, total, whole};
+use crate::channels::groups::{Group, GroupFrame, Grouping, PARTS, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
     usual_noise_m,
@@ -33,7 +33,7 @@ pub(super) struct Sums {
     /// Variance of means of rows in patches, in units of the assumed one.
     pub(super) of_patches: f64,
     /// Sums by row, of surfaces as they are.
-    pub(super) whole_rows: Vec<GroupFrame>,
+    pub(super) whole_rows: Groups,
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
     /// Pose error of each frame, as each sensor sees it.
@@ -77,7 +77,7 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
     Sums {
         of_patches: of_patches(&rows, select, rig.sensors.len()),
         rows,
-        whole_rows: groups(Grouping::Row).whole,
+        whole_rows: groups(Grouping::Row),
         strips: groups(Grouping::Azimuth),
         columns,
         precision,
@@ -157,11 +157,18 @@ fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 
 /// Standard deviations of ego motion: speed along and across the heading, m/s; yaw rate, rad/s.
 const OWN_MOTION: [f64; 3] = [40.0, 3.0, 0.3];
 
-/// Rows to either side of one whose mean is not the rows' but that of the surfaces they meet.
+/// Rows to either side of one that have something in common.
 const BESIDE: usize = 4;
 
 /// Variance of a median in units of that of a mean, of normal numbers.
 const OF_MEDIAN: f64 = std::f64::consts::FRAC_PI_2;
+
+/// Median of some numbers, and its variance from their scatter.
+fn median_and_variance(values: &[f64]) -> [f64; 2] {
+    let (n, middle) = (values.len() as f64, median(values.to_vec()));
+    let scatter = values.iter().map(|o| (o - middle).powi(2)).sum::<f64>();
+    [middle, OF_MEDIAN * scatter / (n * (n - 1.0)).max(1.0)]
+}
 
 /// Linear columns of some hypotheses, each once, and their groupings with the column of the group sums.
 pub(super) fn split(hypotheses: &[Hypothesis]) -> (Vec<usize>, Vec<(Grouping, usize)>) {
@@ -246,9 +253,7 @@ impl Sums {
         out
     }
 
-    /// Offsets of groups over some frames: those of rows against the rows beside them from the patches. What
-    /// neighbouring rows have in common is that of surfaces in range, and of the rows in elevation.
-    /// `columns` of rows are fitted together.
+    /// Offsets of groups over some frames; `columns` of rows are fitted together.
     pub(super) fn offsets(
         &self,
         frames: &[usize],
@@ -256,60 +261,57 @@ impl Sums {
         how: GroupFit,
         columns: &[usize],
     ) -> BTreeMap<Group, f64> {
-        let all = total(frames.iter().map(|&i| &self.groups_of(grouping)[i]));
-        let mut offsets = grouped::offsets(&all, how);
         if grouping == Grouping::Azimuth {
-            return offsets;
+            return grouped::offsets(&total(frames.iter().map(|&i| &self.strips.whole[i])), how);
         }
-        for sensor in 0..self.of_sensors.first().map_or(0, Vec::len) {
-            let own = self.own_offsets(frames, sensor, how.column, columns);
-            if how.column == 0 {
-                offsets.retain(|g, _| usize::from(g.sensor) != sensor);
-                offsets.extend(own);
-                continue;
-            }
-            let others: BTreeMap<Group, f64> =
-                offsets.iter().filter(|(g, _)| own.contains_key(g)).map(|(g, o)| (*g, o - own[g])).collect();
-            let sums: BTreeMap<Group, GroupSums> =
-                all.iter().filter(|(g, _)| others.contains_key(g)).map(|(g, s)| (*g, *s)).collect();
-            for (group, common) in grouped::smooth(&sums, &others, how) {
-                offsets.insert(group, own[&group] + common);
-            }
-        }
-        offsets
+        let sensors = 0..self.of_sensors.first().map_or(0, Vec::len);
+        sensors.flat_map(|sensor| self.row_offsets(frames, sensor, how.column, columns)).collect()
     }
 
-    /// Offsets of the rows of a sensor against those beside them: the median over the quarters of its field of view,
-    /// of which one may show the upper edge of a wall that stands elsewhere.
-    fn own_offsets(&self, frames: &[usize], sensor: usize, column: usize, columns: &[usize]) -> BTreeMap<Group, f64> {
-        let mut of_parts: BTreeMap<usize, Vec<f64>> = BTreeMap::new();
+    /// Offsets of the rows of a sensor: against those beside them from the patches, and what neighbouring rows have in
+    /// common from all surfaces. Both are the median over the quarters of its field of view, of which one may show the
+    /// upper edge of a wall that stands elsewhere, shrunk where the quarters disagree.
+    fn row_offsets(&self, frames: &[usize], sensor: usize, column: usize, columns: &[usize]) -> BTreeMap<Group, f64> {
+        let mut of_parts: BTreeMap<usize, [Vec<f64>; 2]> = BTreeMap::new();
         for part in 0..PARTS {
             let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, &|p| p == part);
-            let offsets = &sum.offsets(precisions(columns, self.of_patches))[column];
+            let own = &sum.offsets(precisions(columns, self.of_patches))[column];
+            let mut whole = total(frames.iter().map(|&i| &self.whole_rows.parted[i][part]));
+            whole.retain(|g, _| usize::from(g.sensor) == sensor);
+            let whole = grouped::offsets(&whole, group_fit(column));
+            let whole = |row: usize| whole.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
             let least = 3.0 * self.of_patches * group_fit(column).precision;
             let known = |row: &usize| sum.precision(*row, column) > least;
             for row in (0..sum.rows()).filter(known) {
-                let beside = row.saturating_sub(BESIDE)..(row + BESIDE + 1).min(sum.rows());
-                let (n, all) = beside.filter(known).fold((0.0, 0.0), |(n, s), r| (n + 1.0, s + offsets[r]));
-                of_parts.entry(row).or_default().push(offsets[row] - all / n);
+                let beside = (row.saturating_sub(BESIDE)..(row + BESIDE + 1).min(sum.rows())).filter(known);
+                let (n, of_own, of_whole) =
+                    beside.fold((0.0, 0.0, 0.0), |(n, o, w), r| (n + 1.0, o + own[r], w + whole(r)));
+                let [apart, common] = of_parts.entry(row).or_default();
+                apart.push(own[row] - of_own / n);
+                common.push(of_whole / n);
             }
         }
-        // Each with the variance of its median, from the scatter of the parts.
-        let of_row = |(row, parts): (usize, Vec<f64>)| {
-            let (n, middle) = (parts.len() as f64, median(parts.clone()));
-            let scatter = parts.iter().map(|o| (o - middle).powi(2)).sum::<f64>();
-            (n > 1.0).then(|| (row, middle, OF_MEDIAN * scatter / (n * (n - 1.0))))
+        of_parts.retain(|_, [apart, _]| apart.len() > 1);
+        let medians = |k: usize| of_parts.values().map(|parts| median_and_variance(&parts[k])).collect::<Vec<_>>();
+        let spread = |of: &[[f64; 2]]| {
+            median(of.iter().map(|[middle, _]| middle.abs()).collect()) / statistics::MEDIAN_OF_NORMAL
         };
-        let all: Vec<(usize, f64, f64)> = of_parts.into_iter().filter_map(of_row).collect();
-        // Rows whose parts disagree are taken to be as the others are.
-        let usual = median(all.iter().map(|(_, o, _)| o.abs()).collect()) / statistics::MEDIAN_OF_NORMAL;
-        let shrunk = |offset: f64, variance: f64| offset * usual.powi(2) / (usual.powi(2) + variance).max(1e-30);
-        all.into_iter().map(|(row, o, v)| (row_patches::group(sensor, row), shrunk(o, v))).collect()
+        let [apart, common] = [medians(0), medians(1)];
+        let of_apart = spread(&apart);
+        // Errors of ranges are independent from row to row: this is what their mean over neighbours scatters by.
+        // Elevations may be wrong along a line.
+        let of_mean = of_apart / (2.0 * BESIDE as f64 + 1.0).sqrt();
+        let of_common = if column == 0 { of_mean } else { spread(&common).max(of_mean) };
+        let shrunk =
+            |[middle, variance]: [f64; 2], usual: f64| middle * usual * usual / (usual * usual + variance).max(1e-30);
+        let rows = of_parts.keys().zip(apart.iter().zip(&common));
+        rows.map(|(row, (a, c))| (row_patches::group(sensor, *row), shrunk(*a, of_apart) + shrunk(*c, of_common)))
+            .collect()
     }
 
     /// The groups of every frame, of surfaces as they are.
     pub(super) fn groups_of(&self, grouping: Grouping) -> &[GroupFrame] {
-        if grouping == Grouping::Row { &self.whole_rows } else { &self.strips.whole }
+        if grouping == Grouping::Row { &self.whole_rows.whole } else { &self.strips.whole }
     }
 
     /// Fit of the base model together with the linear hypotheses.
