@@ -20,7 +20,7 @@ mod tests {
 
     #[test]
     fn files_are_found_by_path_and_by_folder() {
-        assert!(text("simulate/race.toml").unwrap().contains("[track]"));
+        assert!(text("simulate/race.toml").unwrap().contains("name = \"race\""));
         assert_eq!(text("simulate/race"), None);
         let studies: Vec<_> = names("studies").collect();
         assert!(studies.is_sorted() && studies.contains(&"quick"), "{studies:?}");

@@ -272,7 +272,7 @@ impl Effect {
             Effect::BrightTargetDropout { share, halo_rad } => vec![("share", share), ("halo_deg", deg(halo_rad))],
             Effect::Ghosts { probability } => vec![("probability", probability)],
             Effect::DualReturns { divergence_rad, share } => {
-                vec![("divergence_rad", divergence_rad), ("share", share)]
+                vec![("divergence_rad", divergence_rad), ("reported_share", share)]
             }
             Effect::Rain { drops, per_m } => vec![("drops", drops), ("per_m", per_m)],
             Effect::Fog { visibility_m, backscatter } => {
