@@ -3,7 +3,7 @@
 use crate::inference::simplex::minimise;
 use crate::pairing::FramePair;
 use rayon::prelude::*;
-use statistics::{blocks_of, draw_blocks};
+use statistics::{blocks_of, deviation, draw_blocks};
 
 /// One of so many measured returns may lie beyond the largest range: false alarms. The second value is for scenes
 /// with few returns near it.
@@ -125,9 +125,7 @@ pub fn half_point(frames: &[FramePair], which: &[usize], blocks: &[usize], end_m
     let mut rng = data::stream(0, "diagnose end of ranges", 0, 0);
     let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
     let again: Vec<f64> = draws.par_iter().map(|drawn| fit(drawn)).collect();
-    let mean = again.iter().sum::<f64>() / again.len() as f64;
-    let error = (again.iter().map(|m| (m - mean).powi(2)).sum::<f64>() / again.len() as f64).sqrt();
-    [fit(&(0..which.len()).collect::<Vec<_>>()), error]
+    [fit(&(0..which.len()).collect::<Vec<_>>()), deviation(&again)]
 }
 
 /// Middle of the step of the share of measured returns, as a share of the range in the middle of the bins.

@@ -13,7 +13,7 @@ use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::search::hits::refit;
 use rayon::prelude::*;
-use statistics::{blocks_of, draw_blocks};
+use statistics::{blocks_of, deviation, draw_blocks};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Largest number of patches that are reported.
@@ -127,10 +127,7 @@ fn parameters(
     let mut rng = data::stream(0, "diagnose patch", 0, 0);
     let draws: Vec<[f64; 4]> =
         (0..REPETITIONS).map(|_| spot(&sum_of(patch, of_estimate, &draw_blocks(&members, &mut rng)), patch)).collect();
-    let error = |k: usize| {
-        let mean = draws.iter().map(|d| d[k]).sum::<f64>() / draws.len() as f64;
-        (draws.iter().map(|d| (d[k] - mean).powi(2)).sum::<f64>() / draws.len() as f64).sqrt()
-    };
+    let error = |k: usize| deviation(&draws.iter().map(|d| d[k]).collect::<Vec<_>>());
     let degrees = |quantity, k: usize, form: f64| {
         let value = estimates[k].to_degrees();
         let of_cells = error(k).to_degrees().hypot(0.3 * ELEVATION_RAD.to_degrees());

@@ -111,19 +111,18 @@ fn groups(
 ) -> Description {
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
-    let (std, n) = match grouping {
-        Grouping::Row => {
-            let offsets = search.sums.offsets(&search.estimate, grouping, group_fit(column), columns);
-            grouped::spread_of_rows(&all, &offsets, group_fit(column))
-        }
-        Grouping::Azimuth => grouped::spread(&all, group_fit(column), 0.0),
+    let of_rows = (grouping == Grouping::Row)
+        .then(|| search.sums.offsets(&search.estimate, grouping, group_fit(column), columns));
+    let (std, n) = match &of_rows {
+        Some(offsets) => grouped::spread_of_rows(&all, offsets, group_fit(column)),
+        None => grouped::spread(&all, group_fit(column), 0.0),
     };
     let error = std / (2.0 * n.max(1.0)).sqrt();
     // The prior of rows with few returns is the spread of the others.
     let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
     let precision = std.max(least).powi(-2).max(group_fit(column).precision);
     let fit = GroupFit { precision, ..group_fit(column) };
-    let mut offsets = search.sums.offsets(&search.estimate, grouping, fit, columns);
+    let mut offsets = of_rows.unwrap_or_else(|| search.sums.offsets(&search.estimate, grouping, fit, columns));
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
     if column == 0 && grouping == Grouping::Row && !biased {

@@ -81,11 +81,11 @@ pub fn search(context: &Context) -> (ChannelResult, Displacement) {
     let mut chosen = search.select(&mut result);
     search.add_common_turns(&mut chosen, &mut result);
     let (chosen, selected) = search.large_enough(chosen);
-    for (hypothesis, selected) in chosen.iter().zip(selected) {
-        let held_out_gains = search.hold_out.iter().map(|&f| search.gain_of(hypothesis, &chosen, f)).collect();
-        result.found.push(describe::found(&search, hypothesis, &chosen, selected, held_out_gains));
+    let gains: Vec<Vec<f64>> = chosen.iter().map(|hypothesis| search.held_out_gains(hypothesis, &chosen)).collect();
+    result.distance = search.distances(&chosen, &gains);
+    for ((hypothesis, selected), gains) in chosen.iter().zip(selected).zip(gains) {
+        result.found.push(describe::found(&search, hypothesis, &chosen, selected, gains));
     }
-    result.distance = search.distances(&chosen);
     let displaced = displacement(context.rig, &search.sums, &search.select, &search.blocks, &chosen);
     (result, displaced)
 }
@@ -111,9 +111,9 @@ impl<'a> Search<'a> {
         self.sums.gains(&self.select, &self.blocks, hypotheses)
     }
 
-    /// Gain of one frame by one of the chosen hypotheses, nats.
-    fn gain_of(&self, hypothesis: &Hypothesis, chosen: &[Hypothesis], frame: usize) -> f64 {
-        self.sums.gain_of(&self.estimate, &self.estimate_blocks, hypothesis, chosen, frame)
+    /// Gains of the held-out frames by one of the chosen hypotheses, nats.
+    fn held_out_gains(&self, hypothesis: &Hypothesis, chosen: &[Hypothesis]) -> Vec<f64> {
+        self.sums.gains_of(&self.estimate, &self.estimate_blocks, hypothesis, chosen, &self.hold_out)
     }
 
     /// Forward selection, until no hypothesis brings what is demanded.
@@ -198,18 +198,17 @@ impl<'a> Search<'a> {
     }
 
     /// Of each held-out frame its distance, the gain of the chosen hypotheses, and the gain of all columns, nats. The
-    /// sums have no distance of their own: it is taken to be the largest gain.
-    fn distances(&self, chosen: &[Hypothesis]) -> Vec<[f64; 3]> {
+    /// sums have no distance of their own: it is taken to be the largest gain. `gains` are those of each hypothesis.
+    fn distances(&self, chosen: &[Hypothesis], gains: &[Vec<f64>]) -> Vec<[f64; 3]> {
         let (full, base) = self.sums.full_and_base(&self.estimate, &self.estimate_blocks);
-        let of_frame = |&f: &usize| {
-            let each: Vec<(bool, f64)> =
-                chosen.iter().map(|h| (matches!(h, Hypothesis::Groups { .. }), self.gain_of(h, chosen, f))).collect();
-            let gain: f64 = each.iter().map(|e| e.1).sum();
-            let groups: f64 = each.iter().filter(|e| e.0).map(|e| e.1).sum();
+        let of_frame = |(i, &f): (usize, &usize)| {
+            let grouped = |h: &Hypothesis| matches!(h, Hypothesis::Groups { .. });
+            let gain: f64 = gains.iter().map(|g| g[i]).sum();
+            let groups: f64 = chosen.iter().zip(gains).filter(|(h, _)| grouped(h)).map(|(_, g)| g[i]).sum();
             let best = full.gain(&self.sums.linear[f]) - base.gain(&self.sums.linear[f]) + groups.max(0.0);
             [best.max(gain).max(0.0), gain, best]
         };
-        self.hold_out.iter().map(of_frame).collect()
+        self.hold_out.iter().enumerate().map(of_frame).collect()
     }
 }
 

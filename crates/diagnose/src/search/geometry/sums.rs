@@ -322,35 +322,37 @@ impl Sums {
         fit(&frames, blocks, &with, &self.precision)
     }
 
-    /// Gain of one frame by one of the chosen hypotheses, fitted on the estimating frames, over a fit without it, nats.
-    pub(super) fn gain_of(
+    /// Gains of frames by one of the chosen hypotheses, fitted on the estimating frames, over a fit without it, nats.
+    pub(super) fn gains_of(
         &self,
         estimate: &[usize],
         blocks: &[usize],
         hypothesis: &Hypothesis,
         chosen: &[Hypothesis],
-        frame: usize,
-    ) -> f64 {
+        frames: &[usize],
+    ) -> Vec<f64> {
         match hypothesis {
             Hypothesis::Linear { .. } => {
                 let others: Vec<Hypothesis> = chosen.iter().filter(|h| *h != hypothesis).cloned().collect();
-                let gain = |of: &[Hypothesis]| self.fit_all(estimate, blocks, of).gain(&self.linear[frame]);
-                gain(chosen) - gain(&others)
+                let [with, without] = [chosen, &others].map(|of| self.fit_all(estimate, blocks, of));
+                frames.iter().map(|&f| with.gain(&self.linear[f]) - without.gain(&self.linear[f])).collect()
             }
             Hypothesis::Groups { grouping: Grouping::Azimuth, column, .. } => {
                 let offsets = self.offsets(estimate, Grouping::Azimuth, group_fit(*column), &[*column]);
-                grouped::gain(&self.groups_of(Grouping::Azimuth)[frame], *column, &offsets)
+                let strips = self.groups_of(Grouping::Azimuth);
+                frames.iter().map(|&f| grouped::gain(&strips[f], *column, &offsets)).collect()
             }
             Hypothesis::Groups { column, .. } => {
                 let all = row_columns(chosen);
                 let others: Vec<usize> = all.iter().copied().filter(|c| c != column).collect();
-                self.gain_of_rows(estimate, frame, &all) - self.gain_of_rows(estimate, frame, &others)
+                let [with, without] = [all, others].map(|columns| self.gains_of_rows(estimate, frames, &columns));
+                with.iter().zip(without).map(|(with, without)| with - without).collect()
             }
         }
     }
 
-    /// Gain of one frame by the offsets of rows in some columns, fitted together, nats.
-    fn gain_of_rows(&self, estimate: &[usize], frame: usize, columns: &[usize]) -> f64 {
+    /// Gains of frames by the offsets of rows in some columns, fitted together, nats.
+    fn gains_of_rows(&self, estimate: &[usize], frames: &[usize], columns: &[usize]) -> Vec<f64> {
         let fits: Vec<(usize, BTreeMap<Group, f64>)> =
             columns.iter().map(|&c| (c, self.offsets(estimate, Grouping::Row, group_fit(c), columns))).collect();
         let of_sensor = |(sensor, parts): (usize, &[Band; PARTS])| -> f64 {
@@ -362,7 +364,8 @@ impl Sums {
             }
             parts.iter().map(|band| band.gain(&of_rows)).sum()
         };
-        self.rows[frame].sensors.iter().enumerate().map(of_sensor).sum::<f64>() / self.of_patches
+        let of_frame = |&f: &usize| self.rows[f].sensors.iter().enumerate().map(of_sensor).sum::<f64>();
+        frames.iter().map(|f| of_frame(f) / self.of_patches).collect()
     }
 
     /// Fits of all columns and of the base model alone.

@@ -15,7 +15,7 @@ use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands, parame
 use rayon::prelude::*;
 use sensor::Effect;
 use sensor::effects::HeavyTails;
-use statistics::{blocks_of, draw_blocks};
+use statistics::{blocks_of, deviation, draw_blocks};
 
 /// Smallest share of the returns in the tail that is reported.
 const FLOOR: f64 = 3e-4;
@@ -230,12 +230,8 @@ fn errors(tails: &[&[Tail; 2]], blocks: &[usize], leverage: f64) -> [f64; 2] {
     let draws: Vec<Vec<usize>> = (0..REPETITIONS).map(|_| draw_blocks(&members, &mut rng)).collect();
     let again = |drawn: &Vec<usize>| fit(&drawn.iter().map(|&i| tails[i]).collect::<Vec<_>>(), leverage);
     let fits: Vec<Tails> = draws.par_iter().filter_map(again).collect();
-    let error = |of: fn(&Tails) -> f64| {
-        let n = (fits.len() as f64).max(1.0);
-        let mean = fits.iter().map(of).sum::<f64>() / n;
-        (fits.iter().map(|t| (of(t) - mean).powi(2)).sum::<f64>() / n).sqrt()
-    };
-    [error(|t| t.share), error(|t| t.std_m)]
+    let error = |of: fn(&Tails) -> f64| deviation(&fits.iter().map(of).collect::<Vec<_>>());
+    if fits.is_empty() { [0.0; 2] } else { [error(|t| t.share), error(|t| t.std_m)] }
 }
 
 fn describe(tails: Tails, errors: [f64; 2], on_estimate: &[&[Tail; 2]], held_out_gains: Vec<f64>, z: f64) -> Found {
