@@ -48,6 +48,8 @@ identifiers! {
         Labels = "labels",
         /// Measured returns on labelled objects against simulated ones.
         Objects = "objects",
+        /// Shots that follow each other of which no return arrives in single scans.
+        Packets = "packets",
         /// Range values as they were measured, for a quantisation.
         Ranges = "ranges",
         /// Distances of measured returns from simulated surfaces.

@@ -9,6 +9,9 @@ use statistics::{blocks_of, deviation, draw_blocks};
 /// with few returns near it.
 const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
 
+/// Least share of the returns that must be left inside of a step: where fewer are, nothing is known about its place.
+const LEAST_USUAL: f64 = 0.2;
+
 /// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.
 pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
     cut(frames, which, |range_m| range_m)
@@ -49,10 +52,13 @@ fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Opt
     OUTLIER_ONE_IN.into_iter().find_map(|one_in| {
         let farthest = a[a.len() - 1 - a.len() / one_in];
         let lost = above(&b, 1.01 * farthest);
-        let [before_a, before_b] = [&a, &b].map(|v| between(v, 0.9 * farthest, 0.995 * farthest));
+        let [[before_a, before_b], [inside_a, inside_b]] = [[0.9, 0.995], [0.75, 0.9]]
+            .map(|[low, high]| [&a, &b].map(|v| between(v, low * farthest, high * farthest)));
         let beyond = above(&a, 1.01 * farthest) / lost.max(1.0);
         let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
-        (step && before_b > 40.0 && before_a > 0.7 * before_b).then(|| change(&a, &b, 0.8 * farthest))
+        // Other losses take as much just before a step as farther inside; a law of range takes more and more.
+        let usual = (inside_a / inside_b.max(1.0)).clamp(LEAST_USUAL, 1.0);
+        (step && before_b > 40.0 && before_a > 0.7 * usual * before_b).then(|| change(&a, &b, 0.8 * farthest))
     })
 }
 

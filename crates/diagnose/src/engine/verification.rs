@@ -94,11 +94,10 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     let packets = packets::Packets::new(context, sensors);
     let arrived = packets.arrived(context.frames);
     let context = &Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
-    let mut lost = hits::by_table(context, train, test);
-    lost.iter_mut().zip(packets.by_table(train, test)).for_each(|(sum, nats)| *sum += nats);
     let mut all = Distances::from([
         (Channel::Residuals, geometry::by_table(context, train, test)),
-        (Channel::Hits, lost),
+        (Channel::Hits, hits::by_table(context, train, test)),
+        (Channel::Packets, packets.by_table(train, test)),
         (Channel::Roughness, noise::by_table(context, train, test)),
         (Channel::Returns, returns::by_table(context, train, test)),
         (Channel::Ranges, quantisation::by_table(context, train, test)),

@@ -72,6 +72,12 @@ fn half([a, ln_k, ln_skew]: [f64; 3]) -> f64 {
 /// Prior standard deviation of the logarithm of a ratio of reflectivities.
 const BRIGHTNESS: f64 = 1.2;
 
+/// Largest logarithm of a ratio of mean reflectivities of kinds of surfaces: from tar (0.05) to white paint (0.9).
+const MOST_BRIGHTNESS: f64 = 2.9;
+
+/// Smallest steepness of a step: flatter ones lose the same share everywhere, which is a random loss.
+const LEAST_STEEPNESS: f64 = 0.5;
+
 impl Law {
     /// The cause that has this law.
     pub fn cause(self) -> Cause {
@@ -131,10 +137,13 @@ impl Law {
 /// Largest share that a law loses where it has no effect. A larger share is a cause of its own, a random loss.
 pub const MOST_ANYWAY: f64 = 0.025;
 
-/// Penalty on extreme steepness and skew, and on losses where the law has no effect.
-fn shape_penalty(ln_k: f64, ln_skew: f64, anyway: f64) -> f64 {
+/// Penalty on extreme steepness and skew, and on losses where the law has no effect. `usual` is the usual logarithm of
+/// the steepness.
+fn shape_penalty(ln_k: f64, usual: f64, ln_skew: f64, anyway: f64) -> f64 {
     let beyond = (anyway - anyway.clamp(0.0, MOST_ANYWAY)) / 1e-3;
-    0.5 * ln_k.powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2) + beyond * beyond
+    let flat = (LEAST_STEEPNESS.ln() - ln_k).max(0.0) / 1e-2;
+    let of_shape = 0.5 * (ln_k - usual).powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2);
+    of_shape + beyond * beyond + flat * flat
 }
 
 impl FittedLaw {
@@ -158,13 +167,18 @@ impl FittedLaw {
     /// range, ln(cos) for incidence, ln(cos / R^2) at the brightness of the ground for signal.
     pub fn at(&self, range_m: f64, cos_incidence: f64, zone: usize) -> (f64, f64) {
         let at = Where { ln_range: range_m.ln(), ln_cos: cos_incidence.ln(), zone };
-        let brighter = [0.0, self.numbers[4], self.numbers[5], self.numbers[5]][zone];
-        let x = match self.law {
-            Law::Incidence => at.ln_cos,
-            Law::Signal => at.ln_cos - 2.0 * at.ln_range + brighter,
-            _ => at.ln_range,
-        };
-        (x, self.kept(&at))
+        (self.covariate(&at).unwrap_or(at.ln_range), self.kept(&at))
+    }
+
+    /// What the law is a function of; `None` where it is none.
+    pub(super) fn covariate(&self, at: &Where) -> Option<f64> {
+        let [.., c, d] = self.numbers;
+        match self.law {
+            Law::Random | Law::Zone(_) => None,
+            Law::Range => Some(at.ln_range),
+            Law::Incidence => Some(at.ln_cos),
+            Law::Signal => Some(at.ln_cos - 2.0 * at.ln_range + [0.0, c, d, d][at.zone]),
+        }
     }
 
     /// Share that a law of range or of incidence keeps at a range and a cosine.
@@ -178,8 +192,9 @@ impl FittedLaw {
     }
 
     pub(super) fn kept(&self, at: &Where) -> f64 {
-        let [a, b, s, _, c, d] = self.numbers;
+        let [a, b, s, ..] = self.numbers;
         let most = self.most();
+        let x = self.covariate(at).unwrap_or_default();
         match self.law {
             Law::Random => (1.0 - a).clamp(1e-3, 1.5),
             Law::Zone(zone) => {
@@ -189,12 +204,8 @@ impl FittedLaw {
                     1.0
                 }
             }
-            Law::Range => most * step(-at.ln_range, [-a, b, s]),
-            Law::Incidence => most * step(at.ln_cos, [a, b, s]),
-            Law::Signal => {
-                let brighter = [0.0, c, d, d][at.zone];
-                most * step(at.ln_cos - 2.0 * at.ln_range + brighter, [a, b, s])
-            }
+            Law::Range => most * step(-x, [-a, b, s]),
+            Law::Incidence | Law::Signal => most * step(x, [a, b, s]),
         }
     }
 
@@ -202,11 +213,14 @@ impl FittedLaw {
         match self.law {
             Law::Signal => {
                 let [_, steep, skew, anyway, c, d] = self.numbers;
-                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS) + shape_penalty(steep - 0.8, skew, anyway)
+                let beyond = [c, d].map(|v: f64| (v.abs() - MOST_BRIGHTNESS).max(0.0) / 1e-2);
+                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS)
+                    + beyond.map(|b| b * b).iter().sum::<f64>()
+                    + shape_penalty(steep, 0.8, skew, anyway)
             }
             Law::Range | Law::Incidence => {
                 let [_, steep, skew, anyway, ..] = self.numbers;
-                shape_penalty(steep - 1.0, skew, anyway)
+                shape_penalty(steep, 1.0, skew, anyway)
             }
             _ => 0.0,
         }

@@ -4,6 +4,7 @@ use super::law::{FittedLaw, Law, WHOLE_OBJECT, Where, in_zone};
 use super::simplex::minimise;
 use crate::channels::cells::{CELLS, ZONES, zone_of};
 use crate::channels::hits::{HitCell, HitFrame};
+use std::collections::BTreeMap;
 
 /// Counts of some frames, with the share that would match without losses.
 #[derive(Clone, Debug)]
@@ -17,6 +18,9 @@ pub struct LossTable {
 
 /// Weight of the prior share of matches in a cell, returns.
 const PRIOR_RETURNS: f64 = 60.0;
+
+/// Width of a bin of the covariate of a law whose form is free: of ln(m) or of ln(cos).
+const FORM_BIN: f64 = 0.4;
 
 /// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;
@@ -54,14 +58,24 @@ impl LossTable {
 
     /// Share of simulated returns of a cell that have a counterpart.
     fn matched(&self, laws: &[FittedLaw], cell: usize) -> f64 {
-        (self.kept(laws, cell) * self.matches[cell]).clamp(1e-4, 1.0 - 1e-4)
+        self.matched_share(self.kept(laws, cell), cell)
+    }
+
+    /// The same where a share is kept.
+    fn matched_share(&self, kept: f64, cell: usize) -> f64 {
+        (kept * self.matches[cell]).clamp(1e-4, 1.0 - 1e-4)
     }
 
     /// Logarithm of the likelihood of these counts.
     fn likelihood(&self, laws: &[FittedLaw], cells: impl Iterator<Item = (usize, f64, f64)>) -> f64 {
+        self.likelihood_of(|i| self.kept(laws, i), cells)
+    }
+
+    /// The same for any share that is kept in each cell.
+    fn likelihood_of(&self, kept: impl Fn(usize) -> f64, cells: impl Iterator<Item = (usize, f64, f64)>) -> f64 {
         cells
             .map(|(i, n, matched)| {
-                let p = self.matched(laws, i);
+                let p = self.matched_share(kept(i), i);
                 matched * p.ln() + (n - matched) * (1.0 - p).ln()
             })
             .sum()
@@ -88,15 +102,43 @@ impl LossTable {
         best.map(|b| b.0).unwrap_or_default()
     }
 
+    /// Counts of a frame in the cells that are used.
+    fn counts<'f>(&'f self, frame: &'f HitFrame) -> impl Iterator<Item = (usize, f64, f64)> + 'f {
+        frame
+            .iter()
+            .map(|(i, c)| (*i as usize, c.simulated.n, c.simulated_matched))
+            .filter(|(i, ..)| self.cells[*i].simulated.n >= FEWEST)
+    }
+
     /// Gain of a frame by `laws` over `before`, nats; match probabilities are those of this table.
     pub fn gain(&self, frame: &HitFrame, laws: &[FittedLaw], before: &[FittedLaw]) -> f64 {
-        let counts = || {
-            frame
-                .iter()
-                .map(|(i, c)| (*i as usize, c.simulated.n, c.simulated_matched))
-                .filter(|(i, ..)| self.cells[*i].simulated.n >= FEWEST)
-        };
-        self.likelihood(laws, counts()) - self.likelihood(before, counts())
+        self.likelihood(laws, self.counts(frame)) - self.likelihood(before, self.counts(frame))
+    }
+
+    /// The same for the shares that are kept in each cell.
+    pub fn gain_of_shares(&self, frame: &HitFrame, kept: &[f64], before: &[f64]) -> f64 {
+        self.likelihood_of(|i| kept[i], self.counts(frame)) - self.likelihood_of(|i| before[i], self.counts(frame))
+    }
+
+    /// Share that laws keep in each cell where the form of each of `free` is free: no sensor has exactly the form of a
+    /// law. The ratio of the matched returns to those that are expected replaces it along its covariate, one law after
+    /// the other.
+    pub fn kept_by_forms(&self, laws: &[FittedLaw], free: &[FittedLaw]) -> Vec<f64> {
+        let mut kept: Vec<f64> = (0..CELLS).map(|i| self.kept(laws, i)).collect();
+        for law in free {
+            let bin = |i: usize| law.covariate(&self.places[i]).map(|x| (x / FORM_BIN).floor() as i32);
+            let mut sums = BTreeMap::<i32, [f64; 2]>::new();
+            for (i, bin) in self.used.iter().filter_map(|&i| Some((i, bin(i)?))) {
+                let sum = sums.entry(bin).or_default();
+                sum[0] += self.cells[i].simulated_matched;
+                sum[1] += self.cells[i].simulated.n * kept[i] * self.matches[i];
+            }
+            for &i in &self.used {
+                let [matched, expected] = bin(i).and_then(|bin| sums.get(&bin)).copied().unwrap_or_default();
+                kept[i] *= (matched + PRIOR_RETURNS) / (expected + PRIOR_RETURNS);
+            }
+        }
+        kept
     }
 
     /// Share of matched returns of each cell in these frames, shrunk towards the laws: an unconstrained lookup table.
@@ -255,6 +297,26 @@ mod tests {
         let gain = |f: &FittedLaw| table.gain(&frame, &[*f], &[]) - f.law.parameters() as f64;
         let best = fits.into_iter().max_by(|a, b| gain(a).total_cmp(&gain(b))).unwrap();
         (best.law, best)
+    }
+
+    #[test]
+    fn beside_a_free_form_a_second_law_gains_what_the_form_does_not() {
+        // The law of the sensor has another form than the fitted one: two steps of the signal.
+        let signal = |r: f64, c: f64| {
+            let step = |at: f64| 0.5 * (1.0 + (6.0 * ((c / (r * r)).ln() - at)).tanh());
+            0.3 + 0.3 * step(-7.0) + 0.4 * step(-11.0)
+        };
+        let gain = |table: &LossTable, law: Law| {
+            let frame: HitFrame = table.cells.iter().enumerate().map(|(i, c)| (i as u32, *c)).collect();
+            let before = table.fit(&[], Law::Signal);
+            let both = table.fit(&before, law);
+            let [kept, form] = [table.kept_by_forms(&both, &both[..1]), table.kept_by_forms(&before, &before)];
+            [table.gain(&frame, &both, &before), table.gain_of_shares(&frame, &kept, &form)]
+        };
+        let [by_law, by_form] = gain(&table(|r, c, _| signal(r, c)), Law::Signal);
+        assert!(by_law > 1000.0 && by_form < 0.0, "{by_law} {by_form}");
+        let [_, of_material] = gain(&table(|r, c, z| signal(r, c) * if z == 2 { 0.7 } else { 1.0 }), Law::Zone(2));
+        assert!(of_material > 1000.0, "{of_material}");
     }
 
     #[test]

@@ -3,25 +3,24 @@
 mod by_table;
 mod describe;
 mod form;
+mod select;
 
 pub use self::by_table::{by_cell, by_table};
 
 use self::describe::found;
+use self::select::Selection;
 use super::unexplained::{Unexplained, mean_by_group};
-use super::{
-    ChannelResult, Context, Found, Selected, UNEXPLAINED_SHARE, Z_STAR, causes_of, confidence, first_demands, record,
-    rivals_and_confidence, trimmed,
-};
+use super::{ChannelResult, Context, Found, Z_STAR, first_demands, trimmed};
 use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::cells::cell;
 use crate::channels::groups::{Group, Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
 use crate::diagnosis::Minimum;
-use crate::inference::choice::{Demands, Trial, choose, total_and_z};
+use crate::inference::choice::Demands;
 use crate::inference::grouped::{self, GroupFit};
-use crate::inference::law::{FittedLaw, LAWS, Law};
-use crate::inference::linear::{FOLDS, fold_of};
+use crate::inference::law::{FittedLaw, Law};
+use crate::inference::linear::fold_of;
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
@@ -34,13 +33,6 @@ const FLOOR: f64 = 0.005;
 
 /// Smallest share lost on one kind of surface that is reported, of its own returns.
 const ZONE_FLOOR: f64 = 0.03;
-
-/// A loss on one kind of surface with at least this share of the gain of a signal law that is confined to it is
-/// reported as a material.
-const MATERIAL_SHARE: f64 = 0.75;
-
-/// Smallest gain of a second law, as a share of the gain of the first.
-const SECOND_LAW_SHARE: f64 = 0.04;
 
 /// Share of its gain by which a richer law must exceed the simpler one to be reported beside it: the form of a law is
 /// never exactly that of the sensor.
@@ -84,16 +76,6 @@ struct Search<'a> {
     demands: Demands,
 }
 
-/// What the forward selection chose.
-#[derive(Default)]
-struct Selection {
-    laws: Vec<Law>,
-    /// What is said of each law; empty where a table by direction makes the laws mere forms.
-    selected: Vec<Selected>,
-    /// Grouping and confidence of a table by direction.
-    unexplained: Option<(Grouping, f64)>,
-}
-
 impl<'a> Search<'a> {
     fn new(context: &'a Context<'a>, mask: &'a Mask, displaced: bool) -> Self {
         let hits = hit_frames(context.frames, mask);
@@ -114,82 +96,14 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Forward selection: one law, then at most one more of another kind, or a table by direction.
-    fn select(&self, result: &mut ChannelResult) -> Selection {
-        let mut selection = Selection::default();
-        let returns = self.context.returns(&self.select);
-        let mut first_gain = 0.0f64;
-        for step in 0..2 {
-            let joins = |l: &Law| step == 0 || may_join(*l, &selection.laws);
-            let candidates: Vec<Law> = LAWS.into_iter().filter(joins).collect();
-            let mut trials = self.law_trials(&candidates, &selection.laws);
-            trials.extend(self.direction_trials(&selection.laws));
-            // A second law must gain more than a correction of the form of the first. A table by direction tells
-            // against the first law.
-            for trial in trials.iter_mut().filter(|_| step > 0) {
-                let unexplained = trial.cause == Cause::Unexplained;
-                let share = if unexplained { UNEXPLAINED_SHARE } else { SECOND_LAW_SHARE };
-                trial.above_floor &= total_and_z(&trial.gains).0 > share * first_gain;
-            }
-            let choice = choose(&trials, &self.demands);
-            result.considered.extend(record(&trials, choice.as_ref(), Channel::Hits, returns, &self.demands));
-            let Some(choice) = choice else { break };
-            let trial = &trials[choice.chosen];
-            first_gain = total_and_z(&trial.gains).0;
-            if trial.cause == Cause::Unexplained {
-                let grouping = if trial.candidate == LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
-                let confidence = confidence(&trials, &self.blocks, Cause::Unexplained, &self.demands);
-                selection.unexplained = Some((grouping, confidence));
-                selection.selected.clear();
-                break;
-            }
-            selection.laws.push(candidates[trial.candidate]);
-            let mut equals = causes_of(&trials, &choice.equals);
-            equals.retain(|c| *c != Cause::Unexplained);
-            let selected = rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands);
-            selection.selected.push(selected);
-        }
-        selection
-    }
-
-    /// A trial of each law on top of the chosen ones.
-    fn law_trials(&self, candidates: &[Law], chosen: &[Law]) -> Vec<Trial> {
-        let train = |fold: usize| -> Vec<usize> {
-            (0..self.select.len()).filter(|&i| self.folds[i] != fold).map(|i| self.select[i]).collect()
-        };
-        let tables: Vec<LossTable> = (0..FOLDS).map(|fold| table(&self.hits, &train(fold))).collect();
-        let before: Vec<Vec<FittedLaw>> = tables.iter().map(|t| refit(t, chosen)).collect();
-        let trial = |(k, &law): (usize, &Law)| {
-            let fits: Vec<Vec<FittedLaw>> = (0..FOLDS).map(|f| tables[f].fit(&before[f], law)).collect();
-            let gain = |i: usize| {
-                let fold = self.folds[i];
-                tables[fold].gain(&self.hits[self.select[i]], &fits[fold], &before[fold])
-            };
-            let gains = (0..self.select.len()).map(gain).collect();
-            let whole = self.table.fit(&refit(&self.table, chosen), law);
-            let above_floor = self.above_floor(&self.table, &whole);
-            let trial = Trial { candidate: k, cause: law.cause(), parameters: law.parameters(), gains, above_floor };
-            let confined = (law == Law::Signal).then(|| self.table.confined_to(&whole[whole.len() - 1..]));
-            (trial, confined.flatten())
-        };
-        let (mut trials, confined): (Vec<Trial>, Vec<Option<usize>>) =
-            candidates.par_iter().enumerate().map(trial).unzip();
-        // A signal law whose losses are confined to one kind of surface is a material.
-        for (k, zone) in confined.into_iter().enumerate().filter_map(|(k, zone)| Some((k, zone?))) {
-            let total = |k: usize| total_and_z(&trials[k].gains).0;
-            let of_zone = candidates.iter().position(|l| *l == Law::Zone(zone));
-            let material = of_zone.is_some_and(|z| trials[z].above_floor && total(z) > MATERIAL_SHARE * total(k));
-            trials[k].above_floor &= !material;
-        }
-        trials
-    }
-
     /// Whether the last of some laws loses enough to be reported. A second law must lose more than a correction of
     /// the form of the first.
     fn above_floor(&self, table: &LossTable, laws: &[FittedLaw]) -> bool {
         let Some((last, before)) = laws.split_last() else { return false };
         let lost = table.lost(laws) - table.lost(before);
-        let joins = f64::from(u8::from(!before.is_empty()));
+        // A law over range, incidence or signal never has exactly the form of the sensor's losses.
+        let over = |l: &FittedLaw| matches!(l.law, Law::Range | Law::Incidence | Law::Signal);
+        let joins = f64::from(u8::from(before.iter().any(over)));
         // What loses less than the laws before it say only corrects their form.
         let own = if before.is_empty() { last.numbers[0].abs() } else { last.numbers[0] };
         // What the simulation loses beyond the measured side is no more than what only the measured side has.
@@ -199,25 +113,6 @@ impl<'a> Search<'a> {
             Law::Random => own.min(most(None)) > FLOOR + 0.02 * joins + 0.01 * self.displaced,
             _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * self.displaced,
         }
-    }
-
-    /// Trials of tables by row and by azimuth on top of the chosen laws: no cause of the catalogue.
-    fn direction_trials(&self, chosen: &[Law]) -> Vec<Trial> {
-        let laws = refit(&self.table, chosen);
-        let trial = |grouping: Grouping| {
-            let groups = self.loss_groups(grouping, &self.table, &laws);
-            let how = GroupFit { centred: !chosen.is_empty(), ..GROUPED };
-            let all = group_total(self.select.iter().flat_map(|&i| &groups[i]));
-            let (spread, _) = grouped::spread(&all, how, trimmed(grouping));
-            Trial {
-                candidate: LAWS.len() + grouping as usize,
-                cause: Cause::Unexplained,
-                parameters: 12,
-                gains: grouped::cross_part_gains(&groups, &self.select, &self.blocks, how, false),
-                above_floor: spread > GROUP_FLOOR,
-            }
-        };
-        [Grouping::Row, Grouping::Azimuth].map(trial).into()
     }
 
     fn loss_groups(&self, grouping: Grouping, table: &LossTable, laws: &[FittedLaw]) -> Vec<PartedFrame> {
@@ -338,11 +233,4 @@ fn table(hits: &[HitFrame], frames: &[usize]) -> LossTable {
 /// Fits laws one on top of the other.
 pub(super) fn refit(table: &LossTable, laws: &[Law]) -> Vec<FittedLaw> {
     laws.iter().fold(Vec::new(), |before, &law| table.fit(&before, law))
-}
-
-/// Whether a law may be added to those chosen: laws of range, incidence and signal exclude each other, since a second
-/// one corrects the form of the first.
-fn may_join(law: Law, chosen: &[Law]) -> bool {
-    let smooth = |l: &Law| matches!(l, Law::Range | Law::Incidence | Law::Signal);
-    !(chosen.contains(&law) || smooth(&law) && chosen.iter().any(smooth))
 }

@@ -96,8 +96,7 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     let hidden: BTreeSet<DirectionCell> = mask.blocked.union(&edge).copied().collect();
     mask.around = with_neighbours(&hidden.union(&below(&hidden, &counts)).copied().collect());
     mask.partly = edge;
-    let same_place = !matches!(shown, Shown::Elsewhere | Shown::Another);
-    let spots = if same_place { patch::search(context, &mut mask) } else { vec![] };
+    let spots = if shown != Shown::Another { patch::search(context, &mut mask) } else { vec![] };
     (mask, spots)
 }
 

@@ -1,7 +1,10 @@
 //! Lost packets: of shots that a sensor sends one after the other no return arrives in one scan, and in other scans the
 //! same shots have returns.
 
-use super::{ChannelResult, Context, Found, NamedParameter, Z_STAR, parameter, sensor_number};
+mod runs;
+
+use self::runs::Runs;
+use super::{ChannelResult, Context, Found, sensor_number, with_error};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
@@ -24,21 +27,29 @@ const BIN_STEPS: [f64; 2] = [1.5, 12.0];
 /// Fewest simulated returns of a bin that is judged: by chance half of the returns would not all be lost.
 const FEWEST: f64 = 8.0;
 
-/// Share of the returns of a bin below which all are lost; the rest are false alarms.
+/// Share of the expected returns of a bin below which all are lost; the rest are false alarms.
 const DARK: f64 = 0.1;
 
-/// Share of the returns of the same bin in other scans, and of returns at the same ranges, from which on the bin is not
-/// dark for another reason.
+/// Share of the returns that is expected in a bin, by their ranges and by the same bin in other scans, from which on
+/// the bin is not dark for another reason.
 const USUALLY_SEEN: f64 = 0.5;
 
 /// Smallest share of returns that is reported: one in a thousand.
 const FLOOR: f64 = 1e-3;
 
-/// Fewest dark bins, and fewest frames with some.
-const FEWEST_DARK: [usize; 2] = [5, 3];
+/// Fewest dark bins, and fewest runs of them. That all returns of many shots in a row are lost by chance is as good as
+/// impossible; a single run may be a frame that was cut off.
+const FEWEST_DARK: [usize; 2] = [5, 2];
 
 /// Largest ratio of dark bins of the other side: these are things that one side lacks.
 const OTHER_SIDE: f64 = 0.2;
+
+/// Largest ratio of dim bins, which lose most returns and not all: other losses make bins of all shades, packets dark
+/// ones alone.
+const DIM_BINS: f64 = 0.5;
+
+/// Share of the expected returns of a bin below which it is dim.
+const DIM: f64 = 0.35;
 
 /// Factor by which the loss of a return is less likely without packets.
 const SURPRISE: f64 = 20.0;
@@ -88,6 +99,12 @@ type Counts = BTreeMap<Bin, [f64; 3]>;
 /// The dark bins of every frame, and the counts of all bins.
 struct Dark(Vec<BTreeSet<Bin>>, Vec<Counts>);
 
+impl Dark {
+    fn new(counts: Vec<Counts>, other: &[Counts]) -> Self {
+        Dark(bins_below(DARK, &counts, other), counts)
+    }
+}
+
 /// What is lost in all frames.
 pub struct Packets {
     orders: Vec<Option<Order>>,
@@ -100,13 +117,14 @@ impl Packets {
     pub fn new(context: &Context, sensors: &Sensors) -> Self {
         let orders = Order::of_sensors(context, sensors);
         let sides: [fn(&FramePair) -> &[Ray]; 2] = [|f| &f.simulated, |f| &f.measured];
-        let sides = sides.map(|side| {
+        let [simulated, measured] = sides.map(|side| {
             let usual = shares_by_range(context.frames, side);
             let of_frame = |f: &FramePair| counts(side(f), &orders, &usual);
             let all: Vec<Counts> = context.frames.par_iter().map(of_frame).collect();
-            Dark(dark_bins(&all), all)
+            all
         });
-        Packets { orders, sides }
+        let lacking = Dark::new(measured, &simulated);
+        Packets { orders, sides: [Dark::new(simulated, &lacking.1), lacking] }
     }
 
     /// The frames without the rays of packets that either side lost, and of the bins beside them, which are lost in
@@ -127,6 +145,15 @@ impl Packets {
         any.then(|| frames.par_iter().zip(a.par_iter().zip(b)).map(|(f, (a, b))| of_frame((f, [a, b]))).collect())
     }
 
+    /// Bins of some frames that lose most of the returns and not all, but for those beside dark ones: a packet covers a
+    /// part of these.
+    fn dim(&self, frames: &[usize]) -> usize {
+        let [Dark(dark, counts), Dark(_, other)] = &self.sides;
+        let dim = bins_below(DIM, counts, other);
+        let alone = |i: usize, (sensor, bin): Bin| (-1..=1).all(|k| !dark[i].contains(&(sensor, bin + k)));
+        frames.iter().map(|&i| dim[i].iter().filter(|bin| alone(i, **bin)).count()).sum()
+    }
+
     /// Gains of the `test` frames by the share of dark bins of the `train` frames over that of the other side, nats.
     pub fn by_table(&self, train: &[usize], test: &[usize]) -> Vec<f64> {
         let number = |Dark(dark, counts): &Dark, i: usize| [dark[i].len() as f64, counts[i].len() as f64];
@@ -145,7 +172,7 @@ impl Packets {
 /// The search; and the frames without what is lost, where there is something.
 pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Vec<FramePair>>) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
-    let mut result = ChannelResult::new(Channel::Hits, hold_out.len());
+    let mut result = ChannelResult::new(Channel::Packets, hold_out.len());
     let packets = Packets::new(context, sensors);
     let [dark, other] = &packets.sides;
     let returns = |i: usize, Dark(dark, counts): &Dark| dark[i].iter().map(|bin| counts[i][bin][0]).sum::<f64>();
@@ -156,17 +183,19 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     let differences = |of: &[usize]| of.iter().map(|&i| share(i)).collect::<Vec<f64>>();
     let (_, z) = total_and_z(&differences(&select));
     // Bursts are rare: those of the estimating frames count as well.
-    let looked_at = || select.iter().chain(&estimate);
+    let all = [select.as_slice(), &estimate].concat();
+    let looked_at = || all.iter();
     let number = |of: &[BTreeSet<Bin>]| looked_at().map(|&i| of[i].len()).sum::<usize>();
-    let frames_with = looked_at().filter(|&&i| !dark.0[i].is_empty()).count();
+    let runs = looked_at().map(|&i| runs_of(&dark.0[i]).count()).sum::<usize>();
     let mean = looked_at().map(|&i| share(i)).sum::<f64>() / looked_at().count().max(1) as f64;
     let chosen = number(&dark.0) >= FEWEST_DARK[0]
-        && frames_with >= FEWEST_DARK[1]
+        && runs >= FEWEST_DARK[1]
         && (number(&other.0) as f64) < OTHER_SIDE * number(&dark.0) as f64
+        && (packets.dim(&all) as f64) < DIM_BINS * number(&dark.0) as f64
         && mean > FLOOR;
     result.considered.push(Considered {
         cause: Cause::PacketLoss.into(),
-        channel: Channel::Hits,
+        channel: Channel::Packets,
         nats_per_ray: 0.0,
         z,
         outcome: if chosen { "chosen" } else { "no shots in a row are lost in single scans" }.into(),
@@ -177,12 +206,12 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     }
     let held: Vec<f64> = hold_out.iter().map(|&i| returns(i, dark) * SURPRISE.ln()).collect();
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [*g; 3]);
-    let each = differences(&estimate);
+    let each = differences(&all);
     let (total, z) = total_and_z(&each);
     let share = total / each.len().max(1) as f64;
     let widths: Vec<f64> = packets.orders.iter().map(|o| o.map_or(1.0, |o| o.width)).collect();
-    let runs = Runs::new(&dark.0, &dark.1, &estimate, &widths);
-    result.found.push(found(context, &runs, [share, share / z.max(Z_STAR)], held));
+    let runs = Runs::new(&dark.0, &dark.1, &all, &widths);
+    result.found.push(found(context, &runs, [share, share / z.max(1.0)], held));
     (result, packets.arrived(context.frames))
 }
 
@@ -220,78 +249,49 @@ fn counts(rays: &[Ray], orders: &[Option<Order>], usual: &BTreeMap<i32, f64>) ->
     counts
 }
 
-/// Bins that lose all returns in a frame, and not in most of the others.
-fn dark_bins(frames: &[Counts]) -> Vec<BTreeSet<Bin>> {
+/// Bins that lose all returns in a frame but for a share, and not in most of the others. The other side has no returns
+/// there at all: where it has some, it shows another thing.
+fn bins_below(share: f64, frames: &[Counts], other: &[Counts]) -> Vec<BTreeSet<Bin>> {
     let mut all = BTreeMap::<Bin, [f64; 2]>::new();
-    for (bin, [n, matched, _]) in frames.iter().flatten() {
+    for (bin, [_, matched, expected]) in frames.iter().flatten() {
         let sum = all.entry(*bin).or_default();
-        *sum = [sum[0] + n, sum[1] + matched];
+        *sum = [sum[0] + matched, sum[1] + expected];
     }
-    let is_dark = |bin: &Bin, [n, matched, expected]: [f64; 3]| {
-        let [others, seen] = [all[bin][0] - n, all[bin][1] - matched];
-        matched < DARK * n && expected > USUALLY_SEEN * n && seen > USUALLY_SEEN * others
+    let is_below = |bin: &Bin, [n, matched, expected]: [f64; 3]| {
+        // Dirt or a post in its direction may take a part in all scans.
+        let [seen, of_others] = [all[bin][0] - matched, all[bin][1] - expected];
+        let expected = expected * (seen / of_others.max(1e-9)).min(1.0);
+        matched < share * expected && expected > USUALLY_SEEN * n
     };
-    let of_frame = |f: &Counts| f.iter().filter(|(bin, c)| is_dark(bin, **c)).map(|(bin, _)| *bin).collect();
-    frames.iter().map(of_frame).collect()
+    let of_frame = |(f, other): (&Counts, &Counts)| {
+        let empty = |bin: &Bin, n: f64| other.get(bin).is_none_or(|c| c[0] < share * n);
+        f.iter().filter(|(bin, c)| is_below(bin, **c) && empty(bin, c[0])).map(|(bin, _)| *bin).collect()
+    };
+    frames.iter().zip(other).map(of_frame).collect()
 }
 
-/// Runs of dark bins of the sensor that has most of them.
-struct Runs {
-    sensor: usize,
-    /// Width of a bin, as a share of a scan.
-    bin: f64,
-    /// Length of each run as a share of a scan, with the parts of bins at its ends.
-    lengths: Vec<f64>,
-    /// Length of all bins that were judged, in scans.
-    all: f64,
-}
-
-impl Runs {
-    fn new(dark: &[BTreeSet<Bin>], counts: &[Counts], frames: &[usize], widths: &[f64]) -> Self {
-        let of_sensor = |s: usize| frames.iter().flat_map(|&i| &dark[i]).filter(|b| usize::from(b.0) == s).count();
-        let sensor = (0..widths.len()).max_by_key(|s| (of_sensor(*s), usize::MAX - s)).unwrap_or(0);
-        let own = |bin: &&Bin| usize::from(bin.0) == sensor;
-        let mut lengths = Vec::new();
-        for &i in frames {
-            let mut last = None;
-            for (_, bin) in dark[i].iter().filter(own) {
-                match lengths.last_mut() {
-                    Some(length) if last == Some(bin - 1) => *length += widths[sensor],
-                    // A packet covers half a bin more at each end.
-                    _ => lengths.push(2.0 * widths[sensor]),
-                }
-                last = Some(*bin);
-            }
-        }
-        let judged = frames.iter().flat_map(|&i| counts[i].keys()).filter(own).count();
-        Runs { sensor, bin: widths[sensor], lengths, all: judged as f64 * widths[sensor] }
-    }
-
-    /// Length of a packet as a share of a scan: most bursts are short, so that the shortest runs are single packets.
-    fn packet(&self) -> f64 {
-        let mut sorted = self.lengths.clone();
-        sorted.sort_by(f64::total_cmp);
-        sorted.get(sorted.len() / 10).copied().unwrap_or(self.bin)
-    }
-
-    /// Probabilities of a loss after a packet that arrived, and after one that was lost (a Gilbert channel).
-    fn probabilities(&self) -> [f64; 2] {
-        let lost: f64 = self.lengths.iter().sum();
-        let arrived = ((self.all - lost) / self.packet()).max(1.0);
-        let runs = self.lengths.len() as f64;
-        [(runs / arrived).min(1.0), (1.0 - runs * self.packet() / lost.max(1e-9)).max(0.0)]
-    }
+/// First bins of the runs of dark bins of a frame.
+fn runs_of(dark: &BTreeSet<Bin>) -> impl Iterator<Item = &Bin> {
+    dark.iter().filter(|(sensor, bin)| !dark.contains(&(*sensor, bin - 1)))
 }
 
 /// The finding.
-fn found(context: &Context, runs: &Runs, [share, error]: [f64; 2], held_out_gains: Vec<f64>) -> Found {
+fn found(context: &Context, runs: &Runs, [share, of_share]: [f64; 2], held_out_gains: Vec<f64>) -> Found {
     let sensor = &context.rig.sensors[runs.sensor];
     let scan_ms = 1e3 / sensor.rate_hz;
     let packet_ms = runs.packet() * scan_ms;
-    let [loss, burst] = runs.probabilities();
-    let number = (runs.lengths.len() as f64).max(1.0);
-    // The width of a packet is known to a bin.
-    let of_width = runs.bin / runs.packet();
+    let [least, most] = runs.packet_interval();
+    let [loss, burst] = runs.probabilities(runs.packet());
+    let error = (runs.lengths.len() as f64).max(1.0).sqrt().recip();
+    let mut of_runs = with_error(share, of_share, Quantity::Share.unit());
+    of_runs.ci95[0] = of_runs.ci95[0].max(0.0);
+    // Both ends of the width of a packet, each with the error of the number of runs.
+    let interval = |k: usize, estimate: f64, of: f64| {
+        let ends = [least, most].map(|packet| runs.probabilities(packet)[k]);
+        let [low, high] = [ends[0].min(ends[1]), ends[0].max(ends[1])];
+        let ci95 = [low.min(estimate) - 1.96 * of, high.max(estimate) + 1.96 * of].map(|end| end.clamp(0.0, 1.0));
+        Parameter { estimate, unit: Quantity::Burst.unit(), ci95 }
+    };
     let points = curve_points(runs, scan_ms);
     Found {
         effects: Vec::new(),
@@ -299,13 +299,20 @@ fn found(context: &Context, runs: &Runs, [share, error]: [f64; 2], held_out_gain
         causes: vec![Cause::PacketLoss],
         parameters: vec![
             sensor_number(runs.sensor),
-            parameter(Quantity::PacketMs, packet_ms, of_width * packet_ms),
-            probability(Quantity::Loss, loss, loss * number.sqrt().recip().hypot(of_width)),
-            probability(Quantity::Burst, burst, (1.0 - burst) * number.sqrt().recip().hypot(of_width)),
-            parameter(Quantity::Share, share, error),
+            (
+                Quantity::PacketMs.into(),
+                Parameter {
+                    estimate: packet_ms,
+                    unit: Quantity::PacketMs.unit(),
+                    ci95: [least, most].map(|w| w * scan_ms),
+                },
+            ),
+            (Quantity::Loss.into(), interval(0, loss, loss * error)),
+            (Quantity::Burst.into(), interval(1, burst, (1.0 - burst) * error)),
+            (Quantity::Share.into(), of_runs),
         ],
         confidence: 1.0,
-        channel: Channel::Hits,
+        channel: Channel::Packets,
         covariate: Covariate::ScanPhase,
         held_out_gains,
         says: format!(
@@ -322,15 +329,9 @@ fn found(context: &Context, runs: &Runs, [share, error]: [f64; 2], held_out_gain
     }
 }
 
-/// A parameter between 0 and 1.
-fn probability(quantity: Quantity, estimate: f64, error: f64) -> NamedParameter {
-    let (id, Parameter { estimate, unit, ci95 }) = parameter(quantity, estimate, error);
-    (id, Parameter { estimate, unit, ci95: ci95.map(|end| end.clamp(0.0, 1.0)) })
-}
-
 /// How many runs there are of each width, and how many the Gilbert channel has.
 fn curve_points(runs: &Runs, scan_ms: f64) -> Vec<CurvePoint> {
-    let (packet, [_, burst]) = (runs.packet(), runs.probabilities());
+    let (packet, [_, burst]) = (runs.packet(), runs.probabilities(runs.packet()));
     let number = runs.lengths.len() as f64;
     let point = |k: i32| {
         let inside = |w: &&f64| ((**w / packet).round() as i32) == k;
@@ -355,9 +356,28 @@ mod tests {
     #[test]
     fn bins_that_are_dark_in_one_frame_count_and_those_that_always_are_do_not() {
         let counts = frames(|f, bin| (100..105).contains(&bin) || f == 7 && (200..204).contains(&bin));
-        let dark = dark_bins(&counts);
+        let nothing = vec![Counts::new(); counts.len()];
+        let dark = bins_below(DARK, &counts, &nothing);
         assert_eq!(dark[7].iter().map(|b| b.1).collect::<Vec<_>>(), [200, 201, 202, 203]);
         assert!(dark[6].is_empty());
+    }
+
+    #[test]
+    fn bins_of_all_shades_are_no_packets_and_what_the_other_side_has_is_none() {
+        // Every seventh bin of each frame keeps something between nothing and a third of its returns.
+        let shade = |f: usize, bin: i32| (bin + f as i32) % 7 == 0;
+        let matched = |f: usize, bin: i32| if shade(f, bin) { f64::from((3 * bin + f as i32) % 7) } else { 19.0 };
+        let cell = |f: usize, bin: i32| ((0u8, bin), [20.0, matched(f, bin), 19.0]);
+        let counts: Vec<Counts> = (0..30).map(|f| (0..400).map(|bin| cell(f, bin)).collect()).collect();
+        let nothing = vec![Counts::new(); counts.len()];
+        let number = |of: &[BTreeSet<Bin>]| of.iter().map(BTreeSet::len).sum::<usize>();
+        let packets = Packets {
+            orders: vec![],
+            sides: [Dark::new(counts.clone(), &nothing), Dark(vec![BTreeSet::new(); 30], nothing.clone())],
+        };
+        let (dark, dim) = (number(&packets.sides[0].0), packets.dim(&(0..30).collect::<Vec<_>>()));
+        assert!(dark > 100 && dim as f64 > DIM_BINS * dark as f64, "{dark} {dim}");
+        assert_eq!(number(&bins_below(DARK, &counts, &counts)), 0, "another thing is there");
     }
 
     #[test]
@@ -380,9 +400,10 @@ mod tests {
         };
         let counts = frames(dark);
         let all: Vec<usize> = (0..30).collect();
-        let runs = Runs::new(&dark_bins(&counts), &counts, &all, &[0.0025]);
+        let nothing = vec![Counts::new(); counts.len()];
+        let runs = Runs::new(&bins_below(DARK, &counts, &nothing), &counts, &all, &[0.0025]);
         assert!((runs.packet() / 0.0025 - 4.0).abs() < 0.1, "{}", runs.packet() / 0.0025);
-        let [found_loss, found_burst] = runs.probabilities();
+        let [found_loss, found_burst] = runs.probabilities(runs.packet());
         assert!((found_loss / loss - 1.0).abs() < 0.35, "{found_loss}");
         assert!((found_burst - burst).abs() < 0.15, "{found_burst}");
     }
