@@ -3,6 +3,9 @@
 use super::{Bin, Counts};
 use std::collections::BTreeSet;
 
+/// Share of what is lost that is lost by single packets, at least: (1 - burst)^2.
+const OF_SINGLES: f64 = 0.05;
+
 /// Largest probability that another packet is lost after a lost one.
 const MOST_BURST: f64 = 0.8;
 
@@ -38,11 +41,18 @@ impl Runs {
         Runs { sensor, bin: widths[sensor], lengths, all: judged as f64 * widths[sensor] }
     }
 
-    /// Length of a packet as a share of a scan: most bursts are short, so that the shortest runs are single packets.
+    /// Length of a packet as a share of a scan. Most bursts are short, so that the shortest runs are single packets; but
+    /// the shortest ones that hold together less than a twentieth of what is lost may be no packets at all.
     pub(super) fn packet(&self) -> f64 {
         let mut sorted = self.lengths.clone();
         sorted.sort_by(f64::total_cmp);
-        sorted.get(sorted.len() / 10).copied().unwrap_or(self.bin)
+        let lost: f64 = sorted.iter().sum();
+        let mut so_far = 0.0;
+        let single = sorted.into_iter().find(|length| {
+            so_far += length;
+            so_far > OF_SINGLES * lost
+        });
+        single.unwrap_or(self.bin)
     }
 
     /// Where the length of a packet lies (95 %): it is known to a bin, and of few runs none may be a single packet.
