@@ -9,8 +9,8 @@ use statistics::{blocks_of, deviation, draw_blocks};
 /// with few returns near it.
 const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
 
-/// Least share of the returns that must be left inside of a step: where fewer are, nothing is known about its place.
-const LEAST_USUAL: f64 = 0.2;
+/// Least share of the returns that other losses leave inside of a step: where fewer are left, a law of losses ends there.
+const LEAST_USUAL: f64 = 0.4;
 
 /// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.
 pub fn range_cut(frames: &[FramePair], which: &[usize]) -> Option<f64> {
@@ -57,8 +57,8 @@ fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Opt
         let beyond = above(&a, 1.01 * farthest) / lost.max(1.0);
         let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
         // Other losses take as much just before a step as farther inside; a law of range takes more and more.
-        let usual = (inside_a / inside_b.max(1.0)).clamp(LEAST_USUAL, 1.0);
-        (step && before_b > 40.0 && before_a > 0.7 * usual * before_b).then(|| change(&a, &b, 0.8 * farthest))
+        let usual = (inside_a / inside_b.max(1.0)).min(1.0);
+        (step && before_b > 40.0 && usual > LEAST_USUAL && before_a > 0.7 * usual * before_b).then(|| change(&a, &b, 0.8 * farthest))
     })
 }
 

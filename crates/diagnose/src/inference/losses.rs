@@ -19,8 +19,8 @@ pub struct LossTable {
 /// Weight of the prior share of matches in a cell, returns.
 const PRIOR_RETURNS: f64 = 60.0;
 
-/// Width of a bin of the covariate of a law whose form is free: of ln(m) or of ln(cos).
-const FORM_BIN: f64 = 0.4;
+/// Width of a bin of the covariate of a law whose form is free, of ln(m) or of ln(cos): that of the cells.
+const FORM_BIN: f64 = 0.25;
 
 /// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;

@@ -101,11 +101,18 @@ impl Search<'_> {
         }
     }
 
-    /// Gains of the selecting frames by a sum of laws, fitted on other blocks.
+    /// Gains of the selecting frames by a sum of laws of any form, fitted on other blocks.
     fn gains_of(&self, laws: &[Law]) -> Vec<f64> {
         let tables = self.tables();
-        let fits: Vec<Vec<FittedLaw>> = tables.iter().map(|t| refit(t, laws)).collect();
-        let gain = |(&i, &fold): (&usize, &usize)| tables[fold].gain(&self.hits[i], &fits[fold], &[]);
+        let kept = |table: &LossTable| {
+            let laws = refit(table, laws);
+            [table.kept_by_forms(&laws, &laws), table.kept_by_forms(&[], &[])]
+        };
+        let kept: Vec<[Vec<f64>; 2]> = tables.iter().map(kept).collect();
+        let gain = |(&i, &fold): (&usize, &usize)| {
+            let [by_laws, without] = &kept[fold];
+            tables[fold].gain_of_shares(&self.hits[i], by_laws, without)
+        };
         self.select.iter().zip(&self.folds).map(gain).collect()
     }
 
