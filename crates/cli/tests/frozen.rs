@@ -150,7 +150,8 @@ fn cells_of_tables_are_no_formulas() {
     for path in tables.into_iter().chain([dir.path().join("numbers.csv")]) {
         let text = fs::read_to_string(&path).unwrap();
         named += text.matches("'=1+1").count() + text.matches("'=2+2").count();
-        let is_formula = text.lines().flat_map(|line| line.split(',')).any(|cell| cell.trim_matches('"').starts_with('='));
+        let is_formula =
+            text.lines().flat_map(|line| line.split(',')).any(|cell| cell.trim_matches('"').starts_with('='));
         assert!(!is_formula, "{}: {text}", path.display());
     }
     assert!(named > 0, "no table names the data set");
