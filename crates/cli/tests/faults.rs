@@ -341,27 +341,30 @@ impl Case {
                 eprintln!("{what}");
                 wrong.push(what);
             }
+            if (i + 1) % 10 == 0 || i + 1 == count {
+                eprintln!("{}: {} signals, {in_time} before the end, {} wrong", self.name, i + 1, wrong.len());
+            }
         }
-        eprintln!("{}: {count} signals, {in_time} before the end, {} wrong", self.name, wrong.len());
         assert!(wrong.is_empty(), "{} of {count} are wrong:\n{}", wrong.len(), wrong.join("\n---\n"));
     }
 
-    /// Runs the command with `count` limits of its address space, from too little to begin to more than enough, so that
-    /// an allocation fails at one moment or another.
+    /// Runs the command with `count` limits of its address space. They approach the least with which it ends well, so
+    /// that an allocation fails at one moment or another.
     fn limit_memory(&self, count: usize) {
         let count = asked("LIDARSHIFT_MEMORY").unwrap_or(count);
         let (_dir, root, before) = self.prepared();
         must(&root, self.command);
         let wanted = self.files(&root);
-        let (mut wrong, mut ends) = (Vec::new(), BTreeMap::new());
-        for i in 0..count {
+        let (mut wrong, mut ends, mut range_kib) = (Vec::new(), BTreeMap::new(), [32u32 << 10, 4 << 20]);
+        for _ in 0..count {
             restore(&root, &before);
-            let mib = (32.0 * 64f64.powf((i as f64 + 0.5) / count as f64)) as u64;
+            let kib = range_kib.map(f64::from).iter().product::<f64>().sqrt() as u32;
             let mut command = Command::new("bash");
-            command.args(["-c", "ulimit -v $0; exec \"$@\"", &(mib << 10).to_string()]);
+            command.args(["-c", "ulimit -v $0; exec \"$@\"", &kib.to_string()]);
             command.arg(env!("CARGO_BIN_EXE_lidarshift")).args(self.command.split_whitespace());
             let output = command.current_dir(&root).env("RAYON_NUM_THREADS", "1").output().unwrap();
             *ends.entry(output.status.to_string()).or_insert(0) += 1;
+            range_kib[usize::from(output.status.success())] = kib;
             let found = self.files(&root);
             let first = match output.status.code() {
                 Some(0) => self.difference(&found, &wanted),
@@ -372,7 +375,7 @@ impl Case {
                 true => self.difference(&self.files(&root), &wanted),
                 false => Some(format!("the command fails afterwards: {}", output_text(&again))),
             });
-            wrong.extend(what.map(|what| format!("{}: {mib} MiB: {what}\n{}", self.name, output_text(&output))));
+            wrong.extend(what.map(|what| format!("{}: {kib} KiB: {what}\n{}", self.name, output_text(&output))));
         }
         eprintln!("{}: {count} limits of memory, {} wrong; {ends:?}", self.name, wrong.len());
         assert!(wrong.is_empty(), "{} of {count} are wrong:\n{}", wrong.len(), wrong.join("\n---\n"));

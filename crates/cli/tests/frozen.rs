@@ -139,8 +139,8 @@ fn detections_made_elsewhere_are_a_study_without_training() {
 fn cells_of_tables_are_no_formulas() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());
-    let text = STUDY.replace("name = \"sim\"", "name = \"=1+1\"").replace("sim = \"dets", "\"=1+1\" = \"dets");
-    fs::write(dir.path().join("frozen.toml"), text.replace("title = \"Sim\"", "title = \"=2+2\"")).unwrap();
+    let text = STUDY.replace("title = \"Sim\"", "title = \"=1+1\"").replace("title = \"Ours 7\"", "title = \"=2+2\"");
+    fs::write(dir.path().join("frozen.toml"), text).unwrap();
     must(dir.path(), "study frozen.toml");
     must(dir.path(), "eval matrix frozen.toml --csv numbers.csv");
     let tables = fs::read_dir(dir.path().join("runs/frozen/tables")).unwrap().map(|entry| entry.unwrap().path());

@@ -5,8 +5,8 @@
 mod program;
 
 use program::{
-    TWO_SETS_STUDY as STUDY, kill_repeatedly, must, output_text, program, run, slurm, study_steps, training_job,
-    two_sets_study as study, waits_for,
+    TWO_SETS_STUDY as STUDY, data_set, kill_repeatedly, must, output_text, program, run, slurm, study_steps,
+    training_job, two_sets_study as study, waits_for,
 };
 use std::fs;
 use std::path::Path;
