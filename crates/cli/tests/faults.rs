@@ -2,11 +2,12 @@
 //! then ends with an error that names the file, or with all its results. The same command afterwards completes, and its
 //! files are the same bytes.
 //!
-//! Signals at random moments end the program as well. The same command afterwards gives the same bytes.
+//! Signals at random moments end the program as well, and so do limits of its memory. The same command afterwards gives
+//! the same bytes.
 //!
 //! A library between the program and the C library counts the operations and makes one fail (`faults/interpose.rs`).
 //! `cargo test` tries a sample of them. `LIDARSHIFT_FAULTS=all` tries all, a number that many of each command.
-//! `LIDARSHIFT_KILLS` is the number of signals for each command.
+//! `LIDARSHIFT_KILLS` is the number of signals for each command, `LIDARSHIFT_MEMORY` that of limits of the memory.
 #![cfg(target_os = "linux")]
 
 #[allow(dead_code, reason = "each test file uses a part of it")]
@@ -340,8 +341,43 @@ impl Case {
                 eprintln!("{what}");
                 wrong.push(what);
             }
+            if (i + 1) % 10 == 0 || i + 1 == count {
+                eprintln!("{}: {} signals, {in_time} before the end, {} wrong", self.name, i + 1, wrong.len());
+            }
         }
-        eprintln!("{}: {count} signals, {in_time} before the end, {} wrong", self.name, wrong.len());
+        assert!(wrong.is_empty(), "{} of {count} are wrong:\n{}", wrong.len(), wrong.join("\n---\n"));
+    }
+
+    /// Runs the command with `count` limits of its address space. They approach the least with which it ends well, so
+    /// that an allocation fails at one moment or another.
+    fn limit_memory(&self, count: usize) {
+        let count = asked("LIDARSHIFT_MEMORY").unwrap_or(count);
+        let (_dir, root, before) = self.prepared();
+        must(&root, self.command);
+        let wanted = self.files(&root);
+        let (mut wrong, mut ends, mut range_kib) = (Vec::new(), BTreeMap::new(), [32u32 << 10, 4 << 20]);
+        for _ in 0..count {
+            restore(&root, &before);
+            let kib = range_kib.map(f64::from).iter().product::<f64>().sqrt() as u32;
+            let mut command = Command::new("bash");
+            command.args(["-c", "ulimit -v $0; exec \"$@\"", &kib.to_string()]);
+            command.arg(env!("CARGO_BIN_EXE_lidarshift")).args(self.command.split_whitespace());
+            let output = command.current_dir(&root).env("RAYON_NUM_THREADS", "1").output().unwrap();
+            *ends.entry(output.status.to_string()).or_insert(0) += 1;
+            range_kib[usize::from(output.status.success())] = kib;
+            let found = self.files(&root);
+            let first = match output.status.code() {
+                Some(0) => self.difference(&found, &wanted),
+                _ => self.torn(&found, &before, &wanted),
+            };
+            let again = program(&root, self.again).output().unwrap();
+            let what = first.or_else(|| match again.status.success() {
+                true => self.difference(&self.files(&root), &wanted),
+                false => Some(format!("the command fails afterwards: {}", output_text(&again))),
+            });
+            wrong.extend(what.map(|what| format!("{}: {kib} KiB: {what}\n{}", self.name, output_text(&output))));
+        }
+        eprintln!("{}: {count} limits of memory, {} wrong; {ends:?}", self.name, wrong.len());
         assert!(wrong.is_empty(), "{} of {count} are wrong:\n{}", wrong.len(), wrong.join("\n---\n"));
     }
 
@@ -374,6 +410,16 @@ fn asked(variable: &str) -> Option<usize> {
         "all" => Some(usize::MAX),
         number => Some(number.parse().unwrap_or_else(|_| panic!("{variable} is a number or all"))),
     }
+}
+
+#[test]
+fn too_little_memory() {
+    let command = "simulate --config street.toml --out street";
+    Case { name: "simulate", prepare: street, command, again: command, varying: &[] }.limit_memory(8);
+    let command = "train --dataset . --detector tiny.toml --epochs 2 --set run.checkpoint_every_steps=2 --out run \
+                   --workers 1 --resume";
+    Case { name: "train", prepare: data_set, command, again: command, varying: &["provenance.json", "metrics.jsonl"] }
+        .limit_memory(8);
 }
 
 #[test]

@@ -136,6 +136,28 @@ fn detections_made_elsewhere_are_a_study_without_training() {
 
 /// The labels of `measured` are made wrong; the true boxes lie beside them.
 #[test]
+fn cells_of_tables_are_no_formulas() {
+    let dir = tempfile::tempdir().unwrap();
+    study(dir.path());
+    let text = STUDY.replace("title = \"Sim\"", "title = \"=1+1\"").replace("title = \"Ours 7\"", "title = \"=2+2\"");
+    fs::write(dir.path().join("frozen.toml"), text).unwrap();
+    must(dir.path(), "study frozen.toml");
+    must(dir.path(), "eval matrix frozen.toml --csv numbers.csv");
+    let tables = fs::read_dir(dir.path().join("runs/frozen/tables")).unwrap().map(|entry| entry.unwrap().path());
+    let tables: Vec<_> = tables.filter(|path| path.extension().is_some_and(|e| e == "csv")).collect();
+    assert!(!tables.is_empty());
+    let mut named = 0;
+    for path in tables.into_iter().chain([dir.path().join("numbers.csv")]) {
+        let text = fs::read_to_string(&path).unwrap();
+        named += text.matches("'=1+1").count() + text.matches("'=2+2").count();
+        let is_formula =
+            text.lines().flat_map(|line| line.split(',')).any(|cell| cell.trim_matches('"').starts_with('='));
+        assert!(!is_formula, "{}: {text}", path.display());
+    }
+    assert!(named > 0, "no table names the data set");
+}
+
+#[test]
 fn the_difference_is_split_where_the_truth_is_known() {
     let dir = tempfile::tempdir().unwrap();
     study(dir.path());

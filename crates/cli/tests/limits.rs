@@ -101,6 +101,38 @@ fn sizes_of_clouds() {
     refused(image, TRAIN, &["dataset.toml:2:", "image_size"]);
 }
 
+#[test]
+fn many_boxes_and_names() {
+    // Each label overlaps each detection: with time that grows with the square, this is done in seconds.
+    let dir = tempfile::tempdir().unwrap();
+    data_set(dir.path());
+    fs::create_dir(dir.path().join("found")).unwrap();
+    let (mut labels, mut found) = (String::new(), String::new());
+    for i in 0..2000 {
+        let (x, y) = (5.0 * f64::from(i % 50) + 5.0, 4.0 * f64::from(i / 50));
+        let line = format!("Car 0 0 0 0 0 100 50 1.5 1.6 3.9 {x} {y} -1 0");
+        labels += &format!("{line}\n");
+        found += &format!("{line} {}\n", f64::from(i + 1) / 2000.0);
+    }
+    fs::write(dir.path().join("label_2/000005.txt"), labels).unwrap();
+    fs::write(dir.path().join("found/000005.txt"), found).unwrap();
+    fs::write(dir.path().join("ids.txt"), "000005\n").unwrap();
+    let eval = "eval ap --labels label_2 --label-frame lidar --detections found --ids ids.txt --json ap.json";
+    program::must(dir.path(), eval);
+    let ap: serde_json::Value = serde_json::from_slice(&fs::read(dir.path().join("ap.json")).unwrap()).unwrap();
+    let is_all = |r: &&serde_json::Value| r["metric"] == "3d" && r["difficulty"] == "all" && r["n_gt"] == 2000;
+    assert!(ap["rows"].as_array().unwrap().iter().any(|r| is_all(&r)), "{ap}");
+
+    let names = |f: &Path| {
+        let tensor = |i: u32| format!("\"tensor_{i}\":{{\"dtype\":\"F32\",\"shape\":[0],\"data_offsets\":[0,0]}}");
+        let header = format!("{{{}}}", (0..1_000_000).map(tensor).collect::<Vec<_>>().join(","));
+        let length = (header.len() as u64).to_le_bytes();
+        fs::write(f.join("many.safetensors"), [&length[..], header.as_bytes()].concat()).unwrap();
+    };
+    let detect = "detect . --checkpoint many.safetensors --detector tiny.toml --out found";
+    refused(names, detect, &["many.safetensors", "bytes with names of tensors; at most"]);
+}
+
 #[cfg(unix)]
 #[test]
 fn only_regular_files_are_read() {

@@ -4,11 +4,9 @@
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, output_text, program};
+use program::{data_set, kill_repeatedly, must, output_text, program, steps};
 use std::fs;
 use std::path::Path;
-use std::process::Stdio;
-use std::time::Duration;
 
 const TRAIN: &str = "train --dataset . --detector tiny.toml --epochs 4 --set run.checkpoint_every_steps=2";
 const TRAIN_POINTRCNN: &str =
@@ -19,11 +17,6 @@ const TRAIN_CENTERPOINT: &str =
 
 fn weights(folder: &Path, run: &str) -> Vec<u8> {
     fs::read(folder.join(run).join("checkpoint/last.safetensors")).unwrap()
-}
-
-/// Number of lines in the metrics of the run.
-fn steps(folder: &Path, run: &str) -> usize {
-    fs::read_to_string(folder.join(run).join("metrics.jsonl")).map_or(0, |text| text.lines().count())
 }
 
 #[test]
@@ -45,20 +38,8 @@ fn kill_and_resume(train: &str) {
     let dir = tempfile::tempdir().unwrap();
     data_set(dir.path());
     must(dir.path(), &format!("{train} --seed 1 --out whole"));
-    let mut kills = 0;
-    for patience_ms in [0, 15, 40, 90, 150, 300] {
-        let arguments = format!("{train} --seed 1 --out killed --resume");
-        let mut child = program(dir.path(), &arguments).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
-        let before = steps(dir.path(), "killed");
-        while steps(dir.path(), "killed") == before && child.try_wait().unwrap().is_none() {
-            std::thread::sleep(Duration::from_millis(2));
-        }
-        std::thread::sleep(Duration::from_millis(patience_ms));
-        kills += u32::from(child.try_wait().unwrap().is_none());
-        child.kill().unwrap(); // SIGKILL
-        child.wait().unwrap();
-    }
-    assert!(kills >= 2, "only {kills} runs were killed before their end");
+    let command = || program(dir.path(), &format!("{train} --seed 1 --out killed --resume"));
+    kill_repeatedly(command, || steps(&dir.path().join("killed")), &[0, 15, 40, 90, 150, 300]);
     must(dir.path(), &format!("{train} --seed 1 --out killed --resume"));
     assert!(weights(dir.path(), "killed") == weights(dir.path(), "whole"), "the weights differ");
 }

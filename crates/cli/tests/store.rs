@@ -1,5 +1,5 @@
-//! Data sets in an object store, through a program that was built with the feature `store`: trainings and a study,
-//! killed and resumed, equal to those of the same data set on the disk.
+//! Data sets in an object store, through a program that was built with the feature `store`: trainings and studies,
+//! killed and resumed, on this machine and on Slurm, equal to those of the same data set on the disk.
 #![cfg(feature = "store")]
 
 #[path = "../../data/tests/bucket/mod.rs"]
@@ -9,13 +9,15 @@ mod bucket;
 mod program;
 
 use bucket::Server;
-use program::{data_set, must, output_text, program};
+use program::{
+    TWO_SETS_RUNS, TWO_SETS_STUDY, data_set, kill_repeatedly, must, output_text, program, slurm, steps, study_steps,
+    training_job, two_sets_study, waits_for,
+};
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::Ordering::Relaxed;
-use std::time::Duration;
 
 /// The data set in the bucket.
 const URL: &str = "s3://drives/set";
@@ -42,29 +44,16 @@ fn finish(mut command: Command) -> String {
     output_text(&output)
 }
 
-/// Kills the command some times, each time when `done` has grown, and lets it end then.
-fn kill_and_finish(command: &dyn Fn() -> Command, done: &dyn Fn() -> usize, server: &Server) {
-    let mut kills = 0;
-    for patience_ms in [0, 20, 60, 150] {
-        let before = done();
+/// Kills the command some times, and lets it end then.
+fn kill_and_finish(command: impl Fn() -> Command, done: impl Fn() -> usize, server: &Server) {
+    let failing = || {
         // Some requests fail for a while.
         server.busy.store(2, Relaxed);
         server.cut.store(1, Relaxed);
-        let mut child = command().stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        while done() == before && child.try_wait().unwrap().is_none() {
-            std::thread::sleep(Duration::from_millis(2));
-        }
-        std::thread::sleep(Duration::from_millis(patience_ms));
-        kills += u32::from(child.try_wait().unwrap().is_none());
-        child.kill().unwrap(); // SIGKILL
-        child.wait().unwrap();
-    }
-    assert!(kills >= 2, "only {kills} were killed before their end");
+        command()
+    };
+    kill_repeatedly(failing, done, &[0, 20, 60, 150]);
     finish(command());
-}
-
-fn lines(path: &Path) -> usize {
-    fs::read_to_string(path).map_or(0, |text| text.lines().count())
 }
 
 #[test]
@@ -77,7 +66,7 @@ fn a_killed_training_from_a_store_ends_with_the_bits_of_a_local_one() {
     };
     must(dir.path(), &train("shards", "local"));
     let command = || with_store(dir.path(), &address, &train(URL, "remote"));
-    kill_and_finish(&command, &|| lines(&dir.path().join("remote/metrics.jsonl")), &server);
+    kill_and_finish(command, || steps(&dir.path().join("remote")), &server);
     let weights = |out: &str| fs::read(dir.path().join(out).join("checkpoint/last.safetensors")).unwrap();
     assert!(weights("remote") == weights("local"), "the weights differ");
     let report = finish(with_store(dir.path(), &address, &format!("doctor {URL}")));
@@ -89,53 +78,66 @@ fn a_killed_training_from_a_store_ends_with_the_bits_of_a_local_one() {
     assert!(text.contains("s3://drives/set: needs credentials: set AWS_ACCESS_KEY_ID"), "{text}");
 }
 
-/// The data set and a changed copy, two seeds.
-const STUDY: &str = r#"
-name = "tiny"
-about = ["A test."]
-seeds = [1, 2]
-epochs = 2
-splits = { test = "val" }
-[[dataset]]
-name = "plain"
-source = { path = "SET" }
-[[dataset]]
-name = "noisy"
-source = { resim = { of = "plain", effects = "noise.toml" } }
-[[detector]]
-name = "tiny"
-config = "tiny.toml"
-[evaluation]
-tsne = { perplexity = 1.0, steps = 50 }
-distances = { emd_points = 32, sinkhorn_points = 32, sinkhorn_iterations = 5, directions = 4 }
-[evaluation.matrix.bootstrap]
-replicates = 40
-"#;
+/// What has to be equal: weights and detections of each run, and the matrix.
+fn assert_same_study(folder: &Path, wanted: &Path) {
+    let files = TWO_SETS_RUNS.iter().flat_map(|run| {
+        ["checkpoint/last.safetensors", "detections/plain/detections.parquet", "detections/noisy/detections.parquet"]
+            .map(|file| format!("tiny/{run}/{file}"))
+    });
+    for file in files.chain(["matrix.json".into()]) {
+        let bytes = |root: &Path| fs::read(root.join("runs/tiny").join(&file)).unwrap();
+        assert!(bytes(folder) == bytes(wanted), "{file} differs");
+    }
+}
+
+/// Two folders with the study: of the data set on the disk, where it is done, and of that in the store.
+fn studies(study: &str) -> (tempfile::TempDir, tempfile::TempDir, Arc<Server>, String) {
+    let [local, remote] = [(), ()].map(|()| tempfile::tempdir().unwrap());
+    let (server, address) = prepared(local.path());
+    for (folder, set) in [(&local, "shards"), (&remote, URL)] {
+        two_sets_study(folder.path());
+        let text = study.replace("path = \".\"", &format!("path = \"{set}\""));
+        fs::write(folder.path().join("tiny-study.toml"), text).unwrap();
+    }
+    must(local.path(), "study tiny-study.toml");
+    (local, remote, server, address)
+}
 
 #[test]
 fn a_killed_study_with_a_data_set_in_a_store_gives_the_numbers_of_a_local_one() {
-    let dir = tempfile::tempdir().unwrap();
-    let (server, address) = prepared(dir.path());
-    fs::write(dir.path().join("noise.toml"), "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n").unwrap();
-    for (name, set) in [("local", "shards"), ("remote", URL)] {
-        let text = STUDY.replace("SET", set).replace("name = \"tiny\"\nabout", &format!("name = \"{name}\"\nabout"));
-        fs::write(dir.path().join(format!("{name}.toml")), text).unwrap();
-    }
-    must(dir.path(), "study local.toml");
-    let runs = ["plain/seed-1", "plain/seed-2", "noisy/seed-1", "noisy/seed-2"];
-    let run = |study: &str, run: &str| dir.path().join("runs").join(study).join("tiny").join(run);
-    let done = || runs.iter().map(|name| lines(&run("remote", name).join("metrics.jsonl"))).sum();
-    kill_and_finish(&|| with_store(dir.path(), &address, "study remote.toml"), &done, &server);
-    for name in runs {
-        for file in ["checkpoint/last.safetensors", "detections/plain/detections.parquet"] {
-            let bytes = |study: &str| fs::read(run(study, name).join(file)).unwrap();
-            assert!(bytes("remote") == bytes("local"), "{name}/{file} differs");
-        }
-    }
-    let matrix = |study: &str| -> serde_json::Value {
-        serde_json::from_slice(&fs::read(dir.path().join("runs").join(study).join("matrix.json")).unwrap()).unwrap()
-    };
-    assert_eq!(matrix("remote"), matrix("local"));
-    let status = finish(with_store(dir.path(), &address, "study status remote.toml"));
+    let (local, remote, server, address) = studies(TWO_SETS_STUDY);
+    let command = || with_store(remote.path(), &address, "study tiny-study.toml");
+    kill_and_finish(command, || study_steps(remote.path()), &server);
+    assert_same_study(remote.path(), local.path());
+    let status = finish(with_store(remote.path(), &address, "study status tiny-study.toml"));
     assert!(status.contains("4 done"), "{status}");
+}
+
+#[test]
+fn on_slurm_a_requeued_study_with_a_data_set_in_a_store_gives_the_numbers_of_a_local_one() {
+    if slurm(&["sinfo", "--noheader"]).is_none() {
+        eprintln!("skipped: there is no Slurm");
+        return;
+    }
+    let (local, remote, _server, address) = studies(&TWO_SETS_STUDY.replace("epochs = 2", "epochs = 40"));
+    let submit = || finish(with_store(remote.path(), &address, "study tiny-study.toml --launcher slurm"));
+    let run = |index: usize| remote.path().join("runs/tiny/tiny").join(TWO_SETS_RUNS[index]);
+    let job = training_job(&submit());
+    // As at a pre-emption: SIGTERM, then the same task once more. Another task is killed and not repeated.
+    assert!(waits_for(|| steps(&run(0)) > 0), "the first task does not begin");
+    slurm(&["scontrol", "requeue", &format!("{job}_0")]).expect("a task that is at work");
+    slurm(&["scancel", &format!("{job}_3")]).unwrap();
+    assert!(steps(&run(0)) < 120, "the task has ended before");
+    let restarts = slurm(&["scontrol", "show", "job", &format!("{job}_0")]).unwrap();
+    assert!(restarts.contains("Restarts=1"), "{restarts}");
+    assert!(waits_for(|| remote.path().join("runs/tiny/report.html").is_file()), "no report");
+    let status = || finish(with_store(remote.path(), &address, "study status tiny-study.toml"));
+    assert!(status().contains("3 done"), "{}", status());
+    // A second submission fills the gap alone.
+    let text = submit();
+    assert!(text.contains("1 tasks"), "{text}");
+    assert!(waits_for(|| status().contains("4 done")), "{}", status());
+    let matrix = |folder: &Path| fs::read(folder.join("runs/tiny/matrix.json")).unwrap();
+    assert!(waits_for(|| matrix(remote.path()) == matrix(local.path())), "the numbers differ");
+    assert_same_study(remote.path(), local.path());
 }

@@ -4,56 +4,15 @@
 #[allow(dead_code, reason = "each test file uses a part of it")]
 mod program;
 
-use program::{data_set, must, output_text, program, run};
+use program::{
+    TWO_SETS_STUDY as STUDY, data_set, kill_repeatedly, must, output_text, program, run, slurm, study_steps,
+    training_job, two_sets_study as study, waits_for,
+};
 use std::fs;
 use std::path::Path;
-use std::process::Stdio;
-use std::time::Duration;
-
-/// Two data sets with the same seven frames, two seeds of the tiny network.
-const STUDY: &str = r#"
-name = "tiny"
-about = ["A test."]
-seeds = [1, 2]
-epochs = 2
-splits = { test = "val" }
-
-[[dataset]]
-name = "plain"
-title = "Plain"
-source = { path = "." }
-
-[[dataset]]
-name = "noisy"
-title = "Noisy"
-source = { resim = { of = "plain", effects = "noise.toml" } }
-
-[[detector]]
-name = "tiny"
-config = "tiny.toml"
-
-[evaluation]
-tsne = { perplexity = 1.0, steps = 50 }
-distances = { emd_points = 32, sinkhorn_points = 32, sinkhorn_iterations = 5, directions = 4 }
-
-[evaluation.matrix.bootstrap]
-replicates = 40
-"#;
-
-fn study(folder: &Path) {
-    data_set(folder);
-    fs::write(folder.join("noise.toml"), "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n").unwrap();
-    fs::write(folder.join("tiny-study.toml"), STUDY).unwrap();
-}
 
 fn page(folder: &Path) -> String {
     fs::read_to_string(folder.join("runs/tiny/report.html")).unwrap()
-}
-
-fn steps_done(folder: &Path) -> usize {
-    let runs = ["plain/seed-1", "plain/seed-2", "noisy/seed-1", "noisy/seed-2"];
-    let lines = |run: &&str| fs::read_to_string(folder.join("runs/tiny/tiny").join(run).join("metrics.jsonl"));
-    runs.iter().filter_map(|run| lines(run).ok()).map(|text| text.lines().count()).sum()
 }
 
 /// Compares two pages; a failure shows the first difference.
@@ -94,23 +53,8 @@ fn a_killed_study_is_resumed_with_the_same_report() {
     // The same study in another folder, killed several times, gives the same report.
     let killed = tempfile::tempdir().unwrap();
     study(killed.path());
-    let mut kills = 0;
-    for patience_ms in [5, 40, 120, 250, 60] {
-        let before = steps_done(killed.path());
-        let mut child = program(killed.path(), "study tiny-study.toml")
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap();
-        while steps_done(killed.path()) == before && child.try_wait().unwrap().is_none() {
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        std::thread::sleep(Duration::from_millis(patience_ms));
-        kills += u32::from(child.try_wait().unwrap().is_none());
-        child.kill().unwrap(); // SIGKILL
-        child.wait().unwrap();
-    }
-    assert!(kills >= 2, "only {kills} studies were killed before their end");
+    let command = || program(killed.path(), "study tiny-study.toml");
+    kill_repeatedly(command, || study_steps(killed.path()), &[5, 40, 120, 250, 60]);
     must(killed.path(), "study tiny-study.toml");
     assert_same_page(&page(killed.path()), &html);
 
@@ -321,20 +265,6 @@ fn invalid_studies_are_refused() {
     assert!(!output.status.success() && text.contains("do not pair") && text.contains("000000"), "{text}");
 }
 
-/// Whether `condition` comes true within ten minutes.
-fn waits_for(mut condition: impl FnMut() -> bool) -> bool {
-    (0..3000).any(|_| {
-        std::thread::sleep(Duration::from_millis(200));
-        condition()
-    })
-}
-
-/// What a command of Slurm says; `None` when it fails or is not there.
-fn slurm(arguments: &[&str]) -> Option<String> {
-    let output = std::process::Command::new(arguments[0]).args(&arguments[1..]).output().ok()?;
-    output.status.success().then(|| output_text(&output))
-}
-
 /// A node that takes no new task; it goes on with those that run, and takes new ones again when this is dropped.
 struct Drained(String);
 
@@ -350,11 +280,6 @@ impl Drop for Drained {
     fn drop(&mut self) {
         slurm(&["scontrol", "update", &self.0, "state=resume"]);
     }
-}
-
-/// The number of the job of training that a submission names.
-fn training_job(text: &str) -> String {
-    text.lines().find_map(|line| line.strip_prefix("train: job ")?.split(',').next()).unwrap().to_string()
 }
 
 #[test]
@@ -401,7 +326,7 @@ fn on_slurm_the_numbers_are_the_same() {
     let drained = tempfile::tempdir().unwrap();
     study(drained.path());
     must(drained.path(), "study tiny-study.toml --launcher slurm");
-    assert!(waits_for(|| steps_done(drained.path()) > 0), "no task begins");
+    assert!(waits_for(|| study_steps(drained.path()) > 0), "no task begins");
     let Some(guard) = Drained::drain(node) else {
         eprintln!("skipped: only Slurm's administrator may drain a node");
         return;

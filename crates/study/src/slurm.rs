@@ -105,7 +105,9 @@ impl<'a> Submission<'a> {
         let mut command = Command::new("sbatch");
         command.arg("--parsable").arg(format!("--job-name={}-{name}", self.name));
         // Otherwise a job whose dependency has failed would wait forever.
-        command.arg("--kill-on-invalid-dep=yes").arg("--output").arg(&log).args(options).args(self.sbatch).arg(&script);
+        command.arg("--kill-on-invalid-dep=yes").arg("--output").arg(&log);
+        // A task that Slurm pre-empts is repeated, and its log continued.
+        command.args(["--requeue", "--open-mode=append"]).args(options).args(self.sbatch).arg(&script);
         let output = run_command(&mut command)?;
         // "123" or "123;cluster".
         Ok(output.trim().split(';').next().unwrap_or_default().to_string())

@@ -5,7 +5,8 @@ use data::{Cloud, Detection, Frame, Layout, Object, stream};
 use geometry::Box3;
 use rand::RngExt;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::time::Duration;
 
 /// A PointPillars with a few thousand weights and a range of 10 m.
 pub const TINY_DETECTOR: &str = r#"
@@ -150,6 +151,46 @@ config = "tiny.toml"
     std::fs::write(folder.join("study.toml"), study).unwrap();
 }
 
+/// A study of two data sets with the same frames, two seeds of the tiny network each.
+pub const TWO_SETS_STUDY: &str = r#"
+name = "tiny"
+about = ["A test."]
+seeds = [1, 2]
+epochs = 2
+splits = { test = "val" }
+
+[[dataset]]
+name = "plain"
+title = "Plain"
+source = { path = "." }
+
+[[dataset]]
+name = "noisy"
+title = "Noisy"
+source = { resim = { of = "plain", effects = "noise.toml" } }
+
+[[detector]]
+name = "tiny"
+config = "tiny.toml"
+
+[evaluation]
+tsne = { perplexity = 1.0, steps = 50 }
+distances = { emd_points = 32, sinkhorn_points = 32, sinkhorn_iterations = 5, directions = 4 }
+
+[evaluation.matrix.bootstrap]
+replicates = 40
+"#;
+
+/// The runs of [`TWO_SETS_STUDY`] below the folder of its detector.
+pub const TWO_SETS_RUNS: [&str; 4] = ["plain/seed-1", "plain/seed-2", "noisy/seed-1", "noisy/seed-2"];
+
+/// Writes `tiny-study.toml` with [`TWO_SETS_STUDY`] beside the data set of [`data_set`].
+pub fn two_sets_study(folder: &Path) {
+    data_set(folder);
+    std::fs::write(folder.join("noise.toml"), "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.05\n").unwrap();
+    std::fs::write(folder.join("tiny-study.toml"), TWO_SETS_STUDY).unwrap();
+}
+
 /// OpenPCDet's `result.pkl` with these detections by frame, as Python writes arrays of numpy 2 with protocol 3.
 pub fn result_pkl(frames: &[(String, Vec<Detection>)]) -> Vec<u8> {
     let text = |s: &str| [&b"X"[..], &(s.len() as u32).to_le_bytes(), s.as_bytes()].concat();
@@ -205,4 +246,51 @@ pub fn must(folder: &Path, arguments: &str) -> Output {
 /// Stdout and stderr of the program.
 pub fn output_text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// Number of lines in the metrics of a run.
+pub fn steps(run: &Path) -> usize {
+    std::fs::read_to_string(run.join("metrics.jsonl")).map_or(0, |text| text.lines().count())
+}
+
+/// Steps of all runs of [`two_sets_study`].
+pub fn study_steps(folder: &Path) -> usize {
+    TWO_SETS_RUNS.iter().map(|run| steps(&folder.join("runs/tiny/tiny").join(run))).sum()
+}
+
+/// Starts a command once for each patience, and kills it that long after `done` has grown. Two of them at least must
+/// be killed before their end.
+pub fn kill_repeatedly(command: impl Fn() -> Command, done: impl Fn() -> usize, patiences_ms: &[u64]) {
+    let mut kills = 0;
+    for &patience_ms in patiences_ms {
+        let before = done();
+        let mut child = command().stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        while done() == before && child.try_wait().unwrap().is_none() {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        std::thread::sleep(Duration::from_millis(patience_ms));
+        kills += u32::from(child.try_wait().unwrap().is_none());
+        child.kill().unwrap(); // SIGKILL
+        child.wait().unwrap();
+    }
+    assert!(kills >= 2, "only {kills} were killed before their end");
+}
+
+/// Whether `condition` comes true within ten minutes.
+pub fn waits_for(mut condition: impl FnMut() -> bool) -> bool {
+    (0..3000).any(|_| {
+        std::thread::sleep(Duration::from_millis(200));
+        condition()
+    })
+}
+
+/// The output of a command of Slurm; `None` if it fails or does not exist.
+pub fn slurm(arguments: &[&str]) -> Option<String> {
+    let output = Command::new(arguments[0]).args(&arguments[1..]).output().ok()?;
+    output.status.success().then(|| output_text(&output))
+}
+
+/// The number of the job of training that a submission names.
+pub fn training_job(text: &str) -> String {
+    text.lines().find_map(|line| line.strip_prefix("train: job ")?.split(',').next()).unwrap().to_string()
 }
