@@ -134,7 +134,6 @@ fn detections_made_elsewhere_are_a_study_without_training() {
     assert!(page(dir.path()) != html);
 }
 
-/// The labels of `measured` are made wrong; the true boxes lie beside them.
 #[test]
 fn cells_of_tables_are_no_formulas() {
     let dir = tempfile::tempdir().unwrap();
@@ -157,6 +156,7 @@ fn cells_of_tables_are_no_formulas() {
     assert!(named > 0, "no table names the data set");
 }
 
+/// The labels of `measured` are made wrong; the true boxes lie beside them.
 #[test]
 fn the_difference_is_split_where_the_truth_is_known() {
     let dir = tempfile::tempdir().unwrap();
