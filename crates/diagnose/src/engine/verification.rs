@@ -306,6 +306,9 @@ pub(super) fn measure_gain(
 /// Difference of what was promised and what was reached from which on the form of a cause does not fit.
 const FORM: f64 = 0.05;
 
+/// Share of a channel's difference that is much of it.
+const MUCH: f64 = 0.5;
+
 /// Lists findings without an effect as not applied, and writes to each finding what the fits promised of its channel
 /// and what was reached there. A named cause whose effect was applied and surely reaches less than it promised, by more
 /// than 5 points, does not have the form of the difference: it is ambiguous where another cause was significant as
@@ -322,8 +325,9 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, seen: impl Fn(&Finding) -> 
         let (Some(promised), Some(measured)) = (finding.predicted, measured) else { continue };
         let applied = !finding.effects.is_empty()
             && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
-        // What the extended simulation makes no better is not what is wrong.
-        let surely_less = measured.closed <= 0.0 || measured.ci95.is_some_and(|[_, high]| high < promised - FORM);
+        // What the extended simulation makes no better is not what is wrong, if it promised to be much of it.
+        let no_better = measured.closed <= 0.0 && promised > MUCH;
+        let surely_less = no_better || measured.ci95.is_some_and(|[_, high]| high < promised - FORM);
         if finding.status == Status::Named && applied && surely_less && measured.closed < promised - FORM {
             finding.says.push_str(&format!(
                 "; with the extended simulation {:.0} % of the difference is gone where the fit says {:.0} %: the form of \
