@@ -58,7 +58,8 @@ fn cut(frames: &[FramePair], which: &[usize], value: impl Fn(f64) -> f64) -> Opt
         let step = lost > 60.0 && lost > 0.0015 * b.len() as f64 && beyond < 0.05;
         // Other losses take as much just before a step as farther inside; a law of range takes more and more.
         let usual = (inside_a / inside_b.max(1.0)).min(1.0);
-        (step && before_b > 40.0 && usual > LEAST_USUAL && before_a > 0.7 * usual * before_b).then(|| change(&a, &b, 0.8 * farthest))
+        (step && before_b > 40.0 && usual > LEAST_USUAL && before_a > 0.7 * usual * before_b)
+            .then(|| change(&a, &b, 0.8 * farthest))
     })
 }
 
