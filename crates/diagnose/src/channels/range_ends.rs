@@ -9,7 +9,8 @@ use statistics::{blocks_of, deviation, draw_blocks};
 /// with few returns near it.
 const OUTLIER_ONE_IN: [usize; 2] = [2_000, 20_000];
 
-/// Least share of the returns that other losses leave inside of a step: where fewer are left, a law of losses ends there.
+/// Least share of the returns that other losses leave inside of a step: where fewer are left, a law of losses ends
+/// there.
 const LEAST_USUAL: f64 = 0.4;
 
 /// The largest measured range, m: beyond it only the simulation has returns, before it both sides have.

@@ -41,8 +41,8 @@ impl Runs {
         Runs { sensor, bin: widths[sensor], lengths, all: judged as f64 * widths[sensor] }
     }
 
-    /// Length of a packet as a share of a scan. Most bursts are short, so that the shortest runs are single packets; but
-    /// the shortest ones that hold together less than a twentieth of what is lost may be no packets at all.
+    /// Length of a packet as a share of a scan. Most bursts are short, so that the shortest runs are single packets;
+    /// but the shortest ones that hold together less than a twentieth of what is lost may be no packets at all.
     pub(super) fn packet(&self) -> f64 {
         let mut sorted = self.lengths.clone();
         sorted.sort_by(f64::total_cmp);
