@@ -3,6 +3,7 @@
 use super::{GROUP_FLOOR, GROUPED, Search, refit, table};
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::{Grouping, total as group_total};
+use crate::diagnosis::Considered;
 use crate::inference::choice::{Choice, Trial, choose, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::law::{FittedLaw, LAWS, Law};
@@ -39,14 +40,15 @@ impl Search<'_> {
     /// unless the other one gains more, significantly.
     pub(super) fn select(&self, result: &mut ChannelResult) -> Selection {
         let first = self.trials(&[], 0.0);
-        let Some(choice) = self.choose(&first, result) else { return Selection::default() };
+        let Some(choice) = self.choose(&first, &mut result.considered) else { return Selection::default() };
         let gain = |t: &Trial| total_and_z(&t.gains).0;
         let chosen = gain(&first[choice.chosen]);
-        let one = self.grow(&first, &choice, result);
+        let one = self.grow(&first, &choice, &mut result.considered);
         let random = first.iter().position(|t| t.cause == Cause::RandomDropout && t.above_floor);
         let other = random.filter(|&r| r != choice.chosen && gain(&first[r]) > MOSTLY_RANDOM * chosen);
         let Some(random) = other.filter(|_| one.unexplained.is_none()) else { return one };
-        let two = self.grow(&first, &Choice { chosen: random, equals: vec![] }, result);
+        let mut considered = vec![];
+        let two = self.grow(&first, &Choice { chosen: random, equals: vec![] }, &mut considered);
         if two.laws.len() < 2 || two.unexplained.is_some() {
             return one;
         }
@@ -55,24 +57,32 @@ impl Search<'_> {
         let (ahead, z) = total_and_z(&of_two.iter().zip(&of_one).map(|(b, a)| b - a).collect::<Vec<f64>>());
         let better =
             if parameters(&two) <= parameters(&one) { ahead > 0.0 || z > -2.0 } else { ahead > 0.0 && z > 2.0 };
-        if better { two } else { one }
+        if !better {
+            return one;
+        }
+        result.considered.extend(considered);
+        two
     }
 
     /// Adds laws to a first one: the one that gains most beside any form of those before it; then each law is chosen
     /// anew beside the others, until none brings enough. A table by direction tells against laws.
-    fn grow(&self, first: &[Trial], choice: &Choice, result: &mut ChannelResult) -> Selection {
+    fn grow(&self, first: &[Trial], choice: &Choice, considered: &mut Vec<Considered>) -> Selection {
         let mut selection = Selection::default();
         self.add(&mut selection, &LAWS, first, choice);
+        if selection.unexplained.is_some() {
+            return selection;
+        }
         let mut most = total_and_z(&first[choice.chosen].gains).0;
-        while selection.unexplained.is_none() && selection.laws.len() < MOST_LAWS {
+        for _ in 1..MOST_LAWS {
             let trials = self.trials(&selection.laws, most);
-            let Some(choice) = self.choose(&trials, result) else { break };
+            let Some(choice) = self.choose(&trials, considered) else { break };
             most = most.max(total_and_z(&trials[choice.chosen].gains).0);
             let candidates = others(&selection.laws);
             self.add(&mut selection, &candidates, &trials, &choice);
-            if selection.unexplained.is_none() {
-                self.choose_anew(&mut selection, result);
+            if selection.unexplained.is_some() {
+                break;
             }
+            self.choose_anew(&mut selection);
         }
         selection
     }
@@ -125,13 +135,13 @@ impl Search<'_> {
     }
 
     /// Chooses each law anew beside the others; one that brings too little there is dropped.
-    fn choose_anew(&self, selection: &mut Selection, result: &mut ChannelResult) {
+    fn choose_anew(&self, selection: &mut Selection) {
         let mut k = 0;
         while k < selection.laws.len() {
             let beside = [&selection.laws[..k], &selection.laws[k + 1..]].concat();
             let candidates = others(&beside);
             let trials = self.law_trials(&candidates, &beside);
-            match self.choose(&trials, result) {
+            match choose(&trials, &self.demands) {
                 Some(choice) => {
                     selection.laws[k] = candidates[trials[choice.chosen].candidate];
                     selection.selected[k] = self.selected(&trials, &choice);
@@ -145,10 +155,10 @@ impl Search<'_> {
         }
     }
 
-    fn choose(&self, trials: &[Trial], result: &mut ChannelResult) -> Option<Choice> {
+    fn choose(&self, trials: &[Trial], considered: &mut Vec<Considered>) -> Option<Choice> {
         let choice = choose(trials, &self.demands);
         let returns = self.context.returns(&self.select);
-        result.considered.extend(record(trials, choice.as_ref(), Channel::Hits, returns, &self.demands));
+        considered.extend(record(trials, choice.as_ref(), Channel::Hits, returns, &self.demands));
         choice
     }
 
