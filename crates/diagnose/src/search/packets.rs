@@ -37,8 +37,8 @@ const USUALLY_SEEN: f64 = 0.5;
 /// Smallest share of returns that is reported: one in a thousand.
 const FLOOR: f64 = 1e-3;
 
-/// Fewest dark bins, and fewest runs of them. That all returns of many shots in a row are lost by chance is as good as
-/// impossible; a single run may be a frame that was cut off.
+/// Fewest dark bins, and fewest runs of them of one sensor. That all returns of many shots in a row are lost by chance
+/// is as good as impossible; a single run may be a frame that was cut off.
 const FEWEST_DARK: [usize; 2] = [5, 2];
 
 /// Largest ratio of dark bins of the other side: these are things that one side lacks.
@@ -186,7 +186,8 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     let all = [select.as_slice(), &estimate].concat();
     let looked_at = || all.iter();
     let number = |of: &[BTreeSet<Bin>]| looked_at().map(|&i| of[i].len()).sum::<usize>();
-    let runs = looked_at().map(|&i| runs_of(&dark.0[i]).count()).sum::<usize>();
+    let runs_of = |sensor: u8| looked_at().map(|&i| runs_of(&dark.0[i], sensor)).sum::<usize>();
+    let runs = (0..context.rig.sensors.len() as u8).map(runs_of).max().unwrap_or(0);
     let mean = looked_at().map(|&i| share(i)).sum::<f64>() / looked_at().count().max(1) as f64;
     let chosen = number(&dark.0) >= FEWEST_DARK[0]
         && runs >= FEWEST_DARK[1]
@@ -270,9 +271,9 @@ fn bins_below(share: f64, frames: &[Counts], other: &[Counts]) -> Vec<BTreeSet<B
     frames.iter().zip(other).map(of_frame).collect()
 }
 
-/// First bins of the runs of dark bins of a frame.
-fn runs_of(dark: &BTreeSet<Bin>) -> impl Iterator<Item = &Bin> {
-    dark.iter().filter(|(sensor, bin)| !dark.contains(&(*sensor, bin - 1)))
+/// Number of runs of dark bins of a sensor in a frame.
+fn runs_of(dark: &BTreeSet<Bin>, sensor: u8) -> usize {
+    dark.iter().filter(|(s, bin)| *s == sensor && !dark.contains(&(sensor, bin - 1))).count()
 }
 
 /// The finding.
