@@ -90,6 +90,11 @@ impl Law {
         }
     }
 
+    /// Whether it is a step over a covariate, whose form is never exactly that of the sensor.
+    pub fn has_form(self) -> bool {
+        matches!(self, Law::Range | Law::Incidence | Law::Signal)
+    }
+
     /// Free parameters.
     pub fn parameters(self) -> usize {
         match self {

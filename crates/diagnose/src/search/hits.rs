@@ -20,7 +20,7 @@ use crate::diagnosis::Minimum;
 use crate::inference::choice::Demands;
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::law::{FittedLaw, Law};
-use crate::inference::linear::fold_of;
+use crate::inference::linear::{FOLDS, fold_of};
 use crate::inference::losses::LossTable;
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
@@ -71,8 +71,9 @@ struct Search<'a> {
     /// Blocks and folds of the selecting frames.
     blocks: Vec<usize>,
     folds: Vec<usize>,
-    /// Counts of the selecting frames.
+    /// Counts of the selecting frames: of all, and without those of each fold.
     table: LossTable,
+    without_fold: Vec<LossTable>,
     demands: Demands,
 }
 
@@ -81,13 +82,19 @@ impl<'a> Search<'a> {
         let hits = hit_frames(context.frames, mask);
         let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
         let blocks = context.blocks(&select);
+        let folds = fold_of(&blocks);
+        let without = |fold: usize| {
+            let train: Vec<usize> = select.iter().zip(&folds).filter(|(_, f)| **f != fold).map(|(i, _)| *i).collect();
+            table(&hits, &train)
+        };
         Search {
             context,
             mask,
             displaced: f64::from(u8::from(displaced)),
             table: table(&hits, &select),
-            folds: fold_of(&blocks),
+            without_fold: (0..FOLDS).map(without).collect(),
             blocks,
+            folds,
             hits,
             select,
             estimate,
@@ -101,9 +108,7 @@ impl<'a> Search<'a> {
     fn above_floor(&self, table: &LossTable, laws: &[FittedLaw]) -> bool {
         let Some((last, before)) = laws.split_last() else { return false };
         let lost = table.lost(laws) - table.lost(before);
-        // A law over range, incidence or signal never has exactly the form of the sensor's losses.
-        let over = |l: &FittedLaw| matches!(l.law, Law::Range | Law::Incidence | Law::Signal);
-        let joins = f64::from(u8::from(before.iter().any(over)));
+        let joins = f64::from(u8::from(before.iter().any(|l| l.law.has_form())));
         // What loses less than the laws before it say only corrects their form.
         let own = if before.is_empty() { last.numbers[0].abs() } else { last.numbers[0] };
         // What the simulation loses beyond the measured side is no more than what only the measured side has.
@@ -156,8 +161,7 @@ impl<'a> Search<'a> {
             let gains = self.hold_out.iter().map(gain).collect();
             let draws: Vec<FittedLaw> = repeated.iter().map(|r| r[k]).collect();
             // The form is corrected once: with the first law over a covariate.
-            let over = |law: &FittedLaw| matches!(law.law, Law::Range | Law::Incidence | Law::Signal);
-            let first = fitted.iter().position(over) == Some(k);
+            let first = fitted.iter().position(|l| l.law.has_form()) == Some(k);
             let form = if first { self.form(k, &fitted, &on_estimate) } else { vec![] };
             result.found.push(found(&fitted[k], &draws, selected, gains, &on_hold_out, (&fitted, form)));
         }

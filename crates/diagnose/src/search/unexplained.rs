@@ -1,10 +1,11 @@
 //! Findings that depend on rows or azimuths and have no cause in the catalogue.
 
-use super::{Found, NamedParameter};
-use crate::catalogue::Channel;
-use crate::channels::groups::{Group, GroupSums, Grouping, PartedFrame, group_of};
+use super::{Found, NamedParameter, confidence, trimmed};
+use crate::catalogue::{Cause, Channel};
+use crate::channels::groups::{Group, GroupSums, Grouping, PartedFrame, group_of, total};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::Status;
+use crate::inference::choice::{Demands, Trial};
 use crate::inference::grouped::{self, GroupFit};
 use crate::pairing::Ray;
 use std::collections::BTreeMap;
@@ -34,6 +35,42 @@ pub(super) fn mean_by_group<'a>(
         }
     }
     sums.into_iter().map(|(g, s)| (g, s[0] / s[1])).collect()
+}
+
+/// Trials of tables by row and by azimuth: no cause of the catalogue. They are numbered from `first` on; `floors` are
+/// the smallest spreads that are reported by row and by azimuth, and `groups` are the sums of all frames by grouping.
+pub(super) fn direction_trials(
+    select: &[usize],
+    blocks: &[usize],
+    first: usize,
+    how: GroupFit,
+    floors: [f64; 2],
+    groups: impl Fn(Grouping) -> Vec<PartedFrame>,
+) -> Vec<Trial> {
+    let trial = |grouping: Grouping| {
+        let groups = groups(grouping);
+        let (spread, _) = grouped::spread(&total(select.iter().flat_map(|&i| &groups[i])), how, trimmed(grouping));
+        Trial {
+            candidate: first + grouping as usize,
+            cause: Cause::Unexplained,
+            parameters: 12,
+            gains: grouped::cross_part_gains(&groups, select, blocks, how, false),
+            above_floor: spread > floors[grouping as usize],
+        }
+    };
+    [Grouping::Row, Grouping::Azimuth].map(trial).into()
+}
+
+/// Grouping and confidence of the chosen one of these trials.
+pub(super) fn table_by_direction(
+    trials: &[Trial],
+    chosen: usize,
+    first: usize,
+    blocks: &[usize],
+    demands: &Demands,
+) -> (Grouping, f64) {
+    let grouping = if trials[chosen].candidate == first { Grouping::Row } else { Grouping::Azimuth };
+    (grouping, confidence(trials, blocks, Cause::Unexplained, demands))
 }
 
 impl Unexplained {

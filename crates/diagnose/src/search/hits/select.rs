@@ -1,17 +1,15 @@
 //! Which laws lose returns: a sum of laws, each chosen beside any form of the others.
 
-use super::{GROUP_FLOOR, GROUPED, Search, refit, table};
+use super::{GROUP_FLOOR, GROUPED, Search, refit};
 use crate::catalogue::{Cause, Channel};
-use crate::channels::groups::{Grouping, total as group_total};
+use crate::channels::groups::Grouping;
 use crate::diagnosis::Considered;
 use crate::inference::choice::{Choice, Trial, choose, total_and_z};
-use crate::inference::grouped::{self, GroupFit};
+use crate::inference::grouped::GroupFit;
 use crate::inference::law::{FittedLaw, LAWS, Law};
-use crate::inference::linear::FOLDS;
 use crate::inference::losses::LossTable;
-use crate::search::{
-    ChannelResult, Selected, UNEXPLAINED_SHARE, causes_of, confidence, record, rivals_and_confidence, trimmed,
-};
+use crate::search::unexplained::{direction_trials, table_by_direction};
+use crate::search::{ChannelResult, Selected, UNEXPLAINED_SHARE, causes_of, record, rivals_and_confidence};
 use rayon::prelude::*;
 
 /// Share of the gain of the first law from which on a random loss is tried in its place.
@@ -53,8 +51,7 @@ impl Search<'_> {
             return one;
         }
         let parameters = |s: &Selection| s.laws.iter().map(|l| l.parameters()).sum::<usize>();
-        let [of_one, of_two] = [&one, &two].map(|s| self.gains_of(&s.laws));
-        let (ahead, z) = total_and_z(&of_two.iter().zip(&of_one).map(|(b, a)| b - a).collect::<Vec<f64>>());
+        let (ahead, z) = total_and_z(&self.gains_over(&two.laws, &one.laws));
         let better =
             if parameters(&two) <= parameters(&one) { ahead > 0.0 || z > -2.0 } else { ahead > 0.0 && z > 2.0 };
         if !better {
@@ -101,9 +98,8 @@ impl Search<'_> {
     fn add(&self, selection: &mut Selection, candidates: &[Law], trials: &[Trial], choice: &Choice) {
         let trial = &trials[choice.chosen];
         if trial.cause == Cause::Unexplained {
-            let grouping = if trial.candidate == LAWS.len() { Grouping::Row } else { Grouping::Azimuth };
-            let confidence = confidence(trials, &self.blocks, Cause::Unexplained, &self.demands);
-            selection.unexplained = Some((grouping, confidence));
+            let found = table_by_direction(trials, choice.chosen, LAWS.len(), &self.blocks, &self.demands);
+            selection.unexplained = Some(found);
             selection.selected.clear();
         } else {
             selection.laws.push(candidates[trial.candidate]);
@@ -111,27 +107,23 @@ impl Search<'_> {
         }
     }
 
-    /// Gains of the selecting frames by a sum of laws of any form, fitted on other blocks.
-    fn gains_of(&self, laws: &[Law]) -> Vec<f64> {
-        let tables = self.tables();
-        let kept = |table: &LossTable| {
+    /// Gains of the selecting frames by a sum of laws over another one, each of any form, fitted on other blocks.
+    fn gains_over(&self, laws: &[Law], others: &[Law]) -> Vec<f64> {
+        let kept = |table: &LossTable, laws: &[Law]| {
             let laws = refit(table, laws);
-            [table.kept_by_forms(&laws, &laws), table.kept_by_forms(&[], &[])]
+            table.kept_by_forms(&laws, &laws)
         };
-        let kept: Vec<[Vec<f64>; 2]> = tables.iter().map(kept).collect();
-        let gain = |(&i, &fold): (&usize, &usize)| {
-            let [by_laws, without] = &kept[fold];
-            tables[fold].gain_of_shares(&self.hits[i], by_laws, without)
-        };
-        self.select.iter().zip(&self.folds).map(gain).collect()
+        let kept: Vec<[Vec<f64>; 2]> = self.without_fold.iter().map(|t| [laws, others].map(|l| kept(t, l))).collect();
+        self.gains(|fold| [&kept[fold][0], &kept[fold][1]])
     }
 
-    /// Counts of the selecting frames without those of each fold.
-    fn tables(&self) -> Vec<LossTable> {
-        let train = |fold: usize| -> Vec<usize> {
-            (0..self.select.len()).filter(|&i| self.folds[i] != fold).map(|i| self.select[i]).collect()
+    /// Gains of the selecting frames by the first of two shares that are kept in each cell, fitted without a fold.
+    fn gains<'k>(&self, kept: impl Fn(usize) -> [&'k Vec<f64>; 2]) -> Vec<f64> {
+        let gain = |(&i, &fold): (&usize, &usize)| {
+            let [by_laws, before] = kept(fold);
+            self.without_fold[fold].gain_of_shares(&self.hits[i], by_laws, before)
         };
-        (0..FOLDS).map(|fold| table(&self.hits, &train(fold))).collect()
+        self.select.iter().zip(&self.folds).map(gain).collect()
     }
 
     /// Chooses each law anew beside the others; one that brings too little there is dropped.
@@ -171,21 +163,18 @@ impl Search<'_> {
 
     /// A trial of each law beside any form of the chosen ones.
     fn law_trials(&self, candidates: &[Law], chosen: &[Law]) -> Vec<Trial> {
-        let tables = self.tables();
+        let tables = &self.without_fold;
         let before: Vec<Vec<FittedLaw>> = tables.iter().map(|t| refit(t, chosen)).collect();
-        let kept_before: Vec<Vec<f64>> = (0..FOLDS).map(|f| tables[f].kept_by_forms(&before[f], &before[f])).collect();
+        let before_on_all = refit(&self.table, chosen);
+        let kept_before: Vec<Vec<f64>> = tables.iter().zip(&before).map(|(t, b)| t.kept_by_forms(b, b)).collect();
         let trial = |(k, &law): (usize, &Law)| {
-            let kept = |fold: usize| {
-                let laws = tables[fold].fit(&before[fold], law);
-                tables[fold].kept_by_forms(&laws, &laws[..chosen.len()])
+            let kept = |(table, before): (&LossTable, &Vec<FittedLaw>)| {
+                let laws = table.fit(before, law);
+                table.kept_by_forms(&laws, &laws[..chosen.len()])
             };
-            let kept: Vec<Vec<f64>> = (0..FOLDS).map(kept).collect();
-            let gain = |i: usize| {
-                let fold = self.folds[i];
-                tables[fold].gain_of_shares(&self.hits[self.select[i]], &kept[fold], &kept_before[fold])
-            };
-            let gains = (0..self.select.len()).map(gain).collect();
-            let whole = self.table.fit(&refit(&self.table, chosen), law);
+            let kept: Vec<Vec<f64>> = tables.iter().zip(&before).map(kept).collect();
+            let gains = self.gains(|fold| [&kept[fold], &kept_before[fold]]);
+            let whole = self.table.fit(&before_on_all, law);
             let above_floor = self.above_floor(&self.table, &whole);
             let trial = Trial { candidate: k, cause: law.cause(), parameters: law.parameters(), gains, above_floor };
             let confined = (law == Law::Signal).then(|| self.table.confined_to(&whole[whole.len() - 1..]));
@@ -203,23 +192,12 @@ impl Search<'_> {
         trials
     }
 
-    /// Trials of tables by row and by azimuth on top of the chosen laws: no cause of the catalogue.
+    /// Trials of tables by row and by azimuth on top of the chosen laws.
     fn direction_trials(&self, chosen: &[Law]) -> Vec<Trial> {
         let laws = refit(&self.table, chosen);
-        let trial = |grouping: Grouping| {
-            let groups = self.loss_groups(grouping, &self.table, &laws);
-            let how = GroupFit { centred: !chosen.is_empty(), ..GROUPED };
-            let all = group_total(self.select.iter().flat_map(|&i| &groups[i]));
-            let (spread, _) = grouped::spread(&all, how, trimmed(grouping));
-            Trial {
-                candidate: LAWS.len() + grouping as usize,
-                cause: Cause::Unexplained,
-                parameters: 12,
-                gains: grouped::cross_part_gains(&groups, &self.select, &self.blocks, how, false),
-                above_floor: spread > GROUP_FLOOR,
-            }
-        };
-        [Grouping::Row, Grouping::Azimuth].map(trial).into()
+        let how = GroupFit { centred: !chosen.is_empty(), ..GROUPED };
+        let groups = |grouping| self.loss_groups(grouping, &self.table, &laws);
+        direction_trials(&self.select, &self.blocks, LAWS.len(), how, [GROUP_FLOOR; 2], groups)
     }
 }
 

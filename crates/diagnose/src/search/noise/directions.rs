@@ -1,17 +1,17 @@
 //! Noise that depends on row or azimuth.
 
 use super::{Search, Term};
-use crate::catalogue::{Cause, Channel, Quantity};
+use crate::catalogue::{Channel, Quantity};
 use crate::channels::cells::cell;
 use crate::channels::groups::{Grouping, PartedFrame, total as group_total};
 use crate::channels::mean::usual_noise_m;
 use crate::channels::roughness::rough_groups;
 use crate::inference::choice::Trial;
-use crate::inference::grouped::{self, GroupFit};
+use crate::inference::grouped::GroupFit;
 use crate::inference::noise::{NOISE_LAWS, NoiseTable};
 use crate::pairing::Ray;
-use crate::search::unexplained::{Unexplained, mean_by_group};
-use crate::search::{Found, parameter, trimmed};
+use crate::search::unexplained::{Unexplained, direction_trials, mean_by_group};
+use crate::search::{Found, parameter};
 
 /// Fit of the added variance of groups of directions, in units of the expected one: prior standard deviation of three.
 pub(super) const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centred: false, trust: 0.5 };
@@ -21,21 +21,10 @@ pub(super) const GROUPED: GroupFit = GroupFit { column: 0, precision: 0.1, centr
 const GROUP_FLOORS: [f64; 2] = [0.6, 0.25];
 
 impl Search<'_> {
-    /// Trials of tables by row and by azimuth on top of some laws: no cause of the catalogue.
+    /// Trials of tables by row and by azimuth on top of some laws.
     pub(super) fn direction_trials(&self, terms: &[Term], how: GroupFit) -> Vec<Trial> {
-        let trial = |grouping: Grouping| {
-            let groups = self.rough_groups(grouping, &self.table, terms);
-            let all = group_total(self.select.iter().flat_map(|&i| &groups[i]));
-            let (spread, _) = grouped::spread(&all, how, trimmed(grouping));
-            Trial {
-                candidate: NOISE_LAWS.len() + grouping as usize,
-                cause: Cause::Unexplained,
-                parameters: 12,
-                gains: grouped::cross_part_gains(&groups, &self.select, &self.blocks, how, false),
-                above_floor: spread > GROUP_FLOORS[grouping as usize],
-            }
-        };
-        [Grouping::Row, Grouping::Azimuth].map(trial).into()
+        let groups = |grouping| self.rough_groups(grouping, &self.table, terms);
+        direction_trials(&self.select, &self.blocks, NOISE_LAWS.len(), how, GROUP_FLOORS, groups)
     }
 
     fn rough_groups(&self, grouping: Grouping, table: &NoiseTable, terms: &[Term]) -> Vec<PartedFrame> {

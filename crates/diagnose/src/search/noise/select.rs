@@ -8,7 +8,8 @@ use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::grouped::GroupFit;
 use crate::inference::linear::{LinearFrame, cross_gains, positive_cross_gains, positive_fit};
 use crate::inference::noise::NOISE_LAWS;
-use crate::search::{ChannelResult, Selected, UNEXPLAINED_SHARE, causes_of, confidence, record, rivals_and_confidence};
+use crate::search::unexplained::table_by_direction;
+use crate::search::{ChannelResult, Selected, UNEXPLAINED_SHARE, causes_of, record, rivals_and_confidence};
 use statistics::{blocks_of, draw_blocks};
 
 /// Causes of noise.
@@ -192,9 +193,7 @@ impl Search<'_> {
 
     /// Grouping and confidence of a chosen table by direction.
     fn table_by_direction(&self, trials: &[Trial], chosen: usize) -> (Grouping, f64) {
-        let by_row = trials[chosen].candidate == NOISE_LAWS.len();
-        let grouping = if by_row { Grouping::Row } else { Grouping::Azimuth };
-        (grouping, confidence(trials, &self.blocks, Cause::Unexplained, &self.demands))
+        table_by_direction(trials, chosen, NOISE_LAWS.len(), &self.blocks, &self.demands)
     }
 }
 
