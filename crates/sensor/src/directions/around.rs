@@ -2,7 +2,7 @@
 
 use super::Sensors;
 use super::scan::{DirectionIndex, Entry, SensorScan};
-use super::surface::{LocalSurface, fit_surface};
+use super::surface::{LocalSurface, fit_nearest_surface, fit_surface};
 use geometry::Box3;
 use nalgebra::{Isometry3, Vector3};
 
@@ -57,8 +57,9 @@ pub struct Surroundings {
     pub index: DirectionIndex,
     /// Half widths of the window of neighbours, rad.
     pub window: [f64; 2],
+    /// Distance across a plane from which on a return belongs to another surface, m.
+    pub edge_m: f64,
     cloud_from_sensor: Isometry3<f64>,
-    edge_m: f64,
 }
 
 /// What lies around a direction.
@@ -102,6 +103,13 @@ impl Surroundings {
             near_far_m: surface.near_far_m.map(|v| v as f32),
             surface: surface.smooth(self.edge_m).then(|| (surface, normal())),
         }
+    }
+
+    /// The surface of the return that is closest to a direction, where surfaces meet or hide each other, with its
+    /// normal as in [`Around::surface`].
+    pub fn nearest_surface(&self, azimuth_rad: f32, elevation_rad: f32) -> Option<(LocalSurface, Vector3<f64>)> {
+        let surface = fit_nearest_surface(&self.index, self.window, azimuth_rad, elevation_rad, self.edge_m)?;
+        Some((surface, self.normal(&surface, azimuth_rad, elevation_rad)))
     }
 
     /// The unit vector of a direction in the cloud's frame.

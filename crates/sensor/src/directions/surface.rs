@@ -32,10 +32,22 @@ const FEWEST: usize = 5;
 /// Smallest inverse range, 1/m: surfaces farther than 10 km are none.
 const LEAST_INVERSE_RANGE: f64 = 1e-4;
 
+/// Smallest area between three directions that make a plane, in windows squared: two of them a tenth of a window apart
+/// in one angle, a third of one in the other.
+const LEAST_AREA: f64 = 0.03;
+
+/// Support of a plane by the logarithm of its cosine of incidence: at 0.02 it counts as one neighbour less.
+const NORMAL_INCIDENCE: f64 = 0.25;
+
 /// Largest distance of a neighbour from the plane along its ray: as a share of the difference of the nearest and the
 /// farthest range, and in m. Between the top of a wall and the road behind it a plane at grazing incidence fits, from
 /// which no neighbour is far across.
 const ALONG: (f64, f64) = (0.15, 0.5);
+
+/// Largest distance of a neighbour from the plane along its ray, by the nearest and the farthest range, m.
+fn most_along_m([near, far]: [f64; 2]) -> f64 {
+    (ALONG.0 * (far - near)).max(ALONG.1)
+}
 
 /// Fits the surface around a direction to the neighbours that `keep` accepts. `None` where they are too few, or lie
 /// on a line.
@@ -46,8 +58,18 @@ pub fn fit_surface(
     el: f32,
     keep: impl Fn(&Entry) -> bool,
 ) -> Option<LocalSurface> {
-    // Offsets in windows, inverse range, weight.
-    let mut near = [[0.0f64; 4]; 32];
+    let (near, n) = neighbours(index, az, el, keep);
+    let near = &near[..n];
+    let plane = Plane::fit(near).filter(Plane::is_inside)?;
+    Some(plane.surface(near, window, el))
+}
+
+/// Most neighbours of a fit.
+const MOST: usize = 32;
+
+/// The neighbours of a direction that `keep` accepts: offsets in windows, inverse range, weight; and their number.
+fn neighbours(index: &DirectionIndex, az: f32, el: f32, keep: impl Fn(&Entry) -> bool) -> ([[f64; 4]; MOST], usize) {
+    let mut near = [[0.0f64; 4]; MOST];
     let mut n = 0;
     index.around(az, el, |entry, dx, dy| {
         if n < near.len() && keep(entry) {
@@ -57,12 +79,67 @@ pub fn fit_surface(
             n += 1;
         }
     });
+    (near, n)
+}
+
+/// Fits the surface of the neighbour that is closest to a direction where the neighbours are of several surfaces: of
+/// the planes through it and two others the one with the largest support, fitted again to the neighbours that support
+/// it. A neighbour gives 1 - d^2, where d is the distance across in units of `edge_m`, or that along the ray in units
+/// of its limit, whichever is more. Of two with as many neighbours the one closer to normal incidence is taken: a plane
+/// through both sides of an edge is met at grazing incidence. `None` where fewer than five are on it, or on a line.
+pub fn fit_nearest_surface(
+    index: &DirectionIndex,
+    window: [f64; 2],
+    az: f32,
+    el: f32,
+    edge_m: f64,
+) -> Option<LocalSurface> {
+    let (mut near, n) = neighbours(index, az, el, |_| true);
+    let near = &mut near[..n];
     if n < FEWEST {
         return None;
     }
-    let near = &near[..n];
-    let plane = Plane::fit(near)?;
-    Some(plane.surface(near, window, el))
+    let squared = |p: &[f64; 4]| p[0] * p[0] + p[1] * p[1];
+    near.sort_unstable_by(|a, b| squared(a).total_cmp(&squared(b)));
+    let ranges = near.iter().map(|p| 1.0 / p[2]);
+    let along_m = most_along_m(ranges.fold([f64::INFINITY, 0.0f64], |[l, h], r| [l.min(r), h.max(r)]));
+    let cos = |[q0, bx, by]: [f64; 3]| {
+        let (gx, gy) = (bx / window[0] / f64::from(el.cos()) / q0, by / window[1] / q0);
+        1.0 / (1.0 + gx * gx + gy * gy).sqrt()
+    };
+    // What a neighbour gives to a plane.
+    let support = |plane: [f64; 3], [x, y, q, _]: &[f64; 4]| {
+        let predicted = plane[0] + plane[1] * x + plane[2] * y;
+        if plane[0] < LEAST_INVERSE_RANGE || predicted < LEAST_INVERSE_RANGE {
+            return 0.0;
+        }
+        let along = 1.0 / q - 1.0 / predicted;
+        (1.0 - (along * cos(plane) / edge_m).powi(2).max((along / along_m).powi(2))).max(0.0)
+    };
+    let total =
+        |plane: [f64; 3]| near.iter().map(|p| support(plane, p)).sum::<f64>() + NORMAL_INCIDENCE * cos(plane).ln();
+    let planes = (1..n).flat_map(|i| (1..i).map(move |j| (i, j)));
+    let planes = planes.filter_map(|(i, j)| through([near[0], near[i], near[j]])).map(|plane| (total(plane), plane));
+    let (_, best) = planes.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    let mut on = [[0.0f64; 4]; MOST];
+    let mut count = 0;
+    for p in near.iter() {
+        let share = support(best, p);
+        if share > 0.0 {
+            on[count] = [p[0], p[1], p[2], p[3] * share * share];
+            count += 1;
+        }
+    }
+    let on = &on[..count];
+    Plane::fit(on).map(|plane| plane.surface(on, window, el))
+}
+
+/// Inverse range at the middle and its slopes of the plane through three neighbours; `None` where they are on a line.
+fn through([first, a, b]: [[f64; 4]; 3]) -> Option<[f64; 3]> {
+    let [[xa, ya, qa], [xb, yb, qb]] = [a, b].map(|p| [p[0] - first[0], p[1] - first[1], p[2] - first[2]]);
+    let det = xa * yb - xb * ya;
+    let (bx, by) = ((qa * yb - qb * ya) / det, (xa * qb - xb * qa) / det);
+    (det.abs() >= LEAST_AREA).then_some([first[2] - bx * first[0] - by * first[1], bx, by])
 }
 
 /// A weighted linear fit of the inverse range over offsets in windows.
@@ -80,8 +157,11 @@ struct Plane {
 }
 
 impl Plane {
-    /// Fits neighbours (offsets, inverse range, weight); `None` unless they lie on both sides in both angles.
+    /// Fits neighbours (offsets, inverse range, weight); `None` where they are too few, or lie on a line.
     fn fit(near: &[[f64; 4]]) -> Option<Plane> {
+        if near.len() < FEWEST {
+            return None;
+        }
         let mut s = [0.0f64; 9]; // w, wx, wy, wxx, wxy, wyy, wq, wxq, wyq
         for [x, y, q, w] in near {
             for (sum, v) in s.iter_mut().zip([1.0, *x, *y, x * x, x * y, y * y, *q, x * q, y * q]) {
@@ -92,7 +172,7 @@ impl Plane {
         let (xx, xy, yy) = (s[3] - s[0] * mx * mx, s[4] - s[0] * mx * my, s[5] - s[0] * my * my);
         let (xq, yq) = (s[7] - s[0] * mx * mq, s[8] - s[0] * my * mq);
         let det = xx * yy - xy * xy;
-        if xx < 0.02 * s[0] || yy < 0.02 * s[0] || det < 0.1 * xx * yy || mx.abs() > 0.6 || my.abs() > 0.6 {
+        if xx < 0.02 * s[0] || yy < 0.02 * s[0] || det < 0.1 * xx * yy {
             return None;
         }
         let (bx, by) = ((yy * xq - xy * yq) / det, (xx * yq - xy * xq) / det);
@@ -100,6 +180,11 @@ impl Plane {
         let plane =
             Plane { weights: s[0], mean: [mx, my], moments: [xx, xy, yy], determinant: det, q0, slope: [bx, by] };
         (q0 > LEAST_INVERSE_RANGE).then_some(plane)
+    }
+
+    /// Whether the neighbours lie around the direction, not all to one side of it.
+    fn is_inside(&self) -> bool {
+        self.mean.iter().all(|m| m.abs() <= 0.6)
     }
 
     /// Weight of a neighbour in the inverse range at the direction: its derivative by the neighbour's inverse range.
@@ -156,9 +241,8 @@ impl LocalSurface {
 
     /// The same where ranges may be off by `noise_m`.
     pub fn smooth_but_for(&self, noise_m: f64, edge_m: f64) -> bool {
-        let [near, far] = self.near_far_m;
         self.misfit_m < edge_m + self.cos_incidence * noise_m
-            && self.misfit_along_m < (ALONG.0 * (far - near)).max(ALONG.1) + noise_m
+            && self.misfit_along_m < most_along_m(self.near_far_m) + noise_m
     }
 
     /// Unit normal towards the sensor, in the basis (along the ray, along growing azimuth, along growing elevation).
@@ -235,6 +319,32 @@ mod tests {
         let (edge, road) = (at(-0.05), at(-0.03));
         assert!(road.smooth(0.12) && (road.cos_incidence / 0.03 - 1.0).abs() < 0.02, "{road:?}");
         assert!(!edge.smooth(0.12), "{edge:?}");
+    }
+
+    /// A wall 10 m ahead that ends in front of another one, oblique and farther: each side has its own plane, up to the
+    /// edge.
+    #[test]
+    fn at_an_edge_the_surface_is_that_of_the_nearest_return() {
+        let (mut scan, step) = (SensorScan::default(), 0.004);
+        let (near, far) = ((Vector3::x(), 10.0), (Vector3::new(0.8, 0.6, 0.0), 14.0));
+        let range = |(normal, h): (Vector3<f64>, f64), az: f64, el: f64| h / normal.dot(&direction(az, el));
+        for i in -10..10 {
+            for j in -10..10 {
+                let (az, el) = (f64::from(i) * step, f64::from(j) * 2.0 * step);
+                scan.azimuth_rad.push(az as f32);
+                scan.elevation_rad.push(el as f32);
+                scan.range_m.push(range(if i < 0 { near } else { far }, az, el) as f32);
+            }
+        }
+        let window = [2.2 * step, 2.8 * step];
+        let steps = Steps { azimuth_rad: window[0] as f32, elevation_rad: window[1] as f32 };
+        let index = DirectionIndex::new(&scan, steps, false);
+        for (az, of) in [(-0.6 * step, near), (-0.4 * step, far), (0.3 * step, far), (-1.2 * step, near)] {
+            let el = 0.3 * step;
+            assert!(fit_surface(&index, window, az as f32, el as f32, |_| true).is_none_or(|s| !s.smooth(0.12)));
+            let s = fit_nearest_surface(&index, window, az as f32, el as f32, 0.12).unwrap();
+            assert!((s.range_m - range(of, az, el)).abs() < 5e-3 && s.bulge_m.abs() < 5e-3, "{az}: {s:?}");
+        }
     }
 
     #[test]

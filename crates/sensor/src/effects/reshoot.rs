@@ -9,13 +9,6 @@ use crate::scan::{Echo, Scan, dot};
 use geometry::Pose;
 use nalgebra::{Point3, Vector3};
 
-/// Distance across a surface within which the surface around the true direction is the shot's own, m.
-const SAME_SURFACE_M: f64 = 0.12;
-
-/// Distance of a true direction from the reported one up to which the shot's own plane serves, in steps of the
-/// pattern.
-const BESIDE_STEPS: f32 = 2.5;
-
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
@@ -45,24 +38,30 @@ pub(super) fn reshoot(scan: &mut Scan, frame: &FrameContext, true_from_reported:
             let error = pose.inverse() * true_from_reported * pose;
             let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
             let hit = seen.meet(&(error.rotation * own), &error.translation.vector, &before[i], &pose);
-            match hit {
-                Some((range_m, of)) => {
-                    // A shot that was lost on a surface stays lost.
-                    if !echo.is_return() && seen.is_hole(&own) {
-                        continue;
-                    }
-                    if let (false, Some(surface)) = (echo.is_return(), before.get(of).copied()) {
-                        (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
-                        (echo.returned, echo.material, echo.object) =
-                            (surface.returned, surface.material, surface.object);
-                        (echo.normal, echo.cos_incidence) = (surface.normal, surface.cos_incidence);
-                    }
-                    echo.range_m = range_m;
-                }
-                _ => echo.lose(),
+            let Some(Met { range_m, on }) = hit else {
+                echo.lose();
+                continue;
+            };
+            // A shot that was lost on a surface stays lost.
+            if !echo.is_return() && seen.is_hole(&own) {
+                continue;
             }
+            if let Some(surface) = on.and_then(|place| before.get(place)) {
+                (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
+                (echo.returned, echo.material, echo.object) = (surface.returned, surface.material, surface.object);
+                (echo.normal, echo.cos_incidence) = (surface.normal, surface.cos_incidence);
+            }
+            echo.range_m = range_m;
         }
     }
+}
+
+/// What a true ray meets.
+struct Met {
+    /// Its distance, m.
+    range_m: f32,
+    /// Place among the echoes of the return that is nearest; `None` on the surface of the shot itself.
+    on: Option<usize>,
 }
 
 /// The returns of a sensor by direction.
@@ -109,9 +108,9 @@ impl Seen {
         self.around.look(azimuth as f32, elevation as f32, None).surface.is_some()
     }
 
-    /// Range of what a true ray meets, and the place of the return that is nearest to it. The ray starts at `shift` and
-    /// has a direction, both in the sensor's frame; `echo` is the shot as it is reported.
-    fn meet(&self, direction: &Vector3<f64>, shift: &Vector3<f64>, echo: &Echo, pose: &Pose) -> Option<(f32, usize)> {
+    /// What a true ray meets. It starts at `shift` and has a direction, both in the sensor's frame; `echo` is the shot
+    /// as it is reported.
+    fn meet(&self, direction: &Vector3<f64>, shift: &Vector3<f64>, echo: &Echo, pose: &Pose) -> Option<Met> {
         // Where the ray is at the range of what it meets, seen from the reported origin. Twice, since that range is
         // not known before.
         let mut range_m = if echo.is_return() { f64::from(echo.range_m) } else { 50.0 };
@@ -119,7 +118,7 @@ impl Seen {
         for _ in 0..2 {
             let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(shift + direction * range_m));
             met = self.at(azimuth as f32, elevation as f32, direction, shift, echo, pose);
-            range_m = f64::from(met?.0);
+            range_m = f64::from(met.as_ref()?.range_m);
         }
         met
     }
@@ -132,7 +131,7 @@ impl Seen {
         shift: &Vector3<f64>,
         echo: &Echo,
         pose: &Pose,
-    ) -> Option<(f32, usize)> {
+    ) -> Option<Met> {
         let true_direction: [f32; 3] = (pose.rotation * direction).map(|v| v as f32).into();
         // The shot's own surface, met by the true ray: its own error of range is kept.
         let own_m = || {
@@ -146,16 +145,20 @@ impl Seen {
         let outside = [azimuth, elevation].iter().zip(&self.field).any(|(v, [low, high])| v < low || v > high);
         let Some((nearest, near)) = self.nearest(azimuth, elevation) else {
             // Beyond the field of view surfaces go on as they are at its end.
-            return (outside && on_surface).then(|| (own_m(), echo.source as usize));
+            return (outside && on_surface).then(|| Met { range_m: own_m(), on: None });
         };
-        let place = self.places[nearest];
-        let Some((surface, normal)) = self.around.look(azimuth, elevation, None).surface else {
-            if outside && on_surface {
-                return Some((own_m(), place));
-            }
-            // At an edge: the nearest return, at its distance from the true origin.
+        let on = Some(self.places[nearest]);
+        let whole = self.around.look(azimuth, elevation, None).surface;
+        if whole.is_none() && outside && on_surface {
+            return Some(Met { range_m: own_m(), on: None });
+        }
+        // At an edge: the surface of the nearest return.
+        let Some((surface, normal)) =
+            whole.or_else(|| self.around.nearest_surface(azimuth, elevation).filter(|_| near))
+        else {
+            // A lone return is met at its distance from the true origin.
             let reported = f64::from(self.scan.range_m[nearest]);
-            return near.then_some(((reported - shift.dot(direction)).max(0.01) as f32, place));
+            return near.then_some(Met { range_m: (reported - shift.dot(direction)).max(0.01) as f32, on });
         };
         let meets = pose.rotation.inverse() * normal;
         // The plane around the true direction, met from the true origin.
@@ -163,24 +166,17 @@ impl Seen {
         let seen = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin()) * surface.range_m;
         let along = meets.dot(direction);
         if along > -1e-3 {
-            return Some((self.scan.range_m[nearest], place));
+            return Some(Met { range_m: self.scan.range_m[nearest], on });
         }
         let range_m = meets.dot(&(seen - shift)) / along;
-        // Beside the shot its own plane serves, and its own error of range is kept. Farther away that plane is known
-        // too badly: the error is what the shot lies off the surface around it.
-        let [own_azimuth, own_elevation, _] = {
-            let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
-            Sensor::spherical(&Point3::from(own)).map(|v| v as f32)
-        };
-        let apart = [(azimuth - own_azimuth) / self.steps[0], (elevation - own_elevation) / self.steps[1]];
-        if on_surface && apart.iter().all(|steps| steps.abs() < BESIDE_STEPS) {
-            if ((f64::from(own_m()) - range_m) * along).abs() < SAME_SURFACE_M {
-                return Some((own_m(), place));
-            }
-        } else if on_surface && let Some((own, _)) = self.around.look(own_azimuth, own_elevation, None).surface {
-            return Some(((range_m + f64::from(echo.range_m) - own.range_m).max(0.01) as f32, place));
-        }
-        Some((range_m.max(0.01) as f32, place))
+        // The shot's own error is what it lies off the surface around it, or else what the nearest return does. Added
+        // to the surface around the true ray, it keeps its variance: the errors of planes are averages of many returns.
+        let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
+        let [own_azimuth, own_elevation, _] = Sensor::spherical(&Point3::from(own)).map(|v| v as f32);
+        let own = self.around.look(own_azimuth, own_elevation, None).surface.filter(|_| on_surface);
+        let error_m = own.map_or(surface.bulge_m, |(own, _)| f64::from(echo.range_m) - own.range_m);
+        let is_own = own.is_some() && ((f64::from(own_m()) - range_m) * along).abs() < self.around.edge_m;
+        Some(Met { range_m: (range_m + error_m).max(0.01) as f32, on: on.filter(|_| !is_own) })
     }
 
     /// The return nearest to a direction, and whether it is so near that a shot there meets what it met.

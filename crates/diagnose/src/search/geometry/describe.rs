@@ -3,7 +3,7 @@
 use super::curve::linear_curve;
 use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD};
 use super::hypotheses::Hypothesis;
-use super::sums::{Sums, group_fit, row_columns, split};
+use super::sums::{Sums, group_fit, split};
 use super::{Search, Selected};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
 use crate::channels::groups::{Group, GroupSums, Grouping, total};
@@ -38,7 +38,7 @@ pub(super) fn found(
         Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
         Hypothesis::Groups { cause, grouping, column } => {
             let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
-            groups(search, *cause, *grouping, *column, biased, &row_columns(chosen))
+            groups(search, *cause, *grouping, *column, biased, chosen)
         }
     };
     let named = cause != Cause::Unexplained;
@@ -99,20 +99,20 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     }
 }
 
-/// Describes offsets of groups of rays; `biased` says that a bias of all ranges was found beside them, `columns` are
-/// those of rows that are fitted together.
+/// Describes offsets of groups of rays, of rows together with what else was chosen; `biased` says that a bias of all
+/// ranges was found beside them.
 fn groups(
     search: &Search,
     cause: Cause,
     grouping: Grouping,
     column: usize,
     biased: bool,
-    columns: &[usize],
+    chosen: &[Hypothesis],
 ) -> Description {
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
-    let of_rows = (grouping == Grouping::Row)
-        .then(|| search.sums.offsets(&search.estimate, grouping, group_fit(column), columns));
+    let of_rows =
+        (grouping == Grouping::Row).then(|| search.sums.offsets(&search.estimate, grouping, group_fit(column), chosen));
     let (std, n) = match &of_rows {
         Some(offsets) => grouped::spread_of_rows(&all, offsets, group_fit(column)),
         None => grouped::spread(&all, group_fit(column), 0.0),
@@ -122,7 +122,7 @@ fn groups(
     let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
     let precision = std.max(least).powi(-2).max(group_fit(column).precision);
     let fit = GroupFit { precision, ..group_fit(column) };
-    let mut offsets = of_rows.unwrap_or_else(|| search.sums.offsets(&search.estimate, grouping, fit, columns));
+    let mut offsets = of_rows.unwrap_or_else(|| search.sums.offsets(&search.estimate, grouping, fit, chosen));
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
     if column == 0 && grouping == Grouping::Row && !biased {

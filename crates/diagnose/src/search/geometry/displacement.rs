@@ -1,7 +1,7 @@
 //! The displacement that the search of geometry found, to be undone before other channels are searched.
 
 use super::hypotheses::Hypothesis;
-use super::sums::{Sums, group_fit, row_columns, split};
+use super::sums::{Sums, group_fit, split};
 use crate::channels::groups::{Group, Grouping, STRIP_RAD, elevation_lever, group_of};
 use crate::channels::mean::Column;
 use crate::pairing::Ray;
@@ -88,9 +88,8 @@ pub(super) fn displacement(
             Column::Sweep(_) | Column::Structure(_) => {}
         }
     }
-    let columns = row_columns(chosen);
     for (grouping, column) in groups {
-        let offsets = sums.offsets(select, grouping, group_fit(column), &columns);
+        let offsets = sums.offsets(select, grouping, group_fit(column), chosen);
         out.groups.push((grouping, column, offsets));
     }
     out

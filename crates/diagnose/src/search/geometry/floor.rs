@@ -1,7 +1,7 @@
 //! The smallest effects of geometry that are reported.
 
 use super::hypotheses::Hypothesis;
-use super::sums::{Sums, group_fit, row_columns};
+use super::sums::{Sums, group_fit};
 use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
 #[cfg(doc)]
@@ -39,8 +39,7 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
             let all = total(select.iter().map(|&i| &frames[i]));
             match grouping {
                 Grouping::Row => {
-                    let columns = row_columns(hypotheses);
-                    let offsets = sums.offsets(select, *grouping, group_fit(*column), &columns);
+                    let offsets = sums.offsets(select, *grouping, group_fit(*column), hypotheses);
                     grouped::rough_spread(&all, &offsets, group_fit(*column)) > FLOOR_GROUPS[*column]
                 }
                 Grouping::Azimuth => grouped::spread(&all, group_fit(*column), 0.0).0 > FLOOR_GROUPS[2],
@@ -134,6 +133,7 @@ mod tests {
             rows: vec![],
             of_patches: 1.0,
             whole_rows: none(),
+            rows_with_pose: none(),
             strips: none(),
             poses: vec![],
             of_sensors: vec![vec![2e6]],

@@ -1,6 +1,7 @@
 //! Sums of all frames that the hypotheses of geometry are fitted on, and the fits.
 
-use super::hypotheses::Hypothesis;
+use super::hypotheses::{Hypothesis, is_pose};
+use crate::catalogue::Cause;
 use crate::channels::groups::{Group, GroupFrame, Grouping, PARTS, PartedFrame, group_frames, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
@@ -34,6 +35,9 @@ pub(super) struct Sums {
     pub(super) of_patches: f64,
     /// Sums by row, of surfaces as they are.
     pub(super) whole_rows: Groups,
+    /// The same where only what the poses of frames deviate from their median is subtracted: a pose that all frames
+    /// share takes up what the rows of a sensor have in common.
+    pub(super) rows_with_pose: Groups,
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
     /// Pose error of each frame, as each sensor sees it.
@@ -69,16 +73,17 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
-    let groups = |g| {
-        let parted = group_frames(frames, rig, &poses, structure, g, noise_m, design);
+    let groups = |g, poses: &[OwnPoses]| {
+        let parted = group_frames(frames, rig, poses, structure, g, noise_m, design);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
     let rows = row_frames(frames, rig, &poses, noise_m);
     Sums {
         of_patches: of_patches(&rows, select, rig.sensors.len()),
         rows,
-        whole_rows: groups(Grouping::Row),
-        strips: groups(Grouping::Azimuth),
+        whole_rows: groups(Grouping::Row, &poses),
+        rows_with_pose: groups(Grouping::Row, &deviations(&poses, select)),
+        strips: groups(Grouping::Azimuth, &poses),
         columns,
         precision,
         base,
@@ -87,6 +92,13 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
         poses,
         of_sensors,
     }
+}
+
+/// Poses relative to the median of each sensor's over some frames.
+fn deviations(poses: &[OwnPoses], select: &[usize]) -> Vec<OwnPoses> {
+    let middle = |sensor: usize| SVector::from_fn(|k, _| median(select.iter().map(|&f| poses[f][sensor][k]).collect()));
+    let middles: OwnPoses = (0..poses.first().map_or(0, Vec::len)).map(middle).collect();
+    poses.iter().map(|of_frame| of_frame.iter().zip(&middles).map(|(pose, middle)| pose - middle).collect()).collect()
 }
 
 /// Prior precisions of the offsets of rows in some columns, times the variance of what they are fitted to.
@@ -253,32 +265,44 @@ impl Sums {
         out
     }
 
-    /// Offsets of groups over some frames; `columns` of rows are fitted together.
+    /// Offsets of groups over some frames; those of rows are fitted together with what else was chosen.
     pub(super) fn offsets(
         &self,
         frames: &[usize],
         grouping: Grouping,
         how: GroupFit,
-        columns: &[usize],
+        chosen: &[Hypothesis],
     ) -> BTreeMap<Group, f64> {
         if grouping == Grouping::Azimuth {
             return grouped::offsets(&total(frames.iter().map(|&i| &self.strips.whole[i])), how);
         }
         let sensors = 0..self.of_sensors.first().map_or(0, Vec::len);
-        sensors.flat_map(|sensor| self.row_offsets(frames, sensor, how.column, columns)).collect()
+        sensors.flat_map(|sensor| self.row_offsets(frames, sensor, how.column, chosen)).collect()
     }
 
     /// Offsets of the rows of a sensor: against those beside them from the patches, and what neighbouring rows have in
     /// common from all surfaces. Both are the median over the quarters of its field of view, of which one may show the
     /// upper edge of a wall that stands elsewhere, shrunk where the quarters disagree.
-    fn row_offsets(&self, frames: &[usize], sensor: usize, column: usize, columns: &[usize]) -> BTreeMap<Group, f64> {
+    fn row_offsets(
+        &self,
+        frames: &[usize],
+        sensor: usize,
+        column: usize,
+        chosen: &[Hypothesis],
+    ) -> BTreeMap<Group, f64> {
+        let columns = row_columns(chosen);
+        // Without another cause that turns what a sensor sees, its turn is what its rows have in common.
+        let turns = |h: &Hypothesis| is_pose(h) || h.cause() == Cause::RollingShutter;
+        let turned_by_rows = column == 1 && !chosen.iter().any(turns);
+        let rows = if turned_by_rows { &self.rows_with_pose } else { &self.whole_rows };
+        let how = GroupFit { centred: !turned_by_rows, ..group_fit(column) };
         let mut of_parts: BTreeMap<usize, [Vec<f64>; 2]> = BTreeMap::new();
         for part in 0..PARTS {
             let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, &|p| p == part);
-            let own = &sum.offsets(precisions(columns, self.of_patches))[column];
-            let mut whole = total(frames.iter().map(|&i| &self.whole_rows.parted[i][part]));
+            let own = &sum.offsets(precisions(&columns, self.of_patches))[column];
+            let mut whole = total(frames.iter().map(|&i| &rows.parted[i][part]));
             whole.retain(|g, _| usize::from(g.sensor) == sensor);
-            let whole = grouped::offsets(&whole, group_fit(column));
+            let whole = grouped::offsets(&whole, how);
             let whole = |row: usize| whole.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
             let least = 3.0 * self.of_patches * group_fit(column).precision;
             let known = |row: &usize| sum.precision(*row, column) > least;
@@ -338,23 +362,22 @@ impl Sums {
                 frames.iter().map(|&f| with.gain(&self.linear[f]) - without.gain(&self.linear[f])).collect()
             }
             Hypothesis::Groups { grouping: Grouping::Azimuth, column, .. } => {
-                let offsets = self.offsets(estimate, Grouping::Azimuth, group_fit(*column), &[*column]);
+                let offsets = self.offsets(estimate, Grouping::Azimuth, group_fit(*column), chosen);
                 let strips = self.groups_of(Grouping::Azimuth);
                 frames.iter().map(|&f| grouped::gain(&strips[f], *column, &offsets)).collect()
             }
-            Hypothesis::Groups { column, .. } => {
-                let all = row_columns(chosen);
-                let others: Vec<usize> = all.iter().copied().filter(|c| c != column).collect();
-                let [with, without] = [all, others].map(|columns| self.gains_of_rows(estimate, frames, &columns));
+            Hypothesis::Groups { .. } => {
+                let others: Vec<Hypothesis> = chosen.iter().filter(|h| *h != hypothesis).cloned().collect();
+                let [with, without] = [chosen, &others].map(|of| self.gains_of_rows(estimate, frames, of));
                 with.iter().zip(without).map(|(with, without)| with - without).collect()
             }
         }
     }
 
-    /// Gains of frames by the offsets of rows in some columns, fitted together, nats.
-    fn gains_of_rows(&self, estimate: &[usize], frames: &[usize], columns: &[usize]) -> Vec<f64> {
-        let fits: Vec<(usize, BTreeMap<Group, f64>)> =
-            columns.iter().map(|&c| (c, self.offsets(estimate, Grouping::Row, group_fit(c), columns))).collect();
+    /// Gains of frames by the offsets of rows among the chosen hypotheses, fitted together, nats.
+    fn gains_of_rows(&self, estimate: &[usize], frames: &[usize], chosen: &[Hypothesis]) -> Vec<f64> {
+        let offsets = |c: usize| (c, self.offsets(estimate, Grouping::Row, group_fit(c), chosen));
+        let fits: Vec<(usize, BTreeMap<Group, f64>)> = row_columns(chosen).into_iter().map(offsets).collect();
         let of_sensor = |(sensor, parts): (usize, &[Band; PARTS])| -> f64 {
             let rows = parts.iter().map(Band::rows).max().unwrap_or(0);
             let mut of_rows: Offsets = std::array::from_fn(|_| vec![0.0; rows]);
