@@ -80,22 +80,29 @@ fn bin(ray: &Ray) -> usize {
     of(range_m.ln(), BINS[0]) * BINS[1] + of(-cos.ln(), BINS[1])
 }
 
-/// Standard deviation by which the measured ranges scatter more than the simulated ones, by bin, m: from the medians of
-/// their roughness.
+/// Standard deviation by which the measured ranges scatter more than the simulated ones, by bin, m: from the lower
+/// quartiles of their roughness. In a bin that holds the foot of a wall more than half of the returns can be at an edge.
 fn more_noise_m(measured: &[Ray], simulated: &[Ray]) -> Vec<f64> {
-    let usual = |rays: &[Ray]| -> Vec<Option<f32>> {
+    let usual = |rays: &[Ray]| -> Vec<Option<f64>> {
         let mut rough = vec![Vec::new(); BINS[0] * BINS[1]];
         for ray in rays.iter().filter(|r| r.roughness_m.is_finite()) {
-            rough[bin(ray)].push(ray.roughness_m.abs() / (1.0 + ray.roughness_leverage).sqrt());
+            rough[bin(ray)].push(f64::from(ray.roughness_m.abs() / (1.0 + ray.roughness_leverage).sqrt()));
         }
-        rough.into_iter().map(|r| if r.len() < FEWEST { None } else { statistics::median_upper(r) }).collect()
+        let quartile = |mut r: Vec<f64>| {
+            r.sort_unstable_by(f64::total_cmp);
+            (r.len() >= FEWEST).then(|| r[r.len() / 4])
+        };
+        rough.into_iter().map(quartile).collect()
     };
-    let more = |pair: (Option<f32>, Option<f32>)| match pair {
-        (Some(a), Some(b)) => f64::from(a * a - b * b).max(0.0).sqrt() / statistics::MEDIAN_OF_NORMAL,
+    let more = |pair: (Option<f64>, Option<f64>)| match pair {
+        (Some(a), Some(b)) => (a * a - b * b).max(0.0).sqrt() / QUARTILE_OF_NORMAL,
         _ => 0.0,
     };
     usual(measured).into_iter().zip(usual(simulated)).map(more).collect()
 }
+
+/// Lower quartile of the absolute value of a standard normal number.
+const QUARTILE_OF_NORMAL: f64 = 0.318_639;
 
 #[cfg(test)]
 mod tests {
