@@ -199,7 +199,8 @@ pub struct Minimum {
 }
 
 /// Distance between measured and simulated held-out frames. The totals are over the channels in which something was
-/// found, and over those that the extension made worse; they are zero where nothing was found. `channels` has all.
+/// found and those that the extension changed, for better or worse; they are zero where nothing was found. `channels`
+/// has all.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 pub struct Gain {
     /// `nats_per_ray`: what lookup tables of the measured data, fitted on other frames, predict better than the
@@ -215,6 +216,9 @@ pub struct Gain {
     pub closed: Option<f64>,
     /// Interval of `closed`, from a bootstrap over blocks of held-out frames.
     pub ci95: Option<[f64; 2]>,
+    /// Channels of the totals.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub counted: Vec<Channel>,
     /// `before`, `after` and `floor` by channel.
     #[serde(default)]
     pub channels: BTreeMap<Channel, [f64; 3]>,

@@ -206,12 +206,11 @@ impl Run {
         self.first["gain"]["closed"].as_f64()
     }
 
-    /// Share of the gap that the second diagnosis finds closed, in the channels in which the first one found something.
+    /// Share of the gap that the second diagnosis finds closed, in the channels of the first one's totals.
     fn reached(&self) -> Option<f64> {
         let (first, second) = (&self.first["gain"]["channels"], &self.second.as_ref().ok()?["gain"]["channels"]);
-        let found: std::collections::BTreeSet<&str> =
-            self.first["findings"].as_array()?.iter().filter_map(|f| f["channel"].as_str()).collect();
-        let sum = |gain: &Value, k: usize| found.iter().filter_map(|c| gain[*c][k].as_f64()).sum::<f64>();
+        let counted: Vec<&str> = self.first["gain"]["counted"].as_array()?.iter().filter_map(Value::as_str).collect();
+        let sum = |gain: &Value, k: usize| counted.iter().filter_map(|c| gain[*c][k].as_f64()).sum::<f64>();
         share(sum(first, 0), sum(second, 0), sum(first, 2))
     }
 

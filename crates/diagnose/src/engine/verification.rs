@@ -146,7 +146,7 @@ impl<'a> Verification<'a> {
 
     /// The distances by channel where nothing was found. The totals are of what was found: zero.
     pub(super) fn without_extension(&self) -> Gain {
-        Gain { before: 0.0, after: 0.0, floor: 0.0, ..self.gain(&self.before, &self.before, false) }
+        Gain { before: 0.0, after: 0.0, floor: 0.0, counted: vec![], ..self.gain(&self.before, &self.before, false) }
     }
 
     /// The gain by a list of effects.
@@ -235,7 +235,7 @@ pub(crate) struct GainFrames {
 
 impl GainFrames {
     /// Sums of the distances before, after and at the floor. The totals are those of the channels in which something
-    /// was `found`, of all where that is empty, and of those that the extension made worse.
+    /// was `found`, of all where that is empty, and of those that the extension changed.
     pub(crate) fn gain(&self, three: [&Distances; 3], found: &BTreeSet<Channel>, extended: bool) -> Gain {
         let returns = self.returns.max(1.0);
         let members = blocks_of(&self.blocks);
@@ -254,12 +254,12 @@ impl GainFrames {
             interval_nearest(drawn.collect())
         };
         let channels: Vec<Channel> = three[0].keys().copied().collect();
-        let worse = |c: &Channel| {
+        let changed = |c: &Channel| {
             let [before, after, _] = sums(c, &all_frames);
-            after - before > ENOUGH_NATS
+            (after - before).abs() > ENOUGH_NATS
         };
         let found = |c: &Channel| found.is_empty() || found.contains(c);
-        let counted: Vec<Channel> = channels.iter().copied().filter(|c| found(c) || worse(c)).collect();
+        let counted: Vec<Channel> = channels.iter().copied().filter(|c| found(c) || changed(c)).collect();
         let [before, after_all, floor_all] = over(&counted, &all_frames);
         let of_channel = |c: &Channel| (*c, sums(c, &all_frames).map(|v| v / returns));
         let enough = |c: &&Channel| {
@@ -275,6 +275,7 @@ impl GainFrames {
             floor: floor_all / returns,
             closed: of_all,
             ci95: of_all.and_then(|_| interval(&counted)),
+            counted,
             channels: channels.iter().map(of_channel).collect(),
             closed_by_channel: channels.iter().filter(enough).filter_map(share).collect(),
             ..Gain::default()

@@ -81,7 +81,8 @@ fn bin(ray: &Ray) -> usize {
 }
 
 /// Standard deviation by which the measured ranges scatter more than the simulated ones, by bin, m: from the lower
-/// quartiles of their roughness. In a bin that holds the foot of a wall more than half of the returns can be at an edge.
+/// quartiles of their roughness. In a bin that holds the foot of a wall more than half of the returns can be at an
+/// edge.
 fn more_noise_m(measured: &[Ray], simulated: &[Ray]) -> Vec<f64> {
     let usual = |rays: &[Ray]| -> Vec<Option<f64>> {
         let mut rough = vec![Vec::new(); BINS[0] * BINS[1]];

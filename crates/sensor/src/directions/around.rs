@@ -2,7 +2,7 @@
 
 use super::Sensors;
 use super::scan::{DirectionIndex, Entry, SensorScan};
-use super::surface::{LocalSurface, fit_nearest_surface, fit_surface};
+use super::surface::{LocalSurface, fit_surface, fit_surface_through};
 use geometry::Box3;
 use nalgebra::{Isometry3, Vector3};
 
@@ -105,10 +105,15 @@ impl Surroundings {
         }
     }
 
-    /// The surface of the return that is closest to a direction, where surfaces meet or hide each other, with its
-    /// normal as in [`Around::surface`].
-    pub fn nearest_surface(&self, azimuth_rad: f32, elevation_rad: f32) -> Option<(LocalSurface, Vector3<f64>)> {
-        let surface = fit_nearest_surface(&self.index, self.window, azimuth_rad, elevation_rad, self.edge_m)?;
+    /// The surface around a direction of one of the returns there, by its number, where surfaces meet or hide each
+    /// other, with its normal as in [`Around::surface`].
+    pub fn surface_of(
+        &self,
+        azimuth_rad: f32,
+        elevation_rad: f32,
+        return_: u32,
+    ) -> Option<(LocalSurface, Vector3<f64>)> {
+        let surface = fit_surface_through(&self.index, self.window, azimuth_rad, elevation_rad, return_, self.edge_m)?;
         Some((surface, self.normal(&surface, azimuth_rad, elevation_rad)))
     }
 

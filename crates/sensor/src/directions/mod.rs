@@ -11,7 +11,7 @@ mod surface;
 pub use around::{Around, Kind, Surroundings, in_or_beside, kind_of};
 pub use pattern::ScanPattern;
 pub use scan::{DirectionIndex, Entry, SensorScan, Steps, split_by_sensor, split_with_places};
-pub use surface::{LocalSurface, fit_nearest_surface, fit_surface};
+pub use surface::{LocalSurface, fit_surface, fit_surface_through};
 
 use crate::rig::Rig;
 

@@ -82,24 +82,25 @@ fn neighbours(index: &DirectionIndex, az: f32, el: f32, keep: impl Fn(&Entry) ->
     (near, n)
 }
 
-/// Fits the surface of the neighbour that is closest to a direction where the neighbours are of several surfaces: of
-/// the planes through it and two others the one with the largest support, fitted again to the neighbours that support
+/// Fits the surface of one of the neighbours of a direction, which are of several surfaces: of the planes `through` it,
+/// given by its number, and two others the one with the largest support, fitted again to the neighbours that support
 /// it. A neighbour gives 1 - d^2, where d is the distance across in units of `edge_m`, or that along the ray in units
 /// of its limit, whichever is more. Of two with as many neighbours the one closer to normal incidence is taken: a plane
 /// through both sides of an edge is met at grazing incidence. `None` where fewer than five are on it, or on a line.
-pub fn fit_nearest_surface(
+pub fn fit_surface_through(
     index: &DirectionIndex,
     window: [f64; 2],
     az: f32,
     el: f32,
+    through: u32,
     edge_m: f64,
 ) -> Option<LocalSurface> {
     let (mut near, n) = neighbours(index, az, el, |_| true);
     let near = &mut near[..n];
-    if n < FEWEST {
-        return None;
-    }
-    let squared = |p: &[f64; 4]| p[0] * p[0] + p[1] * p[1];
+    let mut at = None;
+    index.around(az, el, |entry, dx, dy| at = if entry.index == through { Some([dx, dy].map(f64::from)) } else { at });
+    let at = at.filter(|_| n >= FEWEST)?;
+    let squared = |p: &[f64; 4]| (p[0] - at[0]).powi(2) + (p[1] - at[1]).powi(2);
     near.sort_unstable_by(|a, b| squared(a).total_cmp(&squared(b)));
     let ranges = near.iter().map(|p| 1.0 / p[2]);
     let along_m = most_along_m(ranges.fold([f64::INFINITY, 0.0f64], |[l, h], r| [l.min(r), h.max(r)]));
@@ -119,7 +120,8 @@ pub fn fit_nearest_surface(
     let total =
         |plane: [f64; 3]| near.iter().map(|p| support(plane, p)).sum::<f64>() + NORMAL_INCIDENCE * cos(plane).ln();
     let planes = (1..n).flat_map(|i| (1..i).map(move |j| (i, j)));
-    let planes = planes.filter_map(|(i, j)| through([near[0], near[i], near[j]])).map(|plane| (total(plane), plane));
+    let planes =
+        planes.filter_map(|(i, j)| plane_through([near[0], near[i], near[j]])).map(|plane| (total(plane), plane));
     let (_, best) = planes.max_by(|a, b| a.0.total_cmp(&b.0))?;
     let mut on = [[0.0f64; 4]; MOST];
     let mut count = 0;
@@ -135,7 +137,7 @@ pub fn fit_nearest_surface(
 }
 
 /// Inverse range at the middle and its slopes of the plane through three neighbours; `None` where they are on a line.
-fn through([first, a, b]: [[f64; 4]; 3]) -> Option<[f64; 3]> {
+fn plane_through([first, a, b]: [[f64; 4]; 3]) -> Option<[f64; 3]> {
     let [[xa, ya, qa], [xb, yb, qb]] = [a, b].map(|p| [p[0] - first[0], p[1] - first[1], p[2] - first[2]]);
     let det = xa * yb - xb * ya;
     let (bx, by) = ((qa * yb - qb * ya) / det, (xa * qb - xb * qa) / det);
@@ -342,7 +344,12 @@ mod tests {
         for (az, of) in [(-0.6 * step, near), (-0.4 * step, far), (0.3 * step, far), (-1.2 * step, near)] {
             let el = 0.3 * step;
             assert!(fit_surface(&index, window, az as f32, el as f32, |_| true).is_none_or(|s| !s.smooth(0.12)));
-            let s = fit_nearest_surface(&index, window, az as f32, el as f32, 0.12).unwrap();
+            let mut nearest = (f32::INFINITY, 0);
+            index.around(az as f32, el as f32, |e, dx, dy| {
+                let distance = dx * dx + dy * dy;
+                nearest = if distance < nearest.0 { (distance, e.index) } else { nearest };
+            });
+            let s = fit_surface_through(&index, window, az as f32, el as f32, nearest.1, 0.12).unwrap();
             assert!((s.range_m - range(of, az, el)).abs() < 5e-3 && s.bulge_m.abs() < 5e-3, "{az}: {s:?}");
         }
     }

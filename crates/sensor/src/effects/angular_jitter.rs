@@ -1,6 +1,6 @@
 //! C1: random direction errors of single shots.
 
-use super::local_plane::measure_along;
+use super::reshoot::reaim;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, turned};
 use crate::scan::Scan;
@@ -13,7 +13,8 @@ use serde::{Deserialize, Serialize};
 
 /// The true direction of every shot differs from the nominal one by `azimuth_std_deg * N(0, 1)` in azimuth and
 /// `elevation_std_deg * N(0, 1)` in elevation. The range is measured in the true direction and reported in the nominal
-/// one. On a finished cloud the range in the true direction is that of the plane through the neighbouring points.
+/// one. On a finished cloud the range in the true direction is that of the plane through the neighbouring points, and
+/// at an edge that of the surface that is met there.
 ///
 /// Typical: 0.01 to 0.03 degrees (Ouster OS1 +-0.01, NVIDIA Isaac 0.025, Robotec's GPU LiDAR 1 mrad).
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
@@ -55,14 +56,12 @@ impl SensorEffect for AngularJitter {
         }
     }
 
-    fn on_cloud(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if *self == AngularJitter::default() {
             return;
         }
         let mut random = draws.of_frame();
-        for echo in scan.returns_mut() {
-            measure_along(echo, self.turn(echo.direction, &mut random));
-        }
+        reaim(scan, frame, draws, |echo| self.turn(echo.direction, &mut random));
     }
 }
 

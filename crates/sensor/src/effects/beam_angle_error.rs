@@ -1,10 +1,10 @@
 //! C3: constant direction errors of each beam (row).
 
-use super::local_plane::measure_along;
+use super::reshoot::reaim;
 use super::row_table::{Rows, check_rows};
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, turned};
-use crate::scan::Scan;
+use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
 use geometry::Pose;
@@ -105,20 +105,17 @@ impl SensorEffect for BeamAngleError {
         }
         if !self.rows_deg.is_empty() {
             let Some(rows) = Rows::of(&self.sensor, &self.rows_deg, frame) else { return };
-            for echo in scan.returns_mut() {
-                if let Some(row) = rows.row(echo) {
-                    measure_along(echo, turned(echo.direction, 0.0, self.up_rad(Some(row))));
-                }
-            }
-            return;
+            let up = |row, direction| turned(direction, 0.0, self.up_rad(Some(row)));
+            let direction = |echo: &Echo| rows.row(echo).map_or(echo.direction, |row| up(row, echo.direction));
+            return reaim(scan, frame, draws, direction);
         }
         let mut known = (u8::MAX, u16::MAX, [0.0; 2]);
-        for echo in scan.returns_mut() {
+        reaim(scan, frame, draws, |echo| {
             if (known.0, known.1) != (echo.sensor, echo.row) {
                 known = (echo.sensor, echo.row, self.of_row(echo.sensor.into(), echo.row, draws));
             }
-            measure_along(echo, turned(echo.direction, known.2[0], known.2[1]));
-        }
+            turned(echo.direction, known.2[0], known.2[1])
+        });
     }
 }
 

@@ -132,6 +132,11 @@ impl Draws {
         stream(self.seed, &self.purpose, 1, self.frame)
     }
 
+    /// Stream of this frame for the places of edges, which no return tells.
+    pub fn of_edges(&self) -> Stream {
+        stream(self.seed, &self.purpose, 2, self.frame)
+    }
+
     /// Stream that is the same in every frame of the data set; each `number` has its own.
     pub fn of_set(&self, number: u64) -> Stream {
         stream(self.seed, &self.purpose, 0, number)

@@ -67,7 +67,7 @@ impl SensorEffect for EgoAttitude {
             return;
         }
         let true_from_reported = Pose::from_parts(Translation3::new(0.0, 0.0, heave_m), tilt);
-        reshoot(scan, frame, |_| Some(true_from_reported));
+        reshoot(scan, frame, draws, |_, _| Some(true_from_reported));
     }
 }
 

@@ -1,39 +1,77 @@
 //! Shots of a finished cloud that truly went elsewhere: their ranges are looked up in the cloud itself, and they keep
 //! the directions that the sensor reports.
 
-use super::FrameContext;
 use super::local_plane::measure_along;
+use super::{Draws, FrameContext};
 use crate::directions::{SensorScan, Sensors, Surroundings};
 use crate::rig::Sensor;
 use crate::scan::{Echo, Scan, dot};
+use data::Stream;
 use geometry::Pose;
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+use rand::RngExt;
+use std::collections::BTreeMap;
 
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
-/// Gives shots the ranges of their true rays: the pose of an echo moves its reported ray to the true one, in the
-/// cloud's frame. Shots without a pose stay as they are. Without scan patterns points are moved instead.
-pub(super) fn reshoot(scan: &mut Scan, frame: &FrameContext, true_from_reported: impl Fn(&Echo) -> Option<Pose>) {
+/// Gives returns the ranges in their true directions, which are close to the reported ones: on a surface that of its
+/// plane; at edges, where the scan patterns are known, that of the surface that the true ray meets.
+pub(super) fn reaim(
+    scan: &mut Scan,
+    frame: &FrameContext,
+    draws: &Draws,
+    mut true_direction: impl FnMut(&Echo) -> [f32; 3],
+) {
+    let mut at_edges = BTreeMap::new();
+    for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| e.is_return()) {
+        let direction = true_direction(echo);
+        if echo.normal != [0.0; 3] {
+            measure_along(echo, direction);
+        } else if direction != echo.direction {
+            at_edges.insert(i, direction);
+        }
+    }
+    let Some(sensors) = frame.sensors.filter(|_| !at_edges.is_empty()) else { return };
+    let origins: Vec<Vector3<f64>> = sensors.rig.sensors.iter().map(|s| Vector3::from(s.position)).collect();
+    let turned = |i: usize, echo: &Echo| {
+        let [from, to] = [echo.direction, *at_edges.get(&i)?].map(|d| Vector3::from(d.map(f64::from)));
+        let turn = UnitQuaternion::rotation_between(&from, &to)?;
+        let origin = origins.get(usize::from(echo.sensor))?;
+        Some(Pose::from_parts((origin - turn * origin).into(), turn))
+    };
+    reshoot(scan, frame, draws, turned);
+}
+
+/// Gives shots the ranges of their true rays: the pose of an echo, of which the place in the scan is given as well,
+/// moves its reported ray to the true one, in the cloud's frame. Shots without a pose stay as they are. Without scan
+/// patterns points are moved instead.
+pub(super) fn reshoot(
+    scan: &mut Scan,
+    frame: &FrameContext,
+    draws: &Draws,
+    true_from_reported: impl Fn(usize, &Echo) -> Option<Pose>,
+) {
     let Some(sensors) = frame.sensors else {
-        for echo in scan.returns_mut() {
-            if let Some(pose) = true_from_reported(echo) {
+        for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| e.is_return()) {
+            if let Some(pose) = true_from_reported(i, echo) {
                 let point = pose.inverse() * Point3::from(echo.point().map(f64::from));
                 echo.move_point(point.coords.map(|v| v as f32).into());
             }
         }
         return;
     };
+    let mut random = draws.of_edges();
     for (number, mount) in sensors.rig.sensors.iter().enumerate() {
         let of_sensor = |e: &Echo| usize::from(e.sensor) == number;
-        if !scan.echoes.iter().any(|e| of_sensor(e) && true_from_reported(e).is_some()) {
+        if !scan.echoes.iter().enumerate().any(|(i, e)| of_sensor(e) && true_from_reported(i, e).is_some()) {
             continue;
         }
-        let seen = Seen::new(scan, sensors, number);
+        let seen = Seen::new(scan, sensors, number, &mut random);
         let pose = mount.pose();
         let before = scan.echoes.clone();
         for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| of_sensor(e)) {
-            let Some(true_from_reported) = true_from_reported(&before[i]) else { continue };
+            let Some(true_from_reported) = true_from_reported(i, &before[i]) else { continue };
             // The true ray in the frame of the sensor as it is reported.
             let error = pose.inverse() * true_from_reported * pose;
             let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
@@ -56,6 +94,21 @@ pub(super) fn reshoot(scan: &mut Scan, frame: &FrameContext, true_from_reported:
     }
 }
 
+/// Number of the step of an angle from the lower end of the field of view.
+fn bin(angle: f32, [low, high]: [f32; 2], step: f32) -> usize {
+    if low < high { ((angle - low) / step + 0.5).max(0.0) as usize } else { 0 }
+}
+
+/// Place of an elevation among ascending rows: 1.5 half-way from the second to the third; beyond the ends as far as the
+/// last two rows are apart.
+fn row_place(rows: &[f32], elevation: f32) -> f32 {
+    let next = rows.partition_point(|r| *r < elevation).clamp(1, rows.len().max(2) - 1);
+    match rows {
+        [_, _, ..] => (next - 1) as f32 + (elevation - rows[next - 1]) / (rows[next] - rows[next - 1]),
+        _ => 0.0,
+    }
+}
+
 /// What a true ray meets.
 struct Met {
     /// Its distance, m.
@@ -65,18 +118,22 @@ struct Met {
 }
 
 /// The returns of a sensor by direction.
-struct Seen {
+struct Seen<'a> {
     scan: SensorScan,
     /// Places of the returns among the echoes.
     places: Vec<usize>,
     around: Surroundings,
     steps: [f32; 2],
+    /// Elevations of the rows, rad; empty where they are not known.
+    rows_rad: &'a [f32],
+    /// Where between two shots an edge lies, from -1/2 to 1/2 about the middle: of each column, and of each row.
+    edges: [Vec<f32>; 2],
     /// Least and largest azimuth and elevation of a return, rad.
     field: [[f32; 2]; 2],
 }
 
-impl Seen {
-    fn new(scan: &Scan, sensors: &Sensors, number: usize) -> Seen {
+impl<'a> Seen<'a> {
+    fn new(scan: &Scan, sensors: &'a Sensors, number: usize, random: &mut Stream) -> Self {
         let sensor_from_cloud = sensors.rig.sensors[number].pose().inverse();
         let (mut own, mut places) = (SensorScan::default(), Vec::new());
         for (i, echo) in scan.echoes.iter().enumerate() {
@@ -93,12 +150,20 @@ impl Seen {
         let ends = |angles: &[f32]| {
             angles.iter().fold([f32::INFINITY, f32::NEG_INFINITY], |[low, high], v| [low.min(*v), high.max(*v)])
         };
+        let steps = [steps.azimuth_rad, steps.elevation_rad];
+        let field = [ends(&own.azimuth_rad), ends(&own.elevation_rad)];
+        let mut of_axis = |axis: usize| {
+            let shots = bin(field[axis][1], field[axis], steps[axis]) + 1;
+            (0..shots).map(|_| random.random_range(-0.5..0.5)).collect()
+        };
         Seen {
-            field: [ends(&own.azimuth_rad), ends(&own.elevation_rad)],
+            edges: [of_axis(0), of_axis(1)],
+            rows_rad: &sensors.patterns[number].rows_rad,
+            field,
             around: Surroundings::new(sensors, number, &own),
             scan: own,
             places,
-            steps: [steps.azimuth_rad, steps.elevation_rad],
+            steps,
         }
     }
 
@@ -143,7 +208,10 @@ impl Seen {
         };
         let on_surface = echo.is_return() && echo.normal != [0.0; 3];
         let outside = [azimuth, elevation].iter().zip(&self.field).any(|(v, [low, high])| v < low || v > high);
-        let Some((nearest, near)) = self.nearest(azimuth, elevation) else {
+        let own_ray = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
+        let [own_azimuth, own_elevation, _] = Sensor::spherical(&Point3::from(own_ray)).map(|v| v as f32);
+        let [beside, above] = self.on_the_side_of([own_azimuth, own_elevation], [azimuth, elevation]);
+        let Some((nearest, near)) = self.nearest(beside, above) else {
             // Beyond the field of view surfaces go on as they are at its end.
             return (outside && on_surface).then(|| Met { range_m: own_m(), on: None });
         };
@@ -152,10 +220,13 @@ impl Seen {
         if whole.is_none() && outside && on_surface {
             return Some(Met { range_m: own_m(), on: None });
         }
-        // At an edge: the surface of the nearest return.
-        let Some((surface, normal)) =
-            whole.or_else(|| self.around.nearest_surface(azimuth, elevation).filter(|_| near))
-        else {
+        // Beyond an edge with nothing behind it. Shots that were lost on a surface leave no such gap.
+        if !near && self.around.look(beside, above, None).surface.is_none() {
+            return None;
+        }
+        // At an edge: the surface of the return on the same side of it.
+        let of_side = || self.around.surface_of(azimuth, elevation, nearest as u32).filter(|_| near);
+        let Some((surface, normal)) = whole.or_else(of_side) else {
             // A lone return is met at its distance from the true origin.
             let reported = f64::from(self.scan.range_m[nearest]);
             return near.then_some(Met { range_m: (reported - shift.dot(direction)).max(0.01) as f32, on });
@@ -171,12 +242,24 @@ impl Seen {
         let range_m = meets.dot(&(seen - shift)) / along;
         // The shot's own error is what it lies off the surface around it, or else what the nearest return does. Added
         // to the surface around the true ray, it keeps its variance: the errors of planes are averages of many returns.
-        let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
-        let [own_azimuth, own_elevation, _] = Sensor::spherical(&Point3::from(own)).map(|v| v as f32);
         let own = self.around.look(own_azimuth, own_elevation, None).surface.filter(|_| on_surface);
         let error_m = own.map_or(surface.bulge_m, |(own, _)| f64::from(echo.range_m) - own.range_m);
-        let is_own = own.is_some() && ((f64::from(own_m()) - range_m) * along).abs() < self.around.edge_m;
-        Some(Met { range_m: (range_m + error_m).max(0.01) as f32, on: on.filter(|_| !is_own) })
+        Some(Met { range_m: (range_m + error_m).max(0.01) as f32, on })
+    }
+
+    /// A direction whose nearest return lies on the side of an edge that a true ray meets. Of two returns an edge lies
+    /// anywhere between: in a share of the rows and columns that is the share of the way from one to the other the ray
+    /// meets what the other one met. Neighbours of a shot see the same edge.
+    fn on_the_side_of(&self, own: [f32; 2], [azimuth, elevation]: [f32; 2]) -> [f32; 2] {
+        let [by_column, by_row] = [0, 1].map(|axis| {
+            let place = bin(own[axis], self.field[axis], self.steps[axis]);
+            self.edges[axis].get(place).copied().unwrap_or(0.0)
+        });
+        let above = match self.rows_rad {
+            [] => elevation + by_row * self.steps[1],
+            rows => rows[(row_place(rows, elevation) + by_row).round().clamp(0.0, rows.len() as f32 - 1.0) as usize],
+        };
+        [azimuth + by_column * self.steps[0], above]
     }
 
     /// The return nearest to a direction, and whether it is so near that a shot there meets what it met.
@@ -200,7 +283,7 @@ mod tests {
     use super::*;
     use crate::cloud_scan::{CloudReader, Surfaces};
     use crate::effects::testing::{rig, scene, with_frame};
-    use nalgebra::{Translation3, UnitQuaternion};
+    use nalgebra::Translation3;
 
     /// A sensor that truly looks 0.5 degrees further down and stands 10 cm further back meets the ground nearer and the
     /// wall farther; what it reports keeps its rows.
@@ -213,9 +296,9 @@ mod tests {
             Translation3::new(-0.1, 0.0, 0.0),
             UnitQuaternion::from_euler_angles(0.0, 0.5f64.to_radians(), 0.0),
         );
-        let after = with_frame(0, |frame, _| {
+        let after = with_frame(0, |frame, draws| {
             let mut scan = before.clone();
-            reshoot(&mut scan, &FrameContext { sensors: Some(reader.sensors()), ..*frame }, |_| Some(error));
+            reshoot(&mut scan, &FrameContext { sensors: Some(reader.sensors()), ..*frame }, draws, |_, _| Some(error));
             scan
         });
         let (mut right, mut all) = (0, 0);
@@ -235,13 +318,48 @@ mod tests {
         assert!(right * 100 > all * 97, "{right} of {all}");
     }
 
+    /// The upper end of the wall lies anywhere between two rows: of rays higher by three tenths of their distance
+    /// three tenths look over it, whole rows at a time. The others are on the wall still.
+    #[test]
+    fn the_share_of_rays_beyond_an_edge_is_that_of_the_way_to_the_next_row() {
+        let mut higher_on_the_left = scene();
+        for echo in higher_on_the_left.echoes.iter_mut().filter(|e| !e.is_return() && e.direction[1] > 0.4) {
+            echo.range_m = 40.0 / echo.direction[0];
+        }
+        let cloud = higher_on_the_left.cloud();
+        let reader = CloudReader::new(&rig(), std::slice::from_ref(&cloud));
+        let before = reader.scan(&cloud, &Surfaces::default());
+        let height = |e: &Echo| e.direction[2] / e.direction[0].hypot(e.direction[1]);
+        let right = before.returns().filter(|e| e.direction[1] < 0.2);
+        let top = right.max_by(|a, b| height(a).total_cmp(&height(b))).unwrap().row;
+        let up = UnitQuaternion::from_euler_angles(0.0, -(0.3 * 25.0 / 31.0f64).to_radians(), 0.0);
+        let ahead = |e: &Echo| e.row == top && e.direction[1].abs() < 0.1;
+        let frames = 300;
+        let mut over = 0;
+        for index in 0..frames {
+            let mut scan = before.clone();
+            with_frame(index, |frame, draws| {
+                let frame = FrameContext { sensors: Some(reader.sensors()), ..*frame };
+                let higher = Pose::from_parts(Translation3::identity(), up);
+                reshoot(&mut scan, &frame, draws, |_, e| ahead(e).then_some(higher));
+            });
+            let row: Vec<&Echo> = scan.echoes.iter().filter(|e| ahead(e)).collect();
+            let returns: Vec<&&Echo> = row.iter().filter(|e| e.is_return()).collect();
+            assert!(returns.is_empty() || returns.len() == row.len(), "{} of {}", returns.len(), row.len());
+            assert!(returns.iter().all(|e| (e.point()[0] - 40.0).abs() < 0.4));
+            over += usize::from(returns.is_empty());
+        }
+        let share = over as f64 / frames as f64;
+        assert!((share - 0.3).abs() < 0.08, "{share}");
+    }
+
     #[test]
     fn without_patterns_the_points_are_moved() {
         let before = scene();
         let shift = Pose::from_parts(Translation3::new(0.0, 0.0, 0.2), UnitQuaternion::identity());
-        let after = with_frame(0, |frame, _| {
+        let after = with_frame(0, |frame, draws| {
             let mut scan = before.clone();
-            reshoot(&mut scan, frame, |_| Some(shift));
+            reshoot(&mut scan, frame, draws, |_, _| Some(shift));
             scan
         });
         for (a, b) in after.returns().zip(before.returns()) {

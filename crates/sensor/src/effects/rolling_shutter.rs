@@ -58,7 +58,7 @@ impl SensorEffect for RollingShutter {
     /// On a finished cloud, points within the boxes of cars move with the velocity of their car. With
     /// `deskewed = false` the velocity of the ego vehicle at the point is subtracted, and shots at all that stands
     /// still start where the ego vehicle is at their time.
-    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         let mounts: Vec<_> = frame.rig.sensors.iter().map(|s| (s, s.pose().inverse())).collect();
         let phase = |echo: &Echo| {
             let (sensor, sensor_from_cloud) = &mounts[usize::from(echo.sensor)];
@@ -71,7 +71,7 @@ impl SensorEffect for RollingShutter {
         if let Some([forward_m, left_m, turn_deg]) = self.slide {
             let (way, turn) = (Vector3::new(forward_m, left_m, 0.0), Vector3::z() * turn_deg.to_radians());
             // The scene slides one way, the origins of the shots the other.
-            reshoot(scan, frame, |echo| Some(moved_by(-way * phase(echo), -turn * phase(echo))));
+            reshoot(scan, frame, draws, |_, echo| Some(moved_by(-way * phase(echo), -turn * phase(echo))));
             return;
         }
         let time_s = |echo: &Echo| self.scan_s.map_or(f64::from(echo.time_s), |scan_s| -scan_s * phase(echo));
@@ -100,7 +100,7 @@ impl SensorEffect for RollingShutter {
             let cars: Vec<Echo> = scan.echoes.iter().zip(&of_car).filter(|(_, car)| **car).map(|(e, _)| *e).collect();
             let mut at = of_car.iter();
             scan.echoes.retain(|_| at.next() != Some(&true));
-            reshoot(scan, frame, |echo| Some(moved_by(ego * time_s(echo), turn * time_s(echo))));
+            reshoot(scan, frame, draws, |_, echo| Some(moved_by(ego * time_s(echo), turn * time_s(echo))));
             scan.echoes.extend(cars);
         }
     }

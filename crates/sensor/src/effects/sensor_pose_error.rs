@@ -58,14 +58,14 @@ impl SensorEffect for SensorPoseError {
     }
 
     /// Ranges are those of the true rays, looked up in the cloud.
-    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, _draws: &Draws) {
+    fn on_cloud(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
         if (self.translation_m, self.rotation_deg) == ([0.0; 3], [0.0; 3]) {
             return;
         }
         let Some(number) = frame.rig.find(&self.sensor) else { return };
         let mount = frame.rig.sensors[number].pose();
         let true_from_reported = mount * self.error() * mount.inverse();
-        reshoot(scan, frame, |echo| (usize::from(echo.sensor) == number).then_some(true_from_reported));
+        reshoot(scan, frame, draws, |_, echo| (usize::from(echo.sensor) == number).then_some(true_from_reported));
     }
 }
 
