@@ -117,6 +117,32 @@ struct Met {
     on: Option<usize>,
 }
 
+/// The true ray of a shot.
+struct TrueRay<'a> {
+    /// Direction and start, m, in the sensor's frame.
+    direction: &'a Vector3<f64>,
+    shift: &'a Vector3<f64>,
+    /// Pose of the sensor in the cloud's frame.
+    pose: &'a Pose,
+    /// Azimuth and elevation of the reported ray, rad.
+    reported: [f32; 2],
+    /// The shot where it is reported on a surface.
+    on_surface: Option<&'a Echo>,
+    /// What its range is off the surface around it, m; `None` where surfaces meet.
+    error_m: Option<f64>,
+}
+
+impl TrueRay<'_> {
+    /// Range at which the ray meets the plane of the surface on which the shot is reported, m.
+    fn on_own_surface_m(&self) -> Option<f32> {
+        let [direction, shift] =
+            [self.direction, self.shift].map(|v| (self.pose.rotation * v).map(|x| x as f32).into());
+        let mut own = *self.on_surface?;
+        measure_along(&mut own, direction);
+        Some((own.range_m - dot(own.normal, shift) / dot(own.normal, direction).min(-1e-3)).max(0.01))
+    }
+}
+
 /// The returns of a sensor by direction.
 struct Seen<'a> {
     scan: SensorScan,
@@ -173,52 +199,45 @@ impl<'a> Seen<'a> {
         self.around.look(azimuth as f32, elevation as f32, None).surface.is_some()
     }
 
-    /// What a true ray meets. It starts at `shift` and has a direction, both in the sensor's frame; `echo` is the shot
-    /// as it is reported.
+    /// What the true ray of a shot meets. It starts at `shift` and has a direction, both in the sensor's frame; `echo`
+    /// is the shot as it is reported.
     fn meet(&self, direction: &Vector3<f64>, shift: &Vector3<f64>, echo: &Echo, pose: &Pose) -> Option<Met> {
+        let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
+        let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(own)).map(|v| v as f32);
+        let on_surface = echo.is_return() && echo.normal != [0.0; 3];
+        let surface = on_surface.then(|| self.around.look(azimuth, elevation, None).surface).flatten();
+        let ray = TrueRay {
+            direction,
+            shift,
+            pose,
+            reported: [azimuth, elevation],
+            on_surface: on_surface.then_some(echo),
+            error_m: surface.map(|(own, _)| f64::from(echo.range_m) - own.range_m),
+        };
         // Where the ray is at the range of what it meets, seen from the reported origin. Twice, since that range is
         // not known before.
         let mut range_m = if echo.is_return() { f64::from(echo.range_m) } else { 50.0 };
         let mut met = None;
         for _ in 0..2 {
             let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(shift + direction * range_m));
-            met = self.at(azimuth as f32, elevation as f32, direction, shift, echo, pose);
+            met = self.at([azimuth as f32, elevation as f32], &ray);
             range_m = f64::from(met.as_ref()?.range_m);
         }
         met
     }
 
-    fn at(
-        &self,
-        azimuth: f32,
-        elevation: f32,
-        direction: &Vector3<f64>,
-        shift: &Vector3<f64>,
-        echo: &Echo,
-        pose: &Pose,
-    ) -> Option<Met> {
-        let true_direction: [f32; 3] = (pose.rotation * direction).map(|v| v as f32).into();
-        // The shot's own surface, met by the true ray: its own error of range is kept.
-        let own_m = || {
-            let mut own = *echo;
-            measure_along(&mut own, true_direction);
-            let shift: [f32; 3] = (pose.rotation * shift).map(|v| v as f32).into();
-            own.range_m -= dot(own.normal, shift) / dot(own.normal, true_direction).min(-1e-3);
-            own.range_m.max(0.01)
-        };
-        let on_surface = echo.is_return() && echo.normal != [0.0; 3];
+    /// What a true ray meets if it meets it in a direction from the reported origin.
+    fn at(&self, [azimuth, elevation]: [f32; 2], ray: &TrueRay) -> Option<Met> {
         let outside = [azimuth, elevation].iter().zip(&self.field).any(|(v, [low, high])| v < low || v > high);
-        let own_ray = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
-        let [own_azimuth, own_elevation, _] = Sensor::spherical(&Point3::from(own_ray)).map(|v| v as f32);
-        let [beside, above] = self.on_the_side_of([own_azimuth, own_elevation], [azimuth, elevation]);
-        let Some((nearest, near)) = self.nearest(beside, above) else {
-            // Beyond the field of view surfaces go on as they are at its end.
-            return (outside && on_surface).then(|| Met { range_m: own_m(), on: None });
-        };
+        // Beyond the field of view surfaces go on as they are at its end.
+        let beyond_m = if outside { ray.on_own_surface_m() } else { None };
+        let beyond = beyond_m.map(|range_m| Met { range_m, on: None });
+        let [beside, above] = self.on_the_side_of(ray.reported, [azimuth, elevation]);
+        let Some((nearest, near)) = self.nearest(beside, above) else { return beyond };
         let on = Some(self.places[nearest]);
         let whole = self.around.look(azimuth, elevation, None).surface;
-        if whole.is_none() && outside && on_surface {
-            return Some(Met { range_m: own_m(), on: None });
+        if whole.is_none() && beyond.is_some() {
+            return beyond;
         }
         // Beyond an edge with nothing behind it. Shots that were lost on a surface leave no such gap.
         if !near && self.around.look(beside, above, None).surface.is_none() {
@@ -226,25 +245,24 @@ impl<'a> Seen<'a> {
         }
         // At an edge: the surface of the return on the same side of it.
         let of_side = || self.around.surface_of(azimuth, elevation, nearest as u32).filter(|_| near);
+        let nearest_m = f64::from(self.scan.range_m[nearest]);
         let Some((surface, normal)) = whole.or_else(of_side) else {
             // A lone return is met at its distance from the true origin.
-            let reported = f64::from(self.scan.range_m[nearest]);
-            return near.then_some(Met { range_m: (reported - shift.dot(direction)).max(0.01) as f32, on });
+            let range_m = (nearest_m - ray.shift.dot(ray.direction)).max(0.01) as f32;
+            return near.then_some(Met { range_m, on });
         };
-        let meets = pose.rotation.inverse() * normal;
+        let meets = ray.pose.rotation.inverse() * normal;
         // The plane around the true direction, met from the true origin.
         let [az, el] = [azimuth, elevation].map(f64::from);
         let seen = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin()) * surface.range_m;
-        let along = meets.dot(direction);
+        let along = meets.dot(ray.direction);
         if along > -1e-3 {
-            return Some(Met { range_m: self.scan.range_m[nearest], on });
+            return Some(Met { range_m: nearest_m as f32, on });
         }
-        let range_m = meets.dot(&(seen - shift)) / along;
         // The shot's own error is what it lies off the surface around it, or else what the nearest return does. Added
         // to the surface around the true ray, it keeps its variance: the errors of planes are averages of many returns.
-        let own = self.around.look(own_azimuth, own_elevation, None).surface.filter(|_| on_surface);
-        let error_m = own.map_or(surface.bulge_m, |(own, _)| f64::from(echo.range_m) - own.range_m);
-        Some(Met { range_m: (range_m + error_m).max(0.01) as f32, on })
+        let range_m = meets.dot(&(seen - ray.shift)) / along + ray.error_m.unwrap_or(surface.bulge_m);
+        Some(Met { range_m: range_m.max(0.01) as f32, on })
     }
 
     /// A direction whose nearest return lies on the side of an edge that a true ray meets. Of two returns an edge lies
