@@ -218,6 +218,22 @@ impl LossTable {
         lost / n.max(1.0)
     }
 
+    /// Share of the returns of a kind of surface that the laws would lose more if all cosines of incidence are equally
+    /// frequent there.
+    pub fn lost_on_round(&self, laws: &[FittedLaw], zone: usize) -> f64 {
+        let kept_at = |i: usize, cos: f64| -> f64 {
+            let at = Where { ln_cos: cos.ln(), ..self.places[i] };
+            laws.iter().map(|law| law.kept(&at)).product()
+        };
+        let on_round = |i: usize| (0..10).map(|k| 0.1 * kept_at(i, 0.1 * f64::from(k) + 0.05)).sum::<f64>();
+        let of_zone = self.used.iter().filter(|i| in_zone(zone, self.places[**i].zone));
+        let [whole, round] = of_zone.fold([0.0; 2], |[whole, round], &i| {
+            let n = self.cells[i].simulated.n;
+            [whole + n * self.kept(laws, i), round + n * on_round(i)]
+        });
+        1.0 - round / whole.max(1e-9)
+    }
+
     /// Share of the measured returns, of one kind of surface or of all, that the simulated side lacks.
     pub fn only_measured(&self, zone: Option<usize>) -> f64 {
         let of_zone = |i: &&usize| zone.is_none_or(|zone| in_zone(zone, self.places[**i].zone));
@@ -317,6 +333,19 @@ mod tests {
         assert!(by_law > 1000.0 && by_form < 0.2 * by_law, "{by_law} {by_form}");
         let [_, of_material] = gain(&table(|r, c, z| signal(r, c) * if z == 2 { 0.7 } else { 1.0 }), Law::Zone(2));
         assert!(of_material > 1000.0, "{of_material}");
+    }
+
+    #[test]
+    fn on_round_bodies_a_law_of_incidence_loses_what_is_met_at_all_cosines() {
+        // Only cosines near 0.8 are seen; half is lost at 0.2, none far above.
+        let kept = |c: f64| 1.0 / (1.0 + (0.2 / c).powi(6));
+        let mut table = table(|_, c, _| kept(c));
+        let laws = table.fit(&[], Law::Incidence);
+        table.used.retain(|&i| table.places[i].ln_cos > -0.3);
+        let want = 1.0 - (0..1000).map(|k| kept((f64::from(k) + 0.5) / 1000.0) / 1000.0).sum::<f64>();
+        let found = table.lost_on_round(&laws, 2);
+        assert!((found - want).abs() < 0.03 && want > 0.18, "{found} {want}");
+        assert!(table.lost_on_round(&[], 2).abs() < 1e-9);
     }
 
     #[test]

@@ -12,7 +12,7 @@ use self::select::Selection;
 use super::unexplained::{Unexplained, mean_by_group};
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands, trimmed};
 use crate::catalogue::{Cause, Channel, Quantity};
-use crate::channels::cells::cell;
+use crate::channels::cells::{OBJECT, cell};
 use crate::channels::groups::{Group, Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
@@ -114,7 +114,13 @@ impl<'a> Search<'a> {
         // What the simulation loses beyond the measured side is no more than what only the measured side has.
         let most = |zone: Option<usize>| if last.numbers[0] < 0.0 { table.only_measured(zone) } else { f64::INFINITY };
         match last.law {
-            Law::Zone(zone) => own.min(most(Some(zone))) > ZONE_FLOOR + 0.07 * joins + 0.1 * self.displaced,
+            Law::Zone(zone) => {
+                // The angle of incidence is not known on curved bodies: what the laws before it may lose there is no
+                // material.
+                let on_round = if zone >= OBJECT { table.lost_on_round(before, zone) } else { 0.0 };
+                let beside = on_round.max(0.07 * joins);
+                own.min(most(Some(zone))) > ZONE_FLOOR + beside + 0.1 * self.displaced
+            }
             Law::Random => own.min(most(None)) > FLOOR + 0.02 * joins + 0.01 * self.displaced,
             _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * self.displaced,
         }
