@@ -82,10 +82,23 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
     let density = Density::of(select.iter().copied());
     let seen = significant(&gains, Z_STAR) || significant_by_signs(&differences, Z_BY_SIGNS[0]);
     let floor_per_m = FLOOR * frames.returns / select.iter().map(|f| f.path_m(0)).sum::<f64>().max(1.0);
-    let outcome = match density {
-        _ if total <= first_demands().nats || !seen => "no more returns behind vehicles than before them",
-        Density { behind, base } if behind < floor_per_m.max(TIMES * base) => "too few to speak of",
-        _ => "chosen",
+    let few = |density: &Density| density.behind < floor_per_m.max(TIMES * density.base);
+    let (estimate, hold_out) = (of(frames.estimate), of(frames.hold_out));
+    let on_estimate = Density::of(estimate.iter().copied());
+    let held = || hold_out.iter().map(|f| on_estimate.gain(f)).collect();
+    let plume = || found(&estimate, frames.within, held(), z);
+    let none_on_paths = |f: &Found| f.parameter(Quantity::DensityPerM).is_none_or(|d| d.estimate < floor_per_m);
+    let (spray, outcome) = if total <= first_demands().nats || !seen {
+        (None, "no more returns behind vehicles than before them")
+    } else if few(&density) {
+        (None, "too few to speak of")
+    } else if few(&on_estimate) {
+        (None, "not on other frames")
+    } else {
+        match Some(plume()).filter(|f| !none_on_paths(f)) {
+            Some(spray) => (Some(spray), "chosen"),
+            None => (None, "too few on free paths behind vehicles"),
+        }
     };
     result.considered.push(Considered {
         cause: Cause::Spray.into(),
@@ -98,17 +111,12 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
         let detectable = floor_per_m.max(TIMES * density.base);
         result.minimum.push((Cause::Spray, Minimum::new(Quantity::DensityPerM, detectable)));
     }
-    if outcome != "chosen" {
-        return false;
-    }
-    let (estimate, hold_out) = (of(frames.estimate), of(frames.hold_out));
-    let density = Density::of(estimate.iter().copied());
-    let held: Vec<f64> = hold_out.iter().map(|f| density.gain(f)).collect();
+    let Some(spray) = spray else { return false };
     for (d, frame) in result.distance.iter_mut().zip(&hold_out) {
-        let [before, after] = density.distance(frame);
+        let [before, after] = on_estimate.distance(frame);
         *d = [d[0] + before, d[1] + before - after, d[2] + before - after];
     }
-    result.found.push(found(&estimate, frames.within, held, z));
+    result.found.push(spray);
     true
 }
 
