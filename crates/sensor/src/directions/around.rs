@@ -57,9 +57,8 @@ pub struct Surroundings {
     pub index: DirectionIndex,
     /// Half widths of the window of neighbours, rad.
     pub window: [f64; 2],
-    /// Distance across a plane from which on a return belongs to another surface, m.
-    pub edge_m: f64,
     cloud_from_sensor: Isometry3<f64>,
+    edge_m: f64,
 }
 
 /// What lies around a direction.

@@ -119,10 +119,9 @@ pub fn fit_surface_through(
     };
     let total =
         |plane: [f64; 3]| near.iter().map(|p| support(plane, p)).sum::<f64>() + NORMAL_INCIDENCE * cos(plane).ln();
-    let planes = (1..n).flat_map(|i| (1..i).map(move |j| (i, j)));
-    let planes =
-        planes.filter_map(|(i, j)| plane_through([near[0], near[i], near[j]])).map(|plane| (total(plane), plane));
-    let (_, best) = planes.max_by(|a, b| a.0.total_cmp(&b.0))?;
+    let others = (1..n).flat_map(|i| (1..i).map(move |j| (i, j)));
+    let planes = others.filter_map(|(i, j)| plane_through([near[0], near[i], near[j]]));
+    let (_, best) = planes.map(|plane| (total(plane), plane)).max_by(|a, b| a.0.total_cmp(&b.0))?;
     let mut on = [[0.0f64; 4]; MOST];
     let mut count = 0;
     for p in near.iter() {

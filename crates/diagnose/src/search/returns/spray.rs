@@ -85,9 +85,6 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
     let few = |density: &Density| density.behind < floor_per_m.max(TIMES * density.base);
     let (estimate, hold_out) = (of(frames.estimate), of(frames.hold_out));
     let on_estimate = Density::of(estimate.iter().copied());
-    let held = || hold_out.iter().map(|f| on_estimate.gain(f)).collect();
-    let plume = || found(&estimate, frames.within, held(), z);
-    let none_on_paths = |f: &Found| f.parameter(Quantity::DensityPerM).is_none_or(|d| d.estimate < floor_per_m);
     let (spray, outcome) = if total <= first_demands().nats || !seen {
         (None, "no more returns behind vehicles than before them")
     } else if few(&density) {
@@ -95,10 +92,10 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
     } else if few(&on_estimate) {
         (None, "not on other frames")
     } else {
-        match Some(plume()).filter(|f| !none_on_paths(f)) {
-            Some(spray) => (Some(spray), "chosen"),
-            None => (None, "too few on free paths behind vehicles"),
-        }
+        let held = hold_out.iter().map(|f| on_estimate.gain(f)).collect();
+        let spray = found(&estimate, frames.within, held, z);
+        let on_free_paths = spray.parameter(Quantity::DensityPerM).is_some_and(|d| d.estimate >= floor_per_m);
+        if on_free_paths { (Some(spray), "chosen") } else { (None, "too few on free paths behind vehicles") }
     };
     result.considered.push(Considered {
         cause: Cause::Spray.into(),
