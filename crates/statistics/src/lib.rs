@@ -12,3 +12,6 @@ pub use quantile::{Number, interval_nearest, median_upper, median_upper_of_sorte
 
 /// Median of the absolute values of normal noise, in standard deviations.
 pub const MEDIAN_OF_NORMAL: f64 = 0.6745;
+
+/// Lower quartile of the absolute values of normal noise, in standard deviations.
+pub const QUARTILE_OF_NORMAL: f64 = 0.318_639;

@@ -25,6 +25,11 @@ const FORM_BIN: f64 = 0.25;
 /// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;
 
+/// Share that laws keep together.
+fn kept_at(laws: &[FittedLaw], at: &Where) -> f64 {
+    laws.iter().map(|law| law.kept(at)).product()
+}
+
 impl LossTable {
     /// From the sums over some frames.
     pub fn new(cells: Vec<HitCell>) -> Self {
@@ -53,7 +58,7 @@ impl LossTable {
 
     /// Share that a law keeps in a cell.
     pub fn kept(&self, laws: &[FittedLaw], cell: usize) -> f64 {
-        laws.iter().map(|law| law.kept(&self.places[cell])).product()
+        kept_at(laws, &self.places[cell])
     }
 
     /// Share of simulated returns of a cell that have a counterpart.
@@ -221,11 +226,8 @@ impl LossTable {
     /// Share of the returns of a kind of surface that the laws would lose more if all cosines of incidence are equally
     /// frequent there.
     pub fn lost_on_round(&self, laws: &[FittedLaw], zone: usize) -> f64 {
-        let kept_at = |i: usize, cos: f64| -> f64 {
-            let at = Where { ln_cos: cos.ln(), ..self.places[i] };
-            laws.iter().map(|law| law.kept(&at)).product()
-        };
-        let on_round = |i: usize| (0..10).map(|k| 0.1 * kept_at(i, 0.1 * f64::from(k) + 0.05)).sum::<f64>();
+        let kept = |i: usize, cos: f64| kept_at(laws, &Where { ln_cos: cos.ln(), ..self.places[i] });
+        let on_round = |i: usize| (0..10).map(|k| 0.1 * kept(i, 0.1 * f64::from(k) + 0.05)).sum::<f64>();
         let of_zone = self.used.iter().filter(|i| in_zone(zone, self.places[**i].zone));
         let [whole, round] = of_zone.fold([0.0; 2], |[whole, round], &i| {
             let n = self.cells[i].simulated.n;

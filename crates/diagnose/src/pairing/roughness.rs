@@ -96,14 +96,11 @@ fn more_noise_m(measured: &[Ray], simulated: &[Ray]) -> Vec<f64> {
         rough.into_iter().map(quartile).collect()
     };
     let more = |pair: (Option<f64>, Option<f64>)| match pair {
-        (Some(a), Some(b)) => (a * a - b * b).max(0.0).sqrt() / QUARTILE_OF_NORMAL,
+        (Some(a), Some(b)) => (a * a - b * b).max(0.0).sqrt() / statistics::QUARTILE_OF_NORMAL,
         _ => 0.0,
     };
     usual(measured).into_iter().zip(usual(simulated)).map(more).collect()
 }
-
-/// Lower quartile of the absolute value of a standard normal number.
-const QUARTILE_OF_NORMAL: f64 = 0.318_639;
 
 #[cfg(test)]
 mod tests {

@@ -75,8 +75,7 @@ pub(super) fn reshoot(
             // The true ray in the frame of the sensor as it is reported.
             let error = pose.inverse() * true_from_reported * pose;
             let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
-            let hit = seen.meet(&(error.rotation * own), &error.translation.vector, &before[i], &pose);
-            let Some(Met { range_m, on }) = hit else {
+            let Some(Met { range_m, on }) = seen.meet(&own, &error, &before[i], &pose) else {
                 echo.lose();
                 continue;
             };
@@ -199,11 +198,11 @@ impl<'a> Seen<'a> {
         self.around.look(azimuth as f32, elevation as f32, None).surface.is_some()
     }
 
-    /// What the true ray of a shot meets. It starts at `shift` and has a direction, both in the sensor's frame; `echo`
-    /// is the shot as it is reported.
-    fn meet(&self, direction: &Vector3<f64>, shift: &Vector3<f64>, echo: &Echo, pose: &Pose) -> Option<Met> {
-        let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
-        let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(own)).map(|v| v as f32);
+    /// What the true ray of a shot meets. The shot is reported as `echo`, in the direction `own`; `error` moves that
+    /// ray to the true one, both in the sensor's frame.
+    fn meet(&self, own: &Vector3<f64>, error: &Pose, echo: &Echo, pose: &Pose) -> Option<Met> {
+        let (direction, shift) = (&(error.rotation * own), &error.translation.vector);
+        let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(*own)).map(|v| v as f32);
         let on_surface = echo.is_return() && echo.normal != [0.0; 3];
         let surface = on_surface.then(|| self.around.look(azimuth, elevation, None).surface).flatten();
         let ray = TrueRay {

@@ -36,10 +36,7 @@ pub(super) fn found(
     let cause = hypothesis.cause();
     let Description { covariate, says, curve, parameters } = match hypothesis {
         Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
-        Hypothesis::Groups { cause, grouping, column } => {
-            let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
-            groups(search, *cause, *grouping, *column, biased, chosen)
-        }
+        Hypothesis::Groups { cause, grouping, column } => groups(search, *cause, *grouping, *column, chosen),
     };
     let named = cause != Cause::Unexplained;
     let rivals = selected.rivals.iter().copied().filter(|r| named && *r != Cause::Unexplained);
@@ -99,16 +96,8 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     }
 }
 
-/// Describes offsets of groups of rays, of rows together with what else was chosen; `biased` says that a bias of all
-/// ranges was found beside them.
-fn groups(
-    search: &Search,
-    cause: Cause,
-    grouping: Grouping,
-    column: usize,
-    biased: bool,
-    chosen: &[Hypothesis],
-) -> Description {
+/// Describes offsets of groups of rays, of rows together with what else was chosen.
+fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chosen: &[Hypothesis]) -> Description {
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
     let of_rows =
@@ -125,6 +114,7 @@ fn groups(
     let mut offsets = of_rows.unwrap_or_else(|| search.sums.offsets(&search.estimate, grouping, fit, chosen));
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
+    let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
     if column == 0 && grouping == Grouping::Row && !biased {
         let mean_m = mean_offset_m(search);
         offsets.values_mut().for_each(|v| *v += mean_m);

@@ -133,7 +133,7 @@ mod tests {
             rows: vec![],
             of_patches: 1.0,
             whole_rows: none(),
-            rows_with_pose: none(),
+            rows_with_pose: vec![],
             strips: none(),
             poses: vec![],
             of_sensors: vec![vec![2e6]],

@@ -35,9 +35,8 @@ pub(super) struct Sums {
     pub(super) of_patches: f64,
     /// Sums by row, of surfaces as they are.
     pub(super) whole_rows: Groups,
-    /// The same where only what the poses of frames deviate from their median is subtracted: a pose that all frames
-    /// share takes up what the rows of a sensor have in common.
-    pub(super) rows_with_pose: Groups,
+    /// The same with the pose that all frames share: it takes up what the rows of a sensor have in common.
+    pub(super) rows_with_pose: Vec<PartedFrame>,
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
     /// Pose error of each frame, as each sensor sees it.
@@ -73,17 +72,18 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
-    let groups = |g, poses: &[OwnPoses]| {
-        let parted = group_frames(frames, rig, poses, structure, g, noise_m, design);
+    let parted = |g, poses: &[OwnPoses]| group_frames(frames, rig, poses, structure, g, noise_m, design);
+    let groups = |g| {
+        let parted = parted(g, &poses);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
     let rows = row_frames(frames, rig, &poses, noise_m);
     Sums {
         of_patches: of_patches(&rows, select, rig.sensors.len()),
         rows,
-        whole_rows: groups(Grouping::Row, &poses),
-        rows_with_pose: groups(Grouping::Row, &deviations(&poses, select)),
-        strips: groups(Grouping::Azimuth, &poses),
+        whole_rows: groups(Grouping::Row),
+        rows_with_pose: parted(Grouping::Row, &deviations(&poses, select)),
+        strips: groups(Grouping::Azimuth),
         columns,
         precision,
         base,
@@ -294,13 +294,13 @@ impl Sums {
         // Without another cause that turns what a sensor sees, its turn is what its rows have in common.
         let turns = |h: &Hypothesis| is_pose(h) || h.cause() == Cause::RollingShutter;
         let turned_by_rows = column == 1 && !chosen.iter().any(turns);
-        let rows = if turned_by_rows { &self.rows_with_pose } else { &self.whole_rows };
+        let rows = if turned_by_rows { &self.rows_with_pose } else { &self.whole_rows.parted };
         let how = GroupFit { centred: !turned_by_rows, ..group_fit(column) };
         let mut of_parts: BTreeMap<usize, [Vec<f64>; 2]> = BTreeMap::new();
         for part in 0..PARTS {
             let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, &|p| p == part);
             let own = &sum.offsets(precisions(&columns, self.of_patches))[column];
-            let mut whole = total(frames.iter().map(|&i| &rows.parted[i][part]));
+            let mut whole = total(frames.iter().map(|&i| &rows[i][part]));
             whole.retain(|g, _| usize::from(g.sensor) == sensor);
             let whole = grouped::offsets(&whole, how);
             let whole = |row: usize| whole.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
