@@ -7,6 +7,8 @@ mod detectors;
 pub mod bev;
 pub mod checkpoint;
 pub mod config;
+#[cfg_attr(not(feature = "cube"), path = "gpu_kernels/absent.rs")]
+pub mod gpu_kernels;
 pub mod kernel_ops;
 pub mod layers;
 pub mod limits;
@@ -14,6 +16,7 @@ pub mod loss;
 pub mod named;
 pub mod onnx;
 pub mod point_ops;
+pub mod products;
 pub mod results;
 pub mod row_ops;
 pub mod suggest;

@@ -5,6 +5,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use kernels::{AdamStep, Parameter};
 use models::checkpoint::{HostTensor, HostValues, NamedTensors};
+use models::gpu_kernels;
 use models::kernel_ops::FlexValues;
 use std::collections::BTreeMap;
 
@@ -119,8 +120,10 @@ impl Adam {
             None => (gradient.zeros_like(), gradient.zeros_like()),
         };
         let tensors = [value, gradient, exp_avg, exp_avg_sq];
-        let [moved, exp_avg, exp_avg_sq] =
-            update_by_kernel(tensors, step).unwrap_or_else(|tensors| update_on_device(tensors, step));
+        let [moved, exp_avg, exp_avg_sq] = match update_by_kernel(tensors, step) {
+            Ok(updated) => updated,
+            Err(tensors) => gpu_kernels::adam(tensors, step).unwrap_or_else(|tensors| update_on_device(tensors, step)),
+        };
         self.moments.insert(name, Moments { shape, exp_avg, exp_avg_sq });
         moved
     }

@@ -3,6 +3,7 @@
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode, host};
 use crate::kernel_ops::{conv3x3, folded_conv3x3, pillar_conv, pixel_heads};
+use crate::products;
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use burn::tensor::module::conv2d;
@@ -94,6 +95,9 @@ impl ConvBnRelu {
 /// # Shapes
 /// `x`: `[B, C_in, H, W]`; `weight`: `[C_out, C_in, 3, 3]`; result `[B, C_out, H / stride, W / stride]`.
 fn conv(x: Tensor<4>, weight: Tensor<4>, stride: usize) -> Tensor<4> {
+    if products::are_used_on(&x.device()) {
+        return multiply(x, weight, |x, weight| products::conv3x3(x, weight, stride));
+    }
     conv3x3(&x, &weight, stride).unwrap_or_else(|| {
         let options = ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
         multiply(x, weight, |x, weight| conv2d(x, weight, None, options))
@@ -186,7 +190,14 @@ impl PointwiseConv {
     pub fn forward_rows<const N: usize>(convs: [&PointwiseConv; N], x: Tensor<4>) -> [Tensor<2>; N] {
         let parameters = convs.map(|conv| (conv.weight.val(), conv.bias.val()));
         pixel_heads(&x, parameters.each_ref().map(|(weight, bias)| (weight, bias))).unwrap_or_else(|| {
+            let by_products = products::are_used_on(&x.device());
             parameters.map(|(weight, bias)| {
+                if by_products {
+                    let ([b, c, h, w], k) = (x.dims(), bias.dims()[0]);
+                    let (x, weight) = (x.clone().reshape([b, c, h * w]), weight.reshape([k, c]));
+                    let y = multiply(x, weight, products::combine_channels); // [B, C_out, H * W]
+                    return products::add_to_rows(y.swap_dims(1, 2).reshape([b * h * w, k]), bias);
+                }
                 let y = conv2d(x.clone(), weight, Some(bias), ConvOptions::new([1, 1], [0, 0], [1, 1], 1));
                 let [b, k, h, w] = y.dims();
                 y.permute([0, 2, 3, 1]).reshape([b * h * w, k]) // [B, H, W, C_out] -> [B * H * W, C_out]

@@ -4,6 +4,7 @@ use super::conv::values;
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode};
 use crate::kernel_ops::{folded_transposed, transposed};
+use crate::products;
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use burn::tensor::module::{conv_transpose2d, conv2d};
@@ -62,6 +63,9 @@ impl ResampleBnRelu {
             && let Some(y) = folded_transposed(&x, stride, fold)
         {
             return y;
+        }
+        if products::are_used_on(&x.device()) {
+            return self.norm.forward_relu(multiply(x, weight, products::transposed), None, mode);
         }
         let y = transposed(&x, &weight, stride).unwrap_or_else(|| {
             let options = ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1);

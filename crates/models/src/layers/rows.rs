@@ -3,6 +3,7 @@
 use super::precision::multiply;
 use super::{BatchNorm, Init, Mode};
 use crate::kernel_ops::{MlpGroups, MlpParameters, MlpRows, shared_mlp, shared_mlp_inference};
+use crate::products;
 use burn::module::{Module, Param};
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -40,6 +41,11 @@ impl RowCounts {
     /// The padded number of rows; padding rows have multiplicity 0.
     pub fn filled_up(rows: usize) -> usize {
         rows.next_multiple_of(FILL)
+    }
+
+    /// The multiplicity of each row, `[N]`.
+    pub fn values(&self) -> Tensor<1> {
+        self.counts.clone().reshape([-1])
     }
 
     /// Sum of the counts.
@@ -103,10 +109,10 @@ impl<const D: usize> RowsBnRelu<D> {
     /// # Shapes
     /// `y` and result: `[N, C_out]`.
     pub fn norm_relu(&self, y: Tensor<2>, counts: &RowCounts, mode: Mode) -> Tensor<2> {
-        relu(match mode {
-            Mode::Train => self.norm.forward_rows_train(y, counts),
-            Mode::Eval => self.norm.forward_rows_eval(y),
-        })
+        match mode {
+            Mode::Train => self.norm.forward_rows_relu_train(y, counts),
+            Mode::Eval => relu(self.norm.forward_rows_eval(y)),
+        }
     }
 
     /// # Shapes
@@ -188,7 +194,8 @@ impl<const D: usize> RowsLinear<D> {
     /// # Shapes
     /// `x`: `[N, C_in]`; result `[N, C_out]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        self.project(x, 0) + self.bias.val().unsqueeze()
+        let (y, bias) = (self.project(x, 0), self.bias.val());
+        if products::are_used_on(&y.device()) { products::add_to_rows(y, bias) } else { y + bias.unsqueeze() }
     }
 }
 
@@ -209,6 +216,9 @@ fn matrix<const D: usize>(weight: &Param<Tensor<D>>) -> Tensor<2> {
 fn project<const D: usize>(weight: &Param<Tensor<D>>, x: Tensor<2>, first: usize) -> Tensor<2> {
     let (matrix, columns) = (matrix(weight), x.dims()[1]);
     let matrix = if columns == matrix.dims()[1] { matrix } else { matrix.narrow(1, first, columns) };
+    if products::are_used_on(&x.device()) {
+        return multiply(x, matrix, products::rows_by);
+    }
     multiply(x, matrix.transpose(), Tensor::matmul)
 }
 

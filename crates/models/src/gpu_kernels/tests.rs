@@ -1,0 +1,177 @@
+use super::*;
+use crate::layers::host;
+use burn::tensor::activation::relu;
+use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
+use kernels::{AdamStep, Parameter};
+use rand::RngExt;
+
+/// The GPU of this machine, or what computes like one.
+fn gpu() -> Option<Device> {
+    if Device::enumerate(DeviceType::Wgpu).is_empty() {
+        eprintln!("not tested: no adapter for wgpu");
+        return None;
+    }
+    Some(Device::wgpu(DeviceKind::DefaultDevice))
+}
+
+/// Random numbers, the same on every device.
+fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> Tensor<D> {
+    let mut random = data::stream(seed, "values", 0, 0);
+    let values: Vec<f32> = (0..shape.iter().product()).map(|_| random.random_range(-1.0..2.0)).collect();
+    Tensor::from_data(TensorData::new(values, shape), device)
+}
+
+#[track_caller]
+fn assert_close(what: &str, ours: &[Vec<f32>], theirs: &[Vec<f32>]) {
+    for (k, (ours, theirs)) in ours.iter().zip(theirs).enumerate() {
+        assert_eq!(ours.len(), theirs.len(), "{what} {k}");
+        let scale = theirs.iter().map(|v| v.abs()).fold(1e-3, f32::max);
+        let apart = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max) / scale;
+        assert!(apart < 1e-4, "{what} {k}: {apart}");
+    }
+}
+
+#[test]
+fn adam_equals_that_of_the_cpu() {
+    let Some(device) = gpu() else { return };
+    for (values, number) in [(1, 1), (255, 2), (70_000, 10)] {
+        let tensors = [1, 2, 3, 4].map(|seed| random([values], seed, &device));
+        let [value, gradient, mean, square] = tensors.each_ref().map(|t| host(t.clone()).unwrap());
+        let square: Vec<f32> = square.iter().map(|v| v.abs()).collect();
+        let tensors = [&value, &gradient, &mean, &square]
+            .map(|v| Tensor::<1>::from_data(TensorData::new(v.clone(), [values]), &device));
+        let step = AdamStep {
+            learning_rate: 3e-3,
+            beta1: 0.9,
+            beta2: 0.99,
+            epsilon: 1e-8,
+            weight_decay: 0.01,
+            step: number,
+            gradient_scale: 0.5,
+        };
+        let ours = adam(tensors, &step).expect("a kernel").map(|t| host(t).unwrap());
+        let (mut value, mut exp_avg, mut exp_avg_sq) = (value, mean, square);
+        let gradient = Some(gradient.as_slice());
+        step.apply(vec![Parameter { value: &mut value, gradient, exp_avg: &mut exp_avg, exp_avg_sq: &mut exp_avg_sq }]);
+        assert_close(&format!("{values} values"), &ours, &[value, exp_avg, exp_avg_sq]);
+    }
+    let flex = Device::flex();
+    let step = AdamStep {
+        learning_rate: 0.1,
+        beta1: 0.9,
+        beta2: 0.99,
+        epsilon: 1e-8,
+        weight_decay: 0.0,
+        step: 1,
+        gradient_scale: 1.0,
+    };
+    assert!(adam([1, 2, 3, 4].map(|seed| random([3], seed, &flex)), &step).is_err());
+}
+
+#[test]
+fn batch_norms_equal_their_definition() {
+    let Some(device) = gpu() else { return };
+    let (device, cpu) = (device.autodiff(), Device::flex().autodiff());
+    for (shape, with_relu) in
+        [([2, 3, 4, 5], true), ([1, 1, 2, 3], false), ([3, 5, 70, 60], true), ([2, 2, 300, 300], false)]
+    {
+        let [_, channels, ..] = shape;
+        let inputs = |device: &Device| {
+            let x = random(shape, 3, device).require_grad();
+            let [gamma, beta] = [4, 5].map(|seed| random([channels], seed, device).require_grad());
+            (x, gamma, beta, random(shape, 6, device))
+        };
+        let (x, gamma, beta, weight) = inputs(&device);
+        let (y, moments) = norm_relu(&x, &gamma, &beta, 1e-3, with_relu).expect("a kernel");
+        let gradients = (y.clone() * weight).sum().backward();
+        let mut ours = vec![host(y).unwrap(), host(moments.mean).unwrap(), host(moments.variance).unwrap()];
+        ours.push(host(x.grad(&gradients).unwrap()).unwrap());
+        ours.extend([gamma, beta].map(|t| host(t.grad(&gradients).unwrap()).unwrap()));
+
+        let (x, gamma, beta, weight) = inputs(&cpu);
+        let mean = |x: Tensor<4>| x.mean_dim(0).mean_dim(2).mean_dim(3);
+        let of_channels = |t: &Tensor<1>| t.clone().reshape([1, channels, 1, 1]);
+        let centre = mean(x.clone());
+        let variance = mean((x.clone() - centre.clone()).square());
+        let y =
+            (x.clone() - centre.clone()) / (variance.clone() + 1e-3).sqrt() * of_channels(&gamma) + of_channels(&beta);
+        let y = if with_relu { relu(y) } else { y };
+        let gradients = (y.clone() * weight).sum().backward();
+        let mut theirs = vec![host(y).unwrap(), host(centre).unwrap(), host(variance).unwrap()];
+        theirs.push(host(x.grad(&gradients).unwrap()).unwrap());
+        theirs.extend([gamma, beta].map(|t| host(t.grad(&gradients).unwrap()).unwrap()));
+        assert_close(&format!("{shape:?}"), &ours, &theirs);
+    }
+}
+
+#[test]
+fn products_equal_burns() {
+    let Some(device) = gpu() else { return };
+    for (a, b) in [
+        ([1, 1, 1, 1], [1, 1, 1, 1]),
+        ([1, 1, 70, 30], [1, 1, 30, 200]),
+        ([2, 3, 64, 17], [2, 3, 17, 130]),
+        ([1, 1, 65, 40], [3, 1, 40, 129]),
+        ([2, 5, 130, 33], [1, 1, 33, 9]),
+        ([1, 40, 256, 8], [1, 40, 8, 256]),
+    ] {
+        let (a, b): (Tensor<4>, Tensor<4>) = (random(a, 3, &device), random(b, 4, &device));
+        // As they are, and both stored with the other dimension first.
+        let turned =
+            |t: &Tensor<4>| Tensor::<4>::from_data(t.clone().swap_dims(2, 3).into_data(), &device).swap_dims(2, 3);
+        let theirs = host(a.clone().matmul(b.clone())).unwrap();
+        for (a, b) in
+            [(a.clone(), b.clone()), (turned(&a), b.clone()), (a.clone(), turned(&b)), (turned(&a), turned(&b))]
+        {
+            let [a, b] = [a, b].map(|t| t.try_into_primitive::<Cube>().unwrap());
+            let ours = host(Tensor::<4>::from_primitive::<Cube>(product(&a, &b).expect("a kernel"))).unwrap();
+            assert_close(&format!("{:?} {:?}", a.shape(), b.shape()), &[ours], std::slice::from_ref(&theirs));
+        }
+    }
+}
+
+#[test]
+fn sums_over_the_first_dimension() {
+    let Some(device) = gpu() else { return };
+    for shape in [[1, 1], [7, 300], [130, 70_000]] {
+        let x: Tensor<2> = random(shape, 3, &device);
+        let ours = sum_of_first(&x.clone().try_into_primitive::<Cube>().unwrap()).expect("a kernel");
+        let ours = host(Tensor::<2>::from_primitive::<Cube>(ours)).unwrap();
+        assert_close(&format!("{shape:?}"), &[ours], &[host(x.sum_dim(0)).unwrap()]);
+    }
+}
+
+#[test]
+fn batch_norms_of_rows_equal_their_definition() {
+    let Some(device) = gpu() else { return };
+    let (device, cpu) = (device.autodiff(), Device::flex().autodiff());
+    for ([rows, channels], with_relu) in [([1, 1], false), ([300, 5], true), ([5000, 33], true), ([9000, 3], false)] {
+        let counts: Vec<f32> = (0..rows).map(|row| [1.0, 0.0, 3.0][row % 3]).collect();
+        let total = counts.iter().sum::<f32>() as usize;
+        let inputs = |device: &Device| {
+            let x = random([rows, channels], 3, device).require_grad();
+            let [gamma, beta] = [4, 5].map(|seed| random([channels], seed, device).require_grad());
+            let counts = Tensor::<1>::from_data(TensorData::new(counts.clone(), [rows]), device);
+            (x, gamma, beta, random([rows, channels], 6, device), counts)
+        };
+        let (x, gamma, beta, weight, of_rows) = inputs(&device);
+        let (y, moments) = norm_relu_rows(&x, (&gamma, &beta), (&of_rows, total), 1e-3, with_relu).expect("a kernel");
+        let gradients = (y.clone() * weight).sum().backward();
+        let mut ours = vec![host(y).unwrap(), host(moments.mean).unwrap(), host(moments.variance).unwrap()];
+        ours.push(host(x.grad(&gradients).unwrap()).unwrap());
+        ours.extend([gamma, beta].map(|t| host(t.grad(&gradients).unwrap()).unwrap()));
+
+        let (x, gamma, beta, weight, of_rows) = inputs(&cpu);
+        let mean = |x: Tensor<2>| (x * of_rows.clone().reshape([rows, 1])).sum_dim(0) / total as f64;
+        let centre = mean(x.clone());
+        let variance = mean((x.clone() - centre.clone()).square());
+        let y = (x.clone() - centre.clone()) / (variance.clone() + 1e-3).sqrt() * gamma.clone().unsqueeze()
+            + beta.clone().unsqueeze();
+        let y = if with_relu { relu(y) } else { y };
+        let gradients = (y.clone() * weight).sum().backward();
+        let mut theirs = vec![host(y).unwrap(), host(centre).unwrap(), host(variance).unwrap()];
+        theirs.push(host(x.grad(&gradients).unwrap()).unwrap());
+        theirs.extend([gamma, beta].map(|t| host(t.grad(&gradients).unwrap()).unwrap()));
+        assert_close(&format!("{rows} rows of {channels}"), &ours, &theirs);
+    }
+}
