@@ -21,6 +21,12 @@ def main():
     parser.add_argument("--threads", type=int, required=True)
     parser.add_argument("--steps", type=int, required=True)
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
+    parser.add_argument(
+        "--precision",
+        choices=["default", "f32", "tf32", "f16"],
+        default="default",
+        help="of products on cuda; PyTorch's default is TF32 in convolutions and f32 in linear layers; f16: autocast",
+    )
     arguments = parser.parse_args()
     with open(arguments.report) as file:
         report = json.load(file)
@@ -30,6 +36,10 @@ def main():
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
     torch.set_default_device(arguments.device)
+    if arguments.precision != "default":
+        is_tf32 = arguments.precision != "f32"
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = is_tf32
+    torch.backends.cudnn.benchmark = arguments.form == "best"
     wait = torch.cuda.synchronize if arguments.device == "cuda" else lambda: None
     config = report["config"]
     if config["network"]["kind"] == "pointpillars":
@@ -56,7 +66,8 @@ def main():
     times_ms = []
     for i in range(arguments.steps + 2):  # two to warm up
         begin = time.perf_counter()
-        step()
+        with torch.autocast(arguments.device, torch.float16, enabled=arguments.precision == "f16"):
+            step()
         wait()
         if i >= 2:
             times_ms.append(1e3 * (time.perf_counter() - begin))

@@ -1,6 +1,6 @@
 //! `cargo xtask bench gpu`: the networks on the GPU of this machine. Parity with the reference, then the training step
-//! of each network by stage, at batch sizes that double until the memory or the patience ends, with PyTorch beside it
-//! where it is installed with CUDA. Writes `gpu.json` and a page, at the end and nothing before.
+//! of each network by stage, at batch sizes that grow fourfold until the memory or the patience ends, with PyTorch
+//! beside it where it is installed with CUDA. Writes `gpu.json` and a page, again after each detector.
 
 use crate::bench_train::{VARIABLE, median};
 use crate::program::{self, Program, output};
@@ -16,7 +16,7 @@ const PARITY: [&str; 3] = ["pointpillars_tiny", "centerpoint_tiny", "pointrcnn_t
 /// Detectors that are timed.
 const DETECTORS: [&str; 3] = ["pointpillars", "centerpoint", "pointrcnn"];
 
-/// Batch sizes stop doubling once a step takes longer, ms.
+/// Batch sizes stop growing once a step takes longer, ms.
 const PATIENCE_MS: f64 = 4000.0;
 
 /// Time the networks on the GPU of this machine.
@@ -24,7 +24,7 @@ const PATIENCE_MS: f64 = 4000.0;
 #[command(name = "cargo xtask bench gpu --")]
 struct GpuArgs {
     /// Cargo features that the program is built with, besides `wgpu`
-    #[arg(long, value_delimiter = ',', default_value = "vulkan,fusion,autotune")]
+    #[arg(long, value_delimiter = ',', default_value = "vulkan")]
     features: Vec<String>,
     /// A built `lidarshift-checks` that is used instead of building one
     #[arg(long, value_name = "FILE")]
@@ -49,6 +49,20 @@ struct GpuArgs {
     devices: PathBuf,
 }
 
+/// Precisions of this program that are timed: label and `--precision`.
+const PRECISIONS: [[&str; 2]; 2] = [["lidarshift", "f32"], ["lidarshift, f16", "f16"]];
+
+/// References: label, `--form` and `--precision` of `step.py`.
+const REFERENCES: [[&str; 3]; 4] = [
+    ["torch as OpenPCDet, TF32 convolutions", "openpcdet", "default"],
+    ["torch as OpenPCDet, f32", "openpcdet", "f32"],
+    ["torch at its best, TF32", "best", "tf32"],
+    ["torch at its best, f16", "best", "f16"],
+];
+
+/// Steps of the two runs whose kernels are counted. Autotuning is over before.
+const COUNTED_STEPS: [usize; 2] = [1, 3];
+
 /// What `lidarshift-checks adapters` prints.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 struct Build {
@@ -68,6 +82,8 @@ struct Adapter {
 struct Turn {
     whole_ms: Vec<f64>,
     #[serde(default)]
+    in_memory_ms: Vec<f64>,
+    #[serde(default)]
     median_ms: Vec<(String, f64)>,
     peak_mib: Option<u64>,
     device_mib: Option<u64>,
@@ -78,11 +94,13 @@ struct Turn {
 struct Row {
     detector: String,
     batch: usize,
-    /// `lidarshift`, or PyTorch in the form of OpenPCDet or at its best.
+    /// This program or PyTorch, and the precision.
     by: String,
-    /// Median of the whole step, ms; `None` if it failed.
+    /// Median of a step on a batch in memory, ms; `None` if it failed.
     step_ms: Option<f64>,
-    /// Median of each stage, ms, the device waited for after each.
+    /// Kernels that a step launches; of this program at batch 1.
+    launches: Option<usize>,
+    /// Median of each stage of a step that begins with clouds, ms; the device is waited for after each.
     stages_ms: Vec<(String, f64)>,
     /// Peak resident memory of the process, MiB.
     host_mib: Option<u64>,
@@ -110,8 +128,8 @@ struct Report {
 /// Runs the command with its arguments.
 ///
 /// # Errors
-/// A machine without a GPU, a parity that fails, a network that fails at batch 1, files that cannot be written. Nothing
-/// is written then.
+/// A machine without a GPU or a parity that fails: nothing is written. A network that fails at batch 1: the detectors
+/// before are kept. Files that cannot be written.
 pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
     let args = match GpuArgs::try_parse_from([&["gpu".to_string()], args].concat()) {
         Ok(args) => args,
@@ -142,7 +160,7 @@ pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
         output(Command::new(&program).arg("parity").arg(folder).args(["--device", "wgpu"]))?;
     }
     let mut report = Report {
-        schema: "lidarshift/bench-gpu/1",
+        schema: "lidarshift/bench-gpu/2",
         measured_unix_s: std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH)?.as_secs(),
         command: std::env::args().collect(),
         system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
@@ -153,13 +171,14 @@ pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
     };
     let python = python().map_err(|reason| report.not_measured.push(format!("PyTorch: {reason}"))).ok();
     let chosen = if args.detectors.is_empty() { DETECTORS.map(String::from).to_vec() } else { args.detectors.clone() };
-    for detector in &chosen {
-        report.rows.extend(measure(root, &program, python.as_deref(), detector, &args)?);
-    }
     if python.is_some() {
         report.not_measured.push("PointRCNN in PyTorch: its neighbours are searched on the CPU".into());
     }
-    write(&root.join(&args.out), &report)
+    for detector in &chosen {
+        report.rows.extend(measure(root, &program, python.as_deref(), detector, &args)?);
+        write(&root.join(&args.out), &report)?;
+    }
+    Ok(())
 }
 
 /// Whether there is a device file of a GPU. On other systems than Linux there always is one.
@@ -174,34 +193,68 @@ fn has_gpu(devices: &Path) -> bool {
 
 /// The rows of one detector.
 fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, args: &GpuArgs) -> Result<Vec<Row>> {
-    let file = std::env::temp_dir().join(format!("lidarshift-bench-gpu-{}.json", std::process::id()));
+    let folder = tempfile::tempdir()?;
+    let file = folder.path().join("step.json");
     let steps = args.steps.to_string();
+    let detector_file = fs_err::canonicalize(root.join(detector)).ok();
     let mut rows = Vec::new();
-    for batch in std::iter::successors(Some(1), |batch| Some(2 * batch)).take_while(|&batch| batch <= args.most) {
-        eprintln!("{detector}, batch {batch}");
-        let mut step = Command::new(program);
-        step.args(["bench-step", "--device", "wgpu", "--detector", detector, "--batch", &batch.to_string()]);
-        step.args(["--steps", &steps, "--json"]).arg(&file).current_dir(root);
-        let turn = output(&mut step).and_then(|_| Ok(serde_json::from_slice::<Turn>(&fs_err::read(&file)?)?));
-        let turn = if batch == 1 { Ok(turn?) } else { turn };
-        let is_end = turn.as_ref().map_or(true, |turn| median(turn.whole_ms.clone()) > PATIENCE_MS);
-        let is_failure = turn.is_err();
-        rows.push(Row::new(detector, batch, "lidarshift", turn));
-        for form in ["openpcdet", "best"] {
-            let Some(python) = python.filter(|_| !is_failure && detector != "pointrcnn") else { continue };
+    for batch in std::iter::successors(Some(1), |batch| Some(4 * batch)).take_while(|&batch| batch <= args.most) {
+        let of_program = |precision: &str, steps: &str| {
+            let mut step = Command::new(program);
+            step.args(["bench-step", "--device", "wgpu", "--precision", precision, "--steps", steps]);
+            step.args(["--batch", &batch.to_string(), "--detector"]);
+            step.arg(detector_file.as_deref().unwrap_or(Path::new(detector)));
+            step.arg("--json").arg(&file).current_dir(folder.path());
+            output(&mut step).and_then(|_| Ok(serde_json::from_slice::<Turn>(&fs_err::read(&file)?)?))
+        };
+        let mut is_end = false;
+        let mut is_known = false;
+        for [label, precision] in PRECISIONS {
+            eprintln!("{detector}, batch {batch}, {label}");
+            let turn = of_program(precision, &steps);
+            let turn = if batch == 1 && precision == "f32" { Ok(turn?) } else { turn };
+            is_known |= turn.is_ok();
+            let mut row = Row::new(detector, batch, label, turn);
+            is_end |= precision == "f32" && row.step_ms.is_none_or(|ms| ms > PATIENCE_MS);
+            if batch == 1 && row.step_ms.is_some() {
+                row.launches = Some(launches(folder.path(), |steps| of_program(precision, steps).map(drop))?);
+            }
+            rows.push(row);
+        }
+        let has_best = detector == "pointpillars";
+        let references = REFERENCES.iter().filter(|[_, form, _]| has_best || *form == "openpcdet");
+        for [label, form, precision] in references {
+            // The report says how many points and pillars the reference gets.
+            let Some(python) = python.filter(|_| is_known && detector != "pointrcnn") else { continue };
+            eprintln!("{detector}, batch {batch}, {label}");
             let mut step = Command::new(python);
             step.arg(root.join("xtask/bench_train/step.py")).arg(&file).args(["--form", form, "--steps", &steps]);
             let threads = std::thread::available_parallelism().map_or(1, usize::from);
-            step.args(["--device", "cuda", "--threads", &threads.to_string()]);
+            step.args(["--device", "cuda", "--precision", precision, "--threads", &threads.to_string()]);
             let turn = output(&mut step).and_then(|text| Ok(serde_json::from_slice::<Turn>(&text)?));
-            rows.push(Row::new(detector, batch, &format!("torch, {form}"), turn));
+            rows.push(Row::new(detector, batch, label, turn));
         }
         if is_end {
             break;
         }
     }
-    std::fs::remove_file(&file).ok();
     Ok(rows)
+}
+
+/// Kernels that a step launches: the difference of two runs, whose kernels burn's runtime lists in a file.
+fn launches(folder: &Path, run: impl Fn(&str) -> Result<()>) -> Result<usize> {
+    let (settings, log) = (folder.join("cubecl.toml"), folder.join("kernels.log"));
+    let mut counts = [0; 2];
+    for (count, steps) in counts.iter_mut().zip(COUNTED_STEPS) {
+        fs_err::write(&settings, "[profiling.logger]\nlevel = \"minimal\"\nfile = \"kernels.log\"\n")?;
+        let ran = run(&steps.to_string());
+        fs_err::remove_file(&settings)?;
+        ran?;
+        *count = fs_err::read_to_string(&log)?.lines().count();
+        fs_err::remove_file(&log)?;
+    }
+    // Each timed step is made twice, by stage and in memory.
+    Ok(counts[1].saturating_sub(counts[0]) / (2 * (COUNTED_STEPS[1] - COUNTED_STEPS[0])))
 }
 
 impl Row {
@@ -210,11 +263,15 @@ impl Row {
             Ok(turn) => (Some(turn), None),
             Err(error) => (None, Some(format!("{error:#}").lines().last().unwrap_or_default().to_string())),
         };
+        // Of PyTorch there are only steps in memory.
+        let times =
+            |turn: &Turn| if turn.in_memory_ms.is_empty() { &turn.whole_ms } else { &turn.in_memory_ms }.clone();
         Row {
             detector: detector.into(),
             batch,
             by: by.into(),
-            step_ms: turn.as_ref().map(|turn| median(turn.whole_ms.clone())),
+            step_ms: turn.as_ref().map(|turn| median(times(turn))),
+            launches: None,
             host_mib: turn.as_ref().and_then(|turn| turn.peak_mib),
             device_mib: turn.as_ref().and_then(|turn| turn.device_mib),
             stages_ms: turn.map_or_else(Vec::new, |turn| turn.median_ms),
@@ -259,21 +316,23 @@ fn page(report: &Report) -> String {
     if report.build.adapters.iter().all(|adapter| !adapter.is_gpu) {
         page += "\nThere is no GPU: these are times of a rasteriser in software.\n";
     }
-    page += "\nMedians of a training step, ms; the device is waited for after each stage. Memory in MiB.\n\n";
-    page +=
-        "| detector | batch | by | step | samples/s | on device | host | stages |\n|---|---|---|---|---|---|---|---|\n";
+    page += "\nMedians of a training step on a batch in memory, ms. The stages are those of a step that begins with clouds; \
+             the device is waited for after each. Memory in MiB.\n\n";
+    page += "| detector | batch | by | step | samples/s | launches | on device | host | stages |\n";
+    page += "|---|---|---|---|---|---|---|---|---|\n";
     for row in &report.rows {
         let number = |value: Option<f64>| value.map_or("not measured".into(), |value| format!("{value:.1}"));
         let mib = |value: Option<u64>| value.map_or(String::new(), |mib| mib.to_string());
         let stages = row.stages_ms.iter().filter(|(stage, _)| stage != "whole");
         let stages: Vec<String> = stages.map(|(stage, ms)| format!("{stage} {ms:.1}")).collect();
         page += &format!(
-            "| `{}` | {} | {} | {} | {} | {} | {} | {} |\n",
+            "| `{}` | {} | {} | {} | {} | {} | {} | {} | {} |\n",
             row.detector,
             row.batch,
             row.by,
             number(row.step_ms),
             number(row.step_ms.map(|ms| 1e3 * row.batch as f64 / ms)),
+            row.launches.map_or(String::new(), |launches| launches.to_string()),
             mib(row.device_mib),
             mib(row.host_mib),
             row.failure.clone().unwrap_or_else(|| stages.join(", "))
@@ -312,7 +371,8 @@ mod tests {
     #[test]
     fn failures_are_rows_without_times() {
         let turn = Turn {
-            whole_ms: vec![3.0, 1.0, 2.0],
+            whole_ms: vec![30.0, 10.0, 20.0],
+            in_memory_ms: vec![3.0, 1.0, 2.0],
             median_ms: vec![("backbone".into(), 1.25), ("whole".into(), 2.0)],
             peak_mib: Some(5),
             device_mib: Some(7),
@@ -331,8 +391,8 @@ mod tests {
         };
         let page = page(&report);
         for line in [
-            "| `pointpillars` | 4 | lidarshift | 2.0 | 2000.0 | 7 | 5 | backbone 1.2 |",
-            "| `pointrcnn` | 8 | lidarshift | not measured | not measured |  |  | out of memory |",
+            "| `pointpillars` | 4 | lidarshift | 2.0 | 2000.0 |  | 7 | 5 | backbone 1.2 |",
+            "| `pointrcnn` | 8 | lidarshift | not measured | not measured |  |  |  | out of memory |",
             "There is no GPU",
             "Not measured: PyTorch: none.",
         ] {

@@ -69,8 +69,11 @@ struct Report {
     steps: usize,
     /// Points (in pillars, or sampled) and pillars of the last batch.
     read: [usize; 2],
-    /// Duration of each timed step, ms.
+    /// Duration of each timed step, ms. The device is waited for after each stage.
     whole_ms: Vec<f64>,
+    /// Duration of each of as many steps on a batch in memory, ms. The device is waited for at their end alone. Empty
+    /// on the CPU and for other work than steps.
+    in_memory_ms: Vec<f64>,
     /// Median duration of each stage and of the whole step, ms.
     median_ms: Vec<(&'static str, f64)>,
     /// Peak resident memory of the process, MiB.
@@ -94,10 +97,11 @@ impl BenchStepArgs {
             Work::PillarNet => layers::pillar_net(pointpillars(&config)?, &samples(&config, &frames, 0)?, self.steps)?,
         };
         let report = Report {
-            schema: "lidarshift/bench-step/3",
+            schema: "lidarshift/bench-step/4",
             work: self.work,
             read: timed.read,
             whole_ms: timed.stages.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
+            in_memory_ms: timed.in_memory_ms.clone(),
             median_ms: timed.stages.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
             peak_mib: train::memory::peak_mib(),
             device_mib: device.memory_pool_usage().map(|usage| usage.bytes_reserved >> 20),
@@ -119,6 +123,10 @@ impl BenchStepArgs {
         );
         for (stage, ms) in &report.median_ms {
             outln!("  {stage:<11} {ms:>9.1} ms");
+        }
+        if !report.in_memory_ms.is_empty() {
+            let ms = median(report.in_memory_ms.clone());
+            outln!("  in memory   {ms:>9.1} ms (without waiting between stages)");
         }
         if let Some(mib) = report.peak_mib {
             outln!("  peak memory {mib:>9} MiB");
@@ -144,21 +152,24 @@ impl BenchStepArgs {
             timed.read = read_of(&batch);
             clock.mark("data")?;
             let mut synced = Ok(());
-            let total = detector
-                .loss_by_stage(&batch, &mut |stage| {
-                    if synced.is_ok() {
-                        synced = clock.mark(stage);
-                    }
-                })?
-                .total;
+            training_step(&mut detector, &mut adam, &batch, config, &mut |stage| {
+                if synced.is_ok() {
+                    synced = clock.mark(stage);
+                }
+            })?;
             synced?;
-            let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
-            let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
-            clock.mark("backward")?;
-            let clip = norm.clip_scale(config.optimization.clip_norm);
-            detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-4, 0.9));
-            clock.mark("optimizer")?;
             timed.add(step, clock.stages());
+        }
+        if device.memory_pool_usage().is_some() {
+            let batch = samples(config, frames, 0)?;
+            for step in 0..self.steps + WARM_UP {
+                let begin = Instant::now();
+                training_step(&mut detector, &mut adam, &batch, config, &mut |_| ())?;
+                device.sync()?;
+                if step >= WARM_UP {
+                    timed.in_memory_ms.push(1e3 * begin.elapsed().as_secs_f64());
+                }
+            }
         }
         Ok(timed)
     }
@@ -180,6 +191,24 @@ impl BenchStepArgs {
     }
 }
 
+/// A step on a batch; `mark` is called with the name of each stage after it was launched.
+fn training_step(
+    detector: &mut Detector,
+    adam: &mut Adam,
+    batch: &[Sample],
+    config: &DetectorConfig,
+    mark: &mut dyn FnMut(&'static str),
+) -> Result<()> {
+    let total = detector.loss_by_stage(batch, mark)?.total;
+    let gradients = GradientsParams::from_grads(total.backward(), &detector.network);
+    let norm = GradientNorm::of(&detector.network, &gradients, reference_name);
+    mark("backward");
+    let clip = norm.clip_scale(config.optimization.clip_norm);
+    detector.network = adam.step(detector.network.clone(), gradients, clip, (1e-4, 0.9));
+    mark("optimizer");
+    Ok(())
+}
+
 /// Number of warm-up steps.
 const WARM_UP: usize = 2;
 
@@ -190,6 +219,8 @@ struct Timed {
     read: [usize; 2],
     /// Durations of the stages of each timed step, the whole step last, ms.
     stages: Vec<(&'static str, Vec<f64>)>,
+    /// Durations of steps on a batch in memory, ms.
+    in_memory_ms: Vec<f64>,
 }
 
 impl Timed {
