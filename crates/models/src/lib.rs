@@ -27,6 +27,8 @@ mod detector;
 mod error;
 mod inference;
 mod layer_features;
+#[cfg(test)]
+mod tests;
 
 pub use architecture::{Architecture, NetworkInput};
 pub use built_in::{detector_text, find_detector};

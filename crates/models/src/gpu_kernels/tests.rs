@@ -1,25 +1,9 @@
 use super::*;
 use crate::layers::host;
+use crate::tests::{gpu, random};
 use burn::tensor::activation::relu;
-use burn::tensor::{Device, DeviceKind, DeviceType, Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use kernels::{AdamStep, Parameter};
-use rand::RngExt;
-
-/// The GPU of this machine, or what computes like one.
-fn gpu() -> Option<Device> {
-    if Device::enumerate(DeviceType::Wgpu).is_empty() {
-        eprintln!("not tested: no adapter for wgpu");
-        return None;
-    }
-    Some(Device::wgpu(DeviceKind::DefaultDevice))
-}
-
-/// Random numbers, the same on every device.
-fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> Tensor<D> {
-    let mut random = data::stream(seed, "values", 0, 0);
-    let values: Vec<f32> = (0..shape.iter().product()).map(|_| random.random_range(-1.0..2.0)).collect();
-    Tensor::from_data(TensorData::new(values, shape), device)
-}
 
 #[track_caller]
 fn assert_close(what: &str, ours: &[Vec<f32>], theirs: &[Vec<f32>]) {

@@ -53,9 +53,12 @@ impl ResampleBnRelu {
     /// `x`: `[B, C_in, H, W]`; result `[B, C_out, H * stride, W * stride]`, or divided by the stride.
     pub fn forward(&self, x: Tensor<4>, mode: Mode) -> Tensor<4> {
         let (weight, stride) = (self.weight.val(), self.stride);
+        let by_products = products::are_used_on(&x.device());
         if self.down {
-            let options = ConvOptions::new([stride; 2], [0, 0], [1, 1], 1);
-            let y = multiply(x, weight, |x, weight| conv2d(x, weight, None, options));
+            let y = multiply(x, weight, |x, weight| {
+                let options = ConvOptions::new([stride; 2], [0, 0], [1, 1], 1);
+                if by_products { products::strided(x, weight) } else { conv2d(x, weight, None, options) }
+            });
             return self.norm.forward_relu(y, None, mode);
         }
         let fold = || self.norm.folded(None, |n| n.fold_into_transposed(&values(&weight), stride));
@@ -64,7 +67,7 @@ impl ResampleBnRelu {
         {
             return y;
         }
-        if products::are_used_on(&x.device()) {
+        if by_products {
             return self.norm.forward_relu(multiply(x, weight, products::transposed), None, mode);
         }
         let y = transposed(&x, &weight, stride).unwrap_or_else(|| {

@@ -118,7 +118,10 @@ impl<B: Products, C: CheckpointStrategy> Products for Autodiff<B, C> {
     }
 
     fn add_to_rows(y: FloatTensor<Self>, bias: FloatTensor<Self>) -> FloatTensor<Self> {
-        tracked!(AddToRows, y, bias, |a, b| B::add_to_rows(a, b))
+        let ((y, y_node), (bias, bias_node)) = (y.into_parts(), bias.into_parts());
+        let channels = bias.shape()[0];
+        let sum = B::add_to_rows(y, bias);
+        AddToRows { channels }.prepare::<C>([y_node, bias_node]).compute_bound().stateless(sum)
     }
 
     fn rows_by(x: FloatTensor<Self>, weight: FloatTensor<Self>) -> FloatTensor<Self> {
@@ -172,15 +175,15 @@ impl<B: Products> Backward<B, 2> for RowsBy {
 }
 
 #[derive(Debug)]
-struct AddToRows;
+struct AddToRows {
+    channels: usize,
+}
 
 impl<B: Products> Backward<B, 2> for AddToRows {
-    /// Rows and bias.
-    type State = (FloatTensor<B>, FloatTensor<B>);
+    type State = ();
 
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let shape = ops.state.1.shape();
-        let by_bias = |dy| reshape::<B>(B::sum_of_rows(dy), shape);
+        let by_bias = |dy| reshape::<B>(B::sum_of_rows(dy), [self.channels]);
         binary::<B, _, _>(ops.parents, ops.node, grads, |dy| dy, by_bias);
     }
 }

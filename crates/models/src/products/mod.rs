@@ -53,6 +53,19 @@ pub fn transposed(x: Tensor<4>, weight: Tensor<4>) -> Tensor<4> {
     y.reshape([batch, outputs, height * s, width * s])
 }
 
+/// Convolution with kernel = stride, without padding and bias.
+///
+/// # Shapes
+/// `x`: `[B, C_in, H, W]`; `weight`: `[C_out, C_in, s, s]`; result `[B, C_out, floor(H / s), floor(W / s)]`.
+pub fn strided(x: Tensor<4>, weight: Tensor<4>) -> Tensor<4> {
+    let ([batch, inputs, height, width], [outputs, _, s, _]) = (x.dims(), weight.dims());
+    let (rows, columns) = (height / s, width / s);
+    let x = x.narrow(2, 0, rows * s).narrow(3, 0, columns * s).reshape([batch, inputs, rows, s, columns, s]);
+    let x = x.permute([0, 1, 3, 5, 2, 4]).reshape([batch, inputs * s * s, rows * columns]); // [B, C, s, s, H, W]
+    let y = combine_channels(x, weight.reshape([outputs, inputs * s * s]));
+    y.reshape([batch, outputs, rows, columns])
+}
+
 /// Linear layer over rows, without bias.
 ///
 /// # Shapes

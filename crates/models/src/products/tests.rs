@@ -1,31 +1,12 @@
 use super::*;
 use crate::layers::host;
-use burn::tensor::TensorData;
+use crate::tests::{self, devices};
 use burn::tensor::module::{conv_transpose2d, conv2d};
 use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
-use rand::RngExt;
 
-/// The devices of this build and this machine.
-fn devices() -> Vec<Device> {
-    #[allow(unused_mut, reason = "not every build has a GPU device")]
-    let mut devices = vec![Device::flex()];
-    #[cfg(feature = "wgpu")]
-    {
-        use burn::tensor::{DeviceKind, DeviceType};
-        if Device::enumerate(DeviceType::Wgpu).is_empty() {
-            eprintln!("not tested on wgpu: no adapter");
-        } else {
-            devices.push(Device::wgpu(DeviceKind::DefaultDevice));
-        }
-    }
-    devices
-}
-
-/// Random numbers, the same on every device.
+/// Random numbers, the same on every device, with a gradient.
 fn random<const D: usize>(shape: [usize; D], seed: u64, device: &Device) -> Tensor<D> {
-    let mut random = data::stream(seed, "values", 0, 0);
-    let values: Vec<f32> = (0..shape.iter().product()).map(|_| random.random_range(-1.0..1.0)).collect();
-    Tensor::from_data(TensorData::new(values, shape), &device.clone().autodiff()).require_grad()
+    tests::random(shape, seed, &device.clone().autodiff()).require_grad()
 }
 
 /// Values, and the gradients of a sum of squares by both tensors.
@@ -50,7 +31,7 @@ fn assert_close(what: &str, ours: &[Vec<f32>; 3], theirs: &[Vec<f32>; 3]) {
 
 #[test]
 fn convolutions_equal_burns() {
-    for device in devices() {
+    for (name, device) in devices() {
         for ([batch, inputs, height, width], outputs, stride) in [
             ([1, 1, 1, 1], 1, 1),
             ([2, 3, 5, 4], 2, 1),
@@ -64,14 +45,14 @@ fn convolutions_equal_burns() {
             let ours = facts((x(), weight()), |x, weight| conv3x3(x, weight, stride));
             let options = || ConvOptions::new([stride; 2], [1, 1], [1, 1], 1);
             let theirs = facts((x(), weight()), |x, weight| conv2d(x, weight, None, options()));
-            assert_close(&format!("{device:?} {height}x{width}, stride {stride}"), &ours, &theirs);
+            assert_close(&format!("{name} {height}x{width}, stride {stride}"), &ours, &theirs);
         }
     }
 }
 
 #[test]
 fn transposed_convolutions_equal_burns() {
-    for device in devices() {
+    for (name, device) in devices() {
         for ([batch, inputs, height, width], outputs, stride) in
             [([1, 1, 1, 1], 1, 1), ([2, 3, 5, 4], 2, 1), ([2, 2, 3, 4], 3, 2), ([1, 2, 16, 24], 3, 4)]
         {
@@ -80,29 +61,56 @@ fn transposed_convolutions_equal_burns() {
             let ours = facts((x(), weight()), transposed);
             let options = || ConvTransposeOptions::new([stride; 2], [0, 0], [0, 0], [1, 1], 1);
             let theirs = facts((x(), weight()), |x, weight| conv_transpose2d(x, weight, None, options()));
-            assert_close(&format!("{device:?} {height}x{width}, stride {stride}"), &ours, &theirs);
+            assert_close(&format!("{name} {height}x{width}, stride {stride}"), &ours, &theirs);
+        }
+    }
+}
+
+#[test]
+fn convolutions_with_kernel_and_stride_equal_burns() {
+    for (name, device) in devices() {
+        for ([batch, inputs, height, width], outputs, stride) in [([2, 3, 6, 4], 2, 2), ([1, 2, 9, 14], 3, 4)] {
+            let x = || random([batch, inputs, height, width], 3, &device);
+            let weight = || random([outputs, inputs, stride, stride], 4, &device);
+            let ours = facts((x(), weight()), strided);
+            let options = || ConvOptions::new([stride; 2], [0, 0], [1, 1], 1);
+            let theirs = facts((x(), weight()), |x, weight| conv2d(x, weight, None, options()));
+            assert_close(&format!("{name} {height}x{width}, stride {stride}"), &ours, &theirs);
+        }
+    }
+}
+
+#[test]
+fn biases_equal_burns() {
+    for (name, device) in devices() {
+        for (rows, channels) in [(1, 3), (2000, 40)] {
+            let y = || random([rows, channels], 3, &device);
+            let bias = || random([channels], 4, &device);
+            let ours = facts((y(), bias()), add_to_rows);
+            let theirs = facts((y(), bias()), |y: Tensor<2>, bias: Tensor<1>| y + bias.unsqueeze());
+            assert_close(&format!("{name} {rows} rows"), &ours, &theirs);
         }
     }
 }
 
 #[test]
 fn linear_layers_equal_burns() {
-    for device in devices() {
+    for (name, device) in devices() {
         // Less rows than a product has terms; a remainder; none.
         for (rows, inputs, outputs) in [(1, 2, 3), (100, 3, 2), (300, 4, 5), (2560, 3, 4), (70_000, 3, 2)] {
             let x = || random([rows, inputs], 3, &device);
             let weight = || random([outputs, inputs], 4, &device);
             let ours = facts((x(), weight()), rows_by);
             let theirs = facts((x(), weight()), |x: Tensor<2>, weight: Tensor<2>| x.matmul(weight.transpose()));
-            assert_close(&format!("{device:?} {rows} rows"), &ours, &theirs);
+            assert_close(&format!("{name} {rows} rows"), &ours, &theirs);
         }
     }
 }
 
 #[test]
 fn only_gpus_use_them() {
-    for device in devices() {
-        let is_gpu = device != Device::flex();
+    for (name, device) in devices() {
+        let is_gpu = name == "wgpu";
         assert_eq!(are_used_on(&device), is_gpu);
         assert_eq!(are_used_on(&device.autodiff()), is_gpu);
     }

@@ -1,31 +1,11 @@
 use super::*;
 use crate::layers::host;
-use burn::tensor::{Device, Distribution, Int, TensorData};
+use crate::tests::{self, devices};
+use burn::tensor::{Device, Int, TensorData};
 
-/// The devices of this build and this machine, and their names.
-fn devices() -> Vec<(&'static str, Device)> {
-    #[expect(deprecated, reason = "kept as long as burn has it")]
-    let ndarray = Device::ndarray();
-    #[allow(unused_mut, reason = "not every build has a GPU device")]
-    let mut devices = vec![("flex", Device::flex()), ("ndarray", ndarray)];
-    #[cfg(feature = "wgpu")]
-    {
-        use burn::tensor::{DeviceKind, DeviceType};
-        if Device::enumerate(DeviceType::Wgpu).is_empty() {
-            eprintln!("not tested on wgpu: no adapter");
-        } else {
-            devices.push(("wgpu", Device::wgpu(DeviceKind::DefaultDevice)));
-        }
-    }
-    devices
-}
-
-/// Random rows, the same on every device.
+/// Random rows, the same on every device, with a gradient.
 fn rows(shape: [usize; 2], device: &Device) -> Tensor<2> {
-    let flex = Device::flex();
-    flex.seed(3);
-    let values = host(Tensor::<2>::random(shape, Distribution::Normal(0.0, 1.0), &flex)).unwrap();
-    Tensor::<2>::from_data(TensorData::new(values, shape), &device.clone().autodiff()).require_grad()
+    tests::random(shape, 3, &device.clone().autodiff()).require_grad()
 }
 
 /// Values, and the gradient by `x` of a sum of squares.
