@@ -144,7 +144,7 @@ pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
     }
     let features = [vec!["wgpu".to_string()], args.features.clone()].concat().join(",");
     let program = match &args.program {
-        Some(program) => program.clone(),
+        Some(program) => fs_err::canonicalize(program)?,
         None => program::build(root, Program::Checks, Some(&features))?,
     };
     let build: Build = serde_json::from_slice(&output(Command::new(&program).arg("adapters"))?)?;
