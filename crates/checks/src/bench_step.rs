@@ -101,7 +101,7 @@ impl BenchStepArgs {
             work: self.work,
             read: timed.read,
             whole_ms: timed.stages.last().map(|(_, whole)| whole.clone()).unwrap_or_default(),
-            in_memory_ms: timed.in_memory_ms.clone(),
+            in_memory_ms: timed.in_memory_ms,
             median_ms: timed.stages.into_iter().map(|(stage, ms)| (stage, median(ms))).collect(),
             peak_mib: train::memory::peak_mib(),
             device_mib: device.memory_pool_usage().map(|usage| usage.bytes_reserved >> 20),
@@ -160,7 +160,7 @@ impl BenchStepArgs {
             synced?;
             timed.add(step, clock.stages());
         }
-        if device.memory_pool_usage().is_some() {
+        if models::products::are_used_on(device) {
             let batch = samples(config, frames, 0)?;
             for step in 0..self.steps + WARM_UP {
                 let begin = Instant::now();

@@ -1,16 +1,8 @@
 //! Operations of a training step as single kernels of a GPU: none in this build, which has no GPU device.
 
+use crate::layers::Moments;
 use burn::tensor::Tensor;
 use kernels::AdamStep;
-
-/// Statistics of a batch on the device.
-#[derive(Clone, Debug)]
-pub struct GpuMoments {
-    /// Mean, `[C]`.
-    pub mean: Tensor<1>,
-    /// Variance with divisor n, `[C]`.
-    pub variance: Tensor<1>,
-}
 
 /// The inputs.
 #[expect(clippy::result_large_err, reason = "the tensors are returned if there is no kernel")]
@@ -25,7 +17,7 @@ pub fn norm_relu<const D: usize>(
     _: &Tensor<1>,
     _: f64,
     _: bool,
-) -> Option<(Tensor<D>, GpuMoments)> {
+) -> Option<(Tensor<D>, Moments)> {
     None
 }
 
@@ -36,6 +28,6 @@ pub fn norm_relu_rows(
     _: (&Tensor<1>, usize),
     _: f64,
     _: bool,
-) -> Option<(Tensor<2>, GpuMoments)> {
+) -> Option<(Tensor<2>, Moments)> {
     None
 }

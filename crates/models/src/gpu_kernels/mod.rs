@@ -11,7 +11,7 @@ mod rows;
 mod units;
 
 pub use adam::adam;
-pub use norm_relu::{GpuMoments, norm_relu};
+pub use norm_relu::norm_relu;
 pub(crate) use product::{product, sum_of_first};
 pub use rows::norm_relu_rows;
 pub(crate) use rows::sum_of_rows;

@@ -2,10 +2,11 @@
 
 use super::units::{end_of, passed, place, rectified, sum_of_cube, sum_of_parts};
 use super::{Primitive, UNITS, argument, cubes, is_plain, unset_like};
+use crate::layers;
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::{Autodiff, Cube, TensorMetadata};
 use burn::tensor::{Shape, Tensor};
@@ -17,49 +18,28 @@ const MOST_PARTS: usize = 32;
 /// Values of a part, at least.
 const LEAST_OF_PART: usize = 2048;
 
-/// Statistics of a batch on the device.
-#[derive(Clone, Debug)]
-pub struct GpuMoments {
-    /// Mean, `[C]`.
-    pub mean: Tensor<1>,
-    /// Variance with divisor n, `[C]`.
-    pub variance: Tensor<1>,
-}
-
-/// Sums over the parts of each channel, [C, parts]: a cube for each part (x) of each channel (y).
+/// Sums over the parts of each channel, [C, parts]: a cube for each part (x) of each channel (y). If `centred`, of the
+/// squares of what is left without the mean, whose sums are given.
 #[cube(launch)]
-fn sums(x: &[f32], out: &mut [f32], frames: u32, pixels: u32) {
+fn sums(x: &[f32], of_mean: &[f32], out: &mut [f32], frames: u32, pixels: u32, #[comptime] centred: bool) {
     let (part, channel) = (CUBE_POS_X as usize, CUBE_POS_Y as usize);
     let (parts, channels) = (CUBE_COUNT_X as usize, CUBE_COUNT_Y as usize);
     let values = (frames * pixels) as usize;
+    let mut mean = 0.0f32;
+    if comptime!(centred) {
+        mean = sum_of_parts(of_mean, channel, parts) / f32::cast_from(values);
+    }
     let of_part = values.div_ceil(parts);
     let mut i = part * of_part + UNIT_POS as usize;
     let end = end_of(part, of_part, values);
     let mut sum = 0.0f32;
     while i < end {
-        sum += x[place(i, channel, channels, pixels as usize)];
-        i += CUBE_DIM as usize;
-    }
-    let sum = sum_of_cube(sum);
-    if UNIT_POS == 0 {
-        out[channel * parts + part] = sum;
-    }
-}
-
-/// The same of the squares of what is left without the mean, whose sums are given.
-#[cube(launch)]
-fn centred_squares(x: &[f32], sums: &[f32], out: &mut [f32], frames: u32, pixels: u32) {
-    let (part, channel) = (CUBE_POS_X as usize, CUBE_POS_Y as usize);
-    let (parts, channels) = (CUBE_COUNT_X as usize, CUBE_COUNT_Y as usize);
-    let values = (frames * pixels) as usize;
-    let mean = sum_of_parts(sums, channel, parts) / f32::cast_from(values);
-    let of_part = values.div_ceil(parts);
-    let mut i = part * of_part + UNIT_POS as usize;
-    let end = end_of(part, of_part, values);
-    let mut sum = 0.0f32;
-    while i < end {
-        let centred = x[place(i, channel, channels, pixels as usize)] - mean;
-        sum += centred * centred;
+        let value = x[place(i, channel, channels, pixels as usize)];
+        if comptime!(centred) {
+            sum += (value - mean) * (value - mean);
+        } else {
+            sum += value;
+        }
         i += CUBE_DIM as usize;
     }
     let sum = sum_of_cube(sum);
@@ -78,9 +58,9 @@ fn moments(sums: &[f32], squares: &[f32], mean: &mut [f32], variance: &mut [f32]
     }
 }
 
-/// A unit for each value.
+/// A unit for each value. Of rows a value is a pixel.
 #[cube(launch)]
-fn normalise(
+pub(super) fn normalise(
     x: &[f32],
     mean: &[f32],
     variance: &[f32],
@@ -219,9 +199,10 @@ impl Norm {
         let [of_parts, squares] = [(); 2].map(|()| self.of_parts(x));
         let [mean, variance] = [(); 2].map(|()| unset_like(gamma));
         let y = unset_like(x);
-        sums::launch(client, self.grid(), units, argument(x), argument(&of_parts), frames, pixels as u32);
-        let [of, into] = [&of_parts, &squares].map(argument);
-        centred_squares::launch(client, self.grid(), units, argument(x), of, into, frames, pixels as u32);
+        for (of_mean, to, centred) in [(x, &of_parts, false), (&of_parts, &squares, true)] {
+            let [x, of_mean, to] = [x, of_mean, to].map(argument);
+            sums::launch(client, self.grid(), units, x, of_mean, to, frames, pixels as u32, centred);
+        }
         let [of_parts, squares, to_mean, to_variance] = [&of_parts, &squares, &mean, &variance].map(argument);
         moments::launch(client, cubes(channels), units, of_parts, squares, to_mean, to_variance, values, parts);
         let [x, means, variances, gamma, beta, to] = [x, &mean, &variance, gamma, beta, &y].map(argument);
@@ -282,11 +263,7 @@ impl Backward<Cube, 3> for Norm {
         let dy = plain(grads.consume::<Cube>(&ops.node));
         let (inputs, moments) = &ops.state;
         let gradients = Norm::backward(&self, inputs, moments, &dy);
-        for (parent, gradient) in ops.parents.iter().zip(gradients) {
-            if let Some(parent) = parent {
-                grads.register::<Cube>(parent.id, gradient);
-            }
-        }
+        register(&ops, gradients, grads);
     }
 }
 
@@ -311,8 +288,7 @@ pub fn norm_relu<const D: usize>(
     beta: &Tensor<1>,
     epsilon: f64,
     relu: bool,
-) -> Option<(Tensor<D>, GpuMoments)> {
-    type Tracked = Autodiff<Cube, NoCheckpointing>;
+) -> Option<(Tensor<D>, layers::Moments)> {
     let shape = x.dims();
     let norm = Norm {
         frames: shape[0],
@@ -321,21 +297,51 @@ pub fn norm_relu<const D: usize>(
         epsilon: epsilon as f32,
         relu,
     };
+    let (inputs, nodes) = tracked_inputs(x, gamma, beta)?;
+    if norm.channels >= 1 << 16 {
+        return None;
+    }
+    let (y, moments) = norm.forward(&inputs[0], &inputs[1], &inputs[2]);
+    let [mean, variance] = moments.clone().map(Tensor::from_primitive::<Cube>);
+    let y = tracked(norm, nodes, (inputs, moments), y);
+    Some((y, layers::Moments { mean, variance, count: norm.values() }))
+}
+
+/// A tensor with autodiff graph on a GPU.
+type Tracked = Autodiff<Cube, NoCheckpointing>;
+
+/// The inputs of a norm without gaps, and their nodes; `None` for tensors that no kernel takes.
+pub(super) fn tracked_inputs<const D: usize>(
+    x: &Tensor<D>,
+    gamma: &Tensor<1>,
+    beta: &Tensor<1>,
+) -> Option<([Primitive; 3], [NodeGuard; 3])> {
     let x = x.clone().try_into_primitive::<Tracked>().ok()?;
     let [gamma, beta] = [gamma, beta].map(|tensor| tensor.clone().try_into_primitive::<Tracked>().ok());
     let parts = [x, gamma?, beta?].map(|tensor| tensor.into_parts());
     let inputs = parts.each_ref().map(|(tensor, _)| plain(tensor.clone()));
-    let is_supported =
-        inputs.iter().all(is_plain) && norm.channels < 1 << 16 && inputs[0].shape().num_elements() < 1 << 32;
-    if !is_supported {
-        return None;
-    }
-    let nodes = parts.map(|(_, node)| node);
-    let (y, moments) = norm.forward(&inputs[0], &inputs[1], &inputs[2]);
-    let [mean, variance] = moments.clone().map(Tensor::from_primitive::<Cube>);
-    let y = match norm.prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
-        OpsKind::Tracked(prepared) => prepared.finish((inputs, moments), y),
+    let is_supported = inputs.iter().all(is_plain) && inputs[0].shape().num_elements() < 1 << 32;
+    is_supported.then(|| (inputs, parts.map(|(_, node)| node)))
+}
+
+/// The result of an operation, with its place in the autodiff graph.
+pub(super) fn tracked<O: Backward<Cube, 3>, const D: usize>(
+    operation: O,
+    nodes: [NodeGuard; 3],
+    state: O::State,
+    y: Primitive,
+) -> Tensor<D> {
+    Tensor::from_primitive::<Tracked>(match operation.prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
+        OpsKind::Tracked(prepared) => prepared.finish(state, y),
         OpsKind::UnTracked(prepared) => prepared.finish(y),
-    };
-    Some((Tensor::from_primitive::<Tracked>(y), GpuMoments { mean, variance }))
+    })
+}
+
+/// Hands the gradients to those inputs that have one.
+pub(super) fn register<S>(ops: &Ops<S, 3>, gradients: [Primitive; 3], grads: &mut Gradients) {
+    for (parent, gradient) in ops.parents.iter().zip(gradients) {
+        if let Some(parent) = parent {
+            grads.register::<Cube>(parent.id, gradient);
+        }
+    }
 }

@@ -8,13 +8,13 @@ use burn::tensor::{DType, Shape};
 use cubecl::prelude::*;
 
 /// Rows and columns of a product that a cube computes.
-const SIDE: usize = 64;
+const SIDE: usize = crate::products::TILE;
 
 /// Columns of the first matrix, and rows of the second, that a cube reads at a time.
 const DEPTH: usize = 16;
 
-/// Rows and columns that a unit computes. Larger tiles (64 x 128, 128 x 128) were
-/// 3 to 8 % slower on an H200 in a step of PointPillars.
+/// Rows and columns that a unit computes. Larger tiles (64 x 128, 128 x 128) were 3 to 8 % slower on an H200 in a step
+/// of PointPillars.
 const OWN: usize = 4;
 
 const _: () = assert!((SIDE / OWN) * (SIDE / OWN) == UNITS as usize && UNITS == 256);

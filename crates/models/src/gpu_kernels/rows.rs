@@ -1,12 +1,13 @@
 //! Sums over rows, and batch normalisation of rows, optionally with a ReLU.
 
-use super::norm_relu::{GpuMoments, plain};
-use super::units::{end_of, passed, rectified};
+use super::norm_relu::{normalise, plain, register, tracked, tracked_inputs};
+use super::units::{end_of, passed};
 use super::{Primitive, UNITS, argument, cubes, is_plain, unset_like};
+use crate::layers::Moments;
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::{Autodiff, Cube, TensorMetadata};
 use burn::tensor::{Shape, Tensor};
@@ -84,26 +85,6 @@ fn row_sums(
     let sum = sum_of_lanes(sum);
     if UNIT_POS < 32 && channel < channels {
         out[CUBE_POS_X as usize * channels + channel] = sum * factor;
-    }
-}
-
-/// A unit for each value.
-#[cube(launch)]
-fn normalise_rows(
-    x: &[f32],
-    mean: &[f32],
-    variance: &[f32],
-    gamma: &[f32],
-    beta: &[f32],
-    y: &mut [f32],
-    epsilon: f32,
-    #[comptime] relu: bool,
-) {
-    let i = ABSOLUTE_POS;
-    if i < x.len() {
-        let channel = i % mean.len();
-        let scale = gamma[channel] / (variance[channel] + epsilon).sqrt();
-        y[i] = rectified((x[i] - mean[channel]) * scale + beta[channel], relu);
     }
 }
 
@@ -214,7 +195,7 @@ impl Norm {
         let all = cubes(x.shape().num_elements());
         let [of, means, variances, gammas, betas, to] = [&x, &mean, &variance, &gamma, &beta, &y].map(argument);
         let (units, epsilon, relu) = (CubeDim::new_1d(UNITS), self.epsilon, self.relu);
-        normalise_rows::launch(&x.client, all, units, of, means, variances, gammas, betas, to, epsilon, relu);
+        normalise::launch(&x.client, all, units, of, means, variances, gammas, betas, to, epsilon, 1, relu);
         (y, State { x, counts, gamma, beta, mean, variance })
     }
 
@@ -243,11 +224,7 @@ impl Backward<Cube, 3> for Norm {
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let dy = plain(grads.consume::<Cube>(&ops.node));
         let gradients = Norm::backward(&self, &ops.state, &dy);
-        for (parent, gradient) in ops.parents.iter().zip(gradients) {
-            if let Some(parent) = parent {
-                grads.register::<Cube>(parent.id, gradient);
-            }
-        }
+        register(&ops, gradients, grads);
     }
 }
 
@@ -263,27 +240,18 @@ pub fn norm_relu_rows(
     (counts, total): (&Tensor<1>, usize),
     epsilon: f64,
     relu: bool,
-) -> Option<(Tensor<2>, GpuMoments)> {
-    type Tracked = Autodiff<Cube, NoCheckpointing>;
+) -> Option<(Tensor<2>, Moments)> {
     let norm = Norm { total: total.max(1) as f32, epsilon: epsilon as f32, relu };
-    let x = x.clone().try_into_primitive::<Tracked>().ok()?;
-    let [gamma, beta] = [gamma, beta].map(|tensor| tensor.clone().try_into_primitive::<Tracked>().ok());
-    let parts = [x, gamma?, beta?].map(|tensor| tensor.into_parts());
-    let inputs = parts.each_ref().map(|(tensor, _)| plain(tensor.clone()));
-    let counts = match counts.clone().try_into_primitive::<Tracked>() {
+    let (inputs, nodes) = tracked_inputs(x, gamma, beta)?;
+    let counts = match counts.clone().try_into_primitive::<Autodiff<Cube, NoCheckpointing>>() {
         Ok(tracked) => tracked.into_parts().0,
         Err(_) => counts.clone().try_into_primitive::<Cube>().ok()?,
     };
     let counts = plain(counts);
-    if !inputs.iter().chain([&counts]).all(is_plain) || inputs[0].shape().num_elements() >= 1 << 32 {
+    if !is_plain(&counts) {
         return None;
     }
-    let nodes = parts.map(|(_, node)| node);
     let (y, state) = norm.forward(inputs, counts);
     let [mean, variance] = [&state.mean, &state.variance].map(|t| Tensor::from_primitive::<Cube>(t.clone()));
-    let y = match norm.prepare::<NoCheckpointing>(nodes).compute_bound().stateful() {
-        OpsKind::Tracked(prepared) => prepared.finish(state, y),
-        OpsKind::UnTracked(prepared) => prepared.finish(y),
-    };
-    Some((Tensor::from_primitive::<Tracked>(y), GpuMoments { mean, variance }))
+    Some((tracked(norm, nodes, state, y), Moments { mean, variance, count: total }))
 }

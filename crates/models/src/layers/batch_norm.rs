@@ -4,7 +4,7 @@
 //! one.
 
 use super::{Init, Mode, RowCounts, host};
-use crate::gpu_kernels::{self, GpuMoments};
+use crate::gpu_kernels;
 use crate::kernel_ops::norm_relu;
 use burn::module::{Module, Param, RunningState};
 use burn::tensor::activation::relu;
@@ -102,15 +102,14 @@ impl BatchNorm {
             };
             return relu(self.forward_eval(x));
         }
-        let count = x.shape().num_elements() / channels;
         let (weight, shift) = (self.weight.val(), self.bias.val());
         if let Some((y, moments)) = gpu_kernels::norm_relu(&x, &weight, &shift, self.epsilon, true) {
-            let GpuMoments { mean, variance } = moments;
-            self.update(Moments { mean, variance, count }.shifted(bias));
+            self.update(moments.shifted(bias));
             return y;
         }
         match norm_relu(&x, &weight, &shift, self.epsilon, true) {
             Some((y, statistics)) => {
+                let count = x.shape().num_elements() / channels;
                 self.update(self.moments(&statistics, count).shifted(bias));
                 y
             }
@@ -221,10 +220,10 @@ impl BatchNorm {
     /// The same with a ReLU.
     pub fn forward_rows_relu_train(&self, x: Tensor<2>, counts: &RowCounts) -> Tensor<2> {
         let (weight, bias, of_rows) = (self.weight.val(), self.bias.val(), counts.values());
-        let (count, epsilon) = (counts.total(), self.epsilon);
-        match gpu_kernels::norm_relu_rows(&x, (&weight, &bias), (&of_rows, count), epsilon, true) {
-            Some((y, GpuMoments { mean, variance })) => {
-                self.update(Moments { mean, variance, count });
+        let of_rows = (&of_rows, counts.total());
+        match gpu_kernels::norm_relu_rows(&x, (&weight, &bias), of_rows, self.epsilon, true) {
+            Some((y, moments)) => {
+                self.update(moments);
                 y
             }
             None => relu(self.forward_rows_train(x, counts)),

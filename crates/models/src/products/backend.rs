@@ -15,8 +15,8 @@ const MOST_UNFOLDED: usize = 1 << 27;
 /// Tiles of a gradient by a weight that are made side by side, at least, if there are pixels or rows enough.
 const SIDE_BY_SIDE: usize = 1024;
 
-/// Height and width of a tile of a product.
-const TILE: usize = 64;
+/// Rows and columns of a tile of a product.
+pub(crate) const TILE: usize = 64;
 
 /// Terms of each product of a sum, at least.
 const LEAST_TERMS: usize = 128;
@@ -95,7 +95,7 @@ impl Products for burn::backend::Cube {
     }
 }
 
-/// An operation of two tensors whose gradients need both and `$state`.
+/// An operation of two tensors whose gradients need both.
 macro_rules! tracked {
     ($operation:expr, $x:ident, $weight:ident, |$a:ident, $b:ident| $forward:expr) => {{
         let (($a, x_node), ($b, weight_node)) = ($x.into_parts(), $weight.into_parts());
@@ -192,8 +192,11 @@ fn reshape<B: Backend>(x: FloatTensor<B>, shape: impl Into<Shape>) -> FloatTenso
     B::float_reshape(x, shape.into())
 }
 
-/// Some of the first dimension.
+/// Some of the first dimension; a copy, unless it is all of it.
 fn part<B: Backend>(x: &FloatTensor<B>, from: usize, to: usize) -> FloatTensor<B> {
+    if to - from == x.shape()[0] {
+        return x.clone();
+    }
     B::float_slice(x.clone(), &[Slice::from(from..to)])
 }
 
@@ -313,8 +316,7 @@ fn products_of_rows<B: Products>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatT
     let (parts, rest) = (rows / terms, rows % terms);
     let product = |from: usize, parts: usize, terms: usize| {
         let of = |x: &FloatTensor<B>, channels: usize| {
-            let x = if parts * terms == rows { x.clone() } else { part::<B>(x, from, from + parts * terms) };
-            reshape::<B>(x, [parts, terms, channels])
+            reshape::<B>(part::<B>(x, from, from + parts * terms), [parts, terms, channels])
         };
         let products = B::product(B::float_swap_dims(of(&a, of_a), 1, 2), of(&b, of_b));
         sum_of_products::<B>(products, [parts, of_a, of_b])

@@ -11,6 +11,8 @@ mod backend;
 mod unfold;
 
 use backend::Products as _;
+#[cfg(feature = "cube")]
+pub(crate) use backend::TILE;
 use burn::backend::Dispatch;
 use burn::tensor::{Device, Tensor};
 
