@@ -374,11 +374,10 @@ impl Engine<'_> {
         let upright = if displaced.moves() { Some(self.pair(moved)?) } else { None };
         let context = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
         let (packets, arrived) = search::packets::search(&context, self.sensors);
-        let of_hits = Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
-        let (hidden, mask) = search::mask::search(&of_hits, known.shown());
+        let context = Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let (hidden, mask) = search::mask::search(&context, known.shown());
         let elsewhere = known.shown() != Shown::InPlace;
-        let mut results = vec![packets, hidden, search::hits::search(&of_hits, &mask, elsewhere)];
-        drop(arrived);
+        let mut results = vec![packets, hidden, search::hits::search(&context, &mask, elsewhere)];
         self.finished(5);
         results.push(search::returns::search(&context));
         results.push(search::intensity::search(&context, notes));

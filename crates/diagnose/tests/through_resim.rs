@@ -257,6 +257,28 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
     }
 }
 
+/// Two draws of one sensor model differ by chance alone: where both sides lose most of the road, lose packets and have
+/// false alarms, nothing is found.
+#[test]
+fn two_draws_of_one_sensor_model_are_alike() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = race_with(folder.path(), true, "columns");
+    for (number, effects) in [
+        "[[effect]]\nkind = \"incidence_dropout\"\ncos_half = 0.13\nsteepness = 2.6\nscale = \"log\"\n",
+        "[[effect]]\nkind = \"packet_loss\"\npacket_ms = 3\nloss = 0.02\nburst = 0.4\n\
+         [[effect]]\nkind = \"random_dropout\"\nshare = 0.4\n\
+         [[effect]]\nkind = \"false_alarms\"\nrate = 0.03\nreach_m = 80\n",
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let [a, b] =
+            [1, 2].map(|seed| with_effects(&sim, effects, &folder.path().join(format!("{number} {seed}")), seed));
+        let d = diagnosed(&b, &a, folder.path()).diagnosis;
+        assert_eq!(d.verdict, Verdict::NothingFound, "{:?}", d.findings);
+    }
+}
+
 #[test]
 fn too_few_frames_are_a_verdict() {
     let folder = tempfile::tempdir().unwrap();

@@ -11,9 +11,10 @@ Draws pairs of a town with hidden differences, diagnoses them and scores the ans
 then tables.
 
 cargo xtask bench town -- [OPTIONS]
-  --kind KIND     null, single, off, swarm, swarmN (N effects), pose, poseN (up to N cm), buildings, consecutive,
-                  few_rows, no_labels, crawl, parallel, or the name of a cause; repeated: in turn. Without it kinds are
-                  drawn: null 20 %, single 40 %, off 10 %, swarm 15 %, each of the others 2 to 3 %
+  --kind KIND     null, single, off, swarm, swarmN (N effects), alike, alikeN (the same N effects on both sides), pose,
+                  poseN (up to N cm), buildings, consecutive, few_rows, no_labels, crawl, parallel, or the name of a
+                  cause; repeated: in turn. Without it kinds are drawn: null 20 %, single 40 %, off 10 %, swarm 15 %,
+                  each of the others but alike 2 to 3 %
   --first SEED    first seed [default: 1]
   --cases N       number of cases [default: 100]
   --frames N      frames per side [default: 40]

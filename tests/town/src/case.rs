@@ -23,6 +23,8 @@ pub enum Kind {
     Off(usize),
     /// So many effects at once, up to two of them of [`OFF_CATALOGUE`].
     Swarm(usize),
+    /// So many effects of [`CAUSES`] at once, the same on both sides: nothing that the simulation lacks.
+    Alike(usize),
     /// No hidden effect, but each measured frame is taken elsewhere than the log says, its labels with it: up to so
     /// many centimetres, and as many hundredths of a degree.
     Pose(u32),
@@ -42,11 +44,12 @@ pub enum Kind {
 
 impl Kind {
     /// Names of the kinds, besides those of the causes.
-    pub const NAMES: [&str; 11] = [
+    pub const NAMES: [&str; 12] = [
         "null",
         "single",
         "off",
         "swarm",
+        "alike",
         "pose",
         "buildings",
         "consecutive",
@@ -56,8 +59,8 @@ impl Kind {
         "parallel",
     ];
 
-    /// The kind of a name, or of the name of a cause. What the name leaves open is drawn. `swarm` may be followed by a
-    /// number of effects, `pose` by centimetres.
+    /// The kind of a name, or of the name of a cause. What the name leaves open is drawn. `swarm` and `alike` may be
+    /// followed by a number of effects, `pose` by centimetres.
     pub fn parse(name: &str, rng: &mut Stream) -> Option<Kind> {
         let index = |list: &[&str]| list.iter().position(|c| *c == name);
         let (word, number) = name.split_at(name.find(|c: char| c.is_ascii_digit()).unwrap_or(name.len()));
@@ -67,6 +70,7 @@ impl Kind {
             ("single", None) => Kind::Single(rng.random_range(0..CAUSES.len())),
             ("off", None) => Kind::Off(rng.random_range(0..OFF_CATALOGUE.len())),
             ("swarm", number) => Kind::Swarm(number.unwrap_or_else(|| draw_number(rng)).clamp(2, 20)),
+            ("alike", number) => Kind::Alike(number.unwrap_or_else(|| draw_number(rng)).clamp(1, 20)),
             ("pose", number) => {
                 Kind::Pose(number.map_or_else(|| [2, 10, 30][rng.random_range(0..3usize)], |n| n as u32))
             }
@@ -91,6 +95,7 @@ impl Kind {
             Kind::Single(_) => "single",
             Kind::Off(_) => "off_catalogue",
             Kind::Swarm(_) => "swarm",
+            Kind::Alike(_) => "alike",
             Kind::Pose(_) => "pose",
             Kind::Buildings => "buildings",
             Kind::Consecutive => "consecutive",
@@ -123,6 +128,13 @@ pub struct Case {
     pub real_world: Arc<World>,
     /// Simulated side.
     pub simulated: Side,
+}
+
+impl Case {
+    /// Effects that the simulated side lacks.
+    pub fn hidden(&self) -> &[Effect] {
+        if let Kind::Alike(_) = self.kind { &[] } else { &self.measured.effects }
+    }
 }
 
 /// Fits the setting to the kind.
@@ -174,6 +186,12 @@ fn effects_of(kind: Kind, setting: &Setting, mounts: &[Mount], rng: &mut Stream)
                 effects.push(one(cause, rng));
             }
             effects
+        }
+        Kind::Alike(number) => {
+            let mut nameable = possible(&CAUSES);
+            let next = |_| nameable.swap_remove(rng.random_range(0..nameable.len()));
+            let causes: Vec<&str> = (0..number).map(next).collect();
+            causes.into_iter().map(|cause| one(cause, rng)).collect()
         }
         Kind::FewRows | Kind::NoLabels | Kind::Crawl | Kind::Parallel if rng.random_bool(0.6) => {
             let nameable = possible(&CAUSES);
@@ -232,6 +250,10 @@ fn draw(seed: u64, kind: Kind, size: CaseSize, two_towns: bool) -> Case {
         duration_s,
     };
     let measured = Side { name: "measured", own: Arc::new(own), ..simulated.clone() }.with_effects(&real, effects);
+    let simulated = match kind {
+        Kind::Alike(_) => simulated.with_effects(&simulated.world, measured.effects.clone()),
+        _ => simulated,
+    };
     let simulated = match elsewhere {
         Some((world, scenario)) => Side { world, scenario, ..simulated },
         None => simulated,

@@ -61,7 +61,7 @@ struct Variant {
 /// Judges the hidden effects of a case, in their order.
 pub fn judge(case: &Case) -> Vec<Judgement> {
     let side = &case.measured;
-    if side.effects.is_empty() {
+    if case.hidden().is_empty() {
         return vec![];
     }
     let variants = variants(case);

@@ -48,7 +48,7 @@ fn write_frame(side: &Side, index: usize, root: &Path) -> Result<(), DataError> 
 
 /// The truth of a case.
 pub fn truth(case: &Case) -> Truth {
-    let hidden = case.measured.effects.iter().zip(judge(case)).map(|(effect, judgement)| {
+    let hidden = case.hidden().iter().zip(judge(case)).map(|(effect, judgement)| {
         let mut parameters = effect.parameters();
         parameters.extend(grown(case, effect));
         Hidden {
@@ -61,11 +61,15 @@ pub fn truth(case: &Case) -> Truth {
         }
         .with_strength(judgement.strength)
     });
-    Truth {
-        seed: case.seed,
-        kind: case.kind.name().into(),
-        setting: case.measured.setting.describe(),
-        hidden: hidden.collect(),
+    Truth { seed: case.seed, kind: case.kind.name().into(), setting: setting(case), hidden: hidden.collect() }
+}
+
+/// The setting of a case, with the effects that both sides have.
+fn setting(case: &Case) -> String {
+    let setting = case.measured.setting.describe();
+    match case.simulated.effects.iter().map(Effect::cause).collect::<Vec<_>>() {
+        none if none.is_empty() => setting,
+        alike => format!("{setting}, on both sides {}", alike.join(", ")),
     }
 }
 

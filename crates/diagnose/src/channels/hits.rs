@@ -3,7 +3,7 @@
 use super::cells::{CELLS, Place, cell};
 use super::groups::{Group, GroupSums, Grouping, PARTS, PartedFrame, group_of, part_of};
 use super::mask::Mask;
-use crate::pairing::FramePair;
+use crate::pairing::{FramePair, Ray};
 use rayon::prelude::*;
 use sensor::Rig;
 
@@ -21,6 +21,20 @@ pub struct HitCell {
 }
 
 impl HitCell {
+    /// Counts a shot.
+    fn add(&mut self, side: Side, ray: &Ray) {
+        if side != Side::Measured {
+            self.simulated.add(ray);
+        }
+        if side != Side::Simulated {
+            self.measured.add(ray);
+        }
+        if side == Side::Both {
+            (self.simulated_matched, self.measured_matched) =
+                (self.simulated_matched + 1.0, self.measured_matched + 1.0);
+        }
+    }
+
     /// Adds another count.
     pub fn merge(&mut self, other: &HitCell) {
         self.simulated.merge(&other.simulated);
@@ -33,20 +47,30 @@ impl HitCell {
 /// Cells of one frame: those that hold something, by number.
 pub type HitFrame = Vec<(u32, HitCell)>;
 
+/// The sides whose returns a ray counts for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Side {
+    Simulated,
+    Measured,
+    Both,
+}
+
+/// Every shot with a return, once: where both sides have one, the simulated one stands for both. Its surface is that of
+/// its neighbours without itself, as for a shot that only one side has; the measured one would see its counterpart as
+/// well, and more often a surface where the returns are few.
+fn counted(frame: &FramePair) -> impl Iterator<Item = (Side, &Ray)> {
+    let simulated = frame.simulated.iter().map(|r| (if r.matched { Side::Both } else { Side::Simulated }, r));
+    let only_measured = frame.measured.iter().filter(|r| !r.matched).map(|r| (Side::Measured, r));
+    simulated.chain(only_measured)
+}
+
 /// The cells of every frame; hidden rays are left out.
 pub fn hit_frames(frames: &[FramePair], mask: &Mask) -> Vec<HitFrame> {
     let one = |frame: &FramePair| -> HitFrame {
         let mut cells = vec![HitCell::default(); CELLS];
-        for ray in &frame.simulated {
+        for (side, ray) in counted(frame) {
             if let Some(c) = cell(ray).filter(|_| !mask.hides(ray)) {
-                cells[c].simulated.add(ray);
-                cells[c].simulated_matched += f64::from(u8::from(ray.matched));
-            }
-        }
-        for ray in &frame.measured {
-            if let Some(c) = cell(ray).filter(|_| !mask.hides(ray)) {
-                cells[c].measured.add(ray);
-                cells[c].measured_matched += f64::from(u8::from(ray.matched));
+                cells[c].add(side, ray);
             }
         }
         let held = |c: &HitCell| c.measured.n + c.simulated.n > 0.0;
@@ -78,18 +102,19 @@ pub fn loss_groups(
         // Of the simulated and of the measured side: returns, and those without a counterpart; then the expected
         // losses.
         let mut sums = std::collections::BTreeMap::<(Group, usize), ([[f64; 2]; 2], f64)>::new();
-        for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
-            for ray in rays {
-                let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
-                if mask.hides(ray) {
-                    continue;
-                }
-                let (count, lost) = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
-                count[side][0] += 1.0;
-                count[side][1] += f64::from(u8::from(!ray.matched));
-                if side == 0 {
-                    *lost += 1.0 - kept(c);
-                }
+        for (side, ray) in counted(frame) {
+            let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
+            if mask.hides(ray) {
+                continue;
+            }
+            let (count, lost) = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
+            for (count, own) in count.iter_mut().zip([Side::Simulated, Side::Measured]) {
+                let counts = side == own || side == Side::Both;
+                count[0] += f64::from(u8::from(counts));
+                count[1] += f64::from(u8::from(side == own));
+            }
+            if side != Side::Measured {
+                *lost += 1.0 - kept(c);
             }
         }
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];

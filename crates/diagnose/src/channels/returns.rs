@@ -8,7 +8,9 @@ use rayon::prelude::*;
 /// Kinds of returns off the surfaces.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Odd {
-    /// Lone, in front of the surface, behind it or without one; not at an edge.
+    /// Lone, in front of the surface, behind it or without one; not at an edge. None of its own side is beside it: a
+    /// simulated return with another one beside it would not lie off a surface, and where both sides have many of them
+    /// pairs would remain.
     Alone,
     /// In a gap of the other side, between the two surfaces of an edge.
     Between,
@@ -51,7 +53,7 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
         // Without rows nothing says that the simulation sent a shot there.
         Lies::Open if ray.row == u16::MAX => None,
         // What both sides show is lone on neither.
-        _ if ray.company <= 1 => (!ray.shown && (ray.smooth || lies == Lies::Open)).then_some(Odd::Alone),
+        _ if ray.company == 0 => (!ray.shown && (ray.smooth || lies == Lies::Open)).then_some(Odd::Alone),
         _ if ray.company < FEW || ray.surface == Surface::Object => None,
         Lies::Behind => Some(Odd::GroupBehind),
         _ => Some(Odd::GroupInFront),
@@ -76,7 +78,7 @@ pub fn is_lone_before(ray: &Ray) -> bool {
         Lies::Open => ray.row != u16::MAX,
         _ => false,
     };
-    before && !ray.shown && ray.company <= 1
+    before && !ray.shown && ray.company == 0
 }
 
 /// Counts of one frame: measured and simulated returns of each kind, and all of them.

@@ -96,11 +96,13 @@ impl Report {
         }
     }
 
-    /// Adds a finding. A cause that is named in two channels is one finding.
+    /// Adds a finding. A cause that is named in two channels is one finding; twice in one channel, as a loss on each of
+    /// two kinds of surface, it is two.
     fn add(&mut self, found: Found) {
         let cause = found.causes.first().copied().filter(|_| found.status == Status::Named);
         let gain = mean_interval(&found.held_out_gains, &self.blocks, self.returns);
-        if let Some(same) = self.findings.iter_mut().find(|f| cause.is_some() && f.cause == cause) {
+        let same = |f: &Finding| cause.is_some() && f.cause == cause && f.channel != found.channel;
+        if let Some(same) = self.findings.iter_mut().find(|f| same(f)) {
             same.gain.nats_per_ray += gain.nats_per_ray;
             (0..2).for_each(|k| same.gain.ci95[k] += gain.ci95[k]);
             for (id, p) in found.parameters {

@@ -2,7 +2,7 @@
 
 use super::law::{FittedLaw, Law, WHOLE_OBJECT, Where, in_zone};
 use super::simplex::minimise;
-use crate::channels::cells::{CELLS, ZONES, zone_of};
+use crate::channels::cells::{CELLS, COS_BINS, RANGE_BINS, ZONES, zone_of};
 use crate::channels::hits::{HitCell, HitFrame};
 use std::collections::BTreeMap;
 
@@ -16,7 +16,10 @@ pub struct LossTable {
     used: Vec<usize>,
 }
 
-/// Weight of the prior share of matches in a cell, returns.
+/// Weight of the share of matches in the cells around a cell, and of that in its zone, returns.
+const PRIOR_OF_MATCHES: f64 = 20.0;
+
+/// Weight of the share that laws keep in a cell, returns.
 const PRIOR_RETURNS: f64 = 60.0;
 
 /// Width of a bin of the covariate of a law whose form is free, of ln(m) or of ln(cos): that of the cells.
@@ -24,6 +27,30 @@ const FORM_BIN: f64 = 0.25;
 
 /// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;
+
+/// Share of the measured returns of each cell with a simulated counterpart. Where the cell has few, that of the cells
+/// around it counts as well, and where these have few, that of its zone: where the simulation itself loses returns, the
+/// share falls from cell to cell.
+fn shares_of_matches(cells: &[HitCell]) -> Vec<f64> {
+    let count = |i: usize| [cells[i].measured.n, cells[i].measured_matched];
+    let sum = |of: &mut dyn Iterator<Item = usize>| of.map(count).fold([0.0; 2], |[n, m], c| [n + c[0], m + c[1]]);
+    let per_zone = COS_BINS * RANGE_BINS;
+    let of_zone = |zone: usize| {
+        let [n, matched] = sum(&mut (zone * per_zone..(zone + 1) * per_zone));
+        (matched + 0.5) / (n + 1.0)
+    };
+    let of_zones: [f64; ZONES] = std::array::from_fn(of_zone);
+    let shrunk = |[n, matched]: [f64; 2], to: f64| (matched + PRIOR_OF_MATCHES * to) / (n + PRIOR_OF_MATCHES);
+    let share = |i: usize| {
+        let (row, r) = (i / RANGE_BINS, i % RANGE_BINS);
+        let (zone, c) = (row / COS_BINS, row % COS_BINS);
+        let rows = c.saturating_sub(1)..(c + 2).min(COS_BINS);
+        let ranges = || r.saturating_sub(1)..(r + 2).min(RANGE_BINS);
+        let around = &mut rows.flat_map(|c| ranges().map(move |r| (zone * COS_BINS + c) * RANGE_BINS + r));
+        shrunk(count(i), shrunk(sum(around), of_zones[zone])).clamp(0.02, 0.9999)
+    };
+    (0..cells.len()).map(share).collect()
+}
 
 /// Share that laws keep together.
 fn kept_at(laws: &[FittedLaw], at: &Where) -> f64 {
@@ -33,17 +60,7 @@ fn kept_at(laws: &[FittedLaw], at: &Where) -> f64 {
 impl LossTable {
     /// From the sums over some frames.
     pub fn new(cells: Vec<HitCell>) -> Self {
-        let mut by_zone = [[0.0f64; 2]; ZONES];
-        for (i, c) in cells.iter().enumerate() {
-            by_zone[zone_of(i)][0] += c.measured.n;
-            by_zone[zone_of(i)][1] += c.measured_matched;
-        }
-        let share = |z: usize| (by_zone[z][1] + 0.5) / (by_zone[z][0] + 1.0);
-        let matches = cells.iter().enumerate().map(|(i, c)| {
-            ((c.measured_matched + PRIOR_RETURNS * share(zone_of(i))) / (c.measured.n + PRIOR_RETURNS))
-                .clamp(0.02, 0.9999)
-        });
-        let matches = matches.collect();
+        let matches = shares_of_matches(&cells);
         let places = cells
             .iter()
             .enumerate()
@@ -282,7 +299,6 @@ fn with_numbers(laws: &[FittedLaw], numbers: &[f64]) -> Vec<FittedLaw> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::channels::cells::{COS_BINS, RANGE_BINS};
     use crate::inference::law::LAWS;
 
     /// Counts without noise: ground where cos = 1 / R, walls of all angles.

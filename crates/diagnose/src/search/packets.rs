@@ -169,7 +169,7 @@ impl Packets {
     }
 }
 
-/// The search; and the frames without what is lost, where there is something.
+/// The search; and the frames without what is lost, where either side loses packets.
 pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Vec<FramePair>>) {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Packets, hold_out.len());
@@ -186,11 +186,13 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     let all = [select.as_slice(), &estimate].concat();
     let looked_at = || all.iter();
     let number = |of: &[BTreeSet<Bin>]| looked_at().map(|&i| of[i].len()).sum::<usize>();
-    let runs_of = |sensor: u8| looked_at().map(|&i| runs_of(&dark.0[i], sensor)).sum::<usize>();
-    let runs = (0..context.rig.sensors.len() as u8).map(runs_of).max().unwrap_or(0);
+    let runs = |of: &[BTreeSet<Bin>]| {
+        let of_sensor = |sensor: u8| looked_at().map(|&i| runs_of(&of[i], sensor)).sum::<usize>();
+        (0..context.rig.sensors.len() as u8).map(of_sensor).max().unwrap_or(0)
+    };
+    let loses = |side: &Dark| number(&side.0) >= FEWEST_DARK[0] && runs(&side.0) >= FEWEST_DARK[1];
     let mean = looked_at().map(|&i| share(i)).sum::<f64>() / looked_at().count().max(1) as f64;
-    let chosen = number(&dark.0) >= FEWEST_DARK[0]
-        && runs >= FEWEST_DARK[1]
+    let chosen = loses(dark)
         && (number(&other.0) as f64) < OTHER_SIDE * number(&dark.0) as f64
         && (packets.dim(&all) as f64) < DIM_BINS * number(&dark.0) as f64
         && mean > FLOOR;
@@ -203,7 +205,9 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     });
     result.minimum.push((Cause::PacketLoss, Minimum::new(Quantity::Share, FLOOR)));
     if !chosen {
-        return (result, None);
+        // What the simulation loses is nothing that the measured side has in addition.
+        let arrived = loses(other).then(|| packets.arrived(context.frames));
+        return (result, arrived.flatten());
     }
     let held: Vec<f64> = hold_out.iter().map(|&i| returns(i, dark) * SURPRISE.ln()).collect();
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [*g; 3]);

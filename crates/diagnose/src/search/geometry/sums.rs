@@ -35,7 +35,7 @@ pub(super) struct Sums {
     pub(super) of_patches: f64,
     /// Sums by row, of surfaces as they are.
     pub(super) whole_rows: Groups,
-    /// The same with the pose that all frames share: it takes up what the rows of a sensor have in common.
+    /// The same with the pose and the offsets of surfaces that all frames share: rows may have both in common.
     pub(super) rows_with_pose: Vec<PartedFrame>,
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
@@ -72,9 +72,9 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
-    let parted = |g, poses: &[OwnPoses]| group_frames(frames, rig, poses, structure, g, noise_m, design);
+    let parted = |g, poses: &[OwnPoses], structure| group_frames(frames, rig, poses, structure, g, noise_m, design);
     let groups = |g| {
-        let parted = parted(g, &poses);
+        let parted = parted(g, &poses, structure);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
     let rows = row_frames(frames, rig, &poses, noise_m);
@@ -82,7 +82,7 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
         of_patches: of_patches(&rows, select, rig.sensors.len()),
         rows,
         whole_rows: groups(Grouping::Row),
-        rows_with_pose: parted(Grouping::Row, &deviations(&poses, select)),
+        rows_with_pose: parted(Grouping::Row, &deviations(&poses, select), Default::default()),
         strips: groups(Grouping::Azimuth),
         columns,
         precision,
