@@ -362,7 +362,7 @@ mod tests {
         let surfaces = FarSurfaces::new([([18.0, 0.0, -2.0], [0.0, 0.0, 1.0]), wall].into_iter());
         assert_eq!(surfaces.through([25.0, 0.0, -2.05], 25.0), Some([0.0, 0.0, 1.0]));
         assert_eq!(surfaces.through([20.0, 3.0, 1.0], 20.0), Some(wall.1));
-        for (point, range_m) in [([25.0, 0.0, -1.0], 25.0), ([30.0, 0.0, -2.0], 30.0)] {
+        for (point, range_m) in [([25.0, 0.0, -1.0], 25.0), ([40.0, 0.0, -2.0], 40.0)] {
             assert_eq!(surfaces.through(point, range_m), None, "beside the planes, or too far along one");
         }
         assert_eq!(FarSurfaces::new(std::iter::empty()).through([1.0, 0.0, 0.0], 1.0), None);
