@@ -67,10 +67,8 @@ pub fn truth(case: &Case) -> Truth {
 /// The setting of a case, with the effects that both sides have.
 fn setting(case: &Case) -> String {
     let setting = case.measured.setting.describe();
-    match case.simulated.effects.iter().map(Effect::cause).collect::<Vec<_>>() {
-        none if none.is_empty() => setting,
-        alike => format!("{setting}, on both sides {}", alike.join(", ")),
-    }
+    let alike: Vec<&str> = case.simulated.effects.iter().map(Effect::cause).collect();
+    if alike.is_empty() { setting } else { format!("{setting}, on both sides {}", alike.join(", ")) }
 }
 
 /// By how much the labelled cars are larger, on average, m.

@@ -64,6 +64,15 @@ pub fn zone_of(cell: usize) -> usize {
     cell / (COS_BINS * RANGE_BINS)
 }
 
+/// A cell and those beside it in range and incidence, of the same zone.
+pub fn cells_around(cell: usize) -> impl Iterator<Item = usize> {
+    let (row, range) = (cell / RANGE_BINS, cell % RANGE_BINS);
+    let (first, cos) = (row - row % COS_BINS, row % COS_BINS);
+    let beside = |bin: usize, bins: usize| bin.saturating_sub(1)..(bin + 2).min(bins);
+    beside(cos, COS_BINS)
+        .flat_map(move |cos| beside(range, RANGE_BINS).map(move |range| (first + cos) * RANGE_BINS + range))
+}
+
 /// Sums over the rays of a cell, for its mean range and incidence.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Place {
@@ -94,5 +103,21 @@ impl Place {
     pub fn mean(&self) -> (f64, f64) {
         let n = self.n.max(1e-9);
         ((self.ln_range / n).exp(), (self.ln_cos / n).exp())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_around_stay_in_their_zone() {
+        let at = |zone: usize, cos: usize, range: usize| (zone * COS_BINS + cos) * RANGE_BINS + range;
+        let around: Vec<usize> = cells_around(at(1, 0, 5)).collect();
+        let want = [(0, 4), (0, 5), (0, 6), (1, 4), (1, 5), (1, 6)].map(|(cos, range)| at(1, cos, range));
+        assert_eq!(around, want);
+        assert_eq!(cells_around(at(2, 3, RANGE_BINS - 1)).count(), 6);
+        assert_eq!(cells_around(at(0, 7, 7)).count(), 9);
+        assert!(cells_around(at(3, COS_BINS - 1, 0)).all(|c| zone_of(c) == 3));
     }
 }

@@ -12,55 +12,47 @@ use sensor::Rig;
 pub struct HitCell {
     /// Simulated returns.
     pub simulated: Place,
-    /// Those of them with a measured return in their direction.
-    pub simulated_matched: f64,
     /// Measured returns.
     pub measured: Place,
-    /// Those of them with a simulated return in their direction.
-    pub measured_matched: f64,
+    /// Those of either with a return of the other side in their direction.
+    pub matched: f64,
 }
 
 impl HitCell {
     /// Counts a shot.
-    fn add(&mut self, side: Side, ray: &Ray) {
-        if side != Side::Measured {
+    fn add(&mut self, [simulated, measured]: Sides, ray: &Ray) {
+        if simulated {
             self.simulated.add(ray);
         }
-        if side != Side::Simulated {
+        if measured {
             self.measured.add(ray);
         }
-        if side == Side::Both {
-            (self.simulated_matched, self.measured_matched) =
-                (self.simulated_matched + 1.0, self.measured_matched + 1.0);
-        }
+        self.matched += f64::from(u8::from(simulated && measured));
     }
 
     /// Adds another count.
     pub fn merge(&mut self, other: &HitCell) {
         self.simulated.merge(&other.simulated);
         self.measured.merge(&other.measured);
-        self.simulated_matched += other.simulated_matched;
-        self.measured_matched += other.measured_matched;
+        self.matched += other.matched;
     }
 }
 
 /// Cells of one frame: those that hold something, by number.
 pub type HitFrame = Vec<(u32, HitCell)>;
 
-/// The sides whose returns a ray counts for.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Side {
-    Simulated,
-    Measured,
-    Both,
-}
+/// Whether a shot has a return on the simulated and on the measured side.
+type Sides = [bool; 2];
+
+/// Variance of a number of lost returns in units of that of independent ones: neighbours are lost together.
+pub const TOGETHER: f64 = 2.0;
 
 /// Every shot with a return, once: where both sides have one, the simulated one stands for both. Its surface is that of
 /// its neighbours without itself, as for a shot that only one side has; the measured one would see its counterpart as
 /// well, and more often a surface where the returns are few.
-fn counted(frame: &FramePair) -> impl Iterator<Item = (Side, &Ray)> {
-    let simulated = frame.simulated.iter().map(|r| (if r.matched { Side::Both } else { Side::Simulated }, r));
-    let only_measured = frame.measured.iter().filter(|r| !r.matched).map(|r| (Side::Measured, r));
+fn counted(frame: &FramePair) -> impl Iterator<Item = (Sides, &Ray)> {
+    let simulated = frame.simulated.iter().map(|r| ([true, r.matched], r));
+    let only_measured = frame.measured.iter().filter(|r| !r.matched).map(|r| ([false, true], r));
     simulated.chain(only_measured)
 }
 
@@ -68,9 +60,9 @@ fn counted(frame: &FramePair) -> impl Iterator<Item = (Side, &Ray)> {
 pub fn hit_frames(frames: &[FramePair], mask: &Mask) -> Vec<HitFrame> {
     let one = |frame: &FramePair| -> HitFrame {
         let mut cells = vec![HitCell::default(); CELLS];
-        for (side, ray) in counted(frame) {
+        for (sides, ray) in counted(frame) {
             if let Some(c) = cell(ray).filter(|_| !mask.hides(ray)) {
-                cells[c].add(side, ray);
+                cells[c].add(sides, ray);
             }
         }
         let held = |c: &HitCell| c.measured.n + c.simulated.n > 0.0;
@@ -102,25 +94,23 @@ pub fn loss_groups(
         // Of the simulated and of the measured side: returns, and those without a counterpart; then the expected
         // losses.
         let mut sums = std::collections::BTreeMap::<(Group, usize), ([[f64; 2]; 2], f64)>::new();
-        for (side, ray) in counted(frame) {
+        for (sides, ray) in counted(frame) {
             let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
             if mask.hides(ray) {
                 continue;
             }
             let (count, lost) = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
-            for (count, own) in count.iter_mut().zip([Side::Simulated, Side::Measured]) {
-                let counts = side == own || side == Side::Both;
-                count[0] += f64::from(u8::from(counts));
-                count[1] += f64::from(u8::from(side == own));
+            for (count, _) in count.iter_mut().zip(sides).filter(|(_, has)| *has) {
+                count[0] += 1.0;
+                count[1] += f64::from(u8::from(sides != [true; 2]));
             }
-            if side != Side::Measured {
+            if sides[0] {
                 *lost += 1.0 - kept(c);
             }
         }
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];
         for ((g, part), ([[n, alone], [seen, odd]], lost)) in sums.into_iter().filter(|(_, (c, _))| c[0][0] >= 5.0) {
-            // Twice the variance of a count: neighbours are lost together.
-            let w = n * n / (2.0 * (alone + odd + 2.0));
+            let w = n * n / (TOGETHER * (alone + odd + 2.0));
             // One-to-one matching leaves as many returns without a counterpart on both sides.
             let y = (alone - lost) / n - odd / f64::max(seen, 1.0);
             out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));

@@ -2,7 +2,7 @@
 
 use super::law::{FittedLaw, Law, WHOLE_OBJECT, Where, in_zone};
 use super::simplex::minimise;
-use crate::channels::cells::{CELLS, COS_BINS, RANGE_BINS, ZONES, zone_of};
+use crate::channels::cells::{CELLS, ZONES, cells_around, zone_of};
 use crate::channels::hits::{HitCell, HitFrame};
 use std::collections::BTreeMap;
 
@@ -22,8 +22,8 @@ const PRIOR_OF_MATCHES: f64 = 20.0;
 /// Weight of the share that laws keep in a cell, returns.
 const PRIOR_RETURNS: f64 = 60.0;
 
-/// Width of a bin of the covariate of a law whose form is free, of ln(m) or of ln(cos): that of the cells.
-const FORM_BIN: f64 = 0.25;
+/// Width of a bin of the covariate of a law whose form is free, of ln(m), ln(cos) or ln(signal): that of the cells.
+pub const FORM_BIN: f64 = 0.25;
 
 /// Fewest simulated returns of a cell.
 const FEWEST: f64 = 40.0;
@@ -32,22 +32,14 @@ const FEWEST: f64 = 40.0;
 /// around it counts as well, and where these have few, that of its zone: where the simulation itself loses returns, the
 /// share falls from cell to cell.
 fn shares_of_matches(cells: &[HitCell]) -> Vec<f64> {
-    let count = |i: usize| [cells[i].measured.n, cells[i].measured_matched];
-    let sum = |of: &mut dyn Iterator<Item = usize>| of.map(count).fold([0.0; 2], |[n, m], c| [n + c[0], m + c[1]]);
-    let per_zone = COS_BINS * RANGE_BINS;
-    let of_zone = |zone: usize| {
-        let [n, matched] = sum(&mut (zone * per_zone..(zone + 1) * per_zone));
-        (matched + 0.5) / (n + 1.0)
-    };
-    let of_zones: [f64; ZONES] = std::array::from_fn(of_zone);
+    let add = |[n, matched]: [f64; 2], i: usize| [n + cells[i].measured.n, matched + cells[i].matched];
+    let mut by_zone = [[0.0; 2]; ZONES];
+    (0..cells.len()).for_each(|i| by_zone[zone_of(i)] = add(by_zone[zone_of(i)], i));
+    let of_zones = by_zone.map(|[n, matched]| (matched + 0.5) / (n + 1.0));
     let shrunk = |[n, matched]: [f64; 2], to: f64| (matched + PRIOR_OF_MATCHES * to) / (n + PRIOR_OF_MATCHES);
     let share = |i: usize| {
-        let (row, r) = (i / RANGE_BINS, i % RANGE_BINS);
-        let (zone, c) = (row / COS_BINS, row % COS_BINS);
-        let rows = c.saturating_sub(1)..(c + 2).min(COS_BINS);
-        let ranges = || r.saturating_sub(1)..(r + 2).min(RANGE_BINS);
-        let around = &mut rows.flat_map(|c| ranges().map(move |r| (zone * COS_BINS + c) * RANGE_BINS + r));
-        shrunk(count(i), shrunk(sum(around), of_zones[zone])).clamp(0.02, 0.9999)
+        let around = shrunk(cells_around(i).fold([0.0; 2], add), of_zones[zone_of(i)]);
+        shrunk(add([0.0; 2], i), around).clamp(0.02, 0.9999)
     };
     (0..cells.len()).map(share).collect()
 }
@@ -113,7 +105,7 @@ impl LossTable {
             let steps: Vec<f64> = laws.iter().flat_map(|l| l.law.steps()).collect();
             let value = |p: &[f64]| {
                 let laws = with_numbers(&laws, p);
-                let counts = self.used.iter().map(|&i| (i, self.cells[i].simulated.n, self.cells[i].simulated_matched));
+                let counts = self.used.iter().map(|&i| (i, self.cells[i].simulated.n, self.cells[i].matched));
                 -self.likelihood(&laws, counts) + laws.iter().map(FittedLaw::penalty).sum::<f64>()
             };
             let (at, v) = minimise(&numbers, &steps, value);
@@ -128,7 +120,7 @@ impl LossTable {
     fn counts<'f>(&'f self, frame: &'f HitFrame) -> impl Iterator<Item = (usize, f64, f64)> + 'f {
         frame
             .iter()
-            .map(|(i, c)| (*i as usize, c.simulated.n, c.simulated_matched))
+            .map(|(i, c)| (*i as usize, c.simulated.n, c.matched))
             .filter(|(i, ..)| self.cells[*i].simulated.n >= FEWEST)
     }
 
@@ -152,7 +144,7 @@ impl LossTable {
             let mut sums = BTreeMap::<i32, [f64; 2]>::new();
             for (i, bin) in self.used.iter().filter_map(|&i| Some((i, bin(i)?))) {
                 let sum = sums.entry(bin).or_default();
-                sum[0] += self.cells[i].simulated_matched;
+                sum[0] += self.cells[i].matched;
                 sum[1] += self.cells[i].simulated.n * kept[i] * self.matches[i];
             }
             for &i in &self.used {
@@ -167,7 +159,7 @@ impl LossTable {
     pub fn matched_shares(&self, laws: &[FittedLaw]) -> Vec<f64> {
         let share = |(i, c): (usize, &HitCell)| {
             let towards = self.matched(laws, i);
-            ((c.simulated_matched + PRIOR_RETURNS * towards) / (c.simulated.n + PRIOR_RETURNS)).clamp(1e-4, 1.0 - 1e-4)
+            ((c.matched + PRIOR_RETURNS * towards) / (c.simulated.n + PRIOR_RETURNS)).clamp(1e-4, 1.0 - 1e-4)
         };
         self.cells.iter().enumerate().map(share).collect()
     }
@@ -183,7 +175,7 @@ impl LossTable {
         let used = frame.iter().filter(|(i, _)| self.cells[*i as usize].simulated.n >= FEWEST);
         used.map(|(i, c)| {
             let (p, q) = (self.matched(&[], *i as usize), shares[*i as usize]);
-            let (n, matched) = (c.simulated.n, c.simulated_matched);
+            let (n, matched) = (c.simulated.n, c.matched);
             matched * (q / p).ln() + (n - matched) * ((1.0 - q) / (1.0 - p)).ln()
         })
         .sum()
@@ -193,7 +185,7 @@ impl LossTable {
     pub fn distance(&self, frame: &HitFrame) -> f64 {
         let mut sum = 0.0;
         for (i, c) in frame {
-            let (n, matched) = (c.simulated.n, c.simulated_matched);
+            let (n, matched) = (c.simulated.n, c.matched);
             if self.cells[*i as usize].simulated.n < FEWEST || n < 1.0 {
                 continue;
             }
@@ -257,7 +249,7 @@ impl LossTable {
     pub fn only_measured(&self, zone: Option<usize>) -> f64 {
         let of_zone = |i: &&usize| zone.is_none_or(|zone| in_zone(zone, self.places[**i].zone));
         let sum = |of: fn(&HitCell) -> f64| self.used.iter().filter(of_zone).map(|&i| of(&self.cells[i])).sum::<f64>();
-        (sum(|c| c.measured.n) - sum(|c| c.measured_matched)) / sum(|c| c.measured.n).max(1.0)
+        (sum(|c| c.measured.n) - sum(|c| c.matched)) / sum(|c| c.measured.n).max(1.0)
     }
 
     /// The kind of standing surface or object with more than nine tenths of the losses; `None` without one.
@@ -277,7 +269,7 @@ impl LossTable {
             .iter()
             .map(|&i| {
                 let (c, p) = (&self.cells[i], &self.places[i]);
-                ([p.ln_range, p.ln_cos], p.zone, c.simulated.n, c.simulated_matched / c.simulated.n / self.matches[i])
+                ([p.ln_range, p.ln_cos], p.zone, c.simulated.n, c.matched / c.simulated.n / self.matches[i])
             })
             .collect()
     }
@@ -299,6 +291,7 @@ fn with_numbers(laws: &[FittedLaw], numbers: &[f64]) -> Vec<FittedLaw> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::channels::cells::{COS_BINS, RANGE_BINS};
     use crate::inference::law::LAWS;
 
     /// Counts without noise: ground where cos = 1 / R, walls of all angles.
@@ -316,9 +309,8 @@ mod tests {
                     cell.simulated.n = n;
                     cell.simulated.ln_range = n * range.ln();
                     cell.simulated.ln_cos = n * cos.ln();
-                    cell.simulated_matched = n * kept * 0.97;
                     cell.measured.n = n * kept;
-                    cell.measured_matched = n * kept * 0.97;
+                    cell.matched = n * kept * 0.97;
                 }
             }
         }

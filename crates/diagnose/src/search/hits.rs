@@ -133,8 +133,7 @@ impl<'a> Search<'a> {
     /// The smallest share of lost returns that would be detected.
     fn minimum(&self) -> Minimum {
         let cells = || self.select.iter().flat_map(|&i| &self.hits[i]).map(|(_, c)| c);
-        let mismatches: f64 =
-            cells().map(|c| c.simulated.n - c.simulated_matched + c.measured.n - c.measured_matched).sum();
+        let mismatches: f64 = cells().map(|c| c.simulated.n - c.matched + c.measured.n - c.matched).sum();
         let simulated: f64 = cells().map(|c| c.simulated.n).sum();
         Minimum::new(Quantity::Share, (Z_STAR * mismatches.max(1.0).sqrt() / simulated.max(1.0)).max(FLOOR))
     }

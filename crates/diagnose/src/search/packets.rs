@@ -206,8 +206,7 @@ pub fn search(context: &Context, sensors: &Sensors) -> (ChannelResult, Option<Ve
     result.minimum.push((Cause::PacketLoss, Minimum::new(Quantity::Share, FLOOR)));
     if !chosen {
         // What the simulation loses is nothing that the measured side has in addition.
-        let arrived = loses(other).then(|| packets.arrived(context.frames));
-        return (result, arrived.flatten());
+        return (result, if loses(other) { packets.arrived(context.frames) } else { None });
     }
     let held: Vec<f64> = hold_out.iter().map(|&i| returns(i, dark) * SURPRISE.ln()).collect();
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [*g; 3]);

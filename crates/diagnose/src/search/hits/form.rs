@@ -2,8 +2,9 @@
 
 use super::Search;
 use crate::channels::cells::{cell, place_of};
+use crate::channels::hits::TOGETHER;
 use crate::inference::law::FittedLaw;
-use crate::inference::losses::LossTable;
+use crate::inference::losses::{FORM_BIN, LossTable};
 
 /// Number of points of the correction of a law's form.
 const FORM_BINS: f64 = 24.0;
@@ -11,15 +12,8 @@ const FORM_BINS: f64 = 24.0;
 /// Fewest returns, weighted by what they tell, of a point of the correction.
 const FEWEST_OF_FORM: f64 = 40.0;
 
-/// Width from which on a point ends though the counts would allow a wider one: of ln(m), ln(cos) or ln(signal). Where a
-/// law keeps nearly all, few returns tell much, and a factor for all of them hides what it is at the end.
-const WIDEST: f64 = 0.25;
-
 /// Expected returns that count as the prior of a factor of 1.
 const FORM_PRIOR: f64 = 20.0;
-
-/// Variance of a number of returns in units of that of independent ones: neighbours are lost together.
-const TOGETHER: f64 = 2.0;
 
 impl Search<'_> {
     /// Ratio of the measured share to that of the laws along the covariate of law `k`, return by return on all frames
@@ -52,7 +46,8 @@ impl Search<'_> {
             {
                 *sum += v;
             }
-            let ends = x - from > WIDEST || i + 1 == seen.len();
+            // Where a law keeps nearly all, few returns tell much, and one factor for all hides what it is at the end.
+            let ends = x - from > FORM_BIN || i + 1 == seen.len();
             if bin[3] >= per || ends && bin[3] >= FEWEST_OF_FORM {
                 from = x;
                 let factor = (bin[2] + FORM_PRIOR) / (bin[1] + FORM_PRIOR);
