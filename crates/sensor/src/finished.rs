@@ -5,7 +5,7 @@ use crate::cloud_scan::{CloudReader, Surfaces};
 use crate::directions::{Kind, SensorScan, kind_of, split_by_sensor};
 use crate::effects::{EffectList, FrameContext, LabelledCar, Need};
 use crate::material::MaterialTable;
-use crate::motion::{OwnMotion, own_motion, seen_velocity, static_edges, times_s};
+use crate::motion::{GroundPoint, OwnMotion, Standing, own_motion, seen_velocity, static_edges, times_s};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
 use data::Presence as _;
@@ -194,8 +194,8 @@ impl<'a> FinishedDataset<'a> {
             time_s: self.times.as_ref().map_or(index as f64 * FRAME_S, |times| times[index]),
             rig: &self.rig,
             materials: &self.materials,
-            ego_velocity: [own.map_or(0.0, |m| m.speed_m_s), 0.0, 0.0],
-            ego_turn_rate: [0.0, 0.0, own.map_or(0.0, |m| m.yaw_rate_rad_s)],
+            ego_velocity: own.map_or([0.0; 3], |m| m.velocity_m_s.into()),
+            ego_turn_rate: own.map_or([0.0; 3], |m| m.turn_rate_rad_s.into()),
             cars: shown,
             sensors: Some(self.reader.sensors()),
             scene: None,
@@ -234,8 +234,7 @@ impl<'a> FinishedDataset<'a> {
         let velocity = |number: usize, bbox: &Box3| {
             let Some(FrameMotion { own, seen, .. }) = motion else { return [0.0; 3] };
             let Some(Some(seen)) = seen.get(number) else { return [0.0; 3] };
-            let turn = Vector3::new(0.0, 0.0, own.yaw_rate_rad_s).cross(&Vector3::from(bbox.center));
-            (seen + Vector3::new(own.speed_m_s, 0.0, 0.0) + turn).into()
+            (seen + own.velocity_at(&Vector3::from(bbox.center))).into()
         };
         let car = |(number, object): (usize, &data::Object)| LabelledCar {
             number,
@@ -252,24 +251,24 @@ impl<'a> FinishedDataset<'a> {
         let read = |id: &String| {
             let frame = self.dataset.load(id)?;
             let boxes: Vec<Box3> = frame.objects.iter().map(|o| o.bbox).collect();
-            Ok((self.edges(&frame.cloud, &boxes), boxes))
+            Ok((self.standing(&frame.cloud, &boxes), boxes))
         };
         let frames: Vec<_> = self.ids.par_iter().map(read).collect::<Result<_, DataError>>()?;
-        let (edges, boxes): (Vec<_>, Vec<Vec<Box3>>) = frames.into_iter().unzip();
-        let own = own_motion(edges, times);
+        let (standing, boxes): (Vec<_>, Vec<Vec<Box3>>) = frames.into_iter().unzip();
+        let own = own_motion(standing, times);
         let of_frame = |g: usize| boxes[g].clone();
         let motion = |(f, own): (usize, Option<OwnMotion>)| FrameMotion {
             own_is_known: own.is_some(),
-            own: own.unwrap_or(OwnMotion { speed_m_s: 0.0, yaw_rate_rad_s: 0.0 }),
+            own: own.unwrap_or(OwnMotion::ahead(0.0)),
             seen: boxes[f].iter().map(|b| seen_velocity(&of_frame, times, f, b)).collect(),
         };
         Ok(Some(own.into_iter().enumerate().map(motion).collect()))
     }
 
-    /// Places of static edges of a cloud.
-    fn edges(&self, cloud: &Cloud, boxes: &[Box3]) -> Vec<nalgebra::Vector2<f64>> {
+    /// Static edges and ground of a cloud.
+    fn standing(&self, cloud: &Cloud, boxes: &[Box3]) -> Standing {
         let scans: Vec<SensorScan> = split_by_sensor(cloud, &self.rig);
-        let mut returns = Vec::new();
+        let (mut returns, mut ground) = (Vec::new(), Vec::new());
         for (number, scan) in scans.iter().enumerate() {
             let around = crate::directions::Surroundings::new(self.reader.sensors(), number, scan);
             for i in 0..scan.len() {
@@ -281,9 +280,13 @@ impl<'a> FinishedDataset<'a> {
                 if edge && kind_of(boxes, place, None) == Kind::Standing {
                     returns.push((Vector3::from(place), range_m));
                 }
+                let normal = seen.surface.map(|(_, normal)| normal);
+                if let Some(normal) = normal.filter(|n| kind_of(boxes, place, Some(n.z)) == Kind::Ground) {
+                    ground.push(GroundPoint { place: place.into(), normal });
+                }
             }
         }
-        static_edges(returns, boxes)
+        Standing { edges: static_edges(returns, boxes), ground }
     }
 }
 

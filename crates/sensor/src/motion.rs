@@ -1,19 +1,49 @@
-//! Motion from frame to frame: of the ego vehicle, from posts, ends of walls and other static edges; of labelled
-//! objects, from their labels.
+//! Motion from frame to frame: of the ego vehicle, from posts, ends of walls and other static edges, and from the
+//! ground; of labelled objects, from their labels.
+
+mod ground;
 
 use geometry::Box3;
+pub use ground::GroundPoint;
+use ground::{Ground, tilt};
 use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use statistics::median_upper;
 use std::collections::BTreeSet;
 
-/// Ego motion between two frames.
+/// Motion of the ego vehicle in its own frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OwnMotion {
-    /// Along its heading, m/s.
-    pub speed_m_s: f64,
-    /// Counter-clockwise, rad/s.
-    pub yaw_rate_rad_s: f64,
+    /// Velocity, m/s.
+    pub velocity_m_s: Vector3<f64>,
+    /// Rates of turn about the axes, rad/s.
+    pub turn_rate_rad_s: Vector3<f64>,
+}
+
+impl OwnMotion {
+    /// Straight ahead, m/s.
+    pub fn ahead(speed_m_s: f64) -> Self {
+        OwnMotion { velocity_m_s: Vector3::new(speed_m_s, 0.0, 0.0), turn_rate_rad_s: Vector3::zeros() }
+    }
+
+    /// Speed along the heading, m/s.
+    pub fn speed_m_s(&self) -> f64 {
+        self.velocity_m_s.x
+    }
+
+    /// Velocity over ground of a point that is fixed to the vehicle, m/s.
+    pub fn velocity_at(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.velocity_m_s + self.turn_rate_rad_s.cross(point)
+    }
+}
+
+/// What of a frame stands still.
+#[derive(Clone, Debug, Default)]
+pub struct Standing {
+    /// Static edges in bird's-eye view, see [`static_edges`].
+    pub edges: Vec<Vector2<f64>>,
+    /// Points of the ground.
+    pub ground: Vec<GroundPoint>,
 }
 
 /// Side of a cell in bird's-eye view, m.
@@ -48,9 +78,9 @@ const STANDS_OUT: f64 = 1.25;
 const SLOWEST: usize = 8;
 
 /// The motion at each frame; `None` where it cannot be estimated.
-pub fn own_motion(edges: Vec<Vec<Vector2<f64>>>, times: &[f64]) -> Vec<Option<OwnMotion>> {
-    let frames = edges.len();
-    let seen: Vec<Seen> = edges.into_par_iter().map(|edges| Seen { taken: Cells::new(&edges), edges }).collect();
+pub fn own_motion(standing: Vec<Standing>, times: &[f64]) -> Vec<Option<OwnMotion>> {
+    let frames = standing.len();
+    let seen: Vec<Seen> = standing.into_par_iter().map(Seen::new).collect();
     let pair = |i: usize| {
         // References: of the frames far in time, those with the most edges at the same places.
         let far = (0..frames).filter(|&j| (times[j] - times[i]).abs() > ELSEWHERE_S);
@@ -69,8 +99,8 @@ pub fn own_motion(edges: Vec<Vec<Vector2<f64>>>, times: &[f64]) -> Vec<Option<Ow
             let after = steps.get(i).copied().flatten();
             match (before, after) {
                 (Some(a), Some(b)) => Some(OwnMotion {
-                    speed_m_s: 0.5 * (a.speed_m_s + b.speed_m_s),
-                    yaw_rate_rad_s: 0.5 * (a.yaw_rate_rad_s + b.yaw_rate_rad_s),
+                    velocity_m_s: (a.velocity_m_s + b.velocity_m_s) / 2.0,
+                    turn_rate_rad_s: (a.turn_rate_rad_s + b.turn_rate_rad_s) / 2.0,
                 }),
                 (one, None) | (None, one) => one,
             }
@@ -92,9 +122,12 @@ fn smooth(raw: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
         .map(|i| {
             let near: Vec<OwnMotion> =
                 (0..raw.len()).filter(|&j| (times[j] - times[i]).abs() < 0.8).filter_map(|j| raw[j]).collect();
+            let usual = |of: fn(&OwnMotion) -> Vector3<f64>| {
+                Vector3::from_fn(|k, _| median(near.iter().map(|m| of(m)[k]).collect()))
+            };
             (near.len() >= 2).then(|| OwnMotion {
-                speed_m_s: median(near.iter().map(|m| m.speed_m_s).collect()),
-                yaw_rate_rad_s: median(near.iter().map(|m| m.yaw_rate_rad_s).collect()),
+                velocity_m_s: usual(|m| m.velocity_m_s),
+                turn_rate_rad_s: usual(|m| m.turn_rate_rad_s),
             })
         })
         .collect()
@@ -202,10 +235,18 @@ impl Cells {
     }
 }
 
-/// Edges in bird's-eye view, and the cells that they occupy.
+/// Edges in bird's-eye view, and the cells that they occupy; the ground.
 struct Seen {
     edges: Vec<Vector2<f64>>,
     taken: Cells,
+    ground: Ground,
+}
+
+impl Seen {
+    fn new(standing: Standing) -> Self {
+        let Standing { edges, ground } = standing;
+        Seen { taken: Cells::new(&edges), edges, ground: Ground::new(&ground) }
+    }
 }
 
 /// Number of edges that match edges of another frame if the vehicle moves ahead by `d` and turns by `yaw`, along its
@@ -224,6 +265,7 @@ fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
 /// pattern, which is static in the frame of the vehicle, and to walls, which look alike along their length.
 struct Pair<'a> {
     some: Vec<Vector2<f64>>,
+    first: &'a Seen,
     second: &'a Seen,
     elsewhere: [&'a Seen; 2],
     dt: f64,
@@ -233,10 +275,10 @@ struct Pair<'a> {
 }
 
 impl<'a> Pair<'a> {
-    fn new(first: &Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
+    fn new(first: &'a Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
         let stride = first.edges.len().div_ceil(SOME);
         let some = first.edges.iter().step_by(stride.max(1)).copied().collect();
-        let mut pair = Pair { some, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
+        let mut pair = Pair { some, first, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
         if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt < LONGEST_S {
             let yaw_steps = (0.6 * dt / 0.009).ceil() as i32;
             let yaws = (-yaw_steps..=yaw_steps).map(|k| 0.6 * dt * f64::from(k) / f64::from(yaw_steps.max(1)));
@@ -272,8 +314,15 @@ impl<'a> Pair<'a> {
                 sum = [sum[0] + weight, sum[1] + weight * d, sum[2] + weight * yaw];
             }
         }
-        (best > 0.0 && sum[0] > 0.0)
-            .then(|| OwnMotion { speed_m_s: sum[1] / sum[0] / self.dt, yaw_rate_rad_s: sum[2] / sum[0] / self.dt })
+        if best <= 0.0 || sum[0] <= 0.0 {
+            return None;
+        }
+        let (d, yaw) = (sum[1] / sum[0], sum[2] / sum[0]);
+        let [climb_m, roll, pitch] = tilt(&self.first.ground, &self.second.ground, d, yaw).unwrap_or_default();
+        Some(OwnMotion {
+            velocity_m_s: Vector3::new(d, 0.0, climb_m) / self.dt,
+            turn_rate_rad_s: Vector3::new(roll, pitch, yaw) / self.dt,
+        })
     }
 }
 
@@ -336,7 +385,7 @@ mod tests {
                 Vector2::new(yaw.cos() * q.x + yaw.sin() * q.y, -yaw.sin() * q.x + yaw.cos() * q.y)
             })
             .collect();
-        let seen = |edges: Vec<Vector2<f64>>| Seen { taken: Cells::new(&edges), edges };
+        let seen = |edges: Vec<Vector2<f64>>| Seen::new(Standing { edges, ground: vec![] });
         let mut rng = data::stream(0, "elsewhere", 0, 0);
         let mut scattered = |n: usize, across_m: f64| {
             let mut at = |half: f64| if half > 0.0 { rng.random_range(-half..half) } else { 8.0 };
@@ -346,7 +395,7 @@ mod tests {
         let [one, other] = [scattered(60, 10.0), scattered(60, 10.0)];
         let pair = Pair::new(&first, &second, [&one, &other], 0.05);
         let motion = pair.motion(speeds(std::slice::from_ref(&pair)).unwrap()[0]).unwrap();
-        assert!((motion.speed_m_s - 48.0).abs() < 3.0 && (motion.yaw_rate_rad_s - 0.24).abs() < 0.1, "{motion:?}");
+        assert!((motion.speed_m_s() - 48.0).abs() < 3.0 && (motion.turn_rate_rad_s.z - 0.24).abs() < 0.1, "{motion:?}");
         // Each scan samples a wall at other places.
         let walls: Vec<Seen> = (0..12).map(|_| scattered(400, 0.0)).collect();
         let pair = |i: usize| Pair::new(&walls[i], &walls[i + 1], [&walls[(i + 5) % 12], &walls[(i + 7) % 12]], 0.25);

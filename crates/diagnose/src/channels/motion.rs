@@ -1,15 +1,17 @@
-//! Ego motion from frame to frame, from static edges of the simulated side.
+//! Ego motion from frame to frame, from static edges and the ground of the simulated side.
 
 use crate::pairing::{FramePair, Surface};
 use geometry::Box3;
 use nalgebra::{Point3, Vector2};
 use rayon::prelude::*;
 pub use sensor::motion::{CELL_M, Cells, OwnMotion, times_s};
+use sensor::motion::{GroundPoint, Standing};
 
 /// The motion at each frame; `None` where it cannot be estimated.
 pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) -> Vec<Option<OwnMotion>> {
-    let edges: Vec<Vec<Vector2<f64>>> = frames.par_iter().map(|frame| edges(frame, origins)).collect();
-    sensor::motion::own_motion(edges, times)
+    let of_frame =
+        |frame: &FramePair| Standing { edges: edges(frame, origins), ground: ground(frame, origins).collect() };
+    sensor::motion::own_motion(frames.par_iter().map(of_frame).collect(), times)
 }
 
 /// Places of static edges: not of the ground, not of objects, not of smooth walls.
@@ -21,4 +23,13 @@ fn edges(frame: &FramePair, origins: &[Point3<f64>]) -> Vec<Vector2<f64>> {
         ((origins[ray.sensor as usize] + ray.direction_vector() * range_m).coords, range_m)
     });
     sensor::motion::static_edges(places, &boxes)
+}
+
+/// Points of smooth ground.
+fn ground<'a>(frame: &'a FramePair, origins: &'a [Point3<f64>]) -> impl Iterator<Item = GroundPoint> + 'a {
+    let rays = frame.simulated.iter().filter(|ray| ray.smooth && ray.surface == Surface::Ground);
+    rays.map(|ray| GroundPoint {
+        place: ray.predicted_point(&origins[ray.sensor as usize]).coords,
+        normal: ray.normal_vector(),
+    })
 }

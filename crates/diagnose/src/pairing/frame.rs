@@ -9,6 +9,7 @@ use super::roughness::Roughness;
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
+use sensor::assignment::Assignment;
 use sensor::directions::{DirectionIndex, SensorScan, Sensors, in_or_beside};
 use std::borrow::Cow;
 
@@ -103,6 +104,8 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
     let measured = moved_back(recorded, sensors, corrections.shift_m);
     let simulated = rounded(&recorded.simulated.scans, corrections.step_m);
+    // A return that is moved out of the field of view of its sensor has nothing to be compared with.
+    let views = corrections.shift_m.map(|_| Assignment::new(&sensors.rig));
     let mut frame = FramePair {
         id: recorded.id.into(),
         measured: Vec::new(),
@@ -121,6 +124,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
             simulated: &simulated[sensor],
             matched: &recorded.matched[sensor],
             boxes: &boxes,
+            views: views.as_ref(),
         };
         pair.add_to(&mut frame, scan, corrections.range_m);
     }
@@ -167,6 +171,8 @@ struct SensorPair<'a> {
     simulated: &'a SensorScan,
     matched: &'a Matched,
     boxes: &'a [Box3],
+    /// Which sensor sees a place, where measured returns were moved.
+    views: Option<&'a Assignment>,
 }
 
 impl SensorPair<'_> {
@@ -195,6 +201,15 @@ impl SensorPair<'_> {
         frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.around.index);
         let missing = measured.len() as f64 - simulated.len() as f64;
         frame.open += open(self.sensors, self.sensor, [a, b], &predictor.around.index).unwrap_or(missing.max(0.0));
+        if let Some(views) = self.views {
+            let mount = &self.sensors.rig.sensors[self.sensor];
+            let seen = |r: &Ray| {
+                let place = predictor.around.place(&r.direction_vector(), r.own_range_m());
+                let at = views.of_point(place.into()).filter(|at| at.sensor == self.sensor);
+                at.is_some_and(|at| mount.sees(at.spherical[0], 0.0))
+            };
+            measured.retain(seen);
+        }
         frame.measured.append(&mut measured);
         frame.simulated.append(&mut simulated);
     }

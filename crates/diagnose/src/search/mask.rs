@@ -240,8 +240,34 @@ struct Run {
     end: i32,
     /// Share of the returns that is lost.
     lost: f64,
-    /// Range of the part's own returns, m; 0 without.
-    shown_m: f64,
+    /// The part's own returns; none where most shots have none.
+    shown: Vec<PartReturn>,
+}
+
+/// Own range, m, and intensity of a return from a part of the ego vehicle.
+type PartReturn = [f64; 2];
+
+/// Distance of two cells' returns from which on they are of different parts, m.
+const OTHER_PART_M: f64 = 0.05;
+
+impl Run {
+    /// Mean and standard deviation of the own ranges, m, or of the intensities.
+    fn moments(&self, of: usize) -> [f64; 2] {
+        let values: Vec<f64> = self.shown.iter().map(|r| r[of]).collect();
+        [statistics::mean(&values), statistics::deviation(&values)]
+            .map(|v| if v.is_finite() { rounded(v, 4) } else { 0.0 })
+    }
+
+    /// Whether a cell's returns continue those of the run.
+    fn joins(&self, next: DirectionCell, lost: f64, shown: &[PartReturn]) -> bool {
+        let median = |returns: &[PartReturn]| statistics::median_upper(returns.iter().map(|r| r[0]).collect());
+        let alike = match (median(&self.shown), median(shown)) {
+            (Some(a), Some(b)) => (a - b).abs() < OTHER_PART_M,
+            (None, None) => true,
+            _ => false,
+        };
+        self.first.2 == next.2 && self.end == next.1 && self.lost == lost && alike
+    }
 }
 
 /// The hidden directions of every sensor with the share of their returns that is lost: neighbouring cells of one
@@ -253,29 +279,26 @@ fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Ef
         (((1.0 - seen / n.max(1.0)).clamp(0.0, 1.0)) * 20.0).round() / 20.0
     };
     // Near returns of the part itself, in place of those that it hides.
-    let mut near = BTreeMap::<DirectionCell, Vec<f64>>::new();
+    let mut near = BTreeMap::<DirectionCell, Vec<PartReturn>>::new();
     for ray in frames.iter().flat_map(|&i| &context.frames[i].measured) {
         if ray.own_range_m() < OWN_CAR_M && mask.blocked.contains(&direction_cell(ray)) {
-            near.entry(direction_cell(ray)).or_default().push(ray.own_range_m());
+            near.entry(direction_cell(ray)).or_default().push([ray.own_range_m(), f64::from(ray.intensity)]);
         }
     }
-    let shown_m = |cell: &DirectionCell| {
-        let (n, ranges) = (counts.get(cell).map_or(0.0, |c| c[0]), near.get(cell));
-        let enough = ranges.filter(|ranges| 2.0 * ranges.len() as f64 > n);
-        enough.and_then(|ranges| statistics::median_upper(ranges.clone())).map_or(0.0, |m| (m * 20.0).round() / 20.0)
-    };
+    near.retain(|cell, shown| 2.0 * shown.len() as f64 > counts.get(cell).map_or(0.0, |c| c[0]));
     let mut of_sensors: BTreeMap<u8, Vec<Run>> = BTreeMap::new();
     // In the order of sensor, elevation and azimuth, so that neighbours follow each other.
     let mut cells: Vec<(DirectionCell, f64)> = mask.blocked.iter().map(|c| (*c, lost(c).max(0.9))).collect();
     cells.extend(mask.partly.difference(&mask.blocked).map(|c| (*c, lost(c))).filter(|(_, lost)| *lost > 0.0));
     cells.sort_by_key(|((sensor, azimuth, elevation), _)| (*sensor, *elevation, *azimuth));
     for (first, lost) in cells {
-        let (runs, shown_m) = (of_sensors.entry(first.0).or_default(), shown_m(&first));
-        let joins =
-            |run: &Run| run.first.2 == first.2 && run.end == first.1 && run.lost == lost && run.shown_m == shown_m;
-        match runs.last_mut().filter(|run| joins(run)) {
-            Some(run) => run.end += 1,
-            None => runs.push(Run { first, end: first.1 + 1, lost, shown_m }),
+        let (runs, shown) = (of_sensors.entry(first.0).or_default(), near.remove(&first).unwrap_or_default());
+        match runs.last_mut().filter(|run| run.joins(first, lost, &shown)) {
+            Some(run) => {
+                run.end += 1;
+                run.shown.extend(shown);
+            }
+            None => runs.push(Run { first, end: first.1 + 1, lost, shown }),
         }
     }
     let degrees = |k: i32, step: f64| rounded((f64::from(k) * step).to_degrees(), 4);
@@ -286,14 +309,18 @@ fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Ef
             let [low, high] = [elevation, elevation + 1].map(|k| degrees(k, ELEVATION_RAD));
             [from, to, low, high, run.lost]
         };
+        let returns = |of: usize| match runs.iter().any(|run| !run.shown.is_empty()) {
+            true => runs.iter().map(|run| run.moments(of)).collect(),
+            false => Vec::new(),
+        };
+        let has_intensity = runs.iter().flat_map(|run| &run.shown).all(|r| r[1].is_finite());
         Effect::EgoBodyMask(EgoBodyMask {
             sensor: context.rig.sensors[usize::from(sensor)].name.clone(),
             boxes: vec![],
             directions: runs.iter().map(direction).collect(),
-            returns_m: match runs.iter().any(|run| run.shown_m > 0.0) {
-                true => runs.iter().map(|run| run.shown_m).collect(),
-                false => vec![],
-            },
+            returns_m: returns(0).iter().map(|moments| moments[0]).collect(),
+            returns_std_m: returns(0).iter().map(|moments| moments[1]).collect(),
+            returns_intensity: if has_intensity { returns(1) } else { vec![] },
         })
     };
     of_sensors.into_iter().map(effect).collect()

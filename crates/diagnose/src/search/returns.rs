@@ -246,11 +246,15 @@ const ELSEWHERE_NATS: f64 = 0.01;
 /// Share of that gain that may remain after surfaces were moved to their place.
 const ELSEWHERE_REMAINS: f64 = 0.5;
 
-/// Whether undoing a displacement brings measured returns onto the simulated surfaces: grouped returns off the
-/// surfaces are significant before and at most half as many after.
+/// Whether grouped returns lie off the simulated surfaces.
+pub fn surfaces_stand_elsewhere(context: &Context) -> bool {
+    grouped_gain(context) > ELSEWHERE_NATS
+}
+
+/// Whether undoing a displacement brings measured returns onto the simulated surfaces: at most half of the gain by
+/// grouped returns off the surfaces is left.
 pub fn is_explained_by_displacement(before: &Context, moved: &Context) -> bool {
-    let [before, after] = [before, moved].map(grouped_gain);
-    before > ELSEWHERE_NATS && after < ELSEWHERE_REMAINS * before
+    grouped_gain(moved) < ELSEWHERE_REMAINS * grouped_gain(before)
 }
 
 /// Gain by grouped returns off the surfaces, nats a return: objects that only one side has, or surfaces that stand

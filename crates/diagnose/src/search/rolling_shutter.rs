@@ -5,6 +5,10 @@
 //! duration is that with the most returns in occupied cells of the simulation, in bird's-eye view. Rays need not be
 //! paired, so that displacements of metres are found.
 
+mod grid;
+
+use self::grid::{Grid, peak};
+use super::returns::surfaces_stand_elsewhere;
 use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::labels::seen_velocity;
@@ -48,11 +52,7 @@ impl Motion {
         };
         match self.objects.iter().find(on) {
             Some((_, v)) => *v,
-            None => Vector3::new(
-                -self.own.speed_m_s + self.own.yaw_rate_rad_s * point.y,
-                -self.own.yaw_rate_rad_s * point.x,
-                0.0,
-            ),
+            None => -self.own.velocity_at(point),
         }
     }
 }
@@ -126,10 +126,6 @@ impl TopView {
     }
 }
 
-/// Mean gain over its standard error from which on an insignificant displacement is tested further, by moving the
-/// scene back.
-const DOUBTFUL_Z: f64 = 1.5;
-
 /// Result of the search.
 pub enum Search {
     /// No displacement along the scan.
@@ -154,14 +150,12 @@ pub fn search(context: &Context) -> Search {
     let mut result = ChannelResult::new(Channel::Slide, hold_out.len());
     let mut models = vec![Model::without_speed(context)];
     models.extend(Model::with_speed(context));
-    let grids = models.iter().map(|model| model.grid(&select)).collect::<Vec<_>>();
+    let mut grids = models.iter().map(|model| model.grid(&select)).collect::<Vec<_>>();
     let total = |k: usize| total_and_z(&grids[k].gains).0;
     let best = (0..models.len()).max_by(|&a, &b| total(a).total_cmp(&total(b)));
-    let Some(k) = best else { return Search::NotFound(result) };
-    let (grid, model) = (&grids[k], models.swap_remove(k));
-    let (gain, z) = total_and_z(&grid.gains);
-    let significant = significant(&grid.gains, Z_STAR) && gain > LEAST_SHARE * (grid.most - gain);
-    let far_enough = grid.best.abs() * model.fastest > LEAST_M;
+    let Some(best) = best else { return Search::NotFound(result) };
+    let (gain, z) = total_and_z(&grids[best].gains);
+    let significant = significant(&grids[best].gains, Z_STAR) && gain > LEAST_SHARE * (grids[best].most - gain);
     let considered = |outcome: &str| Considered {
         cause: Cause::RollingShutter.into(),
         channel: Channel::Slide,
@@ -170,20 +164,30 @@ pub fn search(context: &Context) -> Search {
         outcome: outcome.into(),
     };
     result.minimum.push((Cause::RollingShutter, Minimum::new(Quantity::ShearXM, LEAST_M)));
+    let far_enough = |k: usize, at: f64| at.abs() * models[k].fastest > LEAST_M;
+    let decided = significant && far_enough(best, grids[best].best);
     let outcome =
         if significant { "too small to be seen from above" } else { "no more returns come to lie on the simulation" };
     let not_found = ChannelResult { considered: vec![considered(outcome)], ..result.clone() };
-    if !far_enough || !significant && z < DOUBTFUL_Z {
-        return Search::NotFound(not_found);
-    }
+    let chosen = if decided {
+        Some((best, grids[best].best))
+    } else {
+        // Along walls and fences a displaced scene may look like another one from above. Returns that lie off the
+        // simulated surfaces say that there is something.
+        let peaks = (0..models.len()).filter_map(|k| grids[k].peak(|at| far_enough(k, at)).map(|at| (k, at)));
+        let highest = peaks.max_by(|a, b| grids[a.0].share_at(a.1).total_cmp(&grids[b.0].share_at(b.1)));
+        highest.filter(|(k, at)| grids[*k].share_at(*at) > 1.0 - LEAST_SHARE && surfaces_stand_elsewhere(context))
+    };
+    let Some((k, at)) = chosen else { return Search::NotFound(not_found) };
+    let (grid, model) = (grids.swap_remove(k), models.swap_remove(k));
     result.considered.push(considered("chosen"));
-    let fitted = Fitted::new(context, &model, grid.best, &estimate);
-    let held = model.held_out_gains(grid, &fitted, &select, &hold_out);
+    let fitted = Fitted::new(context, &model, at, &estimate);
+    let held = model.held_out_gains(&grid, &fitted, &select, &hold_out);
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [g.max(0.0), *g, g.max(0.0)]);
     result.found.push(fitted.found(&model, &estimate, held));
     let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
     let slide = Slide { scan_s: fitted.scan_s, motions: model.motions, sensors };
-    if significant { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
+    if decided { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
 }
 
 /// Gains of the `test` frames by the displacement along the scan that fits the `train` frames best, nats.
@@ -230,7 +234,7 @@ impl Fitted {
     /// The finding. Scans that turn clockwise have a positive duration.
     fn found(&self, model: &Model, estimate: &[usize], held_out_gains: Vec<f64>) -> Found {
         let Fitted { scan_s, error, .. } = *self;
-        let middle = median(model.motions.iter().map(|m| m.own.speed_m_s).collect());
+        let middle = median(model.motions.iter().map(|m| m.own.speed_m_s()).collect());
         let parameter = |quantity: Quantity, estimate: f64, error: f64| -> NamedParameter {
             let ci95 = [estimate - 2.0 * error, estimate + 2.0 * error];
             (quantity.into(), Parameter { estimate, unit: quantity.unit(), ci95 })
@@ -297,18 +301,18 @@ impl Model {
         let motion = |f: usize| {
             let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
             let moving = boxes.filter_map(|b| Some((b, seen_velocity(context.frames, times, f, &b)?)));
-            let still = OwnMotion { speed_m_s: 0.0, yaw_rate_rad_s: 0.0 };
+            let still = OwnMotion::ahead(0.0);
             Motion { own: own[f].unwrap_or(still), objects: moving.collect() }
         };
         let motions: Vec<Motion> = (0..context.frames.len()).map(motion).collect();
-        let fastest = motions.iter().map(|m| m.own.speed_m_s.abs()).fold(0.0, f64::max);
+        let fastest = motions.iter().map(|m| m.own.speed_m_s().abs()).fold(0.0, f64::max);
         (fastest > 1.0).then(|| Model::new(context, motions, fastest, STEP_S, true))
     }
 
     /// With the same displacement in all frames; objects are not displaced.
     fn without_speed(context: &Context) -> Model {
         let motion = |frame: &FramePair| Motion {
-            own: OwnMotion { speed_m_s: 1.0, yaw_rate_rad_s: 0.0 },
+            own: OwnMotion::ahead(1.0),
             objects: frame.objects.iter().filter_map(|o| Some((o.simulated?, Vector3::zeros()))).collect(),
         };
         Model::new(context, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
@@ -360,32 +364,12 @@ impl Model {
         let best = (0..grid.len()).max_by(|&a, &b| sums[a].total_cmp(&sums[b])).unwrap_or(still);
         Grid {
             best: grid[best],
+            sums: grid.iter().copied().zip(sums.iter().copied()).collect(),
             gains: on.iter().map(|c| c[best] - c[still]).collect(),
             least: sums.iter().copied().fold(f64::INFINITY, f64::min),
             most: sums[best],
         }
     }
-}
-
-/// Counts on a grid of durations.
-struct Grid {
-    /// The duration with the most points in occupied cells.
-    best: f64,
-    /// Increase of that number on each frame over no displacement.
-    gains: Vec<f64>,
-    /// Smallest and largest number over all durations.
-    least: f64,
-    most: f64,
-}
-
-/// The duration with the most points in occupied cells: the mean of the durations whose counts are within 15 % of the
-/// best, in units of the difference between best and worst, weighted by what exceeds that.
-fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
-    let sums: Vec<f64> = (0..times.len()).map(|k| which.iter().map(|&i| counts[i][k]).sum()).collect();
-    let [low, high] = [sums.iter().copied().fold(f64::INFINITY, f64::min), sums.iter().copied().fold(0.0, f64::max)];
-    let weight = |s: f64| (s - (high - 0.15 * (high - low))).max(0.0);
-    let total: f64 = sums.iter().map(|s| weight(*s)).sum();
-    sums.iter().zip(times).map(|(s, t)| weight(*s) * t).sum::<f64>() / total.max(1e-9)
 }
 
 #[cfg(test)]
@@ -448,7 +432,7 @@ mod tests {
                 }
             })
             .collect();
-        let own = OwnMotion { speed_m_s: 40.0, yaw_rate_rad_s: 0.0 };
+        let own = OwnMotion::ahead(40.0);
         let context = Context {
             rig: &rig,
             frames: &frames,

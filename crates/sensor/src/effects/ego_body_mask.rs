@@ -5,7 +5,8 @@ use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::{within, wrong};
 use nalgebra::Vector3;
-use rand::RngExt;
+use rand::{Rng, RngExt};
+use rand_distr::StandardNormal;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -27,6 +28,11 @@ pub struct EgoBodyMask {
     /// Range of the return of the part itself in each of the directions, m; 0 where there is none. Directions beyond
     /// the end of the list have none.
     pub returns_m: Vec<f64>,
+    /// Standard deviation of these ranges, m, in the same order; 0 beyond the end of the list.
+    pub returns_std_m: Vec<f64>,
+    /// Mean and standard deviation of the intensities of these returns, in units of the cloud and in the same order.
+    /// Beyond the end of the list the intensity of the hidden return stays.
+    pub returns_intensity: Vec<[f64; 2]>,
 }
 
 impl SensorEffect for EgoBodyMask {
@@ -48,7 +54,15 @@ impl SensorEffect for EgoBodyMask {
                 within(&format!("directions[{i}][{k}]"), d[k], low, high)?;
             }
         }
-        self.returns_m.iter().enumerate().try_for_each(|(i, v)| within(&format!("returns_m[{i}]"), *v, 0.0, 100.0))
+        for (key, ranges) in [("returns_m", &self.returns_m), ("returns_std_m", &self.returns_std_m)] {
+            ranges.iter().enumerate().try_for_each(|(i, v)| within(&format!("{key}[{i}]"), *v, 0.0, 100.0))?;
+        }
+        for (i, of_direction) in self.returns_intensity.iter().enumerate() {
+            for (k, v) in of_direction.iter().enumerate() {
+                within(&format!("returns_intensity[{i}][{k}]"), *v, 0.0, 1e6)?;
+            }
+        }
+        Ok(())
     }
 
     fn reads(&self) -> Reads {
@@ -71,9 +85,9 @@ impl SensorEffect for EgoBodyMask {
             let at = sensor_from_cloud.and_then(|pose| self.direction_of(pose.rotation * own_direction(echo)));
             let share = at.map_or(0.0, |k| self.directions[k][4]);
             let hidden = share > 0.0 && random.random_range(0.0..1.0_f64) < share;
-            let own_m = at.and_then(|k| self.returns_m.get(k)).copied().unwrap_or(0.0);
-            if hidden && own_m > 0.0 {
-                (echo.range_m, echo.normal, echo.object) = (own_m as f32, [0.0; 3], 0);
+            let shown = at.filter(|k| hidden && self.returns_m.get(*k).is_some_and(|m| *m > 0.0));
+            if let Some(k) = shown {
+                self.show(echo, k, &mut random);
             } else if hidden || boxes.iter().any(|b| passes(echo, b)) {
                 echo.lose();
             }
@@ -82,6 +96,16 @@ impl SensorEffect for EgoBodyMask {
 }
 
 impl EgoBodyMask {
+    /// Makes a return that of the part in a direction.
+    fn show(&self, echo: &mut Echo, direction: usize, random: &mut impl Rng) {
+        let mut drawn = |mean: f64, std: f64| mean + std * random.sample::<f64, _>(StandardNormal);
+        let range_m = drawn(self.returns_m[direction], self.returns_std_m.get(direction).copied().unwrap_or(0.0));
+        (echo.range_m, echo.normal, echo.object) = (range_m.max(0.01) as f32, [0.0; 3], 0);
+        if let Some([mean, std]) = self.returns_intensity.get(direction) {
+            echo.intensity = drawn(*mean, *std).max(0.0) as f32;
+        }
+    }
+
     /// The entry of a direction of the sensor's frame.
     fn direction_of(&self, own: Vector3<f64>) -> Option<usize> {
         if self.directions.is_empty() {
@@ -165,5 +189,31 @@ mod tests {
         assert!(after.returns().all(|e| !hidden(e)));
         assert_eq!(applied(&mask("left"), &before), before);
         assert!(mask("").check().unwrap_err().to_string().contains("those of one sensor"));
+    }
+
+    #[test]
+    fn a_part_returns_light_with_its_own_spread() {
+        let mask = EgoBodyMask {
+            sensor: "front".into(),
+            directions: vec![[-10.0, 20.0, -15.5, -5.0, 1.0]],
+            returns_m: vec![0.8],
+            returns_std_m: vec![0.02],
+            returns_intensity: vec![[0.3, 0.01]],
+            ..EgoBodyMask::default()
+        };
+        let (before, after) = (scene(), applied(&mask, &scene()));
+        assert_eq!(before.returns().count(), after.returns().count());
+        let of = |value: fn(&Echo) -> f32| -> Vec<f64> {
+            let shown = after.echoes.iter().zip(&before.echoes).filter(|(a, b)| a.range_m != b.range_m);
+            shown.map(|(a, _)| f64::from(value(a))).collect()
+        };
+        for (values, mean, std) in [(of(|e| e.range_m), 0.8, 0.02), (of(|e| e.intensity), 0.3, 0.01)] {
+            let chance = 4.0 * std / (values.len() as f64).sqrt();
+            assert!(values.len() > 100, "{}", values.len());
+            assert!((statistics::mean(&values) - mean).abs() < chance, "{}", statistics::mean(&values));
+            assert!((statistics::deviation(&values) - std).abs() < chance, "{}", statistics::deviation(&values));
+        }
+        let negative = EgoBodyMask { returns_intensity: vec![[0.3, -1.0]], ..mask };
+        assert!(negative.check().unwrap_err().to_string().contains("returns_intensity[0][1]"));
     }
 }

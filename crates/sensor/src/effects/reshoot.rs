@@ -62,35 +62,53 @@ pub(super) fn reshoot(
         return;
     };
     let mut random = draws.of_edges();
-    for (number, mount) in sensors.rig.sensors.iter().enumerate() {
-        let of_sensor = |e: &Echo| usize::from(e.sensor) == number;
-        if !scan.echoes.iter().enumerate().any(|(i, e)| of_sensor(e) && true_from_reported(i, e).is_some()) {
+    let moves = |number: usize| {
+        let mut own = scan.echoes.iter().enumerate().filter(|(_, e)| usize::from(e.sensor) == number);
+        own.any(|(i, e)| true_from_reported(i, e).is_some())
+    };
+    let moved: Vec<bool> = (0..sensors.rig.sensors.len()).map(moves).collect();
+    if !moved.contains(&true) {
+        return;
+    }
+    let all: Vec<Seen> = (0..moved.len()).map(|number| Seen::new(scan, sensors, number, &mut random)).collect();
+    let before = scan.echoes.clone();
+    for (i, echo) in scan.echoes.iter_mut().enumerate() {
+        let Some(true_from_reported) = true_from_reported(i, &before[i]) else { continue };
+        let Some(seen) = all.get(usize::from(echo.sensor)) else { continue };
+        let own = seen.pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
+        // The true ray in the frame of a sensor.
+        let in_frame_of = |other: &Seen| other.pose.inverse() * true_from_reported * seen.pose;
+        let met = seen.meet(&own, &in_frame_of(seen), &before[i]);
+        // Beyond the field of view of the sensor another one may show what the ray meets.
+        let beyond = met.as_ref().is_none_or(|met| met.on.is_none()) && seen.is_left(&own, &in_frame_of(seen), echo);
+        let mut others = all.iter().filter(|other| beyond && !std::ptr::eq(*other, seen));
+        let shown = others.find_map(|other| other.meet_of_another(&own, &in_frame_of(other), &before[i]));
+        let Some(Met { range_m, on }) = shown.or(met) else {
+            echo.lose();
+            continue;
+        };
+        // A shot that was lost on a surface stays lost.
+        if !echo.is_return() && seen.is_hole(&own) {
             continue;
         }
-        let seen = Seen::new(scan, sensors, number, &mut random);
-        let pose = mount.pose();
-        let before = scan.echoes.clone();
-        for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| of_sensor(e)) {
-            let Some(true_from_reported) = true_from_reported(i, &before[i]) else { continue };
-            // The true ray in the frame of the sensor as it is reported.
-            let error = pose.inverse() * true_from_reported * pose;
-            let own = pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from));
-            let Some(Met { range_m, on }) = seen.meet(&own, &error, &before[i], &pose) else {
-                echo.lose();
-                continue;
-            };
-            // A shot that was lost on a surface stays lost.
-            if !echo.is_return() && seen.is_hole(&own) {
-                continue;
-            }
-            if let Some(surface) = on.and_then(|place| before.get(place)) {
-                (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
-                (echo.returned, echo.material, echo.object) = (surface.returned, surface.material, surface.object);
-                (echo.normal, echo.cos_incidence) = (surface.normal, surface.cos_incidence);
-            }
-            echo.range_m = range_m;
+        if let Some(surface) = on.and_then(|place| before.get(place)) {
+            (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
+            (echo.returned, echo.material, echo.object) = (surface.returned, surface.material, surface.object);
+            (echo.normal, echo.cos_incidence) = (surface.normal, surface.cos_incidence);
         }
+        echo.range_m = range_m;
     }
+}
+
+/// Range of a shot, m, or one at which shots without a return are looked up.
+fn about_m(echo: &Echo) -> f64 {
+    if echo.is_return() { f64::from(echo.range_m) } else { 50.0 }
+}
+
+/// Azimuth and elevation of a point in a sensor's frame, rad.
+fn towards(point: &Vector3<f64>) -> [f32; 2] {
+    let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(*point));
+    [azimuth as f32, elevation as f32]
 }
 
 /// Number of the step of an angle from the lower end of the field of view.
@@ -144,6 +162,8 @@ impl TrueRay<'_> {
 
 /// The returns of a sensor by direction.
 struct Seen<'a> {
+    /// Pose of the sensor in the cloud's frame.
+    pose: Pose,
     scan: SensorScan,
     /// Places of the returns among the echoes.
     places: Vec<usize>,
@@ -159,7 +179,8 @@ struct Seen<'a> {
 
 impl<'a> Seen<'a> {
     fn new(scan: &Scan, sensors: &'a Sensors, number: usize, random: &mut Stream) -> Self {
-        let sensor_from_cloud = sensors.rig.sensors[number].pose().inverse();
+        let pose = sensors.rig.sensors[number].pose();
+        let sensor_from_cloud = pose.inverse();
         let (mut own, mut places) = (SensorScan::default(), Vec::new());
         for (i, echo) in scan.echoes.iter().enumerate() {
             if usize::from(echo.sensor) == number && echo.is_return() {
@@ -182,6 +203,7 @@ impl<'a> Seen<'a> {
             (0..shots).map(|_| random.random_range(-0.5..0.5)).collect()
         };
         Seen {
+            pose,
             edges: [of_axis(0), of_axis(1)],
             rows_rad: &sensors.patterns[number].rows_rad,
             field,
@@ -194,40 +216,61 @@ impl<'a> Seen<'a> {
 
     /// Whether a surface lies around a direction of the sensor's frame.
     fn is_hole(&self, own: &Vector3<f64>) -> bool {
-        let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(*own));
-        self.around.look(azimuth as f32, elevation as f32, None).surface.is_some()
+        let [azimuth, elevation] = towards(own);
+        self.around.look(azimuth, elevation, None).surface.is_some()
     }
 
     /// What the true ray of a shot meets. The shot is reported as `echo`, in the direction `own`; `error` moves that
     /// ray to the true one, both in the sensor's frame.
-    fn meet(&self, own: &Vector3<f64>, error: &Pose, echo: &Echo, pose: &Pose) -> Option<Met> {
+    fn meet(&self, own: &Vector3<f64>, error: &Pose, echo: &Echo) -> Option<Met> {
         let (direction, shift) = (&(error.rotation * own), &error.translation.vector);
-        let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(*own)).map(|v| v as f32);
+        let [azimuth, elevation] = towards(own);
         let on_surface = echo.is_return() && echo.normal != [0.0; 3];
         let surface = on_surface.then(|| self.around.look(azimuth, elevation, None).surface).flatten();
         let ray = TrueRay {
             direction,
             shift,
-            pose,
+            pose: &self.pose,
             reported: [azimuth, elevation],
             on_surface: on_surface.then_some(echo),
             error_m: surface.map(|(own, _)| f64::from(echo.range_m) - own.range_m),
         };
-        // Where the ray is at the range of what it meets, seen from the reported origin. Twice, since that range is
-        // not known before.
-        let mut range_m = if echo.is_return() { f64::from(echo.range_m) } else { 50.0 };
-        let mut met = None;
+        self.along(&ray, about_m(echo), |towards| self.at(towards, &ray))
+    }
+
+    /// What the true ray of a shot of another sensor meets within the field of view of this one. `own` is its direction
+    /// in the frame of its sensor, from which `true_ray` leads to the true ray in the frame of this one.
+    fn meet_of_another(&self, own: &Vector3<f64>, true_ray: &Pose, echo: &Echo) -> Option<Met> {
+        let (direction, shift) = (&(true_ray.rotation * own), &true_ray.translation.vector);
+        let reported = towards(direction);
+        let ray = TrueRay { direction, shift, pose: &self.pose, reported, on_surface: None, error_m: None };
+        self.along(&ray, about_m(echo), |towards| if self.is_outside(towards) { None } else { self.at(towards, &ray) })
+    }
+
+    /// What `at` says where a ray is at the range of what it meets, seen from the reported origin. Twice, since that
+    /// range is not known before.
+    fn along(&self, ray: &TrueRay, about_m: f64, at: impl Fn([f32; 2]) -> Option<Met>) -> Option<Met> {
+        let (mut range_m, mut met) = (about_m, None);
         for _ in 0..2 {
-            let [azimuth, elevation, _] = Sensor::spherical(&Point3::from(shift + direction * range_m));
-            met = self.at([azimuth as f32, elevation as f32], &ray);
+            met = at(towards(&(ray.shift + ray.direction * range_m)));
             range_m = f64::from(met.as_ref()?.range_m);
         }
         met
     }
 
+    /// Whether the true ray of a shot is outside of the field of view where its return is.
+    fn is_left(&self, own: &Vector3<f64>, error: &Pose, echo: &Echo) -> bool {
+        self.is_outside(towards(&(error.translation.vector + error.rotation * own * about_m(echo))))
+    }
+
+    /// Whether a direction is outside of the field of view.
+    fn is_outside(&self, towards: [f32; 2]) -> bool {
+        towards.iter().zip(&self.field).any(|(v, [low, high])| v < low || v > high)
+    }
+
     /// What a true ray meets if it meets it in a direction from the reported origin.
     fn at(&self, [azimuth, elevation]: [f32; 2], ray: &TrueRay) -> Option<Met> {
-        let outside = [azimuth, elevation].iter().zip(&self.field).any(|(v, [low, high])| v < low || v > high);
+        let outside = self.is_outside([azimuth, elevation]);
         // Beyond the field of view surfaces go on as they are at its end.
         let beyond_m = if outside { ray.on_own_surface_m() } else { None };
         let beyond = beyond_m.map(|range_m| Met { range_m, on: None });
@@ -300,7 +343,10 @@ mod tests {
     use super::*;
     use crate::cloud_scan::{CloudReader, Surfaces};
     use crate::effects::testing::{rig, scene, with_frame};
+    use crate::rig::Rig;
+    use data::Cloud;
     use nalgebra::Translation3;
+    use std::path::Path;
 
     /// A sensor that truly looks 0.5 degrees further down and stands 10 cm further back meets the ground nearer and the
     /// wall farther; what it reports keeps its rows.
@@ -368,6 +414,48 @@ mod tests {
         }
         let share = over as f64 / frames as f64;
         assert!((share - 0.3).abs() < 0.08, "{share}");
+    }
+
+    /// Two sensors share a corner of two walls: what rays of the first one meet beyond its field of view is what the
+    /// second one shows.
+    #[test]
+    fn beyond_the_field_of_view_another_sensor_shows_what_a_ray_meets() {
+        let text = "[[sensor]]\nname = \"ahead\"\nhorizontal_fov_deg = 60\n\
+                    [[sensor]]\nname = \"left\"\nyaw_deg = 60\nhorizontal_fov_deg = 60\n";
+        let rig = Rig::parse(text, Path::new("rig.toml")).unwrap();
+        // Range of the wall at an azimuth, degrees: 20 m ahead, and 12 m to the left of 30 degrees.
+        let wall_m = |azimuth: f64| {
+            if azimuth < 30.0 { 20.0 / azimuth.to_radians().cos() } else { 12.0 / (azimuth - 60.0).to_radians().cos() }
+        };
+        let mut cloud = Cloud::new(4);
+        for (row, column) in (0..20).flat_map(|row| (0..239).map(move |column| (row, column))) {
+            let (azimuth, up) = (-29.7 + 0.5 * f64::from(column), (-5.0 + 0.5 * f64::from(row)).to_radians().tan());
+            let (range, (s, c)) = (wall_m(azimuth), azimuth.to_radians().sin_cos());
+            cloud.values.extend([range * c, range * s, range * up, 0.5].map(|v| v as f32));
+        }
+        let reader = CloudReader::new(&rig, std::slice::from_ref(&cloud));
+        let before = reader.scan(&cloud, &Surfaces::default());
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 4f64.to_radians());
+        let to_the_left = Pose::from_parts(Translation3::identity(), turn);
+        let after = with_frame(0, |frame, draws| {
+            let mut scan = before.clone();
+            let frame = FrameContext { rig: &rig, sensors: Some(reader.sensors()), ..*frame };
+            reshoot(&mut scan, &frame, draws, |_, e| (e.sensor == 0).then_some(to_the_left));
+            scan
+        });
+        let mut beyond = 0;
+        for echo in after.returns().filter(|e| e.sensor == 0) {
+            let [x, y, z] = echo.direction.map(f64::from);
+            let true_deg = y.atan2(x).to_degrees() + 4.0;
+            // Away from the corner.
+            if (true_deg - 30.0).abs() > 1.0 {
+                let want = wall_m(true_deg) / z.asin().cos();
+                let range_m = f64::from(echo.range_m);
+                assert!((range_m / want - 1.0).abs() < 2e-3, "{range_m} {want} at {true_deg}");
+                beyond += usize::from(true_deg > 30.0);
+            }
+        }
+        assert!(beyond > 60, "{beyond}");
     }
 
     #[test]

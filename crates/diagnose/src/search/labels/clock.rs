@@ -8,7 +8,7 @@ use nalgebra::{DMatrix, DVector};
 
 /// Range of the ego speed, m/s: within 30 to 40 % of the estimate from the scenes, or that of any vehicle.
 pub(super) fn own_speeds(motion: Option<&[Option<OwnMotion>]>) -> [f64; 2] {
-    match median(motion.into_iter().flatten().flatten().map(|m| m.speed_m_s).collect()) {
+    match median(motion.into_iter().flatten().flatten().map(|m| m.speed_m_s()).collect()) {
         v if v > 5.0 => [0.7 * v, 1.4 * v],
         _ => [4.0, 90.0],
     }

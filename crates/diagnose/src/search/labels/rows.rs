@@ -150,8 +150,7 @@ fn velocity_columns(
         known[4] = false;
         return (None, known);
     };
-    let carried = Vector3::new(own.speed_m_s, 0.0, 0.0) + Vector3::new(0.0, 0.0, own.yaw_rate_rad_s).cross(center);
-    let carried = axes(carried);
+    let carried = axes(own.velocity_at(center));
     (0..3).for_each(|k| x[k][4] = seen[k] + carried[k]);
     (Some(x[0][4]), known)
 }

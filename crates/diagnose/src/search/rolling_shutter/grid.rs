@@ -1,0 +1,54 @@
+//! Numbers of points on the simulation by the duration of a scan.
+
+/// Counts on a grid of durations.
+pub(super) struct Grid {
+    /// The duration with the most points in occupied cells.
+    pub(super) best: f64,
+    /// All durations and the numbers of points in occupied cells.
+    pub(super) sums: Vec<(f64, f64)>,
+    /// Increase of that number on each frame over no displacement.
+    pub(super) gains: Vec<f64>,
+    /// Smallest and largest number over all durations.
+    pub(super) least: f64,
+    pub(super) most: f64,
+}
+
+impl Grid {
+    /// The highest local maximum among the durations that are `wanted`.
+    pub(super) fn peak(&self, wanted: impl Fn(f64) -> bool) -> Option<f64> {
+        let maxima = self.sums.windows(3).filter(|w| w[1].1 >= w[0].1 && w[1].1 >= w[2].1).map(|w| w[1]);
+        maxima.filter(|(at, _)| wanted(*at)).max_by(|a, b| a.1.total_cmp(&b.1)).map(|(at, _)| at)
+    }
+
+    /// Number of points at a duration relative to the most of any duration.
+    pub(super) fn share_at(&self, duration: f64) -> f64 {
+        let on = self.sums.iter().find(|(at, _)| *at == duration).map_or(0.0, |(_, on)| *on);
+        on / self.most.max(1.0)
+    }
+}
+
+/// The duration with the most points in occupied cells: the mean of the durations whose counts are within 15 % of the
+/// best, in units of the difference between best and worst, weighted by what exceeds that.
+pub(super) fn peak(times: &[f64], counts: &[Vec<f64>], which: &[usize]) -> f64 {
+    let sums: Vec<f64> = (0..times.len()).map(|k| which.iter().map(|&i| counts[i][k]).sum()).collect();
+    let [low, high] = [sums.iter().copied().fold(f64::INFINITY, f64::min), sums.iter().copied().fold(0.0, f64::max)];
+    let weight = |s: f64| (s - (high - 0.15 * (high - low))).max(0.0);
+    let total: f64 = sums.iter().map(|s| weight(*s)).sum();
+    sums.iter().zip(times).map(|(s, t)| weight(*s) * t).sum::<f64>() / total.max(1e-9)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_highest_of_the_wanted_maxima_counts() {
+        let counts = [5.0, 90.0, 60.0, 95.0, 94.0, 100.0, 97.0];
+        let sums = (-3..=3).map(f64::from).zip(counts).collect();
+        let grid = Grid { best: 2.0, sums, gains: vec![], least: 5.0, most: 100.0 };
+        assert_eq!(grid.peak(|_| true), Some(2.0));
+        assert_eq!(grid.peak(|at| at < 1.5), Some(0.0));
+        assert_eq!(grid.peak(|at| at.abs() > 2.5), None);
+        assert_eq!((grid.share_at(-2.0), grid.share_at(0.5)), (0.9, 0.0));
+    }
+}

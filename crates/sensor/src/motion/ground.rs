@@ -1,0 +1,129 @@
+//! Motion out of the plane from frame to frame, from the ground: on a banked or hilly road the axis of a turn is not
+//! upright in the frame of the vehicle.
+
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use statistics::median_upper;
+
+/// A point of the ground and its unit normal, cloud's frame, m.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GroundPoint {
+    /// The point.
+    pub place: Vector3<f64>,
+    /// Upward normal.
+    pub normal: Vector3<f64>,
+}
+
+/// Points of a frame that are used, at most.
+const SOME: usize = 1500;
+
+/// Largest distance between two points that are on one plane of the road, m.
+const REACH_M: f64 = 2.0;
+
+/// Fewest pairs of points.
+const FEWEST: usize = 100;
+
+/// Rounds of the robust fit.
+const ROUNDS: usize = 4;
+
+/// The ground of a frame.
+pub(super) struct Ground {
+    points: Vec<GroundPoint>,
+    /// By place in bird's-eye view; `None` without points.
+    tree: Option<ImmutableKdTree<f64, 2>>,
+}
+
+impl Ground {
+    pub(super) fn new(points: &[GroundPoint]) -> Self {
+        let stride = points.len().div_ceil(SOME).max(1);
+        let points: Vec<GroundPoint> = points.iter().step_by(stride).copied().collect();
+        let places: Vec<[f64; 2]> = points.iter().map(|g| [g.place.x, g.place.y]).collect();
+        let tree = ImmutableKdTree::new_from_slice(&places).ok().filter(|_| !places.is_empty());
+        Ground { tree, points }
+    }
+
+    fn nearest(&self, p: &Vector3<f64>) -> Option<&GroundPoint> {
+        let found = self.tree.as_ref()?.query(&[p.x, p.y]).nearest_one::<SquaredEuclidean<f64>>().execute();
+        (found.distance < REACH_M * REACH_M).then(|| &self.points[found.item as usize])
+    }
+}
+
+/// Climb, m, and turns about the forward and the left axis, rad, of a vehicle that moves ahead by `d` along its mean
+/// heading and turns by `yaw`: the least squares of the distances of the ground of the first frame from the planes of
+/// the second one, with Tukey's weights. `None` with too few points.
+pub(super) fn tilt(first: &Ground, second: &Ground, d: f64, yaw: f64) -> Option<[f64; 3]> {
+    let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), -yaw);
+    let way = Vector3::new(d * (0.5 * yaw).cos(), d * (0.5 * yaw).sin(), 0.0);
+    // Distance from the plane, and its derivatives by the three.
+    let distance = |g: &GroundPoint| {
+        let p = turn * (g.place - way);
+        let near = second.nearest(&p)?;
+        let arm = p.cross(&near.normal);
+        Some((near.normal.dot(&(p - near.place)), Vector3::new(near.normal.z, arm.x, arm.y)))
+    };
+    let rows: Vec<(f64, Vector3<f64>)> = first.points.iter().filter_map(distance).collect();
+    if rows.len() < FEWEST {
+        return None;
+    }
+    let mut found = Vector3::zeros();
+    for _ in 0..ROUNDS {
+        let left = |(e, x): &(f64, Vector3<f64>)| e - x.dot(&found);
+        let width = 4.7 * 1.4826 * median_upper(rows.iter().map(|r| left(r).abs()).collect())?.max(1e-4);
+        let (mut gram, mut right) = (Matrix3::zeros(), Vector3::zeros());
+        for row in &rows {
+            let weight = (1.0 - (left(row) / width).powi(2)).max(0.0).powi(2);
+            gram += row.1 * row.1.transpose() * weight;
+            right += row.1 * (row.0 * weight);
+        }
+        found = gram.cholesky()?.solve(&right);
+    }
+    // The vehicle also moves along its mean heading out of the plane.
+    Some([found.x + 0.5 * d * found.z, found.y, found.z])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Rotation3;
+
+    /// The ground that a vehicle sees after `driven` m on a circle of 100 m on a cone that falls to the inside with a
+    /// slope of 0.3; `at` are places in its frame.
+    fn seen(driven: f64, at: impl Iterator<Item = [f64; 2]>) -> Ground {
+        let (radius, slope) = (100.0, 0.3_f64);
+        let angle = driven / radius;
+        let height = |p: &Vector3<f64>| slope * (p.xy().norm() - radius);
+        let place = Vector3::new(radius * angle.sin(), -radius * angle.cos(), 0.0);
+        let bank = Rotation3::from_axis_angle(&Vector3::x_axis(), -slope.atan());
+        let world_from_ego = Rotation3::from_axis_angle(&Vector3::z_axis(), angle) * bank;
+        let points: Vec<GroundPoint> = at
+            .map(|[x, y]| {
+                // The point of the ground above or below a place in the plane of the vehicle.
+                let (mut z, up) = (0.0, world_from_ego * Vector3::z());
+                for _ in 0..20 {
+                    let p = place + world_from_ego * Vector3::new(x, y, z);
+                    z += (height(&p) - p.z) * up.z;
+                }
+                let p = place + world_from_ego * Vector3::new(x, y, z);
+                let out = p.xy() / p.xy().norm();
+                let normal = Vector3::new(-slope * out.x, -slope * out.y, 1.0).normalize();
+                GroundPoint { place: Vector3::new(x, y, z), normal: world_from_ego.inverse() * normal }
+            })
+            .collect();
+        Ground::new(&points)
+    }
+
+    #[test]
+    fn the_axis_of_a_turn_on_a_banked_road_is_not_upright() {
+        // A vehicle on the road stands across its slope; the road rises to the right, which is outside.
+        let lines = |off: f64| (0..1200).map(move |k| [f64::from(k % 40) - 20.0 + off, f64::from(k / 40) * 0.5 - 7.0]);
+        let (driven, bank) = (8.0, 0.3_f64.atan());
+        let turn = driven / 100.0;
+        let [climb_m, roll, pitch] =
+            tilt(&seen(0.0, lines(0.0)), &seen(driven, lines(0.37)), driven, turn * bank.cos()).unwrap();
+        assert!(climb_m.abs() < 0.02 && roll.abs() < 2e-3, "{climb_m} {roll}");
+        assert!((pitch + turn * bank.sin()).abs() < 2e-3, "{pitch}");
+        let nothing = Ground::new(&[]);
+        assert_eq!(tilt(&nothing, &seen(0.0, lines(0.0)), 1.0, 0.0), None);
+        assert_eq!(tilt(&seen(0.0, lines(0.0)), &nothing, 1.0, 0.0), None);
+    }
+}
