@@ -286,7 +286,7 @@ impl<'a> FinishedDataset<'a> {
                 }
             }
         }
-        Standing { edges: static_edges(returns, boxes), ground }
+        Standing::new(static_edges(returns, boxes), &ground)
     }
 }
 

@@ -38,12 +38,17 @@ impl OwnMotion {
 }
 
 /// What of a frame stands still.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Standing {
-    /// Static edges in bird's-eye view, see [`static_edges`].
-    pub edges: Vec<Vector2<f64>>,
-    /// Points of the ground.
-    pub ground: Vec<GroundPoint>,
+    edges: Vec<Vector2<f64>>,
+    ground: Vec<GroundPoint>,
+}
+
+impl Standing {
+    /// Static edges in bird's-eye view, see [`static_edges`], and points of the ground, of which a part is kept.
+    pub fn new(edges: Vec<Vector2<f64>>, ground: &[GroundPoint]) -> Self {
+        Standing { edges, ground: ground::some(ground) }
+    }
 }
 
 /// Side of a cell in bird's-eye view, m.
@@ -245,7 +250,7 @@ struct Seen {
 impl Seen {
     fn new(standing: Standing) -> Self {
         let Standing { edges, ground } = standing;
-        Seen { taken: Cells::new(&edges), edges, ground: Ground::new(&ground) }
+        Seen { taken: Cells::new(&edges), edges, ground: Ground::new(ground) }
     }
 }
 
@@ -385,7 +390,7 @@ mod tests {
                 Vector2::new(yaw.cos() * q.x + yaw.sin() * q.y, -yaw.sin() * q.x + yaw.cos() * q.y)
             })
             .collect();
-        let seen = |edges: Vec<Vector2<f64>>| Seen::new(Standing { edges, ground: vec![] });
+        let seen = |edges: Vec<Vector2<f64>>| Seen::new(Standing::new(edges, &[]));
         let mut rng = data::stream(0, "elsewhere", 0, 0);
         let mut scattered = |n: usize, across_m: f64| {
             let mut at = |half: f64| if half > 0.0 { rng.random_range(-half..half) } else { 8.0 };

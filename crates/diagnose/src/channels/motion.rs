@@ -10,7 +10,7 @@ use sensor::motion::{GroundPoint, Standing};
 /// The motion at each frame; `None` where it cannot be estimated.
 pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) -> Vec<Option<OwnMotion>> {
     let of_frame =
-        |frame: &FramePair| Standing { edges: edges(frame, origins), ground: ground(frame, origins).collect() };
+        |frame: &FramePair| Standing::new(edges(frame, origins), &ground(frame, origins).collect::<Vec<_>>());
     sensor::motion::own_motion(frames.par_iter().map(of_frame).collect(), times)
 }
 

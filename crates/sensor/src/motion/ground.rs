@@ -26,6 +26,11 @@ const FEWEST: usize = 100;
 /// Rounds of the robust fit.
 const ROUNDS: usize = 4;
 
+/// Every so many of the points, so that few enough are left.
+pub(super) fn some(points: &[GroundPoint]) -> Vec<GroundPoint> {
+    points.iter().step_by(points.len().div_ceil(SOME).max(1)).copied().collect()
+}
+
 /// The ground of a frame.
 pub(super) struct Ground {
     points: Vec<GroundPoint>,
@@ -34,9 +39,7 @@ pub(super) struct Ground {
 }
 
 impl Ground {
-    pub(super) fn new(points: &[GroundPoint]) -> Self {
-        let stride = points.len().div_ceil(SOME).max(1);
-        let points: Vec<GroundPoint> = points.iter().step_by(stride).copied().collect();
+    pub(super) fn new(points: Vec<GroundPoint>) -> Self {
         let places: Vec<[f64; 2]> = points.iter().map(|g| [g.place.x, g.place.y]).collect();
         let tree = ImmutableKdTree::new_from_slice(&places).ok().filter(|_| !places.is_empty());
         Ground { tree, points }
@@ -109,7 +112,7 @@ mod tests {
                 GroundPoint { place: Vector3::new(x, y, z), normal: world_from_ego.inverse() * normal }
             })
             .collect();
-        Ground::new(&points)
+        Ground::new(points)
     }
 
     #[test]
@@ -122,7 +125,7 @@ mod tests {
             tilt(&seen(0.0, lines(0.0)), &seen(driven, lines(0.37)), driven, turn * bank.cos()).unwrap();
         assert!(climb_m.abs() < 0.02 && roll.abs() < 2e-3, "{climb_m} {roll}");
         assert!((pitch + turn * bank.sin()).abs() < 2e-3, "{pitch}");
-        let nothing = Ground::new(&[]);
+        let nothing = Ground::new(vec![]);
         assert_eq!(tilt(&nothing, &seen(0.0, lines(0.0)), 1.0, 0.0), None);
         assert_eq!(tilt(&seen(0.0, lines(0.0)), &nothing, 1.0, 0.0), None);
     }
