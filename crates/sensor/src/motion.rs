@@ -47,7 +47,7 @@ pub struct Standing {
 impl Standing {
     /// Static edges in bird's-eye view, see [`static_edges`], and points of the ground, of which a part is kept.
     pub fn new(edges: Vec<Vector2<f64>>, ground: &[GroundPoint]) -> Self {
-        Standing { edges, ground: ground::some(ground) }
+        Standing { edges, ground: some_of(ground, ground::SOME) }
     }
 }
 
@@ -254,6 +254,11 @@ impl Seen {
     }
 }
 
+/// Every so many of the values, so that at most `most` are left.
+fn some_of<T: Copy>(values: &[T], most: usize) -> Vec<T> {
+    values.iter().step_by(values.len().div_ceil(most).max(1)).copied().collect()
+}
+
 /// Number of edges that match edges of another frame if the vehicle moves ahead by `d` and turns by `yaw`, along its
 /// mean heading.
 fn hits(some: &[Vector2<f64>], other: &Seen, d: f64, yaw: f64) -> f64 {
@@ -281,8 +286,7 @@ struct Pair<'a> {
 
 impl<'a> Pair<'a> {
     fn new(first: &'a Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
-        let stride = first.edges.len().div_ceil(SOME);
-        let some = first.edges.iter().step_by(stride.max(1)).copied().collect();
+        let some = some_of(&first.edges, SOME);
         let mut pair = Pair { some, first, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
         if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt < LONGEST_S {
             let yaw_steps = (0.6 * dt / 0.009).ceil() as i32;

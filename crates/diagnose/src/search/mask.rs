@@ -247,7 +247,8 @@ struct Run {
 /// Own range, m, and intensity of a return from a part of the ego vehicle.
 type PartReturn = [f64; 2];
 
-/// Distance of two cells' returns from which on they are of different parts, m.
+/// Distance of the returns of two cells from which on they are of different parts, m: several times the noise of a
+/// range.
 const OTHER_PART_M: f64 = 0.05;
 
 impl Run {
@@ -313,13 +314,14 @@ fn hidden_directions(context: &Context, frames: &[usize], mask: &Mask) -> Vec<Ef
             true => runs.iter().map(|run| run.moments(of)).collect(),
             false => Vec::new(),
         };
+        let ranges = returns(0);
         let has_intensity = runs.iter().flat_map(|run| &run.shown).all(|r| r[1].is_finite());
         Effect::EgoBodyMask(EgoBodyMask {
             sensor: context.rig.sensors[usize::from(sensor)].name.clone(),
             boxes: vec![],
             directions: runs.iter().map(direction).collect(),
-            returns_m: returns(0).iter().map(|moments| moments[0]).collect(),
-            returns_std_m: returns(0).iter().map(|moments| moments[1]).collect(),
+            returns_m: ranges.iter().map(|moments| moments[0]).collect(),
+            returns_std_m: ranges.iter().map(|moments| moments[1]).collect(),
             returns_intensity: if has_intensity { returns(1) } else { vec![] },
         })
     };

@@ -155,7 +155,7 @@ pub fn search(context: &Context) -> Search {
     let best = (0..models.len()).max_by(|&a, &b| total(a).total_cmp(&total(b)));
     let Some(best) = best else { return Search::NotFound(result) };
     let (gain, z) = total_and_z(&grids[best].gains);
-    let significant = significant(&grids[best].gains, Z_STAR) && gain > LEAST_SHARE * (grids[best].most - gain);
+    let significant = significant(&grids[best].gains, Z_STAR) && gain > LEAST_SHARE * (grids[best].ends()[1] - gain);
     let considered = |outcome: &str| Considered {
         cause: Cause::RollingShutter.into(),
         channel: Channel::Slide,
@@ -165,18 +165,19 @@ pub fn search(context: &Context) -> Search {
     };
     result.minimum.push((Cause::RollingShutter, Minimum::new(Quantity::ShearXM, LEAST_M)));
     let far_enough = |k: usize, at: f64| at.abs() * models[k].fastest > LEAST_M;
-    let decided = significant && far_enough(best, grids[best].best);
+    let decided = significant && far_enough(best, grids[best].best());
     let outcome =
         if significant { "too small to be seen from above" } else { "no more returns come to lie on the simulation" };
     let not_found = ChannelResult { considered: vec![considered(outcome)], ..result.clone() };
     let chosen = if decided {
-        Some((best, grids[best].best))
+        Some((best, grids[best].best()))
     } else {
         // Along walls and fences a displaced scene may look like another one from above. Returns that lie off the
         // simulated surfaces say that there is something.
-        let peaks = (0..models.len()).filter_map(|k| grids[k].peak(|at| far_enough(k, at)).map(|at| (k, at)));
-        let highest = peaks.max_by(|a, b| grids[a.0].share_at(a.1).total_cmp(&grids[b.0].share_at(b.1)));
-        highest.filter(|(k, at)| grids[*k].share_at(*at) > 1.0 - LEAST_SHARE && surfaces_stand_elsewhere(context))
+        let peaks = (0..models.len()).filter_map(|k| Some((k, grids[k].highest(|at| far_enough(k, at))?)));
+        let highest = peaks.max_by(|a, b| a.1.1.total_cmp(&b.1.1));
+        let as_high = highest.filter(|(_, (_, share))| *share > 1.0 - LEAST_SHARE);
+        as_high.filter(|_| surfaces_stand_elsewhere(context)).map(|(k, (at, _))| (k, at))
     };
     let Some((k, at)) = chosen else { return Search::NotFound(not_found) };
     let (grid, model) = (grids.swap_remove(k), models.swap_remove(k));
@@ -199,7 +200,7 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     let Some((model, grid)) = fits.max_by(|a, b| sum(&a.1).total_cmp(&sum(&b.1))) else {
         return vec![0.0; test.len()];
     };
-    model.gains_of(&grid, grid.best, train, test)
+    model.gains_of(&grid, grid.best(), train, test)
 }
 
 /// The duration of a scan, fitted on the estimating frames.
@@ -346,7 +347,7 @@ impl Model {
     fn gains_of(&self, grid: &Grid, scan_s: f64, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
         let points = self.points(select);
         let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
-        let [chance, there] = [grid.least, grid.most].map(share);
+        let [chance, there] = grid.ends().map(share);
         let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
         let gain = |&f: &usize| {
             let view = &self.frames[f];
@@ -362,13 +363,7 @@ impl Model {
         let sums: Vec<f64> = (0..grid.len()).map(|k| on.iter().map(|c| c[k]).sum()).collect();
         let still = STEPS as usize;
         let best = (0..grid.len()).max_by(|&a, &b| sums[a].total_cmp(&sums[b])).unwrap_or(still);
-        Grid {
-            best: grid[best],
-            sums: grid.iter().copied().zip(sums.iter().copied()).collect(),
-            gains: on.iter().map(|c| c[best] - c[still]).collect(),
-            least: sums.iter().copied().fold(f64::INFINITY, f64::min),
-            most: sums[best],
-        }
+        Grid { gains: on.iter().map(|c| c[best] - c[still]).collect(), sums: grid.into_iter().zip(sums).collect() }
     }
 }
 

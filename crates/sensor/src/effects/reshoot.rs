@@ -62,15 +62,11 @@ pub(super) fn reshoot(
         return;
     };
     let mut random = draws.of_edges();
-    let moves = |number: usize| {
-        let mut own = scan.echoes.iter().enumerate().filter(|(_, e)| usize::from(e.sensor) == number);
-        own.any(|(i, e)| true_from_reported(i, e).is_some())
-    };
-    let moved: Vec<bool> = (0..sensors.rig.sensors.len()).map(moves).collect();
-    if !moved.contains(&true) {
+    if !scan.echoes.iter().enumerate().any(|(i, echo)| true_from_reported(i, echo).is_some()) {
         return;
     }
-    let all: Vec<Seen> = (0..moved.len()).map(|number| Seen::new(scan, sensors, number, &mut random)).collect();
+    let sensor_numbers = 0..sensors.rig.sensors.len();
+    let all: Vec<Seen> = sensor_numbers.map(|number| Seen::new(scan, sensors, number, &mut random)).collect();
     let before = scan.echoes.clone();
     for (i, echo) in scan.echoes.iter_mut().enumerate() {
         let Some(true_from_reported) = true_from_reported(i, &before[i]) else { continue };
@@ -139,8 +135,6 @@ struct TrueRay<'a> {
     /// Direction and start, m, in the sensor's frame.
     direction: &'a Vector3<f64>,
     shift: &'a Vector3<f64>,
-    /// Pose of the sensor in the cloud's frame.
-    pose: &'a Pose,
     /// Azimuth and elevation of the reported ray, rad.
     reported: [f32; 2],
     /// The shot where it is reported on a surface.
@@ -150,10 +144,10 @@ struct TrueRay<'a> {
 }
 
 impl TrueRay<'_> {
-    /// Range at which the ray meets the plane of the surface on which the shot is reported, m.
-    fn on_own_surface_m(&self) -> Option<f32> {
-        let [direction, shift] =
-            [self.direction, self.shift].map(|v| (self.pose.rotation * v).map(|x| x as f32).into());
+    /// Range at which the ray meets the plane of the surface on which the shot is reported, m. `pose` is that of the
+    /// sensor in the cloud's frame.
+    fn on_own_surface_m(&self, pose: &Pose) -> Option<f32> {
+        let [direction, shift] = [self.direction, self.shift].map(|v| (pose.rotation * v).map(|x| x as f32).into());
         let mut own = *self.on_surface?;
         measure_along(&mut own, direction);
         Some((own.range_m - dot(own.normal, shift) / dot(own.normal, direction).min(-1e-3)).max(0.01))
@@ -230,7 +224,6 @@ impl<'a> Seen<'a> {
         let ray = TrueRay {
             direction,
             shift,
-            pose: &self.pose,
             reported: [azimuth, elevation],
             on_surface: on_surface.then_some(echo),
             error_m: surface.map(|(own, _)| f64::from(echo.range_m) - own.range_m),
@@ -243,7 +236,7 @@ impl<'a> Seen<'a> {
     fn meet_of_another(&self, own: &Vector3<f64>, true_ray: &Pose, echo: &Echo) -> Option<Met> {
         let (direction, shift) = (&(true_ray.rotation * own), &true_ray.translation.vector);
         let reported = towards(direction);
-        let ray = TrueRay { direction, shift, pose: &self.pose, reported, on_surface: None, error_m: None };
+        let ray = TrueRay { direction, shift, reported, on_surface: None, error_m: None };
         self.along(&ray, about_m(echo), |towards| if self.is_outside(towards) { None } else { self.at(towards, &ray) })
     }
 
@@ -272,7 +265,7 @@ impl<'a> Seen<'a> {
     fn at(&self, [azimuth, elevation]: [f32; 2], ray: &TrueRay) -> Option<Met> {
         let outside = self.is_outside([azimuth, elevation]);
         // Beyond the field of view surfaces go on as they are at its end.
-        let beyond_m = if outside { ray.on_own_surface_m() } else { None };
+        let beyond_m = if outside { ray.on_own_surface_m(&self.pose) } else { None };
         let beyond = beyond_m.map(|range_m| Met { range_m, on: None });
         let [beside, above] = self.on_the_side_of(ray.reported, [azimuth, elevation]);
         let Some((nearest, near)) = self.nearest(beside, above) else { return beyond };
@@ -293,7 +286,7 @@ impl<'a> Seen<'a> {
             let range_m = (nearest_m - ray.shift.dot(ray.direction)).max(0.01) as f32;
             return near.then_some(Met { range_m, on });
         };
-        let meets = ray.pose.rotation.inverse() * normal;
+        let meets = self.pose.rotation.inverse() * normal;
         // The plane around the true direction, met from the true origin.
         let [az, el] = [azimuth, elevation].map(f64::from);
         let seen = Vector3::new(el.cos() * az.cos(), el.cos() * az.sin(), el.sin()) * surface.range_m;

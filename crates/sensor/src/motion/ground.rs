@@ -3,7 +3,7 @@
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::{Matrix3, Rotation3, Vector3};
-use statistics::median_upper;
+use statistics::{MEDIAN_OF_NORMAL, median_upper};
 
 /// A point of the ground and its unit normal, cloud's frame, m.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,7 +15,7 @@ pub struct GroundPoint {
 }
 
 /// Points of a frame that are used, at most.
-const SOME: usize = 1500;
+pub(super) const SOME: usize = 1500;
 
 /// Largest distance between two points that are on one plane of the road, m.
 const REACH_M: f64 = 2.0;
@@ -26,10 +26,8 @@ const FEWEST: usize = 100;
 /// Rounds of the robust fit.
 const ROUNDS: usize = 4;
 
-/// Every so many of the points, so that few enough are left.
-pub(super) fn some(points: &[GroundPoint]) -> Vec<GroundPoint> {
-    points.iter().step_by(points.len().div_ceil(SOME).max(1)).copied().collect()
-}
+/// Distance in standard deviations from which on Tukey's weight is zero: 95 % efficient for normal errors.
+const TUKEY: f64 = 4.7;
 
 /// The ground of a frame.
 pub(super) struct Ground {
@@ -71,7 +69,8 @@ pub(super) fn tilt(first: &Ground, second: &Ground, d: f64, yaw: f64) -> Option<
     let mut found = Vector3::zeros();
     for _ in 0..ROUNDS {
         let left = |(e, x): &(f64, Vector3<f64>)| e - x.dot(&found);
-        let width = 4.7 * 1.4826 * median_upper(rows.iter().map(|r| left(r).abs()).collect())?.max(1e-4);
+        let usual = median_upper(rows.iter().map(|r| left(r).abs()).collect())?;
+        let width = TUKEY * usual.max(1e-4) / MEDIAN_OF_NORMAL;
         let (mut gram, mut right) = (Matrix3::zeros(), Vector3::zeros());
         for row in &rows {
             let weight = (1.0 - (left(row) / width).powi(2)).max(0.0).powi(2);
@@ -87,7 +86,6 @@ pub(super) fn tilt(first: &Ground, second: &Ground, d: f64, yaw: f64) -> Option<
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::Rotation3;
 
     /// The ground that a vehicle sees after `driven` m on a circle of 100 m on a cone that falls to the inside with a
     /// slope of 0.3; `at` are places in its frame.

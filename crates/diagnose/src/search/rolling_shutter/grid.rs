@@ -2,28 +2,28 @@
 
 /// Counts on a grid of durations.
 pub(super) struct Grid {
-    /// The duration with the most points in occupied cells.
-    pub(super) best: f64,
     /// All durations and the numbers of points in occupied cells.
     pub(super) sums: Vec<(f64, f64)>,
-    /// Increase of that number on each frame over no displacement.
+    /// Increase of that number on each frame, from no displacement to the best duration.
     pub(super) gains: Vec<f64>,
-    /// Smallest and largest number over all durations.
-    pub(super) least: f64,
-    pub(super) most: f64,
 }
 
 impl Grid {
-    /// The highest local maximum among the durations that are `wanted`.
-    pub(super) fn peak(&self, wanted: impl Fn(f64) -> bool) -> Option<f64> {
-        let maxima = self.sums.windows(3).filter(|w| w[1].1 >= w[0].1 && w[1].1 >= w[2].1).map(|w| w[1]);
-        maxima.filter(|(at, _)| wanted(*at)).max_by(|a, b| a.1.total_cmp(&b.1)).map(|(at, _)| at)
+    /// The duration with the most points in occupied cells.
+    pub(super) fn best(&self) -> f64 {
+        self.sums.iter().max_by(|a, b| a.1.total_cmp(&b.1)).map_or(0.0, |(at, _)| *at)
     }
 
-    /// Number of points at a duration relative to the most of any duration.
-    pub(super) fn share_at(&self, duration: f64) -> f64 {
-        let on = self.sums.iter().find(|(at, _)| *at == duration).map_or(0.0, |(_, on)| *on);
-        on / self.most.max(1.0)
+    /// Smallest and largest number over all durations.
+    pub(super) fn ends(&self) -> [f64; 2] {
+        self.sums.iter().fold([f64::INFINITY, 0.0], |[low, high], (_, on)| [low.min(*on), high.max(*on)])
+    }
+
+    /// The highest local maximum among the durations that are `wanted`, and its number relative to the largest one.
+    pub(super) fn highest(&self, wanted: impl Fn(f64) -> bool) -> Option<(f64, f64)> {
+        let maxima = self.sums.windows(3).filter(|w| w[1].1 >= w[0].1 && w[1].1 >= w[2].1).map(|w| w[1]);
+        let highest = maxima.filter(|(at, _)| wanted(*at)).max_by(|a, b| a.1.total_cmp(&b.1));
+        highest.map(|(at, on)| (at, on / self.ends()[1].max(1.0)))
     }
 }
 
@@ -45,10 +45,11 @@ mod tests {
     fn the_highest_of_the_wanted_maxima_counts() {
         let counts = [5.0, 90.0, 60.0, 95.0, 94.0, 100.0, 97.0];
         let sums = (-3..=3).map(f64::from).zip(counts).collect();
-        let grid = Grid { best: 2.0, sums, gains: vec![], least: 5.0, most: 100.0 };
-        assert_eq!(grid.peak(|_| true), Some(2.0));
-        assert_eq!(grid.peak(|at| at < 1.5), Some(0.0));
-        assert_eq!(grid.peak(|at| at.abs() > 2.5), None);
-        assert_eq!((grid.share_at(-2.0), grid.share_at(0.5)), (0.9, 0.0));
+        let grid = Grid { sums, gains: vec![] };
+        assert_eq!((grid.best(), grid.ends()), (2.0, [5.0, 100.0]));
+        assert_eq!(grid.highest(|_| true), Some((2.0, 1.0)));
+        assert_eq!(grid.highest(|at| at < 1.5), Some((0.0, 0.95)));
+        assert_eq!(grid.highest(|at| at < -0.5), Some((-2.0, 0.9)));
+        assert_eq!(grid.highest(|at| at.abs() > 2.5), None);
     }
 }
