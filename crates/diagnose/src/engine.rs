@@ -2,6 +2,7 @@
 
 mod baked_in;
 mod curves;
+mod known;
 mod notes;
 mod report;
 mod verification;
@@ -10,6 +11,7 @@ pub(crate) use report::{refused, report};
 pub(crate) use verification::{Distances, GainFrames, set_reached};
 pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
+use self::known::Known;
 use self::notes::{leave_out_copies, limits, one_speed, without_rows};
 use self::report::corrected;
 use self::verification::{Verification, measure_gain};
@@ -218,10 +220,6 @@ fn context<'a>(rig: &'a Rig, frames: &'a [FramePair], notes: &mut Vec<String>) -
 /// Number of searches, for the progress that is shown.
 const SEARCHES: usize = 9;
 
-/// Quantisation step from which on the simulated side is rounded for all searches, m: coarse steps displace level
-/// ground by the distance of rows.
-const COARSE_M: f64 = 0.02;
-
 /// Smallest cosine of incidence for roughness where offsets of rows were corrected.
 const LEAST_COS: f64 = 0.12;
 
@@ -233,38 +231,6 @@ struct Engine<'a> {
     origins: Vec<Point3<f64>>,
     baked_in: &'a [Unidentifiable],
     progress: Progress<'a>,
-}
-
-/// What earlier searches found, to be corrected for later ones.
-struct Known {
-    slide: Option<Slide>,
-    /// Quantisation step, m.
-    step_m: Option<f64>,
-    displaced: Displacement,
-}
-
-impl Known {
-    /// Quantisation step that matters to where surfaces lie, m.
-    fn coarse_m(&self) -> Option<f64> {
-        self.step_m.filter(|step| *step > COARSE_M)
-    }
-
-    /// Displacement along the scan, m.
-    fn slide_m(&self, frame: usize, p: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
-        match &self.slide {
-            Some(slide) => slide.shift_m(frame, p, sensor),
-            None => Vector3::zeros(),
-        }
-    }
-
-    /// How the measured scene lies when silhouettes and single returns are compared.
-    fn shown(&self) -> Shown {
-        match (self.slide.is_some() || self.displaced.rows_aim_elsewhere(), self.displaced.moves()) {
-            (true, _) => Shown::Elsewhere,
-            (false, true) => Shown::MovedBack,
-            (false, false) => Shown::InPlace,
-        }
-    }
 }
 
 impl Engine<'_> {
@@ -296,7 +262,8 @@ impl Engine<'_> {
         let standing = self.standing(&known)?;
         let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
         self.finished(2);
-        let (geometry, displaced) = search::geometry::search(&context);
+        let undo = |displaced: &Displacement| self.undone(&known, displaced);
+        let (geometry, displaced) = search::geometry::search(&context, &undo)?;
         results.push(geometry);
         known.displaced = displaced;
         self.finished(3);
@@ -355,6 +322,15 @@ impl Engine<'_> {
         self.pair(Corrections { shift_m, step_m: known.coarse_m(), ..Corrections::default() }).map(Some)
     }
 
+    /// Frames with motion distortion, quantisation and a displacement undone, that of rows as well.
+    fn undone(&self, known: &Known, displaced: &Displacement) -> Result<Vec<FramePair>, DiagnoseError> {
+        self.pair(Corrections {
+            shift_m: Some(&|frame, p, sensor| known.shift_m(self, displaced, (frame, sensor), p)),
+            step_m: known.coarse_m(),
+            ..Corrections::default()
+        })
+    }
+
     /// Searches of silhouettes, single returns and intensities, on frames with the displacement of the scene undone;
     /// then of noise, with offsets of rows and quantisation corrected as well: they look like noise between
     /// neighbouring rows.
@@ -383,13 +359,15 @@ impl Engine<'_> {
         results.push(search::intensity::search(&seen, notes));
         drop(arrived);
         self.finished(6);
-        let turns: Vec<_> = context.rig.sensors.iter().map(|s| s.pose().rotation).collect();
-        let off = |ray: &Ray| displaced.of_range(ray, &turns[ray.sensor as usize]);
-        let uneven = !displaced.groups.is_empty();
-        let even = match (uneven, known.step_m) {
-            (false, None) => None,
-            _ => Some(self.pair(Corrections { range_m: uneven.then_some(&off), step_m: known.step_m, ..moved })?),
+        let uneven = displaced.is_uneven();
+        let in_row = |frame: usize, p: &Vector3<f64>, sensor: usize| known.shift_m(self, displaced, (frame, sensor), p);
+        let off = |ray: &Ray| displaced.of_strip(ray);
+        let even = Corrections {
+            shift_m: if displaced.rows.is_empty() { moved.shift_m } else { Some(&in_row) },
+            range_m: (!displaced.strips.is_empty()).then_some(&off),
+            step_m: known.step_m,
         };
+        let even = if uneven || known.step_m.is_some() { Some(self.pair(even)?) } else { None };
         let context = Context { frames: even.as_deref().unwrap_or(context.frames), ..context.clone() };
         results.push(search::noise::search(&context, if uneven { LEAST_COS } else { 0.0 }));
         Ok(results)

@@ -7,6 +7,7 @@ use crate::pairing::{FramePair, Ray};
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 use sensor::Rig;
+use std::collections::BTreeMap;
 
 /// How rays are grouped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,6 +90,8 @@ pub struct GroupSums {
     pub right: [f64; 2],
     /// Rays.
     pub n: f64,
+    /// Sum of the weights, where the squares of a column are divided by it to get its mean squared lever.
+    pub weight: f64,
 }
 
 impl GroupSums {
@@ -97,6 +100,7 @@ impl GroupSums {
         (0..3).for_each(|k| self.gram[k] += other.gram[k]);
         (0..2).for_each(|k| self.right[k] += other.right[k]);
         self.n += other.n;
+        self.weight += other.weight;
     }
 
     /// Subtracts a common level from the offset of one of the columns.
@@ -146,12 +150,32 @@ pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -
     -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
 }
 
-/// Sums of all frames. `structure` is the offset of each kind of surface, m.
+/// Offsets of rows that were undone before frames were paired: of the range, m, and of the elevation, rad.
+pub type Undone = BTreeMap<Group, [f64; 2]>;
+
+/// Where surfaces are seen but for the offsets that are fitted.
+#[derive(Clone, Copy)]
+pub struct Seen<'a> {
+    /// Pose of each frame as each sensor sees it.
+    pub poses: &'a [OwnPoses],
+    /// Offset of each kind of surface, m.
+    pub structure: [f64; KINDS],
+    /// Offsets of rows that were undone. They are added to what is left: the fit is of the whole offsets, with the
+    /// levers of the place where the rows were moved to.
+    pub undone: &'a Undone,
+}
+
+/// Distance across the surface that undone offsets of a row are, m, with the levers of both.
+pub fn undone_m(undone: &Undone, sensor: usize, row: u16, x: [f64; 2]) -> f64 {
+    let of_row = undone.get(&Group { sensor: sensor as u8, index: row });
+    of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad)
+}
+
+/// Sums of all frames.
 pub fn group_frames(
     frames: &[FramePair],
     rig: &Rig,
-    poses: &[OwnPoses],
-    structure: [f64; KINDS],
+    seen: Seen,
     grouping: Grouping,
     noise_m: f64,
     design: f64,
@@ -170,13 +194,14 @@ pub fn group_frames(
             if y.abs() > STRAY_M {
                 continue;
             }
-            let y = y - structure[super::mean::kind_of(ray)];
             let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
+            let y = y - seen.structure[super::mean::kind_of(ray)] + undone_m(seen.undone, sensor, ray.row, x);
             let w = weight(ray, noise_m) / design;
             sums[sensor][usize::from(group.index)][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {
                 gram: [w * x[0] * x[0], w * x[0] * x[1], w * x[1] * x[1]],
                 right: [w * x[0] * y, w * x[1] * y],
                 n: 1.0,
+                weight: w,
             });
         }
         std::array::from_fn(|part| {
@@ -188,7 +213,7 @@ pub fn group_frames(
             sums.iter().enumerate().flat_map(of_sensor).collect()
         })
     };
-    frames.par_iter().zip(poses).map(one).collect()
+    frames.par_iter().zip(seen.poses).map(one).collect()
 }
 
 /// Sums over the parts of a frame.
@@ -197,8 +222,8 @@ pub fn whole(frame: &PartedFrame) -> GroupFrame {
 }
 
 /// Sums over frames, by group.
-pub fn total<'a>(frames: impl Iterator<Item = &'a GroupFrame>) -> std::collections::BTreeMap<Group, GroupSums> {
-    let mut all = std::collections::BTreeMap::<Group, GroupSums>::new();
+pub fn total<'a>(frames: impl Iterator<Item = &'a GroupFrame>) -> BTreeMap<Group, GroupSums> {
+    let mut all = BTreeMap::<Group, GroupSums>::new();
     for (i, sums) in frames.flatten() {
         all.entry(*i).or_default().merge(sums);
     }

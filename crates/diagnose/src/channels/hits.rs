@@ -113,7 +113,7 @@ pub fn loss_groups(
             let w = n * n / (TOGETHER * (alone + odd + 2.0));
             // One-to-one matching leaves as many returns without a counterpart on both sides.
             let y = (alone - lost) / n - odd / f64::max(seen, 1.0);
-            out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n }));
+            out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n, weight: w }));
         }
         out
     };

@@ -349,6 +349,7 @@ impl Scale {
                     gram: [s.weight, 0.0, 0.0],
                     right: [s.weight * (s.y - law(&s)), 0.0],
                     n: 1.0,
+                    weight: s.weight,
                 });
             }
             sums.map(|part| part.into_iter().collect())

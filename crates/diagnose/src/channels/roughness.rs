@@ -164,7 +164,7 @@ pub fn rough_groups(
             let y = a[1] / a[0] - b[1] / b[0];
             // Neighbouring returns share neighbours: half of the weight.
             let w = 1.0 / (2.0 * (a[2] / (a[0] * a[0]) + b[2] / (b[0] * b[0])));
-            out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n: a[0] }));
+            out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n: a[0], weight: w }));
         }
         out
     };

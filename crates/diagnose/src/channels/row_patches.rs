@@ -2,7 +2,7 @@
 //! over a few rows that meet it side by side this is an offset and a slope along it, which are integrated out. What is
 //! left belongs to the rows.
 
-use super::groups::{Group, PARTS, elevation_lever, part_of};
+use super::groups::{Group, PARTS, Seen, elevation_lever, part_of, undone_m};
 use super::mean::{KINDS, OwnPoses, STRAY_M, kind_of, origins, pose_row, usable, weight};
 use crate::pairing::{FramePair, Surface};
 use nalgebra::{DMatrix, DVector, Matrix2, Point3, Vector2};
@@ -40,6 +40,7 @@ pub type Offsets = [Vec<f64>; COLUMNS];
 pub struct Band {
     gram: Vec<[[[f64; COLUMNS]; COLUMNS]; WIDE]>,
     right: Vec<[f64; COLUMNS]>,
+    weight: Vec<f64>,
 }
 
 impl Band {
@@ -48,6 +49,7 @@ impl Band {
         if self.right.len() < rows {
             self.gram.resize(rows, Default::default());
             self.right.resize(rows, [0.0; COLUMNS]);
+            self.weight.resize(rows, 0.0);
         }
     }
 
@@ -59,6 +61,7 @@ impl Band {
                 (0..WIDE).for_each(|k| self.gram[row][k][a][b] += gram[k][a][b]);
             }
             (0..COLUMNS).for_each(|c| self.right[row][c] += right[c]);
+            self.weight[row] += other.weight[row];
         }
     }
 
@@ -103,6 +106,11 @@ impl Band {
         self.right.len()
     }
 
+    /// Mean squared lever of the offset of a row in one column, without the part that its patches absorb.
+    pub fn squared_lever(&self, row: usize, column: usize) -> f64 {
+        self.precision(row, column) / self.weight.get(row).map_or(1.0, |w| w.max(1e-12))
+    }
+
     /// Information about the offset of a row in one column.
     pub fn precision(&self, row: usize, column: usize) -> f64 {
         self.gram.get(row).map_or(0.0, |g| g[0][column][column])
@@ -139,8 +147,8 @@ struct Cell {
     wyy: f64,
 }
 
-/// The sums of all frames. `poses` are the frames' own.
-pub fn row_frames(frames: &[FramePair], rig: &Rig, poses: &[OwnPoses], noise_m: f64) -> Vec<RowFrame> {
+/// The sums of all frames. Offsets of surfaces are integrated out.
+pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> Vec<RowFrame> {
     let origins = origins(rig);
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
@@ -156,6 +164,7 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, poses: &[OwnPoses], noise_m: 
             let part = part_of(ray, super::groups::Grouping::Row, half_fov[sensor]);
             let strip = (f64::from(ray.azimuth_rad) / AZIMUTH_RAD).floor() as i32;
             let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
+            let y = y + undone_m(seen.undone, sensor, ray.row, x);
             let rows = strips.entry((sensor, part, strip, kind_of(ray).min(KINDS - 1))).or_default();
             let (sin, cos) = f64::from(ray.elevation_rad).sin_cos();
             let along = if ray.surface == Surface::Ground { cos } else { sin };
@@ -178,7 +187,7 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, poses: &[OwnPoses], noise_m: 
         }
         out
     };
-    frames.par_iter().zip(poses).map(one).collect()
+    frames.par_iter().zip(seen.poses).map(one).collect()
 }
 
 impl Cell {
@@ -218,6 +227,7 @@ fn add_patch(frame: &mut RowFrame, cells: &[(usize, Cell)], sensor: usize, part:
     let band = &mut frame.sensors[sensor][part];
     band.grow(cells.last().map_or(0, |(r, _)| r + 1));
     for (i, (row, c)) in cells.iter().enumerate() {
+        band.weight[*row] += 0.5 * c.w;
         for a in 0..COLUMNS {
             let across = inverse * place(c) * c.wx[a];
             band.right[*row][a] += 0.5 * (c.wxy[a] - across.dot(&of_own));

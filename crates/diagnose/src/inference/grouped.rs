@@ -129,7 +129,11 @@ fn known(
 ) -> BTreeMap<Group, (f64, f64)> {
     let known = sums.iter().filter(|(_, s)| s.gram[2 * how.column] > 3.0 * how.precision);
     let with_noise = |(k, s): (&Group, &GroupSums)| Some((*k, (*offsets.get(k)?, 1.0 / s.gram[2 * how.column])));
-    let mut known: BTreeMap<Group, (f64, f64)> = known.filter_map(with_noise).collect();
+    best_known(known.filter_map(with_noise).collect())
+}
+
+/// Offsets with their variances, without those that are known much worse than the others.
+fn best_known(mut known: BTreeMap<Group, (f64, f64)>) -> BTreeMap<Group, (f64, f64)> {
     let usual = median(known.values().map(|(_, noise)| *noise).collect());
     known.retain(|_, (_, noise)| *noise <= WORSE * usual);
     known
@@ -153,10 +157,10 @@ fn spread_of(known: BTreeMap<Group, (f64, f64)>, trimmed: f64) -> (f64, f64) {
 /// Ratio of the spread to the spread about the neighbours above which rows are shifted together.
 const TOGETHER: f64 = 1.12;
 
-/// The same for rows. A displaced wall shifts many rows together. Where the spread about the mean of the neighbours
-/// is significantly smaller than for independent rows, it is returned.
-pub fn spread_of_rows(sums: &BTreeMap<Group, GroupSums>, offsets: &BTreeMap<Group, f64>, how: GroupFit) -> (f64, f64) {
-    let known = known(sums, offsets, how);
+/// The same for rows, from their offsets with variances. A displaced wall shifts many rows together. Where the spread
+/// about the mean of the neighbours is significantly smaller than for independent rows, it is returned.
+pub fn spread_of_rows(rows: &BTreeMap<Group, [f64; 2]>) -> (f64, f64) {
+    let known = best_known(rows.iter().map(|(k, [offset, noise])| (*k, (*offset, *noise))).collect());
     let about = |(k, (offset, noise)): (&Group, &(f64, f64))| {
         let around = known.range(k.around(NEIGHBOURS)).filter(|(g, _)| *g != k);
         let (n, sum, of_mean) = around.fold((0.0, 0.0, 0.0), |(n, sum, v), (_, (o, e))| (n + 1.0, sum + o, v + e));
@@ -188,7 +192,7 @@ mod tests {
                 let truth = own + if part == 1 && k > 9 { of_a_part } else { 0.0 };
                 let noise: f64 = StandardNormal.sample(&mut rng);
                 let w = 100.0;
-                (row(k), GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.1 * noise), 0.0], n: 1.0 })
+                (row(k), GroupSums { gram: [w, 0.0, 0.0], right: [w * (truth + 0.1 * noise), 0.0], n: 1.0, weight: w })
             };
             (0..16).map(|_| std::array::from_fn(|part| (0..20).map(|k| group(k, part)).collect())).collect()
         };
@@ -220,12 +224,13 @@ mod tests {
             let w = 1e6;
             let at = |k: usize| offsets[k] + if k < 100 { 0.0 } else { step };
             (0..200)
-                .map(|k| (row(k as u16), GroupSums { gram: [w, 0.0, 0.0], right: [w * at(k), 0.0], n: 1.0 }))
+                .map(|k| (row(k as u16), GroupSums { gram: [w, 0.0, 0.0], right: [w * at(k), 0.0], n: 1.0, weight: w }))
                 .collect()
         };
         let rows = |step: f64| {
             let sums = with_step(step);
-            spread_of_rows(&sums, &super::offsets(&sums, how), how)
+            let offsets = super::offsets(&sums, how);
+            spread_of_rows(&offsets.into_iter().map(|(row, v)| (row, [v, 1.0 / sums[&row].gram[0]])).collect())
         };
         assert_eq!(rows(0.0), spread(&with_step(0.0), how, 0.0));
         assert!((spread(&with_step(0.2), how, 0.0).0 - 0.11).abs() < 0.01);

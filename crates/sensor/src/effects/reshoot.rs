@@ -15,8 +15,12 @@ use std::collections::BTreeMap;
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
-/// Gives returns the ranges in their true directions, which are close to the reported ones: on a surface that of its
-/// plane; at edges, where the scan patterns are known, that of the surface that the true ray meets.
+/// Shots that truly go farther from where they are reported than this share of the way to the next row may leave their
+/// surface.
+const FAR: f32 = 0.1;
+
+/// Gives shots the ranges in their true directions: on a surface that of its plane, as long as it cannot end between;
+/// at edges, and farther away, that of the surface that the true ray meets, where the scan patterns are known.
 pub(super) fn reaim(
     scan: &mut Scan,
     frame: &FrameContext,
@@ -24,12 +28,17 @@ pub(super) fn reaim(
     mut true_direction: impl FnMut(&Echo) -> [f32; 3],
 ) {
     let mut at_edges = BTreeMap::new();
-    for (i, echo) in scan.echoes.iter_mut().enumerate().filter(|(_, e)| e.is_return()) {
+    let far_rad = |echo: &Echo| {
+        let pattern = frame.sensors.and_then(|sensors| sensors.patterns.get(usize::from(echo.sensor)));
+        pattern.map_or(f32::INFINITY, |pattern| FAR * pattern.steps.elevation_rad)
+    };
+    for (i, echo) in scan.echoes.iter_mut().enumerate() {
         let direction = true_direction(echo);
-        if echo.normal != [0.0; 3] {
-            measure_along(echo, direction);
-        } else if direction != echo.direction {
+        let off = (0..3).map(|k| (direction[k] - echo.direction[k]).powi(2)).sum::<f32>().sqrt();
+        if off > far_rad(echo) || echo.is_return() && echo.normal == [0.0; 3] && off > 0.0 {
             at_edges.insert(i, direction);
+        } else if echo.is_return() {
+            measure_along(echo, direction);
         }
     }
     let Some(sensors) = frame.sensors.filter(|_| !at_edges.is_empty()) else { return };

@@ -6,7 +6,7 @@ use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit, split};
 use super::{Search, Selected};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
-use crate::channels::groups::{Group, GroupSums, Grouping, total};
+use crate::channels::groups::{Group, Grouping, total};
 use crate::channels::mean::Column;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
@@ -100,35 +100,35 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
 fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chosen: &[Hypothesis]) -> Description {
     let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
-    let of_rows =
-        (grouping == Grouping::Row).then(|| search.sums.offsets(&search.estimate, grouping, group_fit(column), chosen));
+    let of_rows = (grouping == Grouping::Row).then(|| search.sums.rows(&search.estimate, column, chosen));
     let (std, n) = match &of_rows {
-        Some(offsets) => grouped::spread_of_rows(&all, offsets, group_fit(column)),
+        Some(rows) => grouped::spread_of_rows(rows),
         None => grouped::spread(&all, group_fit(column), 0.0),
     };
     let error = std / (2.0 * n.max(1.0)).sqrt();
-    // The prior of rows with few returns is the spread of the others.
-    let least = FLOOR_GROUPS[if grouping == Grouping::Row { column } else { 2 }];
-    let precision = std.max(least).powi(-2).max(group_fit(column).precision);
-    let fit = GroupFit { precision, ..group_fit(column) };
-    let mut offsets = of_rows.unwrap_or_else(|| search.sums.offsets(&search.estimate, grouping, fit, chosen));
+    let mut offsets = of_rows.unwrap_or_else(|| {
+        // The prior of strips with few returns is the spread of the others.
+        let precision = std.max(FLOOR_GROUPS[2]).powi(-2).max(group_fit(column).precision);
+        let fit = GroupFit { precision, ..group_fit(column) };
+        let offsets = search.sums.offsets(&search.estimate, grouping, fit, chosen);
+        offsets.into_iter().map(|(g, offset)| (g, [offset, 1.0 / (all[&g].gram[2 * column] + precision)])).collect()
+    });
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
     let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
     if column == 0 && grouping == Grouping::Row && !biased {
         let mean_m = mean_offset_m(search);
-        offsets.values_mut().for_each(|v| *v += mean_m);
+        offsets.values_mut().for_each(|[v, _]| *v += mean_m);
     }
     let (scale, unit) = if column == 0 { (1.0, Unit::Metre) } else { (1f64.to_degrees(), Unit::Degree) };
     let mut parameters: Vec<NamedParameter> = Vec::new();
     if cause != Cause::Unexplained {
         let spread = if column == 0 { Quantity::StdM } else { Quantity::StdDeg };
         parameters.push(parameter(spread, std * scale, (error.hypot(0.05 * std)) * scale));
-        parameters.extend(offsets.iter().map(|(group, v)| {
-            let error = 1.0 / (all[group].gram[2 * column] + fit.precision).sqrt();
+        parameters.extend(offsets.iter().map(|(group, [v, variance])| {
             let sensor = search.context.rig.sensors[usize::from(group.sensor)].name.clone();
             let id = ParameterId::Row { sensor, row: usize::from(group.index) };
-            (id, with_error(v * scale, error * scale, unit))
+            (id, with_error(v * scale, variance.sqrt() * scale, unit))
         }));
     }
     let says = match (grouping, column) {
@@ -141,12 +141,7 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chos
             std * 100.0
         ),
     };
-    Description {
-        covariate: grouping.into(),
-        says,
-        curve: group_curve(&all, &offsets, grouping, fit, scale),
-        parameters,
-    }
+    Description { covariate: grouping.into(), says, curve: group_curve(&offsets, grouping, column, scale), parameters }
 }
 
 /// Offset of all ranges, m; 0 where it is not known to three standard errors.
@@ -281,23 +276,17 @@ fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
     parameters
 }
 
-/// Offsets of groups along their rows or azimuths, a curve for each sensor.
-fn group_curve(
-    sums: &BTreeMap<Group, GroupSums>,
-    offsets: &BTreeMap<Group, f64>,
-    grouping: Grouping,
-    fit: GroupFit,
-    scale: f64,
-) -> Curve {
-    let points = offsets.iter().map(|(group, v)| {
+/// Offsets of groups, with their variances, along their rows or azimuths, a curve for each sensor.
+fn group_curve(offsets: &BTreeMap<Group, [f64; 2]>, grouping: Grouping, column: usize, scale: f64) -> Curve {
+    let points = offsets.iter().map(|(group, [v, variance])| {
         let place = group.place(grouping);
         let x = if grouping == Grouping::Row { place } else { place.to_degrees() };
-        let error = 1.0 / (sums[group].gram[2 * fit.column] + fit.precision).sqrt();
         let sensor = usize::from(group.sensor);
-        CurvePoint { sensor, x, measured: v * scale, before: 0.0, after: v * scale, error: error * scale }
+        let error = variance.sqrt() * scale;
+        CurvePoint { sensor, x, measured: v * scale, before: 0.0, after: v * scale, error }
     });
     let x = if grouping == Grouping::Row { "row" } else { "azimuth, degrees" };
-    let y = if fit.column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
+    let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
     Curve { x: x.into(), y: y.into(), by_sensor: true, points: points.collect() }
 }
 

@@ -2,11 +2,12 @@
 
 use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit, split};
-use crate::channels::groups::{Group, Grouping, STRIP_RAD, elevation_lever, group_of};
+use crate::channels::groups::{Group, Grouping, STRIP_RAD, Undone, group_of};
 use crate::channels::mean::Column;
 use crate::pairing::Ray;
-use nalgebra::{Point3, SVector, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Point3, SVector, Vector3};
 use sensor::Rig;
+use sensor::directions::Sensors;
 use std::collections::BTreeMap;
 
 /// Displacements of the measured side against the simulation.
@@ -18,9 +19,10 @@ pub struct Displacement {
     pub sensors: Vec<SVector<f64, 6>>,
     /// Constant range offset, m, and relative range error.
     pub bias: [f64; 2],
-    /// Offsets of groups of rays: the grouping, the column (0: range, m; 1: elevation, rad), and the offset of each
-    /// group.
-    pub groups: Vec<(Grouping, usize, BTreeMap<Group, f64>)>,
+    /// Offsets of rows, of the range, m, and of the elevation, rad.
+    pub rows: Undone,
+    /// Range offsets of strips of azimuth, m.
+    pub strips: BTreeMap<Group, f64>,
 }
 
 impl Displacement {
@@ -31,10 +33,26 @@ impl Displacement {
 
     /// Whether rows have elevation offsets.
     pub fn rows_aim_elsewhere(&self) -> bool {
-        self.groups.iter().any(|(grouping, column, _)| (*grouping, *column) == (Grouping::Row, 1))
+        self.rows.values().any(|[_, elevation_rad]| *elevation_rad != 0.0)
     }
 
-    /// Displacement of a point seen by a sensor, m.
+    /// Whether ranges have offsets by row or by azimuth.
+    pub fn is_uneven(&self) -> bool {
+        !(self.rows.is_empty() && self.strips.is_empty())
+    }
+
+    /// The displacement by one of the columns.
+    pub(super) fn of_column(&self, column: Column) -> f64 {
+        match column {
+            Column::Pose(k) => self.scene[k],
+            Column::SensorPose(s, k) => self.sensors.get(s).map_or(0.0, |pose| pose[k]),
+            Column::RangeOffset => self.bias[0],
+            Column::RangeScale => self.bias[1],
+            Column::Sweep(_) | Column::Structure(_) => 0.0,
+        }
+    }
+
+    /// Displacement of a point seen by a sensor, m, without that of its row.
     pub fn of_point(&self, point: &Vector3<f64>, sensor: usize, origin: &Point3<f64>) -> Vector3<f64> {
         let turned = |p: &SVector<f64, 6>, about: Vector3<f64>| {
             Vector3::new(p[0], p[1], p[2]).cross(&(point - about)) + Vector3::new(p[3], p[4], p[5])
@@ -44,28 +62,36 @@ impl Displacement {
         turned(&self.scene, Vector3::zeros()) + own + to.normalize() * (self.bias[0] + self.bias[1] * to.norm())
     }
 
-    /// Correction to subtract from the range of a measured ray, for the offset of its row or strip, m.
-    pub fn of_range(&self, ray: &Ray, turn: &UnitQuaternion<f64>) -> f64 {
-        self.groups.iter().map(|groups| of_groups(groups, ray, turn)).sum()
+    /// Displacement of a point by the offsets of the row that it was shot by, m; `pose` is that of the sensor.
+    pub fn of_row(
+        &self,
+        point: &Vector3<f64>,
+        sensor: usize,
+        sensors: &Sensors,
+        pose: &Isometry3<f64>,
+    ) -> Vector3<f64> {
+        let seen = pose.inverse_transform_point(&Point3::from(*point)).coords;
+        let (range_m, flat_m) = (seen.norm(), seen.xy().norm());
+        let elevation_rad = seen.z.atan2(flat_m);
+        let group = Group { sensor: sensor as u8, index: sensors.row(sensor, elevation_rad as f32) };
+        let Some([offset_m, offset_rad]) = self.rows.get(&group) else { return Vector3::zeros() };
+        // The shot was sent higher and came back over another length.
+        let (sin, cos) = (elevation_rad + offset_rad).sin_cos();
+        let flat = seen.xy() / flat_m.max(1e-9) * cos;
+        let shot = Vector3::new(flat.x, flat.y, sin) * (range_m - offset_m);
+        pose.rotation * (seen - shot)
     }
-}
 
-/// Offset of the range of a ray by those of groups, m.
-fn of_groups(
-    (grouping, column, offsets): &(Grouping, usize, BTreeMap<Group, f64>),
-    ray: &Ray,
-    turn: &UnitQuaternion<f64>,
-) -> f64 {
-    let Some(group) = group_of(ray, *grouping) else { return 0.0 };
-    let of = |g: Group| offsets.get(&g).copied();
-    let Some(offset) = of(group) else { return 0.0 };
-    if *grouping == Grouping::Azimuth {
-        // Offsets vary continuously: interpolated between the middles of strips.
-        let beside = (f64::from(ray.azimuth_rad) - group.place(*grouping)) / STRIP_RAD;
+    /// Correction to subtract from the range of a measured ray, for the offset of its strip of azimuth, m. Offsets vary
+    /// continuously: they are interpolated between the middles of strips.
+    pub fn of_strip(&self, ray: &Ray) -> f64 {
+        let of = |g: Group| self.strips.get(&g).copied();
+        let Some(group) = group_of(ray, Grouping::Azimuth) else { return 0.0 };
+        let Some(offset) = of(group) else { return 0.0 };
+        let beside = (f64::from(ray.azimuth_rad) - group.place(Grouping::Azimuth)) / STRIP_RAD;
         let next = if beside < 0.0 { group.previous().and_then(of) } else { of(group.next()) };
-        return offset + beside.abs().min(0.5) * (next.unwrap_or(offset) - offset);
+        offset + beside.abs().min(0.5) * (next.unwrap_or(offset) - offset)
     }
-    if *column == 0 { offset } else { -offset * elevation_lever(ray, turn) / f64::from(ray.cos_incidence.max(0.01)) }
 }
 
 /// The displacement by the chosen hypotheses, fitted on the selecting frames.
@@ -90,7 +116,34 @@ pub(super) fn displacement(
     }
     for (grouping, column) in groups {
         let offsets = sums.offsets(select, grouping, group_fit(column), chosen);
-        out.groups.push((grouping, column, offsets));
+        match grouping {
+            Grouping::Row => offsets.into_iter().for_each(|(g, o)| out.rows.entry(g).or_default()[column] = o),
+            Grouping::Azimuth => out.strips = offsets,
+        }
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sensor::directions::{ScanPattern, Steps};
+
+    #[test]
+    fn a_point_without_the_displacement_of_its_row_is_where_the_shot_met_it() {
+        let pattern = ScanPattern { rows_rad: vec![-0.1, 0.0], steps: Steps { azimuth_rad: 0.01, elevation_rad: 0.1 } };
+        let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.1 };
+        let pose = Isometry3::translation(1.0, 2.0, 3.0);
+        let rows = Undone::from([(Group { sensor: 0, index: 0 }, [0.05, 0.02])]);
+        let displaced = Displacement { rows, ..Displacement::default() };
+        let shot = |elevation_rad: f64, range_m: f64| {
+            let (sin, cos) = elevation_rad.sin_cos();
+            pose.translation.vector + Vector3::new(0.6 * cos, 0.8 * cos, sin) * range_m
+        };
+        let reported = shot(-0.1, 20.05);
+        let undone = reported - displaced.of_row(&reported, 0, &sensors, &pose);
+        assert!((undone - shot(-0.08, 20.0)).norm() < 1e-9, "{undone}");
+        let other = shot(0.0, 20.0);
+        assert_eq!(displaced.of_row(&other, 0, &sensors, &pose), Vector3::zeros());
+    }
 }

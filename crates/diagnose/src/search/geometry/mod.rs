@@ -7,6 +7,7 @@ mod describe;
 mod displacement;
 mod floor;
 mod hypotheses;
+mod row_offsets;
 mod rows;
 mod sums;
 
@@ -22,8 +23,10 @@ use super::{ChannelResult, Context, Selected, Z_STAR, causes_of, first_demands, 
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
 use crate::diagnosis::Considered;
+use crate::error::DiagnoseError;
 use crate::inference::choice::{Demands, Trial, choose, significant, total_and_z};
 use crate::inference::roles::Role;
+use crate::pairing::FramePair;
 use rayon::prelude::*;
 
 /// Share of the gain of the first pose that a second pose must bring.
@@ -32,6 +35,7 @@ const SECOND_POSE_SHARE: f64 = 0.3;
 /// Frames by role, their sums and what is demanded of a hypothesis.
 struct Search<'a> {
     context: &'a Context<'a>,
+    /// Of the frames as they are; once the hypotheses are chosen, of those with the displacement undone.
     sums: Sums,
     select: Vec<usize>,
     /// Blocks of the selecting frames.
@@ -50,7 +54,7 @@ type Chosen = (Vec<Hypothesis>, Vec<Selected>);
 /// Gains of the `test` frames by unconstrained tables fitted on the `train` frames, nats: all poses and biases
 /// together or offsets of strips of azimuth, whichever is more, and offsets of rows beyond those of their neighbours.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
-    let sums = sums(context, train);
+    let sums = sums(context, train, &Displacement::default());
     let (full, base) = sums.full_and_base(train, &context.blocks(train));
     let linear: Vec<f64> = test.iter().map(|&f| full.gain(&sums.linear[f]) - base.gain(&sums.linear[f])).collect();
     // Offsets that one part of the rays of a row or strip predicts for the other parts: those of the sensor, not of
@@ -73,21 +77,34 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     smooth.iter().zip(rough).map(|(a, b)| a + b).collect()
 }
 
-/// The search, and the displacement that the other channels have to undo.
-pub fn search(context: &Context) -> (ChannelResult, Displacement) {
-    let search = Search::new(context);
+/// Pairs the frames anew with a displacement undone.
+pub type Undo<'a> = &'a dyn Fn(&Displacement) -> Result<Vec<FramePair>, DiagnoseError>;
+
+/// The search, and the displacement that the other channels have to undo. Turns and shifts of metres at the far end
+/// are not linear, nor is the place where a row meets the ground near its horizon: what was chosen is fitted a second
+/// time, on frames that `undo` pairs anew.
+///
+/// # Errors
+/// Those of `undo`.
+pub fn search(context: &Context, undo: Undo) -> Result<(ChannelResult, Displacement), DiagnoseError> {
+    let mut search = Search::new(context);
     let mut result = ChannelResult::new(Channel::Residuals, search.hold_out.len());
     result.minimum = describe::minimum(&search.sums, &search.select, &search.blocks);
     let mut chosen = search.select(&mut result);
     search.add_common_turns(&mut chosen, &mut result);
+    let displaced = search.displacement(&chosen.0);
+    if displaced.moves() || displaced.rows_aim_elsewhere() {
+        let frames = undo(&displaced)?;
+        search.sums = sums(&Context { frames: &frames, ..context.clone() }, &search.select, &displaced);
+    }
     let (chosen, selected) = search.large_enough(chosen);
     let gains: Vec<Vec<f64>> = chosen.iter().map(|hypothesis| search.held_out_gains(hypothesis, &chosen)).collect();
     result.distance = search.distances(&chosen, &gains);
     for ((hypothesis, selected), gains) in chosen.iter().zip(selected).zip(gains) {
         result.found.push(describe::found(&search, hypothesis, &chosen, selected, gains));
     }
-    let displaced = displacement(context.rig, &search.sums, &search.select, &search.blocks, &chosen);
-    (result, displaced)
+    let displaced = search.displacement(&chosen);
+    Ok((result, displaced))
 }
 
 impl<'a> Search<'a> {
@@ -95,7 +112,7 @@ impl<'a> Search<'a> {
         let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
         Search {
             context,
-            sums: sums(context, &select),
+            sums: sums(context, &select, &Displacement::default()),
             blocks: context.blocks(&select),
             estimate_blocks: context.blocks(&estimate),
             demands: first_demands(),
@@ -104,6 +121,11 @@ impl<'a> Search<'a> {
             estimate,
             hold_out,
         }
+    }
+
+    /// The displacement by the chosen hypotheses.
+    fn displacement(&self, chosen: &[Hypothesis]) -> Displacement {
+        displacement(self.context.rig, &self.sums, &self.select, &self.blocks, chosen)
     }
 
     /// Cross-validated gains of the selecting frames, nats.

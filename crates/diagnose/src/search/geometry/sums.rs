@@ -1,8 +1,9 @@
 //! Sums of all frames that the hypotheses of geometry are fitted on, and the fits.
 
-use super::hypotheses::{Hypothesis, is_pose};
-use crate::catalogue::Cause;
-use crate::channels::groups::{Group, GroupFrame, Grouping, PARTS, PartedFrame, group_frames, total, whole};
+use super::displacement::Displacement;
+use super::hypotheses::Hypothesis;
+use super::row_offsets::row_offsets;
+use crate::channels::groups::{Group, GroupFrame, Grouping, PARTS, PartedFrame, Seen, group_frames, total, whole};
 use crate::channels::mean::{
     Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
     usual_noise_m,
@@ -12,7 +13,7 @@ use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
 use crate::inference::median;
 use crate::search::Context;
-use nalgebra::{DMatrix, SVector};
+use nalgebra::{DMatrix, DVector, SVector};
 use rayon::prelude::*;
 use sensor::Rig;
 use std::collections::BTreeMap;
@@ -51,8 +52,9 @@ pub(super) struct Groups {
     pub(super) whole: Vec<GroupFrame>,
 }
 
-/// Sums of all frames; priors are fitted on the selecting ones.
-pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
+/// Sums of all frames; priors are fitted on the selecting ones. What was undone before the frames were paired is added
+/// to what is left: fits are of the whole displacement, linear about what was undone (a step of Gauss and Newton).
+pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement) -> Sums {
     let (frames, rig) = (context.frames, context.rig);
     let origins = origins(rig);
     let noise_m = usual_noise_m(frames);
@@ -66,23 +68,27 @@ pub(super) fn sums(context: &Context, select: &[usize]) -> Sums {
         let (gram, right) = m.without_own(&prior);
         LinearFrame { gram, right }
     };
-    let linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
+    let mut linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
     let precision: Vec<f64> = columns.iter().map(|c| precision(*c)).collect();
     let base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
-    let parted = |g, poses: &[OwnPoses], structure| group_frames(frames, rig, poses, structure, g, noise_m, design);
+    let by_columns = DVector::from_iterator(columns.len(), columns.iter().map(|c| undone.of_column(*c)));
+    linear.iter_mut().for_each(|frame| frame.right += &frame.gram * &by_columns);
+    let seen = Seen { poses: &poses, structure, undone: &undone.rows };
+    let parted = |g, seen| group_frames(frames, rig, seen, g, noise_m, design);
     let groups = |g| {
-        let parted = parted(g, &poses, structure);
+        let parted = parted(g, seen);
         Groups { whole: parted.iter().map(whole).collect(), parted }
     };
-    let rows = row_frames(frames, rig, &poses, noise_m);
+    let rows = row_frames(frames, rig, seen, noise_m);
+    let with_pose = Seen { poses: &deviations(&poses, select), structure: Default::default(), ..seen };
     Sums {
         of_patches: of_patches(&rows, select, rig.sensors.len()),
         rows,
         whole_rows: groups(Grouping::Row),
-        rows_with_pose: parted(Grouping::Row, &deviations(&poses, select), Default::default()),
+        rows_with_pose: parted(Grouping::Row, with_pose),
         strips: groups(Grouping::Azimuth),
         columns,
         precision,
@@ -102,7 +108,7 @@ fn deviations(poses: &[OwnPoses], select: &[usize]) -> Vec<OwnPoses> {
 }
 
 /// Prior precisions of the offsets of rows in some columns, times the variance of what they are fitted to.
-fn precisions(columns: &[usize], variance: f64) -> [Option<f64>; 2] {
+pub(super) fn precisions(columns: &[usize], variance: f64) -> [Option<f64>; 2] {
     [0, 1].map(|c| columns.contains(&c).then(|| variance * group_fit(c).precision))
 }
 
@@ -168,19 +174,6 @@ fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, 
 
 /// Standard deviations of ego motion: speed along and across the heading, m/s; yaw rate, rad/s.
 const OWN_MOTION: [f64; 3] = [40.0, 3.0, 0.3];
-
-/// Rows to either side of one that have something in common.
-const BESIDE: usize = 4;
-
-/// Variance of a median in units of that of a mean, of normal numbers.
-const OF_MEDIAN: f64 = std::f64::consts::FRAC_PI_2;
-
-/// Median of some numbers, and its variance from their scatter.
-fn median_and_variance(values: &[f64]) -> [f64; 2] {
-    let (n, middle) = (values.len() as f64, median(values.to_vec()));
-    let scatter = values.iter().map(|o| (o - middle).powi(2)).sum::<f64>();
-    [middle, OF_MEDIAN * scatter / (n * (n - 1.0)).max(1.0)]
-}
 
 /// Linear columns of some hypotheses, each once, and their groupings with the column of the group sums.
 pub(super) fn split(hypotheses: &[Hypothesis]) -> (Vec<usize>, Vec<(Grouping, usize)>) {
@@ -276,61 +269,13 @@ impl Sums {
         if grouping == Grouping::Azimuth {
             return grouped::offsets(&total(frames.iter().map(|&i| &self.strips.whole[i])), how);
         }
-        let sensors = 0..self.of_sensors.first().map_or(0, Vec::len);
-        sensors.flat_map(|sensor| self.row_offsets(frames, sensor, how.column, chosen)).collect()
+        self.rows(frames, how.column, chosen).into_iter().map(|(row, [offset, _])| (row, offset)).collect()
     }
 
-    /// Offsets of the rows of a sensor: against those beside them from the patches, and what neighbouring rows have in
-    /// common from all surfaces. Both are the median over the quarters of its field of view, of which one may show the
-    /// upper edge of a wall that stands elsewhere, shrunk where the quarters disagree.
-    fn row_offsets(
-        &self,
-        frames: &[usize],
-        sensor: usize,
-        column: usize,
-        chosen: &[Hypothesis],
-    ) -> BTreeMap<Group, f64> {
-        let columns = row_columns(chosen);
-        // Without another cause that turns what a sensor sees, its turn is what its rows have in common.
-        let turns = |h: &Hypothesis| is_pose(h) || h.cause() == Cause::RollingShutter;
-        let turned_by_rows = column == 1 && !chosen.iter().any(turns);
-        let rows = if turned_by_rows { &self.rows_with_pose } else { &self.whole_rows.parted };
-        let how = GroupFit { centred: !turned_by_rows, ..group_fit(column) };
-        let mut of_parts: BTreeMap<usize, [Vec<f64>; 2]> = BTreeMap::new();
-        for part in 0..PARTS {
-            let sum = row_patches::total(frames.iter().map(|&i| &self.rows[i]), sensor, &|p| p == part);
-            let own = &sum.offsets(precisions(&columns, self.of_patches))[column];
-            let mut whole = total(frames.iter().map(|&i| &rows[i][part]));
-            whole.retain(|g, _| usize::from(g.sensor) == sensor);
-            let whole = grouped::offsets(&whole, how);
-            let whole = |row: usize| whole.get(&row_patches::group(sensor, row)).copied().unwrap_or(0.0);
-            let least = 3.0 * self.of_patches * group_fit(column).precision;
-            let known = |row: &usize| sum.precision(*row, column) > least;
-            for row in (0..sum.rows()).filter(known) {
-                let beside = (row.saturating_sub(BESIDE)..(row + BESIDE + 1).min(sum.rows())).filter(known);
-                let (n, of_own, of_whole) =
-                    beside.fold((0.0, 0.0, 0.0), |(n, o, w), r| (n + 1.0, o + own[r], w + whole(r)));
-                let [apart, common] = of_parts.entry(row).or_default();
-                apart.push(own[row] - of_own / n);
-                common.push(of_whole / n);
-            }
-        }
-        of_parts.retain(|_, [apart, _]| apart.len() > 1);
-        let medians = |k: usize| of_parts.values().map(|parts| median_and_variance(&parts[k])).collect::<Vec<_>>();
-        let spread = |of: &[[f64; 2]]| {
-            median(of.iter().map(|[middle, _]| middle.abs()).collect()) / statistics::MEDIAN_OF_NORMAL
-        };
-        let [apart, common] = [medians(0), medians(1)];
-        let of_apart = spread(&apart);
-        // Errors of ranges are independent from row to row: this is what their mean over neighbours scatters by.
-        // Elevations may be wrong along a line.
-        let of_mean = of_apart / (2.0 * BESIDE as f64 + 1.0).sqrt();
-        let of_common = if column == 0 { of_mean } else { spread(&common).max(of_mean) };
-        let shrunk =
-            |[middle, variance]: [f64; 2], usual: f64| middle * usual * usual / (usual * usual + variance).max(1e-30);
-        let rows = of_parts.keys().zip(apart.iter().zip(&common));
-        rows.map(|(row, (a, c))| (row_patches::group(sensor, *row), shrunk(*a, of_apart) + shrunk(*c, of_common)))
-            .collect()
+    /// Offsets of rows in one column with their variances, over some frames, fitted together with what else was chosen.
+    pub(super) fn rows(&self, frames: &[usize], column: usize, chosen: &[Hypothesis]) -> BTreeMap<Group, [f64; 2]> {
+        let sensors = 0..self.of_sensors.first().map_or(0, Vec::len);
+        sensors.flat_map(|sensor| row_offsets(self, frames, sensor, column, chosen)).collect()
     }
 
     /// The groups of every frame, of surfaces as they are.

@@ -1,0 +1,57 @@
+//! What earlier searches found, to be undone before later ones.
+
+use super::Engine;
+use crate::channels::mask::Shown;
+use crate::search::geometry::Displacement;
+use crate::search::rolling_shutter::Slide;
+use nalgebra::Vector3;
+
+/// Quantisation step from which on the simulated side is rounded for all searches, m: coarse steps displace level
+/// ground by the distance of rows.
+const COARSE_M: f64 = 0.02;
+
+/// What earlier searches found, to be corrected for later ones.
+pub(super) struct Known {
+    pub(super) slide: Option<Slide>,
+    /// Quantisation step, m.
+    pub(super) step_m: Option<f64>,
+    pub(super) displaced: Displacement,
+}
+
+impl Known {
+    /// Quantisation step that matters to where surfaces lie, m.
+    pub(super) fn coarse_m(&self) -> Option<f64> {
+        self.step_m.filter(|step| *step > COARSE_M)
+    }
+
+    /// Displacement along the scan, m.
+    pub(super) fn slide_m(&self, frame: usize, p: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
+        match &self.slide {
+            Some(slide) => slide.shift_m(frame, p, sensor),
+            None => Vector3::zeros(),
+        }
+    }
+
+    /// Displacement of a measured point of a frame and a sensor along the scan, with the scene and with its row, m.
+    pub(super) fn shift_m(
+        &self,
+        engine: &Engine,
+        displaced: &Displacement,
+        (frame, sensor): (usize, usize),
+        p: &Vector3<f64>,
+    ) -> Vector3<f64> {
+        let pose = &engine.sensors.rig.sensors[sensor].pose();
+        let of_row = displaced.of_row(p, sensor, engine.sensors, pose);
+        let p = &(p - of_row);
+        of_row + self.slide_m(frame, p, sensor) + displaced.of_point(p, sensor, &engine.origins[sensor])
+    }
+
+    /// How the measured scene lies when silhouettes and single returns are compared.
+    pub(super) fn shown(&self) -> Shown {
+        match (self.slide.is_some() || self.displaced.rows_aim_elsewhere(), self.displaced.moves()) {
+            (true, _) => Shown::Elsewhere,
+            (false, true) => Shown::MovedBack,
+            (false, false) => Shown::InPlace,
+        }
+    }
+}
