@@ -4,7 +4,7 @@
 use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
 use crate::catalogue::Covariate;
 use crate::pairing::{FramePair, Ray};
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Point3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 use sensor::Rig;
 use std::collections::BTreeMap;
@@ -142,7 +142,7 @@ pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
 }
 
 /// Derivative of the distance across the surface by the row's elevation, m/rad.
-pub fn elevation_lever(ray: &Ray, sensor_turn: &nalgebra::UnitQuaternion<f64>) -> f64 {
+pub fn elevation_lever(ray: &Ray, sensor_turn: &UnitQuaternion<f64>) -> f64 {
     let (az, el) = (f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
     let up = sensor_turn * Vector3::new(-el.sin() * az.cos(), -el.sin() * az.sin(), el.cos());
     // The beam was sent higher by this angle. The predicted range is used: at grazing incidence the measured one
@@ -165,10 +165,22 @@ pub struct Seen<'a> {
     pub undone: &'a Undone,
 }
 
-/// Distance across the surface that undone offsets of a row are, m, with the levers of both.
-pub fn undone_m(undone: &Undone, sensor: usize, row: u16, x: [f64; 2]) -> f64 {
-    let of_row = undone.get(&Group { sensor: sensor as u8, index: row });
-    of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad)
+impl Seen<'_> {
+    /// Distance of a return across its surface beyond the pose of its frame, m, with what was undone of its row, and
+    /// its derivatives by the range and the elevation (m/rad) of the row. `None` where it is not of that surface.
+    pub fn across(
+        &self,
+        ray: &Ray,
+        poses: &OwnPoses,
+        origin: &Point3<f64>,
+        turn: &UnitQuaternion<f64>,
+    ) -> Option<(f64, [f64; 2])> {
+        let y = ray.across_nearest_m() - pose_row(ray, origin, &Point3::origin()).dot(&poses[ray.sensor as usize]);
+        let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, turn)];
+        let of_row = self.undone.get(&Group { sensor: ray.sensor, index: ray.row });
+        let undone = of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad);
+        (y.abs() <= STRAY_M).then_some((y + undone, x))
+    }
 }
 
 /// Sums of all frames.
@@ -189,13 +201,8 @@ pub fn group_frames(
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let Some(group) = group_of(ray, grouping) else { continue };
             let sensor = ray.sensor as usize;
-            let row = pose_row(ray, &origins[sensor], &Point3::origin());
-            let y = ray.across_nearest_m() - row.dot(&poses[sensor]);
-            if y.abs() > STRAY_M {
-                continue;
-            }
-            let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
-            let y = y - seen.structure[super::mean::kind_of(ray)] + undone_m(seen.undone, sensor, ray.row, x);
+            let Some((y, x)) = seen.across(ray, poses, &origins[sensor], &turns[sensor]) else { continue };
+            let y = y - seen.structure[super::mean::kind_of(ray)];
             let w = weight(ray, noise_m) / design;
             sums[sensor][usize::from(group.index)][part_of(ray, grouping, half_fov[sensor])].merge(&GroupSums {
                 gram: [w * x[0] * x[0], w * x[0] * x[1], w * x[1] * x[1]],

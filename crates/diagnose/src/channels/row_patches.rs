@@ -2,10 +2,10 @@
 //! over a few rows that meet it side by side this is an offset and a slope along it, which are integrated out. What is
 //! left belongs to the rows.
 
-use super::groups::{Group, PARTS, Seen, elevation_lever, part_of, undone_m};
-use super::mean::{KINDS, OwnPoses, STRAY_M, kind_of, origins, pose_row, usable, weight};
+use super::groups::{Group, PARTS, Seen, part_of};
+use super::mean::{KINDS, OwnPoses, kind_of, origins, usable, weight};
 use crate::pairing::{FramePair, Surface};
-use nalgebra::{DMatrix, DVector, Matrix2, Point3, Vector2};
+use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
 use rayon::prelude::*;
 use sensor::Rig;
 use std::collections::BTreeMap;
@@ -157,14 +157,9 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> 
         let mut strips = BTreeMap::<(usize, usize, i32, usize), BTreeMap<usize, Cell>>::new();
         for ray in frame.measured.iter().filter(|r| usable(r) && r.row != u16::MAX) {
             let sensor = ray.sensor as usize;
-            let y = ray.across_nearest_m() - pose_row(ray, &origins[sensor], &Point3::origin()).dot(&poses[sensor]);
-            if y.abs() > STRAY_M {
-                continue;
-            }
+            let Some((y, x)) = seen.across(ray, poses, &origins[sensor], &turns[sensor]) else { continue };
             let part = part_of(ray, super::groups::Grouping::Row, half_fov[sensor]);
             let strip = (f64::from(ray.azimuth_rad) / AZIMUTH_RAD).floor() as i32;
-            let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, &turns[sensor])];
-            let y = y + undone_m(seen.undone, sensor, ray.row, x);
             let rows = strips.entry((sensor, part, strip, kind_of(ray).min(KINDS - 1))).or_default();
             let (sin, cos) = f64::from(ray.elevation_rad).sin_cos();
             let along = if ray.surface == Surface::Ground { cos } else { sin };

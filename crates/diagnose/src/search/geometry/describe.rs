@@ -98,21 +98,14 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
 
 /// Describes offsets of groups of rays, of rows together with what else was chosen.
 fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chosen: &[Hypothesis]) -> Description {
-    let frames = search.sums.groups_of(grouping);
-    let all = total(search.estimate.iter().map(|&i| &frames[i]));
-    let of_rows = (grouping == Grouping::Row).then(|| search.sums.rows(&search.estimate, column, chosen));
-    let (std, n) = match &of_rows {
-        Some(rows) => grouped::spread_of_rows(rows),
-        None => grouped::spread(&all, group_fit(column), 0.0),
+    let ((std, n), mut offsets) = match grouping {
+        Grouping::Row => {
+            let rows = search.sums.rows(&search.estimate, column, chosen);
+            (grouped::spread_of_rows(&rows), rows)
+        }
+        Grouping::Azimuth => strips(search, column),
     };
     let error = std / (2.0 * n.max(1.0)).sqrt();
-    let mut offsets = of_rows.unwrap_or_else(|| {
-        // The prior of strips with few returns is the spread of the others.
-        let precision = std.max(FLOOR_GROUPS[2]).powi(-2).max(group_fit(column).precision);
-        let fit = GroupFit { precision, ..group_fit(column) };
-        let offsets = search.sums.offsets(&search.estimate, grouping, fit, chosen);
-        offsets.into_iter().map(|(g, offset)| (g, [offset, 1.0 / (all[&g].gram[2 * column] + precision)])).collect()
-    });
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
     // of the surfaces, which would take it up.
     let biased = chosen.iter().any(|h| h.cause() == Cause::RangeBias);
@@ -142,6 +135,19 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chos
         ),
     };
     Description { covariate: grouping.into(), says, curve: group_curve(&offsets, grouping, column, scale), parameters }
+}
+
+/// Spread of the offsets of strips of azimuth with the number of strips that are known well; the offsets with their
+/// variances.
+fn strips(search: &Search, column: usize) -> ((f64, f64), BTreeMap<Group, [f64; 2]>) {
+    let frames = search.sums.groups_of(Grouping::Azimuth);
+    let all = total(search.estimate.iter().map(|&i| &frames[i]));
+    let spread = grouped::spread(&all, group_fit(column), 0.0);
+    // The prior of strips with few returns is the spread of the others.
+    let precision = spread.0.max(FLOOR_GROUPS[2]).powi(-2).max(group_fit(column).precision);
+    let offsets = grouped::offsets(&all, GroupFit { precision, ..group_fit(column) });
+    let with_variance = |(g, offset)| (g, [offset, 1.0 / (all[&g].gram[2 * column] + precision)]);
+    (spread, offsets.into_iter().map(with_variance).collect())
 }
 
 /// Offset of all ranges, m; 0 where it is not known to three standard errors.

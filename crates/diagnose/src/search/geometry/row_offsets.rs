@@ -50,7 +50,8 @@ fn each(rows: &Quarters) -> impl Iterator<Item = (usize, usize, Said)> {
     rows.iter().flat_map(of_row)
 }
 
-/// Variance of an offset of which nothing is said.
+/// Variance of an offset of which nothing is said, m2 or rad2: without bound, but where nothing is said of any of some
+/// rows their weights are still equal.
 const UNKNOWN: f64 = 1e6;
 
 /// Variance of the errors of the surfaces, m2: what quarters differ by beyond chance, over their levers; the median of
