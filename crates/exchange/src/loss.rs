@@ -85,6 +85,7 @@ mod tests {
             attenuation_per_m: 0.0,
             assumed: None,
             form: None,
+            estimated_incidence: None,
         };
         loss.add(&Effect::SignalDropout(law));
         assert!((loss.at(250.0) - 0.55).abs() < 1e-9, "{}", loss.at(250.0));

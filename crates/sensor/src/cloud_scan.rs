@@ -1,31 +1,21 @@
 //! Finished clouds as scans: sensor, place in the pattern, surface and angle of incidence of each point, recovered as
 //! the diagnosis recovers them.
 
-use crate::directions::{DirectionIndex, SensorScan, Sensors, Surroundings, split_by_sensor, split_with_places};
+use crate::directions::{
+    DirectionIndex, FarSurfaces, LEAST_COS, SensorScan, Sensors, Surroundings, split_by_sensor, split_with_places,
+};
 use crate::effects::{Need, Reads};
 use crate::rig::{Rig, Sensor};
-use crate::scan::{Echo, Scan, dot};
+use crate::scan::{Echo, Incidence, Scan, dot};
 use data::Cloud;
 use geometry::Pose;
-use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Vector3;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
-use std::num::NonZeroUsize;
 
 /// Cosine of incidence that is assumed where no surface can be fitted: on edges and curved parts of objects.
 pub const ROUND_COS: f32 = 0.6;
-
-/// Distance up to which a surface goes on from a return that shows it, m and as a share of the range: rows of a sensor
-/// with 16 of them, 1.8 m above a road, meet it at distances that grow by a third from row to row.
-const REACH: [f32; 2] = [0.5, 0.4];
-
-/// Distance across a plane up to which a point lies on its continuation, m and as a share of the distance along it.
-const ACROSS: [f32; 2] = [0.05, 0.02];
-
-/// Returns on smooth surfaces that are looked at for a point, nearest first.
-const CANDIDATES: NonZeroUsize = NonZeroUsize::new(16).expect("not 0");
 
 /// Difference in range up to which a point at an edge belongs to a surface beside it, m and as a share of the range.
 const BESIDE: [f32; 2] = [0.3, 0.03];
@@ -166,7 +156,7 @@ impl CloudReader {
             echo.cos_incidence = f32::NAN;
             if let Some((surface, normal)) = around.look(azimuth, elevation, Some(i as u32)).surface {
                 echo.normal = normal.map(|v| v as f32).into();
-                echo.cos_incidence = surface.cos_incidence as f32;
+                (echo.incidence, echo.cos_incidence) = (Incidence::Estimated, surface.cos_incidence as f32);
             }
         }
         // Points at edges and on lone rows take the surface that goes on through them.
@@ -176,12 +166,18 @@ impl CloudReader {
             (echo.point(), echo.normal)
         }));
         for (i, &place) in places.iter().enumerate().filter(|(i, _)| !smooth[*i]) {
-            let beside = || nearest(&around.index, scan, i, &smooth).map(|k| echoes[places[k] as usize].normal);
-            let normal = surfaces.through(echoes[place as usize].point(), scan.range_m[i]).or_else(beside);
+            let beside = nearest(&around.index, scan, i, &smooth).map(|k| echoes[places[k] as usize].normal);
+            let through =
+                surfaces.through(echoes[place as usize].point(), echoes[place as usize].direction, scan.range_m[i]);
             let echo = &mut echoes[place as usize];
-            echo.normal = normal.unwrap_or_default();
-            let cos = -dot(echo.normal, echo.direction);
-            echo.cos_incidence = if cos > 1e-3 { cos } else { ROUND_COS };
+            let cos = |normal: &[f32; 3]| -dot(*normal, echo.direction);
+            let met =
+                |normal: Option<[f32; 3]>| Some((normal?, normal.as_ref().map(cos).filter(|cos| *cos > LEAST_COS)?));
+            (echo.incidence, (echo.normal, echo.cos_incidence)) = match (through, met(beside)) {
+                (Some(met), _) => (Incidence::Continued, met),
+                (None, Some(met)) => (Incidence::Assumed, met),
+                (None, None) => (Incidence::Assumed, (beside.unwrap_or_default(), ROUND_COS)),
+            };
         }
     }
 
@@ -223,38 +219,6 @@ impl CloudReader {
             }
         }
         empty
-    }
-}
-
-/// Smooth surfaces that go on beyond the returns that show them, as a road does between rows that lie metres apart.
-struct FarSurfaces {
-    tree: Option<ImmutableKdTree<f32, 3>>,
-    normals: Vec<[f32; 3]>,
-    points: Vec<[f32; 3]>,
-}
-
-impl FarSurfaces {
-    /// Of returns on smooth surfaces, with the normals there.
-    fn new(returns: impl Iterator<Item = ([f32; 3], [f32; 3])>) -> Self {
-        let (points, normals): (Vec<_>, Vec<_>) = returns.unzip();
-        FarSurfaces {
-            tree: ImmutableKdTree::new_from_slice(&points).ok().filter(|_| !points.is_empty()),
-            normals,
-            points,
-        }
-    }
-
-    /// The normal of the nearest return whose plane goes through a point at some range from the sensor.
-    fn through(&self, point: [f32; 3], range_m: f32) -> Option<[f32; 3]> {
-        let reach_m = REACH[0] + REACH[1] * range_m;
-        let near = self.tree.as_ref()?.query(&point).nearest_n::<SquaredEuclidean<f32>>(CANDIDATES);
-        let near = near.within(reach_m * reach_m).execute();
-        let goes_on = |place: usize, squared: f32| {
-            let away: [f32; 3] = std::array::from_fn(|k| point[k] - self.points[place][k]);
-            dot(self.normals[place], away).abs() < ACROSS[0] + ACROSS[1] * squared.sqrt()
-        };
-        let found = near.into_iter().find(|n| goes_on(n.item as usize, n.distance))?;
-        Some(self.normals[found.item as usize])
     }
 }
 
@@ -358,14 +322,6 @@ mod tests {
         for echo in far {
             assert!((echo.cos_incidence * echo.range_m / 2.0 - 1.0).abs() < 0.1, "{echo:?}");
         }
-        let wall = ([20.0, 0.0, 1.0], [-1.0, 0.0, 0.0]);
-        let surfaces = FarSurfaces::new([([18.0, 0.0, -2.0], [0.0, 0.0, 1.0]), wall].into_iter());
-        assert_eq!(surfaces.through([25.0, 0.0, -2.05], 25.0), Some([0.0, 0.0, 1.0]));
-        assert_eq!(surfaces.through([20.0, 3.0, 1.0], 20.0), Some(wall.1));
-        for (point, range_m) in [([25.0, 0.0, -1.0], 25.0), ([40.0, 0.0, -2.0], 40.0)] {
-            assert_eq!(surfaces.through(point, range_m), None, "beside the planes, or too far along one");
-        }
-        assert_eq!(FarSurfaces::new(std::iter::empty()).through([1.0, 0.0, 0.0], 1.0), None);
     }
 
     #[test]

@@ -5,6 +5,20 @@ use crate::object::FIRST_CAR;
 use crate::signal::returned_light_index;
 use data::Cloud;
 
+/// Where the angle of incidence of an echo is from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Incidence {
+    /// From the surface itself.
+    #[default]
+    Known,
+    /// Of a surface fitted to the returns around it in a finished cloud.
+    Estimated,
+    /// No surface can be fitted around it, but one of other returns goes on through it.
+    Continued,
+    /// No surface is known: that of a return beside it, or assumed.
+    Assumed,
+}
+
 /// One shot and its return. Origin and direction are those that the sensor reports, in the cloud's frame; the true ray
 /// can differ.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,6 +43,8 @@ pub struct Echo {
     pub normal: [f32; 3],
     /// Cosine of the angle of incidence.
     pub cos_incidence: f32,
+    /// Where normal and incidence are from.
+    pub incidence: Incidence,
     /// Reflectivity of the material at normal incidence, relative to a white Lambertian plate.
     pub reflectivity: f32,
     /// Returned light: reflectivity times the material's incidence term times the transmission of the path.
@@ -63,6 +79,7 @@ impl Echo {
             range_m: f32::INFINITY,
             normal: [0.0; 3],
             cos_incidence: 1.0,
+            incidence: Incidence::Known,
             reflectivity: 0.0,
             returned: 0.0,
             material: MaterialId(0),

@@ -23,6 +23,8 @@ identifiers! {
         BrighterObjects = "brighter_objects",
         /// Reflectivity of standing surfaces over that of the ground, ln.
         BrighterStanding = "brighter_standing",
+        /// Reflectivity of the lower corners of labelled objects (wheels) over that of the ground, ln.
+        BrighterWheels = "brighter_wheels",
         /// Probability that a packet is lost after one that was lost.
         Burst = "burst",
         /// Cosine of incidence at which half of the returns are lost.

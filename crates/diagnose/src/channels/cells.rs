@@ -22,7 +22,7 @@ pub const OBJECT: usize = 2;
 
 /// Cosine of incidence that is assumed on edges and curved parts of objects, such as wheels: no surface can be fitted
 /// to them.
-const ROUND_COS: f64 = 0.6;
+pub const ROUND_COS: f64 = sensor::cloud_scan::ROUND_COS as f64;
 
 /// Cosine of incidence of a ray on a smooth surface, or on an object; `None` on other edges.
 fn cos_of(ray: &Ray) -> Option<f64> {

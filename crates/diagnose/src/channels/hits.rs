@@ -42,7 +42,7 @@ impl HitCell {
 pub type HitFrame = Vec<(u32, HitCell)>;
 
 /// Whether a shot has a return on the simulated and on the measured side.
-type Sides = [bool; 2];
+pub type Sides = [bool; 2];
 
 /// Variance of a number of lost returns in units of that of independent ones: neighbours are lost together.
 pub const TOGETHER: f64 = 2.0;
@@ -50,7 +50,7 @@ pub const TOGETHER: f64 = 2.0;
 /// Every shot with a return, once: where both sides have one, the simulated one stands for both. Its surface is that of
 /// its neighbours without itself, as for a shot that only one side has; the measured one would see its counterpart as
 /// well, and more often a surface where the returns are few.
-fn counted(frame: &FramePair) -> impl Iterator<Item = (Sides, &Ray)> {
+pub fn counted(frame: &FramePair) -> impl Iterator<Item = (Sides, &Ray)> {
     let simulated = frame.simulated.iter().map(|r| ([true, r.matched], r));
     let only_measured = frame.measured.iter().filter(|r| !r.matched).map(|r| ([false, true], r));
     simulated.chain(only_measured)

@@ -53,15 +53,21 @@ pub struct FittedLaw {
     /// Which.
     pub law: Law,
     /// Random, zone: share lost. Range, incidence, signal: place, logarithm of the steepness, logarithm of the skew,
-    /// share lost where the law has no effect. Signal, in addition: ln of the reflectivity of standing surfaces and
-    /// of objects over that of the ground.
-    pub numbers: [f64; 6],
+    /// share lost where the law has no effect. Signal, in addition: ln of the reflectivity of standing surfaces, of
+    /// bodies of objects and of their lower corners (wheels) over that of the ground.
+    pub numbers: [f64; 7],
 }
 
 /// A logistic step with a skew: (1 + exp(-k (x - a)))^-skew. The skew lets the two tails differ, as those of real
 /// sensors do.
 fn step(x: f64, [a, ln_k, ln_skew]: [f64; 3]) -> f64 {
     (1.0 + (-ln_k.exp() * (x - a)).exp()).powf(-ln_skew.exp())
+}
+
+/// Steepness of the step without skew that has the same slope at one half: d ln(kept) / dx there, over that of a
+/// logistic step.
+fn steepness(ln_k: f64, ln_skew: f64) -> f64 {
+    2.0 * (ln_k + ln_skew).exp() * (1.0 - 0.5f64.powf((-ln_skew).exp()))
 }
 
 /// The place at which a step is one half.
@@ -100,7 +106,7 @@ impl Law {
         match self {
             Law::Random | Law::Zone(_) => 1,
             Law::Range | Law::Incidence => 2,
-            Law::Signal => 4,
+            Law::Signal => 5,
         }
     }
 
@@ -108,7 +114,7 @@ impl Law {
         match self {
             Law::Random | Law::Zone(_) => 1,
             Law::Range | Law::Incidence => 4,
-            Law::Signal => 6,
+            Law::Signal => 7,
         }
     }
 
@@ -116,13 +122,13 @@ impl Law {
         match self {
             Law::Random | Law::Zone(_) => vec![0.05],
             Law::Range | Law::Incidence => vec![0.3, 0.4, 0.3, 0.005],
-            Law::Signal => vec![0.5, 0.4, 0.3, 0.005, 0.4, 0.4],
+            Law::Signal => vec![0.5, 0.4, 0.3, 0.005, 0.4, 0.4, 0.4],
         }
     }
 
     /// Starting points of a fit, from the cells with returns.
     pub(super) fn starts(self, cells: &[Where]) -> Vec<FittedLaw> {
-        let with = |numbers: [f64; 6]| FittedLaw { law: self, numbers };
+        let with = |numbers: [f64; 7]| FittedLaw { law: self, numbers };
         let value = |at: &Where| match self {
             Law::Incidence => at.ln_cos,
             Law::Signal => at.ln_cos - 2.0 * at.ln_range,
@@ -132,9 +138,9 @@ impl Law {
         values.sort_by(f64::total_cmp);
         let quantile = |q: f64| values.get(((values.len() as f64 - 1.0) * q) as usize).copied().unwrap_or(0.0);
         match self {
-            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])],
-            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0, 0.0, 0.0])).to_vec(),
-            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0, 0.0, 0.0])).to_vec(),
+            Law::Random | Law::Zone(_) => vec![with([0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])],
+            Law::Range => [0.4, 0.75, 0.97].map(|q| with([quantile(q), 1.5, 0.0, 0.0, 0.0, 0.0, 0.0])).to_vec(),
+            _ => [0.03, 0.25, 0.6].map(|q| with([quantile(q), 0.8, 0.0, 0.0, 0.0, 0.0, 0.0])).to_vec(),
         }
     }
 }
@@ -146,7 +152,7 @@ pub const MOST_ANYWAY: f64 = 0.025;
 /// the steepness.
 fn shape_penalty(ln_k: f64, usual: f64, ln_skew: f64, anyway: f64) -> f64 {
     let beyond = (anyway - anyway.clamp(0.0, MOST_ANYWAY)) / 1e-3;
-    let flat = (LEAST_STEEPNESS.ln() - ln_k).max(0.0) / 1e-2;
+    let flat = (LEAST_STEEPNESS.ln() - steepness(ln_k, ln_skew).ln()).max(0.0) / 1e-2;
     let of_shape = 0.5 * (ln_k - usual).powi(2) + 0.5 * (ln_skew / 0.7).powi(2) + 0.5 * (anyway / 0.01).powi(2);
     of_shape + beyond * beyond + flat * flat
 }
@@ -163,9 +169,8 @@ impl FittedLaw {
 
     /// Steepness of the step without skew that has the same slope at one half.
     pub fn steepness(&self) -> f64 {
-        let [_, b, s, ..] = self.numbers;
-        // d ln(kept) / dx at one half, over that of a logistic step.
-        2.0 * b.exp() * s.exp() * (1.0 - 0.5f64.powf((-s).exp()))
+        let [_, ln_k, ln_skew, ..] = self.numbers;
+        steepness(ln_k, ln_skew)
     }
 
     /// Covariate of the law, and the share that it keeps, of a surface of a kind at a range and a cosine: ln(m) for
@@ -177,12 +182,12 @@ impl FittedLaw {
 
     /// What the law is a function of; `None` where it is none.
     pub(super) fn covariate(&self, at: &Where) -> Option<f64> {
-        let [.., c, d] = self.numbers;
+        let [.., standing, bodies, wheels] = self.numbers;
         match self.law {
             Law::Random | Law::Zone(_) => None,
             Law::Range => Some(at.ln_range),
             Law::Incidence => Some(at.ln_cos),
-            Law::Signal => Some(at.ln_cos - 2.0 * at.ln_range + [0.0, c, d, d][at.zone]),
+            Law::Signal => Some(at.ln_cos - 2.0 * at.ln_range + [0.0, standing, bodies, wheels][at.zone]),
         }
     }
 
@@ -217,11 +222,12 @@ impl FittedLaw {
     pub(super) fn penalty(&self) -> f64 {
         match self.law {
             Law::Signal => {
-                let [_, steep, skew, anyway, c, d] = self.numbers;
-                let beyond = [c, d].map(|v: f64| (v.abs() - MOST_BRIGHTNESS).max(0.0) / 1e-2);
-                0.5 * (c * c + d * d) / (BRIGHTNESS * BRIGHTNESS)
-                    + beyond.map(|b| b * b).iter().sum::<f64>()
-                    + shape_penalty(steep, 0.8, skew, anyway)
+                let [_, steep, skew, anyway, brighter @ ..] = self.numbers;
+                let of = |v: f64| {
+                    let beyond = (v.abs() - MOST_BRIGHTNESS).max(0.0) / 1e-2;
+                    0.5 * (v / BRIGHTNESS).powi(2) + beyond * beyond
+                };
+                brighter.map(of).iter().sum::<f64>() + shape_penalty(steep, 0.8, skew, anyway)
             }
             Law::Range | Law::Incidence => {
                 let [_, steep, skew, anyway, ..] = self.numbers;

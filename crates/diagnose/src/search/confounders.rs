@@ -230,7 +230,7 @@ fn drop_all(results: &mut [ChannelResult], because: &str, what: impl Fn(&Found) 
 }
 
 /// Parameters of the form of an effect, not of its size.
-const FORM: [Quantity; 11] = [
+const FORM: [Quantity; 12] = [
     Quantity::ReachM,
     Quantity::DivergenceRad,
     Quantity::ShareOnComb,
@@ -243,6 +243,7 @@ const FORM: [Quantity; 11] = [
     Quantity::Threshold,
     Quantity::BrighterStanding,
     Quantity::BrighterObjects,
+    Quantity::BrighterWheels,
 ];
 
 /// Whether the size of a finding is significant on the estimating frames: the interval of some parameter of size

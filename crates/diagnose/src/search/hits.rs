@@ -1,5 +1,6 @@
 //! Lost returns: which simulated returns have no measured counterpart, and on what that depends.
 
+mod as_effects;
 mod by_table;
 mod describe;
 mod form;
@@ -8,6 +9,7 @@ mod select;
 pub use self::by_table::{by_cell, by_table};
 
 use self::describe::found;
+use self::form::Corrections;
 use self::select::Selection;
 use super::unexplained::{Unexplained, mean_by_group};
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands, trimmed};
@@ -104,10 +106,10 @@ impl<'a> Search<'a> {
     }
 
     /// Whether the last of some laws loses enough to be reported. A second law must lose more than a correction of
-    /// the form of the first.
-    fn above_floor(&self, table: &LossTable, laws: &[FittedLaw]) -> bool {
+    /// the form of the first, and more than moving losses from the others to itself: `alone` are the others fitted
+    /// without it.
+    fn above_floor(&self, table: &LossTable, laws: &[FittedLaw], alone: &[FittedLaw]) -> bool {
         let Some((last, before)) = laws.split_last() else { return false };
-        let lost = table.lost(laws) - table.lost(before);
         let joins = f64::from(u8::from(before.iter().any(|l| l.law.has_form())));
         // What loses less than the laws before it say only corrects their form.
         let own = if before.is_empty() { last.numbers[0].abs() } else { last.numbers[0] };
@@ -122,7 +124,10 @@ impl<'a> Search<'a> {
                 own.min(most(Some(zone))) > ZONE_FLOOR + beside + 0.1 * self.displaced
             }
             Law::Random => own.min(most(None)) > FLOOR + 0.02 * joins + 0.01 * self.displaced,
-            _ => lost.abs() > FLOOR + 0.005 * joins + 0.01 * self.displaced,
+            _ => {
+                let lost = (table.lost(laws) - table.lost(before)).abs();
+                lost.min(table.changed(laws, alone)) > FLOOR + 0.005 * joins + 0.01 * self.displaced
+            }
         }
     }
 
@@ -141,7 +146,9 @@ impl<'a> Search<'a> {
     /// Those of the chosen laws that lose enough on the estimating frames as well.
     fn large_enough(&self, mut selection: Selection, on_estimate: &LossTable) -> Selection {
         let fitted = refit(on_estimate, &selection.laws);
-        let large: Vec<bool> = (1..=fitted.len()).map(|n| self.above_floor(on_estimate, &fitted[..n])).collect();
+        let alone = |n: usize| refit(on_estimate, &selection.laws[..n - 1]);
+        let large = (1..=fitted.len()).map(|n| self.above_floor(on_estimate, &fitted[..n], &alone(n)));
+        let large: Vec<bool> = large.collect();
         // Below a table by direction laws are forms, whatever they lose.
         if selection.unexplained.is_none() {
             let mut of_laws = large.iter();
@@ -167,8 +174,8 @@ impl<'a> Search<'a> {
             let draws: Vec<FittedLaw> = repeated.iter().map(|r| r[k]).collect();
             // The form is corrected once: with the first law over a covariate.
             let first = fitted.iter().position(|l| l.law.has_form()) == Some(k);
-            let form = if first { self.form(k, &fitted, &on_estimate) } else { vec![] };
-            result.found.push(found(&fitted[k], &draws, selected, gains, &on_hold_out, (&fitted, form)));
+            let corrections = if first { self.corrections(k, &fitted, &on_estimate) } else { Corrections::default() };
+            result.found.push(found(&fitted[k], &draws, selected, gains, &on_hold_out, (&fitted, corrections)));
         }
         let shares = on_estimate.matched_shares(&fitted);
         let distance = |&i: &usize| {

@@ -38,6 +38,11 @@ pub fn in_or_beside(bbox: &Box3, point: [f64; 3], margin_m: f64) -> bool {
     near && local[2] > -bbox.size[2] / 2.0 + FLOOR_M
 }
 
+/// Whether a surface with that component of its unit normal along z, the cloud's frame, is level as ground is.
+pub fn is_level(normal_z: f64) -> bool {
+    normal_z > LEVEL
+}
+
 /// Kind of the surface at a place, by the labelled boxes and the upward part of its unit normal, where it has one.
 pub fn kind_of(boxes: &[Box3], place: [f64; 3], normal_z: Option<f64>) -> Kind {
     for (k, b) in boxes.iter().enumerate() {
@@ -48,7 +53,7 @@ pub fn kind_of(boxes: &[Box3], place: [f64; 3], normal_z: Option<f64>) -> Kind {
             return Kind::Object { number: k as u16, corner };
         }
     }
-    if normal_z.is_some_and(|z| z > LEVEL) { Kind::Ground } else { Kind::Standing }
+    if normal_z.is_some_and(is_level) { Kind::Ground } else { Kind::Standing }
 }
 
 /// The returns of one sensor by direction, to look around.

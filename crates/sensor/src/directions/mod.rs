@@ -4,11 +4,13 @@
 //! incidence, or ground.
 
 mod around;
+mod far_surfaces;
 mod pattern;
 mod scan;
 mod surface;
 
-pub use around::{Around, Kind, Surroundings, in_or_beside, kind_of};
+pub use around::{Around, Kind, Surroundings, in_or_beside, is_level, kind_of};
+pub use far_surfaces::{FarSurfaces, LEAST_COS};
 pub use pattern::ScanPattern;
 pub use scan::{DirectionIndex, Entry, SensorScan, Steps, split_by_sensor, split_with_places};
 pub use surface::{LocalSurface, fit_surface, fit_surface_through};

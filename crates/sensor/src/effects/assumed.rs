@@ -21,24 +21,29 @@ pub struct AssumedReflectivity {
     pub standing: f64,
     /// Of labelled objects.
     pub objects: f64,
+    /// Of their lower corners, where vehicles have wheels; that of the objects if it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub wheels: Option<f64>,
 }
 
 impl AssumedReflectivity {
     /// The same for all.
     pub fn even(reflectivity: f64) -> Self {
-        AssumedReflectivity { ground: reflectivity, standing: reflectivity, objects: reflectivity }
+        AssumedReflectivity { ground: reflectivity, standing: reflectivity, objects: reflectivity, wheels: None }
     }
 
     pub(super) fn check(&self) -> Result<(), KeyError> {
         within("assumed.ground", self.ground, 1e-6, 1e6)?;
         within("assumed.standing", self.standing, 1e-6, 1e6)?;
-        within("assumed.objects", self.objects, 1e-6, 1e6)
+        within("assumed.objects", self.objects, 1e-6, 1e6)?;
+        self.wheels.map_or(Ok(()), |wheels| within("assumed.wheels", wheels, 1e-6, 1e6))
     }
 
     fn of(&self, kind: Kind) -> f64 {
         match kind {
             Kind::Ground => self.ground,
             Kind::Standing => self.standing,
+            Kind::Object { corner: true, .. } => self.wheels.unwrap_or(self.objects),
             Kind::Object { .. } => self.objects,
         }
     }

@@ -1,6 +1,7 @@
 //! B4: returns lost at grazing incidence.
 
-use super::form::{Form, factor};
+use super::assumed::boxes;
+use super::form::{EstimatedIncidence, Form, factor};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
@@ -33,6 +34,9 @@ pub struct IncidenceDropout {
     /// Correction of the form over x.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub form: Option<Form>,
+    /// What is lost in finished clouds, whose angles of incidence are estimated; factors over x.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub estimated_incidence: Option<Box<EstimatedIncidence>>,
 }
 
 /// Scale of the cosine in [`IncidenceDropout`].
@@ -58,7 +62,8 @@ impl SensorEffect for IncidenceDropout {
         within("steepness", self.steepness, 0.01, 1e4)?;
         within("skew", self.skew, 0.01, 100.0)?;
         within("most", self.most, 0.0, 1.0)?;
-        self.form.as_ref().map_or(Ok(()), Form::check)
+        self.form.as_ref().map_or(Ok(()), Form::check)?;
+        self.estimated_incidence.as_ref().map_or(Ok(()), |estimated| estimated.check())
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
@@ -69,15 +74,19 @@ impl SensorEffect for IncidenceDropout {
         Reads::SURFACES
     }
 
-    fn on_scan(&self, scan: &mut Scan, _frame: &FrameContext, draws: &Draws) {
+    fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
+        let boxes = boxes(frame);
         let x = |cos: f64| if self.scale == CosineScale::Log { cos.max(1e-4).ln() } else { cos };
         let half = if self.scale == CosineScale::Log { self.cos_half.ln() } else { self.cos_half };
         // The logistic function to the power of the skew is one half at `cos_half`.
         let middle = half + (0.5f64.powf(-1.0 / self.skew) - 1.0).ln() / self.steepness;
         drop_some(scan, draws, |echo| {
             let x = x(echo.cos_incidence.into());
-            let (off, form) = (x - middle, factor(self.form.as_ref(), x));
-            (1.0 - form * self.most * (1.0 + (-self.steepness * off).exp()).powf(-self.skew)) as f32
+            let by_law = factor(self.form.as_ref(), x)
+                * self.most
+                * (1.0 + (-self.steepness * (x - middle)).exp()).powf(-self.skew);
+            let estimated = self.estimated_incidence.as_ref();
+            (1.0 - estimated.map_or(by_law, |e| e.kept(echo, &boxes, by_law, x))) as f32
         });
     }
 }
@@ -96,6 +105,7 @@ mod tests {
             skew: 1.0,
             most: 1.0,
             form: None,
+            estimated_incidence: None,
         };
         for (range_m, c) in [(10.0, 0.2), (90.0, 0.2), (10.0, 0.1), (10.0, 0.4)] {
             let mut before = plate(20_000, range_m, 0.5);

@@ -33,7 +33,7 @@ pub use assumed::AssumedReflectivity;
 pub use context::{Draws, FrameContext, LabelledCar, Need, Undulation, WorldPlan};
 pub use empirical::Covariate;
 pub use false_alarms::{FIRST_DROP_M, RangeLaw};
-pub use form::Form;
+pub use form::{EdgeLoss, EstimatedIncidence, Form, OnSurfaces};
 pub use incidence_dropout::CosineScale;
 pub use label_time_offset::Clock;
 pub use material_dropout::SurfaceKind;

@@ -1,7 +1,7 @@
 //! B2: detection probability by returned light (LiDAR equation).
 
 use super::assumed::{AssumedReflectivity, boxes, signal};
-use super::form::{Form, factor};
+use super::form::{EstimatedIncidence, Form, factor};
 use super::random_dropout::drop_some;
 use super::{Draws, FrameContext, Need, Reads, SensorEffect};
 use crate::scan::Scan;
@@ -37,6 +37,9 @@ pub struct SignalDropout {
     /// Correction of the form over the signal index.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub form: Option<Form>,
+    /// What is lost in finished clouds, whose angles of incidence are estimated; factors over the signal index.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub estimated_incidence: Option<Box<EstimatedIncidence>>,
 }
 
 fn all_detected() -> f64 {
@@ -51,6 +54,7 @@ impl SensorEffect for SignalDropout {
         within("skew", self.skew, 0.01, 100.0)?;
         self.assumed.map_or(Ok(()), |assumed| assumed.check())?;
         self.form.as_ref().map_or(Ok(()), Form::check)?;
+        self.estimated_incidence.as_ref().map_or(Ok(()), |estimated| estimated.check())?;
         within("attenuation_per_m", self.attenuation_per_m, 0.0, 1.0)
     }
 
@@ -71,7 +75,9 @@ impl SensorEffect for SignalDropout {
         drop_some(scan, draws, |echo| {
             let signal = signal(self.assumed.as_ref(), echo, &boxes) - 2.0 * attenuation * echo.range_m;
             let form = factor(self.form.as_ref(), signal.into()) as f32;
-            1.0 - form * most * (1.0 + (-steepness * (signal - middle)).exp()).powf(-skew)
+            let by_law = form * most * (1.0 + (-steepness * (signal - middle)).exp()).powf(-skew);
+            let estimated = self.estimated_incidence.as_ref();
+            1.0 - estimated.map_or(by_law, |e| e.kept(echo, &boxes, by_law.into(), signal.into()) as f32)
         });
     }
 }
@@ -91,6 +97,7 @@ mod tests {
             skew: 1.0,
             assumed: None,
             form: None,
+            estimated_incidence: None,
         };
         let logistic = |u: f64| 1.0 - 0.9 / (1.0 + (-4.0 * u).exp());
         // Twice the range returns a quarter of the light.
@@ -123,11 +130,12 @@ mod tests {
             skew: 0.4,
             assumed: None,
             form: None,
+            estimated_incidence: None,
         };
         // The reflectivity at which the index is 2: half of `most`, whatever the skew.
         let half = (0.1 * (2f64).exp() * (100.0f64 / 250.0).powi(2)) as f32;
         assert!((kept(&plain, half) - 0.45).abs() < 0.01, "{}", kept(&plain, half));
-        let assumed = AssumedReflectivity { ground: 0.9, standing: half.into(), objects: 0.9 };
+        let assumed = AssumedReflectivity { ground: 0.9, standing: half.into(), objects: 0.9, wheels: None };
         let assumed = SignalDropout { assumed: Some(assumed), ..plain.clone() };
         assert!((kept(&assumed, 5.0) - 0.45).abs() < 0.01, "a plate stands, whatever its own light");
         let form = Form { at: vec![1.0, 3.0], factor: vec![0.4, 0.8] };

@@ -1,18 +1,14 @@
 //! Findings of lost returns: parameters, sentences and plots.
 
+use super::form::Corrections;
 use crate::catalogue::{Channel, Covariate, Quantity};
 use crate::channels::cells::OBJECT;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::Parameter;
-use crate::effects::rounded;
 use crate::inference::law::{FittedLaw, Law, in_zone};
 use crate::inference::losses::LossTable;
 use crate::search::{Found, NamedParameter, Selected};
-use sensor::effects::{
-    AssumedReflectivity, CosineScale, Effect, Form, IncidenceDropout, MaterialDropout, RandomDropout, RangeDropout,
-    SignalDropout, SurfaceKind, interpolated,
-};
-use sensor::signal::{DIAGNOSIS_REFLECTIVITY, index_offset};
+use sensor::signal::index_offset;
 
 /// Parameters of a law, as a finding has them.
 fn values(law: &FittedLaw) -> Vec<(Quantity, f64)> {
@@ -29,86 +25,26 @@ fn values(law: &FittedLaw) -> Vec<(Quantity, f64)> {
             most,
             (Quantity::BrighterStanding, law.numbers[4]),
             (Quantity::BrighterObjects, law.numbers[5]),
+            (Quantity::BrighterWheels, law.numbers[6]),
         ],
     }
 }
 
-/// The law as the simulator has it; none where the simulation loses more.
-fn effects(law: &FittedLaw, form: &[[f64; 2]]) -> Vec<Effect> {
-    let factor_at = |x: f64| {
-        let [at, factor] = [0, 1].map(|k: usize| form.iter().map(|p| p[k]).collect::<Vec<f64>>());
-        if form.is_empty() { 1.0 } else { interpolated(&at, &factor, x) }
-    };
-    let table = |offset: f64| {
-        let at = form.iter().map(|p| rounded(p[0] + offset, 5)).collect();
-        (!form.is_empty()).then(|| Form { at, factor: form.iter().map(|p| rounded(p[1], 4)).collect() })
-    };
-    let [place, ln_steepness, ln_skew, _, standing, objects] = law.numbers;
-    let (share, most) = (law.numbers[0], rounded(law.most(), 7));
-    let [steepness, skew] = [ln_steepness.exp(), ln_skew.exp()].map(|v| rounded(v.clamp(0.02, 99.0), 7));
-    match law.law {
-        Law::Random | Law::Zone(_) if share <= 0.0 => vec![],
-        Law::Random => vec![Effect::RandomDropout(RandomDropout { share: rounded(share, 7) })],
-        Law::Zone(zone) => {
-            let kinds = [SurfaceKind::Ground, SurfaceKind::Standing, SurfaceKind::Bodies, SurfaceKind::Wheels];
-            let of_law = kinds.into_iter().enumerate().filter(|(k, _)| in_zone(zone, *k));
-            let surfaces = of_law.map(|(_, kind)| kind).collect();
-            let share = rounded(share.min(1.0), 7);
-            vec![Effect::MaterialDropout(MaterialDropout { materials: vec![], surfaces, share })]
-        }
-        Law::Range => {
-            let at = |k: u32| 2f64 * (0.05 * f64::from(k)).exp();
-            let range_m: Vec<f64> = (0..100).map(|k| rounded(at(k), 3)).collect();
-            let share = range_m
-                .iter()
-                .map(|r| rounded((1.0 - factor_at(r.ln()) * law.kept_there(*r, 1.0)).clamp(0.0, 1.0), 5))
-                .collect();
-            vec![Effect::RangeDropout(RangeDropout { range_m, share })]
-        }
-        Law::Incidence => vec![Effect::IncidenceDropout(IncidenceDropout {
-            cos_half: rounded(law.half().clamp(-20.0, 20.0).exp(), 9),
-            steepness,
-            scale: CosineScale::Log,
-            skew,
-            most,
-            form: table(0.0),
-        })],
-        Law::Signal => {
-            let than_ground = |ln: f64| rounded((DIAGNOSIS_REFLECTIVITY * ln.exp()).clamp(1e-5, 1e5), 7);
-            let ground = DIAGNOSIS_REFLECTIVITY;
-            let (standing, objects) = (than_ground(standing), than_ground(objects));
-            let assumed = AssumedReflectivity { ground, standing, objects };
-            vec![Effect::SignalDropout(SignalDropout {
-                most,
-                threshold: rounded((law.half() + index_offset()).clamp(-20.0, 20.0), 7),
-                steepness,
-                skew,
-                attenuation_per_m: 0.0,
-                assumed: Some(assumed),
-                form: table(index_offset()),
-            })]
-        }
-    }
-    .into_iter()
-    .filter(|_| place.is_finite())
-    .collect()
-}
-
 /// The finding of one law. `draws` are its bootstrap fits, `all` are all laws that were fitted together, with the
-/// correction of the form of this one.
+/// corrections of this one.
 pub(super) fn found(
     law: &FittedLaw,
     draws: &[FittedLaw],
     selected: Selected,
     held_out_gains: Vec<f64>,
     table: &LossTable,
-    (all, form): (&[FittedLaw], Vec<[f64; 2]>),
+    (all, corrections): (&[FittedLaw], Corrections),
 ) -> Found {
     let separate_by = (!selected.rivals.is_empty()).then(|| {
         "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
     });
     Found {
-        effects: effects(law, &form),
+        effects: corrections.effects(law),
         status: selected.status(),
         confidence: selected.confidence,
         causes: selected.causes(law.law.cause()),

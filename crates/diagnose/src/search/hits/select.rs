@@ -15,6 +15,10 @@ use rayon::prelude::*;
 /// Share of the gain of the first law from which on a random loss is tried in its place.
 const MOSTLY_RANDOM: f64 = 0.5;
 
+/// The same for any other law beside a sum of several: a tenth is more than any second law brings that stands for what
+/// the first one lacks.
+const NEARLY_ALL: f64 = 0.9;
+
 /// Largest number of laws.
 const MOST_LAWS: usize = 4;
 
@@ -33,32 +37,34 @@ pub(super) struct Selection {
 }
 
 impl Search<'_> {
-    /// Selection of a sum of laws. Where a random loss explains most of what the first law does, the sum that begins
-    /// with it is tried as well: a law can lose nearly the same everywhere. The sum with fewer parameters is taken
-    /// unless the other one gains more, significantly.
+    /// Selection of a sum of laws. Which law gains most alone depends on what the others lose: sums that begin with
+    /// another law are tried as well. The sum with fewer parameters is taken unless the other one gains more,
+    /// significantly.
     pub(super) fn select(&self, result: &mut ChannelResult) -> Selection {
         let first = self.trials(&[], 0.0);
         let Some(choice) = self.choose(&first, &mut result.considered) else { return Selection::default() };
-        let gain = |t: &Trial| total_and_z(&t.gains).0;
-        let chosen = gain(&first[choice.chosen]);
-        let one = self.grow(&first, &choice, &mut result.considered);
-        let random = first.iter().position(|t| t.cause == Cause::RandomDropout && t.above_floor);
-        let other = random.filter(|&r| r != choice.chosen && gain(&first[r]) > MOSTLY_RANDOM * chosen);
-        let Some(random) = other.filter(|_| one.unexplained.is_none()) else { return one };
-        let mut considered = vec![];
-        let two = self.grow(&first, &Choice { chosen: random, equals: vec![] }, &mut considered);
-        if two.laws.len() < 2 || two.unexplained.is_some() {
-            return one;
+        let mut best = self.grow(&first, &choice, &mut result.considered);
+        for start in other_starts(&first, choice.chosen, best.laws.len()) {
+            if best.unexplained.is_some() {
+                break;
+            }
+            let mut considered = vec![];
+            let other = self.grow(&first, &Choice { chosen: start, equals: vec![] }, &mut considered);
+            // Of two single laws the choice is made.
+            let sums = other.unexplained.is_none() && other.laws.len().max(best.laws.len()) > 1;
+            if sums && self.explains_better(&other.laws, &best.laws) {
+                result.considered.extend(considered);
+                best = other;
+            }
         }
-        let parameters = |s: &Selection| s.laws.iter().map(|l| l.parameters()).sum::<usize>();
-        let (ahead, z) = total_and_z(&self.gains_over(&two.laws, &one.laws));
-        let better =
-            if parameters(&two) <= parameters(&one) { ahead > 0.0 || z > -2.0 } else { ahead > 0.0 && z > 2.0 };
-        if !better {
-            return one;
-        }
-        result.considered.extend(considered);
-        two
+        best
+    }
+
+    /// Whether a sum of laws is taken in place of another one.
+    fn explains_better(&self, laws: &[Law], than: &[Law]) -> bool {
+        let parameters = |laws: &[Law]| laws.iter().map(|l| l.parameters()).sum::<usize>();
+        let (ahead, z) = total_and_z(&self.gains_over(laws, than));
+        if parameters(laws) <= parameters(than) { ahead > 0.0 || z > -2.0 } else { ahead > 0.0 && z > 2.0 }
     }
 
     /// Adds laws to a first one: the one that gains most beside any form of those before it; then each law is chosen
@@ -175,7 +181,7 @@ impl Search<'_> {
             let kept: Vec<Vec<f64>> = tables.iter().zip(&before).map(kept).collect();
             let gains = self.gains(|fold| [&kept[fold], &kept_before[fold]]);
             let whole = self.table.fit(&before_on_all, law);
-            let above_floor = self.above_floor(&self.table, &whole);
+            let above_floor = self.above_floor(&self.table, &whole, &before_on_all);
             let trial = Trial { candidate: k, cause: law.cause(), parameters: law.parameters(), gains, above_floor };
             let confined = (law == Law::Signal).then(|| self.table.confined_to(&whole[whole.len() - 1..]));
             (trial, confined.flatten())
@@ -199,6 +205,19 @@ impl Search<'_> {
         let groups = |grouping| self.loss_groups(grouping, &self.table, &laws);
         direction_trials(&self.select, &self.blocks, LAWS.len(), how, [GROUP_FLOOR; 2], groups)
     }
+}
+
+/// Trials of the laws that a sum may begin with in place of the chosen one: a random loss that explains much of it, as
+/// a law can lose nearly the same everywhere, and beside a sum of several `laws` what explains nearly as much.
+fn other_starts(first: &[Trial], chosen: usize, laws: usize) -> Vec<usize> {
+    let gain = |t: &Trial| total_and_z(&t.gains).0;
+    let most = gain(&first[chosen]);
+    let may = |t: &Trial| match t.cause {
+        Cause::Unexplained => false,
+        Cause::RandomDropout => gain(t) > MOSTLY_RANDOM * most,
+        _ => laws > 1 && gain(t) > NEARLY_ALL * most,
+    };
+    (0..first.len()).filter(|&k| k != chosen && first[k].above_floor && may(&first[k])).collect()
 }
 
 /// All laws but some.
