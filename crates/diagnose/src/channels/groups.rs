@@ -1,7 +1,7 @@
 //! Offsets of groups of rays: rows of a sensor, or strips of azimuth. Each group has one range offset, and rows have
 //! one elevation offset as well. The pose error of each frame is subtracted before.
 
-use super::mean::{KINDS, OwnPoses, STRAY_M, pose_row, usable, weight};
+use super::mean::{KINDS, OwnPoses, STRAY_M, own_row, usable, weight};
 use crate::catalogue::Covariate;
 use crate::pairing::{FramePair, Ray};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
@@ -175,7 +175,7 @@ impl Seen<'_> {
         origin: &Point3<f64>,
         turn: &UnitQuaternion<f64>,
     ) -> Option<(f64, [f64; 2])> {
-        let y = ray.across_nearest_m() - pose_row(ray, origin, &Point3::origin()).dot(&poses[ray.sensor as usize]);
+        let y = ray.across_nearest_m() - own_row(ray, origin).dot(&poses[ray.sensor as usize]);
         let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, turn)];
         let of_row = self.undone.get(&Group { sensor: ray.sensor, index: ray.row });
         let undone = of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad);

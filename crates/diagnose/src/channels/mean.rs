@@ -63,8 +63,12 @@ pub struct MeanFrame {
     pub squares: f64,
 }
 
-/// Pose error of one frame as each sensor by itself sees it: turns about the cloud's origin, rad, and shifts, m.
-pub type OwnPoses = Vec<SVector<f64, 6>>;
+/// Numbers of an [`OwnPoses`] for each sensor.
+pub const OWN_NUMBERS: usize = 7;
+
+/// Pose error of one frame as each sensor by itself sees it: turns about the cloud's origin, rad, and shifts, m; then
+/// the offset of all ranges, m. Without the latter a range bias is taken for a pose, another one in each scene.
+pub type OwnPoses = Vec<SVector<f64, OWN_NUMBERS>>;
 
 /// Range noise of the simulated side, m: the median over its smooth returns.
 pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
@@ -120,9 +124,15 @@ pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVecto
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
 }
 
-/// Prior of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m.
-fn loose_prior() -> SVector<f64, 6> {
-    SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
+/// Derivatives of the distance across the surface by what [`OwnPoses`] holds of a sensor at `origin`.
+pub fn own_row(ray: &Ray, origin: &Point3<f64>) -> SVector<f64, OWN_NUMBERS> {
+    let [a, b, c, d, e, f]: [f64; 6] = pose_row(ray, origin, &Point3::origin()).into();
+    SVector::from([a, b, c, d, e, f, -f64::from(ray.cos_incidence)])
+}
+
+/// Prior of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m; and of its range offset.
+fn loose_prior() -> SVector<f64, OWN_NUMBERS> {
+    SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
 }
 
 /// The pose error of one frame as each sensor sees it, fitted with redescending weights.
@@ -130,20 +140,17 @@ pub fn own_poses(frame: &FramePair, origins: &[Point3<f64>], noise_m: f64) -> Ow
     (0..origins.len()).map(|sensor| own_pose(frame, sensor, origins, noise_m)).collect()
 }
 
-fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: f64) -> SVector<f64, 6> {
-    let rows: Vec<(SVector<f64, 6>, f64, f64)> = frame
+fn own_pose(frame: &FramePair, sensor: usize, origins: &[Point3<f64>], noise_m: f64) -> SVector<f64, OWN_NUMBERS> {
+    let rows: Vec<(SVector<f64, OWN_NUMBERS>, f64, f64)> = frame
         .measured
         .iter()
         .filter(|r| usable(r) && r.sensor as usize == sensor)
-        .map(|r| {
-            let row = pose_row(r, &origins[r.sensor as usize], &Point3::origin());
-            (row, r.across_nearest_m(), weight(r, noise_m))
-        })
+        .map(|r| (own_row(r, &origins[sensor]), r.across_nearest_m(), weight(r, noise_m)))
         .collect();
-    let mut pose = SVector::<f64, 6>::zeros();
+    let mut pose = SVector::<f64, OWN_NUMBERS>::zeros();
     for scale in [0.5, 0.3, 0.15, 0.1, 0.07, 0.07] {
-        let mut system = SMatrix::<f64, 6, 6>::from_diagonal(&loose_prior());
-        let mut right = SVector::<f64, 6>::zeros();
+        let mut system = SMatrix::<f64, OWN_NUMBERS, OWN_NUMBERS>::from_diagonal(&loose_prior());
+        let mut right = SVector::<f64, OWN_NUMBERS>::zeros();
         for (row, y, w) in &rows {
             let u = (y - row.dot(&pose)) / (4.0 * scale);
             if u.abs() < 1.0 {
@@ -170,7 +177,7 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
             let mut patches = std::collections::BTreeMap::<(u8, i32, i32), [f64; 3]>::new();
             for ray in frame.measured.iter().filter(|r| usable(r)) {
                 let w = weight(ray, noise_m);
-                let row = pose_row(ray, &origins[ray.sensor as usize], &Point3::origin());
+                let row = own_row(ray, &origins[ray.sensor as usize]);
                 let y = ray.across_nearest_m() - row.dot(&pose[ray.sensor as usize]);
                 if y.abs() > STRAY_M {
                     continue;
@@ -247,7 +254,7 @@ pub fn mean_frames(
         let mut x: Vec<(usize, f64)> = Vec::with_capacity(p);
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let origin = &origins[ray.sensor as usize];
-            let row = pose_row(ray, origin, &Point3::origin());
+            let row = own_row(ray, origin);
             let y = ray.across_nearest_m();
             if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
@@ -291,5 +298,53 @@ impl MeanFrame {
         let gram = &self.gram - &part * across.transpose();
         let right = &self.right - &part * self.right.rows(0, OWN);
         (gram, right)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::TAU;
+
+    /// A frame of returns whose ranges are longer by an offset: a road 2 m below the sensor, and a wall to its left.
+    fn frame(offset_m: f64, wall_m: f64) -> FramePair {
+        let return_ = |direction: Vector3<f64>| {
+            let (range_m, normal, surface) = if direction.z < -0.05 {
+                (-2.0 / direction.z, Vector3::z(), Surface::Ground)
+            } else {
+                (wall_m / direction.y, -Vector3::y(), Surface::Standing)
+            };
+            let cos_incidence = -normal.dot(&direction);
+            let met = cos_incidence > 0.05 && range_m > 0.0;
+            met.then(|| Ray {
+                surface,
+                normal: normal.cast::<f32>().into(),
+                cos_incidence: cos_incidence as f32,
+                residual_m: offset_m as f32,
+                ..Ray::standing(&(direction * range_m))
+            })
+        };
+        let shot = |k: u32| {
+            let (azimuth, elevation) = (TAU * f64::from(k % 180) / 180.0, 0.02 * f64::from(k / 180) - 0.3);
+            Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin())
+        };
+        FramePair {
+            id: String::new(),
+            measured: (0..180 * 20).filter_map(|k| return_(shot(k))).collect(),
+            simulated: vec![],
+            mixed_per_rad: 0.0,
+            jumps: 1.0,
+            open: 0.0,
+            second: [0.0; 2],
+            objects: vec![],
+        }
+    }
+
+    #[test]
+    fn a_range_bias_is_no_pose_of_frames() {
+        for wall_m in [4.0, 9.0] {
+            let own = own_poses(&frame(-0.2, wall_m), &[Point3::origin()], 0.01)[0];
+            assert!(own.fixed_rows::<6>(0).norm() < 2e-3 && (own[6] + 0.2).abs() < 2e-3, "{wall_m}: {own}");
+        }
     }
 }

@@ -149,3 +149,39 @@ impl Ray {
         signal_index(DIAGNOSIS_REFLECTIVITY, self.cos_incidence.max(1e-4).into(), self.range_m.max(0.1).into())
     }
 }
+
+#[cfg(test)]
+impl Ray {
+    /// A return of a static surface at a place, m from the sensor, that it faces.
+    pub fn standing(at: &Vector3<f64>) -> Ray {
+        let direction = at.normalize().cast::<f32>();
+        Ray {
+            sensor: 0,
+            surface: Surface::Standing,
+            smooth: true,
+            corner: false,
+            at_object: false,
+            matched: true,
+            shown: false,
+            company: 5,
+            in_gap: false,
+            row: 0,
+            object: u16::MAX,
+            azimuth_rad: at.y.atan2(at.x) as f32,
+            elevation_rad: at.z.atan2(at.xy().norm()) as f32,
+            range_m: at.norm() as f32,
+            cos_incidence: 1.0,
+            direction: direction.into(),
+            normal: (-direction).into(),
+            residual_m: 0.0,
+            bulge_m: 0.0,
+            leverage: 0.2,
+            roughness_m: 0.0,
+            roughness_leverage: 0.2,
+            near_far_m: [at.norm() as f32; 2],
+            intensity: f32::NAN,
+            intensity_simulated: f32::NAN,
+            intensity_beside: f32::NAN,
+        }
+    }
+}

@@ -373,38 +373,6 @@ mod tests {
     use crate::inference::roles::roles;
     use rand::RngExt;
 
-    /// A return of a static surface.
-    fn standing(at: &Vector3<f64>) -> Ray {
-        Ray {
-            sensor: 0,
-            surface: Surface::Standing,
-            smooth: true,
-            corner: false,
-            at_object: false,
-            matched: true,
-            shown: false,
-            company: 5,
-            in_gap: false,
-            row: 0,
-            object: u16::MAX,
-            azimuth_rad: at.y.atan2(at.x) as f32,
-            elevation_rad: 0.0,
-            range_m: at.norm() as f32,
-            cos_incidence: 1.0,
-            direction: at.normalize().cast::<f32>().into(),
-            normal: [1.0, 0.0, 0.0],
-            residual_m: 0.0,
-            bulge_m: 0.0,
-            leverage: 0.2,
-            roughness_m: 0.0,
-            roughness_leverage: 0.2,
-            near_far_m: [at.norm() as f32; 2],
-            intensity: f32::NAN,
-            intensity_simulated: f32::NAN,
-            intensity_beside: f32::NAN,
-        }
-    }
-
     /// Twenty frames of posts, seen at 40 m/s by a scan that takes `scan_s`, counter-clockwise.
     fn found(scan_s: f64) -> Option<f64> {
         let rig = Rig::single();
@@ -421,8 +389,8 @@ mod tests {
                     open: 0.0,
                     second: [0.0; 2],
                     id: f.to_string(),
-                    measured: posts.iter().map(|p| standing(&shown(p))).collect(),
-                    simulated: posts.iter().map(standing).collect(),
+                    measured: posts.iter().map(|p| Ray::standing(&shown(p))).collect(),
+                    simulated: posts.iter().map(Ray::standing).collect(),
                     objects: vec![],
                 }
             })

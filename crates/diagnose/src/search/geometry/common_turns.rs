@@ -71,7 +71,7 @@ mod tests {
             (0..24)
                 .map(|f| {
                     let own = 2e-4 * (f64::from(f * 7 % 24) / 12.0 - 1.0);
-                    let pose = |pitch: f64| SVector::from([0.0, pitch + own, 0.0, 0.0, 0.0, 0.0]);
+                    let pose = |pitch: f64| SVector::from([0.0, pitch + own, 0.0, 0.0, 0.0, 0.0, 0.0]);
                     vec![pose(0.002), pose(0.009), pose(of_third)]
                 })
                 .collect()

@@ -2,11 +2,11 @@
 
 use super::Search;
 use crate::catalogue::Cause;
-use crate::channels::mean::{Column, Levers, origins, own_poses, pose_row, usable, usual_noise_m};
+use crate::channels::mean::{Column, Levers, OWN_NUMBERS, origins, own_poses, own_row, usable, usual_noise_m};
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
-use nalgebra::{Point3, SVector};
+use nalgebra::SVector;
 use rayon::prelude::*;
 use sensor::Sensor;
 
@@ -48,18 +48,18 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
     let of_frame = |&f: &usize| {
         let frame = &context.frames[f];
         // The pose error of the whole frame is that of the other sensors.
-        let mut pose = SVector::<f64, 6>::zeros();
+        let mut pose = SVector::zeros();
         if let Some(s) = displaced {
             let own = own_poses(frame, &origins, noise_m);
             let others: Vec<_> = (0..own.len()).filter(|k| *k != s).map(|k| own[k]).collect();
-            pose = others.iter().sum::<SVector<f64, 6>>() / others.len().max(1) as f64;
+            pose = others.iter().sum::<SVector<f64, OWN_NUMBERS>>() / others.len().max(1) as f64;
         }
         let place = |ray: &Ray| {
             let sensor = ray.sensor as usize;
             let mount = &context.rig.sensors[sensor];
             let levers = Levers::new(ray, &origins[sensor], mount);
             let expected: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
-            let y = ray.across_nearest_m() - pose_row(ray, &origins[sensor], &Point3::origin()).dot(&pose);
+            let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose);
             (expected != 0.0 && (y - expected).abs() < STRAY_M)
                 .then(|| [value(ray, mount), y * expected.signum(), expected.abs()])
         };

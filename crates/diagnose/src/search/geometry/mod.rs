@@ -93,7 +93,7 @@ pub fn search(context: &Context, undo: Undo) -> Result<(ChannelResult, Displacem
     let mut chosen = search.select(&mut result);
     search.add_common_turns(&mut chosen, &mut result);
     let displaced = search.displacement(&chosen.0);
-    if displaced.moves() || displaced.rows_aim_elsewhere() {
+    if displaced.moves() || displaced.rows_aim_elsewhere() || displaced.bias != [0.0; 2] {
         let frames = undo(&displaced)?;
         search.sums = sums(&Context { frames: &frames, ..context.clone() }, &search.select, &displaced);
     }
