@@ -166,18 +166,18 @@ impl CloudReader {
             (echo.point(), echo.normal)
         }));
         for (i, &place) in places.iter().enumerate().filter(|(i, _)| !smooth[*i]) {
-            let beside = nearest(&around.index, scan, i, &smooth).map(|k| echoes[places[k] as usize].normal);
-            let through =
-                surfaces.through(echoes[place as usize].point(), echoes[place as usize].direction, scan.range_m[i]);
-            let echo = &mut echoes[place as usize];
-            let cos = |normal: &[f32; 3]| -dot(*normal, echo.direction);
-            let met =
-                |normal: Option<[f32; 3]>| Some((normal?, normal.as_ref().map(cos).filter(|cos| *cos > LEAST_COS)?));
-            (echo.incidence, (echo.normal, echo.cos_incidence)) = match (through, met(beside)) {
-                (Some(met), _) => (Incidence::Continued, met),
-                (None, Some(met)) => (Incidence::Assumed, met),
-                (None, None) => (Incidence::Assumed, (beside.unwrap_or_default(), ROUND_COS)),
+            let (point, direction) = (echoes[place as usize].point(), echoes[place as usize].direction);
+            let (incidence, normal, cos) = match surfaces.through(point, direction, scan.range_m[i]) {
+                Some((normal, cos)) => (Incidence::Continued, normal, cos),
+                None => {
+                    let beside = nearest(&around.index, scan, i, &smooth);
+                    let normal = beside.map(|k| echoes[places[k] as usize].normal).unwrap_or_default();
+                    let cos = -dot(normal, direction);
+                    (Incidence::Assumed, normal, if cos > LEAST_COS { cos } else { ROUND_COS })
+                }
             };
+            let echo = &mut echoes[place as usize];
+            (echo.incidence, echo.normal, echo.cos_incidence) = (incidence, normal, cos);
         }
     }
 

@@ -225,18 +225,20 @@ impl LossTable {
         self.used.iter().map(|&i| self.kept(laws, i)).collect()
     }
 
+    /// Mean of a value of the cells over simulated returns.
+    fn mean(&self, of: impl Fn(usize) -> f64) -> f64 {
+        let n: f64 = self.used.iter().map(|&i| self.cells[i].simulated.n).sum();
+        self.used.iter().map(|&i| self.cells[i].simulated.n * of(i)).sum::<f64>() / n.max(1.0)
+    }
+
     /// Share of simulated returns that the laws lose.
     pub fn lost(&self, laws: &[FittedLaw]) -> f64 {
-        let n: f64 = self.used.iter().map(|&i| self.cells[i].simulated.n).sum();
-        let lost: f64 = self.used.iter().map(|&i| self.cells[i].simulated.n * (1.0 - self.kept(laws, i))).sum();
-        lost / n.max(1.0)
+        self.mean(|i| 1.0 - self.kept(laws, i))
     }
 
     /// Mean absolute difference of the shares that some laws and others keep, over simulated returns.
     pub fn changed(&self, laws: &[FittedLaw], others: &[FittedLaw]) -> f64 {
-        let n: f64 = self.used.iter().map(|&i| self.cells[i].simulated.n).sum();
-        let of = |&i: &usize| self.cells[i].simulated.n * (self.kept(laws, i) - self.kept(others, i)).abs();
-        self.used.iter().map(of).sum::<f64>() / n.max(1.0)
+        self.mean(|i| (self.kept(laws, i) - self.kept(others, i)).abs())
     }
 
     /// Share of the returns of a kind of surface that the laws would lose more if all cosines of incidence are equally

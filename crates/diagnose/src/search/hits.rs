@@ -145,9 +145,13 @@ impl<'a> Search<'a> {
 
     /// Those of the chosen laws that lose enough on the estimating frames as well.
     fn large_enough(&self, mut selection: Selection, on_estimate: &LossTable) -> Selection {
-        let fitted = refit(on_estimate, &selection.laws);
-        let alone = |n: usize| refit(on_estimate, &selection.laws[..n - 1]);
-        let large = (1..=fitted.len()).map(|n| self.above_floor(on_estimate, &fitted[..n], &alone(n)));
+        // Of the first laws, from none to all.
+        let mut fits = vec![vec![]];
+        for &law in &selection.laws {
+            fits.push(on_estimate.fit(&fits[fits.len() - 1], law));
+        }
+        let fitted = &fits[selection.laws.len()];
+        let large = (1..=fitted.len()).map(|n| self.above_floor(on_estimate, &fitted[..n], &fits[n - 1]));
         let large: Vec<bool> = large.collect();
         // Below a table by direction laws are forms, whatever they lose.
         if selection.unexplained.is_none() {

@@ -1,5 +1,6 @@
 //! Correction of the form of a law by a table.
 
+use super::assumed::kind;
 use super::table::{check_table, interpolated};
 use crate::directions::{Kind, kind_of};
 use crate::scan::{Echo, Incidence};
@@ -30,8 +31,8 @@ pub(super) fn factor(form: Option<&Form>, x: f64) -> f64 {
     form.map_or(1.0, |form| interpolated(&form.at, &form.factor, x))
 }
 
-/// What a law loses in finished clouds. The angle of incidence is estimated there, from the returns around a return:
-/// across a kerb or on a curved body the estimate is wrong, and at an edge there is none. Factors and shares were
+/// Corrections of a law for finished clouds. Their angles of incidence are estimated from the returns around each
+/// return. The estimate is wrong across a kerb and on a curved body. At an edge there is none. The corrections were
 /// measured with the same estimates. A simulation knows its surfaces and does not use them.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -108,14 +109,13 @@ impl EstimatedIncidence {
     /// The share of the returns that is kept like that of an echo, whose law keeps `by_law` of them at a value of its
     /// covariate. `boxes` are those of the labelled objects.
     pub(super) fn kept(&self, echo: &Echo, boxes: &[Box3], by_law: f64, x: f64) -> f64 {
-        let kind = |normal_z: Option<f32>| kind_of(boxes, echo.point().map(f64::from), normal_z.map(f64::from));
-        let formed = |on: &OnSurfaces| by_law * factor(on.of(kind(Some(echo.normal[2]))), x);
+        let formed = |on: &OnSurfaces| by_law * factor(on.of(kind(echo, boxes)), x);
         match echo.incidence {
             Incidence::Known => by_law,
             Incidence::Estimated => formed(&self.fitted),
             Incidence::Continued => formed(&self.continued),
             Incidence::Assumed => {
-                let at_object = matches!(kind(None), Kind::Object { .. });
+                let at_object = matches!(kind_of(boxes, echo.point().map(f64::from), None), Kind::Object { .. });
                 let loss = if at_object { &self.object_edges } else { &self.standing_edges };
                 let lost = |loss: &EdgeLoss| interpolated(&loss.range_m, &loss.share, echo.range_m.into());
                 loss.as_ref().map_or(by_law, |loss| 1.0 - lost(loss))
