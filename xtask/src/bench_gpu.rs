@@ -50,7 +50,7 @@ struct GpuArgs {
 }
 
 /// Precisions of this program that are timed: label and `--precision`.
-const PRECISIONS: [[&str; 2]; 2] = [["lidarshift", "f32"], ["lidarshift, f16", "f16"]];
+const PRECISIONS: [[&str; 2]; 3] = [["lidarshift", "f32"], ["lidarshift, high", "high"], ["lidarshift, f16", "f16"]];
 
 /// References: label, `--form` and `--precision` of `step.py`.
 const REFERENCES: [[&str; 3]; 4] = [

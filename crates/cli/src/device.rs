@@ -28,6 +28,8 @@ pub struct DeviceArgs {
 pub enum PrecisionChoice {
     /// Single precision
     F32,
+    /// As f32, with products rounded to 16 bits on GPUs whose tensor cores have bf16 (TF32: 11 bits)
+    High,
     /// Half precision, on wgpu and cuda only; batch norms, losses, weights and optimiser stay f32
     F16,
 }
@@ -65,6 +67,7 @@ impl DeviceArgs {
         let device = parse_device(&self.device)?;
         let precision = match self.precision {
             PrecisionChoice::F32 => Precision::F32,
+            PrecisionChoice::High => Precision::High,
             PrecisionChoice::F16 => Precision::F16,
         };
         if precision == Precision::F16 && matches!(self.device.as_str(), "flex" | "ndarray") {
@@ -81,8 +84,9 @@ impl DeviceArgs {
     pub fn arguments(&self) -> Vec<String> {
         let kernels = self.kernels.to_possible_value().map_or(String::new(), |value| value.get_name().to_string());
         let mut arguments = ["--device", &self.device, "--kernels", &kernels].map(String::from).to_vec();
-        if self.precision == PrecisionChoice::F16 {
-            arguments.extend(["--precision", "f16"].map(String::from));
+        if self.precision != PrecisionChoice::F32 {
+            let precision = self.precision.to_possible_value();
+            arguments.extend(precision.into_iter().flat_map(|value| ["--precision".into(), value.get_name().into()]));
         }
         arguments
     }
@@ -102,8 +106,11 @@ impl DeviceArgs {
                 let instructions = InstructionSet::in_use().map_or("best", InstructionSet::name);
                 format!("flex, own kernels, {instructions}, {transform}")
             }
-            (device, _) if self.precision == PrecisionChoice::F16 => format!("{device}, half precision"),
-            (device, _) => device.into(),
+            (device, _) => match self.precision {
+                PrecisionChoice::F32 => device.into(),
+                PrecisionChoice::High => format!("{device}, products of two parts"),
+                PrecisionChoice::F16 => format!("{device}, half precision"),
+            },
         }
     }
 }

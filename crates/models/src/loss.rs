@@ -1,6 +1,6 @@
 //! Losses of the detectors, as OpenPCDet computes them.
 
-use crate::kernel_ops::{self, focal_loss_sum};
+use crate::{gpu_kernels, kernel_ops};
 use burn::tensor::activation::{log_softmax, sigmoid};
 use burn::tensor::{Tensor, TensorData};
 
@@ -19,11 +19,20 @@ pub fn sigmoid_focal(logits: Tensor<2>, target: Tensor<2>) -> Tensor<2> {
 /// The weighted sum of [`sigmoid_focal`] over rows and classes, as one operation if there is a kernel.
 ///
 /// # Shapes
-/// `logits`: `[N, C]`; `labels`: N, k for the class with index k - 1, 0 or less for background; `weights`: N; result
-/// `[1]`.
-pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: Vec<i32>, weights: Vec<f32>) -> Tensor<1> {
+/// `logits`: `[N, C]`; `labels`: N, k for the class with index k - 1, 0 for background, less for a row without loss;
+/// `frame_weights`: one for each of as many equal parts of the rows; result `[1]`.
+pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: &[i32], frame_weights: &[f32]) -> Tensor<1> {
     let ([rows, classes], device) = (logits.dims(), logits.device());
-    focal_loss_sum(&logits, &labels, &weights).unwrap_or_else(|| {
+    if let Some(loss) = gpu_kernels::focal_loss_sum(&logits, labels, frame_weights) {
+        return loss;
+    }
+    let frame = |row: usize| row * frame_weights.len() / rows;
+    let weights: Vec<f32> = labels
+        .iter()
+        .enumerate()
+        .map(|(row, &label)| if label < 0 { 0.0 } else { frame_weights[frame(row)] })
+        .collect();
+    kernel_ops::focal_loss_sum(&logits, labels, &weights).unwrap_or_else(|| {
         let mut one_hot = vec![0f32; rows * classes];
         for (row, &label) in labels.iter().enumerate().filter(|(_, label)| **label > 0) {
             one_hot[row * classes + label as usize - 1] = 1.0;

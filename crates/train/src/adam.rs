@@ -234,8 +234,10 @@ impl GradientNorm {
             return (norm, values.map_or_else(Vec::new, host));
         }
         let parameters = flat.len();
-        let sums = flat.into_iter().map(|gradient| gradient.clone().mul(gradient).sum());
-        let mut sums = host(Tensor::cat(sums.chain(values).collect(), 0));
+        let sums = models::gpu_kernels::sums_of_squares(&flat).unwrap_or_else(|| {
+            Tensor::cat(flat.into_iter().map(|gradient| gradient.clone().mul(gradient).sum()).collect(), 0)
+        });
+        let mut sums = host(Tensor::cat(std::iter::once(sums).chain(values).collect(), 0));
         let values = sums.split_off(parameters);
         let not_finite = sums.iter().position(|s| !s.is_finite()).map(name);
         (GradientNorm { total: sums.iter().map(|&s| s as f64).sum::<f64>().sqrt(), not_finite }, values)

@@ -5,16 +5,23 @@
 //! precision. Sums have a fixed order: the same bits in every run on the same device.
 
 mod adam;
+mod focal_loss;
 mod norm_relu;
 mod product;
 mod rows;
+mod running;
+mod tensor_cores;
 mod units;
 
 pub use adam::adam;
+pub(crate) use focal_loss::focal_loss_sum;
 pub use norm_relu::norm_relu;
 pub(crate) use product::{product, sum_of_first};
 pub use rows::norm_relu_rows;
-pub(crate) use rows::sum_of_rows;
+pub(crate) use rows::{place_rows, sum_of_rows};
+pub(crate) use running::blend;
+pub use running::sums_of_squares;
+pub(crate) use tensor_cores::{convolution, convolution_gradient, has_convolutions};
 
 use burn::backend::Cube;
 use burn::backend::TensorMetadata;

@@ -1,5 +1,6 @@
 //! Products of matrices, many side by side, and sums of many of them.
 
+use super::tensor_cores::{self, Tile, products_of_fragments};
 use super::{Primitive, UNITS, argument, cubes};
 use burn::backend::Cube;
 use burn::backend::TensorMetadata;
@@ -21,11 +22,11 @@ const _: () = assert!((SIDE / OWN) * (SIDE / OWN) == UNITS as usize && UNITS == 
 
 /// Where the values of a matrix lie: steps between matrices of both outer dimensions, rows and columns.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
-struct Steps {
-    outer: u32,
-    inner: u32,
-    row: u32,
-    column: u32,
+pub(super) struct Steps {
+    pub outer: u32,
+    pub inner: u32,
+    pub row: u32,
+    pub column: u32,
 }
 
 /// A cube for each tile along the columns (x) and rows (y) of each product (z).
@@ -180,7 +181,9 @@ pub(crate) fn product(a: &Primitive, b: &Primitive) -> Option<Primitive> {
     let mut shape: Vec<usize> = vec![outer, inner, rows, columns];
     shape.drain(..4 - dims);
     let out = Cube::float_empty(Shape::from(shape), &a.device, a.dtype().into());
-    let grid = [columns.div_ceil(SIDE), rows.div_ceil(SIDE), outer * inner].map(|n| n as u32);
+    let tile = tensor_cores::are_had_by(a.client.properties()).then(|| Tile::of_product(rows));
+    let of_cube = tile.map_or([SIDE, SIDE], |tile| [tile.columns, tile.rows]);
+    let grid = [columns.div_ceil(of_cube[0]), rows.div_ceil(of_cube[1]), outer * inner].map(|n| n as u32);
     if grid[1] > 65_535 {
         return None;
     }
@@ -193,6 +196,29 @@ pub(crate) fn product(a: &Primitive, b: &Primitive) -> Option<Primitive> {
         // SAFETY: the buffer of a tensor reaches to its last value.
         unsafe { BufferArg::from_raw_parts(tensor.handle.clone(), last + 1) }
     };
+    if let Some(tile) = tile {
+        // SAFETY: places outside of the matrices are neither read nor written.
+        unsafe {
+            products_of_fragments::launch_unchecked(
+                &a.client,
+                CubeCount::Static(grid[0], grid[1], grid[2]),
+                CubeDim::new_1d(tile.units() as u32),
+                whole(a, &a_is),
+                whole(b, &b_is),
+                argument(&out),
+                steps(&a_is),
+                steps(&b_is),
+                inner as u32,
+                rows as u32,
+                columns as u32,
+                terms as u32,
+                a_is[3].1 == 1,
+                b_is[3].1 == 1,
+                tile,
+            );
+        }
+        return Some(out);
+    }
     // SAFETY: places outside of the matrices are neither read nor written.
     unsafe {
         products::launch_unchecked(

@@ -9,6 +9,7 @@ use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops};
 use burn::backend::ops::FloatTensorOps;
+use burn::backend::tensor::IntTensor;
 use burn::backend::{Autodiff, Cube, TensorMetadata};
 use burn::tensor::{Shape, Tensor};
 use cubecl::prelude::*;
@@ -254,4 +255,48 @@ pub fn norm_relu_rows(
     let (y, state) = norm.forward(inputs, counts);
     let [mean, variance] = [&state.mean, &state.variance].map(|t| Tensor::from_primitive::<Cube>(t.clone()));
     Some((tracked(norm, nodes, state, y), Moments { mean, variance, count: total }))
+}
+
+/// Rows that go somewhere: a unit for each value.
+#[cube(launch_unchecked)]
+fn place(x: &[f32], rows: &[i32], places: &[i32], out: &mut [f32], channels: u32, values: u32) {
+    let i = ABSOLUTE_POS;
+    let channels = channels as usize;
+    if i < values as usize {
+        let (row, channel) = (i / channels, i % channels);
+        out[places[row] as usize * channels + channel] = x[rows[row] as usize * channels + channel];
+    }
+}
+
+/// Rows of `x` at their places, which are distinct, among rows of zeros. `None` for another precision than single, or
+/// gaps.
+///
+/// # Shapes
+/// `x`: `[N, C]`; `rows` and `places`: as many; result `[count, C]`.
+pub(crate) fn place_rows(x: &Primitive, [rows, places]: [&IntTensor<Cube>; 2], count: usize) -> Option<Primitive> {
+    let channels = x.shape()[1];
+    let values = rows.shape()[0] * channels;
+    if !is_plain(x) || values == 0 || count * channels >= 1 << 32 || values >= 1 << 32 {
+        return None;
+    }
+    let out = Cube::float_zeros(Shape::from([count, channels]), &x.device, x.dtype().into());
+    let ints = |tensor: &IntTensor<Cube>| {
+        // SAFETY: an integer tensor that was made of host values has no gaps.
+        unsafe { BufferArg::from_raw_parts(tensor.handle.clone(), tensor.shape().num_elements()) }
+    };
+    // SAFETY: rows are below N and places below `count`.
+    unsafe {
+        place::launch_unchecked(
+            &x.client,
+            cubes(values),
+            CubeDim::new_1d(UNITS),
+            argument(x),
+            ints(rows),
+            ints(places),
+            argument(&out),
+            channels as u32,
+            values as u32,
+        );
+    }
+    Some(out)
 }

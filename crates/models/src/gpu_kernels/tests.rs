@@ -1,6 +1,7 @@
 use super::*;
 use crate::layers::host;
 use crate::tests::{gpu, random};
+use burn::backend::ops::IntTensorOps;
 use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor, TensorData};
 use kernels::{AdamStep, Parameter};
@@ -158,4 +159,57 @@ fn batch_norms_of_rows_equal_their_definition() {
         theirs.extend([gamma, beta].map(|t| host(t.grad(&gradients).unwrap()).unwrap()));
         assert_close(&format!("{rows} rows of {channels}"), &ours, &theirs);
     }
+}
+
+#[test]
+fn focal_losses_equal_those_of_the_cpu() {
+    let Some(device) = gpu() else { return };
+    for (rows, classes, frames) in [(1, 1, 1), (30, 3, 2), (9_999, 2, 3)] {
+        let labels: Vec<i32> = (0..rows).map(|i| (i * 7 % (classes + 2)) as i32 - 1).collect();
+        let weights: Vec<f32> = (0..frames).map(|f| 0.5 + f as f32).collect();
+        let run = |device: &Device| {
+            let logits: Tensor<2> = (random([rows, classes], 3, device) * 4.0).require_grad();
+            let loss = crate::loss::sigmoid_focal_sum(logits.clone(), &labels, &weights);
+            let gradients = (loss.clone() * 3.0).backward();
+            [host(loss).unwrap(), host(logits.grad(&gradients).unwrap()).unwrap()]
+        };
+        let device = device.clone().autodiff();
+        assert!(focal_loss_sum(&random([rows, classes], 3, &device), &labels, &weights).is_some());
+        assert_close(&format!("{rows} {classes}"), &run(&device), &run(&Device::flex().autodiff()));
+    }
+}
+
+#[test]
+fn running_statistics_and_sums_of_squares() {
+    let Some(device) = gpu() else { return };
+    let [mean, variance, of_batch, variance_of_batch]: [Tensor<1>; 4] = [1, 2, 3, 4].map(|s| random([300], s, &device));
+    let ours = blend([&mean, &variance], [&of_batch, &variance_of_batch], 0.1, 1.5).expect("a kernel");
+    let theirs = [mean * 0.9 + of_batch * 0.1, variance * 0.9 + variance_of_batch * 0.15];
+    assert_close("running", &ours.map(|t| host(t).unwrap()), &theirs.map(|t| host(t).unwrap()));
+
+    let tensors: Vec<Tensor<1>> = [1, 300, 5_000, 200_000].map(|n| random([n], n as u64, &device)).into();
+    let ours = host(sums_of_squares(&tensors).expect("a kernel")).unwrap();
+    let square = |t: &Tensor<1>| host(t.clone()).unwrap().iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() as f32;
+    for (ours, theirs) in ours.iter().zip(tensors.iter().map(square)) {
+        assert!((ours / theirs - 1.0).abs() < 1e-5, "{ours} {theirs}");
+    }
+    assert!(sums_of_squares(&[random([3], 1, &Device::flex())]).is_none());
+}
+
+#[test]
+fn rows_go_to_their_places() {
+    let Some(device) = gpu() else { return };
+    let x: Tensor<2> = random([4, 3], 5, &device);
+    let ints = |values: &[i32]| Cube::int_from_data(TensorData::new(values.to_vec(), [values.len()]), &x_device(&x));
+    let placed = place_rows(&x.clone().try_into_primitive::<Cube>().unwrap(), [&ints(&[2, 0]), &ints(&[1, 5])], 7);
+    let placed = host(Tensor::<2>::from_primitive::<Cube>(placed.expect("a kernel"))).unwrap();
+    let x = host(x).unwrap();
+    let mut want = vec![0.0; 21];
+    want[3..6].copy_from_slice(&x[6..9]);
+    want[15..18].copy_from_slice(&x[..3]);
+    assert_eq!(placed, want);
+}
+
+fn x_device(x: &Tensor<2>) -> <Cube as burn::backend::BackendTypes>::Device {
+    x.clone().try_into_primitive::<Cube>().unwrap().device
 }

@@ -248,13 +248,20 @@ impl BatchNorm {
     /// Updates the running statistics with those of a batch, outside the autodiff graph.
     pub fn update(&self, batch: Moments) {
         let n = batch.count as f64;
-        let unbiased = batch.variance.detach() * (n / (n - 1.0).max(1.0));
-        let blend = |state: &RunningState<Tensor<1>>, new: Tensor<1>| {
-            state.update(state.value() * (1.0 - self.momentum) + new * self.momentum);
+        let unbiased = n / (n - 1.0).max(1.0);
+        let (mean, variance) = (batch.mean.detach(), batch.variance.detach());
+        let states = [&self.running_mean, &self.running_var];
+        let old = states.map(|state| state.value());
+        let [old_mean, old_variance] = &old;
+        let blended = gpu_kernels::blend([old_mean, old_variance], [&mean, &variance], self.momentum, unbiased);
+        let blended = blended.unwrap_or_else(|| {
+            let blend = |old: &Tensor<1>, new: Tensor<1>| old.clone() * (1.0 - self.momentum) + new * self.momentum;
+            [blend(old_mean, mean), blend(old_variance, variance * unbiased)]
+        });
+        for (state, new) in states.into_iter().zip(blended) {
+            state.update(new);
             state.value_sync();
-        };
-        blend(&self.running_mean, batch.mean.detach());
-        blend(&self.running_var, unbiased);
+        }
         self.num_batches_tracked.update(self.num_batches_tracked.value() + 1.0);
         self.num_batches_tracked.value_sync();
     }

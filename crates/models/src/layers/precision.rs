@@ -1,7 +1,7 @@
-//! Precision of the matrix products: f32, or f16 with everything else in f32.
+//! Precision of the matrix products: f32, two parts of bf16, or f16 with everything else in f32.
 
 use burn::tensor::{Device, FloatDType, Tensor};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU8, Ordering};
 
 /// Precision of convolutions and linear layers, forward and backward. Weights, batch norms, losses and the optimiser
 /// are always f32.
@@ -10,34 +10,38 @@ pub enum Precision {
     /// f32.
     #[default]
     F32,
+    /// f32, with factors rounded to sums of two bf16 on GPUs whose tensor cores have bf16 (PyTorch's `high`); elsewhere
+    /// as f32.
+    High,
     /// f16 (mixed precision, Micikevicius et al. 2018): half the memory traffic, and tensor cores of GPUs where burn
     /// uses them.
     F16,
 }
 
-static HALF: AtomicBool = AtomicBool::new(false);
+static CHOSEN: AtomicU8 = AtomicU8::new(Precision::F32 as u8);
 
 /// Sets the choice for this process; call it before the first forward pass.
 pub fn choose_precision(precision: Precision) {
-    HALF.store(precision == Precision::F16, Ordering::Relaxed);
+    CHOSEN.store(precision as u8, Ordering::Relaxed);
 }
 
 impl Precision {
     /// The choice of this process.
     pub fn chosen() -> Precision {
-        if HALF.load(Ordering::Relaxed) { Precision::F16 } else { Precision::F32 }
+        let chosen = CHOSEN.load(Ordering::Relaxed);
+        [Precision::High, Precision::F16].into_iter().find(|&p| p as u8 == chosen).unwrap_or_default()
     }
 
     /// Whether the device supports it.
     pub fn runs_on(self, device: &Device) -> bool {
-        self == Precision::F32 || device.supports_dtype(FloatDType::F16)
+        self != Precision::F16 || device.supports_dtype(FloatDType::F16)
     }
 
     /// The loss scale: the loss is multiplied by it before the backward pass and the gradients are divided by it
     /// afterwards. Many gradients of dense heads are near 6e-8, the smallest f16.
     pub fn loss_scale(self) -> f64 {
         match self {
-            Precision::F32 => 1.0,
+            Precision::F32 | Precision::High => 1.0,
             Precision::F16 => 1024.0,
         }
     }
@@ -53,7 +57,7 @@ pub fn multiply<const A: usize, const B: usize, const C: usize>(
     product: impl FnOnce(Tensor<A>, Tensor<B>) -> Tensor<C>,
 ) -> Tensor<C> {
     match Precision::chosen() {
-        Precision::F32 => product(a, b),
+        Precision::F32 | Precision::High => product(a, b),
         Precision::F16 => product(a.cast(FloatDType::F16), b.cast(FloatDType::F16)).cast(FloatDType::F32),
     }
 }

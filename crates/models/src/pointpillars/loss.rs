@@ -18,14 +18,13 @@ pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig
     let device = predictions.cls.device();
     let [b, anchors, classes] = predictions.cls.dims();
     let mut labels = Vec::with_capacity(b * anchors);
-    let mut class_weight = vec![0f32; b * anchors];
+    let mut frame_weights = Vec::with_capacity(b);
     let (mut positive, mut share, mut residuals, mut bins) = (vec![], vec![], vec![], vec![]);
     for (frame, sample) in batch.iter().enumerate() {
         let targets = sample.targets.as_ref().expect("a training sample has targets");
         let norm = 1.0 / (targets.positive.len().max(1) * b) as f32;
         labels.extend_from_slice(&targets.labels);
-        let weights = class_weight[frame * anchors..].iter_mut().zip(&targets.labels);
-        weights.filter(|(_, label)| **label >= 0).for_each(|(weight, _)| *weight = norm);
+        frame_weights.push(norm);
         for (k, &(anchor, _)) in targets.positive.iter().enumerate() {
             positive.push((frame * anchors + anchor) as u32);
             share.push(norm);
@@ -36,7 +35,7 @@ pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig
     let tensor = |values, shape: [usize; 2]| Tensor::<2>::from_data(TensorData::new(values, shape), &device);
     let rows = b * anchors;
     let logits = predictions.cls.clone().reshape([rows, classes]);
-    let cls = sigmoid_focal_sum(logits, labels, class_weight) * weights.class_weight;
+    let cls = sigmoid_focal_sum(logits, &labels, &frame_weights) * weights.class_weight;
     let n = positive.len();
     let (boxes, dir) = if n == 0 {
         (Tensor::zeros([1], &device), Tensor::zeros([1], &device))

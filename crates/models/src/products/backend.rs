@@ -1,6 +1,6 @@
 //! The operations on the primitives of every backend, and their gradients.
 
-use super::unfold::{Gather, strided};
+use super::convolution::{Convolutions, convolution_weight_gradient, convolve, convolve_back};
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
@@ -8,9 +8,6 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, binary};
 use burn::backend::tensor::FloatTensor;
 use burn::backend::{Autodiff, Backend, Flex, NdArray, TensorMetadata, backend_extension};
 use burn::tensor::{FloatDType, Shape, Slice};
-
-/// Most values of the unfolded images that are made at once: 512 MiB in single precision.
-const MOST_UNFOLDED: usize = 1 << 27;
 
 /// Tiles of a gradient by a weight that are made side by side, at least, if there are pixels or rows enough.
 const SIDE_BY_SIDE: usize = 1024;
@@ -21,14 +18,14 @@ pub(crate) const TILE: usize = 64;
 /// Terms of each product of a sum, at least.
 const LEAST_TERMS: usize = 128;
 
-/// The number of products that a sum over products `[rows, columns]` is split into.
-fn side_by_side([rows, columns]: [usize; 2]) -> usize {
-    SIDE_BY_SIDE.div_ceil(rows.div_ceil(TILE) * columns.div_ceil(TILE))
+/// Tiles of a product `[rows, columns]`.
+pub(super) fn tiles([rows, columns]: [usize; 2]) -> usize {
+    rows.div_ceil(TILE) * columns.div_ceil(TILE)
 }
 
 /// Products. Without autodiff they are compositions of the backend's operations.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
-pub trait Products: Backend {
+pub trait Products: Convolutions {
     /// The product of two matrices, or of many side by side.
     fn product(a: FloatTensor<Self>, b: FloatTensor<Self>) -> FloatTensor<Self> {
         Self::float_matmul(a, b)
@@ -188,115 +185,31 @@ impl<B: Products> Backward<B, 2> for AddToRows {
     }
 }
 
-fn reshape<B: Backend>(x: FloatTensor<B>, shape: impl Into<Shape>) -> FloatTensor<B> {
+pub(super) fn reshape<B: Backend>(x: FloatTensor<B>, shape: impl Into<Shape>) -> FloatTensor<B> {
     B::float_reshape(x, shape.into())
 }
 
 /// Some of the first dimension; a copy, unless it is all of it.
-fn part<B: Backend>(x: &FloatTensor<B>, from: usize, to: usize) -> FloatTensor<B> {
+pub(super) fn part<B: Backend>(x: &FloatTensor<B>, from: usize, to: usize) -> FloatTensor<B> {
     if to - from == x.shape()[0] {
         return x.clone();
     }
     B::float_slice(x.clone(), &[Slice::from(from..to)])
 }
 
-/// `work` on as many frames at a time as [`MOST_UNFOLDED`] allows, if each takes `values`.
-fn frame_by_frame<B: Backend>(
-    frames: usize,
-    values: usize,
-    work: impl Fn(usize, usize) -> FloatTensor<B>,
-) -> Vec<FloatTensor<B>> {
-    let at_once = (MOST_UNFOLDED / values.max(1)).clamp(1, frames.max(1));
-    (0..frames).step_by(at_once).map(|from| work(from, (from + at_once).min(frames))).collect()
-}
-
-fn cat<B: Backend>(mut parts: Vec<FloatTensor<B>>) -> FloatTensor<B> {
-    if parts.len() == 1 { parts.remove(0) } else { B::float_cat(parts, 0) }
-}
-
-/// Values of each channel at an index into its pixels, or 0 behind the last pixel.
-///
-/// # Shapes
-/// `x`: `[B, C, N]`; result `[B, C, size of the index]`.
-fn gather_pixels<B: Backend>(x: FloatTensor<B>, gather: Gather, size: [usize; 2], stride: usize) -> FloatTensor<B> {
-    let [batch, channels, pixels] = x.shape().dims();
-    let device = x.device();
-    let nothing = B::float_zeros(Shape::from([batch * channels, 1]), &device, x.dtype().into());
-    let x = B::float_cat(vec![reshape::<B>(x, [batch * channels, pixels]), nothing], 1);
-    let index = gather.on_device::<B>(size, stride, &device);
-    let count = index.shape()[0];
-    reshape::<B>(B::float_select(x, 1, index), [batch, channels, count])
-}
-
-/// What the taps of a kernel read at each pixel of the result.
-///
-/// # Shapes
-/// `x`: `[B, C, H, W]`; result `[B, C * 9, N]`.
-fn unfold<B: Backend>(x: FloatTensor<B>, stride: usize) -> FloatTensor<B> {
-    let [batch, channels, height, width] = x.shape().dims();
-    let x = reshape::<B>(x, [batch, channels, height * width]);
-    let taps = gather_pixels::<B>(x, Gather::Unfold, [height, width], stride);
-    let pixels = taps.shape()[2] / 9;
-    reshape::<B>(taps, [batch, channels * 9, pixels])
-}
-
-fn convolve<B: Products>(x: FloatTensor<B>, weight: FloatTensor<B>, stride: usize) -> FloatTensor<B> {
-    let ([batch, inputs, height, width], [outputs, ..]) = (x.shape().dims::<4>(), weight.shape().dims::<4>());
-    let (rows, columns) = (strided(height, stride), strided(width, stride));
-    let weight = reshape::<B>(weight, [1, outputs, inputs * 9]);
-    let parts = frame_by_frame::<B>(batch, inputs * 9 * rows * columns, |from, to| {
-        B::product(weight.clone(), unfold::<B>(part::<B>(&x, from, to), stride)) // [b, C_out, N]
-    });
-    reshape::<B>(cat::<B>(parts), [batch, outputs, rows, columns])
-}
-
-/// The gradient of a convolution by its image.
-fn convolve_back<B: Products>(
-    dy: FloatTensor<B>,
-    weight: FloatTensor<B>,
-    [height, width]: [usize; 2],
-    stride: usize,
-) -> FloatTensor<B> {
-    let ([batch, outputs, rows, columns], [_, inputs, ..]) = (dy.shape().dims::<4>(), weight.shape().dims::<4>());
-    if stride == 1 {
-        // A convolution with the kernel turned by half a turn.
-        let weight = B::float_flip(reshape::<B>(weight, [outputs, inputs, 9]), &[2]);
-        let weight = reshape::<B>(B::float_permute(weight, &[1, 0, 2]), [inputs, outputs, 3, 3]);
-        return convolve::<B>(dy, weight, 1);
-    }
-    let folds = Gather::folds(stride);
-    let weight = B::float_transpose(reshape::<B>(weight, [outputs, inputs * 9]));
-    let weight = reshape::<B>(weight, [1, inputs * 9, outputs]);
-    let parts = frame_by_frame::<B>(batch, inputs * (9 * rows * columns).max(folds * height * width), |from, to| {
-        let frames = to - from;
-        let dy = reshape::<B>(part::<B>(&dy, from, to), [frames, outputs, rows * columns]);
-        let taps = reshape::<B>(B::product(weight.clone(), dy), [frames, inputs, 9 * rows * columns]);
-        let terms = gather_pixels::<B>(taps, Gather::Fold, [height, width], stride);
-        let terms = reshape::<B>(terms, [frames * inputs, folds, height * width]);
-        reshape::<B>(B::float_sum_dim(terms, 1), [frames, inputs, height, width])
-    });
-    cat::<B>(parts)
-}
-
-fn convolution_weight_gradient<B: Products>(x: FloatTensor<B>, dy: FloatTensor<B>, stride: usize) -> FloatTensor<B> {
-    let ([batch, inputs, ..], [_, outputs, rows, columns]) = (x.shape().dims::<4>(), dy.shape().dims::<4>());
-    let pixels = rows * columns;
-    let dy = reshape::<B>(dy, [batch, outputs, pixels]);
-    let parts = frame_by_frame::<B>(batch, inputs * 9 * pixels, |from, to| {
-        sum_of_pixels::<B>(part::<B>(&dy, from, to), unfold::<B>(part::<B>(&x, from, to), stride))
-    });
-    let sum = parts.into_iter().reduce(|a, b| B::float_add(a, b)).expect("a batch has frames");
-    reshape::<B>(sum, [outputs, inputs, 3, 3])
+/// The parts of the pixels of a frame whose products are made side by side, with a number of tiles each.
+pub(super) fn parts_of_sum(batch: usize, of_part: usize, pixels: usize) -> usize {
+    let wanted = SIDE_BY_SIDE.div_ceil(of_part * batch.max(1)).min(pixels / LEAST_TERMS).max(1);
+    (wanted..=2 * wanted).find(|parts| pixels.is_multiple_of(*parts)).unwrap_or(1)
 }
 
 /// The sum over frames and pixels of products of two vectors of channels.
 ///
 /// # Shapes
 /// `a`: `[B, C_a, N]`; `b`: `[B, C_b, N]`; result `[C_a, C_b]`.
-fn sum_of_pixels<B: Products>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTensor<B> {
+pub(super) fn sum_of_pixels<B: Products>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTensor<B> {
     let ([batch, rows, pixels], columns) = (a.shape().dims(), b.shape()[1]);
-    let wanted = side_by_side([rows, columns]).div_ceil(batch.max(1)).min(pixels / LEAST_TERMS).max(1);
-    let parts = (wanted..=2 * wanted).find(|parts| pixels % parts == 0).unwrap_or(1);
+    let parts = parts_of_sum(batch, tiles([rows, columns]), pixels);
     let split = |x: FloatTensor<B>, last: bool| {
         let channels = x.shape()[1];
         let x = reshape::<B>(x, [batch, channels, parts, pixels / parts]);
@@ -312,7 +225,7 @@ fn sum_of_pixels<B: Products>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTens
 /// `a`: `[N, C_a]`; `b`: `[N, C_b]`; result `[C_a, C_b]`.
 fn products_of_rows<B: Products>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatTensor<B> {
     let ([rows, of_a], of_b) = (a.shape().dims(), b.shape()[1]);
-    let terms = (rows / side_by_side([of_a, of_b])).max(LEAST_TERMS);
+    let terms = (rows / SIDE_BY_SIDE.div_ceil(tiles([of_a, of_b]))).max(LEAST_TERMS);
     let (parts, rest) = (rows / terms, rows % terms);
     let product = |from: usize, parts: usize, terms: usize| {
         let of = |x: &FloatTensor<B>, channels: usize| {
@@ -330,7 +243,10 @@ fn products_of_rows<B: Products>(a: FloatTensor<B>, b: FloatTensor<B>) -> FloatT
 }
 
 /// The sum of some products, in single precision.
-fn sum_of_products<B: Products>(products: FloatTensor<B>, [count, rows, columns]: [usize; 3]) -> FloatTensor<B> {
+pub(super) fn sum_of_products<B: Products>(
+    products: FloatTensor<B>,
+    [count, rows, columns]: [usize; 3],
+) -> FloatTensor<B> {
     let precision: FloatDType = products.dtype().into();
     let products = reshape::<B>(products, [count, rows * columns]);
     if count == 1 {

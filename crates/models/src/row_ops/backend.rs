@@ -1,19 +1,21 @@
 //! The operations on the primitives of every backend, and their gradients.
 
-use super::segments::SegmentSums;
+use super::segments::{Places, SegmentSums};
 use super::{RowGroups, ZERO};
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, unary};
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn::backend::{Autodiff, Backend, Flex, NdArray, TensorMetadata, backend_extension, get_device_settings};
+use burn::backend::{
+    Autodiff, Backend, Dispatch, Flex, NdArray, TensorMetadata, backend_extension, get_device_settings,
+};
 use burn::tensor::{IntDType, Shape, TensorData};
 use std::sync::Arc;
 
 /// Operations on rows. Without autodiff they are compositions of the backend's operations.
 #[backend_extension(Flex, NdArray, Cube: cfg(feature = "cube"), Autodiff)]
-pub trait RowOps: Backend {
+pub trait RowOps: PlaceRows {
     /// See [`super::gather`].
     fn gather_rows(x: FloatTensor<Self>, index: Arc<[u32]>) -> FloatTensor<Self> {
         select::<Self>(x, &index)
@@ -22,6 +24,33 @@ pub trait RowOps: Backend {
     /// See [`super::group_max`].
     fn max_of_groups(x: FloatTensor<Self>, groups: Arc<RowGroups>) -> FloatTensor<Self> {
         max_with_slots::<Self>(x, &groups).0
+    }
+}
+
+/// Rows at places.
+pub trait PlaceRows: Backend {
+    /// See [`Places`].
+    fn place_rows(x: FloatTensor<Self>, places: &Places) -> FloatTensor<Self> {
+        select::<Self>(x, &places.index())
+    }
+}
+
+impl PlaceRows for Flex {}
+
+impl PlaceRows for NdArray {}
+
+impl PlaceRows for Dispatch {}
+
+impl<B: Backend, C: CheckpointStrategy> PlaceRows for Autodiff<B, C> {}
+
+#[cfg(feature = "cube")]
+impl PlaceRows for burn::backend::Cube {
+    fn place_rows(x: FloatTensor<Self>, places: &Places) -> FloatTensor<Self> {
+        let device = x.device();
+        let [rows, to] = [&places.rows, &places.places]
+            .map(|values| ints::<Self>(values.iter().map(|&value| value as i32).collect(), &device));
+        crate::gpu_kernels::place_rows(&x, [&rows, &to], places.count)
+            .unwrap_or_else(|| select::<Self>(x, &places.index()))
     }
 }
 
@@ -57,7 +86,7 @@ impl<B: RowOps, C: CheckpointStrategy> RowOps for Autodiff<B, C> {
 #[derive(Debug)]
 struct GatherRows;
 
-impl<B: Backend> Backward<B, 1> for GatherRows {
+impl<B: RowOps> Backward<B, 1> for GatherRows {
     /// The index and the number of rows it points into.
     type State = (Arc<[u32]>, usize);
 
@@ -109,7 +138,7 @@ fn select<B: Backend>(x: FloatTensor<B>, index: &[u32]) -> FloatTensor<B> {
     B::float_select(x, 0, rows_of_x)
 }
 
-fn segment_sums<B: Backend>(mut x: FloatTensor<B>, plan: &SegmentSums) -> FloatTensor<B> {
+fn segment_sums<B: PlaceRows>(mut x: FloatTensor<B>, plan: &SegmentSums) -> FloatTensor<B> {
     let channels = x.shape()[1];
     for level in &plan.levels {
         let blocks = level.index.len() / level.width;
@@ -117,7 +146,7 @@ fn segment_sums<B: Backend>(mut x: FloatTensor<B>, plan: &SegmentSums) -> FloatT
         x = B::float_reshape(B::float_sum_dim(rows, 1), Shape::from([blocks, channels]));
     }
     match &plan.last {
-        Some(last) => select::<B>(x, last),
+        Some(places) => B::place_rows(x, places),
         None => x,
     }
 }
