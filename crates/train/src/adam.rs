@@ -234,7 +234,7 @@ impl GradientNorm {
             return (norm, values.map_or_else(Vec::new, host));
         }
         let parameters = flat.len();
-        let sums = models::gpu_kernels::sums_of_squares(&flat).unwrap_or_else(|| {
+        let sums = gpu_kernels::sums_of_squares(&flat).unwrap_or_else(|| {
             Tensor::cat(flat.into_iter().map(|gradient| gradient.clone().mul(gradient).sum()).collect(), 0)
         });
         let mut sums = host(Tensor::cat(std::iter::once(sums).chain(values).collect(), 0));

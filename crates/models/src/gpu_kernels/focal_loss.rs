@@ -40,7 +40,7 @@ fn entry(
 /// The cross entropy of a logit.
 #[cube]
 fn cross_entropy(logit: f32, target: f32) -> f32 {
-    max(logit, 0.0f32) - logit * target + (1.0 + (-logit.abs()).exp()).ln()
+    max(logit, 0.0f32) - logit * target + (-logit.abs()).exp().log1p()
 }
 
 /// Weighted losses, summed over the parts of all entries: a cube for each.

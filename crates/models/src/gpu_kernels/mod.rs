@@ -1,5 +1,6 @@
-//! Operations of a training step as single kernels of a GPU, written in CubeCL: the optimiser, and batch normalisation
-//! with a ReLU. burn's operations are one kernel each, and on a GPU a step then takes as long as its launches.
+//! Operations of a training step as single kernels of a GPU, written in CubeCL: products and convolutions, batch norms
+//! with a ReLU, the focal loss over anchors, copies of rows, the norm of the gradients and the optimiser. burn's
+//! operations are one kernel each, and on a GPU a step then takes as long as its launches.
 //!
 //! Each function gives its inputs back as an error, or `None`, for tensors that are not on a GPU or not in single
 //! precision. Sums have a fixed order: the same bits in every run on the same device.
@@ -10,6 +11,7 @@ mod norm_relu;
 mod product;
 mod rows;
 mod running;
+mod squares;
 mod tensor_cores;
 mod units;
 
@@ -20,13 +22,13 @@ pub(crate) use product::{product, sum_of_first};
 pub use rows::norm_relu_rows;
 pub(crate) use rows::{place_rows, sum_of_rows};
 pub(crate) use running::blend;
-pub use running::sums_of_squares;
+pub use squares::sums_of_squares;
 pub(crate) use tensor_cores::{convolution, convolution_gradient, has_convolutions};
 
-use burn::backend::Cube;
-use burn::backend::TensorMetadata;
+use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
 use burn::backend::tensor::FloatTensor;
-use burn::tensor::DType;
+use burn::backend::{Autodiff, Cube, TensorMetadata};
+use burn::tensor::{DType, Tensor};
 use cubecl::prelude::*;
 
 /// Units of a cube in each kernel.
@@ -46,6 +48,13 @@ fn is_plain(tensor: &Primitive) -> bool {
             stride *= shape[d];
             fits
         })
+}
+
+/// The values of a tensor on a GPU, with or without an autodiff graph.
+fn values(tensor: &Tensor<1>) -> Option<Primitive> {
+    let tracked = || tensor.clone().try_into_primitive::<Autodiff<Cube, NoCheckpointing>>().ok();
+    let values = tensor.clone().try_into_primitive::<Cube>().ok().or_else(|| Some(tracked()?.into_parts().0))?;
+    is_plain(&values).then_some(values)
 }
 
 /// A tensor of the shape of another one, whose values are not set.
