@@ -26,12 +26,10 @@ pub fn sigmoid_focal_sum(logits: Tensor<2>, labels: &[i32], frame_weights: &[f32
     if let Some(loss) = gpu_kernels::focal_loss_sum(&logits, labels, frame_weights) {
         return loss;
     }
-    let frame = |row: usize| row * frame_weights.len() / rows;
-    let weights: Vec<f32> = labels
-        .iter()
-        .enumerate()
-        .map(|(row, &label)| if label < 0 { 0.0 } else { frame_weights[frame(row)] })
-        .collect();
+    let of_frame = (rows / frame_weights.len().max(1)).max(1);
+    let of_label = |weight: f32| move |&label: &i32| if label < 0 { 0.0 } else { weight };
+    let frames = labels.chunks(of_frame).zip(frame_weights);
+    let weights: Vec<f32> = frames.flat_map(|(labels, &weight)| labels.iter().map(of_label(weight))).collect();
     kernel_ops::focal_loss_sum(&logits, labels, &weights).unwrap_or_else(|| {
         let mut one_hot = vec![0f32; rows * classes];
         for (row, &label) in labels.iter().enumerate().filter(|(_, label)| **label > 0) {

@@ -1,12 +1,12 @@
 //! The sum of the sigmoid focal loss over all anchors.
 
-use super::norm_relu::plain;
+use super::norm_relu::{plain, tracked};
 use super::units::{end_of, sum_of_cube};
 use super::{Primitive, UNITS, argument, cubes, is_plain, unset_like};
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind, unary};
+use burn::backend::autodiff::ops::{Backward, Ops, unary};
 use burn::backend::ops::{FloatTensorOps, IntTensorOps};
 use burn::backend::tensor::IntTensor;
 use burn::backend::{Autodiff, Cube, TensorMetadata};
@@ -107,21 +107,16 @@ struct Focal {
 }
 
 impl Focal {
-    fn labels(&self) -> BufferArg {
-        // SAFETY: an integer tensor that was made of host values has no gaps.
-        unsafe { BufferArg::from_raw_parts(self.labels.handle.clone(), self.labels.shape().num_elements()) }
-    }
-
     fn forward(&self) -> Primitive {
         let values = self.logits.shape().num_elements();
         let parts = (values / LEAST_OF_PART).clamp(1, MOST_PARTS);
         let like =
             |size: usize| Cube::float_empty(Shape::from([size]), &self.logits.device, self.logits.dtype().into());
         let (of_parts, sum) = (like(parts), like(1));
-        let [logits, weights, to] = [&self.logits, &self.weights, &of_parts].map(argument);
+        let [logits, labels, weights, to] = [&self.logits, &self.labels, &self.weights, &of_parts].map(argument);
         let (client, units) = (&self.logits.client, CubeDim::new_1d(UNITS));
         let grid = CubeCount::Static(parts as u32, 1, 1);
-        loss_parts::launch(client, grid, units, logits, self.labels(), weights, to, self.classes, self.of_frame);
+        loss_parts::launch(client, grid, units, logits, labels, weights, to, self.classes, self.of_frame);
         total::launch(client, CubeCount::Static(1, 1, 1), units, argument(&of_parts), argument(&sum));
         sum
     }
@@ -138,11 +133,12 @@ impl Backward<Cube, 1> for Loss {
         unary::<Cube, _>(ops.parents, ops.node, grads, |dy| {
             let dy = plain(dy);
             let out = unset_like(&focal.logits);
-            let [logits, weights, dy, to] = [&focal.logits, &focal.weights, &dy, &out].map(argument);
+            let inputs = [&focal.logits, &focal.labels, &focal.weights, &dy, &out];
+            let [logits, labels, weights, dy, to] = inputs.map(argument);
             let all = cubes(focal.logits.shape().num_elements());
             let (client, units) = (&focal.logits.client, CubeDim::new_1d(UNITS));
             let (classes, of_frame) = (focal.classes, focal.of_frame);
-            loss_gradient::launch(client, all, units, logits, focal.labels(), weights, dy, to, classes, of_frame);
+            loss_gradient::launch(client, all, units, logits, labels, weights, dy, to, classes, of_frame);
             out
         });
     }
@@ -174,10 +170,5 @@ pub fn focal_loss_sum(logits: &Tensor<2>, labels: &[i32], weights: &[f32]) -> Op
     let of_frame = (rows / weights.shape()[0]) as u32;
     let focal = Focal { logits, labels, weights, classes: classes as u32, of_frame };
     let loss = focal.forward();
-    Some(Tensor::from_primitive::<Autodiff<Cube, NoCheckpointing>>(
-        match Loss.prepare::<NoCheckpointing>([node]).compute_bound().stateful() {
-            OpsKind::Tracked(prepared) => prepared.finish(focal, loss),
-            OpsKind::UnTracked(prepared) => prepared.finish(loss),
-        },
-    ))
+    Some(tracked(Loss, [node], focal, loss))
 }

@@ -325,9 +325,9 @@ pub(super) fn tracked_inputs<const D: usize>(
 }
 
 /// The result of an operation, with its place in the autodiff graph.
-pub(super) fn tracked<O: Backward<Cube, 3>, const D: usize>(
+pub(super) fn tracked<O: Backward<Cube, N>, const N: usize, const D: usize>(
     operation: O,
-    nodes: [NodeGuard; 3],
+    nodes: [NodeGuard; N],
     state: O::State,
     y: Primitive,
 ) -> Tensor<D> {

@@ -280,10 +280,6 @@ pub(crate) fn place_rows(x: &Primitive, [rows, places]: [&IntTensor<Cube>; 2], c
         return None;
     }
     let out = Cube::float_zeros(Shape::from([count, channels]), &x.device, x.dtype().into());
-    let ints = |tensor: &IntTensor<Cube>| {
-        // SAFETY: an integer tensor that was made of host values has no gaps.
-        unsafe { BufferArg::from_raw_parts(tensor.handle.clone(), tensor.shape().num_elements()) }
-    };
     // SAFETY: rows are below N and places below `count`.
     unsafe {
         place::launch_unchecked(
@@ -291,8 +287,8 @@ pub(crate) fn place_rows(x: &Primitive, [rows, places]: [&IntTensor<Cube>; 2], c
             cubes(values),
             CubeDim::new_1d(UNITS),
             argument(x),
-            ints(rows),
-            ints(places),
+            argument(rows),
+            argument(places),
             argument(&out),
             channels as u32,
             values as u32,

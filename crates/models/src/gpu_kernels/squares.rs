@@ -1,7 +1,7 @@
 //! Sums of the squares of many tensors: the norm of the gradients.
 
 use super::units::{end_of, sum_of_cube};
-use super::{UNITS, argument, cubes, values};
+use super::{UNITS, argument, sum_of_first, values};
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::{Cube, TensorMetadata};
 use burn::tensor::{Shape, Tensor};
@@ -13,9 +13,9 @@ const PARTS: usize = 32;
 /// Values of a part, at least.
 const LEAST_OF_PART: usize = 4096;
 
-/// Squares of a tensor, summed over its parts; the sums of all tensors lie in `out`, `slot` says where.
+/// Squares of a tensor, summed over its parts. `out`: those of all tensors, `[PARTS, tensors]`.
 #[cube(launch)]
-fn square_parts(x: &[f32], out: &mut [f32], slot: u32) {
+fn square_parts(x: &[f32], out: &mut [f32], slot: u32, tensors: u32) {
     let part = CUBE_POS_X as usize;
     let of_part = x.len().div_ceil(CUBE_COUNT_X as usize);
     let mut i = part * of_part + UNIT_POS as usize;
@@ -27,20 +27,7 @@ fn square_parts(x: &[f32], out: &mut [f32], slot: u32) {
     }
     let sum = sum_of_cube(sum);
     if UNIT_POS == 0 {
-        out[slot as usize * PARTS + part] = sum;
-    }
-}
-
-/// The sum of the parts of each tensor.
-#[cube(launch)]
-fn square_sums(parts: &[f32], out: &mut [f32]) {
-    let i = ABSOLUTE_POS;
-    if i < out.len() {
-        let mut sum = 0.0f32;
-        for part in 0..PARTS {
-            sum += parts[i * PARTS + part];
-        }
-        out[i] = sum;
+        out[part * tensors as usize + slot as usize] = sum;
     }
 }
 
@@ -52,13 +39,20 @@ pub fn sums_of_squares(tensors: &[Tensor<1>]) -> Option<Tensor<1>> {
     let tensors = tensors.iter().map(values).collect::<Option<Vec<_>>>()?;
     let first = tensors.first()?;
     let (client, units) = (&first.client, CubeDim::new_1d(UNITS));
-    let parts = Cube::float_zeros(Shape::from([tensors.len() * PARTS]), &first.device, first.dtype().into());
-    let sums = Cube::float_empty(Shape::from([tensors.len()]), &first.device, first.dtype().into());
+    let parts = Cube::float_zeros(Shape::from([PARTS, tensors.len()]), &first.device, first.dtype().into());
     for (slot, tensor) in tensors.iter().enumerate() {
         let cubes = tensor.shape().num_elements().div_ceil(LEAST_OF_PART).min(PARTS);
         let grid = CubeCount::Static(cubes as u32, 1, 1);
-        square_parts::launch(client, grid, units, argument(tensor), argument(&parts), slot as u32);
+        square_parts::launch(
+            client,
+            grid,
+            units,
+            argument(tensor),
+            argument(&parts),
+            slot as u32,
+            tensors.len() as u32,
+        );
     }
-    square_sums::launch(client, cubes(tensors.len()), units, argument(&parts), argument(&sums));
-    Some(Tensor::from_primitive::<Cube>(sums))
+    let sums = sum_of_first(&parts)?;
+    Some(Tensor::from_primitive::<Cube>(Cube::float_reshape(sums, Shape::from([tensors.len()]))))
 }

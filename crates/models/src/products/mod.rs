@@ -3,9 +3,9 @@
 //! burn's own convolutions take the direct strategy on a device without tensor cores of single precision, and their
 //! gradients by the weights a convolution with a kernel as large as the image. On tensor cores of bf16 a kernel looks
 //! up what the taps read; elsewhere an image is unfolded (`im2col`, Chellapilla et al. 2006): a gather whose index is
-//! known on the host. The gradients are a gather and a product as
-//! well. A product over all pixels is split into many, so that every multiprocessor has work, and their results are
-//! added in a fixed order: the same bits in every run on the same device.
+//! known on the host. The gradients are a gather and a product as well. A product over all pixels is split into many,
+//! so that every multiprocessor has work, and their results are added in a fixed order: the same bits in every run on
+//! the same device.
 
 #[expect(deprecated, reason = "NdArray is kept as long as burn has it")]
 mod backend;

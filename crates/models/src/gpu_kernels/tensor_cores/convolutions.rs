@@ -222,7 +222,7 @@ fn convolve(
             CubeDim::new_1d(tile.units() as u32),
             argument(a),
             argument(x),
-            BufferArg::from_raw_parts(taps.handle.clone(), 9 * outputs),
+            argument(taps),
             argument(&out),
             rows as u32,
             channels as u32,
