@@ -8,7 +8,7 @@ mod report;
 mod verification;
 
 pub(crate) use report::{refused, report};
-pub(crate) use verification::{Distances, GainFrames, set_reached};
+pub(crate) use verification::{Distances, GainFrames, of_channels, set_reached};
 pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::known::Known;

@@ -112,6 +112,9 @@ pub(crate) fn why_none(f: &Finding) -> String {
             format!("The simulation has more of it than the measurement: take it out there ({quantity} by {by}).")
         }
         (Cause::MixedPixels, _) => "beam_divergence: how wide the beams are these data do not tell.".into(),
+        (Cause::Ghosts, _) => {
+            "ghosts: give the materials that mirror a specular lobe, and the shots a probability.".into()
+        }
         (Cause::Unexplained, _) => "There is no table of it for any sensor of the rig.".into(),
         (other, _) => {
             format!("The simulator has no effect that does this by itself ({other}): mend its world.")

@@ -39,6 +39,11 @@ const TABLE: &[[&str; 3]] = &[
     ["ground_error", "the ground of the twin is the recorded one", "the same street by a survey"],
     ["rolling_shutter", "both sides are shot from the same moving sensor", "the same street from a standing vehicle"],
     ["missing_object", "the twin has what the recording shows", "the same street by another sensor"],
+    [
+        "ghosts",
+        "what a mirror shows in many frames is in the map, behind the mirror",
+        "the same street by another sensor",
+    ],
     ["wrong_shape", "the shapes of objects are the recorded ones", "an object of known size"],
     ["range_cut", "what no scan of the recording reached is not in the map", "the same street from nearer by"],
     ["near_cut", "what is nearer than all returns of the recording is not in the map", "scans by another sensor"],

@@ -1,7 +1,7 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 36] = [
+pub const CATALOGUE: [&str; 37] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
@@ -11,6 +11,7 @@ pub const CATALOGUE: [&str; 36] = [
     "dual_returns",
     "ego_occlusion",
     "fog",
+    "ghosts",
     "ground_error",
     "heavy_tails",
     "incidence_dropout",

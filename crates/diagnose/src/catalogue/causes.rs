@@ -26,6 +26,8 @@ identifiers! {
         EgoOcclusion = "ego_occlusion",
         /// Fog: droplets return light, ever fewer with range, and the light of surfaces falls.
         Fog = "fog",
+        /// Shots that a surface mirrors return from others, behind it.
+        Ghosts = "ghosts",
         /// The ground is not the plane that it is taken for.
         GroundError = "ground_error",
         /// Single ranges are much farther off than the others.
@@ -110,9 +112,11 @@ impl Cause {
             Cause::Fog => (Family::Returns, 152),
             Cause::Rain => (Family::Returns, 154),
             Cause::Spray => (Family::Returns, 156),
+            Cause::Ghosts => (Family::Returns, 158),
             Cause::RangeBias => (Family::RangeError, 160),
             Cause::BeamRangeOffset => (Family::RangeError, 170),
             Cause::RangeNoise => (Family::RangeError, 180),
+            Cause::IncidenceNoise => (Family::RangeError, 185),
             Cause::SignalNoise => (Family::RangeError, 190),
             Cause::HeavyTails => (Family::RangeError, 191),
             Cause::BeamIntensity => (Family::Returns, 192),
@@ -126,7 +130,6 @@ impl Cause {
             Cause::LabelOffset => (Family::Labels, 220),
             Cause::TimeOffset => (Family::Timing, 230),
             Cause::GroundError => (Family::Geometry, LAST),
-            Cause::IncidenceNoise => (Family::RangeError, LAST),
         }
     }
 

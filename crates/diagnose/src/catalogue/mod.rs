@@ -64,6 +64,36 @@ identifiers! {
 }
 
 identifiers! {
+    /// Kinds of returns of the channel `returns`. Each is what its causes make, and says nothing of the others.
+    ReturnsKind {
+        /// Returns behind smooth surfaces.
+        Behind = "behind",
+        /// Ranges between the two surfaces of an edge.
+        Between = "between",
+        /// Groups of returns where the other side has nothing.
+        Groups = "groups",
+        /// Lone returns.
+        Lone = "lone",
+        /// Returns behind vehicles.
+        Plumes = "plumes",
+    }
+}
+
+impl ReturnsKind {
+    /// The kind of returns that a cause makes; `None` of causes that are seen in other channels.
+    pub const fn of(cause: Cause) -> Option<ReturnsKind> {
+        match cause {
+            Cause::Ghosts => Some(ReturnsKind::Behind),
+            Cause::Outliers | Cause::Fog | Cause::Rain => Some(ReturnsKind::Lone),
+            Cause::MixedPixels => Some(ReturnsKind::Between),
+            Cause::MissingObject => Some(ReturnsKind::Groups),
+            Cause::Spray => Some(ReturnsKind::Plumes),
+            _ => None,
+        }
+    }
+}
+
+identifiers! {
     /// Family of causes.
     Family {
         /// Returns are lost.

@@ -1,6 +1,7 @@
 //! Channels: sums over a pair of data sets from which causes are fitted.
 
 pub mod cells;
+pub mod edges;
 pub mod free_path;
 pub mod groups;
 pub mod hits;
@@ -8,6 +9,7 @@ pub mod intensity;
 pub mod labels;
 pub mod mask;
 pub mod mean;
+pub mod mirrors;
 pub mod motion;
 pub mod patch;
 pub mod plumes;

@@ -34,7 +34,7 @@ pub const OWN_CAR_M: f64 = 4.0;
 
 /// Neighbours at the same range from which on returns are grouped. Mixed ranges may have a few: a beam wider than the
 /// steps mixes several neighbouring shots alike.
-const FEW: u8 = 4;
+pub const FEW: u8 = 4;
 
 /// Distance from a smooth surface, across it, within which a return lies on it, m.
 const FLAT_M: f64 = 0.15;

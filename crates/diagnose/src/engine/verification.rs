@@ -7,7 +7,7 @@
 
 use super::report::METRIC;
 use super::{Engine, curves};
-use crate::catalogue::{Cause, Channel};
+use crate::catalogue::{Cause, Channel, ReturnsKind};
 use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict};
 use crate::effects::cause_of;
 use crate::error::DiagnoseError;
@@ -85,8 +85,28 @@ impl RemadeFrames for CloudsWith<'_> {
     }
 }
 
-/// Distances of the held-out frames by channel, nats, frame by frame.
-pub(crate) type Distances = BTreeMap<Channel, Vec<f64>>;
+/// What a distance is of: a channel, or a part of one that has causes of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Part {
+    Channel(Channel),
+    /// Of the channel of returns, which is the sum over its kinds.
+    Returns(ReturnsKind),
+}
+
+/// Distances of the held-out frames, nats, frame by frame.
+pub(crate) type Distances = BTreeMap<Part, Vec<f64>>;
+
+/// The distances of all channels. Those of returns are summed over their kinds.
+pub(crate) fn of_channels(
+    channels: impl IntoIterator<Item = (Channel, Vec<f64>)>,
+    returns: BTreeMap<ReturnsKind, Vec<f64>>,
+) -> Distances {
+    let n = returns.values().map(Vec::len).max().unwrap_or(0);
+    let sum = (0..n).map(|i| returns.values().map(|of_kind| of_kind[i]).sum()).collect();
+    let channels = channels.into_iter().chain([(Channel::Returns, sum)]);
+    let of_channels = channels.map(|(channel, d)| (Part::Channel(channel), d));
+    of_channels.chain(returns.into_iter().map(|(kind, d)| (Part::Returns(kind), d))).collect()
+}
 
 /// The distances of some frames of a pair.
 fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usize], slide: bool) -> Distances {
@@ -94,21 +114,18 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     let packets = packets::Packets::new(context, sensors);
     let arrived = packets.arrived(context.frames);
     let context = &Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
-    let mut all = Distances::from([
+    let slide = slide.then(|| (Channel::Slide, rolling_shutter::by_table(context, train, test)));
+    let others = [
         (Channel::Residuals, geometry::by_table(context, train, test)),
         (Channel::Hits, hits::by_table(context, train, test)),
         (Channel::Packets, packets.by_table(train, test)),
         (Channel::Roughness, noise::by_table(context, train, test)),
-        (Channel::Returns, returns::by_table(context, train, test)),
         (Channel::Ranges, quantisation::by_table(context, train, test)),
         (Channel::Intensity, intensity::by_table(context, train, test)),
         (Channel::Labels, labels::by_table(context, Side::Labels, train, test)),
         (Channel::Objects, labels::by_table(context, Side::Objects, train, test)),
-    ]);
-    if slide {
-        all.insert(Channel::Slide, rolling_shutter::by_table(context, train, test));
-    }
-    all
+    ];
+    of_channels(others.into_iter().chain(slide), returns::by_table(context, train, test))
 }
 
 /// At most [`FRAMES`] of some frames, evenly spread.
@@ -191,7 +208,7 @@ impl<'a> Verification<'a> {
         }
         let recorded: Vec<&FramePair> = self.used().into_iter().map(|i| &self.context.frames[i]).collect();
         for finding in findings.iter_mut().filter(|f| !f.effects.is_empty()) {
-            let closed = extended.gain.closed_by_channel.get(&finding.channel).map_or(0.0, |c| c.closed);
+            let closed = closed_of(&extended.gain, finding).map_or(0.0, |c| c.closed);
             curves::measure(finding, &recorded, &extended.frames, closed);
         }
     }
@@ -240,33 +257,39 @@ impl GainFrames {
         let returns = self.returns.max(1.0);
         let members = blocks_of(&self.blocks);
         // The distances of a channel over some frames. What tables predict worse than the simulation is no distance.
-        let sums = |channel: &Channel, which: &[usize]| {
-            three.map(|d| which.iter().map(|&i| d[channel][i]).sum::<f64>().max(0.0))
-        };
+        let sums =
+            |part: &Part, which: &[usize]| three.map(|d| which.iter().map(|&i| d[part][i]).sum::<f64>().max(0.0));
         let closed = |[before, after, floor]: [f64; 3]| (before > floor).then(|| (before - after) / (before - floor));
-        let over = |channels: &[Channel], which: &[usize]| {
-            channels.iter().map(|c| sums(c, which)).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
+        let over = |parts: &[Part], which: &[usize]| {
+            parts.iter().map(|c| sums(c, which)).fold([0.0; 3], |s, d| [s[0] + d[0], s[1] + d[1], s[2] + d[2]])
         };
         let all_frames: Vec<usize> = (0..self.blocks.len()).collect();
-        let interval = |channels: &[Channel]| {
+        let interval = |parts: &[Part]| {
             let mut rng = data::stream(0, "diagnose closed", 1, 0);
-            let drawn = (0..REPETITIONS).filter_map(|_| closed(over(channels, &draw_blocks(&members, &mut rng))));
+            let drawn = (0..REPETITIONS).filter_map(|_| closed(over(parts, &draw_blocks(&members, &mut rng))));
             interval_nearest(drawn.collect())
         };
-        let channels: Vec<Channel> = three[0].keys().copied().collect();
-        let changed = |c: &Channel| {
-            let [before, after, _] = sums(c, &all_frames);
+        let channel = |part: &Part| match part {
+            Part::Channel(channel) => Some(*channel),
+            Part::Returns(_) => None,
+        };
+        let kind = |part: &Part| match part {
+            Part::Channel(_) => None,
+            Part::Returns(kind) => Some(*kind),
+        };
+        let changed = |part: &Part| {
+            let [before, after, _] = sums(part, &all_frames);
             (after - before).abs() > ENOUGH_NATS
         };
-        let found = |c: &Channel| found.is_empty() || found.contains(c);
-        let counted: Vec<Channel> = channels.iter().copied().filter(|c| found(c) || changed(c)).collect();
+        let found = |c: Channel| found.is_empty() || found.contains(&c);
+        let all = || three[0].keys().copied();
+        let counted: Vec<Part> = all().filter(|p| channel(p).is_some_and(|c| found(c) || changed(p))).collect();
         let [before, after_all, floor_all] = over(&counted, &all_frames);
-        let of_channel = |c: &Channel| (*c, sums(c, &all_frames).map(|v| v / returns));
-        let enough = |c: &&Channel| {
-            let [before, _, floor] = sums(c, &all_frames);
+        let enough = |part: &Part| {
+            let [before, _, floor] = sums(part, &all_frames);
             extended && before - floor > ENOUGH_NATS
         };
-        let share = |c: &Channel| Some((*c, Closed { closed: closed(sums(c, &all_frames))?, ci95: interval(&[*c]) }));
+        let share = |part: Part| Some(Closed { closed: closed(sums(&part, &all_frames))?, ci95: interval(&[part]) });
         let of_all = closed([before, after_all, floor_all]).filter(|_| extended);
         Gain {
             metric: METRIC.into(),
@@ -275,9 +298,10 @@ impl GainFrames {
             floor: floor_all / returns,
             closed: of_all,
             ci95: of_all.and_then(|_| interval(&counted)),
-            counted,
-            channels: channels.iter().map(of_channel).collect(),
-            closed_by_channel: channels.iter().filter(enough).filter_map(share).collect(),
+            counted: counted.iter().filter_map(channel).collect(),
+            channels: all().filter_map(|p| Some((channel(&p)?, sums(&p, &all_frames).map(|v| v / returns)))).collect(),
+            closed_by_channel: all().filter(enough).filter_map(|p| Some((channel(&p)?, share(p)?))).collect(),
+            closed_by_kind: all().filter(enough).filter_map(|p| Some((kind(&p)?, share(p)?))).collect(),
             ..Gain::default()
         }
     }
@@ -320,7 +344,7 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, seen: impl Fn(&Finding) -> 
     diagnosis.gain.not_applied.extend(not_applied);
     let Diagnosis { findings, gain, considered, .. } = diagnosis;
     for finding in findings.iter_mut().filter(|f| seen(f)) {
-        let measured = gain.closed_by_channel.get(&finding.channel);
+        let measured = closed_of(gain, finding);
         finding.reached = measured.map(|c| c.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
         let (Some(promised), Some(measured)) = (finding.predicted, measured) else { continue };
@@ -342,12 +366,20 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, seen: impl Fn(&Finding) -> 
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
 }
 
+/// What is gone of the difference that a finding is about: of its kind of returns, else of its channel.
+fn closed_of<'a>(gain: &'a Gain, finding: &Finding) -> Option<&'a Closed> {
+    let kind = ReturnsKind::of(cause_of(finding)).filter(|_| finding.channel == Channel::Returns);
+    kind.map_or_else(|| gain.closed_by_channel.get(&finding.channel), |kind| gain.closed_by_kind.get(&kind))
+}
+
 /// Takes the name of a finding's cause back.
 fn lose_name(finding: &mut Finding, considered: &[Considered]) {
     let cause = finding.cause.take();
     let rivals = considered.iter().filter(|c| c.channel == finding.channel && c.z > Z_STAR && c.nats_per_ray > 0.0);
     let named = rivals.map(|c| (c.nats_per_ray, c.cause.cause));
-    let rival = named.filter(|(_, rival)| Some(*rival) != cause && *rival != Cause::Unexplained);
+    // Another kind of returns is no other reason for this one.
+    let alike = |rival: Cause| cause.is_some_and(|c| rival != c && ReturnsKind::of(rival) == ReturnsKind::of(c));
+    let rival = named.filter(|(_, rival)| alike(*rival) && *rival != Cause::Unexplained);
     let rival = rival.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, rival)| rival);
     match (cause, rival) {
         (Some(cause), Some(rival)) => {

@@ -3,6 +3,7 @@
 mod curve;
 mod describe;
 mod directions;
+mod edges;
 mod select;
 mod surfaces;
 mod tails;
@@ -48,12 +49,13 @@ pub fn search(context: &Context, least_cos: f64) -> ChannelResult {
     result
 }
 
-/// The search on all surfaces, and what of the found noise is measured on the ground and on standing surfaces.
+/// The search on all surfaces of different streets, and what of the found noise is measured on the ground and on
+/// standing surfaces.
 pub fn search_by_surface(context: &Context) -> (ChannelResult, [Option<SurfaceShare>; 2]) {
     let scales = scales(context.frames);
     let rough = rough_frames(context.frames, &scales);
     let mut result = ChannelResult::new(Channel::Roughness, context.of(Role::HoldOut).len());
-    let search = Search::new(context, 0.0, scales, rough);
+    let search = Search { same_edges: false, ..Search::new(context, 0.0, scales, rough) };
     let laws = search.run(&mut result);
     (result, search.by_surface(&laws))
 }
@@ -72,6 +74,8 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
 struct Search<'a> {
     context: &'a Context<'a>,
     least_cos: f64,
+    /// Whether both sides show the same edges.
+    same_edges: bool,
     /// Variance by which heavy tails draw the surfaces through their neighbours, m2: less is no other noise.
     drawn_m2: f64,
     scales: Vec<f64>,
@@ -98,6 +102,7 @@ impl<'a> Search<'a> {
         Search {
             context,
             least_cos,
+            same_edges: true,
             drawn_m2: 0.0,
             scales,
             rough,
@@ -185,7 +190,13 @@ impl<'a> Search<'a> {
                 alone.min(likelihood(&terms) - likelihood(&without))
             };
             let gains = self.hold_out.iter().map(gain).collect();
-            result.found.push(found(&fitted, k, selected, gains, &on_hold_out, &terms));
+            let (law, theta) = terms[k];
+            let causes = match law {
+                // The simulation has more of it: what it has is not known here.
+                NoiseLaw::Angular if theta > 0.0 => self.name_of_angular(theta.sqrt()).to_vec(),
+                _ => vec![law.cause()],
+            };
+            result.found.push(found(&fitted, k, (causes, selected), gains, &on_hold_out, &terms));
         }
         let of_frame = |&i: &usize| distance(&on_hold_out, &on_estimate, &self.rough[i], &terms);
         for (d, more) in result.distance.iter_mut().zip(self.hold_out.iter().map(of_frame)) {

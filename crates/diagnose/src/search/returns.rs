@@ -3,12 +3,13 @@
 
 mod describe;
 mod false_alarms;
+mod ghosts;
 mod spray;
 mod weather;
 
 use self::describe::found;
 use super::{ChannelResult, Context, NamedParameter, Z_STAR, with_error};
-use crate::catalogue::{Cause, Channel, Quantity, Unit};
+use crate::catalogue::{Cause, Channel, Quantity, ReturnsKind, Unit};
 use crate::channels::mean::origins;
 use crate::channels::plumes::{Extent, MOST, PlumeFrame, plume_frame};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
@@ -17,8 +18,9 @@ use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::gain_of_count;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
+use crate::pairing::Lies;
 use rayon::prelude::*;
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 /// Smallest share of returns that is reported, by kind.
 const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.003];
@@ -75,8 +77,12 @@ pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> Channel
             spray = plumes.into_iter().map(|p| p.around).collect();
         }
     }
-    let odd = odd_frames(context.frames, end_m, &|frame, side, ray| is_spray(&spray, frame, side, ray));
-    let search = Search { context, scenes, spray, odd, select, blocks, estimate, hold_out, end_m };
+    let ghosts = scenes == Scenes::Same && ghosts::search(context, [&select, &estimate, &hold_out], end_m, &mut result);
+    let explained = |frame: usize, side: usize, ray: usize| {
+        is_spray(&spray, frame, side, ray) || (ghosts && lies_behind(context, frame, side, ray))
+    };
+    let odd = odd_frames(context.frames, end_m, &explained);
+    let search = Search { context, scenes, spray, ghosts, odd, select, blocks, estimate, hold_out, end_m };
     for kind in kinds {
         search.kind(*kind, &mut result);
     }
@@ -88,18 +94,35 @@ fn is_spray(spray: &[[HashSet<usize>; 2]], frame: usize, side: usize, ray: usize
     spray.get(frame).is_some_and(|of_frame| of_frame[side].contains(&ray))
 }
 
+/// Whether a return lies behind a simulated surface.
+fn lies_behind(context: &Context, frame: usize, side: usize, ray: usize) -> bool {
+    let frame = &context.frames[frame];
+    [&frame.measured, &frame.simulated][side][ray].lies() == Lies::Behind
+}
+
 /// Gains of the `test` frames by the shares of odd returns of the `train` frames, and by the density of returns behind
 /// vehicles, nats.
-pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<ReturnsKind, Vec<f64>> {
     let plumes = plumes(context);
     let around = |frame: usize, side: usize, ray: usize| plumes[frame].around[side].contains(&ray);
-    let gains = shares_by_table(context, &ODD, [train, test], &around);
-    let of_plumes = spray::by_table(&plumes, train, test);
-    gains.into_iter().zip(of_plumes).map(|(gain, more)| gain + more).collect()
+    let behind = |frame: usize, side: usize, ray: usize| lies_behind(context, frame, side, ray);
+    let before = |f: usize, side: usize, ray: usize| around(f, side, ray) || behind(f, side, ray);
+    let mut gains = shares_by_table(context, &ODD, [train, test], &before);
+    let others = |f: usize, side: usize, ray: usize| around(f, side, ray) || !behind(f, side, ray);
+    let of_behind = shares_by_table(context, &[Odd::Alone, Odd::GroupBehind], [train, test], &others);
+    let sum = (0..test.len()).map(|i| of_behind.values().map(|of_kind| of_kind[i]).sum()).collect();
+    gains.insert(ReturnsKind::Behind, sum);
+    gains.insert(ReturnsKind::Plumes, spray::by_table(&plumes, train, test));
+    gains
 }
 
 /// Gains by the shares of some kinds of returns alone.
-pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &[usize]) -> Vec<f64> {
+pub fn kinds_by_table(
+    context: &Context,
+    kinds: &[Odd],
+    train: &[usize],
+    test: &[usize],
+) -> BTreeMap<ReturnsKind, Vec<f64>> {
     shares_by_table(context, kinds, [train, test], &|_, _, _| false)
 }
 
@@ -109,20 +132,26 @@ fn plumes(context: &Context) -> Vec<PlumeFrame> {
     context.frames.par_iter().map(|f| plume_frame(f, &origins, MOST)).collect()
 }
 
-/// Gains by the shares of some kinds of returns, without those that are explained: see [`odd_frames`].
+/// Gains by the shares of some returns, by kind, without those that are explained: see [`odd_frames`].
 fn shares_by_table(
     context: &Context,
     kinds: &[Odd],
     [train, test]: [&[usize]; 2],
     explained: &(dyn Fn(usize, usize, usize) -> bool + Sync),
-) -> Vec<f64> {
+) -> BTreeMap<ReturnsKind, Vec<f64>> {
     let odd = odd_frames(context.frames, 0.98 * end_m(context.frames), explained);
     let rates = ODD.map(|kind| excess(train.iter().map(|&i| &odd[i]), kind as usize));
     let of_kind = |i: usize, kind: Odd| {
         let [base, more] = rates[kind as usize];
         gain(&odd[i], kind as usize, base, more)
     };
-    test.iter().map(|&i| kinds.iter().map(|kind| of_kind(i, *kind)).sum()).collect()
+    let mut gains = BTreeMap::<ReturnsKind, Vec<f64>>::new();
+    for kind in kinds {
+        let Some(name) = ReturnsKind::of(cause(*kind)) else { continue };
+        let of_name = gains.entry(name).or_insert_with(|| vec![0.0; test.len()]);
+        of_name.iter_mut().zip(test).for_each(|(sum, &i)| *sum += of_kind(i, *kind));
+    }
+    gains
 }
 
 /// Counts of all frames, and the frames by role.
@@ -131,6 +160,8 @@ struct Search<'a> {
     scenes: Scenes,
     /// Returns that may be spray, frame by frame, of both sides; empty where there is none.
     spray: Vec<[HashSet<usize>; 2]>,
+    /// Whether ghosts explain what lies behind surfaces.
+    ghosts: bool,
     odd: Vec<OddFrame>,
     select: Vec<usize>,
     /// Blocks of the selecting frames.

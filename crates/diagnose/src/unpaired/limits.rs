@@ -30,6 +30,7 @@ const TABLE: &[(Cause, &str, &str)] = &[
         "the surfaces of another street have other small things on them",
         "a flat wall from a standing sensor, or the same scenes on both sides",
     ),
+    (Cause::Ghosts, "other streets have other mirrors, and other things behind them", SAME_SCENES),
     (Cause::Spray, "behind other vehicles other things stand", SAME_SCENES),
     (Cause::LabelOffset, "a label is compared with that of the same object", SAME_SCENES),
     (Cause::TimeOffset, "a label is compared with that of the same object", SAME_SCENES),

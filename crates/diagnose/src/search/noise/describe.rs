@@ -2,16 +2,25 @@
 
 use super::Term;
 use super::curve::curve;
-use crate::catalogue::{Channel, Covariate, Quantity};
+use crate::catalogue::{Cause, Channel, Covariate, Quantity};
+use crate::diagnosis::Status;
 use crate::inference::linear::LinearFit;
 use crate::inference::noise::{NoiseLaw, NoiseTable};
 use crate::search::{Found, NamedParameter, Selected, parameter};
 
-/// The finding of law `k` of those that were fitted together.
+/// What recording tells laws of noise.
+const TELL_BY_INCIDENCE: &str =
+    "surfaces met squarely and at grazing angles at the same range (a wall or a board beside the road, near and far)";
+
+/// What recording tells scattering directions from wide beams.
+const TELL_BY_EDGES: &str =
+    "upright edges (posts, corners of houses) before something farther: directions that scatter make them ragged";
+
+/// The finding of law `k` of those that were fitted together, with the causes that have this law.
 pub(super) fn found(
     fitted: &LinearFit,
     k: usize,
-    selected: Selected,
+    (mut causes, selected): (Vec<Cause>, Selected),
     held_out_gains: Vec<f64>,
     table: &NoiseTable,
     terms: &[Term],
@@ -20,27 +29,26 @@ pub(super) fn found(
     let sigma = theta.signum() * theta.abs().sqrt();
     // The true law may have another form: three per cent of the value.
     let error = (fitted.error(k) / (2.0 * theta.abs().sqrt()).max(1e-9)).hypot(0.03 * sigma);
-    let separate_by = (!selected.rivals.is_empty()).then(|| {
-        "surfaces met squarely and at grazing angles at the same range (a wall or a board beside the road, near and far)"
-            .to_owned()
-    });
+    let by_edges = causes.len() > 1;
+    causes.extend(selected.rivals);
+    let separate_by = (causes.len() > 1).then(|| if by_edges { TELL_BY_EDGES } else { TELL_BY_INCIDENCE }.to_owned());
     Found {
         effects: Vec::new(),
-        status: selected.status(),
+        status: if causes.len() > 1 { Status::Ambiguous } else { Status::Named },
         confidence: selected.confidence,
-        causes: selected.causes(law.cause()),
-        parameters: parameters(law, sigma, error),
+        parameters: parameters(law, causes[0], sigma, error),
         channel: Channel::Roughness,
         covariate: covariate(law),
         held_out_gains,
-        says: says(law, sigma),
+        says: says(law, causes[0], sigma),
+        causes,
         separate_by,
         curve: curve(table, law, terms),
     }
 }
 
 /// Parameters of a law with a standard deviation `sigma`, m or rad, negative where the measured side has less noise.
-fn parameters(law: NoiseLaw, sigma: f64, error: f64) -> Vec<NamedParameter> {
+fn parameters(law: NoiseLaw, cause: Cause, sigma: f64, error: f64) -> Vec<NamedParameter> {
     match law {
         NoiseLaw::Constant => {
             vec![parameter(Quantity::StdM, sigma, error), parameter(Quantity::PerM, 0.0, 1e-4)]
@@ -53,6 +61,7 @@ fn parameters(law: NoiseLaw, sigma: f64, error: f64) -> Vec<NamedParameter> {
             parameter(Quantity::StdM, sigma, error.hypot(0.1 * sigma)),
             parameter(Quantity::Exponent, 0.5 * gamma, 0.15 * gamma),
         ],
+        NoiseLaw::Angular if cause == Cause::IncidenceNoise => vec![parameter(Quantity::AngleRad, sigma, error)],
         NoiseLaw::Angular => vec![parameter(Quantity::StdDeg, sigma.to_degrees(), error.to_degrees())],
     }
 }
@@ -68,7 +77,7 @@ fn covariate(law: NoiseLaw) -> Covariate {
 }
 
 /// The finding in a sentence.
-fn says(law: NoiseLaw, sigma: f64) -> String {
+fn says(law: NoiseLaw, cause: Cause, sigma: f64) -> String {
     match law {
         NoiseLaw::Constant => {
             format!("measured ranges scatter by {:.1} cm more than simulated ones, everywhere alike", sigma * 100.0)
@@ -84,6 +93,11 @@ fn says(law: NoiseLaw, sigma: f64) -> String {
         NoiseLaw::Signal(_) => {
             format!("measured ranges scatter more where the signal is weak: by {:.1} cm at u = 4", sigma * 100.0)
         }
+        NoiseLaw::Angular if cause == Cause::IncidenceNoise => format!(
+            "measured ranges scatter more at grazing incidence, as {:.2} mrad of a beam do there, and edges stay as \
+             straight as simulated ones",
+            1e3 * sigma
+        ),
         NoiseLaw::Angular => format!(
             "the light goes elsewhere than the sensor says, by {:.3} degrees: grazing surfaces scatter, squarely met ones do not",
             sigma.to_degrees()

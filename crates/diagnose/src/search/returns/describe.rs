@@ -34,7 +34,7 @@ struct Description {
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
     let Description { causes, effects, covariate, says, parameters } = match kind {
         Odd::Alone => {
-            let alarms = false_alarms(search.context, &search.estimate, search.end_m);
+            let alarms = false_alarms(search.context, &search.estimate, search.end_m, search.ghosts);
             // No droplet is seen through a surface: returns behind them as well come from the receiver.
             match (!alarms.instead).then(|| weather_of(search)).flatten() {
                 Some(weather) => of_weather(&weather, &share),

@@ -1,5 +1,6 @@
 //! Rate of false alarms, ranges at which nothing is, and the largest range at which they occur.
 
+use super::ONE_SIDED;
 use crate::channels::free_path::scale;
 use crate::channels::returns::{OWN_CAR_M, Odd, margin_m, odd};
 use crate::pairing::{FramePair, Lies, Ray};
@@ -22,6 +23,8 @@ struct Seen {
     returns: [f64; 2],
     /// Lengths of the rays on which they would be lone, m.
     lengths_m: [f64; 2],
+    /// Whether ghosts explain what lies behind surfaces.
+    ghosts: bool,
 }
 
 impl Seen {
@@ -33,7 +36,7 @@ impl Seen {
     /// Whether there are about as many behind surfaces as in front of them.
     fn behind_as_well(&self) -> bool {
         let [front, behind] = self.rates();
-        behind > 0.5 * front
+        !self.ghosts && behind > 0.5 * front
     }
 
     /// False alarms for each metre of ray. Sensors whose false alarms replace the true return show them behind
@@ -48,14 +51,16 @@ impl Seen {
     }
 }
 
-/// False alarms of the measured side beyond those of the simulated one; simulated frames end at `end_m`.
-pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64) -> FalseAlarms {
+/// False alarms of the measured side beyond those of the simulated one; simulated frames end at `end_m`. Where there
+/// are ghosts, what lies behind surfaces does not count.
+pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64, ghosts: bool) -> FalseAlarms {
     let frames: Vec<&FramePair> = frames.iter().map(|&f| &context.frames[f]).collect();
-    let mut reach_m = reach_m(&frames).max(OWN_CAR_M + 1.0);
-    let within = seen(&frames, [OWN_CAR_M, end_m.min(reach_m)]);
+    let mut reach_m = reach_m(&frames, ghosts).max(OWN_CAR_M + 1.0);
+    let seen = |between| Seen { ghosts, ..seen(&frames, between) };
+    let within = seen([OWN_CAR_M, end_m.min(reach_m)]);
     if reach_m > end_m {
         // A much higher rate beyond the end of the simulation is due to real returns: the reach is then not known.
-        let beyond = seen(&frames, [end_m, reach_m]);
+        let beyond = seen([end_m, reach_m]);
         if beyond.per_metre() > 2.0 * within.per_metre() {
             reach_m = end_m;
         }
@@ -64,11 +69,19 @@ pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64) -> F
     FalseAlarms { rate, reach_m, instead: within.behind_as_well() }
 }
 
+/// Whether there are far more lone returns behind surfaces than before them, by the length of ray: noise of the
+/// receiver comes at any time.
+pub(super) fn mostly_behind(context: &Context, frames: &[usize], end_m: f64) -> bool {
+    let frames: Vec<&FramePair> = frames.iter().map(|&f| &context.frames[f]).collect();
+    let [front, behind] = seen(&frames, [OWN_CAR_M, end_m]).rates();
+    behind > ONE_SIDED * front
+}
+
 /// Largest range of false alarms, m: the 99 % quantile of the excess of lone returns, over 0.99.
-fn reach_m(frames: &[&FramePair]) -> f64 {
+fn reach_m(frames: &[&FramePair], ghosts: bool) -> f64 {
     let mut ranges: Vec<(f64, f64)> = Vec::new();
     for frame in frames {
-        let alone = |r: &&Ray| odd(r) == Some(Odd::Alone);
+        let alone = |r: &&Ray| odd(r) == Some(Odd::Alone) && !(ghosts && r.lies() == Lies::Behind);
         ranges.extend(frame.measured.iter().filter(alone).map(|r| (r.own_range_m(), 1.0)));
         ranges.extend(frame.simulated.iter().filter(alone).map(|r| (r.own_range_m(), -scale(frame))));
     }
@@ -111,9 +124,12 @@ mod tests {
     #[test]
     fn false_alarms_before_surfaces_are_related_to_the_length_before_them() {
         // 1000 m of ray before surfaces and 2000 m behind them, one false alarm in 100 m.
-        let before = Seen { returns: [10.0, 0.0], lengths_m: [1000.0, 2000.0] };
-        let instead = Seen { returns: [10.0, 20.0], lengths_m: [1000.0, 2000.0] };
+        let lengths_m = [1000.0, 2000.0];
+        let before = Seen { returns: [10.0, 0.0], lengths_m, ghosts: false };
+        let instead = Seen { returns: [10.0, 20.0], lengths_m, ghosts: false };
         assert!((before.per_metre() - 0.01).abs() < 1e-12 && (instead.per_metre() - 0.01).abs() < 1e-12);
+        let ghosts = Seen { returns: [10.0, 500.0], lengths_m, ghosts: true };
+        assert!((ghosts.per_metre() - 0.01).abs() < 1e-12);
         assert_eq!(Seen::default().per_metre(), 0.0);
     }
 }
