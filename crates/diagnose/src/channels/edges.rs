@@ -137,8 +137,9 @@ pub fn steps_rad(rays: &[Ray], sensors: usize) -> Vec<Option<f64>> {
     (0..sensors).map(of_sensor).collect()
 }
 
-/// The edges of one side of a frame, and how ragged directions with a standard deviation (rad) would make them.
-pub fn edges(rays: &[Ray], steps_rad: &[Option<f64>], std_rad: f64) -> Edges {
+/// The edges of one side of a frame, and how ragged directions with a standard deviation (rad) would make them, where
+/// that is asked for.
+pub fn edges(rays: &[Ray], steps_rad: &[Option<f64>], std_rad: Option<f64>) -> Edges {
     let step_of = |sensor: u8| steps_rad.get(usize::from(sensor)).copied().flatten();
     let of_row = |((sensor, row), shots): ((u8, u16), Vec<[f64; 2]>)| {
         let step = step_of(sensor)?;
@@ -165,9 +166,10 @@ pub fn edges(rays: &[Ray], steps_rad: &[Option<f64>], std_rad: f64) -> Edges {
             }
             let lines = lines(&shots);
             out.all += 1.0;
-            match lines.is_empty() {
-                true => out.ragged += 1.0,
-                false => out.by_jitter += by_jitter(&shots, &lines, std_rad / step, &mut rng),
+            if lines.is_empty() {
+                out.ragged += 1.0;
+            } else if let Some(std_rad) = std_rad {
+                out.by_jitter += by_jitter(&shots, &lines, std_rad / step, &mut rng);
             }
         }
     }
@@ -242,10 +244,10 @@ mod tests {
             let steps = steps_rad(&still, 1);
             assert!((steps[0].unwrap() / STEP - 1.0).abs() < 1e-3);
             for std in [0.05, 0.1, 0.2] {
-                let straight = edges(&still, &steps, std * STEP);
+                let straight = edges(&still, &steps, Some(std * STEP));
                 // Of shots that lie between each other some leave no room for a line.
                 assert!(straight.all > 2000.0 && straight.ragged < 0.1 * straight.all, "{straight:?}");
-                let found = edges(&posts(std * STEP, stagger), &steps, 0.0);
+                let found = edges(&posts(std * STEP, stagger), &steps, None);
                 let more = found.ragged / found.all - straight.ragged / straight.all;
                 // What is stated is of edges of any slant: upright ones are ragged up to three times as often.
                 let stated = straight.by_jitter / straight.all;

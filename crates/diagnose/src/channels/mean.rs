@@ -328,16 +328,8 @@ mod tests {
             let (azimuth, elevation) = (TAU * f64::from(k % 180) / 180.0, 0.02 * f64::from(k / 180) - 0.3);
             Vector3::new(elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin())
         };
-        FramePair {
-            id: String::new(),
-            measured: (0..180 * 20).filter_map(|k| return_(shot(k))).collect(),
-            simulated: vec![],
-            mixed_per_rad: 0.0,
-            jumps: 1.0,
-            open: 0.0,
-            second: [0.0; 2],
-            objects: vec![],
-        }
+        let measured = (0..180 * 20).filter_map(|k| return_(shot(k))).collect();
+        FramePair::of_rays(String::new(), measured, vec![])
     }
 
     #[test]

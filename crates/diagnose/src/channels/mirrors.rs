@@ -6,7 +6,7 @@
 //! lay at another distance behind it.
 
 use super::mean::origins;
-use super::returns::{FEW, OWN_CAR_M};
+use super::returns::{FEW, OWN_CAR_M, Odd, OddFrame};
 use crate::pairing::{FramePair, Lies, Ray};
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Point3;
@@ -23,17 +23,15 @@ const ON: [f64; 3] = [0.4, 0.05, 1.5];
 /// Other distances behind a surface, as ratios.
 const OTHERS: [f64; 4] = [0.55, 0.75, 1.35, 1.8];
 
-/// Returns behind smooth surfaces of one frame, by side, measured first.
+/// Images of the measured returns of one frame behind smooth surfaces.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct MirrorFrame {
-    /// All returns of a side.
-    pub all: [f64; 2],
-    /// Those behind smooth surfaces.
-    pub behind: [f64; 2],
+pub struct Images {
+    /// Returns behind smooth surfaces.
+    pub all: f64,
     /// Those of them whose image lies on a surface.
-    pub mirrored: [f64; 2],
+    pub on_surfaces: f64,
     /// How many images would lie on surfaces if the returns lay at other distances.
-    pub by_chance: [f64; 2],
+    pub by_chance: f64,
 }
 
 /// Whether a return lies alone, so far behind a smooth surface that it has an image. Where the simulation has a thing
@@ -47,25 +45,30 @@ pub fn is_behind(ray: &Ray) -> bool {
         && -ray.across_m() > BEHIND_M[1]
 }
 
-/// The returns of a frame behind smooth surfaces.
-pub fn mirror_frame(frame: &FramePair, rig: &Rig) -> MirrorFrame {
+/// Number of the returns behind smooth surfaces, in the place of lone ones, and of all returns.
+pub fn behind_frame(frame: &FramePair) -> OddFrame {
     let sides = [&frame.measured, &frame.simulated];
-    let mut out = MirrorFrame { all: sides.map(|rays| rays.len() as f64), ..MirrorFrame::default() };
+    let mut out = OddFrame { all: sides.map(|rays| rays.len() as f64), ..OddFrame::default() };
+    out.counts[Odd::Alone as usize] = sides.map(|rays| rays.iter().filter(|ray| is_behind(ray)).count() as f64);
+    out
+}
+
+/// The images of a frame's measured returns behind smooth surfaces.
+pub fn images(frame: &FramePair, rig: &Rig) -> Images {
+    let mut out = Images::default();
     let origins = origins(rig);
     let place = |ray: &Ray| origins[usize::from(ray.sensor)] + ray.direction_vector() * ray.own_range_m();
     let points: Vec<[f32; 3]> = frame.simulated.iter().map(|ray| place(ray).coords.map(|c| c as f32).into()).collect();
     let Some(tree) = (!points.is_empty()).then(|| ImmutableKdTree::new_from_slice(&points).ok()).flatten() else {
         return out;
     };
-    for (side, rays) in sides.into_iter().enumerate() {
-        for ray in rays.iter().filter(|ray| is_behind(ray)) {
-            let origin = &origins[usize::from(ray.sensor)];
-            let on_surface = |times: f64| has_image(&tree, ray, origin, times * f64::from(ray.residual_m));
-            out.behind[side] += 1.0;
-            out.mirrored[side] += f64::from(u8::from(on_surface(1.0)));
-            let others = OTHERS.iter().filter(|times| on_surface(**times)).count();
-            out.by_chance[side] += others as f64 / OTHERS.len() as f64;
-        }
+    for ray in frame.measured.iter().filter(|ray| is_behind(ray)) {
+        let origin = &origins[usize::from(ray.sensor)];
+        let on_surface = |times: f64| has_image(&tree, ray, origin, times * f64::from(ray.residual_m));
+        out.all += 1.0;
+        out.on_surfaces += f64::from(u8::from(on_surface(1.0)));
+        let others = OTHERS.iter().filter(|times| on_surface(**times)).count();
+        out.by_chance += others as f64 / OTHERS.len() as f64;
     }
     out
 }
@@ -109,30 +112,24 @@ mod tests {
             let residual_m = if ghost { behind_m(&d) as f32 } else { 0.0 };
             Ray { residual_m, company: if ghost { 0 } else { 5 }, ..*ray }
         };
-        FramePair {
-            id: String::new(),
-            measured: simulated.iter().enumerate().map(farther).collect(),
-            simulated,
-            mixed_per_rad: 0.0,
-            jumps: 1.0,
-            open: 0.0,
-            second: [0.0; 2],
-            objects: vec![],
-        }
+        let measured = simulated.iter().enumerate().map(farther).collect();
+        FramePair::of_rays(String::new(), measured, simulated)
     }
 
     #[test]
     fn what_a_mirror_shows_has_an_image_on_a_surface_and_false_returns_have_one_by_chance() {
         let rig = Rig::single();
         // From the glass to the houses.
-        let ghosts = mirror_frame(&street(|d| 20.0 / d.y), &rig);
-        assert!(ghosts.behind[0] > 300.0 && ghosts.behind[1] == 0.0, "{ghosts:?}");
+        let street_of_ghosts = street(|d| 20.0 / d.y);
+        assert_eq!(behind_frame(&street_of_ghosts).counts[Odd::Alone as usize][1], 0.0);
+        let ghosts = images(&street_of_ghosts, &rig);
+        assert!(ghosts.all > 300.0, "{ghosts:?}");
         // The others show what lies beyond the ends of the street.
-        assert!(ghosts.mirrored[0] > 0.5 * ghosts.behind[0], "{ghosts:?}");
-        assert!(ghosts.by_chance[0] < 0.1 * ghosts.behind[0], "{ghosts:?}");
+        assert!(ghosts.on_surfaces > 0.5 * ghosts.all, "{ghosts:?}");
+        assert!(ghosts.by_chance < 0.1 * ghosts.all, "{ghosts:?}");
         let rng = std::cell::RefCell::new(data::stream(1, "mirrors test", 0, 0));
-        let others = mirror_frame(&street(|_| rng.borrow_mut().random_range(3.0..60.0)), &rig);
-        assert!(others.behind[0] > 300.0, "{others:?}");
-        assert!((others.mirrored[0] - others.by_chance[0]).abs() < 0.1 * others.behind[0], "{others:?}");
+        let others = images(&street(|_| rng.borrow_mut().random_range(3.0..60.0)), &rig);
+        assert!(others.all > 300.0, "{others:?}");
+        assert!((others.on_surfaces - others.by_chance).abs() < 0.1 * others.all, "{others:?}");
     }
 }

@@ -35,6 +35,23 @@ pub struct FramePair {
     pub objects: Vec<ObjectPair>,
 }
 
+#[cfg(test)]
+impl FramePair {
+    /// Of the returns of both sides alone.
+    pub fn of_rays(id: String, measured: Vec<Ray>, simulated: Vec<Ray>) -> FramePair {
+        FramePair {
+            id,
+            measured,
+            simulated,
+            mixed_per_rad: 0.0,
+            jumps: 1.0,
+            open: 0.0,
+            second: [0.0; 2],
+            objects: vec![],
+        }
+    }
+}
+
 /// A labelled object of the two sides.
 #[derive(Clone, Debug)]
 pub struct ObjectPair {

@@ -383,16 +383,8 @@ mod tests {
                 let mut place = || rng.random_range(-45.0..45.0f64);
                 let posts: Vec<Vector3<f64>> = (0..150).map(|_| Vector3::new(place(), place(), 0.0)).collect();
                 let shown = |p: &Vector3<f64>| p + velocity * (p.y.atan2(p.x) / std::f64::consts::TAU * scan_s);
-                FramePair {
-                    mixed_per_rad: 0.0,
-                    jumps: 1.0,
-                    open: 0.0,
-                    second: [0.0; 2],
-                    id: f.to_string(),
-                    measured: posts.iter().map(|p| Ray::standing(&shown(p))).collect(),
-                    simulated: posts.iter().map(Ray::standing).collect(),
-                    objects: vec![],
-                }
+                let measured = posts.iter().map(|p| Ray::standing(&shown(p))).collect();
+                FramePair::of_rays(f.to_string(), measured, posts.iter().map(Ray::standing).collect())
             })
             .collect();
         let own = OwnMotion::ahead(40.0);

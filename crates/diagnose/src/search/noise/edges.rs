@@ -8,7 +8,7 @@ use crate::search::Z_STAR;
 use rayon::prelude::*;
 
 /// Noise that grows as the tangent of the incidence comes from beams that go elsewhere, or from those that are wide.
-pub(super) const BOTH: [Cause; 2] = [Cause::AngularJitter, Cause::IncidenceNoise];
+const BOTH: [Cause; 2] = [Cause::AngularJitter, Cause::IncidenceNoise];
 
 impl Search<'_> {
     /// What noise by incidence, of directions with this standard deviation (rad), comes from: jitter makes edges
@@ -22,7 +22,7 @@ impl Search<'_> {
         let steps = steps_rad(&self.context.frames[first].simulated, self.context.rig.sensors.len());
         let of_frame = |i: usize| {
             let frame = &self.context.frames[i];
-            [&frame.measured, &frame.simulated].map(|side| edges(side, &steps, std_rad))
+            [edges(&frame.measured, &steps, None), edges(&frame.simulated, &steps, Some(std_rad))]
         };
         let of_frames: Vec<[Edges; 2]> = frames().collect::<Vec<_>>().into_par_iter().map(of_frame).collect();
         let [measured, simulated] = [0, 1].map(|side| share(&of_frames, side));

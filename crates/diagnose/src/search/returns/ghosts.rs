@@ -1,15 +1,13 @@
 //! Ghosts: returns by way of a mirror. They lie behind the surface that reflected their shot.
 
 use super::false_alarms::mostly_behind;
-use super::{FLOORS, share_of};
+use super::{FLOORS, cross_gains, excess, gain, share_of};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::mirrors::{MirrorFrame, is_behind, mirror_frame};
-use crate::channels::returns::Odd;
+use crate::channels::mirrors::{Images, behind_frame, images, is_behind};
+use crate::channels::returns::{Odd, OddFrame};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::choice::{significant, total_and_z};
-use crate::inference::gain_of_count;
-use crate::inference::linear::cross_validated;
 use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands};
 use rayon::prelude::*;
 
@@ -19,36 +17,19 @@ use rayon::prelude::*;
 const MIRRORED: f64 = 0.15;
 
 /// Smallest share of all returns that is reported: that of lone returns.
-const FLOOR: f64 = FLOORS[Odd::Alone as usize];
+const FLOOR: f64 = FLOORS[BEHIND];
+
+/// Their place among the counts of a frame: they are lone returns.
+const BEHIND: usize = Odd::Alone as usize;
 
 /// What recording tells mirrors from things behind glass.
 const TELL_BY: &str = "the same place from elsewhere: a ghost moves with the sensor, a thing behind glass does not";
 
-/// Share of the returns of a side over some frames that a number counts.
-fn share_on(frames: &[&MirrorFrame], side: usize, number: fn(&MirrorFrame, usize) -> f64) -> f64 {
-    let sum = |of: &dyn Fn(&MirrorFrame) -> f64| frames.iter().map(|f| of(f)).sum::<f64>();
-    sum(&|f| number(f, side)) / sum(&|f| f.all[side]).max(1.0)
-}
-
-/// Returns behind surfaces: the simulated share, and the excess of the measured side over it.
-fn excess(frames: &[&MirrorFrame]) -> [f64; 2] {
-    let all: f64 = frames.iter().map(|f| f.all[1]).sum();
-    let [measured, simulated] = [0, 1].map(|side| share_on(frames, side, |f, side| f.behind[side]));
-    let base = simulated + 0.5 / all.max(1.0);
-    [base, measured - base]
-}
-
-/// Gain of a frame's returns behind surfaces, nats.
-fn gain(frame: &MirrorFrame, [base, more]: [f64; 2]) -> f64 {
-    gain_of_count(frame.behind[0], frame.all[0], base + more.max(0.0), base)
-}
-
 /// Whether mirrors explain what lies behind surfaces: more of the images than by chance lie on surfaces, on most
 /// frames.
-fn are_mirrored(frames: &[&MirrorFrame]) -> bool {
-    let images = |f: &&MirrorFrame| f.mirrored[0] - f.by_chance[0];
-    let each: Vec<f64> = frames.iter().map(images).collect();
-    let others: f64 = frames.iter().map(|f| f.behind[0] - f.by_chance[0]).sum();
+fn are_mirrored(frames: &[Images]) -> bool {
+    let each: Vec<f64> = frames.iter().map(|f| f.on_surfaces - f.by_chance).collect();
+    let others: f64 = frames.iter().map(|f| f.all - f.by_chance).sum();
     significant(&each, Z_STAR) && each.iter().sum::<f64>() > MIRRORED * others
 }
 
@@ -59,15 +40,13 @@ pub(super) fn search(
     end_m: f64,
     result: &mut ChannelResult,
 ) -> bool {
-    let frames: Vec<MirrorFrame> = context.frames.par_iter().map(|f| mirror_frame(f, context.rig)).collect();
-    let of = |which: &[usize]| which.iter().map(|&i| &frames[i]).collect::<Vec<_>>();
-    let selected = of(select);
-    let fit = |train: &[usize]| excess(&train.iter().map(|&i| selected[i]).collect::<Vec<_>>());
-    let gains = cross_validated(&context.blocks(select), fit, |rates, i| gain(selected[i], *rates));
+    let frames: Vec<OddFrame> = context.frames.par_iter().map(behind_frame).collect();
+    let excess_of = |which: &[usize]| excess(which.iter().map(|&i| &frames[i]), BEHIND);
+    let gains = cross_gains(&frames, select, &context.blocks(select), BEHIND);
     let (total, z) = total_and_z(&gains);
     let outcome = if total <= first_demands().nats || !significant(&gains, Z_STAR) {
         "no more returns behind surfaces than on the simulated side"
-    } else if [select, estimate].into_iter().any(|role| excess(&of(role))[1] <= FLOOR) {
+    } else if [select, estimate].into_iter().any(|role| excess_of(role)[1] <= FLOOR) {
         "too small to speak of"
     } else if !mostly_behind(context, select, end_m) {
         "as many before surfaces: false alarms"
@@ -85,27 +64,28 @@ pub(super) fn search(
     if outcome != "chosen" {
         return false;
     }
-    let rates = excess(&of(estimate));
-    let each: Vec<f64> = estimate.iter().map(|&i| excess(&[&frames[i]])[1]).collect();
-    let held_out_gains: Vec<f64> = hold_out.iter().map(|&i| gain(&frames[i], rates)).collect();
+    let [base, more] = excess_of(estimate);
+    let each: Vec<f64> = estimate.iter().map(|&i| excess_of(&[i])[1]).collect();
+    let held_out_gains: Vec<f64> = hold_out.iter().map(|&i| gain(&frames[i], BEHIND, base, more)).collect();
     for (d, gain) in result.distance.iter_mut().zip(&held_out_gains) {
         d.iter_mut().for_each(|sum| *sum += gain.max(0.0));
     }
-    let mirrored = are_mirrored(&selected);
+    let of_select: Vec<Images> = select.par_iter().map(|&i| images(&context.frames[i], context.rig)).collect();
+    let mirrored = are_mirrored(&of_select);
     let causes = if mirrored { vec![Cause::Ghosts] } else { vec![Cause::Ghosts, Cause::MissingObject] };
     result.found.push(Found {
         effects: vec![],
         status: if mirrored { Status::Named } else { Status::Ambiguous },
         separate_by: (!mirrored).then(|| TELL_BY.into()),
         causes,
-        parameters: vec![(Quantity::Share.into(), share_of(rates[1], &each))],
+        parameters: vec![(Quantity::Share.into(), share_of(more, &each))],
         confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
         channel: Channel::Returns,
         covariate: Covariate::Place,
         held_out_gains,
         says: format!(
             "{:.2} % of the measured returns lie alone behind surfaces and hardly any before them: {}",
-            100.0 * rates[1],
+            100.0 * more,
             if mirrored {
                 "ghosts, in places where a mirror shows other surfaces"
             } else {
