@@ -40,16 +40,16 @@ impl Assignment {
 
     /// Sensor of a point in the cloud's frame (m); `None` for a rig without sensors.
     pub fn of_point(&self, point: Point3<f64>) -> Option<Assigned> {
-        let mut best: Option<([f64; 3], Assigned)> = None;
+        let mut best: Option<([f64; 3], usize, Point3<f64>)> = None;
         for (sensor, view) in self.views.iter().enumerate() {
-            let spherical = Sensor::spherical(&(view.sensor_from_cloud * point));
-            let (off_rad, half_rad) = (spherical[0].abs(), view.half_fov_rad);
+            let seen = view.sensor_from_cloud * point;
+            let (off_rad, half_rad) = (Sensor::azimuth_rad(&seen).abs(), view.half_fov_rad);
             let order = [(off_rad - half_rad).max(0.0), half_rad, off_rad / half_rad];
-            if best.is_none_or(|(least, _)| order < least) {
-                best = Some((order, Assigned { sensor, spherical }));
+            if best.is_none_or(|(least, ..)| order < least) {
+                best = Some((order, sensor, seen));
             }
         }
-        best.map(|(_, assigned)| assigned)
+        best.map(|(_, sensor, seen)| Assigned { sensor, spherical: Sensor::spherical(&seen) })
     }
 }
 

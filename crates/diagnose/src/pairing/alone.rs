@@ -6,7 +6,7 @@ use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
 use geometry::Box3;
-use sensor::directions::{LocalSurface, SensorScan, Sensors};
+use sensor::directions::{LocalSurface, Neighbour, SensorScan, Sensors};
 
 /// One frame of one side by itself.
 #[derive(Clone, Debug, Default)]
@@ -32,7 +32,8 @@ pub fn frame_alone(side: &SideFrame, sensors: &Sensors) -> FrameAlone {
     let mut out = FrameAlone::default();
     for (sensor, scan) in side.scans.iter().enumerate() {
         let predictor = Predictor::new(sensors, sensor, scan, &boxes);
-        let alone = |i| alone(&predictor, scan, i);
+        let mut neighbours = Vec::new();
+        let alone = |i| alone(&predictor, scan, i, &mut neighbours);
         let (returns, surfaces): (Vec<Ray>, Vec<Option<LocalSurface>>) = (0..scan.len()).map(alone).unzip();
         out.mixed_per_rad += mixed_per_rad(&returns, &predictor.around.index);
         out.shots.extend(shots(&predictor, scan, (&returns, &surfaces), sensors.patterns[sensor].steps.azimuth_rad));
@@ -42,11 +43,16 @@ pub fn frame_alone(side: &SideFrame, sensors: &Sensors) -> FrameAlone {
     out
 }
 
-/// A return with what the others of its side say, and their surface.
-fn alone(predictor: &Predictor, scan: &SensorScan, i: usize) -> (Ray, Option<LocalSurface>) {
-    let (mut ray, surface) = predictor.own_ray(scan, i);
+/// A return with what the others of its side say, and their surface. `neighbours` is overwritten.
+fn alone(
+    predictor: &Predictor,
+    scan: &SensorScan,
+    i: usize,
+    neighbours: &mut Vec<Neighbour>,
+) -> (Ray, Option<LocalSurface>) {
+    let (mut ray, surface) = predictor.own_ray(scan, i, neighbours);
     ray.matched = true;
-    ray.in_gap = in_gap(&predictor.around.index, scan, i);
+    ray.in_gap = in_gap(neighbours, scan.range_m[i]);
     // In the open a far post is as lone as a false alarm.
     if ray.surface == Surface::Open {
         ray.row = u16::MAX;
@@ -134,7 +140,7 @@ fn missed_shot(predictor: &Predictor, [azimuth_rad, elevation_rad]: [f32; 2]) ->
         range_m: vec![1.0],
         intensity: vec![],
     };
-    let (ray, surface) = predictor.seen(&place, 0, false);
+    let (ray, surface) = predictor.seen(&place, 0, None, &mut Vec::new());
     // Nothing came back: it has no range of its own.
     (Ray { matched: false, residual_m: 0.0, ..ray }, surface)
 }

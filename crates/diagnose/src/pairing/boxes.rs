@@ -2,6 +2,7 @@
 //! returns and other shot directions do not bias it.
 
 use geometry::Box3;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::{Matrix3, Point3, Vector3};
 
 /// A return with the surface it lies on, in the cloud's frame.
@@ -41,6 +42,8 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
             (foot, Vector3::from(tip) - foot)
         })
         .collect();
+    let feet: Vec<[f64; 3]> = local.iter().map(|(q, _)| (*q).into()).collect();
+    let surfaces = ImmutableKdTree::<f64, 3>::new_from_slice(&feet).ok()?;
     let points: Vec<Vector3<f64>> = measured.iter().map(|p| Vector3::from(bbox.to_local((*p).into()))).collect();
     let mut shift = Vector3::zeros();
     let mut result = None;
@@ -51,10 +54,9 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
         let mut system = Matrix3::zeros();
         for p in &points {
             let back = p - shift;
-            let nearest =
-                local.iter().map(|(q, n)| ((back - q).norm_squared(), q, n)).min_by(|a, b| a.0.total_cmp(&b.0));
-            let Some((d2, q, n)) = nearest else { continue };
-            if d2 > gate * gate || n.norm_squared() < 0.5 {
+            let nearest = surfaces.query(&back.into()).nearest_one::<SquaredEuclidean<f64>>().execute();
+            let (q, n) = &local[nearest.item as usize];
+            if nearest.distance > gate * gate || n.norm_squared() < 0.5 {
                 continue;
             }
             let off = n.dot(&(p - q)); // across the surface, before any shift

@@ -2,7 +2,7 @@
 
 use super::boxes::{BoxShift, SurfacePoint, fit_shift};
 use super::gaps::{in_gap, mixed_per_rad};
-use super::prediction::{Predictor, mean_intensity};
+use super::prediction::{Intensities, Predictor};
 use super::ray::{Ray, Surface};
 use super::recordings::{Matched, SideFrame};
 use super::roughness::Roughness;
@@ -10,7 +10,7 @@ use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
 use sensor::assignment::Assignment;
-use sensor::directions::{DirectionIndex, SensorScan, Sensors, in_or_beside};
+use sensor::directions::{DirectionIndex, Neighbour, SensorScan, Sensors, in_or_beside};
 use std::borrow::Cow;
 
 /// One frame of both sides.
@@ -198,21 +198,10 @@ impl SensorPair<'_> {
         let (a, b) = (&mut scan, self.simulated);
         let predictor = Predictor::new(self.sensors, self.sensor, b, self.boxes);
         let mut simulated = self.simulated_rays(&predictor);
-        let mut measured: Vec<Ray> = (0..a.len()).map(|i| predictor.ray(a, i, false)).collect();
-        if let Some(correction) = range_m {
-            for (i, ray) in measured.iter_mut().enumerate().filter(|(_, r)| r.smooth) {
-                let off = correction(ray) as f32;
-                ray.residual_m -= off;
-                a.range_m[i] = (a.range_m[i] - off).max(0.05);
-            }
-        }
+        let mut measured = self.measured_rays(&predictor, a, range_m);
         let closes = self.sensors.rig.sensors[self.sensor].is_full_circle();
         let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
-        self.complete_measured(&mut measured, a, &own, &predictor);
-        for (i, ray) in simulated.iter_mut().enumerate() {
-            ray.in_gap = in_gap(&own, b, i);
-            ray.shown = near(&own, b, i, None) > 0;
-        }
+        self.compare_with_measured(&own, a, [&mut measured, &mut simulated]);
         let edge_m = self.sensors.edge_m;
         Roughness { own: &own, window: predictor.around.window, edge_m }.set([&mut measured, &mut simulated], [a, b]);
         frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.around.index);
@@ -233,24 +222,58 @@ impl SensorPair<'_> {
 
     /// Simulated rays, each predicted from the others.
     fn simulated_rays(&self, predictor: &Predictor) -> Vec<Ray> {
-        let scan = self.simulated;
-        let own = |(i, matched): (usize, &bool)| Ray { matched: *matched, ..predictor.own_ray(scan, i).0 };
-        self.matched.1.iter().enumerate().map(own).collect()
+        let mut neighbours = Vec::new();
+        let mut own = |(i, matched): (usize, &bool)| Ray {
+            matched: *matched,
+            ..predictor.own_ray(self.simulated, i, &mut neighbours).0
+        };
+        self.matched.1.iter().enumerate().map(&mut own).collect()
     }
 
-    /// Sets what depends on the direction in which measured rays were sent, and on the returns around them. `own` is
-    /// the index of the scan.
-    fn complete_measured(&self, rays: &mut [Ray], scan: &SensorScan, own: &DirectionIndex, predictor: &Predictor) {
-        for (i, (ray, matched)) in rays.iter_mut().zip(&self.matched.0).enumerate() {
+    /// Measured rays as the simulation predicts them, in the directions in which they were sent. A correction of the
+    /// ranges is subtracted from the scan as well.
+    fn measured_rays(
+        &self,
+        predictor: &Predictor,
+        scan: &mut SensorScan,
+        range_m: Option<&(dyn Fn(&Ray) -> f64 + Sync)>,
+    ) -> Vec<Ray> {
+        let mut neighbours = Vec::new();
+        let mut rays = Vec::with_capacity(scan.len());
+        for (i, matched) in self.matched.0.iter().enumerate() {
+            let mut ray = predictor.seen(scan, i, None, &mut neighbours).0;
+            if let Some(correction) = range_m.filter(|_| ray.smooth) {
+                let off = correction(&ray) as f32;
+                ray.residual_m -= off;
+                scan.range_m[i] = (scan.range_m[i] - off).max(0.05);
+            }
             ray.matched = *matched;
             (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
             ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
-            ray.company = company(own, scan, i);
-            ray.in_gap = in_gap(&predictor.around.index, scan, i);
+            ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
+            rays.push(ray);
+        }
+        rays
+    }
+
+    /// Sets what depends on the measured returns around measured and simulated rays. `own` is the index of the measured
+    /// scan.
+    fn compare_with_measured(&self, own: &DirectionIndex, scan: &SensorScan, sides: [&mut [Ray]; 2]) {
+        let [measured, simulated] = sides;
+        let intensities = Intensities::of(scan);
+        let mut neighbours = Vec::new();
+        for (i, ray) in measured.iter_mut().enumerate() {
+            own.neighbours(scan.azimuth_rad[i], scan.elevation_rad[i], &mut neighbours);
+            ray.company = company(&neighbours, scan.range_m[i], Some(i as u32));
             if ray.smooth {
-                let at = [scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]];
-                ray.intensity_beside = mean_intensity(own, &scan.intensity, at, Some(i as u32));
+                ray.intensity_beside = intensities.mean(&neighbours, scan.range_m[i], Some(i as u32));
             }
+        }
+        let scan = self.simulated;
+        for (i, ray) in simulated.iter_mut().enumerate() {
+            own.neighbours(scan.azimuth_rad[i], scan.elevation_rad[i], &mut neighbours);
+            ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
+            ray.shown = company(&neighbours, scan.range_m[i], None) > 0;
         }
     }
 }
@@ -260,21 +283,12 @@ pub fn company_m(range_m: f64) -> f64 {
     0.3 + 0.03 * range_m
 }
 
-/// Number of returns of a scan around one of its own that lie at about its range.
-pub(super) fn company(index: &DirectionIndex, scan: &SensorScan, i: usize) -> u8 {
-    near(index, scan, i, Some(i as u32))
-}
-
-/// Number of the returns of an index around one of a scan that lie at about its range, but for one.
-fn near(index: &DirectionIndex, scan: &SensorScan, i: usize, without: Option<u32>) -> u8 {
-    let range = scan.range_m[i];
-    let mut n = 0u8;
-    index.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
-        if without != Some(e.index) && f64::from((e.range_m - range).abs()) < company_m(f64::from(range)) {
-            n = n.saturating_add(1);
-        }
-    });
-    n
+/// Number of the returns around a direction that lie at about a range, m, but for one.
+pub(super) fn company(around: &[Neighbour], range_m: f32, without: Option<u32>) -> u8 {
+    let within_m = company_m(f64::from(range_m));
+    let near = |n: &&Neighbour| f64::from((n.entry.range_m - range_m).abs()) < within_m;
+    let others = around.iter().filter(|n| without != Some(n.entry.index));
+    others.filter(near).count().min(usize::from(u8::MAX)) as u8
 }
 
 /// Distance from which on labels are not of the same object, m.

@@ -3,7 +3,7 @@
 
 use super::ray::Ray;
 use crate::inference::median;
-use sensor::directions::{DirectionIndex, SensorScan};
+use sensor::directions::{DirectionIndex, Neighbour};
 use std::collections::BTreeMap;
 
 /// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a
@@ -20,18 +20,17 @@ pub fn gap_margin_m(near_m: f64) -> f64 {
     0.35 + 0.015 * near_m
 }
 
-/// Whether a return lies between two surfaces of the other side, off both of them.
-pub(super) fn in_gap(other: &DirectionIndex, scan: &SensorScan, i: usize) -> bool {
-    let range = scan.range_m[i];
+/// Whether a return at a range, m, lies between two surfaces, off both of them. `around` it are returns of one side.
+pub(super) fn in_gap(around: &[Neighbour], range_m: f32) -> bool {
     let [mut near, mut far] = [0.0f32, f32::INFINITY];
-    other.around(scan.azimuth_rad[i], scan.elevation_rad[i], |e, _, _| {
-        if e.range_m < range {
-            near = near.max(e.range_m);
+    for Neighbour { entry, .. } in around {
+        if entry.range_m < range_m {
+            near = near.max(entry.range_m);
         } else {
-            far = far.min(e.range_m);
+            far = far.min(entry.range_m);
         }
-    });
-    let [range, near, far] = [range, near, far].map(f64::from);
+    }
+    let [range, near, far] = [range_m, near, far].map(f64::from);
     near > 0.0 && is_between(range, near, far)
 }
 

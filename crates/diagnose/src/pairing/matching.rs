@@ -12,16 +12,16 @@ pub fn match_directions(a: &SensorScan, b: &SensorScan, pattern: &ScanPattern, c
     let window = Steps { azimuth_rad: 1.5 * steps.azimuth_rad, elevation_rad: 0.7 * steps.elevation_rad };
     let index = DirectionIndex::new(b, window, closes);
     let (gate_az, gate_el) = (0.8f32, 0.5f32);
-    let row_of = |el: f32| pattern.row(el);
-    let shifts = row_shifts(a, &index, pattern, window);
+    let rows = [a, b].map(|scan| scan.elevation_rad.iter().map(|el| pattern.row(*el)).collect::<Vec<_>>());
+    let shifts = row_shifts(a, &index, &rows, pattern, window);
     let mut pairs: Vec<(f32, u32, u32)> = Vec::with_capacity(a.len() * 2);
     for i in 0..a.len() {
         let el = a.elevation_rad[i];
-        let row = row_of(el);
+        let row = rows[0][i];
         let shift = shifts[row.map_or(shifts.len() - 1, |r| r)];
         index.around(a.azimuth_rad[i] + shift * steps.azimuth_rad, el, |entry, dx, dy| {
             let (dx, dy) = (dx * 1.5, dy * 0.7);
-            let same_row = row.is_none() || row == row_of(entry.elevation_rad);
+            let same_row = row.is_none() || row == rows[1][entry.index as usize];
             if dx.abs() <= gate_az && dy.abs() <= gate_el && same_row {
                 pairs.push((dx * dx + dy * dy, i as u32, entry.index));
             }
@@ -40,15 +40,22 @@ pub fn match_directions(a: &SensorScan, b: &SensorScan, pattern: &ScanPattern, c
 /// Fewest pairs for the shift of a row.
 const FEWEST: f64 = 20.0;
 
-/// Circular mean of the offset to the nearest shot, in steps: one for each row, then one for all.
-fn row_shifts(a: &SensorScan, index: &DirectionIndex, pattern: &ScanPattern, window: Steps) -> Vec<f32> {
+/// Circular mean of the offset to the nearest shot, in steps: one for each row, then one for all. `rows_of` the returns
+/// of both sides.
+fn row_shifts(
+    a: &SensorScan,
+    index: &DirectionIndex,
+    rows_of: &[Vec<Option<usize>>; 2],
+    pattern: &ScanPattern,
+    window: Steps,
+) -> Vec<f32> {
     let rows = pattern.rows_rad.len();
     let mut sums = vec![[0.0f64; 3]; rows + 1];
     for i in 0..a.len() {
-        let row = pattern.row(a.elevation_rad[i]);
+        let row = rows_of[0][i];
         let mut nearest: Option<(f32, f32)> = None;
         index.around(a.azimuth_rad[i], a.elevation_rad[i], |entry, dx, dy| {
-            if row.is_none() || row == pattern.row(entry.elevation_rad) {
+            if row.is_none() || row == rows_of[1][entry.index as usize] {
                 let distance = dx * dx + dy * dy;
                 if nearest.is_none_or(|(d, _)| distance < d) {
                     nearest = Some((distance, dx * window.azimuth_rad / pattern.steps.azimuth_rad));

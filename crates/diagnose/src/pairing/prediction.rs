@@ -6,7 +6,7 @@ use super::roughness::LONE;
 use geometry::Box3;
 use nalgebra::Vector3;
 use sensor::directions::{
-    DirectionIndex, Kind, LocalSurface, SensorScan, Sensors, Surroundings, in_or_beside, kind_of,
+    Kind, LocalSurface, Neighbour, SensorScan, Sensors, Surroundings, in_or_beside, kind_of,
 };
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
@@ -20,8 +20,7 @@ pub(super) struct Predictor<'a> {
     pub(super) around: Surroundings,
     boxes: &'a [Box3],
     others: Vec<Box3>,
-    /// Intensities of the simulated returns; empty without the column.
-    intensity: &'a [f32],
+    intensities: Intensities<'a>,
 }
 
 impl<'a> Predictor<'a> {
@@ -34,7 +33,7 @@ impl<'a> Predictor<'a> {
             others: others(boxes, origin.into()),
             around: Surroundings::new(sensors, sensor, simulated),
             boxes,
-            intensity: &simulated.intensity,
+            intensities: Intensities::of(simulated),
         }
     }
 
@@ -44,9 +43,16 @@ impl<'a> Predictor<'a> {
     }
 
     /// A return of the simulated scan itself with what the others say, and their surface where it is a smooth one.
-    pub(super) fn own_ray(&self, scan: &SensorScan, i: usize) -> (Ray, Option<LocalSurface>) {
-        let (mut ray, surface) = self.seen(scan, i, true);
-        ray.company = company(&self.around.index, scan, i);
+    /// `neighbours` receives the simulated returns around it, and itself.
+    pub(super) fn own_ray(
+        &self,
+        scan: &SensorScan,
+        i: usize,
+        neighbours: &mut Vec<Neighbour>,
+    ) -> (Ray, Option<LocalSurface>) {
+        let itself = Some(i as u32);
+        let (mut ray, surface) = self.seen(scan, i, itself, neighbours);
+        ray.company = company(neighbours, scan.range_m[i], itself);
         ray.intensity_beside = ray.intensity_simulated;
         if ray.smooth && ray.company > LONE {
             (ray.roughness_m, ray.roughness_leverage) = (ray.residual_m, ray.leverage);
@@ -54,13 +60,16 @@ impl<'a> Predictor<'a> {
         (ray, surface)
     }
 
-    /// A return of a scan of that sensor with the prediction for its direction.
-    pub(super) fn ray(&self, scan: &SensorScan, i: usize, without_itself: bool) -> Ray {
-        self.seen(scan, i, without_itself).0
-    }
-
-    /// The same, and the surface that predicts it where there is a smooth one.
-    pub(super) fn seen(&self, scan: &SensorScan, i: usize, without_itself: bool) -> (Ray, Option<LocalSurface>) {
+    /// A return of a scan of that sensor with the prediction for its direction, and the surface that predicts it where
+    /// there is a smooth one. A simulated return is left out of it by its number. `neighbours` receives the simulated
+    /// returns around the direction.
+    pub(super) fn seen(
+        &self,
+        scan: &SensorScan,
+        i: usize,
+        without: Option<u32>,
+        neighbours: &mut Vec<Neighbour>,
+    ) -> (Ray, Option<LocalSurface>) {
         let (az, el, range) = (scan.azimuth_rad[i], scan.elevation_rad[i], scan.range_m[i]);
         let direction = self.around.direction(az, el);
         let mut ray = Ray {
@@ -91,7 +100,8 @@ impl<'a> Predictor<'a> {
             intensity_simulated: f32::NAN,
             intensity_beside: f32::NAN,
         };
-        let around = self.around.look(az, el, without_itself.then_some(i as u32));
+        self.around.index.neighbours(az, el, neighbours);
+        let around = self.around.look_at(neighbours, az, el, without);
         ray.near_far_m = around.near_far_m;
         match around.surface {
             Some((surface, normal)) => {
@@ -102,9 +112,7 @@ impl<'a> Predictor<'a> {
                 ray.leverage = surface.leverage as f32;
                 ray.bulge_m = surface.bulge_m as f32;
                 ray.normal = normal.cast::<f32>().into();
-                let without = without_itself.then_some(i as u32);
-                ray.intensity_simulated =
-                    mean_intensity(&self.around.index, self.intensity, [az, el, ray.range_m], without);
+                ray.intensity_simulated = self.intensities.mean(neighbours, ray.range_m, without);
                 self.set_kind(&mut ray, &direction, surface.range_m, Some(normal.z));
             }
             None if ray.near_far_m[1] > 0.0 => self.set_kind(&mut ray, &direction, f64::from(range), None),
@@ -129,25 +137,38 @@ impl<'a> Predictor<'a> {
 /// Standard deviation of ln(intensity) up to which a surface is evenly bright.
 const EVEN: f64 = 0.2;
 
-/// Mean intensity of the returns around a direction at about a range (azimuth and elevation, rad; range, m); NaN where
-/// there is none, or where they are not evenly bright: the mean does not tell what another return there would have. A
-/// return itself is left out by its number.
-pub(super) fn mean_intensity(index: &DirectionIndex, intensity: &[f32], at: [f32; 3], without: Option<u32>) -> f32 {
-    if intensity.is_empty() {
-        return f32::NAN;
+/// Intensities of the returns of a scan, and their logarithms; empty without the column.
+pub(super) struct Intensities<'a> {
+    own: &'a [f32],
+    ln: Vec<f64>,
+}
+
+impl<'a> Intensities<'a> {
+    /// Those of a scan.
+    pub(super) fn of(scan: &'a SensorScan) -> Self {
+        Intensities { own: &scan.intensity, ln: scan.intensity.iter().map(|v| f64::from(*v).ln()).collect() }
     }
-    let [azimuth_rad, elevation_rad, range_m] = at;
-    let reach_m = company_m(f64::from(range_m)) as f32;
-    let [mut n, mut sum, mut ln, mut square] = [0.0f64; 4];
-    index.around(azimuth_rad, elevation_rad, |e, _, _| {
-        if without != Some(e.index) && (e.range_m - range_m).abs() < reach_m {
-            let own = f64::from(intensity[e.index as usize]);
-            (n, sum, ln, square) = (n + 1.0, sum + own, ln + own.ln(), square + own.ln().powi(2));
+
+    /// Mean intensity of some returns of the scan at about a range, m; NaN where there is none, or where they are not
+    /// evenly bright: the mean does not tell what another return there would have. A return itself is left out by its
+    /// number.
+    pub(super) fn mean(&self, neighbours: &[Neighbour], range_m: f32, without: Option<u32>) -> f32 {
+        if self.own.is_empty() {
+            return f32::NAN;
         }
-    });
-    // A dark return makes the logarithms infinite, and the deviation no number.
-    let even = square / n - (ln / n).powi(2) < EVEN * EVEN;
-    if even { (sum / n) as f32 } else { f32::NAN }
+        let reach_m = company_m(f64::from(range_m)) as f32;
+        let [mut n, mut sum, mut ln, mut square] = [0.0f64; 4];
+        for Neighbour { entry, .. } in neighbours {
+            if without != Some(entry.index) && (entry.range_m - range_m).abs() < reach_m {
+                let own_ln = self.ln[entry.index as usize];
+                (n, sum) = (n + 1.0, sum + f64::from(self.own[entry.index as usize]));
+                (ln, square) = (ln + own_ln, square + own_ln.powi(2));
+            }
+        }
+        // A dark return makes the logarithms infinite, and the deviation no number.
+        let even = square / n - (ln / n).powi(2) < EVEN * EVEN;
+        if even { (sum / n) as f32 } else { f32::NAN }
+    }
 }
 
 /// The labelled objects except the ego vehicle, whose box contains the sensor.

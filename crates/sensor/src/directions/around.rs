@@ -1,8 +1,8 @@
 //! The surface around a direction: its range, incidence, normal and kind.
 
 use super::Sensors;
-use super::scan::{DirectionIndex, Entry, SensorScan};
-use super::surface::{LocalSurface, fit_surface, fit_surface_through};
+use super::scan::{DirectionIndex, Neighbour, SensorScan};
+use super::surface::{LocalSurface, fit_surface_through, fit_surface_to};
 use geometry::Box3;
 use nalgebra::{Isometry3, Vector3};
 
@@ -33,6 +33,12 @@ const LEVEL: f64 = 0.85;
 
 /// Whether a point lies in a box or within a margin beside it, above the ground.
 pub fn in_or_beside(bbox: &Box3, point: [f64; 3], margin_m: f64) -> bool {
+    let (x, y) = (point[0] - bbox.center[0], point[1] - bbox.center[1]);
+    // Most points are far from most boxes.
+    let reach_m = 0.5 * (bbox.size[0] + bbox.size[1]) + 2.0 * margin_m;
+    if x * x + y * y > reach_m * reach_m {
+        return false;
+    }
     let local = bbox.to_local(point);
     let near = (0..3).all(|k| local[k].abs() < bbox.size[k] / 2.0 + margin_m);
     near && local[2] > -bbox.size[2] / 2.0 + FLOOR_M
@@ -91,13 +97,23 @@ impl Surroundings {
 
     /// What lies around a direction; a return itself is left out by its number.
     pub fn look(&self, azimuth_rad: f32, elevation_rad: f32, without: Option<u32>) -> Around {
-        let others = |e: &Entry| without != Some(e.index);
-        let Some(surface) = fit_surface(&self.index, self.window, azimuth_rad, elevation_rad, others) else {
-            let mut near_far = [f32::INFINITY, 0.0f32];
-            self.index.around(azimuth_rad, elevation_rad, |e, _, _| {
-                if others(e) {
-                    near_far = [near_far[0].min(e.range_m), near_far[1].max(e.range_m)];
-                }
+        let mut neighbours = Vec::new();
+        self.index.neighbours(azimuth_rad, elevation_rad, &mut neighbours);
+        self.look_at(&neighbours, azimuth_rad, elevation_rad, without)
+    }
+
+    /// The same with the neighbours of the direction.
+    pub fn look_at(
+        &self,
+        neighbours: &[Neighbour],
+        azimuth_rad: f32,
+        elevation_rad: f32,
+        without: Option<u32>,
+    ) -> Around {
+        let others = || neighbours.iter().filter(|n| without != Some(n.entry.index));
+        let Some(surface) = fit_surface_to(others(), self.window, elevation_rad) else {
+            let near_far = others().fold([f32::INFINITY, 0.0f32], |[near, far], n| {
+                [near.min(n.entry.range_m), far.max(n.entry.range_m)]
             });
             let near_far_m = if near_far[1] > 0.0 { near_far } else { [0.0; 2] };
             return Around { near_far_m, surface: None };

@@ -12,8 +12,8 @@ mod surface;
 pub use around::{Around, Kind, Surroundings, in_or_beside, is_level, kind_of};
 pub use far_surfaces::{FarSurfaces, LEAST_COS};
 pub use pattern::ScanPattern;
-pub use scan::{DirectionIndex, Entry, SensorScan, Steps, split_by_sensor, split_with_places};
-pub use surface::{LocalSurface, fit_surface, fit_surface_through};
+pub use scan::{DirectionIndex, Entry, Neighbour, SensorScan, Steps, split_by_sensor, split_with_places};
+pub use surface::{LocalSurface, fit_surface, fit_surface_through, fit_surface_to};
 
 use crate::rig::Rig;
 

@@ -3,7 +3,7 @@
 //! A plane n . p = h seen from the origin along the unit direction u has the inverse range q = n . u / h: linear in
 //! u, so that a linear fit of q in the two angles is exact for planes up to second order of the window.
 
-use super::scan::{DirectionIndex, Entry};
+use super::scan::{DirectionIndex, Entry, Neighbour};
 
 /// A local plane in inverse range.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,28 +58,65 @@ pub fn fit_surface(
     el: f32,
     keep: impl Fn(&Entry) -> bool,
 ) -> Option<LocalSurface> {
-    let (near, n) = neighbours(index, az, el, keep);
-    let near = &near[..n];
-    let plane = Plane::fit(near).filter(Plane::is_inside)?;
-    Some(plane.surface(near, window, el))
+    let mut near = Points::default();
+    index.around(az, el, |entry, dx, dy| {
+        if keep(entry) {
+            near.push(entry, [dx, dy]);
+        }
+    });
+    near.surface(window, el)
+}
+
+/// The same, to neighbours that are known.
+pub fn fit_surface_to<'a>(
+    neighbours: impl Iterator<Item = &'a Neighbour>,
+    window: [f64; 2],
+    el: f32,
+) -> Option<LocalSurface> {
+    let mut near = Points::default();
+    neighbours.for_each(|n| near.push(&n.entry, n.offset));
+    near.surface(window, el)
 }
 
 /// Most neighbours of a fit.
 const MOST: usize = 32;
 
-/// The neighbours of a direction that `keep` accepts: offsets in windows, inverse range, weight; and their number.
-fn neighbours(index: &DirectionIndex, az: f32, el: f32, keep: impl Fn(&Entry) -> bool) -> ([[f64; 4]; MOST], usize) {
-    let mut near = [[0.0f64; 4]; MOST];
-    let mut n = 0;
-    index.around(az, el, |entry, dx, dy| {
-        if n < near.len() && keep(entry) {
-            let (dx, dy) = (f64::from(dx), f64::from(dy));
-            let weight = (1.0 - 0.7 * (dx * dx + dy * dy).min(1.2)).max(0.05);
-            near[n] = [dx, dy, 1.0 / f64::from(entry.range_m), weight];
-            n += 1;
+/// A neighbour of a direction.
+#[derive(Clone, Copy, Default)]
+struct Point {
+    /// Offset in azimuth and elevation, in windows.
+    x: f64,
+    y: f64,
+    /// m.
+    range: f64,
+    /// 1/m.
+    inverse_range: f64,
+    weight: f64,
+}
+
+/// The first neighbours of a direction.
+#[derive(Default)]
+struct Points {
+    points: [Point; MOST],
+    n: usize,
+}
+
+impl Points {
+    fn push(&mut self, entry: &Entry, offset: [f32; 2]) {
+        if self.n < MOST {
+            let [x, y] = offset.map(f64::from);
+            let weight = (1.0 - 0.7 * (x * x + y * y).min(1.2)).max(0.05);
+            let range = f64::from(entry.range_m);
+            self.points[self.n] = Point { x, y, range, inverse_range: 1.0 / range, weight };
+            self.n += 1;
         }
-    });
-    (near, n)
+    }
+
+    /// The surface of points that lie around the direction.
+    fn surface(&self, window: [f64; 2], el: f32) -> Option<LocalSurface> {
+        let near = &self.points[..self.n];
+        Plane::fit(near).filter(Plane::is_inside).map(|plane| plane.surface(near, window, el))
+    }
 }
 
 /// Fits the surface of one of the neighbours of a direction, which are of several surfaces: of the planes `through` it,
@@ -95,52 +132,56 @@ pub fn fit_surface_through(
     through: u32,
     edge_m: f64,
 ) -> Option<LocalSurface> {
-    let (mut near, n) = neighbours(index, az, el, |_| true);
-    let near = &mut near[..n];
-    let mut at = None;
-    index.around(az, el, |entry, dx, dy| at = if entry.index == through { Some([dx, dy].map(f64::from)) } else { at });
-    let at = at.filter(|_| n >= FEWEST)?;
-    let squared = |p: &[f64; 4]| (p[0] - at[0]).powi(2) + (p[1] - at[1]).powi(2);
+    let (mut near, mut at) = (Points::default(), None);
+    index.around(az, el, |entry, dx, dy| {
+        near.push(entry, [dx, dy]);
+        at = if entry.index == through { Some([dx, dy].map(f64::from)) } else { at };
+    });
+    let near = &mut near.points[..near.n];
+    let at = at.filter(|_| near.len() >= FEWEST)?;
+    let squared = |p: &Point| (p.x - at[0]).powi(2) + (p.y - at[1]).powi(2);
     near.sort_unstable_by(|a, b| squared(a).total_cmp(&squared(b)));
-    let ranges = near.iter().map(|p| 1.0 / p[2]);
+    let ranges = near.iter().map(|p| p.range);
     let along_m = most_along_m(ranges.fold([f64::INFINITY, 0.0f64], |[l, h], r| [l.min(r), h.max(r)]));
     let cos = |[q0, bx, by]: [f64; 3]| {
         let (gx, gy) = (bx / window[0] / f64::from(el.cos()) / q0, by / window[1] / q0);
         1.0 / (1.0 + gx * gx + gy * gy).sqrt()
     };
-    // What a neighbour gives to a plane.
-    let support = |plane: [f64; 3], [x, y, q, _]: &[f64; 4]| {
-        let predicted = plane[0] + plane[1] * x + plane[2] * y;
+    // What a neighbour gives to a plane with that cosine of incidence.
+    let support = |plane: [f64; 3], cos: f64, p: &Point| {
+        let predicted = plane[0] + plane[1] * p.x + plane[2] * p.y;
         if plane[0] < LEAST_INVERSE_RANGE || predicted < LEAST_INVERSE_RANGE {
             return 0.0;
         }
-        let along = 1.0 / q - 1.0 / predicted;
-        (1.0 - (along * cos(plane) / edge_m).powi(2).max((along / along_m).powi(2))).max(0.0)
+        let along = p.range - 1.0 / predicted;
+        (1.0 - (along * cos / edge_m).powi(2).max((along / along_m).powi(2))).max(0.0)
     };
-    let total =
-        |plane: [f64; 3]| near.iter().map(|p| support(plane, p)).sum::<f64>() + NORMAL_INCIDENCE * cos(plane).ln();
-    let others = (1..n).flat_map(|i| (1..i).map(move |j| (i, j)));
+    let total = |plane: [f64; 3]| {
+        let cos = cos(plane);
+        near.iter().map(|p| support(plane, cos, p)).sum::<f64>() + NORMAL_INCIDENCE * cos.ln()
+    };
+    let others = (1..near.len()).flat_map(|i| (1..i).map(move |j| (i, j)));
     let planes = others.filter_map(|(i, j)| plane_through([near[0], near[i], near[j]]));
     let (_, best) = planes.map(|plane| (total(plane), plane)).max_by(|a, b| a.0.total_cmp(&b.0))?;
-    let mut on = [[0.0f64; 4]; MOST];
-    let mut count = 0;
+    let mut on = Points::default();
     for p in near.iter() {
-        let share = support(best, p);
+        let share = support(best, cos(best), p);
         if share > 0.0 {
-            on[count] = [p[0], p[1], p[2], p[3] * share * share];
-            count += 1;
+            on.points[on.n] = Point { weight: p.weight * share * share, ..*p };
+            on.n += 1;
         }
     }
-    let on = &on[..count];
+    let on = &on.points[..on.n];
     Plane::fit(on).map(|plane| plane.surface(on, window, el))
 }
 
 /// Inverse range at the middle and its slopes of the plane through three neighbours; `None` where they are on a line.
-fn plane_through([first, a, b]: [[f64; 4]; 3]) -> Option<[f64; 3]> {
-    let [[xa, ya, qa], [xb, yb, qb]] = [a, b].map(|p| [p[0] - first[0], p[1] - first[1], p[2] - first[2]]);
+fn plane_through([first, a, b]: [Point; 3]) -> Option<[f64; 3]> {
+    let [[xa, ya, qa], [xb, yb, qb]] =
+        [a, b].map(|p| [p.x - first.x, p.y - first.y, p.inverse_range - first.inverse_range]);
     let det = xa * yb - xb * ya;
     let (bx, by) = ((qa * yb - qb * ya) / det, (xa * qb - xb * qa) / det);
-    (det.abs() >= LEAST_AREA).then_some([first[2] - bx * first[0] - by * first[1], bx, by])
+    (det.abs() >= LEAST_AREA).then_some([first.inverse_range - bx * first.x - by * first.y, bx, by])
 }
 
 /// A weighted linear fit of the inverse range over offsets in windows.
@@ -158,14 +199,14 @@ struct Plane {
 }
 
 impl Plane {
-    /// Fits neighbours (offsets, inverse range, weight); `None` where they are too few, or lie on a line.
-    fn fit(near: &[[f64; 4]]) -> Option<Plane> {
+    /// Fits neighbours; `None` where they are too few, or lie on a line.
+    fn fit(near: &[Point]) -> Option<Plane> {
         if near.len() < FEWEST {
             return None;
         }
         let mut s = [0.0f64; 9]; // w, wx, wy, wxx, wxy, wyy, wq, wxq, wyq
-        for [x, y, q, w] in near {
-            for (sum, v) in s.iter_mut().zip([1.0, *x, *y, x * x, x * y, y * y, *q, x * q, y * q]) {
+        for &Point { x, y, inverse_range: q, weight: w, .. } in near {
+            for (sum, v) in s.iter_mut().zip([1.0, x, y, x * x, x * y, y * y, q, x * q, y * q]) {
                 *sum += w * v;
             }
         }
@@ -188,36 +229,35 @@ impl Plane {
         self.mean.iter().all(|m| m.abs() <= 0.6)
     }
 
-    /// Weight of a neighbour in the inverse range at the direction: its derivative by the neighbour's inverse range.
-    fn share(&self, [x, y, _, w]: &[f64; 4]) -> f64 {
-        let ([mx, my], [xx, xy, yy]) = (self.mean, self.moments);
-        let (cx, cy) = (x - mx, y - my);
-        let from_slope = mx * (yy * cx - xy * cy) / self.determinant + my * (xx * cy - xy * cx) / self.determinant;
-        w * (1.0 / self.weights - from_slope)
-    }
-
     /// The surface, with what the neighbours say of its flatness.
-    fn surface(&self, near: &[[f64; 4]], window: [f64; 2], el: f32) -> LocalSurface {
+    fn surface(&self, near: &[Point], window: [f64; 2], el: f32) -> LocalSurface {
         let (q0, [bx, by]) = (self.q0, self.slope);
         let range = 1.0 / q0;
+        // The inverse range at the direction is the sum of those of the neighbours, each with its weight times
+        // `level` + `by_x` x + `by_y` y, x and y from the mean.
+        let ([mx, my], [xx, xy, yy]) = (self.mean, self.moments);
+        let [by_x, by_y] = [my * xy - mx * yy, mx * xy - my * xx].map(|v| v / self.determinant);
+        let level = 1.0 / self.weights;
         let (mut leverage, mut misfit, mut along) = (0.0f64, 0.0f64, 0.0f64);
         let mut near_far = [f64::INFINITY, 0.0f64];
         let (mut closest, mut bulge) = (f64::INFINITY, 0.0);
         let (gx, gy) = (bx / window[0] / f64::from(el.cos()), by / window[1]);
         let cos = 1.0 / (1.0 + (gx * gx + gy * gy) * range * range).sqrt();
-        for neighbour in near {
-            let [x, y, q, _] = neighbour;
+        for &Point { x, y, range: own, inverse_range: q, weight } in near {
             // An error dR of a range is one of q^2 dR of the inverse range.
-            leverage += (self.share(neighbour) * (q / q0).powi(2)).powi(2);
+            leverage += (weight * (level + by_x * (x - mx) + by_y * (y - my)) * (q * range).powi(2)).powi(2);
             let predicted = q0 + bx * x + by * y;
-            let off = if predicted > LEAST_INVERSE_RANGE { (1.0 / q - 1.0 / predicted).abs() } else { f64::INFINITY };
-            along = along.max(off);
+            let met = predicted > LEAST_INVERSE_RANGE;
             let predicted_m = 1.0 / predicted.max(LEAST_INVERSE_RANGE);
-            misfit = misfit.max(off * cos * predicted_m.min(range) / range.max(predicted_m));
-            near_far = [near_far[0].min(1.0 / q), near_far[1].max(1.0 / q)];
+            let off = if met { (own - predicted_m).abs() } else { f64::INFINITY };
+            along = along.max(off);
+            // The smaller of the two ranges by the larger one.
+            let ratio = if predicted_m < range { predicted_m * q0 } else { predicted.max(LEAST_INVERSE_RANGE) * range };
+            misfit = misfit.max(off * cos * ratio);
+            near_far = [near_far[0].min(own), near_far[1].max(own)];
             let distance = x * x + y * y;
-            if distance < closest && predicted > LEAST_INVERSE_RANGE {
-                (closest, bulge) = (distance, 1.0 / q - 1.0 / predicted);
+            if distance < closest && met {
+                (closest, bulge) = (distance, own - predicted_m);
             }
         }
         LocalSurface {

@@ -206,7 +206,12 @@ impl Sensor {
     pub fn spherical(sensor_point: &Point3<f64>) -> [f64; 3] {
         let p = sensor_point.coords;
         let across = p.x.hypot(p.y);
-        [p.y.atan2(p.x), p.z.atan2(across), p.norm()]
+        [Self::azimuth_rad(sensor_point), p.z.atan2(across), p.norm()]
+    }
+
+    /// Azimuth of a point of the sensor's frame, as in [`Sensor::spherical`].
+    pub fn azimuth_rad(sensor_point: &Point3<f64>) -> f64 {
+        sensor_point.y.atan2(sensor_point.x)
     }
 
     /// Whether an azimuth of the sensor's frame is within the horizontal field of view, extended by a margin on both
