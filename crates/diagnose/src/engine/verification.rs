@@ -114,18 +114,20 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     let packets = packets::Packets::new(context, sensors);
     let arrived = packets.arrived(context.frames);
     let context = &Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
-    let slide = slide.then(|| (Channel::Slide, rolling_shutter::by_table(context, train, test)));
-    let others = [
-        (Channel::Residuals, geometry::by_table(context, train, test)),
-        (Channel::Hits, hits::by_table(context, train, test)),
-        (Channel::Packets, packets.by_table(train, test)),
-        (Channel::Roughness, noise::by_table(context, train, test)),
-        (Channel::Ranges, quantisation::by_table(context, train, test)),
-        (Channel::Intensity, intensity::by_table(context, train, test)),
-        (Channel::Labels, labels::by_table(context, Side::Labels, train, test)),
-        (Channel::Objects, labels::by_table(context, Side::Objects, train, test)),
+    let others: [(Channel, &(dyn Fn() -> Vec<f64> + Sync)); 9] = [
+        (Channel::Residuals, &|| geometry::by_table(context, train, test)),
+        (Channel::Hits, &|| hits::by_table(context, train, test)),
+        (Channel::Packets, &|| packets.by_table(train, test)),
+        (Channel::Roughness, &|| noise::by_table(context, train, test)),
+        (Channel::Ranges, &|| quantisation::by_table(context, train, test)),
+        (Channel::Intensity, &|| intensity::by_table(context, train, test)),
+        (Channel::Labels, &|| labels::by_table(context, Side::Labels, train, test)),
+        (Channel::Objects, &|| labels::by_table(context, Side::Objects, train, test)),
+        (Channel::Slide, &|| rolling_shutter::by_table(context, train, test)),
     ];
-    of_channels(others.into_iter().chain(slide), returns::by_table(context, train, test))
+    let asked = others.into_par_iter().filter(|(channel, _)| slide || *channel != Channel::Slide);
+    let distances: Vec<_> = asked.map(|(channel, distance)| (channel, distance())).collect();
+    of_channels(distances, returns::by_table(context, train, test))
 }
 
 /// At most [`FRAMES`] of some frames, evenly spread.
@@ -207,10 +209,10 @@ impl<'a> Verification<'a> {
             return;
         }
         let recorded: Vec<&FramePair> = self.used().into_iter().map(|i| &self.context.frames[i]).collect();
-        for finding in findings.iter_mut().filter(|f| !f.effects.is_empty()) {
+        findings.par_iter_mut().filter(|f| !f.effects.is_empty()).for_each(|finding| {
             let closed = closed_of(&extended.gain, finding).map_or(0.0, |c| c.closed);
             curves::measure(finding, &recorded, &extended.frames, closed);
-        }
+        });
     }
 
     /// Distances of frames that were made anew.
@@ -269,14 +271,8 @@ impl GainFrames {
             let drawn = (0..REPETITIONS).filter_map(|_| closed(over(parts, &draw_blocks(&members, &mut rng))));
             interval_nearest(drawn.collect())
         };
-        let channel = |part: &Part| match part {
-            Part::Channel(channel) => Some(*channel),
-            Part::Returns(_) => None,
-        };
-        let kind = |part: &Part| match part {
-            Part::Channel(_) => None,
-            Part::Returns(kind) => Some(*kind),
-        };
+        let channel = |part: &Part| if let Part::Channel(channel) = part { Some(*channel) } else { None };
+        let kind = |part: &Part| if let Part::Returns(kind) = part { Some(*kind) } else { None };
         let changed = |part: &Part| {
             let [before, after, _] = sums(part, &all_frames);
             (after - before).abs() > ENOUGH_NATS

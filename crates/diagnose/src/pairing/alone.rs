@@ -1,7 +1,7 @@
 //! One side by itself: each return against the surface of its own neighbours, and the shots of smooth surfaces with and
 //! without a return. Two sides that show different streets are compared by these.
 
-use super::gaps::{in_gap, mixed_per_rad};
+use super::gaps::{Returns, in_gap, mixed_per_rad};
 use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
@@ -35,7 +35,8 @@ pub fn frame_alone(side: &SideFrame, sensors: &Sensors) -> FrameAlone {
         let mut neighbours = Vec::new();
         let alone = |i| alone(&predictor, scan, i, &mut neighbours);
         let (returns, surfaces): (Vec<Ray>, Vec<Option<LocalSurface>>) = (0..scan.len()).map(alone).unzip();
-        out.mixed_per_rad += mixed_per_rad(&returns, &predictor.around.index);
+        let of_scan = Returns { scan, index: &predictor.around.index };
+        out.mixed_per_rad += mixed_per_rad(&of_scan, |i| returns[i].row, |i| returns[i].smooth);
         out.shots.extend(shots(&predictor, scan, (&returns, &surfaces), sensors.patterns[sensor].steps.azimuth_rad));
         out.returns.extend(returns);
     }

@@ -1,16 +1,14 @@
 //! One frame of both sides, return by return.
 
 use super::boxes::{BoxShift, SurfacePoint, fit_shift};
-use super::gaps::{in_gap, mixed_per_rad};
-use super::prediction::{Intensities, Predictor};
+use super::of_sensor::{SensorPair, Use};
 use super::ray::{Ray, Surface};
 use super::recordings::{Matched, SideFrame};
-use super::roughness::Roughness;
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
 use sensor::assignment::Assignment;
-use sensor::directions::{DirectionIndex, Neighbour, SensorScan, Sensors, in_or_beside};
+use sensor::directions::{SensorScan, Sensors, in_or_beside};
 use std::borrow::Cow;
 
 /// One frame of both sides.
@@ -65,28 +63,6 @@ pub struct ObjectPair {
     pub points: [usize; 2],
 }
 
-/// Of this many shots of a row one is tested, to count those without a return.
-const EVERY: usize = 3;
-
-/// Shots of a sensor's scan, over the azimuths of its returns, around which a side has no return; `None` where rows are
-/// not known.
-fn open(sensors: &Sensors, sensor: usize, scans: [&SensorScan; 2], side: &DirectionIndex) -> Option<f64> {
-    let pattern = &sensors.patterns[sensor];
-    let azimuths = || scans.into_iter().flat_map(|s| &s.azimuth_rad).copied();
-    let [least, most] = [azimuths().fold(f32::MAX, f32::min), azimuths().fold(f32::MIN, f32::max)];
-    let columns = 1 + ((most - least).max(0.0) / pattern.steps.azimuth_rad).round() as usize;
-    let empty = |azimuth_rad: f32, elevation_rad: f32| {
-        let mut n = 0u32;
-        side.around(azimuth_rad, elevation_rad, |_, _, _| n += 1);
-        n == 0
-    };
-    let in_row = |el: &f32| {
-        let places = (0..columns).step_by(EVERY).map(|k| least + k as f32 * pattern.steps.azimuth_rad);
-        places.filter(|az| empty(*az, *el)).count() * EVERY
-    };
-    (!pattern.rows_rad.is_empty()).then(|| pattern.rows_rad.iter().map(in_row).sum::<usize>() as f64)
-}
-
 /// Displacement of a point of a frame and a sensor, by their numbers, in the cloud's frame, m.
 pub type ShownShift<'a> = &'a (dyn Fn(usize, &Vector3<f64>, usize) -> Vector3<f64> + Sync);
 
@@ -115,25 +91,28 @@ pub struct RecordedFrame<'a> {
     pub matched: &'a [Matched],
 }
 
-/// Pairs a frame, return by return.
-pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corrections) -> FramePair {
+/// Pairs a frame, return by return. About `kept` of the returns of each side are compared, chosen at random; all of
+/// them say what lies around these, and what the objects of the frame are.
+pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corrections, kept: usize) -> FramePair {
     let mut objects = pair_labels(&recorded.measured.objects, &recorded.simulated.objects);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
-    let measured = moved_back(recorded, sensors, corrections.shift_m);
+    let mut measured = moved_back(recorded, sensors, corrections.shift_m);
     let simulated = rounded(&recorded.simulated.scans, corrections.step_m);
     // A return that is moved out of the field of view of its sensor has nothing to be compared with.
     let views = corrections.shift_m.map(|_| Assignment::new(&sensors.rig));
-    let mut frame = FramePair {
-        id: recorded.id.into(),
-        measured: Vec::new(),
-        simulated: Vec::new(),
-        mixed_per_rad: 0.0,
-        jumps: 1.0,
-        open: 0.0,
-        second: [recorded.measured, recorded.simulated].map(|side| side.second as f64),
-        objects: Vec::new(),
+    let seen = |sensor: usize, scan: &SensorScan, i: usize| {
+        views.as_ref().is_none_or(|views| {
+            let mount = &sensors.rig.sensors[sensor];
+            let at = views.of_point(mount.pose() * scan.point(i)).filter(|at| at.sensor == sensor);
+            at.is_some_and(|at| mount.sees(at.spherical[0], 0.0))
+        })
     };
-    for (sensor, scan) in measured.into_iter().enumerate() {
+    let uses = [
+        uses(&measured, seen, kept, [recorded.number as u64, 0]),
+        uses(&simulated, |_, _, _| true, kept, [recorded.number as u64, 1]),
+    ];
+    let (mut rays, mut mixed_per_rad, mut shots_open): ([Vec<(Ray, Use)>; 2], f64, f64) = Default::default();
+    for (sensor, scan) in measured.iter_mut().enumerate() {
         let pair = SensorPair {
             sensors,
             sensor,
@@ -141,14 +120,48 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
             simulated: &simulated[sensor],
             matched: &recorded.matched[sensor],
             boxes: &boxes,
-            views: views.as_ref(),
         };
-        pair.add_to(&mut frame, scan, corrections.range_m);
+        let compared = pair.compare(scan, corrections.range_m, [&uses[0][sensor], &uses[1][sensor]]);
+        rays.iter_mut().zip(compared.rays).for_each(|(all, own)| all.extend(own));
+        mixed_per_rad += compared.mixed_per_rad;
+        shots_open += compared.open;
     }
-    frame.mixed_per_rad /= frame.simulated.len().max(1) as f64;
-    fit_objects(&mut objects, &frame, sensors);
-    frame.objects = objects;
-    frame
+    fit_objects(&mut objects, &rays, sensors);
+    let compared = |side: Vec<(Ray, Use)>| {
+        let mut kept: Vec<Ray> = side.into_iter().filter(|(_, r#use)| *r#use == Use::Compared).map(|r| r.0).collect();
+        kept.shrink_to_fit();
+        kept
+    };
+    let [measured, simulated_rays] = rays.map(compared);
+    FramePair {
+        id: recorded.id.into(),
+        measured,
+        simulated: simulated_rays,
+        mixed_per_rad: mixed_per_rad / simulated.iter().map(SensorScan::len).sum::<usize>().max(1) as f64,
+        jumps: 1.0,
+        open: shots_open,
+        second: [recorded.measured, recorded.simulated].map(|side| side.second as f64),
+        objects,
+    }
+}
+
+/// Uses of the returns of a side, by sensor: of those that are `seen`, about `kept` are drawn. `stream` is the number
+/// of the frame and that of the side.
+fn uses(
+    scans: &[SensorScan],
+    seen: impl Fn(usize, &SensorScan, usize) -> bool,
+    kept: usize,
+    stream: [u64; 2],
+) -> Vec<Vec<Use>> {
+    let of_scan = |(sensor, scan): (usize, &SensorScan)| (0..scan.len()).map(|i| seen(sensor, scan, i)).collect();
+    let seen: Vec<Vec<bool>> = scans.iter().enumerate().map(of_scan).collect();
+    let mut keeps = super::keeps(seen.iter().flatten().filter(|seen| **seen).count(), kept, stream);
+    let mut of_return = |seen: &bool| match *seen {
+        false => Use::Neighbour,
+        true if keeps() => Use::Compared,
+        true => Use::AtObject,
+    };
+    seen.iter().map(|of_scan| of_scan.iter().map(&mut of_return).collect()).collect()
 }
 
 /// Measured scans with a displacement undone.
@@ -177,118 +190,6 @@ fn rounded(scans: &[SensorScan], step_m: Option<f64>) -> Cow<'_, [SensorScan]> {
 /// Rounds the ranges of a scan to a step, m.
 pub(crate) fn round_ranges(scan: &mut SensorScan, step_m: f64) {
     scan.range_m.iter_mut().for_each(|r| *r = ((f64::from(*r) / step_m).round() * step_m).max(0.05) as f32);
-}
-
-/// One sensor of a frame.
-struct SensorPair<'a> {
-    sensors: &'a Sensors,
-    sensor: usize,
-    /// Measured scan as it was recorded: the directions in which shots were sent.
-    sent: &'a SensorScan,
-    simulated: &'a SensorScan,
-    matched: &'a Matched,
-    boxes: &'a [Box3],
-    /// Which sensor sees a place, where measured returns were moved.
-    views: Option<&'a Assignment>,
-}
-
-impl SensorPair<'_> {
-    /// Adds the rays of both sides to a frame; `scan` is the measured scan.
-    fn add_to(&self, frame: &mut FramePair, mut scan: SensorScan, range_m: Option<&(dyn Fn(&Ray) -> f64 + Sync)>) {
-        let (a, b) = (&mut scan, self.simulated);
-        let predictor = Predictor::new(self.sensors, self.sensor, b, self.boxes);
-        let mut simulated = self.simulated_rays(&predictor);
-        let mut measured = self.measured_rays(&predictor, a, range_m);
-        let closes = self.sensors.rig.sensors[self.sensor].is_full_circle();
-        let own = DirectionIndex::new(a, self.sensors.window(self.sensor), closes);
-        self.compare_with_measured(&own, a, [&mut measured, &mut simulated]);
-        let edge_m = self.sensors.edge_m;
-        Roughness { own: &own, window: predictor.around.window, edge_m }.set([&mut measured, &mut simulated], [a, b]);
-        frame.mixed_per_rad += mixed_per_rad(&simulated, &predictor.around.index);
-        let missing = measured.len() as f64 - simulated.len() as f64;
-        frame.open += open(self.sensors, self.sensor, [a, b], &predictor.around.index).unwrap_or(missing.max(0.0));
-        if let Some(views) = self.views {
-            let mount = &self.sensors.rig.sensors[self.sensor];
-            let seen = |r: &Ray| {
-                let place = predictor.around.place(&r.direction_vector(), r.own_range_m());
-                let at = views.of_point(place.into()).filter(|at| at.sensor == self.sensor);
-                at.is_some_and(|at| mount.sees(at.spherical[0], 0.0))
-            };
-            measured.retain(seen);
-        }
-        frame.measured.append(&mut measured);
-        frame.simulated.append(&mut simulated);
-    }
-
-    /// Simulated rays, each predicted from the others.
-    fn simulated_rays(&self, predictor: &Predictor) -> Vec<Ray> {
-        let mut neighbours = Vec::new();
-        let mut own = |(i, matched): (usize, &bool)| Ray {
-            matched: *matched,
-            ..predictor.own_ray(self.simulated, i, &mut neighbours).0
-        };
-        self.matched.1.iter().enumerate().map(&mut own).collect()
-    }
-
-    /// Measured rays as the simulation predicts them, in the directions in which they were sent. A correction of the
-    /// ranges is subtracted from the scan as well.
-    fn measured_rays(
-        &self,
-        predictor: &Predictor,
-        scan: &mut SensorScan,
-        range_m: Option<&(dyn Fn(&Ray) -> f64 + Sync)>,
-    ) -> Vec<Ray> {
-        let mut neighbours = Vec::new();
-        let mut rays = Vec::with_capacity(scan.len());
-        for (i, matched) in self.matched.0.iter().enumerate() {
-            let mut ray = predictor.seen(scan, i, None, &mut neighbours).0;
-            if let Some(correction) = range_m.filter(|_| ray.smooth) {
-                let off = correction(&ray) as f32;
-                ray.residual_m -= off;
-                scan.range_m[i] = (scan.range_m[i] - off).max(0.05);
-            }
-            ray.matched = *matched;
-            (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
-            ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
-            ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
-            rays.push(ray);
-        }
-        rays
-    }
-
-    /// Sets what depends on the measured returns around measured and simulated rays. `own` is the index of the measured
-    /// scan.
-    fn compare_with_measured(&self, own: &DirectionIndex, scan: &SensorScan, sides: [&mut [Ray]; 2]) {
-        let [measured, simulated] = sides;
-        let intensities = Intensities::of(scan);
-        let mut neighbours = Vec::new();
-        for (i, ray) in measured.iter_mut().enumerate() {
-            own.neighbours(scan.azimuth_rad[i], scan.elevation_rad[i], &mut neighbours);
-            ray.company = company(&neighbours, scan.range_m[i], Some(i as u32));
-            if ray.smooth {
-                ray.intensity_beside = intensities.mean(&neighbours, scan.range_m[i], Some(i as u32));
-            }
-        }
-        let scan = self.simulated;
-        for (i, ray) in simulated.iter_mut().enumerate() {
-            own.neighbours(scan.azimuth_rad[i], scan.elevation_rad[i], &mut neighbours);
-            ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
-            ray.shown = company(&neighbours, scan.range_m[i], None) > 0;
-        }
-    }
-}
-
-/// Difference in range up to which returns are neighbours at the same range, m.
-pub fn company_m(range_m: f64) -> f64 {
-    0.3 + 0.03 * range_m
-}
-
-/// Number of the returns around a direction that lie at about a range, m, but for one.
-pub(super) fn company(around: &[Neighbour], range_m: f32, without: Option<u32>) -> u8 {
-    let within_m = company_m(f64::from(range_m));
-    let near = |n: &&Neighbour| f64::from((n.entry.range_m - range_m).abs()) < within_m;
-    let others = around.iter().filter(|n| without != Some(n.entry.index));
-    others.filter(near).count().min(usize::from(u8::MAX)) as u8
 }
 
 /// Distance from which on labels are not of the same object, m.
@@ -330,15 +231,15 @@ fn pair_labels(measured: &[Object], simulated: &[Object]) -> Vec<ObjectPair> {
 }
 
 /// Margin beside the box of an object within which returns may belong to it after a shift, m.
-const AROUND_M: f64 = 1.2;
+pub(super) const AROUND_M: f64 = 1.2;
 
-fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors) {
+fn fit_objects(objects: &mut [ObjectPair], [on_measured, on_simulated]: &[Vec<(Ray, Use)>; 2], sensors: &Sensors) {
     let origins: Vec<Point3<f64>> =
         sensors.rig.sensors.iter().map(|s| Point3::from(Vector3::from(s.position))).collect();
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
     let mut measured = vec![Vec::new(); boxes.len()];
     let mut simulated = vec![Vec::new(); boxes.len()];
-    for ray in &frame.measured {
+    for (ray, _) in on_measured {
         let p = origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m();
         // Returns on predicted ground are ground.
         let ground = ray.surface == Surface::Ground && ray.across_m().abs() < 0.15;
@@ -348,7 +249,7 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
             }
         }
     }
-    for ray in &frame.simulated {
+    for (ray, _) in on_simulated {
         if ray.surface != Surface::Object {
             continue;
         }
@@ -364,30 +265,75 @@ fn fit_objects(objects: &mut [ObjectPair], frame: &FramePair, sensors: &Sensors)
 #[cfg(test)]
 mod tests {
     use super::*;
+    use rand::RngExt;
     use sensor::Rig;
     use sensor::directions::{ScanPattern, Steps};
 
-    #[test]
-    fn shots_without_a_return_are_counted_except_beside_returns() {
-        let (rows, step) = ([-0.06f32, -0.04, -0.02, 0.0], 0.01f32);
-        let steps = Steps { azimuth_rad: step, elevation_rad: 0.02 };
-        let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
-        let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.1 };
-        let scan_up_to = |columns: usize| {
-            let shots: Vec<_> = rows.iter().flat_map(|el| (0..columns).map(move |k| (k as f32 * step, *el))).collect();
-            SensorScan {
-                azimuth_rad: shots.iter().map(|s| s.0).collect(),
-                elevation_rad: shots.iter().map(|s| s.1).collect(),
-                range_m: vec![10.0; shots.len()],
-                intensity: vec![],
+    const ROWS: [f32; 24] = {
+        let mut rows = [0.0; 24];
+        let mut i = 0;
+        while i < 24 {
+            rows[i] = -0.05 + 0.006 * i as f32;
+            i += 1;
+        }
+        rows
+    };
+
+    /// A car 10 m ahead before a front of houses with steps, and some false alarms.
+    fn scan(beside_m: f32, seed: u64) -> SensorScan {
+        let mut rng = data::stream(seed, "pairs", 0, 0);
+        let mut scan = SensorScan::default();
+        for (row, el) in ROWS.iter().enumerate() {
+            for k in 0..500 {
+                let az = (k as f32 - 250.0) * 0.003;
+                let stands_back = ((20.0 * az.tan() + beside_m) / 3.0).rem_euclid(1.0) < 0.5;
+                let wall = if stands_back { 22.5 } else { 20.0 };
+                let depth = if az.abs() < 0.1 && row < 16 { 10.0 + beside_m } else { wall };
+                let range =
+                    if rng.random_bool(0.01) { rng.random_range(3.0..9.0) } else { depth / az.cos() / el.cos() };
+                scan.azimuth_rad.push(az);
+                scan.elevation_rad.push(*el);
+                scan.range_m.push(range + rng.random_range(-0.01..0.01));
+                scan.intensity.push(rng.random_range(0.4..0.5));
             }
-        };
-        let (measured, simulated) = (scan_up_to(300), scan_up_to(100));
-        let index = DirectionIndex::new(&simulated, sensors.window(0), false);
-        let opened = open(&sensors, 0, [&measured, &simulated], &index).unwrap();
-        // Two columns beside the last return are seen together with it.
-        assert!((opened - 4.0 * 198.0).abs() < 4.0 * EVERY as f64, "{opened}");
-        let whole = DirectionIndex::new(&measured, sensors.window(0), false);
-        assert_eq!(open(&sensors, 0, [&measured, &simulated], &whole), Some(0.0));
+        }
+        scan
+    }
+
+    fn paired(kept: usize) -> FramePair {
+        let steps = Steps { azimuth_rad: 0.003, elevation_rad: 0.006 };
+        let pattern = ScanPattern { rows_rad: ROWS.to_vec(), steps };
+        let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
+        let origin = sensors.rig.sensors[0].position;
+        let bbox = Box3::from_array([origin[0] + 12.0, origin[1], origin[2], 4.0, 2.0, 1.6, 0.0]);
+        let car = Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None };
+        let side = |scan| SideFrame { scans: vec![scan], objects: vec![car.clone()], second: 0 };
+        let (measured, simulated) = (side(scan(0.05, 1)), side(scan(0.0, 2)));
+        let n = measured.scans[0].len();
+        let matched = [(vec![true; n], vec![true; n])];
+        let recorded =
+            RecordedFrame { number: 3, id: "3", measured: &measured, simulated: &simulated, matched: &matched };
+        pair_frame(&recorded, &sensors, Corrections::default(), kept)
+    }
+
+    #[test]
+    fn some_of_the_rays_are_as_they_are_among_all() {
+        let (all, some) = (paired(usize::MAX), paired(3_000));
+        assert_eq!(all.measured.len(), ROWS.len() * 500);
+        let of_frame = |f: &FramePair| (f.mixed_per_rad, f.open, f.objects[0].shift, f.objects[0].points);
+        assert_eq!(of_frame(&some), of_frame(&all));
+        assert!(all.mixed_per_rad > 0.0);
+        assert!((all.objects[0].shift.unwrap().shift_m[0] - 0.05).abs() < 0.01, "{:?}", all.objects[0].shift);
+        for (some, all) in [(&some.measured, &all.measured), (&some.simulated, &all.simulated)] {
+            assert!((2_700..3_300).contains(&some.len()), "{}", some.len());
+            for ray in some {
+                let among = all.iter().find(|r| (r.azimuth_rad, r.row) == (ray.azimuth_rad, ray.row)).unwrap();
+                // The noise of other rays says which roughness is used.
+                let said = |r: &Ray| format!("{:?}", Ray { roughness_m: 0.0, roughness_leverage: 0.0, ..*r });
+                assert_eq!(said(ray), said(among));
+            }
+        }
+        let rough = |rays: &[Ray]| rays.iter().filter(|r| r.roughness_m.is_finite()).count() as f64 / rays.len() as f64;
+        assert!((rough(&some.measured) - rough(&all.measured)).abs() < 0.03);
     }
 }

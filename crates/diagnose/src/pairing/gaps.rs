@@ -1,9 +1,8 @@
 //! Range discontinuities over which a beam mixes two surfaces: returns between the surfaces, and their expected
 //! number by the width of the beam.
 
-use super::ray::Ray;
 use crate::inference::median;
-use sensor::directions::{DirectionIndex, Neighbour};
+use sensor::directions::{DirectionIndex, Neighbour, SensorScan};
 use std::collections::BTreeMap;
 
 /// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a
@@ -40,34 +39,46 @@ fn is_between(range_m: f64, near_m: f64, far_m: f64) -> bool {
     gap_mixes(near_m, far_m) && range_m > near_m + margin && range_m < far_m - margin
 }
 
+/// The returns of a scan, and their index.
+pub(super) struct Returns<'a> {
+    pub scan: &'a SensorScan,
+    pub index: &'a DirectionIndex,
+}
+
 /// Expected number of mixed returns of a sensor's scan for each radian of beam width. An edge between two
-/// neighbouring shots is hit with a probability of the beam width over their angle. `index` holds the scan. Two
-/// returns of one shot are no neighbours. 0 where rows are not known.
-pub(super) fn mixed_per_rad(rays: &[Ray], index: &DirectionIndex) -> f64 {
-    let mut rows = BTreeMap::<u16, Vec<&Ray>>::new();
-    for ray in rays.iter().filter(|r| r.row != u16::MAX) {
-        rows.entry(ray.row).or_default().push(ray);
+/// neighbouring shots is hit with a probability of the beam width over their angle. `row` is the row of a return,
+/// `smooth` whether the others around it lie on one surface. Two returns of one shot are no neighbours. 0 where rows
+/// are not known.
+pub(super) fn mixed_per_rad(
+    returns: &Returns,
+    row: impl Fn(usize) -> u16,
+    mut smooth: impl FnMut(usize) -> bool,
+) -> f64 {
+    let SensorScan { azimuth_rad: azimuth, elevation_rad: elevation, .. } = returns.scan;
+    let mut rows = BTreeMap::<u16, Vec<usize>>::new();
+    for (i, row) in (0..returns.scan.len()).map(|i| (i, row(i))).filter(|(_, row)| *row != u16::MAX) {
+        rows.entry(row).or_default().push(i);
     }
-    rows.values_mut().for_each(|row| row.sort_by(|a, b| a.azimuth_rad.total_cmp(&b.azimuth_rad)));
-    let of_pair = |a: &Ray, b: &Ray, apart_rad: f64| {
-        let mixes = if a.smooth || b.smooth { 0.0 } else { mixing_share(a, b, index) };
-        mixes / apart_rad.max(1e-5)
+    rows.values_mut().for_each(|row| row.sort_by(|a, b| azimuth[*a].total_cmp(&azimuth[*b])));
+    let mut of_pair = |a: usize, b: usize, apart_rad: f64| {
+        let mixes = returns.gap_mixes(a, b) && !smooth(a) && !smooth(b);
+        if mixes { returns.mixing_share(a, b) / apart_rad.max(1e-5) } else { 0.0 }
     };
     let mut sum = 0.0;
     for (number, row) in &rows {
-        let gaps = row.windows(2).map(|w| f64::from(w[1].azimuth_rad - w[0].azimuth_rad));
+        let gaps = row.windows(2).map(|w| f64::from(azimuth[w[1]] - azimuth[w[0]]));
         let step = median(gaps.clone().collect());
         for (pair, gap) in row.windows(2).zip(gaps).filter(|(_, gap)| (0.3 * step..1.7 * step).contains(gap)) {
-            sum += of_pair(pair[0], pair[1], gap * f64::from(pair[0].elevation_rad).cos());
+            sum += of_pair(pair[0], pair[1], gap * f64::from(elevation[pair[0]]).cos());
         }
         let Some(above) = rows.get(&(number + 1)) else { continue };
-        for ray in row {
-            let at = above.partition_point(|r| r.azimuth_rad < ray.azimuth_rad);
-            let apart = |r: &Ray| f64::from((r.azimuth_rad - ray.azimuth_rad).abs());
-            let beside = above[at.saturating_sub(1)..above.len().min(at + 1)].iter();
-            let nearest = beside.min_by(|a, b| apart(a).total_cmp(&apart(b))).filter(|r| apart(r) < step);
+        for &i in row {
+            let at = above.partition_point(|&other| azimuth[other] < azimuth[i]);
+            let apart = |other: usize| f64::from((azimuth[other] - azimuth[i]).abs());
+            let beside = above[at.saturating_sub(1)..above.len().min(at + 1)].iter().copied();
+            let nearest = beside.min_by(|a, b| apart(*a).total_cmp(&apart(*b))).filter(|other| apart(*other) < step);
             if let Some(over) = nearest {
-                sum += of_pair(ray, over, f64::from((over.elevation_rad - ray.elevation_rad).abs()));
+                sum += of_pair(i, over, f64::from((elevation[over] - elevation[i]).abs()));
             }
         }
     }
@@ -77,27 +88,38 @@ pub(super) fn mixed_per_rad(rays: &[Ray], index: &DirectionIndex) -> f64 {
 /// Number of places of an edge in a beam that are averaged.
 const PLACES: u32 = 24;
 
-/// Share of the places of an edge in a beam at which the weighted mean of the two ranges lies between them, and
-/// between all other ranges around.
-fn mixing_share(a: &Ray, b: &Ray, index: &DirectionIndex) -> f64 {
-    let [near, far] = [a.own_range_m().min(b.own_range_m()), a.own_range_m().max(b.own_range_m())];
-    if !gap_mixes(near, far) {
-        return 0.0;
+impl Returns<'_> {
+    /// Ranges of two returns, the smaller one first, m.
+    fn near_far_m(&self, a: usize, b: usize) -> [f64; 2] {
+        let [a, b] = [a, b].map(|i| f64::from(self.scan.range_m[i]));
+        [a.min(b), a.max(b)]
     }
-    let mut around = Vec::new();
-    let [azimuth, elevation] = [a.azimuth_rad + b.azimuth_rad, a.elevation_rad + b.elevation_rad].map(|s| 0.5 * s);
-    index.around(azimuth, elevation, |e, _, _| around.push(f64::from(e.range_m)));
-    around.sort_by(f64::total_cmp);
-    // Area of a unit disc beyond an edge at distance d from its middle, as a share.
-    let covered = |d: f64| 0.5 - (d * (1.0 - d * d).sqrt() + d.asin()) / std::f64::consts::PI;
-    let seen = (0..PLACES).filter(|k| {
-        let share = covered(2.0 * (f64::from(*k) + 0.5) / f64::from(PLACES) - 1.0);
-        let range = share * near + (1.0 - share) * far;
-        let at = around.partition_point(|r| *r < range);
-        let (Some(&below), Some(&above)) = (at.checked_sub(1).and_then(|i| around.get(i)), around.get(at)) else {
-            return false;
-        };
-        is_between(range, below, above)
-    });
-    seen.count() as f64 / f64::from(PLACES)
+
+    /// Whether beams mix over the discontinuity between two returns.
+    fn gap_mixes(&self, a: usize, b: usize) -> bool {
+        let [near, far] = self.near_far_m(a, b);
+        gap_mixes(near, far)
+    }
+
+    /// Share of the places of an edge in a beam at which the weighted mean of the ranges of two returns lies between
+    /// them, and between all other ranges around.
+    fn mixing_share(&self, a: usize, b: usize) -> f64 {
+        let [near, far] = self.near_far_m(a, b);
+        let [azimuth, elevation] = [&self.scan.azimuth_rad, &self.scan.elevation_rad].map(|v| 0.5 * (v[a] + v[b]));
+        let mut around = Vec::new();
+        self.index.around(azimuth, elevation, |e, _, _| around.push(f64::from(e.range_m)));
+        around.sort_by(f64::total_cmp);
+        // Area of a unit disc beyond an edge at distance d from its middle, as a share.
+        let covered = |d: f64| 0.5 - (d * (1.0 - d * d).sqrt() + d.asin()) / std::f64::consts::PI;
+        let seen = (0..PLACES).filter(|k| {
+            let share = covered(2.0 * (f64::from(*k) + 0.5) / f64::from(PLACES) - 1.0);
+            let range = share * near + (1.0 - share) * far;
+            let at = around.partition_point(|r| *r < range);
+            let (Some(&below), Some(&above)) = (at.checked_sub(1).and_then(|i| around.get(i)), around.get(at)) else {
+                return false;
+            };
+            is_between(range, below, above)
+        });
+        seen.count() as f64 / f64::from(PLACES)
+    }
 }

@@ -6,6 +6,7 @@ mod frame;
 mod gaps;
 mod identical;
 mod matching;
+mod of_sensor;
 mod prediction;
 mod ray;
 mod recordings;
@@ -15,10 +16,11 @@ mod second;
 pub use alone::{FrameAlone, frame_alone};
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
 pub(crate) use frame::round_ranges;
-pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, ShownShift, company_m, pair_frame};
+pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, ShownShift, pair_frame};
 pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::match_directions;
+pub use of_sensor::company_m;
 pub use ray::{Lies, Ray, Surface};
 pub(crate) use recordings::load;
 pub use recordings::{Matched, PairSide, Recordings, SideFrame};
@@ -128,8 +130,8 @@ pub fn kept_of_frame(frames: usize) -> usize {
     (KEPT / frames.max(1)).max(500)
 }
 
-/// Pairs all frames; keeps at most about `kept` returns of each side of a frame. `done` receives the number of frames
-/// finished so far.
+/// Pairs all frames; compares at most about `kept` returns of each side of a frame. `done` receives the number of
+/// frames finished so far.
 pub fn pair_all(
     recordings: &Recordings,
     sensors: &Sensors,
@@ -146,10 +148,7 @@ pub fn pair_all(
             simulated: recordings.side(i, PairSide::Simulated)?,
             matched: recordings.matched(i, sensors)?,
         };
-        let mut frame = pair_frame(&recorded, sensors, corrections);
-        for (k, rays) in [&mut frame.measured, &mut frame.simulated].into_iter().enumerate() {
-            thin(rays, kept, i as u64, k as u64);
-        }
+        let frame = pair_frame(&recorded, sensors, corrections, kept);
         done(finished.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);
         Ok(frame)
     }))
@@ -162,12 +161,16 @@ pub(crate) fn in_order<T: Send>(
     results.collect::<Vec<_>>().into_iter().collect()
 }
 
-/// Keeps about `kept` of the rays, chosen at random.
-pub(crate) fn thin(rays: &mut Vec<Ray>, kept: usize, frame: u64, side: u64) {
-    if rays.len() > kept {
-        let share = kept as f64 / rays.len() as f64;
-        let mut rng = data::stream(0, "diagnose thin", side, frame);
-        rays.retain(|_| rng.random::<f64>() < share);
-    }
+/// Keeps about `kept` of the rays, chosen at random. `stream` is the number of the frame and one of the kind of rays.
+pub(crate) fn thin(rays: &mut Vec<Ray>, kept: usize, stream: [u64; 2]) {
+    let mut keeps = keeps(rays.len(), kept, stream);
+    rays.retain(|_| keeps());
     rays.shrink_to_fit();
+}
+
+/// Draws for each of `of` whether it is one of about `kept`.
+fn keeps(of: usize, kept: usize, [frame, kind]: [u64; 2]) -> impl FnMut() -> bool {
+    let share = kept as f64 / of.max(1) as f64;
+    let mut rng = data::stream(0, "diagnose thin", kind, frame);
+    move || share >= 1.0 || rng.random::<f64>() < share
 }

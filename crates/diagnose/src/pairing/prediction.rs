@@ -1,12 +1,12 @@
 //! Predictions of the simulation for a direction: the surface around it, its range, incidence and kind.
 
-use super::frame::{company, company_m};
+use super::of_sensor::{company, company_m};
 use super::ray::{Ray, Surface};
 use super::roughness::LONE;
 use geometry::Box3;
 use nalgebra::Vector3;
 use sensor::directions::{
-    Kind, LocalSurface, Neighbour, SensorScan, Sensors, Surroundings, in_or_beside, kind_of,
+    Kind, LocalSurface, Neighbour, SensorScan, Sensors, Surroundings, fit_surface_to, in_or_beside, kind_of,
 };
 
 /// Distance from a labelled object within which a return belongs to it: objects may be larger than their labels, m.
@@ -119,6 +119,30 @@ impl<'a> Predictor<'a> {
             None => {}
         }
         (ray, around.surface.map(|(surface, _)| surface))
+    }
+
+    /// Whether the other simulated returns around one lie on one smooth surface. `neighbours` is overwritten.
+    pub(super) fn is_smooth(&self, simulated: &SensorScan, i: usize, neighbours: &mut Vec<Neighbour>) -> bool {
+        self.surface(simulated, i, Some(i as u32), neighbours).is_some()
+    }
+
+    /// Distance of a return of a scan of that sensor from the simulated surface, across it, m; `None` without a smooth
+    /// one. `neighbours` is overwritten.
+    pub(super) fn across_m(&self, scan: &SensorScan, i: usize, neighbours: &mut Vec<Neighbour>) -> Option<f64> {
+        let surface = self.surface(scan, i, None, neighbours)?;
+        Some((f64::from(scan.range_m[i]) - surface.range_m).abs() * surface.cos_incidence)
+    }
+
+    fn surface(
+        &self,
+        scan: &SensorScan,
+        i: usize,
+        without: Option<u32>,
+        neighbours: &mut Vec<Neighbour>,
+    ) -> Option<LocalSurface> {
+        self.around.index.neighbours(scan.azimuth_rad[i], scan.elevation_rad[i], neighbours);
+        let others = neighbours.iter().filter(|n| without != Some(n.entry.index));
+        fit_surface_to(others, self.around.window, scan.elevation_rad[i]).filter(|s| s.smooth(self.edge_m()))
     }
 
     /// Sets the kind of the surface in a direction at a range.

@@ -10,7 +10,7 @@ pub(super) const LONE: u8 = 1;
 
 /// Distance from the predicted surface, across it, from which on a return is not used for the roughness of its
 /// neighbours, m.
-const STRAY_M: f64 = 0.5;
+pub(super) const STRAY_M: f64 = 0.5;
 
 /// Standard deviations of the measured noise within which neighbours are of one surface.
 const WITHIN: f64 = 4.0;
@@ -33,25 +33,26 @@ pub(super) struct Roughness<'a> {
     pub window: [f64; 2],
     /// Distance from a plane from which on neighbours are beyond an edge, m.
     pub edge_m: f64,
+    /// Measured returns that are left out: lone ones, and those off the predicted surface. False alarms would make all
+    /// returns around them rough.
+    pub stray: &'a [bool],
 }
+
+/// Rays of one side with their numbers in a scan.
+pub(super) type Rays<'a> = (&'a mut [Ray], &'a [usize], &'a SensorScan);
 
 impl Roughness<'_> {
     /// Sets the roughness of measured rays; then takes that of both sides away where the measured scan has an edge.
-    pub fn set(&self, sides: [&mut [Ray]; 2], scans: [&SensorScan; 2]) {
-        let [measured, simulated] = sides;
-        // Lone returns and returns off the predicted surface are left out: false alarms would make all returns around
-        // them rough.
-        let stray: Vec<bool> =
-            measured.iter().map(|r| r.company <= LONE || r.smooth && r.across_m().abs() > STRAY_M).collect();
+    pub fn set(&self, [(measured, of_measured, scan), (simulated, of_simulated, simulated_scan)]: [Rays; 2]) {
         let around = |az: f32, el: f32, without: u32| {
-            fit_surface(self.own, self.window, az, el, |e: &Entry| e.index != without && !stray[e.index as usize])
+            fit_surface(self.own, self.window, az, el, |e: &Entry| e.index != without && !self.stray[e.index as usize])
         };
         let mut surfaces: Vec<Option<LocalSurface>> = vec![None; measured.len()];
-        for (i, ray) in measured.iter_mut().enumerate().filter(|(i, r)| r.smooth && !stray[*i]) {
-            let (az, el) = (scans[0].azimuth_rad[i], scans[0].elevation_rad[i]);
-            surfaces[i] = around(az, el, i as u32);
-            if let Some(s) = surfaces[i] {
-                ray.roughness_m = (f64::from(scans[0].range_m[i]) - s.range_m) as f32;
+        let rays = measured.iter_mut().zip(of_measured).zip(&mut surfaces);
+        for ((ray, &i), surface) in rays.filter(|((ray, i), _)| ray.smooth && !self.stray[**i]) {
+            *surface = around(scan.azimuth_rad[i], scan.elevation_rad[i], i as u32);
+            if let Some(s) = surface {
+                ray.roughness_m = (f64::from(scan.range_m[i]) - s.range_m) as f32;
                 ray.roughness_leverage = s.leverage as f32;
             }
         }
@@ -64,8 +65,8 @@ impl Roughness<'_> {
                 ray.roughness_m = f32::NAN;
             }
         }
-        for (i, ray) in simulated.iter_mut().enumerate().filter(|(_, r)| r.roughness_m.is_finite()) {
-            let surface = around(scans[1].azimuth_rad[i], scans[1].elevation_rad[i], u32::MAX);
+        for (ray, &i) in simulated.iter_mut().zip(of_simulated).filter(|(r, _)| r.roughness_m.is_finite()) {
+            let surface = around(simulated_scan.azimuth_rad[i], simulated_scan.elevation_rad[i], u32::MAX);
             if !even(&surface, ray) {
                 ray.roughness_m = f32::NAN;
             }
@@ -142,7 +143,7 @@ mod tests {
             simulated: &side(simulated),
             matched: &matched,
         };
-        let frame = pair_frame(&recorded, &sensors, Corrections::default());
+        let frame = pair_frame(&recorded, &sensors, Corrections::default(), usize::MAX);
         let rough = |rays: &[super::Ray]| -> Vec<f64> {
             let scaled = |r: &super::Ray| f64::from(r.roughness_m) / (1.0 + f64::from(r.roughness_leverage)).sqrt();
             // Across an edge a slanted plane may fit.

@@ -92,7 +92,7 @@ impl<'a> Side<'a> {
         let sensors = Sensors { edge_m: how.edge_m, ..self.sensors.clone() };
         let mut frame = frame_alone(&side, &sensors);
         for (k, rays) in [&mut frame.returns, &mut frame.shots].into_iter().enumerate() {
-            thin(rays, how.kept, number as u64, 2 + k as u64);
+            thin(rays, how.kept, [number as u64, 2 + k as u64]);
         }
         frame
     }

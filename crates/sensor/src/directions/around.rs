@@ -112,9 +112,8 @@ impl Surroundings {
     ) -> Around {
         let others = || neighbours.iter().filter(|n| without != Some(n.entry.index));
         let Some(surface) = fit_surface_to(others(), self.window, elevation_rad) else {
-            let near_far = others().fold([f32::INFINITY, 0.0f32], |[near, far], n| {
-                [near.min(n.entry.range_m), far.max(n.entry.range_m)]
-            });
+            let near_far = others()
+                .fold([f32::INFINITY, 0.0f32], |[near, far], n| [near.min(n.entry.range_m), far.max(n.entry.range_m)]);
             let near_far_m = if near_far[1] > 0.0 { near_far } else { [0.0; 2] };
             return Around { near_far_m, surface: None };
         };

@@ -25,12 +25,16 @@ impl SensorScan {
         self.range_m.len()
     }
 
+    /// Place of a return in the sensor's frame, m.
+    pub fn point(&self, i: usize) -> Point3<f64> {
+        let [az, el, range] = [self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]].map(f64::from);
+        Point3::new(range * el.cos() * az.cos(), range * el.cos() * az.sin(), range * el.sin())
+    }
+
     /// Moves every return, in the sensor's frame.
     pub fn move_points(&mut self, moved: impl Fn(&Point3<f64>) -> Point3<f64>) {
         for i in 0..self.len() {
-            let [az, el, range] = [self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]].map(f64::from);
-            let p = Point3::new(range * el.cos() * az.cos(), range * el.cos() * az.sin(), range * el.sin());
-            let [az, el, range] = Sensor::spherical(&moved(&p)).map(|v| v as f32);
+            let [az, el, range] = Sensor::spherical(&moved(&self.point(i))).map(|v| v as f32);
             (self.azimuth_rad[i], self.elevation_rad[i], self.range_m[i]) = (az, el, range.max(NEAREST_M as f32));
         }
     }

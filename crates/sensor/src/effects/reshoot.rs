@@ -15,6 +15,10 @@ use std::collections::BTreeMap;
 /// Largest distance of a return from a true direction that the shot meets, in steps of the pattern.
 const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 
+/// Difference of two directions in which the same surface is met, in steps of the pattern: a fiftieth of the distance
+/// at which shots see different returns.
+const SAME_STEPS: f32 = 0.02;
+
 /// Shots that truly go farther from where they are reported than this share of the way to the next row may leave their
 /// surface.
 const FAR: f32 = 0.1;
@@ -252,12 +256,13 @@ impl<'a> Seen<'a> {
     /// What `at` says where a ray is at the range of what it meets, seen from the reported origin. Twice, since that
     /// range is not known before.
     fn along(&self, ray: &TrueRay, about_m: f64, at: impl Fn([f32; 2]) -> Option<Met>) -> Option<Met> {
-        let (mut range_m, mut met) = (about_m, None);
-        for _ in 0..2 {
-            met = at(towards(&(ray.shift + ray.direction * range_m)));
-            range_m = f64::from(met.as_ref()?.range_m);
-        }
-        met
+        let towards_at = |range_m: f64| towards(&(ray.shift + ray.direction * range_m));
+        let first = towards_at(about_m);
+        let met = at(first)?;
+        let again = towards_at(f64::from(met.range_m));
+        // The direction only says which surface is met; the range on that is exact.
+        let same = (0..2).all(|k| (again[k] - first[k]).abs() <= SAME_STEPS * self.steps[k]);
+        if same { Some(met) } else { at(again) }
     }
 
     /// Whether the true ray of a shot is outside of the field of view where its return is.
