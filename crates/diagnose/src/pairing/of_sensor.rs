@@ -1,6 +1,6 @@
 //! One sensor of a frame, return by return.
 
-use super::frame::AROUND_M;
+use super::frame::{AROUND_M, RangeError};
 use super::gaps::{Returns, in_gap, mixed_per_rad};
 use super::prediction::{Intensities, Predictor};
 use super::ray::Ray;
@@ -41,13 +41,10 @@ pub(super) struct Compared {
     pub open: f64,
 }
 
-/// A correction of a measured range, m.
-pub(super) type RangeCorrection<'a> = Option<&'a (dyn Fn(&Ray) -> f64 + Sync)>;
-
 impl SensorPair<'_> {
     /// Compares the returns of both sides, of which there are `uses`. A correction of the ranges is subtracted from the
     /// measured `scan` as well.
-    pub(super) fn compare(&self, scan: &mut SensorScan, range_m: RangeCorrection, uses: [&[Use]; 2]) -> Compared {
+    pub(super) fn compare(&self, scan: &mut SensorScan, range_m: Option<RangeError>, uses: [&[Use]; 2]) -> Compared {
         let predictor = Predictor::new(self.sensors, self.sensor, self.simulated, self.boxes);
         let which = [self.rays(scan, uses[0]), self.rays(self.simulated, uses[1])];
         let mut simulated = self.simulated_rays(&predictor, &which[1]);
@@ -107,7 +104,7 @@ impl SensorPair<'_> {
         &self,
         predictor: &Predictor,
         scan: &mut SensorScan,
-        range_m: RangeCorrection,
+        range_m: Option<RangeError>,
         which: &[usize],
     ) -> (Vec<Ray>, Vec<bool>) {
         let mut neighbours = Vec::new();
