@@ -1,6 +1,6 @@
 //! The result of a diagnosis: the file `diagnosis.json`.
 
-use crate::catalogue::{Cause, Channel, Covariate, Family, Hypothesis, ParameterId, Quantity, ReturnsKind, Unit};
+use crate::catalogue::{Cause, Channel, Covariate, Family, Hypothesis, Kind, ParameterId, Quantity, Unit};
 use crate::curve::Curve;
 use data::JsonForm;
 use schemars::JsonSchema;
@@ -225,9 +225,9 @@ pub struct Gain {
     /// `closed` with its interval by channel, for channels of which a significant part of the difference is.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub closed_by_channel: BTreeMap<Channel, Closed>,
-    /// The same of the channel `returns` by kind of returns, which have different causes.
+    /// The same of the kinds of differences of a channel, which have different causes.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub closed_by_kind: BTreeMap<ReturnsKind, Closed>,
+    pub closed_by_kind: BTreeMap<Kind, Closed>,
     /// Effects of `extended.toml` that were left out because the simulated data cannot be made anew with them. What
     /// they would change counts as not closed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

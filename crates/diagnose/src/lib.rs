@@ -21,7 +21,7 @@ mod scans;
 pub mod search;
 mod unpaired;
 
-pub use catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, ReturnsKind, Unit};
+pub use catalogue::{Cause, Channel, Covariate, Family, Kind, ParameterId, Quantity, Unit};
 pub use curve::{Curve, CurvePoint};
 pub use diagnosis::{
     Considered, DetectorGain, Diagnosis, Finding, FindingGain, Gain, Minimum, Parameter, SCHEMA, Status,

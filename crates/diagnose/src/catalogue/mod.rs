@@ -64,31 +64,51 @@ identifiers! {
 }
 
 identifiers! {
-    /// Kinds of returns of the channel `returns`. Each is what its causes make, and says nothing of the others.
-    ReturnsKind {
+    /// Kinds of differences of a channel. Each is what its causes make, and says nothing of the others.
+    Kind {
         /// Returns behind smooth surfaces.
         Behind = "behind",
         /// Ranges between the two surfaces of an edge.
         Between = "between",
+        /// Losses in some directions, beyond those of surfaces like theirs.
+        Directions = "directions",
+        /// Returns of the ego vehicle.
+        EgoVehicle = "ego_vehicle",
         /// Groups of returns where the other side has nothing.
         Groups = "groups",
         /// Lone returns.
         Lone = "lone",
         /// Returns behind vehicles.
         Plumes = "plumes",
+        /// Losses by surface, range and incidence.
+        Surfaces = "surfaces",
     }
 }
 
-impl ReturnsKind {
-    /// The kind of returns that a cause makes; `None` of causes that are seen in other channels.
-    pub const fn of(cause: Cause) -> Option<ReturnsKind> {
+impl Kind {
+    /// The kind of differences that a cause makes; `None` of causes of channels without kinds.
+    pub const fn of(cause: Cause) -> Option<Kind> {
         match cause {
-            Cause::Ghosts => Some(ReturnsKind::Behind),
-            Cause::Outliers | Cause::Fog | Cause::Rain => Some(ReturnsKind::Lone),
-            Cause::MixedPixels => Some(ReturnsKind::Between),
-            Cause::MissingObject => Some(ReturnsKind::Groups),
-            Cause::Spray => Some(ReturnsKind::Plumes),
+            Cause::DirtyWindow | Cause::EgoOcclusion => Some(Kind::Directions),
+            Cause::Fog | Cause::Outliers | Cause::Rain => Some(Kind::Lone),
+            Cause::Ghosts => Some(Kind::Behind),
+            Cause::IncidenceDropout
+            | Cause::MaterialDropout
+            | Cause::RandomDropout
+            | Cause::RangeDropout
+            | Cause::SignalDropout => Some(Kind::Surfaces),
+            Cause::MissingObject => Some(Kind::Groups),
+            Cause::MixedPixels => Some(Kind::Between),
+            Cause::Spray => Some(Kind::Plumes),
             _ => None,
+        }
+    }
+
+    /// The channel that it is a part of.
+    pub const fn channel(self) -> Channel {
+        match self {
+            Kind::Directions | Kind::EgoVehicle | Kind::Surfaces => Channel::Hits,
+            _ => Channel::Returns,
         }
     }
 }

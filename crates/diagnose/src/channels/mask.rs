@@ -60,6 +60,19 @@ pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 4]>;
 /// A near return below this share of the simulated range is from the ego vehicle and not from the ground.
 const HALF_WAY: f64 = 0.6;
 
+/// Whether a measured return comes from the ego vehicle.
+pub fn on_ego_vehicle(ray: &Ray) -> bool {
+    // Without a simulated return nothing is predicted; but a return with a counterpart was moved out of the field of
+    // view.
+    let predicted = match ray.lies() {
+        Lies::Open if ray.matched => 0.0,
+        Lies::Open => f64::INFINITY,
+        _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
+    };
+    // Another vehicle may drive as near in all frames.
+    ray.own_range_m() < OWN_CAR_M.min(HALF_WAY * predicted) && !ray.at_object
+}
+
 /// Counts over some frames.
 pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCounts {
     let one = |i: &usize| {
@@ -69,16 +82,8 @@ pub fn direction_counts(frames: &[FramePair], which: &[usize]) -> DirectionCount
             counts.entry(direction_cell(ray)).or_default()[0] += 1.0;
         }
         for ray in &frame.measured {
-            // Without a simulated return nothing is predicted; but a return with a counterpart was moved out of the
-            // field of view.
-            let predicted = match ray.lies() {
-                Lies::Open if ray.matched => 0.0,
-                Lies::Open => f64::INFINITY,
-                _ => f64::from(if ray.smooth { ray.range_m } else { ray.near_far_m[0] }),
-            };
             let count = counts.entry(direction_cell(ray)).or_default();
-            // Another vehicle may drive as near in all frames.
-            if ray.own_range_m() < OWN_CAR_M.min(HALF_WAY * predicted) && !ray.at_object {
+            if on_ego_vehicle(ray) {
                 count[2] += 1.0;
                 count[3] = 1.0 / which.len() as f64;
             } else {
@@ -140,7 +145,7 @@ pub enum Shown {
 ///
 /// Cells are judged in connected regions. A region counts if it stands out, see [`Region::stands_out`]. Where the
 /// measured scene is displaced, only regions with returns from the ego vehicle are believed, or regions that are
-/// surrounded on all sides, see [`Region::surrounded`].
+/// surrounded on all sides, see [`Region::surrounded`], or on both sides of most rows, see [`Region::stands_between`].
 pub fn blocked_cells(
     counts: &DirectionCounts,
     shown: Shown,
@@ -159,7 +164,8 @@ pub fn blocked_cells(
         let stands_out = region.stands_out(shown);
         let believed = match shown {
             Shown::InPlace => true,
-            Shown::MovedBack | Shown::Another => region.surrounded(),
+            Shown::MovedBack => region.surrounded() || region.stands_between(),
+            Shown::Another => region.surrounded(),
             Shown::Elsewhere => false,
         };
         if region.on_ego_vehicle() {
@@ -216,14 +222,26 @@ impl Region<'_> {
         self.cells.iter().filter(|c| covered(self.counts, c)).count() >= 2
     }
 
+    /// Whether returns come back beside most of its rows, on one side.
+    fn upright_edge(&self, a: i32) -> bool {
+        4 * self.height(|c| self.open(*c, a, 0)) >= 3 * self.height(|_| true)
+    }
+
+    /// Whether returns come back on both sides of most of its rows. Where a thing that was moved stood before others,
+    /// these come back. A single row is the upper edge of a wall that was moved.
+    fn stands_between(&self) -> bool {
+        self.height(|_| true) > 1 && self.upright_edge(1) && self.upright_edge(-1)
+    }
+
     /// Whether the region differs from the end of a scene: returns come back on two opposite sides; or it hides a
     /// whole side of the field of view with an upright edge, which laws of losses do not; or returns come from the
     /// ego vehicle and the field of view ends on the other side.
     fn stands_out(&self, shown: Shown) -> bool {
         let opposite = |[left, right, above, below]: [bool; 4]| left && right || above && below;
         let open = |c, a, e| self.open(c, a, e);
-        let upright = |a: i32| 4 * self.height(|c| self.open(*c, a, 0)) >= 3 * self.height(|_| true);
-        let whole_side = shown == Shown::InPlace && self.cells.len() >= WHOLE_SIDE_CELLS && (upright(1) || upright(-1));
+        let whole_side = shown == Shown::InPlace
+            && self.cells.len() >= WHOLE_SIDE_CELLS
+            && (self.upright_edge(1) || self.upright_edge(-1));
         self.cells.len() >= FEWEST_CELLS
             && (opposite(self.bounded(open))
                 || whole_side
@@ -267,8 +285,8 @@ pub(crate) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = Dir
 /// Share of the expected returns below which a cell is hidden in part.
 const IN_PART: f64 = 0.85;
 
-/// Cells at the edge of hidden ones: connected to them and hidden in part. None where they outnumber the hidden ones:
-/// then returns are lost for another reason as well.
+/// Cells at the edge of hidden ones: connected to them and hidden in part. None where they outnumber the hidden ones
+/// and the cells around these: then returns are lost for another reason as well.
 pub fn edge_cells(
     blocked: &BTreeSet<DirectionCell>,
     counts: &DirectionCounts,
@@ -284,7 +302,7 @@ pub fn edge_cells(
             }
         }
     }
-    if edge.len() > blocked.len() { BTreeSet::new() } else { edge }
+    if edge.len() > with_neighbours(blocked).len() { BTreeSet::new() } else { edge }
 }
 
 /// Cells below others in which the simulation has almost no returns beyond the ego vehicle: the occlusion continues
@@ -355,6 +373,16 @@ mod tests {
                 side.insert((0, az, el), [100.0, if az < -7 { 0.0 } else { 97.0 }, 0.0, 0.0]);
             }
             assert_eq!(blocked_cells(&side, Shown::InPlace, |_| 1.0).len(), found);
+        }
+        // A post before the sky, in a scene that was moved back: returns come back on both sides, none above. A wall
+        // that ends lower is no post, nor is a single row.
+        for (rows, right, found) in [(0..5, 97.0, 5), (0..5, 0.0, 0), (4..5, 97.0, 0)] {
+            let mut post = DirectionCounts::new();
+            for (az, el) in (-20..10).flat_map(|az| (-5..5).map(move |el| (az, el))) {
+                let seen = if rows.contains(&el) && az >= 3 { if az == 3 { 0.0 } else { right } } else { 97.0 };
+                post.insert((0, az, el), [100.0, seen, 0.0, 0.0]);
+            }
+            assert_eq!(blocked_cells(&post, Shown::MovedBack, |_| 1.0).len(), found);
         }
         // A plate that extends below the field of view, with returns along its upper edge alone.
         let mut low = DirectionCounts::new();

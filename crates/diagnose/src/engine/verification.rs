@@ -7,7 +7,7 @@
 
 use super::report::METRIC;
 use super::{Engine, curves};
-use crate::catalogue::{Cause, Channel, ReturnsKind};
+use crate::catalogue::{Cause, Channel, Kind};
 use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict};
 use crate::effects::cause_of;
 use crate::error::DiagnoseError;
@@ -89,23 +89,25 @@ impl RemadeFrames for CloudsWith<'_> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Part {
     Channel(Channel),
-    /// Of the channel of returns, which is the sum over its kinds.
-    Returns(ReturnsKind),
+    /// Of a channel that is the sum over its kinds.
+    Kind(Kind),
 }
 
 /// Distances of the held-out frames, nats, frame by frame.
 pub(crate) type Distances = BTreeMap<Part, Vec<f64>>;
 
-/// The distances of all channels. Those of returns are summed over their kinds.
+/// The distances of all channels. Those of channels with kinds are summed over them.
 pub(crate) fn of_channels(
     channels: impl IntoIterator<Item = (Channel, Vec<f64>)>,
-    returns: BTreeMap<ReturnsKind, Vec<f64>>,
+    kinds: BTreeMap<Kind, Vec<f64>>,
 ) -> Distances {
-    let n = returns.values().map(Vec::len).max().unwrap_or(0);
-    let sum = (0..n).map(|i| returns.values().map(|of_kind| of_kind[i]).sum()).collect();
-    let channels = channels.into_iter().chain([(Channel::Returns, sum)]);
-    let of_channels = channels.map(|(channel, d)| (Part::Channel(channel), d));
-    of_channels.chain(returns.into_iter().map(|(kind, d)| (Part::Returns(kind), d))).collect()
+    let mut all: Distances = channels.into_iter().map(|(channel, d)| (Part::Channel(channel), d)).collect();
+    for (kind, of_kind) in kinds {
+        let sum = all.entry(Part::Channel(kind.channel())).or_insert_with(|| vec![0.0; of_kind.len()]);
+        sum.iter_mut().zip(&of_kind).for_each(|(sum, d)| *sum += d);
+        all.insert(Part::Kind(kind), of_kind);
+    }
+    all
 }
 
 /// The distances of some frames of a pair.
@@ -114,9 +116,8 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     let packets = packets::Packets::new(context, sensors);
     let arrived = packets.arrived(context.frames);
     let context = &Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
-    let others: [(Channel, &(dyn Fn() -> Vec<f64> + Sync)); 9] = [
+    let others: [(Channel, &(dyn Fn() -> Vec<f64> + Sync)); 8] = [
         (Channel::Residuals, &|| geometry::by_table(context, train, test)),
-        (Channel::Hits, &|| hits::by_table(context, train, test)),
         (Channel::Packets, &|| packets.by_table(train, test)),
         (Channel::Roughness, &|| noise::by_table(context, train, test)),
         (Channel::Ranges, &|| quantisation::by_table(context, train, test)),
@@ -127,7 +128,10 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     ];
     let asked = others.into_par_iter().filter(|(channel, _)| slide || *channel != Channel::Slide);
     let distances: Vec<_> = asked.map(|(channel, distance)| (channel, distance())).collect();
-    of_channels(distances, returns::by_table(context, train, test))
+    let (mut kinds, lost) =
+        rayon::join(|| returns::by_table(context, train, test), || hits::by_table(context, train, test));
+    kinds.extend(lost);
+    of_channels(distances, kinds)
 }
 
 /// At most [`FRAMES`] of some frames, evenly spread.
@@ -272,7 +276,7 @@ impl GainFrames {
             interval_nearest(drawn.collect())
         };
         let channel = |part: &Part| if let Part::Channel(channel) = part { Some(*channel) } else { None };
-        let kind = |part: &Part| if let Part::Returns(kind) = part { Some(*kind) } else { None };
+        let kind = |part: &Part| if let Part::Kind(kind) = part { Some(*kind) } else { None };
         let changed = |part: &Part| {
             let [before, after, _] = sums(part, &all_frames);
             (after - before).abs() > ENOUGH_NATS
@@ -362,9 +366,9 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis, seen: impl Fn(&Finding) -> 
     diagnosis.verdict = Verdict::of(&diagnosis.findings);
 }
 
-/// What is gone of the difference that a finding is about: of its kind of returns, else of its channel.
+/// What is gone of the difference that a finding is about: of its kind, else of its channel.
 fn closed_of<'a>(gain: &'a Gain, finding: &Finding) -> Option<&'a Closed> {
-    let kind = ReturnsKind::of(cause_of(finding)).filter(|_| finding.channel == Channel::Returns);
+    let kind = Kind::of(cause_of(finding)).filter(|kind| kind.channel() == finding.channel);
     kind.map_or_else(|| gain.closed_by_channel.get(&finding.channel), |kind| gain.closed_by_kind.get(&kind))
 }
 
@@ -373,8 +377,8 @@ fn lose_name(finding: &mut Finding, considered: &[Considered]) {
     let cause = finding.cause.take();
     let rivals = considered.iter().filter(|c| c.channel == finding.channel && c.z > Z_STAR && c.nats_per_ray > 0.0);
     let named = rivals.map(|c| (c.nats_per_ray, c.cause.cause));
-    // Another kind of returns is no other reason for this one.
-    let alike = |rival: Cause| cause.is_some_and(|c| rival != c && ReturnsKind::of(rival) == ReturnsKind::of(c));
+    // What makes another kind of differences is no other reason for this one.
+    let alike = |rival: Cause| cause.is_some_and(|c| rival != c && Kind::of(rival) == Kind::of(c));
     let rival = named.filter(|(_, rival)| alike(*rival) && *rival != Cause::Unexplained);
     let rival = rival.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, rival)| rival);
     match (cause, rival) {

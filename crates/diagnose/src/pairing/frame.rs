@@ -25,9 +25,10 @@ pub struct FramePair {
     /// Jumps of the measured scan for each one of the simulated scan, over returns: 1 where both show one scene.
     pub jumps: f64,
     /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns
-    /// it has fewer.
+    /// it has fewer. Of all shots, the share that is compared of the returns.
     pub open: f64,
-    /// Second returns of the shots of the measured and of the simulated side; the rays do not hold them.
+    /// Second returns of the shots of the measured and of the simulated side, which the rays do not hold; the share
+    /// that is compared of the returns.
     pub second: [f64; 2],
     /// Objects, those of the simulation first.
     pub objects: Vec<ObjectPair>,
@@ -94,8 +95,9 @@ pub struct RecordedFrame<'a> {
     pub matched: &'a [Matched],
 }
 
-/// Pairs a frame, return by return. About `kept` of the returns of each side are compared, chosen at random; all of
-/// them say what lies around these, and what the objects of the frame are.
+/// Pairs a frame, return by return. About `kept` of the returns of the side with more are compared, chosen at random,
+/// and the same share of the other's: their numbers are compared as well. All of them say what lies around these, and
+/// what the objects of the frame are.
 pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corrections, kept: usize) -> FramePair {
     let mut objects = pair_labels(&recorded.measured.objects, &recorded.simulated.objects);
     let boxes: Vec<Box3> = objects.iter().filter_map(|o| o.simulated).collect();
@@ -110,9 +112,11 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
             at.is_some_and(|at| mount.sees(at.spherical[0], 0.0))
         })
     };
+    let returns = [&measured[..], &simulated[..]].map(|scans| scans.iter().map(SensorScan::len).sum::<usize>());
+    let share = (kept as f64 / returns[0].max(returns[1]).max(1) as f64).min(1.0);
     let uses = [
-        uses(&measured, seen, kept, [recorded.number as u64, 0]),
-        uses(&simulated, |_, _, _| true, kept, [recorded.number as u64, 1]),
+        uses(&measured, seen, share, [recorded.number as u64, 0]),
+        uses(&simulated, |_, _, _| true, share, [recorded.number as u64, 1]),
     ];
     let (mut rays, mut mixed_per_rad, mut shots_open): ([Vec<(Ray, Use)>; 2], f64, f64) = Default::default();
     for (sensor, scan) in measured.iter_mut().enumerate() {
@@ -140,31 +144,30 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         id: recorded.id.into(),
         measured,
         simulated: simulated_rays,
-        mixed_per_rad: mixed_per_rad / simulated.iter().map(SensorScan::len).sum::<usize>().max(1) as f64,
+        mixed_per_rad: mixed_per_rad / returns[1].max(1) as f64,
         jumps: 1.0,
-        open: shots_open,
-        second: [recorded.measured, recorded.simulated].map(|side| side.second as f64),
+        open: share * shots_open,
+        second: [recorded.measured, recorded.simulated].map(|side| share * side.second as f64),
         objects,
     }
 }
 
-/// Uses of the returns of a side, by sensor: of those that are `seen`, about `kept` are drawn. `stream` is the number
-/// of the frame and that of the side.
+/// Uses of the returns of a side, by sensor: of those that are `seen`, a share is drawn. `stream` is the number of the
+/// frame and that of the side.
 fn uses(
     scans: &[SensorScan],
     seen: impl Fn(usize, &SensorScan, usize) -> bool,
-    kept: usize,
+    share: f64,
     stream: [u64; 2],
 ) -> Vec<Vec<Use>> {
-    let of_scan = |(sensor, scan): (usize, &SensorScan)| (0..scan.len()).map(|i| seen(sensor, scan, i)).collect();
-    let seen: Vec<Vec<bool>> = scans.iter().enumerate().map(of_scan).collect();
-    let mut keeps = super::keeps(seen.iter().flatten().filter(|seen| **seen).count(), kept, stream);
-    let mut of_return = |seen: &bool| match *seen {
+    let mut keeps = super::keeps(share, stream);
+    let mut of_return = |sensor: usize, scan: &SensorScan, i: usize| match seen(sensor, scan, i) {
         false => Use::Neighbour,
         true if keeps() => Use::Compared,
         true => Use::AtObject,
     };
-    seen.iter().map(|of_scan| of_scan.iter().map(&mut of_return).collect()).collect()
+    let scans = scans.iter().enumerate();
+    scans.map(|(sensor, scan)| (0..scan.len()).map(|i| of_return(sensor, scan, i)).collect()).collect()
 }
 
 /// Measured scans with a displacement undone.
@@ -305,8 +308,8 @@ mod tests {
         let origin = sensors.rig.sensors[0].position;
         let bbox = Box3::from_array([origin[0] + 12.0, origin[1], origin[2], 4.0, 2.0, 1.6, 0.0]);
         let car = Object { class: "Car".into(), bbox, truncation: None, occlusion: None, image_box: None };
-        let side = |scan| SideFrame { scans: vec![scan], objects: vec![car.clone()], second: 0 };
-        let (measured, simulated) = (side(scan(0.05, 1)), side(scan(0.0, 2)));
+        let side = |scan, second| SideFrame { scans: vec![scan], objects: vec![car.clone()], second };
+        let (measured, simulated) = (side(scan(0.05, 1), 200), side(scan(0.0, 2), 100));
         let n = measured.scans[0].len();
         let matched = [(vec![true; n], vec![true; n])];
         let recorded =
@@ -318,7 +321,9 @@ mod tests {
     fn some_of_the_rays_are_as_they_are_among_all() {
         let (all, some) = (paired(usize::MAX), paired(3_000));
         assert_eq!(all.measured.len(), rows().len() * 500);
-        assert_eq!((some.mixed_per_rad, some.open), (all.mixed_per_rad, all.open));
+        let share = 3_000.0 / (rows().len() * 500) as f64;
+        assert_eq!((some.mixed_per_rad, some.open), (all.mixed_per_rad, share * all.open));
+        assert_eq!((all.second, some.second), ([200.0, 100.0], [share * 200.0, share * 100.0]));
         let [of_some, of_all] = [&some, &all].map(|f| &f.objects[0]);
         assert_eq!((of_some.shift, of_some.points[0]), (of_all.shift, of_all.points[0]));
         // A false alarm far before an object is no return at it, though the surface behind it is the object's.

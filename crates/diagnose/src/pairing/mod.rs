@@ -130,8 +130,8 @@ pub fn kept_of_frame(frames: usize) -> usize {
     (KEPT / frames.max(1)).max(500)
 }
 
-/// Pairs all frames; compares at most about `kept` returns of each side of a frame. `done` receives the number of
-/// frames finished so far.
+/// Pairs all frames; compares at most about `kept` returns of each side of a frame, the same share of both. `done`
+/// receives the number of frames finished so far.
 pub fn pair_all(
     recordings: &Recordings,
     sensors: &Sensors,
@@ -163,14 +163,13 @@ pub(crate) fn in_order<T: Send>(
 
 /// Keeps about `kept` of the rays, chosen at random. `stream` is the number of the frame and one of the kind of rays.
 pub(crate) fn thin(rays: &mut Vec<Ray>, kept: usize, stream: [u64; 2]) {
-    let mut keeps = keeps(rays.len(), kept, stream);
+    let mut keeps = keeps(kept as f64 / rays.len().max(1) as f64, stream);
     rays.retain(|_| keeps());
     rays.shrink_to_fit();
 }
 
-/// Draws for each of `of` whether it is one of about `kept`.
-fn keeps(of: usize, kept: usize, [frame, kind]: [u64; 2]) -> impl FnMut() -> bool {
-    let share = kept as f64 / of.max(1) as f64;
+/// Draws whether a ray is one of a share of them.
+fn keeps(share: f64, [frame, kind]: [u64; 2]) -> impl FnMut() -> bool {
     let mut rng = data::stream(0, "diagnose thin", kind, frame);
     move || share >= 1.0 || rng.random::<f64>() < share
 }

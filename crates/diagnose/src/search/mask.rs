@@ -100,6 +100,12 @@ fn find(context: &Context, shown: Shown) -> (Mask, Vec<Found>) {
     (mask, spots)
 }
 
+/// Rays that tell what laws keep in a cell of directions.
+const ENOUGH: f64 = 10.0;
+
+/// How many cells around may tell it as well.
+const AROUND_CELLS: i32 = 3;
+
 /// Share of the returns that laws keep in each cell of directions. The laws are fitted on the rays that
 /// `fitted_without` does not hide.
 fn expected_shares(
@@ -123,7 +129,18 @@ fn expected_shares(
         sum[0] += kept;
         sum[1] += 1.0;
     }
-    sums.into_iter().filter(|(_, s)| s[1] >= 10.0).map(|(k, s)| (k, s[0] / s[1])).collect()
+    // Where too few rays tell, those of the cells around count as well.
+    let within = |(s, az, el): DirectionCell, cells: i32| {
+        let around = (-cells..=cells).flat_map(|a| (-cells..=cells).map(move |e| (s, az + a, el + e)));
+        around.filter_map(|cell| sums.get(&cell)).fold([0.0; 2], |sum, own| [sum[0] + own[0], sum[1] + own[1]])
+    };
+    let share = |cell: &DirectionCell| {
+        let [kept, all] = (0..=AROUND_CELLS).map(|cells| within(*cell, cells)).find(|[_, all]| *all >= ENOUGH)?;
+        Some((*cell, kept / all))
+    };
+    let cells: BTreeSet<DirectionCell> =
+        frames.iter().flat_map(|&i| &context.frames[i].simulated).map(direction_cell).collect();
+    cells.iter().filter_map(share).collect()
 }
 
 /// Whether a range lies outside of what is measured.

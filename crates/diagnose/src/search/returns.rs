@@ -9,7 +9,7 @@ mod weather;
 
 use self::describe::found;
 use super::{ChannelResult, Context, NamedParameter, Z_STAR, with_error};
-use crate::catalogue::{Cause, Channel, Quantity, ReturnsKind, Unit};
+use crate::catalogue::{Cause, Channel, Kind, Quantity, Unit};
 use crate::channels::mean::origins;
 use crate::channels::plumes::{Extent, MOST, PlumeFrame, plume_frame};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
@@ -102,7 +102,7 @@ fn lies_behind(context: &Context, frame: usize, side: usize, ray: usize) -> bool
 
 /// Gains of the `test` frames by the shares of odd returns of the `train` frames, and by the density of returns behind
 /// vehicles, nats.
-pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<ReturnsKind, Vec<f64>> {
+pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<Kind, Vec<f64>> {
     let plumes = plumes(context);
     let around = |frame: usize, side: usize, ray: usize| plumes[frame].around[side].contains(&ray);
     let behind = |frame: usize, side: usize, ray: usize| lies_behind(context, frame, side, ray);
@@ -111,18 +111,13 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<
     let others = |f: usize, side: usize, ray: usize| around(f, side, ray) || !behind(f, side, ray);
     let of_behind = shares_by_table(context, &[Odd::Alone, Odd::GroupBehind], [train, test], &others);
     let sum = (0..test.len()).map(|i| of_behind.values().map(|of_kind| of_kind[i]).sum()).collect();
-    gains.insert(ReturnsKind::Behind, sum);
-    gains.insert(ReturnsKind::Plumes, spray::by_table(&plumes, train, test));
+    gains.insert(Kind::Behind, sum);
+    gains.insert(Kind::Plumes, spray::by_table(&plumes, train, test));
     gains
 }
 
 /// Gains by the shares of some kinds of returns alone.
-pub fn kinds_by_table(
-    context: &Context,
-    kinds: &[Odd],
-    train: &[usize],
-    test: &[usize],
-) -> BTreeMap<ReturnsKind, Vec<f64>> {
+pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &[usize]) -> BTreeMap<Kind, Vec<f64>> {
     shares_by_table(context, kinds, [train, test], &|_, _, _| false)
 }
 
@@ -138,16 +133,16 @@ fn shares_by_table(
     kinds: &[Odd],
     [train, test]: [&[usize]; 2],
     explained: &(dyn Fn(usize, usize, usize) -> bool + Sync),
-) -> BTreeMap<ReturnsKind, Vec<f64>> {
+) -> BTreeMap<Kind, Vec<f64>> {
     let odd = odd_frames(context.frames, 0.98 * end_m(context.frames), explained);
     let rates = ODD.map(|kind| excess(train.iter().map(|&i| &odd[i]), kind as usize));
     let of_kind = |i: usize, kind: Odd| {
         let [base, more] = rates[kind as usize];
         gain(&odd[i], kind as usize, base, more)
     };
-    let mut gains = BTreeMap::<ReturnsKind, Vec<f64>>::new();
+    let mut gains = BTreeMap::<Kind, Vec<f64>>::new();
     for kind in kinds {
-        let Some(name) = ReturnsKind::of(cause(*kind)) else { continue };
+        let Some(name) = Kind::of(cause(*kind)) else { continue };
         let of_name = gains.entry(name).or_insert_with(|| vec![0.0; test.len()]);
         of_name.iter_mut().zip(test).for_each(|(sum, &i)| *sum += of_kind(i, *kind));
     }

@@ -3,7 +3,7 @@
 
 use super::sides::as_pairs;
 use super::{Contexts, Unpaired, kinds};
-use crate::catalogue::Channel;
+use crate::catalogue::{Channel, Kind};
 use crate::diagnosis::{Gain, NotApplied};
 use crate::engine::{Distances, GainFrames, Remake, of_channels};
 use crate::error::DiagnoseError;
@@ -20,11 +20,12 @@ fn distances(contexts: &Contexts, train: &[usize], test: &[usize]) -> Distances 
     let lost = hits::by_cell(&contexts.shots, train, test);
     let cut = mask::cut_by_table(&contexts.returns, train, test);
     let others = [
-        (Channel::Hits, lost.into_iter().zip(cut).map(|(lost, cut)| lost + cut).collect()),
         (Channel::Roughness, noise::by_table(&contexts.returns, train, test)),
         (Channel::Ranges, quantisation::by_table(&contexts.returns, train, test)),
     ];
-    of_channels(others, returns::kinds_by_table(&contexts.returns, kinds(&contexts.returns), train, test))
+    let mut all = returns::kinds_by_table(&contexts.returns, kinds(&contexts.returns), train, test);
+    all.insert(Kind::Surfaces, lost.into_iter().zip(cut).map(|(lost, cut)| lost + cut).collect());
+    of_channels(others, all)
 }
 
 /// Distances as they were recorded, and those of frames that are made anew.
