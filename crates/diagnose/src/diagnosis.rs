@@ -222,10 +222,13 @@ pub struct Gain {
     /// `before`, `after` and `floor` by channel.
     #[serde(default)]
     pub channels: BTreeMap<Channel, [f64; 3]>,
+    /// The same by kind of differences, for channels whose kinds have different causes.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub kinds: BTreeMap<Kind, [f64; 3]>,
     /// `closed` with its interval by channel, for channels of which a significant part of the difference is.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub closed_by_channel: BTreeMap<Channel, Closed>,
-    /// The same of the kinds of differences of a channel, which have different causes.
+    /// The same by kind of differences.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub closed_by_kind: BTreeMap<Kind, Closed>,
     /// Effects of `extended.toml` that were left out because the simulated data cannot be made anew with them. What

@@ -4,11 +4,13 @@ mod baked_in;
 mod curves;
 mod known;
 mod notes;
+mod reached;
 mod report;
 mod verification;
 
+pub(crate) use reached::set_reached;
 pub(crate) use report::{refused, report};
-pub(crate) use verification::{Distances, GainFrames, of_channels, set_reached};
+pub(crate) use verification::{Distances, GainFrames, of_channels};
 pub use verification::{OnClouds, RemadeFrames, Remake, SEEDS};
 
 use self::known::Known;

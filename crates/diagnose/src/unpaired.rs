@@ -9,7 +9,7 @@ mod gain;
 mod limits;
 mod sides;
 
-use crate::catalogue::{Cause, Channel};
+use crate::catalogue::Channel;
 use crate::channels::mask::Shown;
 use crate::channels::returns::Odd;
 use crate::diagnosis::{Diagnosis, Finding, Gain, Status, Verdict};
@@ -148,8 +148,7 @@ fn verify(
     let found = diagnosis.findings.iter().map(|f| f.channel).collect();
     let gain = verification.of(&found, Some(&list).filter(|list| !list.effects.is_empty()), remake)?;
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    // What the ego vehicle hides is in no distance.
-    set_reached(diagnosis, |f| f.cause != Some(Cause::EgoOcclusion));
+    set_reached(diagnosis);
     Ok(extended)
 }
 

@@ -70,10 +70,8 @@ identifiers! {
         Behind = "behind",
         /// Ranges between the two surfaces of an edge.
         Between = "between",
-        /// Losses in some directions, beyond those of surfaces like theirs.
+        /// Losses in some directions, beyond those of surfaces like theirs, and returns of the ego vehicle.
         Directions = "directions",
-        /// Returns of the ego vehicle.
-        EgoVehicle = "ego_vehicle",
         /// Groups of returns where the other side has nothing.
         Groups = "groups",
         /// Lone returns.
@@ -107,7 +105,7 @@ impl Kind {
     /// The channel that it is a part of.
     pub const fn channel(self) -> Channel {
         match self {
-            Kind::Directions | Kind::EgoVehicle | Kind::Surfaces => Channel::Hits,
+            Kind::Directions | Kind::Surfaces => Channel::Hits,
             _ => Channel::Returns,
         }
     }

@@ -5,19 +5,17 @@
 //! better of the held-out frames than the simulation does (nats a simulated return). It asks for no cause, is near zero
 //! where the two sides are two draws of the same sensor, and is the same number before and after.
 
+use super::reached::{closed_of, set_reached};
 use super::report::METRIC;
 use super::{Engine, curves};
-use crate::catalogue::{Cause, Channel, Kind};
-use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict};
-use crate::effects::cause_of;
+use crate::catalogue::{Channel, Kind};
+use crate::diagnosis::{Closed, Diagnosis, Finding, Gain, NotApplied};
 use crate::error::DiagnoseError;
-use crate::extended::why_none;
 use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
 use crate::search::{
-    Context, REPETITIONS, Z_STAR, geometry, hits, intensity, labels, noise, packets, quantisation, returns,
-    rolling_shutter,
+    Context, REPETITIONS, geometry, hits, intensity, labels, noise, packets, quantisation, returns, rolling_shutter,
 };
 use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
@@ -300,6 +298,7 @@ impl GainFrames {
             ci95: of_all.and_then(|_| interval(&counted)),
             counted: counted.iter().filter_map(channel).collect(),
             channels: all().filter_map(|p| Some((channel(&p)?, sums(&p, &all_frames).map(|v| v / returns)))).collect(),
+            kinds: all().filter_map(|p| Some((kind(&p)?, sums(&p, &all_frames).map(|v| v / returns)))).collect(),
             closed_by_channel: all().filter(enough).filter_map(|p| Some((channel(&p)?, share(p)?))).collect(),
             closed_by_kind: all().filter(enough).filter_map(|p| Some((kind(&p)?, share(p)?))).collect(),
             ..Gain::default()
@@ -324,73 +323,6 @@ pub(super) fn measure_gain(
         }
     };
     diagnosis.gain = Gain { predicted: diagnosis.gain.predicted.take(), ..gain };
-    set_reached(diagnosis, |_| true);
+    set_reached(diagnosis);
     Ok(())
-}
-
-/// Difference of what was promised and what was reached from which on the form of a cause does not fit.
-const FORM: f64 = 0.05;
-
-/// Share of a channel's difference that is much of it.
-const MUCH: f64 = 0.5;
-
-/// Lists findings without an effect as not applied, and writes to each finding what the fits promised of its channel
-/// and what was reached there. A named cause whose effect was applied and surely reaches less than it promised, by more
-/// than 5 points, does not have the form of the difference: it is ambiguous where another cause was significant as
-/// well, else without a name. `seen` says whether the distances see what a finding changes.
-pub(crate) fn set_reached(diagnosis: &mut Diagnosis, seen: impl Fn(&Finding) -> bool) {
-    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
-    let not_applied = without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) });
-    diagnosis.gain.not_applied.extend(not_applied);
-    let Diagnosis { findings, gain, considered, .. } = diagnosis;
-    for finding in findings.iter_mut().filter(|f| seen(f)) {
-        let measured = closed_of(gain, finding);
-        finding.reached = measured.map(|c| c.closed);
-        finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
-        let (Some(promised), Some(measured)) = (finding.predicted, measured) else { continue };
-        let applied = !finding.effects.is_empty()
-            && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
-        // What the extended simulation makes no better is not what is wrong, if it promised to be much of it.
-        let no_better = measured.closed <= 0.0 && promised > MUCH;
-        let surely_less = no_better || measured.ci95.is_some_and(|[_, high]| high < promised - FORM);
-        if finding.status == Status::Named && applied && surely_less && measured.closed < promised - FORM {
-            finding.says.push_str(&format!(
-                "; with the extended simulation {:.0} % of the difference is gone where the fit says {:.0} %: the form of \
-                 this cause does not fit",
-                100.0 * measured.closed.max(0.0),
-                100.0 * promised
-            ));
-            lose_name(finding, considered);
-        }
-    }
-    diagnosis.verdict = Verdict::of(&diagnosis.findings);
-}
-
-/// What is gone of the difference that a finding is about: of its kind, else of its channel.
-fn closed_of<'a>(gain: &'a Gain, finding: &Finding) -> Option<&'a Closed> {
-    let kind = Kind::of(cause_of(finding)).filter(|kind| kind.channel() == finding.channel);
-    kind.map_or_else(|| gain.closed_by_channel.get(&finding.channel), |kind| gain.closed_by_kind.get(&kind))
-}
-
-/// Takes the name of a finding's cause back.
-fn lose_name(finding: &mut Finding, considered: &[Considered]) {
-    let cause = finding.cause.take();
-    let rivals = considered.iter().filter(|c| c.channel == finding.channel && c.z > Z_STAR && c.nats_per_ray > 0.0);
-    let named = rivals.map(|c| (c.nats_per_ray, c.cause.cause));
-    // What makes another kind of differences is no other reason for this one.
-    let alike = |rival: Cause| cause.is_some_and(|c| rival != c && Kind::of(rival) == Kind::of(c));
-    let rival = named.filter(|(_, rival)| alike(*rival) && *rival != Cause::Unexplained);
-    let rival = rival.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, rival)| rival);
-    match (cause, rival) {
-        (Some(cause), Some(rival)) => {
-            (finding.status, finding.candidates) = (Status::Ambiguous, Some(vec![cause, rival]));
-        }
-        _ => finding.status = Status::Unexplained,
-    }
-}
-
-/// Share of a channel's difference that the fits remove.
-fn promised(predicted: &Predicted, channel: Channel) -> Option<f64> {
-    let [before, after, floor] = *predicted.channels.get(&channel)?;
-    (before > floor).then(|| (before - after) / (before - floor))
 }

@@ -232,14 +232,20 @@ impl Occlusion {
         let counts = direction_counts(context.frames, frames);
         let level =
             |c: &DirectionCell| (self.elevation[0]..self.elevation[1]).contains(&((f64::from(c.2) + 0.5) * el_step));
-        let points = counts.iter().filter(|(c, _)| c.0 == self.sensor && level(c));
-        let points = points.map(|(c, [n, seen, ..])| CurvePoint {
+        // Simulated returns of each azimuth, those that are measured and those that are not hidden.
+        let mut columns = BTreeMap::<i32, [f64; 3]>::new();
+        for (cell, [n, seen, ..]) in counts.iter().filter(|(c, _)| c.0 == self.sensor && level(c)) {
+            let sum = columns.entry(cell.1).or_default();
+            let open = f64::from(u8::from(!mask.blocked.contains(cell)));
+            *sum = [sum[0] + n, sum[1] + seen, sum[2] + n * open];
+        }
+        let points = columns.into_iter().filter(|(_, [n, ..])| *n > 0.0).map(|(azimuth, [n, seen, open])| CurvePoint {
             sensor: 0,
-            x: (f64::from(c.1) + 0.5) * az_step,
-            measured: seen / n.max(1.0),
+            x: (f64::from(azimuth) + 0.5) * az_step,
+            measured: (seen / n).min(1.0),
             before: 1.0,
-            after: if mask.blocked.contains(c) { 0.0 } else { 1.0 },
-            error: 1.0 / n.max(1.0).sqrt(),
+            after: open / n,
+            error: 1.0 / n.sqrt(),
         });
         Curve {
             x: "azimuth, degrees".into(),

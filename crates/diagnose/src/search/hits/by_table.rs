@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 const PRIOR_OF_DIRECTION: f64 = 30.0;
 
 /// Gains of the `test` frames by the shares of matched returns of the `train` frames, nats, by kind: by cell of range,
-/// incidence and surface; what cells of directions add to these; and returns of the ego vehicle.
+/// incidence and surface; and what cells of directions add to these, with returns of the ego vehicle.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<Kind, Vec<f64>> {
     let hits = hit_frames(context.frames, &Mask::default());
     let unmatched = table(&hits, train).unmatched(&[]);
@@ -56,9 +56,9 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<
         let gains = context.frames[i].simulated.iter().map(of_ray);
         gains.fold((0.0, 0.0), |(surfaces, directions), [s, d]| (surfaces + s, directions + d))
     };
-    let (surfaces, directions) = test.par_iter().map(of_frame).unzip();
-    let near = of_near_returns(context, train, test);
-    BTreeMap::from([(Kind::Directions, directions), (Kind::EgoVehicle, near), (Kind::Surfaces, surfaces)])
+    let (surfaces, mut directions): (Vec<f64>, Vec<f64>) = test.par_iter().map(of_frame).unzip();
+    directions.iter_mut().zip(of_ego_vehicle(context, train, test)).for_each(|(sum, gain)| *sum += gain);
+    BTreeMap::from([(Kind::Directions, directions), (Kind::Surfaces, surfaces)])
 }
 
 /// A cell of directions.
@@ -159,7 +159,7 @@ pub fn by_cell(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
 
 /// Gains of the `test` frames by the numbers of returns of the ego vehicle of the `train` frames in each cell of
 /// directions, nats. Returns that lie on a simulated surface, which may be its own, are none.
-fn of_near_returns(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
+fn of_ego_vehicle(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let count = |rays: &[Ray]| {
         let mut counts = BTreeMap::<DirectionCell, f64>::new();
         for ray in rays.iter().filter(|ray| on_ego_vehicle(ray)) {

@@ -1,0 +1,93 @@
+//! What is reached of each finding through `extended.toml`, and which names do not hold against it.
+
+use crate::catalogue::{Cause, Channel, Kind};
+use crate::diagnosis::{Closed, Considered, Diagnosis, Finding, Gain, NotApplied, Predicted, Status, Verdict};
+use crate::effects::cause_of;
+use crate::extended::why_none;
+use crate::search::Z_STAR;
+
+/// Difference of what was promised and what was reached from which on the form of a cause does not fit.
+const FORM: f64 = 0.05;
+
+/// Share of a channel's difference that is much of it.
+const MUCH: f64 = 0.5;
+
+/// Lists findings without an effect as not applied, and writes to each finding what the fits promised of its channel
+/// and what was reached there. A named cause whose effect was applied and surely reaches less than it promised, by more
+/// than 5 points, does not have the form of the difference: it is ambiguous where another cause was significant as
+/// well, else without a name. Of what the distances do not see nothing is said.
+pub(crate) fn set_reached(diagnosis: &mut Diagnosis) {
+    let without = diagnosis.findings.iter().filter(|f| f.effects.is_empty());
+    let not_applied = without.map(|f| NotApplied { effect: cause_of(f).name().into(), why: why_none(f) });
+    diagnosis.gain.not_applied.extend(not_applied);
+    let Diagnosis { findings, gain, considered, .. } = diagnosis;
+    for finding in findings {
+        let Some(measured) = closed_of(gain, finding) else { continue };
+        finding.reached = Some(measured.closed);
+        finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
+        let Some(promised) = finding.predicted else { continue };
+        let promised = promised_at_least(gain, finding, promised);
+        let applied = !finding.effects.is_empty()
+            && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
+        // What the extended simulation makes no better is not what is wrong, if it promised to be much of it.
+        let no_better = measured.closed <= 0.0 && promised > MUCH;
+        let surely_less = no_better || measured.ci95.is_some_and(|[_, high]| high < promised - FORM);
+        if finding.status == Status::Named && applied && surely_less && measured.closed < promised - FORM {
+            finding.says.push_str(&format!(
+                "; with the extended simulation {:.0} % of the difference is gone where the fit says {:.0} %: the form of \
+                 this cause does not fit",
+                100.0 * measured.closed.max(0.0),
+                100.0 * promised
+            ));
+            lose_name(finding, considered);
+        }
+    }
+    diagnosis.verdict = Verdict::of(&diagnosis.findings);
+}
+
+/// The kind of differences that a finding is about; `None` where it is about its whole channel.
+fn kind_of(finding: &Finding) -> Option<Kind> {
+    Kind::of(cause_of(finding)).filter(|kind| kind.channel() == finding.channel)
+}
+
+/// What is gone of the difference that a finding is about.
+pub(super) fn closed_of<'a>(gain: &'a Gain, finding: &Finding) -> Option<&'a Closed> {
+    match kind_of(finding) {
+        Some(kind) => gain.closed_by_kind.get(&kind),
+        None => gain.closed_by_channel.get(&finding.channel),
+    }
+}
+
+/// Takes the name of a finding's cause back.
+fn lose_name(finding: &mut Finding, considered: &[Considered]) {
+    let cause = finding.cause.take();
+    let rivals = considered.iter().filter(|c| c.channel == finding.channel && c.z > Z_STAR && c.nats_per_ray > 0.0);
+    let named = rivals.map(|c| (c.nats_per_ray, c.cause.cause));
+    // What makes another kind of differences is no other reason for this one.
+    let alike = |rival: Cause| cause.is_some_and(|c| rival != c && Kind::of(rival) == Kind::of(c));
+    let rival = named.filter(|(_, rival)| alike(*rival) && *rival != Cause::Unexplained);
+    let rival = rival.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, rival)| rival);
+    match (cause, rival) {
+        (Some(cause), Some(rival)) => {
+            (finding.status, finding.candidates) = (Status::Ambiguous, Some(vec![cause, rival]));
+        }
+        _ => finding.status = Status::Unexplained,
+    }
+}
+
+/// Share of a channel's difference that the fits remove.
+fn promised(predicted: &Predicted, channel: Channel) -> Option<f64> {
+    let [before, after, floor] = *predicted.channels.get(&channel)?;
+    (before > floor).then(|| (before - after) / (before - floor))
+}
+
+/// Share of the difference that a finding is about that the fits remove at least, where they promise a share of its
+/// channel: what they leave of the channel may all be of one kind.
+fn promised_at_least(gain: &Gain, finding: &Finding, of_channel: f64) -> f64 {
+    let difference = |[before, _, floor]: &[f64; 3]| before - floor;
+    let part = kind_of(finding).and_then(|kind| {
+        let [kind, channel] = [gain.kinds.get(&kind)?, gain.channels.get(&finding.channel)?].map(difference);
+        (0.0 < kind && kind < channel).then(|| kind / channel)
+    });
+    1.0 - (1.0 - of_channel) / part.unwrap_or(1.0)
+}
