@@ -92,7 +92,9 @@ impl Kind {
             Cause::Ghosts => Some(Kind::Behind),
             Cause::IncidenceDropout
             | Cause::MaterialDropout
+            | Cause::NearCut
             | Cause::RandomDropout
+            | Cause::RangeCut
             | Cause::RangeDropout
             | Cause::SignalDropout => Some(Kind::Surfaces),
             Cause::MissingObject => Some(Kind::Groups),

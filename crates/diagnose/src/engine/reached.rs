@@ -26,7 +26,9 @@ pub(crate) fn set_reached(diagnosis: &mut Diagnosis) {
         finding.reached = Some(measured.closed);
         finding.predicted = gain.predicted.as_ref().and_then(|p| promised(p, finding.channel));
         let Some(promised) = finding.predicted else { continue };
-        let promised = promised_at_least(gain, finding, promised);
+        let parts =
+            kind_of(finding).and_then(|kind| Some([*gain.kinds.get(&kind)?, *gain.channels.get(&finding.channel)?]));
+        let promised = parts.map_or(promised, |parts| promised_at_least(promised, parts));
         let applied = !finding.effects.is_empty()
             && finding.effects.iter().all(|e| gain.not_applied.iter().all(|left| left.effect != e.kind()));
         // What the extended simulation makes no better is not what is wrong, if it promised to be much of it.
@@ -81,13 +83,25 @@ fn promised(predicted: &Predicted, channel: Channel) -> Option<f64> {
     (before > floor).then(|| (before - after) / (before - floor))
 }
 
-/// Share of the difference that a finding is about that the fits remove at least, where they promise a share of its
-/// channel: what they leave of the channel may all be of one kind.
-fn promised_at_least(gain: &Gain, finding: &Finding, of_channel: f64) -> f64 {
-    let difference = |[before, _, floor]: &[f64; 3]| before - floor;
-    let part = kind_of(finding).and_then(|kind| {
-        let [kind, channel] = [gain.kinds.get(&kind)?, gain.channels.get(&finding.channel)?].map(difference);
-        (0.0 < kind && kind < channel).then(|| kind / channel)
-    });
-    1.0 - (1.0 - of_channel) / part.unwrap_or(1.0)
+/// Share of a kind's difference that the fits remove at least, where they remove a share of its channel's: what they
+/// leave may all be of this kind. Both come as before, after and floor.
+fn promised_at_least(of_channel: f64, [kind, channel]: [[f64; 3]; 2]) -> f64 {
+    let [kind, channel] = [kind, channel].map(|[before, _, floor]| before - floor);
+    if kind > 0.0 { 1.0 - (1.0 - of_channel) * (channel / kind).max(1.0) } else { of_channel }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_fits_leave_of_a_channel_may_all_be_of_one_kind() {
+        let channel = [1.0, 0.0, 0.0];
+        let at_least = |kind: [f64; 3]| promised_at_least(0.98, [kind, channel]);
+        assert!((at_least([0.2, 0.1, 0.0]) - 0.9).abs() < 1e-9);
+        assert!((at_least([1.0, 0.1, 0.0]) - 0.98).abs() < 1e-9, "it is the whole channel");
+        assert!((at_least([1.1, 0.1, 0.0]) - 0.98).abs() < 1e-9, "other kinds are better than the simulation");
+        assert!(at_least([0.01, 0.0, 0.0]) < 0.0, "nothing is promised of so little");
+        assert!((at_least([0.1, 0.0, 0.2]) - 0.98).abs() < 1e-9);
+    }
 }
