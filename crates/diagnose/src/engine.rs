@@ -296,9 +296,10 @@ impl Engine<'_> {
     }
 
     /// Motion distortion. Where it is not decided from above, the scene is moved back to see whether it then lies on
-    /// the simulation.
+    /// the simulation. What other frames do not confirm is not undone: other searches would find it with the opposite
+    /// sign.
     fn rolling_shutter(&self, context: &Context) -> Result<(ChannelResult, Option<Slide>), DiagnoseError> {
-        Ok(match rolling_shutter::search(context) {
+        let (result, slide) = match rolling_shutter::search(context) {
             rolling_shutter::Search::NotFound(result) => (result, None),
             rolling_shutter::Search::Found(result, slide) => (result, Some(slide)),
             rolling_shutter::Search::Undecided { found, slide, not_found } => {
@@ -311,7 +312,9 @@ impl Engine<'_> {
                     (not_found, None)
                 }
             }
-        })
+        };
+        let confirmed = result.found.iter().all(search::confounders::is_confirmed);
+        Ok((result, slide.filter(|_| confirmed)))
     }
 
     /// Frames with motion distortion and coarse quantisation corrected; `None` where there is none.

@@ -255,6 +255,12 @@ fn has_significant_size(f: &Found) -> bool {
     f.channel == Channel::Labels || sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0)
 }
 
+/// Whether the estimating frames tell the size of a finding from nothing, and the held-out frames do not speak against
+/// it by as much as the selection demands for one.
+pub fn is_confirmed(f: &Found) -> bool {
+    has_significant_size(f) && gain(f) >= -first_demands().nats
+}
+
 /// Drops findings that are side effects of others: remainders of corrections (pose, rows, motion distortion) in
 /// channels of single returns, and findings without a significant size.
 pub fn drop_confounded(results: &mut [ChannelResult]) {
