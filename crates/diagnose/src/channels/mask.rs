@@ -60,7 +60,8 @@ pub type DirectionCounts = BTreeMap<DirectionCell, [f64; 4]>;
 /// A near return below this share of the simulated range is from the ego vehicle and not from the ground.
 const HALF_WAY: f64 = 0.6;
 
-/// Whether a measured return comes from the ego vehicle.
+/// Whether a return comes from the ego vehicle and not from what the simulation shows there: it is near, and well
+/// before the simulated surface.
 pub fn on_ego_vehicle(ray: &Ray) -> bool {
     // Without a simulated return nothing is predicted; but a return with a counterpart was moved out of the field of
     // view.
@@ -278,8 +279,13 @@ pub(super) fn take_together(
 }
 
 /// A cell and those around it.
-pub(crate) fn neighbours((s, az, el): DirectionCell) -> impl Iterator<Item = DirectionCell> {
-    (-1..=1).flat_map(move |a| (-1..=1).map(move |e| (s, az + a, el + e)))
+pub(crate) fn neighbours(cell: DirectionCell) -> impl Iterator<Item = DirectionCell> {
+    cells_within(cell, 1)
+}
+
+/// A cell and those around it up to so many cells away.
+pub(crate) fn cells_within((s, az, el): DirectionCell, cells: i32) -> impl Iterator<Item = DirectionCell> {
+    (-cells..=cells).flat_map(move |a| (-cells..=cells).map(move |e| (s, az + a, el + e)))
 }
 
 /// Share of the expected returns below which a cell is hidden in part.

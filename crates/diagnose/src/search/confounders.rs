@@ -255,10 +255,14 @@ fn has_significant_size(f: &Found) -> bool {
     f.channel == Channel::Labels || sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0)
 }
 
-/// Whether the estimating frames tell the size of a finding from nothing, and the held-out frames do not speak against
-/// it by as much as the selection demands for one.
+/// Whether the held-out frames speak against a finding by as much as the selection demands for one.
+fn is_refused(f: &Found) -> bool {
+    gain(f) < -first_demands().nats
+}
+
+/// Whether the estimating frames tell the size of a finding from nothing, and the held-out frames do not refuse it.
 pub fn is_confirmed(f: &Found) -> bool {
-    has_significant_size(f) && gain(f) >= -first_demands().nats
+    has_significant_size(f) && !is_refused(f)
 }
 
 /// Drops findings that are side effects of others: remainders of corrections (pose, rows, motion distortion) in
@@ -266,9 +270,7 @@ pub fn is_confirmed(f: &Found) -> bool {
 pub fn drop_confounded(results: &mut [ChannelResult]) {
     let had_findings: Vec<bool> = results.iter().map(|r| !r.found.is_empty()).collect();
     drop_all(results, "the frames that say how large it is do not tell it from nothing", |f| !has_significant_size(f));
-    // As much evidence against a finding as the selection demands for one.
-    let evidence = first_demands().nats;
-    drop_all(results, "the held-out frames are less likely with it", |f| gain(f) < -evidence);
+    drop_all(results, "the held-out frames are less likely with it", is_refused);
     drop_noise_of_rows(results);
     for Confounder { effect, by, share, because } in CONFOUNDERS {
         if let Some(most) = most(results, |f| by(f).then(|| gain(f))) {

@@ -7,8 +7,8 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::cells::cell;
 use crate::channels::hits::{hit_frames, total};
 use crate::channels::mask::{
-    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, below, blocked_cells, direction_cell, direction_counts,
-    edge_cells, with_neighbours,
+    AZIMUTH_RAD, DirectionCell, ELEVATION_RAD, Mask, Shown, below, blocked_cells, cells_within, direction_cell,
+    direction_counts, edge_cells, with_neighbours,
 };
 use crate::channels::range_ends::{End, half_point, near_cut, range_cut};
 use crate::channels::returns::OWN_CAR_M;
@@ -119,28 +119,26 @@ fn expected_shares(
     let laws = refit(&table, &[Law::Random, Law::Signal]);
     let mut sums = BTreeMap::<DirectionCell, [f64; 2]>::new();
     for ray in frames.iter().flat_map(|&i| &context.frames[i].simulated) {
+        let sum = sums.entry(direction_cell(ray)).or_default();
         let kept = match cell(ray) {
             _ if mask.hides(ray) => 0.0,
             Some(c) => table.kept(&laws, c),
             // The incidence of edges is not known; the rays around them decide.
             None => continue,
         };
-        let sum = sums.entry(direction_cell(ray)).or_default();
         sum[0] += kept;
         sum[1] += 1.0;
     }
     // Where too few rays tell, those of the cells around count as well.
-    let within = |(s, az, el): DirectionCell, cells: i32| {
-        let around = (-cells..=cells).flat_map(|a| (-cells..=cells).map(move |e| (s, az + a, el + e)));
-        around.filter_map(|cell| sums.get(&cell)).fold([0.0; 2], |sum, own| [sum[0] + own[0], sum[1] + own[1]])
+    let within = |cell: DirectionCell, cells: i32| {
+        let known = cells_within(cell, cells).filter_map(|cell| sums.get(&cell));
+        known.fold([0.0; 2], |sum, own| [sum[0] + own[0], sum[1] + own[1]])
     };
     let share = |cell: &DirectionCell| {
         let [kept, all] = (0..=AROUND_CELLS).map(|cells| within(*cell, cells)).find(|[_, all]| *all >= ENOUGH)?;
         Some((*cell, kept / all))
     };
-    let cells: BTreeSet<DirectionCell> =
-        frames.iter().flat_map(|&i| &context.frames[i].simulated).map(direction_cell).collect();
-    cells.iter().filter_map(share).collect()
+    sums.keys().filter_map(share).collect()
 }
 
 /// Whether a range lies outside of what is measured.
