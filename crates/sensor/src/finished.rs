@@ -5,7 +5,7 @@ use crate::cloud_scan::{CloudReader, Surfaces};
 use crate::directions::{Kind, SensorScan, kind_of, split_by_sensor};
 use crate::effects::{EffectList, FrameContext, LabelledCar, Need};
 use crate::material::MaterialTable;
-use crate::motion::{GroundPoint, OwnMotion, Standing, own_motion, seen_velocity, static_edges, times_s};
+use crate::motion::{GroundPoint, OwnMotion, Standing, own_motion, seen_velocity, times_s};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
 use data::Presence as _;
@@ -265,7 +265,7 @@ impl<'a> FinishedDataset<'a> {
         Ok(Some(own.into_iter().enumerate().map(motion).collect()))
     }
 
-    /// Static edges and ground of a cloud.
+    /// What of a cloud stands still.
     fn standing(&self, cloud: &Cloud, boxes: &[Box3]) -> Standing {
         let scans: Vec<SensorScan> = split_by_sensor(cloud, &self.rig);
         let (mut returns, mut ground) = (Vec::new(), Vec::new());
@@ -286,7 +286,7 @@ impl<'a> FinishedDataset<'a> {
                 }
             }
         }
-        Standing::new(static_edges(returns, boxes), &ground)
+        Standing::new(returns, boxes, ground)
     }
 }
 

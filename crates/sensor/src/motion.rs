@@ -4,8 +4,8 @@
 mod ground;
 
 use geometry::Box3;
-pub use ground::GroundPoint;
-use ground::{Ground, tilt};
+use ground::tilt;
+pub use ground::{Ground, GroundPoint};
 use nalgebra::{Vector2, Vector3};
 use rayon::prelude::*;
 use statistics::median_upper;
@@ -45,9 +45,17 @@ pub struct Standing {
 }
 
 impl Standing {
-    /// Static edges in bird's-eye view, see [`static_edges`], and points of the ground, of which a part is kept.
-    pub fn new(edges: Vec<Vector2<f64>>, ground: &[GroundPoint]) -> Self {
-        Standing { edges, ground: some_of(ground, ground::SOME) }
+    /// From returns at edges of standing surfaces, place in the cloud's frame and range, m, of which those near
+    /// labelled objects are left out; and from points of the ground, of which a part is kept.
+    pub fn new(
+        returns: impl IntoIterator<Item = (Vector3<f64>, f64)>,
+        boxes: &[Box3],
+        ground: Vec<GroundPoint>,
+    ) -> Self {
+        let some = some_of(&ground, ground::SOME);
+        let ground = Ground::new(ground);
+        let standing = returns.into_iter().filter(|(place, _)| ground.is_below(place));
+        Standing { edges: static_edges(standing, boxes), ground: some }
     }
 }
 
@@ -146,7 +154,7 @@ const NEAR_OBJECT_M: f64 = 1.0;
 
 /// Places of static edges, one of a cell, from returns at edges of standing surfaces: place in the cloud's frame and
 /// range, m. Those near labelled objects are left out.
-pub fn static_edges(returns: impl IntoIterator<Item = (Vector3<f64>, f64)>, boxes: &[Box3]) -> Vec<Vector2<f64>> {
+fn static_edges(returns: impl IntoIterator<Item = (Vector3<f64>, f64)>, boxes: &[Box3]) -> Vec<Vector2<f64>> {
     let near = |b: &Box3, p: [f64; 3]| {
         let local = b.to_local(p);
         (0..2).all(|k| local[k].abs() < b.size[k] / 2.0 + NEAR_OBJECT_M)
@@ -394,7 +402,7 @@ mod tests {
                 Vector2::new(yaw.cos() * q.x + yaw.sin() * q.y, -yaw.sin() * q.x + yaw.cos() * q.y)
             })
             .collect();
-        let seen = |edges: Vec<Vector2<f64>>| Seen::new(Standing::new(edges, &[]));
+        let seen = |edges: Vec<Vector2<f64>>| Seen::new(Standing { edges, ground: Vec::new() });
         let mut rng = data::stream(0, "elsewhere", 0, 0);
         let mut scattered = |n: usize, across_m: f64| {
             let mut at = |half: f64| if half > 0.0 { rng.random_range(-half..half) } else { 8.0 };

@@ -153,4 +153,19 @@ mod tests {
             assert_eq!(serde_json::to_value(cause).unwrap(), cause.name());
         }
     }
+    #[test]
+    fn the_book_has_a_row_for_each_cause_and_the_readme_their_number() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap();
+        let page = read("docs/src/reference/causes.md");
+        let rows = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+        let mut described: Vec<&str> = rows.collect();
+        described.sort_unstable();
+        // Neither is named in a pair.
+        let named = Cause::ALL.iter().filter(|c| !matches!(c, Cause::GroundError | Cause::Unexplained));
+        let named: Vec<&str> = named.map(|c| c.name()).collect();
+        assert_eq!(described, named);
+        let number = format!("[{} causes](docs/src/reference/causes.md) for pairs", named.len());
+        assert!(read("README.md").contains(&number), "{number}");
+    }
 }

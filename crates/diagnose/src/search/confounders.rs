@@ -67,10 +67,11 @@ const CONFOUNDERS: [Confounder; 21] = [
         because: "the farthest of the ranges that are off",
     },
     Confounder {
-        effect: |f| f.is(Cause::Outliers),
+        // The scene is moved back to the middle of the scan, but was seen from places metres apart.
+        effect: |f| f.is(Cause::Outliers) || f.is(Cause::MixedPixels),
         by: slide,
         share: 0.5,
-        because: "returns that a scene that slides left alone",
+        because: "returns that a scene that slides left alone, or between what its edges show from elsewhere",
     },
     Confounder {
         effect: |f| f.is(Cause::MixedPixels),
@@ -370,6 +371,10 @@ mod tests {
                 (Cause::RandomDropout, Channel::Hits, 0.005, 0.7, 0.9),
             ),
             ((Some(Cause::RollingShutter), Channel::Slide, 4.0), (Cause::Outliers, Channel::Returns, 0.004, 1.9, 2.1)),
+            (
+                (Some(Cause::RollingShutter), Channel::Slide, 4.0),
+                (Cause::MixedPixels, Channel::Returns, 0.004, 1.9, 2.1),
+            ),
             ((None, Channel::Residuals, 1.0), (Cause::TimeOffset, Channel::Objects, 0.002, 0.04, 0.06)),
             ((None, Channel::Residuals, 1.0), (Cause::RangeNoise, Channel::Roughness, 0.02, 0.9, 1.1)),
         ];

@@ -6,24 +6,27 @@
 //! paired, so that displacements of metres are found.
 
 mod grid;
+mod top_view;
 
 use self::grid::{Grid, peak};
+use self::top_view::TopView;
 use super::returns::surfaces_stand_elsewhere;
 use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::labels::seen_velocity;
-use crate::channels::mean::{common_bias_m, origins};
-use crate::channels::motion::{CELL_M, Cells, OwnMotion};
+use crate::channels::mean::origins;
+use crate::channels::motion::{CELL_M, OwnMotion};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
 use crate::inference::choice::{significant, total_and_z};
+use crate::inference::linear::cross_validated;
 use crate::inference::median;
 use crate::inference::roles::Role;
-use crate::pairing::{FramePair, Ray, Surface};
+use crate::pairing::FramePair;
 use geometry::Box3;
-use nalgebra::{Isometry3, Point3, Vector2, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 use rayon::prelude::*;
-use sensor::{Rig, Sensor};
+use sensor::Sensor;
 use statistics::{blocks_of, draw_blocks};
 
 /// Displacement of the scene over a scan.
@@ -67,12 +70,6 @@ impl Slide {
     }
 }
 
-/// Returns of a frame that are moved, at most.
-const POINTS: usize = 2500;
-
-/// Largest range of returns that are used, m: farther ones are too sparse.
-const REACH_M: f64 = 60.0;
-
 /// Steps of the grid to either side of zero.
 const STEPS: i32 = 28;
 
@@ -87,44 +84,6 @@ const LEAST_M: f64 = 0.3;
 
 /// Smallest relative increase of the number of returns on the simulation.
 const LEAST_SHARE: f64 = 0.015;
-
-/// Returns of one frame in bird's-eye view.
-struct TopView {
-    /// Cells that the simulation occupies.
-    occupied: Cells,
-    /// Place of a measured return, m, and its displacement for each second of scan, m/s.
-    points: Vec<(Vector2<f64>, Vector2<f64>)>,
-    /// Measured returns for each of the points.
-    each: f64,
-}
-
-impl TopView {
-    fn new(frame: &FramePair, motion: &Motion, rig: &Rig, origins: &[Point3<f64>], longest: f64) -> Self {
-        let at = |r: &Ray, off_m: f64| origins[r.sensor as usize] + r.direction_vector() * (r.own_range_m() - off_m);
-        let near = |r: &&Ray| (3.0..REACH_M).contains(&r.own_range_m());
-        let stands = |r: &&Ray| r.surface != Surface::Ground || !r.smooth || r.across_m() > 0.25;
-        let simulated = frame.simulated.iter().filter(near).filter(|r| r.surface != Surface::Ground);
-        let occupied = Cells::new(&simulated.map(|r| at(r, 0.0).coords.xy()).collect::<Vec<_>>());
-        let measured: Vec<_> = frame.measured.iter().filter(near).filter(stands).collect();
-        let stride = measured.len().div_ceil(POINTS).max(1);
-        // A common range bias is no displacement along the scan.
-        let bias_m = common_bias_m(frame);
-        let points = measured.iter().step_by(stride).map(|r| {
-            let p = at(r, bias_m).coords;
-            let mount = &rig.sensors[r.sensor as usize];
-            let phase = mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad));
-            let displacement = motion.at(&p, longest) * phase;
-            (p.xy(), displacement.xy())
-        });
-        TopView { occupied, points: points.collect(), each: stride as f64 }
-    }
-
-    /// Number of the points in occupied cells if a scan takes `scan_s`.
-    fn on(&self, scan_s: f64) -> f64 {
-        let on = self.points.iter().filter(|(p, per_s)| self.occupied.contains(&(p - per_s * scan_s)));
-        on.count() as f64
-    }
-}
 
 /// Result of the search.
 pub enum Search {
@@ -150,12 +109,12 @@ pub fn search(context: &Context) -> Search {
     let mut result = ChannelResult::new(Channel::Slide, hold_out.len());
     let mut models = vec![Model::without_speed(context)];
     models.extend(Model::with_speed(context));
-    let mut grids = models.iter().map(|model| model.grid(&select)).collect::<Vec<_>>();
+    let mut grids = models.iter().map(|model| model.grid(&select, &context.blocks(&select))).collect::<Vec<_>>();
     let total = |k: usize| total_and_z(&grids[k].gains).0;
     let best = (0..models.len()).max_by(|&a, &b| total(a).total_cmp(&total(b)));
     let Some(best) = best else { return Search::NotFound(result) };
-    let (gain, z) = total_and_z(&grids[best].gains);
-    let significant = significant(&grids[best].gains, Z_STAR) && gain > LEAST_SHARE * (grids[best].ends()[1] - gain);
+    let (_, z) = total_and_z(&grids[best].gains);
+    let significant = significant(&grids[best].gains, Z_STAR);
     let considered = |outcome: &str| Considered {
         cause: Cause::RollingShutter.into(),
         channel: Channel::Slide,
@@ -195,7 +154,7 @@ pub fn search(context: &Context) -> Search {
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let mut models = vec![Model::without_speed(context)];
     models.extend(Model::with_speed(context));
-    let fits = models.iter().map(|model| (model, model.grid(train)));
+    let fits = models.iter().map(|model| (model, model.grid(train, &context.blocks(train))));
     let sum = |grid: &Grid| grid.gains.iter().sum::<f64>();
     let Some((model, grid)) = fits.max_by(|a, b| sum(&a.1).total_cmp(&sum(&b.1))) else {
         return vec![0.0; test.len()];
@@ -285,9 +244,9 @@ impl Fitted {
 }
 
 /// A model of the motion in all frames.
-struct Model {
+struct Model<'a> {
     motions: Vec<Motion>,
-    frames: Vec<TopView>,
+    frames: Vec<TopView<'a>>,
     /// Largest ego speed, m/s. Where it is not known it is 1, and durations are displacements in m.
     fastest: f64,
     /// Step of the grid, s or m.
@@ -295,9 +254,9 @@ struct Model {
     speed_known: bool,
 }
 
-impl Model {
+impl<'a> Model<'a> {
     /// With the motion of the ego vehicle and of the objects, where both are known.
-    fn with_speed(context: &Context) -> Option<Model> {
+    fn with_speed(context: &Context<'a>) -> Option<Model<'a>> {
         let (times, own) = (context.times.as_ref()?, context.motion.as_ref()?);
         let motion = |f: usize| {
             let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
@@ -311,7 +270,7 @@ impl Model {
     }
 
     /// With the same displacement in all frames; objects are not displaced.
-    fn without_speed(context: &Context) -> Model {
+    fn without_speed(context: &Context<'a>) -> Model<'a> {
         let motion = |frame: &FramePair| Motion {
             own: OwnMotion::ahead(1.0),
             objects: frame.objects.iter().filter_map(|o| Some((o.simulated?, Vector3::zeros()))).collect(),
@@ -319,7 +278,7 @@ impl Model {
         Model::new(context, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
     }
 
-    fn new(context: &Context, motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model {
+    fn new(context: &Context<'a>, motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model<'a> {
         let origins = origins(context.rig);
         let longest = step * f64::from(STEPS);
         let of_frame = |(frame, motion)| TopView::new(frame, motion, context.rig, &origins, longest);
@@ -334,7 +293,7 @@ impl Model {
 
     /// Number of points of some frames.
     fn points(&self, frames: &[usize]) -> f64 {
-        frames.iter().map(|&f| self.frames[f].points.len() as f64).sum::<f64>()
+        frames.iter().map(|&f| self.frames[f].points()).sum::<f64>()
     }
 
     /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the
@@ -356,14 +315,16 @@ impl Model {
         hold_out.iter().map(gain).collect()
     }
 
-    /// Counts on a grid of durations.
-    fn grid(&self, frames: &[usize]) -> Grid {
+    /// Counts on a grid of durations; the gain of a frame is by the best duration of the blocks of other folds.
+    fn grid(&self, frames: &[usize], blocks: &[usize]) -> Grid {
         let grid: Vec<f64> = (-STEPS..=STEPS).map(|k| self.step * f64::from(k)).collect();
         let on = self.counts(frames, &grid);
-        let sums: Vec<f64> = (0..grid.len()).map(|k| on.iter().map(|c| c[k]).sum()).collect();
         let still = STEPS as usize;
-        let best = (0..grid.len()).max_by(|&a, &b| sums[a].total_cmp(&sums[b])).unwrap_or(still);
-        Grid { gains: on.iter().map(|c| c[best] - c[still]).collect(), sums: grid.into_iter().zip(sums).collect() }
+        let sum = |of: &[usize], k: usize| of.iter().map(|&i| on[i][k]).sum::<f64>();
+        let best = |of: &[usize]| (0..grid.len()).max_by(|&a, &b| sum(of, a).total_cmp(&sum(of, b))).unwrap_or(still);
+        let gains = cross_validated(blocks, best, |&best, i| on[i][best] - on[i][still]);
+        let all: Vec<usize> = (0..frames.len()).collect();
+        Grid { gains, sums: grid.iter().enumerate().map(|(k, at)| (*at, sum(&all, k))).collect() }
     }
 }
 
@@ -371,7 +332,9 @@ impl Model {
 mod tests {
     use super::*;
     use crate::inference::roles::roles;
+    use crate::pairing::Ray;
     use rand::RngExt;
+    use sensor::Rig;
 
     /// Twenty frames of posts, seen at 40 m/s by a scan that takes `scan_s`, counter-clockwise.
     fn found(scan_s: f64) -> Option<f64> {

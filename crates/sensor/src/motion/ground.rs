@@ -29,23 +29,34 @@ const ROUNDS: usize = 4;
 /// Distance in standard deviations from which on Tukey's weight is zero: 95 % efficient for normal errors.
 const TUKEY: f64 = 4.7;
 
+/// Smallest height above the ground of what stands, m. A ring of returns of the ground resembles standstill, wherever
+/// it is cut.
+const CLEAR_M: f64 = 0.25;
+
 /// The ground of a frame.
-pub(super) struct Ground {
+pub struct Ground {
     points: Vec<GroundPoint>,
     /// By place in bird's-eye view; `None` without points.
     tree: Option<ImmutableKdTree<f64, 2>>,
 }
 
 impl Ground {
-    pub(super) fn new(points: Vec<GroundPoint>) -> Self {
+    /// From points of it.
+    pub fn new(points: Vec<GroundPoint>) -> Self {
         let places: Vec<[f64; 2]> = points.iter().map(|g| [g.place.x, g.place.y]).collect();
         let tree = ImmutableKdTree::new_from_slice(&places).ok().filter(|_| !places.is_empty());
         Ground { tree, points }
     }
 
-    fn nearest(&self, p: &Vector3<f64>) -> Option<&GroundPoint> {
+    /// The point that is nearest in bird's-eye view, and its squared distance there, m2; `None` without points.
+    fn nearest(&self, p: &Vector3<f64>) -> Option<(&GroundPoint, f64)> {
         let found = self.tree.as_ref()?.query(&[p.x, p.y]).nearest_one::<SquaredEuclidean<f64>>().execute();
-        (found.distance < REACH_M * REACH_M).then(|| &self.points[found.item as usize])
+        Some((&self.points[found.item as usize], found.distance))
+    }
+
+    /// Whether a point is clearly above the plane of the nearest piece of ground; without ground all points are.
+    pub fn is_below(&self, p: &Vector3<f64>) -> bool {
+        self.nearest(p).is_none_or(|(near, _)| near.normal.dot(&(p - near.place)) > CLEAR_M)
     }
 }
 
@@ -58,7 +69,7 @@ pub(super) fn tilt(first: &Ground, second: &Ground, d: f64, yaw: f64) -> Option<
     // Distance from the plane, and its derivatives by the three.
     let distance = |g: &GroundPoint| {
         let p = turn * (g.place - way);
-        let near = second.nearest(&p)?;
+        let (near, _) = second.nearest(&p).filter(|(_, square_m2)| *square_m2 < REACH_M * REACH_M)?;
         let arm = p.cross(&near.normal);
         Some((near.normal.dot(&(p - near.place)), Vector3::new(near.normal.z, arm.x, arm.y)))
     };
@@ -86,6 +97,22 @@ pub(super) fn tilt(first: &Ground, second: &Ground, d: f64, yaw: f64) -> Option<
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_stands_is_above_a_sloping_ground() {
+        let normal = Vector3::new(0.0, -0.3, 1.0).normalize();
+        let point = |x: i32, y: i32| GroundPoint {
+            place: Vector3::new(f64::from(x), f64::from(y), 0.3 * f64::from(y)),
+            normal,
+        };
+        let ground = Ground::new((-9..9).flat_map(|x| (-9..9).map(move |y| point(x, y))).collect());
+        // Far off the known ground its plane goes on.
+        for (x, y) in [(0.4, 0.3), (-7.2, 8.0), (3.0, 20.0)] {
+            assert!(!ground.is_below(&Vector3::new(x, y, 0.3 * y + 0.2)), "{x} {y}");
+            assert!(ground.is_below(&Vector3::new(x, y, 0.3 * y + 0.4)), "{x} {y}");
+        }
+        assert!(Ground::new(Vec::new()).is_below(&Vector3::zeros()));
+    }
 
     /// The ground that a vehicle sees after `driven` m on a circle of 100 m on a cone that falls to the inside with a
     /// slope of 0.3; `at` are places in its frame.

@@ -4,7 +4,7 @@
 pub(super) struct Grid {
     /// All durations and the numbers of points in occupied cells.
     pub(super) sums: Vec<(f64, f64)>,
-    /// Increase of that number on each frame, from no displacement to the best duration.
+    /// Increase of that number on each frame, from no displacement to the best duration of other frames.
     pub(super) gains: Vec<f64>,
 }
 
