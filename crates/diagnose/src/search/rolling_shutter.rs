@@ -82,7 +82,7 @@ const STEP_M: f64 = 0.25;
 /// Smallest displacement that is searched for, m: smaller ones are found by surfaces.
 const LEAST_M: f64 = 0.3;
 
-/// Smallest relative increase of the number of returns on the simulation.
+/// Share of the returns on the simulation by which a maximum may be lower than the highest one and still be as high.
 const LEAST_SHARE: f64 = 0.015;
 
 /// Result of the search.
