@@ -153,6 +153,7 @@ mod tests {
             assert_eq!(serde_json::to_value(cause).unwrap(), cause.name());
         }
     }
+
     #[test]
     fn the_book_has_a_row_for_each_cause_and_the_readme_their_number() {
         let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");

@@ -24,7 +24,7 @@ use crate::inference::median;
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
 use geometry::Box3;
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use rayon::prelude::*;
 use sensor::Sensor;
 use statistics::{blocks_of, draw_blocks};
@@ -107,8 +107,8 @@ pub enum Search {
 pub fn search(context: &Context) -> Search {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Slide, hold_out.len());
-    let mut models = vec![Model::without_speed(context)];
-    models.extend(Model::with_speed(context));
+    let views = top_views(context);
+    let mut models = models(context, &views);
     let mut grids = models.iter().map(|model| model.grid(&select, &context.blocks(&select))).collect::<Vec<_>>();
     let total = |k: usize| total_and_z(&grids[k].gains).0;
     let best = (0..models.len()).max_by(|&a, &b| total(a).total_cmp(&total(b)));
@@ -152,8 +152,8 @@ pub fn search(context: &Context) -> Search {
 
 /// Gains of the `test` frames by the displacement along the scan that fits the `train` frames best, nats.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
-    let mut models = vec![Model::without_speed(context)];
-    models.extend(Model::with_speed(context));
+    let views = top_views(context);
+    let models = models(context, &views);
     let fits = models.iter().map(|model| (model, model.grid(train, &context.blocks(train))));
     let sum = |grid: &Grid| grid.gains.iter().sum::<f64>();
     let Some((model, grid)) = fits.max_by(|a, b| sum(&a.1).total_cmp(&sum(&b.1))) else {
@@ -228,7 +228,7 @@ impl Fitted {
     fn curve(&self, model: &Model, estimate: &[usize]) -> Curve {
         let points = model.points(estimate);
         let share = |on: f64| on / points.max(1.0);
-        let on = |at: f64| estimate.iter().map(|&f| model.frames[f].on(at)).sum();
+        let on = |at: f64| estimate.iter().map(|&f| model.on(f, at)).sum();
         let [before, after] = [0.0, self.scan_s].map(|at| share(on(at)));
         let points = self.fine.iter().enumerate().map(|(k, s)| {
             let measured = share(self.counts.iter().map(|counts| counts[k]).sum());
@@ -243,10 +243,23 @@ impl Fitted {
     }
 }
 
+/// All frames in bird's-eye view.
+fn top_views<'a>(context: &Context<'a>) -> Vec<TopView<'a>> {
+    let origins = origins(context.rig);
+    context.frames.par_iter().map(|frame| TopView::new(frame, context.rig, &origins)).collect()
+}
+
+/// The models of a context.
+fn models<'a>(context: &Context, views: &'a [TopView<'a>]) -> Vec<Model<'a>> {
+    [Some(Model::without_speed(context, views)), Model::with_speed(context, views)].into_iter().flatten().collect()
+}
+
 /// A model of the motion in all frames.
 struct Model<'a> {
     motions: Vec<Motion>,
-    frames: Vec<TopView<'a>>,
+    views: &'a [TopView<'a>],
+    /// Displacements of the points of each frame, m/s.
+    displacements: Vec<Vec<Vector2<f64>>>,
     /// Largest ego speed, m/s. Where it is not known it is 1, and durations are displacements in m.
     fastest: f64,
     /// Step of the grid, s or m.
@@ -256,7 +269,7 @@ struct Model<'a> {
 
 impl<'a> Model<'a> {
     /// With the motion of the ego vehicle and of the objects, where both are known.
-    fn with_speed(context: &Context<'a>) -> Option<Model<'a>> {
+    fn with_speed(context: &Context, views: &'a [TopView<'a>]) -> Option<Model<'a>> {
         let (times, own) = (context.times.as_ref()?, context.motion.as_ref()?);
         let motion = |f: usize| {
             let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
@@ -266,34 +279,38 @@ impl<'a> Model<'a> {
         };
         let motions: Vec<Motion> = (0..context.frames.len()).map(motion).collect();
         let fastest = motions.iter().map(|m| m.own.speed_m_s().abs()).fold(0.0, f64::max);
-        (fastest > 1.0).then(|| Model::new(context, motions, fastest, STEP_S, true))
+        (fastest > 1.0).then(|| Model::new(views, motions, fastest, STEP_S, true))
     }
 
     /// With the same displacement in all frames; objects are not displaced.
-    fn without_speed(context: &Context<'a>) -> Model<'a> {
+    fn without_speed(context: &Context, views: &'a [TopView<'a>]) -> Model<'a> {
         let motion = |frame: &FramePair| Motion {
             own: OwnMotion::ahead(1.0),
             objects: frame.objects.iter().filter_map(|o| Some((o.simulated?, Vector3::zeros()))).collect(),
         };
-        Model::new(context, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
+        Model::new(views, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
     }
 
-    fn new(context: &Context<'a>, motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model<'a> {
-        let origins = origins(context.rig);
+    fn new(views: &'a [TopView<'a>], motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model<'a> {
         let longest = step * f64::from(STEPS);
-        let of_frame = |(frame, motion)| TopView::new(frame, motion, context.rig, &origins, longest);
-        let frames = context.frames.par_iter().zip(&motions).map(of_frame).collect();
-        Model { motions, frames, fastest, step, speed_known }
+        let of_frame = |(view, motion): (&TopView, &Motion)| view.displacements(motion, longest);
+        let displacements = views.par_iter().zip(&motions).map(of_frame).collect();
+        Model { motions, views, displacements, fastest, step, speed_known }
+    }
+
+    /// Number of the points of a frame in occupied cells if a scan takes `scan_s`.
+    fn on(&self, frame: usize, scan_s: f64) -> f64 {
+        self.views[frame].on(&self.displacements[frame], scan_s)
     }
 
     /// Of every frame the numbers of points in occupied cells, for each duration.
     fn counts(&self, frames: &[usize], durations: &[f64]) -> Vec<Vec<f64>> {
-        frames.par_iter().map(|&f| durations.iter().map(|&s| self.frames[f].on(s)).collect()).collect()
+        frames.par_iter().map(|&f| durations.iter().map(|&s| self.on(f, s)).collect()).collect()
     }
 
     /// Number of points of some frames.
     fn points(&self, frames: &[usize]) -> f64 {
-        frames.iter().map(|&f| self.frames[f].points()).sum::<f64>()
+        frames.iter().map(|&f| self.displacements[f].len() as f64).sum::<f64>()
     }
 
     /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the
@@ -308,10 +325,7 @@ impl<'a> Model<'a> {
         let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
         let [chance, there] = grid.ends().map(share);
         let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
-        let gain = |&f: &usize| {
-            let view = &self.frames[f];
-            (view.on(scan_s) - view.on(0.0)) * view.each * worth
-        };
+        let gain = |&f: &usize| (self.on(f, scan_s) - self.on(f, 0.0)) * self.views[f].each * worth;
         hold_out.iter().map(gain).collect()
     }
 

@@ -15,10 +15,10 @@ const POINTS: usize = 2500;
 const REACH_M: std::ops::Range<f64> = 3.0..60.0;
 
 /// A measured return.
-struct Moved {
+struct Shown {
     place: Vector3<f64>,
-    /// Displacement for each second of scan, m/s.
-    per_s: Vector2<f64>,
+    /// Part of the scan at which it was shot, -1/2 to 1/2.
+    phase: f64,
     /// Whether it lies in an occupied cell where it was measured.
     on: bool,
 }
@@ -27,7 +27,7 @@ struct Moved {
 pub(super) struct TopView<'a> {
     /// Cells that the simulated surfaces occupy.
     occupied: Cells,
-    points: Vec<Moved>,
+    points: Vec<Shown>,
     /// Measured returns for each of the points.
     pub(super) each: f64,
     /// Sensors with a blind sector, with `sensor_from_cloud`; none if one of them sees all around.
@@ -35,7 +35,7 @@ pub(super) struct TopView<'a> {
 }
 
 impl<'a> TopView<'a> {
-    pub(super) fn new(frame: &FramePair, motion: &Motion, rig: &'a Rig, origins: &[Point3<f64>], longest: f64) -> Self {
+    pub(super) fn new(frame: &FramePair, rig: &'a Rig, origins: &[Point3<f64>]) -> Self {
         let near = |r: &&Ray| REACH_M.contains(&r.own_range_m());
         let road = Ground::new(ground(frame, origins));
         let stands = |r: &&Ray| road.is_below(&at(r, origins, 0.0).coords);
@@ -48,8 +48,7 @@ impl<'a> TopView<'a> {
             let place = at(r, origins, bias_m).coords;
             let mount = &rig.sensors[r.sensor as usize];
             let phase = mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad));
-            let per_s = motion.at(&place, longest).xy() * phase;
-            Moved { place, per_s, on: occupied.contains(&place.xy()) }
+            Shown { place, phase, on: occupied.contains(&place.xy()) }
         });
         let points = points.collect();
         let sees_all = rig.sensors.iter().any(Sensor::is_full_circle);
@@ -58,21 +57,21 @@ impl<'a> TopView<'a> {
         TopView { occupied, points, each: stride as f64, sensors }
     }
 
-    /// Number of points.
-    pub(super) fn points(&self) -> f64 {
-        self.points.len() as f64
+    /// Displacement of each point for each second of scan, m/s. A scan takes `longest_s` at most.
+    pub(super) fn displacements(&self, motion: &Motion, longest_s: f64) -> Vec<Vector2<f64>> {
+        self.points.iter().map(|point| motion.at(&point.place, longest_s).xy() * point.phase).collect()
     }
 
-    /// Number of the points in occupied cells if a scan takes `scan_s`. A point that moves to where no sensor looks
-    /// counts as where it was measured: nothing is known of that place.
-    pub(super) fn on(&self, scan_s: f64) -> f64 {
-        let on = |point: &&Moved| {
+    /// Number of the points in occupied cells if they are moved back by their displacements in `scan_s`. A point that
+    /// moves to where no sensor looks counts as where it was measured: nothing is known of that place.
+    pub(super) fn on(&self, displacements: &[Vector2<f64>], scan_s: f64) -> f64 {
+        let on = |(point, per_s): &(&Shown, &Vector2<f64>)| {
             let mut place = point.place;
-            place.x -= point.per_s.x * scan_s;
-            place.y -= point.per_s.y * scan_s;
+            place.x -= per_s.x * scan_s;
+            place.y -= per_s.y * scan_s;
             self.occupied.contains(&place.xy()) || point.on && !self.is_seen(&place)
         };
-        self.points.iter().filter(on).count() as f64
+        self.points.iter().zip(displacements).filter(on).count() as f64
     }
 
     fn is_seen(&self, place: &Vector3<f64>) -> bool {
@@ -88,10 +87,11 @@ fn at(ray: &Ray, origins: &[Point3<f64>], off_m: f64) -> Point3<f64> {
     origins[ray.sensor as usize] + ray.direction_vector() * (ray.own_range_m() - off_m)
 }
 
-/// Largest angle between two neighbours of a row, in units of the median.
+/// Largest angle between two neighbours of a row, in units of the median: one or two returns between them may be lost.
 const STEPS_APART: f64 = 3.0;
 
-/// Smallest cosine of the angle between two segments of one surface, in bird's-eye view.
+/// Smallest cosine of the angle between two segments of one surface, in bird's-eye view: 20 degrees. From a near
+/// surface to a far one the segment runs along the ray, across those on either side.
 const STRAIGHT: f64 = 0.94;
 
 /// Places of returns of standing surfaces, and places between neighbours of a row on one surface: those whose segment
@@ -125,23 +125,26 @@ mod tests {
     use super::*;
     use crate::channels::motion::OwnMotion;
 
-    /// A wall 6 m beside the sensor, shot by both sides in the same directions, from 20 degrees to `to_deg`.
-    fn wall(rig: &Rig, to_deg: i32) -> TopView<'_> {
+    /// A wall 6 m beside the sensor, shot by both sides in the same directions, from 20 degrees to `to_deg`: the number
+    /// of its returns, and of those on the simulation by the displacement over a scan, m.
+    fn wall(rig: &Rig, to_deg: i32) -> (f64, impl Fn(f64) -> f64) {
         let place = |deg: i32| Vector3::new(6.0 / f64::from(deg).to_radians().tan(), 6.0, 0.0);
         let rays = || (20..=to_deg).map(|deg| Ray::standing(&place(deg))).collect::<Vec<_>>();
         let frame = FramePair::of_rays("wall".into(), rays(), rays());
         let motion = Motion { own: OwnMotion::ahead(1.0), objects: Vec::new() };
-        TopView::new(&frame, &motion, rig, &[Point3::origin()], 7.0)
+        let view = TopView::new(&frame, rig, &[Point3::origin()]);
+        let displacements = view.displacements(&motion, 7.0);
+        (displacements.len() as f64, move |shift_m| view.on(&displacements, shift_m))
     }
 
     #[test]
     fn a_wall_along_the_motion_does_not_tell_the_displacement() {
         let rig = Rig::single();
-        let view = wall(&rig, 160);
-        assert_eq!(view.on(0.0), view.points());
+        let (points, on) = wall(&rig, 160);
+        assert_eq!(on(0.0), points);
         for shift_m in [-2.0, -0.7, 0.7, 2.0] {
             // Neighbours are up to 0.9 m apart; at the end of the wall one or two points pass it.
-            assert!(view.on(shift_m) > 0.97 * view.points(), "{shift_m} {} {}", view.on(shift_m), view.points());
+            assert!(on(shift_m) > 0.97 * points, "{shift_m} {} {points}", on(shift_m));
         }
     }
 
@@ -150,10 +153,9 @@ mod tests {
         let mut rig = Rig::single();
         rig.sensors[0].horizontal_fov_deg = 120.0;
         // The points of the wall at the edge of the field of view move out of it.
-        let view = wall(&rig, 60);
-        let [out, all] = [-4.0, 0.0].map(|shift_m| view.on(shift_m));
+        let [out, all] = [-4.0, 0.0].map(wall(&rig, 60).1);
         assert_eq!(out, all);
         rig.sensors[0].horizontal_fov_deg = 360.0;
-        assert!(wall(&rig, 60).on(-9.0) < all);
+        assert!(wall(&rig, 60).1(-9.0) < all);
     }
 }
