@@ -48,10 +48,13 @@ fn book(root: &Path) -> Result<()> {
     must(Command::new("mdbook").current_dir(root).args(["build", "docs"]))
 }
 
-/// Runs `work` under a heading; an error carries the name of the step.
+/// Runs `work` under a heading and prints how long it took; an error carries the name of the step.
 fn step(name: &str, work: impl FnOnce() -> Result<()>) -> Result<()> {
     eprintln!("== {name}");
-    work().with_context(|| format!("ci stopped at: {name}"))
+    let start = Instant::now();
+    work().with_context(|| format!("ci stopped at: {name}"))?;
+    eprintln!("== {name}: {:.0} s", start.elapsed().as_secs_f64());
+    Ok(())
 }
 
 /// Runs a command; a non-zero exit code is an error.
