@@ -4,9 +4,12 @@ use crate::axis::Axis;
 use crate::page::{Anchor, COLORS, GRID, INK, Mark, Page};
 use crate::svg::{Theme, svg};
 
+/// Width and height with a legend of one row, px.
 const SIZE: [f64; 2] = [860.0, 480.0];
-/// Left, right, top and bottom of the plot area, px.
-const FRAME: [f64; 4] = [84.0, 836.0, 56.0, 420.0];
+/// Left and right of the plot area, px.
+const SIDES: [f64; 2] = [84.0, 836.0];
+/// Height of the plot area, and of what is below it, px.
+const HEIGHTS: [f64; 2] = [356.0, 60.0];
 
 /// A named curve.
 #[derive(Clone, Debug, PartialEq, Default)]
@@ -40,11 +43,13 @@ pub(crate) fn curve_page(series: &[Series], options: &CurveOptions) -> Page {
     let drawable = |[x, y]: [f64; 2]| x.is_finite() && y.is_finite() && (!options.log_y || y > 0.0);
     let height = |y: f64| if options.log_y { y.log10() } else { y };
     let shown = || series.iter().flat_map(|s| &s.points).copied().filter(|p| drawable(*p));
-    let x_axis = Axis::new(shown().map(|[x, _]| x), [FRAME[0], FRAME[1]], false);
-    let y_axis = Axis::new(shown().map(|[_, y]| height(y)), [FRAME[3], FRAME[2]], options.log_y);
-
     let mut page = Page::new(SIZE, [255; 3], false);
-    axes(&mut page, &x_axis, &y_axis, options);
+    let top = legend(&mut page, series) + 12.0;
+    let bottom = top + HEIGHTS[0];
+    page.size[1] = bottom + HEIGHTS[1];
+    let x_axis = Axis::new(shown().map(|[x, _]| x), SIDES, false);
+    let y_axis = Axis::new(shown().map(|[_, y]| height(y)), [bottom, top], options.log_y);
+    axes(&mut page, [&x_axis, &y_axis], [top, bottom], options);
     for (i, s) in series.iter().enumerate() {
         let color = COLORS[i % COLORS.len()];
         for part in s.points.split(|p| !drawable(*p)).filter(|part| !part.is_empty()) {
@@ -55,7 +60,6 @@ pub(crate) fn curve_page(series: &[Series], options: &CurveOptions) -> Page {
             strokes(line, i).into_iter().for_each(|stroke| page.line(stroke, color, 1.8));
         }
     }
-    legend(&mut page, series);
     page
 }
 
@@ -84,8 +88,8 @@ fn strokes(line: Vec<[f64; 2]>, i: usize) -> Vec<Vec<[f64; 2]>> {
     strokes
 }
 
-fn axes(page: &mut Page, x_axis: &Axis, y_axis: &Axis, options: &CurveOptions) {
-    let [left, right, top, bottom] = FRAME;
+fn axes(page: &mut Page, [x_axis, y_axis]: [&Axis; 2], [top, bottom]: [f64; 2], options: &CurveOptions) {
+    let [left, right] = SIDES;
     for (value, name) in x_axis.ticks() {
         let x = x_axis.px(value);
         page.line(vec![[x, top], [x, bottom]], GRID, 1.0);
@@ -98,18 +102,25 @@ fn axes(page: &mut Page, x_axis: &Axis, y_axis: &Axis, options: &CurveOptions) {
     }
     page.line(vec![[left, top], [left, bottom], [right, bottom]], INK, 1.2);
     page.text([left, 28.0], &options.title, 16.0, INK, Anchor::Start);
-    page.text([(left + right) / 2.0, SIZE[1] - 16.0], &options.x_label, 13.0, INK, Anchor::Middle);
+    page.text([(left + right) / 2.0, bottom + HEIGHTS[1] - 16.0], &options.x_label, 13.0, INK, Anchor::Middle);
     page.text_upwards([20.0, (top + bottom) / 2.0], &options.y_label, 13.0);
 }
 
-fn legend(page: &mut Page, series: &[Series]) {
-    let right = FRAME[1] - 8.0;
+/// Draws names with samples of their lines below the title, in rows from left to right; returns where the last row
+/// ends, px.
+fn legend(page: &mut Page, series: &[Series]) -> f64 {
+    let (mut x, mut y) = (SIDES[0], 50.0);
     for (i, s) in series.iter().enumerate() {
-        let (color, y) = (COLORS[i % COLORS.len()], FRAME[2] + 16.0 + 18.0 * i as f64);
-        let sample = vec![[right - 22.0, y - 4.0], [right, y - 4.0]];
-        strokes(sample, i).into_iter().for_each(|stroke| page.line(stroke, color, 2.5));
-        page.text([right - 28.0, y], &s.name, 12.0, INK, Anchor::End);
+        let width = 50.0 + 6.6 * s.name.chars().count() as f64;
+        if x > SIDES[0] && x + width > SIDES[1] {
+            (x, y) = (SIDES[0], y + 18.0);
+        }
+        let sample = vec![[x, y - 4.0], [x + 22.0, y - 4.0]];
+        strokes(sample, i).into_iter().for_each(|stroke| page.line(stroke, COLORS[i % COLORS.len()], 2.5));
+        page.text([x + 28.0, y], &s.name, 12.0, INK, Anchor::Start);
+        x += width;
     }
+    y + 2.0
 }
 
 #[cfg(test)]
@@ -137,6 +148,27 @@ mod tests {
             };
             assert_eq!(parts(COLORS[0]), 2 + 1, "two parts around the gap, and the legend");
         }
+    }
+
+    #[test]
+    fn a_long_legend_lies_above_the_curves() {
+        let series: Vec<Series> = (0..9)
+            .map(|k| Series { name: format!("simulated with the finding, sensor {k}"), points: vec![[0.0, 1.0]] })
+            .collect();
+        let [one, all] = [&series[..1], &series[..]].map(|s| curve_page(s, &CurveOptions::default()));
+        assert_eq!((one.size, all.size), (SIZE, [SIZE[0], SIZE[1] + 4.0 * 18.0]));
+        let highest_mark = |page: &Page| {
+            let squares = page.marks.iter().filter_map(|m| match m {
+                Mark::Squares { corners, .. } => Some(corners[0][1]),
+                _ => None,
+            });
+            squares.fold(f64::INFINITY, f64::min)
+        };
+        let lowest_name = all.marks.iter().filter_map(|m| match m {
+            Mark::Text { at, text, .. } if text.contains("sensor") => Some(at[1]),
+            _ => None,
+        });
+        assert!(lowest_name.fold(0.0, f64::max) < highest_mark(&all));
     }
 
     #[test]

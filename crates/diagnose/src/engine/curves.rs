@@ -32,6 +32,9 @@ pub(super) fn measure(finding: &mut Finding, recorded: &[&FramePair], extended: 
             _ => closed,
         };
         point.after = point.before + own.clamp(-1.0, 2.0) * (point.measured - point.before);
+        if matches!(finding.channel, Channel::Hits | Channel::Returns | Channel::Roughness) {
+            point.after = point.after.max(0.0); // a share or a standard deviation
+        }
     }
 }
 

@@ -22,7 +22,7 @@ const CONFOUNDERS: [Confounder; 21] = [
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
         share: 0.05,
-        because: "the own car decides which surfaces the sensor still sees",
+        because: "what the ego vehicle hides decides which surfaces the sensor still sees",
     },
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),

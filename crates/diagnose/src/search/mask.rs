@@ -375,7 +375,7 @@ fn blocked_found(context: &Context, mask: &Mask) -> Found {
         covariate: Covariate::Direction,
         held_out_gains: held,
         says: format!(
-            "sensor {} sees nothing at azimuth {:.0} to {:.0} and elevation {:.0} to {:.0} degrees, in all frames: a part of the own car stands in the way",
+            "sensor {} sees nothing at azimuth {:.0} to {:.0} and elevation {:.0} to {:.0} degrees, in all frames: a part of the ego vehicle blocks the view",
             context.rig.sensors[usize::from(occlusion.sensor)].name,
             az[0],
             az[1],

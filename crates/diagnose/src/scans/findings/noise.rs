@@ -135,7 +135,7 @@ impl<'a> Forms<'a> {
             covariate: if free.range { Covariate::Range } else { Covariate::None },
             gain: gain_of(&against_ideal),
             says: format!(
-                "ranges scatter by {:.1} mm at 10 m and {:.1} mm at 30 m on surfaces met squarely; an ideal sensor's by its rounding alone",
+                "ranges scatter by {:.1} mm at 10 m and {:.1} mm at 30 m at normal incidence; an ideal sensor's by its rounding alone",
                 at(10.0),
                 at(30.0)
             ),

@@ -41,7 +41,7 @@ pub(super) fn found(
     (all, corrections): (&[FittedLaw], Corrections),
 ) -> Found {
     let separate_by = (!selected.rivals.is_empty()).then(|| {
-        "walls, boards or cars at many ranges met squarely: on flat ground range and incidence go together".to_owned()
+        "walls, boards or cars at many ranges met at normal incidence: on flat ground range and incidence go together".to_owned()
     });
     Found {
         effects: corrections.effects(law),

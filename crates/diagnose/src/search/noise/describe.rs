@@ -10,7 +10,7 @@ use crate::search::{Found, NamedParameter, Selected, parameter};
 
 /// What recording tells laws of noise.
 const TELL_BY_INCIDENCE: &str =
-    "surfaces met squarely and at grazing angles at the same range (a wall or a board beside the road, near and far)";
+    "surfaces at normal and at grazing incidence at the same range (a wall or a board beside the road, near and far)";
 
 /// What recording tells scattering directions from wide beams.
 const TELL_BY_EDGES: &str =
@@ -99,7 +99,7 @@ fn says(law: NoiseLaw, cause: Cause, sigma: f64) -> String {
             1e3 * sigma
         ),
         NoiseLaw::Angular => format!(
-            "the light goes elsewhere than the sensor says, by {:.3} degrees: grazing surfaces scatter, squarely met ones do not",
+            "beams deviate by {:.3} degrees from the directions that the sensor reports: ranges scatter at grazing incidence and not at normal incidence",
             sigma.to_degrees()
         ),
     }

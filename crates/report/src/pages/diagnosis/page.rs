@@ -31,7 +31,7 @@ impl DiagnosisReport<'_> {
             vec![findings(d), pictures(d), gain(d), detectors(d), not_found(d), not_identifiable(d), considered(d)];
         sections.retain(|section| !section.items.is_empty());
         let left =
-            d.gain.not_applied.iter().map(|n| format!("Not applied, and counted as not gone: {} {}", n.effect, n.why));
+            d.gain.not_applied.iter().map(|n| format!("Not applied, and counted as not gone: {}: {}", n.effect, n.why));
         let warnings: Vec<String> = d.notes.iter().cloned().chain(left).collect();
         let build = if d.build.is_empty() { String::new() } else { format!(" (lidarshift {})", d.build) };
         let footer =
