@@ -1,6 +1,7 @@
 //! Curves on common axes, such as training losses.
 
 use crate::axis::Axis;
+use crate::figure::{color, legend_places};
 use crate::page::{Anchor, COLORS, GRID, INK, Mark, Page};
 use crate::svg::{Theme, svg};
 
@@ -51,7 +52,7 @@ pub(crate) fn curve_page(series: &[Series], options: &CurveOptions) -> Page {
     let y_axis = Axis::new(shown().map(|[_, y]| height(y)), [bottom, top], options.log_y);
     axes(&mut page, [&x_axis, &y_axis], [top, bottom], options);
     for (i, s) in series.iter().enumerate() {
-        let color = COLORS[i % COLORS.len()];
+        let color = color(i);
         for part in s.points.split(|p| !drawable(*p)).filter(|part| !part.is_empty()) {
             let line: Vec<[f64; 2]> = part.iter().map(|[x, y]| [x_axis.px(*x), y_axis.px(height(*y))]).collect();
             if let [[x, y]] = line[..] {
@@ -106,21 +107,17 @@ fn axes(page: &mut Page, [x_axis, y_axis]: [&Axis; 2], [top, bottom]: [f64; 2], 
     page.text_upwards([20.0, (top + bottom) / 2.0], &options.y_label, 13.0);
 }
 
-/// Draws names with samples of their lines below the title, in rows from left to right; returns where the last row
-/// ends, px.
+/// Draws names with samples of their lines below the title; returns where the last row ends, px.
 fn legend(page: &mut Page, series: &[Series]) -> f64 {
-    let (mut x, mut y) = (SIDES[0], 50.0);
-    for (i, s) in series.iter().enumerate() {
-        let width = 50.0 + 6.6 * s.name.chars().count() as f64;
-        if x > SIDES[0] && x + width > SIDES[1] {
-            (x, y) = (SIDES[0], y + 18.0);
-        }
-        let sample = vec![[x, y - 4.0], [x + 22.0, y - 4.0]];
-        strokes(sample, i).into_iter().for_each(|stroke| page.line(stroke, COLORS[i % COLORS.len()], 2.5));
-        page.text([x + 28.0, y], &s.name, 12.0, INK, Anchor::Start);
-        x += width;
+    const SAMPLE: f64 = 22.0; // length of a sample, px
+    let names: Vec<&str> = series.iter().map(|s| s.name.as_str()).collect();
+    let (places, last) = legend_places(&names, SAMPLE + 6.0, [SIDES[0], 50.0], SIDES[1] - SIDES[0]);
+    for (i, (name, [x, y])) in names.into_iter().zip(places).enumerate() {
+        let sample = vec![[x, y - 4.0], [x + SAMPLE, y - 4.0]];
+        strokes(sample, i).into_iter().for_each(|stroke| page.line(stroke, color(i), 2.5));
+        page.text([x + SAMPLE + 6.0, y], name, 12.0, INK, Anchor::Start);
     }
-    y + 2.0
+    last + 2.0
 }
 
 #[cfg(test)]

@@ -78,19 +78,31 @@ pub(crate) fn color(k: usize) -> Rgb {
     COLORS[k % COLORS.len()]
 }
 
-/// Draws a legend of names with coloured dots, in rows from left to right; returns its height, px.
-pub(crate) fn legend(page: &mut Page, names: &[&str], [left, top]: [f64; 2], width: f64) -> f64 {
-    let (mut x, mut y) = (left, top + 12.0);
-    for (k, name) in names.iter().enumerate() {
-        let wide = 30.0 + 7.0 * name.chars().count() as f64;
+/// Places of the entries of a legend in rows of at most `width` px from left to right, each a sample of `sample` px and
+/// a name of 12 px; `first` is the base line of the first entry. The second value is the base line of the last row.
+pub(crate) fn legend_places(names: &[&str], sample: f64, first: [f64; 2], width: f64) -> (Vec<[f64; 2]>, f64) {
+    let [left, mut y] = first;
+    let mut x = left;
+    let mut places = Vec::new();
+    for name in names {
+        let wide = sample + 14.0 + 7.0 * name.chars().count() as f64;
         if x > left && x + wide > left + width {
             (x, y) = (left, y + 18.0);
         }
-        page.dots(vec![[x + 6.0, y - 4.0]], 5.0, color(k), 1.0);
-        page.text([x + 16.0, y], *name, 12.0, INK, Anchor::Start);
+        places.push([x, y]);
         x += wide;
     }
-    y - top + 8.0
+    (places, y)
+}
+
+/// Draws a legend of names with coloured dots, in rows from left to right; returns its height, px.
+pub(crate) fn legend(page: &mut Page, names: &[&str], [left, top]: [f64; 2], width: f64) -> f64 {
+    let (places, last) = legend_places(names, 16.0, [left, top + 12.0], width);
+    for (k, (name, [x, y])) in names.iter().zip(places).enumerate() {
+        page.dots(vec![[x + 6.0, y - 4.0]], 5.0, color(k), 1.0);
+        page.text([x + 16.0, y], *name, 12.0, INK, Anchor::Start);
+    }
+    last - top + 8.0
 }
 
 #[cfg(test)]

@@ -61,7 +61,7 @@ pub(super) fn print_gain(gain: &Gain, list: &str) {
         }
     }
     for left in &gain.not_applied {
-        outln!("not applied, and counted as not gone: {} {}", left.effect, left.why);
+        outln!("not applied, and counted as not gone: {}: {}", left.effect, left.why);
     }
 }
 
