@@ -31,6 +31,16 @@ fn signal(child: &Child, name: &str) {
     assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
 }
 
+/// The signals that stop the program. One that this process ignores, as SIGINT in the background of a script, is ignored
+/// by the program as well.
+fn signals() -> Vec<(&'static str, i32)> {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let ignored = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0);
+    let all = [("-TERM", SIGTERM), ("-INT", SIGINT)];
+    all.into_iter().filter(|(_, number)| ignored >> (number - 1) & 1 == 0).collect()
+}
+
 fn wait_until(what: &str, child: &mut Child, is_true: impl Fn() -> bool) {
     let begin = Instant::now();
     while !is_true() {
@@ -110,7 +120,7 @@ fn a_training_that_is_stopped_is_saved_first() {
                  --set run.evaluate_every_epochs=100";
     must(dir.path(), &format!("{train} --out whole"));
     let weights = |run: &str| fs::read(dir.path().join(run).join("checkpoint/last.safetensors")).unwrap();
-    for (name, number) in [("-TERM", SIGTERM), ("-INT", SIGINT)] {
+    for (name, number) in signals() {
         let run = format!("stopped{name}");
         let metrics = dir.path().join(&run).join("metrics.jsonl");
         let arguments = format!("{train} --out {run} --resume");
@@ -142,7 +152,7 @@ fn a_stopped_program_removes_its_temporary_folder() {
     let temporary = dir.path().join("tmp");
     fs::create_dir(&temporary).unwrap();
     let entries = |folder: &Path| fs::read_dir(folder).unwrap().count();
-    for name in ["-INT", "-TERM"] {
+    for (name, _) in signals() {
         let mut command = program(dir.path(), "train --smoke");
         let mut child = command.env("TMPDIR", &temporary).stderr(Stdio::null()).spawn().unwrap();
         wait_until("the temporary folder", &mut child, || entries(&temporary) > 0);

@@ -120,7 +120,7 @@ pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVecto
     let n = ray.normal_vector();
     // The lever of the measured place: at grazing incidence a turn moves the predicted one along the surface by
     // metres.
-    let lever = (origin + ray.direction_vector() * ray.own_range_m() - center).cross(&n);
+    let lever = (ray.point(origin) - center).cross(&n);
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
 }
 

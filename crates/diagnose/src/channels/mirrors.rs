@@ -57,7 +57,7 @@ pub fn behind_frame(frame: &FramePair) -> OddFrame {
 pub fn images(frame: &FramePair, rig: &Rig) -> Images {
     let mut out = Images::default();
     let origins = origins(rig);
-    let place = |ray: &Ray| origins[usize::from(ray.sensor)] + ray.direction_vector() * ray.own_range_m();
+    let place = |ray: &Ray| ray.point(&origins[usize::from(ray.sensor)]);
     let points: Vec<[f32; 3]> = frame.simulated.iter().map(|ray| place(ray).coords.map(|c| c as f32).into()).collect();
     let Some(tree) = (!points.is_empty()).then(|| ImmutableKdTree::new_from_slice(&points).ok()).flatten() else {
         return out;

@@ -17,10 +17,7 @@ pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) 
 fn standing(frame: &FramePair, origins: &[Point3<f64>]) -> Standing {
     let boxes: Vec<Box3> = frame.objects.iter().filter_map(|o| o.simulated).collect();
     let rays = frame.simulated.iter().filter(|ray| !ray.smooth && ray.surface == Surface::Standing);
-    let places = rays.map(|ray| {
-        let range_m = ray.own_range_m();
-        ((origins[ray.sensor as usize] + ray.direction_vector() * range_m).coords, range_m)
-    });
+    let places = rays.map(|ray| (ray.point(&origins[ray.sensor as usize]).coords, ray.own_range_m()));
     Standing::new(places, &boxes, ground(frame, origins))
 }
 

@@ -130,7 +130,7 @@ pub fn plume_frame(frame: &FramePair, origins: &[Point3<f64>], extent: Extent) -
     }
     for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
         for (i, ray) in rays.iter().enumerate().filter(|(_, ray)| in_the_air(ray)) {
-            let point: [f64; 3] = (origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m()).into();
+            let point: [f64; 3] = ray.point(&origins[ray.sensor as usize]).into();
             if airs.iter().any(|air| air.place == 0 && air.is_around(point)) {
                 out.around[side].insert(i);
             }

@@ -246,7 +246,7 @@ fn fit_objects(objects: &mut [ObjectPair], [on_measured, on_simulated]: &[Vec<(R
     let mut measured = vec![Vec::new(); boxes.len()];
     let mut simulated = vec![Vec::new(); boxes.len()];
     for (ray, _) in on_measured {
-        let p = origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m();
+        let p = ray.point(&origins[ray.sensor as usize]);
         // Returns on predicted ground are ground.
         let ground = ray.surface == Surface::Ground && ray.across_m().abs() < 0.15;
         for (k, b) in boxes.iter().enumerate() {
@@ -259,7 +259,7 @@ fn fit_objects(objects: &mut [ObjectPair], [on_measured, on_simulated]: &[Vec<(R
         if ray.surface != Surface::Object {
             continue;
         }
-        let point = origins[ray.sensor as usize] + ray.direction_vector() * ray.own_range_m();
+        let point = ray.point(&origins[ray.sensor as usize]);
         simulated[ray.object as usize].push(SurfacePoint { point, normal: ray.normal_vector() });
     }
     for (k, object) in objects.iter_mut().take(boxes.len()).enumerate() {

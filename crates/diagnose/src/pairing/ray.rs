@@ -96,6 +96,11 @@ impl Ray {
         f64::from(self.range_m) + f64::from(self.residual_m)
     }
 
+    /// Its place in the cloud's frame, from the sensor's origin.
+    pub fn point(&self, origin: &Point3<f64>) -> Point3<f64> {
+        origin + self.direction_vector() * self.own_range_m()
+    }
+
     /// The predicted point in the cloud's frame, from the sensor's origin.
     pub fn predicted_point(&self, origin: &Point3<f64>) -> Point3<f64> {
         origin + self.direction_vector() * f64::from(self.range_m)

@@ -63,7 +63,7 @@ impl Rounded {
             Rounded::Ranges => rays.map(Ray::own_range_m).filter(within).collect(),
             Rounded::Coordinates => {
                 let origins = origins(context.rig);
-                let point = |r: &Ray| origins[usize::from(r.sensor)] + r.direction_vector() * r.own_range_m();
+                let point = |r: &Ray| r.point(&origins[usize::from(r.sensor)]);
                 rays.map(point).flat_map(|p| [p.x.abs(), p.y.abs()]).filter(within).collect()
             }
         }

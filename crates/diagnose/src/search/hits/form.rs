@@ -125,7 +125,7 @@ impl Surfaces {
 
 /// Where a return lies, in the cloud's frame, m.
 fn place(ray: &Ray, origin: &Point3<f64>) -> [f32; 3] {
-    (origin + ray.direction_vector() * ray.own_range_m()).cast::<f32>().into()
+    ray.point(origin).cast::<f32>().into()
 }
 
 impl Search<'_> {
