@@ -31,8 +31,8 @@ fn signal(child: &Child, name: &str) {
     assert!(Command::new("kill").args([name, &child.id().to_string()]).status().unwrap().success());
 }
 
-/// The signals that stop the program. One that this process ignores, as SIGINT in the background of a script, is ignored
-/// by the program as well.
+/// The signals that stop the program. One that this process ignores, as SIGINT in the background of a script, is also
+/// ignored by the program.
 fn signals() -> Vec<(&'static str, i32)> {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));

@@ -52,7 +52,7 @@ pub const TOGETHER: f64 = 2.0;
 /// well, and more often a surface where the returns are few.
 pub fn counted(frame: &FramePair) -> impl Iterator<Item = (Sides, &Ray)> {
     let simulated = frame.simulated.iter().map(|r| ([true, r.matched], r));
-    let only_measured = frame.measured.iter().filter(|r| !r.matched).map(|r| ([false, true], r));
+    let only_measured = frame.only_measured.iter().map(|r| ([false, true], r));
     simulated.chain(only_measured)
 }
 
@@ -91,28 +91,30 @@ pub fn loss_groups(
 ) -> Vec<PartedFrame> {
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |frame: &FramePair| -> PartedFrame {
-        // Of the simulated and of the measured side: returns, and those without a counterpart; then the expected
-        // losses.
-        let mut sums = std::collections::BTreeMap::<(Group, usize), ([[f64; 2]; 2], f64)>::new();
+        // Simulated returns; returns of the simulated and of the measured side without a counterpart; expected losses.
+        let mut sums = std::collections::BTreeMap::<(Group, usize), [f64; 4]>::new();
         for (sides, ray) in counted(frame) {
             let (Some(c), Some(g)) = (cell(ray), group_of(ray, grouping)) else { continue };
             if mask.hides(ray) {
                 continue;
             }
-            let (count, lost) = sums.entry((g, part_of(ray, grouping, half_fov[ray.sensor as usize]))).or_default();
-            for (count, _) in count.iter_mut().zip(sides).filter(|(_, has)| *has) {
-                count[0] += 1.0;
-                count[1] += f64::from(u8::from(sides != [true; 2]));
-            }
-            if sides[0] {
-                *lost += 1.0 - kept(c);
+            let part = part_of(ray, grouping, half_fov[ray.sensor as usize]);
+            let [n, alone, odd, lost] = sums.entry((g, part)).or_default();
+            match sides {
+                [true, measured] => {
+                    *n += 1.0;
+                    *alone += f64::from(u8::from(!measured));
+                    *lost += 1.0 - kept(c);
+                }
+                [false, _] => *odd += 1.0,
             }
         }
         let mut out: PartedFrame = [const { Vec::new() }; PARTS];
-        for ((g, part), ([[n, alone], [seen, odd]], lost)) in sums.into_iter().filter(|(_, (c, _))| c[0][0] >= 5.0) {
+        for ((g, part), [n, alone, odd, lost]) in sums.into_iter().filter(|(_, [n, ..])| *n >= 5.0) {
             let w = n * n / (TOGETHER * (alone + odd + 2.0));
-            // One-to-one matching leaves as many returns without a counterpart on both sides.
-            let y = (alone - lost) / n - odd / f64::max(seen, 1.0);
+            // The numbers of returns of the two sides differ by as many as the numbers without a counterpart, whatever
+            // the matching misses.
+            let y = (alone - odd - lost) / n;
             out[part].push((g, GroupSums { gram: [w, 0.0, 0.0], right: [w * y, 0.0], n, weight: w }));
         }
         out

@@ -49,8 +49,8 @@ pub type DirectionLosses = BTreeMap<DirectionCell, Losses>;
 pub fn direction_losses(frames: &[FramePair], which: &[usize], mask: &Mask, usual: &[[f64; 2]]) -> DirectionLosses {
     let one = |i: &usize| {
         let mut sums = DirectionLosses::new();
-        for (side, rays) in [&frames[*i].simulated, &frames[*i].measured].into_iter().enumerate() {
-            for ray in rays.iter().filter(|r| r.object == u16::MAX && !mask.hides(r)) {
+        for (side, rays) in frames[*i].for_losses().into_iter().enumerate() {
+            for ray in rays.into_iter().filter(|r| r.object == u16::MAX && !mask.hides(r)) {
                 let Some(c) = cell(ray) else { continue };
                 let sum = sums.entry(direction_cell(ray)).or_default();
                 let alone = f64::from(u8::from(!ray.matched)) - usual[c][side];

@@ -1,9 +1,10 @@
 //! One frame of both sides, return by return.
 
 use super::boxes::{BoxShift, SurfacePoint, fit_shift};
+use super::matching::Matched;
 use super::of_sensor::{SensorPair, Use};
 use super::ray::{Ray, Surface};
-use super::recordings::{Matched, SideFrame};
+use super::recordings::SideFrame;
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
@@ -20,6 +21,9 @@ pub struct FramePair {
     pub measured: Vec<Ray>,
     /// Returns of the simulated side.
     pub simulated: Vec<Ray>,
+    /// Measured returns without a counterpart. Those of a pattern that does not repeat are where the simulation has no
+    /// return near, and have the surface that their own side has around them.
+    pub only_measured: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
     /// Jumps of the measured scan for each one of the simulated scan, over returns: 1 where both show one scene.
@@ -34,11 +38,25 @@ pub struct FramePair {
     pub objects: Vec<ObjectPair>,
 }
 
+impl FramePair {
+    /// Returns of the simulated and of the measured side as losses count them.
+    pub fn for_losses(&self) -> [Vec<&Ray>; 2] {
+        let matched = self.measured.iter().filter(|r| r.matched);
+        [self.simulated.iter().collect(), matched.chain(&self.only_measured).collect()]
+    }
+}
+
+/// Those of some returns that have no counterpart.
+pub(crate) fn alone(rays: &[Ray]) -> Vec<Ray> {
+    rays.iter().filter(|r| !r.matched).copied().collect()
+}
+
 #[cfg(test)]
 impl FramePair {
     /// Of the returns of both sides alone.
     pub fn of_rays(id: String, measured: Vec<Ray>, simulated: Vec<Ray>) -> FramePair {
         FramePair {
+            only_measured: alone(&measured),
             id,
             measured,
             simulated,
@@ -119,6 +137,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         uses(&simulated, |_, _, _| true, share, [recorded.number as u64, 1]),
     ];
     let (mut rays, mut mixed_per_rad, mut shots_open): ([Vec<(Ray, Use)>; 2], f64, f64) = Default::default();
+    let mut only_measured = Vec::new();
     for (sensor, scan) in measured.iter_mut().enumerate() {
         let pair = SensorPair {
             sensors,
@@ -130,6 +149,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         };
         let compared = pair.compare(scan, corrections.range_m, [&uses[0][sensor], &uses[1][sensor]]);
         rays.iter_mut().zip(compared.rays).for_each(|(all, own)| all.extend(own));
+        only_measured.extend(compared.only_measured);
         mixed_per_rad += compared.mixed_per_rad;
         shots_open += compared.open;
     }
@@ -144,6 +164,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         id: recorded.id.into(),
         measured,
         simulated: simulated_rays,
+        only_measured,
         mixed_per_rad: mixed_per_rad / returns[1].max(1) as f64,
         jumps: 1.0,
         open: share * shots_open,
@@ -311,7 +332,7 @@ mod tests {
         let side = |scan, second| SideFrame { scans: vec![scan], objects: vec![car.clone()], second };
         let (measured, simulated) = (side(scan(0.05, 1), 200), side(scan(0.0, 2), 100));
         let n = measured.scans[0].len();
-        let matched = [(vec![true; n], vec![true; n])];
+        let matched = [Matched { measured: vec![true; n], simulated: vec![true; n], repeats: true }];
         let recorded =
             RecordedFrame { number: 3, id: "3", measured: &measured, simulated: &simulated, matched: &matched };
         pair_frame(&recorded, &sensors, Corrections::default(), kept)

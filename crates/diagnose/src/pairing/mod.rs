@@ -15,15 +15,15 @@ mod second;
 
 pub use alone::{FrameAlone, frame_alone};
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
-pub(crate) use frame::round_ranges;
 pub use frame::{Corrections, FramePair, ObjectPair, RecordedFrame, ShownShift, pair_frame};
+pub(crate) use frame::{alone, round_ranges};
 pub use gaps::{GAP_M, gap_margin_m};
 pub use identical::{Identity, check_identity, met_squarely};
-pub use matching::match_directions;
+pub use matching::{Matched, match_directions};
 pub use of_sensor::company_m;
 pub use ray::{Lies, Ray, Surface};
 pub(crate) use recordings::load;
-pub use recordings::{Matched, PairSide, Recordings, SideFrame};
+pub use recordings::{PairSide, Recordings, SideFrame};
 
 use crate::error::DiagnoseError;
 use data::Dataset;

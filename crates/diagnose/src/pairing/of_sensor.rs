@@ -2,9 +2,9 @@
 
 use super::frame::{AROUND_M, RangeError};
 use super::gaps::{Returns, in_gap, mixed_per_rad};
+use super::matching::Matched;
 use super::prediction::{Intensities, Predictor};
 use super::ray::Ray;
-use super::recordings::Matched;
 use super::roughness::{LONE, Roughness, STRAY_M};
 use geometry::Box3;
 use sensor::directions::{DirectionIndex, Neighbour, SensorScan, Sensors, in_or_beside};
@@ -35,6 +35,8 @@ pub(super) struct SensorPair<'a> {
 pub(super) struct Compared {
     /// Rays of both sides, and what they are used for.
     pub rays: [Vec<(Ray, Use)>; 2],
+    /// Compared measured rays without a counterpart, see [`super::FramePair::only_measured`].
+    pub only_measured: Vec<Ray>,
     /// Expected mixed simulated returns for each radian of beam width.
     pub mixed_per_rad: f64,
     /// Shots without a simulated return.
@@ -69,6 +71,7 @@ impl SensorPair<'_> {
             rays.into_iter().zip(which.iter().map(|&i| uses[i])).collect()
         };
         Compared {
+            only_measured: self.only_measured(scan, &measured, &which[0], uses[0]),
             mixed_per_rad: mixed_per_rad(&returns, row, smooth),
             open: open.unwrap_or(missing.max(0.0)),
             rays: [with_use(measured, &which[0], uses[0]), with_use(simulated, &which[1], uses[1])],
@@ -93,8 +96,10 @@ impl SensorPair<'_> {
     /// Simulated rays, each predicted from the others.
     fn simulated_rays(&self, predictor: &Predictor, which: &[usize]) -> Vec<Ray> {
         let mut neighbours = Vec::new();
-        let mut own =
-            |&i: &usize| Ray { matched: self.matched.1[i], ..predictor.own_ray(self.simulated, i, &mut neighbours).0 };
+        let mut own = |&i: &usize| Ray {
+            matched: self.matched.simulated[i],
+            ..predictor.own_ray(self.simulated, i, &mut neighbours).0
+        };
         which.iter().map(&mut own).collect()
     }
 
@@ -111,7 +116,7 @@ impl SensorPair<'_> {
         let mut rays = Vec::with_capacity(which.len());
         let mut off_surface = Vec::with_capacity(scan.len());
         let mut which = which.iter().peekable();
-        for (i, matched) in self.matched.0.iter().enumerate() {
+        for (i, matched) in self.matched.measured.iter().enumerate() {
             let is_ray = which.next_if_eq(&&i).is_some();
             if !is_ray && range_m.is_none() {
                 let off_m = predictor.across_m(scan, i, &mut neighbours);
@@ -134,6 +139,23 @@ impl SensorPair<'_> {
             }
         }
         (rays, off_surface)
+    }
+
+    /// Those of the measured rays that are compared and have no counterpart; of a pattern that does not repeat as their
+    /// own side predicts them.
+    fn only_measured(&self, scan: &SensorScan, rays: &[Ray], which: &[usize], uses: &[Use]) -> Vec<Ray> {
+        let alone = || which.iter().zip(rays).filter(|(i, ray)| !ray.matched && uses[**i] == Use::Compared);
+        if self.matched.repeats {
+            return alone().map(|(_, ray)| *ray).collect();
+        }
+        let predictor = Predictor::new(self.sensors, self.sensor, scan, self.boxes);
+        let mut neighbours = Vec::new();
+        let mut own = |(i, ray): (&usize, &Ray)| Ray {
+            azimuth_rad: ray.azimuth_rad,
+            elevation_rad: ray.elevation_rad,
+            ..predictor.own_ray(scan, *i, &mut neighbours).0
+        };
+        alone().map(&mut own).collect()
     }
 
     /// Sets what depends on the measured returns around measured and simulated rays, which are given with their

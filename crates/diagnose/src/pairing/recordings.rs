@@ -1,6 +1,6 @@
 //! The frames of both data sets, read once and held in memory for every pairing.
 
-use super::matching::match_directions;
+use super::matching::{Matched, match_directions};
 use super::second::drop_second;
 use crate::error::DiagnoseError;
 use data::{Cloud, Dataset, Object};
@@ -27,9 +27,6 @@ pub enum PairSide {
     /// Simulated.
     Simulated,
 }
-
-/// Of one sensor whether each measured and each simulated return has a counterpart on the other side.
-pub type Matched = (Vec<bool>, Vec<bool>);
 
 /// The frames that both data sets have.
 pub struct Recordings<'a> {

@@ -138,6 +138,7 @@ impl Packets {
             };
             let mut frame = frame.clone();
             frame.measured.retain(&stays);
+            frame.only_measured.retain(&stays);
             frame.simulated.retain(&stays);
             frame
         };

@@ -4,7 +4,8 @@ use crate::channels::mask::{DirectionCell, direction_cell, neighbours};
 use crate::channels::returns::OWN_CAR_M;
 use crate::error::DiagnoseError;
 use crate::pairing::{
-    FrameAlone, FramePair, Ray, SideFrame, Surface, frame_alone, has_no_point, in_order, load, round_ranges, thin,
+    FrameAlone, FramePair, Ray, SideFrame, Surface, alone, frame_alone, has_no_point, in_order, load, round_ranges,
+    thin,
 };
 use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
@@ -126,6 +127,7 @@ pub(super) fn as_pairs(ids: &[String], sides: [Vec<FrameAlone>; 2]) -> (Vec<Fram
     let [mut measured, simulated] = sides;
     show_ego_vehicle(&mut measured, &simulated);
     let pair = |id: &String, measured: Vec<Ray>, simulated: Vec<Ray>, mixed: [f64; 2]| FramePair {
+        only_measured: alone(&measured),
         id: id.clone(),
         measured,
         simulated,

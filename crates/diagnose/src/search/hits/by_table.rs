@@ -22,8 +22,8 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<
     let mut at_edges = BTreeMap::<i32, [[f64; 2]; 2]>::new();
     let bin = |ray: &Ray| (f64::from(ray.range_m).max(0.5).ln() / 0.25) as i32;
     for frame in train.iter().map(|&i| &context.frames[i]) {
-        for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
-            for ray in rays.iter().filter(|ray| cell(ray).is_none()) {
+        for (side, rays) in frame.for_losses().into_iter().enumerate() {
+            for ray in rays.into_iter().filter(|ray| cell(ray).is_none()) {
                 let [n, matched] = &mut at_edges.entry(bin(ray)).or_default()[side];
                 (*n, *matched) = (*n + 1.0, *matched + f64::from(u8::from(ray.matched)));
             }
@@ -118,10 +118,10 @@ fn ratios_by_direction(
 ) -> BTreeMap<DirectionCell, [f64; 2]> {
     let mut cells = BTreeMap::<DirectionCell, OfDirection>::new();
     for frame in train.iter().map(|&i| &context.frames[i]) {
-        for (side, rays) in [&frame.simulated, &frame.measured].into_iter().enumerate() {
+        for (side, rays) in frame.for_losses().into_iter().enumerate() {
             // What only the measured ego vehicle hides is lost.
             let hides = |ray: &Ray| side == 1 && !ray.matched && on_ego_vehicle(ray);
-            for ray in rays.iter().filter(|ray| !hides(ray)) {
+            for ray in rays.into_iter().filter(|ray| !hides(ray)) {
                 let cell = cells.entry(direction_cell(ray)).or_default();
                 cell.returns += [1.0, 0.0][side];
                 cell.alone[side] += f64::from(u8::from(!ray.matched));
