@@ -106,6 +106,7 @@ fn more_noise_m(measured: &[Ray], simulated: &[Ray]) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::super::frame::{Corrections, RecordedFrame, pair_frame};
+    use super::super::matching::Matched;
     use super::super::recordings::SideFrame;
     use rand_distr::{Distribution, StandardNormal};
     use sensor::Rig;
@@ -134,7 +135,8 @@ mod tests {
         let steps = Steps { azimuth_rad: 0.003, elevation_rad: 0.006 };
         let pattern = ScanPattern { rows_rad: rows.to_vec(), steps };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
-        let matched = vec![(vec![true; measured.len()], vec![true; simulated.len()])];
+        let [of_measured, of_simulated] = [&measured, &simulated].map(|scan| vec![true; scan.len()]);
+        let matched = [Matched { measured: of_measured, simulated: of_simulated, repeats: true }];
         let side = |scan| SideFrame { scans: vec![scan], objects: vec![], second: 0 };
         let recorded = RecordedFrame {
             number: 0,
