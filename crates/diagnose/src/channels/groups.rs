@@ -145,9 +145,8 @@ pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
 pub fn elevation_lever(ray: &Ray, sensor_turn: &UnitQuaternion<f64>) -> f64 {
     let (az, el) = (f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
     let up = sensor_turn * Vector3::new(-el.sin() * az.cos(), -el.sin() * az.sin(), el.cos());
-    // The beam was sent higher by this angle. The predicted range is used: at grazing incidence the measured one
-    // contains the distance that is to be explained.
-    -ray.normal_vector().dot(&up) * f64::from(ray.range_m)
+    // The beam was sent higher by this angle.
+    -ray.normal_vector().dot(&up) * ray.recorded_range_m()
 }
 
 /// Offsets of rows that were undone before frames were paired: of the range, m, and of the elevation, rad.
@@ -176,7 +175,7 @@ impl Seen<'_> {
         turn: &UnitQuaternion<f64>,
     ) -> Option<(f64, [f64; 2])> {
         let y = ray.across_nearest_m() - own_row(ray, origin).dot(&poses[ray.sensor as usize]);
-        let x = [-f64::from(ray.cos_incidence), elevation_lever(ray, turn)];
+        let x = [ray.range_lever(), elevation_lever(ray, turn)];
         let of_row = self.undone.get(&Group { sensor: ray.sensor, index: ray.row });
         let undone = of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad);
         (y.abs() <= STRAY_M).then_some((y + undone, x))

@@ -118,16 +118,15 @@ pub fn weight(ray: &Ray, noise_m: f64) -> f64 {
 /// Derivatives of the distance across the surface by a movement of the scene about `center`.
 pub fn pose_row(ray: &Ray, origin: &Point3<f64>, center: &Point3<f64>) -> SVector<f64, 6> {
     let n = ray.normal_vector();
-    // The lever of the measured place: at grazing incidence a turn moves the predicted one along the surface by
-    // metres.
-    let lever = (ray.point(origin) - center).cross(&n);
+    // The lever of the recorded place: at grazing incidence a turn moves the predicted one along the surface by metres.
+    let lever = (origin + ray.recorded_vector() - center).cross(&n);
     SVector::from([lever.x, lever.y, lever.z, n.x, n.y, n.z])
 }
 
 /// Derivatives of the distance across the surface by what [`OwnPoses`] holds of a sensor at `origin`.
 pub fn own_row(ray: &Ray, origin: &Point3<f64>) -> SVector<f64, OWN_NUMBERS> {
     let [a, b, c, d, e, f]: [f64; 6] = pose_row(ray, origin, &Point3::origin()).into();
-    SVector::from([a, b, c, d, e, f, -f64::from(ray.cos_incidence)])
+    SVector::from([a, b, c, d, e, f, ray.range_lever()])
 }
 
 /// Prior of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m; and of its range offset.
@@ -202,7 +201,7 @@ pub struct Levers {
     sensor: usize,
     kind: usize,
     range_m: f64,
-    cos_incidence: f64,
+    by_range: f64,
     phase: f64,
     pose: SVector<f64, 6>,
     sensor_pose: SVector<f64, 6>,
@@ -214,8 +213,8 @@ impl Levers {
         Levers {
             sensor: ray.sensor as usize,
             kind: kind_of(ray),
-            range_m: f64::from(ray.range_m),
-            cos_incidence: f64::from(ray.cos_incidence),
+            range_m: ray.recorded_range_m(),
+            by_range: ray.range_lever(),
             phase: mount.scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad)),
             pose: pose_row(ray, origin, &Point3::origin()),
             sensor_pose: pose_row(ray, origin, origin),
@@ -225,8 +224,8 @@ impl Levers {
     /// By one column; `None` of columns of other sensors and surfaces.
     pub fn of(&self, column: Column) -> Option<f64> {
         Some(match column {
-            Column::RangeOffset => -self.cos_incidence,
-            Column::RangeScale => -self.cos_incidence * self.range_m,
+            Column::RangeOffset => self.by_range,
+            Column::RangeScale => self.by_range * self.range_m,
             Column::Pose(k) => self.pose[k],
             Column::SensorPose(s, k) if s == self.sensor => self.sensor_pose[k],
             Column::Sweep(k) => self.phase * [self.pose[3], self.pose[4], self.pose[2]][k],
@@ -330,6 +329,32 @@ mod tests {
         };
         let measured = (0..180 * 20).filter_map(|k| return_(shot(k))).collect();
         FramePair::of_rays(String::new(), measured, vec![])
+    }
+
+    /// A return of the road that is moved 1.5 m forward: range and pose change where it was recorded.
+    #[test]
+    fn levers_are_those_of_the_recorded_place() {
+        let (recorded, moved) = (Vector3::new(3.0, 1.0, -2.0), Vector3::new(4.5, 1.0, -2.0));
+        let ray = Ray {
+            surface: Surface::Ground,
+            normal: [0.0, 0.0, 1.0],
+            cos_incidence: (2.0 / moved.norm()) as f32,
+            recorded_m: recorded.cast::<f32>().into(),
+            ..Ray::standing(&moved)
+        };
+        let levers = Levers::new(&ray, &Point3::origin(), &Rig::single().sensors[0]);
+        let height_m = |recorded: Vector3<f64>| recorded.z + 2.0;
+        let pitched = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), 1e-3) * recorded;
+        let changed = [
+            (Column::RangeOffset, height_m(recorded + recorded.normalize() * 1e-3)),
+            (Column::RangeScale, height_m(recorded * (1.0 + 1e-3))),
+            (Column::Pose(1), height_m(pitched)),
+            (Column::Pose(5), 1e-3),
+        ];
+        for (column, by_m) in changed {
+            let lever = levers.of(column).unwrap();
+            assert!((1e-3 * lever - by_m).abs() < 1e-5, "{column:?}: {lever} {by_m}");
+        }
     }
 
     #[test]

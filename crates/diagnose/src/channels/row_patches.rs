@@ -159,11 +159,10 @@ pub fn row_frames(frames: &[FramePair], rig: &Rig, seen: Seen, noise_m: f64) -> 
             let sensor = ray.sensor as usize;
             let Some((y, x)) = seen.across(ray, poses, &origins[sensor], &turns[sensor]) else { continue };
             let part = part_of(ray, super::groups::Grouping::Row, half_fov[sensor]);
-            let strip = (f64::from(ray.azimuth_rad) / AZIMUTH_RAD).floor() as i32;
+            let at = ray.direction_vector() * f64::from(ray.range_m);
+            let strip = (at.y.atan2(at.x) / AZIMUTH_RAD).floor() as i32;
             let rows = strips.entry((sensor, part, strip, kind_of(ray).min(KINDS - 1))).or_default();
-            let (sin, cos) = f64::from(ray.elevation_rad).sin_cos();
-            let along = if ray.surface == Surface::Ground { cos } else { sin };
-            let place_m = along * f64::from(ray.range_m);
+            let place_m = if ray.surface == Surface::Ground { at.xy().norm() } else { at.z };
             rows.entry(usize::from(ray.row)).or_default().add(place_m, x, y, weight(ray, noise_m));
         }
         let mut out = RowFrame { sensors: vec![Default::default(); rig.sensors.len()], ..RowFrame::default() };

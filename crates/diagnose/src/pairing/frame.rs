@@ -127,7 +127,8 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         views.as_ref().is_none_or(|views| {
             let mount = &sensors.rig.sensors[sensor];
             let at = views.of_point(mount.pose() * scan.point(i)).filter(|at| at.sensor == sensor);
-            at.is_some_and(|at| mount.sees(at.spherical[0], 0.0))
+            let pattern = &sensors.patterns[sensor];
+            at.is_some_and(|at| mount.sees(at.spherical[0], 0.0) && pattern.reaches(at.spherical[1]))
         })
     };
     let returns = [&measured[..], &simulated[..]].map(|scans| scans.iter().map(SensorScan::len).sum::<usize>());
@@ -322,7 +323,7 @@ mod tests {
         scan
     }
 
-    fn paired(kept: usize) -> FramePair {
+    fn paired(kept: usize, corrections: Corrections) -> FramePair {
         let steps = Steps { azimuth_rad: 0.003, elevation_rad: 0.006 };
         let pattern = ScanPattern { rows_rad: rows(), steps };
         let sensors = Sensors { rig: Rig::single(), patterns: vec![pattern], edge_m: 0.12 };
@@ -335,12 +336,28 @@ mod tests {
         let matched = [Matched { measured: vec![true; n], simulated: vec![true; n], repeats: true }];
         let recorded =
             RecordedFrame { number: 3, id: "3", measured: &measured, simulated: &simulated, matched: &matched };
-        pair_frame(&recorded, &sensors, Corrections::default(), kept)
+        pair_frame(&recorded, &sensors, corrections, kept)
+    }
+
+    /// Moved up by 60 cm, the upper rows lie above all rows of the sensor, where the simulation shows nothing.
+    #[test]
+    fn what_moves_out_of_the_rows_is_not_compared_and_the_rest_knows_where_it_was_recorded() {
+        let up = Vector3::new(0.0, 0.0, 0.6);
+        let shift_m: ShownShift = &|_, _, _| -up;
+        let moved = paired(usize::MAX, Corrections { shift_m: Some(shift_m), ..Corrections::default() }).measured;
+        let all = rows().len() * 500;
+        assert!((all / 2..all * 9 / 10).contains(&moved.len()), "{} of {all}", moved.len());
+        let highest = f64::from(rows()[rows().len() - 1]) + 0.003;
+        for ray in &moved {
+            let shown = ray.direction_vector() * ray.own_range_m();
+            assert!(shown.z.atan2(shown.xy().norm()) < highest + 1e-6);
+            assert!((shown - ray.recorded_vector() - up).norm() < 1e-4, "{shown} {ray:?}");
+        }
     }
 
     #[test]
     fn some_of_the_rays_are_as_they_are_among_all() {
-        let (all, some) = (paired(usize::MAX), paired(3_000));
+        let [all, some] = [usize::MAX, 3_000].map(|kept| paired(kept, Corrections::default()));
         assert_eq!(all.measured.len(), rows().len() * 500);
         let share = 3_000.0 / (rows().len() * 500) as f64;
         assert_eq!((some.mixed_per_rad, some.open), (all.mixed_per_rad, share * all.open));

@@ -113,6 +113,7 @@ impl SensorPair<'_> {
         which: &[usize],
     ) -> (Vec<Ray>, Vec<bool>) {
         let mut neighbours = Vec::new();
+        let turn = self.sensors.rig.sensors[self.sensor].pose().rotation;
         let mut rays = Vec::with_capacity(which.len());
         let mut off_surface = Vec::with_capacity(scan.len());
         let mut which = which.iter().peekable();
@@ -134,6 +135,7 @@ impl SensorPair<'_> {
                 ray.matched = *matched;
                 (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
                 ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
+                ray.recorded_m = (turn * self.sent.point(i).coords).cast::<f32>().into();
                 ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
                 rays.push(ray);
             }

@@ -89,6 +89,7 @@ impl<'a> Predictor<'a> {
             range_m: range,
             cos_incidence: 0.0,
             direction: direction.cast::<f32>().into(),
+            recorded_m: (direction * f64::from(range)).cast::<f32>().into(),
             normal: [0.0; 3],
             residual_m: 0.0,
             bulge_m: 0.0,

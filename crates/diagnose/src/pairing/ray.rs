@@ -67,6 +67,9 @@ pub struct Ray {
     pub cos_incidence: f32,
     /// Unit vector of the ray in the cloud's frame.
     pub direction: [f32; 3],
+    /// Where the return was recorded, from the sensor's origin in the cloud's axes, m: elsewhere than along `direction`
+    /// where a displacement was undone. What the sensor does wrong, it does there.
+    pub recorded_m: [f32; 3],
     /// Unit normal of the predicted surface in the cloud's frame, towards the sensor.
     pub normal: [f32; 3],
     /// Range minus predicted range, m.
@@ -104,6 +107,23 @@ impl Ray {
     /// The predicted point in the cloud's frame, from the sensor's origin.
     pub fn predicted_point(&self, origin: &Point3<f64>) -> Point3<f64> {
         origin + self.direction_vector() * f64::from(self.range_m)
+    }
+
+    /// Where it was recorded, as a vector from the sensor's origin, m.
+    pub fn recorded_vector(&self) -> Vector3<f64> {
+        Vector3::from(self.recorded_m.map(f64::from))
+    }
+
+    /// Range at which the surface would have been recorded, m. At grazing incidence the recorded range contains the
+    /// distance that is to be explained.
+    pub fn recorded_range_m(&self) -> f64 {
+        self.recorded_vector().norm() - f64::from(self.residual_m)
+    }
+
+    /// Derivative of the distance across the surface by the recorded range.
+    pub fn range_lever(&self) -> f64 {
+        let recorded = self.recorded_vector();
+        self.normal_vector().dot(&recorded) / recorded.norm().max(1e-3)
     }
 
     /// The direction as a vector.
@@ -177,6 +197,7 @@ impl Ray {
             range_m: at.norm() as f32,
             cos_incidence: 1.0,
             direction: direction.into(),
+            recorded_m: at.cast::<f32>().into(),
             normal: (-direction).into(),
             residual_m: 0.0,
             bulge_m: 0.0,

@@ -6,9 +6,11 @@
 //! paired, so that displacements of metres are found.
 
 mod grid;
+mod own_slides;
 mod top_view;
 
 use self::grid::{Grid, peak};
+use self::own_slides::OwnSlides;
 use self::top_view::TopView;
 use super::returns::surfaces_stand_elsewhere;
 use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR};
@@ -79,6 +81,15 @@ const STEP_S: f64 = 0.005;
 /// Step of the displacement over a scan where the ego speed is not known, m.
 const STEP_M: f64 = 0.25;
 
+/// Steps of the displacement of a frame to either side of zero, as far as [`STEPS`] of [`STEP_M`].
+const FINE_STEPS: i32 = 70;
+
+/// Step of the displacement of a frame, m.
+const FINE_STEP_M: f64 = 0.1;
+
+/// Error of a displacement over a scan by the size of cells, m.
+const OF_CELLS_M: f64 = 0.1 * CELL_M;
+
 /// Smallest displacement that is searched for, m: smaller ones are found by surfaces.
 const LEAST_M: f64 = 0.3;
 
@@ -139,14 +150,22 @@ pub fn search(context: &Context) -> Search {
         as_high.filter(|_| surfaces_stand_elsewhere(context)).map(|(k, (at, _))| (k, at))
     };
     let Some((k, at)) = chosen else { return Search::NotFound(not_found) };
-    let (grid, model) = (grids.swap_remove(k), models.swap_remove(k));
+    let (grid, mut model) = (grids.swap_remove(k), models.swap_remove(k));
     result.considered.push(considered("chosen"));
-    let fitted = Fitted::new(context, &model, at, &estimate);
+    let mut fitted = Fitted::new(context, &model, at, &estimate);
     let held = model.held_out_gains(&grid, &fitted, &select, &hold_out);
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [g.max(0.0), *g, g.max(0.0)]);
+    let of_frames = (!model.speed_known).then(|| fitted.own_slides(context, &model, model.worth(&grid, &select)));
     result.found.push(fitted.found(&model, &estimate, held));
     let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
-    let slide = Slide { scan_s: fitted.scan_s, motions: model.motions, sensors };
+    let scan_s = match of_frames {
+        Some(slides) => {
+            model.motions.iter_mut().zip(slides).for_each(|(motion, slide)| motion.own = OwnMotion::ahead(slide));
+            1.0
+        }
+        None => fitted.scan_s,
+    };
+    let slide = Slide { scan_s, motions: model.motions, sensors };
     if decided { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
 }
 
@@ -172,6 +191,8 @@ struct Fitted {
     error: f64,
     /// Share of bootstrap repetitions with the same sign.
     confidence: f64,
+    /// Standard deviation of the displacements of frames where the speed is not known, m.
+    from_frame_to_frame: Option<f64>,
 }
 
 impl Fitted {
@@ -186,9 +207,24 @@ impl Fitted {
             (0..REPETITIONS).map(|_| peak(&fine, &counts, &draw_blocks(&members, &mut rng))).collect();
         let spread = (draws.iter().map(|d| (d - scan_s).powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
         // The size of a cell, and an error of 3 % of the ego speed.
-        let error = spread.hypot(0.03 * scan_s).hypot(0.1 * CELL_M / model.fastest.max(1.0));
+        let error = spread.hypot(0.03 * scan_s).hypot(OF_CELLS_M / model.fastest.max(1.0));
         let confidence = draws.iter().filter(|d| d.signum() == scan_s.signum()).count() as f64 / draws.len() as f64;
-        Fitted { fine, counts, scan_s, error, confidence }
+        Fitted { fine, counts, scan_s, error, confidence, from_frame_to_frame: None }
+    }
+
+    /// The displacement of each frame, m, where speeds are not known: they differ, and with them the displacements. A
+    /// point on the simulation is worth `worth` nats. The estimate becomes the mean over the estimating frames.
+    fn own_slides(&mut self, context: &Context, model: &Model, worth: f64) -> Vec<f64> {
+        let at: Vec<f64> = (-FINE_STEPS..=FINE_STEPS).map(|k| FINE_STEP_M * f64::from(k)).collect();
+        let all: Vec<usize> = (0..context.frames.len()).collect();
+        let mut frames = model.counts(&all, &at);
+        frames.iter_mut().flatten().for_each(|count| *count *= worth);
+        let estimate = context.of(Role::Estimate);
+        let estimating: Vec<&[f64]> = estimate.iter().map(|&f| &frames[f][..]).collect();
+        let own = OwnSlides::fit(&at, &estimating, &blocks_of(&context.blocks(&estimate)), self.scan_s);
+        (self.scan_s, self.error) = (own.mean, own.error.hypot(OF_CELLS_M));
+        self.from_frame_to_frame = Some(own.spread);
+        frames.iter().map(|frame| own.of_frame(&at, frame)[0]).collect()
     }
 
     /// The finding. Scans that turn clockwise have a positive duration.
@@ -201,10 +237,9 @@ impl Fitted {
         };
         let duration = model.speed_known.then(|| parameter(Quantity::ScanS, -scan_s, error));
         let shear = parameter(Quantity::ShearXM, -middle * scan_s, middle * error);
-        let speed = if model.speed_known {
-            format!(" at {middle:.0} m/s: a scan takes {:.0} ms", 1e3 * scan_s.abs())
-        } else {
-            String::new()
+        let speed = match self.from_frame_to_frame {
+            None => format!(" at {middle:.0} m/s: a scan takes {:.0} ms", 1e3 * scan_s.abs()),
+            Some(spread) => format!(" in the mean, give or take {spread:.2} m from frame to frame"),
         };
         Found {
             effects: Vec::new(),
@@ -313,18 +348,23 @@ impl<'a> Model<'a> {
         frames.iter().map(|&f| self.displacements[f].len() as f64).sum::<f64>()
     }
 
-    /// Gains of the held-out frames, nats. Some points lie in occupied cells by chance: the log odds ratio of the
-    /// best and the worst share is the gain of one more point.
+    /// Gains of the held-out frames, nats.
     fn held_out_gains(&self, grid: &Grid, fitted: &Fitted, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
         self.gains_of(grid, fitted.scan_s, select, hold_out)
     }
 
-    /// The same by a duration of a scan.
-    fn gains_of(&self, grid: &Grid, scan_s: f64, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
+    /// Gain of one more point on the simulation, nats: some lie in occupied cells by chance, so that it is the log odds
+    /// ratio of the best and the worst share.
+    fn worth(&self, grid: &Grid, select: &[usize]) -> f64 {
         let points = self.points(select);
         let share = |on: f64| ((on + 1.0) / (points + 2.0)).clamp(0.01, 0.99);
         let [chance, there] = grid.ends().map(share);
-        let worth = (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0);
+        (there * (1.0 - chance) / (chance * (1.0 - there))).ln().max(0.0)
+    }
+
+    /// The same by a duration of a scan.
+    fn gains_of(&self, grid: &Grid, scan_s: f64, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
+        let worth = self.worth(grid, select);
         let gain = |&f: &usize| (self.on(f, scan_s) - self.on(f, 0.0)) * self.views[f].each * worth;
         hold_out.iter().map(gain).collect()
     }

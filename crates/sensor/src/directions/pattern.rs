@@ -16,6 +16,13 @@ pub struct ScanPattern {
 const BIN_RAD: f32 = 3.5e-4;
 
 impl ScanPattern {
+    /// Whether an elevation, rad, is among the rows or within half a step beside them; true where no rows are known.
+    pub fn reaches(&self, elevation_rad: f64) -> bool {
+        let (Some(&lowest), Some(&highest)) = (self.rows_rad.first(), self.rows_rad.last()) else { return true };
+        let beside = self.steps.elevation_rad / 2.0;
+        (f64::from(lowest - beside)..=f64::from(highest + beside)).contains(&elevation_rad)
+    }
+
     /// From scans of several frames of both sides, whose shots have the same directions.
     pub fn of_scans(scans: &[&SensorScan]) -> ScanPattern {
         let mut rows_rad = rows(scans);
@@ -226,6 +233,11 @@ mod tests {
         assert!(pattern.rows_rad.iter().zip(&truth).all(|(a, b)| (a - b).abs() < 1e-4));
         assert!((pattern.steps.azimuth_rad - 0.01).abs() < 1e-3, "{:?}", pattern.steps);
         assert_eq!(pattern.row(truth[7] + 1e-3), Some(7));
+        let beside = f64::from(pattern.steps.elevation_rad) / 2.0;
+        for (end, out) in [(truth[0], -1.0), (truth[23], 1.0)] {
+            let [inside, outside] = [0.9, 1.1].map(|share| pattern.reaches(f64::from(end) + out * share * beside));
+            assert!(inside && !outside);
+        }
     }
 
     #[test]
