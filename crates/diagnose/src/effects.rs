@@ -172,7 +172,8 @@ fn rolling_shutter(f: &Finding) -> Effect {
     let slide = [Quantity::ShearXM, Quantity::ShearYM, Quantity::ShearYawDeg].map(|quantity| value(f, quantity));
     let slide = scan_s.is_none().then_some(slide);
     let only_objects = f.channel == Channel::Objects;
-    Effect::RollingShutter(RollingShutter { deskewed: false, scan_s, only_objects, slide })
+    let uneven = value(f, Quantity::Uneven).clamp(-RollingShutter::MOST_UNEVEN, RollingShutter::MOST_UNEVEN);
+    Effect::RollingShutter(RollingShutter { deskewed: false, scan_s, uneven, only_objects, slide })
 }
 
 /// Name, elevations of the rows and values of each sensor of which the finding has rows; rows without a value have 0.

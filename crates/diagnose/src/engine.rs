@@ -30,6 +30,7 @@ use crate::pairing::{
     pair_all, with_points,
 };
 use crate::search::geometry::Displacement;
+use crate::search::geometry::Geometry;
 use crate::search::labels::Side;
 use crate::search::quantisation::Rounded;
 use crate::search::rolling_shutter::{self, Slide};
@@ -256,17 +257,31 @@ impl Engine<'_> {
     ) -> Result<Outcome, DiagnoseError> {
         let context = recorded.clone();
         self.finished(0);
-        let (sliding, slide) = self.rolling_shutter(&context)?;
+        let (mut sliding, slide) = self.rolling_shutter(&context)?;
         let (rounding, step_m) = search::quantisation::search(&context, Rounded::Ranges);
         let (of_coordinates, _) = search::quantisation::search(&context, Rounded::Coordinates);
-        let mut results = vec![sliding, rounding, of_coordinates, search::dual_returns::search(&context)];
+        let dual = search::dual_returns::search(&context);
         let mut known = Known { slide, step_m, displaced: Displacement::default() };
-        let standing = self.standing(&known)?;
-        let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
+        let standing = known.standing(self)?;
+        let moved_back = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context.clone() };
         self.finished(2);
-        let undo = |displaced: &Displacement| self.undone(&known, displaced);
-        let (geometry, displaced) = search::geometry::search(&context, &undo)?;
-        results.push(geometry);
+        let undo = |displaced: &Displacement| {
+            let left = displaced.swept().map(|swept| Slide::of_surfaces(&moved_back, swept));
+            known.undone(self, displaced, left.as_ref())
+        };
+        let Geometry { result, displaced, swept } = search::geometry::search(&moved_back, known.slide.as_ref(), &undo)?;
+        let standing = match swept {
+            Some(swept) => {
+                match (&mut known.slide, sliding.found.first_mut()) {
+                    (Some(slide), Some(found)) => slide.refine(found, swept),
+                    _ => known.slide = Some(Slide::of_surfaces(&moved_back, swept)),
+                }
+                known.standing(self)?
+            }
+            None => standing,
+        };
+        let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
+        let mut results = vec![sliding, rounding, of_coordinates, dual, result];
         known.displaced = displaced;
         self.finished(3);
         results.extend(self.single_returns(&context, &known, &mut notes)?);
@@ -315,25 +330,6 @@ impl Engine<'_> {
         };
         let confirmed = result.found.iter().all(search::confounders::is_confirmed);
         Ok((result, slide.filter(|_| confirmed)))
-    }
-
-    /// Frames with motion distortion and coarse quantisation corrected; `None` where there is none.
-    fn standing(&self, known: &Known) -> Result<Option<Vec<FramePair>>, DiagnoseError> {
-        if known.slide.is_none() && known.coarse_m().is_none() {
-            return Ok(None);
-        }
-        let shift: ShownShift = &|frame, p, sensor| known.slide_m(frame, p, sensor);
-        let shift_m = known.slide.as_ref().map(|_| shift);
-        self.pair(Corrections { shift_m, step_m: known.coarse_m(), ..Corrections::default() }).map(Some)
-    }
-
-    /// Frames with motion distortion, quantisation and a displacement undone, that of rows as well.
-    fn undone(&self, known: &Known, displaced: &Displacement) -> Result<Vec<FramePair>, DiagnoseError> {
-        self.pair(Corrections {
-            shift_m: Some(&|frame, p, sensor| known.shift_m(self, displaced, (frame, sensor), p)),
-            step_m: known.coarse_m(),
-            ..Corrections::default()
-        })
     }
 
     /// Searches of silhouettes, single returns and intensities, on frames with the displacement of the scene undone;

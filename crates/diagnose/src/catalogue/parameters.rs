@@ -125,6 +125,8 @@ identifiers! {
         StepM = "step_m",
         /// Signal at which half of the returns are lost.
         Threshold = "threshold",
+        /// What shots at a quarter of the scan are early by, as a share of its duration.
+        Uneven = "uneven",
         /// Shift along the z axis of the object, or of the sensor.
         UpM = "up_m",
         /// Range at which an eye sees 5 % of the contrast.

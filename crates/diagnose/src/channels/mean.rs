@@ -3,6 +3,7 @@
 //!
 //! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
 
+use crate::channels::motion::OwnMotion;
 use crate::inference::median;
 use crate::pairing::{FramePair, Ray, Surface, met_squarely};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
@@ -22,6 +23,10 @@ pub enum Column {
     SensorPose(usize, usize),
     /// A shift along x, y or a turn about z that grows over a scan from -1/2 to +1/2.
     Sweep(usize),
+    /// Duration of a scan, s: what stands still moves by the ego motion of its frame.
+    Scan,
+    /// The same by how unevenly the scan turns, s: see [`Sensor::uneven_phase`].
+    Uneven,
     /// Offset across one kind of surface, m: see [`kind_of`]. No cause: an error of the simulated surfaces.
     Structure(usize),
 }
@@ -29,10 +34,11 @@ pub enum Column {
 /// Number of columns, the first ones, that every frame has of its own: its pose, and its displacement over a scan.
 pub const OWN: usize = 9;
 
-/// All columns for a rig, those of the frames' own first.
-pub fn columns(rig: &Rig) -> Vec<Column> {
+/// All columns for a rig, those of the frames' own first; with that of the ego motion where it is known.
+pub fn columns(rig: &Rig, motion_known: bool) -> Vec<Column> {
     let mut all: Vec<Column> = (0..6).map(Column::Pose).collect();
     all.extend((0..3).map(Column::Sweep));
+    all.extend([Column::Scan, Column::Uneven].into_iter().filter(|_| motion_known));
     all.extend([Column::RangeOffset, Column::RangeScale]);
     all.extend((0..KINDS).map(Column::Structure));
     if rig.sensors.len() > 1 {
@@ -203,20 +209,27 @@ pub struct Levers {
     range_m: f64,
     by_range: f64,
     phase: f64,
+    by_motion: f64,
     pose: SVector<f64, 6>,
     sensor_pose: SVector<f64, 6>,
 }
 
 impl Levers {
-    /// Of a measured ray of a sensor at `origin`.
-    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &Sensor) -> Self {
+    /// Of a measured ray of a sensor at `origin`, with the ego motion of its frame where it is known.
+    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &Sensor, own: Option<&OwnMotion>) -> Self {
+        let pose = pose_row(ray, origin, &Point3::origin());
+        // The scene moves against the vehicle.
+        let against = |own: &OwnMotion| {
+            -(own.turn_rate_rad_s.dot(&pose.fixed_rows::<3>(0)) + own.velocity_m_s.dot(&pose.fixed_rows::<3>(3)))
+        };
         Levers {
             sensor: ray.sensor as usize,
             kind: kind_of(ray),
             range_m: ray.recorded_range_m(),
             by_range: ray.range_lever(),
             phase: mount.scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad)),
-            pose: pose_row(ray, origin, &Point3::origin()),
+            by_motion: own.map_or(0.0, against),
+            pose,
             sensor_pose: pose_row(ray, origin, origin),
         }
     }
@@ -229,23 +242,27 @@ impl Levers {
             Column::Pose(k) => self.pose[k],
             Column::SensorPose(s, k) if s == self.sensor => self.sensor_pose[k],
             Column::Sweep(k) => self.phase * [self.pose[3], self.pose[4], self.pose[2]][k],
+            Column::Scan => self.phase * self.by_motion,
+            Column::Uneven => Sensor::uneven_phase(self.phase) * self.by_motion,
             Column::Structure(k) if k == self.kind => 1.0,
             Column::SensorPose(..) | Column::Structure(_) => return None,
         })
     }
 }
 
-/// Sums of all frames.
+/// Sums of all frames, with the ego motion of each where it is known.
 pub fn mean_frames(
     frames: &[FramePair],
     rig: &Rig,
     columns: &[Column],
     poses: &[OwnPoses],
+    driving: Option<&[OwnMotion]>,
     noise_m: f64,
     design: f64,
 ) -> Vec<MeanFrame> {
     let origins = origins(rig);
-    let one = |(frame, pose): (&FramePair, &OwnPoses)| {
+    let one = |(f, (frame, pose)): (usize, (&FramePair, &OwnPoses))| {
+        let own = driving.map(|own| &own[f]);
         let p = columns.len();
         let (mut gram, mut right) = (vec![0.0; p * p], DVector::zeros(p));
         let (mut rays, mut squares) = (0.0, 0.0);
@@ -258,7 +275,7 @@ pub fn mean_frames(
             if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
                 continue;
             }
-            let levers = Levers::new(ray, origin, &rig.sensors[ray.sensor as usize]);
+            let levers = Levers::new(ray, origin, &rig.sensors[ray.sensor as usize], own);
             x.clear();
             x.extend(columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
             let w = weight(ray, noise_m) / design;
@@ -274,7 +291,7 @@ pub fn mean_frames(
         let gram = DMatrix::from_fn(p, p, |i, j| gram[i.max(j) * p + i.min(j)]);
         MeanFrame { gram, right, rays, squares }
     };
-    frames.par_iter().zip(poses).map(one).collect()
+    frames.par_iter().zip(poses).enumerate().map(one).collect()
 }
 
 /// Origins of the sensors in the cloud's frame.
@@ -342,7 +359,7 @@ mod tests {
             recorded_m: recorded.cast::<f32>().into(),
             ..Ray::standing(&moved)
         };
-        let levers = Levers::new(&ray, &Point3::origin(), &Rig::single().sensors[0]);
+        let levers = Levers::new(&ray, &Point3::origin(), &Rig::single().sensors[0], None);
         let height_m = |recorded: Vector3<f64>| recorded.z + 2.0;
         let pitched = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), 1e-3) * recorded;
         let changed = [
@@ -354,6 +371,23 @@ mod tests {
         for (column, by_m) in changed {
             let lever = levers.of(column).unwrap();
             assert!((1e-3 * lever - by_m).abs() < 1e-5, "{column:?}: {lever} {by_m}");
+        }
+    }
+
+    /// A vehicle that drives and turns during a scan sees a wall that stands still move.
+    #[test]
+    fn levers_of_a_scan_are_those_of_the_motion() {
+        let place = Vector3::new(-9.0, 4.0, 0.5);
+        let normal = Vector3::new(0.8, -0.6, 0.0);
+        let ray = Ray { normal: normal.cast::<f32>().into(), ..Ray::standing(&place) };
+        let own = OwnMotion { velocity_m_s: Vector3::new(8.0, 0.5, 0.0), turn_rate_rad_s: Vector3::new(0.0, 0.0, 0.3) };
+        let rig = Rig::single();
+        let levers = Levers::new(&ray, &Point3::origin(), &rig.sensors[0], Some(&own));
+        let phase = rig.sensors[0].scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
+        let by_motion = -normal.dot(&own.velocity_at(&place));
+        for (column, share) in [(Column::Scan, phase), (Column::Uneven, (std::f64::consts::TAU * phase).sin())] {
+            let lever = levers.of(column).unwrap();
+            assert!((lever - share * by_motion).abs() < 1e-5, "{column:?}: {lever} {}", share * by_motion);
         }
     }
 

@@ -2,6 +2,8 @@
 
 use super::Engine;
 use crate::channels::mask::Shown;
+use crate::error::DiagnoseError;
+use crate::pairing::{Corrections, FramePair, ShownShift};
 use crate::search::geometry::Displacement;
 use crate::search::rolling_shutter::Slide;
 use nalgebra::Vector3;
@@ -44,6 +46,31 @@ impl Known {
         let of_row = displaced.of_row(p, sensor, engine.sensors, pose);
         let p = &(p - of_row);
         of_row + self.slide_m(frame, p, sensor) + displaced.of_point(p, sensor, &engine.origins[sensor])
+    }
+
+    /// Frames with motion distortion and coarse quantisation corrected; `None` where there is none.
+    pub(super) fn standing(&self, engine: &Engine) -> Result<Option<Vec<FramePair>>, DiagnoseError> {
+        if self.slide.is_none() && self.coarse_m().is_none() {
+            return Ok(None);
+        }
+        let shift: ShownShift = &|frame, p, sensor| self.slide_m(frame, p, sensor);
+        let shift_m = self.slide.as_ref().map(|_| shift);
+        engine.pair(Corrections { shift_m, step_m: self.coarse_m(), ..Corrections::default() }).map(Some)
+    }
+
+    /// Frames with motion distortion, quantisation and a displacement undone, that of rows as well; and what is `left`
+    /// of the motion distortion.
+    pub(super) fn undone(
+        &self,
+        engine: &Engine,
+        displaced: &Displacement,
+        left: Option<&Slide>,
+    ) -> Result<Vec<FramePair>, DiagnoseError> {
+        let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
+            let left_m = left.map_or_else(Vector3::zeros, |slide| slide.shift_m(frame, p, sensor));
+            self.shift_m(engine, displaced, (frame, sensor), p) + left_m
+        };
+        engine.pair(Corrections { shift_m: Some(&shift), step_m: self.coarse_m(), ..Corrections::default() })
     }
 
     /// How the measured scene lies when silhouettes and single returns are compared.

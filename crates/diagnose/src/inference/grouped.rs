@@ -173,6 +173,16 @@ pub fn spread_of_rows(rows: &BTreeMap<Group, [f64; 2]>) -> (f64, f64) {
     if n >= 4.0 && whole.0 > TOGETHER * about_neighbours { (about_neighbours, n) } else { whole }
 }
 
+/// Standard deviation of offsets of rows that may be wrong along a line, and the number of them: the root mean square
+/// by what is known of each row, its offset as it was shrunk, with its variance. Shrunk offsets alone are too small by
+/// just that variance.
+pub fn spread_of_smooth_rows(rows: &BTreeMap<Group, [f64; 2]>) -> (f64, f64) {
+    let known = best_known(rows.iter().map(|(k, [offset, variance])| (*k, (*offset, *variance))).collect());
+    let n = known.len() as f64;
+    let squares: f64 = known.values().map(|(offset, variance)| offset.powi(2) + variance).sum();
+    if n < 4.0 { (0.0, 0.0) } else { ((squares / n).sqrt(), n) }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -235,5 +245,18 @@ mod tests {
         assert_eq!(rows(0.0), spread(&with_step(0.0), how, 0.0));
         assert!((spread(&with_step(0.2), how, 0.0).0 - 0.11).abs() < 0.01);
         assert!((rows(0.2).0 - 0.05).abs() < 0.01, "{:?}", rows(0.2));
+    }
+
+    #[test]
+    fn the_spread_of_smooth_rows_does_not_depend_on_how_well_they_are_known() {
+        let mut rng = data::stream(5, "rows", 0, 0);
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+        for noise in [0.0f64, 0.03, 0.06] {
+            let shrink = 0.05f64.powi(2) / (0.05f64.powi(2) + noise.powi(2));
+            let mut of_row = |k| (row(k), [shrink * (0.05 * normal() + noise * normal()), shrink * noise.powi(2)]);
+            let (spread, n) = spread_of_smooth_rows(&(0..400).map(&mut of_row).collect());
+            assert!(n == 400.0 && (spread - 0.05).abs() < 0.005, "{spread} {noise}");
+        }
+        assert_eq!(spread_of_smooth_rows(&BTreeMap::from([(row(0), [1.0, 0.1])])), (0.0, 0.0));
     }
 }

@@ -231,11 +231,12 @@ fn drop_all(results: &mut [ChannelResult], because: &str, what: impl Fn(&Found) 
 }
 
 /// Parameters of the form of an effect, not of its size.
-const FORM: [Quantity; 12] = [
+const FORM: [Quantity; 13] = [
     Quantity::ReachM,
     Quantity::DivergenceRad,
     Quantity::ShareOnComb,
     Quantity::SimulatedStdM,
+    Quantity::Uneven,
     // Of laws of losses.
     Quantity::Most,
     Quantity::Steepness,

@@ -53,11 +53,21 @@ impl Context<'_> {
         frames.iter().map(|&i| self.roles[i].1).collect()
     }
 
+    /// Ego motion at each frame, at rest where it is not known; `None` where all are.
+    pub fn driving(&self) -> Option<Vec<OwnMotion>> {
+        let at_rest = OwnMotion::ahead(0.0);
+        let motions: Vec<OwnMotion> = self.motion.as_ref()?.iter().map(|own| own.unwrap_or(at_rest)).collect();
+        motions.iter().any(|own| own.speed_m_s().abs() > DRIVING_M_S).then_some(motions)
+    }
+
     /// Simulated returns of these frames.
     pub fn returns(&self, frames: &[usize]) -> f64 {
         frames.iter().map(|&i| self.frames[i].simulated.len() as f64).sum()
     }
 }
+
+/// Speed from which on a vehicle is not at rest, m/s.
+const DRIVING_M_S: f64 = 1.0;
 
 /// A difference that a search found, before the results of all channels are put together.
 #[derive(Clone, Debug)]

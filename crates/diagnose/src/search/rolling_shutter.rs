@@ -7,70 +7,29 @@
 
 mod grid;
 mod own_slides;
+mod slide;
 mod top_view;
+
+pub use self::slide::{Extent, Slide};
 
 use self::grid::{Grid, peak};
 use self::own_slides::OwnSlides;
+use self::slide::{Motion, alike, driven, relative_error};
 use self::top_view::TopView;
 use super::returns::surfaces_stand_elsewhere;
-use super::{ChannelResult, Context, Found, NamedParameter, REPETITIONS, Z_STAR};
-use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::labels::seen_velocity;
+use super::{ChannelResult, Context, Found, REPETITIONS, Z_STAR};
+use crate::catalogue::{Cause, Channel, Covariate};
 use crate::channels::mean::origins;
 use crate::channels::motion::{CELL_M, OwnMotion};
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::{Considered, Minimum, Parameter, Status};
+use crate::diagnosis::{Considered, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::cross_validated;
 use crate::inference::median;
 use crate::inference::roles::Role;
-use crate::pairing::FramePair;
-use geometry::Box3;
-use nalgebra::{Isometry3, Point3, Vector2, Vector3};
+use nalgebra::Vector2;
 use rayon::prelude::*;
-use sensor::Sensor;
 use statistics::{blocks_of, draw_blocks};
-
-/// Displacement of the scene over a scan.
-pub struct Slide {
-    /// Duration of a scan from phase -1/2 to +1/2, s.
-    scan_s: f64,
-    /// Motion in every frame.
-    motions: Vec<Motion>,
-    /// Every sensor with `sensor_from_cloud`.
-    sensors: Vec<(Sensor, Isometry3<f64>)>,
-}
-
-/// Motion in one frame: of the ego vehicle, and of the labelled objects relative to it, m/s.
-struct Motion {
-    own: OwnMotion,
-    objects: Vec<(Box3, Vector3<f64>)>,
-}
-
-impl Motion {
-    /// Velocity of what is at a point relative to the ego vehicle, m/s.
-    fn at(&self, point: &Vector3<f64>, longest_s: f64) -> Vector3<f64> {
-        let on = |(b, v): &&(Box3, Vector3<f64>)| {
-            let local = b.to_local((*point).into());
-            let margin = 0.5 + 0.5 * v.norm() * longest_s;
-            (0..2).all(|k| local[k].abs() < b.size[k] / 2.0 + margin) && local[2].abs() < b.size[2] / 2.0 + 0.3
-        };
-        match self.objects.iter().find(on) {
-            Some((_, v)) => *v,
-            None => -self.own.velocity_at(point),
-        }
-    }
-}
-
-impl Slide {
-    /// Displacement of a point of a frame and a sensor from its place in the middle of the scan, m, cloud's frame.
-    pub fn shift_m(&self, frame: usize, point: &Vector3<f64>, sensor: usize) -> Vector3<f64> {
-        let (mount, sensor_from_cloud) = &self.sensors[sensor];
-        let [azimuth_rad, elevation_rad, _] = Sensor::spherical(&(sensor_from_cloud * Point3::from(*point)));
-        let phase = mount.scan_phase(azimuth_rad, elevation_rad);
-        self.motions[frame].at(point, self.scan_s.abs()) * (phase * self.scan_s)
-    }
-}
 
 /// Steps of the grid to either side of zero.
 const STEPS: i32 = 28;
@@ -133,7 +92,6 @@ pub fn search(context: &Context) -> Search {
         z,
         outcome: outcome.into(),
     };
-    result.minimum.push((Cause::RollingShutter, Minimum::new(Quantity::ShearXM, LEAST_M)));
     let far_enough = |k: usize, at: f64| at.abs() * models[k].fastest > LEAST_M;
     let decided = significant && far_enough(best, grids[best].best());
     let outcome =
@@ -156,16 +114,15 @@ pub fn search(context: &Context) -> Search {
     let held = model.held_out_gains(&grid, &fitted, &select, &hold_out);
     result.distance.iter_mut().zip(&held).for_each(|(d, g)| *d = [g.max(0.0), *g, g.max(0.0)]);
     let of_frames = (!model.speed_known).then(|| fitted.own_slides(context, &model, model.worth(&grid, &select)));
-    result.found.push(fitted.found(&model, &estimate, held));
-    let sensors = context.rig.sensors.iter().map(|s| (s.clone(), s.pose().inverse())).collect();
     let scan_s = match of_frames {
         Some(slides) => {
             model.motions.iter_mut().zip(slides).for_each(|(motion, slide)| motion.own = OwnMotion::ahead(slide));
             1.0
         }
-        None => fitted.scan_s,
+        None => fitted.extent.scan_s,
     };
-    let slide = Slide { scan_s, motions: model.motions, sensors };
+    result.found.push(fitted.found(&model, &estimate, held));
+    let slide = Slide::new(context, scan_s, model.motions, Some(fitted.extent));
     if decided { Search::Found(result, slide) } else { Search::Undecided { found: result, slide, not_found } }
 }
 
@@ -186,13 +143,9 @@ struct Fitted {
     /// Durations of a finer grid about the best of the selecting frames, and the counts of every frame.
     fine: Vec<f64>,
     counts: Vec<Vec<f64>>,
-    scan_s: f64,
-    /// Standard error, s.
-    error: f64,
+    extent: Extent,
     /// Share of bootstrap repetitions with the same sign.
     confidence: f64,
-    /// Standard deviation of the displacements of frames where the speed is not known, m.
-    from_frame_to_frame: Option<f64>,
 }
 
 impl Fitted {
@@ -206,10 +159,13 @@ impl Fitted {
         let draws: Vec<f64> =
             (0..REPETITIONS).map(|_| peak(&fine, &counts, &draw_blocks(&members, &mut rng))).collect();
         let spread = (draws.iter().map(|d| (d - scan_s).powi(2)).sum::<f64>() / draws.len() as f64).sqrt();
-        // The size of a cell, and an error of 3 % of the ego speed.
-        let error = spread.hypot(0.03 * scan_s).hypot(OF_CELLS_M / model.fastest.max(1.0));
+        // The size of a cell, and errors of the ego speed and of the form.
+        let error = spread.hypot(relative_error() * scan_s).hypot(OF_CELLS_M / model.fastest.max(1.0));
         let confidence = draws.iter().filter(|d| d.signum() == scan_s.signum()).count() as f64 / draws.len() as f64;
-        Fitted { fine, counts, scan_s, error, confidence, from_frame_to_frame: None }
+        let middle_m_s = median(model.motions.iter().map(|m| m.own.speed_m_s()).collect());
+        let speed_known = model.speed_known;
+        let extent = Extent { scan_s, error, uneven_s: None, middle_m_s, speed_known, from_frame_to_frame: None };
+        Fitted { fine, counts, extent, confidence }
     }
 
     /// The displacement of each frame, m, where speeds are not known: they differ, and with them the displacements. A
@@ -221,39 +177,25 @@ impl Fitted {
         frames.iter_mut().flatten().for_each(|count| *count *= worth);
         let estimate = context.of(Role::Estimate);
         let estimating: Vec<&[f64]> = estimate.iter().map(|&f| &frames[f][..]).collect();
-        let own = OwnSlides::fit(&at, &estimating, &blocks_of(&context.blocks(&estimate)), self.scan_s);
-        (self.scan_s, self.error) = (own.mean, own.error.hypot(OF_CELLS_M));
-        self.from_frame_to_frame = Some(own.spread);
+        let own = OwnSlides::fit(&at, &estimating, &blocks_of(&context.blocks(&estimate)), self.extent.scan_s);
+        (self.extent.scan_s, self.extent.error) =
+            (own.mean, own.error.hypot(relative_error() * own.mean).hypot(OF_CELLS_M));
+        self.extent.from_frame_to_frame = Some(own.spread);
         frames.iter().map(|frame| own.of_frame(&at, frame)[0]).collect()
     }
 
-    /// The finding. Scans that turn clockwise have a positive duration.
+    /// The finding.
     fn found(&self, model: &Model, estimate: &[usize], held_out_gains: Vec<f64>) -> Found {
-        let Fitted { scan_s, error, .. } = *self;
-        let middle = median(model.motions.iter().map(|m| m.own.speed_m_s()).collect());
-        let parameter = |quantity: Quantity, estimate: f64, error: f64| -> NamedParameter {
-            let ci95 = [estimate - 2.0 * error, estimate + 2.0 * error];
-            (quantity.into(), Parameter { estimate, unit: quantity.unit(), ci95 })
-        };
-        let duration = model.speed_known.then(|| parameter(Quantity::ScanS, -scan_s, error));
-        let shear = parameter(Quantity::ShearXM, -middle * scan_s, middle * error);
-        let speed = match self.from_frame_to_frame {
-            None => format!(" at {middle:.0} m/s: a scan takes {:.0} ms", 1e3 * scan_s.abs()),
-            Some(spread) => format!(" in the mean, give or take {spread:.2} m from frame to frame"),
-        };
         Found {
             effects: Vec::new(),
             status: Status::Named,
             causes: vec![Cause::RollingShutter],
-            parameters: duration.into_iter().chain([shear]).collect(),
+            parameters: self.extent.parameters(),
             confidence: self.confidence,
             channel: Channel::Slide,
             covariate: Covariate::ScanPhase,
             held_out_gains,
-            says: format!(
-                "what stands still slides by {:.2} m over a scan{speed}, and nobody moves its points back; your simulator shoots all at once",
-                (middle * scan_s).abs()
-            ),
+            says: self.extent.says(),
             separate_by: None,
             curve: self.curve(model, estimate),
         }
@@ -264,7 +206,7 @@ impl Fitted {
         let points = model.points(estimate);
         let share = |on: f64| on / points.max(1.0);
         let on = |at: f64| estimate.iter().map(|&f| model.on(f, at)).sum();
-        let [before, after] = [0.0, self.scan_s].map(|at| share(on(at)));
+        let [before, after] = [0.0, self.extent.scan_s].map(|at| share(on(at)));
         let points = self.fine.iter().enumerate().map(|(k, s)| {
             let measured = share(self.counts.iter().map(|counts| counts[k]).sum());
             CurvePoint { sensor: 0, x: -s, measured, before, after, error: 0.0 }
@@ -305,25 +247,14 @@ struct Model<'a> {
 impl<'a> Model<'a> {
     /// With the motion of the ego vehicle and of the objects, where both are known.
     fn with_speed(context: &Context, views: &'a [TopView<'a>]) -> Option<Model<'a>> {
-        let (times, own) = (context.times.as_ref()?, context.motion.as_ref()?);
-        let motion = |f: usize| {
-            let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
-            let moving = boxes.filter_map(|b| Some((b, seen_velocity(context.frames, times, f, &b)?)));
-            let still = OwnMotion::ahead(0.0);
-            Motion { own: own[f].unwrap_or(still), objects: moving.collect() }
-        };
-        let motions: Vec<Motion> = (0..context.frames.len()).map(motion).collect();
+        let motions = driven(context)?;
         let fastest = motions.iter().map(|m| m.own.speed_m_s().abs()).fold(0.0, f64::max);
-        (fastest > 1.0).then(|| Model::new(views, motions, fastest, STEP_S, true))
+        Some(Model::new(views, motions, fastest, STEP_S, true))
     }
 
     /// With the same displacement in all frames; objects are not displaced.
     fn without_speed(context: &Context, views: &'a [TopView<'a>]) -> Model<'a> {
-        let motion = |frame: &FramePair| Motion {
-            own: OwnMotion::ahead(1.0),
-            objects: frame.objects.iter().filter_map(|o| Some((o.simulated?, Vector3::zeros()))).collect(),
-        };
-        Model::new(views, context.frames.iter().map(motion).collect(), 1.0, STEP_M, false)
+        Model::new(views, alike(context, OwnMotion::ahead(1.0)), 1.0, STEP_M, false)
     }
 
     fn new(views: &'a [TopView<'a>], motions: Vec<Motion>, fastest: f64, step: f64, speed_known: bool) -> Model<'a> {
@@ -350,7 +281,7 @@ impl<'a> Model<'a> {
 
     /// Gains of the held-out frames, nats.
     fn held_out_gains(&self, grid: &Grid, fitted: &Fitted, select: &[usize], hold_out: &[usize]) -> Vec<f64> {
-        self.gains_of(grid, fitted.scan_s, select, hold_out)
+        self.gains_of(grid, fitted.extent.scan_s, select, hold_out)
     }
 
     /// Gain of one more point on the simulation, nats: some lie in occupied cells by chance, so that it is the log odds
@@ -386,7 +317,9 @@ impl<'a> Model<'a> {
 mod tests {
     use super::*;
     use crate::inference::roles::roles;
+    use crate::pairing::FramePair;
     use crate::pairing::Ray;
+    use nalgebra::Vector3;
     use rand::RngExt;
     use sensor::Rig;
 

@@ -3,7 +3,7 @@
 
 use super::local_plane::measure_along;
 use super::{Draws, FrameContext};
-use crate::directions::{SensorScan, Sensors, Surroundings};
+use crate::directions::{DirectionIndex, Entry, LEAST_COS, SensorScan, Sensors, Surroundings};
 use crate::rig::Sensor;
 use crate::scan::{Echo, Scan, dot};
 use data::Stream;
@@ -18,6 +18,9 @@ const REACH_STEPS: [f32; 2] = [0.6, 0.5];
 /// Difference of two directions in which the same surface is met, in steps of the pattern: a fiftieth of the distance
 /// at which shots see different returns.
 const SAME_STEPS: f32 = 0.02;
+
+/// Cosine of the angle between two normals of one surface, at least: 20 degrees.
+const SAME_COS: f32 = 0.94;
 
 /// Shots that truly go farther from where they are reported than this share of the way to the next row may leave their
 /// surface.
@@ -97,16 +100,32 @@ pub(super) fn reshoot(
             continue;
         };
         // A shot that was lost on a surface stays lost.
-        if !echo.is_return() && seen.is_hole(&own) {
+        if !echo.is_return() && seen.is_hole(towards(&own)) {
             continue;
         }
-        if let Some(surface) = on.and_then(|place| before.get(place)) {
+        let true_ray = true_from_reported.rotation.cast::<f32>() * Vector3::from(echo.direction);
+        let beside = on.and_then(|place| before.get(place));
+        if let Some(surface) = beside.filter(|surface| !is_lit_alike(echo, surface, range_m, true_ray.into())) {
             (echo.intensity, echo.reflectivity) = (surface.intensity, surface.reflectivity);
             (echo.returned, echo.material, echo.object) = (surface.returned, surface.material, surface.object);
-            (echo.normal, echo.cos_incidence) = (surface.normal, surface.cos_incidence);
+            echo.normal = surface.normal;
+        }
+        let cos = -dot(echo.normal, true_ray.into());
+        if cos > LEAST_COS {
+            echo.cos_incidence = cos;
         }
         echo.range_m = range_m;
     }
+}
+
+/// Whether a shot that truly meets a surface at a range keeps its own light: it was reported on a surface with the same
+/// normal as the return beside the true ray, at a range and an angle of incidence that send back what the true ones do,
+/// more nearly than those of that return.
+fn is_lit_alike(own: &Echo, beside: &Echo, range_m: f32, true_ray: [f32; 3]) -> bool {
+    let of = |cos: f32, range_m: f32| cos.max(LEAST_COS).ln() - 2.0 * range_m.ln();
+    let met = of(-dot(beside.normal, true_ray), range_m);
+    let off = |echo: &Echo| (of(echo.cos_incidence, echo.range_m) - met).abs();
+    own.is_return() && dot(own.normal, beside.normal) > SAME_COS && off(own) < off(beside)
 }
 
 /// Range of a shot, m, or one at which shots without a return are looked up.
@@ -178,6 +197,9 @@ struct Seen<'a> {
     steps: [f32; 2],
     /// Elevations of the rows, rad; empty where they are not known.
     rows_rad: &'a [f32],
+    /// The shots without a return, where they are known: by direction, and azimuth and elevation of each, rad.
+    empty: DirectionIndex,
+    empty_shots: Vec<[f32; 2]>,
     /// Where between two shots an edge lies, from -1/2 to 1/2 about the middle: of each column, and of each row.
     edges: [Vec<f32>; 2],
     /// Least and largest azimuth and elevation of a return, rad.
@@ -188,15 +210,21 @@ impl<'a> Seen<'a> {
     fn new(scan: &Scan, sensors: &'a Sensors, number: usize, random: &mut Stream) -> Self {
         let pose = sensors.rig.sensors[number].pose();
         let sensor_from_cloud = pose.inverse();
-        let (mut own, mut places) = (SensorScan::default(), Vec::new());
-        for (i, echo) in scan.echoes.iter().enumerate() {
-            if usize::from(echo.sensor) == number && echo.is_return() {
+        let (mut own, mut empty, mut places) = (SensorScan::default(), SensorScan::default(), Vec::new());
+        for (i, echo) in scan.echoes.iter().enumerate().filter(|(_, e)| usize::from(e.sensor) == number) {
+            if echo.is_return() {
                 let point = sensor_from_cloud * Point3::from(echo.point().map(f64::from));
                 let [azimuth, elevation, range] = Sensor::spherical(&point);
                 own.azimuth_rad.push(azimuth as f32);
                 own.elevation_rad.push(elevation as f32);
                 own.range_m.push(range as f32);
                 places.push(i);
+            } else {
+                let [azimuth, elevation] =
+                    towards(&(pose.rotation.inverse() * Vector3::from(echo.direction.map(f64::from))));
+                empty.azimuth_rad.push(azimuth);
+                empty.elevation_rad.push(elevation);
+                empty.range_m.push(f32::INFINITY);
             }
         }
         let steps = sensors.patterns[number].steps;
@@ -214,6 +242,8 @@ impl<'a> Seen<'a> {
             edges: [of_axis(0), of_axis(1)],
             rows_rad: &sensors.patterns[number].rows_rad,
             field,
+            empty: DirectionIndex::new(&empty, sensors.window(number), sensors.rig.sensors[number].is_full_circle()),
+            empty_shots: empty.azimuth_rad.into_iter().zip(empty.elevation_rad).map(|(az, el)| [az, el]).collect(),
             around: Surroundings::new(sensors, number, &own),
             scan: own,
             places,
@@ -221,10 +251,27 @@ impl<'a> Seen<'a> {
         }
     }
 
-    /// Whether a surface lies around a direction of the sensor's frame.
-    fn is_hole(&self, own: &Vector3<f64>) -> bool {
-        let [azimuth, elevation] = towards(own);
-        self.around.look(azimuth, elevation, None).surface.is_some()
+    /// Whether a shot without a return was lost on a surface: one lies around its direction, or the shots to its left
+    /// and right in its row returned.
+    fn is_hole(&self, [azimuth, elevation]: [f32; 2]) -> bool {
+        if self.around.look(azimuth, elevation, None).surface.is_some() {
+            return true;
+        }
+        let mut beside = [false; 2];
+        self.around(&self.around.index, [azimuth, elevation], |_, x, y| {
+            if y.abs() <= REACH_STEPS[1] && x.abs() <= 1.0 + REACH_STEPS[0] {
+                beside[usize::from(x > 0.0)] = true;
+            }
+        });
+        beside == [true; 2] && !self.rows_rad.is_empty()
+    }
+
+    /// Calls `visit` with the shots around a direction, and with their distances along and across the rows in steps of
+    /// the pattern.
+    fn around(&self, shots: &DirectionIndex, [azimuth, elevation]: [f32; 2], mut visit: impl FnMut(&Entry, f32, f32)) {
+        let window = self.around.window.map(|v| v as f32);
+        let in_steps = [window[0] / self.steps[0], window[1] / self.steps[1]];
+        shots.around(azimuth, elevation, |entry, dx, dy| visit(entry, dx * in_steps[0], dy * in_steps[1]));
     }
 
     /// What the true ray of a shot meets. The shot is reported as `echo`, in the direction `own`; `error` moves that
@@ -281,15 +328,22 @@ impl<'a> Seen<'a> {
         // Beyond the field of view surfaces go on as they are at its end.
         let beyond_m = if outside { ray.on_own_surface_m(&self.pose) } else { None };
         let beyond = beyond_m.map(|range_m| Met { range_m, on: None });
-        let [beside, above] = self.on_the_side_of(ray.reported, [azimuth, elevation]);
-        let Some((nearest, near)) = self.nearest(beside, above) else { return beyond };
+        let side = self.on_the_side_of(ray.reported, [azimuth, elevation]);
+        let Some((nearest, distance, near)) = self.nearest(&self.around.index, side) else { return beyond };
+        // A shot that returned nothing shows that nothing is there, unless it was lost on a surface.
+        let empty = self.nearest(&self.empty, side).filter(|(_, other, _)| *other < distance);
+        let hole = empty.map(|(shot, ..)| self.is_hole(self.empty_shots[shot]));
+        if hole == Some(false) && !outside {
+            return None;
+        }
+        let near = near || hole == Some(true);
         let on = Some(self.places[nearest]);
         let whole = self.around.look(azimuth, elevation, None).surface;
         if whole.is_none() && beyond.is_some() {
             return beyond;
         }
         // Beyond an edge with nothing behind it. Shots that were lost on a surface leave no such gap.
-        if !near && self.around.look(beside, above, None).surface.is_none() {
+        if !near && self.around.look(side[0], side[1], None).surface.is_none() {
             return None;
         }
         // At an edge: the surface of the return on the same side of it.
@@ -329,19 +383,18 @@ impl<'a> Seen<'a> {
         [azimuth + by_column * self.steps[0], above]
     }
 
-    /// The return nearest to a direction, and whether it is so near that a shot there meets what it met.
-    fn nearest(&self, azimuth: f32, elevation: f32) -> Option<(usize, bool)> {
-        let mut nearest: Option<(f32, usize, bool)> = None;
-        let window = self.around.window.map(|v| v as f32);
-        self.around.index.around(azimuth, elevation, |e, dx, dy| {
-            let (x, y) = (dx * window[0] / self.steps[0], dy * window[1] / self.steps[1]);
+    /// The shot nearest to a direction, the square of its distance in steps of the pattern, and whether it is so near
+    /// that a shot there meets what it met.
+    fn nearest(&self, shots: &DirectionIndex, direction: [f32; 2]) -> Option<(usize, f32, bool)> {
+        let mut nearest: Option<(usize, f32, bool)> = None;
+        self.around(shots, direction, |entry, x, y| {
             let distance = x * x + y * y;
-            if nearest.is_none_or(|(least, ..)| distance < least) {
+            if nearest.is_none_or(|(_, least, _)| distance < least) {
                 let near = x.abs() <= REACH_STEPS[0] && y.abs() <= REACH_STEPS[1];
-                nearest = Some((distance, e.index as usize, near));
+                nearest = Some((entry.index as usize, distance, near));
             }
         });
-        nearest.map(|(_, index, near)| (index, near))
+        nearest
     }
 }
 
@@ -463,6 +516,56 @@ mod tests {
             }
         }
         assert!(beyond > 60, "{beyond}");
+    }
+
+    /// A cloud with lost returns on the ground and on the wall, and with a gap in the wall: true rays that are as they
+    /// are reported meet what they met, and nothing where they met nothing.
+    #[test]
+    fn true_rays_that_are_as_reported_change_nothing() {
+        let mut with_gaps = scene();
+        for (i, echo) in with_gaps.echoes.iter_mut().enumerate() {
+            let gap = echo.direction[0] > 0.95 && (0.1..0.14).contains(&echo.direction[1]) && echo.direction[2] > -0.03;
+            if gap || i % 41 == 0 {
+                echo.lose();
+            }
+        }
+        let cloud = with_gaps.cloud();
+        let reader = CloudReader::new(&rig(), std::slice::from_ref(&cloud));
+        let before = reader.scan(&cloud, &Surfaces::default());
+        assert!(before.echoes.iter().filter(|e| !e.is_return()).count() > 200);
+        for index in 0..20 {
+            let mut after = before.clone();
+            with_frame(index, |frame, draws| {
+                let frame = FrameContext { sensors: Some(reader.sensors()), ..*frame };
+                reshoot(&mut after, &frame, draws, |_, _| Some(Pose::identity()));
+            });
+            for (a, b) in after.echoes.iter().zip(&before.echoes) {
+                assert_eq!(a.is_return(), b.is_return(), "{b:?}");
+                assert!(!b.is_return() || (a.range_m / b.range_m - 1.0).abs() < 0.01, "{a:?} {b:?}");
+            }
+        }
+    }
+
+    /// A sensor that is truly 1 m further ahead meets level ground at the range and the angle of incidence that it
+    /// reports: as much light comes back.
+    #[test]
+    fn near_ground_keeps_its_light() {
+        let mut lit = scene();
+        let light = |echo: &Echo| echo.cos_incidence * (20.0 / echo.range_m).powi(2);
+        lit.echoes.iter_mut().filter(|e| e.is_return()).for_each(|echo| echo.intensity = light(echo));
+        let cloud = lit.cloud();
+        let reader = CloudReader::new(&rig(), std::slice::from_ref(&cloud));
+        let mut after = reader.scan(&cloud, &Surfaces::default());
+        let ahead = Pose::from_parts(Translation3::new(1.0, 0.0, 0.0), UnitQuaternion::identity());
+        with_frame(0, |frame, draws| {
+            let frame = FrameContext { sensors: Some(reader.sensors()), ..*frame };
+            reshoot(&mut after, &frame, draws, |_, _| Some(ahead));
+        });
+        let near_ground = after.returns().filter(|e| e.direction[2] < -0.1);
+        let off: Vec<f32> = near_ground.map(|e| (e.intensity / light(e)).ln().abs()).collect();
+        assert!(off.len() > 500);
+        let mean = off.iter().sum::<f32>() / off.len() as f32;
+        assert!(mean < 0.02, "{mean}");
     }
 
     #[test]

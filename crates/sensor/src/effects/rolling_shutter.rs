@@ -3,6 +3,7 @@
 use super::reshoot::reshoot;
 use super::{Draws, FrameContext, Need, SensorEffect};
 use crate::beams::{Beams, Shutter};
+use crate::rig::Sensor;
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
@@ -26,6 +27,10 @@ pub struct RollingShutter {
     /// positive. Without it the times of the shots are taken.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scan_s: Option<f64>,
+    /// With `scan_s`: what shots at a quarter of the scan are early by and those at three quarters late, as a share of
+    /// its duration, beyond even motion. Mirrors that swing are fastest in the middle of a scan.
+    #[serde(default, skip_serializing_if = "is_even")]
+    pub uneven: f64,
     /// On finished clouds, displace labelled objects alone, by their velocities relative to the ego vehicle.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub only_objects: bool,
@@ -35,9 +40,19 @@ pub struct RollingShutter {
     pub slide: Option<[f64; 3]>,
 }
 
+fn is_even(uneven: &f64) -> bool {
+    *uneven == 0.0
+}
+
+impl RollingShutter {
+    /// Largest unevenness of a scan that never turns back.
+    pub const MOST_UNEVEN: f64 = 0.15;
+}
+
 impl SensorEffect for RollingShutter {
     fn check(&self) -> Result<(), KeyError> {
         within("scan_s", self.scan_s.unwrap_or(0.0), -1.0, 1.0)?;
+        within("uneven", self.uneven, -Self::MOST_UNEVEN, Self::MOST_UNEVEN)?;
         let slide = self.slide.unwrap_or_default();
         slide.iter().enumerate().try_for_each(|(k, v)| within(&format!("slide[{k}]"), *v, -100.0, 100.0))
     }
@@ -74,7 +89,8 @@ impl SensorEffect for RollingShutter {
             reshoot(scan, frame, draws, |_, echo| Some(moved_by(-way * phase(echo), -turn * phase(echo))));
             return;
         }
-        let time_s = |echo: &Echo| self.scan_s.map_or(f64::from(echo.time_s), |scan_s| -scan_s * phase(echo));
+        let late = |echo: &Echo| phase(echo) + self.uneven * Sensor::uneven_phase(phase(echo));
+        let time_s = |echo: &Echo| self.scan_s.map_or(f64::from(echo.time_s), |scan_s| -scan_s * late(echo));
         let (ego, turn) = (Vector3::from(frame.ego_velocity), Vector3::from(frame.ego_turn_rate));
         let car_at = |echo: &Echo| {
             let point = echo.point().map(f64::from);
@@ -123,7 +139,7 @@ mod tests {
     }
 
     fn shutter(deskewed: bool) -> RollingShutter {
-        RollingShutter { deskewed, scan_s: None, only_objects: false, slide: None }
+        RollingShutter { deskewed, scan_s: None, uneven: 0.0, only_objects: false, slide: None }
     }
 
     #[test]

@@ -202,6 +202,12 @@ impl Sensor {
         0.5 - blocks.iter().map(done).sum::<f64>() / all
     }
 
+    /// Form of a scan that does not turn evenly, by its phase: what is added to the phase, in units of `uneven`.
+    /// Mirrors that swing are fastest in the middle.
+    pub fn uneven_phase(phase: f64) -> f64 {
+        (std::f64::consts::TAU * phase).sin()
+    }
+
     /// Azimuth (counter-clockwise from x, rad), elevation (rad) and range (m) of a point in the sensor's frame.
     pub fn spherical(sensor_point: &Point3<f64>) -> [f64; 3] {
         let p = sensor_point.coords;

@@ -45,8 +45,10 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
     let origins = origins(context.rig);
     let displaced = moving.iter().find_map(|(c, _)| if let Column::SensorPose(s, _) = c { Some(*s) } else { None });
     let noise_m = usual_noise_m(context.frames);
+    let driving = context.driving();
     let of_frame = |&f: &usize| {
         let frame = &context.frames[f];
+        let own = driving.as_ref().map(|own| &own[f]);
         // The pose error of the whole frame is that of the other sensors.
         let mut pose = SVector::zeros();
         if let Some(s) = displaced {
@@ -57,7 +59,7 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
         let place = |ray: &Ray| {
             let sensor = ray.sensor as usize;
             let mount = &context.rig.sensors[sensor];
-            let levers = Levers::new(ray, &origins[sensor], mount);
+            let levers = Levers::new(ray, &origins[sensor], mount, own);
             let expected: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
             let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose);
             (expected != 0.0 && (y - expected).abs() < STRAY_M)

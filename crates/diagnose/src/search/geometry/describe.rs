@@ -1,7 +1,7 @@
 //! Findings of geometry: parameters, sentences and plots.
 
 use super::curve::linear_curve;
-use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_TURN_RAD};
+use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SWEEP, FLOOR_TURN_RAD};
 use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit, split};
 use super::{Search, Selected};
@@ -12,6 +12,7 @@ use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, fit};
+use crate::search::rolling_shutter::Extent;
 use crate::search::{Found, NamedParameter, Z_STAR, parameter, sensor_number, with_error};
 use nalgebra::Vector3;
 use sensor::Rig;
@@ -74,6 +75,20 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     let numbers = parameters.iter().filter(|(id, _)| !is_sensor(id));
     let list: Vec<String> = numbers.map(|(id, p)| format!("{id} {:.4} {}", p.estimate, p.unit)).collect();
     let seen_by = sensor.map_or("lidar", |s| rig.sensors[s].name.as_str());
+    if columns.iter().any(|c| sums.columns[*c] == Column::Scan) {
+        let of = |column: Column| {
+            let i = fitted.columns.iter().position(|c| sums.columns[*c] == column);
+            i.map_or([0.0; 2], |i| [fitted.theta[i], fitted.error(i)])
+        };
+        let driving = search.context.driving().unwrap_or_default();
+        let extent = Extent::of_duration([Column::Scan, Column::Uneven].map(of), &driving);
+        return Description {
+            covariate: Covariate::ScanPhase,
+            says: extent.says(),
+            curve: linear_curve(search, &fitted, columns, cause),
+            parameters: extent.parameters(),
+        };
+    }
     let displaced = format!("sensor {seen_by} sees the scene displaced: it is mounted otherwise than believed");
     let (covariate, what) = match cause {
         Cause::RangeBias => {
@@ -101,7 +116,9 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chos
     let ((std, n), mut offsets) = match grouping {
         Grouping::Row => {
             let rows = search.sums.rows(&search.estimate, column, chosen);
-            (grouped::spread_of_rows(&rows), rows)
+            // Errors of ranges are independent from row to row, those of elevations may be along a line.
+            let spread = if column == 0 { grouped::spread_of_rows } else { grouped::spread_of_smooth_rows };
+            (spread(&rows), rows)
         }
         Grouping::Azimuth => strips(search, column),
     };
@@ -238,7 +255,7 @@ fn linear_parameters(
                     (shift[k - 3], shift_error[k - 3]) = (-theta, error.hypot(0.003));
                 }
             }
-            Column::Structure(_) => {}
+            Column::Scan | Column::Uneven | Column::Structure(_) => {}
         }
     }
     parameters.extend(pose_parameters(rig, Pose { turn, turn_error, shift, shift_error, sensor }, cause));
@@ -324,6 +341,8 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(C
     // The pose of one of several sensors has no other smallest size.
     let least = if one == Column::Pose(2) { FLOOR_TURN_RAD } else { 0.0 };
     push(Cause::SensorExtrinsics, Quantity::YawDeg, error(one), displacing(one).max(least), deg);
+    let ahead = Column::Sweep(0);
+    push(Cause::RollingShutter, Quantity::ShearXM, error(ahead), displacing(ahead).max(FLOOR_SWEEP[0]), 1.0);
     push(Cause::BeamRangeOffset, Quantity::StdM, Some(0.0), FLOOR_GROUPS[0], 1.0);
     push(Cause::BeamElevationOffset, Quantity::StdDeg, Some(0.0), FLOOR_GROUPS[1], deg);
     all

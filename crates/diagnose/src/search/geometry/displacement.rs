@@ -1,12 +1,14 @@
 //! The displacement that the search of geometry found, to be undone before other channels are searched.
 
-use super::hypotheses::Hypothesis;
+use super::hypotheses::{Hypothesis, is_sweep};
 use super::sums::{Sums, group_fit, split};
 use crate::channels::groups::{Group, Grouping, STRIP_RAD, Undone, group_of};
 use crate::channels::mean::Column;
 use crate::pairing::Ray;
 use nalgebra::{Isometry3, Point3, SVector, Vector3};
 use sensor::Rig;
+#[cfg(doc)]
+use sensor::Sensor;
 use sensor::directions::Sensors;
 use std::collections::BTreeMap;
 
@@ -23,6 +25,21 @@ pub struct Displacement {
     pub rows: Undone,
     /// Range offsets of strips of azimuth, m.
     pub strips: BTreeMap<Group, f64>,
+    /// Displacement over a scan: along x and y, m, and about z, rad.
+    pub shear: [f64; 3],
+    /// Duration of a scan, s.
+    pub scan_s: f64,
+    /// How uneven it is, s.
+    pub uneven_s: f64,
+}
+
+/// What surfaces show of a displacement over a scan: estimates with their standard errors.
+#[derive(Clone, Copy, Debug)]
+pub enum Swept {
+    /// Duration of a scan, s, where the motion is known, and how unevenly it turns, s (see [`Sensor::uneven_phase`]).
+    Duration([[f64; 2]; 2]),
+    /// Displacement of what stands still: along x and y, m, and about z, rad.
+    Shear([[f64; 2]; 3]),
 }
 
 impl Displacement {
@@ -34,6 +51,14 @@ impl Displacement {
     /// Whether rows have elevation offsets.
     pub fn rows_aim_elsewhere(&self) -> bool {
         self.rows.values().any(|[_, elevation_rad]| *elevation_rad != 0.0)
+    }
+
+    /// The displacement over a scan.
+    pub fn swept(&self) -> Option<Swept> {
+        if self.scan_s != 0.0 {
+            return Some(Swept::Duration([self.scan_s, self.uneven_s].map(|by| [by, 0.0])));
+        }
+        (self.shear != [0.0; 3]).then(|| Swept::Shear(self.shear.map(|by| [by, 0.0])))
     }
 
     /// Whether ranges have offsets by row or by azimuth.
@@ -48,7 +73,10 @@ impl Displacement {
             Column::SensorPose(s, k) => self.sensors.get(s).map_or(0.0, |pose| pose[k]),
             Column::RangeOffset => self.bias[0],
             Column::RangeScale => self.bias[1],
-            Column::Sweep(_) | Column::Structure(_) => 0.0,
+            Column::Sweep(k) => self.shear[k],
+            Column::Scan => self.scan_s,
+            Column::Uneven => self.uneven_s,
+            Column::Structure(_) => 0.0,
         }
     }
 
@@ -105,13 +133,17 @@ pub(super) fn displacement(
     let mut out = Displacement { sensors: vec![SVector::zeros(); rig.sensors.len()], ..Displacement::default() };
     let (columns, groups) = split(chosen);
     let fitted = sums.fit_all(select, blocks, chosen);
-    for (c, theta) in fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c)) {
+    let undone = |c: &usize| columns.contains(c) || is_sweep(sums.columns[*c]);
+    for (c, theta) in fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| undone(c)) {
         match sums.columns[*c] {
             Column::Pose(k) => out.scene[k] += theta,
             Column::SensorPose(s, k) => out.sensors[s][k] += theta,
             Column::RangeOffset => out.bias[0] = *theta,
             Column::RangeScale => out.bias[1] = *theta,
-            Column::Sweep(_) | Column::Structure(_) => {}
+            Column::Sweep(k) => out.shear[k] = *theta,
+            Column::Scan => out.scan_s = *theta,
+            Column::Uneven => out.uneven_s = *theta,
+            Column::Structure(_) => {}
         }
     }
     for (grouping, column) in groups {

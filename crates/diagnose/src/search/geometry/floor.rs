@@ -18,8 +18,9 @@ pub(super) const FLOOR_TURN_RAD: f64 = 5.2e-4;
 /// Smallest shift of the scene that is reported, m.
 const FLOOR_SHIFT_M: f64 = 0.04;
 
-/// Smallest displacement over a scan that is reported: along x and y in m, about z in rad.
-const FLOOR_SWEEP: [f64; 3] = [0.3, 0.3, 0.01];
+/// Smallest displacement over a scan that is reported: along x and y in m, the shift of a scene at either end; about z
+/// in rad.
+pub(super) const FLOOR_SWEEP: [f64; 3] = [2.0 * FLOOR_SHIFT_M, 2.0 * FLOOR_SHIFT_M, 0.01];
 
 /// Smallest displacement of surfaces that is reported, root mean square over the returns, m, without the part that
 /// errors of the surfaces themselves and the other hypotheses can be. The surfaces of a model lie up to [`STRUCTURE_M`]
@@ -65,9 +66,12 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
                 Column::Pose(0..3) => FLOOR_TURN_RAD,
                 Column::Pose(_) => FLOOR_SHIFT_M,
                 Column::Sweep(k) => FLOOR_SWEEP[k],
-                Column::RangeOffset | Column::RangeScale | Column::SensorPose(..) | Column::Structure(_) => {
-                    f64::INFINITY
-                }
+                Column::Scan => FLOOR_SWEEP[0] / sums.middle_m_s.max(1e-9),
+                Column::RangeOffset
+                | Column::RangeScale
+                | Column::SensorPose(..)
+                | Column::Structure(_)
+                | Column::Uneven => f64::INFINITY,
             };
             bias_m(10.0) > FLOOR_OFFSET_M
                 || bias_m(40.0) > 3.2 * FLOOR_OFFSET_M
@@ -137,6 +141,7 @@ mod tests {
             strips: none(),
             poses: vec![],
             of_sensors: vec![vec![2e6]],
+            middle_m_s: 0.0,
         }
     }
 

@@ -20,6 +20,14 @@ impl Hypothesis {
         }
     }
 
+    /// Its columns of the linear fit.
+    pub(super) fn columns(&self) -> &[usize] {
+        match self {
+            Hypothesis::Linear { columns, .. } => columns,
+            Hypothesis::Groups { .. } => &[],
+        }
+    }
+
     /// Number of free parameters. Offsets of groups are shrunk by their prior: 12 for rows and 14 for strips of
     /// azimuth are what they count.
     pub(super) fn parameters(&self) -> usize {
@@ -31,8 +39,9 @@ impl Hypothesis {
     }
 }
 
-/// All hypotheses of a rig. With a single sensor its pose and that of the scene are the same columns.
-pub(super) fn hypotheses(context: &Context, columns: &[Column]) -> Vec<Hypothesis> {
+/// All hypotheses of a rig, without a displacement over a scan where one was undone. With a single sensor its pose and
+/// that of the scene are the same columns.
+pub(super) fn hypotheses(context: &Context, columns: &[Column], undone: bool) -> Vec<Hypothesis> {
     let at = |c: Column| columns.iter().position(|x| *x == c);
     let pick = |list: &[Column]| list.iter().filter_map(|c| at(*c)).collect::<Vec<_>>();
     let linear = |cause, list: &[Column]| Hypothesis::Linear { cause, columns: pick(list) };
@@ -43,6 +52,7 @@ pub(super) fn hypotheses(context: &Context, columns: &[Column]) -> Vec<Hypothesi
         linear(Cause::PitchRoll, &[Column::Pose(1)]),
         linear(Cause::PitchRoll, &[Column::Pose(0)]),
         linear(Cause::PitchRoll, &[Column::Pose(0), Column::Pose(1)]),
+        linear(Cause::RollingShutter, &[Column::Scan]),
         linear(Cause::RollingShutter, &[Column::Sweep(0)]),
         linear(Cause::RollingShutter, &[Column::Sweep(2)]),
         linear(Cause::RollingShutter, &[Column::Sweep(0), Column::Sweep(2)]),
@@ -67,7 +77,16 @@ pub(super) fn hypotheses(context: &Context, columns: &[Column]) -> Vec<Hypothesi
     all.push(Hypothesis::Groups { cause: Cause::BeamRangeOffset, grouping: Grouping::Row, column: 0 });
     all.push(Hypothesis::Groups { cause: Cause::BeamElevationOffset, grouping: Grouping::Row, column: 1 });
     all.push(Hypothesis::Groups { cause: Cause::Unexplained, grouping: Grouping::Azimuth, column: 0 });
+    all.retain(|h| match h {
+        Hypothesis::Linear { cause: Cause::RollingShutter, columns } => !undone && !columns.is_empty(),
+        _ => true,
+    });
     all
+}
+
+/// Whether a column is a displacement over a scan.
+pub(super) fn is_sweep(column: Column) -> bool {
+    matches!(column, Column::Sweep(_) | Column::Scan | Column::Uneven)
 }
 
 /// Whether a hypothesis is a pose. A second pose may only compensate the non-linear part of a large first one.

@@ -11,7 +11,7 @@ mod row_offsets;
 mod rows;
 mod sums;
 
-pub use self::displacement::Displacement;
+pub use self::displacement::{Displacement, Swept};
 
 use self::common_turns::common_turns;
 use self::displacement::displacement;
@@ -19,9 +19,12 @@ use self::floor::above_floor;
 use self::hypotheses::{Hypothesis, hypotheses, is_pose, may_join};
 use self::rows::drop_less_certain_rows;
 use self::sums::{Sums, sums};
+use super::confounders::is_confirmed;
+use super::rolling_shutter::Slide;
 use super::{ChannelResult, Context, Selected, Z_STAR, causes_of, first_demands, record, rivals_and_confidence};
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
+use crate::channels::mean::Column;
 use crate::diagnosis::Considered;
 use crate::error::DiagnoseError;
 use crate::inference::choice::{Demands, Trial, choose, significant, total_and_z};
@@ -35,6 +38,10 @@ const SECOND_POSE_SHARE: f64 = 0.3;
 /// Frames by role, their sums and what is demanded of a hypothesis.
 struct Search<'a> {
     context: &'a Context<'a>,
+    /// Whether a displacement over a scan was undone.
+    is_moved_back: bool,
+    /// What may be left of it.
+    swept: Vec<Column>,
     /// Of the frames as they are; once the hypotheses are chosen, of those with the displacement undone.
     sums: Sums,
     select: Vec<usize>,
@@ -51,10 +58,17 @@ struct Search<'a> {
 /// Chosen hypotheses, with what the selection says of each.
 type Chosen = (Vec<Hypothesis>, Vec<Selected>);
 
+/// A displacement over a scan that was chosen, with its gains on the held-out frames, nats.
+struct Sheared {
+    hypothesis: Hypothesis,
+    selected: Selected,
+    gains: Vec<f64>,
+}
+
 /// Gains of the `test` frames by unconstrained tables fitted on the `train` frames, nats: all poses and biases
 /// together or offsets of strips of azimuth, whichever is more, and offsets of rows beyond those of their neighbours.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
-    let sums = sums(context, train, &Displacement::default());
+    let sums = sums(context, train, &Displacement::default(), &[]);
     let (full, base) = sums.full_and_base(train, &context.blocks(train));
     let linear: Vec<f64> = test.iter().map(|&f| full.gain(&sums.linear[f]) - base.gain(&sums.linear[f])).collect();
     // Offsets that one part of the rays of a row or strip predicts for the other parts: those of the sensor, not of
@@ -80,39 +94,64 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
 /// Pairs the frames anew with a displacement undone.
 pub type Undo<'a> = &'a dyn Fn(&Displacement) -> Result<Vec<FramePair>, DiagnoseError>;
 
-/// The search, and the displacement that the other channels have to undo. Turns and shifts of metres at the far end
-/// are not linear, nor is the place where a row meets the ground near its horizon: what was chosen is fitted a second
-/// time, on frames that `undo` pairs anew.
+/// What the search found.
+pub struct Geometry {
+    /// Findings.
+    pub result: ChannelResult,
+    /// The displacement that the other channels have to undo.
+    pub displaced: Displacement,
+    /// The displacement over a scan, or what was left of one that was undone.
+    pub swept: Option<Swept>,
+}
+
+/// The search. Turns and shifts of metres at the far end are not linear, nor is the place where a row meets the ground
+/// near its horizon: what was chosen is fitted a second time, on frames that `undo` pairs anew. Where a displacement
+/// over a scan was undone before, what may be left of it is fitted with all else. Where one is chosen it is undone
+/// first, and the search begins anew: it leaves every sensor with an apparent turn and shift of its own.
 ///
 /// # Errors
 /// Those of `undo`.
-pub fn search(context: &Context, undo: Undo) -> Result<(ChannelResult, Displacement), DiagnoseError> {
-    let mut search = Search::new(context);
+pub fn search(context: &Context, slide: Option<&Slide>, undo: Undo) -> Result<Geometry, DiagnoseError> {
+    let mut search = Search::new(context, slide);
     let mut result = ChannelResult::new(Channel::Residuals, search.hold_out.len());
     result.minimum = describe::minimum(&search.sums, &search.select, &search.blocks);
     let mut chosen = search.select(&mut result);
-    search.add_common_turns(&mut chosen, &mut result);
-    let displaced = search.displacement(&chosen.0);
-    if displaced.moves() || displaced.rows_aim_elsewhere() || displaced.bias != [0.0; 2] {
-        let frames = undo(&displaced)?;
-        search.sums = sums(&Context { frames: &frames, ..context.clone() }, &search.select, &displaced);
+    let sheared = search.take_sheared(&mut chosen);
+    if let Some(Sheared { hypothesis, .. }) = &sheared {
+        search.is_moved_back = true;
+        search.swept = hypothesis.columns().iter().map(|&c| search.sums.columns[c]).collect();
+        if search.swept == [Column::Scan] {
+            search.swept.push(Column::Uneven);
+        }
+        search.undo(std::slice::from_ref(hypothesis), undo)?;
+        chosen = search.select(&mut result);
     }
+    search.add_common_turns(&mut chosen, &mut result);
+    search.undo(&chosen.0, undo)?;
     let (chosen, selected) = search.large_enough(chosen);
     let gains: Vec<Vec<f64>> = chosen.iter().map(|hypothesis| search.held_out_gains(hypothesis, &chosen)).collect();
     result.distance = search.distances(&chosen, &gains);
     for ((hypothesis, selected), gains) in chosen.iter().zip(selected).zip(gains) {
         result.found.push(describe::found(&search, hypothesis, &chosen, selected, gains));
     }
-    let displaced = search.displacement(&chosen);
-    Ok((result, displaced))
+    let (displaced, swept) = (search.displacement(&chosen), search.what_is_swept(&chosen));
+    if let Some(Sheared { hypothesis, selected, gains }) = sheared {
+        result.distance.iter_mut().zip(&gains).for_each(|(d, g)| *d = d.map(|nats| nats + g));
+        let all = [chosen, vec![hypothesis.clone()]].concat();
+        result.found.push(describe::found(&search, &hypothesis, &all, selected, gains));
+    }
+    Ok(Geometry { result, displaced, swept })
 }
 
 impl<'a> Search<'a> {
-    fn new(context: &'a Context<'a>) -> Self {
+    fn new(context: &'a Context<'a>, slide: Option<&Slide>) -> Self {
+        let swept = slide.map_or(&[][..], Slide::left);
         let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
         Search {
             context,
-            sums: sums(context, &select, &Displacement::default()),
+            is_moved_back: slide.is_some(),
+            swept: swept.to_vec(),
+            sums: sums(context, &select, &Displacement::default(), swept),
             blocks: context.blocks(&select),
             estimate_blocks: context.blocks(&estimate),
             demands: first_demands(),
@@ -128,6 +167,51 @@ impl<'a> Search<'a> {
         displacement(self.context.rig, &self.sums, &self.select, &self.blocks, chosen)
     }
 
+    /// Sums of frames that are paired with the displacement by some hypotheses undone, where there is any.
+    fn undo(&mut self, chosen: &[Hypothesis], undo: Undo) -> Result<(), DiagnoseError> {
+        let displaced = self.displacement(chosen);
+        if displaced.moves()
+            || displaced.rows_aim_elsewhere()
+            || displaced.bias != [0.0; 2]
+            || displaced.swept().is_some()
+        {
+            let frames = undo(&displaced)?;
+            let context = Context { frames: &frames, ..self.context.clone() };
+            self.sums = sums(&context, &self.select, &displaced, &self.swept);
+        }
+        Ok(())
+    }
+
+    /// Takes a displacement over a scan out of the chosen hypotheses, where the estimating and the held-out frames
+    /// confirm it.
+    fn take_sheared(&self, (chosen, selected): &mut Chosen) -> Option<Sheared> {
+        let at = chosen.iter().position(|h| h.cause() == Cause::RollingShutter)?;
+        let hypothesis = chosen[at].clone();
+        let others = chosen.iter().filter(|h| **h != hypothesis).cloned();
+        let last: Vec<Hypothesis> = others.chain([hypothesis.clone()]).collect();
+        let gains = self.held_out_gains(&hypothesis, chosen);
+        let found = describe::found(self, &hypothesis, chosen, selected[at].clone(), gains.clone());
+        let large = above_floor(&self.sums, &self.estimate, &self.estimate_blocks, &last);
+        (large && is_confirmed(&found)).then(|| {
+            chosen.remove(at);
+            Sheared { hypothesis, selected: selected.remove(at), gains }
+        })
+    }
+
+    /// The displacement over a scan by the estimating frames.
+    fn what_is_swept(&self, chosen: &[Hypothesis]) -> Option<Swept> {
+        let fitted = self.sums.fit_all(&self.estimate, &self.estimate_blocks, chosen);
+        let of = |column: Column| {
+            let i = fitted.columns.iter().position(|c| self.sums.columns[*c] == column)?;
+            Some([fitted.theta[i], fitted.error(i)]).filter(|_| self.swept.contains(&column))
+        };
+        if let Some(duration) = of(Column::Scan) {
+            return Some(Swept::Duration([duration, of(Column::Uneven).unwrap_or_default()]));
+        }
+        let shear = [0, 1, 2].map(|k| of(Column::Sweep(k)));
+        shear.iter().any(Option::is_some).then(|| Swept::Shear(shear.map(Option::unwrap_or_default)))
+    }
+
     /// Cross-validated gains of the selecting frames, nats.
     fn gains(&self, hypotheses: &[Hypothesis]) -> Vec<f64> {
         self.sums.gains(&self.select, &self.blocks, hypotheses)
@@ -140,7 +224,7 @@ impl<'a> Search<'a> {
 
     /// Forward selection, until no hypothesis brings what is demanded.
     fn select(&self, result: &mut ChannelResult) -> Chosen {
-        let all = hypotheses(self.context, &self.sums.columns);
+        let all = hypotheses(self.context, &self.sums.columns, self.is_moved_back);
         let (mut chosen, mut selected): Chosen = (Vec::new(), Vec::new());
         let mut first_gains: Vec<f64> = Vec::new();
         for step in 0..all.len() {

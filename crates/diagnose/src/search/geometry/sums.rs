@@ -24,7 +24,8 @@ pub(super) struct Sums {
     pub(super) columns: Vec<Column>,
     /// Prior precision of each column.
     pub(super) precision: Vec<f64>,
-    /// Columns of the base model: offsets of the surfaces.
+    /// Columns of the base model: offsets of the surfaces, and what is left of a displacement over a scan that was
+    /// undone.
     pub(super) base: Vec<usize>,
     /// Linear sums of each frame, its own pose and displacement over a scan integrated out.
     pub(super) linear: Vec<LinearFrame>,
@@ -44,6 +45,8 @@ pub(super) struct Sums {
     pub(super) poses: Vec<OwnPoses>,
     /// Weights of all returns of each sensor, by frame.
     pub(super) of_sensors: Vec<Vec<f64>>,
+    /// Median ego speed, m/s; 0 where it is not known.
+    pub(super) middle_m_s: f64,
 }
 
 /// Groups of every frame, by part and whole.
@@ -53,15 +56,17 @@ pub(super) struct Groups {
 }
 
 /// Sums of all frames; priors are fitted on the selecting ones. What was undone before the frames were paired is added
-/// to what is left: fits are of the whole displacement, linear about what was undone (a step of Gauss and Newton).
-pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement) -> Sums {
+/// to what is left: fits are of the whole displacement, linear about what was undone (a step of Gauss and Newton). The
+/// columns `swept` are in the base model.
+pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, swept: &[Column]) -> Sums {
     let (frames, rig) = (context.frames, context.rig);
     let origins = origins(rig);
     let noise_m = usual_noise_m(frames);
     let poses: Vec<OwnPoses> = frames.par_iter().map(|f| own_poses(f, &origins, noise_m)).collect();
     let design = design_effect(frames, &origins, &poses, noise_m);
-    let columns = columns(rig);
-    let means: Vec<MeanFrame> = mean_frames(frames, rig, &columns, &poses, noise_m, design);
+    let driving = context.driving();
+    let columns = columns(rig, driving.is_some());
+    let means = mean_frames(frames, rig, &columns, &poses, driving.as_deref(), noise_m, design);
     let of_sensors = sensor_weights(&means, &columns, rig.sensors.len());
     let prior = own_scatter(rig, &poses, select);
     let without_own = |m: &MeanFrame| {
@@ -70,7 +75,8 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement) -
     };
     let mut linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
     let precision: Vec<f64> = columns.iter().map(|c| precision(*c)).collect();
-    let base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
+    let mut base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
+    base.extend((0..columns.len()).filter(|&i| swept.contains(&columns[i])));
     let selected: Vec<&LinearFrame> = select.iter().map(|&i| &linear[i]).collect();
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
@@ -97,6 +103,7 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement) -
         whole: means.into_iter().map(|m| m.gram).collect(),
         poses,
         of_sensors,
+        middle_m_s: driving.map_or(0.0, |own| median(own.iter().map(|own| own.speed_m_s().abs()).collect())),
     }
 }
 
@@ -148,6 +155,8 @@ fn precision(column: Column) -> f64 {
         Column::Pose(_) | Column::SensorPose(..) => 0.2,
         Column::Sweep(0..2) => 8.0,
         Column::Sweep(_) => 0.2,
+        Column::Scan => 0.1,
+        Column::Uneven => 0.005,
         Column::Structure(_) => STRUCTURE_M,
     };
     1.0 / (sd * sd)
@@ -285,7 +294,8 @@ impl Sums {
 
     /// Fit of the base model together with the linear hypotheses.
     pub(super) fn fit_all(&self, frames: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> LinearFit {
-        let (columns, _) = split(hypotheses);
+        let (mut columns, _) = split(hypotheses);
+        columns.retain(|c| !self.base.contains(c));
         let with: Vec<usize> = self.base.iter().chain(&columns).copied().collect();
         let frames: Vec<&LinearFrame> = frames.iter().map(|&i| &self.linear[i]).collect();
         fit(&frames, blocks, &with, &self.precision)

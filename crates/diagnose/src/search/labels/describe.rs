@@ -84,7 +84,8 @@ impl Description<'_> {
                 }
                 Column::Longer => (Quantity::LongerM, 2.0 * theta, 2.0 * error),
                 Column::Wider => (Quantity::WiderM, 2.0 * theta, 2.0 * error),
-                Column::Swept => (Quantity::ScanS, -theta, error.hypot(0.05 * theta)),
+                // By the form of the scan as well.
+                Column::Swept => (Quantity::ScanS, -theta, error.hypot(0.1 * theta)),
             };
             parameters.push(parameter(quantity, estimate, error));
         }
