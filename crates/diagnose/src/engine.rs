@@ -270,16 +270,14 @@ impl Engine<'_> {
             known.undone(self, displaced, left.as_ref())
         };
         let Geometry { result, displaced, swept } = search::geometry::search(&moved_back, known.slide.as_ref(), &undo)?;
-        let standing = match swept {
-            Some(swept) => {
-                match (&mut known.slide, sliding.found.first_mut()) {
-                    (Some(slide), Some(found)) => slide.refine(found, swept),
-                    _ => known.slide = Some(Slide::of_surfaces(&moved_back, swept)),
-                }
-                known.standing(self)?
+        let changed = swept.is_some_and(|swept| match (&mut known.slide, sliding.found.first_mut()) {
+            (Some(slide), Some(found)) => slide.refine(found, swept),
+            _ => {
+                known.slide = Some(Slide::of_surfaces(&moved_back, swept));
+                true
             }
-            None => standing,
-        };
+        });
+        let standing = if changed { known.standing(self)? } else { standing };
         let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
         let mut results = vec![sliding, rounding, of_coordinates, dual, result];
         known.displaced = displaced;

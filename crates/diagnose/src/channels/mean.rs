@@ -217,11 +217,9 @@ pub struct Levers {
 impl Levers {
     /// Of a measured ray of a sensor at `origin`, with the ego motion of its frame where it is known.
     pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &Sensor, own: Option<&OwnMotion>) -> Self {
-        let pose = pose_row(ray, origin, &Point3::origin());
+        let place = origin.coords + ray.recorded_vector();
         // The scene moves against the vehicle.
-        let against = |own: &OwnMotion| {
-            -(own.turn_rate_rad_s.dot(&pose.fixed_rows::<3>(0)) + own.velocity_m_s.dot(&pose.fixed_rows::<3>(3)))
-        };
+        let against = |own: &OwnMotion| -ray.normal_vector().dot(&own.velocity_at(&place));
         Levers {
             sensor: ray.sensor as usize,
             kind: kind_of(ray),
@@ -229,7 +227,7 @@ impl Levers {
             by_range: ray.range_lever(),
             phase: mount.scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad)),
             by_motion: own.map_or(0.0, against),
-            pose,
+            pose: pose_row(ray, origin, &Point3::origin()),
             sensor_pose: pose_row(ray, origin, origin),
         }
     }

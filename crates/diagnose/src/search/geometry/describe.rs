@@ -76,10 +76,7 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     let list: Vec<String> = numbers.map(|(id, p)| format!("{id} {:.4} {}", p.estimate, p.unit)).collect();
     let seen_by = sensor.map_or("lidar", |s| rig.sensors[s].name.as_str());
     if columns.iter().any(|c| sums.columns[*c] == Column::Scan) {
-        let of = |column: Column| {
-            let i = fitted.columns.iter().position(|c| sums.columns[*c] == column);
-            i.map_or([0.0; 2], |i| [fitted.theta[i], fitted.error(i)])
-        };
+        let of = |column: Column| sums.fitted(&fitted, column).unwrap_or_default();
         let driving = search.context.driving().unwrap_or_default();
         let extent = Extent::of_duration([Column::Scan, Column::Uneven].map(of), &driving);
         return Description {

@@ -201,10 +201,7 @@ impl<'a> Search<'a> {
     /// The displacement over a scan by the estimating frames.
     fn what_is_swept(&self, chosen: &[Hypothesis]) -> Option<Swept> {
         let fitted = self.sums.fit_all(&self.estimate, &self.estimate_blocks, chosen);
-        let of = |column: Column| {
-            let i = fitted.columns.iter().position(|c| self.sums.columns[*c] == column)?;
-            Some([fitted.theta[i], fitted.error(i)]).filter(|_| self.swept.contains(&column))
-        };
+        let of = |column: Column| self.sums.fitted(&fitted, column).filter(|_| self.swept.contains(&column));
         if let Some(duration) = of(Column::Scan) {
             return Some(Swept::Duration([duration, of(Column::Uneven).unwrap_or_default()]));
         }

@@ -301,6 +301,12 @@ impl Sums {
         fit(&frames, blocks, &with, &self.precision)
     }
 
+    /// The coefficient of a column in a fit with its standard error; `None` where it was not fitted.
+    pub(super) fn fitted(&self, fit: &LinearFit, column: Column) -> Option<[f64; 2]> {
+        let i = fit.columns.iter().position(|c| self.columns[*c] == column)?;
+        Some([fit.theta[i], fit.error(i)])
+    }
+
     /// Gains of frames by one of the chosen hypotheses, fitted on the estimating frames, over a fit without it, nats.
     pub(super) fn gains_of(
         &self,
