@@ -126,10 +126,11 @@ fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
         Cause::PitchRoll => Effect::EgoAttitude(EgoAttitude {
             roll_deg: value(Quantity::RollDeg),
             pitch_deg: value(Quantity::PitchDeg),
-            pitch_at_70mps_deg: 0.0,
-            roll_std_deg: 0.0,
-            pitch_std_deg: 0.0,
-            heave_std_m: 0.0,
+            ..EgoAttitude::default()
+        }),
+        Cause::EgoAttitude => Effect::EgoAttitude(EgoAttitude {
+            pitch_at_70mps_deg: value(Quantity::PitchAt70MpsDeg),
+            ..EgoAttitude::default()
         }),
         Cause::RollingShutter => return vec![rolling_shutter(f)],
         // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
@@ -243,6 +244,7 @@ fn tables(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
             sensor: sensor.name.clone(),
             covariate: match f.covariate {
                 Covariate::Row => TableCovariate::ElevationDeg,
+                Covariate::Range => TableCovariate::RangeM,
                 _ => TableCovariate::AzimuthDeg,
             },
             at: table.iter().map(|p| rounded(p[0], 4)).collect(),

@@ -341,7 +341,7 @@ impl Engine<'_> {
     ) -> Result<Vec<ChannelResult>, DiagnoseError> {
         let displaced = &known.displaced;
         let shift = |frame: usize, p: &Vector3<f64>, sensor: usize| {
-            known.slide_m(frame, p, sensor) + displaced.of_point(p, sensor, &self.origins[sensor])
+            known.slide_m(frame, p, sensor) + displaced.of_point(p, (frame, sensor), &self.origins[sensor])
         };
         let moves = known.slide.is_some() || displaced.moves();
         let moved =
@@ -363,7 +363,7 @@ impl Engine<'_> {
         let off = |ray: &Ray| displaced.of_strip(ray);
         let even = Corrections {
             shift_m: if displaced.rows.is_empty() { moved.shift_m } else { Some(&in_row) },
-            range_m: (!displaced.strips.is_empty()).then_some(&off),
+            range_m: displaced.has_strips().then_some(&off),
             step_m: known.step_m,
         };
         let even = if uneven || known.step_m.is_some() { Some(self.pair(even)?) } else { None };

@@ -148,6 +148,23 @@ fn a_small_motion_distortion_is_found_and_corrected() {
     assert!(second.findings.is_empty(), "{:?}", second.findings);
 }
 
+/// A range offset that grows over the recording is found with its size, and corrected.
+#[test]
+fn a_drift_of_ranges_is_found_and_corrected() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = race_with(folder.path(), false, "columns");
+    let drift = "[[effect]]\nkind = \"range_drift\"\ndrift_m = 0.1\ntime_constant_s = 30\n";
+    let measured = with_effects(&sim, drift, &folder.path().join("drift"), 11);
+    let outcome = diagnosed(&measured, &sim, folder.path());
+    let d = &outcome.diagnosis;
+    assert_eq!(named(d), ["range_drift"], "{:?} {:?}", d.findings, d.considered);
+    // Within the 75 s of the race 92 % of it have come.
+    let found = d.findings[0].parameter(Quantity::DriftM).unwrap();
+    assert!((found.estimate / 0.092 - 1.0).abs() < 0.15, "{found:?}");
+    let closed = d.gain.closed_by_channel[&Channel::Residuals].closed;
+    assert!(closed > 0.8 && d.gain.not_applied.is_empty(), "{:?}", d.gain);
+}
+
 /// What a file format, a minimum range, lost packets and dirt do is found with its size, and corrected.
 #[test]
 fn formats_limits_packets_and_dirt_are_found_and_corrected() {

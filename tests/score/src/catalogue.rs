@@ -1,7 +1,7 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 37] = [
+pub const CATALOGUE: [&str; 39] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
@@ -9,6 +9,7 @@ pub const CATALOGUE: [&str; 37] = [
     "coordinate_rounding",
     "dirty_window",
     "dual_returns",
+    "ego_attitude",
     "ego_occlusion",
     "fog",
     "ghosts",
@@ -30,6 +31,7 @@ pub const CATALOGUE: [&str; 37] = [
     "random_dropout",
     "range_bias",
     "range_cut",
+    "range_drift",
     "range_dropout",
     "range_noise",
     "rolling_shutter",

@@ -280,7 +280,7 @@ impl Effect {
             }
             Effect::Spray { per_m } => vec![("density_per_m", per_m)],
             Effect::RangeDrift { drift_m } => vec![("drift_m", drift_m)],
-            Effect::EgoAttitude { pitch_rad } => vec![("pitch_at_10mps_deg", deg(pitch_rad))],
+            Effect::EgoAttitude { pitch_rad } => vec![("pitch_at_70mps_deg", deg(49.0 * pitch_rad))],
             Effect::RangeLimits { min_m } => vec![("min_m", min_m)],
             Effect::ThermalRows { drift_m } => vec![("drift_m", drift_m)],
             Effect::Bursts { frames, std_m } => vec![("frames", frames), ("std_m", std_m)],

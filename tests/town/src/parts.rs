@@ -102,7 +102,7 @@ impl Effect {
             Effect::RangeDrift { drift_m } => return whole("drift_m", drift_m, Scaling::Shift),
             Effect::EgoAttitude { pitch_rad } => {
                 let nearly = Effect::EgoAttitude { pitch_rad: keep * pitch_rad };
-                return turning("pitch_at_10mps_deg", pitch_rad.to_degrees(), nearly);
+                return turning("pitch_at_70mps_deg", 49.0 * pitch_rad.to_degrees(), nearly);
             }
             Effect::EncoderRipple { amplitude_rad, waves } => {
                 let nearly = Effect::EncoderRipple { amplitude_rad: keep * amplitude_rad, waves };

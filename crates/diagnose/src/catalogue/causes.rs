@@ -22,6 +22,8 @@ identifiers! {
         DirtyWindow = "dirty_window",
         /// Some shots have a second return, farther away.
         DualReturns = "dual_returns",
+        /// The ego vehicle pitches with the square of its speed.
+        EgoAttitude = "ego_attitude",
         /// A part of the ego vehicle hides some directions.
         EgoOcclusion = "ego_occlusion",
         /// Fog: droplets return light, ever fewer with range, and the light of surfaces falls.
@@ -64,6 +66,8 @@ identifiers! {
         RangeBias = "range_bias",
         /// Nothing is measured beyond a range.
         RangeCut = "range_cut",
+        /// A range offset that grows over the recording, as by warm-up.
+        RangeDrift = "range_drift",
         /// Returns are lost with range.
         RangeDropout = "range_dropout",
         /// Ranges scatter.
@@ -95,6 +99,7 @@ impl Cause {
             Cause::MissingObject => (Family::Geometry, 10),
             Cause::WrongShape => (Family::Geometry, 20),
             Cause::PitchRoll => (Family::Geometry, 30),
+            Cause::EgoAttitude => (Family::Geometry, 35),
             Cause::SensorExtrinsics => (Family::Geometry, 40),
             Cause::BeamElevationOffset => (Family::Geometry, 50),
             Cause::AngularJitter => (Family::RangeError, 60),
@@ -114,6 +119,7 @@ impl Cause {
             Cause::Spray => (Family::Returns, 156),
             Cause::Ghosts => (Family::Returns, 158),
             Cause::RangeBias => (Family::RangeError, 160),
+            Cause::RangeDrift => (Family::RangeError, 165),
             Cause::BeamRangeOffset => (Family::RangeError, 170),
             Cause::RangeNoise => (Family::RangeError, 180),
             Cause::IncidenceNoise => (Family::RangeError, 185),

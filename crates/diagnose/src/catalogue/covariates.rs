@@ -50,6 +50,8 @@ identifiers! {
         SurfaceStanding = "surface: standing",
         /// Labelled objects with their corners.
         SurfaceWholeObject = "surface: whole_object",
+        /// Time since the first frame.
+        Time = "time_s",
         /// Velocity over the ground.
         Velocity = "velocity_m_s",
     }
@@ -60,6 +62,7 @@ impl From<Grouping> for Covariate {
         match grouping {
             Grouping::Row => Covariate::Row,
             Grouping::Azimuth => Covariate::Azimuth,
+            Grouping::Range => Covariate::Range,
         }
     }
 }

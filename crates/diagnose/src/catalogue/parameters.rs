@@ -35,6 +35,8 @@ identifiers! {
         DepthM = "depth_m",
         /// Full width of the beam.
         DivergenceRad = "divergence_rad",
+        /// What a range offset grows by over the recording.
+        DriftM = "drift_m",
         /// Middle of a patch of directions.
         ElevationDeg = "elevation_deg",
         /// Lower end of the hidden directions.
@@ -83,6 +85,8 @@ identifiers! {
         PacketMs = "packet_ms",
         /// Growth of the noise with range.
         PerM = "per_m",
+        /// Turn about the y axis at an ego speed of 70 m/s, where it grows with the square of the speed.
+        PitchAt70MpsDeg = "pitch_at_70mps_deg",
         /// Turn about the y axis.
         PitchDeg = "pitch_deg",
         /// Radius of a patch of directions.
@@ -167,6 +171,7 @@ impl Quantity {
     pub const fn unit(self) -> Unit {
         match self {
             Quantity::DepthM
+            | Quantity::DriftM
             | Quantity::ForwardM
             | Quantity::HalfAtM
             | Quantity::HeightM
@@ -195,6 +200,7 @@ impl Quantity {
             | Quantity::ElevationToDeg
             | Quantity::MeanByWallsDeg
             | Quantity::MeanDeg
+            | Quantity::PitchAt70MpsDeg
             | Quantity::PitchDeg
             | Quantity::RadiusDeg
             | Quantity::RollDeg

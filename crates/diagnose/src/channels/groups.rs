@@ -1,5 +1,5 @@
-//! Offsets of groups of rays: rows of a sensor, or strips of azimuth. Each group has one range offset, and rows have
-//! one elevation offset as well. The pose error of each frame is subtracted before.
+//! Offsets of groups of rays: rows of a sensor, strips of azimuth, or steps of range. Each group has one range offset,
+//! and rows have one elevation offset as well. The pose error of each frame is subtracted before.
 
 use super::mean::{KINDS, OwnPoses, STRAY_M, own_row, usable, weight};
 use crate::catalogue::Covariate;
@@ -16,6 +16,8 @@ pub enum Grouping {
     Row,
     /// Strips of azimuth of each sensor.
     Azimuth,
+    /// Steps of range of each sensor.
+    Range,
 }
 
 impl Grouping {
@@ -26,10 +28,16 @@ impl Grouping {
 }
 
 /// Width of a strip of azimuth, rad: 5 degrees.
-pub const STRIP_RAD: f64 = 0.0873;
+const STRIP_RAD: f64 = 0.0873;
 
 /// Strips of a full turn.
 const STRIPS: usize = 72;
+
+/// Step of range, m.
+const STEP_M: f64 = 0.25;
+
+/// Steps of range: up to 64 m.
+const STEPS: usize = 256;
 
 /// Largest number of rows of a sensor.
 const ROWS: usize = 256;
@@ -60,16 +68,46 @@ impl Group {
         Group { index: self.index + 1, ..self }
     }
 
-    /// The number of the row, or the middle azimuth of the strip in rad.
+    /// The number of the row, the middle azimuth of the strip in rad, or the middle range of the step in m.
     pub fn place(self, grouping: Grouping) -> f64 {
         match grouping {
             Grouping::Row => f64::from(self.index),
             Grouping::Azimuth => (f64::from(self.index) + 0.5) * STRIP_RAD - std::f64::consts::PI,
+            Grouping::Range => (f64::from(self.index) + 0.5) * STEP_M,
         }
     }
 }
 
-/// The group of a ray; `None` where its row is not known.
+impl Grouping {
+    /// Width of a group, in the unit of [`Group::place`].
+    pub fn width(self) -> f64 {
+        match self {
+            Grouping::Row => 1.0,
+            Grouping::Azimuth => STRIP_RAD,
+            Grouping::Range => STEP_M,
+        }
+    }
+
+    /// Where a ray lies among the groups, in the unit of [`Group::place`].
+    pub fn place_of(self, ray: &Ray) -> f64 {
+        match self {
+            Grouping::Row => f64::from(ray.row),
+            Grouping::Azimuth => f64::from(ray.azimuth_rad),
+            Grouping::Range => ray.recorded_range_m(),
+        }
+    }
+
+    /// Largest number of groups of a sensor.
+    fn most(self) -> usize {
+        match self {
+            Grouping::Row => ROWS,
+            Grouping::Azimuth => STRIPS,
+            Grouping::Range => STEPS,
+        }
+    }
+}
+
+/// The group of a ray; `None` where its row is not known, and beyond the last step of range.
 pub fn group_of(ray: &Ray, grouping: Grouping) -> Option<Group> {
     let index = match grouping {
         Grouping::Row => Some(ray.row).filter(|row| usize::from(*row) < ROWS)?,
@@ -77,6 +115,7 @@ pub fn group_of(ray: &Ray, grouping: Grouping) -> Option<Group> {
             let strip = ((f64::from(ray.azimuth_rad) + std::f64::consts::PI) / STRIP_RAD).floor() as usize;
             strip.min(STRIPS - 1) as u16
         }
+        Grouping::Range => Some((ray.recorded_range_m() / STEP_M) as u16).filter(|step| usize::from(*step) < STEPS)?,
     };
     Some(Group { sensor: ray.sensor, index })
 }
@@ -125,13 +164,14 @@ pub type GroupFrame = Vec<(Group, GroupSums)>;
 /// Number of parts of a group.
 pub const PARTS: usize = 4;
 
-/// Groups of one frame by part: rows by quarters of the field of view, strips of azimuth by bands of elevation.
+/// Groups of one frame by part: rows and steps of range by quarters of the field of view, strips of azimuth by bands of
+/// elevation.
 pub type PartedFrame = [GroupFrame; PARTS];
 
 /// Part of a ray within its group.
 pub fn part_of(ray: &Ray, grouping: Grouping, half_fov_rad: f64) -> usize {
     let at = match grouping {
-        Grouping::Row => f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad) + 0.5,
+        Grouping::Row | Grouping::Range => f64::from(ray.azimuth_rad) / (2.0 * half_fov_rad) + 0.5,
         // Bands with about as many rays each for a sensor on a vehicle: edges at -10, -5 and -1 degrees.
         Grouping::Azimuth => {
             let below = [-0.175, -0.087, -0.017].iter().filter(|edge| f64::from(ray.elevation_rad) > **edge).count();
@@ -193,7 +233,7 @@ pub fn group_frames(
 ) -> Vec<PartedFrame> {
     let origins = super::mean::origins(rig);
     let turns: Vec<_> = rig.sensors.iter().map(|s| s.pose().rotation).collect();
-    let of_sensor = if grouping == Grouping::Row { ROWS } else { STRIPS };
+    let of_sensor = grouping.most();
     let half_fov: Vec<f64> = rig.sensors.iter().map(|s| s.half_fov_rad()).collect();
     let one = |(frame, poses): (&FramePair, &OwnPoses)| -> PartedFrame {
         let mut sums = vec![vec![[GroupSums::default(); PARTS]; of_sensor]; rig.sensors.len()];

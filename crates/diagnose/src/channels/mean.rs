@@ -3,7 +3,7 @@
 //!
 //! A movement of the scene by `delta` brings a surface with normal n (towards the sensor) nearer by n . delta.
 
-use crate::channels::motion::OwnMotion;
+use crate::channels::moments::{COURSES, Moment, Moments};
 use crate::inference::median;
 use crate::pairing::{FramePair, Ray, Surface, met_squarely};
 use nalgebra::{DMatrix, DVector, Point3, SMatrix, SVector, Vector3};
@@ -27,6 +27,10 @@ pub enum Column {
     Scan,
     /// The same by how unevenly the scan turns, s: see [`Sensor::uneven_phase`].
     Uneven,
+    /// An offset of all ranges that grows over the recording, m at its end: one of the courses of [`Moment::course`].
+    Drift(usize),
+    /// Pitch of the scene that grows with the square of the speed, rad at 10 m/s.
+    Lean,
     /// Offset across one kind of surface, m: see [`kind_of`]. No cause: an error of the simulated surfaces.
     Structure(usize),
 }
@@ -34,12 +38,14 @@ pub enum Column {
 /// Number of columns, the first ones, that every frame has of its own: its pose, and its displacement over a scan.
 pub const OWN: usize = 9;
 
-/// All columns for a rig, those of the frames' own first; with that of the ego motion where it is known.
-pub fn columns(rig: &Rig, motion_known: bool) -> Vec<Column> {
+/// All columns for a rig, those of the frames' own first; with those of time and ego motion where these are known.
+pub fn columns(rig: &Rig, moments: &Moments) -> Vec<Column> {
     let mut all: Vec<Column> = (0..6).map(Column::Pose).collect();
     all.extend((0..3).map(Column::Sweep));
-    all.extend([Column::Scan, Column::Uneven].into_iter().filter(|_| motion_known));
+    all.extend([Column::Scan, Column::Uneven].into_iter().filter(|_| moments.drives));
     all.extend([Column::RangeOffset, Column::RangeScale]);
+    all.extend((0..COURSES).filter(|_| moments.passes).map(Column::Drift));
+    all.extend(Some(Column::Lean).filter(|_| moments.speed_varies));
     all.extend((0..KINDS).map(Column::Structure));
     if rig.sensors.len() > 1 {
         all.extend((0..rig.sensors.len()).flat_map(|s| (0..6).map(move |k| Column::SensorPose(s, k))));
@@ -63,10 +69,6 @@ pub struct MeanFrame {
     pub gram: DMatrix<f64>,
     /// X' W y.
     pub right: DVector<f64>,
-    /// Rays used.
-    pub rays: f64,
-    /// y' W y.
-    pub squares: f64,
 }
 
 /// Numbers of an [`OwnPoses`] for each sensor.
@@ -210,23 +212,26 @@ pub struct Levers {
     by_range: f64,
     phase: f64,
     by_motion: f64,
+    courses: [f64; COURSES],
+    lean: f64,
     pose: SVector<f64, 6>,
     sensor_pose: SVector<f64, 6>,
 }
 
 impl Levers {
-    /// Of a measured ray of a sensor at `origin`, with the ego motion of its frame where it is known.
-    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &Sensor, own: Option<&OwnMotion>) -> Self {
+    /// Of a measured ray of a sensor at `origin`, at the moment of its frame.
+    pub fn new(ray: &Ray, origin: &Point3<f64>, mount: &Sensor, moment: &Moment) -> Self {
         let place = origin.coords + ray.recorded_vector();
-        // The scene moves against the vehicle.
-        let against = |own: &OwnMotion| -ray.normal_vector().dot(&own.velocity_at(&place));
         Levers {
             sensor: ray.sensor as usize,
             kind: kind_of(ray),
             range_m: ray.recorded_range_m(),
             by_range: ray.range_lever(),
             phase: mount.scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad)),
-            by_motion: own.map_or(0.0, against),
+            // The scene moves against the vehicle.
+            by_motion: -ray.normal_vector().dot(&moment.own.velocity_at(&place)),
+            courses: std::array::from_fn(|k| moment.course(k)),
+            lean: moment.lean(),
             pose: pose_row(ray, origin, &Point3::origin()),
             sensor_pose: pose_row(ray, origin, origin),
         }
@@ -242,54 +247,70 @@ impl Levers {
             Column::Sweep(k) => self.phase * [self.pose[3], self.pose[4], self.pose[2]][k],
             Column::Scan => self.phase * self.by_motion,
             Column::Uneven => Sensor::uneven_phase(self.phase) * self.by_motion,
+            Column::Drift(k) => self.by_range * self.courses[k],
+            Column::Lean => self.pose[1] * self.lean,
             Column::Structure(k) if k == self.kind => 1.0,
             Column::SensorPose(..) | Column::Structure(_) => return None,
         })
     }
 }
 
-/// Sums of all frames, with the ego motion of each where it is known.
-pub fn mean_frames(
-    frames: &[FramePair],
-    rig: &Rig,
-    columns: &[Column],
-    poses: &[OwnPoses],
-    driving: Option<&[OwnMotion]>,
-    noise_m: f64,
-    design: f64,
-) -> Vec<MeanFrame> {
-    let origins = origins(rig);
-    let one = |(f, (frame, pose)): (usize, (&FramePair, &OwnPoses))| {
-        let own = driving.map(|own| &own[f]);
-        let p = columns.len();
-        let (mut gram, mut right) = (vec![0.0; p * p], DVector::zeros(p));
-        let (mut rays, mut squares) = (0.0, 0.0);
-        // Most columns belong to other sensors and surfaces: only non-zero ones are multiplied.
-        let mut x: Vec<(usize, f64)> = Vec::with_capacity(p);
+/// What the rays of all frames are compared by.
+pub struct Compared<'a> {
+    /// Sensors.
+    pub rig: &'a Rig,
+    /// Columns of the fit.
+    pub columns: &'a [Column],
+    /// Range noise of the simulated side, m.
+    pub noise_m: f64,
+    /// See [`design_effect`].
+    pub design: f64,
+}
+
+impl Compared<'_> {
+    /// Calls `each` with every ray of a frame that is of its surface: with its non-zero columns, its distance across
+    /// the surface, m, and its weight, 1/m2.
+    pub fn for_each(
+        &self,
+        frame: &FramePair,
+        pose: &OwnPoses,
+        moment: &Moment,
+        mut each: impl FnMut(&Ray, &[(usize, f64)], f64, f64),
+    ) {
+        let origins = origins(self.rig);
+        // Most columns belong to other sensors and surfaces.
+        let mut x: Vec<(usize, f64)> = Vec::with_capacity(self.columns.len());
         for ray in frame.measured.iter().filter(|r| usable(r)) {
-            let origin = &origins[ray.sensor as usize];
-            let row = own_row(ray, origin);
+            let sensor = ray.sensor as usize;
             let y = ray.across_nearest_m();
-            if (y - row.dot(&pose[ray.sensor as usize])).abs() > STRAY_M {
+            if (y - own_row(ray, &origins[sensor]).dot(&pose[sensor])).abs() > STRAY_M {
                 continue;
             }
-            let levers = Levers::new(ray, origin, &rig.sensors[ray.sensor as usize], own);
+            let levers = Levers::new(ray, &origins[sensor], &self.rig.sensors[sensor], moment);
             x.clear();
-            x.extend(columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
-            let w = weight(ray, noise_m) / design;
-            for (i, &(k, v)) in x.iter().enumerate() {
-                let wx = w * v;
-                right[k] += wx * y;
-                let line = &mut gram[k * p..(k + 1) * p];
-                x[..=i].iter().for_each(|&(j, u)| line[j] += wx * u);
-            }
-            rays += 1.0;
-            squares += w * y * y;
+            x.extend(self.columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
+            each(ray, &x, y, weight(ray, self.noise_m) / self.design);
         }
-        let gram = DMatrix::from_fn(p, p, |i, j| gram[i.max(j) * p + i.min(j)]);
-        MeanFrame { gram, right, rays, squares }
-    };
-    frames.par_iter().zip(poses).enumerate().map(one).collect()
+    }
+
+    /// Sums of all frames, with the moment of each.
+    pub fn sums(&self, frames: &[FramePair], poses: &[OwnPoses], moments: &[Moment]) -> Vec<MeanFrame> {
+        let one = |((frame, pose), moment): ((&FramePair, &OwnPoses), &Moment)| {
+            let p = self.columns.len();
+            let (mut gram, mut right) = (vec![0.0; p * p], DVector::zeros(p));
+            self.for_each(frame, pose, moment, |_, x, y, w| {
+                for (i, &(k, v)) in x.iter().enumerate() {
+                    let wx = w * v;
+                    right[k] += wx * y;
+                    let line = &mut gram[k * p..(k + 1) * p];
+                    x[..=i].iter().for_each(|&(j, u)| line[j] += wx * u);
+                }
+            });
+            let gram = DMatrix::from_fn(p, p, |i, j| gram[i.max(j) * p + i.min(j)]);
+            MeanFrame { gram, right }
+        };
+        frames.par_iter().zip(poses).zip(moments).map(one).collect()
+    }
 }
 
 /// Origins of the sensors in the cloud's frame.
@@ -298,15 +319,26 @@ pub fn origins(rig: &Rig) -> Vec<Point3<f64>> {
 }
 
 impl MeanFrame {
-    /// The same sums with the frame's own pose and displacement over a scan integrated out; `prior` holds the
+    /// The covariance of the frame's own pose and displacement over a scan, given all columns; `prior` holds the
     /// variances of their parameters.
-    pub fn without_own(&self, prior: &SVector<f64, OWN>) -> (DMatrix<f64>, DVector<f64>) {
-        let p = self.gram.nrows();
+    fn of_own(&self, prior: &SVector<f64, OWN>) -> Option<DMatrix<f64>> {
         let mut own = self.gram.view((0, 0), (OWN, OWN)).into_owned();
         for k in 0..OWN {
             own[(k, k)] += 1.0 / prior[k].max(1e-16);
         }
-        let Some(inverse) = own.try_inverse() else { return (self.gram.clone(), self.right.clone()) };
+        own.try_inverse()
+    }
+
+    /// The frame's own pose and displacement over a scan that fit best where the products of the columns with the
+    /// distances are these.
+    pub fn own(&self, prior: &SVector<f64, OWN>, right: &DVector<f64>) -> DVector<f64> {
+        self.of_own(prior).map_or_else(|| DVector::zeros(OWN), |inverse| inverse * right.rows(0, OWN))
+    }
+
+    /// The same sums with the frame's own pose and displacement over a scan integrated out.
+    pub fn without_own(&self, prior: &SVector<f64, OWN>) -> (DMatrix<f64>, DVector<f64>) {
+        let p = self.gram.nrows();
+        let Some(inverse) = self.of_own(prior) else { return (self.gram.clone(), self.right.clone()) };
         let across = self.gram.view((0, 0), (p, OWN)).into_owned();
         let part = &across * inverse;
         let gram = &self.gram - &part * across.transpose();
@@ -318,6 +350,7 @@ impl MeanFrame {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::channels::motion::OwnMotion;
     use std::f64::consts::TAU;
 
     /// A frame of returns whose ranges are longer by an offset: a road 2 m below the sensor, and a wall to its left.
@@ -357,7 +390,7 @@ mod tests {
             recorded_m: recorded.cast::<f32>().into(),
             ..Ray::standing(&moved)
         };
-        let levers = Levers::new(&ray, &Point3::origin(), &Rig::single().sensors[0], None);
+        let levers = Levers::new(&ray, &Point3::origin(), &Rig::single().sensors[0], &Moment::default());
         let height_m = |recorded: Vector3<f64>| recorded.z + 2.0;
         let pitched = nalgebra::Rotation3::from_axis_angle(&Vector3::y_axis(), 1e-3) * recorded;
         let changed = [
@@ -380,13 +413,26 @@ mod tests {
         let ray = Ray { normal: normal.cast::<f32>().into(), ..Ray::standing(&place) };
         let own = OwnMotion { velocity_m_s: Vector3::new(8.0, 0.5, 0.0), turn_rate_rad_s: Vector3::new(0.0, 0.0, 0.3) };
         let rig = Rig::single();
-        let levers = Levers::new(&ray, &Point3::origin(), &rig.sensors[0], Some(&own));
+        let moment = Moment { own, ..Moment::default() };
+        let levers = Levers::new(&ray, &Point3::origin(), &rig.sensors[0], &moment);
         let phase = rig.sensors[0].scan_phase(f64::from(ray.azimuth_rad), f64::from(ray.elevation_rad));
         let by_motion = -normal.dot(&own.velocity_at(&place));
         for (column, share) in [(Column::Scan, phase), (Column::Uneven, (std::f64::consts::TAU * phase).sin())] {
             let lever = levers.of(column).unwrap();
             assert!((lever - share * by_motion).abs() < 1e-5, "{column:?}: {lever} {}", share * by_motion);
         }
+    }
+
+    /// Half-way through a recording, at 20 m/s.
+    #[test]
+    fn levers_of_drift_and_lean_are_those_of_the_moment() {
+        let ray = Ray { normal: [0.0, 0.0, 1.0], ..Ray::standing(&Vector3::new(9.0, 4.0, -2.0)) };
+        let moment = Moment { time_s: 10.0, passed: 0.5, own: OwnMotion::ahead(20.0) };
+        let levers = Levers::new(&ray, &Point3::origin(), &Rig::single().sensors[0], &moment);
+        let of = |column| levers.of(column).unwrap();
+        assert!((of(Column::Lean) - 4.0 * of(Column::Pose(1))).abs() < 1e-9);
+        let share = (1.0 - (-1.0f64).exp()) / (1.0 - (-2.0f64).exp());
+        assert!((of(Column::Drift(1)) - share * of(Column::RangeOffset)).abs() < 1e-9);
     }
 
     #[test]

@@ -10,6 +10,7 @@ pub mod labels;
 pub mod mask;
 pub mod mean;
 pub mod mirrors;
+pub mod moments;
 pub mod motion;
 pub mod patch;
 pub mod plumes;

@@ -45,7 +45,7 @@ impl Known {
         let pose = &engine.sensors.rig.sensors[sensor].pose();
         let of_row = displaced.of_row(p, sensor, engine.sensors, pose);
         let p = &(p - of_row);
-        of_row + self.slide_m(frame, p, sensor) + displaced.of_point(p, sensor, &engine.origins[sensor])
+        of_row + self.slide_m(frame, p, sensor) + displaced.of_point(p, (frame, sensor), &engine.origins[sensor])
     }
 
     /// Frames with motion distortion and coarse quantisation corrected; `None` where there is none.

@@ -13,8 +13,17 @@ pub struct Trial {
     pub parameters: usize,
     /// Gain of each frame over the model so far, nats.
     pub gains: Vec<f64>,
+    /// What each frame is expected to gain if the hypothesis is right, nats; empty where that is not known.
+    pub expected: Vec<f64>,
     /// Whether the effect fitted on all frames exceeds the smallest effect that is reported.
     pub above_floor: bool,
+}
+
+impl Trial {
+    /// Sum of the gains, and their mean over its standard error.
+    pub fn total_and_z(&self) -> (f64, f64) {
+        total_and_z_about(&self.gains, &self.expected, FEWEST_EXPECTED).unwrap_or_else(|| total_and_z(&self.gains))
+    }
 }
 
 /// What a hypothesis must bring to be chosen.
@@ -62,6 +71,24 @@ pub fn total_and_z(gains: &[f64]) -> (f64, f64) {
     (total, mean / error)
 }
 
+/// Fewest frames, each counted by its share of what all are expected to gain, from which the scatter about it is known.
+const FEWEST_EXPECTED: f64 = 6.0;
+
+/// The same where frames are expected to gain more or less, as by how much of the effect they show: what scatters are
+/// the gains about their share of the total. The shares `w` take `1 - sum w^2` of the variance up. Where few frames are
+/// expected to gain anything, fewer than `fewest`, it is not known.
+pub fn total_and_z_about(gains: &[f64], expected: &[f64], fewest: f64) -> Option<(f64, f64)> {
+    let [total, all] = [gains, expected].map(|of| of.iter().sum::<f64>());
+    let squares: f64 = expected.iter().map(|e| (e / all.max(1e-300)).powi(2)).sum();
+    if expected.len() != gains.len() || all <= 0.0 || squares * fewest > 1.0 {
+        return None;
+    }
+    let about: f64 = gains.iter().zip(expected).map(|(g, e)| (g - total * e / all).powi(2)).sum();
+    let n = gains.len() as f64;
+    let error = (about / (1.0 - squares)).sqrt().max(total.abs() / (30.0 * n.sqrt())).max(1e-12);
+    Some((total, total / error))
+}
+
 /// Whether gains are consistent although few frames have most of them. An effect that only some scenes show (a bend,
 /// an object beside the road) gains much on at least three frames, and all losses together are below 15 % of all
 /// gains.
@@ -93,7 +120,7 @@ pub fn significant_by_signs(differences: &[f64], z_least: f64) -> bool {
 pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
     let eligible: Vec<usize> = (0..trials.len())
         .filter(|&i| {
-            let (total, z) = total_and_z(&trials[i].gains);
+            let (total, z) = trials[i].total_and_z();
             trials[i].above_floor && total > demands.nats && z > demands.z
         })
         .collect();
@@ -160,7 +187,7 @@ mod tests {
     use super::*;
 
     fn trial(cause: Cause, parameters: usize, gains: &[f64]) -> Trial {
-        Trial { candidate: 0, cause, parameters, gains: gains.to_vec(), above_floor: true }
+        Trial { candidate: 0, cause, parameters, gains: gains.to_vec(), expected: vec![], above_floor: true }
     }
 
     const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02, richer: 0.02 };
@@ -177,6 +204,22 @@ mod tests {
         assert_eq!((choice.chosen, choice.equals), (0, vec![1]), "significantly better, and by more than a wrong form");
         let better = trial(Cause::RangeDropout, 3, &[20.0, 21.0, 19.0, 20.0]);
         assert_eq!(choose(&[better, simple], &DEMANDS).unwrap().chosen, 0);
+    }
+
+    /// Ever less of the effect from the beginning to the end: the gains are what is expected, but for little.
+    #[test]
+    fn gains_scatter_about_what_is_expected_of_them() {
+        let expected: Vec<f64> = (0..16).map(|f| f64::from(16 - f).powi(2) / 20.0).collect();
+        let gains: Vec<f64> = expected.iter().enumerate().map(|(f, e)| e + [0.5, -0.4][f % 2]).collect();
+        let (total, z) = total_and_z(&gains);
+        let about = total_and_z_about(&gains, &expected, 6.0).unwrap();
+        assert!(z < 5.0 && about.0 == total && about.1 > 20.0, "{z} {about:?}");
+        // Alike everywhere: the same as without.
+        let (_, alike) = total_and_z_about(&gains, &[2.0; 16], 6.0).unwrap();
+        assert!((alike - z).abs() < 1e-9, "{alike} {z}");
+        // One frame alone tells nothing of the scatter.
+        let one: Vec<f64> = (0..16).map(|f| if f == 3 { 900.0 } else { 1e-3 }).collect();
+        assert_eq!(total_and_z_about(&one, &one, 6.0), None);
     }
 
     #[test]

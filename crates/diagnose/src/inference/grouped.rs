@@ -118,6 +118,26 @@ pub fn rough_spread(sums: &BTreeMap<Group, GroupSums>, offsets: &BTreeMap<Group,
     median(differences) / statistics::MEDIAN_OF_NORMAL / 1.5f64.sqrt()
 }
 
+/// Standard deviation of offsets about the mean of those up to `reach` groups away, beyond chance: zero for offsets
+/// that are smooth over twice that reach.
+pub fn spread_about(
+    sums: &BTreeMap<Group, GroupSums>,
+    offsets: &BTreeMap<Group, f64>,
+    how: GroupFit,
+    reach: u16,
+) -> f64 {
+    let known = known(sums, offsets, how);
+    let about = |(k, (offset, noise)): (&Group, &(f64, f64))| {
+        let around = known.range(k.around(reach));
+        let (n, sum) = around.fold((0.0, 0.0), |(n, sum), (_, (o, _))| (n + 1.0, sum + o));
+        // At the ends, and where many are not known, the mean is that of other ranges.
+        (n >= f64::from(2 * reach)).then(|| (offset - sum / n).powi(2) - noise)
+    };
+    let squares: Vec<f64> = known.iter().filter_map(about).collect();
+    let mean = squares.iter().sum::<f64>() / squares.len().max(1) as f64;
+    if squares.len() < usize::from(2 * reach) { 0.0 } else { mean.max(0.0).sqrt() }
+}
+
 /// Groups with an offset of more than this many times the median variance are left out of spreads.
 const WORSE: f64 = 16.0;
 
@@ -187,6 +207,25 @@ pub fn spread_of_smooth_rows(rows: &BTreeMap<Group, [f64; 2]>) -> (f64, f64) {
 mod tests {
     use super::*;
     use rand_distr::{Distribution, StandardNormal};
+
+    #[test]
+    fn offsets_about_their_neighbours_are_those_that_are_not_smooth() {
+        let how = GroupFit { column: 0, precision: 1.0, centred: true, trust: 1.0 };
+        let spread = |of: &dyn Fn(f64) -> f64| {
+            let group = |k: u16| {
+                let gram = 1e6;
+                let sums =
+                    GroupSums { gram: [gram, 0.0, 0.0], right: [gram * of(f64::from(k)), 0.0], ..GroupSums::default() };
+                (row(k), sums)
+            };
+            let sums: BTreeMap<Group, GroupSums> = (0..80).map(group).collect();
+            spread_about(&sums, &offsets(&sums, how), how, 8)
+        };
+        // A line, and half of a sine of eight groups.
+        assert!(spread(&|k| 0.01 * k) < 1e-3);
+        let wave = spread(&|k| 0.01 * k + 0.05 * (std::f64::consts::TAU * k / 8.0).sin());
+        assert!((wave - 0.05 / 2f64.sqrt()).abs() < 0.004, "{wave}");
+    }
 
     fn row(index: u16) -> Group {
         Group { sensor: 0, index }

@@ -130,6 +130,27 @@ pub fn cross_gains(frames: &[&LinearFrame], blocks: &[usize], columns: &[usize],
     cross_validated(blocks, fit_on, |fit, i| fit.as_ref().map_or(0.0, |fit| fit.gain(frames[i])))
 }
 
+/// What each frame is expected to gain by the columns `with` over the columns `before`, among them, if it is as the
+/// blocks of other folds say, nats: half of the square of what the fits differ by.
+pub fn cross_expected(
+    frames: &[&LinearFrame],
+    blocks: &[usize],
+    [before, with]: [&[usize]; 2],
+    precision: &[f64],
+) -> Vec<f64> {
+    let fit_on = |train: &[usize]| {
+        let (train, train_blocks): (Vec<_>, Vec<_>) = train.iter().map(|&i| (frames[i], blocks[i])).unzip();
+        (!train.is_empty()).then(|| [before, with].map(|columns| fit(&train, &train_blocks, columns, precision)))
+    };
+    let expected = |[before, with]: &[LinearFit; 2], frame: &LinearFrame| {
+        let mut by = DVector::zeros(frame.right.len());
+        with.columns.iter().zip(with.theta.iter()).for_each(|(c, theta)| by[*c] += theta);
+        before.columns.iter().zip(before.theta.iter()).for_each(|(c, theta)| by[*c] -= theta);
+        0.5 * by.dot(&(&frame.gram * &by))
+    };
+    cross_validated(blocks, fit_on, |fits, i| fits.as_ref().map_or(0.0, |fits| expected(fits, frames[i])))
+}
+
 /// Gains of each frame by what is fitted on the blocks of other folds; frames are known by their places in `blocks`.
 pub fn cross_validated<F>(blocks: &[usize], fit: impl Fn(&[usize]) -> F, gain: impl Fn(&F, usize) -> f64) -> Vec<f64> {
     let folds = fold_of(blocks);

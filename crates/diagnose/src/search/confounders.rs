@@ -1,8 +1,8 @@
 //! Confounders across channels: findings that are side effects of others are dropped, and the reason is recorded.
 
 use super::{ChannelResult, Found, NamedParameter, first_demands};
-use crate::catalogue::{Cause, Channel, Hypothesis, ParameterId, Quantity, Unit};
-use crate::diagnosis::Status;
+use crate::catalogue::{Cause, Channel, Covariate, Hypothesis, ParameterId, Quantity, Unit};
+use crate::diagnosis::{Parameter, Status};
 
 /// A confounder: a finding whose cause has a side effect that resembles another finding.
 struct Confounder {
@@ -42,12 +42,7 @@ const CONFOUNDERS: [Confounder; 21] = [
         share: 0.1,
         because: "where far returns are lost, those that come back are the nearer ones",
     },
-    Confounder {
-        effect: noise,
-        by: |f| f.causes.first().is_some_and(|c| BEAM_CAUSES.contains(c)),
-        share: 0.15,
-        because: "offsets of rows are mended but for their errors",
-    },
+    Confounder { effect: noise, by: rows, share: 0.15, because: "offsets of rows are mended but for their errors" },
     Confounder {
         effect: noise,
         by: rows_aim_elsewhere,
@@ -188,12 +183,20 @@ fn shapes(f: &Found) -> bool {
 
 /// Whether the ego vehicle is tilted or a sensor is mounted otherwise.
 fn pose(f: &Found) -> bool {
-    f.channel == Channel::Residuals && f.causes.iter().any(|c| matches!(c, Cause::PitchRoll | Cause::SensorExtrinsics))
+    let turns = [Cause::EgoAttitude, Cause::PitchRoll, Cause::SensorExtrinsics];
+    f.channel == Channel::Residuals && f.causes.iter().any(|c| turns.contains(c))
 }
 
-/// Whether surfaces have unexplained offsets.
+/// Whether surfaces have unexplained offsets in some directions.
 fn unexplained_surfaces(f: &Found) -> bool {
-    f.channel == Channel::Residuals && f.status == Status::Unexplained
+    let of_directions = !matches!(f.covariate, Covariate::Range | Covariate::Row);
+    f.channel == Channel::Residuals && f.status == Status::Unexplained && of_directions
+}
+
+/// Whether rows have values of their own, with or without a name.
+fn rows(f: &Found) -> bool {
+    f.covariate == Covariate::Row && f.channel == Channel::Residuals
+        || f.causes.first().is_some_and(|c| BEAM_CAUSES.contains(c))
 }
 
 /// Whether a finding is a bias of range of less than 4 cm at 30 m.
@@ -248,13 +251,23 @@ const FORM: [Quantity; 13] = [
     Quantity::BrighterWheels,
 ];
 
-/// Whether the size of a finding is significant on the estimating frames: the interval of some parameter of size
-/// excludes 0, where it has one. A difference of labels is no chance, even where none of its parameters is known.
+/// Whether the size of a finding is significant on the estimating frames: some parameter of size, where it has one, is
+/// not 0, at a level of 5 % for all of them together (Bonferroni). A difference of labels is no chance, even where none
+/// of its parameters is known, nor are packets, of which a few runs among all frames are compared with two controls.
 fn has_significant_size(f: &Found) -> bool {
     let is_form = |id: &ParameterId| matches!(id, ParameterId::Of(quantity) if FORM.contains(quantity));
     let sized = |(id, p): &&NamedParameter| p.unit != Unit::Number && !is_form(id);
-    let mut sizes = f.parameters.iter().filter(sized).map(|(_, p)| p).peekable();
-    f.channel == Channel::Labels || sizes.peek().is_none() || sizes.any(|p| p.ci95[0] * p.ci95[1] > 0.0)
+    let sizes: Vec<&Parameter> = f.parameters.iter().filter(sized).map(|(_, p)| p).collect();
+    let level = 0.05 / sizes.len() as f64;
+    let by_itself = matches!(f.channel, Channel::Labels | Channel::Packets);
+    by_itself || sizes.is_empty() || sizes.iter().any(|p| by_chance(p) < level)
+}
+
+/// Probability that a parameter is as far from 0 by chance: normal, with the end of its interval towards 0 at 1.96
+/// standard errors.
+fn by_chance(p: &Parameter) -> f64 {
+    let half = if p.estimate > 0.0 { p.estimate - p.ci95[0] } else { p.ci95[1] - p.estimate };
+    libm::erfc(1.96 * p.estimate.abs() / half.max(1e-300) / 2f64.sqrt())
 }
 
 /// Whether the held-out frames speak against a finding by as much as the selection demands for one.
@@ -318,7 +331,6 @@ fn drop_shifts_of_surfaces(results: &mut [ChannelResult]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::catalogue::Covariate;
     use crate::curve::Curve;
     use crate::diagnosis::Considered;
     use crate::search::{parameter, sensor_number};
@@ -441,6 +453,13 @@ mod tests {
         let first = || named(Cause::RangeBias, Channel::Residuals, vec![]);
         assert!(left(vec![first(), about(-0.0006)]).is_empty());
         assert_eq!(left(vec![first(), about(-0.02)]), [Cause::TimeOffset]);
+        // Two standard errors: significant alone, and by chance among six.
+        let turns = [Quantity::RollDeg, Quantity::PitchDeg, Quantity::YawDeg, Quantity::LeftM, Quantity::UpM];
+        let more = turns.map(|quantity| parameter(quantity, 0.0001, 0.003));
+        let pose = |list: Vec<NamedParameter>| named(Cause::SensorExtrinsics, Channel::Residuals, list);
+        let one = || parameter(Quantity::ForwardM, 0.0063, 0.003);
+        assert_eq!(left(vec![first(), pose(vec![one()])]), [Cause::SensorExtrinsics]);
+        assert!(left(vec![first(), pose([vec![one()], more.to_vec()].concat())]).is_empty());
         let of_labels = Found { channel: Channel::Labels, ..about(-0.0006) };
         assert_eq!(left(vec![first(), of_labels]), [Cause::TimeOffset], "its size is not known, its presence is");
         assert_eq!(left(vec![first(), named(Cause::MissingObject, Channel::Returns, vec![])]), [Cause::MissingObject]);

@@ -174,6 +174,7 @@ impl Search<'_> {
             cause,
             parameters: own.len(),
             gains,
+            expected: vec![],
             above_floor: plausible && size > least && moved > self.side.least_displacement_m(),
         }
     }

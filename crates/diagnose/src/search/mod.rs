@@ -18,6 +18,7 @@ mod unexplained;
 
 use crate::catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
 use crate::channels::groups::Grouping;
+use crate::channels::moments::Moments;
 use crate::channels::motion::OwnMotion;
 use crate::curve::Curve;
 use crate::diagnosis::{Considered, FindingGain, Minimum, Parameter, Status};
@@ -58,6 +59,11 @@ impl Context<'_> {
         let at_rest = OwnMotion::ahead(0.0);
         let motions: Vec<OwnMotion> = self.motion.as_ref()?.iter().map(|own| own.unwrap_or(at_rest)).collect();
         motions.iter().any(|own| own.speed_m_s().abs() > DRIVING_M_S).then_some(motions)
+    }
+
+    /// Time and ego motion of each frame.
+    pub fn moments(&self) -> Moments {
+        Moments::new(self.frames.len(), self.times.as_deref(), self.driving())
     }
 
     /// Simulated returns of these frames.
@@ -221,7 +227,7 @@ pub fn confidence(trials: &[Trial], blocks: &[usize], chosen: Cause, demands: &D
             let drawn = draw_blocks(&members, &mut rng);
             let again: Vec<Trial> = trials
                 .iter()
-                .map(|t| Trial { gains: drawn.iter().map(|&i| t.gains[i]).collect(), ..t.clone() })
+                .map(|t| Trial { gains: drawn.iter().map(|&i| t.gains[i]).collect(), expected: vec![], ..t.clone() })
                 .collect();
             let easier = Demands { z: 0.0, nats: 0.0, ..*demands };
             choose(&again, &easier).is_some_and(|c| again[c.chosen].cause == chosen)
@@ -302,7 +308,7 @@ pub fn record(
     demands: &Demands,
 ) -> Vec<Considered> {
     let line = |(i, t): (usize, &Trial)| {
-        let (total, z) = total_and_z(&t.gains);
+        let (total, z) = t.total_and_z();
         let outcome = match choice {
             Some(c) if c.chosen == i => "chosen".to_owned(),
             Some(c) if c.equals.contains(&i) => "explains as much, or nearly so, as far as these frames tell".into(),

@@ -55,6 +55,7 @@ pub(super) fn direction_trials(
             cause: Cause::Unexplained,
             parameters: 12,
             gains: grouped::cross_part_gains(&groups, select, blocks, how, false),
+            expected: vec![],
             above_floor: spread > floors[grouping as usize],
         }
     };
@@ -87,7 +88,7 @@ impl Unexplained {
         let offsets = grouped::offsets(all, how);
         let points = offsets.iter().map(|(group, offset)| {
             let place = group.place(self.grouping);
-            let x = if self.grouping == Grouping::Row { place } else { place.to_degrees() };
+            let x = if self.grouping == Grouping::Azimuth { place.to_degrees() } else { place };
             let [measured, error] = shown(*group, *offset, 1.0 / (all[group].gram[0] + how.precision).sqrt());
             CurvePoint { sensor: usize::from(group.sensor), x, measured, before: 1.0, after: measured, error }
         });

@@ -13,10 +13,12 @@ const SAME_SCENES: &str =
 /// Cause, why, what to record.
 const TABLE: &[(Cause, &str, &str)] = &[
     (Cause::RangeBias, "a bias of all ranges moves a street as a whole", "a wall at two surveyed distances"),
+    (Cause::RangeDrift, "a bias of all ranges moves a street as a whole", "a wall, at the beginning and at the end"),
     (Cause::BeamRangeOffset, PLACES, "flat walls with a spinning sensor, and diagnose them with --scans"),
     (Cause::BeamElevationOffset, PLACES, "a level hall, or a survey of the road; or the same scenes on both sides"),
     (Cause::SensorExtrinsics, PLACES, SAME_SCENES),
     (Cause::PitchRoll, "roads have slopes of their own", SAME_SCENES),
+    (Cause::EgoAttitude, "roads have slopes of their own", SAME_SCENES),
     (Cause::GroundError, "roads differ from street to street", SAME_SCENES),
     (Cause::RollingShutter, "a sheared street is another street", SAME_SCENES),
     (Cause::MissingObject, "other streets have other things", SAME_SCENES),

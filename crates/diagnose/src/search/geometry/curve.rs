@@ -3,6 +3,7 @@
 use super::Search;
 use crate::catalogue::Cause;
 use crate::channels::mean::{Column, Levers, OWN_NUMBERS, origins, own_poses, own_row, usable, usual_noise_m};
+use crate::channels::moments::Moment;
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::pairing::Ray;
@@ -20,18 +21,20 @@ const FEWEST: f64 = 30.0;
 const STRAY_M: f64 = 0.5;
 
 /// Name of the horizontal axis, and its value for a ray.
-type Axis = (&'static str, fn(&Ray, &Sensor) -> f64);
+type Axis = (&'static str, fn(&Ray, &Sensor, &Moment) -> f64);
 
-/// The horizontal axis of a cause: range for a bias, distance along the vehicle for a tilt, phase for motion
-/// distortion, azimuth for a sensor.
+/// The horizontal axis of a cause: range for a bias, time for a drift, speed or distance along the vehicle for a tilt,
+/// phase for motion distortion, azimuth for a sensor.
 fn axis(cause: Cause) -> Axis {
     match cause {
-        Cause::RangeBias => ("range, m", |r, _| f64::from(r.range_m)),
-        Cause::PitchRoll => ("distance along the car, m", |r, _| f64::from(r.direction[0] * r.range_m)),
+        Cause::RangeBias => ("range, m", |r, _, _| f64::from(r.range_m)),
+        Cause::RangeDrift => ("time since the first frame, s", |_, _, moment| moment.time_s),
+        Cause::EgoAttitude => ("ego speed, m/s", |_, _, moment| moment.own.speed_m_s().abs()),
+        Cause::PitchRoll => ("distance along the car, m", |r, _, _| f64::from(r.direction[0] * r.range_m)),
         Cause::RollingShutter => {
-            ("phase of the scan", |r, mount| mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad)))
+            ("phase of the scan", |r, mount, _| mount.scan_phase(f64::from(r.azimuth_rad), f64::from(r.elevation_rad)))
         }
-        _ => ("azimuth of the sensor, degrees", |r, _| f64::from(r.azimuth_rad).to_degrees()),
+        _ => ("azimuth of the sensor, degrees", |r, _, _| f64::from(r.azimuth_rad).to_degrees()),
     }
 }
 
@@ -45,10 +48,9 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
     let origins = origins(context.rig);
     let displaced = moving.iter().find_map(|(c, _)| if let Column::SensorPose(s, _) = c { Some(*s) } else { None });
     let noise_m = usual_noise_m(context.frames);
-    let driving = context.driving();
     let of_frame = |&f: &usize| {
         let frame = &context.frames[f];
-        let own = driving.as_ref().map(|own| &own[f]);
+        let moment = &sums.moments.of_frames[f];
         // The pose error of the whole frame is that of the other sensors.
         let mut pose = SVector::zeros();
         if let Some(s) = displaced {
@@ -59,11 +61,11 @@ pub(super) fn linear_curve(search: &Search, fitted: &LinearFit, columns: &[usize
         let place = |ray: &Ray| {
             let sensor = ray.sensor as usize;
             let mount = &context.rig.sensors[sensor];
-            let levers = Levers::new(ray, &origins[sensor], mount, own);
+            let levers = Levers::new(ray, &origins[sensor], mount, moment);
             let expected: f64 = moving.iter().filter_map(|(c, theta)| Some(levers.of(*c)? * theta)).sum();
             let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose);
             (expected != 0.0 && (y - expected).abs() < STRAY_M)
-                .then(|| [value(ray, mount), y * expected.signum(), expected.abs()])
+                .then(|| [value(ray, mount, moment), y * expected.signum(), expected.abs()])
         };
         frame.measured.iter().filter(|r| usable(r)).filter_map(place).collect::<Vec<[f64; 3]>>()
     };

@@ -3,19 +3,24 @@
 use super::curve::linear_curve;
 use super::floor::{FLOOR_DISPLACED_M, FLOOR_GROUPS, FLOOR_OFFSET_M, FLOOR_SWEEP, FLOOR_TURN_RAD};
 use super::hypotheses::Hypothesis;
+use super::steadiness::come_with_time;
 use super::sums::{Sums, group_fit, split};
 use super::{Search, Selected};
 use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity, Unit};
 use crate::channels::groups::{Group, Grouping, total};
 use crate::channels::mean::Column;
+use crate::channels::moments::{final_share, lean_at};
+use crate::channels::motion::OwnMotion;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
+use crate::effects::rounded;
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::linear::{LinearFit, LinearFrame, fit};
 use crate::search::rolling_shutter::Extent;
 use crate::search::{Found, NamedParameter, Z_STAR, parameter, sensor_number, with_error};
 use nalgebra::Vector3;
-use sensor::Rig;
+use sensor::effects::RangeDrift;
+use sensor::{Effect, Rig};
 use std::collections::BTreeMap;
 
 /// What is said of one hypothesis.
@@ -34,10 +39,11 @@ pub(super) fn found(
     selected: Selected,
     held_out_gains: Vec<f64>,
 ) -> Found {
-    let cause = hypothesis.cause();
+    let comes_with_time = hypothesis.cause() == Cause::BeamRangeOffset && come_with_time(search, chosen);
+    let cause = if comes_with_time { Cause::Unexplained } else { hypothesis.cause() };
     let Description { covariate, says, curve, parameters } = match hypothesis {
         Hypothesis::Linear { cause, columns } => linear(search, *cause, columns, chosen),
-        Hypothesis::Groups { cause, grouping, column } => groups(search, *cause, *grouping, *column, chosen),
+        Hypothesis::Groups { grouping, column, .. } => groups(search, cause, *grouping, *column, chosen),
     };
     let named = cause != Cause::Unexplained;
     let rivals = selected.rivals.iter().copied().filter(|r| named && *r != Cause::Unexplained);
@@ -50,7 +56,7 @@ pub(super) fn found(
     let separate_by = (status == Status::Ambiguous)
         .then(|| "surfaces on all sides at many ranges, and a second sensor that sees the same ones".to_owned());
     Found {
-        effects: Vec::new(),
+        effects: drift(&search.sums, hypothesis.columns(), &parameters).into_iter().collect(),
         status,
         causes,
         parameters,
@@ -62,6 +68,17 @@ pub(super) fn found(
         separate_by,
         curve,
     }
+}
+
+/// The effect of a drift, whose course is no parameter of its finding.
+fn drift(sums: &Sums, columns: &[usize], parameters: &[NamedParameter]) -> Option<Effect> {
+    let of = |c: &usize| if let Column::Drift(k) = sums.columns[*c] { Some(k) } else { None };
+    let course = columns.iter().find_map(of)?;
+    let (_, drift) = parameters.iter().find(|(id, _)| *id == ParameterId::Of(Quantity::DriftM))?;
+    Some(Effect::RangeDrift(RangeDrift {
+        drift_m: rounded(drift.estimate * final_share(course), 5),
+        time_constant_s: rounded(sums.moments.time_constant_s(course), 3),
+    }))
 }
 
 /// Describes a linear hypothesis.
@@ -77,7 +94,7 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
     let seen_by = sensor.map_or("lidar", |s| rig.sensors[s].name.as_str());
     if columns.iter().any(|c| sums.columns[*c] == Column::Scan) {
         let of = |column: Column| sums.fitted(&fitted, column).unwrap_or_default();
-        let driving = search.context.driving().unwrap_or_default();
+        let driving: Vec<OwnMotion> = sums.moments.of_frames.iter().map(|moment| moment.own).collect();
         let extent = Extent::of_duration([Column::Scan, Column::Uneven].map(of), &driving);
         return Description {
             covariate: Covariate::ScanPhase,
@@ -91,6 +108,11 @@ fn linear(search: &Search, cause: Cause, columns: &[usize], chosen: &[Hypothesis
         Cause::RangeBias => {
             (Covariate::CosIncidence, "all ranges are measured longer (shorter where negative) than they are")
         }
+        Cause::RangeDrift => (Covariate::Time, "all ranges grow longer (shorter where negative) over the recording"),
+        Cause::EgoAttitude => (
+            Covariate::Velocity,
+            "the whole scene is tilted, the more the faster the car drives: it pitches otherwise than simulated",
+        ),
         Cause::PitchRoll => {
             (Covariate::Range, "the whole scene is tilted: the car leans otherwise than the simulation believes")
         }
@@ -117,7 +139,7 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chos
             let spread = if column == 0 { grouped::spread_of_rows } else { grouped::spread_of_smooth_rows };
             (spread(&rows), rows)
         }
-        Grouping::Azimuth => strips(search, column),
+        Grouping::Azimuth | Grouping::Range => strips(search, grouping, column),
     };
     let error = std / (2.0 * n.max(1.0)).sqrt();
     // The mean offset of all rows is theirs unless a bias of all ranges was found. It is fitted together with offsets
@@ -139,22 +161,27 @@ fn groups(search: &Search, cause: Cause, grouping: Grouping, column: usize, chos
         }));
     }
     let says = match (grouping, column) {
+        (Grouping::Row, 0) if cause == Cause::Unexplained => format!(
+            "offsets of rows grow over the recording: {:.1} cm from row to row; no cause of the catalogue does that",
+            std * 100.0
+        ),
         (Grouping::Row, 0) => format!("each row has a range offset of its own: {:.1} cm from row to row", std * 100.0),
         (Grouping::Row, _) => {
             format!("each row aims otherwise than believed: by {:.3} degrees from row to row", std * scale)
         }
         _ => format!(
-            "ranges are off by {:.1} cm in a way that depends on the azimuth; no cause of the catalogue does that",
-            std * 100.0
+            "ranges are off by {:.1} cm in a way that depends on the {}; no cause of the catalogue does that",
+            std * 100.0,
+            if grouping == Grouping::Range { "range" } else { "azimuth" }
         ),
     };
     Description { covariate: grouping.into(), says, curve: group_curve(&offsets, grouping, column, scale), parameters }
 }
 
-/// Spread of the offsets of strips of azimuth with the number of strips that are known well; the offsets with their
-/// variances.
-fn strips(search: &Search, column: usize) -> ((f64, f64), BTreeMap<Group, [f64; 2]>) {
-    let frames = search.sums.groups_of(Grouping::Azimuth);
+/// Spread of the offsets of strips of azimuth, or steps of range, with the number of those that are known well; the
+/// offsets with their variances.
+fn strips(search: &Search, grouping: Grouping, column: usize) -> ((f64, f64), BTreeMap<Group, [f64; 2]>) {
+    let frames = search.sums.groups_of(grouping);
     let all = total(search.estimate.iter().map(|&i| &frames[i]));
     let spread = grouped::spread(&all, group_fit(column), 0.0);
     // The prior of strips with few returns is the spread of the others.
@@ -235,6 +262,12 @@ fn linear_parameters(
         match sums.columns[c] {
             Column::RangeOffset => parameters.push(parameter(Quantity::OffsetM, theta, error.hypot(0.003))),
             Column::RangeScale => parameters.push(parameter(Quantity::Scale, theta, error.hypot(1e-4))),
+            Column::Drift(_) => parameters.push(parameter(Quantity::DriftM, theta, error.hypot(0.003))),
+            Column::Lean => {
+                let by = -theta.to_degrees() * lean_at(70.0);
+                let error = error.to_degrees() * lean_at(70.0);
+                parameters.push(parameter(Quantity::PitchAt70MpsDeg, by, error.hypot(FORM_OF_POSE * by)));
+            }
             Column::Sweep(k) => {
                 let shear = [Quantity::ShearXM, Quantity::ShearYM, Quantity::ShearYawDeg][k];
                 let by = if k == 2 { 1f64.to_degrees() } else { 1.0 };
@@ -259,6 +292,9 @@ fn linear_parameters(
     parameters
 }
 
+/// Relative error of the model of a turn of the whole scene: poses of frames absorb a part of it.
+const FORM_OF_POSE: f64 = 0.03;
+
 /// Parameters of a pose; none where it has no turn and no shift.
 fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
     let Pose { mut turn, mut turn_error, mut shift, mut shift_error, sensor } = pose;
@@ -281,7 +317,7 @@ fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
     let deg = f64::to_degrees;
     // Relative error of the model: poses of frames and offsets of surfaces absorb a part of the turn of a single
     // sensor.
-    let form = if sensor.is_some() { 0.07 } else { 0.03 };
+    let form = if sensor.is_some() { 0.07 } else { FORM_OF_POSE };
     for (k, angle) in [Quantity::RollDeg, Quantity::PitchDeg, Quantity::YawDeg].into_iter().enumerate() {
         if turn[k].abs() > 1e-9 {
             let value = deg(turn[k]);
@@ -300,12 +336,16 @@ fn pose_parameters(rig: &Rig, pose: Pose, cause: Cause) -> Vec<NamedParameter> {
 fn group_curve(offsets: &BTreeMap<Group, [f64; 2]>, grouping: Grouping, column: usize, scale: f64) -> Curve {
     let points = offsets.iter().map(|(group, [v, variance])| {
         let place = group.place(grouping);
-        let x = if grouping == Grouping::Row { place } else { place.to_degrees() };
+        let x = if grouping == Grouping::Azimuth { place.to_degrees() } else { place };
         let sensor = usize::from(group.sensor);
         let error = variance.sqrt() * scale;
         CurvePoint { sensor, x, measured: v * scale, before: 0.0, after: v * scale, error }
     });
-    let x = if grouping == Grouping::Row { "row" } else { "azimuth, degrees" };
+    let x = match grouping {
+        Grouping::Row => "row",
+        Grouping::Azimuth => "azimuth, degrees",
+        Grouping::Range => "range, m",
+    };
     let y = if column == 0 { "offset of range, m" } else { "offset of elevation, degrees" };
     Curve { x: x.into(), y: y.into(), by_sensor: true, points: points.collect() }
 }
@@ -333,6 +373,11 @@ pub(super) fn minimum(sums: &Sums, select: &[usize], blocks: &[usize]) -> Vec<(C
     let deg = 1f64.to_degrees();
     let [offset, pitch] = [Column::RangeOffset, Column::Pose(1)];
     push(Cause::RangeBias, Quantity::OffsetM, error(offset), displacing(offset).max(FLOOR_OFFSET_M), 1.0);
+    let drift = Column::Drift(1);
+    push(Cause::RangeDrift, Quantity::DriftM, error(drift), displacing(drift).max(FLOOR_OFFSET_M), 1.0);
+    let least_lean = FLOOR_TURN_RAD / sums.moments.most_lean().max(1e-9);
+    let lean = displacing(Column::Lean).max(least_lean);
+    push(Cause::EgoAttitude, Quantity::PitchAt70MpsDeg, error(Column::Lean), lean, deg * lean_at(70.0));
     push(Cause::PitchRoll, Quantity::PitchDeg, error(pitch), displacing(pitch).max(FLOOR_TURN_RAD), deg);
     let one = if sums.columns.contains(&Column::SensorPose(0, 2)) { Column::SensorPose(0, 2) } else { Column::Pose(2) };
     // The pose of one of several sensors has no other smallest size.

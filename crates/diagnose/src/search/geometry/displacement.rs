@@ -2,8 +2,9 @@
 
 use super::hypotheses::{Hypothesis, is_sweep};
 use super::sums::{Sums, group_fit, split};
-use crate::channels::groups::{Group, Grouping, STRIP_RAD, Undone, group_of};
+use crate::channels::groups::{Group, Grouping, Undone, group_of};
 use crate::channels::mean::Column;
+use crate::channels::moments::{COURSES, Moment};
 use crate::pairing::Ray;
 use nalgebra::{Isometry3, Point3, SVector, Vector3};
 use sensor::Rig;
@@ -21,10 +22,16 @@ pub struct Displacement {
     pub sensors: Vec<SVector<f64, 6>>,
     /// Constant range offset, m, and relative range error.
     pub bias: [f64; 2],
+    /// Range offsets that grow over the recording, m at its end: see [`Moment::course`].
+    pub drift: [f64; COURSES],
+    /// Pitch of the scene that grows with the square of the speed, rad at 10 m/s.
+    pub lean_rad: f64,
+    /// Moments of the frames; empty where nothing depends on them.
+    pub moments: Vec<Moment>,
     /// Offsets of rows, of the range, m, and of the elevation, rad.
     pub rows: Undone,
-    /// Range offsets of strips of azimuth, m.
-    pub strips: BTreeMap<Group, f64>,
+    /// Range offsets of strips of azimuth, and of steps of range, m.
+    pub strips: [BTreeMap<Group, f64>; 2],
     /// Displacement over a scan: along x and y, m, and about z, rad.
     pub shear: [f64; 3],
     /// Duration of a scan, s.
@@ -45,7 +52,7 @@ pub enum Swept {
 impl Displacement {
     /// Whether the scene as a whole is turned or shifted.
     pub fn moves(&self) -> bool {
-        self.scene.norm() > 0.0 || self.sensors.iter().any(|s| s.norm() > 0.0)
+        self.lean_rad != 0.0 || self.scene.norm() > 0.0 || self.sensors.iter().any(|s| s.norm() > 0.0)
     }
 
     /// Whether rows have elevation offsets.
@@ -63,7 +70,12 @@ impl Displacement {
 
     /// Whether ranges have offsets by row or by azimuth.
     pub fn is_uneven(&self) -> bool {
-        !(self.rows.is_empty() && self.strips.is_empty())
+        !self.rows.is_empty() || self.has_strips()
+    }
+
+    /// Whether ranges have offsets by azimuth or by range.
+    pub fn has_strips(&self) -> bool {
+        self.strips.iter().any(|offsets| !offsets.is_empty())
     }
 
     /// The displacement by one of the columns.
@@ -73,6 +85,8 @@ impl Displacement {
             Column::SensorPose(s, k) => self.sensors.get(s).map_or(0.0, |pose| pose[k]),
             Column::RangeOffset => self.bias[0],
             Column::RangeScale => self.bias[1],
+            Column::Drift(k) => self.drift[k],
+            Column::Lean => self.lean_rad,
             Column::Sweep(k) => self.shear[k],
             Column::Scan => self.scan_s,
             Column::Uneven => self.uneven_s,
@@ -80,14 +94,24 @@ impl Displacement {
         }
     }
 
-    /// Displacement of a point seen by a sensor, m, without that of its row.
-    pub fn of_point(&self, point: &Vector3<f64>, sensor: usize, origin: &Point3<f64>) -> Vector3<f64> {
+    /// Displacement of a point seen by a sensor in a frame, m, without that of its row.
+    pub fn of_point(
+        &self,
+        point: &Vector3<f64>,
+        (frame, sensor): (usize, usize),
+        origin: &Point3<f64>,
+    ) -> Vector3<f64> {
         let turned = |p: &SVector<f64, 6>, about: Vector3<f64>| {
             Vector3::new(p[0], p[1], p[2]).cross(&(point - about)) + Vector3::new(p[3], p[4], p[5])
         };
         let to = point - origin.coords;
         let own = self.sensors.get(sensor).map_or_else(Vector3::zeros, |p| turned(p, origin.coords));
-        turned(&self.scene, Vector3::zeros()) + own + to.normalize() * (self.bias[0] + self.bias[1] * to.norm())
+        let moment = self.moments.get(frame).copied().unwrap_or_default();
+        let drift_m: f64 = self.drift.iter().enumerate().map(|(k, by)| by * moment.course(k)).sum();
+        let mut scene = self.scene;
+        scene[1] += self.lean_rad * moment.lean();
+        let bias_m = self.bias[0] + self.bias[1] * to.norm() + drift_m;
+        turned(&scene, Vector3::zeros()) + own + to.normalize() * bias_m
     }
 
     /// Displacement of a point by the offsets of the row that it was shot by, m; `pose` is that of the sensor.
@@ -110,16 +134,22 @@ impl Displacement {
         pose.rotation * (seen - shot)
     }
 
-    /// Correction to subtract from the range of a measured ray, for the offset of its strip of azimuth, m. Offsets vary
-    /// continuously: they are interpolated between the middles of strips.
+    /// Correction to subtract from the range of a measured ray, for the offsets of its strip of azimuth and of its step
+    /// of range, m.
     pub fn of_strip(&self, ray: &Ray) -> f64 {
-        let of = |g: Group| self.strips.get(&g).copied();
-        let Some(group) = group_of(ray, Grouping::Azimuth) else { return 0.0 };
-        let Some(offset) = of(group) else { return 0.0 };
-        let beside = (f64::from(ray.azimuth_rad) - group.place(Grouping::Azimuth)) / STRIP_RAD;
-        let next = if beside < 0.0 { group.previous().and_then(of) } else { of(group.next()) };
-        offset + beside.abs().min(0.5) * (next.unwrap_or(offset) - offset)
+        let groupings = [Grouping::Azimuth, Grouping::Range];
+        groupings.into_iter().zip(&self.strips).map(|(grouping, offsets)| of_group(ray, grouping, offsets)).sum()
     }
+}
+
+/// The offset of a ray's group. Offsets vary continuously: they are interpolated between the middles of groups.
+fn of_group(ray: &Ray, grouping: Grouping, offsets: &BTreeMap<Group, f64>) -> f64 {
+    let of = |g: Group| offsets.get(&g).copied();
+    let Some(group) = group_of(ray, grouping) else { return 0.0 };
+    let Some(offset) = of(group) else { return 0.0 };
+    let beside = (grouping.place_of(ray) - group.place(grouping)) / grouping.width();
+    let next = if beside < 0.0 { group.previous().and_then(of) } else { of(group.next()) };
+    offset + beside.abs().min(0.5) * (next.unwrap_or(offset) - offset)
 }
 
 /// The displacement by the chosen hypotheses, fitted on the selecting frames.
@@ -130,7 +160,11 @@ pub(super) fn displacement(
     blocks: &[usize],
     chosen: &[Hypothesis],
 ) -> Displacement {
-    let mut out = Displacement { sensors: vec![SVector::zeros(); rig.sensors.len()], ..Displacement::default() };
+    let mut out = Displacement {
+        sensors: vec![SVector::zeros(); rig.sensors.len()],
+        moments: sums.moments.of_frames.clone(),
+        ..Displacement::default()
+    };
     let (columns, groups) = split(chosen);
     let fitted = sums.fit_all(select, blocks, chosen);
     let undone = |c: &usize| columns.contains(c) || is_sweep(sums.columns[*c]);
@@ -140,6 +174,8 @@ pub(super) fn displacement(
             Column::SensorPose(s, k) => out.sensors[s][k] += theta,
             Column::RangeOffset => out.bias[0] = *theta,
             Column::RangeScale => out.bias[1] = *theta,
+            Column::Drift(k) => out.drift[k] = *theta,
+            Column::Lean => out.lean_rad = *theta,
             Column::Sweep(k) => out.shear[k] = *theta,
             Column::Scan => out.scan_s = *theta,
             Column::Uneven => out.uneven_s = *theta,
@@ -150,7 +186,8 @@ pub(super) fn displacement(
         let offsets = sums.offsets(select, grouping, group_fit(column), chosen);
         match grouping {
             Grouping::Row => offsets.into_iter().for_each(|(g, o)| out.rows.entry(g).or_default()[column] = o),
-            Grouping::Azimuth => out.strips = offsets,
+            Grouping::Azimuth => out.strips[0] = offsets,
+            Grouping::Range => out.strips[1] = offsets,
         }
     }
     out

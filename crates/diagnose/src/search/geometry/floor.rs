@@ -6,6 +6,7 @@ use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
 #[cfg(doc)]
 use crate::channels::mean::STRUCTURE_M;
+use crate::channels::moments::COURSES;
 use crate::inference::grouped;
 use nalgebra::{DMatrix, DVector};
 
@@ -28,8 +29,11 @@ pub(super) const FLOOR_SWEEP: [f64; 3] = [2.0 * FLOOR_SHIFT_M, 2.0 * FLOOR_SHIFT
 pub(super) const FLOOR_DISPLACED_M: f64 = 0.004;
 
 /// Smallest spread of group offsets that is reported: rows in range, m; rows in elevation, rad; strips of azimuth in
-/// range, m.
-pub(super) const FLOOR_GROUPS: [f64; 3] = [0.006, 2.6e-4, 0.02];
+/// range, m; steps of range, m.
+pub(super) const FLOOR_GROUPS: [f64; 4] = [0.006, 2.6e-4, 0.02, 0.012];
+
+/// Steps of range to either side that an offset by range is compared with, 2 m: a bias and a scale are alike there.
+const STEPS_BESIDE: u16 = 8;
 
 /// Whether the effect of the last of some hypotheses, fitted together, is large enough to be reported.
 pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> bool {
@@ -44,6 +48,10 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
                     grouped::rough_spread(&all, &offsets, group_fit(*column)) > FLOOR_GROUPS[*column]
                 }
                 Grouping::Azimuth => grouped::spread(&all, group_fit(*column), 0.0).0 > FLOOR_GROUPS[2],
+                Grouping::Range => {
+                    let offsets = sums.offsets(select, *grouping, group_fit(*column), hypotheses);
+                    grouped::spread_about(&all, &offsets, group_fit(*column), STEPS_BESIDE) > FLOOR_GROUPS[3]
+                }
             }
         }
         Hypothesis::Linear { columns, .. } => {
@@ -61,14 +69,17 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
             }
             let of =
                 |column: Column| coefficients.iter().find(|(c, _)| sums.columns[*c] == column).map_or(0.0, |(_, t)| *t);
-            let bias_m = |range_m: f64| (of(Column::RangeOffset) + range_m * of(Column::RangeScale)).abs();
+            let drift_m: f64 = (0..COURSES).map(|k| of(Column::Drift(k))).sum();
+            let bias_m = |range_m: f64| (of(Column::RangeOffset) + range_m * of(Column::RangeScale) + drift_m).abs();
             let floor = |c: usize| match sums.columns[c] {
                 Column::Pose(0..3) => FLOOR_TURN_RAD,
                 Column::Pose(_) => FLOOR_SHIFT_M,
                 Column::Sweep(k) => FLOOR_SWEEP[k],
-                Column::Scan => FLOOR_SWEEP[0] / sums.middle_m_s.max(1e-9),
+                Column::Scan => FLOOR_SWEEP[0] / sums.moments.middle_m_s().max(1e-9),
+                Column::Lean => FLOOR_TURN_RAD / sums.moments.most_lean().max(1e-9),
                 Column::RangeOffset
                 | Column::RangeScale
+                | Column::Drift(_)
                 | Column::SensorPose(..)
                 | Column::Structure(_)
                 | Column::Uneven => f64::INFINITY,
@@ -91,7 +102,7 @@ impl Sums {
         coefficients: &[(usize, f64)],
         others: &[usize],
     ) -> f64 {
-        let of_frame = |f: usize| if sensor.is_some() { &self.linear[f].gram } else { &self.whole[f] };
+        let of_frame = |f: usize| if sensor.is_some() { &self.linear[f].gram } else { &self.whole[f].gram };
         let gram: DMatrix<f64> = frames.iter().map(|&f| of_frame(f)).sum();
         let mut by = DVector::zeros(self.columns.len());
         coefficients.iter().for_each(|(c, x)| by[*c] = *x);
@@ -114,7 +125,10 @@ impl Sums {
 mod tests {
     use super::super::sums::Groups;
     use super::*;
+    use crate::channels::mean::MeanFrame;
+    use crate::channels::moments::Moments;
     use crate::inference::linear::LinearFrame;
+    use nalgebra::SVector;
 
     /// One sensor that sees ground and, in half of its returns, a wall; its shift along the wall's normal, and up.
     fn sums() -> Sums {
@@ -132,16 +146,21 @@ mod tests {
             columns,
             precision: vec![2500.0, 2500.0, 25.0, 25.0],
             base: vec![0, 1],
-            whole: vec![gram.clone()],
+            whole: vec![MeanFrame { gram: gram.clone(), right: DVector::zeros(4) }],
+            own_prior: SVector::zeros(),
+            undone: DVector::zeros(4),
+            noise_m: 0.01,
+            design: 1.0,
             linear: vec![LinearFrame { gram, right: DVector::zeros(4) }],
             rows: vec![],
             of_patches: 1.0,
             whole_rows: none(),
             rows_with_pose: vec![],
             strips: none(),
+            steps: none(),
             poses: vec![],
             of_sensors: vec![vec![2e6]],
-            middle_m_s: 0.0,
+            moments: Moments::default(),
         }
     }
 

@@ -3,6 +3,7 @@
 use crate::catalogue::Cause;
 use crate::channels::groups::Grouping;
 use crate::channels::mean::Column;
+use crate::channels::moments::COURSES;
 use crate::search::Context;
 
 /// A hypothesis: some columns of the linear fit, or one offset for each group of rays.
@@ -29,9 +30,11 @@ impl Hypothesis {
     }
 
     /// Number of free parameters. Offsets of groups are shrunk by their prior: 12 for rows and 14 for strips of
-    /// azimuth are what they count.
+    /// azimuth and steps of range are what they count.
     pub(super) fn parameters(&self) -> usize {
         match self {
+            // The course of a drift is one of several.
+            Hypothesis::Linear { cause: Cause::RangeDrift, columns } => columns.len() + 1,
             Hypothesis::Linear { columns, .. } => columns.len(),
             Hypothesis::Groups { grouping: Grouping::Row, .. } => 12,
             Hypothesis::Groups { .. } => 14,
@@ -39,8 +42,8 @@ impl Hypothesis {
     }
 }
 
-/// All hypotheses of a rig, without a displacement over a scan where one was undone. With a single sensor its pose and
-/// that of the scene are the same columns.
+/// All hypotheses of which columns are known, without a displacement over a scan where one was undone. With a single
+/// sensor its pose and that of the scene are the same columns.
 pub(super) fn hypotheses(context: &Context, columns: &[Column], undone: bool) -> Vec<Hypothesis> {
     let at = |c: Column| columns.iter().position(|x| *x == c);
     let pick = |list: &[Column]| list.iter().filter_map(|c| at(*c)).collect::<Vec<_>>();
@@ -52,11 +55,13 @@ pub(super) fn hypotheses(context: &Context, columns: &[Column], undone: bool) ->
         linear(Cause::PitchRoll, &[Column::Pose(1)]),
         linear(Cause::PitchRoll, &[Column::Pose(0)]),
         linear(Cause::PitchRoll, &[Column::Pose(0), Column::Pose(1)]),
+        linear(Cause::EgoAttitude, &[Column::Lean]),
         linear(Cause::RollingShutter, &[Column::Scan]),
         linear(Cause::RollingShutter, &[Column::Sweep(0)]),
         linear(Cause::RollingShutter, &[Column::Sweep(2)]),
         linear(Cause::RollingShutter, &[Column::Sweep(0), Column::Sweep(2)]),
     ];
+    all.extend((0..COURSES).map(|k| linear(Cause::RangeDrift, &[Column::Drift(k)])));
     let mount = |list: &[Column]| linear(Cause::SensorExtrinsics, list);
     if context.rig.sensors.len() > 1 {
         for s in 0..context.rig.sensors.len() {
@@ -76,10 +81,15 @@ pub(super) fn hypotheses(context: &Context, columns: &[Column], undone: bool) ->
     }
     all.push(Hypothesis::Groups { cause: Cause::BeamRangeOffset, grouping: Grouping::Row, column: 0 });
     all.push(Hypothesis::Groups { cause: Cause::BeamElevationOffset, grouping: Grouping::Row, column: 1 });
-    all.push(Hypothesis::Groups { cause: Cause::Unexplained, grouping: Grouping::Azimuth, column: 0 });
+    all.extend([Grouping::Azimuth, Grouping::Range].map(|grouping| Hypothesis::Groups {
+        cause: Cause::Unexplained,
+        grouping,
+        column: 0,
+    }));
     all.retain(|h| match h {
-        Hypothesis::Linear { cause: Cause::RollingShutter, columns } => !undone && !columns.is_empty(),
-        _ => true,
+        Hypothesis::Linear { cause: Cause::RollingShutter, .. } if undone => false,
+        Hypothesis::Linear { columns, .. } => !columns.is_empty(),
+        Hypothesis::Groups { .. } => true,
     });
     all
 }
@@ -94,8 +104,9 @@ pub(super) fn is_pose(hypothesis: &Hypothesis) -> bool {
     matches!(hypothesis.cause(), Cause::PitchRoll | Cause::SensorExtrinsics)
 }
 
-/// Whether a hypothesis may be added to those chosen: another cause, one grouping (by rows in range and in elevation),
-/// and nothing after motion distortion. A strong shear leaves every sensor with an apparent turn and shift of its own.
+/// Whether a hypothesis may be added to those chosen: another cause, one grouping of directions (by rows in range and
+/// in elevation), and nothing after motion distortion. A strong shear leaves every sensor with an apparent turn and
+/// shift of its own.
 pub(super) fn may_join(hypothesis: &Hypothesis, chosen: &[Hypothesis]) -> bool {
     chosen.iter().all(|c| {
         let grouping = |h: &Hypothesis| match h {
@@ -103,7 +114,8 @@ pub(super) fn may_join(hypothesis: &Hypothesis, chosen: &[Hypothesis]) -> bool {
             Hypothesis::Linear { .. } => None,
         };
         let sheared = c.cause() == Cause::RollingShutter;
-        let grouped_otherwise = grouping(c).zip(grouping(hypothesis)).is_some_and(|(a, b)| a != b);
+        let other = |(a, b): (Grouping, Grouping)| a != b && a != Grouping::Range && b != Grouping::Range;
+        let grouped_otherwise = grouping(c).zip(grouping(hypothesis)).is_some_and(other);
         c.cause() != hypothesis.cause() && !sheared && !grouped_otherwise
     })
 }

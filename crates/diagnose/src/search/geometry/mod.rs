@@ -1,14 +1,18 @@
 //! Where surfaces lie: range biases, poses of sensors and of the ego vehicle, rows that aim or measure wrongly, and
-//! unexplained offsets by azimuth.
+//! unexplained offsets by azimuth or by range.
 
 mod common_turns;
 mod curve;
 mod describe;
+mod directions;
 mod displacement;
 mod floor;
 mod hypotheses;
+mod own_scatter;
 mod row_offsets;
 mod rows;
+mod selection;
+mod steadiness;
 mod sums;
 
 pub use self::displacement::{Displacement, Swept};
@@ -16,24 +20,20 @@ pub use self::displacement::{Displacement, Swept};
 use self::common_turns::common_turns;
 use self::displacement::displacement;
 use self::floor::above_floor;
-use self::hypotheses::{Hypothesis, hypotheses, is_pose, may_join};
-use self::rows::drop_less_certain_rows;
+use self::hypotheses::Hypothesis;
 use self::sums::{Sums, sums};
 use super::confounders::is_confirmed;
 use super::rolling_shutter::Slide;
-use super::{ChannelResult, Context, Selected, Z_STAR, causes_of, first_demands, record, rivals_and_confidence};
+use super::{ChannelResult, Context, Selected, Z_STAR, first_demands};
 use crate::catalogue::{Cause, Channel};
 use crate::channels::groups::Grouping;
 use crate::channels::mean::Column;
+use crate::channels::moments::COURSES;
 use crate::diagnosis::Considered;
 use crate::error::DiagnoseError;
-use crate::inference::choice::{Demands, Trial, choose, significant, total_and_z};
+use crate::inference::choice::{Demands, significant, total_and_z};
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
-use rayon::prelude::*;
-
-/// Share of the gain of the first pose that a second pose must bring.
-const SECOND_POSE_SHARE: f64 = 0.3;
 
 /// Frames by role, their sums and what is demanded of a hypothesis.
 struct Search<'a> {
@@ -44,6 +44,8 @@ struct Search<'a> {
     swept: Vec<Column>,
     /// Of the frames as they are; once the hypotheses are chosen, of those with the displacement undone.
     sums: Sums,
+    /// The frames with the displacement undone, once there are any.
+    undone: Option<Vec<FramePair>>,
     select: Vec<usize>,
     /// Blocks of the selecting frames.
     blocks: Vec<usize>,
@@ -66,7 +68,8 @@ struct Sheared {
 }
 
 /// Gains of the `test` frames by unconstrained tables fitted on the `train` frames, nats: all poses and biases
-/// together or offsets of strips of azimuth, whichever is more, and offsets of rows beyond those of their neighbours.
+/// together or offsets of strips of azimuth, whichever is more, offsets of rows beyond those of their neighbours, and
+/// offsets of steps of range.
 pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> {
     let sums = sums(context, train, &Displacement::default(), &[]);
     let (full, base) = sums.full_and_base(train, &context.blocks(train));
@@ -88,7 +91,8 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> Vec<f64> 
     let more = |a: Vec<f64>, b: Vec<f64>| if a.iter().sum::<f64>() >= b.iter().sum() { a } else { b };
     let smooth = more(linear, groups(Grouping::Azimuth, 0));
     let rough = more(groups(Grouping::Row, 0), groups(Grouping::Row, 1));
-    smooth.iter().zip(rough).map(|(a, b)| a + b).collect()
+    let steps = groups(Grouping::Range, 0);
+    smooth.iter().zip(rough).zip(steps).map(|((a, b), c)| a + b + c).collect()
 }
 
 /// Pairs the frames anew with a displacement undone.
@@ -128,7 +132,7 @@ pub fn search(context: &Context, slide: Option<&Slide>, undo: Undo) -> Result<Ge
     }
     search.add_common_turns(&mut chosen, &mut result);
     search.undo(&chosen.0, undo)?;
-    let (chosen, selected) = search.large_enough(chosen);
+    let (chosen, selected) = search.large_enough(search.still_significant(chosen));
     let gains: Vec<Vec<f64>> = chosen.iter().map(|hypothesis| search.held_out_gains(hypothesis, &chosen)).collect();
     result.distance = search.distances(&chosen, &gains);
     for ((hypothesis, selected), gains) in chosen.iter().zip(selected).zip(gains) {
@@ -152,6 +156,7 @@ impl<'a> Search<'a> {
             is_moved_back: slide.is_some(),
             swept: swept.to_vec(),
             sums: sums(context, &select, &Displacement::default(), swept),
+            undone: None,
             blocks: context.blocks(&select),
             estimate_blocks: context.blocks(&estimate),
             demands: first_demands(),
@@ -160,6 +165,11 @@ impl<'a> Search<'a> {
             estimate,
             hold_out,
         }
+    }
+
+    /// The frames that the sums are of.
+    fn paired(&self) -> Context<'_> {
+        Context { frames: self.undone.as_deref().unwrap_or(self.context.frames), ..self.context.clone() }
     }
 
     /// The displacement by the chosen hypotheses.
@@ -173,11 +183,13 @@ impl<'a> Search<'a> {
         if displaced.moves()
             || displaced.rows_aim_elsewhere()
             || displaced.bias != [0.0; 2]
+            || displaced.drift != [0.0; COURSES]
             || displaced.swept().is_some()
         {
             let frames = undo(&displaced)?;
             let context = Context { frames: &frames, ..self.context.clone() };
             self.sums = sums(&context, &self.select, &displaced, &self.swept);
+            self.undone = Some(frames);
         }
         Ok(())
     }
@@ -219,54 +231,6 @@ impl<'a> Search<'a> {
         self.sums.gains_of(&self.estimate, &self.estimate_blocks, hypothesis, chosen, &self.hold_out)
     }
 
-    /// Forward selection, until no hypothesis brings what is demanded.
-    fn select(&self, result: &mut ChannelResult) -> Chosen {
-        let all = hypotheses(self.context, &self.sums.columns, self.is_moved_back);
-        let (mut chosen, mut selected): Chosen = (Vec::new(), Vec::new());
-        let mut first_gains: Vec<f64> = Vec::new();
-        for step in 0..all.len() {
-            let candidates: Vec<&Hypothesis> = all.iter().filter(|h| may_join(h, &chosen)).collect();
-            let mut trials = self.trials(&candidates, &chosen, &first_gains);
-            drop_less_certain_rows(&mut trials, &candidates);
-            if step > 0 {
-                drop_remainders(&mut trials, &first_gains);
-            }
-            let choice = choose(&trials, &self.demands);
-            let considered = record(&trials, choice.as_ref(), result.channel, self.returns, &self.demands);
-            result.considered.extend(considered);
-            let Some(choice) = choice else { break };
-            let trial = &trials[choice.chosen];
-            first_gains.clone_from(&trial.gains);
-            let equals = causes_of(&trials, &choice.equals);
-            selected.push(rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands));
-            chosen.push(candidates[trial.candidate].clone());
-        }
-        // What is there as well is no rival.
-        let is_chosen = |cause: &Cause| chosen.iter().any(|h| h.cause() == *cause);
-        selected.iter_mut().for_each(|s| s.rivals.retain(|r| !is_chosen(r)));
-        (chosen, selected)
-    }
-
-    /// A trial of each candidate on top of what is chosen.
-    fn trials(&self, candidates: &[&Hypothesis], chosen: &[Hypothesis], first_gains: &[f64]) -> Vec<Trial> {
-        let before = self.gains(chosen);
-        let trial = |(k, hypothesis): (usize, &&Hypothesis)| {
-            let with: Vec<Hypothesis> = chosen.iter().cloned().chain([(*hypothesis).clone()]).collect();
-            let mut gains = self.gains(&with);
-            gains.iter_mut().zip(&before).for_each(|(g, b)| *g -= b);
-            let second_pose = is_pose(hypothesis) && chosen.iter().any(is_pose);
-            let enough = !second_pose || total_and_z(&gains).0 > SECOND_POSE_SHARE * first_gains.iter().sum::<f64>();
-            Trial {
-                candidate: k,
-                cause: hypothesis.cause(),
-                parameters: hypothesis.parameters(),
-                gains,
-                above_floor: enough && above_floor(&self.sums, &self.select, &self.blocks, &with),
-            }
-        };
-        candidates.par_iter().enumerate().map(trial).collect()
-    }
-
     /// Adds turns of the ego vehicle that all other sensors agree on, beside a sensor that is mounted otherwise.
     fn add_common_turns(&self, (chosen, selected): &mut Chosen, result: &mut ChannelResult) {
         let Some(turns) = common_turns(&self.sums, &self.select, &self.blocks, chosen) else { return };
@@ -288,18 +252,6 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// Those of the chosen hypotheses whose effect exceeds the floor on the estimating frames as well.
-    fn large_enough(&self, (chosen, selected): Chosen) -> Chosen {
-        let large: Vec<bool> = (0..chosen.len())
-            .map(|k| {
-                let last: Vec<Hypothesis> =
-                    (0..chosen.len()).filter(|i| *i != k).chain([k]).map(|i| chosen[i].clone()).collect();
-                above_floor(&self.sums, &self.estimate, &self.estimate_blocks, &last)
-            })
-            .collect();
-        chosen.into_iter().zip(selected).zip(large).filter(|(_, large)| *large).map(|(both, _)| both).unzip()
-    }
-
     /// Of each held-out frame its distance, the gain of the chosen hypotheses, and the gain of all columns, nats. The
     /// sums have no distance of their own: it is taken to be the largest gain. `gains` are those of each hypothesis.
     fn distances(&self, chosen: &[Hypothesis], gains: &[Vec<f64>]) -> Vec<[f64; 3]> {
@@ -313,14 +265,4 @@ impl<'a> Search<'a> {
         };
         self.hold_out.iter().enumerate().map(of_frame).collect()
     }
-}
-
-/// Drops trials of a second step that only fit what the first one left: below 10 % of the first gain, or below 2 %
-/// where they are more significant than the first.
-fn drop_remainders(trials: &mut [Trial], first_gains: &[f64]) {
-    let first = total_and_z(first_gains);
-    trials.iter_mut().for_each(|t| {
-        let (total, z) = total_and_z(&t.gains);
-        t.above_floor &= total > 0.1 * first.0 || z > first.1 && total > 0.02 * first.0;
-    });
 }

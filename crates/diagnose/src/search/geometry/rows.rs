@@ -48,6 +48,7 @@ mod tests {
             cause: hypotheses[candidate].cause(),
             parameters: 1,
             gains,
+            expected: vec![],
             above_floor: true,
         };
         // A larger total gain from few frames, against a smaller one on every frame.

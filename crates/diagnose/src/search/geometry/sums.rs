@@ -2,20 +2,20 @@
 
 use super::displacement::Displacement;
 use super::hypotheses::Hypothesis;
+use super::own_scatter::own_scatter;
 use super::row_offsets::row_offsets;
 use crate::channels::groups::{Group, GroupFrame, Grouping, PARTS, PartedFrame, Seen, group_frames, total, whole};
 use crate::channels::mean::{
-    Column, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, mean_frames, origins, own_poses,
-    usual_noise_m,
+    Column, Compared, MeanFrame, OWN, OwnPoses, STRUCTURE_M, columns, design_effect, origins, own_poses, usual_noise_m,
 };
+use crate::channels::moments::Moments;
 use crate::channels::row_patches::{self, Band, Offsets, RowFrame, row_frames};
 use crate::inference::grouped::{self, GroupFit};
-use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_gains, fit, fold_of};
+use crate::inference::linear::{FOLDS, LinearFit, LinearFrame, cross_expected, cross_gains, fit, fold_of};
 use crate::inference::median;
 use crate::search::Context;
-use nalgebra::{DMatrix, DVector, SVector};
+use nalgebra::{DVector, SVector};
 use rayon::prelude::*;
-use sensor::Rig;
 use std::collections::BTreeMap;
 
 /// Sums of all frames.
@@ -29,8 +29,16 @@ pub(super) struct Sums {
     pub(super) base: Vec<usize>,
     /// Linear sums of each frame, its own pose and displacement over a scan integrated out.
     pub(super) linear: Vec<LinearFrame>,
-    /// X' W X of each frame with its own pose.
-    pub(super) whole: Vec<DMatrix<f64>>,
+    /// Sums of each frame with its own pose.
+    pub(super) whole: Vec<MeanFrame>,
+    /// Prior variances of what each frame has of its own.
+    pub(super) own_prior: SVector<f64, OWN>,
+    /// What was undone before the frames were paired, by column.
+    pub(super) undone: DVector<f64>,
+    /// Range noise of the simulated side, m.
+    pub(super) noise_m: f64,
+    /// Variance of means over patches of directions, in units of that of independent residuals.
+    pub(super) design: f64,
     /// Sums by row, offsets and slopes of the surfaces in patches integrated out.
     pub(super) rows: Vec<RowFrame>,
     /// Variance of means of rows in patches, in units of the assumed one.
@@ -41,12 +49,14 @@ pub(super) struct Sums {
     pub(super) rows_with_pose: Vec<PartedFrame>,
     /// Sums by strip of azimuth.
     pub(super) strips: Groups,
+    /// Sums by step of range.
+    pub(super) steps: Groups,
     /// Pose error of each frame, as each sensor sees it.
     pub(super) poses: Vec<OwnPoses>,
     /// Weights of all returns of each sensor, by frame.
     pub(super) of_sensors: Vec<Vec<f64>>,
-    /// Median ego speed, m/s; 0 where it is not known.
-    pub(super) middle_m_s: f64,
+    /// Moments of all frames.
+    pub(super) moments: Moments,
 }
 
 /// Groups of every frame, by part and whole.
@@ -64,16 +74,17 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
     let noise_m = usual_noise_m(frames);
     let poses: Vec<OwnPoses> = frames.par_iter().map(|f| own_poses(f, &origins, noise_m)).collect();
     let design = design_effect(frames, &origins, &poses, noise_m);
-    let driving = context.driving();
-    let columns = columns(rig, driving.is_some());
-    let means = mean_frames(frames, rig, &columns, &poses, driving.as_deref(), noise_m, design);
+    let moments = context.moments();
+    let columns = columns(rig, &moments);
+    let compared = Compared { rig, columns: &columns, noise_m, design };
+    let mut means = compared.sums(frames, &poses, &moments.of_frames);
     let of_sensors = sensor_weights(&means, &columns, rig.sensors.len());
-    let prior = own_scatter(rig, &poses, select);
+    let prior = own_scatter(rig, &poses, select, &moments);
     let without_own = |m: &MeanFrame| {
         let (gram, right) = m.without_own(&prior);
         LinearFrame { gram, right }
     };
-    let mut linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
+    let linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
     let precision: Vec<f64> = columns.iter().map(|c| precision(*c)).collect();
     let mut base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
     base.extend((0..columns.len()).filter(|&i| swept.contains(&columns[i])));
@@ -81,7 +92,8 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
     let by_columns = DVector::from_iterator(columns.len(), columns.iter().map(|c| undone.of_column(*c)));
-    linear.iter_mut().for_each(|frame| frame.right += &frame.gram * &by_columns);
+    means.iter_mut().for_each(|frame| frame.right += &frame.gram * &by_columns);
+    let linear = means.iter().map(without_own).collect();
     let seen = Seen { poses: &poses, structure, undone: &undone.rows };
     let parted = |g, seen| group_frames(frames, rig, seen, g, noise_m, design);
     let groups = |g| {
@@ -96,14 +108,19 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
         whole_rows: groups(Grouping::Row),
         rows_with_pose: parted(Grouping::Row, with_pose),
         strips: groups(Grouping::Azimuth),
+        steps: groups(Grouping::Range),
         columns,
         precision,
         base,
         linear,
-        whole: means.into_iter().map(|m| m.gram).collect(),
+        whole: means,
+        own_prior: prior,
+        undone: by_columns,
+        noise_m,
+        design,
         poses,
         of_sensors,
-        middle_m_s: driving.map_or(0.0, |own| median(own.iter().map(|own| own.speed_m_s().abs()).collect())),
+        moments,
     }
 }
 
@@ -152,7 +169,8 @@ fn precision(column: Column) -> f64 {
         Column::RangeOffset => 0.5,
         Column::RangeScale => 0.02,
         Column::Pose(0..3) | Column::SensorPose(_, 0..3) => 0.035,
-        Column::Pose(_) | Column::SensorPose(..) => 0.2,
+        Column::Lean => 0.035,
+        Column::Pose(_) | Column::SensorPose(..) | Column::Drift(_) => 0.2,
         Column::Sweep(0..2) => 8.0,
         Column::Sweep(_) => 0.2,
         Column::Scan => 0.1,
@@ -161,28 +179,6 @@ fn precision(column: Column) -> f64 {
     };
     1.0 / (sd * sd)
 }
-
-/// Prior variances of what every frame may have of its own. Pose: the robust scatter of the frames' poses about the
-/// median of each sensor. Displacement over a scan: that of a driving vehicle where a sensor scans row after row,
-/// since static surfaces are then displaced along columns, which resembles a pose error of a sensor; zero otherwise.
-fn own_scatter(rig: &Rig, poses: &[OwnPoses], select: &[usize]) -> SVector<f64, OWN> {
-    let least = [2e-5, 2e-5, 2e-5, 5e-4, 5e-4, 5e-4];
-    let scatter = |k: usize| {
-        let mut deviations = Vec::new();
-        for sensor in 0..poses.first().map_or(0, Vec::len) {
-            let values: Vec<f64> = select.iter().map(|&f| poses[f][sensor][k]).collect();
-            let middle = median(values.clone());
-            deviations.extend(values.iter().map(|v| (v - middle).abs()));
-        }
-        (median(deviations) / statistics::MEDIAN_OF_NORMAL).max(least[k])
-    };
-    let by_rows = rig.sensors.iter().find(|s| !s.sequential_rows().is_empty());
-    let slide = |k: usize| by_rows.map_or(0.0, |s| OWN_MOTION[k] / s.rate_hz);
-    SVector::from_fn(|k, _| if k < 6 { scatter(k) } else { slide(k - 6) }.powi(2))
-}
-
-/// Standard deviations of ego motion: speed along and across the heading, m/s; yaw rate, rad/s.
-const OWN_MOTION: [f64; 3] = [40.0, 3.0, 0.3];
 
 /// Linear columns of some hypotheses, each once, and their groupings with the column of the group sums.
 pub(super) fn split(hypotheses: &[Hypothesis]) -> (Vec<usize>, Vec<(Grouping, usize)>) {
@@ -229,7 +225,7 @@ impl Sums {
             let all = cross_gains(&frames, blocks, &with, &self.precision);
             (0..out.len()).for_each(|i| out[i] += all[i] - base[i]);
         }
-        for grouping in [Grouping::Row, Grouping::Azimuth] {
+        for grouping in [Grouping::Row, Grouping::Azimuth, Grouping::Range] {
             let columns: Vec<usize> = groups.iter().filter(|(g, _)| *g == grouping).map(|(_, c)| *c).collect();
             if !columns.is_empty() {
                 let more = self.group_gains(select, blocks, grouping, &columns);
@@ -237,6 +233,17 @@ impl Sums {
             }
         }
         out
+    }
+
+    /// What the selecting frames are expected to gain by the last of the hypotheses `with` over those `before`, if they
+    /// are as other blocks say, nats; empty where the last one is offsets of groups.
+    pub(super) fn expected(&self, select: &[usize], blocks: &[usize], [before, with]: [&[Hypothesis]; 2]) -> Vec<f64> {
+        let columns = [before, with].map(|hypotheses| [&self.base[..], &split(hypotheses).0].concat());
+        if columns[0].len() == columns[1].len() {
+            return vec![];
+        }
+        let frames: Vec<&LinearFrame> = select.iter().map(|&i| &self.linear[i]).collect();
+        cross_expected(&frames, blocks, [&columns[0], &columns[1]], &self.precision)
     }
 
     /// Gains of the selecting frames by offsets of groups in some columns, fitted on other frames and on other parts
@@ -248,8 +255,9 @@ impl Sums {
         grouping: Grouping,
         columns: &[usize],
     ) -> Vec<f64> {
-        if grouping == Grouping::Azimuth {
-            return grouped::cross_part_gains(&self.strips.parted, select, blocks, group_fit(columns[0]), false);
+        if grouping != Grouping::Row {
+            let parted = &self.sums_of(grouping).parted;
+            return grouped::cross_part_gains(parted, select, blocks, group_fit(columns[0]), false);
         }
         let folds = fold_of(blocks);
         let mut out = vec![0.0; select.len()];
@@ -275,8 +283,8 @@ impl Sums {
         how: GroupFit,
         chosen: &[Hypothesis],
     ) -> BTreeMap<Group, f64> {
-        if grouping == Grouping::Azimuth {
-            return grouped::offsets(&total(frames.iter().map(|&i| &self.strips.whole[i])), how);
+        if grouping != Grouping::Row {
+            return grouped::offsets(&total(frames.iter().map(|&i| &self.groups_of(grouping)[i])), how);
         }
         self.rows(frames, how.column, chosen).into_iter().map(|(row, [offset, _])| (row, offset)).collect()
     }
@@ -287,9 +295,18 @@ impl Sums {
         sensors.flat_map(|sensor| row_offsets(self, frames, sensor, column, chosen)).collect()
     }
 
+    /// Sums by group, of surfaces as they are.
+    fn sums_of(&self, grouping: Grouping) -> &Groups {
+        match grouping {
+            Grouping::Row => &self.whole_rows,
+            Grouping::Azimuth => &self.strips,
+            Grouping::Range => &self.steps,
+        }
+    }
+
     /// The groups of every frame, of surfaces as they are.
     pub(super) fn groups_of(&self, grouping: Grouping) -> &[GroupFrame] {
-        if grouping == Grouping::Row { &self.whole_rows.whole } else { &self.strips.whole }
+        &self.sums_of(grouping).whole
     }
 
     /// Fit of the base model together with the linear hypotheses.
@@ -322,12 +339,12 @@ impl Sums {
                 let [with, without] = [chosen, &others].map(|of| self.fit_all(estimate, blocks, of));
                 frames.iter().map(|&f| with.gain(&self.linear[f]) - without.gain(&self.linear[f])).collect()
             }
-            Hypothesis::Groups { grouping: Grouping::Azimuth, column, .. } => {
-                let offsets = self.offsets(estimate, Grouping::Azimuth, group_fit(*column), chosen);
-                let strips = self.groups_of(Grouping::Azimuth);
-                frames.iter().map(|&f| grouped::gain(&strips[f], *column, &offsets)).collect()
+            Hypothesis::Groups { grouping: grouping @ (Grouping::Azimuth | Grouping::Range), column, .. } => {
+                let offsets = self.offsets(estimate, *grouping, group_fit(*column), chosen);
+                let groups = self.groups_of(*grouping);
+                frames.iter().map(|&f| grouped::gain(&groups[f], *column, &offsets)).collect()
             }
-            Hypothesis::Groups { .. } => {
+            Hypothesis::Groups { grouping: Grouping::Row, .. } => {
                 let others: Vec<Hypothesis> = chosen.iter().filter(|h| *h != hypothesis).cloned().collect();
                 let [with, without] = [chosen, &others].map(|of| self.gains_of_rows(estimate, frames, of));
                 with.iter().zip(without).map(|(with, without)| with - without).collect()

@@ -182,7 +182,14 @@ impl Search<'_> {
             let gains = self.gains(|fold| [&kept[fold], &kept_before[fold]]);
             let whole = self.table.fit(&before_on_all, law);
             let above_floor = self.above_floor(&self.table, &whole, &before_on_all);
-            let trial = Trial { candidate: k, cause: law.cause(), parameters: law.parameters(), gains, above_floor };
+            let trial = Trial {
+                candidate: k,
+                cause: law.cause(),
+                parameters: law.parameters(),
+                gains,
+                expected: vec![],
+                above_floor,
+            };
             let confined = (law == Law::Signal).then(|| self.table.confined_to(&whole[whole.len() - 1..]));
             (trial, confined.flatten())
         };

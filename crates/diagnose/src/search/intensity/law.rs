@@ -80,7 +80,7 @@ impl Search<'_> {
                 let above_floor = form.exponents.iter().all(|c| rms(c) > FLOOR_RMS);
                 let gains = cross_gains(&frames, &blocks, &columns, &PRIOR);
                 let cause = Cause::IntensityLaw;
-                (form, Trial { candidate: 0, cause, parameters: columns.len(), gains, above_floor })
+                (form, Trial { candidate: 0, cause, parameters: columns.len(), gains, expected: vec![], above_floor })
             })
             .collect();
         let total = |t: &Trial| total_and_z(&t.gains).0;

@@ -41,7 +41,8 @@ impl Search<'_> {
         let std = grouped::rough_spread(&all, &grouped::offsets(&all, ROWS), ROWS);
         let least = FLOOR_ROWS + self.scale.rounding;
         let above_floor = std > least;
-        let trial = Trial { candidate: 0, cause: Cause::BeamIntensity, parameters: 2, gains, above_floor };
+        let trial =
+            Trial { candidate: 0, cause: Cause::BeamIntensity, parameters: 2, gains, expected: vec![], above_floor };
         let (total, z) = total_and_z(&trial.gains);
         let chosen = above_floor && total > demands.nats && z > demands.z;
         let rays = self.context.returns(&self.select);

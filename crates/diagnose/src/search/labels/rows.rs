@@ -98,7 +98,7 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
     let sensor = Assignment::new(context.rig).of_point(center.into()).map_or(0, |assigned| assigned.sensor);
     if side == Side::Objects {
         let origin = origins(context.rig)[sensor];
-        let known = axes(displaced.of_point(&center, sensor, &origin));
+        let known = axes(displaced.of_point(&center, (s.frame, sensor), &origin));
         (0..3).for_each(|k| shift[k] -= known[k]);
     }
     if shift.iter().any(|v| v.abs() > LARGEST_M) {

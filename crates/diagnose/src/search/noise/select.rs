@@ -87,6 +87,7 @@ impl Search<'_> {
             cause: NOISE_LAWS[law].cause(),
             parameters: NOISE_LAWS[law].parameters(),
             gains: cross_gains(&frames, &self.blocks, &[law], &NO_PRIOR),
+            expected: vec![],
             above_floor: self.above_floor(NOISE_LAWS[law], self.whole(&[law]).theta[0]),
         }
     }
