@@ -25,6 +25,33 @@ impl Grouping {
     pub fn name(self) -> &'static str {
         Covariate::from(self).name()
     }
+
+    /// Width of a group, in the unit of [`Group::place`].
+    pub fn width(self) -> f64 {
+        match self {
+            Grouping::Row => 1.0,
+            Grouping::Azimuth => STRIP_RAD,
+            Grouping::Range => STEP_M,
+        }
+    }
+
+    /// Where a ray lies among the groups, in the unit of [`Group::place`].
+    pub fn place_of(self, ray: &Ray) -> f64 {
+        match self {
+            Grouping::Row => f64::from(ray.row),
+            Grouping::Azimuth => f64::from(ray.azimuth_rad),
+            Grouping::Range => ray.recorded_range_m(),
+        }
+    }
+
+    /// Largest number of groups of a sensor.
+    fn most(self) -> usize {
+        match self {
+            Grouping::Row => ROWS,
+            Grouping::Azimuth => STRIPS,
+            Grouping::Range => STEPS,
+        }
+    }
 }
 
 /// Width of a strip of azimuth, rad: 5 degrees.
@@ -74,35 +101,6 @@ impl Group {
             Grouping::Row => f64::from(self.index),
             Grouping::Azimuth => (f64::from(self.index) + 0.5) * STRIP_RAD - std::f64::consts::PI,
             Grouping::Range => (f64::from(self.index) + 0.5) * STEP_M,
-        }
-    }
-}
-
-impl Grouping {
-    /// Width of a group, in the unit of [`Group::place`].
-    pub fn width(self) -> f64 {
-        match self {
-            Grouping::Row => 1.0,
-            Grouping::Azimuth => STRIP_RAD,
-            Grouping::Range => STEP_M,
-        }
-    }
-
-    /// Where a ray lies among the groups, in the unit of [`Group::place`].
-    pub fn place_of(self, ray: &Ray) -> f64 {
-        match self {
-            Grouping::Row => f64::from(ray.row),
-            Grouping::Azimuth => f64::from(ray.azimuth_rad),
-            Grouping::Range => ray.recorded_range_m(),
-        }
-    }
-
-    /// Largest number of groups of a sensor.
-    fn most(self) -> usize {
-        match self {
-            Grouping::Row => ROWS,
-            Grouping::Azimuth => STRIPS,
-            Grouping::Range => STEPS,
         }
     }
 }

@@ -31,8 +31,7 @@ impl Moment {
     /// What has come by now of a drift of one of the courses, `1 - exp(-t / T)`: 0 at the beginning of the recording, 1
     /// at its end.
     pub fn course(&self, k: usize) -> f64 {
-        let come = |passed: f64| 1.0 - (-passed / TIME_CONSTANTS[k]).exp();
-        come(self.passed) / come(1.0)
+        (1.0 - (-self.passed / TIME_CONSTANTS[k]).exp()) * final_share(k)
     }
 
     /// The square of the speed, in units of (10 m/s)^2: what a pitch by the load of the air, or by that of driving,

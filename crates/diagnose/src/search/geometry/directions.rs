@@ -55,14 +55,8 @@ fn by_direction(
     }
     let others: Vec<usize> = fitted.columns.iter().copied().filter(|c| !columns.contains(c)).collect();
     let gram: DMatrix<f64> = frames.iter().map(|&f| &sums.linear[f].gram).sum();
-    let response = &gram * &effect;
-    let prior = |i: usize, j: usize| if i == j { sums.precision[others[i]] } else { 0.0 };
-    let n = others.len();
-    let own = DMatrix::from_fn(n, n, |i, j| gram[(others[i], others[j])] + prior(i, j));
-    if let Some(own) = own.cholesky() {
-        let taken_up = own.solve(&DVector::from_fn(n, |i, _| response[others[i]]));
-        others.iter().zip(taken_up.iter()).for_each(|(&c, by)| effect[c] -= by);
-    }
+    let taken_up = sums.taken_up(&gram, &(&gram * &effect), &others);
+    others.iter().zip(taken_up.iter()).for_each(|(&c, by)| effect[c] -= by);
     theta -= &sums.undone;
     let compared = Compared { rig: context.rig, columns: &sums.columns, noise_m: sums.noise_m, design: sums.design };
     let of_frame = |&f: &usize| {

@@ -92,6 +92,16 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
 }
 
 impl Sums {
+    /// Coefficients of some other columns that take up what they can of an effect; `response` is the product of `gram`
+    /// with the effect.
+    pub(super) fn taken_up(&self, gram: &DMatrix<f64>, response: &DVector<f64>, others: &[usize]) -> DVector<f64> {
+        let prior = |i: usize, j: usize| if i == j { self.precision[others[i]] } else { 0.0 };
+        let n = others.len();
+        let own = DMatrix::from_fn(n, n, |i, j| gram[(others[i], others[j])] + prior(i, j));
+        let on_others = DVector::from_fn(n, |i, _| response[others[i]]);
+        own.cholesky().map_or_else(|| DVector::zeros(n), |own| own.solve(&on_others))
+    }
+
     /// Displacement of the surfaces that a sensor sees, or all sensors, by some columns, m, root mean square. The part
     /// that `others` of the columns absorb is subtracted; of what one sensor sees, also the part that the ego pose of a
     /// single frame is.
@@ -107,11 +117,8 @@ impl Sums {
         let mut by = DVector::zeros(self.columns.len());
         coefficients.iter().for_each(|(c, x)| by[*c] = *x);
         let response = &gram * &by;
-        let prior = |i: usize, j: usize| if i == j { self.precision[others[i]] } else { 0.0 };
-        let n = others.len();
-        let absorbing = DMatrix::from_fn(n, n, |i, j| gram[(others[i], others[j])] + prior(i, j));
-        let on_others = DVector::from_fn(n, |i, _| response[others[i]]);
-        let absorbed = absorbing.cholesky().map_or(0.0, |c| on_others.dot(&c.solve(&on_others)));
+        let taken_up = self.taken_up(&gram, &response, others);
+        let absorbed: f64 = others.iter().zip(taken_up.iter()).map(|(&c, by)| response[c] * by).sum();
         let of_frame = |f: &usize| match sensor {
             Some(sensor) => self.of_sensors[*f][sensor],
             None => self.of_sensors[*f].iter().sum(),

@@ -18,8 +18,11 @@ const LEAST_SHARE: f64 = 0.5;
 type Rows = BTreeMap<Group, [f64; 2]>;
 
 /// Whether the offsets of rows in range come with time: they change over the recording, by more than a small part of
-/// their mean, and those at its beginning are not seen.
+/// their mean, and those at its beginning are not seen. Not known without times.
 pub(super) fn come_with_time(search: &Search, chosen: &[Hypothesis]) -> bool {
+    if !search.sums.moments.passes {
+        return false;
+    }
     let mut frames = [&search.select[..], &search.estimate[..]].concat();
     frames.sort_unstable();
     let (early, late) = frames.split_at(frames.len() / 2);

@@ -77,14 +77,14 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
     let moments = context.moments();
     let columns = columns(rig, &moments);
     let compared = Compared { rig, columns: &columns, noise_m, design };
-    let mut means = compared.sums(frames, &poses, &moments.of_frames);
+    let means = compared.sums(frames, &poses, &moments.of_frames);
     let of_sensors = sensor_weights(&means, &columns, rig.sensors.len());
     let prior = own_scatter(rig, &poses, select, &moments);
     let without_own = |m: &MeanFrame| {
         let (gram, right) = m.without_own(&prior);
         LinearFrame { gram, right }
     };
-    let linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
+    let mut linear: Vec<LinearFrame> = means.iter().map(without_own).collect();
     let precision: Vec<f64> = columns.iter().map(|c| precision(*c)).collect();
     let mut base: Vec<usize> = (0..columns.len()).filter(|&i| matches!(columns[i], Column::Structure(_))).collect();
     base.extend((0..columns.len()).filter(|&i| swept.contains(&columns[i])));
@@ -92,8 +92,7 @@ pub(super) fn sums(context: &Context, select: &[usize], undone: &Displacement, s
     let structure = fit(&selected, &context.blocks(select), &base, &precision);
     let structure = std::array::from_fn(|k| structure.theta[k]);
     let by_columns = DVector::from_iterator(columns.len(), columns.iter().map(|c| undone.of_column(*c)));
-    means.iter_mut().for_each(|frame| frame.right += &frame.gram * &by_columns);
-    let linear = means.iter().map(without_own).collect();
+    linear.iter_mut().for_each(|frame| frame.right += &frame.gram * &by_columns);
     let seen = Seen { poses: &poses, structure, undone: &undone.rows };
     let parted = |g, seen| group_frames(frames, rig, seen, g, noise_m, design);
     let groups = |g| {
