@@ -287,7 +287,9 @@ impl Engine<'_> {
         results.extend([Side::Labels, Side::Objects].map(|s| search::labels::search(&context, s, &known.displaced)));
         self.finished(SEARCHES);
         search::confounders::drop_confounded(&mut results);
-        notes.extend(search::set_aside(&mut results));
+        if known.slide.is_none() {
+            notes.extend(search::set_aside(&mut results));
+        }
         let corrected = corrected(&context, &results);
         let degrees = |rows: &Vec<f32>| rows.iter().map(|r| f64::from(*r).to_degrees()).collect();
         let rows_deg: Vec<Vec<f64>> = self.sensors.patterns.iter().map(|p| degrees(&p.rows_rad)).collect();

@@ -19,3 +19,4 @@ pub mod returns;
 pub mod roughness;
 pub mod row_patches;
 pub mod tails;
+pub mod together;

@@ -1,4 +1,5 @@
-//! Tails of the roughness: single returns far off their surface, by the usual roughness of the shots around them.
+//! Tails of the roughness: single returns far off their surface, by the usual roughness of the shots around them and by
+//! their distance.
 //!
 //! The usual roughness is the median over the shots before and after in the same row: it follows what a surface, its
 //! brightness and its incidence do to the noise. It is at least that of the noisier side at such ranges and angles:
@@ -7,7 +8,8 @@
 
 use super::cells::{cell, place_of};
 use super::roughness::own_roughness_m;
-use crate::pairing::{FramePair, Ray};
+pub use crate::pairing::STRAY_M;
+use crate::pairing::{FramePair, Ray, company_m};
 use rayon::prelude::*;
 
 /// Standard deviations from which on a return is in the tail.
@@ -37,19 +39,38 @@ pub fn size_m(bin: usize) -> f64 {
     0.01 * (bin as f64 / 4.0).exp2()
 }
 
-fn size_bin(size_m: f64) -> usize {
+/// The bin of a size.
+pub fn size_bin(size_m: f64) -> usize {
     ((size_m / 0.01).log2() * 4.0).clamp(0.0, SIZES as f64 - 1.0) as usize
 }
 
-/// Measured returns with the same usual roughness.
+/// Measured returns with the same usual distance from the surface through their neighbours.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TailBin {
     /// Returns.
     pub all: f64,
-    /// Standard deviation of the usual roughness, m, summed over them.
+    /// Standard deviation of the usual distance, m, summed over them.
     pub usual_m: f64,
-    /// Cosine of incidence, summed over them.
-    pub cos: f64,
+    /// The same returns by the size of [`most_m`], up to which they are looked at.
+    pub most: [f64; SIZES],
+}
+
+impl TailBin {
+    /// Adds another bin.
+    pub fn merge(&mut self, other: &TailBin) {
+        (self.all, self.usual_m) = (self.all + other.all, self.usual_m + other.usual_m);
+        self.most.iter_mut().zip(other.most).for_each(|(sum, n)| *sum += n);
+    }
+}
+
+/// Share of the distance from which on returns are left out within which none is.
+const SURELY: f64 = 0.8;
+
+/// Largest distance along the ray, at a range and a cosine of incidence, up to which a return surely is of the surface
+/// through its neighbours, m: it is not far across that surface, and not alone at its range. Returns that are farther
+/// off are not counted.
+pub fn most_m(range_m: f64, cos: f64) -> f64 {
+    SURELY * (STRAY_M / cos.max(0.05)).min(company_m(range_m))
 }
 
 /// Tails of one side of a frame.
@@ -59,11 +80,11 @@ pub struct Tail {
     pub all: f64,
     /// Of these in the tail.
     pub beyond: f64,
-    /// The same by the size of their roughness: see [`size_m`].
+    /// The same by their distance from the surface through their neighbours: see [`size_m`].
     pub sizes: [f64; SIZES],
     /// Shots that follow one in the tail, and those of them that are in it as well.
     pub next: [f64; 2],
-    /// All returns by their usual roughness.
+    /// All returns by their usual distance.
     pub bins: Vec<TailBin>,
 }
 
@@ -108,9 +129,17 @@ fn tail(rays: &[Ray], scales: &[f64]) -> Tail {
         let of_cell_m = cell(ray).map_or(0.0, |c| scales[c]);
         let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(of_cell_m).max(LEAST_M);
         let beyond = own.abs() > BEYOND * usual_m;
+        // The distance itself: a single error has no part in the surface, whose own error the usual ones have.
+        let times = (1.0 + f64::from(ray.roughness_leverage)).sqrt();
+        let [off_m, usual_m] = [times * own.abs(), times * usual_m];
+        let most_m = place_of(ray).map_or(0.0, |(range_m, cos, _)| most_m(range_m, cos));
+        if off_m > most_m {
+            before = false;
+            continue;
+        }
         let bin = &mut out.bins[bin_of(usual_m)];
-        let cos = place_of(ray).map_or(1.0, |(_, cos, _)| cos);
-        *bin = TailBin { all: bin.all + 1.0, usual_m: bin.usual_m + usual_m, cos: bin.cos + cos };
+        (bin.all, bin.usual_m) = (bin.all + 1.0, bin.usual_m + usual_m);
+        bin.most[size_bin(most_m)] += 1.0;
         out.all += 1.0;
         if before {
             out.next[0] += 1.0;
@@ -118,7 +147,7 @@ fn tail(rays: &[Ray], scales: &[f64]) -> Tail {
         }
         if beyond {
             out.beyond += 1.0;
-            out.sizes[size_bin(own.abs())] += 1.0;
+            out.sizes[size_bin(off_m)] += 1.0;
         }
         before = beyond;
     }

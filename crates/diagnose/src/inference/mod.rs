@@ -2,6 +2,7 @@
 
 pub mod choice;
 pub mod comb;
+pub mod counts;
 pub mod grouped;
 pub mod law;
 pub mod linear;
@@ -9,11 +10,6 @@ pub mod losses;
 pub mod noise;
 pub mod roles;
 pub mod simplex;
-
-/// Gain of a count out of `all` by a rate over another rate, nats (Poisson).
-pub fn gain_of_count(count: f64, all: f64, rate: f64, base: f64) -> f64 {
-    count * (rate / base).ln() - all * (rate - base)
-}
 
 /// Median of some values, the upper one of the two in the middle; 0 of none.
 pub fn median(values: Vec<f64>) -> f64 {

@@ -24,6 +24,7 @@ pub use of_sensor::company_m;
 pub use ray::{Lies, Ray, Surface};
 pub(crate) use recordings::load;
 pub use recordings::{PairSide, Recordings, SideFrame};
+pub use roughness::STRAY_M;
 
 use crate::error::DiagnoseError;
 use data::Dataset;

@@ -10,7 +10,7 @@ pub(super) const LONE: u8 = 1;
 
 /// Distance from the predicted surface, across it, from which on a return is not used for the roughness of its
 /// neighbours, m.
-pub(super) const STRAY_M: f64 = 0.5;
+pub const STRAY_M: f64 = 0.5;
 
 /// Standard deviations of the measured noise within which neighbours are of one surface.
 const WITHIN: f64 = 4.0;

@@ -17,7 +17,7 @@ struct Confounder {
 }
 
 /// Confounders in the order in which they are applied: a finding that is dropped confounds nothing after it.
-const CONFOUNDERS: [Confounder; 21] = [
+const CONFOUNDERS: [Confounder; 20] = [
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
@@ -48,12 +48,6 @@ const CONFOUNDERS: [Confounder; 21] = [
         by: rows_aim_elsewhere,
         share: 2.5,
         because: "on the ground the range jumps from row to row where rows aim elsewhere",
-    },
-    Confounder {
-        effect: |f| f.is(Cause::HeavyTails),
-        by: lone,
-        share: 0.5,
-        because: "droplets and false alarms right in front of surfaces",
     },
     Confounder {
         effect: lone,

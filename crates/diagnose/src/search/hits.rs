@@ -18,8 +18,9 @@ use crate::channels::cells::{OBJECT, cell};
 use crate::channels::groups::{Group, Grouping, PartedFrame, total as group_total};
 use crate::channels::hits::{HitFrame, hit_frames, loss_groups, total};
 use crate::channels::mask::Mask;
+use crate::channels::together::{BesideLost, beside_lost};
 use crate::diagnosis::Minimum;
-use crate::inference::choice::Demands;
+use crate::inference::choice::{Demands, total_and_z};
 use crate::inference::grouped::{self, GroupFit};
 use crate::inference::law::{FittedLaw, Law};
 use crate::inference::linear::{FOLDS, fold_of};
@@ -48,6 +49,10 @@ const GROUP_FLOOR: f64 = 0.02;
 
 /// Fit of the shares lost by groups of directions: prior standard deviation of a fifth.
 const GROUPED: GroupFit = GroupFit { column: 0, precision: 25.0, centred: false, trust: 1.0 };
+
+/// Share of the lost shots from which on more of those in the same column are lost as well than of those beside them in
+/// the row: losses by chance are no columns.
+const IN_COLUMNS: f64 = 0.1;
 
 /// The search. Rays that the mask hides are left out. `displaced` says that the measured scene is turned or moved as
 /// a whole: silhouettes do not match, and small losses are an effect of that.
@@ -179,7 +184,11 @@ impl<'a> Search<'a> {
             // The form is corrected once: with the first law over a covariate.
             let first = fitted.iter().position(|l| l.law.has_form()) == Some(k);
             let corrections = if first { self.corrections(k, &fitted, &on_estimate) } else { Corrections::default() };
-            result.found.push(found(&fitted[k], &draws, selected, gains, &on_hold_out, (&fitted, corrections)));
+            let mut found = found(&fitted[k], &draws, selected, gains, &on_hold_out, (&fitted, corrections));
+            if fitted[k].law == Law::Random && self.lose_columns() {
+                describe::of_columns(&mut found);
+            }
+            result.found.push(found);
         }
         let shares = on_estimate.matched_shares(&fitted);
         let distance = |&i: &usize| {
@@ -203,6 +212,19 @@ impl<'a> Search<'a> {
             }
             result.found.push(found);
         }
+    }
+
+    /// Whether the shots of a column are lost together in the estimating frames: what is lost by chance is lost shot by
+    /// shot.
+    fn lose_columns(&self) -> bool {
+        let each = beside_lost(self.context.frames, &self.estimate, self.mask);
+        let sum = |of: fn(&BesideLost) -> [f64; 2]| {
+            each.iter().map(of).fold([0.0; 2], |sum, of| [sum[0] + of[0], sum[1] + of[1]])
+        };
+        let share = |[all, lost]: [f64; 2]| lost / all.max(1.0);
+        let in_rows = share(sum(|b| b.in_row));
+        let more: Vec<f64> = each.iter().map(|b| b.in_column[1] - in_rows * b.in_column[0]).collect();
+        share(sum(|b| b.in_column)) - in_rows > IN_COLUMNS && total_and_z(&more).1 > Z_STAR
     }
 
     /// Fits of the laws on estimating frames whose blocks are drawn with replacement.

@@ -184,8 +184,8 @@ pub fn trimmed(grouping: Grouping) -> f64 {
 /// Displacement of the fastest objects over one scan from which on motion distortion spoils the other channels, m.
 const SWEPT_M: f64 = 0.8;
 
-/// Removes findings of other channels where objects show strong motion distortion: the whole scene is sheared, so
-/// that surfaces, silhouettes and directions do not match. Returns a note about what was removed.
+/// Removes findings of other channels where objects show strong motion distortion that was not undone: the whole scene
+/// is sheared, so that surfaces, silhouettes and directions do not match. Returns a note about what was removed.
 pub fn set_aside(results: &mut [ChannelResult]) -> Option<String> {
     let of_objects = |f: &Found| f.channel == Channel::Objects && f.is(Cause::RollingShutter);
     let found = results.iter().flat_map(|r| &r.found).find(|f| of_objects(f))?;

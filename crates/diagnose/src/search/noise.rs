@@ -4,6 +4,7 @@ mod curve;
 mod describe;
 mod directions;
 mod edges;
+mod mixture;
 mod select;
 mod surfaces;
 mod tails;

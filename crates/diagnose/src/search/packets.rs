@@ -9,7 +9,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Parameter, Status};
 use crate::inference::choice::total_and_z;
-use crate::inference::gain_of_count;
+use crate::inference::counts::gain_of_count;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Ray};
 use rayon::prelude::*;

@@ -15,7 +15,7 @@ use crate::channels::plumes::{Extent, MOST, PlumeFrame, plume_frame};
 use crate::channels::returns::{ODD, Odd, OddFrame, end_m, odd_frames};
 use crate::diagnosis::{Considered, Minimum, Parameter};
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
-use crate::inference::gain_of_count;
+use crate::inference::counts::likelihood_of_counts;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use crate::pairing::Lies;
@@ -327,10 +327,17 @@ fn share_of(more: f64, each: &[f64]) -> Parameter {
     share
 }
 
-/// Gain of a frame's count, nats.
+/// Gain of a frame's counts by the excess of the measured side, nats.
 fn gain(frame: &OddFrame, k: usize, base: f64, more: f64) -> f64 {
     let rate = (base + more).max(0.05 * base);
-    gain_of_count(frame.counts[k][0], frame.all[0], rate, base)
+    let [measured, simulated] = frame.counts[k];
+    // Where the measured side has fewer, as many of them as the world has are hidden.
+    let likelihood = |rate: f64| {
+        let [all, of_simulated] = frame.all;
+        let alike = [[rate.min(base) * all], [base * of_simulated]];
+        likelihood_of_counts([&[measured], &[simulated]], [&alike[0], &alike[1]], &[(rate - base).max(0.0) * all])
+    };
+    likelihood(rate) - likelihood(base)
 }
 
 /// Kullback-Leibler distance of a frame's count from the simulated share, and from that with the excess, nats.

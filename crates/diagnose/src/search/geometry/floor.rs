@@ -2,6 +2,7 @@
 
 use super::hypotheses::Hypothesis;
 use super::sums::{Sums, group_fit};
+use crate::catalogue::Cause;
 use crate::channels::groups::{Grouping, total};
 use crate::channels::mean::Column;
 #[cfg(doc)]
@@ -71,27 +72,44 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
                 |column: Column| coefficients.iter().find(|(c, _)| sums.columns[*c] == column).map_or(0.0, |(_, t)| *t);
             let drift_m: f64 = (0..COURSES).map(|k| of(Column::Drift(k))).sum();
             let bias_m = |range_m: f64| (of(Column::RangeOffset) + range_m * of(Column::RangeScale) + drift_m).abs();
-            let floor = |c: usize| match sums.columns[c] {
-                Column::Pose(0..3) => FLOOR_TURN_RAD,
-                Column::Pose(_) => FLOOR_SHIFT_M,
-                Column::Sweep(k) => FLOOR_SWEEP[k],
-                Column::Scan => FLOOR_SWEEP[0] / sums.moments.middle_m_s().max(1e-9),
-                Column::Lean => FLOOR_TURN_RAD / sums.moments.most_lean().max(1e-9),
-                Column::RangeOffset
-                | Column::RangeScale
-                | Column::Drift(_)
-                | Column::SensorPose(..)
-                | Column::Structure(_)
-                | Column::Uneven => f64::INFINITY,
-            };
             bias_m(10.0) > FLOOR_OFFSET_M
                 || bias_m(40.0) > 3.2 * FLOOR_OFFSET_M
-                || coefficients.iter().any(|(c, t)| t.abs() > floor(*c))
+                || coefficients.iter().any(|(c, t)| t.abs() > sums.smallest(*c))
         }
     }
 }
 
+/// Whether the last of some hypotheses, fitted together, is a pose of the only sensor of which nothing but roll and
+/// pitch is large enough to be reported: the ego vehicle may have that attitude.
+pub(super) fn is_attitude_alone(sums: &Sums, frames: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> bool {
+    let Some(Hypothesis::Linear { cause: Cause::SensorExtrinsics, columns }) = hypotheses.last() else { return false };
+    let fitted = sums.fit_all(frames, blocks, hypotheses);
+    let mut of_pose = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
+    of_pose.all(|(&c, theta)| match sums.columns[c] {
+        Column::Pose(0 | 1) => true,
+        Column::Pose(_) => theta.abs() < sums.smallest(c),
+        _ => false,
+    })
+}
+
 impl Sums {
+    /// Smallest coefficient of a column that is reported for itself.
+    fn smallest(&self, column: usize) -> f64 {
+        match self.columns[column] {
+            Column::Pose(0..3) => FLOOR_TURN_RAD,
+            Column::Pose(_) => FLOOR_SHIFT_M,
+            Column::Sweep(k) => FLOOR_SWEEP[k],
+            Column::Scan => FLOOR_SWEEP[0] / self.moments.middle_m_s().max(1e-9),
+            Column::Lean => FLOOR_TURN_RAD / self.moments.most_lean().max(1e-9),
+            Column::RangeOffset
+            | Column::RangeScale
+            | Column::Drift(_)
+            | Column::SensorPose(..)
+            | Column::Structure(_)
+            | Column::Uneven => f64::INFINITY,
+        }
+    }
+
     /// Coefficients of some other columns that take up what they can of an effect; `response` is the product of `gram`
     /// with the effect.
     pub(super) fn taken_up(&self, gram: &DMatrix<f64>, response: &DVector<f64>, others: &[usize]) -> DVector<f64> {
@@ -178,5 +196,20 @@ mod tests {
         let across = sums.displaced_m(&[0], Some(0), &[(2, 0.02)], &[0, 1]);
         assert!((across - 0.02 * 0.05 / 2f64.sqrt()).abs() < 1e-5, "{across}");
         assert!((sums.displaced_m(&[0], None, &[(2, 0.02)], &[]) - 0.02 / 2f64.sqrt()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_pose_of_the_only_sensor_without_yaw_and_shift_may_be_an_attitude() {
+        let alone = |[pitch, yaw, ahead_m]: [f64; 3]| {
+            let gram = DMatrix::identity(3, 3) * 1e6;
+            let linear = LinearFrame { right: &gram * DVector::from_row_slice(&[pitch, yaw, ahead_m]), gram };
+            let columns = vec![Column::Pose(1), Column::Pose(2), Column::Pose(3)];
+            let sums = Sums { columns, precision: vec![25.0; 3], base: vec![], linear: vec![linear], ..sums() };
+            let pose = |cause| [Hypothesis::Linear { cause, columns: vec![0, 1, 2] }];
+            assert!(!is_attitude_alone(&sums, &[0], &[0], &pose(Cause::RangeBias)));
+            is_attitude_alone(&sums, &[0], &[0], &pose(Cause::SensorExtrinsics))
+        };
+        assert!(alone([5e-3, 2e-4, 0.02]));
+        assert!(!alone([5e-3, 2e-3, 0.02]) && !alone([5e-3, 2e-4, 0.06]));
     }
 }

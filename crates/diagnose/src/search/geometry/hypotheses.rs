@@ -104,6 +104,11 @@ pub(super) fn is_pose(hypothesis: &Hypothesis) -> bool {
     matches!(hypothesis.cause(), Cause::PitchRoll | Cause::SensorExtrinsics)
 }
 
+/// Whether a hypothesis is a constant attitude of the ego vehicle.
+pub(super) fn is_attitude(hypothesis: &Hypothesis) -> bool {
+    hypothesis.cause() == Cause::PitchRoll
+}
+
 /// Whether a hypothesis may be added to those chosen: another cause, one grouping of directions (by rows in range and
 /// in elevation), and nothing after motion distortion. A strong shear leaves every sensor with an apparent turn and
 /// shift of its own.

@@ -4,7 +4,7 @@ use super::form::Corrections;
 use crate::catalogue::{Channel, Covariate, Quantity};
 use crate::channels::cells::OBJECT;
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::Parameter;
+use crate::diagnosis::{Parameter, Status};
 use crate::inference::law::{FittedLaw, Law, in_zone};
 use crate::inference::losses::LossTable;
 use crate::search::{Found, NamedParameter, Selected};
@@ -56,6 +56,19 @@ pub(super) fn found(
         separate_by,
         curve: curve(table, law.law, all),
     }
+}
+
+/// Takes the name of a random loss whose shots are lost column by column.
+pub(super) fn of_columns(found: &mut Found) {
+    found.status = Status::Unexplained;
+    found.causes.clear();
+    found.covariate = Covariate::Azimuth;
+    found.separate_by = None;
+    found.says = format!(
+        "{:.1} % of the returns are lost, those of a column together; no cause of the catalogue does that, losses by \
+         chance are lost one by one",
+        100.0 * found.parameter(Quantity::Share).map_or(0.0, |share| share.estimate)
+    );
 }
 
 /// Parameters of a law with intervals: 2.1 times the standard deviation of the bootstrap fits and the error of the

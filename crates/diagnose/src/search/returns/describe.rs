@@ -6,11 +6,12 @@ use super::{NamedParameter, Scenes, Search, cause, is_spray};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::free_path::{Shape, bins};
 use crate::channels::returns::{self, Odd, OddFrame};
+use crate::channels::together::crowding;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Parameter, Status};
 use crate::effects::rounded;
 use crate::pairing::Ray;
-use crate::search::{Context, Found, parameter};
+use crate::search::{Context, Found, Z_STAR, parameter};
 use sensor::Effect;
 use sensor::effects::RangeLaw;
 
@@ -33,14 +34,7 @@ struct Description {
 /// frames.
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
     let Description { causes, effects, covariate, says, parameters } = match kind {
-        Odd::Alone => {
-            let alarms = false_alarms(search.context, &search.estimate, search.end_m, search.ghosts);
-            // No droplet is seen through a surface: returns behind them as well come from the receiver.
-            match (!alarms.instead).then(|| weather_of(search)).flatten() {
-                Some(weather) => of_weather(&weather, &share),
-                None => of_false_alarms(&alarms, &share),
-            }
-        }
+        Odd::Alone => alone(search, &share),
         Odd::Between => mixed(search, share),
         Odd::GroupInFront => Description {
             causes: vec![cause(kind)],
@@ -56,7 +50,11 @@ pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains
     };
     Found {
         effects,
-        status: if causes.len() > 1 { Status::Ambiguous } else { Status::Named },
+        status: match causes.len() {
+            0 => Status::Unexplained,
+            1 => Status::Named,
+            _ => Status::Ambiguous,
+        },
         separate_by: (causes.len() > 1).then(|| TELL_WEATHER_BY.into()),
         causes,
         parameters,
@@ -67,6 +65,44 @@ pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains
         says,
         curve: curve(search.context, kind, &search.estimate),
     }
+}
+
+/// Describes returns that are alone in the air.
+fn alone(search: &Search, share: &Parameter) -> Description {
+    let alarms = false_alarms(search.context, &search.estimate, search.end_m, search.ghosts);
+    // No droplet is seen through a surface: returns behind them as well come from the receiver.
+    let description = match (!alarms.instead).then(|| weather_of(search)).flatten() {
+        Some(weather) => of_weather(&weather, share),
+        None => of_false_alarms(&alarms, share),
+    };
+    if !crowd(search) {
+        return description;
+    }
+    Description {
+        causes: vec![],
+        covariate: Covariate::Azimuth,
+        says: format!(
+            "{:.2} % of the measured returns stand alone where nothing is, in other directions from frame to frame; no \
+             cause of the catalogue does that, false alarms and droplets come everywhere",
+            100.0 * share.estimate
+        ),
+        ..description
+    }
+}
+
+/// Relative variance of the number of lone returns over patches of directions from which on they do not come by chance:
+/// that of one half of the patches with three times as many as the other half.
+const CROWDED: f64 = 0.25;
+
+/// Whether the lone returns of the estimating frames come in some directions of each frame, others from frame to frame.
+fn crowd(search: &Search) -> bool {
+    let frames: Vec<_> = search.estimate.iter().map(|&f| &search.context.frames[f]).collect();
+    let is_lone = |f: usize, ray: usize| {
+        returns::odd(&frames[f].measured[ray]) == Some(Odd::Alone)
+            && !is_spray(&search.spray, search.estimate[f], 0, ray)
+    };
+    let [variance, error] = crowding(&frames, &is_lone);
+    variance - Z_STAR * error > CROWDED
 }
 
 /// What recording tells fog from rain.

@@ -7,7 +7,7 @@ use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::effects::rounded;
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
-use crate::inference::gain_of_count;
+use crate::inference::counts::gain_of_count;
 use crate::inference::linear::cross_validated;
 use crate::search::{ChannelResult, Found, Z_STAR, first_demands, parameter};
 use sensor::Effect;

@@ -1,0 +1,60 @@
+//! Counts of what both sides show alike, and one of them more of.
+
+/// Gain of a count out of `all` by a rate over another rate, nats (Poisson).
+pub fn gain_of_count(count: f64, all: f64, rate: f64, base: f64) -> f64 {
+    count * (rate / base).ln() - all * (rate - base)
+}
+
+/// Steps by which the factor of a frame is found.
+const STEPS: usize = 20;
+
+/// Shape of the gamma distribution of the factor, whose mean is 1: its standard deviation is one half.
+const SHAPE: f64 = 4.0;
+
+/// Smallest expected count.
+const LEAST: f64 = 1e-6;
+
+/// Logarithm of the likelihood of counts by bin of a frame's measured and simulated side (Poisson), up to a constant.
+/// `base` is expected of either side in the mean over frames, `more` on the measured side beyond it.
+///
+/// Both sides show the same world. Where it has more edges or leaves both count more: `base` has a factor, drawn from a
+/// gamma distribution for each frame. The likeliest one is taken, by expectation and maximisation.
+pub fn likelihood_of_counts(counts: [&[f64]; 2], base: [&[f64]; 2], more: &[f64]) -> f64 {
+    let bins = 0..more.len();
+    let base_of = |side: usize, k: usize| base[side][k].max(LEAST);
+    let all: f64 = bins.clone().map(|k| base_of(0, k) + base_of(1, k)).sum();
+    let mut factor = 1.0;
+    for _ in 0..STEPS {
+        // Of the measured ones those that are of the world.
+        let of_world = |k: usize| counts[0][k] * factor * base_of(0, k) / (factor * base_of(0, k) + more[k]);
+        let number: f64 = bins.clone().map(|k| of_world(k) + counts[1][k]).sum();
+        factor = (number + SHAPE) / (all + SHAPE);
+    }
+    let of_bin = |k: usize| {
+        let [measured, simulated] = [factor * base_of(0, k) + more[k], factor * base_of(1, k)];
+        counts[0][k] * measured.ln() - measured + counts[1][k] * simulated.ln() - simulated
+    };
+    bins.map(of_bin).sum::<f64>() + SHAPE * (factor.ln() - factor)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_both_sides_show_more_of_is_no_excess() {
+        let gain = |counts: [f64; 2]| {
+            let likelihood =
+                |more: f64| likelihood_of_counts([&counts[..1], &counts[1..]], [&[100.0], &[100.0]], &[more]);
+            likelihood(50.0) - likelihood(0.0)
+        };
+        assert!(gain([150.0, 100.0]) > 4.0 && gain([350.0, 300.0]) > 1.5, "50 more on the measured side");
+        assert!(gain([300.0, 300.0]) < -1.0, "a world with three times as many");
+        assert!(gain_of_count(300.0, 1.0, 150.0, 100.0) > 70.0, "of which the mean world says otherwise");
+        assert!(gain([100.0, 100.0]) < -2.0 && gain([0.0, 0.0]).is_finite());
+        // Where the world has none, no factor makes some of it.
+        let likelihood = |more: f64| likelihood_of_counts([&[20.0], &[0.0]], [&[0.01], &[0.01]], &[more]);
+        let gain = likelihood(20.0) - likelihood(0.0);
+        assert!(gain > 100.0 && gain / gain_of_count(20.0, 1.0, 20.0, 0.01) > 0.8, "{gain}");
+    }
+}
