@@ -8,8 +8,7 @@
 
 use super::cells::{cell, place_of};
 use super::roughness::own_roughness_m;
-pub use crate::pairing::STRAY_M;
-use crate::pairing::{FramePair, Ray, company_m};
+use crate::pairing::{FramePair, Ray, STRAY_M, company_m};
 use rayon::prelude::*;
 
 /// Standard deviations from which on a return is in the tail.
@@ -39,8 +38,7 @@ pub fn size_m(bin: usize) -> f64 {
     0.01 * (bin as f64 / 4.0).exp2()
 }
 
-/// The bin of a size.
-pub fn size_bin(size_m: f64) -> usize {
+fn size_bin(size_m: f64) -> usize {
     ((size_m / 0.01).log2() * 4.0).clamp(0.0, SIZES as f64 - 1.0) as usize
 }
 

@@ -148,15 +148,11 @@ mod tests {
                     let simulated = wall(|_, _| false);
                     let mut lone = Vec::new();
                     for ray in &simulated {
-                        let rate = match (ray.azimuth_rad * 5.0 + f as f32).sin() > 0.9 {
-                            _ if !stripes => 0.01,
-                            inside => {
-                                if inside {
-                                    0.07
-                                } else {
-                                    0.0
-                                }
-                            }
+                        let inside = (ray.azimuth_rad * 5.0 + f as f32).sin() > 0.9;
+                        let rate = match [stripes, inside] {
+                            [false, _] => 0.01,
+                            [true, true] => 0.07,
+                            [true, false] => 0.0,
                         };
                         if rng.random_bool(rate) {
                             lone.push(Ray { residual_m: -15.0, company: 0, matched: false, ..*ray });

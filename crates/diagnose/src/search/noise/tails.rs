@@ -3,13 +3,14 @@
 use super::mixture::{Fit, Mixture};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::roughness::{CAP, RoughFrame};
-use crate::channels::tails::{BEYOND, STRAY_M, Tail, most_m, tails};
+use crate::channels::tails::{BEYOND, Tail, most_m, tails};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::effects::rounded;
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
+use crate::pairing::STRAY_M;
 use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter};
 use rayon::prelude::*;
 use sensor::Effect;
@@ -45,7 +46,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     let gains = cross_gains(&on_select, &context.blocks(&select));
     let (total, z) = total_and_z(&gains);
     let fitted = Fit::of(&on_select);
-    let [base, share] = fitted.as_ref().map_or([0.0; 2], |fit| fit.shares(&on_select));
+    let [base, share] = fitted.map_or([0.0; 2], |fit| fit.shares(&on_select));
     let std_m = fitted.map_or(0.0, |fit| fit.mixture.std_m);
     let clustered = clustering(&on_select);
     let outcome = if total <= first_demands().nats || !significant(&gains, Z_STAR) {
