@@ -215,9 +215,10 @@ fn context<'a>(rig: &'a Rig, frames: &'a [FramePair], notes: &mut Vec<String>) -
         notes.push("frame ids are no rising numbers: velocities, and what depends on them, are not known".into());
     }
     notes.extend(limits(frames));
-    notes.extend(times.as_deref().and_then(|t| one_speed(frames, t)));
-    let motion = times.as_deref().map(|t| motion::own_motion(frames, t, &origins(rig)));
-    Context { rig, frames, roles: roles(frames.len()), times, motion }
+    let driven = times.as_deref().map(|t| motion::own_motion(frames, t, &origins(rig)));
+    let (motion, to_next) = driven.map_or((None, vec![]), |driven| (Some(driven.at), driven.to_next));
+    notes.extend(times.as_deref().and_then(|t| one_speed(frames, t, &to_next)));
+    Context { rig, frames, roles: roles(frames.len()), times, motion, to_next }
 }
 
 /// Number of searches, for the progress that is shown.

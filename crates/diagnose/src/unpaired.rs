@@ -73,6 +73,7 @@ impl Unpaired<'_> {
             roles: roles(frames.len()),
             times: None,
             motion: None,
+            to_next: vec![],
         };
         Contexts { returns: context(returns), shots: context(shots) }
     }

@@ -5,7 +5,7 @@ use crate::cloud_scan::{CloudReader, Surfaces};
 use crate::directions::{Kind, SensorScan, kind_of, split_by_sensor};
 use crate::effects::{EffectList, FrameContext, LabelledCar, Need};
 use crate::material::MaterialTable;
-use crate::motion::{GroundPoint, OwnMotion, Standing, own_motion, seen_velocity, times_s};
+use crate::motion::{GroundPoint, OwnMotion, SeenVelocity, Standing, own_motion, seen_velocity, times_s};
 use crate::rig::Rig;
 use crate::scan::{Echo, Scan};
 use data::Presence as _;
@@ -53,8 +53,8 @@ pub struct Refusal {
 struct FrameMotion {
     own: OwnMotion,
     own_is_known: bool,
-    /// Velocities of the labelled objects relative to the ego vehicle, m/s.
-    seen: Vec<Option<Vector3<f64>>>,
+    /// Velocities of the labelled objects.
+    seen: Vec<Option<SeenVelocity>>,
 }
 
 impl<'a> FinishedDataset<'a> {
@@ -234,7 +234,10 @@ impl<'a> FinishedDataset<'a> {
         let velocity = |number: usize, bbox: &Box3| {
             let Some(FrameMotion { own, seen, .. }) = motion else { return [0.0; 3] };
             let Some(Some(seen)) = seen.get(number) else { return [0.0; 3] };
-            (seen + own.velocity_at(&Vector3::from(bbox.center))).into()
+            match seen.speed_m_s {
+                Some(speed) => [speed * bbox.yaw_rad.cos(), speed * bbox.yaw_rad.sin(), 0.0],
+                None => (seen.relative_m_s + own.velocity_at(&Vector3::from(bbox.center))).into(),
+            }
         };
         let car = |(number, object): (usize, &data::Object)| LabelledCar {
             number,
@@ -255,14 +258,14 @@ impl<'a> FinishedDataset<'a> {
         };
         let frames: Vec<_> = self.ids.par_iter().map(read).collect::<Result<_, DataError>>()?;
         let (standing, boxes): (Vec<_>, Vec<Vec<Box3>>) = frames.into_iter().unzip();
-        let own = own_motion(standing, times);
+        let driven = own_motion(standing, times);
         let of_frame = |g: usize| boxes[g].clone();
         let motion = |(f, own): (usize, Option<OwnMotion>)| FrameMotion {
             own_is_known: own.is_some(),
             own: own.unwrap_or(OwnMotion::ahead(0.0)),
-            seen: boxes[f].iter().map(|b| seen_velocity(&of_frame, times, f, b)).collect(),
+            seen: boxes[f].iter().map(|b| seen_velocity(&of_frame, times, f, b, &driven.to_next)).collect(),
         };
-        Ok(Some(own.into_iter().enumerate().map(motion).collect()))
+        Ok(Some(driven.at.iter().copied().enumerate().map(motion).collect()))
     }
 
     /// What of a cloud stands still.

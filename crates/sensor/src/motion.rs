@@ -6,7 +6,7 @@ mod ground;
 use geometry::Box3;
 use ground::tilt;
 pub use ground::{Ground, GroundPoint};
-use nalgebra::{Vector2, Vector3};
+use nalgebra::{Rotation2, Vector2, Vector3};
 use rayon::prelude::*;
 use statistics::median_upper;
 use std::collections::BTreeSet;
@@ -72,7 +72,10 @@ const SPEED_M_S: f64 = 0.6;
 const HARDEST_M_S2: f64 = 15.0;
 
 /// Longest time between two frames that are compared, s.
-const LONGEST_S: f64 = 0.6;
+const LONGEST_S: f64 = 1.05;
+
+/// Largest rate of turn of a vehicle, rad/s: at a junction.
+const SHARPEST_RAD_S: f64 = 0.9;
 
 /// Fewest edges of a frame.
 const FEWEST: usize = 40;
@@ -90,8 +93,17 @@ const STANDS_OUT: f64 = 1.25;
 /// resembles standstill.
 const SLOWEST: usize = 8;
 
-/// The motion at each frame; `None` where it cannot be estimated.
-pub fn own_motion(standing: Vec<Standing>, times: &[f64]) -> Vec<Option<OwnMotion>> {
+/// Motion of the ego vehicle over a recording; `None` where it cannot be estimated.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Driven {
+    /// At each frame, over the frames around it.
+    pub at: Vec<Option<OwnMotion>>,
+    /// From each frame to the next.
+    pub to_next: Vec<Option<OwnMotion>>,
+}
+
+/// The motion over all frames.
+pub fn own_motion(standing: Vec<Standing>, times: &[f64]) -> Driven {
     let frames = standing.len();
     let seen: Vec<Seen> = standing.into_par_iter().map(Seen::new).collect();
     let pair = |i: usize| {
@@ -104,7 +116,9 @@ pub fn own_motion(standing: Vec<Standing>, times: &[f64]) -> Vec<Option<OwnMotio
     };
     let pairs: Option<Vec<Pair>> = (0..frames.saturating_sub(1)).into_par_iter().map(pair).collect();
     let known = pairs.and_then(|pairs| speeds(&pairs).map(|speeds| (pairs, speeds)));
-    let Some((pairs, speeds)) = known else { return vec![None; frames] };
+    let Some((pairs, speeds)) = known else {
+        return Driven { at: vec![None; frames], to_next: vec![None; frames.saturating_sub(1)] };
+    };
     let steps: Vec<Option<OwnMotion>> = pairs.par_iter().zip(speeds).map(|(pair, k)| pair.motion(k)).collect();
     let raw: Vec<Option<OwnMotion>> = (0..frames)
         .map(|i| {
@@ -119,31 +133,55 @@ pub fn own_motion(standing: Vec<Standing>, times: &[f64]) -> Vec<Option<OwnMotio
             }
         })
         .collect();
-    smooth(&raw, times)
+    let at = smooth(&raw, times);
+    let to_next = if at.iter().any(Option::is_some) { smooth_steps(&steps, times) } else { vec![None; steps.len()] };
+    Driven { at, to_next }
 }
 
 /// Smallest share of frames with a known motion.
 const KNOWN: f64 = 0.4;
 
-/// Median of the motions within 0.8 s, where at least two are known: speeds change slowly.
+/// Time within which a vehicle may change its speed by a fifth, s.
+const STEADY_S: f64 = 0.8;
+
+/// Time within which a vehicle may turn in or out of a bend, s.
+const STRAIGHT_S: f64 = 0.4;
+
+/// Medians of the motions within [`STEADY_S`] and of the frames before and after, where at least two are known; nothing
+/// where too few are known.
 fn smooth(raw: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
     let known = raw.iter().flatten().count();
     if (known as f64) < KNOWN * raw.len() as f64 || known < 3 {
         return vec![None; raw.len()];
     }
-    (0..raw.len())
-        .map(|i| {
-            let near: Vec<OwnMotion> =
-                (0..raw.len()).filter(|&j| (times[j] - times[i]).abs() < 0.8).filter_map(|j| raw[j]).collect();
-            let usual = |of: fn(&OwnMotion) -> Vector3<f64>| {
-                Vector3::from_fn(|k, _| median(near.iter().map(|m| of(m)[k]).collect()))
-            };
-            (near.len() >= 2).then(|| OwnMotion {
-                velocity_m_s: usual(|m| m.velocity_m_s),
-                turn_rate_rad_s: usual(|m| m.turn_rate_rad_s),
-            })
-        })
-        .collect()
+    let beside = |i: usize, j: usize| i.abs_diff(j) <= 1 || (times[j] - times[i]).abs() < STEADY_S;
+    let of_frame = |i: usize| {
+        let near: Vec<OwnMotion> = (0..raw.len()).filter(|&j| beside(i, j)).filter_map(|j| raw[j]).collect();
+        (near.len() >= 2).then(|| usual(&near))
+    };
+    (0..raw.len()).map(of_frame).collect()
+}
+
+/// Medians of the motions from frame to frame: of speeds within [`STEADY_S`], of turns within [`STRAIGHT_S`].
+fn smooth_steps(steps: &[Option<OwnMotion>], times: &[f64]) -> Vec<Option<OwnMotion>> {
+    let apart_s = |i: usize, j: usize| 0.5 * (times[j] + times[j + 1] - times[i] - times[i + 1]).abs();
+    let within = |i: usize, most_s: f64| {
+        let near = (0..steps.len()).filter(|&j| apart_s(i, j) < most_s).filter_map(|j| steps[j]);
+        usual(&near.collect::<Vec<_>>())
+    };
+    let of_step = |i: usize| {
+        steps[i]?;
+        Some(OwnMotion { turn_rate_rad_s: within(i, STRAIGHT_S).turn_rate_rad_s, ..within(i, STEADY_S) })
+    };
+    (0..steps.len()).map(of_step).collect()
+}
+
+/// Component by component, the median.
+fn usual(motions: &[OwnMotion]) -> OwnMotion {
+    let usual = |of: fn(&OwnMotion) -> Vector3<f64>| {
+        Vector3::from_fn(|k, _| median(motions.iter().map(|m| of(m)[k]).collect()))
+    };
+    OwnMotion { velocity_m_s: usual(|m| m.velocity_m_s), turn_rate_rad_s: usual(|m| m.turn_rate_rad_s) }
 }
 
 /// Largest range of an edge, m.
@@ -182,33 +220,111 @@ pub fn times_s(ids: &[String], rate_hz: f64) -> Option<Vec<f64>> {
     Some(numbers.iter().map(|n| (n - numbers[0]) * unit).collect())
 }
 
-/// Largest relative speed of an object, m/s.
-const FASTEST_M_S: f64 = 60.0;
+/// Largest speed of an object over the ground, m/s; backwards and forwards.
+const FASTEST_M_S: [f64; 2] = [5.0, 60.0];
 
-/// Velocity of a box of frame `f` relative to the ego vehicle, from the nearest boxes of the frames before and after,
-/// m/s, cloud's frame. `boxes` gives those of a frame.
-pub fn seen_velocity(boxes: &dyn Fn(usize) -> Vec<Box3>, times: &[f64], f: usize, bbox: &Box3) -> Option<Vector3<f64>> {
-    let neighbour = |g: usize| -> Option<(f64, Vector3<f64>)> {
+/// Distance across its heading within which an object may be that of another frame, m, and its growth with the
+/// distance along it.
+const ACROSS_M: [f64; 2] = [0.6, 0.15];
+
+/// Without the motion of the ego vehicle: longest time to another frame, s, and largest distance of an object from its
+/// place there, m.
+const UNGUIDED: (f64, f64) = (0.6, 5.0);
+
+/// How many metres of distance a metre of different size counts like. An object keeps its size.
+const SIZE_COUNTS: f64 = 20.0;
+
+/// Largest change of an object's speed from the way to a frame to the way from it that is always possible, m/s, and
+/// its growth with the time between these, m/s2.
+const CHANGES: [f64; 2] = [2.0, 8.0];
+
+/// An object of another frame that may be the same as one of this frame.
+#[derive(Clone, Copy)]
+struct Same {
+    /// Later by so much, s.
+    dt: f64,
+    /// Moved by so much relative to the ego vehicle, m.
+    moved: Vector3<f64>,
+    /// Velocity along its heading over the ground, m/s; relative to the ego vehicle where its motion is not known.
+    speed_m_s: f64,
+    /// Whether the motion of the ego vehicle is known.
+    over_ground: bool,
+    /// How unlike it is: the way over the ground, and the difference of the sizes, m.
+    unlike_m: f64,
+}
+
+/// Velocity of a labelled object.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SeenVelocity {
+    /// Relative to the ego vehicle, m/s, cloud's frame.
+    pub relative_m_s: Vector3<f64>,
+    /// Along its heading over the ground, m/s, where the motion of the ego vehicle is known.
+    pub speed_m_s: Option<f64>,
+}
+
+/// Velocity of a box of frame `f`, from the same object in the frames before and after. `boxes` gives those of a frame, `to_next` is the motion of the ego vehicle from each frame to
+/// the next. The same object is one of that size which has moved least over the ground along its heading; without the
+/// motion of the ego vehicle, the one nearest to its place. `None` where there is none, or where it would have changed
+/// its speed faster than vehicles do.
+pub fn seen_velocity(
+    boxes: &dyn Fn(usize) -> Vec<Box3>,
+    times: &[f64],
+    f: usize,
+    bbox: &Box3,
+    to_next: &[Option<OwnMotion>],
+) -> Option<SeenVelocity> {
+    let candidates = |g: usize| -> Vec<Same> {
+        let own = to_next.get(f.min(g)).copied().flatten();
         let dt = times[g] - times[f];
-        if dt.abs() > LONGEST_S {
-            return None;
-        }
-        let here = Vector3::from(bbox.center);
-        let same_size = |b: &Box3| (0..3).all(|k| (b.size[k] - bbox.size[k]).abs() < 0.35 * bbox.size[k]);
-        let nearest = boxes(g)
-            .iter()
-            .filter(|b| same_size(b))
-            .map(|b| Vector3::from(b.center) - here)
-            .min_by(|a, b| a.norm().total_cmp(&b.norm()))?;
-        (nearest.norm() < (FASTEST_M_S * dt.abs()).min(5.0)).then_some((dt, nearest))
+        let longest_s = if own.is_some() { LONGEST_S } else { UNGUIDED.0 };
+        // Times are sums of steps.
+        let near = dt.abs() < longest_s + 1e-3;
+        boxes(g).iter().filter(|_| near).filter_map(|b| same(bbox, b, dt, own)).collect()
     };
-    let before = f.checked_sub(1).and_then(neighbour);
-    let after = if f + 1 < times.len() { neighbour(f + 1) } else { None };
-    match (before, after) {
-        (Some((t0, d0)), Some((t1, d1))) => Some((d1 - d0) / (t1 - t0)),
-        (Some((t, d)), None) | (None, Some((t, d))) => Some(d / t),
-        (None, None) => None,
+    let before = f.checked_sub(1).map_or(vec![], candidates);
+    let after = if f + 1 < times.len() { candidates(f + 1) } else { vec![] };
+    let least = |all: &[Same]| all.iter().copied().min_by(|a, b| a.unlike_m.total_cmp(&b.unlike_m));
+    if before.is_empty() || after.is_empty() {
+        return least(&[before, after].concat())
+            .map(|s| SeenVelocity { relative_m_s: s.moved / s.dt, speed_m_s: s.over_ground.then_some(s.speed_m_s) });
     }
+    let change = |[a, b]: &[Same; 2]| (b.speed_m_s - a.speed_m_s).abs();
+    let unlike = |both: &[Same; 2]| both[0].unlike_m + both[1].unlike_m + change(both) * (both[1].dt - both[0].dt);
+    let pairs = before.iter().flat_map(|a| after.iter().map(|b| [*a, *b]));
+    let best = pairs.min_by(|a, b| unlike(a).total_cmp(&unlike(b)))?;
+    let [a, b] = best;
+    let possible = change(&best) < CHANGES[0] + CHANGES[1] * 0.5 * (b.dt - a.dt);
+    possible.then(|| SeenVelocity {
+        relative_m_s: (b.moved - a.moved) / (b.dt - a.dt),
+        speed_m_s: (a.over_ground && b.over_ground)
+            .then_some((a.speed_m_s * a.dt - b.speed_m_s * b.dt) / (a.dt - b.dt)),
+    })
+}
+
+/// A box of another frame, `dt` later (s), as the same object; `None` where it cannot be. `own` is the motion of the ego
+/// vehicle between both.
+fn same(bbox: &Box3, other: &Box3, dt: f64, own: Option<OwnMotion>) -> Option<Same> {
+    let like = (0..3).all(|k| (other.size[k] - bbox.size[k]).abs() < 0.35 * bbox.size[k]);
+    let moved = Vector3::from(other.center) - Vector3::from(bbox.center);
+    let other_size_m = (0..3).map(|k| (other.size[k] - bbox.size[k]).abs()).sum::<f64>();
+    let [backwards, forwards] = FASTEST_M_S;
+    // Where it would be if it stood, in the later frame: the vehicle moves along its mean heading.
+    let (turned, carried) = own.map_or((0.0, Vector2::zeros()), |own| {
+        let turned = own.turn_rate_rad_s.z * dt;
+        (turned, Rotation2::new(0.5 * turned) * own.velocity_m_s.xy() * dt)
+    });
+    let standing = Rotation2::new(-turned) * (Vector2::new(bbox.center[0], bbox.center[1]) - carried);
+    let there = Vector2::new(other.center[0], other.center[1]);
+    let away = Rotation2::new(turned - bbox.yaw_rad) * (there - standing);
+    let speed_m_s = away.x / dt;
+    let possible = match own {
+        Some(_) => {
+            (-backwards..forwards).contains(&speed_m_s) && away.y.abs() < ACROSS_M[0] + ACROSS_M[1] * away.x.abs()
+        }
+        None => moved.norm() < (forwards * dt.abs()).min(UNGUIDED.1),
+    };
+    let unlike_m = away.norm() + SIZE_COUNTS * other_size_m;
+    (like && possible).then_some(Same { dt, moved, speed_m_s, over_ground: own.is_some(), unlike_m })
 }
 
 /// The median; 0 without values.
@@ -296,9 +412,10 @@ impl<'a> Pair<'a> {
     fn new(first: &'a Seen, second: &'a Seen, elsewhere: [&'a Seen; 2], dt: f64) -> Self {
         let some = some_of(&first.edges, SOME);
         let mut pair = Pair { some, first, second, elsewhere, dt, scores: vec![[0.0; 3]; SPEEDS] };
-        if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt < LONGEST_S {
-            let yaw_steps = (0.6 * dt / 0.009).ceil() as i32;
-            let yaws = (-yaw_steps..=yaw_steps).map(|k| 0.6 * dt * f64::from(k) / f64::from(yaw_steps.max(1)));
+        if first.edges.len() >= FEWEST && second.edges.len() >= FEWEST && dt > 0.0 && dt <= LONGEST_S {
+            let yaw_steps = (SHARPEST_RAD_S * dt / 0.009).ceil() as i32;
+            let yaws =
+                (-yaw_steps..=yaw_steps).map(|k| SHARPEST_RAD_S * dt * f64::from(k) / f64::from(yaw_steps.max(1)));
             let at = |k: usize| {
                 let mut best = [f64::NEG_INFINITY, 0.0, f64::NEG_INFINITY];
                 for yaw in yaws.clone() {
@@ -385,6 +502,37 @@ fn path(pairs: &[Pair], score: usize) -> Option<(Vec<usize>, f64)> {
 mod tests {
     use super::*;
     use rand::RngExt;
+
+    /// Boxes of two frames before and after a frame of a turning vehicle between parked cars, one of which moves.
+    #[test]
+    fn objects_are_followed_over_the_ground() {
+        let (dt, own) = (
+            0.8,
+            OwnMotion { velocity_m_s: Vector3::new(9.0, 0.0, 0.0), turn_rate_rad_s: Vector3::new(0.0, 0.0, 0.4) },
+        );
+        // Places in the frame of the vehicle at time 0; cars are 6 m apart, the vehicle moves 7.2 m from frame to frame.
+        let parked: Vec<[f64; 2]> = (0..6).map(|k| [-12.0 + 6.0 * f64::from(k), 4.0]).collect();
+        let speed = 8.0;
+        let at = |t: f64, [x, y]: [f64; 2], length_m: f64| {
+            let turned = own.turn_rate_rad_s.z * t;
+            let moved = Rotation2::new(0.5 * turned) * own.velocity_m_s.xy() * t;
+            let p = Rotation2::new(-turned) * (Vector2::new(x, y) - moved);
+            Box3 { center: [p.x, p.y, 0.8], size: [length_m, 1.8, 1.5], yaw_rad: -turned }
+        };
+        let boxes = |f: usize| -> Vec<Box3> {
+            let t = dt * (f as f64 - 1.0);
+            let moving = at(t, [10.0 + speed * t, 0.5], 4.4);
+            parked.iter().map(|p| at(t, *p, 4.2)).chain([moving]).collect()
+        };
+        let times = [0.0, dt, 2.0 * dt];
+        for (number, bbox) in boxes(1).iter().enumerate() {
+            let seen = seen_velocity(&boxes, &times, 1, bbox, &[Some(own); 2]).unwrap();
+            let truth = if number == parked.len() { speed } else { 0.0 };
+            assert!((seen.speed_m_s.unwrap() - truth).abs() < 0.1, "{number}: {seen:?}");
+        }
+        // Without the motion of the vehicle nothing is said of frames so far apart.
+        assert_eq!(seen_velocity(&boxes, &times, 1, &boxes(1)[0], &[None; 2]), None);
+    }
 
     #[test]
     fn posts_give_the_motion_and_walls_do_not() {

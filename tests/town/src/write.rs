@@ -6,6 +6,7 @@ use crate::frame::Frame;
 use crate::oracle::judge;
 use crate::sensor::rig_toml;
 use crate::side::Side;
+use crate::world::REACH_M;
 use data::{Cloud, DataError, Layout, write_atomic};
 use rayon::prelude::*;
 use score::{Hidden, Truth};
@@ -51,6 +52,7 @@ pub fn truth(case: &Case) -> Truth {
     let hidden = case.hidden().iter().zip(judge(case)).map(|(effect, judgement)| {
         let mut parameters = effect.parameters();
         parameters.extend(grown(case, effect));
+        parameters.extend(sprayed(case, effect));
         Hidden {
             cause: effect.cause().into(),
             in_catalogue: effect.in_catalogue(),
@@ -79,4 +81,30 @@ fn grown(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
     let sizes: Vec<[f64; 3]> = labelled.map(|v| world.models[v.model].size_m).collect();
     let mean = |k: usize| sizes.iter().map(|s| s[k]).sum::<f64>() / sizes.len().max(1) as f64;
     [("longer_m", length * mean(0)), ("higher_m", height * mean(2))].map(|(k, v)| (k.to_owned(), v)).into()
+}
+
+/// One of so many frames, and of so many shots, that tell the mean density of plumes.
+const SPRAY_ONE_IN: [usize; 2] = [4, 7];
+
+/// Mean density of the plumes that shots pass, 1/m: the effect's own number is that behind a car at 8 m/s.
+fn sprayed(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
+    let Effect::Spray { per_m } = *effect else { return BTreeMap::new() };
+    let side = &case.measured;
+    let [frames, shots] = SPRAY_ONE_IN;
+    let of_frame = |index: usize| {
+        let frame = Frame::new(side, index);
+        let mut sum = [0.0; 2];
+        for (sensor, mount) in side.mounts.iter().enumerate() {
+            let all = mount.shots(sensor, &side.nuisances.dither, &mut side.stream(&format!("shots {sensor}"), index));
+            for shot in all.iter().step_by(shots) {
+                if let Some(([from, to], times)) = frame.plume_m(shot, REACH_M) {
+                    sum = [sum[0] + (to - from), sum[1] + times * (to - from)];
+                }
+            }
+        }
+        sum
+    };
+    let sums: Vec<[f64; 2]> = (0..case.size.frames).step_by(frames).map(of_frame).collect();
+    let [path, weighed] = [0, 1].map(|k| sums.iter().map(|s| s[k]).sum::<f64>());
+    if path > 0.0 { [("density_per_m".to_owned(), per_m * weighed / path)].into() } else { BTreeMap::new() }
 }

@@ -1,6 +1,7 @@
 //! Shifts of labelled objects in the object's own frame (forward, left, up): of the measured label against the
 //! simulated one, and of the measured returns against the simulated ones.
 
+use super::motion::{OwnMotion, SeenVelocity};
 use crate::pairing::FramePair;
 use geometry::{Box3, limit_period};
 use nalgebra::Vector3;
@@ -22,6 +23,8 @@ pub struct ObjectShift {
     /// Velocity of the simulated label relative to the ego vehicle, along the object's own axes, m/s. `None` where
     /// neighbouring frames do not show the object.
     pub seen_velocity_m_s: Option<[f64; 3]>,
+    /// Its velocity over the ground, forward, m/s, where the motion of the ego vehicle is known as well.
+    pub speed_m_s: Option<f64>,
     /// Distance, m.
     pub distance_m: f64,
     /// Azimuth in the cloud's frame, rad.
@@ -30,8 +33,9 @@ pub struct ObjectShift {
     pub points: usize,
 }
 
-/// Shifts of all objects.
-pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectShift> {
+/// Shifts of all objects; times of the frames, s, where they are known, and motion of the
+/// ego vehicle from each frame to the next.
+pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>, to_next: &[Option<OwnMotion>]) -> Vec<ObjectShift> {
     let mut shifts = Vec::new();
     for (f, frame) in frames.iter().enumerate() {
         for (k, object) in frame.objects.iter().enumerate() {
@@ -39,13 +43,15 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectS
             let center = Vector3::from(simulated.center);
             let (sin, cos) = simulated.yaw_rad.sin_cos();
             let along = |v: Vector3<f64>| [v.x * cos + v.y * sin, -v.x * sin + v.y * cos, v.z];
+            let seen = times.and_then(|t| seen_velocity(frames, t, f, &simulated, to_next));
             shifts.push(ObjectShift {
                 frame: f,
                 object: k,
                 label_m: simulated.to_local(measured.center),
                 label_yaw_rad: limit_period(measured.yaw_rad - simulated.yaw_rad, 0.5, PI),
                 cloud_m: object.shift.map(|s| (s.shift_m, s.error_m)),
-                seen_velocity_m_s: times.and_then(|t| seen_velocity(frames, t, f, &simulated)).map(along),
+                seen_velocity_m_s: seen.map(|seen| along(seen.relative_m_s)),
+                speed_m_s: seen.and_then(|seen| seen.speed_m_s),
                 distance_m: center.xy().norm(),
                 azimuth_rad: center.y.atan2(center.x),
                 points: object.points[0],
@@ -55,9 +61,15 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>) -> Vec<ObjectS
     shifts
 }
 
-/// Velocity of a simulated box of frame `f` relative to the ego vehicle, m/s, cloud's frame; see
+/// Velocity of a simulated box of frame `f`; see
 /// [`sensor::motion::seen_velocity`].
-pub fn seen_velocity(frames: &[FramePair], times: &[f64], f: usize, bbox: &Box3) -> Option<Vector3<f64>> {
+pub fn seen_velocity(
+    frames: &[FramePair],
+    times: &[f64],
+    f: usize,
+    bbox: &Box3,
+    to_next: &[Option<OwnMotion>],
+) -> Option<SeenVelocity> {
     let boxes = |g: usize| frames[g].objects.iter().filter_map(|o| o.simulated).collect();
-    sensor::motion::seen_velocity(&boxes, times, f, bbox)
+    sensor::motion::seen_velocity(&boxes, times, f, bbox, to_next)
 }

@@ -4,11 +4,11 @@ use crate::pairing::{FramePair, Ray, Surface};
 use geometry::Box3;
 use nalgebra::Point3;
 use rayon::prelude::*;
-pub use sensor::motion::{CELL_M, Cells, Ground, OwnMotion, times_s};
+pub use sensor::motion::{CELL_M, Cells, Driven, Ground, OwnMotion, SeenVelocity, times_s};
 use sensor::motion::{GroundPoint, Standing};
 
-/// The motion at each frame; `None` where it cannot be estimated.
-pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) -> Vec<Option<OwnMotion>> {
+/// The motion over all frames.
+pub fn own_motion(frames: &[FramePair], times: &[f64], origins: &[Point3<f64>]) -> Driven {
     let of_frame = |frame: &FramePair| standing(frame, origins);
     sensor::motion::own_motion(frames.par_iter().map(of_frame).collect(), times)
 }

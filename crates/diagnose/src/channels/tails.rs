@@ -8,11 +8,15 @@
 
 use super::cells::{cell, place_of};
 use super::roughness::own_roughness_m;
-use crate::pairing::{FramePair, Ray, STRAY_M, company_m};
+use crate::pairing::{FramePair, Ray, STRAY_M, Surface, company_m};
 use rayon::prelude::*;
 
 /// Standard deviations from which on a return is in the tail.
 pub const BEYOND: f64 = 6.0;
+
+/// Smallest distance of a return in the tail from its surface, m. A neighbour that is off by less than what makes an
+/// edge, 0.12 m, draws the surface by up to half of that.
+pub const LEAST_OFF_M: f64 = 0.06;
 
 /// Shots before and after one that tell the usual roughness.
 const AROUND: usize = 8;
@@ -92,10 +96,29 @@ impl Default for Tail {
     }
 }
 
-/// Tails of both sides of each frame. `scales` holds the usual roughness of the noisier side by cell, m: see
+/// Kinds of surfaces: ground, what stands, labelled objects.
+pub const KINDS: usize = 3;
+
+fn kind_of(surface: Surface) -> usize {
+    match surface {
+        Surface::Ground => 0,
+        Surface::Standing | Surface::Open => 1,
+        Surface::Object => 2,
+    }
+}
+
+/// Tails of both sides of a frame, measured first, by the kind of the surface.
+pub type FrameTails = [[Tail; 2]; KINDS];
+
+/// Tails of each frame. `scales` holds the usual roughness of the noisier side by cell, m: see
 /// [`super::roughness::scales`].
-pub fn tails(frames: &[FramePair], scales: &[f64]) -> Vec<[Tail; 2]> {
-    frames.par_iter().map(|f| [&f.measured, &f.simulated].map(|rays| tail(rays, scales))).collect()
+pub fn tails(frames: &[FramePair], scales: &[f64]) -> Vec<FrameTails> {
+    let of_frame = |frame: &FramePair| {
+        let [measured, simulated] = [&frame.measured, &frame.simulated].map(|rays| tails_of(rays, scales));
+        let mut of_sides = measured.into_iter().zip(simulated).map(|(a, b)| [a, b]);
+        std::array::from_fn(|_| of_sides.next().unwrap_or_default())
+    };
+    frames.par_iter().map(of_frame).collect()
 }
 
 /// Rays in the order in which a row sends them; of sensors without rows as they are recorded.
@@ -109,9 +132,9 @@ fn in_order(rays: &[Ray]) -> Vec<&Ray> {
     order
 }
 
-fn tail(rays: &[Ray], scales: &[f64]) -> Tail {
+fn tails_of(rays: &[Ray], scales: &[f64]) -> [Tail; KINDS] {
     let shots: Vec<(&Ray, Option<f64>)> = in_order(rays).into_iter().map(|ray| (ray, own_roughness_m(ray))).collect();
-    let mut out = Tail::default();
+    let mut of_kinds: [Tail; KINDS] = Default::default();
     let (mut before, mut around) = (false, Vec::with_capacity(2 * AROUND));
     for (i, (ray, own)) in shots.iter().enumerate() {
         let row = |j: &usize| shots[*j].0.row == ray.row && shots[*j].0.sensor == ray.sensor;
@@ -126,15 +149,16 @@ fn tail(rays: &[Ray], scales: &[f64]) -> Tail {
         let median = *around.select_nth_unstable_by(half, f64::total_cmp).1;
         let of_cell_m = cell(ray).map_or(0.0, |c| scales[c]);
         let usual_m = (median / statistics::MEDIAN_OF_NORMAL).max(of_cell_m).max(LEAST_M);
-        let beyond = own.abs() > BEYOND * usual_m;
         // The distance itself: a single error has no part in the surface, whose own error the usual ones have.
         let times = (1.0 + f64::from(ray.roughness_leverage)).sqrt();
         let [off_m, usual_m] = [times * own.abs(), times * usual_m];
+        let beyond = off_m > (BEYOND * usual_m).max(LEAST_OFF_M);
         let most_m = place_of(ray).map_or(0.0, |(range_m, cos, _)| most_m(range_m, cos));
         if off_m > most_m {
             before = false;
             continue;
         }
+        let out = &mut of_kinds[kind_of(ray.surface)];
         let bin = &mut out.bins[bin_of(usual_m)];
         (bin.all, bin.usual_m) = (bin.all + 1.0, bin.usual_m + usual_m);
         bin.most[size_bin(most_m)] += 1.0;
@@ -149,5 +173,5 @@ fn tail(rays: &[Ray], scales: &[f64]) -> Tail {
         }
         before = beyond;
     }
-    out
+    of_kinds
 }

@@ -1,5 +1,6 @@
 //! Notes: limits of the data, and what was left out.
 
+use crate::channels::motion::OwnMotion;
 use crate::channels::{labels, returns};
 use crate::pairing::{FramePair, ObjectPair, Ray};
 use sensor::directions::Sensors;
@@ -32,8 +33,8 @@ pub(super) fn leave_out_copies(frames: &mut Vec<FramePair>) -> Option<String> {
 const ONE_SPEED_M_S: f64 = 0.5;
 
 /// A note where all objects move at one speed.
-pub(super) fn one_speed(frames: &[FramePair], times: &[f64]) -> Option<String> {
-    let shifts = labels::object_shifts(frames, Some(times));
+pub(super) fn one_speed(frames: &[FramePair], times: &[f64], to_next: &[Option<OwnMotion>]) -> Option<String> {
+    let shifts = labels::object_shifts(frames, Some(times), to_next);
     let speeds: Vec<f64> = shifts.iter().filter_map(|s| Some(s.seen_velocity_m_s?[0])).collect();
     let n = speeds.len() as f64;
     let mean = speeds.iter().sum::<f64>() / n.max(1.0);

@@ -225,12 +225,14 @@ impl<'a> Verification<'a> {
     ) -> Result<(Distances, Vec<FramePair>), DiagnoseError> {
         let kept = kept_of_frame(self.context.frames.len());
         let frames: Vec<FramePair> = pair_all(recordings, self.engine.sensors, Corrections::default(), kept, &|_| ())?;
+        let to_next = |w: &[usize]| self.context.to_next.get(w[0]).copied().flatten().filter(|_| w[1] == w[0] + 1);
         let context = Context {
             rig: self.context.rig,
             frames: &frames,
             roles: which.iter().map(|&i| self.context.roles[i]).collect(),
             times: self.context.times.as_ref().map(|t| which.iter().map(|&i| t[i]).collect()),
             motion: self.context.motion.as_ref().map(|m| which.iter().map(|&i| m[i]).collect()),
+            to_next: which.windows(2).map(to_next).collect(),
         };
         let places = |frames: &[usize]| -> Vec<usize> {
             frames.iter().filter_map(|frame| which.iter().position(|own| own == frame)).collect()

@@ -37,6 +37,24 @@ pub fn likelihood_of_counts(counts: [&[f64]; 2], base: [&[f64]; 2], more: &[f64]
     bins.map(of_bin).sum::<f64>() + SHAPE * (factor.ln() - factor)
 }
 
+/// Shape of the gamma distribution of the factor between the two sides of what both show alike, in one bin: its
+/// standard deviation is 0.35.
+const BESIDE_SHAPE: f64 = 8.0;
+
+/// Logarithm of the likelihood of one side's count in a bin (Poisson), up to a constant, and the factor on `base` for
+/// which it is largest: the other side shows `base` of the same world, but by other shots and with other noise. `more`
+/// is expected beyond it.
+pub fn likelihood_beside(count: f64, base: f64, more: f64) -> [f64; 2] {
+    let (base, shape) = (base.max(LEAST), BESIDE_SHAPE);
+    // Where the derivative by the factor f is zero: count / (f base + more) base - base + shape / f - shape = 0.
+    let square = (base + shape) * base;
+    let linear = (base + shape) * more - (count + shape) * base;
+    let factor = (-linear + (linear * linear + 4.0 * square * shape * more).sqrt()) / (2.0 * square);
+    let factor = factor.max(LEAST);
+    let expected = factor * base + more;
+    [count * expected.ln() - expected + shape * (factor.ln() - factor), factor]
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -56,5 +74,25 @@ mod tests {
         let likelihood = |more: f64| likelihood_of_counts([&[20.0], &[0.0]], [&[0.01], &[0.01]], &[more]);
         let gain = likelihood(20.0) - likelihood(0.0);
         assert!(gain > 100.0 && gain / gain_of_count(20.0, 1.0, 20.0, 0.01) > 0.8, "{gain}");
+    }
+
+    #[test]
+    fn the_factor_beside_the_other_side_is_the_likeliest() {
+        let of_factor = |f: f64, [count, base, more]: [f64; 3]| {
+            let expected = f * base + more;
+            count * expected.ln() - expected + BESIDE_SHAPE * (f.ln() - f)
+        };
+        for case in [[40.0, 30.0, 0.0], [40.0, 30.0, 25.0], [3.0, 300.0, 10.0], [5.0, 0.0, 4.0], [0.0, 20.0, 0.0]] {
+            let [likelihood, factor] = likelihood_beside(case[0], case[1], case[2]);
+            let base = case[1].max(LEAST);
+            let around = [0.9, 1.0, 1.1].map(|k| of_factor(k * factor, [case[0], base, case[2]]));
+            assert!(around[1] >= around[0] && around[1] >= around[2], "{case:?} {factor} {around:?}");
+            assert!((likelihood - around[1]).abs() < 1e-9);
+        }
+        // What the world may show more of is no evidence, where there is little of it a surplus is.
+        let gain = |count: f64, base: f64, more: f64| {
+            likelihood_beside(count, base, more)[0] - likelihood_beside(count, base, 0.0)[0]
+        };
+        assert!(gain(130.0, 100.0, 30.0) < 1.0 && gain(33.0, 3.0, 30.0) > 8.0);
     }
 }

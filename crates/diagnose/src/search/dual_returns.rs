@@ -65,14 +65,18 @@ pub fn search(context: &Context) -> ChannelResult {
     result
 }
 
-/// The share of second returns, and the full width of a beam that meets two surfaces as often. Which part of the light
-/// must fall on the second surface is not known, so that the width is known within a factor of two.
+/// Interval of the width of beams as multiples of the width of those that report each second surface they meet. A
+/// receiver reports one on which enough light falls, and some sensors not each of them: beams are wider. The least is
+/// for the errors of the gaps that are counted.
+const WIDER: [f64; 2] = [0.75, 4.0];
+
+/// The share of second returns, and the full width of a beam that meets two surfaces as often.
 fn parameters(context: &Context, frames: &[usize], more: f64, error: f64) -> Vec<NamedParameter> {
     let mut parameters = vec![(Quantity::Share.into(), with_error(more, error, Unit::One))];
     let mixed = frames.iter().map(|&i| context.frames[i].mixed_per_rad).sum::<f64>() / frames.len().max(1) as f64;
     if more > 0.0 && mixed > 0.0 {
         let width = (more / mixed).min(WIDEST_RAD);
-        let ci95 = [0.5 * width, 2.0 * width];
+        let ci95 = WIDER.map(|times| times * width);
         parameters.push((Quantity::DivergenceRad.into(), Parameter { estimate: width, unit: Unit::Radian, ci95 }));
     }
     parameters

@@ -6,16 +6,16 @@ mod describe;
 mod hypotheses;
 mod rows;
 
-use self::clock::{forward, late, own_speeds, surely_late, within_frames};
+use self::clock::{alike, forward, late, own_speeds, surely_late, within_frames};
 use self::describe::Description;
 use self::hypotheses::{HYPOTHESES, Hypothesis, TARGETS_CLOCK};
-use self::rows::{Row, displacement_m, distance, keep_known, row, set_noise, sums};
+use self::rows::{ALL, Row, displacement_m, distance, keep_known, row, set_noise, sums};
 use super::geometry::Displacement;
 use super::{ChannelResult, Context, Repair, Selected, Z_STAR, causes_of, confidence, first_demands, record};
 use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::labels::object_shifts;
 use crate::diagnosis::Minimum;
-use crate::inference::choice::{Demands, Trial, as_good, choose, total_and_z};
+use crate::inference::choice::{Demands, Trial, as_good, choose, significant, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
 use nalgebra::Vector3;
@@ -69,7 +69,7 @@ const AS_GOOD: f64 = 0.02;
 const FEWEST: usize = 8;
 
 /// No prior on the coefficients.
-const NO_PRIOR: [f64; 8] = [0.0; 8];
+const NO_PRIOR: [f64; ALL] = [0.0; ALL];
 
 /// Hypotheses that were chosen, with what is said of each.
 type Chosen = (Vec<&'static Hypothesis>, Vec<Selected>);
@@ -78,7 +78,7 @@ type Chosen = (Vec<&'static Hypothesis>, Vec<Selected>);
 pub fn search(context: &Context, side: Side, displaced: &Displacement) -> ChannelResult {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(side.channel(), hold_out.len());
-    let shifts = object_shifts(context.frames, context.times.as_deref());
+    let shifts = object_shifts(context.frames, context.times.as_deref(), &context.to_next);
     let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, displaced)).collect();
     if rows.iter().filter(|r| select.contains(&r.frame)).count() < FEWEST {
         return result;
@@ -89,7 +89,10 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let on_select: Vec<LinearFrame> = select.iter().map(|&f| sums(&rows, f)).collect();
     let speeds = own_speeds(context.motion.as_deref());
     let line = within_frames(&rows, &select, &blocks);
-    let clock = usable[3] && surely_late(forward(&rows, line[0]), line, speeds);
+    let frames: Vec<&LinearFrame> = on_select.iter().collect();
+    let gains = |columns: &[usize]| cross_gains(&frames, &blocks, columns, &NO_PRIOR);
+    let more_alike: Vec<f64> = gains(&[0]).iter().zip(gains(TARGETS_CLOCK)).map(|(a, b)| a - b).collect();
+    let clock = usable[3] && surely_late(forward(&rows, line[0]), line, speeds) && !significant(&more_alike, Z_STAR);
     let demands = Demands { nats: 6.0, slack: 0.03, richer: 0.03, ..first_demands() };
     let search =
         Search { context, side, rows, usable, blocks, on_select, speeds, line, clock, demands, estimate, hold_out };
@@ -105,7 +108,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
 
 /// Gains of the `test` frames by all shifts fitted on the `train` frames, nats; zeros with too few objects.
 pub fn by_table(context: &Context, side: Side, train: &[usize], test: &[usize]) -> Vec<f64> {
-    let shifts = object_shifts(context.frames, context.times.as_deref());
+    let shifts = object_shifts(context.frames, context.times.as_deref(), &context.to_next);
     let in_place = Displacement::default();
     let mut rows: Vec<Row> = shifts.iter().filter_map(|s| row(context, s, side, &in_place)).collect();
     if rows.iter().filter(|r| train.contains(&r.frame)).count() < FEWEST {
@@ -113,9 +116,9 @@ pub fn by_table(context: &Context, side: Side, train: &[usize], test: &[usize]) 
     }
     let usable = keep_known(&mut rows);
     set_noise(&mut rows, train, side);
-    let known: Vec<usize> = (0..8).filter(|&k| usable[k]).collect();
+    let known: Vec<usize> = (0..ALL).filter(|&k| usable[k]).collect();
     let linear: Vec<LinearFrame> = train.iter().map(|&f| sums(&rows, f)).collect();
-    let best = fit(&linear.iter().collect::<Vec<_>>(), &context.blocks(train), &known, &[1e-3; 8]);
+    let best = fit(&linear.iter().collect::<Vec<_>>(), &context.blocks(train), &known, &[1e-3; ALL]);
     test.iter().map(|&f| best.gain(&sums(&rows, f))).collect()
 }
 
@@ -125,7 +128,7 @@ struct Search<'a> {
     side: Side,
     rows: Vec<Row>,
     /// Whether each column is used.
-    usable: [bool; 8],
+    usable: [bool; ALL],
     /// Blocks of the selecting frames.
     blocks: Vec<usize>,
     /// Linear sums of the selecting frames.
@@ -226,8 +229,9 @@ impl Search<'_> {
         Some((chosen, selected))
     }
 
-    /// Rival causes of the first hypothesis. A forward shift that is the same for all objects may be a late clock
-    /// unless the velocities contradict it; without velocities nothing does.
+    /// Rival causes of the first hypothesis. Where velocities over the ground are not known, a forward shift that is the
+    /// same for all objects may be a late clock, unless relative velocities contradict it, or the shifts scatter less
+    /// than the speeds of a long recording.
     fn rivals_of_first(&self, trials: &[Trial], chosen: usize, equals: &[usize]) -> Vec<Cause> {
         let mut rivals = causes_of(trials, equals);
         if self.side == Side::Objects {
@@ -236,7 +240,9 @@ impl Search<'_> {
         let first = &HYPOTHESES[trials[chosen].candidate];
         let forward_alike = first.cause == Cause::LabelOffset && first.columns.contains(&0);
         let may_be_late = || late(forward(&self.rows, self.line[0]), self.line, self.speeds);
-        if forward_alike && (!self.usable[3] || may_be_late()) {
+        let select = self.context.of(Role::Select);
+        let differ = || !alike(&self.rows, &select, self.context.times.as_deref());
+        if forward_alike && !self.usable[4] && differ() && (!self.usable[3] || may_be_late()) {
             rivals.push(Cause::TimeOffset);
         }
         rivals.sort();
@@ -283,8 +289,8 @@ impl Search<'_> {
             };
             result.found.push(description.found(selected, gains));
         }
-        let known: Vec<usize> = (0..8).filter(|&k| self.usable[k]).collect();
-        let best = fit(&frames, &blocks, &known, &[1e-3; 8]);
+        let known: Vec<usize> = (0..ALL).filter(|&k| self.usable[k]).collect();
+        let best = fit(&frames, &blocks, &known, &[1e-3; ALL]);
         let of_frame =
             |(&f, sums): (&usize, &LinearFrame)| [distance(&self.rows, f), fitted.gain(sums), best.gain(sums)];
         result.distance = self.hold_out.iter().zip(&on_hold_out).map(of_frame).collect();

@@ -41,6 +41,8 @@ pub struct Context<'a> {
     pub times: Option<Vec<f64>>,
     /// Ego motion at each frame, where it can be estimated.
     pub motion: Option<Vec<Option<OwnMotion>>>,
+    /// Ego motion from each frame to the next, where it can be estimated.
+    pub to_next: Vec<Option<OwnMotion>>,
 }
 
 impl Context<'_> {

@@ -344,6 +344,7 @@ mod tests {
             roles: roles(frames.len()),
             times: Some((0..20).map(|f| 0.05 * f64::from(f)).collect()),
             motion: Some(vec![Some(own); 20]),
+            to_next: vec![],
         };
         let (result, slide) = match search(&context) {
             Search::Found(result, slide) => (result, Some(slide)),

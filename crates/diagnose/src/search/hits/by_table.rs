@@ -213,7 +213,8 @@ mod tests {
         };
         let frames: Vec<FramePair> = (0..60).map(frame).collect();
         let rig = Rig::single();
-        let context = Context { rig: &rig, frames: &frames, roles: roles(60), times: None, motion: None };
+        let context =
+            Context { rig: &rig, frames: &frames, roles: roles(60), times: None, motion: None, to_next: vec![] };
         let [train, test] = [0, 30].map(|from| (from..from + 30).collect::<Vec<usize>>());
         let of_kind = by_table(&context, &train, &test);
         [Kind::Directions, Kind::Surfaces].map(|kind| of_kind[&kind].iter().sum())

@@ -27,6 +27,26 @@ pub(super) fn surely_late(forward_m: f64, [slope, error]: [f64; 2], speeds: [f64
     slope.abs() > 3.2 * error && (speeds[0]..speeds[1]).contains(&(forward_m / slope))
 }
 
+/// Least standard deviation of the speeds of all road users of a long recording, as a share of their mean.
+const SPEEDS_DIFFER: f64 = 0.2;
+
+/// Shortest recording of which this holds, s.
+const LONG_S: f64 = 10.0;
+
+/// Whether all objects are shifted forward alike: a late clock would shift each by its own speed, so that shifts along
+/// the heading would scatter more than those across it.
+pub(super) fn alike(rows: &[Row], which: &[usize], times: Option<&[f64]>) -> bool {
+    let long = times.is_some_and(|t| t.last().zip(t.first()).is_some_and(|(last, first)| last - first > LONG_S));
+    let rows: Vec<&Row> = rows.iter().filter(|r| which.contains(&r.frame)).collect();
+    let n = rows.len() as f64;
+    let mean = [0, 1].map(|axis: usize| rows.iter().map(|r| r.shift[axis]).sum::<f64>() / n);
+    let square = |r: &Row, axis: usize| (r.shift[axis] - mean[axis]).powi(2);
+    let of_frame = |frame: &[&Row]| frame.iter().map(|r| square(r, 0) - square(r, 1)).sum::<f64>();
+    let more: Vec<f64> = rows.chunk_by(|a, b| a.frame == b.frame).map(of_frame).collect();
+    let error = more.iter().map(|d| d * d).sum::<f64>().sqrt();
+    long && (more.iter().sum::<f64>() + 2.5 * error) / n < (SPEEDS_DIFFER * mean[0]).powi(2)
+}
+
 /// Forward shift at zero relative velocity of an object with the heading of the ego vehicle, m. For oncoming objects
 /// a late clock has the opposite sign.
 pub(super) fn forward(rows: &[Row], slope: f64) -> f64 {
@@ -108,4 +128,43 @@ pub(super) fn within_frames(rows: &[Row], which: &[usize], blocks: &[usize]) -> 
     let fitted = fit(&frames.iter().collect::<Vec<_>>(), blocks, &[0, 1], &[1.0, 1.0]);
     let slope = fitted.theta[0] / kept;
     [slope, (fitted.error(0) / kept).hypot(slope * kept_error / kept)]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::rows::ALL;
+    use super::*;
+    use rand::RngExt;
+
+    /// 20 frames of 12 objects with a shift forward by their speed.
+    fn rows(shift: impl Fn(f64) -> f64) -> Vec<Row> {
+        let mut rng = data::stream(0, "alike", 0, 0);
+        let speeds: Vec<f64> = (0..12).map(f64::from).collect();
+        let mut row = |frame: usize, object: usize| {
+            let mut noise = || rng.random_range(-0.05..0.05);
+            Row {
+                frame,
+                object,
+                yaw_rad: 0.0,
+                center: [0.0; 3],
+                shift: [shift(speeds[object]) + noise(), noise(), 0.0],
+                variance: [1.0; 3],
+                x: [[0.0; ALL]; 3],
+                speed: None,
+                known: [true; ALL],
+            }
+        };
+        (0..20).flat_map(|frame| (0..12).map(move |object| (frame, object))).map(|(f, o)| row(f, o)).collect()
+    }
+
+    #[test]
+    fn shifts_that_do_not_scatter_are_of_no_clock() {
+        let which: Vec<usize> = (0..20).collect();
+        let times: Vec<f64> = which.iter().map(|&f| f as f64).collect();
+        let constant = rows(|_| 0.1);
+        assert!(alike(&constant, &which, Some(&times)));
+        let short: Vec<f64> = times.iter().map(|t| 0.1 * t).collect();
+        assert!(!alike(&constant, &which, Some(&short)) && !alike(&constant, &which, None));
+        assert!(!alike(&rows(|speed| 0.02 * speed), &which, Some(&times)));
+    }
 }

@@ -2,7 +2,7 @@
 
 use super::Side;
 use super::hypotheses::{Hypothesis, TARGETS_CLOCK};
-use super::rows::{COLUMNS, Column, Row};
+use super::rows::{ALL, COLUMNS, Column, Row};
 use crate::catalogue::{Cause, Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
@@ -21,7 +21,7 @@ pub(super) struct Description<'a> {
     pub(super) side: Side,
     pub(super) rows: &'a [Row],
     /// Whether each column is used.
-    pub(super) usable: &'a [bool; 8],
+    pub(super) usable: &'a [bool; ALL],
 }
 
 impl Description<'_> {
@@ -74,7 +74,7 @@ impl Description<'_> {
                 [theta, error] = self.line;
             }
             let (quantity, estimate, error) = match COLUMNS[c] {
-                Column::Forward if cause == Cause::TimeOffset => continue,
+                Column::Ahead => continue,
                 Column::Forward => (Quantity::ForwardM, sign * theta, error),
                 Column::Left => (Quantity::LeftM, sign * theta, error),
                 Column::Up if cause == Cause::WrongShape => (Quantity::HigherM, theta, error),

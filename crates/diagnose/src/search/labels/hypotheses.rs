@@ -1,5 +1,6 @@
 //! Hypotheses about shifts of labels and objects.
 
+use super::rows::AHEAD;
 use crate::catalogue::Cause;
 
 /// A cause with the columns that it needs; see [`super::rows::COLUMNS`].
@@ -31,6 +32,6 @@ pub(super) const HYPOTHESES: [Hypothesis; 14] = [
     of(Cause::TimeOffset, TARGETS_CLOCK),
 ];
 
-/// Columns of a late clock of the objects where the ego speed is not known: the constant is the share of the ego
-/// speed.
-pub(super) const TARGETS_CLOCK: &[usize] = &[0, 3];
+/// Columns of a late clock of the objects where the ego speed is not known: the share of the ego speed and that of the
+/// relative one.
+pub(super) const TARGETS_CLOCK: &[usize] = &[AHEAD, 3];

@@ -3,7 +3,6 @@
 use super::Side;
 use crate::channels::labels::ObjectShift;
 use crate::channels::mean::origins;
-use crate::channels::motion::OwnMotion;
 use crate::inference::linear::LinearFrame;
 use crate::search::Context;
 use crate::search::geometry::Displacement;
@@ -27,10 +26,18 @@ pub(super) enum Column {
     Wider,
     /// Relative velocity times the phase of the scan.
     Swept,
+    /// Ahead along the heading of the ego vehicle: the ego speed, where it is not known, times the error of a clock.
+    Ahead,
 }
 
+/// Number of columns.
+pub(super) const ALL: usize = 9;
+
+/// Number of [`Column::Ahead`].
+pub(super) const AHEAD: usize = 8;
+
 /// All columns, in the order of their numbers.
-pub(super) const COLUMNS: [Column; 8] = [
+pub(super) const COLUMNS: [Column; ALL] = [
     Column::Forward,
     Column::Left,
     Column::Up,
@@ -39,6 +46,7 @@ pub(super) const COLUMNS: [Column; 8] = [
     Column::Longer,
     Column::Wider,
     Column::Swept,
+    Column::Ahead,
 ];
 
 /// Largest shift of an object that is used, m.
@@ -57,11 +65,11 @@ pub(super) struct Row {
     /// Variance of the shift, m2.
     pub(super) variance: [f64; 3],
     /// Derivatives by the columns, by axis.
-    pub(super) x: [[f64; 8]; 3],
+    pub(super) x: [[f64; ALL]; 3],
     /// Velocity over the ground along the heading, m/s.
     pub(super) speed: Option<f64>,
     /// Whether each column is known of this object.
-    pub(super) known: [bool; 8],
+    pub(super) known: [bool; ALL],
 }
 
 impl Row {
@@ -73,6 +81,11 @@ impl Row {
         coefficients: impl IntoIterator<Item = &'a f64>,
     ) -> f64 {
         columns.iter().zip(coefficients).map(|(&c, t)| self.x[axis][c] * t).sum::<f64>()
+    }
+
+    /// Shift along an axis that coefficients of all columns leave, m.
+    fn residual(&self, axis: usize, theta: &DVector<f64>) -> f64 {
+        self.shift[axis] - (0..ALL).map(|k| self.x[axis][k] * theta[k]).sum::<f64>()
     }
 
     /// Weight of a shift along an axis: shifts beyond 2 m and six standard deviations count less.
@@ -104,16 +117,17 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
     if shift.iter().any(|v| v.abs() > LARGEST_M) {
         return None;
     }
-    let mut x = [[0.0; 8]; 3];
+    let mut x = [[0.0; ALL]; 3];
     for (k, x) in x.iter_mut().enumerate() {
         x[k] = 1.0;
     }
     let mount = &context.rig.sensors[sensor];
-    let motion = context.motion.as_deref().and_then(|m| m[s.frame]);
-    let (speed, known) = velocity_columns(&mut x, s.seen_velocity_m_s, &center, mount, motion, axes);
+    let known = velocity_columns(&mut x, s, &center, mount);
     let towards = axes(-center / center.norm().max(1e-6));
     x[0][5] = towards[0];
     x[1][6] = towards[1];
+    let ahead = axes(Vector3::x());
+    (0..3).for_each(|k| x[k][AHEAD] = ahead[k]);
     Some(Row {
         frame: s.frame,
         object: s.object,
@@ -122,77 +136,88 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
         shift,
         variance,
         x,
-        speed,
+        speed: s.speed_m_s,
         known,
     })
 }
 
-/// Fills the columns of velocities. Returns the velocity over the ground along the heading, and which columns are
-/// known.
-fn velocity_columns(
-    x: &mut [[f64; 8]; 3],
-    seen: Option<[f64; 3]>,
-    center: &Vector3<f64>,
-    mount: &Sensor,
-    motion: Option<OwnMotion>,
-    axes: impl Fn(Vector3<f64>) -> [f64; 3],
-) -> (Option<f64>, [bool; 8]) {
-    let mut known = [true; 8];
-    let Some(seen) = seen else {
+/// Fills the columns of velocities. Returns which columns are known.
+fn velocity_columns(x: &mut [[f64; ALL]; 3], s: &ObjectShift, center: &Vector3<f64>, mount: &Sensor) -> [bool; ALL] {
+    let mut known = [true; ALL];
+    let Some(seen) = s.seen_velocity_m_s else {
         (known[3], known[4], known[7]) = (false, false, false);
-        return (None, known);
+        return known;
     };
-    (0..3).for_each(|k| x[k][3] = seen[k]);
     let [azimuth_rad, elevation_rad, _] = Sensor::spherical(&mount.pose().inverse_transform_point(&(*center).into()));
     let phase = mount.scan_phase(azimuth_rad, elevation_rad);
-    (0..3).for_each(|k| x[k][7] = seen[k] * phase);
-    let Some(own) = motion else {
-        known[4] = false;
-        return (None, known);
-    };
-    let carried = axes(own.velocity_at(center));
-    (0..3).for_each(|k| x[k][4] = seen[k] + carried[k]);
-    (Some(x[0][4]), known)
+    (0..3).for_each(|k| (x[k][3], x[k][7]) = (seen[k], seen[k] * phase));
+    // Vehicles move along their heading.
+    x[0][4] = s.speed_m_s.unwrap_or(0.0);
+    known[4] = s.speed_m_s.is_some();
+    known
 }
 
 /// Leaves columns out that are not known of more than 60 % of the objects, then objects with an unknown column.
 /// Returns which columns are used.
-pub(super) fn keep_known(rows: &mut Vec<Row>) -> [bool; 8] {
+pub(super) fn keep_known(rows: &mut Vec<Row>) -> [bool; ALL] {
     let share = |k: usize| rows.iter().filter(|r| r.known[k]).count() as f64 / rows.len() as f64;
-    let usable: [bool; 8] = std::array::from_fn(|k| share(k) > 0.6);
-    rows.retain(|r| (0..8).all(|k| r.known[k] || !usable[k]));
-    rows.iter_mut().for_each(|r| r.x.iter_mut().for_each(|x| (0..8).filter(|&k| !usable[k]).for_each(|k| x[k] = 0.0)));
+    let usable: [bool; ALL] = std::array::from_fn(|k| share(k) > 0.6);
+    rows.retain(|r| (0..ALL).all(|k| r.known[k] || !usable[k]));
+    rows.iter_mut()
+        .for_each(|r| r.x.iter_mut().for_each(|x| (0..ALL).filter(|&k| !usable[k]).for_each(|k| x[k] = 0.0)));
     usable
 }
 
-/// Sets the variances to the robust variance of the residuals of a fit of all columns, axis by axis.
+/// Rounds of the robust fit.
+const ROUNDS: usize = 25;
+
+/// Residual from which on a row counts less: in standard deviations, and beyond these, m. Velocities of other objects
+/// are off by metres per second, which a clock turns into decimetres.
+const OUTLYING: (f64, f64) = (3.0, 0.1);
+
+/// Sets the variances to the robust variance of the residuals of a fit of all columns, axis by axis; larger where the
+/// residual is [`OUTLYING`]: among the velocities are some of other objects.
 pub(super) fn set_noise(rows: &mut [Row], select: &[usize], side: Side) {
     for axis in 0..3 {
-        let mut gram = DMatrix::<f64>::identity(8, 8) * 1e-3;
-        let mut right = DVector::<f64>::zeros(8);
-        for r in rows.iter().filter(|r| select.contains(&r.frame)) {
-            let x = DVector::from_row_slice(&r.x[axis]);
-            let w = if side == Side::Labels { 1.0 } else { 1.0 / (r.variance[axis] + 0.05f64.powi(2)) };
-            gram += &x * x.transpose() * w;
-            right += &x * (w * r.shift[axis]);
-        }
-        let theta = gram.try_inverse().map_or_else(|| DVector::zeros(8), |inverse| inverse * right);
-        let left: Vec<f64> = rows
-            .iter()
-            .filter(|r| select.contains(&r.frame))
-            .filter(|r| side == Side::Labels || r.variance[axis] < 0.1)
-            .map(|r| (r.shift[axis] - (0..8).map(|k| r.x[axis][k] * theta[k]).sum::<f64>()).abs())
-            .collect();
-        let scale = (statistics::median_upper(left).unwrap_or(0.1) / statistics::MEDIAN_OF_NORMAL).max(0.008);
+        let (theta, scale) = robust_fit(rows, select, side, axis);
         for r in rows.iter_mut() {
-            r.variance[axis] = if side == Side::Labels { scale * scale } else { r.variance[axis] + scale * scale };
+            let variance = if side == Side::Labels { scale * scale } else { r.variance[axis] + scale * scale };
+            let residual = r.residual(axis, &theta).abs() / (OUTLYING.0 * variance.sqrt() + OUTLYING.1);
+            r.variance[axis] = variance * residual.max(1.0).powi(2);
         }
     }
 }
 
+/// Coefficients of all columns along an axis, and the standard deviation of what is left of the selecting frames'
+/// objects, m. Residuals count as if they had a Cauchy distribution.
+fn robust_fit(rows: &[Row], select: &[usize], side: Side, axis: usize) -> (DVector<f64>, f64) {
+    let error = |r: &Row| if side == Side::Labels { 0.0 } else { r.variance[axis].sqrt() };
+    let used: Vec<&Row> = rows.iter().filter(|r| select.contains(&r.frame)).collect();
+    let (mut theta, mut scale) = (DVector::zeros(ALL), None);
+    for _ in 0..ROUNDS {
+        let mut gram = DMatrix::<f64>::identity(ALL, ALL) * 1e-3;
+        let mut right = DVector::<f64>::zeros(ALL);
+        for r in &used {
+            let x = DVector::from_row_slice(&r.x[axis]);
+            let own = if side == Side::Labels { 1.0 } else { 1.0 / (r.variance[axis] + 0.05f64.powi(2)) };
+            let unlike =
+                scale.map_or(0.0, |scale: f64| r.residual(axis, &theta) / (2.0 * scale.hypot(error(r)) + OUTLYING.1));
+            let w = own / (1.0 + unlike * unlike);
+            gram += &x * x.transpose() * w;
+            right += &x * (w * r.shift[axis]);
+        }
+        theta = gram.try_inverse().map_or_else(|| DVector::zeros(ALL), |inverse| inverse * right);
+        let sharp = used.iter().filter(|r| side == Side::Labels || r.variance[axis] < 0.1);
+        let left: Vec<f64> = sharp.map(|r| r.residual(axis, &theta).abs()).collect();
+        let robust = statistics::median_upper(left).unwrap_or(0.1) / statistics::MEDIAN_OF_NORMAL;
+        scale = Some(robust.max(0.008));
+    }
+    (theta, scale.unwrap_or(0.1))
+}
+
 /// Linear sums of one frame over all columns.
 pub(super) fn sums(rows: &[Row], frame: usize) -> LinearFrame {
-    let mut out = LinearFrame { gram: DMatrix::zeros(8, 8), right: DVector::zeros(8) };
+    let mut out = LinearFrame { gram: DMatrix::zeros(ALL, ALL), right: DVector::zeros(ALL) };
     for r in rows.iter().filter(|r| r.frame == frame) {
         for axis in 0..3 {
             let x = DVector::from_row_slice(&r.x[axis]);

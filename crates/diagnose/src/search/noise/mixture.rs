@@ -1,7 +1,7 @@
 //! Tails of range noise as a mixture: larger errors of single shots, and returns that are spread evenly about surfaces.
 
-use crate::channels::tails::{BEYOND, SIZES, Tail, TailBin, size_m};
-use crate::inference::counts::likelihood_of_counts;
+use crate::channels::tails::{BEYOND, FrameTails, KINDS, LEAST_OFF_M, SIZES, Tail, TailBin, size_m};
+use crate::inference::counts::{likelihood_beside, likelihood_of_counts};
 use crate::inference::simplex::minimise;
 
 /// Law of the larger errors.
@@ -63,16 +63,47 @@ struct Usual {
     within: [f64; SIZES],
 }
 
-/// Returns by their usual distance from surfaces.
-fn usual(tails: &[&[Tail; 2]]) -> Vec<Usual> {
-    let mut sum = vec![TailBin::default(); tails.first().map_or(0, |t| t[0].bins.len())];
-    tails.iter().flat_map(|t| t[0].bins.iter().enumerate()).for_each(|(to, of)| sum[to].merge(of));
-    let of_bin = |bin: TailBin| {
-        // Half of a bin reaches its middle.
-        let farther = |k: usize| bin.most[k + 1..].iter().sum::<f64>() + 0.5 * bin.most[k];
-        Usual { distance_m: bin.usual_m / bin.all, within: std::array::from_fn(farther) }
-    };
-    sum.into_iter().filter(|b| b.all > 0.0).map(of_bin).collect()
+/// Tails on surfaces of one kind, summed over frames.
+struct OfKind {
+    usual: Vec<Usual>,
+    /// Returns: measured, simulated.
+    all: [f64; 2],
+    /// Those in the tail by size.
+    sizes: [[f64; SIZES]; 2],
+}
+
+impl OfKind {
+    fn new(tails: &[&FrameTails], kind: usize) -> OfKind {
+        let mut bins = vec![TailBin::default(); tails.first().map_or(0, |t| t[kind][0].bins.len())];
+        tails.iter().flat_map(|t| t[kind][0].bins.iter().enumerate()).for_each(|(to, of)| bins[to].merge(of));
+        let of_bin = |bin: TailBin| {
+            // Half of a bin reaches its middle.
+            let farther = |k: usize| bin.most[k + 1..].iter().sum::<f64>() + 0.5 * bin.most[k];
+            Usual { distance_m: bin.usual_m / bin.all, within: std::array::from_fn(farther) }
+        };
+        let sum = |side: usize, of: &dyn Fn(&Tail) -> f64| tails.iter().map(|t| of(&t[kind][side])).sum::<f64>();
+        OfKind {
+            usual: bins.into_iter().filter(|b| b.all > 0.0).map(of_bin).collect(),
+            all: [0, 1].map(|side| sum(side, &|t| t.all)),
+            sizes: [0, 1].map(|side| std::array::from_fn(|k| sum(side, &|t| t.sizes[k]))),
+        }
+    }
+
+    fn all_kinds(tails: &[&FrameTails]) -> [OfKind; KINDS] {
+        std::array::from_fn(|kind| OfKind::new(tails, kind))
+    }
+
+    /// Share of the simulated returns in the tail by size.
+    fn simulated(&self) -> [f64; SIZES] {
+        self.sizes[1].map(|n| n / self.all[1].max(1.0))
+    }
+
+    /// Likelihood of what is measured by size if a mixture is there beside what is simulated, and the likeliest factor
+    /// on that.
+    fn likelihoods(&self, mixture: &Mixture) -> [[f64; 2]; SIZES] {
+        let (simulated, expected) = (self.simulated(), expected(&self.usual, mixture));
+        std::array::from_fn(|k| likelihood_beside(self.sizes[0][k], simulated[k] * self.all[0], expected[k]))
+    }
 }
 
 /// Expected number of returns in the tail by their size.
@@ -81,7 +112,7 @@ fn expected(usual: &[Usual], mixture: &Mixture) -> [f64; SIZES] {
     for Usual { distance_m, within } in usual {
         let beyond = |size_m: f64| mixture.law.beyond(size_m, *distance_m, mixture.std_m);
         for (bin, sum) in out.iter_mut().enumerate().filter(|(bin, _)| within[*bin] > 0.0) {
-            let [from, to] = [size_m(bin).max(BEYOND * distance_m), size_m(bin + 1)];
+            let [from, to] = [size_m(bin).max(BEYOND * distance_m).max(LEAST_OFF_M), size_m(bin + 1)];
             if from < to {
                 // What is spread evenly alone has no law.
                 let of_law = if mixture.share > 0.0 { beyond(from) - beyond(to) } else { 0.0 };
@@ -92,11 +123,17 @@ fn expected(usual: &[Usual], mixture: &Mixture) -> [f64; SIZES] {
     out
 }
 
-/// What is likeliest to be in the measured tails beside what is in the simulated ones (Poisson).
+/// What is likeliest to be in the measured tails beside what is in the simulated ones (Poisson). Walls have a relief
+/// and leaves, of which the two sides may show different parts: for each kind of surface and each size what is
+/// simulated has a factor. The ground, which has little of either, tells most.
 #[derive(Clone, Copy)]
 pub(super) struct Fit {
-    /// Share of the simulated returns in the tail by size.
-    simulated: [f64; SIZES],
+    /// Share of the simulated returns in the tail by kind of surface and size.
+    simulated: [[f64; SIZES]; KINDS],
+    /// Factors on these beside the mixture.
+    factors: [[f64; SIZES]; KINDS],
+    /// By how much the mixture is likelier than what is spread evenly alone, nats, both with their likeliest factors.
+    pub(super) evidence: f64,
     /// With errors of the law that is likelier.
     pub(super) mixture: Mixture,
     /// With normal ones, as the simulator has them.
@@ -109,26 +146,19 @@ pub(super) struct Fit {
 
 impl Fit {
     /// Of some frames; `None` where the simulated side has as many.
-    pub(super) fn of(tails: &[&[Tail; 2]]) -> Option<Fit> {
-        let sum = |side: usize, of: &dyn Fn(&Tail) -> f64| tails.iter().map(|t| of(&t[side])).sum::<f64>();
-        let all = [0, 1].map(|side| sum(side, &|t| t.all).max(1.0));
-        let sizes = |side: usize| std::array::from_fn::<f64, SIZES, _>(|k| sum(side, &|t| t.sizes[k]));
-        let [measured, simulated] = [sizes(0), sizes(1).map(|n| n / all[1])];
-        let excess: f64 = measured.iter().zip(simulated).map(|(a, b)| a - b * all[0]).sum();
-        if excess <= 0.0 {
+    pub(super) fn of(tails: &[&FrameTails]) -> Option<Fit> {
+        let kinds = OfKind::all_kinds(tails);
+        let excess = |of: &OfKind| {
+            let [measured, simulated] = of.sizes.map(|sizes| sizes.iter().sum::<f64>());
+            (measured - simulated * of.all[0] / of.all[1].max(1.0)) / of.all[0].max(1.0)
+        };
+        let share = kinds.iter().map(excess).fold(0.0, f64::max);
+        if share <= 0.0 {
             return None;
         }
-        let usual = usual(tails);
-        let surprise = |mixture: &Mixture| {
-            let expected = expected(&usual, mixture);
-            let of_bin = |k: usize| {
-                let rate = (expected[k] + simulated[k] * all[0]).max(1e-6);
-                rate - measured[k] * rate.ln()
-            };
-            (0..SIZES).map(of_bin).sum::<f64>()
-        };
+        let surprise =
+            |mixture: &Mixture| -kinds.iter().flat_map(|of| of.likelihoods(mixture)).map(|l| l[0]).sum::<f64>();
         let stray = |p: &[f64]| Mixture { law: Law::Normal, share: 0.0, std_m: 0.0, stray_per_m: p[0].exp() };
-        let share = excess / all[0];
         let start = [(2.0 * share).ln(), 0.1f64.ln(), (0.1 * share).ln()];
         let fitted = |law: Law| {
             let mixture = |p: &[f64]| Mixture { law, share: p[0].exp(), std_m: p[1].exp(), stray_per_m: p[2].exp() };
@@ -137,29 +167,45 @@ impl Fit {
         };
         let [(normal, by_normal), (laplace, by_laplace)] = [Law::Normal, Law::Laplace].map(fitted);
         let mixture = if by_normal <= by_laplace { normal } else { laplace };
-        let (alone, _) = minimise(&[share.ln()], &[0.5], |p| surprise(&stray(p)));
-        let of_law = [normal.share - laplace.share, normal.std_m - laplace.std_m].map(|d| 0.5 * d.abs());
-        let fit = Fit { simulated, mixture, normal, of_law, without: stray(&alone) };
+        let (alone, by_stray) = minimise(&[share.ln()], &[0.5], |p| surprise(&stray(p)));
+        let without = stray(&alone);
+        let fit = Fit {
+            simulated: kinds.each_ref().map(OfKind::simulated),
+            factors: kinds.each_ref().map(|of| of.likelihoods(&mixture).map(|l| l[1])),
+            evidence: by_stray - by_normal.min(by_laplace),
+            mixture,
+            normal,
+            of_law: [normal.share - laplace.share, normal.std_m - laplace.std_m].map(|d| 0.5 * d.abs()),
+            without,
+        };
         (fit.mixture.share < 0.5).then_some(fit)
     }
 
     /// Gain of a frame by the tail over what is spread evenly alone, nats.
-    pub(super) fn gain(&self, frame: &[Tail; 2]) -> f64 {
-        let usual = usual(&[frame]);
-        let base = frame.each_ref().map(|side| self.simulated.map(|share| share * side.all));
-        let likelihood = |mixture: Mixture| {
-            let sizes = frame.each_ref().map(|side| side.sizes.as_slice());
-            likelihood_of_counts(sizes, base.each_ref().map(|of| of.as_slice()), &expected(&usual, &mixture))
+    pub(super) fn gain(&self, frame: &FrameTails) -> f64 {
+        let of_kind = |(kind, of): (usize, OfKind)| {
+            let simulated = self.simulated[kind].map(|share| share * of.all[1]);
+            let measured: [f64; SIZES] =
+                std::array::from_fn(|k| self.factors[kind][k] * self.simulated[kind][k] * of.all[0]);
+            let likelihood = |mixture: &Mixture| {
+                let counts = of.sizes.each_ref().map(|sizes| sizes.as_slice());
+                likelihood_of_counts(counts, [&measured, &simulated], &expected(&of.usual, mixture))
+            };
+            likelihood(&self.mixture) - likelihood(&self.without)
         };
-        likelihood(self.mixture) - likelihood(self.without)
+        OfKind::all_kinds(&[frame]).into_iter().enumerate().map(of_kind).sum()
     }
 
     /// Shares of the returns in the tail: those of the simulated side, and those that are of the noise.
-    pub(super) fn shares(&self, tails: &[&[Tail; 2]]) -> [f64; 2] {
-        let usual = usual(tails);
-        let of_noise = expected(&usual, &Mixture { stray_per_m: 0.0, ..self.mixture });
-        let all: f64 = tails.iter().map(|t| t[0].all).sum();
-        [self.simulated.iter().sum(), of_noise.iter().sum::<f64>() / all.max(1.0)]
+    pub(super) fn shares(&self, tails: &[&FrameTails]) -> [f64; 2] {
+        let of_noise = Mixture { stray_per_m: 0.0, ..self.mixture };
+        let of_kind = |(of, simulated): (&OfKind, &[f64; SIZES])| {
+            [simulated.iter().sum::<f64>() * of.all[0], expected(&of.usual, &of_noise).iter().sum(), of.all[0]]
+        };
+        let kinds = OfKind::all_kinds(tails);
+        let of_kinds: Vec<[f64; 3]> = kinds.iter().zip(&self.simulated).map(of_kind).collect();
+        let [simulated, noise, all] = [0, 1, 2].map(|k| of_kinds.iter().map(|v| v[k]).sum::<f64>());
+        [simulated, noise].map(|n| n / all.max(1.0))
     }
 }
 
@@ -203,13 +249,15 @@ mod tests {
         for (law, stray) in [(Law::Normal, 0.0), (Law::Normal, 0.01), (Law::Laplace, 0.0), (Law::Laplace, 0.01)] {
             let truth = Mixture { law, share: 0.01, std_m: 0.15, stray_per_m: 0.0 };
             let [with, without] = [side(&mut rng, Some(truth), stray), side(&mut rng, None, 0.0)];
-            let fit = Fit::of(&[&[with.clone(), without.clone()]]).unwrap();
+            let frame =
+                |sides: [&Tail; 2]| -> FrameTails { [sides.map(Tail::clone), Default::default(), Default::default()] };
+            let fit = Fit::of(&[&frame([&with, &without])]).unwrap();
             let (found, [of_share, of_std]) = (fit.mixture, fit.of_law);
             assert!(stray > 0.0 || found.law == law, "{found:?}");
             // Beside what is spread evenly the law is hard to tell.
             assert!((found.share - truth.share).abs() < 0.1 * truth.share + 2.0 * of_share, "{found:?} {of_share}");
             assert!((found.std_m - truth.std_m).abs() < 0.1 * truth.std_m + 2.0 * of_std, "{found:?} {of_std}");
-            assert!(Fit::of(&[&[without, with]]).is_none(), "the simulated side has them");
+            assert!(Fit::of(&[&frame([&without, &with])]).is_none(), "the simulated side has them");
         }
     }
 
@@ -218,7 +266,8 @@ mod tests {
         let mut rng = data::stream(5, "tails", 0, 0);
         let truth = Mixture { law: Law::Normal, share: 0.005, std_m: 0.2, stray_per_m: 0.0 };
         let mut gain = |tails: Option<Mixture>| {
-            let frames = [0, 1].map(|_| [side(&mut rng, tails, 0.02), side(&mut rng, None, 0.0)]);
+            let mut frame = || [side(&mut rng, tails, 0.02), side(&mut rng, None, 0.0)];
+            let frames = [0, 1].map(|_| -> FrameTails { [frame(), Default::default(), Default::default()] });
             Fit::of(&[&frames[0]]).map_or(0.0, |fit| fit.gain(&frames[1]))
         };
         let [none, some] = [gain(None), gain(Some(truth))];

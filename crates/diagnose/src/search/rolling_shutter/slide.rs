@@ -53,7 +53,8 @@ pub(super) fn driven(context: &Context) -> Option<Vec<Motion>> {
     let (times, own) = (context.times.as_ref()?, context.driving()?);
     let motion = |(f, own): (usize, OwnMotion)| {
         let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
-        let moving = boxes.filter_map(|b| Some((b, seen_velocity(context.frames, times, f, &b)?)));
+        let moving = boxes
+            .filter_map(|b| Some((b, seen_velocity(context.frames, times, f, &b, &context.to_next)?.relative_m_s)));
         Motion { own, objects: moving.collect() }
     };
     Some(own.into_iter().enumerate().map(motion).collect())
@@ -228,6 +229,7 @@ mod tests {
             roles: roles(20),
             times: Some((0..20).map(f64::from).collect()),
             motion: Some(vec![Some(OwnMotion::ahead(8.0)); 20]),
+            to_next: vec![],
         };
         let (mut slide, mut found) = from_above(&context);
         assert_eq!(slide.left(), [Column::Scan, Column::Uneven]);
@@ -246,7 +248,8 @@ mod tests {
     fn a_shear_of_surfaces_moves_all_that_stands() {
         let rig = Rig::single();
         let frames = [FramePair::of_rays("0".into(), vec![], vec![])];
-        let context = Context { rig: &rig, frames: &frames, roles: roles(1), times: None, motion: None };
+        let context =
+            Context { rig: &rig, frames: &frames, roles: roles(1), times: None, motion: None, to_next: vec![] };
         let slide = Slide::of_surfaces(&context, Swept::Shear([[0.4, 0.0], [0.0; 2], [0.02, 0.0]]));
         assert!(slide.left().is_empty());
         let shift_m = slide.shift_m(0, &Vector3::new(0.0, 10.0, 0.0), 0);
