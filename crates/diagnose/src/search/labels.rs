@@ -229,9 +229,9 @@ impl Search<'_> {
         Some((chosen, selected))
     }
 
-    /// Rival causes of the first hypothesis. Where velocities over the ground are not known, a forward shift that is the
-    /// same for all objects may be a late clock, unless relative velocities contradict it, or the shifts scatter less
-    /// than the speeds of a long recording.
+    /// Rival causes of the first hypothesis. Where velocities over the ground are not known, a forward shift that is
+    /// the same for all objects may be a late clock, unless relative velocities contradict it, or the shifts scatter
+    /// less than the speeds of a long recording.
     fn rivals_of_first(&self, trials: &[Trial], chosen: usize, equals: &[usize]) -> Vec<Cause> {
         let mut rivals = causes_of(trials, equals);
         if self.side == Side::Objects {

@@ -33,8 +33,8 @@ const SPEEDS_DIFFER: f64 = 0.2;
 /// Shortest recording of which this holds, s.
 const LONG_S: f64 = 10.0;
 
-/// Whether all objects are shifted forward alike: a late clock would shift each by its own speed, so that shifts along
-/// the heading would scatter more than those across it.
+/// Whether all objects are shifted forward alike: a late clock would shift each by its speed, so that shifts along the
+/// heading would scatter more than those across it.
 pub(super) fn alike(rows: &[Row], which: &[usize], times: Option<&[f64]>) -> bool {
     let long = times.is_some_and(|t| t.last().zip(t.first()).is_some_and(|(last, first)| last - first > LONG_S));
     let rows: Vec<&Row> = rows.iter().filter(|r| which.contains(&r.frame)).collect();
