@@ -189,8 +189,8 @@ fn compare(case: &Case, variants: &[Variant], plain: &Side, index: usize, weight
     let counts = vec![Counts::default(); side.effects.len()];
     let mut sums = FrameEvidence { counts, ..FrameEvidence::default() };
     let mut on_vehicle: BTreeMap<u32, f64> = BTreeMap::new();
-    for (sensor, mount) in side.mounts.iter().enumerate() {
-        let shots = mount.shots(sensor, &side.nuisances.dither, &mut side.stream(&format!("shots {sensor}"), index));
+    for sensor in 0..side.mounts.len() {
+        let shots = side.shots(sensor, index);
         // An odd step visits all rows.
         let stride = (shots.len() * side.mounts.len()).div_ceil(SHOTS) | 1;
         let each = weight * stride as f64;

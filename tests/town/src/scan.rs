@@ -51,8 +51,7 @@ impl Frame<'_> {
         let mut on_vehicle = vec![0; side.world.vehicles.len()];
         for (k, mount) in side.mounts.iter().enumerate() {
             let pose = mount.pose();
-            let shots = mount.shots(k, &side.nuisances.dither, &mut side.stream(&format!("shots {k}"), self.index));
-            for shot in &shots {
+            for shot in &side.shots(k, self.index) {
                 self.shoot(shot, &pose, rng, &mut scan, &mut on_vehicle);
             }
         }

@@ -2,7 +2,7 @@
 
 use crate::effect::Effect;
 use crate::scenario::Scenario;
-use crate::sensor::{Dither, Mount};
+use crate::sensor::{Dither, Mount, Shot};
 use crate::setting::Setting;
 use crate::solid::{Block, Material};
 use crate::town::rolling;
@@ -171,6 +171,12 @@ impl Side {
     /// A stream of random numbers of this side.
     pub fn stream(&self, purpose: &str, frame: usize) -> Stream {
         data::stream(self.seed, &format!("town {} {purpose}", self.name), 0, frame as u64)
+    }
+
+    /// The shots of a sensor in a frame.
+    pub fn shots(&self, sensor: usize, frame: usize) -> Vec<Shot> {
+        let rng = &mut self.stream(&format!("shots {sensor}"), frame);
+        self.mounts[sensor].shots(sensor, &self.nuisances.dither, rng)
     }
 }
 

@@ -94,9 +94,8 @@ fn sprayed(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
     let of_frame = |index: usize| {
         let frame = Frame::new(side, index);
         let mut sum = [0.0; 2];
-        for (sensor, mount) in side.mounts.iter().enumerate() {
-            let all = mount.shots(sensor, &side.nuisances.dither, &mut side.stream(&format!("shots {sensor}"), index));
-            for shot in all.iter().step_by(shots) {
+        for sensor in 0..side.mounts.len() {
+            for shot in side.shots(sensor, index).iter().step_by(shots) {
                 if let Some(([from, to], times)) = frame.plume_m(shot, REACH_M) {
                     sum = [sum[0] + (to - from), sum[1] + times * (to - from)];
                 }

@@ -33,8 +33,8 @@ pub struct ObjectShift {
     pub points: usize,
 }
 
-/// Shifts of all objects; times of the frames, s, where they are known, and motion of the
-/// ego vehicle from each frame to the next.
+/// Shifts of all objects, from the times of the frames, s, where they are known, and the motion of the ego vehicle from
+/// each frame to the next.
 pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>, to_next: &[Option<OwnMotion>]) -> Vec<ObjectShift> {
     let mut shifts = Vec::new();
     for (f, frame) in frames.iter().enumerate() {
@@ -61,8 +61,7 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>, to_next: &[Opt
     shifts
 }
 
-/// Velocity of a simulated box of frame `f`; see
-/// [`sensor::motion::seen_velocity`].
+/// Velocity of a simulated box of frame `f`; see [`sensor::motion::seen_velocity`].
 pub fn seen_velocity(
     frames: &[FramePair],
     times: &[f64],

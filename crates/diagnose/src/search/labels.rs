@@ -91,8 +91,8 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let line = within_frames(&rows, &select, &blocks);
     let frames: Vec<&LinearFrame> = on_select.iter().collect();
     let gains = |columns: &[usize]| cross_gains(&frames, &blocks, columns, &NO_PRIOR);
-    let more_alike: Vec<f64> = gains(&[0]).iter().zip(gains(TARGETS_CLOCK)).map(|(a, b)| a - b).collect();
-    let clock = usable[3] && surely_late(forward(&rows, line[0]), line, speeds) && !significant(&more_alike, Z_STAR);
+    let more_alike = || gains(&[0]).iter().zip(gains(TARGETS_CLOCK)).map(|(a, b)| a - b).collect::<Vec<f64>>();
+    let clock = usable[3] && surely_late(forward(&rows, line[0]), line, speeds) && !significant(&more_alike(), Z_STAR);
     let demands = Demands { nats: 6.0, slack: 0.03, richer: 0.03, ..first_demands() };
     let search =
         Search { context, side, rows, usable, blocks, on_select, speeds, line, clock, demands, estimate, hold_out };

@@ -11,9 +11,11 @@ const FASTEST_M_S: [f64; 2] = [5.0, 60.0];
 /// distance along it.
 const ACROSS_M: [f64; 2] = [0.6, 0.15];
 
-/// Without the motion of the ego vehicle: longest time to another frame, s, and largest distance of an object from its
-/// place there, m.
-const UNGUIDED: (f64, f64) = (0.6, 5.0);
+/// Longest time to another frame without the motion of the ego vehicle, s.
+const UNGUIDED_S: f64 = 0.6;
+
+/// Largest distance of an object from its place in another frame without that motion, m.
+const UNGUIDED_M: f64 = 5.0;
 
 /// How many metres of distance a metre of different size counts like. An object keeps its size.
 const SIZE_COUNTS: f64 = 20.0;
@@ -60,7 +62,7 @@ pub fn seen_velocity(
     let candidates = |g: usize| -> Vec<Same> {
         let own = to_next.get(f.min(g)).copied().flatten();
         let dt = times[g] - times[f];
-        let longest_s = if own.is_some() { LONGEST_S } else { UNGUIDED.0 };
+        let longest_s = if own.is_some() { LONGEST_S } else { UNGUIDED_S };
         // Times are sums of steps.
         let near = dt.abs() < longest_s + 1e-3;
         boxes(g).iter().filter(|_| near).filter_map(|b| same(bbox, b, dt, own)).collect()
@@ -105,7 +107,7 @@ fn same(bbox: &Box3, other: &Box3, dt: f64, own: Option<OwnMotion>) -> Option<Sa
         Some(_) => {
             (-backwards..forwards).contains(&speed_m_s) && away.y.abs() < ACROSS_M[0] + ACROSS_M[1] * away.x.abs()
         }
-        None => moved.norm() < (forwards * dt.abs()).min(UNGUIDED.1),
+        None => moved.norm() < (forwards * dt.abs()).min(UNGUIDED_M),
     };
     let unlike_m = away.norm() + SIZE_COUNTS * other_size_m;
     (like && possible).then_some(Same { dt, moved, speed_m_s, over_ground: own.is_some(), unlike_m })

@@ -31,13 +31,13 @@ pub(super) enum Column {
 }
 
 /// Number of columns.
-pub(super) const ALL: usize = 9;
+pub(super) const ALL: usize = COLUMNS.len();
 
 /// Number of [`Column::Ahead`].
 pub(super) const AHEAD: usize = 8;
 
 /// All columns, in the order of their numbers.
-pub(super) const COLUMNS: [Column; ALL] = [
+pub(super) const COLUMNS: [Column; 9] = [
     Column::Forward,
     Column::Left,
     Column::Up,

@@ -51,9 +51,9 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     let on_select = tail(&select);
     let leverage = leverage(context);
     let on_estimate = tail(&estimate);
-    let [fitted, again] = [&on_select, &on_estimate].map(|tails| Fit::of(tails));
+    let [fitted, on_others] = [&on_select, &on_estimate].map(|tails| Fit::of(tails));
     let gains = cross_gains(&on_select, &context.blocks(&select));
-    let [evidence, again] = [fitted, again].map(|fit| fit.map_or(0.0, |fit| fit.evidence));
+    let [evidence, again] = [fitted, on_others].map(|fit| fit.map_or(0.0, |fit| fit.evidence));
     let (_, z) = total_and_z(&gains);
     let [base, share] = fitted.map_or([0.0; 2], |fit| fit.shares(&on_select));
     let std_m = fitted.map_or(0.0, |fit| fit.mixture.std_m);
@@ -77,7 +77,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
         outcome: outcome.into(),
     });
     result.minimum.push((Cause::HeavyTails, Minimum::new(Quantity::Share, FLOOR.max(SHARE_OF_BASE * base))));
-    let Some(fitted) = Fit::of(&on_estimate) else { return 0.0 };
+    let Some(fitted) = on_others else { return 0.0 };
     if outcome != "chosen" {
         if clustered <= INDEPENDENT {
             take_out(rough, scales, fitted.without, leverage);
