@@ -15,6 +15,8 @@ pub mod motion;
 pub mod patch;
 pub mod plumes;
 pub mod range_ends;
+pub mod range_laws;
+pub mod range_mixture;
 pub mod returns;
 pub mod roughness;
 pub mod row_patches;

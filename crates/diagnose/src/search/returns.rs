@@ -8,6 +8,7 @@ mod spray;
 mod weather;
 
 use self::describe::found;
+use self::weather::Air;
 use super::{ChannelResult, Context, NamedParameter, Z_STAR, with_error};
 use crate::catalogue::{Cause, Channel, Kind, Quantity, Unit};
 use crate::channels::mean::origins;
@@ -18,7 +19,7 @@ use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::counts::likelihood_of_counts;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
-use crate::pairing::Lies;
+use crate::pairing::{FramePair, Lies};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 
@@ -77,7 +78,10 @@ pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> Channel
             spray = plumes.into_iter().map(|p| p.around).collect();
         }
     }
-    let ghosts = scenes == Scenes::Same && ghosts::search(context, [&select, &estimate, &hold_out], end_m, &mut result);
+    let ghosts = scenes == Scenes::Same && {
+        let air = air(context, &spray, &select, end_m);
+        ghosts::search(context, [&select, &estimate, &hold_out], &air, &mut result)
+    };
     let explained = |frame: usize, side: usize, ray: usize| {
         is_spray(&spray, frame, side, ray) || (ghosts && lies_behind(context, frame, side, ray))
     };
@@ -92,6 +96,12 @@ pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> Channel
 /// Whether a return, by the number of its frame, its side and its place there, may be one of spray.
 fn is_spray(spray: &[[HashSet<usize>; 2]], frame: usize, side: usize, ray: usize) -> bool {
     spray.get(frame).is_some_and(|of_frame| of_frame[side].contains(&ray))
+}
+
+/// Where the lone returns of some frames come from, without those of spray.
+fn air(context: &Context, spray: &[[HashSet<usize>; 2]], frames: &[usize], end_m: f64) -> Air {
+    let of_frames: Vec<&FramePair> = frames.iter().map(|&f| &context.frames[f]).collect();
+    Air::new(&of_frames, end_m, &|f, side, ray| is_spray(spray, frames[f], side, ray))
 }
 
 /// Whether a return lies behind a simulated surface.
@@ -258,7 +268,7 @@ impl Search<'_> {
         let [base, more] = self.excess(&self.estimate, kind);
         let share = share_of(more, &self.differences(&self.estimate, kind));
         let held: Vec<f64> = self.hold_out.iter().map(|&i| gain(&self.odd[i], k, base, more)).collect();
-        result.found.push(found(self, kind, share, held, evidence.z));
+        result.found.extend(found(self, kind, share, held, evidence.z));
         for (d, &i) in result.distance.iter_mut().zip(&self.hold_out) {
             let (before, after) = distance(&self.odd[i], k, base, more);
             *d = [d[0] + before, d[1] + before - after, d[2] + before - after];

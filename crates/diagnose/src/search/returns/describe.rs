@@ -1,17 +1,16 @@
 //! Findings of returns off the simulated surfaces: parameters, sentences and plots.
 
 use super::false_alarms::{FalseAlarms, false_alarms};
-use super::weather::{Weather, lost_with_range, weather};
-use super::{NamedParameter, Scenes, Search, cause, is_spray};
+use super::weather::{Weather, lost_with_range};
+use super::{NamedParameter, Scenes, Search, air};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::free_path::{Shape, bins};
+use crate::channels::range_laws::Shape;
 use crate::channels::returns::{self, Odd, OddFrame};
-use crate::channels::together::crowding;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Parameter, Status};
 use crate::effects::rounded;
 use crate::pairing::Ray;
-use crate::search::{Context, Found, Z_STAR, parameter};
+use crate::search::{Context, Found, parameter};
 use sensor::Effect;
 use sensor::effects::RangeLaw;
 
@@ -30,54 +29,83 @@ struct Description {
     parameters: Vec<NamedParameter>,
 }
 
-/// The finding of an excess of one kind of returns; `share` is the excess, `z` its significance on the selecting
-/// frames.
-pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Found {
-    let Description { causes, effects, covariate, says, parameters } = match kind {
+/// The findings of an excess of one kind of returns, one for each of its causes; `share` is the excess, `z` its
+/// significance on the selecting frames.
+pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Vec<Found> {
+    let described = match kind {
         Odd::Alone => alone(search, &share),
-        Odd::Between => mixed(search, share),
-        Odd::GroupInFront => Description {
-            causes: vec![cause(kind)],
-            effects: vec![],
-            covariate: Covariate::Place,
-            says: format!(
-                "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
-                100.0 * share.estimate
-            ),
-            parameters: vec![(Quantity::Share.into(), share)],
-        },
-        Odd::GroupBehind => behind(share),
+        Odd::Between => vec![(1.0, mixed(search, share))],
+        Odd::GroupInFront => vec![(1.0, in_front(share))],
+        Odd::GroupBehind => vec![(1.0, behind(share))],
     };
-    Found {
-        effects,
-        status: match causes.len() {
-            0 => Status::Unexplained,
-            1 => Status::Named,
-            _ => Status::Ambiguous,
-        },
-        separate_by: (causes.len() > 1).then(|| TELL_WEATHER_BY.into()),
-        causes,
-        parameters,
-        confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
-        channel: Channel::Returns,
-        covariate,
-        held_out_gains,
-        says,
-        curve: curve(search.context, kind, &search.estimate),
+    let curve = curve(search.context, kind, &search.estimate);
+    let finding = |(part, description): (f64, Description)| {
+        let Description { causes, effects, covariate, says, parameters } = description;
+        Found {
+            effects,
+            status: match causes.len() {
+                0 => Status::Unexplained,
+                1 => Status::Named,
+                _ => Status::Ambiguous,
+            },
+            separate_by: (causes.len() > 1).then(|| TELL_WEATHER_BY.into()),
+            causes,
+            parameters,
+            confidence: (z / (z + 1.0)).clamp(0.0, 1.0),
+            channel: Channel::Returns,
+            covariate,
+            held_out_gains: held_out_gains.iter().map(|nats| part * nats).collect(),
+            says,
+            curve: curve.clone(),
+        }
+    };
+    described.into_iter().map(finding).collect()
+}
+
+/// Describes grouped returns in front of simulated surfaces.
+fn in_front(share: Parameter) -> Description {
+    Description {
+        causes: vec![Cause::MissingObject],
+        effects: vec![],
+        covariate: Covariate::Place,
+        says: format!(
+            "{:.2} % of the measured returns lie together where the simulation has nothing: things are missing in it",
+            100.0 * share.estimate
+        ),
+        parameters: vec![(Quantity::Share.into(), share)],
     }
 }
 
-/// Describes returns that are alone in the air.
-fn alone(search: &Search, share: &Parameter) -> Description {
-    let alarms = false_alarms(search.context, &search.estimate, search.end_m, search.ghosts);
-    // No droplet is seen through a surface: returns behind them as well come from the receiver.
-    let description = match (!alarms.instead).then(|| weather_of(search)).flatten() {
-        Some(weather) => of_weather(&weather, share),
-        None => of_false_alarms(&alarms, share),
+/// Describes returns that are alone in the air: each of what they come from, with its part of them.
+fn alone(search: &Search, share: &Parameter) -> Vec<(f64, Description)> {
+    let air = air(search.context, &search.spray, &search.estimate, search.end_m);
+    let alarms = false_alarms(search.context, &search.estimate, search.end_m, search.ghosts, &air);
+    let frames: Vec<_> = search.estimate.iter().map(|&f| &search.context.frames[f]).collect();
+    let lost = |depth_m: f64| match search.scenes {
+        Scenes::Same => lost_with_range(&frames, depth_m),
+        Scenes::Different => None,
     };
-    if !crowd(search) {
-        return description;
+    let of_part = |(place, part): (usize, f64)| {
+        let own = scaled(share, part);
+        let of_receiver = air.of_receiver().unwrap_or(part).max(part);
+        let alarms = FalseAlarms { rate: alarms.rate * part / of_receiver, ..alarms };
+        let description = match air.weather(place, lost) {
+            _ if air.crowds[place] => of_a_crowd(&alarms, &own),
+            Some(weather) if !(alarms.instead && air.is_of_receiver(place)) => of_weather(&weather, &own),
+            _ => of_false_alarms(&alarms, &own),
+        };
+        (part, description)
+    };
+    // No droplet is seen through a surface: returns behind them as well come from the receiver.
+    let of_receiver = !search.ghosts && air.of_receiver().is_none() && air.before_and_behind() > 0.0;
+    if of_receiver || air.mixture.parts.is_empty() {
+        return vec![(1.0, of_false_alarms(&alarms, share))];
     }
+    air.shares().into_iter().enumerate().map(of_part).collect()
+}
+
+/// Describes lone returns in some directions.
+fn of_a_crowd(alarms: &FalseAlarms, share: &Parameter) -> Description {
     Description {
         causes: vec![],
         covariate: Covariate::Azimuth,
@@ -86,39 +114,18 @@ fn alone(search: &Search, share: &Parameter) -> Description {
              cause of the catalogue does that, false alarms and droplets come everywhere",
             100.0 * share.estimate
         ),
-        ..description
+        ..of_false_alarms(alarms, share)
     }
 }
 
-/// Relative variance of the number of lone returns over patches of directions from which on they do not come by chance:
-/// that of one half of the patches with three times as many as the other half.
-const CROWDED: f64 = 0.25;
-
-/// Whether the lone returns of the estimating frames come in some directions of each frame, others from frame to frame.
-fn crowd(search: &Search) -> bool {
-    let frames: Vec<_> = search.estimate.iter().map(|&f| &search.context.frames[f]).collect();
-    let is_lone = |f: usize, ray: usize| {
-        returns::odd(&frames[f].measured[ray]) == Some(Odd::Alone)
-            && !is_spray(&search.spray, search.estimate[f], 0, ray)
-    };
-    let [variance, error] = crowding(&frames, &is_lone);
-    variance - Z_STAR * error > CROWDED
+/// A part of a share.
+fn scaled(share: &Parameter, part: f64) -> Parameter {
+    Parameter { estimate: part * share.estimate, ci95: share.ci95.map(|end| part * end), ..*share }
 }
 
 /// What recording tells fog from rain.
 const TELL_WEATHER_BY: &str =
     "a flat wall at two known distances in the same weather: fog weakens its light by far more";
-
-/// The weather that the lone returns of the estimating frames tell.
-fn weather_of(search: &Search) -> Option<Weather> {
-    let frames: Vec<_> = search.estimate.iter().map(|&f| &search.context.frames[f]).collect();
-    let of_spray = |f: usize, side: usize, ray: usize| is_spray(&search.spray, search.estimate[f], side, ray);
-    let bins = bins(&frames, search.end_m, &of_spray);
-    weather(&bins, |depth_m| match search.scenes {
-        Scenes::Same => lost_with_range(&frames, depth_m),
-        Scenes::Different => None,
-    })
-}
 
 /// Describes droplets. `extended.toml` has the droplets alone: what the light of surfaces loses is a law of its own.
 fn of_weather(weather: &Weather, share: &Parameter) -> Description {
@@ -135,10 +142,10 @@ fn of_weather(weather: &Weather, share: &Parameter) -> Description {
             Shape::Exponential(_) => RangeLaw::Exponential,
             Shape::Gamma(_) => RangeLaw::Gamma,
             Shape::Drops(_) => RangeLaw::Inverse,
-            Shape::Even(_) | Shape::OfPath => RangeLaw::Uniform,
+            Shape::Even(..) | Shape::OfPath | Shape::Band(..) => RangeLaw::Uniform,
         },
         reach_m: match weather.shape {
-            Shape::Drops(reach_m) | Shape::Even(reach_m) => rounded(reach_m, 3),
+            Shape::Drops(reach_m) | Shape::Even(reach_m, _) | Shape::Band(_, reach_m) => rounded(reach_m, 3),
             _ => rounded(8.0 * depth_m, 3).min(1000.0),
         },
         ..Default::default()

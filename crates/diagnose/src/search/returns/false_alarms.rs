@@ -1,12 +1,13 @@
 //! Rate of false alarms, ranges at which nothing is, and the largest range at which they occur.
 
-use super::ONE_SIDED;
+use super::weather::Air;
 use crate::channels::free_path::scale;
 use crate::channels::returns::{OWN_CAR_M, Odd, margin_m, odd};
 use crate::pairing::{FramePair, Lies, Ray};
 use crate::search::Context;
 
 /// False alarms, uniform over range.
+#[derive(Clone, Copy)]
 pub(super) struct FalseAlarms {
     /// False alarms for each shot.
     pub(super) rate: f64,
@@ -17,7 +18,7 @@ pub(super) struct FalseAlarms {
 }
 
 /// Lone returns, and the lengths of ray on which they could be seen, between the ego vehicle and a range.
-#[derive(Default)]
+#[derive(Clone, Copy, Default)]
 struct Seen {
     /// Excess over the simulated side: in front of surfaces and in the open, and behind surfaces.
     returns: [f64; 2],
@@ -25,12 +26,19 @@ struct Seen {
     lengths_m: [f64; 2],
     /// Whether ghosts explain what lies behind surfaces.
     ghosts: bool,
+    /// Share of the receiver in those in front of surfaces; the others are droplets.
+    of_receiver: f64,
 }
 
 impl Seen {
     /// False alarms for each metre in front of surfaces and behind them.
     fn rates(&self) -> [f64; 2] {
-        [0, 1].map(|k| self.returns[k] / self.lengths_m[k].max(1.0))
+        [0, 1].map(|k| self.false_alarms(k) / self.lengths_m[k].max(1.0))
+    }
+
+    /// Returns of the receiver, in front of surfaces or behind them.
+    fn false_alarms(&self, place: usize) -> f64 {
+        self.returns[place] * [self.of_receiver, 1.0][place]
     }
 
     /// Whether there are about as many behind surfaces as in front of them.
@@ -44,7 +52,7 @@ impl Seen {
     fn per_metre(&self) -> f64 {
         let [front, _] = self.rates();
         if self.behind_as_well() {
-            (self.returns[0] + self.returns[1]) / (self.lengths_m[0] + self.lengths_m[1]).max(1.0)
+            (self.false_alarms(0) + self.false_alarms(1)) / (self.lengths_m[0] + self.lengths_m[1]).max(1.0)
         } else {
             front
         }
@@ -52,11 +60,12 @@ impl Seen {
 }
 
 /// False alarms of the measured side beyond those of the simulated one; simulated frames end at `end_m`. Where there
-/// are ghosts, what lies behind surfaces does not count.
-pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64, ghosts: bool) -> FalseAlarms {
+/// are ghosts, what lies behind surfaces does not count. What is in front of them is the receiver's by `air`.
+pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64, ghosts: bool, air: &Air) -> FalseAlarms {
     let frames: Vec<&FramePair> = frames.iter().map(|&f| &context.frames[f]).collect();
-    let mut reach_m = reach_m(&frames, ghosts).max(OWN_CAR_M + 1.0);
-    let seen = |between| Seen { ghosts, ..seen(&frames, between) };
+    let of_receiver = air.of_receiver().unwrap_or(1.0);
+    let mut reach_m = air.reach_m().unwrap_or_else(|| reach_m(&frames, ghosts)).max(OWN_CAR_M + 1.0);
+    let seen = |between| Seen { ghosts, of_receiver, ..seen(&frames, between) };
     let within = seen([OWN_CAR_M, end_m.min(reach_m)]);
     if reach_m > end_m {
         // A much higher rate beyond the end of the simulation is due to real returns: the reach is then not known.
@@ -67,14 +76,6 @@ pub(super) fn false_alarms(context: &Context, frames: &[usize], end_m: f64, ghos
     }
     let rate = (within.per_metre() * reach_m).clamp(0.0, 1.0);
     FalseAlarms { rate, reach_m, instead: within.behind_as_well() }
-}
-
-/// Whether there are far more lone returns behind surfaces than before them, by the length of ray: noise of the
-/// receiver comes at any time.
-pub(super) fn mostly_behind(context: &Context, frames: &[usize], end_m: f64) -> bool {
-    let frames: Vec<&FramePair> = frames.iter().map(|&f| &context.frames[f]).collect();
-    let [front, behind] = seen(&frames, [OWN_CAR_M, end_m]).rates();
-    behind > ONE_SIDED * front
 }
 
 /// Largest range of false alarms, m: the 99 % quantile of the excess of lone returns, over 0.99.
@@ -125,11 +126,15 @@ mod tests {
     fn false_alarms_before_surfaces_are_related_to_the_length_before_them() {
         // 1000 m of ray before surfaces and 2000 m behind them, one false alarm in 100 m.
         let lengths_m = [1000.0, 2000.0];
-        let before = Seen { returns: [10.0, 0.0], lengths_m, ghosts: false };
-        let instead = Seen { returns: [10.0, 20.0], lengths_m, ghosts: false };
+        let all = Seen { lengths_m, of_receiver: 1.0, ..Seen::default() };
+        let before = Seen { returns: [10.0, 0.0], ..all };
+        let instead = Seen { returns: [10.0, 20.0], ..all };
         assert!((before.per_metre() - 0.01).abs() < 1e-12 && (instead.per_metre() - 0.01).abs() < 1e-12);
-        let ghosts = Seen { returns: [10.0, 500.0], lengths_m, ghosts: true };
+        let ghosts = Seen { returns: [10.0, 500.0], ghosts: true, ..all };
         assert!((ghosts.per_metre() - 0.01).abs() < 1e-12);
+        // Three quarters of those before surfaces are droplets.
+        let droplets = Seen { returns: [40.0, 20.0], of_receiver: 0.25, ..all };
+        assert!((droplets.per_metre() - 0.01).abs() < 1e-12);
         assert_eq!(Seen::default().per_metre(), 0.0);
     }
 }

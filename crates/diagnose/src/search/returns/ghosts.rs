@@ -1,6 +1,6 @@
 //! Ghosts: returns by way of a mirror. They lie behind the surface that reflected their shot.
 
-use super::false_alarms::mostly_behind;
+use super::weather::Air;
 use super::{FLOORS, cross_gains, excess, gain, share_of};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::mirrors::{Images, behind_frame, images, is_behind};
@@ -33,11 +33,11 @@ fn are_mirrored(frames: &[Images]) -> bool {
     significant(&each, Z_STAR) && each.iter().sum::<f64>() > MIRRORED * others
 }
 
-/// Searches ghosts. What lies behind surfaces is then left out by other searches.
+/// Searches ghosts. What lies behind surfaces is then left out by other searches. `air` is of the selecting frames.
 pub(super) fn search(
     context: &Context,
     [select, estimate, hold_out]: [&[usize]; 3],
-    end_m: f64,
+    air: &Air,
     result: &mut ChannelResult,
 ) -> bool {
     let frames: Vec<OddFrame> = context.frames.par_iter().map(behind_frame).collect();
@@ -48,7 +48,7 @@ pub(super) fn search(
         "no more returns behind surfaces than on the simulated side"
     } else if [select, estimate].into_iter().any(|role| excess_of(role)[1] <= FLOOR) {
         "too small to speak of"
-    } else if !mostly_behind(context, select, end_m) {
+    } else if !air.mostly_behind() {
         "as many before surfaces: false alarms"
     } else {
         "chosen"

@@ -1,15 +1,14 @@
 //! Whether lone returns come from droplets, and from which: their distribution over the free path of shots.
 
+use super::ONE_SIDED;
 use crate::catalogue::Cause;
-use crate::channels::free_path::{Bin, Fit, Fits, Shape, fit, fits};
+use crate::channels::free_path::{Bin, bins};
+use crate::channels::range_laws::{Fall, Origin, Shape};
+use crate::channels::range_mixture::{Mixture, Part, fit, instead, mixture, steady_instead};
+use crate::channels::returns::{OWN_CAR_M, Odd, odd};
+use crate::channels::together::crowding;
 use crate::pairing::FramePair;
-use crate::search::first_demands;
-
-/// Mean distance of droplets up to which lone returns come from them, and up to which they may come from them, as a
-/// part of the range that holds nine tenths of the free paths: there, droplets are down to 13 % and 37 % of what they
-/// are at the sensor. The threshold of a receiver may fall with time, and its noise with it, by some tens of per
-/// cent.
-const OF_VIEW: [f64; 2] = [0.5, 1.0];
+use crate::search::{Z_STAR, first_demands};
 
 /// Mean distances of droplets between which they may be single drops or fog, m. A drop of 2 mm returns as much light
 /// as a surface of some per mille of the beam: it is seen up to 20 to 50 m, and on average at a quarter of that. Fog
@@ -29,6 +28,13 @@ const LOSES: [f64; 2] = [0.3, 0.05];
 
 /// Fewest far simulated returns whose losses are counted.
 const FEWEST: f64 = 500.0;
+
+/// Relative variance of the number of lone returns over patches of directions from which on they do not come by chance:
+/// that of one half of the patches with three times as many as the other half.
+const CROWDED: f64 = 0.25;
+
+/// Some returns: by the number of the frame, the side (0 measured) and their place there.
+type Which<'a> = &'a (dyn Fn(usize, usize, usize) -> bool + Sync);
 
 /// Droplets instead of false alarms.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,28 +57,161 @@ impl Weather {
     }
 }
 
-/// The weather that lone returns tell; `None` where they are spread evenly over the ranges. `lost` is
-/// [`lost_with_range`] for a depth, `None` where it is not known.
-pub(super) fn weather(bins: &[Bin], lost: impl Fn(f64) -> Option<f64>) -> Option<Weather> {
-    let Fits { even, of_path, droplets } = fits(bins)?;
-    let depth = droplets.shape.mean_m();
-    let of_view = depth / view_m(bins);
-    if droplets.nats - even.nats.max(of_path.nats) < first_demands().nats || of_view > OF_VIEW[1] {
-        return None;
+/// Lone returns in front of surfaces and in the open: where they come from.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Air {
+    bins: Vec<Bin>,
+    /// What they come from.
+    pub(super) mixture: Mixture,
+    /// Whether those of each part come at some ranges alone, or in some directions of a frame, others from frame to
+    /// frame.
+    pub(super) crowds: Vec<bool>,
+}
+
+impl Air {
+    /// Of some frames, up to `end_m`, without those that are left out; see [`bins`].
+    pub(super) fn new(frames: &[&FramePair], end_m: f64, leave_out: Which) -> Air {
+        let bins = bins(frames, end_m, leave_out);
+        let mixture = mixture(&bins, first_demands().nats);
+        let mut air = Air { bins, mixture, crowds: vec![] };
+        let crowd = |place: usize| {
+            air.mixture.parts[place].shape.origin() == Origin::Others || air.crowd(place, frames, leave_out)
+        };
+        air.crowds = (0..air.mixture.parts.len()).map(crowd).collect();
+        air
     }
-    let causes = if of_view > OF_VIEW[0] {
-        vec![Cause::Outliers, Cause::Fog]
-    } else if depth > SINGLE_DROPS_M[1] {
-        vec![Cause::Fog]
-    } else {
+
+    /// Whether the returns of one part come in some directions, where it has the most of all returns.
+    fn crowd(&self, place: usize, frames: &[&FramePair], leave_out: Which) -> bool {
+        let shares = self.mixture.shares_by_bin(place, &self.bins);
+        let most = shares.iter().copied().fold(0.0, f64::max);
+        let inside = |range_m: f64| {
+            let at = self.bins.iter().position(|b| (b.ends_m[0]..b.ends_m[1]).contains(&range_m));
+            at.is_some_and(|k| shares[k] > 0.5 * most)
+        };
+        let counts = |f: usize, i: usize| {
+            let ray = &frames[f].measured[i];
+            odd(ray) == Some(Odd::Alone) && inside(ray.own_range_m()) && !leave_out(f, 0, i)
+        };
+        let [variance, error] = crowding(frames, &counts);
+        variance - Z_STAR * error > CROWDED
+    }
+
+    /// Share of the returns that each part of the mixture has.
+    pub(super) fn shares(&self) -> Vec<f64> {
+        self.mixture.shares(&self.bins, 0.0)
+    }
+
+    /// Share in the returns beyond the ego vehicle of those that come from the receiver, or from the light of others;
+    /// `None` where there are none.
+    pub(super) fn of_receiver(&self) -> Option<f64> {
+        let shares = self.mixture.shares(&self.bins, OWN_CAR_M);
+        let places = self.of_receiver_at();
+        (!places.is_empty()).then(|| places.iter().map(|&k| shares[k]).sum())
+    }
+
+    /// Whether a part is noise of the receiver.
+    pub(super) fn is_of_receiver(&self, place: usize) -> bool {
+        self.mixture.parts[place].shape.origin() == Origin::Receiver
+    }
+
+    /// Places of the parts that come from the receiver, or from the light of others.
+    fn of_receiver_at(&self) -> Vec<usize> {
+        (0..self.mixture.parts.len()).filter(|&k| self.crowds[k] || self.is_of_receiver(k)).collect()
+    }
+
+    /// Whether there are far more lone returns behind surfaces than what comes from the receiver: its noise, and the
+    /// light of others, come at any time, behind surfaces as often as before them.
+    pub(super) fn mostly_behind(&self) -> bool {
+        let seen: f64 = self.bins.iter().map(excess_behind).sum();
+        let places = self.of_receiver_at();
+        let expected = if places.is_empty() { self.before_and_behind() } else { self.expected_behind(&places) };
+        seen > ONE_SIDED * expected
+    }
+
+    /// Returns of some parts that are expected behind surfaces.
+    fn expected_behind(&self, places: &[usize]) -> f64 {
+        let of_bin = |k: usize, bin: &Bin| {
+            let of_part = |&place: &usize| self.mixture.returns_by_bin(place, &self.bins)[k];
+            places.iter().map(of_part).sum::<f64>() / bin.free_m.max(1.0) * bin.behind_m
+        };
+        self.bins.iter().enumerate().map(|(k, bin)| of_bin(k, bin)).sum()
+    }
+
+    /// Returns behind surfaces that would be there if all those before surfaces came from the receiver, whatever their
+    /// ranges; none where less than half of them are.
+    pub(super) fn before_and_behind(&self) -> f64 {
+        let expected = |b: &Bin| (b.measured - b.simulated).max(0.0) / b.free_m.max(1.0) * b.behind_m;
+        let all: f64 = self.bins.iter().map(expected).sum();
+        let both: f64 = self.bins.iter().map(|b| expected(b).min(excess_behind(b))).sum();
+        if both > 0.5 * all { all } else { 0.0 }
+    }
+
+    /// Reach of false alarms beside droplets, m; `None` where there are no droplets, or no reach is known.
+    pub(super) fn reach_m(&self) -> Option<f64> {
+        let shape = self.mixture.parts[self.mixture.place(Origin::Receiver)?].shape;
+        match shape {
+            Shape::Even(reach_m, _) if self.mixture.parts.len() > 1 => Some(reach_m),
+            _ => None,
+        }
+    }
+
+    /// The weather that one part of the mixture tells; `None` where it is of the receiver. `lost` is
+    /// [`lost_with_range`] for a depth, `None` where it is not known.
+    pub(super) fn weather(&self, place: usize, lost: impl Fn(f64) -> Option<f64>) -> Option<Weather> {
+        let part = self.mixture.parts[place];
+        match part.shape {
+            Shape::OfPath | Shape::Even(_, Fall::No) | Shape::Band(..) => None,
+            Shape::Even(..) => self.fog_beyond_the_view(place),
+            Shape::Exponential(_) | Shape::Gamma(_) | Shape::Drops(_) => {
+                let causes = self.droplets(place, lost);
+                Some(weather(causes, part, interval(&self.bins, &self.mixture, place)))
+            }
+        }
+    }
+
+    /// What droplets a part of the mixture is of.
+    fn droplets(&self, place: usize, lost: impl Fn(f64) -> Option<f64>) -> Vec<Cause> {
+        let shape = self.mixture.parts[place].shape;
+        let depth = shape.mean_m();
+        if depth > SINGLE_DROPS_M[1] {
+            return vec![Cause::Fog];
+        }
+        let are_drops = shape.origin() == Origin::Drops;
+        let other = if are_drops { Origin::Droplets } else { Origin::Drops };
+        let by_law = self.mixture.nats - instead(&self.mixture, place, other, &self.bins).nats > first_demands().nats;
+        let beside_fog = self.mixture.place(Origin::Droplets).is_some();
         match lost(depth) {
+            // What is lost far away may be the fog's.
+            _ if are_drops && by_law && beside_fog => vec![Cause::Rain],
             Some(lost) if lost < LOSES[1] && depth < SINGLE_DROPS_M[0] => vec![Cause::Rain],
             Some(lost) if lost > LOSES[0] => vec![Cause::Fog, Cause::Rain],
+            _ if are_drops && by_law => vec![Cause::Rain],
+            _ if by_law && depth > SINGLE_DROPS_M[0] => vec![Cause::Fog],
             _ => vec![Cause::Rain, Cause::Fog],
         }
-    };
-    let [low, high] = interval(bins, &droplets);
-    Some(Weather { causes, shape: droplets.shape, rate: droplets.rate, depth_m: [depth, low, high] })
+    }
+
+    /// Fog that is as likely as false alarms that fall with range, where those that do not are less likely.
+    fn fog_beyond_the_view(&self, place: usize) -> Option<Weather> {
+        let fog = instead(&self.mixture, place, Origin::Droplets, &self.bins);
+        let part = *fog.parts.get(place)?;
+        let demanded = first_demands().nats;
+        let likely = fog.nats > self.mixture.nats - demanded
+            && fog.nats > steady_instead(&self.mixture, place, &self.bins).nats + demanded
+            && part.shape.mean_m() < view_m(&self.bins);
+        likely.then(|| weather(vec![Cause::Outliers, Cause::Fog], part, interval(&self.bins, &fog, place)))
+    }
+}
+
+/// Measured lone returns behind surfaces beyond the simulated ones.
+fn excess_behind(bin: &Bin) -> f64 {
+    (bin.behind[0] - bin.behind[1]).max(0.0)
+}
+
+/// Droplets of some causes.
+fn weather(causes: Vec<Cause>, Part { shape, rate }: Part, [low, high]: [f64; 2]) -> Weather {
+    Weather { causes, shape, rate, depth_m: [shape.mean_m(), low, high] }
 }
 
 /// Range that holds nine tenths of the free paths, m.
@@ -86,11 +225,16 @@ fn view_m(bins: &[Bin]) -> f64 {
     last.map_or(0.0, |b| b.ends_m[1])
 }
 
-/// Interval of the mean of a law: where the likelihood falls by two nats; at least 10 %.
-fn interval(bins: &[Bin], best: &Fit) -> [f64; 2] {
+/// Interval of the mean of one part of a mixture: where the likelihood falls by two nats; at least 10 %.
+fn interval(bins: &[Bin], mixture: &Mixture, place: usize) -> [f64; 2] {
+    let shapes: Vec<Shape> = mixture.parts.iter().map(|p| p.shape).collect();
     let falls = |factor: f64| {
-        let other = |k: i32| best.shape.scaled(factor.powi(k));
-        let likely = |k: &i32| best.nats - fit(other(*k), bins).nats < 2.0;
+        let other = |k: i32| shapes[place].scaled(factor.powi(k));
+        let likely = |k: &i32| {
+            let mut shapes = shapes.clone();
+            shapes[place] = other(*k);
+            mixture.nats - fit(&shapes, bins).nats < 2.0
+        };
         other((1..60).take_while(likely).last().unwrap_or(0).max(5)).mean_m()
     };
     [falls(1.0 / 1.02), falls(1.02)]
@@ -98,16 +242,18 @@ fn interval(bins: &[Bin], best: &Fit) -> [f64; 2] {
 
 /// Share of the simulated returns far beyond a depth that the measured side lacks, beyond the share of those nearer
 /// than that; `None` with too few of either. Light that goes `n` depths through fog and back is weakened by at least
-/// `exp(-0.35 n)`.
+/// `exp(-0.35 n)`. Returns beyond the range of the measured side, in which all but 1 % of its returns are, do not
+/// count: a sensor may have an end.
 pub(super) fn lost_with_range(frames: &[&FramePair], depth_m: f64) -> Option<f64> {
     let beyond_m = (2.0 / LEAST_EXTINCTION * depth_m).max(25.0);
     let within_m = (2.0 * depth_m).max(12.0);
+    let end_m = end_of_range(frames);
     let mut kept = [[0.0f64; 2]; 2];
     for ray in frames.iter().flat_map(|f| &f.simulated).filter(|r| r.smooth && r.cos_incidence > 0.2) {
         let range_m = f64::from(ray.range_m);
         let place = match range_m {
             r if r < within_m => 0,
-            r if r > beyond_m => 1,
+            r if r > beyond_m && r < end_m => 1,
             _ => continue,
         };
         kept[place][0] += 1.0;
@@ -117,10 +263,17 @@ pub(super) fn lost_with_range(frames: &[&FramePair], depth_m: f64) -> Option<f64
     Some(1.0 - far? / near?)
 }
 
+/// Range in which 99 % of the simulated returns are that the measured side has as well, m.
+fn end_of_range(frames: &[&FramePair]) -> f64 {
+    let matched = frames.iter().flat_map(|f| &f.simulated).filter(|r| r.matched);
+    let mut ranges: Vec<f64> = matched.map(|r| f64::from(r.range_m)).collect();
+    let last = ranges.len() * 99 / 100;
+    if ranges.is_empty() { 0.0 } else { *ranges.select_nth_unstable_by(last, f64::total_cmp).1 }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::channels::free_path::bins;
 
     /// Bins of shots that are free up to 100 m, with lone returns of a density over range.
     fn of(density: impl Fn(f64) -> f64) -> Vec<Bin> {
@@ -134,23 +287,52 @@ mod tests {
         bins
     }
 
+    /// The weather of the only part of what is most likely.
+    fn alone(bins: &[Bin], lost: Option<f64>) -> Option<Weather> {
+        let mixture = mixture(bins, first_demands().nats);
+        let air = Air { mixture, bins: bins.to_vec(), crowds: vec![] };
+        assert_eq!(air.mixture.parts.len(), 1, "{air:?}");
+        air.weather(0, |_| lost)
+    }
+
     #[test]
     fn even_returns_are_no_weather_also_where_the_threshold_falls() {
-        assert_eq!(weather(&of(|_| 1e-4), |_| None), None);
-        assert_eq!(weather(&of(|r| 1e-4 * (1.0 - 0.003 * r)), |_| None), None);
+        assert_eq!(alone(&of(|_| 1e-4), None), None);
+        assert_eq!(alone(&of(|r| 1e-4 * (1.0 - 0.003 * r)), None), None);
     }
 
     #[test]
     fn fog_reaches_far_and_rain_is_near_and_leaves_far_returns() {
         let exponential = |mean: f64| of(move |r| 0.01 / mean * (-r / mean).exp());
-        let fog = weather(&exponential(25.0), |_| None).unwrap();
+        let gamma = |mean: f64| of(move |r| 0.04 / mean / mean * r * (-2.0 * r / mean).exp());
+        let fog = alone(&exponential(25.0), None).unwrap();
         assert_eq!(fog.causes, [Cause::Fog]);
         assert!((fog.rate / 0.01 - 1.0).abs() < 0.1 && (fog.depth_m[0] / 25.0 - 1.0).abs() < 0.1, "{fog:?}");
         let [visibility, low, high] = fog.visibility_m();
         assert!((visibility / 150.0 - 1.0).abs() < 0.1 && low < visibility && visibility < high);
-        let near = |lost: Option<f64>| weather(&exponential(5.0), |_| lost).unwrap().causes;
+        let near = |lost: Option<f64>| alone(&exponential(5.0), lost).unwrap().causes;
         assert_eq!(near(Some(0.01)), [Cause::Rain]);
         assert_eq!(near(Some(0.8)), [Cause::Fog, Cause::Rain]);
         assert_eq!(near(None), [Cause::Rain, Cause::Fog]);
+        // Fog of which nothing is seen at the sensor has another law than single drops, also far away.
+        assert_eq!(alone(&gamma(10.0), Some(0.1)).unwrap().causes, [Cause::Fog]);
+        assert_eq!(alone(&gamma(60.0), None).unwrap().causes, [Cause::Fog]);
+    }
+
+    #[test]
+    fn droplets_are_before_surfaces_alone_and_noise_is_behind_them_as_well() {
+        // As many metres of shots behind surfaces as before them, with a number of returns there.
+        let mostly_behind = |before: &[Bin], behind: f64| {
+            let all: f64 = before.iter().map(|b| b.free_m).sum();
+            let with = |b: &Bin| Bin { behind: [behind * b.free_m / all, 0.0], behind_m: b.free_m, ..*b };
+            let bins: Vec<Bin> = before.iter().map(with).collect();
+            let mixture = mixture(&bins, first_demands().nats);
+            Air { crowds: vec![false; mixture.parts.len()], mixture, bins }.mostly_behind()
+        };
+        let noise = of(|_| 1e-4);
+        assert!(!mostly_behind(&noise, 3000.0) && mostly_behind(&noise, 30_000.0));
+        let rain = of(|r| if r < 22.0 { 3e-3 / r } else { 0.0 });
+        assert!(mostly_behind(&rain, 1000.0));
+        assert!(!mostly_behind(&of(|_| 0.0), 0.0));
     }
 }
