@@ -92,7 +92,7 @@ impl Frame<'_> {
                 Effect::Fog { visibility_m, backscatter } => {
                     Some(Clutter { rate: backscatter, law: Law::Backscatter(0.06 * visibility_m) })
                 }
-                Effect::Spray { per_m } => self.plume_m(shot, free_m).map(|([begin, end], times)| Clutter {
+                Effect::Spray { per_m } => self.plume_m(shot, free_m).map(|(_, [begin, end], times)| Clutter {
                     rate: 1.0 - (-per_m * times * (end - begin)).exp(),
                     law: Law::Plume(begin, end),
                 }),

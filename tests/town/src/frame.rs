@@ -295,9 +295,9 @@ impl<'a> Frame<'a> {
         Some(hit.range_m)
     }
 
-    /// Where the way through a plume behind a moving car begins and ends before `until_m`, m, and its density over that
-    /// behind a car at 8 m/s.
-    pub fn plume_m(&self, shot: &Shot, until_m: f64) -> Option<([f64; 2], f64)> {
+    /// The vehicle before a plume on the way of a shot, where that way begins and ends in it before `until_m`, m, and the
+    /// density over that behind a car at 8 m/s.
+    pub fn plume_m(&self, shot: &Shot, until_m: f64) -> Option<(usize, [f64; 2], f64)> {
         let (ray, _) = self.rays(shot, [0.0; 2]);
         let world = &self.side.world;
         for (vehicle, place) in self.slice(shot).moment.places() {
@@ -315,7 +315,7 @@ impl<'a> Frame<'a> {
             if let Some([enter, leave]) = plume.chord(&ray) {
                 let leave = leave.min(until_m);
                 if leave > enter {
-                    return Some(([enter, leave], (speed / 8.0).powi(2)));
+                    return Some((vehicle, [enter, leave], (speed / 8.0).powi(2)));
                 }
             }
         }

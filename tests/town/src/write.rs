@@ -86,7 +86,8 @@ fn grown(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
 /// One of so many frames, and of so many shots, that tell the mean density of plumes.
 const SPRAY_ONE_IN: [usize; 2] = [4, 7];
 
-/// Mean density of the plumes that shots pass, 1/m: the effect's own number is that behind a car at 8 m/s.
+/// Mean density of the plumes of labelled vehicles that shots pass before they meet a surface, 1/m: the effect's own
+/// number is that behind a car at 8 m/s.
 fn sprayed(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
     let Effect::Spray { per_m } = *effect else { return BTreeMap::new() };
     let side = &case.measured;
@@ -96,7 +97,9 @@ fn sprayed(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
         let mut sum = [0.0; 2];
         for sensor in 0..side.mounts.len() {
             for shot in side.shots(sensor, index).iter().step_by(shots) {
-                if let Some(([from, to], times)) = frame.plume_m(shot, REACH_M) {
+                let until_m = frame.trace(shot, [0.0; 2]).first.map_or(REACH_M, |echo| echo.range_m);
+                let plume = frame.plume_m(shot, until_m).filter(|(v, ..)| side.world.vehicles[*v].labelled);
+                if let Some((_, [from, to], times)) = plume {
                     sum = [sum[0] + (to - from), sum[1] + times * (to - from)];
                 }
             }

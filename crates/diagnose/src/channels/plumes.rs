@@ -58,6 +58,20 @@ pub struct PlumeFrame {
     pub around: [HashSet<usize>; 2],
     /// Paths of shots with a simulated surface, m: behind, before.
     pub paths_m: [Vec<f32>; 2],
+    /// The air behind each vehicle.
+    pub plumes: Vec<Plume>,
+}
+
+/// The air behind one vehicle.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Plume {
+    /// Speed of the vehicle over the ground, m/s, where it is known.
+    pub speed_m_s: Option<f64>,
+    /// Paths of shots with a simulated surface, m, and the whole path of each in the plume, also close to the vehicle, to
+    /// the ground and to the surface, where droplets are not counted: one there hides others behind it.
+    pub paths_m: Vec<[f32; 2]>,
+    /// Measured droplets on such paths.
+    pub droplets: f64,
 }
 
 impl PlumeFrame {
@@ -71,18 +85,29 @@ impl PlumeFrame {
 struct Air<'a> {
     vehicle: &'a Box3,
     place: usize,
+    /// Where droplets are counted.
     air: Box3,
+    /// From the vehicle and from the ground on.
+    whole: Box3,
 }
 
 impl Air<'_> {
     fn of(vehicle: &Box3, Extent { until_m, height_m, beside_m }: Extent) -> [Air<'_>; 2] {
-        [0, 1].map(|place| {
-            let [from, to] = [FROM_M, until_m.max(FROM_M + 0.5)].map(|m| vehicle.size[0] / 2.0 + m);
+        let until_m = until_m.max(FROM_M + 0.5);
+        let height_m = height_m.max(OVER_GROUND_M + 0.1);
+        let part = |place: usize, from_m: f64, over_ground_m: f64| {
+            let [from, to] = [from_m, until_m].map(|m| vehicle.size[0] / 2.0 + m);
             let along = if place == 0 { -(from + to) / 2.0 } else { (from + to) / 2.0 };
-            let [low, high] = [OVER_GROUND_M, height_m.max(OVER_GROUND_M + 0.1)].map(|m| m - vehicle.size[2] / 2.0);
+            let [low, high] = [over_ground_m, height_m].map(|m| m - vehicle.size[2] / 2.0);
             let center = vehicle.from_local([along, 0.0, (low + high) / 2.0]);
             let size = [to - from, vehicle.size[1] + 2.0 * beside_m, high - low];
-            Air { vehicle, place, air: Box3 { center, size, yaw_rad: vehicle.yaw_rad } }
+            Box3 { center, size, yaw_rad: vehicle.yaw_rad }
+        };
+        [0, 1].map(|place| Air {
+            vehicle,
+            place,
+            air: part(place, FROM_M, OVER_GROUND_M),
+            whole: part(place, 0.0, 0.0),
         })
     }
 
@@ -116,15 +141,24 @@ fn in_the_air(ray: &Ray) -> bool {
     }
 }
 
-/// The air around the vehicles of a frame; `origins` are those of the sensors, in the cloud's frame.
-pub fn plume_frame(frame: &FramePair, origins: &[Point3<f64>], extent: Extent) -> PlumeFrame {
+/// The air around the vehicles of a frame; `origins` are those of the sensors, in the cloud's frame, `speed_m_s` is that
+/// of a vehicle over the ground.
+pub fn plume_frame(
+    frame: &FramePair,
+    origins: &[Point3<f64>],
+    extent: Extent,
+    speed_m_s: &dyn Fn(&Box3) -> Option<f64>,
+) -> PlumeFrame {
     let boxes: Vec<Box3> = frame.objects.iter().flat_map(|o| [o.simulated, o.measured]).flatten().collect();
     let vehicles: Vec<Box3> = frame.objects.iter().filter_map(|o| o.simulated).collect();
     let vehicles = vehicles.iter().filter(|b| b.size[0] > LEAST_LENGTH_M);
     // The ego vehicle's own air is that of the sensors.
     let vehicles = vehicles.filter(|b| origins.iter().all(|o| !in_or_beside(b, (*o).into(), OTHERS_M)));
-    let airs: Vec<Air> = vehicles.flat_map(|b| Air::of(b, extent)).collect();
-    let mut out = PlumeFrame::default();
+    let vehicles: Vec<&Box3> = vehicles.collect();
+    // Two for each vehicle: behind it, before it.
+    let airs: Vec<Air> = vehicles.iter().flat_map(|b| Air::of(b, extent)).collect();
+    let plume = |b: &&Box3| Plume { speed_m_s: speed_m_s(b), ..Plume::default() };
+    let mut out = PlumeFrame { plumes: vehicles.iter().map(plume).collect(), ..PlumeFrame::default() };
     if airs.is_empty() {
         return out;
     }
@@ -137,18 +171,26 @@ pub fn plume_frame(frame: &FramePair, origins: &[Point3<f64>], extent: Extent) -
             if boxes.iter().any(|b| in_or_beside(b, point, OTHERS_M)) {
                 continue;
             }
-            if let Some((air, droplet)) = airs.iter().find_map(|air| Some((air, air.droplet(ray.smooth, point)?))) {
+            let of_air = |(k, air): (usize, &Air)| Some((k, air.place, air.droplet(ray.smooth, point)?));
+            if let Some((k, place, droplet)) = airs.iter().enumerate().find_map(of_air) {
                 let found = if side == 0 { &mut out.measured } else { &mut out.simulated };
-                found[air.place].push(droplet);
+                found[place].push(droplet);
+                if side == 0 && place == 0 && droplet.on_path {
+                    out.plumes[k / 2].droplets += 1.0;
+                }
             }
         }
     }
     for ray in frame.simulated.iter().filter(|r| r.smooth) {
         let origin: [f64; 3] = origins[ray.sensor as usize].into();
-        let until_m = ray.own_range_m() - super::returns::margin_m(ray);
-        for air in &airs {
-            if let Some([from, to]) = air.air.path_through(origin, ray.direction_vector().into(), until_m) {
-                out.paths_m[air.place].push((to - from) as f32);
+        let (range_m, direction) = (ray.own_range_m(), ray.direction_vector().into());
+        let path_m = |of: &Box3, until_m: f64| of.path_through(origin, direction, until_m).map(|[a, b]| (b - a) as f32);
+        for (k, air) in airs.iter().enumerate() {
+            let Some(counted) = path_m(&air.air, range_m - super::returns::margin_m(ray)) else { continue };
+            out.paths_m[air.place].push(counted);
+            if air.place == 0 {
+                let whole = path_m(&air.whole, range_m).unwrap_or(counted).max(counted);
+                out.plumes[k / 2].paths_m.push([counted, whole]);
             }
         }
     }

@@ -18,13 +18,15 @@ mod unexplained;
 
 use crate::catalogue::{Cause, Channel, Covariate, Family, ParameterId, Quantity, Unit};
 use crate::channels::groups::Grouping;
+use crate::channels::labels::seen_velocity;
 use crate::channels::moments::Moments;
-use crate::channels::motion::OwnMotion;
+use crate::channels::motion::{OwnMotion, SeenVelocity};
 use crate::curve::Curve;
 use crate::diagnosis::{Considered, FindingGain, Minimum, Parameter, Status};
 use crate::inference::choice::{Choice, Demands, Trial, choose, total_and_z};
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
+use ::geometry::Box3;
 use sensor::Rig;
 use statistics::{blocks_of, draw_blocks, interval_nearest};
 
@@ -66,6 +68,11 @@ impl Context<'_> {
     /// Time and ego motion of each frame.
     pub fn moments(&self) -> Moments {
         Moments::new(self.frames.len(), self.times.as_deref(), self.driving())
+    }
+
+    /// Velocity of a simulated box of a frame, where times are known and the same object is seen in frames beside it.
+    pub fn seen_velocity(&self, frame: usize, bbox: &Box3) -> Option<SeenVelocity> {
+        seen_velocity(self.frames, self.times.as_ref()?, frame, bbox, &self.to_next)
     }
 
     /// Simulated returns of these frames.

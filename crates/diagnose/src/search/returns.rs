@@ -20,6 +20,7 @@ use crate::inference::counts::likelihood_of_counts;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use crate::pairing::{FramePair, Lies};
+use geometry::Box3;
 use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 
@@ -63,7 +64,11 @@ pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> Channel
         let returns = context.returns(&select);
         let of_estimate = |extent: Extent| {
             let origins = origins(context.rig);
-            estimate.par_iter().map(|&i| plume_frame(&context.frames[i], &origins, extent)).collect()
+            let of_frame = |&i: &usize| {
+                let speed = |vehicle: &Box3| context.seen_velocity(i, vehicle)?.speed_m_s;
+                plume_frame(&context.frames[i], &origins, extent, &speed)
+            };
+            estimate.par_iter().map(of_frame).collect()
         };
         let frames = spray::Frames {
             plumes: &plumes,
@@ -134,7 +139,7 @@ pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &
 /// The air behind the vehicles of each frame.
 fn plumes(context: &Context) -> Vec<PlumeFrame> {
     let origins = origins(context.rig);
-    context.frames.par_iter().map(|f| plume_frame(f, &origins, MOST)).collect()
+    context.frames.par_iter().map(|f| plume_frame(f, &origins, MOST, &|_| None)).collect()
 }
 
 /// Gains by the shares of some returns, by kind, without those that are explained: see [`odd_frames`].

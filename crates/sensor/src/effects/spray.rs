@@ -1,6 +1,6 @@
 //! D4: spray or dust behind other cars.
 
-use super::{Draws, FrameContext, Need, SensorEffect};
+use super::{Draws, FrameContext, LabelledCar, Need, SensorEffect};
 use crate::scan::{Echo, Scan};
 use data::KeyError;
 use data::toml_text::within;
@@ -19,6 +19,8 @@ use serde::{Deserialize, Serialize};
 pub struct Spray {
     /// Probability density of a droplet return along the path, 1/m.
     pub density_per_m: f64,
+    /// Speed of a car with that density, m/s; 0 where all cars have it.
+    pub at_speed_m_s: f64,
     /// Length of the plume, m.
     pub length_m: f64,
     /// Height of the plume, m.
@@ -27,27 +29,28 @@ pub struct Spray {
 
 impl Default for Spray {
     fn default() -> Self {
-        Spray { density_per_m: 0.0, length_m: 12.0, height_m: 1.5 }
+        Spray { density_per_m: 0.0, at_speed_m_s: 0.0, length_m: 12.0, height_m: 1.5 }
     }
 }
 
 impl SensorEffect for Spray {
     fn check(&self) -> Result<(), KeyError> {
         within("density_per_m", self.density_per_m, 0.0, 100.0)?;
+        within("at_speed_m_s", self.at_speed_m_s, 0.0, 200.0)?;
         within("length_m", self.length_m, 0.01, 200.0)?;
         within("height_m", self.height_m, 0.01, 20.0)
     }
 
     fn needs(&self) -> Option<&'static [Need]> {
-        Some(&[Need::Cars])
+        Some(if self.at_speed_m_s > 0.0 { &[Need::Cars, Need::Motion] } else { &[Need::Cars] })
     }
 
     fn on_scan(&self, scan: &mut Scan, frame: &FrameContext, draws: &Draws) {
-        let plumes: Vec<Box3> = frame.cars.iter().map(|car| self.plume(&car.true_box)).collect();
-        let density = self.density_per_m as f32;
+        let plumes: Vec<(Box3, f32)> =
+            frame.cars.iter().map(|car| (self.plume(&car.true_box), self.density(car) as f32)).collect();
         let mut random = draws.of_frame();
         for echo in &mut scan.echoes {
-            for plume in &plumes {
+            for (plume, density) in plumes.iter().filter(|(_, density)| *density > 0.0) {
                 let Some([near, far]) = path_through(plume, echo) else {
                     continue;
                 };
@@ -63,6 +66,13 @@ impl SensorEffect for Spray {
 }
 
 impl Spray {
+    /// Density behind a car, 1/m.
+    fn density(&self, car: &LabelledCar) -> f64 {
+        let [x, y, _] = car.velocity;
+        let times = if self.at_speed_m_s > 0.0 { (x.hypot(y) / self.at_speed_m_s).powi(2) } else { 1.0 };
+        self.density_per_m * times
+    }
+
     fn plume(&self, car: &Box3) -> Box3 {
         let bottom = -car.size[2] / 2.0;
         let back = -(car.size[0] + self.length_m) / 2.0;
@@ -84,7 +94,7 @@ mod tests {
 
     #[test]
     fn droplets_are_within_the_plume() {
-        let effect = Spray { density_per_m: 0.2, length_m: 8.0, height_m: 2.0 };
+        let effect = Spray { density_per_m: 0.2, length_m: 8.0, height_m: 2.0, ..Spray::default() };
         let before = scene();
         let after = applied(&effect, &before);
         let plume = effect.plume(&cars()[0].true_box);
@@ -99,5 +109,16 @@ mod tests {
         let expected: f64 =
             before.echoes.iter().filter_map(through).map(|[n, f]| 1.0 - f64::from((-0.2 * (f - n)).exp())).sum();
         assert!((changed.len() as f64 / expected - 1.0).abs() < 0.15, "{} {expected}", changed.len());
+    }
+
+    #[test]
+    fn the_density_grows_with_the_square_of_the_speed() {
+        // The car of the scene drives 60 m/s.
+        let at = |at_speed_m_s: f64| Spray { density_per_m: 0.2, at_speed_m_s, ..Spray::default() }.density(&cars()[0]);
+        assert!((at(0.0) - 0.2).abs() < 1e-12 && (at(60.0) - 0.2).abs() < 1e-12 && (at(30.0) - 0.8).abs() < 1e-12);
+        let standing = LabelledCar { velocity: [0.0; 3], ..cars()[0].clone() };
+        let spray = Spray { density_per_m: 0.2, at_speed_m_s: 10.0, ..Spray::default() };
+        assert_eq!(spray.density(&standing), 0.0);
+        assert_eq!(spray.needs(), Some(&[Need::Cars, Need::Motion][..]));
     }
 }

@@ -2,7 +2,7 @@
 
 use super::{Z_BY_SIGNS, poisson_distance};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::plumes::{Droplet, Extent, PlumeFrame};
+use crate::channels::plumes::{Droplet, Extent, Plume, PlumeFrame};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::effects::rounded;
@@ -93,7 +93,7 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
         (None, "not on other frames")
     } else {
         let held = hold_out.iter().map(|f| on_estimate.gain(f)).collect();
-        let spray = found(&estimate, frames.within, held, z);
+        let spray = found(&estimate, frames.within, on_estimate.base, held, z);
         let on_free_paths = spray.parameter(Quantity::DensityPerM).is_some_and(|d| d.estimate >= floor_per_m);
         if on_free_paths { (Some(spray), "chosen") } else { (None, "too few on free paths behind vehicles") }
     };
@@ -130,6 +130,7 @@ pub(super) fn by_table(plumes: &[PlumeFrame], train: &[usize], test: &[usize]) -
 fn found(
     frames: &[&PlumeFrame],
     within: &dyn Fn(Extent) -> Vec<PlumeFrame>,
+    base_per_m: f64,
     held_out_gains: Vec<f64>,
     z: f64,
 ) -> Found {
@@ -142,14 +143,19 @@ fn found(
     let (length_m, height_m) = (quantile(&|d| d.behind_m), quantile(&|d| d.over_ground_m));
     // Plumes of the simulator are as wide as the vehicle.
     let plumes = within(Extent { until_m: length_m, height_m, beside_m: 0.0 });
-    let paths: Vec<f64> = plumes.iter().flat_map(|f| &f.paths_m[0]).copied().map(f64::from).collect();
-    let inside = plumes.iter().flat_map(|f| &f.measured[0]).filter(|d| d.on_path).count();
-    let per_m = density(&paths, inside as f64);
+    let plumes: Vec<&Plume> = plumes.iter().flat_map(|f| &f.plumes).collect();
+    let Fitted { per_m, at_speed_m_s } = fitted(&plumes, base_per_m);
     let error = per_m * (1.0 / (droplets.len() as f64).max(1.0).sqrt()).hypot(OF_FORM);
     let spray = sensor::effects::Spray {
         density_per_m: rounded(per_m, 5),
+        at_speed_m_s: rounded(at_speed_m_s, 2),
         length_m: rounded(length_m.max(1.0), 2),
         height_m: rounded(height_m.max(0.5), 2),
+    };
+    let by_speed = if at_speed_m_s > 0.0 {
+        format!("; the density is that at {at_speed_m_s:.0} m/s and grows with the square of the speed")
+    } else {
+        String::new()
     };
     Found {
         status: Status::Named,
@@ -165,20 +171,77 @@ fn found(
         held_out_gains,
         says: format!(
             "behind vehicles the air returns light, {per_m:.3} droplets a metre up to {length_m:.0} m behind them and \
-             {height_m:.1} m high; the air before them does not: spray or dust that your simulator does not have"
+             {height_m:.1} m high; the air before them does not: spray or dust that your simulator does not have\
+             {by_speed}"
         ),
         separate_by: None,
-        curve: curve(&droplets, paths.iter().sum()),
+        curve: curve(&droplets, plumes.iter().map(|p| p.path_m()).sum()),
         effects: vec![Effect::Spray(spray)],
     }
 }
 
-/// Density with which so many of the paths have a droplet, 1/m: `sum(1 - exp(-density * path)) = number`.
-fn density(paths_m: &[f64], number: f64) -> f64 {
+/// Speed from which on a vehicle moves, m/s: that of a walk.
+const MOVING_M_S: f64 = 1.0;
+
+/// Density of plumes.
+struct Fitted {
+    /// Mean over the paths, behind moving vehicles where speeds are known, 1/m.
+    per_m: f64,
+    /// Speed at which it is that, m/s, where it grows with the square of the speed; 0 where all plumes are alike.
+    at_speed_m_s: f64,
+}
+
+/// The density of plumes: the same behind all vehicles, or with the square of their speed where that is more likely by
+/// what a further parameter has to gain. `base_per_m` is there without spray.
+fn fitted(plumes: &[&Plume], base_per_m: f64) -> Fitted {
+    // The density that fits where each plume has so many times of it, and how likely the droplets are.
+    let with = |plumes: &[&Plume], times: &[f64]| {
+        let per_m = density(plumes, times);
+        let of_plume = |(p, times): (&&Plume, &f64)| {
+            let expected = p.expected(per_m * times) + base_per_m * p.path_m() + 1e-6;
+            p.droplets * expected.ln() - expected
+        };
+        (per_m, plumes.iter().zip(times).map(of_plume).sum::<f64>())
+    };
+    let alike = |plumes: &[&Plume]| with(plumes, &vec![1.0; plumes.len()]);
+    let (known, squares): (Vec<&Plume>, Vec<f64>) =
+        plumes.iter().filter_map(|p| Some((*p, p.speed_m_s?.powi(2)))).unzip();
+    let moving = known.iter().zip(&squares).filter(|(_, square)| **square > MOVING_M_S * MOVING_M_S);
+    let [path, weighed] = moving.fold([0.0; 2], |sum, (p, s)| [sum[0] + p.path_m(), sum[1] + s * p.path_m()]);
+    if path > 0.0 {
+        let square = weighed / path;
+        let times: Vec<f64> = squares.iter().map(|s| s / square).collect();
+        let (per_m, nats) = with(&known, &times);
+        if nats > alike(&known).1 + first_demands().nats {
+            return Fitted { per_m, at_speed_m_s: square.sqrt() };
+        }
+    }
+    Fitted { per_m: alike(plumes).0, at_speed_m_s: 0.0 }
+}
+
+impl Plume {
+    /// Metres of all paths.
+    fn path_m(&self) -> f64 {
+        self.paths_m.iter().map(|[counted, _]| f64::from(*counted)).sum()
+    }
+
+    /// Expected droplets at a density, 1/m: a shot returns from one droplet of its whole path.
+    fn expected(&self, per_m: f64) -> f64 {
+        let of_path = |path: &[f32; 2]| {
+            let [counted, whole] = path.map(f64::from);
+            (1.0 - (-per_m * whole).exp()) * counted / whole.max(1e-6)
+        };
+        self.paths_m.iter().map(of_path).sum()
+    }
+}
+
+/// Density with which plumes have as many droplets as they have, 1/m; that of each is so many times as high.
+fn density(plumes: &[&Plume], times: &[f64]) -> f64 {
+    let number: f64 = plumes.iter().map(|p| p.droplets).sum();
     let (mut low, mut high) = (0.0, 10.0);
     for _ in 0..60 {
         let middle = 0.5 * (low + high);
-        let expected: f64 = paths_m.iter().map(|path| 1.0 - (-middle * path).exp()).sum();
+        let expected: f64 = plumes.iter().zip(times).map(|(p, times)| p.expected(middle * times)).sum();
         if expected < number { low = middle } else { high = middle }
     }
     0.5 * (low + high)
@@ -211,6 +274,7 @@ mod tests {
             simulated: [vec![], vec![]],
             around: Default::default(),
             paths_m: [vec![4.0; 200], vec![4.0; 200]],
+            plumes: vec![Plume { speed_m_s: None, paths_m: vec![[4.0; 2]; 200], droplets: (behind + i % 2) as f64 }],
         };
         let plumes: Vec<PlumeFrame> = (0..12).map(frame).collect();
         let of = |from: usize| (from..from + 4).collect::<Vec<_>>();
@@ -238,5 +302,24 @@ mod tests {
         assert!((per_m.estimate / truth - 1.0).abs() < 0.02, "{per_m:?} {truth}");
         assert!(result.distance.iter().all(|d| d[1] > 10.0));
         assert!(!searched(80, 60).0 && !searched(1, 0).0);
+    }
+
+    #[test]
+    fn plumes_that_grow_with_the_square_of_the_speed_are_distinguished_from_plumes_that_are_alike() {
+        let plumes = |times: fn(f64) -> f64| {
+            let of_speed = |speed: f64| {
+                let plume = Plume { speed_m_s: Some(speed), paths_m: vec![[3.0, 5.0]; 400], droplets: 0.0 };
+                Plume { droplets: plume.expected(0.05 * times(speed)).round(), ..plume }
+            };
+            [0.0, 0.0, 4.0, 8.0, 12.0].map(of_speed)
+        };
+        let growing = plumes(|speed| (speed / 8.0).powi(2));
+        let Fitted { per_m, at_speed_m_s } = fitted(&growing.each_ref(), 1e-5);
+        let mean: f64 = [16.0, 64.0, 144.0].iter().sum::<f64>() / 3.0;
+        assert!((at_speed_m_s - mean.sqrt()).abs() < 1e-6);
+        assert!((per_m / (0.05 * mean / 64.0) - 1.0).abs() < 0.02, "{per_m}");
+        let alike = plumes(|_| 1.0);
+        let Fitted { per_m, at_speed_m_s } = fitted(&alike.each_ref(), 1e-5);
+        assert!(at_speed_m_s == 0.0 && (per_m / 0.05 - 1.0).abs() < 0.02, "{per_m}");
     }
 }

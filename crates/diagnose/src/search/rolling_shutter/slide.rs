@@ -1,7 +1,6 @@
 //! How far the scene slides over a scan.
 
 use crate::catalogue::Quantity;
-use crate::channels::labels::seen_velocity;
 use crate::channels::mean::Column;
 use crate::channels::motion::OwnMotion;
 use crate::inference::median;
@@ -50,11 +49,10 @@ impl Motion {
 
 /// Motion of the ego vehicle and of the objects in every frame; `None` where it is not known.
 pub(super) fn driven(context: &Context) -> Option<Vec<Motion>> {
-    let (times, own) = (context.times.as_ref()?, context.driving()?);
+    let own = context.driving().filter(|_| context.times.is_some())?;
     let motion = |(f, own): (usize, OwnMotion)| {
         let boxes = context.frames[f].objects.iter().filter_map(|o| o.simulated);
-        let moving = boxes
-            .filter_map(|b| Some((b, seen_velocity(context.frames, times, f, &b, &context.to_next)?.relative_m_s)));
+        let moving = boxes.filter_map(|b| Some((b, context.seen_velocity(f, &b)?.relative_m_s)));
         Motion { own, objects: moving.collect() }
     };
     Some(own.into_iter().enumerate().map(motion).collect())
