@@ -258,7 +258,8 @@ impl Effect {
             Effect::BeamIntensity { std } => vec![("std", std)],
             Effect::IncidenceNoise { angle_rad } => vec![("angle_rad", angle_rad)],
             Effect::GroundError { amplitude_m } => vec![("amplitude_m", amplitude_m)],
-            Effect::PacketLoss { loss, burst } => vec![("loss", loss), ("burst", burst)],
+            // The share of lost packets as the probability that one is lost after one that arrived.
+            Effect::PacketLoss { loss, burst } => vec![("loss", loss * (1.0 - burst) / (1.0 - loss)), ("burst", burst)],
             Effect::DirtyWindow { spot, share, noise_m } => vec![
                 ("sensor", spot.sensor as f64),
                 ("azimuth_deg", deg(spot.center[0])),

@@ -295,8 +295,8 @@ impl<'a> Frame<'a> {
         Some(hit.range_m)
     }
 
-    /// The vehicle before a plume on the way of a shot, where that way begins and ends in it before `until_m`, m, and the
-    /// density over that behind a car at 8 m/s.
+    /// The vehicle before a plume on the way of a shot, where that way begins and ends in it before `until_m`, m, and
+    /// the density over that behind a car at 8 m/s.
     pub fn plume_m(&self, shot: &Shot, until_m: f64) -> Option<(usize, [f64; 2], f64)> {
         let (ray, _) = self.rays(shot, [0.0; 2]);
         let world = &self.side.world;

@@ -67,8 +67,8 @@ pub struct PlumeFrame {
 pub struct Plume {
     /// Speed of the vehicle over the ground, m/s, where it is known.
     pub speed_m_s: Option<f64>,
-    /// Paths of shots with a simulated surface, m, and the whole path of each in the plume, also close to the vehicle, to
-    /// the ground and to the surface, where droplets are not counted: one there hides others behind it.
+    /// Paths of shots with a simulated surface, m, and the whole path of each in the plume, also close to the vehicle,
+    /// to the ground and to the surface, where droplets are not counted: one there hides others behind it.
     pub paths_m: Vec<[f32; 2]>,
     /// Measured droplets on such paths.
     pub droplets: f64,
@@ -141,8 +141,8 @@ fn in_the_air(ray: &Ray) -> bool {
     }
 }
 
-/// The air around the vehicles of a frame; `origins` are those of the sensors, in the cloud's frame, `speed_m_s` is that
-/// of a vehicle over the ground.
+/// The air around the vehicles of a frame; `origins` are those of the sensors, in the cloud's frame, `speed_m_s` is
+/// that of a vehicle over the ground.
 pub fn plume_frame(
     frame: &FramePair,
     origins: &[Point3<f64>],

@@ -119,13 +119,14 @@ impl Mixture {
         self
     }
 
-    /// What is preferred to it although it is less likely, by its number: the receiver needs nothing in the air, and
-    /// weather is more frequent than light of others.
+    /// How far other mixtures are preferred to it although they are less likely: the receiver alone needs nothing in
+    /// the air, and weather is more frequent than light of others.
     fn rank(&self) -> usize {
-        match [Origin::Receiver, Origin::Others].map(|o| self.place(o).is_some()) {
-            [true, _] => 0,
-            [false, false] => 1,
-            [false, true] => 2,
+        let [receiver, others] = [Origin::Receiver, Origin::Others].map(|o| self.place(o).is_some());
+        match self.parts.len() {
+            _ if others => 2,
+            1 if !receiver => 1,
+            _ => 0,
         }
     }
 

@@ -9,7 +9,7 @@ mod rows;
 use self::clock::{alike, forward, late, own_speeds, surely_late, within_frames};
 use self::describe::Description;
 use self::hypotheses::{HYPOTHESES, Hypothesis, TARGETS_CLOCK};
-use self::rows::{ALL, Row, displacement_m, distance, keep_known, row, set_noise, sums};
+use self::rows::{ALL, Row, displacement_m, distance, errors_by_vehicle, keep_known, row, set_noise, sums};
 use super::geometry::Displacement;
 use super::{ChannelResult, Context, Repair, Selected, Z_STAR, causes_of, confidence, first_demands, record};
 use crate::catalogue::{Cause, Channel, Quantity};
@@ -269,6 +269,8 @@ impl Search<'_> {
         let blocks = self.context.blocks(&self.estimate);
         let frames: Vec<&LinearFrame> = on_estimate.iter().collect();
         let fitted = fit(&frames, &blocks, &columns, &NO_PRIOR);
+        let by_vehicle = errors_by_vehicle(&self.rows, &self.estimate, &columns);
+        let errors: Vec<f64> = by_vehicle.iter().enumerate().map(|(i, error)| fitted.error(i).max(*error)).collect();
         let line = within_frames(&self.rows, &self.estimate, &blocks);
         let line = if line[1].is_finite() { line } else { self.line };
         let mut at = 0;
@@ -281,6 +283,7 @@ impl Search<'_> {
             let description = Description {
                 hypothesis,
                 fitted: &fitted,
+                errors: &errors,
                 own,
                 line,
                 side: self.side,

@@ -6,6 +6,7 @@ use super::hypotheses::{Hypothesis, hypotheses, is_attitude, is_pose, may_join};
 use super::rows::drop_less_certain_rows;
 use super::{Chosen, Search, directions};
 use crate::catalogue::Cause;
+use crate::channels::mean::Column;
 use crate::inference::choice::{Choice, Trial, choose, total_and_z};
 use crate::search::{ChannelResult, Selected, causes_of, record, rivals_and_confidence};
 use rayon::prelude::*;
@@ -47,7 +48,8 @@ impl Search<'_> {
             let trial = &trials[choice.chosen];
             first_gains.clone_from(&trial.gains);
             let equals = causes_of(&trials, &choice.equals);
-            selected.push(rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands));
+            let rivals = rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands);
+            selected.push(self.that_vary(candidates[trial.candidate], rivals));
             chosen.push(candidates[trial.candidate].clone());
         }
         self.choose_anew(&all, &mut chosen, &mut selected);
@@ -75,8 +77,9 @@ impl Search<'_> {
                 let (Some(choice), _) = self.choose(&mut trials, &candidates, &others) else { continue };
                 let trial = &trials[choice.chosen];
                 let rivals = causes_of(&trials, &choice.equals);
-                selected[k] = rivals_and_confidence(rivals, &trials, &self.blocks, trial.cause, &self.demands);
                 let anew = candidates[trial.candidate];
+                let rivals = rivals_and_confidence(rivals, &trials, &self.blocks, trial.cause, &self.demands);
+                selected[k] = self.that_vary(anew, rivals);
                 changed |= *anew != chosen[k];
                 chosen[k] = anew.clone();
             }
@@ -104,6 +107,15 @@ impl Search<'_> {
             refused.push(choice.chosen);
         }
         (None, refused)
+    }
+
+    /// The rivals of a hypothesis. Offsets of rows are the same at all speeds: they are none of what grows with the
+    /// speed.
+    fn that_vary(&self, hypothesis: &Hypothesis, mut selected: Selected) -> Selected {
+        if hypothesis.columns().iter().any(|&c| self.sums.columns[c] == Column::Lean) {
+            selected.rivals.retain(|r| !matches!(r, Cause::BeamRangeOffset | Cause::BeamElevationOffset));
+        }
+        selected
     }
 
     /// A trial of each candidate on top of what is chosen.

@@ -146,6 +146,7 @@ mod tests {
                 frame,
                 object,
                 yaw_rad: 0.0,
+                size_mm: [4000, 1800, 1500],
                 center: [0.0; 3],
                 shift: [shift(speeds[object]) + noise(), noise(), 0.0],
                 variance: [1.0; 3],

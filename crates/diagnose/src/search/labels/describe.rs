@@ -14,6 +14,8 @@ pub(super) struct Description<'a> {
     pub(super) hypothesis: &'a Hypothesis,
     /// Fit of all chosen hypotheses on the estimating frames.
     pub(super) fitted: &'a LinearFit,
+    /// Standard errors of its coefficients: over blocks of frames, or over vehicles, whichever are larger.
+    pub(super) errors: &'a [f64],
     /// Places of the hypothesis' own columns in the fit.
     pub(super) own: Range<usize>,
     /// Slope of the shift over the relative velocity among objects of the same frame, and its standard error, s.
@@ -68,7 +70,7 @@ impl Description<'_> {
         let sign = if self.side == Side::Labels { 1.0 } else { -1.0 };
         let mut parameters = Vec::new();
         for (i, &c) in self.own.clone().zip(columns) {
-            let (mut theta, mut error) = (self.fitted.theta[i], self.fitted.error(i));
+            let (mut theta, mut error) = (self.fitted.theta[i], self.errors[i]);
             if columns == TARGETS_CLOCK && c == 3 {
                 // The ego speed varies between frames, but not among the objects of a frame.
                 [theta, error] = self.line;

@@ -1,14 +1,15 @@
 //! Objects with their shifts and the covariates that may explain them.
 
-use super::Side;
+use super::{NO_PRIOR, Side};
 use crate::channels::labels::ObjectShift;
 use crate::channels::mean::origins;
-use crate::inference::linear::LinearFrame;
+use crate::inference::linear::{LinearFrame, fit};
 use crate::search::Context;
 use crate::search::geometry::Displacement;
 use nalgebra::{DMatrix, DVector, Vector3};
 use sensor::Sensor;
 use sensor::assignment::Assignment;
+use std::collections::BTreeMap;
 
 /// A linear effect on the shift of an object, in the object's own frame: one column of the fit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,6 +61,8 @@ pub(super) struct Row {
     pub(super) object: usize,
     pub(super) yaw_rad: f64,
     pub(super) center: [f64; 3],
+    /// Size, mm: the same vehicle has the same one in all frames, and mostly another one than others.
+    pub(super) size_mm: [i64; 3],
     /// Along the axes of the object, m.
     pub(super) shift: [f64; 3],
     /// Variance of the shift, m2.
@@ -133,6 +136,7 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
         object: s.object,
         yaw_rad: object.yaw_rad,
         center: object.center,
+        size_mm: object.size.map(|m| (1e3 * m).round() as i64),
         shift,
         variance,
         x,
@@ -217,8 +221,13 @@ fn robust_fit(rows: &[Row], select: &[usize], side: Side, axis: usize) -> (DVect
 
 /// Linear sums of one frame over all columns.
 pub(super) fn sums(rows: &[Row], frame: usize) -> LinearFrame {
+    sums_of(rows.iter().filter(|r| r.frame == frame))
+}
+
+/// Linear sums of some objects over all columns.
+fn sums_of<'a>(rows: impl Iterator<Item = &'a Row>) -> LinearFrame {
     let mut out = LinearFrame { gram: DMatrix::zeros(ALL, ALL), right: DVector::zeros(ALL) };
-    for r in rows.iter().filter(|r| r.frame == frame) {
+    for r in rows {
         for axis in 0..3 {
             let x = DVector::from_row_slice(&r.x[axis]);
             let w = r.robust(axis) / r.variance[axis];
@@ -227,6 +236,23 @@ pub(super) fn sums(rows: &[Row], frame: usize) -> LinearFrame {
         }
     }
     out
+}
+
+/// Fewest vehicles over which the scatter of shifts is known.
+const FEWEST_VEHICLES: usize = 4;
+
+/// Standard errors of coefficients by the scatter over the vehicles of some frames; zero with too few of them. A label
+/// may be beside its vehicle in all frames alike: more frames do not tell it better.
+pub(super) fn errors_by_vehicle(rows: &[Row], frames: &[usize], columns: &[usize]) -> Vec<f64> {
+    let mut vehicles = BTreeMap::<[i64; 3], Vec<&Row>>::new();
+    rows.iter().filter(|r| frames.contains(&r.frame)).for_each(|r| vehicles.entry(r.size_mm).or_default().push(r));
+    if vehicles.len() < FEWEST_VEHICLES {
+        return vec![0.0; columns.len()];
+    }
+    let sums: Vec<LinearFrame> = vehicles.values().map(|rows| sums_of(rows.iter().copied())).collect();
+    let each: Vec<usize> = (0..sums.len()).collect();
+    let fitted = fit(&sums.iter().collect::<Vec<_>>(), &each, columns, &NO_PRIOR);
+    (0..columns.len()).map(|i| fitted.error(i)).collect()
 }
 
 /// Displacement of objects by coefficients of some columns, root mean square, m.
@@ -240,4 +266,35 @@ pub(super) fn displacement_m(rows: &[Row], columns: &[usize], coefficients: &[f6
 pub(super) fn distance(rows: &[Row], frame: usize) -> f64 {
     let of = |r: &Row| (0..3).map(|axis| 0.5 * r.robust(axis) / r.variance[axis] * r.shift[axis].powi(2)).sum::<f64>();
     rows.iter().filter(|r| r.frame == frame).map(of).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn labels_that_are_beside_their_vehicles_in_all_frames_count_once_for_each_vehicle() {
+        // Eight vehicles in 50 frames, each label 5 cm ahead of its vehicle or behind it.
+        let row = |frame: usize, vehicle: usize| {
+            let mut x = [[0.0; ALL]; 3];
+            x[0][0] = 1.0;
+            Row {
+                frame,
+                object: vehicle,
+                yaw_rad: 0.0,
+                center: [20.0, 0.0, 0.0],
+                size_mm: [4000 + vehicle as i64, 1800, 1500],
+                shift: [0.3 + 0.05 * if vehicle.is_multiple_of(2) { 1.0 } else { -1.0 }, 0.0, 0.0],
+                variance: [0.05 * 0.05; 3],
+                x,
+                speed: None,
+                known: [true; ALL],
+            }
+        };
+        let rows_of = |n: usize| (0..50).flat_map(|f| (0..n).map(move |v| row(f, v))).collect::<Vec<_>>();
+        let frames: Vec<usize> = (0..50).collect();
+        let [error] = errors_by_vehicle(&rows_of(8), &frames, &[0])[..] else { panic!() };
+        assert!((error / (0.05 / 8f64.sqrt()) - 1.0).abs() < 0.15, "{error}");
+        assert_eq!(errors_by_vehicle(&rows_of(3), &frames, &[0]), [0.0]);
+    }
 }

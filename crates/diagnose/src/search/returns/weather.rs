@@ -174,12 +174,16 @@ impl Air {
     fn droplets(&self, place: usize, lost: impl Fn(f64) -> Option<f64>) -> Vec<Cause> {
         let shape = self.mixture.parts[place].shape;
         let depth = shape.mean_m();
+        let likely = |other: Origin| {
+            self.mixture.nats - instead(&self.mixture, place, other, &self.bins).nats < first_demands().nats
+        };
         if depth > SINGLE_DROPS_M[1] {
-            return vec![Cause::Fog];
+            let noise = self.mixture.place(Origin::Receiver).is_none() && likely(Origin::Receiver);
+            return if noise { vec![Cause::Fog, Cause::Outliers] } else { vec![Cause::Fog] };
         }
         let are_drops = shape.origin() == Origin::Drops;
         let other = if are_drops { Origin::Droplets } else { Origin::Drops };
-        let by_law = self.mixture.nats - instead(&self.mixture, place, other, &self.bins).nats > first_demands().nats;
+        let by_law = !likely(other);
         let beside_fog = self.mixture.place(Origin::Droplets).is_some();
         match lost(depth) {
             // What is lost far away may be the fog's.
