@@ -13,6 +13,9 @@ use serde::{Deserialize, Serialize};
 /// a plume is w long, m, before its surface, reports a droplet with probability `1 - exp(-density_per_m * w)`. The
 /// droplet's distance r from the point of entry has a density proportional to `exp(-density_per_m * r)`.
 ///
+/// With `at_speed_m_s` the density is that behind a car of this speed. It grows with the square of the speed, and a car
+/// that stands, or whose speed is not known, has no plume.
+///
 /// Typical: 0.01 to 0.2 per metre on a wet road at speed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
