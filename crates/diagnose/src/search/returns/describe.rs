@@ -104,13 +104,13 @@ fn alone(search: &Search, share: &Parameter) -> Vec<(f64, Description)> {
     air.shares().into_iter().enumerate().map(of_part).collect()
 }
 
-/// Describes lone returns in some directions.
+/// Describes lone returns at some ranges, or in some directions, such as the light of another sensor.
 fn of_a_crowd(alarms: &FalseAlarms, share: &Parameter) -> Description {
     Description {
         causes: vec![],
         covariate: Covariate::Azimuth,
         says: format!(
-            "{:.2} % of the measured returns stand alone where nothing is, in other directions from frame to frame; no \
+            "{:.2} % of the measured returns stand alone where nothing is, at some ranges or in some directions only; no \
              cause of the catalogue does that, false alarms and droplets come everywhere",
             100.0 * share.estimate
         ),
