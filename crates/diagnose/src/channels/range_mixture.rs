@@ -28,7 +28,7 @@ const LEAST: f64 = 0.5;
 const STEPS: usize = 200;
 
 /// The most likely rates of some shapes beside what the simulated side shows, by expectation and maximisation.
-pub fn fit(shapes: &[Shape], bins: &[Bin]) -> Mixture {
+fn fit(shapes: &[Shape], bins: &[Bin]) -> Mixture {
     let of_one: Vec<Vec<f64>> = shapes.iter().map(|s| s.expected(bins)).collect();
     let all: Vec<f64> = of_one.iter().map(|q| q.iter().sum::<f64>().max(1e-9)).collect();
     let base: Vec<f64> = bins.iter().map(|b| b.simulated.max(LEAST)).collect();
@@ -88,7 +88,7 @@ impl Mixture {
     }
 
     /// The most likely of some shapes in one place beside the other parts.
-    fn likeliest(&self, place: usize, shapes: impl IntoIterator<Item = Shape>, bins: &[Bin]) -> Mixture {
+    pub fn likeliest(&self, place: usize, shapes: impl IntoIterator<Item = Shape>, bins: &[Bin]) -> Mixture {
         let with = |shape: Shape| {
             let mut shapes = self.shapes();
             shapes.splice(place..(place + 1).min(shapes.len()), [shape]);

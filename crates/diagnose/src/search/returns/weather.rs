@@ -4,7 +4,7 @@ use super::ONE_SIDED;
 use crate::catalogue::Cause;
 use crate::channels::free_path::{Bin, bins};
 use crate::channels::range_laws::{Fall, Origin, Shape};
-use crate::channels::range_mixture::{Mixture, Part, fit, instead, mixture, steady_instead};
+use crate::channels::range_mixture::{Mixture, Part, instead, mixture, steady_instead};
 use crate::channels::returns::{OWN_CAR_M, Odd, odd};
 use crate::channels::together::crowding;
 use crate::pairing::FramePair;
@@ -131,11 +131,11 @@ impl Air {
 
     /// Returns of some parts that are expected behind surfaces.
     fn expected_behind(&self, places: &[usize]) -> f64 {
-        let of_bin = |k: usize, bin: &Bin| {
-            let of_part = |&place: &usize| self.mixture.returns_by_bin(place, &self.bins)[k];
-            places.iter().map(of_part).sum::<f64>() / bin.free_m.max(1.0) * bin.behind_m
+        let of_part = |&place: &usize| {
+            let before = self.mixture.returns_by_bin(place, &self.bins);
+            before.iter().zip(&self.bins).map(|(n, bin)| n / bin.free_m.max(1.0) * bin.behind_m).sum::<f64>()
         };
-        self.bins.iter().enumerate().map(|(k, bin)| of_bin(k, bin)).sum()
+        places.iter().map(of_part).sum()
     }
 
     /// Returns behind surfaces that would be there if all those before surfaces came from the receiver, whatever their
@@ -231,14 +231,10 @@ fn view_m(bins: &[Bin]) -> f64 {
 
 /// Interval of the mean of one part of a mixture: where the likelihood falls by two nats; at least 10 %.
 fn interval(bins: &[Bin], mixture: &Mixture, place: usize) -> [f64; 2] {
-    let shapes: Vec<Shape> = mixture.parts.iter().map(|p| p.shape).collect();
+    let shape = mixture.parts[place].shape;
     let falls = |factor: f64| {
-        let other = |k: i32| shapes[place].scaled(factor.powi(k));
-        let likely = |k: &i32| {
-            let mut shapes = shapes.clone();
-            shapes[place] = other(*k);
-            mixture.nats - fit(&shapes, bins).nats < 2.0
-        };
+        let other = |k: i32| shape.scaled(factor.powi(k));
+        let likely = |k: &i32| mixture.nats - mixture.likeliest(place, [other(*k)], bins).nats < 2.0;
         other((1..60).take_while(likely).last().unwrap_or(0).max(5)).mean_m()
     };
     [falls(1.0 / 1.02), falls(1.02)]
