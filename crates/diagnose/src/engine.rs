@@ -26,8 +26,8 @@ use crate::error::DiagnoseError;
 use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, roles};
 use crate::pairing::{
-    Corrections, FramePair, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors, kept_of_frame,
-    pair_all, with_points,
+    Corrections, FramePair, RangeError, Ray, Recordings, ShownShift, check_identity, common_ids, find_sensors,
+    kept_of_frame, pair_all, with_points,
 };
 use crate::search::geometry::Displacement;
 use crate::search::geometry::Geometry;
@@ -262,8 +262,14 @@ impl Engine<'_> {
         let (rounding, step_m) = search::quantisation::search(&context, Rounded::Ranges);
         let (of_coordinates, _) = search::quantisation::search(&context, Rounded::Coordinates);
         let dual = search::dual_returns::search(&context);
-        let mut known = Known { slide, step_m, displaced: Displacement::default() };
-        let standing = known.standing(self)?;
+        let mut known = Known { slide, step_m, walk: None, displaced: Displacement::default() };
+        let mut standing = known.standing(self)?;
+        let recorded_still = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let (by_brightness, walk) = search::geometry::walk::search(&recorded_still);
+        if walk.is_some() {
+            known.walk = walk;
+            standing = known.standing(self)?;
+        }
         let moved_back = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context.clone() };
         self.finished(2);
         let undo = |displaced: &Displacement| {
@@ -280,7 +286,7 @@ impl Engine<'_> {
         });
         let standing = if changed { known.standing(self)? } else { standing };
         let context = Context { frames: standing.as_deref().unwrap_or(context.frames), ..context };
-        let mut results = vec![sliding, rounding, of_coordinates, dual, result];
+        let mut results = vec![sliding, rounding, of_coordinates, dual, by_brightness, result];
         known.displaced = displaced;
         self.finished(3);
         results.extend(self.single_returns(&context, &known, &mut notes)?);
@@ -347,8 +353,9 @@ impl Engine<'_> {
             known.slide_m(frame, p, sensor) + displaced.of_point(p, (frame, sensor), &self.origins[sensor])
         };
         let moves = known.slide.is_some() || displaced.moves();
-        let moved =
-            Corrections { shift_m: moves.then_some(&shift), step_m: known.coarse_m(), ..Corrections::default() };
+        let walk = |ray: &Ray| known.walk_m(ray);
+        let walks: Option<RangeError> = if known.walk.is_some() { Some(&walk) } else { None };
+        let moved = Corrections { shift_m: moves.then_some(&shift), range_m: walks, step_m: known.coarse_m() };
         let upright = if displaced.moves() { Some(self.pair(moved)?) } else { None };
         let context = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
         let (packets, arrived) = search::packets::search(&context, self.sensors);
@@ -363,10 +370,10 @@ impl Engine<'_> {
         self.finished(6);
         let uneven = displaced.is_uneven();
         let in_row = |frame: usize, p: &Vector3<f64>, sensor: usize| known.shift_m(self, displaced, (frame, sensor), p);
-        let off = |ray: &Ray| displaced.of_strip(ray);
+        let off = |ray: &Ray| known.walk_m(ray) + displaced.of_strip(ray);
         let even = Corrections {
             shift_m: if displaced.rows.is_empty() { moved.shift_m } else { Some(&in_row) },
-            range_m: displaced.has_strips().then_some(&off),
+            range_m: if displaced.has_strips() { Some(&off) } else { walks },
             step_m: known.step_m,
         };
         let even = if uneven || known.step_m.is_some() { Some(self.pair(even)?) } else { None };

@@ -294,6 +294,31 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
     }
 }
 
+/// Bright surfaces are measured nearer, beside noise that both sides have. Of the simulated side only points are known:
+/// its own intensities tell brightness.
+#[test]
+fn a_range_walk_is_found_by_intensities_and_corrected() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = race_of(folder.path(), true, "rows", 0.5);
+    // Intensities are reflectivities.
+    let noise = "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.01\n\
+                 [[effect]]\nkind = \"intensity_response\"\nincidence_exponent = -1\n";
+    let walk = "[[effect]]\nkind = \"reflectivity_walk\"\nwalk_m = -0.06\n";
+    let simulated = with_effects(&foreign(&sim, folder.path()), noise, &folder.path().join("noisy"), 5);
+    let measured = with_effects(&sim, &format!("{walk}{noise}"), &folder.path().join("measured"), 11);
+    let rig = Rig::read(&folder.path().join("foreign/rig.toml")).unwrap();
+    let outcome = diagnose(&measured, &simulated, &rig, &Options::default(), &|_, _, _| ()).unwrap();
+    let d = &outcome.diagnosis;
+    assert_eq!(named(d), ["reflectivity_walk"], "{:?} {:?}", d.findings, d.considered);
+    let found = d.findings[0].parameter(Quantity::WalkM).unwrap();
+    assert!(found.ci95[0] <= -0.06 && -0.06 <= found.ci95[1] && found.estimate < -0.04, "{found:?}");
+    let closed = d.findings[0].reached.unwrap();
+    assert!(closed > 0.9 && d.gain.not_applied.is_empty(), "{:?}", d.gain);
+    let again = with_effects(&simulated, &outcome.extended, &folder.path().join("again"), 12);
+    let second = diagnose(&measured, &again, &rig, &Options::default(), &|_, _, _| ()).unwrap().diagnosis;
+    assert!(second.findings.is_empty(), "{:?}", second.findings);
+}
+
 /// Two draws of one sensor model differ by chance alone: where both sides lose most of the road, lose packets and have
 /// false alarms, nothing is found.
 #[test]

@@ -31,6 +31,11 @@ const TABLE: &[[&str; 3]] = &[
         "a drift of all ranges is in the map as it is in the returns of the same time",
         "a wall at a known distance, at the beginning and at the end of a recording",
     ],
+    [
+        "reflectivity_walk",
+        "surfaces of the map stand where returns of their own brightness put them",
+        "plates of several reflectivities at one distance",
+    ],
     ["range_noise", NOISE, WALL],
     ["signal_noise", NOISE, "surfaces of several reflectivities at the same distance from a standing sensor"],
     ["incidence_noise", NOISE, "a flat wall from a standing sensor at several angles"],

@@ -1,7 +1,7 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 39] = [
+pub const CATALOGUE: [&str; 40] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
@@ -34,6 +34,7 @@ pub const CATALOGUE: [&str; 39] = [
     "range_drift",
     "range_dropout",
     "range_noise",
+    "reflectivity_walk",
     "rolling_shutter",
     "sensor_extrinsics",
     "signal_dropout",

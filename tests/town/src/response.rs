@@ -104,6 +104,11 @@ impl Spot {
     }
 }
 
+/// What a range walk changes the range of a surface by, m.
+pub fn walk_of_m(walk_m: f64, reflectivity: f64) -> f64 {
+    -walk_m * (0.8 * (reflectivity / 0.25).ln()).tanh()
+}
+
 impl Frame<'_> {
     /// Attenuation of the way to a range and back, in the logarithm of the signal.
     pub fn attenuation(&self, range_m: f64) -> f64 {
@@ -187,7 +192,7 @@ impl Frame<'_> {
         for effect in &side.effects {
             shift += match *effect {
                 Effect::RangeBias { offset_m, scale } => offset_m + scale * range * (1.0 + 0.05 * range / REACH_M),
-                Effect::ReflectivityWalk { walk_m } => -walk_m * (0.8 * (echo.reflectivity / 0.25).ln()).tanh(),
+                Effect::ReflectivityWalk { walk_m } => walk_of_m(walk_m, echo.reflectivity),
                 Effect::RangeDrift { drift_m } => drift_m * aged,
                 Effect::ThermalRows { drift_m } => drift_m * aged * if shot.row.is_multiple_of(2) { 1.0 } else { -1.0 },
                 Effect::RangeRipple { amplitude_m, length_m } => amplitude_m * (TAU * range / length_m).sin(),

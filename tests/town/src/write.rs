@@ -4,6 +4,7 @@ use crate::case::Case;
 use crate::effect::Effect;
 use crate::frame::Frame;
 use crate::oracle::judge;
+use crate::response::walk_of_m;
 use crate::sensor::rig_toml;
 use crate::side::Side;
 use crate::world::REACH_M;
@@ -53,11 +54,16 @@ pub fn truth(case: &Case) -> Truth {
         let mut parameters = effect.parameters();
         parameters.extend(grown(case, effect));
         parameters.extend(sprayed(case, effect));
+        let mut bound = judgement.bound;
+        if let Some((walk_m, of_effect)) = walked_m(case, effect) {
+            parameters.insert("walk_m".into(), walk_m);
+            bound.iter_mut().for_each(|(_, by)| *by *= (walk_m / of_effect).abs());
+        }
         Hidden {
             cause: effect.cause().into(),
             in_catalogue: effect.in_catalogue(),
             parameters,
-            bound: judgement.bound,
+            bound,
             touched: judgement.touched,
             ..Hidden::default()
         }
@@ -83,15 +89,48 @@ fn grown(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
     [("longer_m", length * mean(0)), ("higher_m", height * mean(2))].map(|(k, v)| (k.to_owned(), v)).into()
 }
 
-/// One of so many frames, and of so many shots, that tell the mean density of plumes.
-const SPRAY_ONE_IN: [usize; 2] = [4, 7];
+/// What a range walk changes ranges by for each factor e of the intensity that the column has, or of reflectivity where
+/// there is none: the line through its law over the surfaces that shots meet; and the number of the effect, m.
+fn walked_m(case: &Case, effect: &Effect) -> Option<(f64, f64)> {
+    let Effect::ReflectivityWalk { walk_m } = *effect else { return None };
+    let side = &case.measured;
+    let column = side.setting.intensity;
+    let mut met: Vec<[f64; 3]> = Vec::new();
+    for index in (0..case.size.frames).step_by(ONE_IN[0]) {
+        let frame = Frame::new(side, index);
+        for sensor in 0..side.mounts.len() {
+            for shot in side.shots(sensor, index).iter().step_by(ONE_IN[1]) {
+                let Some(echo) = frame.trace(shot, [0.0; 2]).first else { continue };
+                let value = |times: f64| {
+                    let rng = &mut data::stream(case.seed, "walk", 0, 0);
+                    column.value(times * echo.reflectivity, echo.cos_incidence, echo.range_m, 1.0, rng)
+                };
+                // How the logarithm of the column follows that of reflectivity there.
+                let by = 1.2f64;
+                let follows = match [value(1.0), value(by)].map(|v| v.filter(|_| column.is_of_surface())) {
+                    [Some(one), Some(more)] if one > 0.0 => f64::from(more / one).ln() / by.ln(),
+                    _ => 1.0,
+                };
+                met.push([echo.reflectivity.ln(), walk_of_m(walk_m, echo.reflectivity), follows]);
+            }
+        }
+    }
+    let n = met.len().max(1) as f64;
+    let mean = |of: &dyn Fn(&[f64; 3]) -> f64| met.iter().map(of).sum::<f64>() / n;
+    let [x, y, follows] = [0, 1, 2].map(|k: usize| mean(&|m| m[k]));
+    let slope = mean(&|m| (m[0] - x) * (m[1] - y)) / mean(&|m| (m[0] - x).powi(2)).max(1e-12);
+    Some((slope / follows.max(1e-3), walk_m))
+}
+
+/// One of so many frames, and of so many shots, that tell the mean of what an effect does.
+const ONE_IN: [usize; 2] = [4, 7];
 
 /// Mean density of the plumes of labelled vehicles that shots pass before they meet a surface, 1/m: the effect's own
 /// number is that behind a car at 8 m/s.
 fn sprayed(case: &Case, effect: &Effect) -> BTreeMap<String, f64> {
     let Effect::Spray { per_m } = *effect else { return BTreeMap::new() };
     let side = &case.measured;
-    let [frames, shots] = SPRAY_ONE_IN;
+    let [frames, shots] = ONE_IN;
     let of_frame = |index: usize| {
         let frame = Frame::new(side, index);
         let mut sum = [0.0; 2];

@@ -72,6 +72,8 @@ identifiers! {
         RangeDropout = "range_dropout",
         /// Ranges scatter.
         RangeNoise = "range_noise",
+        /// Range walk: ranges depend on how bright a surface is.
+        ReflectivityWalk = "reflectivity_walk",
         /// Motion distortion: a scan takes its time and is not de-skewed.
         RollingShutter = "rolling_shutter",
         /// One sensor is mounted otherwise than the rig says.
@@ -121,6 +123,7 @@ impl Cause {
             Cause::RangeBias => (Family::RangeError, 160),
             Cause::RangeDrift => (Family::RangeError, 165),
             Cause::BeamRangeOffset => (Family::RangeError, 170),
+            Cause::ReflectivityWalk => (Family::RangeError, 175),
             Cause::RangeNoise => (Family::RangeError, 180),
             Cause::IncidenceNoise => (Family::RangeError, 185),
             Cause::SignalNoise => (Family::RangeError, 190),

@@ -8,6 +8,8 @@ identifiers! {
     Covariate {
         /// Azimuth in the sensor's frame.
         Azimuth = "azimuth",
+        /// Brightness of the surface.
+        Brightness = "brightness",
         /// Cosine of the angle of incidence.
         CosIncidence = "cos_incidence",
         /// A region of azimuth and elevation.

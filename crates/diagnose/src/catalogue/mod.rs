@@ -70,6 +70,8 @@ identifiers! {
         Behind = "behind",
         /// Ranges between the two surfaces of an edge.
         Between = "between",
+        /// Ranges on bright spots against those on dark ones of the same surface.
+        Brightness = "brightness",
         /// Losses in some directions, beyond those of surfaces like theirs, and returns of the ego vehicle.
         Directions = "directions",
         /// Groups of returns where the other side has nothing.
@@ -99,6 +101,7 @@ impl Kind {
             | Cause::SignalDropout => Some(Kind::Surfaces),
             Cause::MissingObject => Some(Kind::Groups),
             Cause::MixedPixels => Some(Kind::Between),
+            Cause::ReflectivityWalk => Some(Kind::Brightness),
             Cause::Spray => Some(Kind::Plumes),
             _ => None,
         }
@@ -107,6 +110,7 @@ impl Kind {
     /// The channel that it is a part of.
     pub const fn channel(self) -> Channel {
         match self {
+            Kind::Brightness => Channel::Residuals,
             Kind::Directions | Kind::Surfaces => Channel::Hits,
             _ => Channel::Returns,
         }

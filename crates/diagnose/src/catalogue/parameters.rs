@@ -135,6 +135,8 @@ identifiers! {
         UpM = "up_m",
         /// Range at which an eye sees 5 % of the contrast.
         VisibilityM = "visibility_m",
+        /// Change of range for each factor e of brightness.
+        WalkM = "walk_m",
         /// Measured objects are wider by this.
         WiderM = "wider_m",
         /// Turn about the z axis.
@@ -190,6 +192,7 @@ impl Quantity {
             | Quantity::StepM
             | Quantity::UpM
             | Quantity::VisibilityM
+            | Quantity::WalkM
             | Quantity::WiderM => Unit::Metre,
             Quantity::AzimuthDeg
             | Quantity::AzimuthFromDeg

@@ -81,7 +81,7 @@ pub struct Column {
 
 impl Column {
     /// Of the rays of one side.
-    fn of<'a>(rays: impl Iterator<Item = &'a Ray> + Clone) -> Column {
+    pub fn of<'a>(rays: impl Iterator<Item = &'a Ray> + Clone) -> Column {
         let mut values: Vec<f32> = rays.clone().map(|r| r.intensity).filter(|v| v.is_finite()).collect();
         values.sort_by(f32::total_cmp);
         let (n, last) = (values.len().max(1), values.last().copied().unwrap_or(0.0));

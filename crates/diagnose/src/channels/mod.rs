@@ -1,5 +1,6 @@
 //! Channels: sums over a pair of data sets from which causes are fitted.
 
+pub mod brightness;
 pub mod cells;
 pub mod edges;
 pub mod free_path;

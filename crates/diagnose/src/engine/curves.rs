@@ -84,8 +84,8 @@ fn place_and_value(finding: &Finding, ray: &Ray) -> Option<(f64, f64)> {
         Covariate::Signal if finding.channel == Channel::Hits => {
             (cos > 0.0).then(|| cos.ln() - 2.0 * range.ln() + index_offset())
         }
-        // Those of the frame: a ray does not say.
-        Covariate::Time | Covariate::Velocity => None,
+        // Those of the frame, and what the search alone knows of intensities: a ray does not say.
+        Covariate::Time | Covariate::Velocity | Covariate::Brightness => None,
         Covariate::RangeTanIncidence => (cos > 0.0).then(|| range * (1.0 / (cos * cos) - 1.0).max(0.0).sqrt()),
         _ => Some(range),
     };

@@ -3,8 +3,9 @@
 use super::Engine;
 use crate::channels::mask::Shown;
 use crate::error::DiagnoseError;
-use crate::pairing::{Corrections, FramePair, ShownShift};
+use crate::pairing::{Corrections, FramePair, RangeError, Ray, ShownShift};
 use crate::search::geometry::Displacement;
+use crate::search::geometry::walk::Walk;
 use crate::search::rolling_shutter::Slide;
 use nalgebra::Vector3;
 
@@ -17,6 +18,8 @@ pub(super) struct Known {
     pub(super) slide: Option<Slide>,
     /// Quantisation step, m.
     pub(super) step_m: Option<f64>,
+    /// Range walk.
+    pub(super) walk: Option<Walk>,
     pub(super) displaced: Displacement,
 }
 
@@ -48,18 +51,25 @@ impl Known {
         of_row + self.slide_m(frame, p, sensor) + displaced.of_point(p, (frame, sensor), &engine.origins[sensor])
     }
 
-    /// Frames with motion distortion and coarse quantisation corrected; `None` where there is none.
+    /// Range walk of a measured return, m.
+    pub(super) fn walk_m(&self, ray: &Ray) -> f64 {
+        self.walk.map_or(0.0, |walk| walk.of(ray))
+    }
+
+    /// Frames with motion distortion, range walk and coarse quantisation corrected; `None` where there is none.
     pub(super) fn standing(&self, engine: &Engine) -> Result<Option<Vec<FramePair>>, DiagnoseError> {
-        if self.slide.is_none() && self.coarse_m().is_none() {
+        if self.slide.is_none() && self.walk.is_none() && self.coarse_m().is_none() {
             return Ok(None);
         }
         let shift: ShownShift = &|frame, p, sensor| self.slide_m(frame, p, sensor);
         let shift_m = self.slide.as_ref().map(|_| shift);
-        engine.pair(Corrections { shift_m, step_m: self.coarse_m(), ..Corrections::default() }).map(Some)
+        let walk: RangeError = &|ray| self.walk_m(ray);
+        let range_m = self.walk.map(|_| walk);
+        engine.pair(Corrections { shift_m, range_m, step_m: self.coarse_m() }).map(Some)
     }
 
-    /// Frames with motion distortion, quantisation and a displacement undone, that of rows as well; and what is `left`
-    /// of the motion distortion.
+    /// Frames with motion distortion, range walk, quantisation and a displacement undone, that of rows as well; and
+    /// what is `left` of the motion distortion.
     pub(super) fn undone(
         &self,
         engine: &Engine,
@@ -70,7 +80,9 @@ impl Known {
             let left_m = left.map_or_else(Vector3::zeros, |slide| slide.shift_m(frame, p, sensor));
             self.shift_m(engine, displaced, (frame, sensor), p) + left_m
         };
-        engine.pair(Corrections { shift_m: Some(&shift), step_m: self.coarse_m(), ..Corrections::default() })
+        let walk: RangeError = &|ray| self.walk_m(ray);
+        let range_m = self.walk.map(|_| walk);
+        engine.pair(Corrections { shift_m: Some(&shift), range_m, step_m: self.coarse_m() })
     }
 
     /// How the measured scene lies when silhouettes and single returns are compared.

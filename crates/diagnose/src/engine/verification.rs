@@ -129,6 +129,7 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     let (mut kinds, lost) =
         rayon::join(|| returns::by_table(context, train, test), || hits::by_table(context, train, test));
     kinds.extend(lost);
+    kinds.insert(Kind::Brightness, geometry::walk::by_table(context, train, test));
     of_channels(distances, kinds)
 }
 

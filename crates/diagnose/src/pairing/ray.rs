@@ -2,6 +2,7 @@
 
 use nalgebra::{Point3, Vector3};
 use sensor::signal::{DIAGNOSIS_REFLECTIVITY, signal_index};
+use std::f64::consts::TAU;
 
 /// Kind of the simulated surface in the direction of a ray.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -93,6 +94,9 @@ pub struct Ray {
     pub intensity_beside: f32,
 }
 
+/// Directions about the vehicle, of 45 degrees each.
+pub const OCTANTS: usize = 8;
+
 impl Ray {
     /// Its own range, m.
     pub fn own_range_m(&self) -> f64 {
@@ -107,6 +111,12 @@ impl Ray {
     /// The predicted point in the cloud's frame, from the sensor's origin.
     pub fn predicted_point(&self, origin: &Point3<f64>) -> Point3<f64> {
         origin + self.direction_vector() * f64::from(self.range_m)
+    }
+
+    /// Number of the eighth of a turn, in the cloud's axes, in which it was recorded.
+    pub fn octant(&self) -> usize {
+        let turn = (f64::from(self.recorded_m[1]).atan2(f64::from(self.recorded_m[0])) / TAU).rem_euclid(1.0);
+        ((turn * OCTANTS as f64) as usize).min(OCTANTS - 1)
     }
 
     /// Where it was recorded, as a vector from the sensor's origin, m.

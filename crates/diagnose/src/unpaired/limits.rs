@@ -14,6 +14,7 @@ const SAME_SCENES: &str =
 const TABLE: &[(Cause, &str, &str)] = &[
     (Cause::RangeBias, "a bias of all ranges moves a street as a whole", "a wall at two surveyed distances"),
     (Cause::RangeDrift, "a bias of all ranges moves a street as a whole", "a wall, at the beginning and at the end"),
+    (Cause::ReflectivityWalk, PLACES, "plates of several reflectivities at one distance"),
     (Cause::BeamRangeOffset, PLACES, "flat walls with a spinning sensor, and diagnose them with --scans"),
     (Cause::BeamElevationOffset, PLACES, "a level hall, or a survey of the road; or the same scenes on both sides"),
     (Cause::SensorExtrinsics, PLACES, SAME_SCENES),

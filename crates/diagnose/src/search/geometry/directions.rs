@@ -6,13 +6,10 @@ use super::hypotheses::Hypothesis;
 use super::sums::Sums;
 use crate::channels::mean::{Compared, OWN};
 use crate::inference::choice::total_and_z_about;
+use crate::pairing::OCTANTS;
 use crate::search::Context;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
-use std::f64::consts::TAU;
-
-/// Directions about the vehicle, of 45 degrees each.
-const DIRECTIONS: usize = 8;
 
 /// Fewest directions, each counted by its share of what all are expected to gain, that are compared.
 const FEWEST: f64 = 2.5;
@@ -31,7 +28,11 @@ pub(super) fn agree(
     hypotheses: &[Hypothesis],
 ) -> bool {
     let Some(Hypothesis::Linear { columns, .. }) = hypotheses.last() else { return true };
-    let [gains, expected] = by_direction(context, sums, frames, blocks, (hypotheses, columns));
+    alike(by_direction(context, sums, frames, blocks, (hypotheses, columns)))
+}
+
+/// Whether the gains of the directions agree with what each is expected to gain; true where too few show the effect.
+pub(super) fn alike([gains, expected]: [[f64; OCTANTS]; 2]) -> bool {
     total_and_z_about(&gains, &expected, FEWEST).is_none_or(|(_, z)| z > Z_LEAST)
 }
 
@@ -45,7 +46,7 @@ fn by_direction(
     frames: &[usize],
     blocks: &[usize],
     (hypotheses, columns): (&[Hypothesis], &[usize]),
-) -> [[f64; DIRECTIONS]; 2] {
+) -> [[f64; OCTANTS]; 2] {
     let fitted = sums.fit_all(frames, blocks, hypotheses);
     let p = sums.columns.len();
     let (mut theta, mut effect) = (DVector::zeros(p), DVector::zeros(p));
@@ -64,19 +65,17 @@ fn by_direction(
         let taken_up = mean.own(&sums.own_prior, &(&mean.gram * &effect));
         let mut rest = effect.clone();
         (0..OWN).for_each(|k| rest[k] -= taken_up[k]);
-        let mut out = [[0.0; DIRECTIONS]; 2];
+        let mut out = [[0.0; OCTANTS]; 2];
         compared.for_each(&context.frames[f], &sums.poses[f], &sums.moments.of_frames[f], |ray, x, y, w| {
             let by = |of: &DVector<f64>| x.iter().map(|&(k, v)| v * of[k]).sum::<f64>();
             let (moved, rest, left) = (by(&effect), by(&rest), y - by(&theta));
-            let place = ray.recorded_vector();
-            let turn = (place.y.atan2(place.x) / TAU).rem_euclid(1.0);
-            let at = ((turn * DIRECTIONS as f64) as usize).min(DIRECTIONS - 1);
+            let at = ray.octant();
             out[0][at] += w * rest * (0.5 * moved + left);
             out[1][at] += 0.5 * w * moved * rest;
         });
         out
     };
-    let add = |a: [[f64; DIRECTIONS]; 2], b: [[f64; DIRECTIONS]; 2]| {
+    let add = |a: [[f64; OCTANTS]; 2], b: [[f64; OCTANTS]; 2]| {
         [0, 1].map(|i: usize| std::array::from_fn(|k| a[i][k] + b[i][k]))
     };
     frames.par_iter().map(of_frame).reduce(Default::default, add)

@@ -14,6 +14,7 @@ mod rows;
 mod selection;
 mod steadiness;
 mod sums;
+pub mod walk;
 
 pub use self::displacement::{Displacement, Swept};
 

@@ -1,0 +1,269 @@
+//! Ranges against brightness: how much longer or shorter a range is on a bright spot than beside it on the same
+//! surface. A surface that stands elsewhere than in the simulation displaces both alike, whatever its brightness.
+
+use super::intensity::Column;
+use super::mean::{KINDS, OwnPoses, STRAY_M, kind_of, origins, own_row, usable, weight};
+use crate::inference::linear::LinearFrame;
+use crate::pairing::{FramePair, OCTANTS, Ray};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use rayon::prelude::*;
+use sensor::Rig;
+use sensor::effects::ReflectivityWalk;
+use std::collections::BTreeMap;
+
+/// Width and height of a patch of directions, rad.
+const PATCH_RAD: [f64; 2] = [0.12, 0.05];
+
+/// Fewest returns of a patch.
+const FEWEST: f64 = 8.0;
+
+/// Smallest intensity that tells a brightness, in steps of the column.
+const STEPS: f64 = 3.0;
+
+/// Largest deviation of the brightness of a return from that of the returns around it, of the spread over all returns.
+const EVEN: f64 = 0.3;
+
+/// Columns that the fall of a column of intensities is fitted with: the kinds of surfaces, range and incidence.
+const OF_FALL: usize = KINDS + 2;
+
+/// The brightness of surfaces by a column of intensities: the logarithm of an intensity, without what range and
+/// incidence do to it in the mean over the returns of each kind of surface.
+#[derive(Clone, Copy, Debug)]
+pub struct Brightness {
+    /// Smallest intensity that is used.
+    least: f64,
+    /// Logarithm of the intensity of mean brightness, at 20 m and at normal incidence.
+    middle_ln: f64,
+    /// Exponent of the fall with range, and with the cosine of incidence.
+    fall: [f64; 2],
+    /// Standard deviation over the returns.
+    pub spread: f64,
+}
+
+impl Brightness {
+    /// By the intensities of some returns; `None` where they do not tell surfaces apart.
+    pub fn of<'a>(rays: impl Iterator<Item = &'a Ray> + Clone) -> Option<Brightness> {
+        let rays = rays.filter(|r| usable(r) && r.intensity.is_finite());
+        let column = Column::of(rays.clone());
+        if !column.tells_surfaces() {
+            return None;
+        }
+        let least = STEPS * column.step;
+        let bright = || rays.clone().filter_map(|r| Some((r, ln_above(r.intensity, least)?)));
+        let mut gram = SMatrix::<f64, OF_FALL, OF_FALL>::identity() * 1e-6;
+        let mut right = SVector::<f64, OF_FALL>::zeros();
+        for (ray, ln) in bright() {
+            let mut x = SVector::<f64, OF_FALL>::zeros();
+            x[kind_of(ray)] = 1.0;
+            x.fixed_rows_mut::<2>(KINDS).copy_from_slice(&of_fall(ray));
+            gram.ger(1.0, &x, &x, 1.0);
+            right += x * ln;
+        }
+        let fitted = gram.cholesky()?.solve(&right);
+        let fall = [-fitted[KINDS], fitted[KINDS + 1]];
+        let mut own = Brightness { least, middle_ln: 0.0, fall, spread: 0.0 };
+        let [n, sum, squares] =
+            bright().filter_map(|(ray, _)| own.ln(ray)).fold([0.0; 3], |s, b| [s[0] + 1.0, s[1] + b, s[2] + b * b]);
+        let count: f64 = f64::max(n, 1.0);
+        own.middle_ln = sum / count;
+        own.spread = (squares / count - own.middle_ln.powi(2)).max(0.0).sqrt();
+        Some(own)
+    }
+
+    /// Brightness of the surface of a return over the mean, ln; `None` without an intensity that tells it.
+    pub fn ln(&self, ray: &Ray) -> Option<f64> {
+        let [range, incidence] = of_fall(ray);
+        Some(ln_above(ray.intensity, self.least)? + self.fall[0] * range - self.fall[1] * incidence - self.middle_ln)
+    }
+
+    /// Brightness around a return against that elsewhere on its plane, ln. Over a plane the logarithm of the cosine of
+    /// incidence is that of the range with the opposite sign, and an estimated cosine scatters where returns are few.
+    fn on_a_plane(&self, ray: &Ray) -> Option<f64> {
+        let [range, _] = of_fall(ray);
+        Some(ln_above(ray.intensity_beside, self.least)? + (self.fall[0] + self.fall[1]) * range)
+    }
+
+    /// Whether the simulated returns around a return, and the measured ones, are as bright as each other and as it: at
+    /// the edge of a bright spot, as at that of a window in a wall, the surface is another one as well.
+    fn is_even(&self, ray: &Ray) -> bool {
+        let beside = (f64::from(ray.intensity) / f64::from(ray.intensity_beside)).ln().abs();
+        ray.intensity_simulated.is_finite() && beside < EVEN * self.spread
+    }
+
+    /// The effect that changes ranges by `walk_m` for each factor e of this brightness.
+    pub fn effect(&self, walk_m: f64) -> ReflectivityWalk {
+        let round = |v| crate::effects::rounded(v, 5);
+        ReflectivityWalk {
+            walk_m: round(walk_m),
+            reference: crate::effects::rounded(self.middle_ln.exp(), 7),
+            of_intensity: true,
+            range_exponent: round(self.fall[0]),
+            incidence_exponent: round(self.fall[1]),
+        }
+    }
+}
+
+/// Logarithm of an intensity that is not too small.
+fn ln_above(intensity: f32, least: f64) -> Option<f64> {
+    let own = f64::from(intensity);
+    (own > 0.0 && own >= least).then(|| own.ln())
+}
+
+/// Logarithms of range, over that at which effects have no fall, and of the cosine of incidence.
+fn of_fall(ray: &Ray) -> [f64; 2] {
+    let range = f64::from(ray.range_m).max(0.1) / ReflectivityWalk::REFERENCE_M;
+    [range.ln(), f64::from(ray.cos_incidence).max(ReflectivityWalk::LEAST_COS).ln()]
+}
+
+/// Sums of one frame: those of a fit of one column, m for each factor e of brightness.
+#[derive(Clone, Debug)]
+pub struct BrightFrame {
+    /// By direction about the vehicle.
+    pub octants: [LinearFrame; OCTANTS],
+    /// Squares that the patches leave, in units of the assumed variance.
+    pub squares: f64,
+    /// Degrees of freedom of these squares.
+    pub freedom: f64,
+}
+
+/// Columns of a patch that its returns have in common: its offset, and an offset of ranges.
+const COMMON: usize = 2;
+
+/// All columns of a patch, the logarithm of intensities and the measured distance last.
+const OF_PATCH: usize = COMMON + 2;
+
+/// The sums of all frames. What the returns of a patch have in common is taken out. Brightness is the mean of the
+/// measured returns around each one, which scatters less: scatter that no surface has makes a change of ranges by
+/// brightness look smaller.
+pub fn bright_frames(
+    frames: &[FramePair],
+    rig: &Rig,
+    poses: &[OwnPoses],
+    brightness: &Brightness,
+    noise_m: f64,
+) -> Vec<BrightFrame> {
+    let origins = origins(rig);
+    let one = |(frame, pose): (&FramePair, &OwnPoses)| {
+        let mut patches = BTreeMap::<(u8, usize, usize, [i32; 2]), (f64, SMatrix<f64, OF_PATCH, OF_PATCH>)>::new();
+        for ray in frame.measured.iter().filter(|r| usable(r)) {
+            let sensor = ray.sensor as usize;
+            let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose[sensor]);
+            let even = brightness.is_even(ray) && y.abs() < STRAY_M;
+            let Some(bright) = brightness.on_a_plane(ray).filter(|_| even) else { continue };
+            let at = [ray.azimuth_rad, ray.elevation_rad].map(f64::from);
+            let place = [0, 1].map(|k| (at[k] / PATCH_RAD[k]).floor() as i32);
+            let lever = ray.range_lever();
+            let x = SVector::from([1.0, lever, lever * bright, y]);
+            let (n, sums) = patches.entry((ray.sensor, ray.octant(), kind_of(ray), place)).or_default();
+            *n += 1.0;
+            sums.ger(weight(ray, noise_m), &x, &x, 1.0);
+        }
+        let none = LinearFrame { gram: DMatrix::zeros(1, 1), right: DVector::zeros(1) };
+        let mut out = BrightFrame { octants: std::array::from_fn(|_| none.clone()), squares: 0.0, freedom: 0.0 };
+        for ((_, octant, ..), (n, sums)) in patches.into_iter().filter(|(_, (n, _))| *n >= FEWEST) {
+            let (left, taken) = without_common(sums);
+            let [bright, distance] = [COMMON, COMMON + 1];
+            out.octants[octant].gram[(0, 0)] += left[(bright, bright)];
+            out.octants[octant].right[0] += left[(bright, distance)];
+            out.squares += left[(distance, distance)];
+            out.freedom += n - taken;
+        }
+        out
+    };
+    frames.par_iter().zip(poses).map(one).collect()
+}
+
+/// Share of a column's square beyond what other columns explain, up to which the rest is rounding.
+const SAME: f64 = 1e-9;
+
+/// The products of a patch without what its returns have in common, and how many numbers that are.
+fn without_common(mut sums: SMatrix<f64, OF_PATCH, OF_PATCH>) -> (SMatrix<f64, OF_PATCH, OF_PATCH>, f64) {
+    let whole = sums.diagonal();
+    let mut taken = 0.0;
+    for column in 0..COMMON {
+        let left = sums[(column, column)];
+        if left > SAME * whole[column] {
+            let by = sums.column(column).into_owned();
+            sums -= by * by.transpose() / left;
+            taken += 1.0;
+        }
+    }
+    (sums, taken)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::channels::mean::OWN_NUMBERS;
+    use nalgebra::Vector3;
+    use sensor::Rig;
+
+    /// Intensity in counts of a wall with bright and dark fields, which falls with range and incidence.
+    fn counts(bright: bool, range_m: f64, cos: f64) -> f64 {
+        let reflectivity = if bright { 0.6 } else { 0.1 };
+        200.0 * reflectivity * (10.0 / range_m).powf(1.5) * cos
+    }
+
+    /// Walls to the left at some distances; ranges are `walk_m` longer for each factor e of brightness, and dark fields
+    /// stand back by `inset_m` on both sides.
+    fn frame(walk_m: f64, inset_m: f64) -> FramePair {
+        let mut measured = Vec::new();
+        for (wall, (column, row)) in (0..4).flat_map(|w| (0..160).flat_map(move |c| (0..12).map(move |r| (w, (c, r)))))
+        {
+            let azimuth = 0.3 + 0.6 * f64::from(wall) + 0.0035 * f64::from(column);
+            let elevation = -0.06 + 0.01 * f64::from(row);
+            let (sin, cos) = elevation.sin_cos();
+            let direction = Vector3::new(cos * azimuth.cos(), cos * azimuth.sin(), sin);
+            let range_m = (6.0 + 5.0 * f64::from(wall)) / direction.y;
+            let place = direction.x * range_m;
+            let bright = (place / 0.8).rem_euclid(2.0) < 1.0;
+            let at_edge = (place / 0.8).rem_euclid(1.0).min(1.0 - (place / 0.8).rem_euclid(1.0)) < 0.05;
+            let own = counts(bright, range_m, direction.y);
+            let mixed = 0.5 * (counts(true, range_m, direction.y) + counts(false, range_m, direction.y));
+            let off_m = if bright { 6f64.ln() } else { 0.0 } * walk_m;
+            // Beside an edge a plane lies between the two fields.
+            let amiss_m = if at_edge { if bright { -0.5 * inset_m } else { 0.5 * inset_m } } else { 0.0 };
+            measured.push(Ray {
+                normal: [0.0, -1.0, 0.0],
+                cos_incidence: direction.y as f32,
+                residual_m: (off_m + amiss_m + 0.002 * (f64::from(column * 7 + row * 3).sin())) as f32,
+                intensity: own as f32,
+                intensity_beside: if at_edge { mixed } else { own } as f32,
+                intensity_simulated: own as f32,
+                ..Ray::standing(&(direction * range_m))
+            });
+        }
+        FramePair::of_rays(String::new(), measured, vec![])
+    }
+
+    fn walk_m(frame: FramePair) -> (Brightness, f64, f64) {
+        let brightness = Brightness::of(frame.measured.iter()).expect("fields");
+        let poses = [vec![SVector::<f64, OWN_NUMBERS>::zeros()]];
+        let sums = bright_frames(&[frame], &Rig::single(), &poses, &brightness, 0.005).remove(0);
+        let sum = |of: &dyn Fn(&LinearFrame) -> f64| sums.octants.iter().map(of).sum::<f64>();
+        let (gram, right) = (sum(&|o| o.gram[(0, 0)]), sum(&|o| o.right[0]));
+        (brightness, right / gram, 1.0 / gram.sqrt())
+    }
+
+    #[test]
+    fn the_brightness_is_without_the_fall_of_the_column() {
+        let (brightness, ..) = walk_m(frame(0.0, 0.0));
+        let [range, incidence] = brightness.fall;
+        assert!((range - 1.5).abs() < 0.1 && (incidence - 1.0).abs() < 0.15, "{range} {incidence}");
+        assert!((brightness.spread - 0.5 * 6f64.ln()).abs() < 0.05, "{}", brightness.spread);
+    }
+
+    #[test]
+    fn bright_fields_of_a_wall_tell_a_walk() {
+        for by_m in [0.02, -0.01, 0.0] {
+            let (_, found_m, error_m) = walk_m(frame(by_m, 0.0));
+            assert!((found_m - by_m).abs() < 3.0 * error_m && error_m < 5e-4, "{by_m} {found_m} {error_m}");
+        }
+    }
+
+    #[test]
+    fn dark_windows_that_stand_back_are_no_walk() {
+        let (_, found_m, _) = walk_m(frame(0.0, 0.2));
+        assert!(found_m.abs() < 1e-3, "{found_m}");
+    }
+}
