@@ -378,6 +378,7 @@ impl Engine<'_> {
         };
         let even = if uneven || known.step_m.is_some() { Some(self.pair(even)?) } else { None };
         let context = Context { frames: even.as_deref().unwrap_or(context.frames), ..context.clone() };
+        results.push(search::geometry::ground::search(&context));
         results.push(search::noise::search(&context, if uneven { LEAST_COS } else { 0.0 }));
         Ok(results)
     }

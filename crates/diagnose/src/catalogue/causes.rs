@@ -30,7 +30,7 @@ identifiers! {
         Fog = "fog",
         /// Shots that a surface mirrors return from others, behind it.
         Ghosts = "ghosts",
-        /// The ground is not the plane that it is taken for.
+        /// The ground is not where the simulation has it, or not the plane that it is taken for.
         GroundError = "ground_error",
         /// Single ranges are much farther off than the others.
         HeavyTails = "heavy_tails",

@@ -2,7 +2,7 @@
 //! simulated one, and of the measured returns against the simulated ones.
 
 use super::motion::{OwnMotion, SeenVelocity};
-use crate::pairing::FramePair;
+use crate::pairing::{BoxShift, FramePair};
 use geometry::{Box3, limit_period};
 use nalgebra::Vector3;
 use std::f64::consts::PI;
@@ -18,8 +18,8 @@ pub struct ObjectShift {
     pub label_m: [f64; 3],
     /// Difference of the headings, rad.
     pub label_yaw_rad: f64,
-    /// Measured returns against simulated returns, m, with standard errors; `None` where there are too few.
-    pub cloud_m: Option<([f64; 3], [f64; 3])>,
+    /// Measured returns against simulated returns; `None` where there are too few.
+    pub cloud: Option<BoxShift>,
     /// Velocity of the simulated label relative to the ego vehicle, along the object's own axes, m/s. `None` where
     /// neighbouring frames do not show the object.
     pub seen_velocity_m_s: Option<[f64; 3]>,
@@ -49,7 +49,7 @@ pub fn object_shifts(frames: &[FramePair], times: Option<&[f64]>, to_next: &[Opt
                 object: k,
                 label_m: simulated.to_local(measured.center),
                 label_yaw_rad: limit_period(measured.yaw_rad - simulated.yaw_rad, 0.5, PI),
-                cloud_m: object.shift.map(|s| (s.shift_m, s.error_m)),
+                cloud: object.shift,
                 seen_velocity_m_s: seen.map(|seen| along(seen.relative_m_s)),
                 speed_m_s: seen.and_then(|seen| seen.speed_m_s),
                 distance_m: center.xy().norm(),

@@ -21,6 +21,9 @@ pub struct BoxShift {
     pub shift_m: [f64; 3],
     /// Its standard errors, m; large along directions that the visible faces do not constrain.
     pub error_m: [f64; 3],
+    /// What this shift changes by for each metre that the object is longer, wider and higher: the surfaces grow from
+    /// the middle, and from the ground.
+    pub by_size: [[f64; 3]; 3],
     /// Measured returns used.
     pub points: usize,
 }
@@ -51,7 +54,7 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
         let mut information = Matrix3::identity() / (PRIOR_M * PRIOR_M);
         let mut right = Vector3::zeros();
         let (mut used, mut squares) = (0usize, 0.0);
-        let mut system = Matrix3::zeros();
+        let (mut system, mut of_size) = (Matrix3::zeros(), Matrix3::zeros());
         for p in &points {
             let back = p - shift;
             let nearest = surfaces.query(&back.into()).nearest_one::<SquaredEuclidean<f64>>().execute();
@@ -68,6 +71,7 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
             let w = (1.0 - u * u).powi(2);
             system += n * n.transpose() * w;
             right += n * (w * off);
+            of_size += n * grown(bbox, q).component_mul(n).transpose() * w;
             squares += w * now * now;
             used += 1;
         }
@@ -79,10 +83,21 @@ pub fn fit_shift(bbox: &Box3, measured: &[Point3<f64>], simulated: &[SurfacePoin
         information += system / variance;
         let inverse = information.try_inverse()?;
         shift = inverse * (right / variance);
-        result =
-            Some(BoxShift { shift_m: shift.into(), error_m: [0, 1, 2].map(|k| inverse[(k, k)].sqrt()), points: used });
+        let by_size = inverse * of_size / variance;
+        result = Some(BoxShift {
+            shift_m: shift.into(),
+            error_m: [0, 1, 2].map(|k| inverse[(k, k)].sqrt()),
+            by_size: [0, 1, 2].map(|k| by_size.column(k).into_owned().into()),
+            points: used,
+        });
     }
     result
+}
+
+/// How far a place in the box's own frame moves for each metre that the object is longer, wider and higher.
+fn grown(bbox: &Box3, place: &Vector3<f64>) -> Vector3<f64> {
+    let [length, width, height] = bbox.size.map(|m| m.max(0.1));
+    Vector3::new(place.x / length, place.y / width, place.z / height + 0.5)
 }
 
 #[cfg(test)]
@@ -126,5 +141,27 @@ mod tests {
         let fit = fit_shift(&b, &points, &simulated).unwrap();
         assert!((fit.shift_m[0] - 0.4).abs() < 0.02 && (fit.shift_m[1] + 0.1).abs() < 0.02, "{fit:?}");
         assert!(fit.error_m[2] > 0.5, "no horizontal face, no height: {fit:?}");
+    }
+
+    /// Of a longer object the rear is farther back, its side is where it was; of a higher one a roof at its top rises
+    /// as much, and a bonnet at half of its height half as much.
+    #[test]
+    fn what_a_larger_object_does_is_known() {
+        let b = Box3::from_array([20.0, 3.0, 0.0, 4.8, 1.9, 1.2, 0.4]);
+        let simulated = faces(&b, [0.0; 3], 0.13, |_| true);
+        let points: Vec<_> = simulated.iter().map(|s| s.point).collect();
+        let [longer, wider, _] = fit_shift(&b, &points, &simulated).unwrap().by_size;
+        assert!((longer[0] + 0.5).abs() < 0.03 && longer[1].abs() < 0.03, "{longer:?}");
+        assert!((wider[1] - 0.5).abs() < 0.03 && wider[0].abs() < 0.03, "{wider:?}");
+        let level = |z: f64| {
+            let at = |k: usize| b.from_local([0.1 * k as f64 - 1.0, 0.02 * (k % 7) as f64, z]);
+            (0..20).map(at).map(|p| SurfacePoint { point: p.into(), normal: Vector3::z() }).collect::<Vec<_>>()
+        };
+        for (z, rises) in [(0.6, 1.0), (0.0, 0.5)] {
+            let simulated = level(z);
+            let points: Vec<_> = simulated.iter().map(|s| s.point).collect();
+            let [.., higher] = fit_shift(&b, &points, &simulated).unwrap().by_size;
+            assert!((higher[2] - rises).abs() < 0.02, "{z} {higher:?}");
+        }
     }
 }

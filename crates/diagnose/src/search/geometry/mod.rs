@@ -7,6 +7,7 @@ mod describe;
 mod directions;
 mod displacement;
 mod floor;
+pub mod ground;
 mod hypotheses;
 mod own_scatter;
 mod row_offsets;

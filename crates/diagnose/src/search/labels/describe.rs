@@ -3,7 +3,7 @@
 use super::Side;
 use super::hypotheses::{Hypothesis, TARGETS_CLOCK};
 use super::rows::{ALL, COLUMNS, Column, Row};
-use crate::catalogue::{Cause, Covariate, Quantity};
+use crate::catalogue::{Covariate, Quantity};
 use crate::curve::{Curve, CurvePoint};
 use crate::inference::linear::LinearFit;
 use crate::search::{Found, NamedParameter, Selected, parameter};
@@ -66,7 +66,7 @@ impl Description<'_> {
     /// One parameter for each column; the constant of a late clock is none. Labels ahead of the returns equal returns
     /// behind the labels, hence the sign.
     fn parameters(&self) -> Vec<NamedParameter> {
-        let Hypothesis { cause, columns } = *self.hypothesis;
+        let Hypothesis { columns, .. } = *self.hypothesis;
         let sign = if self.side == Side::Labels { 1.0 } else { -1.0 };
         let mut parameters = Vec::new();
         for (i, &c) in self.own.clone().zip(columns) {
@@ -79,13 +79,13 @@ impl Description<'_> {
                 Column::Ahead => continue,
                 Column::Forward => (Quantity::ForwardM, sign * theta, error),
                 Column::Left => (Quantity::LeftM, sign * theta, error),
-                Column::Up if cause == Cause::WrongShape => (Quantity::HigherM, theta, error),
                 Column::Up => (Quantity::UpM, sign * theta, error),
                 Column::SeenVelocity | Column::Velocity => {
                     (Quantity::OffsetS, -sign * theta, error.hypot(0.02 * theta))
                 }
-                Column::Longer => (Quantity::LongerM, 2.0 * theta, 2.0 * error),
-                Column::Wider => (Quantity::WiderM, 2.0 * theta, 2.0 * error),
+                Column::Longer => (Quantity::LongerM, theta, error),
+                Column::Wider => (Quantity::WiderM, theta, error),
+                Column::Higher => (Quantity::HigherM, theta, error),
                 // By the form of the scan as well.
                 Column::Swept => (Quantity::ScanS, -theta, error.hypot(0.1 * theta)),
             };
@@ -139,7 +139,7 @@ fn curve(rows: &[Row], column: usize, axis: usize, fitted: &LinearFit) -> Curve 
         3 => "velocity that the sensor sees, forward, m/s",
         4 => "velocity over the ground, m/s",
         7 => "velocity times phase of the scan, m/s",
-        _ => "side seen (1: front or left, -1: rear or right)",
+        _ => "side seen (0.5: front or left, -0.5: rear or right)",
     };
     Curve {
         x: x.into(),

@@ -1,6 +1,6 @@
 //! Hypotheses about shifts of labels and objects.
 
-use super::rows::AHEAD;
+use super::rows::{AHEAD, HIGHER};
 use crate::catalogue::Cause;
 
 /// A cause with the columns that it needs; see [`super::rows::COLUMNS`].
@@ -27,7 +27,7 @@ pub(super) const HYPOTHESES: [Hypothesis; 14] = [
     of(Cause::TimeOffset, &[4]),
     of(Cause::WrongShape, &[5]),
     of(Cause::WrongShape, &[6]),
-    of(Cause::WrongShape, &[5, 2]),
+    of(Cause::WrongShape, &[5, HIGHER]),
     of(Cause::RollingShutter, &[7]),
     of(Cause::TimeOffset, TARGETS_CLOCK),
 ];

@@ -21,10 +21,13 @@ pub(super) enum Column {
     SeenVelocity,
     /// Velocity over the ground, m/s: positions of the objects are late.
     Velocity,
-    /// Length: the visible one of front and rear is displaced by half of the difference.
+    /// Length: surfaces grow from the middle of the object, so that the visible one of front and rear is displaced by
+    /// half of the difference.
     Longer,
     /// Width.
     Wider,
+    /// Height: surfaces grow from the ground.
+    Higher,
     /// Relative velocity times the phase of the scan.
     Swept,
     /// Ahead along the heading of the ego vehicle: the ego speed, where it is not known, times the error of a clock.
@@ -37,8 +40,11 @@ pub(super) const ALL: usize = COLUMNS.len();
 /// Number of [`Column::Ahead`].
 pub(super) const AHEAD: usize = 8;
 
+/// Number of [`Column::Higher`].
+pub(super) const HIGHER: usize = 9;
+
 /// All columns, in the order of their numbers.
-pub(super) const COLUMNS: [Column; 9] = [
+pub(super) const COLUMNS: [Column; 10] = [
     Column::Forward,
     Column::Left,
     Column::Up,
@@ -48,6 +54,7 @@ pub(super) const COLUMNS: [Column; 9] = [
     Column::Wider,
     Column::Swept,
     Column::Ahead,
+    Column::Higher,
 ];
 
 /// Largest shift of an object that is used, m.
@@ -103,8 +110,8 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
     let (mut shift, variance) = match side {
         Side::Labels => (s.label_m, [1.0; 3]),
         Side::Objects => {
-            let (shift, error) = s.cloud_m?;
-            (shift, error.map(|e| e * e))
+            let cloud = s.cloud?;
+            (cloud.shift_m, cloud.error_m.map(|e| e * e))
         }
     };
     let object = context.frames[s.frame].objects[s.object].simulated?;
@@ -126,9 +133,18 @@ pub(super) fn row(context: &Context, s: &ObjectShift, side: Side, displaced: &Di
     }
     let mount = &context.rig.sensors[sensor];
     let known = velocity_columns(&mut x, s, &center, mount);
-    let towards = axes(-center / center.norm().max(1e-6));
-    x[0][5] = towards[0];
-    x[1][6] = towards[1];
+    match s.cloud.filter(|_| side == Side::Objects) {
+        Some(cloud) => {
+            for (column, by) in [5, 6, HIGHER].into_iter().zip(cloud.by_size) {
+                (0..3).for_each(|k| x[k][column] = by[k]);
+            }
+        }
+        // A label of another size has its visible sides where they are seen.
+        None => {
+            let towards = axes(-center / center.norm().max(1e-6));
+            (x[0][5], x[1][6]) = (towards[0], towards[1]);
+        }
+    }
     let ahead = axes(Vector3::x());
     (0..3).for_each(|k| x[k][AHEAD] = ahead[k]);
     Some(Row {
