@@ -115,9 +115,6 @@ pub(crate) fn why_none(f: &Finding) -> String {
         (Cause::Ghosts, _) => {
             "ghosts: give the materials that mirror a specular lobe, and the shots a probability.".into()
         }
-        (Cause::ReflectivityWalk, _) => {
-            "reflectivity_walk: simulated intensities do not tell surfaces apart, give the materials theirs.".into()
-        }
         (Cause::Unexplained, _) => "There is no table of it for any sensor of the rig.".into(),
         (other, _) => {
             format!("The simulator has no effect that does this by itself ({other}): mend its world.")

@@ -299,10 +299,10 @@ fn the_file_of_a_cause_does_what_is_claimed_on_foreign_clouds() {
 #[test]
 fn a_range_walk_is_found_by_intensities_and_corrected() {
     let folder = tempfile::tempdir().unwrap();
-    let sim = race_of(folder.path(), true, "rows", 0.5);
-    // Intensities are reflectivities.
-    let noise = "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.01\n\
-                 [[effect]]\nkind = \"intensity_response\"\nincidence_exponent = -1\n";
+    let race = race_of(folder.path(), true, "rows", 0.5);
+    let reflectivities = "[[effect]]\nkind = \"intensity_response\"\nincidence_exponent = -1\n";
+    let sim = with_effects(&race, reflectivities, &folder.path().join("reflectivities"), 3);
+    let noise = "[[effect]]\nkind = \"range_noise\"\nstd_m = 0.01\n";
     let walk = "[[effect]]\nkind = \"reflectivity_walk\"\nwalk_m = -0.06\n";
     let simulated = with_effects(&foreign(&sim, folder.path()), noise, &folder.path().join("noisy"), 5);
     let measured = with_effects(&sim, &format!("{walk}{noise}"), &folder.path().join("measured"), 11);
@@ -311,7 +311,7 @@ fn a_range_walk_is_found_by_intensities_and_corrected() {
     let d = &outcome.diagnosis;
     assert_eq!(named(d), ["reflectivity_walk"], "{:?} {:?}", d.findings, d.considered);
     let found = d.findings[0].parameter(Quantity::WalkM).unwrap();
-    assert!(found.ci95[0] <= -0.06 && -0.06 <= found.ci95[1] && found.estimate < -0.04, "{found:?}");
+    assert!((found.estimate / -0.06 - 1.0).abs() < 0.3, "{found:?}");
     let closed = d.findings[0].reached.unwrap();
     assert!(closed > 0.9 && d.gain.not_applied.is_empty(), "{:?}", d.gain);
     let again = with_effects(&simulated, &outcome.extended, &folder.path().join("again"), 12);

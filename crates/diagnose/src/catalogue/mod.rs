@@ -163,12 +163,17 @@ mod tests {
         let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
         let read = |path: &str| std::fs::read_to_string(root.join(path)).unwrap();
         let page = read("docs/src/reference/causes.md");
-        let rows = page.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
+        let (causes, _) = page.split_once("## Effects of the simulator without a cause").unwrap();
+        let rows = causes.lines().filter_map(|line| line.strip_prefix("| `")?.split('`').next());
         let mut described: Vec<&str> = rows.collect();
         described.sort_unstable();
         let named = Cause::ALL.iter().filter(|c| **c != Cause::Unexplained);
         let named: Vec<&str> = named.map(|c| c.name()).collect();
         assert_eq!(described, named);
+        // Each effect of the simulator has a cause, or a reason why not.
+        let kinds = sensor::Effect::CATALOGUE.iter().map(|(kind, _)| *kind);
+        let without: Vec<&str> = kinds.filter(|kind| !page.contains(&format!("`{kind}`"))).collect();
+        assert!(without.is_empty(), "{without:?}");
         let number = format!("[{} causes](docs/src/reference/causes.md) for pairs", named.len());
         assert!(read("README.md").contains(&number), "{number}");
     }

@@ -20,8 +20,9 @@ const FEWEST: f64 = 8.0;
 /// Smallest intensity that tells a brightness, in steps of the column.
 const STEPS: f64 = 3.0;
 
-/// Largest deviation of the brightness of a return from that of the returns around it, of the spread over all returns.
-const EVEN: f64 = 0.3;
+/// Largest deviation of the brightness of a return from that of the simulated returns around it, in units of the spread
+/// over all returns of each side.
+const EVEN: f64 = 0.5;
 
 /// Columns that the fall of a column of intensities is fitted with: the kinds of surfaces, range and incidence.
 const OF_FALL: usize = KINDS + 2;
@@ -62,32 +63,25 @@ impl Brightness {
         let fitted = gram.cholesky()?.solve(&right);
         let fall = [-fitted[KINDS], fitted[KINDS + 1]];
         let mut own = Brightness { least, middle_ln: 0.0, fall, spread: 0.0 };
-        let [n, sum, squares] =
-            bright().filter_map(|(ray, _)| own.ln(ray)).fold([0.0; 3], |s, b| [s[0] + 1.0, s[1] + b, s[2] + b * b]);
+        let [n, sum, squares] = bright()
+            .filter_map(|(ray, _)| own.by(ray, ray.intensity))
+            .fold([0.0; 3], |s, b| [s[0] + 1.0, s[1] + b, s[2] + b * b]);
         let count: f64 = f64::max(n, 1.0);
         own.middle_ln = sum / count;
         own.spread = (squares / count - own.middle_ln.powi(2)).max(0.0).sqrt();
         Some(own)
     }
 
-    /// Brightness of the surface of a return over the mean, ln; `None` without an intensity that tells it.
-    pub fn ln(&self, ray: &Ray) -> Option<f64> {
+    /// Brightness of the surface of a return over the mean by an intensity, ln; `None` where it is too small to tell.
+    fn by(&self, ray: &Ray, intensity: f32) -> Option<f64> {
         let [range, incidence] = of_fall(ray);
-        Some(ln_above(ray.intensity, self.least)? + self.fall[0] * range - self.fall[1] * incidence - self.middle_ln)
+        Some(ln_above(intensity, self.least)? + self.fall[0] * range - self.fall[1] * incidence - self.middle_ln)
     }
 
-    /// Brightness around a return against that elsewhere on its plane, ln. Over a plane the logarithm of the cosine of
-    /// incidence is that of the range with the opposite sign, and an estimated cosine scatters where returns are few.
-    fn on_a_plane(&self, ray: &Ray) -> Option<f64> {
-        let [range, _] = of_fall(ray);
-        Some(ln_above(ray.intensity_beside, self.least)? + (self.fall[0] + self.fall[1]) * range)
-    }
-
-    /// Whether the simulated returns around a return, and the measured ones, are as bright as each other and as it: at
-    /// the edge of a bright spot, as at that of a window in a wall, the surface is another one as well.
-    fn is_even(&self, ray: &Ray) -> bool {
-        let beside = (f64::from(ray.intensity) / f64::from(ray.intensity_beside)).ln().abs();
-        ray.intensity_simulated.is_finite() && beside < EVEN * self.spread
+    /// The same against that elsewhere on its plane, ln. Over a plane the logarithm of the cosine of incidence is that
+    /// of the range with the opposite sign, and an estimated cosine scatters where returns are few.
+    fn on_a_plane(&self, ray: &Ray, intensity: f32) -> Option<f64> {
+        Some(ln_above(intensity, self.least)? + (self.fall[0] + self.fall[1]) * of_fall(ray)[0])
     }
 
     /// The effect that changes ranges by `walk_m` for each factor e of this brightness.
@@ -100,6 +94,38 @@ impl Brightness {
             range_exponent: round(self.fall[0]),
             incidence_exponent: round(self.fall[1]),
         }
+    }
+}
+
+/// The brightness of surfaces by both sides.
+#[derive(Clone, Copy, Debug)]
+pub struct Brightnesses {
+    measured: Brightness,
+    /// By the simulated intensities, on which effects act.
+    pub simulated: Brightness,
+}
+
+impl Brightnesses {
+    /// Of a pair; `None` where the intensities of a side do not tell surfaces apart.
+    pub fn of(frames: &[FramePair]) -> Option<Brightnesses> {
+        Some(Brightnesses {
+            measured: Brightness::of(frames.iter().flat_map(|f| &f.measured))?,
+            simulated: Brightness::of(frames.iter().flat_map(|f| &f.simulated))?,
+        })
+    }
+
+    /// Brightness of the simulated surface around a measured return over the mean, ln. It does not depend on the error
+    /// of the return's own range.
+    pub fn ln(&self, ray: &Ray) -> Option<f64> {
+        self.simulated.by(ray, ray.intensity_simulated)
+    }
+
+    /// The same against that elsewhere on its plane, where the return is as bright as the simulated ones around it: at
+    /// the edge of a bright spot, as at that of a window in a wall, the surface is another one as well.
+    fn on_a_plane(&self, ray: &Ray) -> Option<f64> {
+        let own = self.measured.by(ray, ray.intensity)? / self.measured.spread;
+        let unlike = own - self.ln(ray)? / self.simulated.spread;
+        self.simulated.on_a_plane(ray, ray.intensity_simulated).filter(|_| unlike.abs() < EVEN)
     }
 }
 
@@ -132,14 +158,12 @@ const COMMON: usize = 2;
 /// All columns of a patch, the logarithm of intensities and the measured distance last.
 const OF_PATCH: usize = COMMON + 2;
 
-/// The sums of all frames. What the returns of a patch have in common is taken out. Brightness is the mean of the
-/// measured returns around each one, which scatters less: scatter that no surface has makes a change of ranges by
-/// brightness look smaller.
+/// The sums of all frames. What the returns of a patch have in common is taken out.
 pub fn bright_frames(
     frames: &[FramePair],
     rig: &Rig,
     poses: &[OwnPoses],
-    brightness: &Brightness,
+    brightness: &Brightnesses,
     noise_m: f64,
 ) -> Vec<BrightFrame> {
     let origins = origins(rig);
@@ -148,8 +172,7 @@ pub fn bright_frames(
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let sensor = ray.sensor as usize;
             let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose[sensor]);
-            let even = brightness.is_even(ray) && y.abs() < STRAY_M;
-            let Some(bright) = brightness.on_a_plane(ray).filter(|_| even) else { continue };
+            let Some(bright) = brightness.on_a_plane(ray).filter(|_| y.abs() < STRAY_M) else { continue };
             let at = [ray.azimuth_rad, ray.elevation_rad].map(f64::from);
             let place = [0, 1].map(|k| (at[k] / PATCH_RAD[k]).floor() as i32);
             let lever = ray.range_lever();
@@ -161,8 +184,11 @@ pub fn bright_frames(
         let none = LinearFrame { gram: DMatrix::zeros(1, 1), right: DVector::zeros(1) };
         let mut out = BrightFrame { octants: std::array::from_fn(|_| none.clone()), squares: 0.0, freedom: 0.0 };
         for ((_, octant, ..), (n, sums)) in patches.into_iter().filter(|(_, (n, _))| *n >= FEWEST) {
-            let (left, taken) = without_common(sums);
+            let (mut left, taken) = without_common(sums);
             let [bright, distance] = [COMMON, COMMON + 1];
+            // Ranges scatter otherwise on each surface than is assumed of all.
+            let scatter = left[(distance, distance)] / (n - taken).max(1.0);
+            left /= scatter.max(1.0);
             out.octants[octant].gram[(0, 0)] += left[(bright, bright)];
             out.octants[octant].right[0] += left[(bright, distance)];
             out.squares += left[(distance, distance)];
@@ -228,21 +254,22 @@ mod tests {
                 cos_incidence: direction.y as f32,
                 residual_m: (off_m + amiss_m + 0.002 * (f64::from(column * 7 + row * 3).sin())) as f32,
                 intensity: own as f32,
-                intensity_beside: if at_edge { mixed } else { own } as f32,
-                intensity_simulated: own as f32,
+                intensity_simulated: if at_edge { mixed } else { own } as f32,
                 ..Ray::standing(&(direction * range_m))
             });
         }
-        FramePair::of_rays(String::new(), measured, vec![])
+        let beside = |ray: &Ray| Ray { intensity_beside: ray.intensity, ..*ray };
+        let measured: Vec<Ray> = measured.iter().map(beside).collect();
+        FramePair::of_rays(String::new(), measured.clone(), measured)
     }
 
     fn walk_m(frame: FramePair) -> (Brightness, f64, f64) {
-        let brightness = Brightness::of(frame.measured.iter()).expect("fields");
+        let brightness = Brightnesses::of(std::slice::from_ref(&frame)).expect("fields");
         let poses = [vec![SVector::<f64, OWN_NUMBERS>::zeros()]];
         let sums = bright_frames(&[frame], &Rig::single(), &poses, &brightness, 0.005).remove(0);
         let sum = |of: &dyn Fn(&LinearFrame) -> f64| sums.octants.iter().map(of).sum::<f64>();
         let (gram, right) = (sum(&|o| o.gram[(0, 0)]), sum(&|o| o.right[0]));
-        (brightness, right / gram, 1.0 / gram.sqrt())
+        (brightness.simulated, right / gram, 1.0 / gram.sqrt())
     }
 
     #[test]

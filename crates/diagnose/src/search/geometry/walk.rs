@@ -3,11 +3,11 @@
 
 use super::directions::alike;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::brightness::{BrightFrame, Brightness, bright_frames};
+use crate::channels::brightness::{BrightFrame, Brightnesses, bright_frames};
 use crate::channels::mean::{origins, own_poses, usable, usual_noise_m};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
-use crate::inference::choice::{significant, total_and_z};
+use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
 use crate::pairing::{OCTANTS, Ray};
@@ -27,7 +27,7 @@ const FEWEST: f64 = 50.0;
 /// A range walk that was found.
 #[derive(Clone, Copy, Debug)]
 pub struct Walk {
-    brightness: Brightness,
+    brightness: Brightnesses,
     /// Change of range, m for each factor e of brightness.
     by_m: f64,
 }
@@ -39,9 +39,9 @@ impl Walk {
     }
 }
 
-/// Sums of all frames, with the brightness of the measured side.
+/// Sums of all frames, with the brightness of surfaces.
 struct Sums {
-    brightness: Brightness,
+    brightness: Brightnesses,
     frames: Vec<BrightFrame>,
     /// The frames as a whole, in units of the variance that patches leave.
     whole: Vec<LinearFrame>,
@@ -49,9 +49,9 @@ struct Sums {
 }
 
 impl Sums {
-    /// `None` where measured intensities do not tell surfaces apart. The variance is that of the `train` frames.
+    /// `None` where intensities do not tell surfaces apart. The variance is that of the `train` frames.
     fn new(context: &Context, train: &[usize]) -> Option<Sums> {
-        let brightness = Brightness::of(context.frames.iter().flat_map(|f| &f.measured))?;
+        let brightness = Brightnesses::of(context.frames)?;
         let origins = origins(context.rig);
         let noise_m = usual_noise_m(context.frames);
         let poses: Vec<_> = context.frames.par_iter().map(|f| own_poses(f, &origins, noise_m)).collect();
@@ -128,7 +128,7 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     let demands = first_demands();
     let (total, z) = total_and_z(&gains);
     let large = chosen.theta[0].abs() > FLOOR_M;
-    let enough = total > demands.nats && significant(&gains, demands.z);
+    let enough = total > demands.nats && z > demands.z;
     let alike = alike(sums.by_octant(chosen.theta[0], &select));
     let outcome = match (enough, large, alike) {
         (true, true, true) => "chosen",
@@ -159,10 +159,9 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     (result, Some(walk))
 }
 
-/// The finding. The effect is of the simulated intensities, where these tell surfaces apart.
+/// The finding. The effect is of the simulated intensities.
 fn found(context: &Context, walk: &Walk, error_m: f64, held_out_gains: Vec<f64>, estimate: &[usize]) -> Found {
     let by_m = walk.by_m;
-    let simulated = Brightness::of(context.frames.iter().flat_map(|f| &f.simulated));
     let way = if by_m < 0.0 { "shorter" } else { "longer" };
     Found {
         status: Status::Named,
@@ -179,7 +178,7 @@ fn found(context: &Context, walk: &Walk, error_m: f64, held_out_gains: Vec<f64>,
         ),
         separate_by: None,
         curve: curve(context, walk, estimate),
-        effects: simulated.map(|bright| Effect::ReflectivityWalk(bright.effect(by_m))).into_iter().collect(),
+        effects: vec![Effect::ReflectivityWalk(walk.brightness.simulated.effect(by_m))],
     }
 }
 
