@@ -2,10 +2,9 @@
 //! surface. A surface that stands elsewhere than in the simulation displaces both alike, whatever its brightness.
 
 use super::intensity::Column;
-use super::mean::{KINDS, OwnPoses, STRAY_M, kind_of, origins, own_row, usable, weight};
-use crate::inference::linear::LinearFrame;
+use super::mean::{KINDS, OwnPoses, kind_of, off_surface_m, origins, usable, weight};
 use crate::pairing::{FramePair, OCTANTS, Ray};
-use nalgebra::{DMatrix, DVector, SMatrix, SVector};
+use nalgebra::{SMatrix, SVector};
 use rayon::prelude::*;
 use sensor::Rig;
 use sensor::effects::ReflectivityWalk;
@@ -38,7 +37,7 @@ pub struct Brightness {
     /// Exponent of the fall with range, and with the cosine of incidence.
     fall: [f64; 2],
     /// Standard deviation over the returns.
-    pub spread: f64,
+    spread: f64,
 }
 
 impl Brightness {
@@ -141,11 +140,11 @@ fn of_fall(ray: &Ray) -> [f64; 2] {
     [range.ln(), f64::from(ray.cos_incidence).max(ReflectivityWalk::LEAST_COS).ln()]
 }
 
-/// Sums of one frame: those of a fit of one column, m for each factor e of brightness.
-#[derive(Clone, Debug)]
+/// Sums of one frame.
+#[derive(Clone, Debug, Default)]
 pub struct BrightFrame {
-    /// By direction about the vehicle.
-    pub octants: [LinearFrame; OCTANTS],
+    /// By direction about the vehicle: the square of the lever of brightness, and its product with what is measured.
+    pub octants: [[f64; 2]; OCTANTS],
     /// Squares that the patches leave, in units of the assumed variance.
     pub squares: f64,
     /// Degrees of freedom of these squares.
@@ -170,9 +169,8 @@ pub fn bright_frames(
     let one = |(frame, pose): (&FramePair, &OwnPoses)| {
         let mut patches = BTreeMap::<(u8, usize, usize, [i32; 2]), (f64, SMatrix<f64, OF_PATCH, OF_PATCH>)>::new();
         for ray in frame.measured.iter().filter(|r| usable(r)) {
-            let sensor = ray.sensor as usize;
-            let y = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose[sensor]);
-            let Some(bright) = brightness.on_a_plane(ray).filter(|_| y.abs() < STRAY_M) else { continue };
+            let Some(y) = off_surface_m(ray, &origins[usize::from(ray.sensor)], pose) else { continue };
+            let Some(bright) = brightness.on_a_plane(ray) else { continue };
             let at = [ray.azimuth_rad, ray.elevation_rad].map(f64::from);
             let place = [0, 1].map(|k| (at[k] / PATCH_RAD[k]).floor() as i32);
             let lever = ray.range_lever();
@@ -181,16 +179,15 @@ pub fn bright_frames(
             *n += 1.0;
             sums.ger(weight(ray, noise_m), &x, &x, 1.0);
         }
-        let none = LinearFrame { gram: DMatrix::zeros(1, 1), right: DVector::zeros(1) };
-        let mut out = BrightFrame { octants: std::array::from_fn(|_| none.clone()), squares: 0.0, freedom: 0.0 };
+        let mut out = BrightFrame::default();
         for ((_, octant, ..), (n, sums)) in patches.into_iter().filter(|(_, (n, _))| *n >= FEWEST) {
             let (mut left, taken) = without_common(sums);
             let [bright, distance] = [COMMON, COMMON + 1];
             // Ranges scatter otherwise on each surface than is assumed of all.
             let scatter = left[(distance, distance)] / (n - taken).max(1.0);
             left /= scatter.max(1.0);
-            out.octants[octant].gram[(0, 0)] += left[(bright, bright)];
-            out.octants[octant].right[0] += left[(bright, distance)];
+            out.octants[octant][0] += left[(bright, bright)];
+            out.octants[octant][1] += left[(bright, distance)];
             out.squares += left[(distance, distance)];
             out.freedom += n - taken;
         }
@@ -267,8 +264,7 @@ mod tests {
         let brightness = Brightnesses::of(std::slice::from_ref(&frame)).expect("fields");
         let poses = [vec![SVector::<f64, OWN_NUMBERS>::zeros()]];
         let sums = bright_frames(&[frame], &Rig::single(), &poses, &brightness, 0.005).remove(0);
-        let sum = |of: &dyn Fn(&LinearFrame) -> f64| sums.octants.iter().map(of).sum::<f64>();
-        let (gram, right) = (sum(&|o| o.gram[(0, 0)]), sum(&|o| o.right[0]));
+        let [gram, right] = [0, 1].map(|k: usize| sums.octants.iter().map(|o| o[k]).sum::<f64>());
         (brightness.simulated, right / gram, 1.0 / gram.sqrt())
     }
 

@@ -1,7 +1,7 @@
 //! Offsets of groups of rays: rows of a sensor, strips of azimuth, or steps of range. Each group has one range offset,
 //! and rows have one elevation offset as well. The pose error of each frame is subtracted before.
 
-use super::mean::{KINDS, OwnPoses, STRAY_M, own_row, usable, weight};
+use super::mean::{KINDS, OwnPoses, off_surface_m, usable, weight};
 use crate::catalogue::Covariate;
 use crate::pairing::{FramePair, Ray};
 use nalgebra::{Point3, UnitQuaternion, Vector3};
@@ -212,11 +212,11 @@ impl Seen<'_> {
         origin: &Point3<f64>,
         turn: &UnitQuaternion<f64>,
     ) -> Option<(f64, [f64; 2])> {
-        let y = ray.across_nearest_m() - own_row(ray, origin).dot(&poses[ray.sensor as usize]);
+        let y = off_surface_m(ray, origin, poses)?;
         let x = [ray.range_lever(), elevation_lever(ray, turn)];
         let of_row = self.undone.get(&Group { sensor: ray.sensor, index: ray.row });
         let undone = of_row.map_or(0.0, |[range_m, elevation_rad]| x[0] * range_m + x[1] * elevation_rad);
-        (y.abs() <= STRAY_M).then_some((y + undone, x))
+        Some((y + undone, x))
     }
 }
 

@@ -57,7 +57,7 @@ pub fn columns(rig: &Rig, moments: &Moments) -> Vec<Column> {
 pub const STRUCTURE_M: f64 = 0.02;
 
 /// Distance from the surface, after the frame's own pose is subtracted, from which on a return is not of it, m.
-pub const STRAY_M: f64 = 0.30;
+const STRAY_M: f64 = 0.30;
 
 /// Standard deviation of real surfaces from a plane, m.
 const RIPPLE_M: f64 = 0.006;
@@ -137,6 +137,13 @@ pub fn own_row(ray: &Ray, origin: &Point3<f64>) -> SVector<f64, OWN_NUMBERS> {
     SVector::from([a, b, c, d, e, f, ray.range_lever()])
 }
 
+/// Distance of a ray's return across its surface, with its frame's own pose taken out, m; `None` where it is not of the
+/// surface. `origin` is that of its sensor.
+pub fn off_surface_m(ray: &Ray, origin: &Point3<f64>, pose: &OwnPoses) -> Option<f64> {
+    let y = ray.across_nearest_m() - own_row(ray, origin).dot(&pose[usize::from(ray.sensor)]);
+    (y.abs() <= STRAY_M).then_some(y)
+}
+
 /// Prior of a frame's own pose when it is fitted alone: 2 degrees, 0.5 m; and of its range offset.
 fn loose_prior() -> SVector<f64, OWN_NUMBERS> {
     SVector::from([0.035, 0.035, 0.035, 0.5, 0.5, 0.5, 0.5]).map(|s: f64| 1.0 / (s * s))
@@ -184,11 +191,7 @@ pub fn design_effect(frames: &[FramePair], origins: &[Point3<f64>], poses: &[Own
             let mut patches = std::collections::BTreeMap::<(u8, i32, i32), [f64; 3]>::new();
             for ray in frame.measured.iter().filter(|r| usable(r)) {
                 let w = weight(ray, noise_m);
-                let row = own_row(ray, &origins[ray.sensor as usize]);
-                let y = ray.across_nearest_m() - row.dot(&pose[ray.sensor as usize]);
-                if y.abs() > STRAY_M {
-                    continue;
-                }
+                let Some(y) = off_surface_m(ray, &origins[usize::from(ray.sensor)], pose) else { continue };
                 let key =
                     (ray.sensor, (ray.azimuth_rad / 0.1).floor() as i32, (ray.elevation_rad / 0.05).floor() as i32);
                 let patch = patches.entry(key).or_default();
@@ -282,14 +285,13 @@ impl Compared<'_> {
         let mut x: Vec<(usize, f64)> = Vec::with_capacity(self.columns.len());
         for ray in frame.measured.iter().filter(|r| usable(r)) {
             let sensor = ray.sensor as usize;
-            let y = ray.across_nearest_m();
-            if (y - own_row(ray, &origins[sensor]).dot(&pose[sensor])).abs() > STRAY_M {
+            if off_surface_m(ray, &origins[sensor], pose).is_none() {
                 continue;
             }
             let levers = Levers::new(ray, &origins[sensor], &self.rig.sensors[sensor], moment);
             x.clear();
             x.extend(self.columns.iter().enumerate().filter_map(|(k, column)| Some((k, levers.of(*column)?))));
-            each(ray, &x, y, weight(ray, self.noise_m) / self.design);
+            each(ray, &x, ray.across_nearest_m(), weight(ray, self.noise_m) / self.design);
         }
     }
 

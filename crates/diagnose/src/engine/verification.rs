@@ -126,10 +126,12 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     ];
     let asked = others.into_par_iter().filter(|(channel, _)| slide || *channel != Channel::Slide);
     let distances: Vec<_> = asked.map(|(channel, distance)| (channel, distance())).collect();
-    let (mut kinds, lost) =
-        rayon::join(|| returns::by_table(context, train, test), || hits::by_table(context, train, test));
+    let (mut kinds, (lost, by_brightness)) = rayon::join(
+        || returns::by_table(context, train, test),
+        || rayon::join(|| hits::by_table(context, train, test), || geometry::walk::by_table(context, train, test)),
+    );
     kinds.extend(lost);
-    kinds.insert(Kind::Brightness, geometry::walk::by_table(context, train, test));
+    kinds.insert(Kind::Brightness, by_brightness);
     of_channels(distances, kinds)
 }
 

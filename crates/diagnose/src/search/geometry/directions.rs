@@ -28,12 +28,12 @@ pub(super) fn agree(
     hypotheses: &[Hypothesis],
 ) -> bool {
     let Some(Hypothesis::Linear { columns, .. }) = hypotheses.last() else { return true };
-    alike(by_direction(context, sums, frames, blocks, (hypotheses, columns)))
+    alike(&by_direction(context, sums, frames, blocks, (hypotheses, columns)).map(Vec::from))
 }
 
 /// Whether the gains of the directions agree with what each is expected to gain; true where too few show the effect.
-pub(super) fn alike([gains, expected]: [[f64; OCTANTS]; 2]) -> bool {
-    total_and_z_about(&gains, &expected, FEWEST).is_none_or(|(_, z)| z > Z_LEAST)
+pub(super) fn alike([gains, expected]: &[Vec<f64>; 2]) -> bool {
+    total_and_z_about(gains, expected, FEWEST).is_none_or(|(_, z)| z > Z_LEAST)
 }
 
 /// Gain of each direction by some columns beside all others that are fitted, and what it is expected to gain, nats.

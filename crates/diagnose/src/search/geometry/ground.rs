@@ -4,7 +4,7 @@
 
 use super::floor::FLOOR_DISPLACED_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::mean::{OwnPoses, STRAY_M, origins, own_poses, own_row, usable, usual_noise_m, weight};
+use crate::channels::mean::{OwnPoses, off_surface_m, origins, own_poses, usable, usual_noise_m, weight};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::choice::total_and_z;
@@ -116,10 +116,10 @@ fn pairs(context: &Context) -> Option<Vec<Vec<Pair>>> {
 fn heights(frame: &FramePair, pose: &OwnPoses, origins: &[Point3<f64>], noise_m: f64) -> Heights {
     let mut cells = BTreeMap::<Cell, [f64; 3]>::new();
     for ray in frame.measured.iter().filter(|r| usable(r) && r.surface == Surface::Ground) {
-        let sensor = ray.sensor as usize;
-        let place = ray.predicted_point(&origins[sensor]).coords.xy();
-        let up_m = ray.across_nearest_m() - own_row(ray, &origins[sensor]).dot(&pose[sensor]);
-        if (NEAR_FAR_M[0]..NEAR_FAR_M[1]).contains(&place.norm()) && up_m.abs() < STRAY_M {
+        let origin = &origins[usize::from(ray.sensor)];
+        let place = ray.predicted_point(origin).coords.xy();
+        let Some(up_m) = off_surface_m(ray, origin, pose) else { continue };
+        if (NEAR_FAR_M[0]..NEAR_FAR_M[1]).contains(&place.norm()) {
             let sums = cells.entry(cell_of(&place)).or_default();
             let w = weight(ray, noise_m);
             (sums[0], sums[1], sums[2]) = (sums[0] + 1.0, sums[1] + w, sums[2] + w * up_m);

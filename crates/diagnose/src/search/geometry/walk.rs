@@ -12,6 +12,7 @@ use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
 use crate::pairing::{OCTANTS, Ray};
 use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter};
+use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
 use sensor::Effect;
 
@@ -59,13 +60,7 @@ impl Sums {
         let [squares, freedom] =
             train.iter().fold([0.0; 2], |s, &f| [s[0] + frames[f].squares, s[1] + frames[f].freedom]);
         let variance = (squares / freedom.max(1.0)).max(1.0);
-        let whole = |f: &BrightFrame| {
-            let sum = |of: &dyn Fn(&LinearFrame) -> f64| f.octants.iter().map(of).sum::<f64>() / variance;
-            LinearFrame {
-                gram: nalgebra::DMatrix::from_element(1, 1, sum(&|o| o.gram[(0, 0)])),
-                right: nalgebra::DVector::from_element(1, sum(&|o| o.right[0])),
-            }
-        };
+        let whole = |f: &BrightFrame| of_one_column(sum_of(f.octants.iter()), variance);
         let whole = frames.iter().map(whole).collect();
         Some(Sums { brightness, frames, whole, variance })
     }
@@ -75,39 +70,40 @@ impl Sums {
         fit(&frames, &context.blocks(which), &[0], &[0.0])
     }
 
+    /// Sums of some frames by direction about the vehicle.
+    fn octants(&self, which: &[usize]) -> Vec<LinearFrame> {
+        let sums = (0..OCTANTS).map(|k| sum_of(which.iter().map(|&f| &self.frames[f].octants[k])));
+        sums.map(|sums| of_one_column(sums, self.variance)).collect()
+    }
+
     /// Standard error of a walk fitted on some frames, m: by the scatter of blocks of frames, or by that of directions,
     /// whichever is larger. Directions show other surfaces, whose brightness differs more or less: the law need not be
     /// a straight line in its logarithm.
     fn error_m(&self, fitted: &LinearFit, which: &[usize]) -> f64 {
-        let mut octants = [[0.0; 2]; OCTANTS];
-        for (sums, octant) in which.iter().flat_map(|&f| octants_of(&self.frames[f])) {
-            octants[octant][0] += sums.gram[(0, 0)];
-            octants[octant][1] += sums.right[0] - sums.gram[(0, 0)] * fitted.theta[0];
-        }
-        let gram: f64 = octants.iter().map(|o| o[0]).sum();
-        let scores: f64 = octants.iter().map(|o| o[1] * o[1]).sum();
-        let n = octants.iter().filter(|o| o[0] > 0.0).count() as f64;
-        let by_octants = (scores * n / (n - 1.0).max(1.0)).sqrt() / gram.max(1e-300);
-        fitted.error(0).max(by_octants)
+        let octants = self.octants(which);
+        let seen: Vec<&LinearFrame> = octants.iter().filter(|octant| octant.gram[(0, 0)] > 0.0).collect();
+        let each: Vec<usize> = (0..seen.len()).collect();
+        fitted.error(0).max(fit(&seen, &each, &[0], &[0.0]).error(0))
     }
 
-    /// Gain of each direction by a walk over some frames, and what it is expected to gain, nats.
-    fn by_octant(&self, by_m: f64, which: &[usize]) -> [[f64; OCTANTS]; 2] {
-        let mut out = [[0.0; OCTANTS]; 2];
-        for &f in which {
-            for (octant, k) in octants_of(&self.frames[f]) {
-                let expected = 0.5 * by_m * by_m * octant.gram[(0, 0)] / self.variance;
-                out[0][k] += by_m * octant.right[0] / self.variance - expected;
-                out[1][k] += expected;
-            }
-        }
-        out
+    /// Gain of each direction by a walk fitted on some frames, and what it is expected to gain, nats.
+    fn by_octant(&self, fitted: &LinearFit, which: &[usize]) -> [Vec<f64>; 2] {
+        let octants = self.octants(which);
+        let expected = |octant: &LinearFrame| 0.5 * octant.gram[(0, 0)] * fitted.theta[0].powi(2);
+        [octants.iter().map(|octant| fitted.gain(octant)).collect(), octants.iter().map(expected).collect()]
     }
 }
 
-/// Sums of the directions of a frame with their numbers.
-fn octants_of(frame: &BrightFrame) -> impl Iterator<Item = (&LinearFrame, usize)> {
-    frame.octants.iter().zip(0..OCTANTS)
+fn sum_of<'a>(all: impl Iterator<Item = &'a [f64; 2]>) -> [f64; 2] {
+    all.fold([0.0; 2], |sum, one| [sum[0] + one[0], sum[1] + one[1]])
+}
+
+/// Sums of the only column, in units of a variance.
+fn of_one_column([square, product]: [f64; 2], variance: f64) -> LinearFrame {
+    LinearFrame {
+        gram: DMatrix::from_element(1, 1, square / variance),
+        right: DVector::from_element(1, product / variance),
+    }
 }
 
 /// Gains of the `test` frames by a walk fitted on the `train` frames, nats.
@@ -129,7 +125,7 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     let (total, z) = total_and_z(&gains);
     let large = chosen.theta[0].abs() > FLOOR_M;
     let enough = total > demands.nats && z > demands.z;
-    let alike = alike(sums.by_octant(chosen.theta[0], &select));
+    let alike = alike(&sums.by_octant(&chosen, &select));
     let outcome = match (enough, large, alike) {
         (true, true, true) => "chosen",
         (false, ..) => "no gain on frames that it was not fitted on",
