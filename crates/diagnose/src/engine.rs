@@ -360,13 +360,16 @@ impl Engine<'_> {
         let context = Context { frames: upright.as_deref().unwrap_or(context.frames), ..context.clone() };
         let (packets, arrived) = search::packets::search(&context, self.sensors);
         let seen = Context { frames: arrived.as_deref().unwrap_or(context.frames), ..context.clone() };
+        let (of_bright, without_halos) = search::bright_targets::search(&seen);
+        let seen = Context { frames: without_halos.as_deref().unwrap_or(seen.frames), ..seen };
         let (hidden, mask) = search::mask::search(&seen, known.shown());
         let elsewhere = known.shown() != Shown::InPlace;
         let mut results = vec![packets, hidden, search::hits::search(&seen, &mask, elsewhere)];
+        results.extend(of_bright);
         self.finished(5);
         results.push(search::returns::search(&seen));
         results.push(search::intensity::search(&seen, notes));
-        drop(arrived);
+        drop((arrived, without_halos));
         self.finished(6);
         let uneven = displaced.is_uneven();
         let in_row = |frame: usize, p: &Vector3<f64>, sensor: usize| known.shift_m(self, displaced, (frame, sensor), p);
@@ -378,7 +381,10 @@ impl Engine<'_> {
         };
         let even = if uneven || known.step_m.is_some() { Some(self.pair(even)?) } else { None };
         let context = Context { frames: even.as_deref().unwrap_or(context.frames), ..context.clone() };
-        results.push(search::geometry::ground::search(&context));
+        let vibration = search::geometry::vibration::search(&context);
+        // In frames that tilt within a scan the ground is elsewhere than it is.
+        let ground = vibration.found.is_empty().then(|| search::geometry::ground::search(&context));
+        results.extend([vibration].into_iter().chain(ground));
         results.push(search::noise::search(&context, if uneven { LEAST_COS } else { 0.0 }));
         Ok(results)
     }

@@ -112,8 +112,16 @@ pub(crate) fn why_none(f: &Finding) -> String {
             format!("The simulation has more of it than the measurement: take it out there ({quantity} by {by}).")
         }
         (Cause::MixedPixels, _) => "beam_divergence: how wide the beams are these data do not tell.".into(),
+        (Cause::Blooming | Cause::BrightTargetDropout, _) => format!(
+            "{}: it needs the light that targets return, which finished clouds do not hold: put it into the list of the \
+             simulator, with returned_above below that of your signs and plates.",
+            cause_of(f)
+        ),
         (Cause::Ghosts, _) => {
             "ghosts: give the materials that mirror a specular lobe, and the shots a probability.".into()
+        }
+        (Cause::Unexplained, _) if f.covariate == Covariate::ScanPhase => {
+            "The simulator has no effect that does this: mount_vibration tilts whole scans.".into()
         }
         (Cause::Unexplained, _) => "There is no table of it for any sensor of the rig.".into(),
         (other, _) => {

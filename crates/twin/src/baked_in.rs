@@ -51,6 +51,16 @@ const TABLE: &[[&str; 3]] = &[
     ["rolling_shutter", "both sides are shot from the same moving sensor", "the same street from a standing vehicle"],
     ["missing_object", "the twin has what the recording shows", "the same street by another sensor"],
     [
+        "blooming",
+        "the halo of a bright target is around it in all frames, and in the map",
+        "the same street by another sensor",
+    ],
+    [
+        "bright_target_dropout",
+        "what is lost beside a bright target in all frames is not in the map",
+        "the same street by another sensor",
+    ],
+    [
         "ghosts",
         "what a mirror shows in many frames is in the map, behind the mirror",
         "the same street by another sensor",

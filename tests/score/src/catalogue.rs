@@ -1,11 +1,13 @@
 //! Causes that the present diagnosis can name. This list decides which hidden effects count as nameable.
 
 /// Names of `diagnose::Cause`, without `unexplained`, in alphabetical order. A test in `tests/town` compares the two.
-pub const CATALOGUE: [&str; 40] = [
+pub const CATALOGUE: [&str; 42] = [
     "angular_jitter",
     "beam_elevation_offset",
     "beam_intensity",
     "beam_range_offset",
+    "blooming",
+    "bright_target_dropout",
     "coordinate_rounding",
     "dirty_window",
     "dual_returns",

@@ -16,6 +16,10 @@ identifiers! {
         BeamIntensity = "beam_intensity",
         /// Each row has a range offset of its own.
         BeamRangeOffset = "beam_range_offset",
+        /// Bright targets have a halo of false returns at their range.
+        Blooming = "blooming",
+        /// Shots beside bright targets return nothing.
+        BrightTargetDropout = "bright_target_dropout",
         /// Coordinates are rounded.
         CoordinateRounding = "coordinate_rounding",
         /// A patch of directions loses returns: dirt on the sensor's window.
@@ -108,6 +112,8 @@ impl Cause {
             Cause::RollingShutter => (Family::Timing, 70),
             Cause::MixedPixels => (Family::Returns, 80),
             Cause::DualReturns => (Family::Returns, 85),
+            Cause::Blooming => (Family::Returns, 87),
+            Cause::BrightTargetDropout => (Family::Detection, 88),
             Cause::EgoOcclusion => (Family::Detection, 90),
             Cause::DirtyWindow => (Family::Detection, 95),
             Cause::MaterialDropout => (Family::Detection, 100),

@@ -53,6 +53,8 @@ identifiers! {
         Gamma = "gamma",
         /// Range at which half of the returns are lost.
         HalfAtM = "half_at_m",
+        /// Angle from a bright target at which the rate of false returns has fallen to 1/e.
+        HaloDeg = "halo_deg",
         /// Height of what is behind vehicles over the ground.
         HeightM = "height_m",
         /// Measured objects are higher by this.
@@ -127,6 +129,8 @@ identifiers! {
         Steepness = "steepness",
         /// Quantisation step.
         StepM = "step_m",
+        /// Rate of false returns of the shots beside a bright target.
+        Strength = "strength",
         /// Signal at which half of the returns are lost.
         Threshold = "threshold",
         /// What shots at a quarter of the scan are early by, as a share of its duration.
@@ -201,6 +205,7 @@ impl Quantity {
             | Quantity::ElevationDeg
             | Quantity::ElevationFromDeg
             | Quantity::ElevationToDeg
+            | Quantity::HaloDeg
             | Quantity::MeanByWallsDeg
             | Quantity::MeanDeg
             | Quantity::PitchAt70MpsDeg

@@ -77,6 +77,11 @@ impl Brightness {
         Some(ln_above(intensity, self.least)? + self.fall[0] * range - self.fall[1] * incidence - self.middle_ln)
     }
 
+    /// Brightness of the surface of a return as the sensor sees it, ln: of its incidence nothing is taken out.
+    pub fn towards_sensor(&self, ray: &Ray) -> Option<f64> {
+        Some(ln_above(ray.intensity, self.least)? + self.fall[0].max(0.0) * of_fall(ray)[0])
+    }
+
     /// The same against that elsewhere on its plane, ln. Over a plane the logarithm of the cosine of incidence is that
     /// of the range with the opposite sign, and an estimated cosine scatters where returns are few.
     fn on_a_plane(&self, ray: &Ray, intensity: f32) -> Option<f64> {
@@ -151,8 +156,10 @@ pub struct BrightFrame {
     pub freedom: f64,
 }
 
-/// Columns of a patch that its returns have in common: its offset, and an offset of ranges.
-const COMMON: usize = 2;
+/// Columns of a patch that its returns have in common: its offset, an offset of ranges, and its turns. A plane that is
+/// turned a little lies beside the simulated one by what grows with range, and so does the intensity of a plane of one
+/// brightness fall.
+const COMMON: usize = 4;
 
 /// All columns of a patch, the logarithm of intensities and the measured distance last.
 const OF_PATCH: usize = COMMON + 2;
@@ -174,7 +181,8 @@ pub fn bright_frames(
             let at = [ray.azimuth_rad, ray.elevation_rad].map(f64::from);
             let place = [0, 1].map(|k| (at[k] / PATCH_RAD[k]).floor() as i32);
             let lever = ray.range_lever();
-            let x = SVector::from([1.0, lever, lever * bright, y]);
+            let turned = [0, 1].map(|k| (at[k] - (f64::from(place[k]) + 0.5) * PATCH_RAD[k]) * f64::from(ray.range_m));
+            let x = SVector::from([1.0, lever, turned[0], turned[1], lever * bright, y]);
             let (n, sums) = patches.entry((ray.sensor, ray.octant(), kind_of(ray), place)).or_default();
             *n += 1.0;
             sums.ger(weight(ray, noise_m), &x, &x, 1.0);

@@ -5,6 +5,8 @@ pub mod cells;
 pub mod edges;
 pub mod free_path;
 pub mod groups;
+pub mod halos;
+pub mod heights;
 pub mod hits;
 pub mod intensity;
 pub mod labels;

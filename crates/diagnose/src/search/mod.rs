@@ -1,6 +1,7 @@
 //! The search of each channel: hypotheses are compared on the selecting frames, fitted on the estimating frames, and
 //! their gain is measured on the held-out frames.
 
+pub mod bright_targets;
 pub mod confounders;
 pub mod dual_returns;
 pub mod geometry;

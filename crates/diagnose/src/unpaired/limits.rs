@@ -33,6 +33,8 @@ const TABLE: &[(Cause, &str, &str)] = &[
         "the surfaces of another street have other small things on them",
         "a flat wall from a standing sensor, or the same scenes on both sides",
     ),
+    (Cause::Blooming, "other streets have other bright things", SAME_SCENES),
+    (Cause::BrightTargetDropout, "other streets have other bright things", SAME_SCENES),
     (Cause::Ghosts, "other streets have other mirrors, and other things behind them", SAME_SCENES),
     (Cause::Spray, "behind other vehicles other things stand", SAME_SCENES),
     (Cause::LabelOffset, "a label is compared with that of the same object", SAME_SCENES),

@@ -4,44 +4,23 @@
 
 use super::floor::FLOOR_DISPLACED_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
-use crate::channels::mean::{OwnPoses, off_surface_m, origins, own_poses, usable, usual_noise_m, weight};
+use crate::channels::heights::{Cell, common_std, heights, largest_of_ground};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
-use crate::pairing::{FramePair, Surface};
 use crate::search::{ChannelResult, Context, Found, first_demands, parameter};
-use nalgebra::{DMatrix, DVector, Point3, Rotation2, Vector2};
-use rayon::prelude::*;
-use std::collections::BTreeMap;
+use nalgebra::{DMatrix, DVector, Rotation2, Vector2};
 
 /// Width of a cell of the ground, m.
 const CELL_M: f64 = 2.0;
-
-/// Distances of the ground that is compared, m.
-const NEAR_FAR_M: [f64; 2] = [3.0, 25.0];
-
-/// Fewest returns of a cell.
-const FEWEST: f64 = 4.0;
-
-/// Fewest frames in which a cell of the vehicle's axes is seen, for their mean.
-const FEWEST_FRAMES: usize = 5;
 
 /// Least way between two frames that are compared, m: farther than what is the same in the vehicle's axes reaches.
 const LEAST_WAY_M: f64 = 4.0;
 
 /// Longest way between them, m.
 const MOST_WAY_M: f64 = 15.0;
-
-/// Standard deviation of small unevenness in a cell, m.
-const UNEVEN_M: f64 = 0.003;
-
-/// A cell, by its place in the vehicle's axes in units of its width.
-type Cell = [i32; 2];
-
-/// Height of the ground in a cell over the simulated one, m, with its variance.
-type Heights = BTreeMap<Cell, [f64; 2]>;
 
 /// The search, on frames with what is known of the sensor undone. Without the way from frame to frame nothing is known.
 pub fn search(context: &Context) -> ChannelResult {
@@ -95,10 +74,10 @@ fn gains_of_places(frames: &[&LinearFrame], blocks: &[usize]) -> Vec<f64> {
 /// Of each frame the heights of its cells beside those of the same places in another frame.
 fn pairs(context: &Context) -> Option<Vec<Vec<Pair>>> {
     let times = context.times.as_ref()?;
-    let (origins, noise_m) = (origins(context.rig), usual_noise_m(context.frames));
-    let of_frame = |frame: &FramePair| heights(frame, &own_poses(frame, &origins, noise_m), &origins, noise_m);
-    let mut heights: Vec<Heights> = context.frames.par_iter().map(of_frame).collect();
-    take_out_means(&mut heights);
+    let mut heights = heights(context.frames, context.rig, |_, place| cell_of(place));
+    // The ground rolls everywhere, things stand in some places.
+    let most_m = largest_of_ground(heights.iter().flat_map(|frame| frame.values().map(|[height_m, _]| *height_m)));
+    heights.iter_mut().for_each(|frame| frame.retain(|_, [height_m, _]| height_m.abs() <= most_m));
     let of_frame = |f: usize| -> Vec<Pair> {
         let Some((g, way)) = another(context, times, f) else { return vec![] };
         let same = |(cell, [own_m, variance]): (&Cell, &[f64; 2])| {
@@ -112,38 +91,8 @@ fn pairs(context: &Context) -> Option<Vec<Vec<Pair>>> {
     Some((0..context.frames.len()).map(of_frame).collect())
 }
 
-/// Heights by cell, with the frame's own pose taken out.
-fn heights(frame: &FramePair, pose: &OwnPoses, origins: &[Point3<f64>], noise_m: f64) -> Heights {
-    let mut cells = BTreeMap::<Cell, [f64; 3]>::new();
-    for ray in frame.measured.iter().filter(|r| usable(r) && r.surface == Surface::Ground) {
-        let origin = &origins[usize::from(ray.sensor)];
-        let place = ray.predicted_point(origin).coords.xy();
-        let Some(up_m) = off_surface_m(ray, origin, pose) else { continue };
-        if (NEAR_FAR_M[0]..NEAR_FAR_M[1]).contains(&place.norm()) {
-            let sums = cells.entry(cell_of(&place)).or_default();
-            let w = weight(ray, noise_m);
-            (sums[0], sums[1], sums[2]) = (sums[0] + 1.0, sums[1] + w, sums[2] + w * up_m);
-        }
-    }
-    let height = |(cell, [_, w, wy]): (Cell, [f64; 3])| (cell, [wy / w, 1.0 / w + UNEVEN_M * UNEVEN_M]);
-    cells.into_iter().filter(|(_, s)| s[0] >= FEWEST).map(height).collect()
-}
-
 fn cell_of(place: &Vector2<f64>) -> Cell {
     [place.x, place.y].map(|v| (v / CELL_M).floor() as i32)
-}
-
-/// Takes out what a cell of the vehicle's axes has in the mean over the frames.
-fn take_out_means(frames: &mut [Heights]) {
-    let mut means = BTreeMap::<Cell, (usize, f64)>::new();
-    for (cell, [height_m, _]) in frames.iter().flatten() {
-        let mean = means.entry(*cell).or_default();
-        (mean.0, mean.1) = (mean.0 + 1, mean.1 + height_m);
-    }
-    for frame in frames {
-        frame.retain(|cell, _| means[cell].0 >= FEWEST_FRAMES);
-        frame.iter_mut().for_each(|(cell, [height_m, _])| *height_m -= means[cell].1 / means[cell].0 as f64);
-    }
 }
 
 /// The next frame, or the one before, that is far enough from a frame, and where a place of the latter is in its axes.
@@ -185,20 +134,11 @@ fn sums(pairs: &[Pair]) -> LinearFrame {
     LinearFrame { gram, right }
 }
 
-/// Standard deviation of the heights that two frames agree on, m, with its error by the scatter of blocks.
+/// Standard deviation of the heights that two frames agree on, m, with its error.
 fn std_m(pairs: &[Vec<Pair>], which: &[usize], blocks: &[usize]) -> [f64; 2] {
-    let mut by_block = BTreeMap::<usize, [f64; 2]>::new();
-    for (&f, block) in which.iter().zip(blocks) {
-        let sums = by_block.entry(*block).or_default();
-        pairs[f].iter().for_each(|[own_m, place_m, ..]| *sums = [sums[0] + 1.0, sums[1] + own_m * place_m]);
-    }
-    let [n, product] = by_block.values().fold([0.0; 2], |s, b| [s[0] + b[0], s[1] + b[1]]);
-    let (n, blocks) = (f64::max(n, 1.0), by_block.len() as f64);
-    let mean = product / n;
-    let scatter: f64 = by_block.values().map(|[n, product]| (product - mean * n).powi(2)).sum();
-    let error = (scatter * blocks / (blocks - 1.0).max(1.0)).sqrt() / n;
-    let std_m = mean.max(0.0).sqrt();
-    [std_m, error / (2.0 * std_m).max(1e-6)]
+    let of_frame =
+        |f: usize| pairs[f].iter().fold([0.0; 2], |s, [own_m, place_m, ..]| [s[0] + 1.0, s[1] + own_m * place_m]);
+    common_std(which.iter().zip(blocks).map(|(&f, block)| (*block, of_frame(f))))
 }
 
 fn found(pairs: &[Vec<Pair>], estimate: &[usize], [std_m, error_m]: [f64; 2], held_out_gains: Vec<f64>) -> Found {
@@ -244,58 +184,11 @@ fn curve(pairs: &[Vec<Pair>], estimate: &[usize]) -> Curve {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::channels::motion::OwnMotion;
-    use crate::inference::roles::roles;
-    use crate::pairing::Ray;
-    use nalgebra::Vector3;
-    use sensor::Rig;
-
-    /// A vehicle that drives 1.5 m from frame to frame and turns slowly; heights of the ground by the place in the
-    /// world and by the place in the vehicle's axes, in a frame.
-    fn found_in(height_m: impl Fn(Vector2<f64>, Vector2<f64>, usize) -> f64) -> ChannelResult {
-        let (frames, speed, turn, dt) = (60, 15.0, 0.1, 0.1);
-        let (mut at, mut heading) = (Vector2::zeros(), 0.0);
-        let mut recorded = Vec::new();
-        for f in 0..frames {
-            let mut rays = Vec::new();
-            for k in 0..6000 {
-                let (azimuth, distance) = (2.4 * f64::from(k), 4.0 + 18.0 * f64::from(k) / 6000.0);
-                let own = Vector2::new(azimuth.cos(), azimuth.sin()) * distance;
-                let up_m = height_m(at + Rotation2::new(heading) * own, own, f);
-                let place = Vector3::new(own.x, own.y, -2.0);
-                let cos = 2.0 / place.norm();
-                rays.push(Ray {
-                    surface: Surface::Ground,
-                    normal: [0.0, 0.0, 1.0],
-                    cos_incidence: cos as f32,
-                    residual_m: (-up_m / cos) as f32,
-                    ..Ray::standing(&place)
-                });
-            }
-            recorded.push(FramePair::of_rays(f.to_string(), rays, vec![]));
-            at += Rotation2::new(heading + 0.5 * turn * dt) * Vector2::new(speed * dt, 0.0);
-            heading += turn * dt;
-        }
-        let turn_rate_rad_s = Vector3::new(0.0, 0.0, turn);
-        let own = OwnMotion { velocity_m_s: Vector3::new(speed, 0.0, 0.0), turn_rate_rad_s };
-        let context = Context {
-            rig: &Rig::single(),
-            frames: &recorded,
-            roles: roles(frames),
-            times: Some((0..frames).map(|f| dt * f as f64).collect()),
-            motion: None,
-            to_next: vec![Some(own); frames - 1],
-        };
-        search(&context)
-    }
-
-    fn wave(place: Vector2<f64>) -> f64 {
-        0.02 * (0.35 * place.x).sin() * (0.25 * place.y + 1.0).cos()
-    }
+    use crate::channels::heights::testing::{found_in, wave};
 
     #[test]
     fn ground_that_rolls_where_it_is_has_a_name_and_its_height() {
-        let result = found_in(|world, _, _| wave(world));
+        let result = found_in(search, |world, _, _| wave(world));
         let [found] = &result.found[..] else { panic!("{:?}", result.considered) };
         let std_m = found.parameter(Quantity::StdM).unwrap().estimate;
         assert!(found.is(Cause::GroundError) && (0.006..0.011).contains(&std_m), "{std_m}");
@@ -303,8 +196,9 @@ mod tests {
 
     #[test]
     fn what_moves_with_the_vehicle_or_vibrates_is_no_ground() {
-        assert!(found_in(|_, own, _| wave(own)).found.is_empty());
+        assert!(found_in(search, |_, own, _| wave(own)).found.is_empty());
         // Alike in two frames that are compared, which are three apart.
-        assert!(found_in(|_, own, f| wave(own) * (std::f64::consts::TAU * f as f64 / 3.0).cos()).found.is_empty());
+        let beats = |f: usize| (std::f64::consts::TAU * f as f64 / 3.0).cos();
+        assert!(found_in(search, |_, own, f| wave(own) * beats(f)).found.is_empty());
     }
 }

@@ -15,6 +15,7 @@ mod rows;
 mod selection;
 mod steadiness;
 mod sums;
+pub mod vibration;
 pub mod walk;
 
 pub use self::displacement::{Displacement, Swept};
