@@ -35,6 +35,20 @@ pub struct CurvePoint {
     pub error: f64,
 }
 
+/// Points of means over as many of some pairs of a covariate and what is measured there each, in their order, where the
+/// simulation has 0.
+pub fn means(mut pairs: Vec<[f64; 2]>) -> Vec<CurvePoint> {
+    const POINTS: usize = 12;
+    pairs.sort_by(|a, b| a[0].total_cmp(&b[0]));
+    let point = |chunk: &[[f64; 2]]| {
+        let n = chunk.len() as f64;
+        let [x, measured] = [0, 1].map(|k: usize| chunk.iter().map(|p| p[k]).sum::<f64>() / n);
+        let variance = chunk.iter().map(|p| (p[1] - measured).powi(2)).sum::<f64>() / n;
+        CurvePoint { sensor: 0, x, measured, before: 0.0, after: 0.0, error: (variance / n).sqrt() }
+    };
+    pairs.chunks(pairs.len().div_ceil(POINTS).max(1)).map(point).collect()
+}
+
 /// In `diagnosis.json` the curves of sensors lie this far apart along the horizontal axis: sensor `s` at `x + 1000 s`.
 const SENSOR_SPACING: f64 = 1000.0;
 

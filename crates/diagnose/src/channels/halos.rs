@@ -121,15 +121,6 @@ fn nearest<'a>(
     (bin < BINS).then_some((bin, best.1))
 }
 
-/// Whether a measured return may be of the halo of some target.
-fn is_of_halo(ray: &Ray) -> bool {
-    match ray.lies() {
-        Lies::InFront => true,
-        Lies::Open => ray.row != u16::MAX,
-        _ => false,
-    }
-}
-
 fn at_its_range(ray: &Ray) -> impl Fn(&Target) -> bool {
     let own_m = ray.own_range_m();
     move |target| (target.range_m - own_m).abs() < SAME_RANGE_M
@@ -208,7 +199,7 @@ pub fn without_halos(
         let near = nearest(&bright[usize::from(ray.sensor)], &ray.direction_vector(), counts);
         near.is_some_and(|(bin, _)| (bin as f64 + 0.5) * BIN_RAD < most_rad)
     };
-    let is_halo = |ray: &Ray| is_of_halo(ray) && within(ray, halo_rad, &at_its_range(ray));
+    let is_halo = |ray: &Ray| ray.is_in_the_air() && within(ray, halo_rad, &at_its_range(ray));
     let is_dark = |ray: &Ray| within(ray, dark_rad, &at_another_range(ray));
     let mut out = frame.clone();
     out.measured.retain(|r| !is_halo(r));

@@ -1,6 +1,6 @@
 //! The air behind vehicles, where wheels throw up water and dust, and as a comparison the air before them.
 
-use crate::pairing::{FramePair, Lies, Ray};
+use crate::pairing::FramePair;
 use geometry::Box3;
 use nalgebra::Point3;
 use sensor::directions::in_or_beside;
@@ -132,15 +132,6 @@ impl Air<'_> {
     }
 }
 
-/// Whether nothing simulated explains a return.
-fn in_the_air(ray: &Ray) -> bool {
-    match ray.lies() {
-        Lies::InFront => true,
-        Lies::Open => ray.row != u16::MAX,
-        _ => false,
-    }
-}
-
 /// The air around the vehicles of a frame; `origins` are those of the sensors, in the cloud's frame, `speed_m_s` is
 /// that of a vehicle over the ground.
 pub fn plume_frame(
@@ -163,7 +154,7 @@ pub fn plume_frame(
         return out;
     }
     for (side, rays) in [&frame.measured, &frame.simulated].into_iter().enumerate() {
-        for (i, ray) in rays.iter().enumerate().filter(|(_, ray)| in_the_air(ray)) {
+        for (i, ray) in rays.iter().enumerate().filter(|(_, ray)| ray.is_in_the_air()) {
             let point: [f64; 3] = ray.point(&origins[ray.sensor as usize]).into();
             if airs.iter().any(|air| air.place == 0 && air.is_around(point)) {
                 out.around[side].insert(i);

@@ -103,6 +103,17 @@ impl Ray {
         f64::from(self.range_m) + f64::from(self.residual_m)
     }
 
+    /// Whether nothing simulated explains it: it lies before all surfaces, or where the simulation sent a shot that did
+    /// not return.
+    pub fn is_in_the_air(&self) -> bool {
+        match self.lies() {
+            Lies::InFront => true,
+            // Without rows nothing says that the simulation sent a shot there.
+            Lies::Open => self.row != u16::MAX,
+            _ => false,
+        }
+    }
+
     /// Its place in the cloud's frame, from the sensor's origin.
     pub fn point(&self, origin: &Point3<f64>) -> Point3<f64> {
         origin + self.direction_vector() * self.own_range_m()

@@ -5,7 +5,7 @@
 use super::floor::FLOOR_DISPLACED_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::heights::{Cell, common_std, heights, largest_of_ground};
-use crate::curve::{Curve, CurvePoint};
+use crate::curve::{Curve, means};
 use crate::diagnosis::{Considered, Minimum, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFrame, cross_gains, fit};
@@ -160,24 +160,14 @@ fn found(pairs: &[Vec<Pair>], estimate: &[usize], [std_m, error_m]: [f64; 2], he
     }
 }
 
-/// Points of the plot.
-const BINS: usize = 12;
-
 /// Heights of the same places in other frames over those in one.
 fn curve(pairs: &[Vec<Pair>], estimate: &[usize]) -> Curve {
-    let mut all: Vec<Pair> = estimate.iter().flat_map(|&f| pairs[f].clone()).collect();
-    all.sort_by(|a, b| a[1].total_cmp(&b[1]));
-    let point = |chunk: &[Pair]| {
-        let n = chunk.len() as f64;
-        let [measured, x] = [0, 1].map(|k: usize| chunk.iter().map(|p| p[k]).sum::<f64>() / n);
-        let variance = chunk.iter().map(|p| (p[0] - measured).powi(2)).sum::<f64>() / n;
-        CurvePoint { sensor: 0, x, measured, before: 0.0, after: 0.0, error: (variance / n).sqrt() }
-    };
+    let heights = |&f: &usize| pairs[f].iter().map(|[own_m, place_m, ..]| [*place_m, *own_m]);
     Curve {
         x: "height of the same place in another frame, m".into(),
         y: "height of the ground over the simulated one, m".into(),
         by_sensor: false,
-        points: all.chunks(all.len().div_ceil(BINS).max(1)).map(point).collect(),
+        points: means(estimate.iter().flat_map(heights).collect()),
     }
 }
 

@@ -6,7 +6,7 @@ use super::floor::FLOOR_TURN_RAD;
 use crate::catalogue::{Cause, Channel, Covariate};
 use crate::channels::heights::{Cell, Heights, common_std, heights, largest_of_ground};
 use crate::channels::mean::origins;
-use crate::curve::{Curve, CurvePoint};
+use crate::curve::{Curve, means};
 use crate::diagnosis::{Considered, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFrame, cross_gains, fit};
@@ -37,6 +37,13 @@ struct Pair {
     by_near_m: f64,
     variance: f64,
     lever_m: f64,
+}
+
+impl Pair {
+    /// Tilts by near and by far ground, rad.
+    fn tilts(&self) -> [f64; 2] {
+        [self.by_near_m, self.height_m].map(|m| m / self.lever_m)
+    }
 }
 
 /// The search, on frames with what is known of the sensor undone.
@@ -83,9 +90,8 @@ fn pairs(context: &Context) -> Vec<Vec<Pair>> {
     heights.iter_mut().for_each(|frame| take_out_plane(frame, &origins));
     let middle = middle(&heights, &origins);
     let mut pairs: Vec<Vec<Pair>> = heights.iter().map(|frame| of_frame(frame, &origins, middle)).collect();
-    let tilts = |p: &Pair| [p.by_near_m, p.height_m].map(|m| m / p.lever_m);
-    let most = largest_of_ground(pairs.iter().flatten().flat_map(tilts));
-    pairs.iter_mut().for_each(|frame| frame.retain(|p| tilts(p).iter().all(|tilt| tilt.abs() <= most)));
+    let most = largest_of_ground(pairs.iter().flatten().flat_map(Pair::tilts));
+    pairs.iter_mut().for_each(|frame| frame.retain(|p| p.tilts().iter().all(|tilt| tilt.abs() <= most)));
     pairs
 }
 
@@ -185,25 +191,14 @@ fn found(pairs: &[Vec<Pair>], estimate: &[usize], tilt_rad: f64, held_out_gains:
     }
 }
 
-/// Points of the plot.
-const BINS: usize = 12;
-
 /// Tilts of far ground over those of near ground of the same direction and frame.
 fn curve(pairs: &[Vec<Pair>], estimate: &[usize]) -> Curve {
-    let tilts = |p: &Pair| [p.by_near_m, p.height_m].map(|m| (m / p.lever_m).to_degrees());
-    let mut all: Vec<[f64; 2]> = estimate.iter().flat_map(|&f| pairs[f].iter().map(tilts)).collect();
-    all.sort_by(|a, b| a[0].total_cmp(&b[0]));
-    let point = |chunk: &[[f64; 2]]| {
-        let n = chunk.len() as f64;
-        let [x, measured] = [0, 1].map(|k: usize| chunk.iter().map(|p| p[k]).sum::<f64>() / n);
-        let variance = chunk.iter().map(|p| (p[1] - measured).powi(2)).sum::<f64>() / n;
-        CurvePoint { sensor: 0, x, measured, before: 0.0, after: 0.0, error: (variance / n).sqrt() }
-    };
+    let tilts = |&f: &usize| pairs[f].iter().map(|p| p.tilts().map(f64::to_degrees));
     Curve {
         x: "tilt of near ground, degrees".into(),
         y: "tilt of far ground in the same direction, degrees".into(),
         by_sensor: false,
-        points: all.chunks(all.len().div_ceil(BINS).max(1)).map(point).collect(),
+        points: means(estimate.iter().flat_map(tilts).collect()),
     }
 }
 
