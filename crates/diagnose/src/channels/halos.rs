@@ -8,10 +8,15 @@ use nalgebra::Vector3;
 use std::collections::BTreeSet;
 
 /// Width of a bin of angles, rad: a quarter of a degree.
-pub const BIN_RAD: f64 = 0.25 * std::f64::consts::PI / 180.0;
+const BIN_RAD: f64 = 0.25 * std::f64::consts::PI / 180.0;
 
 /// Bins of angles, up to 12 degrees.
 pub const BINS: usize = 48;
+
+/// Middle of a bin, rad.
+pub fn angle_rad(bin: usize) -> f64 {
+    (bin as f64 + 0.5) * BIN_RAD
+}
 
 /// Shares of the returns, the brightest ones, that may be of bright targets.
 const BRIGHTEST: [f64; 6] = [0.005, 0.002, 0.001, 5e-4, 2e-4, 1e-4];
@@ -109,16 +114,11 @@ fn targets<'a>(rays: impl Iterator<Item = &'a Ray>) -> Vec<Target> {
     rays.filter_map(one).collect()
 }
 
-/// Angle to the nearest of those targets that a return may have to do with, and that target.
-fn nearest<'a>(
-    targets: &'a [Target],
-    direction: &Vector3<f64>,
-    counts: impl Fn(&Target) -> bool,
-) -> Option<(usize, &'a Target)> {
+/// The bin of the angle to the nearest of those targets that a return may have to do with.
+fn nearest(targets: &[Target], direction: &Vector3<f64>, counts: impl Fn(&Target) -> bool) -> Option<usize> {
     let near = targets.iter().filter(|t| counts(t));
-    let best = near.map(|t| (t.direction.dot(direction), t)).max_by(|a, b| a.0.total_cmp(&b.0))?;
-    let bin = (best.0.clamp(-1.0, 1.0).acos() / BIN_RAD) as usize;
-    (bin < BINS).then_some((bin, best.1))
+    let cos = near.map(|t| t.direction.dot(direction)).max_by(f64::total_cmp)?;
+    Some((cos.clamp(-1.0, 1.0).acos() / BIN_RAD) as usize).filter(|bin| *bin < BINS)
 }
 
 fn at_its_range(ray: &Ray) -> impl Fn(&Target) -> bool {
@@ -139,17 +139,17 @@ fn profile(frame: &FramePair, sensor: u8, targets: &[Target]) -> Profile {
         let direction = ray.direction_vector();
         // At the edge of the target itself a return at its range is on a surface.
         let free_m = ray.own_range_m().min(f64::from(ray.near_far_m[0]));
-        if let Some((bin, _)) = nearest(targets, &direction, |t| t.range_m + SAME_RANGE_M < free_m) {
+        if let Some(bin) = nearest(targets, &direction, |t| t.range_m + SAME_RANGE_M < free_m) {
             out[bin].free += step as f64;
         }
-        if let Some((bin, _)) = nearest(targets, &direction, at_another_range(ray)) {
+        if let Some(bin) = nearest(targets, &direction, at_another_range(ray)) {
             out[bin].shots += 1.0;
             out[bin].lost += f64::from(u8::from(!ray.matched));
         }
     }
     // Where the simulation has no return no shot is counted.
     for ray in frame.measured.iter().filter(|r| r.sensor == sensor && r.lies() == Lies::InFront) {
-        if let Some((bin, _)) = nearest(targets, &ray.direction_vector(), at_its_range(ray)) {
+        if let Some(bin) = nearest(targets, &ray.direction_vector(), at_its_range(ray)) {
             out[bin].returns += 1.0;
         }
     }
@@ -197,7 +197,7 @@ pub fn without_halos(
     let bright = bright_targets(frame, sensors, brightness, least);
     let within = |ray: &Ray, most_rad: f64, counts: &dyn Fn(&Target) -> bool| {
         let near = nearest(&bright[usize::from(ray.sensor)], &ray.direction_vector(), counts);
-        near.is_some_and(|(bin, _)| (bin as f64 + 0.5) * BIN_RAD < most_rad)
+        near.is_some_and(|bin| angle_rad(bin) < most_rad)
     };
     let is_halo = |ray: &Ray| ray.is_in_the_air() && within(ray, halo_rad, &at_its_range(ray));
     let is_dark = |ray: &Ray| within(ray, dark_rad, &at_another_range(ray));

@@ -3,9 +3,11 @@
 use super::{ChannelResult, Context, Found, Z_STAR, first_demands, parameter, with_error};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity, Unit};
 use crate::channels::brightness::Brightness;
-use crate::channels::halos::{Around, BIN_RAD, BINS, HaloFrame, Profile, halo_frame, thresholds, total, without_halos};
+use crate::channels::halos::{
+    Around, BINS, HaloFrame, Profile, angle_rad, halo_frame, thresholds, total, without_halos,
+};
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::{Considered, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
@@ -75,7 +77,7 @@ impl What {
     }
 
     fn shape(self, bin: usize, reach_rad: f64) -> f64 {
-        let angle = (bin as f64 + 0.5) * BIN_RAD / reach_rad;
+        let angle = angle_rad(bin) / reach_rad;
         match self {
             What::Halo => (-angle).exp(),
             What::Dark => (-angle * angle).exp(),
@@ -220,13 +222,7 @@ fn search_one(context: &Context, what: What, profiles: &[HaloFrame], result: &mu
     } else {
         "chosen"
     };
-    result.considered.push(Considered {
-        cause: what.cause().into(),
-        channel: result.channel,
-        nats_per_ray: nats / context.returns(&select).max(1.0),
-        z,
-        outcome: outcome.into(),
-    });
+    result.consider(what.cause(), (nats, z), context.returns(&select), outcome);
     result.minimum.push((what.cause(), Minimum::new(what.size(), FLOOR)));
     if outcome != "chosen" {
         return None;
@@ -296,7 +292,7 @@ fn curve(law: &Law, frames: &[&HaloFrame]) -> Curve {
     let counts = counts(law.what, &total(frames.iter().map(|f| &f.bright)));
     let point = |(i, [n, k]): (usize, &[f64; 2])| CurvePoint {
         sensor: 0,
-        x: ((i as f64 + 0.5) * BIN_RAD).to_degrees(),
+        x: angle_rad(i).to_degrees(),
         measured: k / n,
         before: law.base[i],
         after: law.rate(i),
@@ -326,7 +322,7 @@ mod tests {
             Around { free: n as f64, returns: happened, shots: n as f64, lost: happened }
         };
         let mut one = || HaloFrame {
-            bright: std::array::from_fn(|i| around(rate((i as f64 + 0.5) * BIN_RAD), 8 + 3 * i)),
+            bright: std::array::from_fn(|i| around(rate(angle_rad(i)), 8 + 3 * i)),
             usual: std::array::from_fn(|i| around(0.0, 30 + 9 * i)),
         };
         (0..40).map(|_| one()).collect()

@@ -148,6 +148,13 @@ pub struct ChannelResult {
 }
 
 impl ChannelResult {
+    /// Lists a cause that was looked for: its gain, nats, with z, of frames with so many returns.
+    pub fn consider(&mut self, cause: Cause, (nats, z): (f64, f64), returns: f64, outcome: &str) {
+        let nats_per_ray = nats / returns.max(1.0);
+        let channel = self.channel;
+        self.considered.push(Considered { cause: cause.into(), channel, nats_per_ray, z, outcome: outcome.into() });
+    }
+
     /// Without any finding, for a number of held-out frames.
     pub fn new(channel: Channel, hold_out: usize) -> Self {
         ChannelResult {

@@ -6,7 +6,7 @@ use super::floor::FLOOR_DISPLACED_M;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::heights::{Cell, common_std, heights, largest_of_ground};
 use crate::curve::{Curve, means};
-use crate::diagnosis::{Considered, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
@@ -31,18 +31,10 @@ pub fn search(context: &Context) -> ChannelResult {
     let on = |which: &[usize]| which.iter().map(|&f| &sums[f]).collect::<Vec<_>>();
     let gains = gains_of_places(&on(&select), &context.blocks(&select));
     let (total, z) = total_and_z(&gains);
-    let demands = first_demands();
     let [on_select, on_estimate] = [&select, &estimate].map(|which| std_m(&pairs, which, &context.blocks(which)));
     // Surfaces of a model lie beside the real ones by as much as the floor.
-    let large = on_select[0] > FLOOR_DISPLACED_M && on_estimate[0] - 1.96 * on_estimate[1] > FLOOR_DISPLACED_M;
-    let outcome = match (total > demands.nats && z > demands.z, large) {
-        (false, _) => "no gain on frames that it was not fitted on",
-        (true, false) => "too small to speak of",
-        (true, true) => "chosen",
-    };
-    let nats_per_ray = total / context.returns(&select).max(1.0);
-    let cause = Cause::GroundError.into();
-    result.considered.push(Considered { cause, channel: result.channel, nats_per_ray, z, outcome: outcome.into() });
+    let outcome = outcome((total, z), [on_select, on_estimate], FLOOR_DISPLACED_M);
+    result.consider(Cause::GroundError, (total, z), context.returns(&select), outcome);
     result.minimum.push((Cause::GroundError, Minimum::new(Quantity::StdM, FLOOR_DISPLACED_M)));
     if outcome == "chosen" {
         let [fitted, without] =
@@ -52,6 +44,18 @@ pub fn search(context: &Context) -> ChannelResult {
         result.found.push(found(&pairs, &estimate, on_estimate, gains));
     }
     result
+}
+
+/// What becomes of a standard deviation with its error, on the selecting and on the estimating frames, by the gain with
+/// its z, and by the smallest one that is reported.
+pub(super) fn outcome((nats, z): (f64, f64), [on_select, on_estimate]: [[f64; 2]; 2], smallest: f64) -> &'static str {
+    let demands = first_demands();
+    let large = on_select[0] > smallest && on_estimate[0] - 1.96 * on_estimate[1] > smallest;
+    match (nats > demands.nats && z > demands.z, large) {
+        (false, _) => "no gain on frames that it was not fitted on",
+        (true, false) => "too small to speak of",
+        (true, true) => "chosen",
+    }
 }
 
 /// Height of a cell in a frame; in another frame that of the same place, and that of the same cell of the vehicle's

@@ -3,16 +3,17 @@
 //! does not do that: what is uneven near the vehicle says nothing about what is farther away.
 
 use super::floor::FLOOR_TURN_RAD;
+use super::ground::outcome;
 use crate::catalogue::{Cause, Channel, Covariate};
 use crate::channels::heights::{Cell, Heights, common_std, heights, largest_of_ground};
 use crate::channels::mean::origins;
 use crate::curve::{Curve, means};
-use crate::diagnosis::{Considered, Status};
+use crate::diagnosis::Status;
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
 use crate::pairing::Ray;
-use crate::search::{ChannelResult, Context, Found, first_demands};
+use crate::search::{ChannelResult, Context, Found};
 use nalgebra::{DMatrix, DVector, Matrix3, Point3, Vector2, Vector3};
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
@@ -54,17 +55,9 @@ pub fn search(context: &Context) -> ChannelResult {
     let sums: Vec<LinearFrame> = pairs.iter().map(|pairs| sums(pairs)).collect();
     let on = |which: &[usize]| which.iter().map(|&f| &sums[f]).collect::<Vec<_>>();
     let (total, z) = total_and_z(&cross_gains(&on(&select), &context.blocks(&select), &[0], &PRIOR));
-    let demands = first_demands();
     let [on_select, on_estimate] = [&select, &estimate].map(|which| tilt_rad(&pairs, which, &context.blocks(which)));
-    let large = on_select[0] > FLOOR_TURN_RAD && on_estimate[0] - 1.96 * on_estimate[1] > FLOOR_TURN_RAD;
-    let outcome = match (total > demands.nats && z > demands.z, large) {
-        (false, _) => "no gain on frames that it was not fitted on",
-        (true, false) => "too small to speak of",
-        (true, true) => "chosen",
-    };
-    let nats_per_ray = total / context.returns(&select).max(1.0);
-    let cause = Cause::Unexplained.into();
-    result.considered.push(Considered { cause, channel: result.channel, nats_per_ray, z, outcome: outcome.into() });
+    let outcome = outcome((total, z), [on_select, on_estimate], FLOOR_TURN_RAD);
+    result.consider(Cause::Unexplained, (total, z), context.returns(&select), outcome);
     if outcome == "chosen" {
         let fitted = fit(&on(&estimate), &context.blocks(&estimate), &[0], &PRIOR);
         let gains: Vec<f64> = hold_out.iter().map(|&f| fitted.gain(&sums[f])).collect();

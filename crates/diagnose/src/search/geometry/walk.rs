@@ -6,7 +6,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::brightness::{BrightFrame, Brightnesses, bright_frames};
 use crate::channels::mean::{origins, own_poses, usable, usual_noise_m};
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::{Considered, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::inference::choice::total_and_z;
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
@@ -132,15 +132,8 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
         (_, false, _) => "too small to speak of",
         (.., false) => "surfaces in other directions say otherwise",
     };
-    let nats_per_ray = total / context.returns(&select).max(1.0);
     let cause = Cause::ReflectivityWalk;
-    result.considered.push(Considered {
-        cause: cause.into(),
-        channel: result.channel,
-        nats_per_ray,
-        z,
-        outcome: outcome.into(),
-    });
+    result.consider(cause, (total, z), context.returns(&select), outcome);
     let least = Minimum::new(Quantity::WalkM, (Z_STAR * sums.error_m(&chosen, &select)).max(FLOOR_M));
     result.minimum.push((cause, least));
     let fitted = sums.fit(context, &estimate);

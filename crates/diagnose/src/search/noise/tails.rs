@@ -5,7 +5,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::roughness::{CAP, RoughFrame};
 use crate::channels::tails::{BEYOND, FrameTails, Tail, most_m, tails};
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::{Considered, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::effects::rounded;
 use crate::inference::choice::{significant, total_and_z};
 use crate::inference::linear::cross_validated;
@@ -69,13 +69,7 @@ pub(super) fn search(context: &Context, rough: &mut [RoughFrame], scales: &[f64]
     } else {
         "chosen"
     };
-    result.considered.push(Considered {
-        cause: Cause::HeavyTails.into(),
-        channel: Channel::Roughness,
-        nats_per_ray: evidence / context.returns(&select).max(1.0),
-        z,
-        outcome: outcome.into(),
-    });
+    result.consider(Cause::HeavyTails, (evidence, z), context.returns(&select), outcome);
     result.minimum.push((Cause::HeavyTails, Minimum::new(Quantity::Share, FLOOR.max(SHARE_OF_BASE * base))));
     let Some(fitted) = on_others else { return 0.0 };
     if outcome != "chosen" {

@@ -6,7 +6,7 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::mirrors::{Images, behind_frame, images, is_behind};
 use crate::channels::returns::{Odd, OddFrame};
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::{Considered, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::inference::choice::{significant, total_and_z};
 use crate::search::{ChannelResult, Context, Found, Z_STAR, first_demands};
 use rayon::prelude::*;
@@ -53,13 +53,7 @@ pub(super) fn search(
     } else {
         "chosen"
     };
-    result.considered.push(Considered {
-        cause: Cause::Ghosts.into(),
-        channel: Channel::Returns,
-        nats_per_ray: total / context.returns(select).max(1.0),
-        z,
-        outcome: outcome.into(),
-    });
+    result.consider(Cause::Ghosts, (total, z), context.returns(select), outcome);
     result.minimum.push((Cause::Ghosts, Minimum::new(Quantity::Share, FLOOR)));
     if outcome != "chosen" {
         return false;

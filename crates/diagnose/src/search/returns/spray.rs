@@ -4,7 +4,7 @@ use super::{Z_BY_SIGNS, poisson_distance};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::plumes::{Droplet, Extent, Plume, PlumeFrame};
 use crate::curve::{Curve, CurvePoint};
-use crate::diagnosis::{Considered, Minimum, Status};
+use crate::diagnosis::{Minimum, Status};
 use crate::effects::rounded;
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::counts::gain_of_count;
@@ -97,13 +97,7 @@ pub(super) fn search(frames: &Frames, result: &mut ChannelResult) -> bool {
         let on_free_paths = spray.parameter(Quantity::DensityPerM).is_some_and(|d| d.estimate >= floor_per_m);
         if on_free_paths { (Some(spray), "chosen") } else { (None, "too few on free paths behind vehicles") }
     };
-    result.considered.push(Considered {
-        cause: Cause::Spray.into(),
-        channel: Channel::Returns,
-        nats_per_ray: total / frames.returns.max(1.0),
-        z,
-        outcome: outcome.into(),
-    });
+    result.consider(Cause::Spray, (total, z), frames.returns, outcome);
     if select.iter().any(|f| f.path_m(0) > 0.0) {
         let detectable = floor_per_m.max(TIMES * density.base);
         result.minimum.push((Cause::Spray, Minimum::new(Quantity::DensityPerM, detectable)));
