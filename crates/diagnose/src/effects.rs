@@ -7,7 +7,6 @@ use crate::catalogue::{Cause, Channel, Covariate, ParameterId, Quantity};
 use crate::curve::CurvePoint;
 use crate::diagnosis::{Finding, Status};
 use crate::inference::noise::USUAL_SIGNAL;
-use crate::pairing::GAP_M;
 use sensor::beams::Pick;
 use sensor::effects::{
     AngularJitter, AssumedReflectivity, BeamAngleError, BeamDivergence, BeamIntensity, BeamRangeOffset, Clock,
@@ -133,15 +132,12 @@ fn named(f: &Finding, rig: &Rig, rows_deg: &[Vec<f64>]) -> Vec<Effect> {
             ..EgoAttitude::default()
         }),
         Cause::RollingShutter => return vec![rolling_shutter(f)],
-        // Ranges that mix over such jumps come from pulses, or modulations, as long as that.
-        Cause::MixedPixels if f.parameter(Quantity::DivergenceRad).is_some() => {
-            Effect::BeamDivergence(BeamDivergence {
-                divergence_rad: value(Quantity::DivergenceRad),
-                rays: 7,
-                pulse_m: GAP_M[1],
-                pick: Pick::Strongest,
-            })
-        }
+        Cause::MixedPixels => Effect::BeamDivergence(BeamDivergence {
+            divergence_rad: value(Quantity::DivergenceRad),
+            rays: 7,
+            pulse_m: value(Quantity::PulseM),
+            pick: Pick::Strongest,
+        }),
         Cause::LabelOffset => Effect::LabelOffset(LabelOffset {
             forward_m: value(Quantity::ForwardM),
             left_m: value(Quantity::LeftM),

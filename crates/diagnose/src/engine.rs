@@ -367,7 +367,7 @@ impl Engine<'_> {
         let mut results = vec![packets, hidden, search::hits::search(&seen, &mask, elsewhere)];
         results.extend(of_bright);
         self.finished(5);
-        results.push(search::returns::search(&seen));
+        results.extend([search::returns::search(&seen), search::mixed_pixels::search(&seen)]);
         results.push(search::intensity::search(&seen, notes));
         drop((arrived, without_halos));
         self.finished(6);

@@ -111,7 +111,6 @@ pub(crate) fn why_none(f: &Finding) -> String {
             let by = short(by);
             format!("The simulation has more of it than the measurement: take it out there ({quantity} by {by}).")
         }
-        (Cause::MixedPixels, _) => "beam_divergence: how wide the beams are these data do not tell.".into(),
         (Cause::Blooming | Cause::BrightTargetDropout, _) => format!(
             "{}: it needs the light that targets return, which finished clouds do not hold: put it into the list of the \
              simulator, with returned_above below that of your signs and plates.",
@@ -274,7 +273,7 @@ mod tests {
             finding(Cause::SensorExtrinsics, &[(Quantity::Sensor, 0.0), (Quantity::YawDeg, 0.2)]),
             finding(Cause::PitchRoll, &[(Quantity::PitchDeg, 0.2)]),
             finding(Cause::RollingShutter, &[(Quantity::ScanS, 0.1)]),
-            finding(Cause::MixedPixels, &[(Quantity::Share, 0.01), (Quantity::DivergenceRad, 0.004)]),
+            finding(Cause::MixedPixels, &[(Quantity::DivergenceRad, 0.004), (Quantity::PulseM, 1.5)]),
             finding(Cause::LabelOffset, &[(Quantity::ForwardM, 0.2)]),
             finding(Cause::TimeOffset, &[(Quantity::OffsetS, 0.02)]),
             finding(Cause::WrongShape, &[(Quantity::LongerM, 0.2)]),

@@ -20,7 +20,7 @@ use crate::extended::{extended_toml, made_from};
 use crate::inference::roles::{FEWEST_FRAMES, roles};
 use crate::pairing::{FrameAlone, FramePair, kept_of_frame};
 use crate::search::returns::{self, Scenes};
-use crate::search::{Context, hits, mask, noise, quantisation};
+use crate::search::{Context, hits, mask, mixed_pixels, noise, quantisation};
 use data::Dataset;
 use gain::Verification;
 use sensor::effects::MadeFrom;
@@ -29,11 +29,8 @@ use sides::{How, Side, as_pairs, edge_m};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-/// Kinds of odd returns that both sides show by themselves: edges are counted along rows.
-fn kinds(returns: &Context) -> &'static [Odd] {
-    let edges = returns.frames.iter().any(|f| f.mixed_per_rad > 0.0);
-    if edges { &[Odd::Alone, Odd::Between] } else { &[Odd::Alone] }
-}
+/// Kinds of odd returns that both sides show by themselves.
+const KINDS: &[Odd] = &[Odd::Alone];
 
 /// Ratio of the excess noise on the ground to that on standing surfaces from which on it is not one of the sensor.
 const SAME_NOISE: f64 = 1.6;
@@ -214,7 +211,7 @@ fn search_all(
     let has_shots = contexts.shots.frames.iter().any(|f| !f.measured.is_empty() && !f.simulated.is_empty());
     let lost = has_shots.then(|| hits::search(&contexts.shots, &hides, false));
     finished(3);
-    let odd = returns::search_kinds(&contexts.returns, kinds(&contexts.returns), Scenes::Different);
+    let odd = returns::search_kinds(&contexts.returns, KINDS, Scenes::Different);
     finished(4);
     // Rounding is no noise: the simulated side is rounded as well.
     let rounded = match step_m {
@@ -226,7 +223,8 @@ fn search_all(
     let returns = &even.as_ref().unwrap_or(contexts).returns;
     let (rough, by_surface) = noise::search_by_surface(returns);
     finished(SEARCHES);
-    let results = [Some(rounding), Some(of_coordinates), Some(hidden), lost, Some(odd), Some(rough)];
+    let mixed = mixed_pixels::search(&contexts.returns);
+    let results = [Some(rounding), Some(of_coordinates), Some(hidden), lost, Some(odd), Some(mixed), Some(rough)];
     let mut diagnosis = report(&contexts.returns, results.into_iter().flatten().collect(), notes);
     for finding in diagnosis.findings.iter_mut().filter(|f| f.channel == Channel::Roughness) {
         judge_by_surface(finding, by_surface);

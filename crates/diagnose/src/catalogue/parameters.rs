@@ -91,6 +91,8 @@ identifiers! {
         PitchAt70MpsDeg = "pitch_at_70mps_deg",
         /// Turn about the y axis.
         PitchDeg = "pitch_deg",
+        /// Longest jump of the range at an edge over which a beam mixes: about the length of a pulse.
+        PulseM = "pulse_m",
         /// Radius of a patch of directions.
         RadiusDeg = "radius_deg",
         /// Exponent of the decrease of the intensity with range.
@@ -188,6 +190,7 @@ impl Quantity {
             | Quantity::MaxM
             | Quantity::MinM
             | Quantity::OffsetM
+            | Quantity::PulseM
             | Quantity::ReachM
             | Quantity::ShearXM
             | Quantity::ShearYM

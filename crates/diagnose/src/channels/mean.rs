@@ -80,9 +80,13 @@ pub type OwnPoses = Vec<SVector<f64, OWN_NUMBERS>>;
 
 /// Range noise of the simulated side, m: the median over its smooth returns.
 pub fn usual_noise_m(frames: &[FramePair]) -> f64 {
-    let values: Vec<f32> = frames
-        .iter()
-        .flat_map(|f| f.simulated.iter().step_by(17))
+    noise_m(frames.iter().flat_map(|f| &f.simulated))
+}
+
+/// Range noise of some returns of one side, m: the median over the smooth ones.
+pub fn noise_m<'a>(rays: impl Iterator<Item = &'a Ray>) -> f64 {
+    let values: Vec<f32> = rays
+        .step_by(17)
         .filter(|r| r.smooth && r.cos_incidence > 0.2 && r.roughness_m.is_finite())
         .map(|r| r.roughness_m.abs() / (1.0 + r.roughness_leverage).sqrt())
         .collect();

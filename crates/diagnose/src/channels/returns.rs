@@ -1,4 +1,4 @@
-//! Returns off the simulated surfaces: lone ones, groups, and returns between the two surfaces of an edge. Simulated
+//! Returns off the simulated surfaces: lone ones and groups. Simulated
 //! returns are counted in the same way, each against the others and in gaps of the measured side, so that effects of
 //! both sides cancel.
 
@@ -12,8 +12,6 @@ pub enum Odd {
     /// simulated return with another one beside it would not lie off a surface, and where both sides have many of them
     /// pairs would remain.
     Alone,
-    /// In a gap of the other side, between the two surfaces of an edge.
-    Between,
     /// Grouped, in front of the surface or without one; not on objects.
     GroupInFront,
     /// Grouped, behind the surface; not on objects.
@@ -21,7 +19,7 @@ pub enum Odd {
 }
 
 /// All kinds.
-pub const ODD: [Odd; 4] = [Odd::Alone, Odd::Between, Odd::GroupInFront, Odd::GroupBehind];
+pub const ODD: [Odd; 3] = [Odd::Alone, Odd::GroupInFront, Odd::GroupBehind];
 
 /// Distance from a surface within which a return lies on it, m: along the ray, or across the surface.
 const ON_M: [f64; 2] = [0.6, 0.3];
@@ -36,9 +34,6 @@ pub const OWN_CAR_M: f64 = 4.0;
 /// steps mixes several neighbouring shots alike.
 pub const FEW: u8 = 4;
 
-/// Distance from a smooth surface, across it, within which a return lies on it, m.
-const FLAT_M: f64 = 0.15;
-
 /// The kind of a return; `None` on a surface.
 pub fn odd(ray: &Ray) -> Option<Odd> {
     let lies = ray.lies();
@@ -47,8 +42,6 @@ pub fn odd(ray: &Ray) -> Option<Odd> {
         return single.then_some(Odd::Alone);
     }
     match lies {
-        // On a smooth surface at grazing incidence neighbouring rows lie apart as well.
-        _ if ray.in_gap && ray.company < FEW && !(ray.smooth && ray.across_m().abs() < FLAT_M) => Some(Odd::Between),
         Lies::On => None,
         // Without rows nothing says that the simulation sent a shot there.
         Lies::Open if ray.row == u16::MAX => None,
@@ -84,13 +77,10 @@ pub fn is_lone_before(ray: &Ray) -> bool {
 /// Counts of one frame: measured and simulated returns of each kind, and all of them.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct OddFrame {
-    /// By kind: measured, simulated. Returns between the surfaces of an edge are for as many edges as the simulation
-    /// has.
-    pub counts: [[f64; 2]; 4],
+    /// By kind: measured, simulated.
+    pub counts: [[f64; 2]; 3],
     /// All returns: measured, simulated.
     pub all: [f64; 2],
-    /// Returns that beams would mix over the jumps of the simulated side, for each radian of their width.
-    pub mixed_per_rad: f64,
 }
 
 /// Largest range of the simulation, m: one in 2000 returns lies farther. Beyond it the measured side cannot be judged.
@@ -122,9 +112,6 @@ pub fn odd_frames(
                     }
                 }
             }
-            // Where the scenes differ, there are as many ranges between edges as there are edges.
-            out.counts[Odd::Between as usize][0] /= frame.jumps;
-            out.mixed_per_rad = frame.mixed_per_rad * out.all[1];
             out
         })
         .collect()

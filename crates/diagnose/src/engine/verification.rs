@@ -15,7 +15,8 @@ use crate::inference::roles::Role;
 use crate::pairing::{Corrections, FramePair, Recordings, SideFrame, kept_of_frame, pair_all};
 use crate::search::labels::Side;
 use crate::search::{
-    Context, REPETITIONS, geometry, hits, intensity, labels, noise, packets, quantisation, returns, rolling_shutter,
+    Context, REPETITIONS, geometry, hits, intensity, labels, mixed_pixels, noise, packets, quantisation, returns,
+    rolling_shutter,
 };
 use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
@@ -132,6 +133,7 @@ fn distances(context: &Context, sensors: &Sensors, train: &[usize], test: &[usiz
     );
     kinds.extend(lost);
     kinds.insert(Kind::Brightness, by_brightness);
+    kinds.insert(Kind::Between, mixed_pixels::by_table(context, train, test));
     of_channels(distances, kinds)
 }
 

@@ -24,6 +24,13 @@ impl Trial {
     pub fn total_and_z(&self) -> (f64, f64) {
         total_and_z_about(&self.gains, &self.expected, FEWEST_EXPECTED).unwrap_or_else(|| total_and_z(&self.gains))
     }
+
+    /// Whether it gains what is demanded.
+    pub fn gains_enough(&self, demands: &Demands) -> bool {
+        let (total, z) = self.total_and_z();
+        let sure = z > demands.z || demands.of_few && significant(&self.gains, demands.z);
+        total > demands.nats && sure
+    }
 }
 
 /// What a hypothesis must bring to be chosen.
@@ -38,6 +45,8 @@ pub struct Demands {
     /// Share of its gain by which a hypothesis with more parameters and another cause must exceed the simpler one,
     /// significantly, to be reported beside it.
     pub richer: f64,
+    /// Whether few frames may have most of the gain, if they agree: objects are seen in few frames.
+    pub of_few: bool,
 }
 
 /// The outcome of a step.
@@ -89,6 +98,20 @@ pub fn total_and_z_about(gains: &[f64], expected: &[f64], fewest: f64) -> Option
     Some((total, total / error))
 }
 
+/// Fewest directions, each counted by its share of what all are expected to gain, that are compared.
+const FEWEST_DIRECTIONS: f64 = 2.5;
+
+/// Mean gain of a direction over its standard error that is demanded: 4 % of errors of surfaces alone reach it (seven
+/// degrees of freedom).
+const Z_DIRECTIONS: f64 = 2.0;
+
+/// Whether the gains of directions agree with what each is expected to gain; true where too few show the effect. A
+/// surface that stands elsewhere, or is missing, does so in all frames that show it: other directions tell that from
+/// an effect of the sensor.
+pub fn directions_agree(gains: &[f64], expected: &[f64]) -> bool {
+    total_and_z_about(gains, expected, FEWEST_DIRECTIONS).is_none_or(|(_, z)| z > Z_DIRECTIONS)
+}
+
 /// Whether gains are consistent although few frames have most of them. An effect that only some scenes show (a bend,
 /// an object beside the road) gains much on at least three frames, and all losses together are below 15 % of all
 /// gains.
@@ -118,12 +141,8 @@ pub fn significant_by_signs(differences: &[f64], z_least: f64) -> bool {
 
 /// Chooses the simplest of the trials that are nearly as good as the best; `None` where no trial meets the demands.
 pub fn choose(trials: &[Trial], demands: &Demands) -> Option<Choice> {
-    let eligible: Vec<usize> = (0..trials.len())
-        .filter(|&i| {
-            let (total, z) = trials[i].total_and_z();
-            trials[i].above_floor && total > demands.nats && z > demands.z
-        })
-        .collect();
+    let eligible: Vec<usize> =
+        (0..trials.len()).filter(|&i| trials[i].above_floor && trials[i].gains_enough(demands)).collect();
     let total = |i: usize| total_and_z(&trials[i].gains).0;
     let best = eligible.iter().copied().max_by(|a, b| total(*a).total_cmp(&total(*b)))?;
     // Difference of the gains, and its z.
@@ -190,7 +209,7 @@ mod tests {
         Trial { candidate: 0, cause, parameters, gains: gains.to_vec(), expected: vec![], above_floor: true }
     }
 
-    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02, richer: 0.02 };
+    const DEMANDS: Demands = Demands { z: 3.0, nats: 8.0, slack: 0.02, richer: 0.02, of_few: false };
 
     #[test]
     fn the_simplest_of_equals_wins() {

@@ -1,10 +1,10 @@
 //! One side by itself: each return against the surface of its own neighbours, and the shots of smooth surfaces with and
 //! without a return. Two sides that show different streets are compared by these.
 
-use super::gaps::{Returns, in_gap, mixed_per_rad};
 use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
+use super::row_edges::{RowEdges, add_edges, row_edges};
 use geometry::Box3;
 use sensor::directions::{LocalSurface, Neighbour, SensorScan, Sensors};
 
@@ -16,8 +16,8 @@ pub struct FrameAlone {
     /// Shots onto smooth surfaces; [`Ray::matched`] says whether the shot has a return. Empty for sensors without known
     /// rows.
     pub shots: Vec<Ray>,
-    /// Share of the returns that beams would mix over the jumps of the scan, for each radian of their width.
-    pub mixed_per_rad: f64,
+    /// Edges in its rows.
+    pub edges: RowEdges,
 }
 
 /// Longest gap of a row that is filled with shots, in shots.
@@ -35,12 +35,10 @@ pub fn frame_alone(side: &SideFrame, sensors: &Sensors) -> FrameAlone {
         let mut neighbours = Vec::new();
         let alone = |i| alone(&predictor, scan, i, &mut neighbours);
         let (returns, surfaces): (Vec<Ray>, Vec<Option<LocalSurface>>) = (0..scan.len()).map(alone).unzip();
-        let of_scan = Returns { scan, index: &predictor.around.index };
-        out.mixed_per_rad += mixed_per_rad(&of_scan, |i| returns[i].row, |i| returns[i].smooth);
+        add_edges(&mut out.edges, &row_edges(scan, |elevation_rad| sensors.row(sensor, elevation_rad)));
         out.shots.extend(shots(&predictor, scan, (&returns, &surfaces), sensors.patterns[sensor].steps.azimuth_rad));
         out.returns.extend(returns);
     }
-    out.mixed_per_rad /= out.returns.len().max(1) as f64;
     out
 }
 
@@ -53,7 +51,6 @@ fn alone(
 ) -> (Ray, Option<LocalSurface>) {
     let (mut ray, surface) = predictor.own_ray(scan, i, neighbours);
     ray.matched = true;
-    ray.in_gap = in_gap(neighbours, scan.range_m[i]);
     // In the open a far post is as lone as a false alarm.
     if ray.surface == Surface::Open {
         ray.row = u16::MAX;

@@ -5,6 +5,7 @@ use super::matching::Matched;
 use super::of_sensor::{SensorPair, Use};
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
+use super::row_edges::{RowEdges, add_edges, row_edges};
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
@@ -26,8 +27,8 @@ pub struct FramePair {
     pub only_measured: Vec<Ray>,
     /// Share of the simulated returns that beams would mix over the jumps of the scan, for each radian of their width.
     pub mixed_per_rad: f64,
-    /// Jumps of the measured scan for each one of the simulated scan, over returns: 1 where both show one scene.
-    pub jumps: f64,
+    /// Edges in the rows of the measured and of the simulated side, as they were recorded.
+    pub edges: [RowEdges; 2],
     /// Shots around whose direction the simulation has no return. For sensors without known rows: by how many returns
     /// it has fewer. Of all shots, the share that is compared of the returns.
     pub open: f64,
@@ -61,7 +62,7 @@ impl FramePair {
             measured,
             simulated,
             mixed_per_rad: 0.0,
-            jumps: 1.0,
+            edges: Default::default(),
             open: 0.0,
             second: [0.0; 2],
             objects: vec![],
@@ -139,6 +140,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
     ];
     let (mut rays, mut mixed_per_rad, mut shots_open): ([Vec<(Ray, Use)>; 2], f64, f64) = Default::default();
     let mut only_measured = Vec::new();
+    let mut edges: [RowEdges; 2] = Default::default();
     for (sensor, scan) in measured.iter_mut().enumerate() {
         let pair = SensorPair {
             sensors,
@@ -151,6 +153,9 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         let compared = pair.compare(scan, corrections.range_m, [&uses[0][sensor], &uses[1][sensor]]);
         rays.iter_mut().zip(compared.rays).for_each(|(all, own)| all.extend(own));
         only_measured.extend(compared.only_measured);
+        for (all, side) in edges.iter_mut().zip([recorded.measured, recorded.simulated]) {
+            add_edges(all, &row_edges(&side.scans[sensor], |elevation_rad| sensors.row(sensor, elevation_rad)));
+        }
         mixed_per_rad += compared.mixed_per_rad;
         shots_open += compared.open;
     }
@@ -167,7 +172,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         simulated: simulated_rays,
         only_measured,
         mixed_per_rad: mixed_per_rad / returns[1].max(1) as f64,
-        jumps: 1.0,
+        edges,
         open: share * shots_open,
         second: [recorded.measured, recorded.simulated].map(|side| share * side.second as f64),
         objects,

@@ -2,12 +2,12 @@
 //! number by the width of the beam.
 
 use crate::inference::median;
-use sensor::directions::{DirectionIndex, Neighbour, SensorScan};
+use sensor::directions::{DirectionIndex, SensorScan};
 use std::collections::BTreeMap;
 
 /// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a
 /// pulse.
-pub const GAP_M: [f64; 2] = [1.2, 12.0];
+const GAP_M: [f64; 2] = [1.2, 12.0];
 
 /// Whether beams mix over a range discontinuity.
 fn gap_mixes(near_m: f64, far_m: f64) -> bool {
@@ -17,20 +17,6 @@ fn gap_mixes(near_m: f64, far_m: f64) -> bool {
 /// Distance from either surface within which a return lies on it, m.
 pub fn gap_margin_m(near_m: f64) -> f64 {
     0.35 + 0.015 * near_m
-}
-
-/// Whether a return at a range, m, lies between two surfaces, off both of them. `around` it are returns of one side.
-pub(super) fn in_gap(around: &[Neighbour], range_m: f32) -> bool {
-    let [mut near, mut far] = [0.0f32, f32::INFINITY];
-    for Neighbour { entry, .. } in around {
-        if entry.range_m < range_m {
-            near = near.max(entry.range_m);
-        } else {
-            far = far.min(entry.range_m);
-        }
-    }
-    let [range, near, far] = [range_m, near, far].map(f64::from);
-    near > 0.0 && is_between(range, near, far)
 }
 
 /// Whether a range lies in a discontinuity over which beams mix, off both surfaces.

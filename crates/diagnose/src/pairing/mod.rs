@@ -11,13 +11,14 @@ mod prediction;
 mod ray;
 mod recordings;
 mod roughness;
+mod row_edges;
 mod second;
 
 pub use alone::{FrameAlone, frame_alone};
 pub use boxes::{BoxShift, SurfacePoint, fit_shift};
 pub use frame::{Corrections, FramePair, ObjectPair, RangeError, RecordedFrame, ShownShift, pair_frame};
 pub(crate) use frame::{alone, round_ranges};
-pub use gaps::{GAP_M, gap_margin_m};
+pub use gaps::gap_margin_m;
 pub use identical::{Identity, check_identity, met_squarely};
 pub use matching::{Matched, match_directions};
 pub use of_sensor::company_m;
@@ -25,6 +26,7 @@ pub use ray::{Lies, OCTANTS, Ray, Surface};
 pub(crate) use recordings::load;
 pub use recordings::{PairSide, Recordings, SideFrame};
 pub use roughness::STRAY_M;
+pub use row_edges::{JUMPS, Jumps, LEVEL, RowEdges, jump_m};
 
 use crate::error::DiagnoseError;
 use data::Dataset;

@@ -1,7 +1,7 @@
 //! One sensor of a frame, return by return.
 
 use super::frame::{AROUND_M, RangeError};
-use super::gaps::{Returns, in_gap, mixed_per_rad};
+use super::gaps::{Returns, mixed_per_rad};
 use super::matching::Matched;
 use super::prediction::{Intensities, Predictor};
 use super::ray::Ray;
@@ -136,7 +136,6 @@ impl SensorPair<'_> {
                 (ray.azimuth_rad, ray.elevation_rad) = (self.sent.azimuth_rad[i], self.sent.elevation_rad[i]);
                 ray.row = self.sensors.row(self.sensor, ray.elevation_rad);
                 ray.recorded_m = (turn * self.sent.point(i).coords).cast::<f32>().into();
-                ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
                 rays.push(ray);
             }
         }
@@ -187,7 +186,6 @@ impl SensorPair<'_> {
         let scan = self.simulated;
         for (&i, ray) in which[1].iter().zip(simulated) {
             own.neighbours(scan.azimuth_rad[i], scan.elevation_rad[i], &mut neighbours);
-            ray.in_gap = in_gap(&neighbours, scan.range_m[i]);
             ray.shown = company(&neighbours, scan.range_m[i], None) > 0;
         }
         lone

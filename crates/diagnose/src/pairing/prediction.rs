@@ -81,7 +81,6 @@ impl<'a> Predictor<'a> {
             matched: false,
             company: 0,
             shown: false,
-            in_gap: false,
             row: self.sensors.row(self.sensor, el),
             object: u16::MAX,
             azimuth_rad: az,

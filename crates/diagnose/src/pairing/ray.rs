@@ -52,8 +52,6 @@ pub struct Ray {
     /// Of a simulated return: whether the measured side has one in this direction at about its range. (For a measured
     /// one, [`Ray::lies`] tells it.)
     pub shown: bool,
-    /// Whether it lies between two surfaces of the *other* side, over a range discontinuity that beams mix.
-    pub in_gap: bool,
     /// Row of the sensor; `u16::MAX` where rows are not known.
     pub row: u16,
     /// Number of the labelled object in the frame; `u16::MAX` for none.
@@ -210,7 +208,6 @@ impl Ray {
             matched: true,
             shown: false,
             company: 5,
-            in_gap: false,
             row: 0,
             object: u16::MAX,
             azimuth_rad: at.y.atan2(at.x) as f32,

@@ -17,7 +17,7 @@ struct Confounder {
 }
 
 /// Confounders in the order in which they are applied: a finding that is dropped confounds nothing after it.
-const CONFOUNDERS: [Confounder; 20] = [
+const CONFOUNDERS: [Confounder; 17] = [
     Confounder {
         effect: |f| f.is(Cause::SensorExtrinsics),
         by: |f| f.is(Cause::EgoOcclusion),
@@ -57,28 +57,10 @@ const CONFOUNDERS: [Confounder; 20] = [
     },
     Confounder {
         // The scene is moved back to the middle of the scan, but was seen from places metres apart.
-        effect: |f| f.is(Cause::Outliers) || f.is(Cause::MixedPixels),
+        effect: |f| f.is(Cause::Outliers),
         by: slide,
         share: 0.5,
-        because: "returns that a scene that slides left alone, or between what its edges show from elsewhere",
-    },
-    Confounder {
-        effect: |f| f.is(Cause::MixedPixels),
-        by: |f| f.is(Cause::MissingObject),
-        share: 0.05,
-        because: "things that stand before edges lie between what these show",
-    },
-    Confounder {
-        effect: |f| f.is(Cause::MixedPixels),
-        by: |f| f.is(Cause::AngularJitter),
-        share: 0.001,
-        because: "returns that jitter carried across edges",
-    },
-    Confounder {
-        effect: |f| f.is(Cause::MixedPixels),
-        by: rows_aim_elsewhere,
-        share: 0.1,
-        because: "rows that aim elsewhere see past edges",
+        because: "returns that a scene that slides left alone",
     },
     Confounder {
         effect: |f| f.is(Cause::MissingObject) && number(f, Quantity::Share) < FEW_THINGS,
@@ -228,9 +210,10 @@ fn drop_all(results: &mut [ChannelResult], because: &str, what: impl Fn(&Found) 
 }
 
 /// Parameters of the form of an effect, not of its size.
-const FORM: [Quantity; 13] = [
+const FORM: [Quantity; 14] = [
     Quantity::ReachM,
     Quantity::DivergenceRad,
+    Quantity::PulseM,
     Quantity::ShareOnComb,
     Quantity::SimulatedStdM,
     Quantity::Uneven,
@@ -363,7 +346,7 @@ mod tests {
             // (first, its gain), (second, its channel, its size, gain of a side effect, gain of a finding of its own)
             (
                 (Some(Cause::BeamElevationOffset), Channel::Residuals, 3.0),
-                (Cause::MixedPixels, Channel::Returns, 0.003, 0.2, 0.4),
+                (Cause::RangeNoise, Channel::Roughness, 0.02, 7.4, 7.6),
             ),
             (
                 (Some(Cause::SensorExtrinsics), Channel::Residuals, 40.0),
@@ -378,10 +361,6 @@ mod tests {
                 (Cause::RandomDropout, Channel::Hits, 0.005, 0.7, 0.9),
             ),
             ((Some(Cause::RollingShutter), Channel::Slide, 4.0), (Cause::Outliers, Channel::Returns, 0.004, 1.9, 2.1)),
-            (
-                (Some(Cause::RollingShutter), Channel::Slide, 4.0),
-                (Cause::MixedPixels, Channel::Returns, 0.004, 1.9, 2.1),
-            ),
             ((None, Channel::Residuals, 1.0), (Cause::TimeOffset, Channel::Objects, 0.002, 0.04, 0.06)),
             ((None, Channel::Residuals, 1.0), (Cause::RangeNoise, Channel::Roughness, 0.02, 0.9, 1.1)),
         ];
@@ -406,21 +385,21 @@ mod tests {
         };
         let of_returns = ChannelResult {
             found: vec![
-                found(Some(Cause::MixedPixels), Channel::Returns, 0.2, vec![]),
+                found(Some(Cause::Outliers), Channel::Returns, 0.2, vec![]),
                 found(Some(Cause::RangeCut), Channel::Returns, 0.2, vec![]),
             ],
             considered: vec![
-                considered(Cause::MixedPixels, "chosen"),
-                considered(Cause::MixedPixels, "gains less"),
+                considered(Cause::Outliers, "chosen"),
+                considered(Cause::Outliers, "gains less"),
                 considered(Cause::RangeCut, "chosen"),
             ],
             ..result(vec![])
         };
-        let rows = found(Some(Cause::BeamElevationOffset), Channel::Residuals, 3.0, vec![]);
-        let mut results = [of_returns, result(vec![rows])];
+        let slide = found(Some(Cause::RollingShutter), Channel::Slide, 3.0, vec![]);
+        let mut results = [of_returns, result(vec![slide])];
         drop_confounded(&mut results);
         let outcomes: Vec<&str> = results[0].considered.iter().map(|c| c.outcome.as_str()).collect();
-        assert_eq!(outcomes, ["left over: rows that aim elsewhere see past edges", "gains less", "chosen"]);
+        assert_eq!(outcomes, ["left over: returns that a scene that slides left alone", "gains less", "chosen"]);
     }
 
     fn named(cause: Cause, channel: Channel, parameters: Vec<NamedParameter>) -> Found {

@@ -16,7 +16,7 @@ use crate::catalogue::{Cause, Channel, Quantity};
 use crate::channels::labels::object_shifts;
 use crate::diagnosis::Minimum;
 use crate::inference::choice::{Demands, Trial, as_good, choose, significant, total_and_z};
-use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
+use crate::inference::linear::{LinearFit, LinearFrame, cross_expected, cross_gains, fit};
 use crate::inference::roles::Role;
 use nalgebra::Vector3;
 
@@ -93,7 +93,7 @@ pub fn search(context: &Context, side: Side, displaced: &Displacement) -> Channe
     let gains = |columns: &[usize]| cross_gains(&frames, &blocks, columns, &NO_PRIOR);
     let more_alike = || gains(&[0]).iter().zip(gains(TARGETS_CLOCK)).map(|(a, b)| a - b).collect::<Vec<f64>>();
     let clock = usable[3] && surely_late(forward(&rows, line[0]), line, speeds) && !significant(&more_alike(), Z_STAR);
-    let demands = Demands { nats: 6.0, slack: 0.03, richer: 0.03, ..first_demands() };
+    let demands = Demands { nats: 6.0, slack: 0.03, richer: 0.03, of_few: true, ..first_demands() };
     let search =
         Search { context, side, rows, usable, blocks, on_select, speeds, line, clock, demands, estimate, hold_out };
     if side == Side::Labels {
@@ -177,7 +177,7 @@ impl Search<'_> {
             cause,
             parameters: own.len(),
             gains,
-            expected: vec![],
+            expected: cross_expected(&self.frames(), &self.blocks, [others, &columns], &NO_PRIOR),
             above_floor: plausible && size > least && moved > self.side.least_displacement_m(),
         }
     }

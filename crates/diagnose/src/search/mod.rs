@@ -9,6 +9,7 @@ pub mod hits;
 pub mod intensity;
 pub mod labels;
 pub mod mask;
+pub mod mixed_pixels;
 pub mod noise;
 pub mod packets;
 mod patch;
@@ -185,7 +186,7 @@ pub const Z_STAR: f64 = 3.2;
 
 /// What the first step of a forward selection demands.
 pub fn first_demands() -> Demands {
-    Demands { z: Z_STAR, nats: 8.0, slack: 0.02, richer: 0.02 }
+    Demands { z: Z_STAR, nats: 8.0, slack: 0.02, richer: 0.02, of_few: false }
 }
 
 /// Smallest gain of a table by direction on top of laws, as a share of their gain: the form of a law is never exactly
@@ -329,7 +330,7 @@ pub fn record(
         let outcome = match choice {
             Some(c) if c.chosen == i => "chosen".to_owned(),
             Some(c) if c.equals.contains(&i) => "explains as much, or nearly so, as far as these frames tell".into(),
-            _ if total <= demands.nats || z <= demands.z => "no gain on frames that it was not fitted on".into(),
+            _ if !t.gains_enough(demands) => "no gain on frames that it was not fitted on".into(),
             _ if !t.above_floor => "too small to speak of".into(),
             Some(c) => {
                 let (best, _) = total_and_z(&trials[c.chosen].gains);

@@ -25,7 +25,7 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, HashSet};
 
 /// Smallest share of returns that is reported, by kind.
-const FLOORS: [f64; 4] = [0.0008, 0.0006, 0.0015, 0.003];
+const FLOORS: [f64; 3] = [0.0008, 0.0015, 0.003];
 
 /// Ratio of the excess in front of surfaces to the excess behind them, or the reverse, from which on objects were
 /// added or are missing. Below it, surfaces stand elsewhere.
@@ -220,12 +220,12 @@ impl Search<'_> {
         let (_, z_difference) = total_and_z(&differences);
         let error = base.max(more.abs() / 30.0) / z_difference.abs().max(1e-9);
         // Thin objects that the simulation lacks, or loses, lie between its surfaces, too.
-        let floor = FLOORS[k].max(if kind == Odd::Between { 0.5 } else { 0.3 } * base);
+        let floor = FLOORS[k].max(0.3 * base);
         // Missing objects of the other side would be of this kind.
         let opposite = match kind {
             Odd::GroupInFront => Some(Odd::GroupBehind),
             Odd::GroupBehind => Some(Odd::GroupInFront),
-            Odd::Alone | Odd::Between => None,
+            Odd::Alone => None,
         };
         // Objects stand in few places. Where few frames have most of the excess, signs are more powerful than the
         // mean.
@@ -312,7 +312,6 @@ fn grouped_gain(context: &Context) -> f64 {
 fn cause(kind: Odd) -> Cause {
     match kind {
         Odd::Alone => Cause::Outliers,
-        Odd::Between => Cause::MixedPixels,
         Odd::GroupInFront | Odd::GroupBehind => Cause::MissingObject,
     }
 }

@@ -2,14 +2,14 @@
 //! distances are measured again.
 
 use super::sides::as_pairs;
-use super::{Contexts, Unpaired, kinds};
+use super::{Contexts, KINDS, Unpaired};
 use crate::catalogue::{Channel, Kind};
 use crate::diagnosis::{Gain, NotApplied};
 use crate::engine::{Distances, GainFrames, Remake, of_channels};
 use crate::error::DiagnoseError;
 use crate::inference::roles::Role;
 use crate::pairing::{FrameAlone, in_order};
-use crate::search::{hits, mask, noise, quantisation, returns};
+use crate::search::{hits, mask, mixed_pixels, noise, quantisation, returns};
 use rayon::prelude::*;
 use sensor::EffectList;
 use std::collections::BTreeSet;
@@ -23,7 +23,8 @@ fn distances(contexts: &Contexts, train: &[usize], test: &[usize]) -> Distances 
         (Channel::Roughness, noise::by_table(&contexts.returns, train, test)),
         (Channel::Ranges, quantisation::by_table(&contexts.returns, train, test)),
     ];
-    let mut all = returns::kinds_by_table(&contexts.returns, kinds(&contexts.returns), train, test);
+    let mut all = returns::kinds_by_table(&contexts.returns, KINDS, train, test);
+    all.insert(Kind::Between, mixed_pixels::by_table(&contexts.returns, train, test));
     all.insert(Kind::Surfaces, lost.into_iter().zip(cut).map(|(lost, cut)| lost + cut).collect());
     of_channels(others, all)
 }

@@ -4,8 +4,8 @@ use crate::channels::mask::{DirectionCell, direction_cell, neighbours};
 use crate::channels::returns::OWN_CAR_M;
 use crate::error::DiagnoseError;
 use crate::pairing::{
-    FrameAlone, FramePair, Ray, SideFrame, Surface, alone, frame_alone, has_no_point, in_order, load, round_ranges,
-    thin,
+    FrameAlone, FramePair, Ray, RowEdges, SideFrame, Surface, alone, frame_alone, has_no_point, in_order, load,
+    round_ranges, thin,
 };
 use data::{Cloud, Dataset, Object};
 use rayon::prelude::*;
@@ -126,23 +126,23 @@ pub(super) fn edge_m(sides: [&[FrameAlone]; 2]) -> f64 {
 pub(super) fn as_pairs(ids: &[String], sides: [Vec<FrameAlone>; 2]) -> (Vec<FramePair>, Vec<FramePair>) {
     let [mut measured, simulated] = sides;
     show_ego_vehicle(&mut measured, &simulated);
-    let pair = |id: &String, measured: Vec<Ray>, simulated: Vec<Ray>, mixed: [f64; 2]| FramePair {
+    let pair = |id: &String, measured: Vec<Ray>, simulated: Vec<Ray>, edges: [RowEdges; 2]| FramePair {
         only_measured: alone(&measured),
         id: id.clone(),
         measured,
         simulated,
-        mixed_per_rad: if mixed[0] > 0.0 { mixed[1] } else { 0.0 },
-        jumps: if mixed.iter().all(|m| *m > 0.0) { mixed[0] / mixed[1] } else { 1.0 },
+        mixed_per_rad: 0.0,
+        edges,
         open: 0.0,
         second: [0.0; 2],
         objects: Vec::new(),
     };
     let both = ids.iter().zip(measured.into_iter().zip(simulated));
     both.map(|(id, (a, b))| {
-        let mixed = [a.mixed_per_rad, b.mixed_per_rad];
+        let edges = [a.edges, b.edges];
         // What of the shots has a return takes the place of what is matched: on the measured side what is lost, on the
         // simulated side what is lost anyway.
-        (pair(id, a.returns, b.returns, mixed), pair(id, b.shots, a.shots, mixed))
+        (pair(id, a.returns, b.returns, edges), pair(id, b.shots, a.shots, edges))
     })
     .unzip()
 }

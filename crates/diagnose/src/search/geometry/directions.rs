@@ -5,18 +5,11 @@
 use super::hypotheses::Hypothesis;
 use super::sums::Sums;
 use crate::channels::mean::{Compared, OWN};
-use crate::inference::choice::total_and_z_about;
+use crate::inference::choice::directions_agree;
 use crate::pairing::OCTANTS;
 use crate::search::Context;
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
-
-/// Fewest directions, each counted by its share of what all are expected to gain, that are compared.
-const FEWEST: f64 = 2.5;
-
-/// Mean gain of a direction over its standard error that is demanded: 4 % of errors of surfaces alone reach it (seven
-/// degrees of freedom).
-const Z_LEAST: f64 = 2.0;
 
 /// Whether the directions agree on the last of some hypotheses, fitted together on some frames. True of offsets of
 /// groups, which are compared by their parts, and where too few directions show the effect.
@@ -28,12 +21,8 @@ pub(super) fn agree(
     hypotheses: &[Hypothesis],
 ) -> bool {
     let Some(Hypothesis::Linear { columns, .. }) = hypotheses.last() else { return true };
-    alike(&by_direction(context, sums, frames, blocks, (hypotheses, columns)).map(Vec::from))
-}
-
-/// Whether the gains of the directions agree with what each is expected to gain; true where too few show the effect.
-pub(super) fn alike([gains, expected]: &[Vec<f64>; 2]) -> bool {
-    total_and_z_about(gains, expected, FEWEST).is_none_or(|(_, z)| z > Z_LEAST)
+    let [gains, expected] = by_direction(context, sums, frames, blocks, (hypotheses, columns));
+    directions_agree(&gains, &expected)
 }
 
 /// Gain of each direction by some columns beside all others that are fitted, and what it is expected to gain, nats.

@@ -79,17 +79,23 @@ pub(super) fn above_floor(sums: &Sums, select: &[usize], blocks: &[usize], hypot
     }
 }
 
+/// Columns of the last of some hypotheses, fitted together, that are large enough to be reported by themselves.
+pub(super) fn sizable(sums: &Sums, frames: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> Vec<Column> {
+    let own = hypotheses.last().map_or(&[][..], Hypothesis::columns);
+    let fitted = sums.fit_all(frames, blocks, hypotheses);
+    let all = fitted.columns.iter().zip(fitted.theta.iter());
+    all.filter(|(c, theta)| own.contains(c) && theta.abs() >= sums.smallest(**c))
+        .map(|(c, _)| sums.columns[*c])
+        .collect()
+}
+
 /// Whether the last of some hypotheses, fitted together, is a pose of the only sensor of which nothing but roll and
 /// pitch is large enough to be reported: the ego vehicle may have that attitude.
 pub(super) fn is_attitude_alone(sums: &Sums, frames: &[usize], blocks: &[usize], hypotheses: &[Hypothesis]) -> bool {
     let Some(Hypothesis::Linear { cause: Cause::SensorExtrinsics, columns }) = hypotheses.last() else { return false };
-    let fitted = sums.fit_all(frames, blocks, hypotheses);
-    let mut of_pose = fitted.columns.iter().zip(fitted.theta.iter()).filter(|(c, _)| columns.contains(c));
-    of_pose.all(|(&c, theta)| match sums.columns[c] {
-        Column::Pose(0 | 1) => true,
-        Column::Pose(_) => theta.abs() < sums.smallest(c),
-        _ => false,
-    })
+    let is_turn = |column: &Column| matches!(column, Column::Pose(0 | 1));
+    columns.iter().all(|&c| matches!(sums.columns[c], Column::Pose(_)))
+        && sizable(sums, frames, blocks, hypotheses).iter().all(is_turn)
 }
 
 impl Sums {

@@ -135,6 +135,9 @@ pub fn search(context: &Context, slide: Option<&Slide>, undo: Undo) -> Result<Ge
     }
     search.add_common_turns(&mut chosen, &mut result);
     search.undo(&chosen.0, undo)?;
+    if !chosen.0.is_empty() {
+        search.select_beside(&mut chosen, &mut result);
+    }
     let (chosen, selected) = search.large_enough(search.still_significant(chosen));
     let gains: Vec<Vec<f64>> = chosen.iter().map(|hypothesis| search.held_out_gains(hypothesis, &chosen)).collect();
     result.distance = search.distances(&chosen, &gains);

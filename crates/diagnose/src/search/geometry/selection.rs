@@ -1,7 +1,7 @@
 //! Which hypotheses are chosen: one after the other, then each anew beside the others, and of these those that hold
 //! once their displacement is undone.
 
-use super::floor::{above_floor, is_attitude_alone};
+use super::floor::{above_floor, is_attitude_alone, sizable};
 use super::hypotheses::{Hypothesis, hypotheses, is_attitude, is_pose, may_join};
 use super::rows::drop_less_certain_rows;
 use super::{Chosen, Search, directions};
@@ -11,13 +11,13 @@ use crate::inference::choice::{Choice, Trial, choose, total_and_z};
 use crate::search::{ChannelResult, Selected, causes_of, record, rivals_and_confidence};
 use rayon::prelude::*;
 
-/// Share of the gain of the first pose that a second pose must bring.
+/// Share of the gain of the last hypothesis that a second pose must bring.
 const SECOND_POSE_SHARE: f64 = 0.3;
 
 /// Most rounds in which hypotheses are chosen anew beside the others.
 const ROUNDS: usize = 3;
 
-/// Share of the gain of the first hypothesis that a further one must bring.
+/// Share of the gain of the last hypothesis that a further one must bring.
 const FURTHER_SHARE: f64 = 0.02;
 
 /// All but one of the chosen hypotheses.
@@ -28,17 +28,28 @@ fn without(chosen: &[Hypothesis], k: usize) -> Vec<Hypothesis> {
 impl Search<'_> {
     /// Forward selection, until no hypothesis brings what is demanded.
     pub(super) fn select(&self, result: &mut ChannelResult) -> Chosen {
-        let all = hypotheses(self.context, &self.sums.columns, self.is_moved_back);
-        let (mut chosen, mut selected): Chosen = (Vec::new(), Vec::new());
-        let mut first_gains: Vec<f64> = Vec::new();
-        for step in 0..all.len() {
-            let candidates: Vec<&Hypothesis> = all.iter().filter(|h| may_join(h, &chosen)).collect();
-            let mut trials = self.trials(&candidates, &chosen, &first_gains);
+        let mut chosen = Chosen::default();
+        self.select_beside(&mut chosen, result);
+        chosen
+    }
+
+    /// The same beside hypotheses that were chosen before, of which the displacement is undone: what differs from frame
+    /// to frame has only to bring what any effect has to, however large the others are. Errors of what was undone are
+    /// the same in all frames, and may look like anything that is.
+    pub(super) fn select_beside(&self, (chosen, selected): &mut Chosen, result: &mut ChannelResult) {
+        let mut all = hypotheses(self.context, &self.sums.columns, self.is_moved_back);
+        let beside = !chosen.is_empty();
+        if beside {
+            let varies = |&column: &usize| matches!(self.sums.columns[column], Column::Lean | Column::Drift(_));
+            all.retain(|h| !h.columns().is_empty() && h.columns().iter().all(varies));
+        }
+        let mut last_gains: Vec<f64> = Vec::new();
+        for _ in 0..all.len() {
+            let candidates: Vec<&Hypothesis> = all.iter().filter(|h| may_join(h, chosen)).collect();
+            let mut trials = self.trials(&candidates, chosen, &last_gains);
             drop_less_certain_rows(&mut trials, &candidates);
-            if step > 0 {
-                drop_remainders(&mut trials, &first_gains);
-            }
-            let (choice, refused) = self.choose(&mut trials, &candidates, &chosen);
+            drop_remainders(&mut trials, &last_gains);
+            let (choice, refused) = self.choose(&mut trials, &candidates, chosen);
             let mut considered = record(&trials, choice.as_ref(), result.channel, self.returns, &self.demands);
             for k in refused {
                 considered[k].outcome = "surfaces in other directions do not say so".into();
@@ -46,17 +57,18 @@ impl Search<'_> {
             result.considered.extend(considered);
             let Some(choice) = choice else { break };
             let trial = &trials[choice.chosen];
-            first_gains.clone_from(&trial.gains);
+            if !beside {
+                last_gains.clone_from(&trial.gains);
+            }
             let equals = causes_of(&trials, &choice.equals);
             let rivals = rivals_and_confidence(equals, &trials, &self.blocks, trial.cause, &self.demands);
             selected.push(self.that_vary(candidates[trial.candidate], rivals));
             chosen.push(candidates[trial.candidate].clone());
         }
-        self.choose_anew(&all, &mut chosen, &mut selected);
+        self.choose_anew(&all, chosen, selected);
         // What is there as well is no rival.
         let is_chosen = |cause: &Cause| chosen.iter().any(|h| h.cause() == *cause);
         selected.iter_mut().for_each(|s| s.rivals.retain(|r| !is_chosen(r)));
-        (chosen, selected)
     }
 
     /// Chooses every hypothesis anew beside the others, as long as that changes one: the first one was chosen alone,
@@ -68,6 +80,9 @@ impl Search<'_> {
         for _ in 0..ROUNDS {
             let mut changed = false;
             for k in 0..chosen.len() {
+                if !all.contains(&chosen[k]) {
+                    continue;
+                }
                 let others = without(chosen, k);
                 let one_pose =
                     |h: &Hypothesis| !is_pose(h) || h.cause() == chosen[k].cause() || !others.iter().any(is_pose);
@@ -119,14 +134,14 @@ impl Search<'_> {
     }
 
     /// A trial of each candidate on top of what is chosen.
-    fn trials(&self, candidates: &[&Hypothesis], chosen: &[Hypothesis], first_gains: &[f64]) -> Vec<Trial> {
+    fn trials(&self, candidates: &[&Hypothesis], chosen: &[Hypothesis], last_gains: &[f64]) -> Vec<Trial> {
         let before = self.gains(chosen);
         let trial = |(k, hypothesis): (usize, &&Hypothesis)| {
             let with: Vec<Hypothesis> = chosen.iter().cloned().chain([(*hypothesis).clone()]).collect();
             let mut gains = self.gains(&with);
             gains.iter_mut().zip(&before).for_each(|(g, b)| *g -= b);
             let second_pose = is_pose(hypothesis) && chosen.iter().any(is_pose);
-            let enough = !second_pose || total_and_z(&gains).0 > SECOND_POSE_SHARE * first_gains.iter().sum::<f64>();
+            let enough = !second_pose || total_and_z(&gains).0 > SECOND_POSE_SHARE * last_gains.iter().sum::<f64>();
             Trial {
                 candidate: k,
                 cause: hypothesis.cause(),
@@ -176,6 +191,14 @@ impl Search<'_> {
             if both && !selected.rivals.contains(&Cause::PitchRoll) && !chosen.iter().any(is_attitude) {
                 selected.rivals.push(Cause::PitchRoll);
             }
+            // At one speed a constant pitch and one that grows with the speed are the same.
+            let one_speed = self.sums.moments.drives && !self.sums.moments.speed_varies;
+            if is_pose(hypothesis)
+                && one_speed
+                && sizable(&self.sums, &self.estimate, &self.estimate_blocks, &last) == [Column::Pose(1)]
+            {
+                selected.rivals.push(Cause::EgoAttitude);
+            }
             large.0.push(hypothesis.clone());
             large.1.push(selected);
         }
@@ -183,8 +206,8 @@ impl Search<'_> {
     }
 }
 
-/// Drops trials of a further step that only fit what the first one left.
-fn drop_remainders(trials: &mut [Trial], first_gains: &[f64]) {
-    let first: f64 = first_gains.iter().sum();
-    trials.iter_mut().for_each(|t| t.above_floor &= t.gains.iter().sum::<f64>() > FURTHER_SHARE * first);
+/// Drops trials of a further step that only fit what the last one left.
+fn drop_remainders(trials: &mut [Trial], last_gains: &[f64]) {
+    let last: f64 = last_gains.iter().sum();
+    trials.iter_mut().for_each(|t| t.above_floor &= t.gains.iter().sum::<f64>() > FURTHER_SHARE * last);
 }

@@ -1,13 +1,12 @@
 //! Range walk: ranges that depend on how bright a surface is. It is looked for before all else of geometry, between
 //! bright and dark spots of one surface, which no pose and no error of the surfaces displaces against each other.
 
-use super::directions::alike;
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::brightness::{BrightFrame, Brightnesses, bright_frames};
 use crate::channels::mean::{origins, own_poses, usable, usual_noise_m};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
-use crate::inference::choice::total_and_z;
+use crate::inference::choice::{directions_agree, total_and_z};
 use crate::inference::linear::{LinearFit, LinearFrame, cross_gains, fit};
 use crate::inference::roles::Role;
 use crate::pairing::{OCTANTS, Ray};
@@ -125,7 +124,8 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     let (total, z) = total_and_z(&gains);
     let large = chosen.theta[0].abs() > FLOOR_M;
     let enough = total > demands.nats && z > demands.z;
-    let alike = alike(&sums.by_octant(&chosen, &select));
+    let [gains, expected] = sums.by_octant(&chosen, &select);
+    let alike = directions_agree(&gains, &expected);
     let outcome = match (enough, large, alike) {
         (true, true, true) => "chosen",
         (false, ..) => "no gain on frames that it was not fitted on",

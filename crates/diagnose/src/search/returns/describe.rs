@@ -5,7 +5,7 @@ use super::weather::{Weather, lost_with_range};
 use super::{NamedParameter, Scenes, Search, air};
 use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::range_laws::Shape;
-use crate::channels::returns::{self, Odd, OddFrame};
+use crate::channels::returns::{self, Odd};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Parameter, Status};
 use crate::effects::rounded;
@@ -13,12 +13,6 @@ use crate::pairing::Ray;
 use crate::search::{Context, Found, parameter};
 use sensor::Effect;
 use sensor::effects::RangeLaw;
-
-/// Factor by which the true width of a beam may differ from that of a uniform disc that mixes as many ranges.
-const WIDTH_FACTOR: f64 = 5.0;
-
-/// Plausible widths of beams, rad.
-const WIDTHS_RAD: std::ops::Range<f64> = 1e-5..0.1;
 
 /// What is said of one kind of returns.
 struct Description {
@@ -34,7 +28,6 @@ struct Description {
 pub(super) fn found(search: &Search, kind: Odd, share: Parameter, held_out_gains: Vec<f64>, z: f64) -> Vec<Found> {
     let described = match kind {
         Odd::Alone => alone(search, &share),
-        Odd::Between => vec![(1.0, mixed(search, share))],
         Odd::GroupInFront => vec![(1.0, in_front(share))],
         Odd::GroupBehind => vec![(1.0, behind(share))],
     };
@@ -198,33 +191,6 @@ fn of_false_alarms(alarms: &FalseAlarms, share: &Parameter) -> Description {
             parameter(Quantity::Rate, rate, form * rate),
             parameter(Quantity::ReachM, reach_m, 0.05 * reach_m),
         ],
-    }
-}
-
-/// Describes ranges between the two surfaces of an edge. The width of the beam is reported where it is plausible; how
-/// a sensor weights what a beam meets is not known.
-fn mixed(search: &Search, share: Parameter) -> Description {
-    let more = share.estimate;
-    let mut parameters = vec![(Quantity::Share.into(), share)];
-    let sum = |f: fn(&OddFrame) -> f64| search.estimate.iter().map(|&i| f(&search.odd[i])).sum::<f64>();
-    let width = more * sum(|f| f.all[0]) / sum(|f| f.mixed_per_rad);
-    let so_wide = if WIDTHS_RAD.contains(&width) {
-        let ci95 = [width / WIDTH_FACTOR, width * WIDTH_FACTOR];
-        let unit = Quantity::DivergenceRad.unit();
-        parameters.push((Quantity::DivergenceRad.into(), Parameter { estimate: width, unit, ci95 }));
-        format!(", about {:.1} mrad", 1e3 * width)
-    } else {
-        String::new()
-    };
-    Description {
-        causes: vec![Cause::MixedPixels],
-        effects: vec![],
-        covariate: Covariate::Edge,
-        says: format!(
-            "{:.2} % of the measured returns lie between the two surfaces of an edge: beams have a width{so_wide}, your simulator's are lines",
-            100.0 * more
-        ),
-        parameters,
     }
 }
 
