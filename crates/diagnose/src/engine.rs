@@ -33,6 +33,7 @@ use crate::search::geometry::Displacement;
 use crate::search::geometry::Geometry;
 use crate::search::labels::Side;
 use crate::search::quantisation::Rounded;
+use crate::search::returns::Scenes;
 use crate::search::rolling_shutter::{self, Slide};
 use crate::search::{self, ChannelResult, Context};
 use data::Dataset;
@@ -367,7 +368,7 @@ impl Engine<'_> {
         let mut results = vec![packets, hidden, search::hits::search(&seen, &mask, elsewhere)];
         results.extend(of_bright);
         self.finished(5);
-        results.extend([search::returns::search(&seen), search::mixed_pixels::search(&seen)]);
+        results.extend([search::returns::search(&seen, Scenes::Same), search::mixed_pixels::search(&seen)]);
         results.push(search::intensity::search(&seen, notes));
         drop((arrived, without_halos));
         self.finished(6);

@@ -11,7 +11,6 @@ mod sides;
 
 use crate::catalogue::Channel;
 use crate::channels::mask::Shown;
-use crate::channels::returns::Odd;
 use crate::diagnosis::{Diagnosis, Finding, Gain, Status, Verdict};
 use crate::effects::fill_effects;
 use crate::engine::{Options, Outcome, Progress, Remake, Stage, refused, report, set_reached};
@@ -28,9 +27,6 @@ use sensor::{EffectList, Rig};
 use sides::{How, Side, as_pairs, edge_m};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
-
-/// Kinds of odd returns that both sides show by themselves.
-const KINDS: &[Odd] = &[Odd::Alone];
 
 /// Ratio of the excess noise on the ground to that on standing surfaces from which on it is not one of the sensor.
 const SAME_NOISE: f64 = 1.6;
@@ -211,7 +207,7 @@ fn search_all(
     let has_shots = contexts.shots.frames.iter().any(|f| !f.measured.is_empty() && !f.simulated.is_empty());
     let lost = has_shots.then(|| hits::search(&contexts.shots, &hides, false));
     finished(3);
-    let odd = returns::search_kinds(&contexts.returns, KINDS, Scenes::Different);
+    let odd = returns::search(&contexts.returns, Scenes::Different);
     finished(4);
     // Rounding is no noise: the simulated side is rounded as well.
     let rounded = match step_m {

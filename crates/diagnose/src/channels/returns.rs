@@ -1,6 +1,5 @@
-//! Returns off the simulated surfaces: lone ones and groups. Simulated
-//! returns are counted in the same way, each against the others and in gaps of the measured side, so that effects of
-//! both sides cancel.
+//! Returns off the simulated surfaces: lone ones and groups. Simulated returns are counted in the same way, each
+//! against the others, so that effects of both sides cancel.
 
 use crate::pairing::{FramePair, Lies, Ray, Surface, company_m};
 use rayon::prelude::*;

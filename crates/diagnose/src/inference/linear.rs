@@ -151,10 +151,15 @@ pub fn cross_expected(
     cross_validated(blocks, fit_on, |fits, i| fits.as_ref().map_or(0.0, |fits| expected(fits, frames[i])))
 }
 
-/// Gains of each frame by what is fitted on the blocks of other folds; frames are known by their places in `blocks`.
-pub fn cross_validated<F>(blocks: &[usize], fit: impl Fn(&[usize]) -> F, gain: impl Fn(&F, usize) -> f64) -> Vec<f64> {
+/// Gains of each frame by what is fitted on the blocks of other folds, or what else that says of it; frames are known
+/// by their places in `blocks`.
+pub fn cross_validated<F, T: Clone + Default>(
+    blocks: &[usize],
+    fit: impl Fn(&[usize]) -> F,
+    gain: impl Fn(&F, usize) -> T,
+) -> Vec<T> {
     let folds = fold_of(blocks);
-    let mut gains = vec![0.0; blocks.len()];
+    let mut gains = vec![T::default(); blocks.len()];
     for fold in 0..FOLDS {
         let (test, train): (Vec<usize>, Vec<usize>) = (0..blocks.len()).partition(|&i| folds[i] == fold);
         if test.is_empty() {

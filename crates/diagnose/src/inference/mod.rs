@@ -11,6 +11,15 @@ pub mod noise;
 pub mod roles;
 pub mod simplex;
 
+/// Where a condition that holds below some place between two ends, and not above it, ends; by halving so many times.
+pub fn bisect([mut low, mut high]: [f64; 2], times: usize, holds: impl Fn(f64) -> bool) -> f64 {
+    for _ in 0..times {
+        let middle = 0.5 * (low + high);
+        if holds(middle) { low = middle } else { high = middle }
+    }
+    0.5 * (low + high)
+}
+
 /// Median of some values, the upper one of the two in the middle; 0 of none.
 pub fn median(values: Vec<f64>) -> f64 {
     statistics::median_upper(values).unwrap_or(0.0)

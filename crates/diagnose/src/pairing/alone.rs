@@ -4,7 +4,7 @@
 use super::prediction::Predictor;
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
-use super::row_edges::{RowEdges, add_edges, row_edges};
+use super::row_edges::{RowEdges, edges_of};
 use geometry::Box3;
 use sensor::directions::{LocalSurface, Neighbour, SensorScan, Sensors};
 
@@ -29,13 +29,12 @@ const OFF_STEP: f32 = 0.3;
 /// The returns and shots of one side of a frame.
 pub fn frame_alone(side: &SideFrame, sensors: &Sensors) -> FrameAlone {
     let boxes: Vec<Box3> = side.objects.iter().map(|o| o.bbox).collect();
-    let mut out = FrameAlone::default();
+    let mut out = FrameAlone { edges: edges_of(&side.scans, sensors), ..FrameAlone::default() };
     for (sensor, scan) in side.scans.iter().enumerate() {
         let predictor = Predictor::new(sensors, sensor, scan, &boxes);
         let mut neighbours = Vec::new();
         let alone = |i| alone(&predictor, scan, i, &mut neighbours);
         let (returns, surfaces): (Vec<Ray>, Vec<Option<LocalSurface>>) = (0..scan.len()).map(alone).unzip();
-        add_edges(&mut out.edges, &row_edges(scan, |elevation_rad| sensors.row(sensor, elevation_rad)));
         out.shots.extend(shots(&predictor, scan, (&returns, &surfaces), sensors.patterns[sensor].steps.azimuth_rad));
         out.returns.extend(returns);
     }

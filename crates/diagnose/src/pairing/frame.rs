@@ -5,7 +5,7 @@ use super::matching::Matched;
 use super::of_sensor::{SensorPair, Use};
 use super::ray::{Ray, Surface};
 use super::recordings::SideFrame;
-use super::row_edges::{RowEdges, add_edges, row_edges};
+use super::row_edges::RowEdges;
 use data::Object;
 use geometry::Box3;
 use nalgebra::{Point3, Vector3};
@@ -112,6 +112,8 @@ pub struct RecordedFrame<'a> {
     pub simulated: &'a SideFrame,
     /// Which returns have a counterpart, by sensor.
     pub matched: &'a [Matched],
+    /// Edges in the rows of both sides.
+    pub edges: &'a [RowEdges; 2],
 }
 
 /// Pairs a frame, return by return. About `kept` of the returns of the side with more are compared, chosen at random,
@@ -140,7 +142,6 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
     ];
     let (mut rays, mut mixed_per_rad, mut shots_open): ([Vec<(Ray, Use)>; 2], f64, f64) = Default::default();
     let mut only_measured = Vec::new();
-    let mut edges: [RowEdges; 2] = Default::default();
     for (sensor, scan) in measured.iter_mut().enumerate() {
         let pair = SensorPair {
             sensors,
@@ -153,9 +154,6 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         let compared = pair.compare(scan, corrections.range_m, [&uses[0][sensor], &uses[1][sensor]]);
         rays.iter_mut().zip(compared.rays).for_each(|(all, own)| all.extend(own));
         only_measured.extend(compared.only_measured);
-        for (all, side) in edges.iter_mut().zip([recorded.measured, recorded.simulated]) {
-            add_edges(all, &row_edges(&side.scans[sensor], |elevation_rad| sensors.row(sensor, elevation_rad)));
-        }
         mixed_per_rad += compared.mixed_per_rad;
         shots_open += compared.open;
     }
@@ -172,7 +170,7 @@ pub fn pair_frame(recorded: &RecordedFrame, sensors: &Sensors, corrections: Corr
         simulated: simulated_rays,
         only_measured,
         mixed_per_rad: mixed_per_rad / returns[1].max(1) as f64,
-        edges,
+        edges: *recorded.edges,
         open: share * shots_open,
         second: [recorded.measured, recorded.simulated].map(|side| share * side.second as f64),
         objects,
@@ -339,8 +337,14 @@ mod tests {
         let (measured, simulated) = (side(scan(0.05, 1), 200), side(scan(0.0, 2), 100));
         let n = measured.scans[0].len();
         let matched = [Matched { measured: vec![true; n], simulated: vec![true; n], repeats: true }];
-        let recorded =
-            RecordedFrame { number: 3, id: "3", measured: &measured, simulated: &simulated, matched: &matched };
+        let recorded = RecordedFrame {
+            number: 3,
+            id: "3",
+            measured: &measured,
+            simulated: &simulated,
+            matched: &matched,
+            edges: &Default::default(),
+        };
         pair_frame(&recorded, &sensors, corrections, kept)
     }
 

@@ -1,9 +1,9 @@
-//! Range discontinuities over which a beam mixes two surfaces: returns between the surfaces, and their expected
-//! number by the width of the beam.
+//! Range discontinuities over which a beam meets two surfaces: how many returns it has of both, or between them, by its
+//! width.
 
+use super::row_edges::rows_of;
 use crate::inference::median;
 use sensor::directions::{DirectionIndex, SensorScan};
-use std::collections::BTreeMap;
 
 /// Range discontinuities over which a beam mixes, m: smaller ones are not resolved, larger ones are longer than a
 /// pulse.
@@ -41,11 +41,7 @@ pub(super) fn mixed_per_rad(
     mut smooth: impl FnMut(usize) -> bool,
 ) -> f64 {
     let SensorScan { azimuth_rad: azimuth, elevation_rad: elevation, .. } = returns.scan;
-    let mut rows = BTreeMap::<u16, Vec<usize>>::new();
-    for (i, row) in (0..returns.scan.len()).map(|i| (i, row(i))).filter(|(_, row)| *row != u16::MAX) {
-        rows.entry(row).or_default().push(i);
-    }
-    rows.values_mut().for_each(|row| row.sort_by(|a, b| azimuth[*a].total_cmp(&azimuth[*b])));
+    let rows = rows_of(returns.scan, row);
     let mut of_pair = |a: usize, b: usize, apart_rad: f64| {
         let mixes = returns.gap_mixes(a, b) && !smooth(a) && !smooth(b);
         if mixes { returns.mixing_share(a, b) / apart_rad.max(1e-5) } else { 0.0 }

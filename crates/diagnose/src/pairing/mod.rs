@@ -150,6 +150,7 @@ pub fn pair_all(
             measured: recordings.side(i, PairSide::Measured)?,
             simulated: recordings.side(i, PairSide::Simulated)?,
             matched: recordings.matched(i, sensors)?,
+            edges: recordings.edges(i, sensors)?,
         };
         let frame = pair_frame(&recorded, sensors, corrections, kept);
         done(finished.fetch_add(1, std::sync::atomic::Ordering::Relaxed) + 1);

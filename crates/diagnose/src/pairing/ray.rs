@@ -95,6 +95,12 @@ pub struct Ray {
 /// Directions about the vehicle, of 45 degrees each.
 pub const OCTANTS: usize = 8;
 
+/// The octant of an azimuth, rad.
+pub(super) fn octant_of(azimuth_rad: f64) -> usize {
+    let turn = (azimuth_rad / TAU).rem_euclid(1.0);
+    ((turn * OCTANTS as f64) as usize).min(OCTANTS - 1)
+}
+
 impl Ray {
     /// Its own range, m.
     pub fn own_range_m(&self) -> f64 {
@@ -124,8 +130,7 @@ impl Ray {
 
     /// Number of the eighth of a turn, in the cloud's axes, in which it was recorded.
     pub fn octant(&self) -> usize {
-        let turn = (f64::from(self.recorded_m[1]).atan2(f64::from(self.recorded_m[0])) / TAU).rem_euclid(1.0);
-        ((turn * OCTANTS as f64) as usize).min(OCTANTS - 1)
+        octant_of(f64::from(self.recorded_m[1]).atan2(f64::from(self.recorded_m[0])))
     }
 
     /// Where it was recorded, as a vector from the sensor's origin, m.

@@ -1,6 +1,7 @@
 //! The frames of both data sets, read once and held in memory for every pairing.
 
 use super::matching::{Matched, match_directions};
+use super::row_edges::{RowEdges, edges_of};
 use super::second::drop_second;
 use crate::error::DiagnoseError;
 use data::{Cloud, Dataset, Object};
@@ -40,6 +41,7 @@ struct Held {
     id: String,
     sides: [OnceLock<Arc<SideFrame>>; 2],
     matched: OnceLock<Vec<Matched>>,
+    edges: OnceLock<[RowEdges; 2]>,
 }
 
 impl SideFrame {
@@ -54,7 +56,7 @@ impl SideFrame {
 impl<'a> Recordings<'a> {
     /// Frames by their ids; nothing is read yet.
     pub fn new(measured: &'a Dataset, simulated: &'a Dataset, rig: &'a Rig, ids: Vec<String>) -> Self {
-        let held = |id| Held { id, sides: Default::default(), matched: OnceLock::new() };
+        let held = |id| Held { id, sides: Default::default(), matched: OnceLock::new(), edges: OnceLock::new() };
         Recordings { datasets: [measured, simulated], rig, frames: ids.into_iter().map(held).collect() }
     }
 
@@ -75,7 +77,7 @@ impl<'a> Recordings<'a> {
                 }
             };
             let sides = [measured, OnceLock::from(simulated[at].clone())];
-            Ok(Held { id: self.id(frame).into(), sides, matched: OnceLock::new() })
+            Ok(Held { id: self.id(frame).into(), sides, matched: OnceLock::new(), edges: OnceLock::new() })
         };
         let frames = which.iter().enumerate().map(of_frame).collect::<Result<_, DiagnoseError>>()?;
         Ok(Recordings { datasets: self.datasets, rig: self.rig, frames })
@@ -123,6 +125,13 @@ impl<'a> Recordings<'a> {
         };
         let all = || (0..sensors.rig.sensors.len()).map(of_sensor).collect();
         Ok(self.frames[frame].matched.get_or_init(all))
+    }
+
+    /// Edges in the rows of the measured and of the simulated side of a frame, as they were recorded.
+    pub fn edges(&self, frame: usize, sensors: &Sensors) -> Result<&[RowEdges; 2], DiagnoseError> {
+        let sides = [self.side(frame, PairSide::Measured)?, self.side(frame, PairSide::Simulated)?];
+        let both = || sides.map(|side| edges_of(&side.scans, sensors));
+        Ok(self.frames[frame].edges.get_or_init(both))
     }
 }
 

@@ -144,6 +144,7 @@ mod tests {
             measured: &side(measured),
             simulated: &side(simulated),
             matched: &matched,
+            edges: &Default::default(),
         };
         let frame = pair_frame(&recorded, &sensors, Corrections::default(), usize::MAX);
         let rough = |rays: &[super::Ray]| -> Vec<f64> {

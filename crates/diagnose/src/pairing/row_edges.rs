@@ -2,11 +2,10 @@
 //! two levels. A beam that meets both reports a range between them, if the jump is shorter than its pulse. Each side is
 //! looked at by itself: where the edges lie, and whether the scene is displaced, does not matter.
 
-use super::ray::OCTANTS;
+use super::ray::{OCTANTS, octant_of};
 use crate::inference::median;
-use sensor::directions::SensorScan;
+use sensor::directions::{SensorScan, Sensors};
 use std::collections::BTreeMap;
-use std::f64::consts::{PI, TAU};
 
 /// Smallest and largest jump, m: smaller ones are not resolved, longer ones than any pulse.
 const JUMPS_M: [f64; 2] = [0.4, 12.0];
@@ -51,9 +50,26 @@ impl Jumps {
 /// The edges of one side of a frame, by octant of the azimuth and by jump.
 pub type RowEdges = [[Jumps; JUMPS]; OCTANTS];
 
-/// Adds the edges of another sensor.
-pub(super) fn add_edges(sum: &mut RowEdges, others: &RowEdges) {
-    sum.iter_mut().flatten().zip(others.iter().flatten()).for_each(|(all, one)| all.merge(one));
+/// The edges of all sensors of a frame.
+pub(super) fn edges_of(scans: &[SensorScan], sensors: &Sensors) -> RowEdges {
+    let mut sum = RowEdges::default();
+    for (sensor, scan) in scans.iter().enumerate() {
+        let of_scan = row_edges(scan, |i| sensors.row(sensor, scan.elevation_rad[i]));
+        sum.iter_mut().flatten().zip(of_scan.iter().flatten()).for_each(|(all, one)| all.merge(one));
+    }
+    sum
+}
+
+/// The returns of each row of a scan, in the order of their azimuths; none of those whose row is `u16::MAX`: it is not
+/// known.
+pub(super) fn rows_of(scan: &SensorScan, row_of: impl Fn(usize) -> u16) -> BTreeMap<u16, Vec<usize>> {
+    let mut rows = BTreeMap::<u16, Vec<usize>>::new();
+    for (i, row) in (0..scan.len()).map(|i| (i, row_of(i))).filter(|(_, row)| *row != u16::MAX) {
+        rows.entry(row).or_default().push(i);
+    }
+    let azimuth = &scan.azimuth_rad;
+    rows.values_mut().for_each(|row| row.sort_by(|a, b| azimuth[*a].total_cmp(&azimuth[*b])));
+    rows
 }
 
 /// The smallest jump of a bin, m.
@@ -66,16 +82,10 @@ fn bin(jump_m: f64) -> Option<usize> {
     (0.0..JUMPS as f64).contains(&at).then_some(at as usize)
 }
 
-/// The edges of a scan; `row_of` is the row of an elevation, `u16::MAX` where rows are not known.
-pub(super) fn row_edges(scan: &SensorScan, row_of: impl Fn(f32) -> u16) -> RowEdges {
-    let mut rows = BTreeMap::<u16, Vec<usize>>::new();
-    for i in 0..scan.len() {
-        rows.entry(row_of(scan.elevation_rad[i])).or_default().push(i);
-    }
-    rows.remove(&u16::MAX);
+/// The edges of a scan; `row_of` is the row of a return.
+fn row_edges(scan: &SensorScan, row_of: impl Fn(usize) -> u16) -> RowEdges {
     let mut out = RowEdges::default();
-    for shots in rows.values_mut() {
-        shots.sort_by(|a, b| scan.azimuth_rad[*a].total_cmp(&scan.azimuth_rad[*b]));
+    for shots in rows_of(scan, row_of).values() {
         let gaps: Vec<f64> =
             shots.windows(2).map(|w| f64::from(scan.azimuth_rad[w[1]] - scan.azimuth_rad[w[0]])).collect();
         let step = median(gaps.clone());
@@ -86,9 +96,8 @@ pub(super) fn row_edges(scan: &SensorScan, row_of: impl Fn(f32) -> u16) -> RowEd
             let found = (4..=longest).find_map(|n| Some((n - 4, edge(&ranges[first..first + n])?)));
             let Some((between, bin)) = found else { continue };
             let at = shots[first + 1];
-            let turn = ((f64::from(scan.azimuth_rad[at]) + PI) / TAU * OCTANTS as f64) as usize;
             let apart_rad = step * f64::from(scan.elevation_rad[at]).cos();
-            out[turn.min(OCTANTS - 1)][bin].merge(&Jumps {
+            out[octant_of(scan.azimuth_rad[at].into())][bin].merge(&Jumps {
                 edges: 1.0,
                 between: between as f64,
                 per_rad: MIXES / apart_rad.max(1e-5),
@@ -101,7 +110,7 @@ pub(super) fn row_edges(scan: &SensorScan, row_of: impl Fn(f32) -> u16) -> RowEd
 /// The bin of the jump between the first two and the last two of some neighbouring ranges, where all others lie between
 /// the two levels; `None` where there is no such edge.
 fn edge(ranges: &[f64]) -> Option<usize> {
-    let (&[before, a, ref between @ .., b, after], true) = (ranges, ranges.len() >= 4) else { return None };
+    let &[before, a, ref between @ .., b, after] = ranges else { return None };
     let jump = b - a;
     let share = |range: f64| (range - a) / jump;
     let level = share(before).abs() < LEVEL && (share(after) - 1.0).abs() < LEVEL;

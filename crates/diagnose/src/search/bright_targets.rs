@@ -8,7 +8,9 @@ use crate::channels::halos::{
 };
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
+use crate::inference::bisect;
 use crate::inference::choice::{significant, total_and_z};
+use crate::inference::counts::gain_of_count;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use crate::pairing::FramePair;
@@ -137,12 +139,7 @@ impl Law {
             };
             counts.iter().enumerate().map(of_bin).sum()
         };
-        let (mut low, mut high) = (0.0, 1.0);
-        for _ in 0..30 {
-            let middle = 0.5 * (low + high);
-            if slope(middle) > 0.0 { low = middle } else { high = middle }
-        }
-        0.5 * (low + high)
+        bisect([0.0, 1.0], 30, |size| slope(size) > 0.0)
     }
 
     fn rate(&self, bin: usize) -> f64 {
@@ -153,7 +150,7 @@ impl Law {
     fn gain(&self, counts: &[[f64; 2]]) -> f64 {
         let of_bin = |(i, [n, k]): (usize, &[f64; 2])| {
             let (rate, base) = (self.rate(i), self.base[i]);
-            if *n > 0.0 { k * (rate / base).ln() - n * (rate - base) } else { 0.0 }
+            if *n > 0.0 { gain_of_count(*k, *n, rate, base) } else { 0.0 }
         };
         counts.iter().enumerate().map(of_bin).sum()
     }

@@ -7,7 +7,9 @@ use crate::catalogue::{Cause, Channel, Covariate, Quantity};
 use crate::channels::mean::noise_m;
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Parameter, Status};
+use crate::inference::bisect;
 use crate::inference::choice::{Demands, Trial, directions_agree};
+use crate::inference::counts::gain_of_count;
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use crate::pairing::{JUMPS, Jumps, LEVEL, OCTANTS, RowEdges, jump_m};
@@ -97,12 +99,7 @@ impl Law {
             let mixed = counts.iter().enumerate().filter(|(i, j)| (self.from..self.end).contains(i) && j.edges > 0.0);
             mixed.map(|(i, j)| j.per_rad * (j.between / law.expected(i, j) - 1.0)).sum()
         };
-        let (mut low, mut high) = (0.0, WIDEST_RAD);
-        for _ in 0..30 {
-            let middle = 0.5 * (low + high);
-            if slope(middle) > 0.0 { low = middle } else { high = middle }
-        }
-        0.5 * (low + high)
+        bisect([0.0, WIDEST_RAD], 30, |width_rad| slope(width_rad) > 0.0)
     }
 
     /// Returns between the levels of some edges.
@@ -113,12 +110,12 @@ impl Law {
 
     /// Gain of the counts of both sides over rates that both have, nats (Poisson).
     fn gain(&self, [measured, simulated]: &[Counts; 2]) -> f64 {
-        let over = |between: f64, with: f64, without: f64| between * (with / without).ln() - (with - without);
         let of_bin = |i: usize| {
             let (m, s) = (&measured[i], &simulated[i]);
             let common = self.common[i];
-            let own = if m.edges > 0.0 { over(m.between, self.expected(i, m), common * m.edges) } else { 0.0 };
-            own + if s.edges > 0.0 { over(s.between, self.base[i] * s.edges, common * s.edges) } else { 0.0 }
+            let own =
+                if m.edges > 0.0 { gain_of_count(m.between, 1.0, self.expected(i, m), common * m.edges) } else { 0.0 };
+            own + if s.edges > 0.0 { gain_of_count(s.between, s.edges, self.base[i], common) } else { 0.0 }
         };
         (self.from..JUMPS).map(of_bin).sum()
     }
@@ -164,14 +161,12 @@ pub fn search(context: &Context) -> ChannelResult {
     let from = first_bin(context);
     let fit = |train: &[usize]| Law::of(&train.iter().map(|&i| on_select[i]).collect::<Vec<_>>(), from);
     let blocks = context.blocks(&select);
-    let trial = Trial {
-        candidate: 0,
-        cause: Cause::MixedPixels,
-        parameters: 2,
-        gains: cross_validated(&blocks, fit, |law, i| law.gain_of(on_select[i])),
-        expected: cross_validated(&blocks, fit, |law, i| law.expected_gain(&both(&[on_select[i]]))),
-        above_floor: true,
+    let of_frame = |law: &Law, i: usize| {
+        let counts = both(&[on_select[i]]);
+        (law.gain(&counts), law.expected_gain(&counts))
     };
+    let (gains, expected) = cross_validated(&blocks, fit, of_frame).into_iter().unzip();
+    let trial = Trial { candidate: 0, cause: Cause::MixedPixels, parameters: 2, gains, expected, above_floor: true };
     let (nats, z) = trial.total_and_z();
     let [chosen, law] = [&on_select, &on_estimate].map(|frames| Law::of(frames, from));
     let draws = drawn(&on_estimate, &context.blocks(&estimate), from);

@@ -1,5 +1,4 @@
-//! Returns without a simulated surface at their place: false alarms, mixed ranges at edges, objects that the
-//! simulation lacks.
+//! Returns without a simulated surface at their place: false alarms, objects that the simulation lacks.
 
 mod describe;
 mod false_alarms;
@@ -47,13 +46,18 @@ pub enum Scenes {
     Different,
 }
 
-/// The search of all kinds.
-pub fn search(context: &Context) -> ChannelResult {
-    search_kinds(context, &ODD, Scenes::Same)
+impl Scenes {
+    /// Kinds of returns that are compared: of different streets those that each side shows by itself.
+    fn kinds(self) -> &'static [Odd] {
+        match self {
+            Scenes::Same => &ODD,
+            Scenes::Different => &[Odd::Alone],
+        }
+    }
 }
 
-/// The search of some kinds of returns.
-pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> ChannelResult {
+/// The search of all kinds.
+pub fn search(context: &Context, scenes: Scenes) -> ChannelResult {
     let end_m = 0.98 * end_m(context.frames);
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Returns, hold_out.len());
@@ -92,7 +96,7 @@ pub fn search_kinds(context: &Context, kinds: &[Odd], scenes: Scenes) -> Channel
     };
     let odd = odd_frames(context.frames, end_m, &explained);
     let search = Search { context, scenes, spray, ghosts, odd, select, blocks, estimate, hold_out, end_m };
-    for kind in kinds {
+    for kind in scenes.kinds() {
         search.kind(*kind, &mut result);
     }
     result
@@ -131,9 +135,9 @@ pub fn by_table(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<
     gains
 }
 
-/// Gains by the shares of some kinds of returns alone.
-pub fn kinds_by_table(context: &Context, kinds: &[Odd], train: &[usize], test: &[usize]) -> BTreeMap<Kind, Vec<f64>> {
-    shares_by_table(context, kinds, [train, test], &|_, _, _| false)
+/// The same of different streets.
+pub fn by_table_of_streets(context: &Context, train: &[usize], test: &[usize]) -> BTreeMap<Kind, Vec<f64>> {
+    shares_by_table(context, Scenes::Different.kinds(), [train, test], &|_, _, _| false)
 }
 
 /// The air behind the vehicles of each frame.
@@ -219,7 +223,6 @@ impl Search<'_> {
         let differences = self.differences(&self.select, kind);
         let (_, z_difference) = total_and_z(&differences);
         let error = base.max(more.abs() / 30.0) / z_difference.abs().max(1e-9);
-        // Thin objects that the simulation lacks, or loses, lie between its surfaces, too.
         let floor = FLOORS[k].max(0.3 * base);
         // Missing objects of the other side would be of this kind.
         let opposite = match kind {

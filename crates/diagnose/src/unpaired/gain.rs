@@ -2,7 +2,7 @@
 //! distances are measured again.
 
 use super::sides::as_pairs;
-use super::{Contexts, KINDS, Unpaired};
+use super::{Contexts, Unpaired};
 use crate::catalogue::{Channel, Kind};
 use crate::diagnosis::{Gain, NotApplied};
 use crate::engine::{Distances, GainFrames, Remake, of_channels};
@@ -23,7 +23,7 @@ fn distances(contexts: &Contexts, train: &[usize], test: &[usize]) -> Distances 
         (Channel::Roughness, noise::by_table(&contexts.returns, train, test)),
         (Channel::Ranges, quantisation::by_table(&contexts.returns, train, test)),
     ];
-    let mut all = returns::kinds_by_table(&contexts.returns, KINDS, train, test);
+    let mut all = returns::by_table_of_streets(&contexts.returns, train, test);
     all.insert(Kind::Between, mixed_pixels::by_table(&contexts.returns, train, test));
     all.insert(Kind::Surfaces, lost.into_iter().zip(cut).map(|(lost, cut)| lost + cut).collect());
     of_channels(others, all)

@@ -124,8 +124,8 @@ pub fn search(context: &Context) -> (ChannelResult, Option<Walk>) {
     let (total, z) = total_and_z(&gains);
     let large = chosen.theta[0].abs() > FLOOR_M;
     let enough = total > demands.nats && z > demands.z;
-    let [gains, expected] = sums.by_octant(&chosen, &select);
-    let alike = directions_agree(&gains, &expected);
+    let [by_octant, expected] = sums.by_octant(&chosen, &select);
+    let alike = directions_agree(&by_octant, &expected);
     let outcome = match (enough, large, alike) {
         (true, true, true) => "chosen",
         (false, ..) => "no gain on frames that it was not fitted on",

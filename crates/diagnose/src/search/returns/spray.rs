@@ -6,6 +6,7 @@ use crate::channels::plumes::{Droplet, Extent, Plume, PlumeFrame};
 use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Status};
 use crate::effects::rounded;
+use crate::inference::bisect;
 use crate::inference::choice::{significant, significant_by_signs, total_and_z};
 use crate::inference::counts::gain_of_count;
 use crate::inference::linear::cross_validated;
@@ -232,13 +233,8 @@ impl Plume {
 /// Density with which plumes have as many droplets as they have, 1/m; that of each is so many times as high.
 fn density(plumes: &[&Plume], times: &[f64]) -> f64 {
     let number: f64 = plumes.iter().map(|p| p.droplets).sum();
-    let (mut low, mut high) = (0.0, 10.0);
-    for _ in 0..60 {
-        let middle = 0.5 * (low + high);
-        let expected: f64 = plumes.iter().zip(times).map(|(p, times)| p.expected(middle * times)).sum();
-        if expected < number { low = middle } else { high = middle }
-    }
-    0.5 * (low + high)
+    let expected = |per_m: f64| plumes.iter().zip(times).map(|(p, times)| p.expected(per_m * times)).sum::<f64>();
+    bisect([0.0, 10.0], 60, |per_m| expected(per_m) < number)
 }
 
 /// Droplets by distance behind the vehicle.
