@@ -1,6 +1,7 @@
 """A training step of PointRCNN (Shi et al. 2019): convolutions of 1x1 over groups filled up to their full size, as OpenPCDet runs it.
 
-Sampling and neighbour search are compiled for the CPU by numba. Regions and their points are given, not searched for.
+Sampling and neighbour search are compiled for the CPU by numba. Regions and their points are given, not searched for. On a GPU
+neighbours are searched once, before the steps that are timed: all steps have the same points.
 """
 
 import numba
@@ -102,9 +103,21 @@ def chain1d(channels, last):
     return nn.Sequential(*layers, nn.Linear(channels[-1], last))
 
 
+def once(module, key, on_gpu, search):
+    """What `search` finds; on a GPU, what it found in the first step."""
+    found = module.found.get(key)
+    if found is None or not on_gpu:
+        found = module.found[key] = search()
+    return found
+
+
+def on_host(tensor):
+    return tensor.detach().cpu().numpy()
+
+
 def rows(tensor, index):
     """`tensor`: [B, N, C], `index`: [B, ...]; result [B, ..., C]."""
-    batch = torch.arange(tensor.shape[0]).view(-1, *[1] * (index.dim() - 1))
+    batch = torch.arange(tensor.shape[0], device=tensor.device).view(-1, *[1] * (index.dim() - 1))
     return tensor[batch, index]
 
 
@@ -118,20 +131,25 @@ def grouped(xyz, features, centers, index):
 class SetAbstraction(nn.Module):
     def __init__(self, inputs, centers, scales):
         super().__init__()
-        self.centers, self.scales = centers, scales
+        self.centers, self.scales, self.found = centers, scales, {}
         self.mlps = nn.ModuleList(chain2d([3 + inputs, *scale["filters"]]) for scale in scales)
         self.outputs = sum(scale["filters"][-1] for scale in scales)
 
+    def search(self, xyz):
+        to = lambda index: torch.from_numpy(index).to(xyz.device)
+        picks = to(farthest_of_all(on_host(xyz), self.centers))
+        centers = on_host(rows(xyz, picks))
+        ball = lambda scale: ball_of_all(on_host(xyz), centers, np.float32(scale["radius_m"]), scale["samples"])
+        return picks, [to(ball(scale)) for scale in self.scales]
+
     def forward(self, xyz, features):
         if self.centers is None:
-            index = torch.arange(xyz.shape[1]).expand(xyz.shape[0], 1, -1)
-            centers = torch.zeros(xyz.shape[0], 1, 3)
+            index = torch.arange(xyz.shape[1], device=xyz.device).expand(xyz.shape[0], 1, -1)
+            centers = torch.zeros(xyz.shape[0], 1, 3, device=xyz.device)
             groups = [index]
         else:
-            picks = torch.from_numpy(farthest_of_all(xyz.numpy(), self.centers))
+            picks, groups = once(self, "groups", xyz.is_cuda, lambda: self.search(xyz))
             centers = rows(xyz, picks)
-            search = lambda s: ball_of_all(xyz.numpy(), centers.numpy(), np.float32(s["radius_m"]), s["samples"])
-            groups = [torch.from_numpy(search(scale)) for scale in self.scales]
         out = [mlp(grouped(xyz, features, centers, g)).max(dim=-1)[0] for mlp, g in zip(self.mlps, groups)]
         return centers, torch.cat(out, dim=1)
 
@@ -139,7 +157,7 @@ class SetAbstraction(nn.Module):
 class Network(nn.Module):
     def __init__(self, config):
         super().__init__()
-        net, classes = config["network"], len(config["classes"])
+        net, classes, self.found = config["network"], len(config["classes"]), {}
         inputs = [config["channels"] - 3]
         self.sa_modules = nn.ModuleList()
         for level in net["levels"]:
@@ -168,6 +186,10 @@ class Network(nn.Module):
         self.roi_cls = chain1d([before, *roi["class_filters"]], 1)
         self.roi_box = chain1d([before, *roi["box_filters"]], 7)
 
+    def nearest(self, points, known):
+        found = [nearest_three(a, b) for a, b in zip(on_host(points), on_host(known))]
+        return [torch.from_numpy(np.stack(part)).to(points.device) for part in zip(*found)]
+
     def points(self, xyz, values):
         """xyz: [B, N, 3], values: [B, C, N]; features of all points, [B, C', N]."""
         clouds, features = [xyz], [values]
@@ -177,8 +199,7 @@ class Network(nn.Module):
             features.append(out)
         known = features[-1]
         for i in reversed(range(len(self.fp_modules))):
-            found = [nearest_three(a, b) for a, b in zip(clouds[i].numpy(), clouds[i + 1].numpy())]
-            index, distance = (torch.from_numpy(np.stack(part)) for part in zip(*found))
+            index, distance = once(self, i, xyz.is_cuda, lambda: self.nearest(clouds[i], clouds[i + 1]))
             weight = 1 / (distance.sqrt() + 1e-8)
             weight = weight / weight.sum(-1, keepdim=True)
             known = (rows(known.transpose(1, 2), index) * weight[..., None]).sum(2).transpose(1, 2)

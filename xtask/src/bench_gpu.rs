@@ -171,9 +171,6 @@ pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
     };
     let python = python().map_err(|reason| report.not_measured.push(format!("PyTorch: {reason}"))).ok();
     let chosen = if args.detectors.is_empty() { DETECTORS.map(String::from).to_vec() } else { args.detectors.clone() };
-    if python.is_some() {
-        report.not_measured.push("PointRCNN in PyTorch: its neighbours are searched on the CPU".into());
-    }
     for detector in &chosen {
         report.rows.extend(measure(root, &program, python.as_deref(), detector, &args)?);
         write(&root.join(&args.out), &report)?;
@@ -225,7 +222,7 @@ fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, a
         let references = REFERENCES.iter().filter(|[_, form, _]| has_best || *form == "openpcdet");
         for [label, form, precision] in references {
             // The report says how many points and pillars the reference gets.
-            let Some(python) = python.filter(|_| is_known && detector != "pointrcnn") else { continue };
+            let Some(python) = python.filter(|_| is_known) else { continue };
             eprintln!("{detector}, batch {batch}, {label}");
             let mut step = Command::new(python);
             step.arg(root.join("xtask/bench_train/step.py")).arg(&file).args(["--form", form, "--steps", &steps]);

@@ -4,6 +4,15 @@ use crate::{gpu_kernels, kernel_ops};
 use burn::tensor::activation::{log_softmax, sigmoid};
 use burn::tensor::{Tensor, TensorData};
 
+/// Rows of objects are filled up to a multiple of this by rows without loss. On a GPU burn compiles its kernels for how
+/// many values divide evenly, and the number of objects is another one in each step.
+const OBJECTS: usize = 16;
+
+/// The number of rows for `objects` objects.
+pub fn filled_up(objects: usize) -> usize {
+    objects.next_multiple_of(OBJECTS)
+}
+
 /// Sigmoid focal loss with alpha 0.25 and gamma 2, one value per entry.
 ///
 /// # Shapes

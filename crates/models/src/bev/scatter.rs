@@ -12,15 +12,11 @@ pub fn scatter(features: Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Tensor
     kernel_ops::scatter(&features, cells, canvas).unwrap_or_else(|| scatter_on_device(features, cells, canvas))
 }
 
-/// The same by gathers: each cell reads the row of its pillar or zeros, and in the backward pass each pillar its cell.
+/// The same by rows: each goes to its cell, and in the backward pass each pillar reads its cell.
 fn scatter_on_device(features: Tensor<2>, cells: &[u32], canvas: [usize; 3]) -> Tensor<4> {
     let [b, h, w] = canvas;
     let c = features.dims()[1];
-    let mut pillars = vec![row_ops::ZERO; b * h * w];
-    for (pillar, &cell) in cells.iter().enumerate() {
-        pillars[cell as usize] = pillar as u32;
-    }
-    let rows = row_ops::gather(features, &pillars.into()); // [B * H * W, C]
+    let rows = row_ops::place(features, &cells.into(), b * h * w); // [B * H * W, C]
     rows.reshape([b, h, w, c]).permute([0, 3, 1, 2]) // [B, C, H, W]
 }
 

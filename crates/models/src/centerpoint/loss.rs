@@ -5,7 +5,7 @@ use super::config::CenterLossConfig;
 use super::head::HeadOutputs;
 use super::target_assigner::HeadTargets;
 use crate::Losses;
-use crate::loss::gaussian_focal_sum;
+use crate::loss::{filled_up, gaussian_focal_sum};
 use crate::row_ops;
 use burn::tensor::{Tensor, TensorData};
 
@@ -37,18 +37,19 @@ fn box_loss(outputs: &HeadOutputs, targets: &[&HeadTargets], weights: &CenterLos
     let device = outputs.hm.device();
     let boxes = targets.iter().enumerate().flat_map(|(frame, t)| t.boxes.iter().flatten().map(move |b| (frame, *b)));
     let boxes: Vec<(usize, (usize, [f32; 8]))> = boxes.collect();
-    let n = boxes.len();
+    let (n, rows) = (boxes.len(), filled_up(boxes.len()));
     if n == 0 {
         return Tensor::zeros([1], &device);
     }
     let pick = |map: &Tensor<4>| {
         let [b, c, h, w] = map.dims();
         let place = |&(frame, (cell, _)): &(usize, (usize, _))| (0..c).map(move |k| (frame * c + k) * h * w + cell);
-        let index = boxes.iter().flat_map(place).map(|place| place as u32).collect();
-        row_ops::gather(map.clone().reshape([b * c * h * w, 1]), &index).reshape([n, c]) // [n, c]
+        let mut index: Vec<u32> = boxes.iter().flat_map(place).map(|place| place as u32).collect();
+        index.resize(rows * c, row_ops::ZERO);
+        row_ops::gather(map.clone().reshape([b * c * h * w, 1]), &index.into()).reshape([rows, c]) // [rows, c]
     };
-    let found = Tensor::cat(outputs.code().map(pick).to_vec(), 1); // [n, 8]
-    let (mut code, mut share) = (Vec::with_capacity(n * 8), Vec::with_capacity(n * 8));
+    let found = Tensor::cat(outputs.code().map(pick).to_vec(), 1); // [rows, 8]
+    let (mut code, mut share) = (Vec::with_capacity(rows * 8), Vec::with_capacity(rows * 8));
     for (_, (_, target)) in &boxes {
         for (&value, &weight) in target.iter().zip(&weights.code_weights) {
             // The logarithm of a negative height is not a number; such a value is no target.
@@ -57,6 +58,8 @@ fn box_loss(outputs: &HeadOutputs, targets: &[&HeadTargets], weights: &CenterLos
             share.push(if known { weight / n as f32 } else { 0.0 });
         }
     }
-    let tensor = |values| Tensor::<2>::from_data(TensorData::new(values, [n, 8]), &device);
+    code.resize(rows * 8, 0.0);
+    share.resize(rows * 8, 0.0);
+    let tensor = |values| Tensor::<2>::from_data(TensorData::new(values, [rows, 8]), &device);
     ((found - tensor(code)).abs() * tensor(share)).sum() * weights.box_weight
 }

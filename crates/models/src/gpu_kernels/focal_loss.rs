@@ -12,6 +12,7 @@ use burn::backend::tensor::IntTensor;
 use burn::backend::{Autodiff, Cube, TensorMetadata};
 use burn::tensor::{Shape, Tensor, TensorData};
 use cubecl::prelude::*;
+use rayon::prelude::*;
 
 /// Most parts that the entries are split into; each is summed by a cube.
 const MOST_PARTS: usize = 256;
@@ -163,7 +164,7 @@ pub fn focal_loss_sum(logits: &Tensor<2>, labels: &[i32], weights: &[f32]) -> Op
         bytes.iter_mut().zip(labels).for_each(|(to, &label)| *to = byte(label));
         i32::from_le_bytes(bytes)
     };
-    let words: Vec<i32> = labels.chunks(4).map(word).collect();
+    let words: Vec<i32> = labels.par_chunks(4).map(word).collect();
     let length = words.len();
     let labels = Cube::int_from_data(TensorData::new(words, [length]), &logits.device);
     let weights = Cube::float_from_data(TensorData::new(weights.to_vec(), [weights.len()]), &logits.device);

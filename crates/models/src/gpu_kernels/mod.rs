@@ -1,12 +1,14 @@
 //! Operations of a training step as single kernels of a GPU, written in CubeCL: products and convolutions, batch norms
-//! with a ReLU, the focal loss over anchors, copies of rows, the norm of the gradients and the optimiser. burn's
-//! operations are one kernel each, and on a GPU a step then takes as long as its launches.
+//! with a ReLU, the focal loss over anchors, copies and maxima of rows, the norm of the gradients and the optimiser.
+//! burn's operations are one kernel each, and on a GPU a step then takes as long as its launches.
 //!
 //! Each function gives its inputs back as an error, or `None`, for tensors that are not on a GPU or not in single
 //! precision. Sums have a fixed order: the same bits in every run on the same device.
 
 mod adam;
+mod blocks;
 mod focal_loss;
+mod maxima;
 mod norm_relu;
 mod product;
 mod rows;
@@ -16,7 +18,9 @@ mod tensor_cores;
 mod units;
 
 pub use adam::adam;
+pub(crate) use blocks::sums_of_blocks;
 pub(crate) use focal_loss::focal_loss_sum;
+pub(crate) use maxima::{gradient_of_maxima, maxima_of_groups};
 pub use norm_relu::norm_relu;
 pub(crate) use product::{product, sum_of_first};
 pub use rows::norm_relu_rows;

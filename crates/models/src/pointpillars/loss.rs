@@ -4,7 +4,7 @@ use super::Sample;
 use super::config::LossConfig;
 use super::head::Predictions;
 use crate::Losses;
-use crate::loss::{add_sin_difference, cross_entropy, sigmoid_focal_sum, smooth_l1};
+use crate::loss::{add_sin_difference, cross_entropy, filled_up, sigmoid_focal_sum, smooth_l1};
 use crate::row_ops;
 use burn::tensor::{Tensor, TensorData};
 use std::sync::Arc;
@@ -36,7 +36,11 @@ pub fn losses(predictions: &Predictions, batch: &[&Sample], weights: &LossConfig
     let rows = b * anchors;
     let logits = predictions.cls.clone().reshape([rows, classes]);
     let cls = sigmoid_focal_sum(logits, &labels, &frame_weights) * weights.class_weight;
-    let n = positive.len();
+    let n = filled_up(positive.len());
+    positive.resize(n, row_ops::ZERO);
+    share.resize(n, 0.0);
+    residuals.resize(7 * n, 0.0);
+    bins.resize(n, 0);
     let (boxes, dir) = if n == 0 {
         (Tensor::zeros([1], &device), Tensor::zeros([1], &device))
     } else {

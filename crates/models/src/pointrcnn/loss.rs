@@ -5,7 +5,7 @@ use super::config::PointRcnnLossConfig;
 use super::point_head::{POINT_CODE, PointPredictions};
 use super::point_targets::PointTargets;
 use super::roi_targets::RoiTargets;
-use crate::loss::{sigmoid_focal, smooth_l1};
+use crate::loss::{filled_up, sigmoid_focal, smooth_l1};
 use crate::row_ops;
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -52,9 +52,12 @@ pub fn point_losses(
     if n == 0 {
         return [cls, Tensor::zeros([1], &device)];
     }
-    let predicted = row_ops::gather(predictions.boxes.clone(), &positive.into()); // [n, 8]
+    let filled = filled_up(n);
+    positive.resize(filled, row_ops::ZERO);
+    codes.resize(filled * POINT_CODE, 0.0);
+    let predicted = row_ops::gather(predictions.boxes.clone(), &positive.into()); // [filled, 8]
     let code_weights = rows(weights.point_code_weights.to_vec(), [1, POINT_CODE], &device);
-    let difference = (predicted - rows(codes, [n, POINT_CODE], &device)) * code_weights;
+    let difference = (predicted - rows(codes, [filled, POINT_CODE], &device)) * code_weights;
     let boxes = smooth_l1(difference, BETA).sum() * (share * f64::from(weights.point_box_weight));
     [cls, boxes]
 }
@@ -77,14 +80,22 @@ pub fn roi_losses(
     if n == 0 {
         return [cls, Tensor::zeros([1], &device), Tensor::zeros([1], &device)];
     }
-    let reg = row_ops::gather(reg, &learned.iter().map(|&r| r as u32).collect()); // [n, 7]
-    let residuals = rows(learned.iter().flat_map(|&r| targets.residuals[r]).collect(), [n, 7], &device);
+    // What fills up the rows is the first region, without residuals: it is its own ground truth, and has no loss.
+    let filled = filled_up(n);
+    let mut places: Vec<u32> = learned.iter().map(|&r| r as u32).collect();
+    places.resize(filled, row_ops::ZERO);
+    let reg = row_ops::gather(reg, &places.into()); // [filled, 7]
+    let mut residuals: Vec<f32> = learned.iter().flat_map(|&r| targets.residuals[r]).collect();
+    residuals.resize(filled * 7, 0.0);
+    let residuals = rows(residuals, [filled, 7], &device);
     let code_weights = rows(weights.roi_code_weights.to_vec(), [1, 7], &device);
     let difference = (reg.clone() - residuals) * code_weights;
     let boxes = smooth_l1(difference, BETA).sum() * (f64::from(weights.roi_box_weight) / n as f64);
 
-    let rois: Vec<[f32; 7]> = learned.iter().map(|&r| targets.rois[r]).collect();
-    let truth: Vec<[f32; 7]> = learned.iter().map(|&r| std::array::from_fn(|i| targets.truth[r][i])).collect();
+    let mut rois: Vec<[f32; 7]> = learned.iter().map(|&r| targets.rois[r]).collect();
+    let mut truth: Vec<[f32; 7]> = learned.iter().map(|&r| std::array::from_fn(|i| targets.truth[r][i])).collect();
+    rois.resize(filled, rois[0]);
+    truth.resize(filled, rois[0]);
     let corner =
         corner_loss(decode_in_regions(reg, &rois), &truth).sum() * (f64::from(weights.corner_weight) / n as f64);
     [cls, boxes, corner]

@@ -29,6 +29,19 @@ pub fn gather(x: Tensor<2>, index: &Arc<[u32]>) -> Tensor<2> {
     Tensor::from_dispatch(Dispatch::gather_rows(x.into_dispatch(), index.clone()))
 }
 
+/// Rows that go to distinct places among rows of zeros.
+///
+/// # Shapes
+/// `x`: `[N, C]`; `places`: N; result `[count, C]`.
+///
+/// # Panics
+/// Another number of places, or one that is not below `count`.
+pub fn place(x: Tensor<2>, places: &Arc<[u32]>, count: usize) -> Tensor<2> {
+    assert_eq!(x.dims()[0], places.len(), "a place for each row");
+    assert!(places.iter().all(|&place| (place as usize) < count), "a place is not below {count}");
+    Tensor::from_dispatch(Dispatch::rows_at(x.into_dispatch(), places.clone(), count))
+}
+
 /// Groups of consecutive rows. Rows after the last group belong to none.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RowGroups {
@@ -36,8 +49,6 @@ pub struct RowGroups {
     ends: Vec<u32>,
     /// Rows of the largest group.
     most: usize,
-    /// The rows of each group, filled up to the size of the largest with its first row, which changes no maximum.
-    places: Vec<u32>,
 }
 
 impl RowGroups {
@@ -49,9 +60,14 @@ impl RowGroups {
         let spans = || std::iter::once(0).chain(ends.iter().copied()).zip(ends.iter().copied());
         let most = spans().map(|(begin, end)| end.checked_sub(begin).expect("ends rise")).max().unwrap_or(0);
         assert!(spans().all(|(begin, end)| begin < end), "a group has no rows");
+        RowGroups { ends: ends.to_vec(), most: most as usize }
+    }
+
+    /// The rows of each group, filled up to the size of the largest with its first row, which changes no maximum.
+    fn places(&self) -> impl Iterator<Item = u32> {
+        let spans = std::iter::once(0).chain(self.ends.iter().copied()).zip(self.ends.iter().copied());
         let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
-        let places = spans().flat_map(|(b, e)| (0..most).map(move |slot| place(b, e, slot))).collect();
-        RowGroups { ends: ends.to_vec(), most: most as usize, places }
+        spans.flat_map(move |(begin, end)| (0..self.most as u32).map(move |slot| place(begin, end, slot)))
     }
 
     /// Number of groups.

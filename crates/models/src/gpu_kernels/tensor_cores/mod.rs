@@ -96,10 +96,12 @@ impl Part {
     /// `lines`, `line`: number of lines, and values of a line.
     fn new(#[comptime] lines: usize, #[comptime] line: usize, #[comptime] whole: bool) -> Part {
         let values = comptime!(lines * (line + GAP) / 2);
+        // What is not used keeps the next parts on multiples of 16 bytes, from which fragments are loaded.
+        let unused = comptime!(GAP / 2);
         Part {
             high: Shared::<[Vector<bf16, Const<2>>]>::new_slice(values),
             middle: Shared::<[Vector<bf16, Const<2>>]>::new_slice(values),
-            low: Shared::<[Vector<bf16, Const<2>>]>::new_slice(comptime!(if whole { values } else { 1 })),
+            low: Shared::<[Vector<bf16, Const<2>>]>::new_slice(comptime!(if whole { values } else { unused })),
         }
     }
 
