@@ -167,6 +167,8 @@ pub struct Scale {
     pub columns: [Column; 2],
     /// Mean of ln(simulated intensity) of the used rays.
     pub centre: f64,
+    /// Standard deviation of ln(simulated intensity) of the used rays.
+    pub spread: f64,
     /// Root mean square of what rounding of both columns does to the logarithm of a ratio. All rays of a row that meet
     /// one evenly bright surface are rounded alike.
     pub rounding: f64,
@@ -250,12 +252,16 @@ impl Scale {
         }
         let square = |b: usize| ratios[b].iter().map(|y| (y - median[b]).clamp(-CAP, CAP).powi(2)).sum::<f64>();
         let variance = (kept().map(square).sum::<f64>() / n as f64).max(LEAST_STD.powi(2));
-        let centre = kept().map(|b| ratios[b].len() as f64 * bins.middle(b)).sum::<f64>() / n as f64;
+        let mean =
+            |of_bin: &dyn Fn(usize) -> f64| kept().map(|b| ratios[b].len() as f64 * of_bin(b)).sum::<f64>() / n as f64;
+        let centre = mean(&|b| bins.middle(b));
+        let spread = mean(&|b| (bins.middle(b) - centre).powi(2)).sqrt();
         let rounding = (kept().map(|b| rounding[b]).sum::<f64>() / n as f64).sqrt();
         let weight = 1.0 / (DESIGN * variance);
         let mut scale = Scale {
             columns,
             centre,
+            spread,
             rounding,
             bins,
             median,

@@ -158,8 +158,8 @@ fn next(losses: &DirectionLosses, (s, az, el): DirectionCell, (a, e): (i32, i32)
     (1..=reach).map(|k| (s, az + k * a, el + k * e)).find(|c| losses.contains_key(c))
 }
 
-/// Whether losses are small on all sides of a patch. Below it the field of view may end, but not above, where scenes
-/// end.
+/// Whether losses are small on all sides of a patch. Below it the field of view may end, or what is near be cut off, so
+/// that too few returns are left to tell; not above, where scenes end.
 fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bool {
     let span = |f: fn(&DirectionCell) -> i32, step: f64| {
         let [low, high] = [patch.iter().map(f).min(), patch.iter().map(f).max()].map(Option::unwrap_or_default);
@@ -185,7 +185,7 @@ fn stands_alone(losses: &DirectionLosses, patch: &BTreeSet<DirectionCell>) -> bo
     };
     let open = |l: &Losses| l.simulated >= FEWEST && l.share() < AROUND * own;
     let [left, right, up, down] = SIDES.map(|(a, e)| beside(a, e));
-    open(&left) && open(&right) && open(&up) && (open(&down) || down.simulated < 1.0)
+    open(&left) && open(&right) && open(&up) && (open(&down) || down.simulated < FEWEST)
 }
 
 fn place(cell: &DirectionCell) -> [f64; 2] {

@@ -20,6 +20,17 @@ const LEAST: f64 = 1e-6;
 /// Both sides show the same world. Where it has more edges or leaves both count more: `base` has a factor, drawn from a
 /// gamma distribution for each frame. The likeliest one is taken, by expectation and maximisation.
 pub fn likelihood_of_counts(counts: [&[f64]; 2], base: [&[f64]; 2], more: &[f64]) -> f64 {
+    let factor = factor_of_counts(counts, base, more);
+    let of_bin = |k: usize| {
+        let [measured, simulated] = [0, 1].map(|side| factor * base[side][k].max(LEAST));
+        let measured = measured + more[k];
+        counts[0][k] * measured.ln() - measured + counts[1][k] * simulated.ln() - simulated
+    };
+    (0..more.len()).map(of_bin).sum::<f64>() + SHAPE * (factor.ln() - factor)
+}
+
+/// The likeliest factor of a frame on what is expected of both sides, as above.
+pub fn factor_of_counts(counts: [&[f64]; 2], base: [&[f64]; 2], more: &[f64]) -> f64 {
     let bins = 0..more.len();
     let base_of = |side: usize, k: usize| base[side][k].max(LEAST);
     let all: f64 = bins.clone().map(|k| base_of(0, k) + base_of(1, k)).sum();
@@ -30,11 +41,7 @@ pub fn likelihood_of_counts(counts: [&[f64]; 2], base: [&[f64]; 2], more: &[f64]
         let number: f64 = bins.clone().map(|k| of_world(k) + counts[1][k]).sum();
         factor = (number + SHAPE) / (all + SHAPE);
     }
-    let of_bin = |k: usize| {
-        let [measured, simulated] = [factor * base_of(0, k) + more[k], factor * base_of(1, k)];
-        counts[0][k] * measured.ln() - measured + counts[1][k] * simulated.ln() - simulated
-    };
-    bins.map(of_bin).sum::<f64>() + SHAPE * (factor.ln() - factor)
+    factor
 }
 
 /// Shape of the gamma distribution of the factor between the two sides of what both show alike, in one bin: its

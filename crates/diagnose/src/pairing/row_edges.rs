@@ -72,9 +72,9 @@ pub(super) fn rows_of(scan: &SensorScan, row_of: impl Fn(usize) -> u16) -> BTree
     rows
 }
 
-/// The smallest jump of a bin, m.
-pub fn jump_m(bin: usize) -> f64 {
-    JUMPS_M[0] * (JUMPS_M[1] / JUMPS_M[0]).powf(bin as f64 / JUMPS as f64)
+/// The smallest jump of a bin, or one within it, m.
+pub fn jump_m(bin: f64) -> f64 {
+    JUMPS_M[0] * (JUMPS_M[1] / JUMPS_M[0]).powf(bin / JUMPS as f64)
 }
 
 fn bin(jump_m: f64) -> Option<usize> {
@@ -164,7 +164,7 @@ mod tests {
 
     #[test]
     fn bins_hold_their_jumps() {
-        assert!((0..JUMPS).all(|k| bin(jump_m(k) * 1.01) == Some(k)));
+        assert!((0..JUMPS).all(|k| bin(jump_m(k as f64) * 1.01) == Some(k)));
         assert!(bin(0.39).is_none() && bin(12.1).is_none());
     }
 }

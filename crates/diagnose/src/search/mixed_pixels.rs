@@ -9,7 +9,7 @@ use crate::curve::{Curve, CurvePoint};
 use crate::diagnosis::{Minimum, Parameter, Status};
 use crate::inference::bisect;
 use crate::inference::choice::{Demands, Trial, directions_agree};
-use crate::inference::counts::gain_of_count;
+use crate::inference::counts::{factor_of_counts, likelihood_of_counts};
 use crate::inference::linear::cross_validated;
 use crate::inference::roles::Role;
 use crate::pairing::{JUMPS, Jumps, LEVEL, OCTANTS, RowEdges, jump_m};
@@ -32,6 +32,13 @@ const NOISE: f64 = 3.0;
 /// spread, and how bright the two surfaces are, is not known.
 const OF_BEAM: f64 = 2.5;
 
+/// Parts of a bin of jumps in which a pulse may end.
+const PARTS: usize = 3;
+
+/// Factors of a frame on what a width mixes: sixths of a gamma distribution of mean 1 and shape 2. In each scene edges
+/// are met at other angles, and between surfaces of other brightness.
+const OF_FRAME: [f64; 6] = [0.23, 0.48, 0.72, 0.98, 1.35, 2.14];
+
 /// Bootstrap repetitions for intervals.
 const REPETITIONS: usize = 40;
 
@@ -48,9 +55,9 @@ fn sum<'a>(all: impl Iterator<Item = &'a Counts>) -> Counts {
     })
 }
 
-/// Sums over octants of both sides of some frames.
-fn both(frames: &[&Sides]) -> [Counts; 2] {
-    [0, 1].map(|side| sum(frames.iter().flat_map(|f| &f[side])))
+/// Sums over octants of both sides.
+fn both(frame: &Sides) -> [Counts; 2] {
+    [0, 1].map(|side| sum(frame[side].iter()))
 }
 
 /// Returns between the levels for each edge, by jump.
@@ -60,7 +67,9 @@ fn rates(counts: &Counts) -> [f64; JUMPS] {
     counts.map(|j| (j.between + SMOOTHING * rate) / (j.edges + SMOOTHING))
 }
 
-/// Rates of the simulated side, and beams with a width on top of them; beside rates that both sides have.
+/// Rates of the simulated side, and beams with a width on top of them; beside rates that both sides have. Both sides
+/// see the same surfaces: those that are seen at an angle have returns between their levels as well, and rates have a
+/// factor for each frame.
 #[derive(Clone, Copy, Debug)]
 struct Law {
     /// Returns between the levels for each edge, by jump.
@@ -70,65 +79,99 @@ struct Law {
     width_rad: f64,
     /// Jumps that are compared.
     from: usize,
-    /// The first jump that is longer than the pulse.
-    end: usize,
+    /// The jump that is as long as the pulse, in bins: of the bin in which it lies this part mixes.
+    end: f64,
 }
 
 impl Law {
     /// Fitted to some frames, to jumps of the bin `from` on.
     fn of(frames: &[&Sides], from: usize) -> Law {
-        let [measured, simulated] = both(frames);
-        let mut all = measured;
-        all.iter_mut().zip(&simulated).for_each(|(sum, jumps)| sum.merge(jumps));
-        let none = Law { base: rates(&simulated), common: rates(&all), width_rad: 0.0, from, end: from };
-        let sides = [measured, simulated];
-        let laws = (from + 1..=JUMPS).map(|end| none.up_to(end, &measured));
-        laws.max_by(|a, b| a.gain(&sides).total_cmp(&b.gain(&sides))).unwrap_or(none)
+        let frames: Vec<[Counts; 2]> = frames.iter().map(|frame| both(frame)).collect();
+        let [measured, simulated] = [0, 1].map(|side| sum(frames.iter().map(|f| &f[side])));
+        let all = sum([&measured, &simulated].into_iter());
+        let none = Law { base: rates(&simulated), common: rates(&all), width_rad: 0.0, from, end: from as f64 };
+        let ends = 1..=PARTS * JUMPS.saturating_sub(from);
+        let laws = ends.map(|parts| none.up_to(from as f64 + parts as f64 / PARTS as f64, &frames));
+        let gain = |law: &Law| frames.iter().map(|frame| law.gain(frame)).sum::<f64>();
+        let by_gain = laws.map(|law| (gain(&law), law));
+        by_gain.max_by(|a, b| a.0.total_cmp(&b.0)).map_or(none, |(_, law)| law)
     }
 
-    /// With jumps up to a bin that mix, and the width that is likeliest.
-    fn up_to(self, end: usize, measured: &Counts) -> Law {
+    /// With jumps that mix up to one, and the width that is likeliest.
+    fn up_to(self, end: f64, frames: &[[Counts; 2]]) -> Law {
         let law = Law { end, ..self };
-        Law { width_rad: law.best_width(measured), ..law }
+        let slope = |width_rad: f64| frames.iter().map(|frame| law.wide(width_rad).slope(frame)).sum::<f64>();
+        law.wide(bisect([0.0, WIDEST_RAD], 20, |width_rad| slope(width_rad) > 0.0))
     }
 
-    /// The width that is likeliest: the likelihood is concave in it.
-    fn best_width(&self, counts: &Counts) -> f64 {
-        let slope = |width_rad: f64| -> f64 {
-            let law = Law { width_rad, ..*self };
-            let mixed = counts.iter().enumerate().filter(|(i, j)| (self.from..self.end).contains(i) && j.edges > 0.0);
-            mixed.map(|(i, j)| j.per_rad * (j.between / law.expected(i, j) - 1.0)).sum()
-        };
-        bisect([0.0, WIDEST_RAD], 30, |width_rad| slope(width_rad) > 0.0)
+    fn wide(mut self, width_rad: f64) -> Law {
+        self.width_rad = width_rad;
+        self
+    }
+
+    /// Derivative of the logarithm of the likelihood of a frame by the width, with the factor of the frame that is
+    /// likeliest.
+    fn slope(&self, frame: &[Counts; 2]) -> f64 {
+        let [base, mixed] = [self.of_surfaces(&frame[0], &self.base), self.mixed(&frame[0])];
+        let simulated = self.of_surfaces(&frame[1], &self.base);
+        let [counts, of_simulated] = frame.each_ref().map(|side| self.between(side));
+        let factor = factor_of_counts([&counts, &of_simulated], [&base, &simulated], &mixed);
+        let of_bin = |(k, per_rad): (usize, f64)| per_rad * (counts[k] / (factor * base[k] + mixed[k]) - 1.0);
+        self.per_rad(&frame[0]).into_iter().enumerate().filter(|(_, per_rad)| *per_rad > 0.0).map(of_bin).sum()
+    }
+
+    /// Returns between the levels, of the bins that are compared.
+    fn between(&self, side: &Counts) -> Vec<f64> {
+        side[self.from..].iter().map(|jumps| jumps.between).collect()
+    }
+
+    /// Returns between the levels that rates make of edges.
+    fn of_surfaces(&self, side: &Counts, rates: &[f64; JUMPS]) -> Vec<f64> {
+        (self.from..JUMPS).map(|bin| rates[bin] * side[bin].edges).collect()
+    }
+
+    /// Returns between the levels that jumps up to the length of the pulse make for each radian of the width.
+    fn per_rad(&self, side: &Counts) -> Vec<f64> {
+        (self.from..JUMPS).map(|bin| (self.end - bin as f64).clamp(0.0, 1.0) * side[bin].per_rad).collect()
+    }
+
+    /// Returns between the levels that the width makes.
+    fn mixed(&self, side: &Counts) -> Vec<f64> {
+        self.per_rad(side).iter().map(|per_rad| self.width_rad * per_rad).collect()
     }
 
     /// Returns between the levels of some edges.
-    fn expected(&self, bin: usize, jumps: &Jumps) -> f64 {
-        let mixed = if (self.from..self.end).contains(&bin) { self.width_rad * jumps.per_rad } else { 0.0 };
-        self.base[bin] * jumps.edges + mixed
+    fn expected(&self, side: &Counts) -> Vec<f64> {
+        self.of_surfaces(side, &self.base).iter().zip(self.mixed(side)).map(|(base, mixed)| base + mixed).collect()
     }
 
     /// Gain of the counts of both sides over rates that both have, nats (Poisson).
-    fn gain(&self, [measured, simulated]: &[Counts; 2]) -> f64 {
-        let of_bin = |i: usize| {
-            let (m, s) = (&measured[i], &simulated[i]);
-            let common = self.common[i];
-            let own =
-                if m.edges > 0.0 { gain_of_count(m.between, 1.0, self.expected(i, m), common * m.edges) } else { 0.0 };
-            own + if s.edges > 0.0 { gain_of_count(s.between, s.edges, self.base[i], common) } else { 0.0 }
+    fn gain(&self, sides: &[Counts; 2]) -> f64 {
+        let [measured, simulated] = sides.each_ref().map(|side| self.between(side));
+        let mixed = self.mixed(&sides[0]);
+        let likelihood = |rates: &[f64; JUMPS], factor: f64| {
+            let [base, of_simulated] = sides.each_ref().map(|side| self.of_surfaces(side, rates));
+            let more: Vec<f64> = mixed.iter().map(|mixed| factor * mixed).collect();
+            likelihood_of_counts([&measured, &simulated], [&base, &of_simulated], &more)
         };
-        (self.from..JUMPS).map(of_bin).sum()
+        let of_factors = OF_FRAME.map(|factor| likelihood(&self.base, factor));
+        let most = of_factors.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        let mean = of_factors.iter().map(|l| (l - most).exp()).sum::<f64>() / OF_FRAME.len() as f64;
+        most + mean.ln() - likelihood(&self.common, 0.0)
     }
 
     /// What counts are expected to gain of edges as many as there are.
-    fn expected_gain(&self, [measured, simulated]: &[Counts; 2]) -> f64 {
-        let with = |i: usize| Jumps { between: self.expected(i, &measured[i]), ..measured[i] };
-        let alone = |i: usize| Jumps { between: self.base[i] * simulated[i].edges, ..simulated[i] };
-        self.gain(&[std::array::from_fn(with), std::array::from_fn(alone)])
+    fn expected_gain(&self, sides: &[Counts; 2]) -> f64 {
+        let mut all = *sides;
+        let expected = [self.expected(&sides[0]), self.of_surfaces(&sides[1], &self.base)];
+        for (side, expected) in all.iter_mut().zip(expected) {
+            side[self.from..].iter_mut().zip(expected).for_each(|(jumps, between)| jumps.between = between);
+        }
+        self.gain(&all)
     }
 
     fn gain_of(&self, frame: &Sides) -> f64 {
-        self.gain(&both(&[frame]))
+        self.gain(&both(frame))
     }
 
     /// Whether edges in all directions say so, on some frames.
@@ -142,7 +185,7 @@ impl Law {
 /// The first bin of jumps whose levels are farther apart than noise of the measured side carries a range.
 fn first_bin(context: &Context) -> usize {
     let own_m = noise_m(context.frames.iter().flat_map(|f| &f.measured));
-    (0..JUMPS).find(|&bin| LEVEL * jump_m(bin) > NOISE * std::f64::consts::SQRT_2 * own_m).unwrap_or(JUMPS)
+    (0..JUMPS).find(|&bin| LEVEL * jump_m(bin as f64) > NOISE * std::f64::consts::SQRT_2 * own_m).unwrap_or(JUMPS)
 }
 
 /// Edges of both sides of some frames.
@@ -155,14 +198,14 @@ pub fn search(context: &Context) -> ChannelResult {
     let [select, estimate, hold_out] = [Role::Select, Role::Estimate, Role::HoldOut].map(|r| context.of(r));
     let mut result = ChannelResult::new(Channel::Returns, hold_out.len());
     let [on_select, on_estimate] = [&select, &estimate].map(|frames| sides(context, frames));
-    if both(&on_select)[0].iter().all(|jumps| jumps.edges == 0.0) {
+    if on_select.iter().all(|frame| frame[0].iter().flatten().all(|jumps| jumps.edges == 0.0)) {
         return result;
     }
     let from = first_bin(context);
     let fit = |train: &[usize]| Law::of(&train.iter().map(|&i| on_select[i]).collect::<Vec<_>>(), from);
     let blocks = context.blocks(&select);
     let of_frame = |law: &Law, i: usize| {
-        let counts = both(&[on_select[i]]);
+        let counts = both(on_select[i]);
         (law.gain(&counts), law.expected_gain(&counts))
     };
     let (gains, expected) = cross_validated(&blocks, fit, of_frame).into_iter().unzip();
@@ -189,7 +232,8 @@ pub fn search(context: &Context) -> ChannelResult {
     if outcome == "chosen" {
         let gains: Vec<f64> = sides(context, &hold_out).iter().map(|frame| law.gain_of(frame)).collect();
         result.distance = gains.iter().map(|g| [g.max(0.0), *g, *g]).collect();
-        result.found.push(found(&law, &draws, error, &both(&on_estimate)[0], gains, z));
+        let counts = sum(on_estimate.iter().flat_map(|frame| &frame[0]));
+        result.found.push(found(&law, &draws, error, &counts, gains, z));
     }
     result
 }
@@ -215,20 +259,22 @@ fn found(law: &Law, draws: &[Law], error: f64, counts: &Counts, held_out_gains: 
         unit: Quantity::DivergenceRad.unit(),
         ci95: [(law.width_rad - 1.96 * error).max(0.0) / OF_BEAM, (law.width_rad + 1.96 * error) * OF_BEAM],
     };
-    // A pulse ends within the last bin that mixes, the one before or the next.
-    let ends = || draws.iter().map(|law| law.end).chain([law.end]);
-    let [first, last] = [ends().min(), ends().max()].map(|end| end.unwrap_or(law.end));
+    // As good as a bin: where a jump ends up in it is not compared.
+    let ends = || draws.iter().map(|law| law.end);
+    let [first, last] = [ends().fold(law.end, f64::min), ends().fold(law.end, f64::max)];
     let pulse = Parameter {
         estimate: jump_m(law.end),
         unit: Quantity::PulseM.unit(),
-        ci95: [jump_m(first.saturating_sub(1)), jump_m(last + 1)],
+        ci95: [jump_m(first - 1.0), jump_m(last + 1.0)],
     };
-    let points = counts.iter().enumerate().filter(|(_, jumps)| jumps.edges > 0.0).map(|(i, jumps)| CurvePoint {
+    let expected = law.expected(counts);
+    let seen = (law.from..JUMPS).filter(|&i| counts[i].edges > 0.0);
+    let points = seen.map(|i| (i, &counts[i])).map(|(i, jumps)| CurvePoint {
         sensor: 0,
-        x: jump_m(i),
+        x: jump_m(i as f64),
         measured: jumps.between / jumps.edges,
         before: law.base[i],
-        after: law.expected(i, jumps) / jumps.edges,
+        after: expected[i - law.from] / jumps.edges,
         error: jumps.between.max(1.0).sqrt() / jumps.edges,
     });
     Found {
@@ -271,7 +317,7 @@ mod tests {
             let mut one = |bin: usize| {
                 let edges = 40.0;
                 let per_rad = edges * 0.55 / STEP_RAD;
-                let mixed = if jump_m(bin) < pulse_m { width_rad * per_rad } else { 0.0 };
+                let mixed = if jump_m(bin as f64) < pulse_m { width_rad * per_rad } else { 0.0 };
                 let between = Poisson::new(0.01 * edges + mixed).unwrap().sample(&mut rng);
                 Jumps { edges, between, per_rad }
             };
@@ -285,7 +331,7 @@ mod tests {
         let frames = frames(2e-3, 2.5);
         let law = Law::of(&frames.iter().collect::<Vec<_>>(), 0);
         assert!((law.width_rad / 2e-3 - 1.0).abs() < 0.05, "{law:?}");
-        assert!(jump_m(law.end - 1) < 2.5 && jump_m(law.end) >= 2.5, "{law:?}");
+        assert!(jump_m(law.end - 1.0) < 2.5 && jump_m(law.end) >= 2.5, "{law:?}");
         assert!(law.directions_agree(&frames.iter().collect::<Vec<_>>()));
     }
 
