@@ -149,15 +149,16 @@ impl Law {
     fn gain(&self, sides: &[Counts; 2]) -> f64 {
         let [measured, simulated] = sides.each_ref().map(|side| self.between(side));
         let mixed = self.mixed(&sides[0]);
-        let likelihood = |rates: &[f64; JUMPS], factor: f64| {
-            let [base, of_simulated] = sides.each_ref().map(|side| self.of_surfaces(side, rates));
+        let [base, common] =
+            [&self.base, &self.common].map(|rates| sides.each_ref().map(|side| self.of_surfaces(side, rates)));
+        let likelihood = |[of_measured, of_simulated]: &[Vec<f64>; 2], factor: f64| {
             let more: Vec<f64> = mixed.iter().map(|mixed| factor * mixed).collect();
-            likelihood_of_counts([&measured, &simulated], [&base, &of_simulated], &more)
+            likelihood_of_counts([&measured, &simulated], [of_measured, of_simulated], &more)
         };
-        let of_factors = OF_FRAME.map(|factor| likelihood(&self.base, factor));
+        let of_factors = OF_FRAME.map(|factor| likelihood(&base, factor));
         let most = of_factors.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let mean = of_factors.iter().map(|l| (l - most).exp()).sum::<f64>() / OF_FRAME.len() as f64;
-        most + mean.ln() - likelihood(&self.common, 0.0)
+        most + mean.ln() - likelihood(&common, 0.0)
     }
 
     /// What counts are expected to gain of edges as many as there are.

@@ -42,6 +42,11 @@ pub fn place(x: Tensor<2>, places: &Arc<[u32]>, count: usize) -> Tensor<2> {
     Tensor::from_dispatch(Dispatch::rows_at(x.into_dispatch(), places.clone(), count))
 }
 
+/// Begin and end of groups with these ends.
+fn spans(ends: &[u32]) -> impl Iterator<Item = (u32, u32)> {
+    std::iter::once(0).chain(ends.iter().copied()).zip(ends.iter().copied())
+}
+
 /// Groups of consecutive rows. Rows after the last group belong to none.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RowGroups {
@@ -57,17 +62,15 @@ impl RowGroups {
     /// # Panics
     /// A group without rows.
     pub fn new(ends: &[u32]) -> Self {
-        let spans = || std::iter::once(0).chain(ends.iter().copied()).zip(ends.iter().copied());
-        let most = spans().map(|(begin, end)| end.checked_sub(begin).expect("ends rise")).max().unwrap_or(0);
-        assert!(spans().all(|(begin, end)| begin < end), "a group has no rows");
+        let most = spans(ends).map(|(begin, end)| end.checked_sub(begin).expect("ends rise")).max().unwrap_or(0);
+        assert!(spans(ends).all(|(begin, end)| begin < end), "a group has no rows");
         RowGroups { ends: ends.to_vec(), most: most as usize }
     }
 
     /// The rows of each group, filled up to the size of the largest with its first row, which changes no maximum.
     fn places(&self) -> impl Iterator<Item = u32> {
-        let spans = std::iter::once(0).chain(self.ends.iter().copied()).zip(self.ends.iter().copied());
         let place = |begin: u32, end: u32, slot: u32| if begin + slot < end { begin + slot } else { begin };
-        spans.flat_map(move |(begin, end)| (0..self.most as u32).map(move |slot| place(begin, end, slot)))
+        spans(&self.ends).flat_map(move |(begin, end)| (0..self.most as u32).map(move |slot| place(begin, end, slot)))
     }
 
     /// Number of groups.
