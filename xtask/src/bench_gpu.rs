@@ -60,6 +60,9 @@ const REFERENCES: [[&str; 3]; 4] = [
     ["torch at its best, f16", "best", "f16"],
 ];
 
+/// The files that are written.
+const FILES: [&str; 2] = ["gpu.json", "gpu.md"];
+
 /// Steps of the two runs whose kernels are counted. Autotuning is over before.
 const COUNTED_STEPS: [usize; 2] = [1, 3];
 
@@ -98,7 +101,7 @@ struct Row {
     by: String,
     /// Median of a step on a batch in memory, ms; `None` if it failed.
     step_ms: Option<f64>,
-    /// Kernels that a step launches; of this program at batch 1.
+    /// Kernels that a step launches; of this program in f32 at batch 1.
     launches: Option<usize>,
     /// Median of each stage of a step that begins with clouds, ms; the device is waited for after each.
     stages_ms: Vec<(String, f64)>,
@@ -128,8 +131,8 @@ struct Report {
 /// Runs the command with its arguments.
 ///
 /// # Errors
-/// A machine without a GPU or a parity that fails: nothing is written. A network that fails at batch 1: the detectors
-/// before are kept. Files that cannot be written.
+/// A machine without a GPU or a parity that fails: nothing is written. A network that fails at batch 1: what was
+/// measured before is kept. Files that cannot be written.
 pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
     let args = match GpuArgs::try_parse_from([&["gpu".to_string()], args].concat()) {
         Ok(args) => args,
@@ -172,8 +175,13 @@ pub fn bench_gpu(root: &Path, args: &[String]) -> Result<()> {
     let python = python().map_err(|reason| report.not_measured.push(format!("PyTorch: {reason}"))).ok();
     let chosen = if args.detectors.is_empty() { DETECTORS.map(String::from).to_vec() } else { args.detectors.clone() };
     for detector in &chosen {
-        report.rows.extend(measure(root, &program, python.as_deref(), detector, &args)?);
-        write(&root.join(&args.out), &report)?;
+        measure(root, &program, python.as_deref(), detector, &args, |row| {
+            report.rows.push(row);
+            write(&root.join(&args.out), &report)
+        })?;
+    }
+    for name in FILES {
+        eprintln!("{}", root.join(&args.out).join(name).display());
     }
     Ok(())
 }
@@ -188,13 +196,19 @@ fn has_gpu(devices: &Path) -> bool {
     !cfg!(target_os = "linux") || found || starts_with(&devices.join("dri"), "renderD")
 }
 
-/// The rows of one detector.
-fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, args: &GpuArgs) -> Result<Vec<Row>> {
+/// Gives each row of one detector to `keep` when it is measured.
+fn measure(
+    root: &Path,
+    program: &Path,
+    python: Option<&Path>,
+    detector: &str,
+    args: &GpuArgs,
+    mut keep: impl FnMut(Row) -> Result<()>,
+) -> Result<()> {
     let folder = tempfile::tempdir()?;
     let file = folder.path().join("step.json");
     let steps = args.steps.to_string();
     let detector_file = fs_err::canonicalize(root.join(detector)).ok();
-    let mut rows = Vec::new();
     for batch in std::iter::successors(Some(1), |batch| Some(4 * batch)).take_while(|&batch| batch <= args.most) {
         let of_program = |precision: &str, steps: &str| {
             let mut step = Command::new(program);
@@ -213,10 +227,10 @@ fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, a
             is_known |= turn.is_ok();
             let mut row = Row::new(detector, batch, label, turn);
             is_end |= precision == "f32" && row.step_ms.is_none_or(|ms| ms > PATIENCE_MS);
-            if batch == 1 && row.step_ms.is_some() {
+            if batch == 1 && precision == "f32" {
                 row.launches = Some(launches(folder.path(), |steps| of_program(precision, steps).map(drop))?);
             }
-            rows.push(row);
+            keep(row)?;
         }
         let has_best = detector == "pointpillars";
         let references = REFERENCES.iter().filter(|[_, form, _]| has_best || *form == "openpcdet");
@@ -229,13 +243,13 @@ fn measure(root: &Path, program: &Path, python: Option<&Path>, detector: &str, a
             let threads = std::thread::available_parallelism().map_or(1, usize::from);
             step.args(["--device", "cuda", "--precision", precision, "--threads", &threads.to_string()]);
             let turn = output(&mut step).and_then(|text| Ok(serde_json::from_slice::<Turn>(&text)?));
-            rows.push(Row::new(detector, batch, label, turn));
+            keep(Row::new(detector, batch, label, turn))?;
         }
         if is_end {
             break;
         }
     }
-    Ok(rows)
+    Ok(())
 }
 
 /// Kernels that a step launches: the difference of two runs, whose kernels burn's runtime lists in a file.
@@ -289,11 +303,10 @@ fn python() -> Result<PathBuf, String> {
 
 fn write(folder: &Path, report: &Report) -> Result<()> {
     fs_err::create_dir_all(folder)?;
-    for (name, text) in [("gpu.json", serde_json::to_string_pretty(report)? + "\n"), ("gpu.md", page(report))] {
+    for (name, text) in FILES.into_iter().zip([serde_json::to_string_pretty(report)? + "\n", page(report)]) {
         let partial = folder.join(format!("{name}.partial"));
         fs_err::write(&partial, text)?;
         fs_err::rename(&partial, folder.join(name))?;
-        eprintln!("{}", folder.join(name).display());
     }
     Ok(())
 }

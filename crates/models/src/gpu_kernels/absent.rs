@@ -1,7 +1,7 @@
 //! Operations of a training step as single kernels of a GPU: none in this build, which has no GPU device.
 
 use crate::layers::Moments;
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 use kernels::AdamStep;
 
 /// The inputs.
@@ -45,4 +45,9 @@ pub(crate) fn blend(_: [&Tensor<1>; 2], _: [&Tensor<1>; 2], _: f64, _: f64) -> O
 /// `None`.
 pub fn sums_of_squares(_: &[Tensor<1>]) -> Option<Tensor<1>> {
     None
+}
+
+/// No.
+pub(crate) fn round_to_f16(_: &Device) -> bool {
+    false
 }

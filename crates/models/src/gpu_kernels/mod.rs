@@ -27,7 +27,7 @@ pub use rows::norm_relu_rows;
 pub(crate) use rows::{place_rows, sum_of_rows};
 pub(crate) use running::blend;
 pub use squares::sums_of_squares;
-pub(crate) use tensor_cores::{convolution, convolution_gradient, has_convolutions};
+pub(crate) use tensor_cores::{convolution, convolution_gradient, has_convolutions, round_to_f16};
 
 use burn::backend::autodiff::checkpoint::strategy::NoCheckpointing;
 use burn::backend::tensor::FloatTensor;

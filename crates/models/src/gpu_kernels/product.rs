@@ -5,7 +5,7 @@ use super::{Primitive, UNITS, argument, cubes};
 use burn::backend::Cube;
 use burn::backend::TensorMetadata;
 use burn::backend::ops::FloatTensorOps;
-use burn::tensor::{DType, Shape};
+use burn::tensor::{DType, Shape, bf16, f16};
 use cubecl::prelude::*;
 
 /// Rows and columns of a product that a cube computes.
@@ -197,9 +197,14 @@ pub(crate) fn product(a: &Primitive, b: &Primitive) -> Option<Primitive> {
         unsafe { BufferArg::from_raw_parts(tensor.handle.clone(), last + 1) }
     };
     if let Some(tile) = tile {
+        let launch = if tile.parts == 1 {
+            products_of_fragments::launch_unchecked::<f16>
+        } else {
+            products_of_fragments::launch_unchecked::<bf16>
+        };
         // SAFETY: places outside of the matrices are neither read nor written.
         unsafe {
-            products_of_fragments::launch_unchecked(
+            launch(
                 &a.client,
                 CubeCount::Static(grid[0], grid[1], grid[2]),
                 CubeDim::new_1d(tile.units() as u32),

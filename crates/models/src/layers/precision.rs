@@ -1,5 +1,6 @@
 //! Precision of the matrix products: f32, two parts of bf16, or f16 with everything else in f32.
 
+use crate::gpu_kernels::round_to_f16;
 use burn::tensor::{Device, FloatDType, Tensor};
 use std::sync::atomic::{AtomicU8, Ordering};
 
@@ -13,8 +14,8 @@ pub enum Precision {
     /// f32, with factors rounded to sums of two bf16 on GPUs whose tensor cores have bf16 (PyTorch's `high`); elsewhere
     /// as f32.
     High,
-    /// f16 (mixed precision, Micikevicius et al. 2018): half the memory traffic, and tensor cores of GPUs where burn
-    /// uses them.
+    /// f16 (mixed precision, Micikevicius et al. 2018). On tensor cores factors are rounded as they are read, which are
+    /// 11 bits as in TF32; elsewhere tensors are converted.
     F16,
 }
 
@@ -58,6 +59,7 @@ pub fn multiply<const A: usize, const B: usize, const C: usize>(
 ) -> Tensor<C> {
     match Precision::chosen() {
         Precision::F32 | Precision::High => product(a, b),
+        Precision::F16 if round_to_f16(&a.device()) => product(a, b),
         Precision::F16 => product(a.cast(FloatDType::F16), b.cast(FloatDType::F16)).cast(FloatDType::F32),
     }
 }

@@ -5,7 +5,7 @@ use crate::gpu_kernels::{Primitive, argument, is_plain};
 use burn::backend::ops::FloatTensorOps;
 use burn::backend::tensor::IntTensor;
 use burn::backend::{Cube, TensorMetadata};
-use burn::tensor::{DType, Shape};
+use burn::tensor::{DType, Shape, bf16, f16};
 use cubecl::prelude::*;
 
 /// 3x3 convolutions, or their gradients by the weights, of images that are not unfolded.
@@ -18,7 +18,7 @@ use cubecl::prelude::*;
 /// `x`: images `[B, channels, pixels]`; `taps`: the pixel that a tap reads, or `pixels` for none, `[9, outputs]`;
 /// `of_part`: pixels of a part.
 #[cube(launch_unchecked)]
-fn convolutions(
+fn convolutions<E: Float>(
     a: &[f32],
     x: &[f32],
     taps: &[i32],
@@ -35,8 +35,8 @@ fn convolutions(
     let depth = comptime!(tile.depth);
     let line_b = comptime!(if forward { tile.columns } else { tile.depth });
     let [pairs_a, pairs_b] = comptime!(tile.pairs());
-    let mut part_a = Part::new(comptime!(tile.rows), depth, tile.whole);
-    let mut part_b = Part::new(comptime!(tile.columns * tile.depth / line_b), line_b, tile.whole);
+    let mut part_a = Part::<E>::new(comptime!(tile.rows), depth, tile.parts);
+    let mut part_b = Part::<E>::new(comptime!(tile.columns * tile.depth / line_b), line_b, tile.parts);
     let mut next_a = Array::<f32>::new(comptime!(2 * pairs_a));
     let mut next_b = Array::<f32>::new(comptime!(2 * pairs_b));
     let sums = zeros(comptime!(tile.own()[0] * tile.own()[1] * tile.sums()));
@@ -82,8 +82,8 @@ fn convolutions(
         let multiplies = has_part;
         if multiplies {
             sync_cube();
-            part_a.set(&next_a, pairs_a, depth, units, tile.whole);
-            part_b.set(&next_b, pairs_b, line_b, units, tile.whole);
+            part_a.set(&next_a, pairs_a, depth, units, tile.parts);
+            part_b.set(&next_b, pairs_b, line_b, units, tile.parts);
             sync_cube();
         }
         has_part = !ends;
@@ -152,7 +152,7 @@ fn convolutions(
             }
         }
         if multiplies {
-            multiply(&part_a, &part_b, &sums, true, forward, tile);
+            multiply::<E>(&part_a, &part_b, &sums, true, forward, tile);
         }
     }
     let mut columns = outputs;
@@ -214,9 +214,11 @@ fn convolve(
         return None;
     }
     let out = Cube::float_empty(shape, &a.device, a.dtype().into());
+    let launch =
+        if tile.parts == 1 { convolutions::launch_unchecked::<f16> } else { convolutions::launch_unchecked::<bf16> };
     // SAFETY: places outside of the matrices are neither read nor written.
     unsafe {
-        convolutions::launch_unchecked(
+        launch(
             &a.client,
             CubeCount::Static(grid[0], grid[1], grid[2]),
             CubeDim::new_1d(tile.units() as u32),

@@ -1,11 +1,12 @@
-//! Products of matrices and 3x3 convolutions in single precision on tensor cores of bf16.
+//! Products of matrices and 3x3 convolutions of values in single precision on tensor cores.
 //!
 //! A value is the sum of three of bf16, each the nearest one to what is missing: 24 bits, which is all of it. Of the
 //! nine products of two such sums six are added; the others are below the rounding of the result (Henry et al. 2019,
 //! "Leveraging the bfloat16 Artificial Intelligence Datatype For Higher-Precision Computations"). Tensor cores cut off
 //! what they add, so that the largest of the six has a sum of its own, which has a sixth of the additions (Ootomo and
 //! Yokota 2022, "Recovering single precision accuracy from Tensor Cores"). With [`Precision::High`] two parts and three
-//! products are used: a relative error of 2^-16 (TF32: 2^-11).
+//! products are used: a relative error of 2^-16 (TF32: 2^-11). With [`Precision::F16`] a value is rounded to f16, which
+//! has as many digits as TF32.
 
 mod convolutions;
 mod products;
@@ -14,7 +15,8 @@ pub(crate) use convolutions::{convolution, convolution_gradient, has_convolution
 pub(super) use products::products_of_fragments;
 
 use crate::layers::Precision;
-use burn::tensor::bf16;
+use burn::backend::DispatchDevice;
+use burn::tensor::Device;
 use cubecl::cmma::{self, Matrix, MatrixIdent, MatrixLayout};
 use cubecl::ir::{DeviceProperties, ElemType, FloatKind};
 use cubecl::prelude::*;
@@ -38,28 +40,29 @@ pub(super) struct Tile {
     pub depth: usize,
     /// Planes along the rows and the columns.
     pub planes: [usize; 2],
-    /// Whether values have three parts, not two.
-    pub whole: bool,
+    /// Parts of a value: three or two of bf16, or one of f16.
+    pub parts: usize,
 }
 
 impl Tile {
     /// For gradients by the weights of a convolution.
     pub(super) fn of_gradient() -> Tile {
-        Tile { rows: 64, columns: 64, depth: 16, planes: [2, 2], whole: is_whole() }
+        Tile { rows: 64, columns: 64, depth: 16, planes: [2, 2], parts: parts() }
     }
 
     /// For products of some rows.
     pub(super) fn of_product(rows: usize) -> Tile {
-        if rows <= 64 || is_whole() {
-            Tile { rows: 64, columns: 128, depth: 16, planes: [2, 4], whole: is_whole() }
+        let parts = parts();
+        if rows <= 64 || parts == 3 {
+            Tile { rows: 64, columns: 128, depth: 16, planes: [2, 4], parts }
         } else {
-            Tile { rows: 128, columns: 128, depth: 32, planes: [2, 4], whole: false }
+            Tile { rows: 128, columns: 128, depth: 32, planes: [2, 4], parts }
         }
     }
 
     /// Sums that a plane has of each fragment.
     const fn sums(&self) -> usize {
-        if self.whole { 2 } else { 1 }
+        if self.parts == 3 { 2 } else { 1 }
     }
 
     pub(super) const fn units(&self) -> usize {
@@ -77,31 +80,35 @@ impl Tile {
     }
 }
 
-/// Whether products have all digits of single precision.
-fn is_whole() -> bool {
-    Precision::chosen() != Precision::High
+/// Parts of a value in the chosen precision. Three have all digits of single precision.
+fn parts() -> usize {
+    match Precision::chosen() {
+        Precision::F32 => 3,
+        Precision::High => 2,
+        Precision::F16 => 1,
+    }
 }
 
 /// A part of a matrix in shared memory, as sums.
 #[derive(CubeType)]
-struct Part {
-    high: Shared<[Vector<bf16, Const<2>>]>,
-    middle: Shared<[Vector<bf16, Const<2>>]>,
-    low: Shared<[Vector<bf16, Const<2>>]>,
+struct Part<E: Float> {
+    high: Shared<[Vector<E, Const<2>>]>,
+    middle: Shared<[Vector<E, Const<2>>]>,
+    low: Shared<[Vector<E, Const<2>>]>,
 }
 
 #[cube]
-impl Part {
+impl<E: Float> Part<E> {
     /// # Arguments
     /// `lines`, `line`: number of lines, and values of a line.
-    fn new(#[comptime] lines: usize, #[comptime] line: usize, #[comptime] whole: bool) -> Part {
+    fn new(#[comptime] lines: usize, #[comptime] line: usize, #[comptime] parts: usize) -> Part<E> {
         let values = comptime!(lines * (line + GAP) / 2);
         // What is not used keeps the next parts on multiples of 16 bytes, from which fragments are loaded.
         let unused = comptime!(GAP / 2);
-        Part {
-            high: Shared::<[Vector<bf16, Const<2>>]>::new_slice(values),
-            middle: Shared::<[Vector<bf16, Const<2>>]>::new_slice(values),
-            low: Shared::<[Vector<bf16, Const<2>>]>::new_slice(comptime!(if whole { values } else { unused })),
+        Part::<E> {
+            high: Shared::<[Vector<E, Const<2>>]>::new_slice(values),
+            middle: Shared::<[Vector<E, Const<2>>]>::new_slice(comptime!(if parts >= 2 { values } else { unused })),
+            low: Shared::<[Vector<E, Const<2>>]>::new_slice(comptime!(if parts == 3 { values } else { unused })),
         }
     }
 
@@ -112,7 +119,7 @@ impl Part {
         #[comptime] pairs: usize,
         #[comptime] line: usize,
         #[comptime] units: usize,
-        #[comptime] whole: bool,
+        #[comptime] parts: usize,
     ) {
         #[unroll]
         for j in 0..pairs {
@@ -121,14 +128,16 @@ impl Part {
             let mut pair = Vector::<f32, Const<2>>::empty();
             pair.insert(0usize, values[2 * j]);
             pair.insert(1usize, values[2 * j + 1]);
-            let high = Vector::<bf16, Const<2>>::cast_from(pair);
-            let missing = pair - Vector::<f32, Const<2>>::cast_from(high);
-            let middle = Vector::<bf16, Const<2>>::cast_from(missing);
+            let high = Vector::<E, Const<2>>::cast_from(pair);
             self.high[at] = high;
-            self.middle[at] = middle;
-            if comptime!(whole) {
-                let missing = missing - Vector::<f32, Const<2>>::cast_from(middle);
-                self.low[at] = Vector::<bf16, Const<2>>::cast_from(missing);
+            if comptime!(parts >= 2) {
+                let missing = pair - Vector::<f32, Const<2>>::cast_from(high);
+                let middle = Vector::<E, Const<2>>::cast_from(missing);
+                self.middle[at] = middle;
+                if comptime!(parts == 3) {
+                    let missing = missing - Vector::<f32, Const<2>>::cast_from(middle);
+                    self.low[at] = Vector::<E, Const<2>>::cast_from(missing);
+                }
             }
         }
     }
@@ -155,9 +164,9 @@ fn zeros(#[comptime] count: usize) -> Sequence<Matrix<f32>> {
 /// Adds the products of two parts. The lines of the first one are rows, or terms; those of the second one terms, or
 /// columns.
 #[cube]
-fn multiply(
-    a: &Part,
-    b: &Part,
+fn multiply<E: Float>(
+    a: &Part<E>,
+    b: &Part<E>,
     sums: &Sequence<Matrix<f32>>,
     #[comptime] a_by_columns: bool,
     #[comptime] b_by_columns: bool,
@@ -170,7 +179,7 @@ fn multiply(
     #[unroll]
     for k in 0..comptime!(tile.depth / SIDE) {
         let term = comptime!(k * SIDE);
-        let mut of_rows = Sequence::<Matrix<bf16>>::new();
+        let mut of_rows = Sequence::<Matrix<E>>::new();
         #[unroll]
         for i in 0..own_rows {
             let row = plane_row + comptime!(i * SIDE);
@@ -178,10 +187,12 @@ fn multiply(
             if comptime!(a_by_columns) {
                 at = row * step_a + term;
             }
-            of_rows.push(fragment(&a.high, at / 2, MatrixIdent::A, a_by_columns, step_a));
-            of_rows.push(fragment(&a.middle, at / 2, MatrixIdent::A, a_by_columns, step_a));
-            if comptime!(tile.whole) {
-                of_rows.push(fragment(&a.low, at / 2, MatrixIdent::A, a_by_columns, step_a));
+            of_rows.push(fragment::<E>(&a.high, at / 2, MatrixIdent::A, a_by_columns, step_a));
+            if comptime!(tile.parts >= 2) {
+                of_rows.push(fragment::<E>(&a.middle, at / 2, MatrixIdent::A, a_by_columns, step_a));
+            }
+            if comptime!(tile.parts == 3) {
+                of_rows.push(fragment::<E>(&a.low, at / 2, MatrixIdent::A, a_by_columns, step_a));
             }
         }
         #[unroll]
@@ -191,10 +202,16 @@ fn multiply(
             if comptime!(b_by_columns) {
                 at = term * step_b + column;
             }
-            let high = fragment(&b.high, at / 2, MatrixIdent::B, b_by_columns, step_b);
-            let middle = fragment(&b.middle, at / 2, MatrixIdent::B, b_by_columns, step_b);
-            if comptime!(tile.whole) {
-                let low = fragment(&b.low, at / 2, MatrixIdent::B, b_by_columns, step_b);
+            let high = fragment::<E>(&b.high, at / 2, MatrixIdent::B, b_by_columns, step_b);
+            if comptime!(tile.parts == 1) {
+                #[unroll]
+                for i in 0..own_rows {
+                    let sum = sums.index(comptime!(i * own_columns + j));
+                    cmma::execute(of_rows.index(i), &high, sum, sum);
+                }
+            } else if comptime!(tile.parts == 3) {
+                let middle = fragment::<E>(&b.middle, at / 2, MatrixIdent::B, b_by_columns, step_b);
+                let low = fragment::<E>(&b.low, at / 2, MatrixIdent::B, b_by_columns, step_b);
                 #[unroll]
                 for i in 0..own_rows {
                     let small = sums.index(comptime!(2 * (i * own_columns + j) + 1));
@@ -207,6 +224,7 @@ fn multiply(
                     cmma::execute(of_rows.index(comptime!(3 * i)), &high, sum, sum);
                 }
             } else {
+                let middle = fragment::<E>(&b.middle, at / 2, MatrixIdent::B, b_by_columns, step_b);
                 #[unroll]
                 for i in 0..own_rows {
                     let sum = sums.index(comptime!(i * own_columns + j));
@@ -286,27 +304,37 @@ fn write(
 
 /// A fragment of shared memory, whose lines are rows, or columns.
 #[cube]
-fn fragment(
-    part: &Shared<[Vector<bf16, Const<2>>]>,
+fn fragment<E: Float>(
+    part: &Shared<[Vector<E, Const<2>>]>,
     at: usize,
     #[comptime] ident: MatrixIdent,
     #[comptime] lines_are_rows: bool,
     #[comptime] step: usize,
-) -> Matrix<bf16> {
+) -> Matrix<E> {
     let layout = comptime!(if lines_are_rows { MatrixLayout::RowMajor } else { MatrixLayout::ColMajor });
-    let mut read = unsafe { Matrix::<bf16>::uninitialized(ident, SIDE, SIDE, SIDE, layout) };
+    let mut read = unsafe { Matrix::<E>::uninitialized(ident, SIDE, SIDE, SIDE, layout) };
     let end = part.len();
     cmma::load(&mut read, &part[at..end], step as u32);
     read
 }
 
-/// Whether a device has tensor cores of bf16 for such fragments.
+/// Whether products round their factors to f16 themselves on a device: its tensor cores have f16.
+pub(crate) fn round_to_f16(device: &Device) -> bool {
+    parts() == 1
+        && match device.clone().inner().as_dispatch() {
+            DispatchDevice::Cube(device) => are_had_by(device.client().properties()),
+            _ => false,
+        }
+}
+
+/// Whether a device has tensor cores for such fragments in the chosen precision.
 pub(super) fn are_had_by(properties: &DeviceProperties) -> bool {
-    let (bf16, f32) = (ElemType::Float(FloatKind::BF16), ElemType::Float(FloatKind::F32));
+    let kind = if parts() == 1 { FloatKind::F16 } else { FloatKind::BF16 };
+    let (part, f32) = (ElemType::Float(kind), ElemType::Float(FloatKind::F32));
     let hardware = &properties.hardware;
     (hardware.plane_size_min, hardware.plane_size_max) == (PLANE as u32, PLANE as u32)
         && properties.features.matmul.cmma.iter().any(|config| {
             [config.m, config.n, config.k] == [SIDE as u32; 3]
-                && (config.a_type, config.b_type, config.cd_type) == (bf16, bf16, f32)
+                && (config.a_type, config.b_type, config.cd_type) == (part, part, f32)
         })
 }

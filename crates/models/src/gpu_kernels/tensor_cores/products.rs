@@ -6,7 +6,7 @@ use cubecl::prelude::*;
 
 /// Products of matrices. A cube for each tile along the columns (x) and rows (y) of each product (z).
 #[cube(launch_unchecked)]
-pub(in crate::gpu_kernels) fn products_of_fragments(
+pub(in crate::gpu_kernels) fn products_of_fragments<E: Float>(
     a: &[f32],
     b: &[f32],
     out: &mut [f32],
@@ -25,8 +25,8 @@ pub(in crate::gpu_kernels) fn products_of_fragments(
     let line_a = comptime!(if a_by_columns { tile.depth } else { tile.rows });
     let line_b = comptime!(if b_by_columns { tile.columns } else { tile.depth });
     let [pairs_a, pairs_b] = comptime!(tile.pairs());
-    let mut part_a = Part::new(comptime!(tile.rows * tile.depth / line_a), line_a, tile.whole);
-    let mut part_b = Part::new(comptime!(tile.columns * tile.depth / line_b), line_b, tile.whole);
+    let mut part_a = Part::<E>::new(comptime!(tile.rows * tile.depth / line_a), line_a, tile.parts);
+    let mut part_b = Part::<E>::new(comptime!(tile.columns * tile.depth / line_b), line_b, tile.parts);
     let mut next_a = Array::<f32>::new(comptime!(2 * pairs_a));
     let mut next_b = Array::<f32>::new(comptime!(2 * pairs_b));
     let sums = zeros(comptime!(tile.own()[0] * tile.own()[1] * tile.sums()));
@@ -44,8 +44,8 @@ pub(in crate::gpu_kernels) fn products_of_fragments(
     while first < terms + comptime!(tile.depth) {
         if first > 0 {
             sync_cube();
-            part_a.set(&next_a, pairs_a, line_a, units, tile.whole);
-            part_b.set(&next_b, pairs_b, line_b, units, tile.whole);
+            part_a.set(&next_a, pairs_a, line_a, units, tile.parts);
+            part_b.set(&next_b, pairs_b, line_b, units, tile.parts);
             sync_cube();
         }
         if first < terms {
@@ -87,7 +87,7 @@ pub(in crate::gpu_kernels) fn products_of_fragments(
             }
         }
         if first > 0 {
-            multiply(&part_a, &part_b, &sums, a_by_columns, b_by_columns, tile);
+            multiply::<E>(&part_a, &part_b, &sums, a_by_columns, b_by_columns, tile);
         }
         first += comptime!(tile.depth);
     }
