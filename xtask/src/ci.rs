@@ -22,7 +22,7 @@ pub fn ci(root: &Path) -> Result<()> {
         let args = ["--quiet", "--workspace", "--all-targets", FEATURES[0], FEATURES[1], "--", "-D", "warnings"];
         component(root, "clippy", &args)
     })?;
-    step("test", || must(cargo(root).args(["test", "--workspace"]).args(FEATURES)))?;
+    step("test", || must(cargo(root).args(["test", "--workspace", "--no-fail-fast"]).args(FEATURES)))?;
     step("python", || crate::python::test(root, &FEATURES))?;
     eprintln!("ci: all passed in {:.0} s", start.elapsed().as_secs_f64());
     Ok(())
